@@ -1,0 +1,114 @@
+//! The triclinic cell and the few 3×3 operations that go with it.
+
+/// A vector in space, Å unless said otherwise.
+pub type Vec3 = [f64; 3];
+
+/// A 3×3 matrix by rows.
+pub type Matrix3 = [[f64; 3]; 3];
+
+/// Lattice vectors as rows, Å. A direction that is not periodic may have any non-degenerate vector.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Cell(pub Matrix3);
+
+impl Cell {
+    /// An orthorhombic cell with edges `a`, `b`, `c`, Å.
+    pub fn orthorhombic(a: f64, b: f64, c: f64) -> Self {
+        Self([[a, 0.0, 0.0], [0.0, b, 0.0], [0.0, 0.0, c]])
+    }
+
+    /// Volume, Å³; negative for a left-handed set of lattice vectors.
+    pub fn signed_volume(&self) -> f64 {
+        let [a, b, c] = self.0;
+        dot(a, cross(b, c))
+    }
+
+    /// |Volume|, Å³.
+    pub fn volume(&self) -> f64 {
+        self.signed_volume().abs()
+    }
+
+    /// Rows of the inverse transposed: the reciprocal vectors b_i with a_i · b_j = δ_ij, 1/Å.
+    pub fn reciprocal(&self) -> Matrix3 {
+        let [a, b, c] = self.0;
+        let volume = self.signed_volume();
+        [scale(cross(b, c), 1.0 / volume), scale(cross(c, a), 1.0 / volume), scale(cross(a, b), 1.0 / volume)]
+    }
+
+    /// Distance between opposite faces of the cell in each lattice direction, Å.
+    pub fn heights(&self) -> Vec3 {
+        self.reciprocal().map(|b| 1.0 / norm(b))
+    }
+
+    /// Fractional coordinates of a Cartesian position.
+    pub fn fractional(&self, position: Vec3) -> Vec3 {
+        self.reciprocal().map(|b| dot(b, position))
+    }
+
+    /// Cartesian position of fractional coordinates, Å.
+    pub fn cartesian(&self, fractional: Vec3) -> Vec3 {
+        let [a, b, c] = self.0;
+        std::array::from_fn(|k| fractional[0] * a[k] + fractional[1] * b[k] + fractional[2] * c[k])
+    }
+
+    /// The translation of a periodic image, Å.
+    #[inline]
+    pub fn translation(&self, image: [i32; 3]) -> Vec3 {
+        self.cartesian(image.map(f64::from))
+    }
+}
+
+/// a · b
+#[inline]
+pub fn dot(a: Vec3, b: Vec3) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// a × b
+#[inline]
+pub fn cross(a: Vec3, b: Vec3) -> Vec3 {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// |a|
+#[inline]
+pub fn norm(a: Vec3) -> f64 {
+    dot(a, a).sqrt()
+}
+
+/// s a
+#[inline]
+pub fn scale(a: Vec3, s: f64) -> Vec3 {
+    a.map(|x| s * x)
+}
+
+/// a + b
+#[inline]
+pub fn add(a: Vec3, b: Vec3) -> Vec3 {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+/// a − b
+#[inline]
+pub fn sub(a: Vec3, b: Vec3) -> Vec3 {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+/// x M for a row vector x: Σ_i x_i M_ik.
+#[inline]
+pub fn row_times(x: Vec3, m: &Matrix3) -> Vec3 {
+    std::array::from_fn(|k| x[0] * m[0][k] + x[1] * m[1][k] + x[2] * m[2][k])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fractional_and_cartesian_are_inverse() {
+        let cell = Cell([[4.0, 0.3, 0.0], [-1.0, 5.0, 0.2], [0.5, 0.1, 6.0]]);
+        let position = [1.5, -7.0, 22.0];
+        let back = cell.cartesian(cell.fractional(position));
+        assert!(norm(sub(back, position)) < 1e-12);
+        assert!((cell.heights()[2] - cell.volume() / norm(cross(cell.0[0], cell.0[1]))).abs() < 1e-12);
+    }
+}

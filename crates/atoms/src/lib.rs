@@ -1,0 +1,19 @@
+//! Atoms and what every other part needs to speak of them: species, cell, structure, neighbour
+//! list, the [`Potential`] trait and the file formats at the edges.
+//!
+//! Units inside: eV, Å, fs, u, K. Conversion happens in the module that knows a foreign format.
+
+pub mod cell;
+pub mod extxyz;
+mod neighbours;
+pub mod poscar;
+mod potential;
+mod species;
+mod structure;
+pub mod units;
+
+pub use cell::{Cell, Matrix3, Vec3};
+pub use neighbours::{Neighbour, NeighbourList};
+pub use potential::{Evaluation, Potential, PotentialError};
+pub use species::{Species, UnknownSpecies};
+pub use structure::{Structure, StructureError};

@@ -1,0 +1,80 @@
+//! What every interatomic potential gives.
+
+use crate::cell::{Matrix3, Vec3};
+use crate::neighbours::NeighbourList;
+use crate::species::Species;
+use crate::structure::Structure;
+
+/// Energy and its derivatives for one structure.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Evaluation {
+    /// Energy of each atom, [n], eV.
+    pub atomic_energies: Vec<f64>,
+    /// −∂E/∂r, [n], eV/Å.
+    pub forces: Vec<Vec3>,
+    /// −∂E/∂ε, eV (symmetric; stress = −virial / volume, tension positive).
+    pub virial: Matrix3,
+}
+
+impl Evaluation {
+    /// Sets the arrays to `n` atoms and zero.
+    pub fn reset(&mut self, n: usize) {
+        self.atomic_energies.clear();
+        self.atomic_energies.resize(n, 0.0);
+        self.forces.clear();
+        self.forces.resize(n, [0.0; 3]);
+        self.virial = [[0.0; 3]; 3];
+    }
+
+    /// Total energy, eV.
+    pub fn energy(&self) -> f64 {
+        self.atomic_energies.iter().sum()
+    }
+
+    /// Stress = −virial / volume, eV/Å³, tension positive.
+    pub fn stress(&self, volume: f64) -> Matrix3 {
+        self.virial.map(|row| row.map(|w| -w / volume))
+    }
+}
+
+/// Why a potential cannot evaluate a structure.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum PotentialError {
+    /// An element the potential has no parameters for.
+    #[error("atom {atom} is {species}, which the potential does not know (it knows {known})")]
+    Species {
+        /// Index of the atom.
+        atom: usize,
+        /// Its element.
+        species: Species,
+        /// Symbols the potential knows.
+        known: String,
+    },
+    /// The neighbour list reaches less far than the potential.
+    #[error("the neighbour list reaches {list} Å, the potential needs {needed} Å")]
+    Cutoff {
+        /// Cutoff of the list, Å.
+        list: f64,
+        /// Cutoff of the potential, Å.
+        needed: f64,
+    },
+}
+
+/// An interatomic potential. `&mut self` lets an implementation keep its work arrays between steps.
+pub trait Potential: Send {
+    /// The largest pair distance that matters, Å.
+    fn cutoff(&self) -> f64;
+
+    /// The elements it knows.
+    fn species(&self) -> &[Species];
+
+    /// Writes energies, forces and virial of `structure` into `out` (whatever it held before).
+    ///
+    /// `neighbours` must be up to date for `structure` and reach at least [`Potential::cutoff`].
+    fn evaluate(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError>;
+}

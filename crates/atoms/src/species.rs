@@ -1,0 +1,107 @@
+//! The chemical element of an atom.
+
+use std::fmt;
+use std::str::FromStr;
+
+use mendeleev::Element;
+use serde::{Deserialize, Serialize};
+
+/// A chemical element, by atomic number (1 … 118).
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Species(u8);
+
+/// A symbol or atomic number that names no element.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("unknown element '{0}' (expected a symbol such as Al, or an atomic number from 1 to 118)")]
+pub struct UnknownSpecies(pub String);
+
+impl Species {
+    /// The element of atomic number `number`.
+    pub fn from_atomic_number(number: u8) -> Result<Self, UnknownSpecies> {
+        if (1..=118).contains(&number) { Ok(Self(number)) } else { Err(UnknownSpecies(number.to_string())) }
+    }
+
+    /// Atomic number Z.
+    pub fn atomic_number(self) -> u8 {
+        self.0
+    }
+
+    /// Symbol, `"Al"`.
+    pub fn symbol(self) -> &'static str {
+        self.element().symbol()
+    }
+
+    /// Standard atomic weight, u; the mass number of the most stable isotope where there is none.
+    pub fn mass(self) -> f64 {
+        self.element().atomic_weight().into()
+    }
+
+    fn element(self) -> Element {
+        // The constructor admits 1 … 118 only, which is what the table holds, in order.
+        mendeleev::ALL_ELEMENTS[usize::from(self.0) - 1]
+    }
+}
+
+impl FromStr for Species {
+    type Err = UnknownSpecies;
+
+    fn from_str(symbol: &str) -> Result<Self, UnknownSpecies> {
+        mendeleev::ALL_ELEMENTS
+            .iter()
+            .position(|element| element.symbol() == symbol)
+            .map(|index| Self(index as u8 + 1))
+            .ok_or_else(|| UnknownSpecies(symbol.to_owned()))
+    }
+}
+
+impl TryFrom<String> for Species {
+    type Error = UnknownSpecies;
+
+    fn try_from(symbol: String) -> Result<Self, UnknownSpecies> {
+        symbol.parse()
+    }
+}
+
+impl From<Species> for String {
+    fn from(species: Species) -> Self {
+        species.symbol().to_owned()
+    }
+}
+
+impl fmt::Display for Species {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.symbol())
+    }
+}
+
+impl fmt::Debug for Species {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.symbol())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_element_goes_to_its_symbol_and_back() {
+        for number in 1..=118 {
+            let species = Species::from_atomic_number(number).unwrap();
+            assert_eq!(species.symbol().parse(), Ok(species));
+            assert!(species.mass() >= 1.0);
+        }
+        assert_eq!("Al".parse::<Species>().unwrap().atomic_number(), 13);
+        assert!("al".parse::<Species>().is_err());
+        assert!(Species::from_atomic_number(0).is_err());
+    }
+
+    #[test]
+    fn masses_are_the_standard_atomic_weights() {
+        for (symbol, mass) in [("H", 1.008), ("Al", 26.9815), ("Si", 28.085), ("W", 183.84)] {
+            let species: Species = symbol.parse().unwrap();
+            assert!((species.mass() - mass).abs() < 1e-3, "{symbol} {}", species.mass());
+        }
+    }
+}

@@ -1,0 +1,1 @@
+//! The CALM mixture: grade, gradient, update. Knows numbers, not atoms.

@@ -1,0 +1,1 @@
+//! Integrators, thermostats, counter-based random numbers.

@@ -1,0 +1,1 @@
+//! Interatomic potentials: GRACE, EAM, Stillinger–Weber, ZBL.

@@ -1,0 +1,1 @@
+//! Identifiers, messages and the transport between actors.

@@ -1,0 +1,3 @@
+//! calmwalk: expands the training set of an interatomic potential.
+
+fn main() {}
