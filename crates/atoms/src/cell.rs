@@ -50,6 +50,30 @@ impl Cell {
         std::array::from_fn(|k| fractional[0] * a[k] + fractional[1] * b[k] + fractional[2] * c[k])
     }
 
+    /// The cell with unit vectors, orthogonal to all others, in the directions that do not repeat.
+    ///
+    /// What the lattice vectors of these directions were (often zero) does not matter.
+    pub fn completed(&self, periodic: [bool; 3]) -> Self {
+        let mut rows = self.0;
+        match periodic {
+            [true, true, true] => {}
+            [false, false, false] => rows = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            _ => {
+                // Seen cyclically, the first vector that repeats stands at k and a gap follows or precedes it.
+                let k = (0..3).find(|k| periodic[*k] && !periodic[(k + 2) % 3]).unwrap_or(0);
+                let (second, third) = ((k + 1) % 3, (k + 2) % 3);
+                if !periodic[second] {
+                    let axis = (0..3).fold(0, |m, n| if rows[k][n].abs() < rows[k][m].abs() { n } else { m });
+                    let mut least_aligned = [0.0; 3];
+                    least_aligned[axis] = 1.0;
+                    rows[second] = unit(cross(rows[k], least_aligned));
+                }
+                rows[third] = unit(cross(rows[k], rows[second]));
+            }
+        }
+        Self(rows)
+    }
+
     /// The translation of a periodic image, Å.
     #[inline]
     pub fn translation(&self, image: [i32; 3]) -> Vec3 {
@@ -73,6 +97,12 @@ pub fn cross(a: Vec3, b: Vec3) -> Vec3 {
 #[inline]
 pub fn norm(a: Vec3) -> f64 {
     dot(a, a).sqrt()
+}
+
+/// a / |a|
+#[inline]
+pub fn unit(a: Vec3) -> Vec3 {
+    scale(a, 1.0 / norm(a))
 }
 
 /// s a

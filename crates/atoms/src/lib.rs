@@ -13,7 +13,7 @@ mod structure;
 pub mod units;
 
 pub use cell::{Cell, Matrix3, Vec3};
-pub use neighbours::{Neighbour, NeighbourList};
+pub use neighbours::{Bond, Neighbour, NeighbourList, shortest_distance};
 pub use potential::{Evaluation, Potential, PotentialError};
 pub use species::{Species, UnknownSpecies};
 pub use structure::{Structure, StructureError};

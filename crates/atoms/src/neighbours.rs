@@ -1,14 +1,20 @@
 //! The neighbour list.
 
-use crate::cell::{self, Vec3};
+mod linked_cells;
+
+use crate::cell::{self, Matrix3, Vec3};
 use crate::structure::{Structure, StructureError};
+use linked_cells::LinkedCells;
+
+/// More neighbours than this of one atom mean that atoms overlap or the cell has collapsed.
+const MOST_NEIGHBOURS: usize = 20_000;
 
 /// A directed bond i → j + image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Neighbour {
     /// Index of the neighbour.
     pub atom: u32,
-    /// Which periodic image of it, in lattice vectors.
+    /// Which periodic image of it, in lattice vectors, relative to the positions as they stand.
     pub image: [i32; 3],
 }
 
@@ -22,14 +28,28 @@ impl Neighbour {
     }
 }
 
+/// A directed bond with its geometry.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bond {
+    /// Index of the neighbour.
+    pub atom: u32,
+    /// d = r_j + image · cell − r_i, Å.
+    pub d: Vec3,
+    /// |d|, Å.
+    pub r: f64,
+}
+
 /// Every directed pair within cutoff + skin, periodic images and self-images included.
 ///
 /// The neighbours of an atom stand in canonical order (atom, then image), so that sums over those
-/// within the cutoff give the same bits whenever the list was built.
+/// within the cutoff give the same bits whenever the list was built. Lattice vectors of directions
+/// that do not repeat are never looked at, and positions are never wrapped.
 #[derive(Clone, Debug)]
 pub struct NeighbourList {
     cutoff: f64,
     skin: f64,
+    /// The structure the list was built for.
+    reference: Option<Structure>,
     offsets: Vec<usize>,
     neighbours: Vec<Neighbour>,
 }
@@ -37,35 +57,26 @@ pub struct NeighbourList {
 impl NeighbourList {
     /// An empty list that [`NeighbourList::update`] fills. `cutoff` and `skin` in Å.
     pub fn new(cutoff: f64, skin: f64) -> Self {
-        Self { cutoff, skin, offsets: vec![0], neighbours: Vec::new() }
+        Self { cutoff, skin, reference: None, offsets: vec![0], neighbours: Vec::new() }
     }
 
     /// Makes the list valid for `structure`; true if it had to be built anew.
+    ///
+    /// # Errors
+    /// If the structure is not valid, if an atom is absurdly far away or has absurdly many
+    /// neighbours, or if the cell is too thin. The list is then empty.
     pub fn update(&mut self, structure: &Structure) -> Result<bool, StructureError> {
-        structure.validate()?;
-        let reach = self.cutoff + self.skin;
-        let heights = structure.cell.heights();
-        let n: [i32; 3] = std::array::from_fn(|k| {
-            if structure.periodic[k] { (reach / heights[k]).ceil() as i32 + 1 } else { 0 }
-        });
-        self.offsets = vec![0];
-        self.neighbours.clear();
-        for i in 0..structure.len() {
-            for j in 0..structure.len() as u32 {
-                for a in -n[0]..=n[0] {
-                    for b in -n[1]..=n[1] {
-                        for c in -n[2]..=n[2] {
-                            let neighbour = Neighbour { atom: j, image: [a, b, c] };
-                            let d = cell::norm(neighbour.displacement(structure, i));
-                            if d <= reach && !(j as usize == i && [a, b, c] == [0; 3]) {
-                                self.neighbours.push(neighbour);
-                            }
-                        }
-                    }
-                }
-            }
-            self.offsets.push(self.neighbours.len());
+        let valid = structure.validate();
+        if valid.is_ok() && self.reference.as_ref().is_some_and(|old| self.still_complete(old, structure)) {
+            return Ok(false);
         }
+        self.clear();
+        valid?;
+        if let Err(error) = self.build(structure) {
+            self.clear();
+            return Err(error);
+        }
+        self.reference = Some(structure.clone());
         Ok(true)
     }
 
@@ -74,9 +85,151 @@ impl NeighbourList {
         self.cutoff
     }
 
+    /// Number of atoms in the list; 0 before the first update.
+    pub fn len(&self) -> usize {
+        self.offsets.len() - 1
+    }
+
+    /// Whether the list holds no atoms.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
     /// Neighbours of atom `i` within cutoff + skin (a few may be farther than the cutoff).
     #[inline]
     pub fn of(&self, i: usize) -> &[Neighbour] {
         &self.neighbours[self.offsets[i]..self.offsets[i + 1]]
+    }
+
+    /// Writes the bonds of atom `i` shorter than `cutoff` (Å, at most that of the list) into `bonds`.
+    #[inline]
+    pub fn bonds_within(&self, structure: &Structure, i: usize, cutoff: f64, bonds: &mut Vec<Bond>) {
+        bonds.clear();
+        for neighbour in self.of(i) {
+            let d = neighbour.displacement(structure, i);
+            let square = cell::dot(d, d);
+            if square < cutoff * cutoff {
+                bonds.push(Bond { atom: neighbour.atom, d, r: square.sqrt() });
+            }
+        }
+    }
+
+    fn clear(&mut self) {
+        self.reference = None;
+        self.offsets.truncate(1);
+        self.neighbours.clear();
+    }
+
+    fn build(&mut self, structure: &Structure) -> Result<(), StructureError> {
+        let reach = self.cutoff + self.skin;
+        let cells = LinkedCells::new(structure, reach)?;
+        for i in 0..structure.len() {
+            let start = self.neighbours.len();
+            let own = Neighbour { atom: i as u32, image: [0; 3] };
+            cells.candidates(i, |neighbour| {
+                let d = neighbour.displacement(structure, i);
+                if cell::dot(d, d) <= reach * reach && neighbour != own {
+                    self.neighbours.push(neighbour);
+                }
+                if self.neighbours.len() - start > MOST_NEIGHBOURS {
+                    return Err(StructureError::Crowded { atom: i, limit: MOST_NEIGHBOURS, reach });
+                }
+                Ok(())
+            })?;
+            self.neighbours[start..].sort_unstable();
+            self.offsets.push(self.neighbours.len());
+        }
+        Ok(())
+    }
+
+    /// Whether no pair outside the list can have come within the cutoff.
+    ///
+    /// With the deformation gradient F of the cell and the displacement u of each atom from its
+    /// affinely moved reference position, d = d₀ F + u_j − u_i, so that |d| ≥ s_min(F) |d₀| − 2 max|u|.
+    /// Holds for any F that moves the periodic lattice vectors rightly.
+    fn still_complete(&self, reference: &Structure, structure: &Structure) -> bool {
+        if reference == structure {
+            return true;
+        }
+        if reference.periodic != structure.periodic
+            || reference.species != structure.species
+            || reference.positions.len() != structure.positions.len()
+        {
+            return false;
+        }
+        let f = deformation_gradient(reference, structure);
+        let largest = reference
+            .positions
+            .iter()
+            .zip(&structure.positions)
+            .map(|(old, new)| cell::sub(*new, cell::row_times(*old, &f)))
+            .map(|u| cell::dot(u, u))
+            .fold(0.0, f64::max);
+        let least = least_singular_value(&f) * (self.cutoff + self.skin) - 2.0 * largest.sqrt();
+        // The margin is for the rounding of the singular value.
+        least > self.cutoff * (1.0 + 1e-7)
+    }
+}
+
+/// The shortest pair (i ≤ j, distance in Å), the lowest indices first among equals; i = j for an atom
+/// and its own image. `None` if no two atoms are within the reach of the list.
+pub fn shortest_distance(structure: &Structure, neighbours: &NeighbourList) -> Option<(usize, usize, f64)> {
+    let mut shortest = None;
+    let mut least = f64::INFINITY;
+    for i in 0..neighbours.len() {
+        for neighbour in neighbours.of(i).iter().filter(|neighbour| neighbour.atom as usize >= i) {
+            let r = cell::norm(neighbour.displacement(structure, i));
+            if r < least {
+                least = r;
+                shortest = Some((i, neighbour.atom as usize, r));
+            }
+        }
+    }
+    shortest
+}
+
+/// F with h = h₀ F, for lattice vectors as rows; directions that do not repeat only turn with the others.
+fn deformation_gradient(reference: &Structure, structure: &Structure) -> Matrix3 {
+    let from = reference.cell.completed(reference.periodic).reciprocal();
+    let to = structure.cell.completed(structure.periodic).0;
+    std::array::from_fn(|k| {
+        std::array::from_fn(|l| from[0][k] * to[0][l] + from[1][k] * to[1][l] + from[2][k] * to[2][l])
+    })
+}
+
+/// Square root of the least eigenvalue of F Fᵀ, by the trigonometric solution of the cubic
+/// (Smith, Commun. ACM 4, 168 (1961)).
+fn least_singular_value(f: &Matrix3) -> f64 {
+    let c: Matrix3 = std::array::from_fn(|i| std::array::from_fn(|j| cell::dot(f[i], f[j])));
+    let mean = (c[0][0] + c[1][1] + c[2][2]) / 3.0;
+    let deviator: Matrix3 =
+        std::array::from_fn(|i| std::array::from_fn(|j| if i == j { c[i][j] - mean } else { c[i][j] }));
+    let p = (deviator.iter().map(|row| cell::dot(*row, *row)).sum::<f64>() / 6.0).sqrt();
+    if p == 0.0 {
+        return mean.sqrt();
+    }
+    let half_determinant = cell::dot(deviator[0], cell::cross(deviator[1], deviator[2])) / (2.0 * p * p * p);
+    let angle = half_determinant.clamp(-1.0, 1.0).acos() / 3.0;
+    let least = mean + 2.0 * p * (angle + 2.0 * std::f64::consts::PI / 3.0).cos();
+    least.max(0.0).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn least_singular_value_of_known_deformations() {
+        let stretch = [[1.1, 0.0, 0.0], [0.0, 0.93, 0.0], [0.0, 0.0, 1.02]];
+        assert!((least_singular_value(&stretch) - 0.93).abs() < 1e-9);
+        let (s, c) = 0.7_f64.sin_cos();
+        let turned = stretch.map(|row| cell::row_times(row, &[[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]));
+        assert!((least_singular_value(&turned) - 0.93).abs() < 1e-9);
+        assert_eq!(least_singular_value(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 1.0);
+        // Simple shear g: s² − g s − 1 = 0 has the roots s_max and −s_min.
+        let g: f64 = 0.3;
+        let sheared = [[1.0, 0.0, 0.0], [g, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let exact = ((g * g + 4.0).sqrt() - g) / 2.0;
+        assert!((least_singular_value(&sheared) - exact).abs() < 1e-9);
     }
 }

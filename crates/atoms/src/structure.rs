@@ -39,6 +39,34 @@ pub enum StructureError {
     /// A periodic direction without extent.
     #[error("the cell is periodic but its volume is {0:.3e} Å³: its lattice vectors must span space")]
     CellVolume(f64),
+    /// An atom so far away that its lattice translation loses all digits.
+    #[error("atom {atom} is more than {limit:.0e} lattice vectors (or Å) away from the cell")]
+    FarAway {
+        /// Index of the atom.
+        atom: usize,
+        /// The limit.
+        limit: f64,
+    },
+    /// A cell so thin that the search for neighbours would not end.
+    #[error("the cell is {height:.3e} Å high, far too thin to find the neighbours within {reach:.3} Å")]
+    CellThin {
+        /// Least height of the cell among the directions that repeat, Å.
+        height: f64,
+        /// Cutoff + skin, Å.
+        reach: f64,
+    },
+    /// Far more neighbours than matter has.
+    #[error(
+        "atom {atom} has more than {limit} neighbours within {reach:.3} Å: atoms overlap, or the cell is too small"
+    )]
+    Crowded {
+        /// Index of the atom.
+        atom: usize,
+        /// The limit.
+        limit: usize,
+        /// Cutoff + skin, Å.
+        reach: f64,
+    },
     /// Two atoms closer than any bond.
     #[error("atoms {first} and {second} are {distance:.3} Å apart, less than {least:.3} Å")]
     Overlap {
@@ -81,9 +109,11 @@ impl Structure {
         if self.cell.0.iter().flatten().any(|x| !x.is_finite()) {
             return Err(StructureError::CellEntry);
         }
-        let spanned: f64 = self.cell.0.iter().map(|a| cell::norm(*a)).product();
-        if self.periodic != [false; 3] && !(self.cell.volume() > 1e-6 * spanned) {
-            return Err(StructureError::CellVolume(self.cell.volume()));
+        // Directions that do not repeat may have any lattice vector, also none.
+        let lattice = self.cell.completed(self.periodic);
+        let spanned: f64 = lattice.0.iter().map(|a| cell::norm(*a)).product();
+        if lattice.volume().partial_cmp(&(1e-6 * spanned)) != Some(std::cmp::Ordering::Greater) {
+            return Err(StructureError::CellVolume(lattice.volume()));
         }
         Ok(())
     }
