@@ -1,5 +1,7 @@
 //! The triclinic cell and the few 3×3 operations that go with it.
 
+use serde::{Deserialize, Serialize};
+
 /// A vector in space, Å unless said otherwise.
 pub type Vec3 = [f64; 3];
 
@@ -7,7 +9,7 @@ pub type Vec3 = [f64; 3];
 pub type Matrix3 = [[f64; 3]; 3];
 
 /// Lattice vectors as rows, Å. A direction that is not periodic may have any non-degenerate vector.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Cell(pub Matrix3);
 
 impl Cell {

@@ -1,12 +1,14 @@
 //! What every interatomic potential gives.
 
+use serde::{Deserialize, Serialize};
+
 use crate::cell::{Matrix3, Vec3};
 use crate::neighbours::NeighbourList;
 use crate::species::Species;
 use crate::structure::Structure;
 
 /// Energy and its derivatives for one structure.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Evaluation {
     /// Energy of each atom, [n], eV.
     pub atomic_energies: Vec<f64>,

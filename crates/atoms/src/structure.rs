@@ -1,10 +1,12 @@
 //! Species, positions, cell and periodicity.
 
+use serde::{Deserialize, Serialize};
+
 use crate::cell::{self, Cell, Vec3};
 use crate::species::Species;
 
 /// A piece of matter: what a potential is evaluated on.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Structure {
     /// The element of each atom, [n].
     pub species: Vec<Species>,

@@ -1,0 +1,77 @@
+//! Thermostats against the canonical distribution: mean and width, within five standard errors.
+
+mod common;
+
+use atoms::units::{ACCELERATION, BOLTZMANN};
+use common::{Springs, argon_crystal, mean_and_variance, settings, warm_argon};
+use md::{Dynamics, Langevin, NoseHooverChain, State, Thermostat};
+
+fn within_five_errors(what: &str, [found, error]: [f64; 2], expected: f64) {
+    assert!(error < 0.1 * expected, "{what}: too few samples, {found} ± {error}");
+    assert!((found - expected).abs() < 5.0 * error, "{what}: {found} ± {error}, expected {expected}");
+}
+
+/// ⟨K⟩ = g k_B T / 2 and ⟨(K − ⟨K⟩)²⟩ = g (k_B T)² / 2.
+fn kinetic_energy_is_canonical(temperature: f64, thermostat: Thermostat) {
+    let (mut dynamics, mut potential) = warm_argon(2, temperature, settings(4.0, thermostat), 1000);
+    let series: Vec<f64> = (0..40_000)
+        .map(|_| {
+            dynamics.step(&mut potential).unwrap();
+            dynamics.kinetic_energy()
+        })
+        .collect();
+    let (mean, variance) = mean_and_variance(&series, 50);
+    let (freedom, thermal) = (dynamics.degrees_of_freedom() as f64, BOLTZMANN * temperature);
+    within_five_errors("mean", mean, 0.5 * freedom * thermal);
+    within_five_errors("variance", variance, 0.5 * freedom * thermal * thermal);
+}
+
+#[test]
+fn langevin_kinetic_energy_is_canonical() {
+    kinetic_energy_is_canonical(60.0, Thermostat::Langevin(Langevin { temperature: 60.0, friction: 0.01 }));
+}
+
+#[test]
+fn nose_hoover_kinetic_energy_is_canonical() {
+    kinetic_energy_is_canonical(120.0, Thermostat::NoseHooverChain(NoseHooverChain::new(120.0, 200.0, 3)));
+}
+
+/// In a harmonic well BAOAB samples positions exactly at any stable time step, ⟨x²⟩ = k_B T / k, while the
+/// velocities at the end of a step are cold by 1 − (ω Δt)²/4 (Leimkuhler & Matthews, J. Chem. Phys. 138,
+/// 174102 (2013)). Each oscillator is an independent sample, whatever its correlation in time.
+#[test]
+fn baoab_is_exact_for_harmonic_positions() {
+    let (temperature, stiffness) = (300.0, 2.0);
+    let structure = argon_crystal(5);
+    let mut springs = Springs::new(structure.positions.clone(), stiffness);
+    let mass = structure.species[0].mass();
+    let frequency = (stiffness * ACCELERATION / mass).sqrt();
+    let time_step = 1.0 / frequency;
+    let thermostat = Thermostat::Langevin(Langevin { temperature, friction: 0.2 * frequency });
+    let settings = settings(time_step, thermostat);
+    let state = State::thermal(structure, temperature, &settings.stream);
+    let mut dynamics = Dynamics::new(state, settings, &mut springs).unwrap();
+    (0..200).for_each(|_| dynamics.step(&mut springs).unwrap());
+
+    let oscillators = 3 * springs.sites.len();
+    let (mut positions, mut velocities) = (vec![0.0; oscillators], vec![0.0; oscillators]);
+    let steps = 1000;
+    for _ in 0..steps {
+        dynamics.step(&mut springs).unwrap();
+        let sites = springs.sites.iter().flatten();
+        for (sum, (x, site)) in
+            positions.iter_mut().zip(dynamics.structure().positions.iter().flatten().zip(sites))
+        {
+            *sum += (x - site).powi(2) / steps as f64;
+        }
+        for (sum, v) in velocities.iter_mut().zip(dynamics.state().velocities.iter().flatten()) {
+            *sum += v * v / steps as f64;
+        }
+    }
+    let thermal = BOLTZMANN * temperature;
+    let (position, _) = mean_and_variance(&positions, oscillators);
+    within_five_errors("⟨x²⟩", position, thermal / stiffness);
+    assert!(position[1] < 0.01 * position[0]);
+    let (velocity, _) = mean_and_variance(&velocities, oscillators);
+    within_five_errors("⟨v²⟩", velocity, 0.75 * thermal * ACCELERATION / mass);
+}
