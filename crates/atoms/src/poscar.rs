@@ -1,1 +1,316 @@
-//! VASP POSCAR.
+//! VASP POSCAR (version 5, with a line of element symbols), read and written.
+//!
+//! The kept crate `vasp-poscar` 0.3 was last released in 2018 and rests on the retired `failure`.
+
+use std::fmt;
+use std::io::{BufRead, ErrorKind, Write};
+
+use crate::cell::{Cell, Vec3};
+use crate::extxyz::{Column, Entries, Frame};
+use crate::species::{Species, UnknownSpecies};
+use crate::structure::{Structure, StructureError};
+
+/// What is wrong with a file, and where.
+#[derive(Debug, thiserror::Error)]
+#[error("line {line}: {fault}")]
+pub struct PoscarError {
+    /// Line of the file, from 1.
+    pub line: usize,
+    /// What is wrong with it.
+    #[source]
+    pub fault: Fault,
+}
+
+/// What is wrong with a line.
+#[derive(Debug, thiserror::Error)]
+pub enum Fault {
+    /// The stream cannot be read.
+    #[error("cannot be read: {0}")]
+    Io(std::io::Error),
+    /// The stream ends too early.
+    #[error("the file ends here, expected {0}")]
+    End(Part),
+    /// A line of another kind.
+    #[error("found '{found}', expected {expected}")]
+    Line {
+        /// The line.
+        found: String,
+        /// What it should be.
+        expected: Part,
+    },
+    /// A file of VASP 4, which does not say what its atoms are.
+    #[error(
+        "found '{0}', expected element symbols: this is a file of VASP 4; insert a line such as 'Al Si' above it"
+    )]
+    NoSymbols(String),
+    /// A symbol of no element.
+    #[error(transparent)]
+    Species(#[from] UnknownSpecies),
+    /// The structure as a whole.
+    #[error(transparent)]
+    Structure(#[from] StructureError),
+}
+
+/// A part of the file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Line 1.
+    Comment,
+    /// Line 2.
+    Scale,
+    /// Lines 3 to 5.
+    LatticeVector,
+    /// Line 6.
+    Symbols,
+    /// Line 7.
+    Counts,
+    /// `Direct` or `Cartesian`.
+    Mode,
+    /// A line of an atom.
+    Position,
+    /// A line of an atom with selective dynamics.
+    PositionAndFlags,
+}
+
+impl fmt::Display for Part {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Comment => "a comment",
+            Self::Scale => "a scale factor (three positive ones, or a negative one: the volume)",
+            Self::LatticeVector => "a lattice vector of three finite numbers",
+            Self::Symbols => "element symbols",
+            Self::Counts => "a number of atoms for each element symbol",
+            Self::Mode => "'Direct' or 'Cartesian'",
+            Self::Position => "a position of three finite numbers",
+            Self::PositionAndFlags => "a position of three finite numbers and three of T and F",
+        })
+    }
+}
+
+/// Reads one structure, periodic in all directions.
+///
+/// The comment becomes the text `comment` of `info`, the flags of selective dynamics the array
+/// `move_mask` [n × 3] (true: free to move), as ASE calls it. What follows the positions
+/// (velocities, predictor–corrector data) is ignored.
+pub fn read_poscar(input: impl BufRead) -> Result<Frame, PoscarError> {
+    let mut lines = Lines { input, number: 0, text: String::new() };
+    let frame = frame(&mut lines);
+    frame.map_err(|fault| PoscarError { line: lines.number, fault })
+}
+
+fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, Fault> {
+    let comment = lines.take(Part::Comment)?.to_owned();
+    let factors = lines.parse(Part::Scale, factors)?;
+    let mut lattice = [[0.0; 3]; 3];
+    for vector in &mut lattice {
+        *vector = lines.parse(Part::LatticeVector, vector3)?;
+    }
+    let factors = match factors {
+        Scale::Factors(factors) => factors,
+        Scale::Volume(volume) => [(volume / Cell(lattice).volume()).cbrt(); 3],
+    };
+    let stretch = |x: Vec3| -> Vec3 { std::array::from_fn(|k| x[k] * factors[k]) };
+    let cell = Cell(lattice.map(stretch));
+    let symbols = symbols(lines.take(Part::Symbols)?)?;
+    let counts = lines.parse(Part::Counts, |text| counts(text, symbols.len()))?;
+    let mut mode = lines.parse(Part::Mode, mode)?;
+    let selective = mode == Mode::Selective;
+    if selective {
+        mode = lines.parse(Part::Mode, mode_of_positions)?;
+    }
+    let mut structure = Structure { species: vec![], positions: vec![], cell, periodic: [true; 3] };
+    let mut flags = Vec::new();
+    for (species, count) in symbols.into_iter().zip(counts) {
+        for _ in 0..count {
+            let position = if selective {
+                let (position, free) = lines.parse(Part::PositionAndFlags, position_and_flags)?;
+                flags.extend(free);
+                position
+            } else {
+                lines.parse(Part::Position, vector3)?
+            };
+            structure.species.push(species);
+            let cartesian = mode == Mode::Cartesian;
+            structure.positions.push(if cartesian { stretch(position) } else { cell.cartesian(position) });
+        }
+    }
+    structure.validate()?;
+    let mut frame = Frame { line: 1, ..Frame::from(structure) };
+    if !comment.is_empty() {
+        frame.info.insert("comment".to_owned(), comment.into());
+    }
+    if selective {
+        let entries = Entries::Bool(flags);
+        frame.arrays.insert("move_mask".to_owned(), Column { width: 3, entries });
+    }
+    Ok(frame)
+}
+
+/// Why a structure cannot be written.
+#[derive(Debug, thiserror::Error)]
+pub enum WriteError {
+    /// The stream does not take it.
+    #[error("cannot be written: {0}")]
+    Io(#[from] std::io::Error),
+    /// The structure is not one, or its cell has no volume.
+    #[error(transparent)]
+    Structure(#[from] StructureError),
+}
+
+/// Writes a structure in Cartesian coordinates and returns the order of its atoms: the k-th position
+/// of the file is that of atom `order[k]`.
+///
+/// Atoms of one element stand together, elements in the order of their first atom. The format has no
+/// word for directions that are not periodic: the cell must span space whatever `periodic` says.
+/// Only the first line of `comment` is written.
+pub fn write_poscar(
+    out: &mut impl Write,
+    structure: &Structure,
+    comment: &str,
+) -> Result<Vec<usize>, WriteError> {
+    Structure { periodic: [true; 3], ..structure.clone() }.validate()?;
+    let mut elements: Vec<Species> = Vec::new();
+    for species in &structure.species {
+        if !elements.contains(species) {
+            elements.push(*species);
+        }
+    }
+    let atoms = |element: &Species| {
+        let element = *element;
+        structure
+            .species
+            .iter()
+            .enumerate()
+            .filter(move |(_, species)| **species == element)
+            .map(|(atom, _)| atom)
+    };
+    writeln!(out, "{}\n1.0", comment.lines().next().unwrap_or("").trim())?;
+    for [x, y, z] in structure.cell.0 {
+        writeln!(out, "{x:?} {y:?} {z:?}")?;
+    }
+    writeln!(out, "{}", joined(elements.iter().map(|element| element.symbol().to_owned())))?;
+    writeln!(
+        out,
+        "{}\nCartesian",
+        joined(elements.iter().map(|element| atoms(element).count().to_string()))
+    )?;
+    let order: Vec<usize> = elements.iter().flat_map(atoms).collect();
+    for [x, y, z] in order.iter().filter_map(|atom| structure.positions.get(*atom)) {
+        writeln!(out, "{x:?} {y:?} {z:?}")?;
+    }
+    Ok(order)
+}
+
+fn joined(words: impl Iterator<Item = String>) -> String {
+    words.collect::<Vec<_>>().join(" ")
+}
+
+struct Lines<R> {
+    input: R,
+    /// Number of the line in `text`, from 1.
+    number: usize,
+    text: String,
+}
+
+impl<R: BufRead> Lines<R> {
+    fn take(&mut self, expected: Part) -> Result<&str, Fault> {
+        self.text.clear();
+        self.number += 1;
+        match self.input.read_line(&mut self.text) {
+            Ok(0) => Err(Fault::End(expected)),
+            Ok(_) => Ok(self.text.trim()),
+            Err(error) if error.kind() == ErrorKind::InvalidData => {
+                Err(Fault::Line { found: "bytes that are not text".to_owned(), expected })
+            }
+            Err(error) => Err(Fault::Io(error)),
+        }
+    }
+
+    fn parse<T>(&mut self, expected: Part, parse: impl Fn(&str) -> Option<T>) -> Result<T, Fault> {
+        let text = self.take(expected)?;
+        parse(text).ok_or_else(|| Fault::Line { found: text.chars().take(60).collect(), expected })
+    }
+}
+
+enum Scale {
+    Factors(Vec3),
+    /// Å³
+    Volume(f64),
+}
+
+/// One factor or three; what follows them is a remark.
+fn factors(text: &str) -> Option<Scale> {
+    let numbers: Vec<f64> = text.split_whitespace().map_while(|word| word.parse().ok()).take(3).collect();
+    match *numbers {
+        _ if !numbers.iter().all(|x| x.is_finite()) => None,
+        [factor] if factor > 0.0 => Some(Scale::Factors([factor; 3])),
+        [volume] if volume < 0.0 => Some(Scale::Volume(-volume)),
+        [x, y, z] if x > 0.0 && y > 0.0 && z > 0.0 => Some(Scale::Factors([x, y, z])),
+        _ => None,
+    }
+}
+
+/// Three numbers; what follows them is a remark.
+fn vector3(text: &str) -> Option<Vec3> {
+    let numbers =
+        text.split_whitespace().take(3).map(|word| word.parse().ok().filter(|x: &f64| x.is_finite()));
+    numbers.collect::<Option<Vec<f64>>>()?.try_into().ok()
+}
+
+fn position_and_flags(text: &str) -> Option<(Vec3, Vec<bool>)> {
+    let flag = |word: &str| match word.trim_start_matches('.').chars().next() {
+        Some('T' | 't') => Some(true),
+        Some('F' | 'f') => Some(false),
+        _ => None,
+    };
+    let flags: Vec<bool> = text.split_whitespace().skip(3).take(3).map(flag).collect::<Option<_>>()?;
+    vector3(text).filter(|_| flags.len() == 3).map(|position| (position, flags))
+}
+
+/// Element symbols; VASP may add the potential's name and a hash: `Al_pv/6a2f54`.
+fn symbols(text: &str) -> Result<Vec<Species>, Fault> {
+    if text.is_empty() {
+        return Err(Fault::Line { found: String::new(), expected: Part::Symbols });
+    }
+    if text.split_whitespace().all(|word| word.parse::<u64>().is_ok()) {
+        return Err(Fault::NoSymbols(text.chars().take(60).collect()));
+    }
+    let species = |word: &str| word.split(['_', '/']).next().unwrap_or(word).parse::<Species>();
+    Ok(text
+        .split_whitespace()
+        .take_while(|word| !word.starts_with('!'))
+        .map(species)
+        .collect::<Result<_, _>>()?)
+}
+
+fn counts(text: &str, symbols: usize) -> Option<Vec<u64>> {
+    let words = text.split_whitespace().take_while(|word| !word.starts_with('!'));
+    let counts: Option<Vec<u64>> = words.map(|word| word.parse().ok()).collect();
+    counts.filter(|counts| counts.len() == symbols)
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Mode {
+    Selective,
+    Direct,
+    Cartesian,
+}
+
+/// Only the first letter counts.
+fn mode(text: &str) -> Option<Mode> {
+    match text.chars().next()? {
+        'S' | 's' => Some(Mode::Selective),
+        _ => mode_of_positions(text),
+    }
+}
+
+fn mode_of_positions(text: &str) -> Option<Mode> {
+    match text.chars().next()? {
+        'D' | 'd' => Some(Mode::Direct),
+        'C' | 'c' | 'K' | 'k' => Some(Mode::Cartesian),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests;

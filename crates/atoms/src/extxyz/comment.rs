@@ -1,0 +1,135 @@
+//! The comment line: `key=value` pairs with quotes, brackets and escapes.
+
+use super::fault::Fault;
+use super::value::Value;
+
+/// Keys whose value stays text whatever it looks like.
+pub(super) fn is_verbatim(key: &str) -> bool {
+    key.eq_ignore_ascii_case("uid")
+}
+
+/// The pairs of a comment line, in order.
+///
+/// Between `"…"`, `'…'`, `{…}` and `[…]` white space belongs to the word, a backslash takes the next
+/// character as it is, spaces may stand round `=`, and a key without `=` is true. A line without any
+/// `=` is free text: its words are true keys, and a lone apostrophe does not matter.
+pub(super) fn parse(line: &str) -> Result<Vec<(String, Value)>, Fault> {
+    let mut cursor = Cursor { line, at: 0, lenient: !line.contains('=') };
+    let mut pairs = Vec::new();
+    loop {
+        cursor.skip_space();
+        let column = cursor.column();
+        let Some(first) = cursor.peek() else { return Ok(pairs) };
+        if first == '=' {
+            return Err(Fault::NoKey { column });
+        }
+        let key = cursor.word(true)?;
+        cursor.skip_space();
+        let value = if cursor.peek() == Some('=') {
+            cursor.next();
+            cursor.skip_space();
+            cursor.value(&key)?
+        } else {
+            Value::Bool(true)
+        };
+        pairs.push((key, value));
+    }
+}
+
+/// A word in quotes with escapes where the bare word would be read as something else.
+pub(super) fn quote(word: &str) -> String {
+    let bare = |c: char| c.is_ascii_graphic() && !r#""'{}[]\=,"#.contains(c);
+    if !word.is_empty() && word.chars().all(bare) {
+        return word.to_owned();
+    }
+    format!("\"{}\"", word.replace('\\', "\\\\").replace('"', "\\\""))
+}
+
+struct Cursor<'a> {
+    line: &'a str,
+    /// Byte offset of the next character.
+    at: usize,
+    /// Whether the end of the line closes what is open.
+    lenient: bool,
+}
+
+impl Cursor<'_> {
+    fn rest(&self) -> &str {
+        self.line.get(self.at..).unwrap_or("")
+    }
+
+    fn peek(&self) -> Option<char> {
+        self.rest().chars().next()
+    }
+
+    fn next(&mut self) -> Option<char> {
+        let next = self.peek();
+        self.at += next.map_or(0, char::len_utf8);
+        next
+    }
+
+    fn skip_space(&mut self) {
+        self.at += self.rest().len() - self.rest().trim_start().len();
+    }
+
+    /// Column of the next character, from 1.
+    fn column(&self) -> usize {
+        self.line.get(..self.at).unwrap_or("").chars().count() + 1
+    }
+
+    /// A word up to white space (or an equals sign).
+    fn word(&mut self, ends_at_equals: bool) -> Result<String, Fault> {
+        let mut word = String::new();
+        while let Some(c) = self.peek().filter(|c| !(c.is_whitespace() || ends_at_equals && *c == '=')) {
+            let column = self.column();
+            self.next();
+            match c {
+                '\\' => word.extend(self.next()),
+                '"' | '\'' => self.delimited(c, c, column, &mut word)?,
+                '{' => self.delimited('{', '}', column, &mut word)?,
+                '[' => self.delimited('[', ']', column, &mut word)?,
+                _ => word.push(c),
+            }
+        }
+        Ok(word)
+    }
+
+    /// What stands before the closing delimiter, which is taken too.
+    fn delimited(&mut self, open: char, close: char, column: usize, word: &mut String) -> Result<(), Fault> {
+        loop {
+            match self.next() {
+                Some('\\') => word.extend(self.next()),
+                Some(c) if c == close => return Ok(()),
+                Some(c) => word.push(c),
+                None if self.lenient => return Ok(()),
+                None => return Err(Fault::Unclosed { column, delimiter: open }),
+            }
+        }
+    }
+
+    fn value(&mut self, key: &str) -> Result<Value, Fault> {
+        if self.rest().starts_with("[[") {
+            return self.matrix(key);
+        }
+        let word = self.word(false)?;
+        Ok(if is_verbatim(key) { Value::Text(word) } else { Value::parse(&word) })
+    }
+
+    /// `[[…], […]]` without quotes, up to the bracket that closes the first one.
+    fn matrix(&mut self, key: &str) -> Result<Value, Fault> {
+        let (start, column) = (self.at, self.column());
+        let mut depth = 0_usize;
+        while let Some(c) = self.next() {
+            match c {
+                '[' => depth += 1,
+                ']' => depth -= 1,
+                _ => {}
+            }
+            if depth == 0 {
+                let text = self.line.get(start..self.at).unwrap_or("");
+                return Value::parse_json(text).ok_or_else(|| Fault::key(key, text, "rows of numbers"));
+            }
+        }
+        Err(Fault::Unclosed { column, delimiter: '[' })
+    }
+}

@@ -1,0 +1,143 @@
+//! Energy, forces and stress under the names that other programs give them.
+
+use super::{Column, Frame, Value};
+use crate::cell::{Matrix3, Vec3};
+
+/// The labels of a frame: what a calculation, usually DFT, says of it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Labels {
+    /// Total energy, eV.
+    pub energy: Option<f64>,
+    /// `[n]`, eV/Å.
+    pub forces: Option<Vec<Vec3>>,
+    /// eV/Å³, tension positive, symmetric.
+    pub stress: Option<Matrix3>,
+}
+
+/// The names under which labels are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Keys {
+    /// `energy`, `forces`, `stress`: ASE makes them the results of the frame's calculator.
+    Ase,
+    /// `REF_energy`, `REF_forces`, `REF_stress` (9 numbers), which MACE trains on by default.
+    Mace,
+    /// As [`Keys::Ase`] with the same energy also as `free_energy`: gracemaker reads through ASE and
+    /// prefers the free energy. If one frame of a file lacks the stress, it uses no stress of that file.
+    Grace,
+}
+
+/// A label that cannot be used.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("the frame at line {line}: {key} is {found}, expected {expected}")]
+pub struct LabelError {
+    /// Where the frame starts.
+    pub line: usize,
+    /// The key or column.
+    pub key: String,
+    /// What it holds.
+    pub found: String,
+    /// What it should hold.
+    pub expected: &'static str,
+}
+
+impl Frame {
+    /// The labels of the frame.
+    ///
+    /// If it has any of `REF_energy`, `REF_free_energy`, `REF_forces`, `REF_stress` and `REF_virial`,
+    /// only these count (the plain ones may then be a model's); otherwise the same names without
+    /// `REF_`. `energy` goes before `free_energy`, as in ASE, and `stress` before `virial` (eV), with
+    /// stress = −virial / volume. Of a stress that is not symmetric the upper triangle counts, as in ASE.
+    pub fn labels(&self) -> Result<Labels, LabelError> {
+        let reference = QUANTITIES.map(|quantity| format!("REF_{quantity}"));
+        let given = |key: &String| self.info.contains_key(key) || self.arrays.contains_key(key);
+        let prefix = if reference.iter().any(given) { "REF_" } else { "" };
+        let energy = match self.label(prefix, "energy", Self::energy)? {
+            None => self.label(prefix, "free_energy", Self::energy)?,
+            energy => energy,
+        };
+        let stress = match self.label(prefix, "stress", Self::matrix)? {
+            None => self.label(prefix, "virial", Self::stress_from_virial)?,
+            stress => stress,
+        };
+        Ok(Labels { energy, forces: self.forces(&format!("{prefix}forces"))?, stress })
+    }
+
+    /// Replaces all labels of the frame, whatever their names.
+    pub fn set_labels(&mut self, labels: &Labels, keys: Keys) {
+        for quantity in QUANTITIES {
+            for key in [quantity.to_owned(), format!("REF_{quantity}")] {
+                self.info.remove(&key);
+                self.arrays.remove(&key);
+            }
+        }
+        let prefix = if keys == Keys::Mace { "REF_" } else { "" };
+        if let Some(energy) = labels.energy {
+            self.info.insert(format!("{prefix}energy"), energy.into());
+            if keys == Keys::Grace {
+                self.info.insert("free_energy".to_owned(), energy.into());
+            }
+        }
+        if let Some(forces) = &labels.forces {
+            self.arrays.insert(format!("{prefix}forces"), Column::vectors(forces));
+        }
+        if let Some(stress) = labels.stress {
+            let value = if keys == Keys::Mace { stress.concat().into() } else { stress.into() };
+            self.info.insert(format!("{prefix}stress"), value);
+        }
+    }
+
+    fn label<T>(
+        &self,
+        prefix: &str,
+        quantity: &str,
+        read: fn(&Self, &Value) -> Result<T, &'static str>,
+    ) -> Result<Option<T>, LabelError> {
+        let key = format!("{prefix}{quantity}");
+        let read = |value| {
+            read(self, value).map_err(|expected| self.label_error(&key, format!("'{value}'"), expected))
+        };
+        self.info.get(&key).map(read).transpose()
+    }
+
+    fn energy(&self, value: &Value) -> Result<f64, &'static str> {
+        value.number().filter(|energy| energy.is_finite()).ok_or("a finite number")
+    }
+
+    fn matrix(&self, value: &Value) -> Result<Matrix3, &'static str> {
+        let numbers = value.numbers().filter(|numbers| numbers.iter().all(|x| x.is_finite()));
+        match numbers.as_deref() {
+            Some(&[xx, xy, xz, _, yy, yz, _, _, zz]) | Some(&[xx, yy, zz, yz, xz, xy]) => {
+                Ok([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            }
+            _ => Err("9 finite numbers (or 6)"),
+        }
+    }
+
+    fn stress_from_virial(&self, value: &Value) -> Result<Matrix3, &'static str> {
+        let volume = self.structure.cell.volume();
+        if volume == 0.0 {
+            return Err("none without a cell that has a volume");
+        }
+        self.matrix(value).map(|virial| virial.map(|row| row.map(|w| -w / volume)))
+    }
+
+    fn forces(&self, key: &str) -> Result<Option<Vec<Vec3>>, LabelError> {
+        let Some(column) = self.arrays.get(key) else { return Ok(None) };
+        let numbers = column.reals().filter(|_| column.width == 3);
+        let numbers = numbers.filter(|numbers| numbers.len() == 3 * self.structure.len());
+        let Some(numbers) = numbers else {
+            let found = format!("a column of width {}", column.width);
+            return Err(self.label_error(key, found, "three numbers for each atom"));
+        };
+        if let Some(index) = numbers.iter().position(|force| !force.is_finite()) {
+            return Err(self.label_error(key, format!("not finite at atom {}", index / 3), "finite numbers"));
+        }
+        Ok(Some(numbers.as_chunks().0.to_vec()))
+    }
+
+    fn label_error(&self, key: &str, found: String, expected: &'static str) -> LabelError {
+        LabelError { line: self.line, key: key.to_owned(), found, expected }
+    }
+}
+
+const QUANTITIES: [&str; 5] = ["energy", "free_energy", "forces", "stress", "virial"];

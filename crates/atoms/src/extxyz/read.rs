@@ -1,0 +1,152 @@
+//! Reading frames from a stream.
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, ErrorKind};
+
+use super::fault::{ExtxyzError, Fault, excerpt};
+use super::table::Table;
+use super::{Frame, Value, comment};
+use crate::cell::{Cell, Matrix3};
+use crate::structure::Structure;
+
+/// The frames of a stream, one after another. The first error is the last item.
+pub struct Reader<R> {
+    input: R,
+    /// Number of the line in `text`, from 1.
+    line: usize,
+    text: String,
+    ended: bool,
+}
+
+impl<R: BufRead> Reader<R> {
+    /// Reads from `input` as the iterator advances.
+    pub fn new(input: R) -> Self {
+        Self { input, line: 0, text: String::new(), ended: false }
+    }
+
+    /// Takes the next line into `text`; false at the end of the stream.
+    fn advance(&mut self) -> Result<bool, ExtxyzError> {
+        self.text.clear();
+        self.line += 1;
+        match self.input.read_line(&mut self.text) {
+            Ok(bytes) => Ok(bytes > 0),
+            Err(error) if error.kind() == ErrorKind::InvalidData => Err(Fault::Encoding.at(self.line)),
+            Err(error) => Err(Fault::Io(error).at(self.line)),
+        }
+    }
+
+    fn frame(&mut self) -> Result<Option<Frame>, ExtxyzError> {
+        while self.advance()? {
+            if self.text.trim().is_empty() {
+                continue;
+            }
+            let Ok(count) = self.text.trim().parse() else {
+                return Err(Fault::Count { found: excerpt(&self.text) }.at(self.line));
+            };
+            return self.body(count, self.line).map(Some);
+        }
+        Ok(None)
+    }
+
+    /// The frame of `count` atoms whose first line, `start`, has been read.
+    fn body(&mut self, count: u64, start: usize) -> Result<Frame, ExtxyzError> {
+        if !self.advance()? {
+            return Err(Fault::Truncated { found: 0, expected: count, start }.at(self.line));
+        }
+        let Header { info, cell, periodic, mut table } =
+            Header::new(&self.text).map_err(|fault| fault.at(self.line))?;
+        for atom in 0..count {
+            if !self.advance()? {
+                return Err(Fault::Truncated { found: atom, expected: count, start }.at(self.line));
+            }
+            table.push(&self.text).map_err(|fault| fault.at(self.line))?;
+        }
+        let (species, positions, arrays) = table.finish();
+        let structure = Structure { species, positions, cell, periodic };
+        structure.validate().map_err(|fault| Fault::from(fault).at(start))?;
+        Ok(Frame { structure, info, arrays, line: start })
+    }
+}
+
+impl<R: BufRead> Iterator for Reader<R> {
+    type Item = Result<Frame, ExtxyzError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.ended {
+            return None;
+        }
+        let frame = self.frame().transpose();
+        self.ended = !matches!(frame, Some(Ok(_)));
+        frame
+    }
+}
+
+/// What the comment line says.
+struct Header {
+    info: BTreeMap<String, Value>,
+    cell: Cell,
+    periodic: [bool; 3],
+    table: Table,
+}
+
+impl Header {
+    fn new(line: &str) -> Result<Self, Fault> {
+        let mut info = BTreeMap::new();
+        for (key, mut value) in comment::parse(line)? {
+            if key == "stress" || key == "virial" {
+                value = matrix(&value).ok_or_else(|| fault(&key, &value, "9 numbers (or 6)"))?.into();
+            }
+            if info.get(&key).is_some_and(|other| *other != value) {
+                return Err(Fault::Repeated { key });
+            }
+            info.insert(key, value);
+        }
+        let lattice = info.remove("Lattice").map(|value| lattice(&value)).transpose()?;
+        let periodic = info.remove("pbc").map(|value| periodic(&value)).transpose()?;
+        let table = match info.remove("Properties") {
+            Some(Value::Text(properties)) => Table::new(&properties, true)?,
+            Some(other) => return Err(fault("Properties", &other, "name:type:columns triples")),
+            None => Table::new("species:S:1:pos:R:3", false)?,
+        };
+        Ok(Self {
+            info,
+            cell: lattice.unwrap_or(Cell([[0.0; 3]; 3])),
+            periodic: periodic.unwrap_or([lattice.is_some(); 3]),
+            table,
+        })
+    }
+}
+
+fn fault(key: &str, value: &Value, expected: &'static str) -> Fault {
+    Fault::key(key, &value.to_string(), expected)
+}
+
+fn lattice(value: &Value) -> Result<Cell, Fault> {
+    match value.numbers().as_deref() {
+        Some(&[a, b, c, d, e, f, g, h, i]) => Ok(Cell([[a, b, c], [d, e, f], [g, h, i]])),
+        _ => Err(fault("Lattice", value, "9 numbers")),
+    }
+}
+
+/// A 3×3 matrix from its 9 components in Fortran order, or from 6 in Voigt order.
+fn matrix(value: &Value) -> Option<Matrix3> {
+    match *value.numbers()? {
+        [xx, yx, zx, xy, yy, zy, xz, yz, zz] => Some([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]]),
+        [xx, yy, zz, yz, xz, xy] => Some([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
+        _ => None,
+    }
+}
+
+fn periodic(value: &Value) -> Result<[bool; 3], Fault> {
+    let flag = |value: &Value| match value {
+        Value::Bool(flag) => Some(*flag),
+        Value::Int(0) => Some(false),
+        Value::Int(1) => Some(true),
+        _ => None,
+    };
+    let flags: Option<Vec<bool>> = match value {
+        Value::List(values) => values.iter().map(flag).collect(),
+        _ => flag(value).map(|flag| vec![flag; 3]),
+    };
+    flags.and_then(|flags| flags.try_into().ok()).ok_or_else(|| fault("pbc", value, "three of T and F"))
+}

@@ -1,0 +1,159 @@
+//! The columns of the atom lines, as `Properties` describes them.
+
+use std::collections::BTreeMap;
+
+use super::fault::{Fault, excerpt};
+use super::value::logical;
+use super::{Column, Entries};
+use crate::cell::Vec3;
+use crate::species::{Species, UnknownSpecies};
+
+/// The atoms of a frame as they are read.
+pub(super) struct Table {
+    columns: Vec<TableColumn>,
+    /// Fields of a line.
+    width: usize,
+    /// Whether more fields are an error.
+    exact: bool,
+    species: Vec<Species>,
+    positions: Vec<Vec3>,
+}
+
+struct TableColumn {
+    name: String,
+    width: usize,
+    content: Content,
+}
+
+enum Content {
+    Symbol,
+    AtomicNumber,
+    Position,
+    Array(Column),
+    /// Symbols where atomic numbers are given too: ASE takes the numbers.
+    Ignored,
+}
+
+impl Table {
+    /// Columns as `Properties` describes them: `name:type:columns` triples.
+    pub(super) fn new(properties: &str, exact: bool) -> Result<Self, Fault> {
+        let fault = |expected| Fault::key("Properties", properties, expected);
+        let fields: Vec<&str> = properties.split(':').collect();
+        let (triples, rest) = fields.as_chunks::<3>();
+        if !rest.is_empty() {
+            return Err(fault("name:type:columns triples"));
+        }
+        let numbered = triples.iter().any(|[name, ..]| matches!(*name, "Z" | "numbers"));
+        let mut table = Self { columns: vec![], width: 0, exact, species: vec![], positions: vec![] };
+        for [name, kind, width] in triples {
+            let count = width.parse().ok().filter(|width| *width > 0);
+            let columns = count.and_then(|width| table.width.checked_add(width)).zip(count);
+            let (total, width) = columns.ok_or_else(|| fault("a positive number of columns"))?;
+            let content = content(name, kind, width, numbered).map_err(fault)?;
+            if table.columns.iter().any(|column| column.name == *name) {
+                return Err(Fault::Repeated { key: format!("column {name}") });
+            }
+            table.width = total;
+            table.columns.push(TableColumn { name: (*name).to_owned(), width, content });
+        }
+        let positions =
+            table.columns.iter().filter(|column| matches!(column.content, Content::Position)).count();
+        let elements =
+            |column: &&TableColumn| matches!(column.content, Content::Symbol | Content::AtomicNumber);
+        if positions != 1 || table.columns.iter().filter(elements).count() != 1 {
+            return Err(fault("one column pos:R:3 and one of species:S:1 and Z:I:1"));
+        }
+        Ok(table)
+    }
+
+    /// Reads one atom line.
+    pub(super) fn push(&mut self, line: &str) -> Result<(), Fault> {
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        if fields.len() < self.width || (self.exact && fields.len() > self.width) {
+            return Err(Fault::Fields { found: fields.len(), expected: self.width });
+        }
+        let mut fields = fields.into_iter().enumerate();
+        for column in &mut self.columns {
+            let name = &column.name;
+            let mut take = fields.by_ref().take(column.width);
+            match &mut column.content {
+                Content::Ignored => take.for_each(drop),
+                Content::Symbol => self.species.extend(take.map(symbol).collect::<Result<Vec<_>, _>>()?),
+                Content::AtomicNumber => {
+                    self.species.extend(take.map(atomic_number).collect::<Result<Vec<_>, _>>()?);
+                }
+                Content::Position => {
+                    let mut position = [0.0; 3];
+                    for (x, (index, field)) in position.iter_mut().zip(take) {
+                        let finite = field.parse().ok().filter(|x: &f64| x.is_finite());
+                        *x = finite.ok_or_else(|| field_fault(index, name, field, "a finite number"))?;
+                    }
+                    self.positions.push(position);
+                }
+                Content::Array(array) => take.try_for_each(|(index, field)| {
+                    array.entries.push(field).map_err(|expected| field_fault(index, name, field, expected))
+                })?,
+            }
+        }
+        Ok(())
+    }
+
+    /// Species, positions, and the other columns by name.
+    pub(super) fn finish(self) -> (Vec<Species>, Vec<Vec3>, BTreeMap<String, Column>) {
+        let arrays = self.columns.into_iter().filter_map(|column| match column.content {
+            Content::Array(array) => Some((column.name, array)),
+            _ => None,
+        });
+        (self.species, self.positions, arrays.collect())
+    }
+}
+
+/// What a column is for; on failure what was expected.
+fn content(name: &str, kind: &str, width: usize, numbered: bool) -> Result<Content, &'static str> {
+    match (name, kind, width) {
+        ("species" | "symbols", "S", 1) if numbered => Ok(Content::Ignored),
+        ("species" | "symbols", "S", 1) => Ok(Content::Symbol),
+        ("species" | "symbols", ..) => Err("species:S:1"),
+        ("Z" | "numbers", "I", 1) => Ok(Content::AtomicNumber),
+        ("Z" | "numbers", ..) => Err("Z:I:1"),
+        ("pos" | "positions", "R", 3) => Ok(Content::Position),
+        ("pos" | "positions", ..) => Err("pos:R:3"),
+        ("", ..) => Err("a name for each column"),
+        (_, "R", _) => Ok(Content::Array(Column { width, entries: Entries::Real(vec![]) })),
+        (_, "I", _) => Ok(Content::Array(Column { width, entries: Entries::Int(vec![]) })),
+        (_, "L", _) => Ok(Content::Array(Column { width, entries: Entries::Bool(vec![]) })),
+        (_, "S", _) => Ok(Content::Array(Column { width, entries: Entries::Text(vec![]) })),
+        _ => Err("one of the types R, I, S and L"),
+    }
+}
+
+fn field_fault(index: usize, name: &str, found: &str, expected: &'static str) -> Fault {
+    Fault::Field { field: index + 1, name: name.to_owned(), found: excerpt(found), expected }
+}
+
+/// A symbol in any case: `AL` is aluminium.
+fn symbol((index, field): (usize, &str)) -> Result<Species, Fault> {
+    let (first, rest) = field.split_at_checked(1).unwrap_or((field, ""));
+    let capitalised = first.to_ascii_uppercase() + &rest.to_ascii_lowercase();
+    capitalised
+        .parse()
+        .map_err(|_| Fault::Species { field: index + 1, source: UnknownSpecies(excerpt(field)) })
+}
+
+fn atomic_number((index, field): (usize, &str)) -> Result<Species, Fault> {
+    let species = field.parse().ok().and_then(|number| Species::from_atomic_number(number).ok());
+    species.ok_or_else(|| Fault::Species { field: index + 1, source: UnknownSpecies(excerpt(field)) })
+}
+
+impl Entries {
+    /// Adds a field; on failure what was expected.
+    fn push(&mut self, field: &str) -> Result<(), &'static str> {
+        match self {
+            Self::Real(values) => values.push(field.parse().map_err(|_| "a number")?),
+            Self::Int(values) => values.push(field.parse().map_err(|_| "an integer")?),
+            Self::Bool(values) => values.push(logical(field).ok_or("T or F")?),
+            Self::Text(values) => values.push(field.to_owned()),
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,234 @@
+//! Values of the comment line.
+
+use std::fmt;
+
+use serde_json::Value as Json;
+
+use crate::cell::Matrix3;
+
+/// What a key of the comment line stands for.
+///
+/// JSON objects and nulls (`_JSON {…}`) stay the text they came as, and are written back as such.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Value {
+    /// `T` or `F`; a key without a value is true.
+    Bool(bool),
+    /// An integer.
+    Int(i64),
+    /// A real number.
+    Real(f64),
+    /// Anything else.
+    Text(String),
+    /// A vector; a matrix is a list of its rows.
+    List(Vec<Value>),
+}
+
+impl Value {
+    /// The number, if it is one.
+    pub fn number(&self) -> Option<f64> {
+        match self {
+            Self::Int(value) => Some(*value as f64),
+            Self::Real(value) => Some(*value),
+            _ => None,
+        }
+    }
+
+    /// All numbers of a vector, or of a matrix row by row.
+    pub fn numbers(&self) -> Option<Vec<f64>> {
+        match self {
+            Self::List(values) => {
+                let rows: Option<Vec<_>> = values.iter().map(Self::numbers).collect();
+                rows.map(|rows| rows.concat())
+            }
+            _ => self.number().map(|value| vec![value]),
+        }
+    }
+
+    /// The text, if it is one.
+    pub fn text(&self) -> Option<&str> {
+        match self {
+            Self::Text(text) => Some(text),
+            _ => None,
+        }
+    }
+
+    /// Reads what stands after `=`, quotes and escapes already resolved.
+    ///
+    /// Integers if all words (separated by white space or commas) are integers, otherwise reals,
+    /// otherwise booleans, otherwise JSON after `_JSON `, otherwise text.
+    pub(super) fn parse(text: &str) -> Self {
+        let words = || text.split(|c: char| c.is_whitespace() || c == ',').filter(|word| !word.is_empty());
+        all(words(), |word| word.parse().ok().map(Self::Int))
+            .or_else(|| all(words(), |word| word.parse().ok().map(Self::Real)))
+            .or_else(|| all(words(), |word| logical(word).map(Self::Bool)))
+            .or_else(|| text.strip_prefix("_JSON ").and_then(Self::parse_json))
+            .unwrap_or_else(|| Self::Text(text.to_owned()))
+    }
+
+    /// JSON made of numbers, booleans, strings and arrays of them.
+    pub(super) fn parse_json(text: &str) -> Option<Self> {
+        from_json(&serde_json::from_str(text).ok()?)
+    }
+
+    /// The text, before quotes and escapes, that [`Value::parse`] and ASE read as this value.
+    ///
+    /// None for a list whose rows differ in length, or with numbers that are not finite below its
+    /// first level: JSON or ASE cannot hold them.
+    pub(super) fn to_text(&self) -> Option<String> {
+        match self {
+            Self::Text(text) if !stays_text(text) => Some(format!("_JSON {}", json_string(text))),
+            Self::List(values) if !is_plain_vector(values) => {
+                self.shape().filter(|_| self.is_finite()).map(|_| format!("_JSON {self}"))
+            }
+            Self::List(values) => Some(values.iter().map(Self::to_string).collect::<Vec<_>>().join(" ")),
+            _ => Some(self.to_string()),
+        }
+    }
+
+    /// Lengths of a list and of the lists in it; none if they differ.
+    fn shape(&self) -> Option<Vec<usize>> {
+        let Self::List(values) = self else { return Some(vec![]) };
+        let mut shape = vec![values.len()];
+        let inner: Option<Vec<_>> = values.iter().map(Self::shape).collect();
+        let inner = inner?;
+        shape.extend(inner.first().into_iter().flatten());
+        inner.windows(2).all(|pair| pair[0] == pair[1]).then_some(shape)
+    }
+
+    fn is_finite(&self) -> bool {
+        match self {
+            Self::Real(value) => value.is_finite(),
+            Self::List(values) => values.iter().all(Self::is_finite),
+            _ => true,
+        }
+    }
+}
+
+/// As in the comment line, before quotes; lists and what is in them as in JSON.
+impl fmt::Display for Value {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Bool(value) => f.write_str(if *value { "T" } else { "F" }),
+            Self::Int(value) => write!(f, "{value}"),
+            Self::Real(value) => write!(f, "{value:?}"),
+            Self::Text(text) => f.write_str(text),
+            Self::List(values) => {
+                let items: Vec<_> = values.iter().map(json_item).collect();
+                write!(f, "[{}]", items.join(", "))
+            }
+        }
+    }
+}
+
+fn json_item(value: &Value) -> String {
+    match value {
+        Value::Bool(value) => value.to_string(),
+        Value::Text(text) => json_string(text),
+        _ => value.to_string(),
+    }
+}
+
+/// One value for a single word, a list for several, none if a word is of another type.
+fn all<'a>(words: impl Iterator<Item = &'a str>, parse: impl Fn(&str) -> Option<Value>) -> Option<Value> {
+    let mut values = words.map(parse).collect::<Option<Vec<_>>>()?;
+    match values.len() {
+        0 | 1 => values.pop(),
+        _ => Some(Value::List(values)),
+    }
+}
+
+/// The ways to write a truth value.
+pub(super) fn logical(word: &str) -> Option<bool> {
+    match word {
+        "T" | "true" | "True" | "TRUE" => Some(true),
+        "F" | "false" | "False" | "FALSE" => Some(false),
+        _ => None,
+    }
+}
+
+fn from_json(json: &Json) -> Option<Value> {
+    match json {
+        Json::Null | Json::Object(_) => None,
+        Json::Bool(value) => Some(Value::Bool(*value)),
+        Json::Number(number) if number.is_f64() => number.as_f64().map(Value::Real),
+        Json::Number(number) => number.as_i64().map(Value::Int),
+        Json::String(text) => Some(Value::Text(text.clone())),
+        Json::Array(values) => values.iter().map(from_json).collect::<Option<_>>().map(Value::List),
+    }
+}
+
+/// At least two numbers or booleans of one type: what needs no JSON.
+fn is_plain_vector(values: &[Value]) -> bool {
+    values.len() > 1
+        && (values.iter().all(|value| matches!(value, Value::Bool(_)))
+            || values.iter().all(|value| matches!(value, Value::Int(_)))
+            || values.iter().all(|value| matches!(value, Value::Real(_))))
+}
+
+/// Whether a text, written as it stands, is read as the same text, by ASE as well.
+///
+/// Python takes `1_000` for a number, and files that are not ASCII depend on the locale.
+fn stays_text(text: &str) -> bool {
+    let printable = text.bytes().all(|byte| (b' '..=b'~').contains(&byte));
+    let number =
+        matches!(Value::parse(&text.replace('_', "")), Value::Int(_) | Value::Real(_) | Value::List(_));
+    let words = text.contains(|c| c != ' ' && c != ',');
+    let json = text.strip_prefix("_JSON ").is_none_or(|json| serde_json::from_str::<Json>(json).is_ok());
+    printable && words && !number && json && Value::parse(text) == Value::Text(text.to_owned())
+}
+
+/// A JSON string in ASCII.
+fn json_string(text: &str) -> String {
+    let mut quoted = String::from("\"");
+    for unit in text.encode_utf16() {
+        match char::from_u32(u32::from(unit)) {
+            Some(c @ ('"' | '\\')) => quoted.extend(['\\', c]),
+            Some(c @ ' '..='~') => quoted.push(c),
+            _ => quoted.push_str(&format!("\\u{unit:04x}")),
+        }
+    }
+    quoted.push('"');
+    quoted
+}
+
+impl From<bool> for Value {
+    fn from(value: bool) -> Self {
+        Self::Bool(value)
+    }
+}
+
+impl From<i64> for Value {
+    fn from(value: i64) -> Self {
+        Self::Int(value)
+    }
+}
+
+impl From<f64> for Value {
+    fn from(value: f64) -> Self {
+        Self::Real(value)
+    }
+}
+
+impl From<&str> for Value {
+    fn from(text: &str) -> Self {
+        Self::Text(text.to_owned())
+    }
+}
+
+impl From<String> for Value {
+    fn from(text: String) -> Self {
+        Self::Text(text)
+    }
+}
+
+impl<T: Into<Value>> From<Vec<T>> for Value {
+    fn from(values: Vec<T>) -> Self {
+        Self::List(values.into_iter().map(Into::into).collect())
+    }
+}
+
+impl From<Matrix3> for Value {
+    fn from(matrix: Matrix3) -> Self {
+        matrix.map(|row| Self::from(row.to_vec())).to_vec().into()
+    }
+}
