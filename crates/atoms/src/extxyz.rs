@@ -9,7 +9,7 @@
 //! Real numbers are written with the fewest digits that give the same bits back.
 //!
 //! The kept crates do not do this job: `extxyz` 0.2 only reads, knows no escapes, and its errors
-//! have no line (unknown column types end in a panic).
+//! have no line (a column count beyond 64 bits ends in a panic).
 
 mod comment;
 mod fault;

@@ -1,6 +1,6 @@
 //! VASP POSCAR (version 5, with a line of element symbols), read and written.
 //!
-//! The kept crate `vasp-poscar` 0.3 was last released in 2018 and rests on the retired `failure`.
+//! The kept crate `vasp-poscar` 0.3 rests on `failure`, which is retired (RUSTSEC-2020-0036).
 
 use std::fmt;
 use std::io::{BufRead, ErrorKind, Write};
