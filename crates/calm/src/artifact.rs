@@ -1,0 +1,394 @@
+//! Loading a mixture from a CALM artifact (`gmm_artifacts.npz`) or from an exported model (`kokkos.npz`).
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::component::{Component, ComponentError, Statistics};
+use crate::mixture::{Mixture, MixtureError};
+use crate::npz::Archive;
+
+/// Schema versions that can be read: 3 (linear features), 4 (asinh), 6 (normalised, with density channels).
+pub const SCHEMAS: [usize; 3] = [3, 4, 6];
+
+/// Centroids of unused slots are filled with 10¹⁰; no feature comes near this.
+const SENTINEL: f64 = 1e9;
+
+/// A mixture as loaded, with what ties it to a potential.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Artifact {
+    /// Chemical symbols, in the order of the element indices.
+    pub symbols: Vec<String>,
+    /// The mixture, version 0. Loaded from an export alone it can grade but not be updated.
+    pub mixture: Mixture,
+    /// The projection that its features were made with.
+    pub projection: Projection,
+}
+
+/// How features are made of the invariant basis: what must agree between an artifact and a potential.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Projection {
+    /// Random projection matrix R, `[rows × columns]`, row-major, as stored.
+    pub matrix: Vec<f32>,
+    /// Basis size.
+    pub rows: usize,
+    /// Projected dimension d.
+    pub columns: usize,
+    /// Feature dimension D: d, or d + 1 + blocks with density channels.
+    pub feature_dimension: usize,
+    /// Whether the normalised basis goes through asinh.
+    pub asinh: bool,
+    /// Whether the basis is normalised.
+    pub normalised: bool,
+    /// Whether logarithmic norms are appended.
+    pub density_channels: bool,
+    /// Factor of the logarithmic norms.
+    pub density_scale: f32,
+}
+
+/// Why an artifact does not belong to a model.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("the CALM artifact belongs to another model: its {what} is {artifact}, that of the model {model}")]
+pub struct ProjectionMismatch {
+    /// What differs.
+    pub what: &'static str,
+    /// Its value in the artifact.
+    pub artifact: String,
+    /// Its value in the model.
+    pub model: String,
+}
+
+/// Why an artifact could not be loaded.
+#[derive(Debug, thiserror::Error)]
+pub enum ArtifactError {
+    /// The file could not be opened as an archive.
+    #[error("{}: {source}; expected a NumPy .npz archive", path.display())]
+    Open {
+        /// The file.
+        path: PathBuf,
+        /// What went wrong.
+        source: std::io::Error,
+    },
+    /// An array is missing.
+    #[error(
+        "{}: no array '{key}'; expected gmm_artifacts.npz, or an export made with CALM arrays (uq_*)",
+        path.display()
+    )]
+    Missing {
+        /// The file.
+        path: PathBuf,
+        /// Its missing key.
+        key: String,
+    },
+    /// An array is not as it should be.
+    #[error("{}: array '{key}': found {found}, expected {expected}", path.display())]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// Key of the array.
+        key: String,
+        /// What it holds.
+        found: String,
+        /// What it should hold.
+        expected: String,
+    },
+    /// The numbers of a slot do not make a component.
+    #[error("{}: component {slot} of element {element}: {source}", path.display())]
+    Component {
+        /// The file.
+        path: PathBuf,
+        /// Element index.
+        element: usize,
+        /// Component index.
+        slot: usize,
+        /// What is wrong with it.
+        source: ComponentError,
+    },
+    /// The components do not make a mixture.
+    #[error("{}: {source}", path.display())]
+    Mixture {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with them.
+        source: MixtureError,
+    },
+}
+
+impl Artifact {
+    /// Loads `gmm_artifacts.npz`: a mixture that can be graded with and updated.
+    ///
+    /// Of two sets of thresholds the weighted ones are used. Slots at the end that can never be the nearest are left
+    /// out. Elements that the artifact does not hold get [`Component::unknown_element`].
+    ///
+    /// # Errors
+    /// Missing or ill-shaped arrays and unknown schema versions, with file, key, what was found and expected.
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, ArtifactError> {
+        let path = path.as_ref();
+        let mut file = Archive::open(path)?;
+        check_schema(&mut file, "__schema_version__")?;
+        if file.contains("uq_feature_mode") {
+            let mode = file.strings("uq_feature_mode")?.concat();
+            if mode != "basis_rp" {
+                return Err(file.invalid("uq_feature_mode", mode, "basis_rp"));
+            }
+        }
+        let symbols = file.strings("element_map")?;
+        let thresholds = thresholds(&mut file, symbols.len())?;
+        let mut elements = vec![None; symbols.len()];
+        let mut dimension = 0;
+        for number in file.array("elements")?.numbers {
+            let element = file.as_count("elements", number)?;
+            let place = elements.get_mut(element);
+            let place = place.ok_or_else(|| {
+                file.invalid("elements", element, format!("an index below {}", symbols.len()))
+            })?;
+            let slots = Slots::read(&mut file, element, thresholds.get(element))?;
+            dimension = slots.dimension;
+            *place = Some(slots.components(path, element)?);
+        }
+        if dimension == 0 {
+            return Err(file.invalid("elements", "no element", "at least one"));
+        }
+        let unknown = || vec![Arc::new(Component::unknown_element(dimension))];
+        let elements = elements.into_iter().map(|element| element.unwrap_or_else(unknown)).collect();
+        let transform = match file.contains("uq_feature_transform") {
+            true => file.strings("uq_feature_transform")?.concat(),
+            false => String::new(),
+        };
+        let asinh = match transform.as_str() {
+            "" | "none" | "linear" | "identity" => false,
+            "asinh" => true,
+            _ => return Err(file.invalid("uq_feature_transform", transform, "none or asinh")),
+        };
+        finish(path, &mut file, symbols, elements, asinh)
+    }
+
+    /// Loads the CALM arrays (`uq_*`) of an exported model: a mixture to grade with, which cannot be updated.
+    ///
+    /// # Errors
+    /// As [`Artifact::load`].
+    pub fn load_export(path: impl AsRef<Path>) -> Result<Self, ArtifactError> {
+        let path = path.as_ref();
+        let mut file = Archive::open(path)?;
+        check_schema(&mut file, "uq_schema_version")?;
+        let symbols = file.strings("element_names")?;
+        let element_count = file.count("uq_n_elements")?;
+        if element_count != symbols.len() {
+            return Err(file.invalid("uq_n_elements", element_count, symbols.len()));
+        }
+        let (slots, dimension) = (file.count("uq_max_clusters")?, file.count("uq_feature_dim")?);
+        let centroids = file.shaped("uq_centroids", &[element_count, slots, dimension])?;
+        let inverses = file.shaped("uq_inv_cov", &[element_count, slots, dimension, dimension])?;
+        let thresholds = file.shaped("uq_interp_thresholds", &[element_count, slots])?;
+        if slots == 0 || dimension == 0 {
+            return Err(file.invalid("uq_centroids", "no centroid", "at least one an element"));
+        }
+        let mut elements = Vec::new();
+        let rows = thresholds.chunks_exact(slots).zip(centroids.chunks_exact(slots * dimension));
+        let rows = rows.zip(inverses.chunks_exact(slots * dimension * dimension));
+        for (element, ((thresholds, centroids), inverses)) in rows.enumerate() {
+            let slots = Slots {
+                dimension,
+                thresholds: thresholds.to_vec(),
+                centroids: centroids.to_vec(),
+                inverses: inverses.to_vec(),
+                statistics: Vec::new(),
+            };
+            elements.push(slots.components(path, element)?);
+        }
+        let asinh = file.scalar_or("uq_feature_transform", 0.0)?;
+        if asinh != 0.0 && asinh != 1.0 {
+            return Err(file.invalid("uq_feature_transform", asinh, "0 (none) or 1 (asinh)"));
+        }
+        finish(path, &mut file, symbols, elements, asinh == 1.0)
+    }
+
+    /// Checks that this artifact belongs to a model, itself known by its export: same elements in the same order
+    /// and the same projection.
+    ///
+    /// # Errors
+    /// The first thing that differs.
+    pub fn check_belongs_to(
+        &self,
+        symbols: &[String],
+        projection: &Projection,
+    ) -> Result<(), ProjectionMismatch> {
+        differs("list of elements", self.symbols.join(" "), symbols.join(" "))?;
+        self.projection.check_same(projection)
+    }
+}
+
+impl Projection {
+    /// Checks that features made with the two are the same.
+    ///
+    /// # Errors
+    /// The first thing that differs; `self` is called the artifact, `model` the model.
+    pub fn check_same(&self, model: &Self) -> Result<(), ProjectionMismatch> {
+        differs("feature dimension", self.feature_dimension, model.feature_dimension)?;
+        differs("basis size", self.rows, model.rows)?;
+        differs("projected dimension", self.columns, model.columns)?;
+        differs("asinh transform", self.asinh, model.asinh)?;
+        differs("basis normalisation", self.normalised, model.normalised)?;
+        differs("use of density channels", self.density_channels, model.density_channels)?;
+        differs("density scale", self.density_scale, model.density_scale)?;
+        let different =
+            self.matrix.iter().zip(&model.matrix).position(|(a, b)| a.to_bits() != b.to_bits()).map(
+                |index| {
+                    let describe = |matrix: &[f32]| format!("{:?} at number {index}", matrix.get(index));
+                    (describe(&self.matrix), describe(&model.matrix))
+                },
+            );
+        match different {
+            Some((artifact, model)) => Err(ProjectionMismatch { what: "projection matrix", artifact, model }),
+            None => differs("projection matrix length", self.matrix.len(), model.matrix.len()),
+        }
+    }
+
+    /// All of it as bytes in a fixed order (sizes, flags, scale, matrix; little-endian), to be hashed.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let mut out = Vec::new();
+        for size in [self.rows, self.columns, self.feature_dimension] {
+            out.extend((size as u64).to_le_bytes());
+        }
+        out.extend([self.asinh, self.normalised, self.density_channels].map(u8::from));
+        out.extend(self.density_scale.to_le_bytes());
+        out.extend(self.matrix.iter().flat_map(|value| value.to_le_bytes()));
+        out
+    }
+}
+
+fn differs<T: PartialEq + ToString>(
+    what: &'static str,
+    artifact: T,
+    model: T,
+) -> Result<(), ProjectionMismatch> {
+    if artifact == model {
+        return Ok(());
+    }
+    Err(ProjectionMismatch { what, artifact: artifact.to_string(), model: model.to_string() })
+}
+
+fn check_schema(file: &mut Archive, key: &str) -> Result<(), ArtifactError> {
+    let schema = file.count(key)?;
+    if SCHEMAS.contains(&schema) {
+        return Ok(());
+    }
+    Err(file.invalid(key, format!("schema version {schema}"), "version 3, 4 or 6; build the artifact again"))
+}
+
+/// θ, `[elements][slots]`: the weighted thresholds where there are some.
+fn thresholds(file: &mut Archive, elements: usize) -> Result<Vec<Vec<f64>>, ArtifactError> {
+    let weighted = file.contains("eff_interp_thresholds");
+    let key = if weighted { "eff_interp_thresholds" } else { "interp_thresholds" };
+    let found = file.array(key)?;
+    match found.shape[..] {
+        [rows, slots] if rows == elements && slots > 0 => {
+            Ok(found.numbers.chunks_exact(slots).map(<[f64]>::to_vec).collect())
+        }
+        _ => Err(file.invalid(key, format!("shape {:?}", found.shape), format!("shape [{elements}, K]"))),
+    }
+}
+
+/// The arrays of one element, slot by slot.
+struct Slots {
+    dimension: usize,
+    thresholds: Vec<f64>,
+    centroids: Vec<f64>,
+    inverses: Vec<f64>,
+    statistics: Vec<Statistics>,
+}
+
+impl Slots {
+    fn read(
+        file: &mut Archive,
+        element: usize,
+        thresholds: Option<&Vec<f64>>,
+    ) -> Result<Self, ArtifactError> {
+        let key = format!("centroids_{element}");
+        let centroids = file.array(&key)?;
+        let [slots, dimension] = centroids.shape[..] else {
+            return Err(file.invalid(&key, format!("shape {:?}", centroids.shape), "shape [K, D]"));
+        };
+        let thresholds = thresholds.filter(|row| row.len() >= slots).cloned();
+        let thresholds = thresholds
+            .ok_or_else(|| file.invalid(&key, format!("{slots} slots"), "at most one for each threshold"))?;
+        if slots == 0 || dimension == 0 {
+            return Err(file.invalid(&key, format!("shape {:?}", centroids.shape), "at least one centroid"));
+        }
+        let square = [slots, dimension, dimension];
+        let inverses = file.shaped(&format!("inv_cov_{element}"), &square)?;
+        let scatters = file.shaped(&format!("scatter_{element}"), &square)?;
+        let counts = file.shaped(&format!("counts_{element}"), &[slots])?;
+        let weighted = format!("effective_count_{element}");
+        let effective =
+            if file.contains(&weighted) { file.shaped(&weighted, &[slots])? } else { counts.clone() };
+        let statistics = scatters.chunks_exact(dimension * dimension).zip(counts.iter().zip(effective));
+        let statistics = statistics
+            .map(|(scatter, (&count, effective_count))| Statistics {
+                scatter: scatter.to_vec(),
+                count,
+                effective_count,
+            })
+            .collect();
+        Ok(Self { dimension, thresholds, centroids: centroids.numbers, inverses, statistics })
+    }
+
+    /// The components of the slots up to the last that can be the nearest: trailing sentinels and repetitions of
+    /// the first centroid (an element that the artifact does not hold) are left out, indices stay.
+    fn components(&self, path: &Path, element: usize) -> Result<Vec<Arc<Component>>, ArtifactError> {
+        let centroids: Vec<&[f64]> = self.centroids.chunks_exact(self.dimension).collect();
+        let used = |centroid: &&[f64]| {
+            centroid.iter().any(|value| value.abs() < SENTINEL) && Some(centroid) != centroids.first()
+        };
+        let count = centroids.iter().rposition(used).map_or(1, |last| last + 1);
+        let inverses = self.inverses.chunks_exact(self.dimension * self.dimension);
+        let slots = centroids.iter().zip(inverses).zip(&self.thresholds).take(count).enumerate();
+        let components = slots.map(|(slot, ((centroid, inverse), &threshold))| {
+            let statistics = self.statistics.get(slot).cloned();
+            Component::new(centroid.to_vec(), inverse.to_vec(), threshold, statistics).map(Arc::new).map_err(
+                |source| ArtifactError::Component { path: path.to_path_buf(), element, slot, source },
+            )
+        });
+        components.collect()
+    }
+}
+
+/// Reads the projection, whose keys both files share, and puts all together.
+fn finish(
+    path: &Path,
+    file: &mut Archive,
+    symbols: Vec<String>,
+    elements: Vec<Vec<Arc<Component>>>,
+    asinh: bool,
+) -> Result<Artifact, ArtifactError> {
+    let mixture = Mixture::new(0, elements)
+        .map_err(|source| ArtifactError::Mixture { path: path.to_path_buf(), source })?;
+    let matrix = file.array("uq_rp_matrix")?;
+    let [rows, columns] = matrix.shape[..] else {
+        return Err(file.invalid("uq_rp_matrix", format!("shape {:?}", matrix.shape), "shape [D_basis, d]"));
+    };
+    let announced = file.count("uq_rp_dim")?;
+    if announced != columns {
+        return Err(file.invalid("uq_rp_dim", announced, format!("{columns}, the columns of uq_rp_matrix")));
+    }
+    let projection = Projection {
+        matrix: matrix.numbers.iter().map(|&value| value as f32).collect(),
+        rows,
+        columns,
+        feature_dimension: mixture.dimension(),
+        asinh,
+        normalised: file.scalar_or("uq_rp_normalize", 0.0)? != 0.0,
+        density_channels: file.scalar_or("uq_rp_add_density_channel", 0.0)? != 0.0,
+        density_scale: file.scalar_or("uq_rp_density_scale", 1.0)? as f32,
+    };
+    let extra = projection.feature_dimension.checked_sub(columns);
+    let fits = if projection.density_channels { extra >= Some(2) } else { extra == Some(0) };
+    if !fits {
+        let found = format!("{columns} columns for {} features", projection.feature_dimension);
+        return Err(file.invalid(
+            "uq_rp_matrix",
+            found,
+            "as many, or at least two less with density channels",
+        ));
+    }
+    Ok(Artifact { symbols, mixture, projection })
+}

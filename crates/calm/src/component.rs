@@ -1,0 +1,190 @@
+//! One Gaussian of the mixture: immutable, shared by reference counting.
+
+use crate::linear::{self, LinearError, regularised_inverse, symmetrised, view};
+
+/// A component, as slices: what the grade needs. Made from a [`Component`] or from a block of shared memory.
+#[derive(Debug, Clone, Copy)]
+pub struct ComponentView<'a> {
+    /// Centroid **μ**, `[D]`.
+    pub centroid: &'a [f64],
+    /// Inverse covariance S, `[D × D]`, exactly symmetric.
+    pub inverse: &'a [f64],
+    /// Calibrated threshold θ of σ.
+    pub threshold: f64,
+}
+
+/// What an update needs to know of the data behind a component.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Statistics {
+    /// Scatter Σ w δδᵀ about the fixed centroid, `[D × D]`, exactly symmetric.
+    pub scatter: Vec<f64>,
+    /// Number of environments.
+    pub count: f64,
+    /// Sum of their weights.
+    pub effective_count: f64,
+}
+
+impl Statistics {
+    /// The covariance C = scatter / effective count; zero for an empty component.
+    pub fn covariance(&self) -> Vec<f64> {
+        if self.effective_count > 0.0 {
+            self.scatter.iter().map(|value| value / self.effective_count).collect()
+        } else {
+            vec![0.0; self.scatter.len()]
+        }
+    }
+}
+
+/// One Gaussian of the mixture, of one species. Immutable: an update makes a new one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Component {
+    centroid: Vec<f64>,
+    inverse: Vec<f64>,
+    threshold: f64,
+    statistics: Option<Statistics>,
+}
+
+/// Numbers that do not make a component.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ComponentError {
+    /// A feature dimension of zero.
+    #[error("a component needs at least one feature dimension")]
+    Empty,
+    /// A matrix or vector of the wrong length.
+    #[error("{what}: found {found} numbers, expected {expected}")]
+    Length {
+        /// Which array.
+        what: &'static str,
+        /// Its length.
+        found: usize,
+        /// The length that fits the centroid.
+        expected: usize,
+    },
+    /// An infinite or undefined number, or a negative count or threshold.
+    #[error("{what}: found {found}, expected a finite number{}", if *.not_negative { " that is not negative" } else { "" })]
+    Number {
+        /// Which quantity.
+        what: &'static str,
+        /// The number.
+        found: f64,
+        /// Whether it also must not be negative.
+        not_negative: bool,
+    },
+}
+
+impl Component {
+    /// Checks and takes the numbers of a component; inverse and scatter are made exactly symmetric, (M + Mᵀ)/2.
+    ///
+    /// For a symmetric S, S**δ** equals (S + Sᵀ)**δ**/2 and **δ**ᵀS**δ** is unchanged, so nothing of the grade is lost.
+    ///
+    /// # Errors
+    /// Lengths that do not fit, numbers that are not finite, negative counts or threshold.
+    pub fn new(
+        centroid: Vec<f64>,
+        inverse: Vec<f64>,
+        threshold: f64,
+        statistics: Option<Statistics>,
+    ) -> Result<Self, ComponentError> {
+        let dimension = centroid.len();
+        if dimension == 0 {
+            return Err(ComponentError::Empty);
+        }
+        finite("centroid", &centroid)?;
+        not_negative("threshold", threshold)?;
+        let inverse = symmetric("inverse covariance", &inverse, dimension)?;
+        let statistics = statistics.map(|found| checked_statistics(found, dimension)).transpose()?;
+        Ok(Self { centroid, inverse, threshold, statistics })
+    }
+
+    /// The stand-in for an element that the artifact does not hold: **μ** = 0, S = 10⁶ I, θ = 1, no data.
+    ///
+    /// Its grade is enormous, so structures with the element are collected, and an update can learn it.
+    pub fn unknown_element(dimension: usize) -> Self {
+        let mut inverse = vec![0.0; dimension * dimension];
+        inverse.iter_mut().step_by(dimension + 1).for_each(|value| *value = 1.0 / linear::REGULARISATION);
+        let scatter = vec![0.0; dimension * dimension];
+        Self {
+            centroid: vec![0.0; dimension],
+            inverse,
+            threshold: 1.0,
+            statistics: Some(Statistics { scatter, count: 0.0, effective_count: 0.0 }),
+        }
+    }
+
+    /// The same centroid and threshold with a new covariance: statistics and the regularised inverse follow it.
+    pub(crate) fn with_covariance(
+        &self,
+        covariance: &[f64],
+        count: f64,
+        effective_count: f64,
+    ) -> Result<Self, LinearError> {
+        let inverse = regularised_inverse(covariance, self.dimension())?;
+        let scatter = covariance.iter().map(|value| value * effective_count).collect();
+        Ok(Self {
+            centroid: self.centroid.clone(),
+            inverse,
+            threshold: self.threshold,
+            statistics: Some(Statistics { scatter, count, effective_count }),
+        })
+    }
+
+    /// Feature dimension D.
+    pub fn dimension(&self) -> usize {
+        self.centroid.len()
+    }
+
+    /// Centroid **μ**, `[D]`: fixed for the whole campaign.
+    pub fn centroid(&self) -> &[f64] {
+        &self.centroid
+    }
+
+    /// Inverse covariance S, `[D × D]`, exactly symmetric.
+    pub fn inverse(&self) -> &[f64] {
+        &self.inverse
+    }
+
+    /// Calibrated threshold θ: fixed for the whole campaign.
+    pub fn threshold(&self) -> f64 {
+        self.threshold
+    }
+
+    /// Scatter and counts; `None` when the mixture came from an export alone and cannot be updated.
+    pub fn statistics(&self) -> Option<&Statistics> {
+        self.statistics.as_ref()
+    }
+
+    /// The slices that the grade needs.
+    pub fn view(&self) -> ComponentView<'_> {
+        ComponentView { centroid: &self.centroid, inverse: &self.inverse, threshold: self.threshold }
+    }
+}
+
+fn checked_statistics(found: Statistics, dimension: usize) -> Result<Statistics, ComponentError> {
+    not_negative("count", found.count)?;
+    not_negative("effective count", found.effective_count)?;
+    Ok(Statistics { scatter: symmetric("scatter", &found.scatter, dimension)?, ..found })
+}
+
+fn symmetric(what: &'static str, matrix: &[f64], dimension: usize) -> Result<Vec<f64>, ComponentError> {
+    let expected = dimension.saturating_mul(dimension);
+    if matrix.len() != expected {
+        return Err(ComponentError::Length { what, found: matrix.len(), expected });
+    }
+    finite(what, matrix)?;
+    Ok(symmetrised(view(matrix, dimension, dimension)))
+}
+
+fn finite(what: &'static str, numbers: &[f64]) -> Result<(), ComponentError> {
+    match numbers.iter().find(|value| !value.is_finite()) {
+        Some(&found) => Err(ComponentError::Number { what, found, not_negative: false }),
+        None => Ok(()),
+    }
+}
+
+fn not_negative(what: &'static str, found: f64) -> Result<(), ComponentError> {
+    if found.is_finite() && found >= 0.0 {
+        Ok(())
+    } else {
+        Err(ComponentError::Number { what, found, not_negative: true })
+    }
+}

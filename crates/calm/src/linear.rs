@@ -1,0 +1,200 @@
+//! Dense symmetric linear algebra on row-major slices, sequential throughout.
+
+use faer::dyn_stack::{MemBuffer, MemStack};
+use faer::linalg::cholesky::llt::factor::{LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
+use faer::linalg::evd::{ComputeEigenvectors, self_adjoint_evd, self_adjoint_evd_scratch};
+use faer::linalg::matmul::matmul;
+use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
+use faer::{Accum, Mat, MatRef, Par};
+
+/// Added to the diagonal of every covariance before it is inverted (paper, Methods): ε = 10⁻⁶.
+pub const REGULARISATION: f64 = 1e-6;
+
+/// Eigenvalues with |w| ≤ this times max |w| are left out of the pseudo-inverse.
+pub const TRUNCATION: f64 = 1e-15;
+
+/// A matrix on which the linear algebra failed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum LinearError {
+    /// The slice is not a square matrix of the stated dimension.
+    #[error("a {dimension} × {dimension} matrix needs {} numbers, found {found}", dimension * dimension)]
+    Size {
+        /// Expected rows and columns.
+        dimension: usize,
+        /// Numbers found.
+        found: usize,
+    },
+    /// An element is infinite or not a number.
+    #[error("the matrix has an element that is not finite (row {row}, column {column})")]
+    NotFinite {
+        /// Row of the first such element.
+        row: usize,
+        /// Its column.
+        column: usize,
+    },
+    /// The eigenvalue iteration failed.
+    #[error("the eigenvalues of a {dimension} × {dimension} matrix did not converge")]
+    NoConvergence {
+        /// Rows and columns.
+        dimension: usize,
+    },
+}
+
+/// Eigenvalues (ascending) and eigenvectors (columns) of a symmetric matrix.
+pub(crate) struct Eigen {
+    pub values: Vec<f64>,
+    pub vectors: Mat<f64>,
+}
+
+/// A row-major slice as a faer view; for a symmetric matrix the order does not matter.
+pub(crate) fn view(matrix: &[f64], rows: usize, columns: usize) -> MatRef<'_, f64> {
+    MatRef::from_row_major_slice(matrix, rows, columns)
+}
+
+/// The product of two matrices.
+pub(crate) fn product(left: MatRef<'_, f64>, right: MatRef<'_, f64>) -> Mat<f64> {
+    let mut out = Mat::zeros(left.nrows(), right.ncols());
+    matmul(&mut out, Accum::Replace, left, right, 1.0, Par::Seq);
+    out
+}
+
+/// The symmetric part (M + Mᵀ)/2 as a row-major matrix: exactly symmetric.
+pub(crate) fn symmetrised(matrix: MatRef<'_, f64>) -> Vec<f64> {
+    let dimension = matrix.nrows();
+    let mut out = Vec::with_capacity(dimension * dimension);
+    for row in 0..dimension {
+        out.extend((0..dimension).map(|column| 0.5 * (matrix[(row, column)] + matrix[(column, row)])));
+    }
+    out
+}
+
+/// Eigen-decomposition of a symmetric matrix, of which the lower triangle is read.
+pub(crate) fn eigen(matrix: MatRef<'_, f64>) -> Result<Eigen, LinearError> {
+    let dimension = matrix.nrows();
+    let mut values = faer::diag::Diag::zeros(dimension);
+    let mut vectors = Mat::zeros(dimension, dimension);
+    let scratch =
+        self_adjoint_evd_scratch::<f64>(dimension, ComputeEigenvectors::Yes, Par::Seq, Default::default());
+    self_adjoint_evd(
+        matrix,
+        values.as_mut(),
+        Some(vectors.as_mut()),
+        Par::Seq,
+        MemStack::new(&mut MemBuffer::new(scratch)),
+        Default::default(),
+    )
+    .map_err(|_| LinearError::NoConvergence { dimension })?;
+    let values = values.column_vector().iter().copied().collect();
+    Ok(Eigen { values, vectors })
+}
+
+/// The factor L of A = LLᵀ, or `None` when A is not positive definite in floating point.
+pub(crate) fn cholesky(matrix: &[f64], dimension: usize) -> Option<Mat<f64>> {
+    let mut factor = view(matrix, dimension, dimension).to_owned();
+    let scratch = cholesky_in_place_scratch::<f64>(dimension, Par::Seq, Default::default());
+    let factorised = cholesky_in_place(
+        factor.as_mut(),
+        LltRegularization::default(),
+        Par::Seq,
+        MemStack::new(&mut MemBuffer::new(scratch)),
+        Default::default(),
+    );
+    factorised.is_ok().then_some(factor)
+}
+
+/// Replaces X by L⁻¹X.
+pub(crate) fn solve_lower(factor: &Mat<f64>, right: &mut Mat<f64>) {
+    solve_lower_triangular_in_place(factor.as_ref(), right.as_mut(), Par::Seq);
+}
+
+/// Symmetric pseudo-inverse Σ_i u_i u_iᵀ / w_i over the eigenpairs with |w_i| > 10⁻¹⁵ max |w|.
+///
+/// `matrix` is `[dimension × dimension]`, symmetric. The result is exactly symmetric.
+///
+/// # Errors
+/// A wrong length, an element that is not finite, or eigenvalues that do not converge.
+pub fn pseudo_inverse(matrix: &[f64], dimension: usize) -> Result<Vec<f64>, LinearError> {
+    if dimension.checked_mul(dimension) != Some(matrix.len()) {
+        return Err(LinearError::Size { dimension, found: matrix.len() });
+    }
+    if let Some(index) = matrix.iter().position(|value| !value.is_finite()) {
+        return Err(LinearError::NotFinite { row: index / dimension, column: index % dimension });
+    }
+    let Eigen { values, vectors } = eigen(view(matrix, dimension, dimension))?;
+    let largest = values.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
+    let kept = |value: f64| value.abs() > TRUNCATION * largest;
+    let scaled = Mat::from_fn(dimension, dimension, |row, column| match values.get(column) {
+        Some(&value) if kept(value) => vectors[(row, column)] / value,
+        _ => 0.0,
+    });
+    Ok(symmetrised(product(scaled.as_ref(), vectors.transpose()).as_ref()))
+}
+
+/// The regularised inverse (C + εI)⁺ of a covariance, ε = 10⁻⁶ (paper, Methods).
+///
+/// # Errors
+/// Those of [`pseudo_inverse`].
+pub fn regularised_inverse(covariance: &[f64], dimension: usize) -> Result<Vec<f64>, LinearError> {
+    pseudo_inverse(&regularised(covariance, dimension), dimension)
+}
+
+/// C + εI.
+pub(crate) fn regularised(covariance: &[f64], dimension: usize) -> Vec<f64> {
+    let mut out = covariance.to_vec();
+    out.iter_mut().step_by(dimension + 1).for_each(|value| *value += REGULARISATION);
+    out
+}
+
+/// out = S v for a symmetric row-major S, summed over rows four at a time in a fixed order.
+///
+/// Every lane adds the same terms in the same order whatever the vector width, without fused multiply-add,
+/// so the bits do not depend on the processor.
+pub(crate) fn symmetric_product(matrix: &[f64], vector: &[f64], out: &mut [f64]) {
+    let dimension = vector.len();
+    out.fill(0.0);
+    let mut rows = matrix.chunks_exact(4 * dimension);
+    let mut factors = vector.chunks_exact(4);
+    for (block, factor) in rows.by_ref().zip(factors.by_ref()) {
+        let (first, second) = block.split_at(2 * dimension);
+        let (row_0, row_1) = first.split_at(dimension);
+        let (row_2, row_3) = second.split_at(dimension);
+        let [v_0, v_1, v_2, v_3] = *factor else { continue };
+        let terms = row_0.iter().zip(row_1).zip(row_2.iter().zip(row_3));
+        for (sum, ((a, b), (c, d))) in out.iter_mut().zip(terms) {
+            *sum += (a * v_0 + b * v_1) + (c * v_2 + d * v_3);
+        }
+    }
+    for (row, factor) in rows.remainder().chunks_exact(dimension).zip(factors.remainder()) {
+        out.iter_mut().zip(row).for_each(|(sum, value)| *sum += value * factor);
+    }
+}
+
+/// Σ a_i b_i in order, in four interleaved sums (fixed bits, vectorisable).
+pub(crate) fn dot(left: &[f64], right: &[f64]) -> f64 {
+    let (mut sums, mut rest) = ([0.0; 4], 0.0);
+    let (left, right) = (left.chunks_exact(4), right.chunks_exact(4));
+    for (a, b) in left.remainder().iter().zip(right.remainder()) {
+        rest += a * b;
+    }
+    for (a, b) in left.zip(right) {
+        for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
+            *sum += a * b;
+        }
+    }
+    (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
+}
+
+/// |a − b|² in four interleaved sums (fixed bits, vectorisable).
+pub(crate) fn squared_distance(left: &[f64], right: &[f64]) -> f64 {
+    let (mut sums, mut rest) = ([0.0; 4], 0.0);
+    let (left, right) = (left.chunks_exact(4), right.chunks_exact(4));
+    for (a, b) in left.remainder().iter().zip(right.remainder()) {
+        rest += (a - b) * (a - b);
+    }
+    for (a, b) in left.zip(right) {
+        for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
+            *sum += (a - b) * (a - b);
+        }
+    }
+    (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
+}

@@ -1,0 +1,51 @@
+//! The grade averaged over the neighbourhood of each atom.
+
+use std::f64::consts::PI;
+
+/// One directed bond, image bonds included: `i` sees `j`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pair {
+    /// Central atom.
+    pub i: usize,
+    /// Neighbour (the atom whose image it is); may equal `i`.
+    pub j: usize,
+    /// Distance r_ij, Å.
+    pub distance: f64,
+    /// Cutoff r_c,ij of this pair of species, Å.
+    pub cutoff: f64,
+}
+
+/// A pair that names an atom which has no grade.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error("pair ({i}, {j}) names an atom beyond the {atoms} that were graded")]
+pub struct PairError {
+    /// Central atom.
+    pub i: usize,
+    /// Neighbour.
+    pub j: usize,
+    /// Number of graded atoms.
+    pub atoms: usize,
+}
+
+/// γ_nbr,i = (γ_i + Σ_j w_ij γ_j) / (1 + Σ_j w_ij), w_ij = ½[1 + cos(π r_ij / r_c,ij)] (paper, Eq. 3).
+///
+/// `gamma` is `[atoms]` and so is the result. Pairs at or beyond their cutoff have no weight. The sum runs in the
+/// order of the pairs: give them in a fixed order.
+///
+/// # Errors
+/// A pair that names an atom without a grade.
+pub fn neighbourhood_average(
+    gamma: &[f64],
+    pairs: impl IntoIterator<Item = Pair>,
+) -> Result<Vec<f64>, PairError> {
+    let mut sums: Vec<(f64, f64)> = gamma.iter().map(|&grade| (grade, 1.0)).collect();
+    for Pair { i, j, distance, cutoff } in pairs {
+        let error = PairError { i, j, atoms: gamma.len() };
+        let (sum, grade) = (sums.get_mut(i).ok_or(error)?, gamma.get(j).ok_or(error)?);
+        if distance < cutoff {
+            let weight = 0.5 * (1.0 + (PI * distance / cutoff).cos());
+            *sum = (sum.0 + weight * grade, sum.1 + weight);
+        }
+    }
+    Ok(sums.into_iter().map(|(sum, weight)| sum / weight).collect())
+}

@@ -1,0 +1,243 @@
+//! When a structure is collected, and when an update of the mixture has done enough.
+
+use std::num::NonZeroUsize;
+
+use serde::{Deserialize, Serialize};
+
+use crate::grade::maximum;
+
+/// A finite number above zero.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[serde(try_from = "f64", into = "f64")]
+pub struct Positive(f64);
+
+/// A number above 0 and not above 1.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[serde(try_from = "f64", into = "f64")]
+pub struct Fraction(f64);
+
+/// The values of α to try, ascending, each above 0 and not above 1.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Vec<f64>", into = "Vec<f64>")]
+pub struct AlphaLadder(Vec<f64>);
+
+/// A setting out of its range.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum RuleError {
+    /// Not a positive number.
+    #[error("found {0}, expected a finite number above 0")]
+    NotPositive(f64),
+    /// Not a fraction.
+    #[error("found {0}, expected a number above 0 and not above 1")]
+    NotFraction(f64),
+    /// Not a ladder.
+    #[error("found α = {0:?}, expected at least one value, ascending, each above 0 and not above 1")]
+    NotLadder(Vec<f64>),
+}
+
+impl Positive {
+    /// The number itself.
+    pub fn get(self) -> f64 {
+        self.0
+    }
+}
+
+impl Fraction {
+    pub(crate) const FIFTH: Self = Self(0.2);
+
+    /// The number itself.
+    pub fn get(self) -> f64 {
+        self.0
+    }
+}
+
+impl AlphaLadder {
+    /// The values, ascending.
+    pub fn values(&self) -> &[f64] {
+        &self.0
+    }
+}
+
+impl TryFrom<f64> for Positive {
+    type Error = RuleError;
+    fn try_from(found: f64) -> Result<Self, RuleError> {
+        if found.is_finite() && found > 0.0 { Ok(Self(found)) } else { Err(RuleError::NotPositive(found)) }
+    }
+}
+
+impl TryFrom<f64> for Fraction {
+    type Error = RuleError;
+    fn try_from(found: f64) -> Result<Self, RuleError> {
+        if found > 0.0 && found <= 1.0 { Ok(Self(found)) } else { Err(RuleError::NotFraction(found)) }
+    }
+}
+
+impl TryFrom<Vec<f64>> for AlphaLadder {
+    type Error = RuleError;
+    fn try_from(found: Vec<f64>) -> Result<Self, RuleError> {
+        let within = found.iter().all(|&alpha| alpha > 0.0 && alpha <= 1.0);
+        if !found.is_empty() && within && found.is_sorted_by(|a, b| a < b) {
+            Ok(Self(found))
+        } else {
+            Err(RuleError::NotLadder(found))
+        }
+    }
+}
+
+impl From<Positive> for f64 {
+    fn from(number: Positive) -> f64 {
+        number.0
+    }
+}
+
+impl From<Fraction> for f64 {
+    fn from(number: Fraction) -> f64 {
+        number.0
+    }
+}
+
+impl From<AlphaLadder> for Vec<f64> {
+    fn from(ladder: AlphaLadder) -> Vec<f64> {
+        ladder.0
+    }
+}
+
+/// When a structure becomes a candidate.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "rule", rename_all = "snake_case", deny_unknown_fields)]
+pub enum CollectionRule {
+    /// γ_max above a threshold (paper, aluminium and silicon: 1.5).
+    MaximumGrade {
+        /// The threshold.
+        #[serde(default = "collection_threshold")]
+        threshold: Positive,
+    },
+    /// At least max[`least`, ⌈`fraction` N⌉] of the N atoms above a threshold (paper, foundation model).
+    AtomCount {
+        /// Grade above which an atom counts (paper: 1.3).
+        #[serde(default = "atom_threshold")]
+        threshold: Positive,
+        /// Share of the atoms (paper: 0.15).
+        #[serde(default = "atom_fraction")]
+        fraction: Fraction,
+        /// Least number of atoms (paper: 3).
+        #[serde(default = "atom_least")]
+        least: NonZeroUsize,
+    },
+}
+
+/// Which α is chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "rule", rename_all = "snake_case", deny_unknown_fields)]
+pub enum UpdateRule {
+    /// The smallest α with γ_max below the target, else the last and a bounded inflation (paper, aluminium and silicon).
+    MaximumGrade {
+        /// Update target (paper: 1.25).
+        #[serde(default = "update_target")]
+        target: Positive,
+    },
+    /// The smallest α that leaves fewer than max[`least`, ⌈`fraction` N⌉] atoms above the threshold, else the smallest
+    /// with γ_max below the target, else the last (paper, foundation model).
+    AtomCount {
+        /// Grade above which an atom counts (paper: 1.3).
+        #[serde(default = "atom_threshold")]
+        threshold: Positive,
+        /// Share of the atoms (paper: 0.15).
+        #[serde(default = "atom_fraction")]
+        fraction: Fraction,
+        /// Least number of atoms (paper: 3).
+        #[serde(default = "atom_least")]
+        least: NonZeroUsize,
+        /// Update target of the fallback (paper: 1.25).
+        #[serde(default = "update_target")]
+        target: Positive,
+    },
+}
+
+/// How old and new covariance are combined.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Combination {
+    /// (1 − α) C + α C_batch, the paper's.
+    #[default]
+    Convex,
+    /// C + α C_batch, which forgets nothing.
+    Additive,
+}
+
+impl Combination {
+    /// The α to try unless others are given.
+    ///
+    /// Convex: the paper's six. Additive: from 0.0005 to 1 in steps of about two (1, 2, 5 a decade), since without
+    /// the factor 1 − α already a very small α can suffice, and a larger one than needed covers too much.
+    pub fn default_ladder(self) -> AlphaLadder {
+        AlphaLadder(match self {
+            Self::Convex => vec![0.05, 0.1, 0.2, 0.4, 0.7, 1.0],
+            Self::Additive => vec![0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0],
+        })
+    }
+}
+
+/// How the mixture is updated after a collection.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct UpdateSettings {
+    /// Convex or additive.
+    #[serde(default)]
+    pub combination: Combination,
+    /// The α to try; left out, [`Combination::default_ladder`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ladder: Option<AlphaLadder>,
+    /// Which α is chosen.
+    pub stop: UpdateRule,
+}
+
+impl UpdateSettings {
+    /// The α to try, ascending.
+    pub fn alphas(&self) -> Vec<f64> {
+        self.ladder.clone().unwrap_or_else(|| self.combination.default_ladder()).into()
+    }
+}
+
+impl CollectionRule {
+    /// Whether a structure with these grades, `[atoms]`, is to be collected.
+    pub fn is_met(&self, gamma: &[f64]) -> bool {
+        match *self {
+            Self::MaximumGrade { threshold } => maximum(gamma) > threshold.0,
+            Self::AtomCount { threshold, fraction, least } => {
+                count_above(gamma, threshold.0) >= atom_limit(gamma.len(), fraction, least)
+            }
+        }
+    }
+}
+
+/// Number of atoms with γ above a threshold.
+pub fn count_above(gamma: &[f64], threshold: f64) -> usize {
+    gamma.iter().filter(|&&grade| grade > threshold).count()
+}
+
+/// max[least, ⌈fraction · atoms⌉], where a product that is whole but for rounding counts as whole.
+pub fn atom_limit(atoms: usize, fraction: Fraction, least: NonZeroUsize) -> usize {
+    let share = (fraction.0 * atoms as f64 * (1.0 - 1e-12)).ceil() as usize;
+    share.max(least.get())
+}
+
+fn collection_threshold() -> Positive {
+    Positive(1.5)
+}
+
+fn atom_threshold() -> Positive {
+    Positive(1.3)
+}
+
+fn atom_fraction() -> Fraction {
+    Fraction(0.15)
+}
+
+fn atom_least() -> NonZeroUsize {
+    NonZeroUsize::MIN.saturating_add(2)
+}
+
+fn update_target() -> Positive {
+    Positive(1.25)
+}

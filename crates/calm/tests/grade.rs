@@ -1,0 +1,188 @@
+//! σ, γ, component and γ_nbr against gracemaker; the gradient against finite differences.
+
+mod common;
+
+use std::path::Path;
+
+use calm::{Artifact, Grades, Pair, neighbourhood_average};
+use common::{assert_close, data, indices, niobium, numbers, optional, peer};
+
+/// Both sides compute in f64 from the same f32 inverse; only the order of summation differs.
+const TOLERANCE: f64 = 1e-9;
+
+const MODELS: [&str; 6] = [
+    "grace1l_tiny",
+    "grace1l_tiny_bondcut",
+    "grace1l_paper",
+    "grace2l_tiny",
+    "grace2l_small",
+    "grace3l_tiny",
+];
+
+#[test]
+fn niobium_atoms_have_the_reference_grades() {
+    let (mixture, reference) = (niobium().mixture, data("niobium_reference.npz"));
+    let features = numbers(&reference, "features");
+    let elements = vec![1; features.len() / 130];
+    let mut grades = Grades::default();
+    grades.evaluate(&mixture, &elements, &features, None).unwrap();
+    assert_eq!(grades.component, indices(&reference, "cluster"));
+    assert_close("sigma", &grades.sigma, &numbers(&reference, "sigma"), TOLERANCE);
+    assert_close("gamma", &grades.gamma, &numbers(&reference, "gamma"), TOLERANCE);
+}
+
+#[test]
+fn an_absent_element_is_graded_by_its_length() {
+    let mixture = niobium().mixture;
+    let features = numbers(&data("niobium_reference.npz"), "features");
+    let mut grades = Grades::default();
+    grades.evaluate(&mixture, &[3], &features[..130], None).unwrap();
+    let squared: f64 = features[..130].iter().map(|z| 1e6 * z * z).sum();
+    assert_close("gamma", &grades.gamma, &[(squared + 1e-8).sqrt()], 1e-14);
+}
+
+#[test]
+fn every_model_has_the_reference_grades() {
+    for model in MODELS {
+        let Some(folder) = peer(&format!("grace/{model}")) else { return };
+        let golden = folder.join("golden.npz");
+        let export = Artifact::load_export(folder.join("kokkos.npz")).unwrap();
+        let mut artifacts = vec![export];
+        if folder.join("gmm_artifacts.npz").exists() {
+            artifacts.push(Artifact::load(folder.join("gmm_artifacts.npz")).unwrap());
+        }
+        for artifact in artifacts {
+            for structure in 0..15 {
+                check_structure(model, &artifact, &golden, &format!("s{structure:02}"));
+            }
+        }
+    }
+}
+
+fn check_structure(model: &str, artifact: &Artifact, golden: &Path, structure: &str) {
+    let key = |name: &str| format!("{structure}_{name}");
+    let elements = element_indices(artifact, &indices(golden, &key("numbers")));
+    let features = numbers(golden, &key("features"));
+    let mut grades = Grades::default();
+    grades.evaluate(&artifact.mixture, &elements, &features, None).unwrap();
+    let name = format!("{model} {structure}");
+    assert_eq!(grades.component, indices(golden, &key("cluster")), "{name}");
+    assert_close(&format!("{name} sigma"), &grades.sigma, &numbers(golden, &key("sigma")), TOLERANCE);
+    assert_close(&format!("{name} gamma"), &grades.gamma, &numbers(golden, &key("gamma")), TOLERANCE);
+    let pairs = brute_force_pairs(golden, structure, &elements, artifact.symbols.len());
+    let averaged = neighbourhood_average(&grades.gamma, pairs).unwrap();
+    assert_close(&format!("{name} gamma_nbr"), &averaged, &numbers(golden, &key("gamma_nbr")), TOLERANCE);
+}
+
+fn element_indices(artifact: &Artifact, atomic_numbers: &[usize]) -> Vec<usize> {
+    let symbol = |number: &usize| match number {
+        41 => "Nb",
+        42 => "Mo",
+        73 => "Ta",
+        74 => "W",
+        other => panic!("atomic number {other}"),
+    };
+    let index = |number| artifact.symbols.iter().position(|found| found == symbol(number)).unwrap();
+    atomic_numbers.iter().map(index).collect()
+}
+
+/// Every pair within its cutoff by trying all images, periodic in all directions unless there is no cell.
+fn brute_force_pairs(golden: &Path, structure: &str, elements: &[usize], element_count: usize) -> Vec<Pair> {
+    let positions = numbers(golden, &format!("{structure}_positions"));
+    let cell = numbers(golden, &format!("{structure}_cell"));
+    let export = golden.with_file_name("kokkos.npz");
+    let longest = numbers(golden, "cutoff")[0];
+    let cutoffs =
+        optional(&export, "bond_cutoff_map").unwrap_or_else(|| vec![longest; element_count * element_count]);
+    let range = if cell.iter().all(|&value| value == 0.0) { 0 } else { 6 };
+    let mut pairs = Vec::new();
+    for (i, from) in positions.chunks_exact(3).enumerate() {
+        for (j, to) in positions.chunks_exact(3).enumerate() {
+            let cutoff = cutoffs[elements[i] * element_count + elements[j]];
+            for image in images(range) {
+                let component = |axis: usize| {
+                    let shift: f64 = (0..3).map(|row| f64::from(image[row]) * cell[3 * row + axis]).sum();
+                    to[axis] - from[axis] + shift
+                };
+                let distance = (0..3).map(|axis| component(axis).powi(2)).sum::<f64>().sqrt();
+                if distance < cutoff && (i != j || image != [0; 3]) {
+                    pairs.push(Pair { i, j, distance, cutoff });
+                }
+            }
+        }
+    }
+    pairs
+}
+
+fn images(range: i32) -> impl Iterator<Item = [i32; 3]> {
+    let steps = move || -range..=range;
+    steps().flat_map(move |a| steps().flat_map(move |b| steps().map(move |c| [a, b, c])))
+}
+
+#[test]
+fn the_gradient_is_that_of_the_grade() {
+    let mixture = niobium().mixture;
+    let features = numbers(&data("niobium_reference.npz"), "features");
+    let elements = vec![1; features.len() / 130];
+    let mut gradient = vec![0.0; features.len()];
+    let mut grades = Grades::default();
+    grades.evaluate(&mixture, &elements, &features, Some(&mut gradient)).unwrap();
+    let (mut shifted, step) = (Grades::default(), 1e-5);
+    for atom in [0, 7, 20, 41] {
+        let z = &features[130 * atom..130 * (atom + 1)];
+        let row = &gradient[130 * atom..130 * (atom + 1)];
+        let scale = row.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
+        for channel in 0..130 {
+            let mut gamma_at = |sign: f64| {
+                let mut z = z.to_vec();
+                z[channel] += sign * step;
+                shifted.evaluate(&mixture, &[1], &z, None).unwrap();
+                assert_eq!(shifted.component[0], grades.component[atom]);
+                shifted.gamma[0]
+            };
+            let difference = (gamma_at(1.0) - gamma_at(-1.0)) / (2.0 * step);
+            assert!((difference - row[channel]).abs() < 1e-5 * scale, "atom {atom} channel {channel}");
+        }
+    }
+}
+
+#[test]
+fn an_atom_keeps_its_bits_in_any_company() {
+    let mixture = niobium().mixture;
+    let features = numbers(&data("niobium_reference.npz"), "features");
+    let elements = vec![1; features.len() / 130];
+    let (mut together, mut alone) = (Grades::default(), Grades::default());
+    let (mut gradient, mut row) = (vec![0.0; features.len()], vec![0.0; 130]);
+    together.evaluate(&mixture, &elements, &features, Some(&mut gradient)).unwrap();
+    for (atom, z) in features.chunks_exact(130).enumerate() {
+        alone.evaluate(&mixture, &[1], z, Some(&mut row)).unwrap();
+        assert_eq!(alone.gamma[0].to_bits(), together.gamma[atom].to_bits());
+        assert_eq!(row, gradient[130 * atom..130 * (atom + 1)]);
+    }
+}
+
+#[test]
+fn what_cannot_be_graded_is_an_error() {
+    let mixture = niobium().mixture;
+    let mut grades = Grades::default();
+    let mut grade =
+        |elements: &[usize], features: &[f64]| grades.evaluate(&mixture, elements, features, None);
+    let message = |result: Result<(), calm::GradeError>| result.unwrap_err().to_string();
+    assert!(message(grade(&[1], &[0.0; 129])).contains("129 numbers"));
+    assert!(message(grade(&[4], &[0.0; 130])).contains("element index 4"));
+    assert!(message(grade(&[1, 1], &[[0.0; 130], [f64::NAN; 130]].concat())).contains("atom 1"));
+    assert!(grade(&[], &[]).is_ok());
+}
+
+#[test]
+fn a_pair_counts_by_its_cosine_weight() {
+    let pairs = [
+        Pair { i: 0, j: 1, distance: 2.0, cutoff: 4.0 },
+        Pair { i: 0, j: 0, distance: 4.0 / 3.0, cutoff: 4.0 },
+        Pair { i: 1, j: 0, distance: 4.0, cutoff: 4.0 },
+    ];
+    let averaged = neighbourhood_average(&[1.0, 3.0], pairs).unwrap();
+    assert_close("average", &averaged, &[(1.0 + 0.5 * 3.0 + 0.75) / (1.0 + 0.5 + 0.75), 3.0], 1e-15);
+    let error = neighbourhood_average(&[1.0], pairs).unwrap_err();
+    assert_eq!((error.i, error.j, error.atoms), (0, 1, 1));
+}
