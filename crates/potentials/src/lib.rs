@@ -1,1 +1,16 @@
 //! Interatomic potentials: GRACE, EAM, Stillinger–Weber, ZBL.
+
+mod eam;
+mod eam_spline;
+mod pairs;
+mod potential_file;
+mod setfl;
+mod stillinger_weber;
+mod stillinger_weber_file;
+mod zbl;
+
+pub use eam::Eam;
+pub use potential_file::PotentialFileError;
+pub use setfl::EamStyle;
+pub use stillinger_weber::StillingerWeber;
+pub use zbl::{Zbl, ZblRangeError};
