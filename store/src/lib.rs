@@ -1,1 +1,36 @@
-//! The database of a campaign.
+//! The database of a campaign: what was decided, what is queued, what was labelled.
+//!
+//! One directory holds one campaign. Whoever runs it holds the [`CampaignLock`]; anyone may open the [`Store`] beside
+//! it. Every writing function is one transaction that is on the disk when the function returns, so any process
+//! may be killed at any time. No function reads a clock: `now` is ms since 1970, see [`unix_milliseconds`].
+
+mod compress;
+mod encoding;
+mod error;
+mod export;
+mod filesystem;
+mod jobs;
+mod lock;
+mod processes;
+pub mod records;
+mod sqlite;
+mod status;
+
+use std::time::{SystemTime, UNIX_EPOCH};
+
+pub use compress::{DecompressError, compress, decompress};
+pub use error::{Result, StoreError};
+pub use export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
+pub use filesystem::{check_directory, network_file_system};
+pub use jobs::{Attempt, Completed, Failed, Imported, Job, JobDetails, LabelRecord, LabelSource, Standing};
+pub use lock::{CampaignLock, LOCK};
+pub use processes::{ProcessRecord, this_host};
+pub use records::*;
+pub use sqlite::{DATABASE, Store};
+pub use status::{Candidates, Declined, Labels, Status, WalkStatus};
+
+/// The time now, ms since 1970.
+pub fn unix_milliseconds() -> i64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    i64::try_from(since.as_millis()).unwrap_or(i64::MAX)
+}

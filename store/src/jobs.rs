@@ -1,0 +1,161 @@
+//! The label queue and its labels, as they are shown.
+
+use serde::Serialize;
+
+use crate::records::{JobState, Label};
+
+/// What became of a result that was brought.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Completed {
+    /// It is the label.
+    Label,
+    /// There was a label already: it is kept beside it.
+    KeptAsCheck,
+}
+
+/// What became of a job whose attempt failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Failed {
+    /// It waits for another attempt.
+    Requeued,
+    /// It has used up its attempts.
+    GivenUp,
+    /// The lease was lost before: what became of the job was decided without this attempt.
+    LeaseLost,
+}
+
+/// How many of the frames of an import became what.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Imported {
+    /// Labels.
+    pub labels: usize,
+    /// Other numbers for structures that have a label: kept beside it.
+    pub checks: usize,
+    /// The very same numbers were there.
+    pub known: usize,
+}
+
+/// A line of the queue.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Job {
+    /// Number of the job.
+    pub job: i64,
+    /// Name of the candidate.
+    pub candidate: String,
+    /// Name of the protocol.
+    pub protocol: String,
+    /// Its state.
+    pub state: JobState,
+    /// Higher first.
+    pub priority: i32,
+    /// Who labels it now.
+    pub holder: Option<String>,
+    /// When the lease ends, ms since 1970.
+    pub expires: Option<i64>,
+    /// Attempts begun.
+    pub attempts: u32,
+    /// Those that failed or ran out of time since the job was last put into the queue.
+    pub failures: u32,
+    /// Number of atoms.
+    pub atoms: u32,
+    /// Formula.
+    pub formula: String,
+    /// Largest γ under the original mixture.
+    pub original_gamma: Option<f64>,
+}
+
+/// An attempt at a job.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, sqlx::FromRow)]
+pub struct Attempt {
+    /// Its number, from 1.
+    pub attempt: u32,
+    /// Who made it.
+    pub holder: String,
+    /// What finds the calculation again (process group, number in a batch system).
+    pub calculation: Option<String>,
+    /// When it started, ms since 1970.
+    pub started: i64,
+    /// When it ended.
+    pub ended: Option<i64>,
+    /// `labelled`, `check`, `failed`, `expired`, `released`, `lost`, `dropped`, `overtaken`; none while it lasts.
+    pub outcome: Option<String>,
+    /// Class of a failure.
+    pub class: Option<String>,
+    /// Log of a failure.
+    pub log: Option<String>,
+}
+
+/// A job with its attempts.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct JobDetails {
+    /// The job.
+    #[serde(flatten)]
+    pub job: Job,
+    /// Every attempt, oldest first.
+    pub attempts_made: Vec<Attempt>,
+    /// Energies of its structure's labels and checks, oldest first, eV.
+    pub energies: Vec<(Standing, f64)>,
+}
+
+/// What a stored result is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Standing {
+    /// The label.
+    Label,
+    /// A further result, for comparison.
+    Check,
+    /// It was the label until it was corrected.
+    Superseded,
+}
+
+impl Standing {
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Label => "label",
+            Self::Check => "check",
+            Self::Superseded => "superseded",
+        }
+    }
+
+    pub(crate) fn named(name: &str) -> Option<Self> {
+        [Self::Label, Self::Check, Self::Superseded].into_iter().find(|standing| standing.name() == name)
+    }
+}
+
+/// Where a label came from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LabelSource {
+    /// A calculation of this campaign.
+    Attempt {
+        /// Number of the job.
+        job: i64,
+        /// Number of the attempt.
+        attempt: u32,
+    },
+    /// A file.
+    Import {
+        /// Its name.
+        file: String,
+        /// The frame in it, from 0.
+        frame: u64,
+    },
+    /// Somebody who corrected another label.
+    Correction {
+        /// Why.
+        reason: String,
+    },
+}
+
+/// A label with its history.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LabelRecord {
+    /// What it is now.
+    pub standing: Standing,
+    /// Its numbers.
+    pub label: Label,
+    /// Where it came from.
+    pub source: LabelSource,
+    /// When it came, ms since 1970.
+    pub received: i64,
+}

@@ -1,0 +1,208 @@
+//! What people do to the label queue. Each change leaves a line in the operations log.
+
+use serde_json::{Value, json};
+
+use super::logs::insert_operation;
+use super::queue::end_attempt;
+use super::{Store, Transaction};
+use crate::error::{Result, StoreError};
+use crate::jobs::{Attempt, Job, JobDetails, Standing};
+use crate::records::JobState;
+
+/// Candidates shown when a name fits none or several.
+const SHOWN: usize = 5;
+
+pub(super) const LIST: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
+    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
+    CROSS JOIN protocol ON protocol.number = job.protocol
+    WHERE state = ? ORDER BY job.priority DESC, job.decision LIMIT ? OFFSET ?";
+
+const LIST_ALL: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
+    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
+    CROSS JOIN protocol ON protocol.number = job.protocol
+    ORDER BY job.number LIMIT ? OFFSET ?";
+
+const SHOW: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
+    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
+    CROSS JOIN protocol ON protocol.number = job.protocol
+    WHERE job.number = ?";
+
+/// Candidates of one beginning, with the newest job of their structure.
+pub(super) const FIND: &str = "SELECT id, max(job.number) FROM candidate
+    CROSS JOIN job ON job.structure = candidate.structure
+    WHERE id >= ?1 AND id < ?1 || '~' GROUP BY id ORDER BY id LIMIT ?2";
+
+#[derive(sqlx::FromRow)]
+struct Row {
+    number: i64,
+    structure: i64,
+    id: String,
+    name: String,
+    state: String,
+    priority: i32,
+    holder: Option<String>,
+    expires: Option<i64>,
+    attempts: u32,
+    failures: u32,
+    atoms: u32,
+    formula: String,
+    original_gamma: Option<f64>,
+}
+
+impl Store {
+    /// The jobs in a state, in the order in which they would be leased; or all, in the order in which they came.
+    pub async fn queue_list(&self, state: Option<JobState>, limit: u32, offset: u32) -> Result<Vec<Job>> {
+        let query = match state {
+            Some(state) => sqlx::query_as(LIST).bind(state.name()),
+            None => sqlx::query_as(LIST_ALL),
+        };
+        let rows: Vec<Row> = query.bind(limit).bind(offset).fetch_all(&self.readers).await?;
+        rows.into_iter().map(Row::into_job).collect()
+    }
+
+    /// A job by the name of its candidate or the beginning of it; the campaign's part of the name may be left out.
+    pub async fn queue_show(&self, id: &str) -> Result<JobDetails> {
+        let (job, _) = self.find(id).await?;
+        let row: Row = sqlx::query_as(SHOW).bind(job).fetch_one(&self.readers).await?;
+        let attempts = sqlx::query_as("SELECT * FROM attempt WHERE job = ? ORDER BY attempt").bind(job);
+        let attempts: Vec<Attempt> = attempts.fetch_all(&self.readers).await?;
+        let sql = "SELECT standing, energy FROM label WHERE structure = ?
+                   AND protocol = (SELECT protocol FROM job WHERE number = ?) ORDER BY number";
+        let energies = sqlx::query_as(sql).bind(row.structure).bind(job);
+        let energies: Vec<(String, f64)> = energies.fetch_all(&self.readers).await?;
+        let standing = |(name, energy): (String, f64)| Some((Standing::named(&name)?, energy));
+        Ok(JobDetails {
+            job: row.into_job()?,
+            attempts_made: attempts,
+            energies: energies.into_iter().filter_map(standing).collect(),
+        })
+    }
+
+    /// Takes a candidate out of the queue and out of exports. Returns its full name.
+    pub async fn drop_job(&self, id: &str, now: i64) -> Result<String> {
+        use JobState::{Failed, Leased, Queued};
+        let allowed = [Queued, Leased, Failed];
+        let mut change = self.change("drop", id, &allowed, "queued, leased and failed").await?;
+        end_attempt(&mut change.transaction, change.job, "dropped", now).await?;
+        let sql = "UPDATE job SET state = 'dropped', holder = NULL, expires = NULL WHERE number = ?";
+        sqlx::query(sql).bind(change.job).execute(&mut *change.transaction).await?;
+        change.log("drop", json!({}), now).await
+    }
+
+    /// Puts a failed or dropped candidate back into the queue, with all its attempts before it; a dropped one that
+    /// has its label by now is done. Returns its full name.
+    pub async fn retry_job(&self, id: &str, now: i64) -> Result<String> {
+        let allowed = [JobState::Failed, JobState::Dropped];
+        let mut change = self.change("retry", id, &allowed, "failed and dropped").await?;
+        let sql = "UPDATE job SET failures = 0, state = CASE WHEN EXISTS (
+                       SELECT 1 FROM label WHERE label.structure = job.structure
+                       AND label.protocol = job.protocol AND standing = 'label'
+                   ) THEN 'labelled' ELSE 'queued' END WHERE number = ?";
+        sqlx::query(sql).bind(change.job).execute(&mut *change.transaction).await?;
+        change.log("retry", json!({}), now).await
+    }
+
+    /// Gives a candidate that waits another priority (higher first); one in work keeps it should it come back.
+    /// Returns its full name.
+    pub async fn prioritise_job(&self, id: &str, priority: i32, now: i64) -> Result<String> {
+        let allowed = [JobState::Queued, JobState::Leased];
+        let mut change = self.change("prioritise", id, &allowed, "queued and leased").await?;
+        let sql = "UPDATE job SET priority = ? WHERE number = ?";
+        sqlx::query(sql).bind(priority).bind(change.job).execute(&mut *change.transaction).await?;
+        change.log("prioritise", json!({ "priority": priority }), now).await
+    }
+
+    async fn change(
+        &self,
+        action: &'static str,
+        id: &str,
+        allowed: &[JobState],
+        allowed_text: &'static str,
+    ) -> Result<Change> {
+        let (job, candidate) = self.find(id).await?;
+        let mut transaction = self.begin().await?;
+        let state = sqlx::query_scalar("SELECT state FROM job WHERE number = ?").bind(job);
+        let state = parse_state(state.fetch_one(&mut *transaction).await?)?;
+        if !allowed.contains(&state) {
+            return Err(StoreError::WrongState { action, candidate, state, allowed: allowed_text });
+        }
+        Ok(Change { transaction, job, candidate })
+    }
+
+    /// Number of the job, and full name of the candidate.
+    async fn find(&self, id: &str) -> Result<(i64, String)> {
+        let campaign = self.campaign_value("id").await?;
+        let campaign = campaign.get(..8).unwrap_or_default();
+        let mut found = self.beginning_with(id).await?;
+        if found.is_empty() {
+            found = self.beginning_with(&format!("{campaign}-{id}")).await?;
+        }
+        let exact = found.iter().position(|(candidate, _)| candidate == id);
+        match (exact, found.as_slice()) {
+            (Some(k), _) => Ok((found[k].1, found.swap_remove(k).0)),
+            (None, [(candidate, job)]) => Ok((*job, candidate.clone())),
+            (None, []) => Err(StoreError::UnknownJob { id: id.into(), near: self.near(campaign, id).await? }),
+            (None, _) => {
+                let matches = found.into_iter().map(|(candidate, _)| candidate).collect();
+                Err(StoreError::AmbiguousJob { id: id.into(), matches })
+            }
+        }
+    }
+
+    async fn beginning_with(&self, begin: &str) -> Result<Vec<(String, i64)>> {
+        let query = sqlx::query_as(FIND).bind(begin).bind(SHOWN as i64);
+        Ok(query.fetch_all(&self.readers).await?)
+    }
+
+    /// The candidates whose names begin like `id` for as long as possible.
+    async fn near(&self, campaign: &str, id: &str) -> Result<Vec<String>> {
+        let full = if id.starts_with(campaign) { id.to_owned() } else { format!("{campaign}-{id}") };
+        for (end, _) in full.char_indices().rev() {
+            let found = self.beginning_with(&full[..end]).await?;
+            if !found.is_empty() {
+                return Ok(found.into_iter().map(|(candidate, _)| candidate).collect());
+            }
+        }
+        Ok(Vec::new())
+    }
+}
+
+/// A change that is allowed, and not yet made.
+struct Change {
+    transaction: Transaction,
+    job: i64,
+    candidate: String,
+}
+
+impl Change {
+    async fn log(mut self, action: &str, mut detail: Value, now: i64) -> Result<String> {
+        detail["candidate"] = json!(self.candidate);
+        detail["job"] = json!(self.job);
+        insert_operation(&mut self.transaction, now, action, &detail).await?;
+        self.transaction.commit().await?;
+        Ok(self.candidate)
+    }
+}
+
+impl Row {
+    fn into_job(self) -> Result<Job> {
+        Ok(Job {
+            job: self.number,
+            candidate: self.id,
+            protocol: self.name,
+            state: parse_state(self.state)?,
+            priority: self.priority,
+            holder: self.holder,
+            expires: self.expires,
+            attempts: self.attempts,
+            failures: self.failures,
+            atoms: self.atoms,
+            formula: self.formula,
+            original_gamma: self.original_gamma,
+        })
+    }
+}
+
+fn parse_state(name: String) -> Result<JobState> {
+    JobState::named(&name).ok_or_else(|| StoreError::damaged("the state of a job", name))
+}

@@ -1,0 +1,150 @@
+//! Labelled structures, page by page.
+
+use wire::{CandidateBlock, ContentHash};
+
+use super::Store;
+use super::labels::decode_label;
+use super::restore::{grades, origin};
+use crate::encoding::decode_structure;
+use crate::error::{Result, StoreError};
+use crate::export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
+
+pub(super) const CANDIDATES: &str = "SELECT candidate.decision, id, candidate.seed_structure,
+        coalesce(seed_structure.name, '') AS seed_name, origin, decision.mixture_version AS version_after,
+        block, original_grades, hash, data, label.energy, forces, stress
+    FROM candidate
+    CROSS JOIN label ON label.structure = candidate.structure AND label.protocol = ?1 AND standing = 'label'
+    CROSS JOIN structure ON structure.number = candidate.structure
+    CROSS JOIN decision ON decision.sequence = candidate.decision
+    CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
+    LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
+    WHERE candidate.decision > ?2 AND CASE origin WHEN 'biased' THEN ?3 ELSE ?4 END
+    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure AND job.protocol = ?1
+                    AND state = 'dropped')
+    ORDER BY candidate.decision LIMIT ?5";
+
+/// Imported structures that are not rows of candidates already.
+pub(super) const IMPORTS: &str =
+    "SELECT import.number, import.file, import.frame, hash, data, energy, forces, stress
+    FROM import
+    CROSS JOIN label ON label.structure = import.structure AND label.protocol = ?1 AND standing = 'label'
+    CROSS JOIN structure ON structure.number = import.structure
+    WHERE import.number > ?2
+    AND NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.structure = import.structure)
+    ORDER BY import.number LIMIT ?3";
+
+#[derive(sqlx::FromRow)]
+struct CandidateRow {
+    decision: i64,
+    id: String,
+    seed_structure: u32,
+    seed_name: String,
+    origin: String,
+    version_after: u64,
+    block: Vec<u8>,
+    original_grades: Option<Vec<u8>>,
+    #[sqlx(flatten)]
+    labelled: Labelled,
+}
+
+#[derive(sqlx::FromRow)]
+struct ImportRow {
+    number: i64,
+    file: String,
+    frame: u64,
+    #[sqlx(flatten)]
+    labelled: Labelled,
+}
+
+#[derive(sqlx::FromRow)]
+struct Labelled {
+    hash: Vec<u8>,
+    data: Vec<u8>,
+    energy: f64,
+    forces: Vec<u8>,
+    stress: Option<Vec<u8>>,
+}
+
+impl Store {
+    /// At most `limit` labelled structures behind `after` (`None`: from the first on): candidates in decision order, then
+    /// imports as they came, whatever the order in which the labels came. An empty page is the end. What was dropped by
+    /// hand is left out.
+    pub async fn labelled(
+        &self,
+        filter: &ExportFilter,
+        after: Option<ExportPlace>,
+        limit: u32,
+    ) -> Result<Vec<ExportRow>> {
+        let name =
+            sqlx::query_scalar("SELECT name FROM protocol WHERE hash = ?").bind(filter.protocol.0.to_vec());
+        let name: Option<String> = name.fetch_optional(&self.readers).await?;
+        let name = name.ok_or_else(|| StoreError::UnknownProtocol(filter.protocol.to_string()))?;
+        let sql = "SELECT number FROM protocol WHERE hash = ?";
+        let number = sqlx::query_scalar(sql).bind(filter.protocol.0.to_vec());
+        let number: i64 = number.fetch_one(&self.readers).await?;
+        let (decision, import) = match after {
+            None => (Some(0), 0),
+            Some(ExportPlace::Candidate(decision)) => (Some(decision), 0),
+            Some(ExportPlace::Import(import)) => (None, import),
+        };
+        let mut rows = Vec::new();
+        if let Some(decision) = decision {
+            let query = sqlx::query_as(CANDIDATES).bind(number).bind(decision);
+            let query = query.bind(filter.biased).bind(filter.control).bind(limit);
+            let found: Vec<CandidateRow> = query.fetch_all(&self.readers).await?;
+            for row in found {
+                rows.push(row.into_export(&name, filter.protocol)?);
+            }
+        }
+        let left = limit.saturating_sub(rows.len() as u32);
+        if filter.imported && left > 0 {
+            let query = sqlx::query_as(IMPORTS).bind(number).bind(import).bind(left);
+            let found: Vec<ImportRow> = query.fetch_all(&self.readers).await?;
+            for row in found {
+                rows.push(row.into_export(&name, filter.protocol)?);
+            }
+        }
+        Ok(rows)
+    }
+}
+
+impl CandidateRow {
+    fn into_export(self, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
+        let source = ExportSource::Candidate {
+            id: self.id,
+            seed_structure: self.seed_structure,
+            seed_structure_name: self.seed_name,
+            origin: origin(&self.origin)?,
+            mixture_version_after: self.version_after,
+            block: CandidateBlock::from_bytes(&self.block)?,
+            original: grades(self.original_grades.as_deref())?,
+        };
+        self.labelled.into_export(ExportPlace::Candidate(self.decision), source, protocol_name, protocol)
+    }
+}
+
+impl ImportRow {
+    fn into_export(self, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
+        let source = ExportSource::Import { file: self.file, frame: self.frame };
+        self.labelled.into_export(ExportPlace::Import(self.number), source, protocol_name, protocol)
+    }
+}
+
+impl Labelled {
+    fn into_export(
+        self,
+        place: ExportPlace,
+        source: ExportSource,
+        protocol_name: &str,
+        protocol: ContentHash,
+    ) -> Result<ExportRow> {
+        Ok(ExportRow {
+            place,
+            source,
+            structure: decode_structure(&self.data, &self.hash)?,
+            label: decode_label(self.energy, &self.forces, self.stress.as_deref())?,
+            protocol_name: protocol_name.to_owned(),
+            protocol,
+        })
+    }
+}

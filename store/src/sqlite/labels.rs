@@ -1,0 +1,203 @@
+//! Labels: the first valid result is the label, later ones are checks, corrections supersede. Nothing is
+//! overwritten.
+
+use wire::ContentHash;
+
+use super::queue::{end_attempt, job_row};
+use super::{Store, Transaction, protocols};
+use crate::encoding::{decode_matrix, decode_vectors, encode_vectors, integer};
+use crate::error::{Result, StoreError};
+use crate::jobs::{Completed, LabelRecord, LabelSource, Standing};
+use crate::records::{Label, Lease};
+
+pub(super) const CURRENT: &str =
+    "SELECT EXISTS (SELECT 1 FROM label WHERE structure = ? AND protocol = ? AND standing = 'label')";
+
+/// A label as a row.
+#[derive(sqlx::FromRow)]
+pub(super) struct LabelRow {
+    standing: String,
+    energy: f64,
+    forces: Vec<u8>,
+    stress: Option<Vec<u8>>,
+    job: Option<i64>,
+    attempt: Option<u32>,
+    file: Option<String>,
+    frame: Option<u64>,
+    correction: Option<String>,
+    received: i64,
+}
+
+impl Store {
+    /// Brings the result of a leased job. The first valid one for structure and protocol is the label, whether or not
+    /// the lease still lasts; later ones are kept as checks. A job that was dropped meanwhile stays dropped. Bringing
+    /// the result of one attempt twice changes nothing.
+    ///
+    /// # Errors
+    /// [`StoreError::InvalidLabel`] for a wrong number of forces, or numbers that are not finite.
+    pub async fn complete(&self, lease: &Lease, label: &Label, now: i64) -> Result<Completed> {
+        let mut transaction = self.begin().await?;
+        let job = job_row(&mut transaction, lease.job).await?;
+        check(&mut transaction, job.structure, label).await?;
+        let sql =
+            "SELECT standing FROM label WHERE structure = ? AND protocol = ? AND job = ? AND attempt = ?";
+        let before = sqlx::query_scalar(sql).bind(job.structure).bind(job.protocol);
+        let before = before.bind(lease.job).bind(lease.attempt).fetch_optional(&mut *transaction).await?;
+        let before: Option<String> = before;
+        if let Some(standing) = before {
+            let check = standing == Standing::Check.name();
+            return Ok(if check { Completed::KeptAsCheck } else { Completed::Label });
+        }
+        let source = LabelSource::Attempt { job: lease.job, attempt: lease.attempt };
+        let standing = add(&mut transaction, job.structure, job.protocol, label, &source, now).await?;
+        let outcome = if standing == Standing::Label { "labelled" } else { "check" };
+        let sql = "UPDATE attempt SET ended = ?, outcome = ? WHERE job = ? AND attempt = ?";
+        let query = sqlx::query(sql).bind(now).bind(outcome).bind(lease.job).bind(lease.attempt);
+        query.execute(&mut *transaction).await?;
+        finish_job(&mut transaction, job.structure, job.protocol, now).await?;
+        transaction.commit().await?;
+        Ok(if standing == Standing::Label { Completed::Label } else { Completed::KeptAsCheck })
+    }
+
+    /// Puts a corrected label in the place of the present one, which stays in the history.
+    pub async fn supersede(
+        &self,
+        structure: ContentHash,
+        protocol: ContentHash,
+        label: &Label,
+        reason: &str,
+        now: i64,
+    ) -> Result<()> {
+        let mut transaction = self.begin().await?;
+        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let number = sqlx::query_scalar("SELECT number FROM structure WHERE hash = ?").bind(&structure.0[..]);
+        let number: Option<i64> = number.fetch_optional(&mut *transaction).await?;
+        let number = number.ok_or(StoreError::NoLabel(structure))?;
+        check(&mut transaction, number, label).await?;
+        let sql = "UPDATE label SET standing = 'superseded'
+                   WHERE structure = ? AND protocol = ? AND standing = 'label'";
+        let query = sqlx::query(sql).bind(number).bind(protocol);
+        if query.execute(&mut *transaction).await?.rows_affected() == 0 {
+            return Err(StoreError::NoLabel(structure));
+        }
+        let source = LabelSource::Correction { reason: reason.to_owned() };
+        add(&mut transaction, number, protocol, label, &source, now).await?;
+        Ok(transaction.commit().await?)
+    }
+
+    /// Every label and check of a structure under a protocol, oldest first.
+    pub async fn label_history(
+        &self,
+        structure: ContentHash,
+        protocol: ContentHash,
+    ) -> Result<Vec<LabelRecord>> {
+        let sql = "SELECT label.* FROM label
+                   JOIN structure ON structure.number = label.structure
+                   JOIN protocol ON protocol.number = label.protocol
+                   WHERE structure.hash = ? AND protocol.hash = ? ORDER BY label.number";
+        let query = sqlx::query_as(sql).bind(structure.0.to_vec()).bind(protocol.0.to_vec());
+        let rows: Vec<LabelRow> = query.fetch_all(&self.readers).await?;
+        rows.into_iter().map(LabelRow::into_record).collect()
+    }
+}
+
+/// Whether the label can be one of that structure.
+pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: &Label) -> Result<()> {
+    let atoms = sqlx::query_scalar("SELECT atoms FROM structure WHERE number = ?").bind(structure);
+    let atoms: u64 = atoms.fetch_one(&mut **transaction).await?;
+    let invalid = |reason: String| Err(StoreError::InvalidLabel(reason));
+    if label.forces.len() as u64 != atoms {
+        return invalid(format!("{} forces for {atoms} atoms", label.forces.len()));
+    }
+    if !label.energy.is_finite() {
+        return invalid(format!("the energy is {}", label.energy));
+    }
+    let stress = label.stress.iter().flatten();
+    if label.forces.iter().chain(stress).flatten().any(|x| !x.is_finite()) {
+        return invalid("forces or stress have entries that are not finite".into());
+    }
+    Ok(())
+}
+
+/// Adds a result: the label if there is none, otherwise a check.
+pub(super) async fn add(
+    transaction: &mut Transaction,
+    structure: i64,
+    protocol: i64,
+    label: &Label,
+    source: &LabelSource,
+    now: i64,
+) -> Result<Standing> {
+    let labelled: bool =
+        sqlx::query_scalar(CURRENT).bind(structure).bind(protocol).fetch_one(&mut **transaction).await?;
+    let standing = if labelled { Standing::Check } else { Standing::Label };
+    let (mut job, mut attempt, mut file, mut frame, mut correction) = (None, None, None, None, None);
+    match source {
+        LabelSource::Attempt { job: j, attempt: a } => (job, attempt) = (Some(*j), Some(*a)),
+        LabelSource::Import { file: name, frame: number } => {
+            (file, frame) = (Some(name.as_str()), Some(integer("frame", *number)?));
+        }
+        LabelSource::Correction { reason } => correction = Some(reason.as_str()),
+    }
+    let sql =
+        "INSERT INTO label (structure, protocol, standing, energy, forces, stress, job, attempt, file, frame,
+                                  correction, received) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)";
+    sqlx::query(sql)
+        .bind(structure)
+        .bind(protocol)
+        .bind(standing.name())
+        .bind(label.energy)
+        .bind(encode_vectors(&label.forces))
+        .bind(label.stress.map(|stress| encode_vectors(&stress)))
+        .bind(job)
+        .bind(attempt)
+        .bind(file)
+        .bind(frame)
+        .bind(correction)
+        .bind(now)
+        .execute(&mut **transaction)
+        .await?;
+    Ok(standing)
+}
+
+/// The structure has its label: its job, if it has one that was not dropped, is done.
+pub(super) async fn finish_job(
+    transaction: &mut Transaction,
+    structure: i64,
+    protocol: i64,
+    now: i64,
+) -> Result<()> {
+    let sql = "UPDATE job SET state = 'labelled', holder = NULL, expires = NULL
+               WHERE structure = ? AND protocol = ? AND state IN ('queued', 'leased', 'failed')
+               RETURNING number";
+    let job = sqlx::query_scalar(sql).bind(structure).bind(protocol);
+    if let Some(job) = job.fetch_optional(&mut **transaction).await? {
+        end_attempt(transaction, job, "overtaken", now).await?;
+    }
+    Ok(())
+}
+
+impl LabelRow {
+    fn into_record(self) -> Result<LabelRecord> {
+        let unknown = || StoreError::damaged("a label", "unknown standing or source");
+        let standing = Standing::named(&self.standing).ok_or_else(unknown)?;
+        let source = match (self.job, self.attempt, self.file, self.frame, self.correction) {
+            (Some(job), Some(attempt), None, None, None) => LabelSource::Attempt { job, attempt },
+            (None, None, Some(file), Some(frame), None) => LabelSource::Import { file, frame },
+            (None, None, None, None, Some(reason)) => LabelSource::Correction { reason },
+            _ => return Err(unknown()),
+        };
+        let label = decode_label(self.energy, &self.forces, self.stress.as_deref())?;
+        Ok(LabelRecord { standing, label, source, received: self.received })
+    }
+}
+
+/// A label from its columns.
+pub(super) fn decode_label(energy: f64, forces: &[u8], stress: Option<&[u8]>) -> Result<Label> {
+    let damaged = || StoreError::damaged("a label", "its forces or stress have a wrong length");
+    Ok(Label {
+        energy,
+        forces: decode_vectors(forces).ok_or_else(damaged)?,
+        stress: stress.map(|bytes| decode_matrix(bytes).ok_or_else(damaged)).transpose()?,
+    })
+}

@@ -1,0 +1,134 @@
+//! The decision log, the same bytes for two runs of one campaign, and the operations log, which is not.
+
+use std::fmt::Write;
+use std::ops::RangeInclusive;
+
+use serde_json::Value;
+
+use super::{Store, Transaction};
+use crate::error::{Result, StoreError};
+use crate::processes::ProcessRecord;
+use crate::records::{LoggedDecision, Operation};
+
+/// Decisions read at a time.
+const PAGE: usize = 1000;
+
+#[derive(sqlx::FromRow)]
+struct Row {
+    sequence: i64,
+    round: u64,
+    kind: String,
+    walk: Option<u32>,
+    candidate: Option<String>,
+    mixture_version: u64,
+    detail: String,
+}
+
+impl Store {
+    /// The decisions with numbers (from 1) in `range`, in order.
+    pub async fn decisions(&self, range: RangeInclusive<i64>) -> Result<Vec<LoggedDecision>> {
+        let decision = |row: Row| {
+            let detail = serde_json::from_str(&row.detail);
+            let detail = detail.map_err(|error| StoreError::damaged("the decision log", error))?;
+            let Row { sequence, round, kind, walk, candidate, mixture_version, .. } = row;
+            Ok(LoggedDecision { sequence, round, kind, walk, candidate, mixture_version, detail })
+        };
+        self.decision_rows(range).await?.into_iter().map(decision).collect()
+    }
+
+    async fn decision_rows(&self, range: RangeInclusive<i64>) -> Result<Vec<Row>> {
+        let sql = "SELECT * FROM decision WHERE sequence BETWEEN ? AND ? ORDER BY sequence";
+        let query = sqlx::query_as(sql).bind(*range.start()).bind(*range.end());
+        Ok(query.fetch_all(&self.readers).await?)
+    }
+
+    /// The whole decision log, one JSON object a line, keys in a fixed order: equal for two runs of a campaign in
+    /// reproducible mode, byte by byte.
+    pub async fn decision_log_text(&self) -> Result<String> {
+        let mut text = String::new();
+        for first in (1..).step_by(PAGE) {
+            let rows = self.decision_rows(first..=first + PAGE as i64 - 1).await?;
+            if rows.is_empty() {
+                break;
+            }
+            rows.iter().for_each(|row| write_line(&mut text, row));
+        }
+        Ok(text)
+    }
+
+    /// Adds a line to the operations log. What `kind` is, is up to the caller; `detail` is a JSON object.
+    pub async fn log_operation(&self, now: i64, kind: &str, detail: &Value) -> Result<()> {
+        let mut transaction = self.begin().await?;
+        insert_operation(&mut transaction, now, kind, detail).await?;
+        Ok(transaction.commit().await?)
+    }
+
+    /// At most `limit` lines of the operations log after number `after`, in order.
+    pub async fn operations(&self, after: i64, limit: u32) -> Result<Vec<Operation>> {
+        let sql = "SELECT number, time, kind, detail FROM operation WHERE number > ? ORDER BY number LIMIT ?";
+        let rows: Vec<(i64, i64, String, String)> =
+            sqlx::query_as(sql).bind(after).bind(limit).fetch_all(&self.readers).await?;
+        rows.into_iter()
+            .map(|(number, time, kind, detail)| {
+                let detail = serde_json::from_str(&detail);
+                let detail = detail.map_err(|error| StoreError::damaged("the operations log", error))?;
+                Ok(Operation { number, time, kind, detail })
+            })
+            .collect()
+    }
+
+    /// Says that a process works for the campaign, or how it is now. One that appears for the first time takes the
+    /// place of those of its kind and host that are gone.
+    pub async fn upsert_process(&self, process: &ProcessRecord) -> Result<()> {
+        let mut transaction = self.begin().await?;
+        let sql = "SELECT * FROM process WHERE kind = ? AND host = ? AND id <> ?";
+        let query = sqlx::query_as(sql).bind(&process.kind).bind(&process.host).bind(&process.id);
+        let others: Vec<ProcessRecord> = query.fetch_all(&mut *transaction).await?;
+        for other in others.iter().filter(|other| other.is_gone()) {
+            sqlx::query("DELETE FROM process WHERE id = ?")
+                .bind(&other.id)
+                .execute(&mut *transaction)
+                .await?;
+        }
+        sqlx::query("INSERT OR REPLACE INTO process VALUES (?, ?, ?, ?, ?, ?, ?)")
+            .bind(&process.id)
+            .bind(&process.kind)
+            .bind(process.pid)
+            .bind(&process.host)
+            .bind(process.started)
+            .bind(process.last_seen)
+            .bind(&process.state)
+            .execute(&mut *transaction)
+            .await?;
+        Ok(transaction.commit().await?)
+    }
+
+    /// A process ended in order.
+    pub async fn remove_process(&self, id: &str) -> Result<()> {
+        let mut transaction = self.begin().await?;
+        sqlx::query("DELETE FROM process WHERE id = ?").bind(id).execute(&mut *transaction).await?;
+        Ok(transaction.commit().await?)
+    }
+}
+
+fn write_line(text: &mut String, row: &Row) {
+    let Row { sequence, round, mixture_version, detail, .. } = row;
+    let (kind, candidate) = (Value::from(row.kind.as_str()), Value::from(row.candidate.clone()));
+    let walk = Value::from(row.walk);
+    // Writing to a string cannot fail.
+    let _ = writeln!(
+        text,
+        r#"{{"sequence":{sequence},"round":{round},"kind":{kind},"walk":{walk},"candidate":{candidate},"mixture_version":{mixture_version},"detail":{detail}}}"#
+    );
+}
+
+pub(super) async fn insert_operation(
+    transaction: &mut Transaction,
+    now: i64,
+    kind: &str,
+    detail: &Value,
+) -> Result<()> {
+    let sql = "INSERT INTO operation (time, kind, detail) VALUES (?, ?, ?)";
+    sqlx::query(sql).bind(now).bind(kind).bind(detail.to_string()).execute(&mut **transaction).await?;
+    Ok(())
+}

@@ -1,0 +1,208 @@
+//! The store in one SQLite file: making it, opening it, and the ways to its tables.
+
+mod by_hand;
+mod commit;
+mod export;
+mod imports;
+mod labels;
+mod logs;
+mod protocols;
+mod queue;
+mod restore;
+mod status;
+
+use std::fs::{self, File};
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use sqlx::migrate::Migrator;
+use sqlx::sqlite::{
+    Sqlite, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool, SqlitePoolOptions,
+    SqliteSynchronous,
+};
+use sqlx::{ConnectOptions, Connection};
+
+use crate::error::{Result, StoreError};
+use crate::filesystem::check_directory;
+use crate::records::{Campaign, SeedStructure};
+
+/// Name of the database, in the campaign's directory.
+pub const DATABASE: &str = "campaign.sqlite";
+/// The database while it is being made.
+const UNFINISHED: &str = "campaign.sqlite.new";
+/// `PRAGMA application_id` of a campaign: "CALM".
+const APPLICATION: i64 = 0x4341_4c4d;
+/// `PRAGMA user_version` that the newest migration leaves behind.
+const SCHEMA: i64 = 1;
+/// How long another connection may hold the database.
+const PATIENCE: Duration = Duration::from_secs(30);
+const READERS: u32 = 4;
+
+static MIGRATIONS: Migrator = sqlx::migrate!("migrations/sqlite");
+
+type Transaction = sqlx::Transaction<'static, Sqlite>;
+
+/// The database of one campaign. Clones share its connections.
+#[derive(Clone, Debug)]
+pub struct Store {
+    /// One connection: who writes waits in line. None in a store that was opened to be read.
+    writer: Option<SqlitePool>,
+    readers: SqlitePool,
+}
+
+impl Store {
+    /// Begins a campaign in `directory`, which must exist and whose [`crate::CampaignLock`] the caller holds. Either the whole database is there afterwards, or none.
+    pub async fn create(
+        directory: &Path,
+        campaign: &Campaign,
+        seeds: &[SeedStructure],
+        now: i64,
+    ) -> Result<Self> {
+        check_directory(directory)?;
+        let path = directory.join(DATABASE);
+        if path.exists() {
+            return Err(StoreError::Exists { path });
+        }
+        let unfinished = directory.join(UNFINISHED);
+        remove_database(&unfinished)?;
+        let writer = writer(&unfinished).await?;
+        MIGRATIONS.run(&writer).await.map_err(schema_error)?;
+        let store = Self { readers: writer.clone(), writer: Some(writer) };
+        store.write_campaign(campaign, seeds, now).await?;
+        // The last connection to close empties the write-ahead log into the file.
+        store.close().await;
+        publish(directory, &unfinished, &path)?;
+        Self::open(directory).await
+    }
+
+    /// Opens the campaign in `directory`.
+    pub async fn open(directory: &Path) -> Result<Self> {
+        let path = existing(directory)?;
+        check_directory(directory)?;
+        identify(&path, false).await?;
+        let writer = writer(&path).await?;
+        MIGRATIONS.run(&writer).await.map_err(schema_error)?;
+        let readers = readers(options(&path).read_only(true));
+        Ok(Self { writer: Some(writer), readers })
+    }
+
+    /// Opens the campaign in `directory` to look at it, also where nothing may be written.
+    pub async fn open_read_only(directory: &Path) -> Result<Self> {
+        let path = existing(directory)?;
+        let immutable = match check_directory(directory) {
+            Ok(()) => false,
+            // Without a write-ahead log the file is all there is, and it can be read without a lock.
+            Err(StoreError::Directory { .. }) => !directory.join(format!("{DATABASE}-wal")).exists(),
+            Err(error) => return Err(error),
+        };
+        let found = identify(&path, immutable).await?;
+        if found < SCHEMA {
+            return Err(StoreError::Version { path, found, reads: SCHEMA });
+        }
+        Ok(Self { writer: None, readers: readers(options(&path).read_only(true).immutable(immutable)) })
+    }
+
+    /// Closes every connection. What was committed is safe without it.
+    pub async fn close(&self) {
+        self.readers.close().await;
+        if let Some(writer) = &self.writer {
+            writer.close().await;
+        }
+    }
+
+    /// A transaction that has the right to write from its first statement on: one that asked for it later could be
+    /// refused in spite of the time limit.
+    async fn begin(&self) -> Result<Transaction> {
+        let writer = self.writer.as_ref().ok_or(StoreError::ReadOnly)?;
+        Ok(writer.begin_with("BEGIN IMMEDIATE").await?)
+    }
+}
+
+fn options(path: &Path) -> SqliteConnectOptions {
+    SqliteConnectOptions::new().filename(path).foreign_keys(true).busy_timeout(PATIENCE)
+}
+
+async fn writer(path: &Path) -> Result<SqlitePool> {
+    let options = options(path)
+        .create_if_missing(true)
+        .journal_mode(SqliteJournalMode::Wal)
+        .synchronous(SqliteSynchronous::Full);
+    let pool = SqlitePoolOptions::new().max_connections(1).idle_timeout(None).max_lifetime(None);
+    // SQLite itself rolls back after a full disk or a failed write. The connection is then out of step with its
+    // driver, which fails to roll back once more, and could not begin another transaction: it is closed.
+    let pool = pool.after_release(|connection, _| {
+        Box::pin(async move {
+            connection.ping().await?;
+            Ok(!connection.is_in_transaction())
+        })
+    });
+    Ok(pool.connect_with(options).await?)
+}
+
+fn readers(options: SqliteConnectOptions) -> SqlitePool {
+    SqlitePoolOptions::new().max_connections(READERS).max_lifetime(None).connect_lazy_with(options)
+}
+
+fn existing(directory: &Path) -> Result<PathBuf> {
+    let path = directory.join(DATABASE);
+    if path.exists() { Ok(path) } else { Err(StoreError::Missing { directory: directory.into() }) }
+}
+
+/// Checks that the file is a campaign that this program can read, without changing a byte of it. Returns the version of
+/// its schema.
+async fn identify(path: &Path, immutable: bool) -> Result<i64> {
+    let mut begin = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(16).read_to_end(&mut begin));
+    read.map_err(|source| StoreError::File { path: path.into(), source })?;
+    if begin != b"SQLite format 3\0" {
+        let found = begin.escape_ascii().to_string();
+        return Err(StoreError::NotADatabase { path: path.into(), found });
+    }
+    let mut connection = options(path).read_only(true).immutable(immutable).connect().await?;
+    let found = pragma(&mut connection, "PRAGMA application_id").await?;
+    if found != APPLICATION {
+        return Err(StoreError::Foreign { path: path.into(), found, expected: APPLICATION });
+    }
+    let found = pragma(&mut connection, "PRAGMA user_version").await?;
+    if !(1..=SCHEMA).contains(&found) {
+        return Err(StoreError::Version { path: path.into(), found, reads: SCHEMA });
+    }
+    Ok(found)
+}
+
+async fn pragma(connection: &mut SqliteConnection, pragma: &'static str) -> Result<i64> {
+    Ok(sqlx::query_scalar(pragma).fetch_one(connection).await?)
+}
+
+fn schema_error(error: sqlx::migrate::MigrateError) -> StoreError {
+    match error {
+        sqlx::migrate::MigrateError::Execute(error) => error.into(),
+        error => StoreError::Schema(error),
+    }
+}
+
+/// Removes what a killed [`Store::create`] left behind.
+fn remove_database(path: &Path) -> Result<()> {
+    for suffix in ["", "-wal", "-shm"] {
+        let mut name = path.as_os_str().to_owned();
+        name.push(suffix);
+        match fs::remove_file(&name) {
+            Err(source) if source.kind() != io::ErrorKind::NotFound => {
+                return Err(StoreError::File { path: name.into(), source });
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Gives the finished database its name, once and for all.
+fn publish(directory: &Path, unfinished: &Path, path: &Path) -> Result<()> {
+    let failed = |source| StoreError::File { path: path.into(), source };
+    fs::rename(unfinished, path).map_err(failed)?;
+    File::open(directory).and_then(|directory| directory.sync_all()).map_err(failed)
+}
+
+#[cfg(test)]
+mod tests;

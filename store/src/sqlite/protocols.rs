@@ -1,0 +1,179 @@
+//! The campaign itself, its seed structures, and the protocols of its labels.
+
+use wire::ContentHash;
+
+use super::commit::{enqueue, structure_number};
+use super::logs::insert_operation;
+use super::{Store, Transaction};
+use crate::encoding::{decode_hash, decode_structure};
+use crate::error::{Result, StoreError};
+use crate::records::{Campaign, Protocol, SeedStructure};
+
+/// Priority of jobs that are made later than their candidate.
+const LATE_PRIORITY: i32 = 0;
+
+#[derive(sqlx::FromRow)]
+struct SeedRow {
+    seed: u32,
+    name: String,
+    source: String,
+    hash: Vec<u8>,
+    data: Vec<u8>,
+}
+
+impl Store {
+    pub(super) async fn write_campaign(
+        &self,
+        campaign: &Campaign,
+        seeds: &[SeedStructure],
+        now: i64,
+    ) -> Result<()> {
+        let mut transaction = self.begin().await?;
+        for (key, value) in [
+            ("id", campaign.id.to_string().as_str()),
+            ("program_version", &campaign.program_version),
+            ("mode", &campaign.mode),
+            ("configuration", &campaign.configuration),
+            ("resolved_configuration", &campaign.resolved_configuration),
+            ("configuration_in_force", &campaign.configuration_in_force),
+        ] {
+            set_campaign_value(&mut transaction, key, value).await?;
+        }
+        for seed in seeds {
+            insert_seed_structure(&mut transaction, seed).await?;
+        }
+        let detail = serde_json::json!({ "program_version": campaign.program_version });
+        insert_operation(&mut transaction, now, "created", &detail).await?;
+        Ok(transaction.commit().await?)
+    }
+
+    /// What the campaign is.
+    pub async fn campaign(&self) -> Result<Campaign> {
+        let id = self.campaign_value("id").await?;
+        Ok(Campaign {
+            id: id.parse().map_err(|error| StoreError::damaged("the campaign's id", error))?,
+            program_version: self.campaign_value("program_version").await?,
+            mode: self.campaign_value("mode").await?,
+            configuration: self.campaign_value("configuration").await?,
+            resolved_configuration: self.campaign_value("resolved_configuration").await?,
+            configuration_in_force: self.campaign_value("configuration_in_force").await?,
+        })
+    }
+
+    pub(super) async fn campaign_value(&self, key: &str) -> Result<String> {
+        let value = sqlx::query_scalar("SELECT value FROM campaign WHERE key = ?").bind(key);
+        let value: Option<String> = value.fetch_optional(&self.readers).await?;
+        value.ok_or_else(|| StoreError::damaged("the campaign", format!("it has no {key}")))
+    }
+
+    /// From now on the campaign runs by another configuration (JSON); one that is in force already changes nothing.
+    pub async fn set_configuration_in_force(&self, configuration: &str, now: i64) -> Result<()> {
+        if self.campaign_value("configuration_in_force").await? == configuration {
+            return Ok(());
+        }
+        let mut transaction = self.begin().await?;
+        set_campaign_value(&mut transaction, "configuration_in_force", configuration).await?;
+        let detail = serde_json::json!({ "configuration": configuration });
+        insert_operation(&mut transaction, now, "configuration", &detail).await?;
+        Ok(transaction.commit().await?)
+    }
+
+    /// Adds seed structures; those with the index of one that is there replace it.
+    pub async fn add_seed_structures(&self, seeds: &[SeedStructure]) -> Result<()> {
+        let mut transaction = self.begin().await?;
+        for seed in seeds {
+            insert_seed_structure(&mut transaction, seed).await?;
+        }
+        Ok(transaction.commit().await?)
+    }
+
+    /// Every seed structure, by index.
+    pub async fn seed_structures(&self) -> Result<Vec<SeedStructure>> {
+        let sql = "SELECT seed, name, source, hash, data FROM seed_structure
+                   JOIN structure ON structure.number = seed_structure.structure ORDER BY seed";
+        let rows: Vec<SeedRow> = sqlx::query_as(sql).fetch_all(&self.readers).await?;
+        rows.into_iter()
+            .map(|SeedRow { seed, name, source, hash, data }| {
+                let structure = decode_structure(&data, &hash)?;
+                Ok(SeedStructure { index: seed, name, source, structure })
+            })
+            .collect()
+    }
+
+    /// Makes `protocol` the one of new label jobs. Accepted candidates that have no job at all (there was no protocol
+    /// when they were found) get one; those with a job of an earlier protocol keep that.
+    pub async fn add_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
+        let mut transaction = self.begin().await?;
+        let sql =
+            "INSERT INTO protocol (hash, name, settings) VALUES (?, ?, ?) ON CONFLICT (hash) DO NOTHING";
+        let query = sqlx::query(sql)
+            .bind(&protocol.hash.0[..])
+            .bind(&protocol.name)
+            .bind(protocol.settings.to_string());
+        let added = query.execute(&mut *transaction).await.map_err(|error| match &error {
+            sqlx::Error::Database(database) if database.is_unique_violation() => {
+                StoreError::ProtocolName(protocol.name.clone())
+            }
+            _ => error.into(),
+        })?;
+        let hash = protocol.hash.to_string();
+        set_campaign_value(&mut transaction, "protocol", &hash).await?;
+        if added.rows_affected() > 0 {
+            let detail = serde_json::json!({ "name": protocol.name, "hash": hash });
+            insert_operation(&mut transaction, now, "protocol", &detail).await?;
+        }
+        let number = number(&mut transaction, protocol.hash).await?;
+        let sql = "SELECT structure, min(decision) FROM candidate WHERE structure IS NOT NULL
+                   AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure)
+                   GROUP BY structure ORDER BY min(decision)";
+        let late: Vec<(i64, i64)> = sqlx::query_as(sql).fetch_all(&mut *transaction).await?;
+        for (structure, decision) in late {
+            enqueue(&mut transaction, structure, number, decision, LATE_PRIORITY).await?;
+        }
+        Ok(transaction.commit().await?)
+    }
+
+    /// Every protocol, in the order in which they were added.
+    pub async fn protocols(&self) -> Result<Vec<Protocol>> {
+        let sql = "SELECT hash, name, settings FROM protocol ORDER BY number";
+        let rows: Vec<(Vec<u8>, String, String)> = sqlx::query_as(sql).fetch_all(&self.readers).await?;
+        rows.into_iter()
+            .map(|(hash, name, settings)| {
+                let settings = serde_json::from_str(&settings);
+                let settings = settings.map_err(|error| StoreError::damaged("a protocol", error))?;
+                Ok(Protocol { hash: decode_hash(&hash)?, name, settings })
+            })
+            .collect()
+    }
+}
+
+async fn set_campaign_value(transaction: &mut Transaction, key: &str, value: &str) -> Result<()> {
+    let sql = "INSERT INTO campaign (key, value) VALUES (?, ?)
+               ON CONFLICT (key) DO UPDATE SET value = excluded.value";
+    sqlx::query(sql).bind(key).bind(value).execute(&mut **transaction).await?;
+    Ok(())
+}
+
+async fn insert_seed_structure(transaction: &mut Transaction, seed: &SeedStructure) -> Result<()> {
+    let structure = structure_number(transaction, &seed.structure, ContentHash::of(&seed.structure)).await?;
+    let sql = "INSERT OR REPLACE INTO seed_structure (seed, name, source, structure) VALUES (?, ?, ?, ?)";
+    let query = sqlx::query(sql).bind(seed.index).bind(&seed.name).bind(&seed.source).bind(structure);
+    query.execute(&mut **transaction).await?;
+    Ok(())
+}
+
+/// Number of the protocol of new jobs.
+pub(super) async fn in_force(transaction: &mut Transaction) -> Result<Option<i64>> {
+    let hash = sqlx::query_scalar("SELECT value FROM campaign WHERE key = 'protocol'");
+    let hash: Option<String> = hash.fetch_optional(&mut **transaction).await?;
+    let Some(hash) = hash else { return Ok(None) };
+    let hash = hash.parse().map_err(|error| StoreError::damaged("the protocol in force", error))?;
+    number(transaction, hash).await.map(Some)
+}
+
+/// Number of the protocol's row.
+pub(super) async fn number(transaction: &mut Transaction, hash: ContentHash) -> Result<i64> {
+    let number = sqlx::query_scalar("SELECT number FROM protocol WHERE hash = ?").bind(hash.0.to_vec());
+    let number: Option<i64> = number.fetch_optional(&mut **transaction).await?;
+    number.ok_or_else(|| StoreError::UnknownProtocol(hash.to_string()))
+}

@@ -1,0 +1,84 @@
+//! The state of a campaign, from indexes.
+
+use super::Store;
+use crate::error::Result;
+use crate::processes::ProcessRecord;
+use crate::status::{Candidates, Labels, Status, WalkStatus};
+
+pub(super) const FATES: &str =
+    "SELECT origin, coalesce(reason, fate), count(*) FROM candidate GROUP BY origin, fate, reason";
+
+pub(super) const STATES: &str = "SELECT state, count(*) FROM job GROUP BY state";
+
+const WALKS: &str =
+    "SELECT walk, coalesce(name, '') AS seed_structure, origin, state, reason, step, segment, tau,
+        temperature, relative_volume, gamma_max, accepted, refused, returns
+    FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure ORDER BY walk";
+
+impl Store {
+    /// Everything at one instant.
+    pub async fn status(&self) -> Result<Status> {
+        let mut transaction = self.readers.begin().await?;
+        let fates: Vec<(String, String, u64)> = sqlx::query_as(FATES).fetch_all(&mut *transaction).await?;
+        let states: Vec<(String, u64)> = sqlx::query_as(STATES).fetch_all(&mut *transaction).await?;
+        let walks: Vec<WalkStatus> = sqlx::query_as(WALKS).fetch_all(&mut *transaction).await?;
+        let refused = sqlx::query_scalar("SELECT coalesce(sum(refused), 0) FROM walk");
+        let refused: u64 = refused.fetch_one(&mut *transaction).await?;
+        let sql = "SELECT mixture_version, round FROM decision ORDER BY sequence DESC LIMIT 1";
+        let last: Option<(u64, u64)> = sqlx::query_as(sql).fetch_optional(&mut *transaction).await?;
+        let (mixture_version, round) = last.unwrap_or_default();
+        let imported = sqlx::query_scalar("SELECT count(*) FROM import").fetch_one(&mut *transaction).await?;
+        let processes = sqlx::query_as("SELECT * FROM process ORDER BY started, id");
+        let processes: Vec<ProcessRecord> = processes.fetch_all(&mut *transaction).await?;
+        transaction.commit().await?;
+        let labels = labels(&states);
+        let under_way = |walk: &WalkStatus| matches!(walk.state.as_str(), "waiting" | "running");
+        Ok(Status {
+            candidates: candidates(&fates, refused),
+            imported,
+            mixture_version,
+            round,
+            finished: !walks.is_empty() && !walks.iter().any(under_way) && labels.queued + labels.leased == 0,
+            labels,
+            walks,
+            processes: processes.into_iter().map(seen_from_here).collect(),
+        })
+    }
+}
+
+fn candidates(fates: &[(String, String, u64)], refused_by_walkers: u64) -> Candidates {
+    let mut candidates = Candidates { refused_by_walkers, ..Candidates::default() };
+    for (origin, fate, count) in fates {
+        if origin == "control" {
+            candidates.control += count;
+            continue;
+        }
+        candidates.seen += count;
+        let declined = &mut candidates.declined;
+        match fate.as_str() {
+            "accepted" => candidates.accepted += count,
+            "covered" => declined.covered += count,
+            "duplicate" => declined.duplicate += count,
+            "guard" => declined.guard += count,
+            "budget" => declined.budget += count,
+            _ => {}
+        }
+    }
+    candidates
+}
+
+fn labels(states: &[(String, u64)]) -> Labels {
+    let number = |name: &str| states.iter().find(|(state, _)| state == name).map_or(0, |(_, count)| *count);
+    Labels {
+        queued: number("queued"),
+        leased: number("leased"),
+        labelled: number("labelled"),
+        failed: number("failed"),
+        dropped: number("dropped"),
+    }
+}
+
+fn seen_from_here(process: ProcessRecord) -> ProcessRecord {
+    let state = if process.is_gone() { "gone".to_owned() } else { process.state };
+    ProcessRecord { state, ..process }
+}

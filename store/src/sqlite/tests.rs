@@ -1,0 +1,105 @@
+//! What cannot be seen from outside: plans of queries, settings of connections, a full disk.
+
+use sqlx::AssertSqlSafe;
+use wire::CampaignId;
+
+use super::*;
+use crate::records::{Commit, ComponentRecord};
+
+async fn store(directory: &Path) -> Store {
+    let campaign = Campaign {
+        id: CampaignId([1; 16]),
+        program_version: "0".into(),
+        mode: "live".into(),
+        configuration: String::new(),
+        resolved_configuration: "{}".into(),
+        configuration_in_force: "{}".into(),
+    };
+    Store::create(directory, &campaign, &[], 0).await.unwrap()
+}
+
+async fn plan(store: &Store, sql: &str) -> String {
+    let explain = AssertSqlSafe(format!("EXPLAIN QUERY PLAN {sql}"));
+    let rows: Vec<(i64, i64, i64, String)> =
+        sqlx::query_as(explain).fetch_all(store.writer.as_ref().unwrap()).await.unwrap();
+    rows.into_iter().map(|(.., step)| step + "\n").collect()
+}
+
+#[tokio::test]
+async fn what_is_asked_often_goes_through_indexes() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = store(directory.path()).await;
+    for sql in [
+        queue::LEASE,
+        queue::EXPIRED,
+        queue::UNFINISHED,
+        queue::HELD,
+        by_hand::LIST,
+        by_hand::FIND,
+        export::CANDIDATES,
+        export::IMPORTS,
+        labels::CURRENT,
+    ] {
+        let plan = plan(&store, sql).await.replace("SCAN CONSTANT ROW", "");
+        assert!(!plan.contains("SCAN") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");
+    }
+    for sql in [status::FATES, status::STATES] {
+        let plan = plan(&store, sql).await;
+        assert!(plan.contains("COVERING INDEX") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");
+    }
+}
+
+#[tokio::test]
+async fn connections_are_safe_against_a_loss_of_power() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = store(directory.path()).await;
+    let pool = store.writer.as_ref().unwrap();
+    let journal: String = sqlx::query_scalar("PRAGMA journal_mode").fetch_one(pool).await.unwrap();
+    assert_eq!(journal, "wal");
+    for (sql, expected) in [
+        ("PRAGMA synchronous", 2),
+        ("PRAGMA foreign_keys", 1),
+        ("PRAGMA application_id", APPLICATION),
+        ("PRAGMA user_version", SCHEMA),
+    ] {
+        let found: i64 = sqlx::query_scalar(sql).fetch_one(pool).await.unwrap();
+        assert_eq!(found, expected, "{sql}");
+    }
+    assert_eq!(MIGRATIONS.iter().count() as i64, SCHEMA, "a migration for every version");
+}
+
+#[tokio::test]
+async fn a_full_disk_says_so_and_loses_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = store(directory.path()).await;
+    let component = |size| Commit {
+        components: vec![ComponentRecord { element: 0, slot: 0, bytes: vec![7; size] }],
+        ..Commit::default()
+    };
+    store.commit(&component(10)).await.unwrap();
+    // SQLite answers a limit on the size of the file as it answers a full disk.
+    let pool = store.writer.as_ref().unwrap();
+    let pages: i64 = sqlx::query_scalar("PRAGMA page_count").fetch_one(pool).await.unwrap();
+    sqlx::query(AssertSqlSafe(format!("PRAGMA max_page_count = {}", pages + 2))).execute(pool).await.unwrap();
+    let error = store.commit(&component(1_000_000)).await.unwrap_err();
+    assert!(matches!(error, StoreError::DiskFull) && error.is_transient(), "{error:?}");
+    assert_eq!(store.load_components().await.unwrap()[0].bytes, [7; 10]);
+    sqlx::query("PRAGMA max_page_count = 1000000").execute(pool).await.unwrap();
+    store.commit(&component(1_000_000)).await.unwrap();
+    assert_eq!(store.load_components().await.unwrap()[0].bytes.len(), 1_000_000);
+}
+
+#[tokio::test]
+async fn a_database_that_another_program_holds_is_busy() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = store(directory.path()).await;
+    let pool = store.writer.as_ref().unwrap();
+    sqlx::query("PRAGMA busy_timeout = 20").execute(pool).await.unwrap();
+    let other = Store::open(directory.path()).await.unwrap();
+    let held = other.begin().await.unwrap();
+    let error = store.commit(&Commit::default()).await.unwrap_err();
+    assert!(matches!(error, StoreError::Busy) && error.is_transient(), "{error:?}");
+    drop(held);
+    sqlx::query("PRAGMA busy_timeout = 30000").execute(pool).await.unwrap();
+    store.commit(&Commit::default()).await.unwrap();
+}

@@ -1,0 +1,102 @@
+//! The state of a campaign at a glance, for people and as JSON.
+
+use serde::Serialize;
+
+use crate::processes::ProcessRecord;
+
+/// Everything that `status` shows.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Status {
+    /// Candidates.
+    pub candidates: Candidates,
+    /// The label queue.
+    pub labels: Labels,
+    /// Structures that came with their labels.
+    pub imported: u64,
+    /// Version of the mixture.
+    pub mixture_version: u64,
+    /// Round (reproducible mode) or 0.
+    pub round: u64,
+    /// Every walk, in order.
+    pub walks: Vec<WalkStatus>,
+    /// Processes that said that they work for the campaign.
+    pub processes: Vec<ProcessRecord>,
+    /// Every walk is over, and no label job is queued or leased.
+    pub finished: bool,
+}
+
+/// Numbers of candidates.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Candidates {
+    /// Those of biased walks that reached the selector.
+    pub seen: u64,
+    /// Of them, in the data set.
+    pub accepted: u64,
+    /// Of them, not taken.
+    pub declined: Declined,
+    /// Frames of control walks.
+    pub control: u64,
+    /// Structures that walkers' own guards refused.
+    pub refused_by_walkers: u64,
+}
+
+/// Numbers of declined candidates by reason.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Declined {
+    /// The newest mixture covered them.
+    pub covered: u64,
+    /// Known already.
+    pub duplicate: u64,
+    /// Atoms too close.
+    pub guard: u64,
+    /// As many as there may be.
+    pub budget: u64,
+}
+
+/// Numbers of label jobs by state.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Labels {
+    /// Waiting.
+    pub queued: u64,
+    /// In work.
+    pub leased: u64,
+    /// Done.
+    pub labelled: u64,
+    /// Given up.
+    pub failed: u64,
+    /// Taken out by hand.
+    pub dropped: u64,
+}
+
+/// Where a walk stands.
+#[derive(Clone, Debug, PartialEq, Serialize, sqlx::FromRow)]
+pub struct WalkStatus {
+    /// Its number.
+    pub walk: u32,
+    /// Name of its seed structure.
+    pub seed_structure: String,
+    /// `biased` or `control`.
+    pub origin: String,
+    /// `waiting`, `running`, or how it ended.
+    pub state: String,
+    /// Why it ended, in words.
+    pub reason: String,
+    /// Step.
+    pub step: i64,
+    /// Segment.
+    pub segment: u32,
+    /// τ.
+    pub tau: Option<f64>,
+    /// Kinetic temperature, K.
+    pub temperature: Option<f64>,
+    /// V / V₀.
+    pub relative_volume: Option<f64>,
+    /// Largest γ of the last graded step.
+    pub gamma_max: Option<f64>,
+    /// Structures accepted.
+    pub accepted: u32,
+    /// Refusals by the walker's guard.
+    pub refused: i64,
+    /// Returns to a checkpoint.
+    pub returns: u32,
+}

@@ -1,0 +1,281 @@
+//! Beginning and opening campaigns; what is committed is what comes back.
+
+mod common;
+
+use std::fs;
+
+use common::*;
+use store::{
+    CampaignLock, CandidateRecord, Commit, ComponentRecord, DATABASE, Fate, ProcessRecord, Store, StoreError,
+};
+use wire::messages::{Decline, Progress};
+use wire::{Origin, WalkId};
+
+#[tokio::test]
+async fn a_campaign_is_begun_once_and_opened_often() {
+    let directory = tempfile::tempdir().unwrap();
+    let error = Store::open(directory.path()).await.unwrap_err();
+    assert!(matches!(error, StoreError::Missing { .. }), "{error}");
+    // What a creation that was killed may leave behind does not matter.
+    fs::write(directory.path().join("campaign.sqlite.new"), b"half a file").unwrap();
+    let store = create(directory.path()).await;
+    store.close().await;
+    let files = fs::read_dir(directory.path()).unwrap().count();
+    assert_eq!(files, 1, "only {DATABASE}");
+    let error = Store::create(directory.path(), &campaign(), &[], 0).await.unwrap_err();
+    assert!(matches!(error, StoreError::Exists { .. }), "{error}");
+
+    let store = Store::open(directory.path()).await.unwrap();
+    assert_eq!(store.campaign().await.unwrap(), campaign());
+    let seeds = store.seed_structures().await.unwrap();
+    assert_eq!((seeds.len(), seeds[0].name.as_str()), (1, "diamond"));
+    assert_eq!(seeds[0].structure, structure(0.0));
+    assert_eq!(store.protocols().await.unwrap(), [protocol("dft")]);
+    store.set_configuration_in_force("{\"walkers\":2}", 7).await.unwrap();
+    assert_eq!(store.campaign().await.unwrap().configuration_in_force, "{\"walkers\":2}");
+    let operations = store.operations(0, 10).await.unwrap();
+    let kinds: Vec<_> = operations.iter().map(|o| (o.time, o.kind.as_str())).collect();
+    assert_eq!(kinds, [(0, "created"), (0, "protocol"), (7, "configuration")]);
+}
+
+#[tokio::test]
+async fn other_files_and_versions_are_refused_with_what_was_found() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join(DATABASE);
+    fs::write(&path, "units metal\natom_style atomic\n").unwrap();
+    let message = Store::open(directory.path()).await.unwrap_err().to_string();
+    assert!(message.contains("no SQLite database") && message.contains("units metal"), "{message}");
+    fs::write(&path, "").unwrap();
+    assert!(matches!(Store::open(directory.path()).await, Err(StoreError::NotADatabase { .. })));
+    fs::remove_file(&path).unwrap();
+
+    create(directory.path()).await.close().await;
+    let whole = fs::read(&path).unwrap();
+    // https://www.sqlite.org/fileformat.html: user version at byte 60, application id at byte 68, big-endian.
+    let mut newer = whole.clone();
+    newer[63] = 7;
+    fs::write(&path, &newer).unwrap();
+    let message = Store::open(directory.path()).await.unwrap_err().to_string();
+    assert!(message.contains("version 7") && message.contains("reads version 1"), "{message}");
+    assert!(matches!(
+        Store::open_read_only(directory.path()).await,
+        Err(StoreError::Version { found: 7, reads: 1, .. })
+    ));
+    let mut foreign = whole.clone();
+    foreign[68..72].copy_from_slice(&[0, 0, 0, 9]);
+    fs::write(&path, &foreign).unwrap();
+    assert!(matches!(Store::open(directory.path()).await, Err(StoreError::Foreign { found: 9, .. })));
+    assert_eq!(fs::read(&path).unwrap(), foreign, "a foreign database is left as it is");
+    // Bytes of a page in disorder.
+    let mut damaged = whole;
+    damaged[4096..].fill(0x55);
+    fs::write(&path, &damaged).unwrap();
+    let error = Store::open(directory.path()).await.unwrap_err();
+    assert!(error.to_string().contains("damaged") || matches!(error, StoreError::Schema(_)), "{error}");
+}
+
+#[tokio::test]
+async fn a_directory_that_cannot_be_written_is_named() {
+    let directory = tempfile::tempdir().unwrap();
+    let missing = directory.path().join("missing");
+    let error = Store::create(&missing, &campaign(), &[], 0).await.unwrap_err();
+    assert!(matches!(error, StoreError::Directory { .. }), "{error}");
+    let file = directory.path().join("file");
+    fs::write(&file, "").unwrap();
+    let error = Store::create(&file, &campaign(), &[], 0).await.unwrap_err();
+    assert!(error.to_string().contains("file"), "{error}");
+    assert!(matches!(CampaignLock::acquire(&file, "run"), Err(StoreError::Directory { .. })));
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn a_campaign_can_be_looked_at_where_nothing_may_be_written() {
+    use std::os::unix::fs::PermissionsExt;
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 2).await;
+    store.close().await;
+    let permit = |mode| fs::set_permissions(directory.path(), fs::Permissions::from_mode(mode)).unwrap();
+    permit(0o555);
+    let refused = Store::open(directory.path()).await;
+    let lock = CampaignLock::acquire(directory.path(), "run");
+    let seen = Store::open_read_only(directory.path()).await.unwrap().status().await.unwrap();
+    permit(0o755);
+    assert_eq!(seen.labels.queued, 2);
+    // Nothing is forbidden to the superuser.
+    if !rustix::process::geteuid().is_root() {
+        assert!(matches!(lock, Err(StoreError::Directory { .. })), "{lock:?}");
+        let error = refused.unwrap_err();
+        assert!(matches!(error, StoreError::Directory { .. }), "{error}");
+    }
+}
+
+fn mixed_commit() -> Commit {
+    let mut declined = candidate(1, 20, Origin::Biased, Fate::Declined(Decline::Covered));
+    declined.keep_features = false;
+    let candidates = vec![
+        candidate(0, 10, Origin::Biased, Fate::Accepted),
+        declined,
+        candidate(1, 30, Origin::Biased, Fate::Declined(Decline::Guard)),
+        candidate(2, 10, Origin::Control, Fate::Accepted),
+    ];
+    Commit {
+        components: vec![
+            ComponentRecord { element: 0, slot: 4, bytes: vec![1, 2] },
+            ComponentRecord { element: 0, slot: 4, bytes: vec![3, 4] },
+        ],
+        walks: vec![walk(0, 1), walk(1, 1)],
+        values: vec![("round".into(), "1".into())],
+        ..commit_of(candidates)
+    }
+}
+
+#[tokio::test]
+async fn what_is_committed_comes_back() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let commit = mixed_commit();
+    assert_eq!(store.commit(&commit).await.unwrap(), 1..5);
+    store.close().await;
+
+    let store = Store::open(directory.path()).await.unwrap();
+    assert_eq!(store.load_walks().await.unwrap(), commit.walks);
+    assert_eq!(store.load_components().await.unwrap(), commit.components[1..]);
+    assert_eq!(store.values().await.unwrap(), commit.values);
+    let content = |record: &CandidateRecord| record.block.view().id().content;
+    assert_eq!(store.known_hashes().await.unwrap(), [content(&commit.candidates[0])]);
+    for (record, decision) in commit.candidates.iter().zip(1..) {
+        let stored = store.candidate(&name_of(record)).await.unwrap().unwrap();
+        assert_eq!(stored.decision, decision);
+        assert_eq!(stored.block, record.block.without_features());
+        assert_eq!((stored.fate, stored.seed_structure), (record.fate, 0));
+        assert_eq!((&stored.selector, &stored.original), (&record.selector, &record.original));
+        let features = record.keep_features.then(|| record.block.view().features.to_vec());
+        assert_eq!(stored.features, features);
+    }
+    assert!(store.candidate("9f").await.unwrap().is_none());
+    assert_eq!(store.candidate_ids(2, 1).await.unwrap(), [(3, name_of(&commit.candidates[2]))]);
+
+    let jobs = store.queue_list(None, 10, 0).await.unwrap();
+    let names: Vec<_> = jobs.iter().map(|job| job.candidate.clone()).collect();
+    assert_eq!(names, [name_of(&commit.candidates[0]), name_of(&commit.candidates[3])]);
+    let decisions = store.decisions(2..=3).await.unwrap();
+    assert_eq!(decisions.len(), 2);
+    assert_eq!(decisions[0].kind, "declined");
+    assert_eq!(decisions[0].detail, commit.decisions[1].detail);
+    let line = store.decision_log_text().await.unwrap().lines().next().unwrap().to_owned();
+    let id = name_of(&commit.candidates[0]);
+    assert_eq!(
+        line,
+        format!(
+            r#"{{"sequence":1,"round":1,"kind":"accepted","walk":0,"candidate":"{id}","mixture_version":10,"detail":{{"gamma":1.25,"text":"a \"quoted\" line\n"}}}}"#
+        )
+    );
+
+    let restart = Commit {
+        restart_mixture: true,
+        components: vec![ComponentRecord { element: 1, slot: 0, bytes: vec![9] }],
+        ..Commit::default()
+    };
+    assert_eq!(store.commit(&restart).await.unwrap(), 5..5);
+    assert_eq!(store.load_components().await.unwrap(), restart.components);
+}
+
+#[tokio::test]
+async fn a_contradictory_commit_leaves_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    store.commit(&mixed_commit()).await.unwrap();
+    let log = store.decision_log_text().await.unwrap();
+
+    let fresh = || candidate(0, 99, Origin::Biased, Fate::Accepted);
+    let again = commit_of(vec![fresh(), candidate(0, 10, Origin::Biased, Fate::Accepted)]);
+    assert!(matches!(store.commit(&again).await, Err(StoreError::DuplicateCandidate(_))));
+    let twice = commit_of(vec![fresh(), fresh()]);
+    assert!(matches!(store.commit(&twice).await, Err(StoreError::Inconsistent(_))));
+    let mut undecided = commit_of(vec![fresh()]);
+    undecided.decisions.clear();
+    assert!(matches!(store.commit(&undecided).await, Err(StoreError::Inconsistent(_))));
+    let mut missing = commit_of(vec![fresh()]);
+    missing.candidates.clear();
+    assert!(matches!(store.commit(&missing).await, Err(StoreError::Inconsistent(_))));
+    let mut short = commit_of(vec![fresh()]);
+    short.candidates[0].original.gamma.pop();
+    assert!(matches!(store.commit(&short).await, Err(StoreError::Inconsistent(_))));
+
+    assert_eq!(store.decision_log_text().await.unwrap(), log);
+    assert!(store.candidate(&name_of(&fresh())).await.unwrap().is_none());
+    assert_eq!(store.commit(&commit_of(vec![fresh()])).await.unwrap(), 5..6);
+}
+
+#[tokio::test]
+async fn a_checkpoint_is_kept_between_decisions() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    store.commit(&mixed_commit()).await.unwrap();
+    let progress = Progress { step: 150, gamma_max: f64::NAN, ..Progress::default() };
+    store.save_checkpoint(WalkId(0), 1, &progress, b"state").await.unwrap();
+    let walks = store.load_walks().await.unwrap();
+    assert_eq!((walks[0].progress.step, walks[0].checkpoint.as_deref()), (150, Some(&b"state"[..])));
+    assert!(walks[0].progress.gamma_max.is_nan());
+    assert_eq!(walks[1], walk(1, 1));
+    let old = store.save_checkpoint(WalkId(0), 0, &progress, b"").await;
+    assert!(matches!(old, Err(StoreError::OldTurn { found: 0, stored: 1, .. })));
+    let unknown = store.save_checkpoint(WalkId(5), 0, &progress, b"").await;
+    assert!(matches!(unknown, Err(StoreError::UnknownWalk(5))));
+}
+
+#[tokio::test]
+async fn status_counts_everything_once() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    assert!(!store.status().await.unwrap().finished);
+    store.commit(&mixed_commit()).await.unwrap();
+    let dft = protocol("dft").hash;
+    store.import(dft, "old.extxyz", &[(0, structure(7.0), label(-7.0))], 0).await.unwrap();
+    let mut dead = std::process::Command::new("true").spawn().unwrap();
+    dead.wait().unwrap();
+    let process = |id: &str, pid| ProcessRecord {
+        id: id.into(),
+        kind: id.into(),
+        pid,
+        host: store::this_host(),
+        started: 5,
+        last_seen: 6,
+        state: "running".into(),
+    };
+    store.upsert_process(&process("a", std::process::id())).await.unwrap();
+    store.upsert_process(&process("b", dead.id())).await.unwrap();
+
+    let reader = Store::open_read_only(directory.path()).await.unwrap();
+    let status = serde_json::to_value(reader.status().await.unwrap()).unwrap();
+    let candidates = serde_json::json!({
+        "seen": 3, "accepted": 1, "declined": { "covered": 1, "duplicate": 0, "guard": 1, "budget": 0 },
+        "control": 1, "refused_by_walkers": 4,
+    });
+    assert_eq!(status["candidates"], candidates);
+    let labels = serde_json::json!({ "queued": 2, "leased": 0, "labelled": 0, "failed": 0, "dropped": 0 });
+    assert_eq!(status["labels"], labels);
+    assert_eq!((&status["imported"], &status["round"]), (&1.into(), &1.into()));
+    assert_eq!(status["walks"][1]["seed_structure"], "diamond");
+    assert_eq!(status["walks"][1]["step"], 100);
+    assert_eq!(status["processes"][0]["state"], "running");
+    assert_eq!(status["processes"][1]["state"], "gone");
+    assert_eq!(status["finished"], false);
+    assert!(matches!(reader.commit(&Commit::default()).await, Err(StoreError::ReadOnly)));
+
+    // A new process of its kind takes the place of a dead one; the end of everything is seen.
+    let next = ProcessRecord { id: "c".into(), ..process("b", std::process::id()) };
+    store.upsert_process(&next).await.unwrap();
+    store.remove_process("a").await.unwrap();
+    let mut walks = store.load_walks().await.unwrap();
+    walks.iter_mut().for_each(|walk| walk.state = "steps".into());
+    store.commit(&Commit { walks, ..Commit::default() }).await.unwrap();
+    for job in store.queue_list(None, 10, 0).await.unwrap() {
+        assert!(!store.status().await.unwrap().finished);
+        store.drop_job(&job.candidate, 1).await.unwrap();
+    }
+    let status = reader.status().await.unwrap();
+    assert!(status.finished);
+    assert_eq!(status.processes, [next]);
+}

@@ -1,0 +1,153 @@
+//! A small campaign to test with.
+#![allow(dead_code, reason = "each test file uses its part")]
+
+use std::path::Path;
+
+use atoms::{Cell, Structure};
+use serde_json::json;
+use store::{
+    AtomGrades, Campaign, CandidateRecord, Commit, Decision, Fate, Label, Protocol, SeedStructure, Store,
+    WalkRecord,
+};
+use wire::messages::Progress;
+use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
+
+pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
+pub const ATOMS: usize = 2;
+
+pub fn campaign() -> Campaign {
+    Campaign {
+        id: CAMPAIGN,
+        program_version: "0.1.0".into(),
+        mode: "reproducible".into(),
+        configuration: "mode = \"reproducible\"\n".into(),
+        resolved_configuration: "{}".into(),
+        configuration_in_force: "{}".into(),
+    }
+}
+
+pub fn structure(shift: f64) -> Structure {
+    let silicon = "Si".parse().unwrap();
+    Structure {
+        species: vec![silicon; ATOMS],
+        positions: vec![[shift, 0.0, 0.0], [1.3575, 1.3575, 1.3575]],
+        cell: Cell::orthorhombic(5.43, 5.43, 5.43),
+        periodic: [true; 3],
+    }
+}
+
+pub fn protocol(name: &str) -> Protocol {
+    let mut hash = [0; 32];
+    hash[..name.len()].copy_from_slice(name.as_bytes());
+    Protocol { hash: ContentHash(hash), name: name.into(), settings: json!({ "code": name }) }
+}
+
+/// A campaign with one seed structure and the protocol "dft" in force.
+pub async fn create(directory: &Path) -> Store {
+    let seed = SeedStructure {
+        index: 0,
+        name: "diamond".into(),
+        source: "seeds.extxyz".into(),
+        structure: structure(0.0),
+    };
+    let store = Store::create(directory, &campaign(), &[seed], 0).await.unwrap();
+    store.add_protocol(&protocol("dft"), 0).await.unwrap();
+    store
+}
+
+pub fn label(energy: f64) -> Label {
+    Label {
+        energy,
+        forces: vec![[0.5 * energy, -0.1, 0.0]; ATOMS],
+        stress: Some([[energy, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]),
+    }
+}
+
+/// The candidate of a walk at a step; its structure follows from both.
+pub fn candidate(walk: u32, step: u64, origin: Origin, fate: Fate) -> CandidateRecord {
+    let structure = structure(f64::from(walk) + 1e-6 * step as f64);
+    let content = ContentHash::of(&structure);
+    let block = CandidateBlock::encode(&Candidate {
+        id: CandidateId { campaign: CAMPAIGN, walk: WalkId(walk), segment: 0, step, content },
+        origin,
+        mixture_version: 3,
+        temperature: 300.25,
+        relative_volume: 1.01,
+        energy: -8.5,
+        virial: [[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]],
+        structure,
+        forces: vec![[0.1, 0.2, 0.3]; ATOMS],
+        gamma: vec![1.4, 0.9],
+        gamma_nbr: vec![1.1, 1.0],
+        features: (0..3 * ATOMS).map(|k| (k as f64).sqrt()).collect(),
+    });
+    let grades =
+        |shift: f64| AtomGrades { gamma: vec![1.3 + shift, 0.8], gamma_nbr: vec![1.05, 1.0 + shift] };
+    CandidateRecord {
+        block,
+        fate,
+        seed_structure: 0,
+        selector: grades(0.0),
+        original: grades(0.1),
+        keep_features: true,
+        priority: if origin == Origin::Biased { 10 } else { 0 },
+    }
+}
+
+pub fn name_of(candidate: &CandidateRecord) -> String {
+    candidate.block.view().id().to_string()
+}
+
+/// A commit of these candidates with a decision about each.
+pub fn commit_of(candidates: Vec<CandidateRecord>) -> Commit {
+    let decisions = candidates.iter().map(|candidate| {
+        let id = candidate.block.view().id();
+        let kind = match (candidate.block.view().origin(), candidate.fate) {
+            (Origin::Control, _) => "control",
+            (_, Fate::Accepted) => "accepted",
+            (_, Fate::Declined(_)) => "declined",
+        };
+        Decision {
+            round: 1,
+            kind,
+            walk: Some(id.walk),
+            candidate: Some(id),
+            mixture_version: id.step,
+            detail: json!({ "gamma": 1.25, "text": "a \"quoted\" line\n" }),
+        }
+    });
+    Commit { decisions: decisions.collect(), candidates, ..Commit::default() }
+}
+
+pub fn walk(walk: u32, turn: u64) -> WalkRecord {
+    WalkRecord {
+        walk: WalkId(walk),
+        origin: Origin::Biased,
+        partner: None,
+        seed_structure: 0,
+        state: "running".into(),
+        reason: String::new(),
+        turn,
+        accepted: 1,
+        progress: Progress {
+            step: 100 * turn,
+            tau: 0.5,
+            temperature: 310.0,
+            refused: 2,
+            ..Progress::default()
+        },
+        selector_state: "{}".into(),
+        checkpoint: Some(turn.to_le_bytes().to_vec()),
+    }
+}
+
+/// Commits `number` accepted candidates of walk 0 and returns their names.
+pub async fn accept(store: &Store, number: u64) -> Vec<String> {
+    let mut names = Vec::new();
+    for step in 1..=number {
+        let record = candidate(0, step, Origin::Biased, Fate::Accepted);
+        names.push(name_of(&record));
+        store.commit(&commit_of(vec![record])).await.unwrap();
+    }
+    names
+}

@@ -1,0 +1,310 @@
+//! The label queue step by step, imports and exports.
+
+mod common;
+
+use std::collections::BTreeSet;
+
+use common::*;
+use store::{
+    Completed, ExportFilter, ExportPlace, ExportSource, Failed, Fate, Imported, JobState, LabelSource, Lease,
+    Standing, Store, StoreError,
+};
+use wire::{ContentHash, Origin};
+
+const LIMIT: u32 = 2;
+
+async fn lease(store: &Store, holder: &str, now: i64) -> Option<Lease> {
+    store.lease(protocol("dft").hash, holder, now, 10, LIMIT).await.unwrap()
+}
+
+async fn state(store: &Store, candidate: &str) -> JobState {
+    store.queue_show(candidate).await.unwrap().job.state
+}
+
+#[tokio::test]
+async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let names = accept(&store, 3).await;
+    store.prioritise_job(&names[2], 20, 0).await.unwrap();
+    let first = lease(&store, "host-1/a", 0).await.unwrap();
+    assert_eq!((first.candidate.as_str(), first.attempt), (names[2].as_str(), 1));
+    assert_eq!(ContentHash::of(&first.structure), ContentHash::of(&structure(3e-6)));
+    store.record_calculation(&first, "slurm 17").await.unwrap();
+    assert_eq!(lease(&store, "host-1/b", 0).await.unwrap().candidate, names[0]);
+    assert_eq!(lease(&store, "host-2", 0).await.unwrap().candidate, names[1]);
+    assert!(lease(&store, "host-2", 9_999).await.is_none());
+    assert!(store.renew(&first, 5_000, 60).await.unwrap());
+    assert_eq!(store.unfinished_jobs().await.unwrap(), 3);
+
+    // The two others ran out of time; the renewed one did not.
+    assert_eq!(lease(&store, "c", 10_000).await.unwrap().candidate, names[0]);
+    assert_eq!(state(&store, &names[1]).await, JobState::Queued);
+    assert_eq!(state(&store, &names[2]).await, JobState::Leased);
+    let again = lease(&store, "c", 65_000).await.unwrap();
+    assert_eq!((again.candidate.as_str(), again.attempt), (names[2].as_str(), 2));
+    assert_eq!(again.earlier_calculation.as_deref(), Some("slurm 17"));
+    assert!(!store.renew(&first, 65_000, 60).await.unwrap());
+    // The job whose time ran out twice is given up, the others are not.
+    assert_eq!(state(&store, &names[0]).await, JobState::Failed);
+    let details = store.queue_show(&names[0]).await.unwrap();
+    let outcomes: Vec<_> = details.attempts_made.iter().map(|a| a.outcome.as_deref()).collect();
+    assert_eq!(outcomes, [Some("expired"), Some("expired")]);
+}
+
+#[tokio::test]
+async fn the_first_result_is_the_label_whoever_brings_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let names = accept(&store, 1).await;
+    let lost = lease(&store, "a", 0).await.unwrap();
+    let holds = lease(&store, "b", 10_000).await.unwrap();
+    assert_eq!(store.complete(&lost, &label(-1.0), 11_000).await.unwrap(), Completed::Label);
+    assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
+    assert_eq!(store.complete(&holds, &label(-2.0), 12_000).await.unwrap(), Completed::KeptAsCheck);
+    assert_eq!(store.complete(&lost, &label(-3.0), 13_000).await.unwrap(), Completed::Label);
+    assert_eq!(store.fail(&holds, "timeout", "", LIMIT, 14_000).await.unwrap(), Failed::LeaseLost);
+    assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
+
+    let (structure, dft) = (ContentHash::of(&holds.structure), protocol("dft").hash);
+    store.supersede(structure, dft, &label(-1.5), "wrong smearing", 15_000).await.unwrap();
+    let history = store.label_history(structure, dft).await.unwrap();
+    let lines: Vec<_> = history.iter().map(|record| (record.standing, record.label.energy)).collect();
+    assert_eq!(lines, [(Standing::Superseded, -1.0), (Standing::Check, -2.0), (Standing::Label, -1.5)]);
+    assert_eq!(history[0].label, label(-1.0));
+    assert_eq!(history[2].source, LabelSource::Correction { reason: "wrong smearing".into() });
+    let unknown = store.supersede(ContentHash([7; 32]), dft, &label(0.0), "", 0).await;
+    assert!(matches!(unknown, Err(StoreError::NoLabel(_))));
+}
+
+#[tokio::test]
+async fn results_that_cannot_be_true_are_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 1).await;
+    let lease = lease(&store, "a", 0).await.unwrap();
+    let mut short = label(-1.0);
+    short.forces.pop();
+    let mut infinite = label(-1.0);
+    infinite.forces[1][2] = f64::INFINITY;
+    for wrong in [label(f64::NAN), short, infinite] {
+        let refused = store.complete(&lease, &wrong, 1).await;
+        assert!(matches!(refused, Err(StoreError::InvalidLabel(_))));
+    }
+    assert_eq!(store.complete(&lease, &label(-1.0), 2).await.unwrap(), Completed::Label);
+}
+
+#[tokio::test]
+async fn failures_count_and_releases_do_not() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let names = accept(&store, 1).await;
+    for (stop, holder) in [(true, "h-1/a"), (false, "h-1/b"), (true, "h-1")] {
+        lease(&store, holder, 0).await.unwrap();
+        assert_eq!(store.release_all("h", 1).await.unwrap(), 0, "another holder");
+        let released = if stop { store.release_all("h-1", 1) } else { store.release_all(holder, 1) };
+        assert_eq!(released.await.unwrap(), 1);
+    }
+    lease(&store, "h-1/c", 1).await.unwrap();
+    assert_eq!(store.release_stale_leases_of("h-1", 2).await.unwrap(), 1);
+    let first = lease(&store, "h", 2).await.unwrap();
+    assert_eq!(first.attempt, 5);
+    assert_eq!(store.fail(&first, "not converged", "SCF", LIMIT, 3).await.unwrap(), Failed::Requeued);
+    let second = lease(&store, "h", 3).await.unwrap();
+    assert_eq!(second.earlier_calculation, None, "that one ended");
+    assert_eq!(store.fail(&second, "not converged", "SCF", LIMIT, 4).await.unwrap(), Failed::GivenUp);
+    let details = store.queue_show(&names[0]).await.unwrap();
+    assert_eq!((details.job.state, details.job.failures), (JobState::Failed, 2));
+    let outcomes: Vec<_> = details.attempts_made.iter().map(|a| a.outcome.as_deref().unwrap()).collect();
+    assert_eq!(outcomes, ["released", "released", "released", "lost", "failed", "failed"]);
+    assert_eq!(details.attempts_made[5].class.as_deref(), Some("not converged"));
+    assert!(lease(&store, "h", 5).await.is_none());
+    store.retry_job(&names[0], 6).await.unwrap();
+    assert_eq!(lease(&store, "h", 7).await.unwrap().attempt, 7);
+}
+
+#[tokio::test]
+async fn jobs_are_found_by_name_or_a_beginning_of_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let error = store.drop_job("0.0.1", 0).await.unwrap_err();
+    assert!(error.to_string().contains("queue is empty"), "{error}");
+    let names = accept(&store, 12).await;
+    assert_eq!(store.queue_show(&names[4]).await.unwrap().job.candidate, names[4]);
+    assert_eq!(store.drop_job("0.0.5", 1).await.unwrap(), names[4]);
+    assert_eq!(store.queue_show("9f9f9f9f-0.0.5").await.unwrap().job.state, JobState::Dropped);
+    let error = store.drop_job("0.0.1", 2).await.unwrap_err();
+    assert!(matches!(&error, StoreError::AmbiguousJob { matches, .. } if matches.len() == 4), "{error}");
+    let error = store.drop_job("0.0.77", 2).await.unwrap_err();
+    assert!(matches!(&error, StoreError::UnknownJob { near, .. } if near[0] == names[6]), "{error}");
+    let message = store.drop_job("0.0.5", 3).await.unwrap_err().to_string();
+    assert!(
+        message.contains("is dropped, and only queued, leased and failed jobs can be dropped"),
+        "{message}"
+    );
+    assert!(matches!(store.retry_job("0.0.6", 3).await, Err(StoreError::WrongState { .. })));
+    let dropped = store.queue_list(Some(JobState::Dropped), 5, 0).await.unwrap();
+    assert_eq!((dropped.len(), dropped[0].candidate.as_str()), (1, names[4].as_str()));
+    let page = store.queue_list(Some(JobState::Queued), 2, 3).await.unwrap();
+    assert_eq!([&page[0].candidate, &page[1].candidate], [&names[3], &names[5]]);
+    let operation = store.operations(0, 100).await.unwrap().pop().unwrap();
+    assert_eq!((operation.kind.as_str(), operation.time), ("drop", 1));
+    assert_eq!(operation.detail["candidate"], names[4]);
+}
+
+#[tokio::test]
+async fn a_dropped_job_stays_dropped_until_it_is_wanted_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let names = accept(&store, 1).await;
+    let lease = lease(&store, "a", 0).await.unwrap();
+    store.drop_job(&names[0], 1).await.unwrap();
+    assert_eq!(store.complete(&lease, &label(-1.0), 2).await.unwrap(), Completed::Label);
+    assert_eq!(state(&store, &names[0]).await, JobState::Dropped);
+    let all = ExportFilter { protocol: lease.protocol, biased: true, control: true, imported: true };
+    assert!(store.labelled(&all, None, 10).await.unwrap().is_empty());
+    store.retry_job(&names[0], 3).await.unwrap();
+    assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
+    assert_eq!(store.labelled(&all, None, 10).await.unwrap().len(), 1);
+}
+
+#[tokio::test]
+async fn candidates_found_before_there_is_a_protocol_get_their_jobs_later() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = Store::create(directory.path(), &campaign(), &[], 0).await.unwrap();
+    let names = accept(&store, 2).await;
+    assert_eq!(store.unfinished_jobs().await.unwrap(), 0);
+    let unknown = store.lease(protocol("dft").hash, "a", 0, 10, LIMIT).await;
+    assert!(matches!(unknown, Err(StoreError::UnknownProtocol(_))));
+    for _ in 0..2 {
+        store.add_protocol(&protocol("dft"), 1).await.unwrap();
+    }
+    assert_eq!(lease(&store, "a", 2).await.unwrap().candidate, names[0]);
+    assert_eq!(store.unfinished_jobs().await.unwrap(), 2);
+    let mut other = protocol("other");
+    other.name = "dft".into();
+    assert!(matches!(store.add_protocol(&other, 3).await, Err(StoreError::ProtocolName(_))));
+    // A new protocol holds for new candidates only.
+    store.add_protocol(&protocol("finer"), 4).await.unwrap();
+    assert!(store.lease(protocol("finer").hash, "a", 5, 10, LIMIT).await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn imports_label_what_waits_and_can_be_repeated() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let names = accept(&store, 2).await;
+    let dft = protocol("dft").hash;
+    let frames = [(0, structure(50.0), label(-5.0)), (1, structure(1e-6), label(-1.0))];
+    let first = store.import(dft, "old.extxyz", &frames, 1).await.unwrap();
+    assert_eq!(first, Imported { labels: 2, ..Imported::default() });
+    let second = store.import(dft, "old.extxyz", &frames, 2).await.unwrap();
+    assert_eq!(second, Imported { known: 2, ..Imported::default() });
+    let other = [(0, structure(50.0), label(-5.1))];
+    let third = store.import(dft, "other.extxyz", &other, 3).await.unwrap();
+    assert_eq!(third, Imported { checks: 1, ..Imported::default() });
+    assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
+    assert_eq!(state(&store, &names[1]).await, JobState::Queued);
+    let known = store.known_hashes().await.unwrap();
+    let expected: Vec<_> = [1e-6, 2e-6, 50.0, 1e-6].map(|shift| ContentHash::of(&structure(shift))).into();
+    assert_eq!(known, expected);
+    // All frames or none.
+    let mut wrong = label(-6.0);
+    wrong.forces.pop();
+    let frames = [(0, structure(60.0), label(-6.0)), (1, structure(61.0), wrong)];
+    assert!(store.import(dft, "bad.extxyz", &frames, 4).await.is_err());
+    assert_eq!(store.status().await.unwrap().imported, 2);
+}
+
+/// A campaign whose labels come in the order `order`; the text of its export, read in pages of `page`.
+async fn export_text(order: &[usize], page: u32, filter: &ExportFilter) -> Vec<String> {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 4).await;
+    store.commit(&commit_of(vec![candidate(3, 5, Origin::Control, Fate::Accepted)])).await.unwrap();
+    let imports = [(4, structure(50.0), label(-50.0)), (6, structure(40.0), label(-40.0))];
+    store.import(filter.protocol, "old.extxyz", &imports, 0).await.unwrap();
+    let mut leases = Vec::new();
+    while let Some(lease) = lease(&store, "a", 0).await {
+        leases.push(lease);
+    }
+    for k in order {
+        let energy = leases[*k].structure.positions[0][0];
+        store.complete(&leases[*k], &label(energy), 1).await.unwrap();
+    }
+    let (mut rows, mut after): (Vec<String>, Option<ExportPlace>) = (Vec::new(), None);
+    loop {
+        let found = store.labelled(filter, after, page).await.unwrap();
+        let Some(last) = found.last() else { return rows };
+        assert!(after < Some(last.place));
+        after = Some(last.place);
+        rows.extend(found.iter().map(|row| format!("{row:?}")));
+    }
+}
+
+#[tokio::test]
+async fn exports_do_not_depend_on_the_order_of_labels() {
+    let filter = |biased, control, imported| ExportFilter {
+        protocol: protocol("dft").hash,
+        biased,
+        control,
+        imported,
+    };
+    let all = filter(true, true, true);
+    let rows = export_text(&[0, 1, 2, 3, 4], 100, &all).await;
+    assert_eq!(rows.len(), 7);
+    assert_eq!(export_text(&[4, 2, 0, 3, 1], 2, &all).await, rows);
+    assert_eq!(export_text(&[3, 0, 4, 1, 2], 3, &filter(true, false, true)).await.len(), 6);
+    assert_eq!(export_text(&[0, 1, 2, 3, 4], 1, &filter(false, true, false)).await, rows[4..5]);
+    assert_eq!(export_text(&[3, 1], 10, &filter(true, false, false)).await, [rows[1].as_str(), &rows[3]]);
+}
+
+#[tokio::test]
+async fn an_exported_row_tells_all_that_is_known() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let record = candidate(0, 1, Origin::Biased, Fate::Accepted);
+    store.commit(&commit_of(vec![record.clone()])).await.unwrap();
+    let lease = lease(&store, "a", 0).await.unwrap();
+    store.complete(&lease, &label(-1.0), 1).await.unwrap();
+    let filter = ExportFilter { protocol: lease.protocol, biased: true, control: false, imported: false };
+    let row = store.labelled(&filter, None, 5).await.unwrap().pop().unwrap();
+    assert_eq!((row.structure, row.label), (lease.structure, label(-1.0)));
+    assert_eq!((row.protocol_name.as_str(), row.protocol), ("dft", lease.protocol));
+    let ExportSource::Candidate { id, seed_structure_name, mixture_version_after, block, original, .. } =
+        row.source
+    else {
+        panic!("not an import")
+    };
+    assert_eq!((id, seed_structure_name.as_str()), (name_of(&record), "diamond"));
+    assert_eq!((mixture_version_after, block.view().mixture_version()), (1, 3));
+    assert_eq!((block.view().forces, original), (record.block.view().forces, record.original));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn two_connections_never_lease_the_same_job() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let records = (1..=60).map(|step| candidate(0, step, Origin::Biased, Fate::Accepted)).collect();
+    store.commit(&commit_of(records)).await.unwrap();
+    let mut labellers = Vec::new();
+    for holder in ["a", "b", "c"] {
+        let store = Store::open(directory.path()).await.unwrap();
+        labellers.push(tokio::spawn(async move {
+            let mut jobs = Vec::new();
+            while let Some(lease) = lease(&store, holder, 0).await {
+                store.complete(&lease, &label(-1.0), 1).await.unwrap();
+                jobs.push(lease.job);
+            }
+            jobs
+        }));
+    }
+    let (mut all, mut distinct) = (0, BTreeSet::new());
+    for labeller in labellers {
+        let jobs = labeller.await.unwrap();
+        all += jobs.len();
+        distinct.extend(jobs);
+    }
+    assert_eq!((all, distinct.len()), (60, 60));
+    assert_eq!(store.status().await.unwrap().labels.labelled, 60);
+}
