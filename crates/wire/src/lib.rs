@@ -1,1 +1,11 @@
-//! Identifiers, messages and the transport between actors.
+//! What actors say to each other: identifiers, the candidate as one block of bytes, small control
+//! messages, and the [`transport`] that carries them.
+
+pub mod block;
+pub mod control;
+pub mod ids;
+pub mod messages;
+pub mod transport;
+
+pub use block::{BlockError, Candidate, CandidateBlock, CandidateView};
+pub use ids::{CampaignId, CandidateId, ContentHash, IdError, Origin, WalkId};

@@ -1,0 +1,216 @@
+//! Control messages as bytes, for transports between processes.
+//!
+//! | bytes | content |
+//! | --- | --- |
+//! | 4 | `CALM` |
+//! | 1 | format version |
+//! | 4 | CRC-32 of the rest, little-endian |
+//! | rest | the message in [postcard](https://postcard.jamesmunns.com) encoding, the number of its variant first |
+//!
+//! A candidate is not inside: its block travels beside the report that names it, as the bytes that it has already.
+
+use std::borrow::Cow;
+
+use atoms::StructureError;
+use serde::{Deserialize, Serialize};
+
+use crate::block::CandidateBlock;
+use crate::ids::{CandidateId, Origin, WalkId};
+use crate::messages::{Assignment, End, Outcome, Progress, Report};
+
+const MAGIC: [u8; 4] = *b"CALM";
+const VERSION: u8 = 1;
+const PREFIX: usize = MAGIC.len() + 1 + 4;
+
+/// What is sent between reactor and walkers.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Message {
+    /// To a walker: its next turn.
+    Assignment(Assignment),
+    /// From a walker: what came of its turn.
+    Report(Report),
+    /// From a walker: where its walk stands.
+    Progress(WalkId, Progress),
+}
+
+/// Why bytes are not a control message.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ControlError {
+    /// Fewer bytes than the fixed part.
+    #[error("a control message of {0} bytes: its fixed part alone has {PREFIX}")]
+    Short(usize),
+    /// Something else.
+    #[error("not a control message: it begins with {0:02x?}, expected {MAGIC:02x?}")]
+    Magic([u8; 4]),
+    /// A message of another version of this program.
+    #[error(
+        "a control message of version {0}; this program reads version {VERSION}: run the same program everywhere"
+    )]
+    Version(u8),
+    /// Damaged.
+    #[error("a damaged control message: checksum {found:08x}, expected {expected:08x}")]
+    Checksum {
+        /// Of the bytes at hand.
+        found: u32,
+        /// In the message.
+        expected: u32,
+    },
+    /// Bytes that do not spell a message.
+    #[error("a control message that cannot be decoded: {0}")]
+    Content(#[from] postcard::Error),
+    /// More bytes than the message has.
+    #[error("{0} bytes behind the end of a control message")]
+    Trailing(usize),
+    /// An assignment whose seed structure cannot be used.
+    #[error("the seed structure of walk {walk}: {source}")]
+    SeedStructure {
+        /// The walk.
+        walk: WalkId,
+        /// What is wrong with it.
+        source: StructureError,
+    },
+    /// Wanted frames that are not in order, or of a walk that has none.
+    #[error("the {origin} walk {walk} is to give the frames of steps {wanted:?}: expected {expected}")]
+    Wanted {
+        /// The walk.
+        walk: WalkId,
+        /// Biased or control.
+        origin: Origin,
+        /// The steps.
+        wanted: Vec<u64>,
+        /// What they should be.
+        expected: &'static str,
+    },
+    /// A report without the candidate that it names, or with another.
+    #[error("a report of walk {walk} names candidate {}, the block beside it is {}", name(.named), name(.beside))]
+    Candidate {
+        /// The walk.
+        walk: WalkId,
+        /// In the report.
+        named: Option<Box<CandidateId>>,
+        /// Of the block.
+        beside: Option<Box<CandidateId>>,
+    },
+}
+
+/// A message as it is encoded.
+#[derive(Serialize, Deserialize)]
+enum Encoded<'a> {
+    Assignment(Cow<'a, Assignment>),
+    Report {
+        walk: WalkId,
+        turn: u64,
+        outcome: EncodedOutcome<'a>,
+        checkpoint: &'a [u8],
+        progress: Cow<'a, Progress>,
+    },
+    Progress(WalkId, Cow<'a, Progress>),
+}
+
+/// An [`Outcome`] with the name of the candidate in its place.
+#[derive(Serialize, Deserialize)]
+enum EncodedOutcome<'a> {
+    Candidate(CandidateId),
+    Turn,
+    Paused,
+    Ended(Cow<'a, End>),
+}
+
+/// Encodes a message. The block of a report's candidate is not in it and must be sent beside it.
+pub fn encode(message: &Message) -> Vec<u8> {
+    let encoded = match message {
+        Message::Assignment(assignment) => Encoded::Assignment(Cow::Borrowed(assignment)),
+        Message::Progress(walk, progress) => Encoded::Progress(*walk, Cow::Borrowed(progress)),
+        Message::Report(report) => Encoded::Report {
+            walk: report.walk,
+            turn: report.turn,
+            outcome: match &report.outcome {
+                Outcome::Candidate(block) => EncodedOutcome::Candidate(block.view().id()),
+                Outcome::Turn => EncodedOutcome::Turn,
+                Outcome::Paused => EncodedOutcome::Paused,
+                Outcome::Ended(end) => EncodedOutcome::Ended(Cow::Borrowed(end)),
+            },
+            checkpoint: &report.checkpoint,
+            progress: Cow::Borrowed(&report.progress),
+        },
+    };
+    let content = postcard::to_stdvec(&encoded).expect("plain data is encoded into memory");
+    let checksum = crc32fast::hash(&content).to_le_bytes();
+    [MAGIC.as_slice(), &[VERSION], &checksum, &content].concat()
+}
+
+/// Decodes a message and checks all of it; `candidate` is the block that came beside it, if one did.
+///
+/// # Errors
+/// Other, damaged or left-over bytes; an assignment that cannot be worked on; a report without the candidate that it
+/// names, or with another.
+pub fn decode(bytes: &[u8], candidate: Option<CandidateBlock>) -> Result<Message, ControlError> {
+    let (encoded, rest) = postcard::take_from_bytes(content(bytes)?)?;
+    if !rest.is_empty() {
+        return Err(ControlError::Trailing(rest.len()));
+    }
+    match encoded {
+        Encoded::Assignment(assignment) => {
+            checked_assignment(assignment.into_owned()).map(Message::Assignment)
+        }
+        Encoded::Progress(walk, progress) => Ok(Message::Progress(walk, progress.into_owned())),
+        Encoded::Report { walk, turn, outcome, checkpoint, progress } => {
+            let outcome = checked_outcome(walk, outcome, candidate)?;
+            let (checkpoint, progress) = (checkpoint.to_vec(), progress.into_owned());
+            Ok(Message::Report(Report { walk, turn, outcome, checkpoint, progress }))
+        }
+    }
+}
+
+/// The checked bytes behind the fixed part.
+fn content(bytes: &[u8]) -> Result<&[u8], ControlError> {
+    let short = ControlError::Short(bytes.len());
+    let Some((magic, rest)) = bytes.split_first_chunk() else { return Err(short) };
+    let Some(([version], rest)) = rest.split_first_chunk() else { return Err(short) };
+    let Some((checksum, content)) = rest.split_first_chunk() else { return Err(short) };
+    if *magic != MAGIC {
+        return Err(ControlError::Magic(*magic));
+    }
+    if *version != VERSION {
+        return Err(ControlError::Version(*version));
+    }
+    let (found, expected) = (crc32fast::hash(content), u32::from_le_bytes(*checksum));
+    if found == expected { Ok(content) } else { Err(ControlError::Checksum { found, expected }) }
+}
+
+fn checked_assignment(assignment: Assignment) -> Result<Assignment, ControlError> {
+    let Assignment { walk, origin, ref wanted, ref seed_structure, .. } = assignment;
+    seed_structure.validate().map_err(|source| ControlError::SeedStructure { walk, source })?;
+    let wrong = |expected| Err(ControlError::Wanted { walk, origin, wanted: wanted.clone(), expected });
+    if origin == Origin::Biased && !wanted.is_empty() {
+        return wrong("none of a biased walk");
+    }
+    if !wanted.is_sorted_by(|a, b| a < b) {
+        return wrong("ascending steps");
+    }
+    Ok(assignment)
+}
+
+fn checked_outcome(
+    walk: WalkId,
+    outcome: EncodedOutcome<'_>,
+    candidate: Option<CandidateBlock>,
+) -> Result<Outcome, ControlError> {
+    match (outcome, candidate) {
+        (EncodedOutcome::Turn, None) => Ok(Outcome::Turn),
+        (EncodedOutcome::Paused, None) => Ok(Outcome::Paused),
+        (EncodedOutcome::Ended(end), None) => Ok(Outcome::Ended(end.into_owned())),
+        (EncodedOutcome::Candidate(id), Some(block)) if id == block.view().id() && id.walk == walk => {
+            Ok(Outcome::Candidate(block))
+        }
+        (outcome, block) => {
+            let named = if let EncodedOutcome::Candidate(id) = outcome { Some(Box::new(id)) } else { None };
+            let beside = block.map(|block| Box::new(block.view().id()));
+            Err(ControlError::Candidate { walk, named, beside })
+        }
+    }
+}
+
+fn name(candidate: &Option<Box<CandidateId>>) -> String {
+    candidate.as_ref().map_or_else(|| "none".to_owned(), |id| id.to_string())
+}

@@ -1,0 +1,160 @@
+//! Control messages. A walker holds nothing between two of them: an [`Assignment`] is all that it needs to
+//! go on with a walk, a [`Report`] is all that came of it. The same checkpoint gives the same report,
+//! whoever works on it and however often, which is what makes a campaign crash-only.
+
+use atoms::Structure;
+use serde::{Deserialize, Serialize};
+
+use crate::block::CandidateBlock;
+use crate::ids::{CampaignId, Origin, WalkId};
+
+/// A turn of one walk, for whichever walker is free.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Assignment {
+    /// Campaign, for the ids of candidates.
+    pub campaign: CampaignId,
+    /// The walk.
+    pub walk: WalkId,
+    /// Counts the turns of the walk; a report of another turn is out of date.
+    pub turn: u64,
+    /// What kind of walk.
+    pub origin: Origin,
+    /// The walk whose random numbers it uses: itself, or the biased walk that a control matches.
+    pub random_walk: WalkId,
+    /// Where it starts.
+    pub seed_structure: Structure,
+    /// The walker's own state of the walk; none at the start of it.
+    pub checkpoint: Option<Vec<u8>>,
+    /// What became of the candidate that its last turn ended with.
+    pub verdict: Option<Verdict>,
+    /// Stop at this step at the latest.
+    pub until: u64,
+    /// A control walk: the steps whose frames are wanted, ascending. Otherwise empty.
+    pub wanted: Vec<u64>,
+}
+
+/// The answer to a candidate.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// Taken into the data set; the mixture covers it from now on.
+    Accepted,
+    /// Not taken.
+    Declined(Decline),
+}
+
+/// Why a candidate is not taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Decline {
+    /// The newest mixture covers it: another walk found its like meanwhile.
+    Covered,
+    /// The very same structure is known already.
+    Duplicate,
+    /// The selector's guard: atoms too close.
+    Guard,
+    /// The seed structure or the campaign has as many as it may have.
+    Budget,
+}
+
+impl Decline {
+    /// Every reason, in the order of summaries.
+    pub const ALL: [Self; 4] = [Self::Covered, Self::Duplicate, Self::Guard, Self::Budget];
+
+    /// `"covered"`, `"duplicate"`, `"guard"`, `"budget"`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Covered => "covered",
+            Self::Duplicate => "duplicate",
+            Self::Guard => "guard",
+            Self::Budget => "budget",
+        }
+    }
+}
+
+/// How a turn ended.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Outcome {
+    /// With a candidate (or, in a control walk, a wanted frame).
+    Candidate(CandidateBlock),
+    /// At its last step.
+    Turn,
+    /// Before that, because the process was asked to stop: the same turn goes on later.
+    Paused,
+    /// The walk is over.
+    Ended(End),
+}
+
+/// Why a walk is over.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum End {
+    /// It made all its steps.
+    Steps,
+    /// Its seed structure has given as many structures as it may.
+    Collected,
+    /// A guard refused it too often, after the allowed number of returns to a checkpoint.
+    Trapped {
+        /// The guard.
+        guard: String,
+    },
+    /// Non-finite forces, an absurd temperature, lost atoms.
+    BlewUp {
+        /// What was seen.
+        reason: String,
+    },
+    /// The seed structure itself cannot be walked from.
+    BadStart {
+        /// What was seen.
+        reason: String,
+    },
+}
+
+impl End {
+    /// `"steps"`, `"collected"`, `"trapped"`, `"blew_up"`, `"bad_start"`.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Steps => "steps",
+            Self::Collected => "collected",
+            Self::Trapped { .. } => "trapped",
+            Self::BlewUp { .. } => "blew_up",
+            Self::BadStart { .. } => "bad_start",
+        }
+    }
+}
+
+/// What came of a turn.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Report {
+    /// The walk.
+    pub walk: WalkId,
+    /// The turn it answers.
+    pub turn: u64,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// The walker's state of the walk from which the next turn goes on.
+    pub checkpoint: Vec<u8>,
+    /// Where the walk stands.
+    pub progress: Progress,
+}
+
+/// Where a walk stands; also sent while a turn lasts, for those who watch.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Progress {
+    /// Step, equilibration included.
+    pub step: u64,
+    /// Segment.
+    pub segment: u32,
+    /// Uncertainty-force scale τ in force.
+    pub tau: f64,
+    /// Kinetic temperature, K.
+    pub temperature: f64,
+    /// V / V₀.
+    pub relative_volume: f64,
+    /// Largest γ of the last graded step.
+    pub gamma_max: f64,
+    /// Refusals by the walker's own guard so far.
+    pub refused: u64,
+    /// Returns to a checkpoint so far.
+    pub returns: u32,
+}

@@ -1,0 +1,82 @@
+//! How a walker speaks to the reactor. Whatever carries the messages, the reactor sees one channel of
+//! [`Incoming`]; a walker sees a [`Transport`].
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use calm::Mixture;
+use tokio::sync::{mpsc, oneshot};
+
+use crate::ids::WalkId;
+use crate::messages::{Assignment, Progress, Report};
+
+/// A turn and the mixture that holds in it.
+#[derive(Clone, Debug)]
+pub struct Work {
+    /// The turn.
+    pub assignment: Assignment,
+    /// The mixture, evaluated in place.
+    pub mixture: Arc<Mixture>,
+}
+
+/// A walker's end of the line.
+pub trait Transport: Send {
+    /// Delivers what came of the last turn (nothing at first) and waits for the next; `None` when there is
+    /// no more work, or nobody to give it. A report is safe only once this has returned `Some`.
+    fn exchange(&mut self, report: Option<Report>) -> Option<Work>;
+
+    /// Tells those who watch where a walk stands. May be lost.
+    fn progress(&self, walk: WalkId, progress: Progress);
+
+    /// Whether the walker was asked to stop at the next step.
+    fn stopping(&self) -> bool;
+}
+
+/// What the reactor receives.
+#[derive(Debug)]
+pub enum Incoming {
+    /// A walker is free.
+    Free {
+        /// Which walker.
+        walker: u32,
+        /// What came of its last turn.
+        report: Option<Report>,
+        /// Where its next turn goes; `None` sends it home.
+        reply: oneshot::Sender<Option<Work>>,
+    },
+    /// Where a walk stands.
+    Progress(WalkId, Progress),
+}
+
+/// The transport between threads of one process: values move, nothing is encoded.
+#[derive(Clone, Debug)]
+pub struct InProcess {
+    walker: u32,
+    to_reactor: mpsc::Sender<Incoming>,
+    stopping: Arc<AtomicBool>,
+}
+
+impl InProcess {
+    /// The end of walker number `walker` of a line into `to_reactor`. Setting `stopping` asks it to stop.
+    pub fn new(walker: u32, to_reactor: mpsc::Sender<Incoming>, stopping: Arc<AtomicBool>) -> Self {
+        Self { walker, to_reactor, stopping }
+    }
+}
+
+impl Transport for InProcess {
+    fn exchange(&mut self, report: Option<Report>) -> Option<Work> {
+        let (reply, answer) = oneshot::channel();
+        let message = Incoming::Free { walker: self.walker, report, reply };
+        self.to_reactor.blocking_send(message).ok()?;
+        answer.blocking_recv().ok().flatten()
+    }
+
+    fn progress(&self, walk: WalkId, progress: Progress) {
+        // A full channel means that the reactor is busy: whoever watches can do without this one.
+        let _ = self.to_reactor.try_send(Incoming::Progress(walk, progress));
+    }
+
+    fn stopping(&self) -> bool {
+        self.stopping.load(Ordering::Relaxed)
+    }
+}

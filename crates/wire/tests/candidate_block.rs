@@ -1,0 +1,195 @@
+//! A block gives back every bit that went in, and refuses every byte that did not.
+
+mod common;
+
+use common::{bits, candidate};
+use proptest::collection::vec;
+use proptest::prelude::*;
+use wire::{BlockError, Candidate, CandidateBlock, CandidateView};
+
+/// Places in the header.
+const LENGTH: usize = 16;
+const ATOMS: usize = 24;
+const FEATURES: usize = 32;
+const HEADER: usize = 288;
+
+fn assert_same_bits(a: &Candidate, b: &Candidate) {
+    assert_eq!((a.id, a.origin, a.mixture_version), (b.id, b.origin, b.mixture_version));
+    assert_eq!((&a.structure.species, a.structure.periodic), (&b.structure.species, b.structure.periodic));
+    let fixed = |c: &Candidate| [c.temperature, c.relative_volume, c.energy];
+    assert_eq!(bits(&fixed(a)), bits(&fixed(b)));
+    assert_eq!(bits(a.virial.as_flattened()), bits(b.virial.as_flattened()));
+    assert_eq!(bits(a.structure.cell.0.as_flattened()), bits(b.structure.cell.0.as_flattened()));
+    assert_eq!(bits(a.structure.positions.as_flattened()), bits(b.structure.positions.as_flattened()));
+    assert_eq!(bits(a.forces.as_flattened()), bits(b.forces.as_flattened()));
+    assert_eq!(bits(&a.gamma), bits(&b.gamma));
+    assert_eq!(bits(&a.gamma_nbr), bits(&b.gamma_nbr));
+    assert_eq!(bits(&a.features), bits(&b.features));
+}
+
+/// The bytes with another number at a place of the header and the checksum that then fits.
+fn with_number(block: &CandidateBlock, numbers: &[(usize, u64)]) -> Vec<u8> {
+    let mut bytes = block.as_bytes().to_vec();
+    for (place, number) in numbers {
+        bytes[*place..place + 8].copy_from_slice(&number.to_le_bytes());
+    }
+    with_checksum(bytes)
+}
+
+fn with_checksum(mut bytes: Vec<u8>) -> Vec<u8> {
+    let checksum = crc32fast::hash(&bytes[16..]);
+    bytes[12..16].copy_from_slice(&checksum.to_le_bytes());
+    bytes
+}
+
+proptest! {
+    #[test]
+    fn every_bit_comes_back(candidate in candidate()) {
+        let block = CandidateBlock::encode(&candidate);
+        prop_assert_eq!(block.as_bytes().len() % 8, 0);
+        let copy = CandidateBlock::from_bytes(block.as_bytes()).unwrap();
+        prop_assert_eq!(copy.as_bytes(), block.as_bytes());
+        let view = CandidateView::new(block.as_bytes()).unwrap();
+        assert_same_bits(&candidate, &view.to_candidate());
+        assert_same_bits(&candidate, &copy.view().to_candidate());
+        prop_assert_eq!(view.feature_dimension() * candidate.gamma.len(), candidate.features.len());
+    }
+
+    #[test]
+    fn a_changed_byte_is_refused(candidate in candidate(), at in any::<prop::sample::Index>(), change in 1..=255_u8) {
+        let mut bytes = CandidateBlock::encode(&candidate).as_bytes().to_vec();
+        let at = at.index(bytes.len());
+        bytes[at] ^= change;
+        prop_assert!(CandidateBlock::from_bytes(&bytes).is_err(), "byte {}", at);
+    }
+
+    #[test]
+    fn missing_and_added_bytes_are_refused(
+        candidate in candidate(), at in any::<prop::sample::Index>(), added in vec(any::<u8>(), 1..20),
+    ) {
+        let bytes = CandidateBlock::encode(&candidate).as_bytes().to_vec();
+        let cut = at.index(bytes.len());
+        prop_assert!(CandidateBlock::from_bytes(&bytes[..cut]).is_err(), "cut at {}", cut);
+        let longer = [bytes.as_slice(), &added].concat();
+        let (found, expected) = (longer.len() as u64, bytes.len() as u64);
+        prop_assert_eq!(CandidateBlock::from_bytes(&longer), Err(BlockError::Length { found, expected }));
+    }
+
+    #[test]
+    fn random_bytes_are_refused(bytes in vec(any::<u8>(), 0..600)) {
+        prop_assert!(CandidateBlock::from_bytes(&bytes).is_err());
+        prop_assert!(CandidateView::new(&bytes).is_err());
+    }
+
+    /// Counts are checked before anything is taken by them, also where the checksum fits.
+    #[test]
+    fn absurd_counts_are_refused(
+        candidate in candidate(), atoms in any::<u64>(), features in any::<u64>(), length in any::<u64>(),
+    ) {
+        let block = CandidateBlock::encode(&candidate);
+        let view = block.view();
+        prop_assume!(atoms != view.numbers.len() as u64 || features != view.feature_dimension() as u64);
+        for numbers in [
+            vec![(ATOMS, atoms)],
+            vec![(ATOMS, atoms), (LENGTH, length)],
+            vec![(ATOMS, atoms), (FEATURES, features), (LENGTH, length)],
+            vec![(ATOMS, atoms >> 32), (FEATURES, features >> 40)],
+        ] {
+            let bytes = with_number(&block, &numbers);
+            prop_assert!(
+                matches!(CandidateBlock::from_bytes(&bytes), Err(BlockError::Length { .. })),
+                "{:?}", numbers
+            );
+        }
+    }
+
+    #[test]
+    fn a_block_without_features_is_the_same_in_all_else(candidate in candidate()) {
+        let block = CandidateBlock::encode(&candidate).without_features();
+        prop_assert_eq!(block.as_bytes().len(), HEADER + 72 * candidate.gamma.len());
+        prop_assert_eq!(block.view().feature_dimension(), 0);
+        let copy = CandidateBlock::from_bytes(block.as_bytes()).unwrap();
+        let bare = Candidate { features: Vec::new(), ..candidate };
+        assert_same_bits(&copy.view().to_candidate(), &bare);
+    }
+}
+
+fn some_block() -> CandidateBlock {
+    use proptest::strategy::ValueTree;
+    let mut runner = proptest::test_runner::TestRunner::deterministic();
+    CandidateBlock::encode(&candidate().new_tree(&mut runner).unwrap().current())
+}
+
+#[test]
+fn every_single_byte_counts() {
+    let bytes = some_block().as_bytes().to_vec();
+    for at in 0..bytes.len() {
+        let mut damaged = bytes.clone();
+        damaged[at] ^= 1;
+        assert!(CandidateBlock::from_bytes(&damaged).is_err(), "byte {at}");
+        assert!(CandidateBlock::from_bytes(&bytes[..at]).is_err(), "cut at {at}");
+    }
+}
+
+#[test]
+fn counts_whose_product_overflows_are_refused() {
+    let block = some_block();
+    let edges = [0, 1 << 31, (1 << 32) - 1, 1 << 32, 1 << 60, 1 << 63, u64::MAX / 8, u64::MAX];
+    for atoms in edges {
+        for features in edges {
+            let bytes = with_number(&block, &[(ATOMS, atoms), (FEATURES, features)]);
+            let error = CandidateBlock::from_bytes(&bytes).unwrap_err();
+            assert!(matches!(error, BlockError::Length { .. }), "{atoms} × {features}: {error}");
+        }
+    }
+}
+
+#[test]
+fn what_is_wrong_is_said() {
+    let block = some_block();
+    let bytes = block.as_bytes();
+    let error = |bytes: &[u8]| CandidateBlock::from_bytes(bytes).unwrap_err();
+    let changed = |at: usize, byte: u8| {
+        let mut bytes = bytes.to_vec();
+        bytes[at] = byte;
+        error(&with_checksum(bytes))
+    };
+    let field = |error: BlockError| match error {
+        BlockError::Field { field, .. } => field,
+        error => panic!("{error}"),
+    };
+    assert_eq!(error(&[]), BlockError::Short(0));
+    assert_eq!(error(&bytes[..HEADER - 1]), BlockError::Short(HEADER - 1));
+    assert_eq!(changed(0, b'X'), BlockError::Magic(*b"XALMCAND"));
+    assert_eq!(changed(8, 7), BlockError::Version(7));
+    assert_eq!(field(changed(112, 2)), "origin");
+    assert_eq!(field(changed(116, 2)), "periodic");
+    assert_eq!(field(changed(119, 1)), "periodic", "the byte that only fills up");
+    assert_eq!(field(changed(HEADER, 119)), "atomic number");
+    assert_eq!(field(changed(HEADER, 0)), "atomic number");
+    assert_eq!(field(changed(HEADER + 7, 1)), "atomic number");
+    assert_eq!(field(changed(56, bytes[56] ^ 1)), "content hash");
+    let position = HEADER + 8 * block.view().numbers.len();
+    assert_eq!(field(changed(position, bytes[position] ^ 1)), "content hash");
+}
+
+#[test]
+fn bytes_that_are_not_aligned_are_refused_in_place_and_copied_well() {
+    let block = some_block();
+    let mut words = vec![0_u64; block.as_bytes().len() / 8 + 1];
+    for shift in 1..8 {
+        let bytes = zerocopy::IntoBytes::as_mut_bytes(words.as_mut_slice());
+        let shifted = &mut bytes[shift..shift + block.as_bytes().len()];
+        shifted.copy_from_slice(block.as_bytes());
+        assert_eq!(CandidateView::new(shifted).unwrap_err(), BlockError::Unaligned);
+        assert_eq!(CandidateBlock::from_bytes(shifted).unwrap(), block);
+    }
+}
+
+#[test]
+#[should_panic = "the hash of this very structure"]
+fn a_candidate_with_the_name_of_another_is_not_encoded() {
+    let mut candidate = some_block().view().to_candidate();
+    candidate.structure.positions[0][0] = 1.0;
+    CandidateBlock::encode(&candidate);
+}

@@ -1,0 +1,295 @@
+//! What becomes of the reports of a round, one after the other in walk order.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use calm::grade::maximum;
+use calm::watch::{GradeDistribution, grade_distribution};
+use calm::{GradeError, Mixture, UpdateOutcome};
+use serde_json::json;
+use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate};
+use wire::messages::{Decline, End, Outcome, Report, Verdict};
+use wire::{CandidateBlock, ContentHash, WalkId};
+
+use super::{Selector, SelectorError, UpdateProtocol};
+use crate::grader::Bonds;
+
+/// Priority of the label jobs of biased candidates; control frames come after them.
+const BIASED_PRIORITY: i32 = 10;
+const CONTROL_PRIORITY: i32 = 0;
+
+/// Features of the original training frames, whose γ under the live mixture is watched: a mixture that moves must
+/// not forget what the potential was trained on.
+#[derive(Clone, Debug)]
+pub struct TrainingFrames {
+    /// Element index of each atom.
+    pub elements: Vec<usize>,
+    /// Features, [atoms × D].
+    pub features: Vec<f64>,
+    /// Their grades under the original mixture.
+    pub original: GradeDistribution,
+}
+
+impl TrainingFrames {
+    /// Training frames with these features, graded under the original mixture.
+    pub fn new(elements: Vec<usize>, features: Vec<f64>, original: &Mixture) -> Result<Self, GradeError> {
+        let original = grade_distribution(original, &elements, &features)?;
+        Ok(Self { elements, features, original })
+    }
+
+    fn grades(&self, mixture: &Mixture) -> Result<GradeDistribution, SelectorError> {
+        grade_distribution(mixture, &self.elements, &self.features)
+            .map_err(|source| SelectorError::Training { source })
+    }
+}
+
+impl Selector {
+    pub(super) fn decide(&mut self, reports: Vec<Report>) -> Result<Commit, SelectorError> {
+        let mut commit = Commit::default();
+        let mut touched = BTreeSet::new();
+        for report in reports {
+            let id = report.walk;
+            touched.insert(id);
+            self.take_in(&report, &mut commit);
+            match report.outcome {
+                Outcome::Candidate(block) if self.walks[&id].is_biased() => {
+                    self.decide_candidate(id, block, &mut commit)?;
+                }
+                Outcome::Candidate(block) => self.keep_control_frame(id, block, &mut commit)?,
+                Outcome::Ended(end) => self.end_walk(id, &end, &mut commit),
+                Outcome::Turn | Outcome::Paused => {}
+            }
+            touched.extend(self.begin_control(id, &mut commit));
+        }
+        commit.walks = touched.iter().map(|id| self.walks[id].to_record()).collect();
+        self.seal(&mut commit);
+        Ok(commit)
+    }
+
+    /// Moves the walk to where its turn ended, and logs returns to a checkpoint.
+    fn take_in(&mut self, report: &Report, commit: &mut Commit) {
+        let turn_steps = self.settings.turn_steps;
+        let walk = self.walks.get_mut(&report.walk).expect("checked when the report came in");
+        let returned = report.progress.segment > walk.record.progress.segment;
+        walk.record.turn += 1;
+        walk.record.checkpoint = Some(report.checkpoint.clone());
+        walk.record.progress = report.progress.clone();
+        walk.memory.verdict = None;
+        if walk.is_biased() {
+            walk.memory.until = report.progress.step + turn_steps;
+        }
+        if returned {
+            let progress = &report.progress;
+            let detail = json!({
+                "segment": progress.segment, "step": progress.step, "tau": progress.tau, "returns": progress.returns,
+            });
+            commit.decisions.push(self.decision("segment", report.walk, detail));
+        }
+    }
+
+    fn decide_candidate(
+        &mut self,
+        id: WalkId,
+        block: CandidateBlock,
+        commit: &mut Commit,
+    ) -> Result<(), SelectorError> {
+        let candidate = block.view().id();
+        let failed = |source| SelectorError::Grade { candidate, source };
+        let bonds = self.grader.bonds(&block.view().structure()).map_err(failed)?;
+        let selector = bonds.grade(&self.mixture, block.view().features).map_err(failed)?;
+        let original = bonds.grade(&self.original, block.view().features).map_err(failed)?;
+        let decline = self.reason_to_decline(id, candidate.content, &bonds, &selector.gamma);
+        let mut detail = json!({
+            "walker": grade_summary(block.view().gamma, block.view().mixture_version()),
+            "selector": grade_summary(&selector.gamma, self.mixture.version()),
+            "original": grade_summary(&original.gamma, 0),
+        });
+        let (fate, verdict, kind) = match decline {
+            Some(reason) => {
+                detail["reason"] = json!(reason.name());
+                (Fate::Declined(reason), Verdict::Declined(reason), "declined")
+            }
+            None => {
+                self.update(&block, &bonds, commit, &mut detail)?;
+                self.accept(id, candidate.content, candidate.step);
+                (Fate::Accepted, Verdict::Accepted, "accepted")
+            }
+        };
+        let keep_features = self.keeps_features(fate, &block);
+        let seed_structure = self.walks[&id].record.seed_structure;
+        let priority = BIASED_PRIORITY;
+        commit.decisions.push(Decision { candidate: Some(candidate), ..self.decision(kind, id, detail) });
+        commit.candidates.push(CandidateRecord {
+            block,
+            fate,
+            seed_structure,
+            selector,
+            original,
+            keep_features,
+            priority,
+        });
+        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
+        walk.memory.verdict = Some(verdict);
+        if walk.record.accepted >= self.settings.per_seed {
+            self.end_walk(id, &End::Collected, commit);
+        }
+        Ok(())
+    }
+
+    /// The first reason, if any, in the order: guard, duplicate, budget, covered.
+    fn reason_to_decline(
+        &self,
+        id: WalkId,
+        content: ContentHash,
+        bonds: &Bonds,
+        gamma: &[f64],
+    ) -> Option<Decline> {
+        let walk = &self.walks[&id].record;
+        let used_up = self.settings.total.is_some_and(|total| self.accepted >= total);
+        if bonds.shortest < self.least_distances[walk.seed_structure as usize] {
+            Some(Decline::Guard)
+        } else if self.known.contains(&content) {
+            Some(Decline::Duplicate)
+        } else if walk.accepted >= self.settings.per_seed || used_up {
+            Some(Decline::Budget)
+        } else if !self.settings.collection.is_met(gamma) {
+            Some(Decline::Covered)
+        } else {
+            None
+        }
+    }
+
+    /// Makes the mixture cover the candidate: the next version, in the commit.
+    fn update(
+        &mut self,
+        block: &CandidateBlock,
+        bonds: &Bonds,
+        commit: &mut Commit,
+        detail: &mut serde_json::Value,
+    ) -> Result<(), SelectorError> {
+        if self.settings.update == UpdateProtocol::Never {
+            return Ok(());
+        }
+        let candidate = block.view().id();
+        let failed = |source| SelectorError::Update { candidate, source };
+        let features = block.view().features;
+        let outcome =
+            calm::update(&self.mixture, &bonds.elements, features, &self.settings.search).map_err(failed)?;
+        self.mixture = Arc::new(self.mixture.with_changes(&outcome.changed)?);
+        for change in &outcome.changed {
+            let (element, slot) = (change.element as u32, change.slot as u32);
+            commit.components.push(ComponentRecord { element, slot, bytes: change.component.to_bytes() });
+        }
+        detail["update"] = update_summary(&outcome);
+        if let Some(training) = &self.training {
+            let live = training.grades(&self.mixture)?;
+            detail["training_frames"] = json!(live);
+            detail["forgetting_alarm"] = json!(self.settings.forgetting_alarm.is_raised(&training.original, &live));
+            commit.values.push(("training_frames".to_owned(), json!(live).to_string()));
+        }
+        Ok(())
+    }
+
+    fn accept(&mut self, id: WalkId, content: ContentHash, step: u64) {
+        self.accepted += 1;
+        self.known.insert(content);
+        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
+        walk.record.accepted += 1;
+        walk.memory.accepted_steps.push(step);
+    }
+
+    /// Feature vectors of accepted candidates are always kept, those of declined ones within a byte budget.
+    fn keeps_features(&mut self, fate: Fate, block: &CandidateBlock) -> bool {
+        if fate == Fate::Accepted {
+            return true;
+        }
+        let bytes = size_of_val(block.view().features) as u64;
+        let keeps = self.declined_feature_bytes + bytes <= self.settings.declined_feature_bytes;
+        if keeps {
+            self.declined_feature_bytes += bytes;
+        }
+        keeps
+    }
+
+    /// A wanted frame of a control walk: labelled like a candidate, but no mixture learns from it.
+    fn keep_control_frame(
+        &mut self,
+        id: WalkId,
+        block: CandidateBlock,
+        commit: &mut Commit,
+    ) -> Result<(), SelectorError> {
+        let candidate = block.view().id();
+        let failed = |source| SelectorError::Grade { candidate, source };
+        let bonds = self.grader.bonds(&block.view().structure()).map_err(failed)?;
+        let original = bonds.grade(&self.original, block.view().features).map_err(failed)?;
+        let detail = json!({ "original": grade_summary(&original.gamma, 0) });
+        let selector = bonds.grade(&self.mixture, block.view().features).map_err(failed)?;
+        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
+        walk.record.accepted += 1;
+        walk.memory.wanted.retain(|step| *step > candidate.step);
+        let (done, seed_structure) = (walk.memory.wanted.is_empty(), walk.record.seed_structure);
+        commit.decisions.push(Decision { candidate: Some(candidate), ..self.decision("control", id, detail) });
+        commit.candidates.push(CandidateRecord {
+            block,
+            fate: Fate::Accepted,
+            seed_structure,
+            selector,
+            original,
+            keep_features: true,
+            priority: CONTROL_PRIORITY,
+        });
+        if done {
+            self.end_walk(id, &End::Collected, commit);
+        }
+        Ok(())
+    }
+
+    fn end_walk(&mut self, id: WalkId, end: &End, commit: &mut Commit) {
+        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
+        walk.end(end);
+        let detail = json!({
+            "end": end.name(), "reason": walk.record.reason, "step": walk.record.progress.step,
+            "accepted": walk.record.accepted,
+        });
+        let restart = walk.is_biased() && self.settings.update == UpdateProtocol::Restarted;
+        if restart {
+            let next_version = self.mixture.version() + 1;
+            self.mixture = Arc::new(self.original.at_version(next_version));
+            commit.components.clear();
+            commit.restart_mixture = true;
+        }
+        commit.decisions.push(self.decision("ended", id, detail));
+    }
+
+    /// The control of a biased walk that has ended and had something accepted.
+    fn begin_control(&mut self, id: WalkId, commit: &mut Commit) -> Option<WalkId> {
+        let walk = &self.walks[&id];
+        let wanted = walk.is_biased() && walk.has_ended() && walk.record.accepted > 0;
+        if !(wanted && self.settings.control) {
+            return None;
+        }
+        let control_id = self.next_walk_id();
+        let control = walk.control_of(control_id);
+        let detail = json!({ "control_of": id, "wanted": control.memory.wanted });
+        commit.decisions.push(self.decision("begun", control_id, detail));
+        self.walks.insert(control_id, control);
+        Some(control_id)
+    }
+}
+
+fn grade_summary(gamma: &[f64], mixture_version: u64) -> serde_json::Value {
+    let above = gamma.iter().filter(|gamma| **gamma > 1.0).count();
+    json!({ "gamma_max": maximum(gamma), "atoms_above_1": above, "mixture_version": mixture_version })
+}
+
+fn update_summary(outcome: &UpdateOutcome) -> serde_json::Value {
+    let places: Vec<_> = outcome.changed.iter().map(|change| (change.element, change.slot)).collect();
+    json!({
+        "alpha": outcome.alpha,
+        "trials": outcome.trials,
+        "ended_by": outcome.end,
+        "inflations": outcome.inflations,
+        "gamma_max_after": maximum(&outcome.gamma_after),
+        "components": places,
+    })
+}

@@ -1,0 +1,298 @@
+//! The selector: owns the one mixture, decides on every candidate, and hands out the turns of walks.
+//!
+//! It is driven by three calls. [`Selector::next`] gives the next turn for a free walker, [`Selector::report`] takes
+//! what came of a turn and returns what must be committed, and nothing is given out again before the caller has
+//! committed it. All state that matters goes through a [`Commit`], so [`Selector::restore`] continues from the store
+//! as if nothing had happened.
+
+mod decide;
+mod turns;
+mod walk;
+
+use std::collections::{BTreeMap, HashSet};
+use std::sync::Arc;
+
+use atoms::Structure;
+use calm::watch::ForgettingAlarm;
+use calm::{ChangedComponent, Component, Mixture, MixtureError};
+use serde::{Deserialize, Serialize};
+use store::records::{Commit, ComponentRecord, Decision, WalkRecord};
+use wire::messages::{Outcome, Report};
+use wire::{CampaignId, CandidateId, ContentHash, WalkId};
+
+use crate::grader::{Grader, GraderError};
+pub use decide::TrainingFrames;
+pub use turns::Next;
+use walk::Walk;
+
+/// Whether the same campaign gives the same bytes each time, or walks never wait for each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mode {
+    /// Walks advance in rounds; the decisions do not depend on the number of walkers or on their speed.
+    Reproducible,
+    /// Updates are applied as candidates arrive.
+    Live,
+}
+
+/// What becomes of the mixture from one seed structure to the next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum UpdateProtocol {
+    /// A seed structure starts from the coverage gathered before it.
+    Carried,
+    /// Each seed structure starts from the original mixture.
+    Restarted,
+    /// The mixture is never updated.
+    Never,
+}
+
+/// What the selector needs to know of the configuration.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Reproducible or live.
+    pub mode: Mode,
+    /// Biased walks that advance together in a round.
+    pub walks_per_round: usize,
+    /// Steps of a turn.
+    pub turn_steps: u64,
+    /// Carried, restarted or never.
+    pub update: UpdateProtocol,
+    /// How the covariance is updated and when the search for α stops.
+    pub search: calm::UpdateSettings,
+    /// When the training frames' grades are an alarm.
+    pub forgetting_alarm: ForgettingAlarm,
+    /// When a structure is a candidate.
+    pub collection: calm::CollectionRule,
+    /// Most structures accepted from one seed structure.
+    pub per_seed: u32,
+    /// Most structures accepted in the campaign.
+    pub total: Option<u32>,
+    /// Whether every biased walk that collected something is followed by its unbiased control.
+    pub control: bool,
+    /// Shortest distance below which a structure is refused, Å, and as a fraction of the seed structure's own.
+    pub least_distance: (f64, f64),
+    /// Bytes of feature vectors of declined candidates that are kept.
+    pub declined_feature_bytes: u64,
+}
+
+/// Where walks start.
+#[derive(Clone, Debug)]
+pub struct SeedStructure {
+    /// Name.
+    pub name: String,
+    /// Structure.
+    pub structure: Structure,
+}
+
+/// What a store gives back of a selector.
+#[derive(Clone, Debug, Default)]
+pub struct Snapshot {
+    /// Every walk.
+    pub walks: Vec<WalkRecord>,
+    /// The components that differ from the original mixture.
+    pub components: Vec<ComponentRecord>,
+    /// Hashes of the structures that are known already.
+    pub known: Vec<ContentHash>,
+    /// The values of past commits.
+    pub values: Vec<(String, String)>,
+}
+
+/// Why the selector cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum SelectorError {
+    /// A candidate that cannot be graded.
+    #[error("candidate {candidate}: {source}")]
+    Grade {
+        /// Which.
+        candidate: CandidateId,
+        /// Why.
+        source: GraderError,
+    },
+    /// An update that failed.
+    #[error("updating the mixture for candidate {candidate}: {source}")]
+    Update {
+        /// Which.
+        candidate: CandidateId,
+        /// Why.
+        source: calm::UpdateError,
+    },
+    /// A mixture that does not fit together.
+    #[error(transparent)]
+    Mixture(#[from] MixtureError),
+    /// A seed structure that cannot be used.
+    #[error("seed structure '{name}': {source}")]
+    SeedStructure {
+        /// Which.
+        name: String,
+        /// Why.
+        source: GraderError,
+    },
+    /// A report about a walk or turn that was not given out.
+    #[error("a report about turn {turn} of walk {walk}, which nobody was asked for")]
+    Unasked {
+        /// Walk.
+        walk: WalkId,
+        /// Turn.
+        turn: u64,
+    },
+    /// A database that does not fit the campaign.
+    #[error("the campaign's database cannot be continued: {0}")]
+    Snapshot(String),
+    /// Training frames that do not fit the mixture.
+    #[error("grading the training frames: {source}")]
+    Training {
+        /// Why.
+        source: calm::GradeError,
+    },
+}
+
+/// The pure core. See the [module](self).
+pub struct Selector {
+    settings: Settings,
+    campaign: CampaignId,
+    seeds: Vec<SeedStructure>,
+    /// Shortest distance of each seed structure that a candidate must keep, Å.
+    least_distances: Vec<f64>,
+    grader: Grader,
+    original: Arc<Mixture>,
+    mixture: Arc<Mixture>,
+    training: Option<TrainingFrames>,
+    walks: BTreeMap<WalkId, Walk>,
+    known: HashSet<ContentHash>,
+    /// Rounds begun; always 0 in live mode.
+    round: u64,
+    /// Walks of the round in hand, with the reports that have come in.
+    in_round: BTreeMap<WalkId, Option<Report>>,
+    accepted: u32,
+    declined_feature_bytes: u64,
+}
+
+impl Selector {
+    /// A selector that continues from what a store holds, from nothing at the start of a campaign. Seed structures that
+    /// have no walk yet are left to [`Selector::begin_walks`].
+    pub fn restore(
+        settings: Settings,
+        campaign: CampaignId,
+        seeds: Vec<SeedStructure>,
+        grader: Grader,
+        original: Arc<Mixture>,
+        training: Option<TrainingFrames>,
+        snapshot: Snapshot,
+    ) -> Result<Self, SelectorError> {
+        let least_distances = least_distances(&settings, &seeds, &grader)?;
+        let value = |name: &str| -> Result<u64, SelectorError> {
+            let stored = snapshot.values.iter().find(|(key, _)| key == name);
+            let Some((_, text)) = stored else { return Ok(0) };
+            text.parse().map_err(|_| SelectorError::Snapshot(format!("{name} is '{text}', not a number")))
+        };
+        let (round, version) = (value("round")?, value("mixture_version")?);
+        let declined_feature_bytes = value("declined_feature_bytes")?;
+        let mixture = Arc::new(restored_mixture(&original, version, &snapshot.components)?);
+        let walks = snapshot.walks.into_iter().map(|record| Ok((record.walk, Walk::restore(record)?)));
+        let walks: BTreeMap<_, _> = walks.collect::<Result<_, SelectorError>>()?;
+        let accepted = walks.values().filter(|walk| walk.is_biased()).map(|walk| walk.record.accepted).sum();
+        Ok(Self {
+            settings,
+            campaign,
+            seeds,
+            least_distances,
+            grader,
+            original,
+            mixture,
+            training,
+            walks,
+            known: snapshot.known.into_iter().collect(),
+            round,
+            in_round: BTreeMap::new(),
+            accepted,
+            declined_feature_bytes,
+        })
+    }
+
+    /// The mixture of the turns that [`Selector::next`] gives out.
+    pub fn mixture(&self) -> &Arc<Mixture> {
+        &self.mixture
+    }
+
+    /// Every walk for those who watch: its seed structure's name, and its step (`last` once it has ended).
+    pub fn standing(&self, last: u64) -> Vec<(WalkId, String, u64)> {
+        let standing = |walk: &Walk| {
+            let name = &self.seeds[walk.record.seed_structure as usize].name;
+            let control = if walk.is_biased() { "" } else { " (control)" };
+            let step = if walk.has_ended() { last } else { walk.record.progress.step };
+            (walk.record.walk, format!("{name}{control}"), step)
+        };
+        self.walks.values().map(standing).collect()
+    }
+
+    /// Takes what came of a turn. What it returns must be committed before anything else is asked of the selector.
+    pub fn report(&mut self, report: Report) -> Result<Option<Commit>, SelectorError> {
+        let (id, turn) = (report.walk, report.turn);
+        let walk = self.walks.get_mut(&id).filter(|walk| walk.out && walk.record.turn == turn);
+        let walk = walk.ok_or(SelectorError::Unasked { walk: id, turn })?;
+        walk.out = false;
+        if report.outcome == Outcome::Paused {
+            walk.pause(report);
+            return Ok(Some(Commit { walks: vec![walk.to_record()], ..Commit::default() }));
+        }
+        let reports = match self.settings.mode {
+            Mode::Live => vec![report],
+            Mode::Reproducible => {
+                self.in_round.insert(id, Some(report));
+                if self.in_round.values().any(Option::is_none) {
+                    return Ok(None);
+                }
+                std::mem::take(&mut self.in_round).into_values().flatten().collect()
+            }
+        };
+        self.decide(reports).map(Some)
+    }
+
+    /// Seals a commit: what holds after it.
+    fn seal(&self, commit: &mut Commit) {
+        let values = [
+            ("round", self.round),
+            ("mixture_version", self.mixture.version()),
+            ("declined_feature_bytes", self.declined_feature_bytes),
+        ];
+        commit.values.extend(values.map(|(name, value)| (name.to_owned(), value.to_string())));
+    }
+
+    fn decision(&self, kind: &'static str, walk: WalkId, detail: serde_json::Value) -> Decision {
+        let (round, mixture_version) = (self.round, self.mixture.version());
+        Decision { round, kind, walk: Some(walk), candidate: None, mixture_version, detail }
+    }
+}
+
+/// max(least, fraction × shortest distance) of each seed structure, Å (paper: max(1.2 Å, 0.75 d_nn⁰)).
+fn least_distances(
+    settings: &Settings,
+    seeds: &[SeedStructure],
+    grader: &Grader,
+) -> Result<Vec<f64>, SelectorError> {
+    let (least, fraction) = settings.least_distance;
+    let of = |seed: &SeedStructure| match grader.bonds(&seed.structure) {
+        Ok(bonds) if bonds.shortest.is_finite() => Ok(least.max(fraction * bonds.shortest)),
+        Ok(_) => Ok(least),
+        Err(source) => Err(SelectorError::SeedStructure { name: seed.name.clone(), source }),
+    };
+    seeds.iter().map(of).collect()
+}
+
+fn restored_mixture(
+    original: &Mixture,
+    version: u64,
+    components: &[ComponentRecord],
+) -> Result<Mixture, SelectorError> {
+    let changed = components.iter().map(|record| {
+        let component = Component::from_bytes(&record.bytes).map_err(|error| {
+            let place = format!("component {} of element {}", record.slot, record.element);
+            SelectorError::Snapshot(format!("{place}: {error}"))
+        })?;
+        let (element, slot) = (record.element as usize, record.slot as usize);
+        Ok(ChangedComponent { element, slot, component: Arc::new(component) })
+    });
+    let changed = changed.collect::<Result<Vec<_>, SelectorError>>()?;
+    Ok(original.with_changes(&changed)?.at_version(version))
+}

@@ -1,0 +1,98 @@
+//! One walk as the selector sees it.
+
+use serde::{Deserialize, Serialize};
+use store::records::WalkRecord;
+use wire::messages::{End, Progress, Report, Verdict};
+use wire::{Origin, WalkId};
+
+use super::SelectorError;
+
+/// A walk: what the store holds of it, and whether a walker has it in hand.
+pub(super) struct Walk {
+    pub record: WalkRecord,
+    pub memory: Memory,
+    /// A walker works on its turn.
+    pub out: bool,
+}
+
+/// What the selector itself remembers of a walk from one turn to the next.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Memory {
+    /// The answer to the candidate that the last turn ended with.
+    pub verdict: Option<Verdict>,
+    /// Last step of the turn.
+    pub until: u64,
+    /// Control walk: steps whose frames are still wanted.
+    pub wanted: Vec<u64>,
+    /// Biased walk: steps at which structures were accepted, for its control.
+    pub accepted_steps: Vec<u64>,
+}
+
+impl Walk {
+    pub fn new(walk: WalkId, seed_structure: u32, until: u64) -> Self {
+        let record = WalkRecord {
+            walk,
+            origin: Origin::Biased,
+            partner: None,
+            seed_structure,
+            state: "waiting".to_owned(),
+            reason: String::new(),
+            turn: 0,
+            accepted: 0,
+            progress: Progress::default(),
+            selector_state: String::new(),
+            checkpoint: None,
+        };
+        Self { record, memory: Memory { until, ..Memory::default() }, out: false }
+    }
+
+    /// The unbiased control of a biased walk: frames at the steps at which that one collected.
+    pub fn control_of(&self, walk: WalkId) -> Self {
+        let mut control = Self::new(walk, self.record.seed_structure, 0);
+        control.record.origin = Origin::Control;
+        control.record.partner = Some(self.record.walk);
+        let wanted = &mut control.memory.wanted;
+        wanted.clone_from(&self.memory.accepted_steps);
+        wanted.sort_unstable();
+        wanted.dedup();
+        control.memory.until = wanted.last().copied().unwrap_or(0);
+        control
+    }
+
+    pub fn restore(record: WalkRecord) -> Result<Self, SelectorError> {
+        let memory = serde_json::from_str(&record.selector_state).map_err(|error| {
+            SelectorError::Snapshot(format!("state of walk {} is damaged: {error}", record.walk))
+        })?;
+        Ok(Self { record, memory, out: false })
+    }
+
+    pub fn to_record(&self) -> WalkRecord {
+        let selector_state = serde_json::to_string(&self.memory).expect("plain data becomes JSON");
+        WalkRecord { selector_state, ..self.record.clone() }
+    }
+
+    pub fn is_biased(&self) -> bool {
+        self.record.origin == Origin::Biased
+    }
+
+    pub fn has_ended(&self) -> bool {
+        !matches!(self.record.state.as_str(), "waiting" | "running")
+    }
+
+    /// Keeps where a turn was interrupted: the same turn goes on from there. A verdict that the turn began with is
+    /// in the checkpoint by now.
+    pub fn pause(&mut self, report: Report) {
+        self.record.checkpoint = Some(report.checkpoint);
+        self.record.progress = report.progress;
+        self.memory.verdict = None;
+    }
+
+    pub fn end(&mut self, end: &End) {
+        self.record.state = end.name().to_owned();
+        self.record.reason = match end {
+            End::Steps | End::Collected => String::new(),
+            End::Trapped { guard } => format!("refused by the {guard} guard again and again"),
+            End::BlewUp { reason } | End::BadStart { reason } => reason.clone(),
+        };
+    }
+}

@@ -1,0 +1,164 @@
+//! The HAL force: the potential, driven along the gradient of the extrapolation grade.
+//!
+//! F_i^HAL = F_i^phys + τ_r ∇_i 𝒰, 𝒰 = Σ_j γ_j, τ_r = τ Σ_i‖F_i^phys‖ / Σ_i‖∇_i 𝒰‖, both sums exponentially averaged
+//! (paper, Eq. hal-force). Energy and grade share one forward pass and one reverse sweep. A switched ZBL repulsion is
+//! added after the biased force and virial have been formed, so it does not enter τ_r.
+
+use std::sync::Arc;
+
+use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
+use calm::{GradeError, Grades, Mixture};
+use potentials::Zbl;
+use potentials::grace::{Grace, GraceModel, PullBack};
+use serde::{Deserialize, Serialize};
+
+/// The bias's own memory, part of a walk's checkpoint.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct BiasState {
+    /// Evaluations with the bias switched on.
+    pub evaluations: u64,
+    /// Running average of Σ‖F^phys‖, eV/Å.
+    pub force_norm: f64,
+    /// Running average of Σ‖∇𝒰‖, 1/Å.
+    pub gradient_norm: f64,
+}
+
+impl BiasState {
+    /// Takes in one step's sums and gives τ_r / τ, eV. The averages start at the first values; the bias is silent for
+    /// the first `steps` evaluations, while they settle.
+    fn advance(&mut self, force_norm: f64, gradient_norm: f64, steps: u64) -> f64 {
+        let weight = if self.evaluations == 0 { 1.0 } else { 1.0 / steps.max(1) as f64 };
+        self.force_norm += weight * (force_norm - self.force_norm);
+        self.gradient_norm += weight * (gradient_norm - self.gradient_norm);
+        self.evaluations += 1;
+        let silent = self.evaluations <= steps || self.gradient_norm <= 0.0;
+        if silent { 0.0 } else { self.force_norm / self.gradient_norm }
+    }
+}
+
+/// A GRACE potential with its bias and its short-range repulsion.
+pub struct BiasedPotential {
+    grace: Grace,
+    elements: Vec<usize>,
+    zbl: Option<Zbl>,
+    mixture: Arc<Mixture>,
+    /// τ; 0 leaves the dynamics unbiased and computes no grades.
+    pub tau: f64,
+    /// Memory of the running averages.
+    pub state: BiasState,
+    average_steps: u64,
+    cotangent: Vec<f64>,
+    pull_back: PullBack,
+    grades: Grades,
+    grade_error: Option<GradeError>,
+    physical: Evaluation,
+}
+
+impl BiasedPotential {
+    /// A potential for one composition, with the bias off (τ = 0).
+    ///
+    /// # Errors
+    /// An element that the model does not know.
+    pub fn new(
+        model: Arc<GraceModel>,
+        mixture: Arc<Mixture>,
+        zbl: Option<Zbl>,
+        average_steps: u64,
+        species: &[Species],
+    ) -> Result<Self, PotentialError> {
+        let elements = model.element_indices(species)?;
+        Ok(Self {
+            grace: Grace::new(model),
+            elements,
+            zbl,
+            mixture,
+            tau: 0.0,
+            state: BiasState::default(),
+            average_steps,
+            cotangent: Vec::new(),
+            pull_back: PullBack::default(),
+            grades: Grades::default(),
+            grade_error: None,
+            physical: Evaluation::default(),
+        })
+    }
+
+    /// Energy, forces and virial of the potential alone at the last evaluation.
+    pub fn physical(&self) -> &Evaluation {
+        &self.physical
+    }
+
+    /// Features at the last evaluation, [n × D].
+    pub fn features(&self) -> &[f64] {
+        self.grace.features()
+    }
+
+    /// Element index of each atom.
+    pub fn elements(&self) -> &[usize] {
+        &self.elements
+    }
+
+    /// Grades at the last evaluation; with the bias off they are computed here.
+    ///
+    /// # Errors
+    /// Features that are not finite.
+    pub fn grades(&mut self) -> Result<&Grades, GradeError> {
+        if let Some(error) = self.grade_error.take() {
+            return Err(error);
+        }
+        if self.tau == 0.0 {
+            self.grades.evaluate(&self.mixture, &self.elements, self.grace.features(), None)?;
+        }
+        Ok(&self.grades)
+    }
+
+    fn add_bias(&mut self, out: &mut Evaluation) {
+        let norm = |vectors: &[Vec3]| vectors.iter().map(|v| cell::norm(*v)).sum::<f64>();
+        let (force_norm, gradient_norm) = (norm(&out.forces), norm(&self.pull_back.gradient));
+        let scale = self.tau * self.state.advance(force_norm, gradient_norm, self.average_steps);
+        for (force, gradient) in out.forces.iter_mut().zip(&self.pull_back.gradient) {
+            *force = cell::add(*force, cell::scale(*gradient, scale));
+        }
+        for (w, u) in out.virial.iter_mut().flatten().zip(self.pull_back.virial.iter().flatten()) {
+            *w += scale * u;
+        }
+    }
+}
+
+impl Potential for BiasedPotential {
+    fn cutoff(&self) -> f64 {
+        self.grace.cutoff()
+    }
+
+    fn species(&self) -> &[Species] {
+        self.grace.species()
+    }
+
+    fn evaluate(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        self.grace.forward(structure, neighbours)?;
+        let biased = self.tau != 0.0;
+        self.grade_error = None;
+        if biased {
+            let features = self.grace.features();
+            self.cotangent.resize(features.len(), 0.0);
+            let cotangent = Some(self.cotangent.as_mut_slice());
+            self.grade_error = self.grades.evaluate(&self.mixture, &self.elements, features, cotangent).err();
+        }
+        let graded = biased && self.grade_error.is_none();
+        let cotangent = graded.then_some(self.cotangent.as_slice());
+        self.grace.backward(cotangent, out, &mut self.pull_back);
+        self.physical.clone_from(out);
+        if graded {
+            self.add_bias(out);
+        }
+        if let Some(zbl) = &self.zbl {
+            zbl.add(structure, neighbours, out)?;
+        }
+        Ok(())
+    }
+}

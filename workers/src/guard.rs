@@ -1,0 +1,42 @@
+//! What keeps a walk physical: which structures are not offered, and when a walk is over.
+
+use atoms::{Evaluation, NeighbourList, Structure, shortest_distance};
+
+use crate::settings::GuardSettings;
+
+/// Name of the guard against atoms that are too close.
+pub const SHORTEST_BOND: &str = "shortest-bond";
+
+/// max(least, fraction × shortest distance of the seed structure), Å (paper: max(1.2 Å, 0.75 d_nn⁰)).
+pub fn least_distance(settings: &GuardSettings, seed_shortest: Option<f64>) -> f64 {
+    let relative = seed_shortest.map_or(0.0, |d| settings.least_distance_fraction * d);
+    settings.least_distance.max(relative)
+}
+
+/// Whether two atoms are closer than `least` Å.
+pub fn too_close(structure: &Structure, neighbours: &NeighbourList, least: f64) -> bool {
+    shortest_distance(structure, neighbours).is_some_and(|(_, _, d)| d < least)
+}
+
+/// Why a walk cannot go on, if so: forces that are not finite, an absurd temperature (K), an atom that has lost
+/// every neighbour within the cutoff.
+pub fn blown_up(
+    settings: &GuardSettings,
+    structure: &Structure,
+    neighbours: &NeighbourList,
+    evaluation: &Evaluation,
+    temperature: f64,
+) -> Option<String> {
+    if let Some(atom) = evaluation.forces.iter().position(|f| f.iter().any(|x| !x.is_finite())) {
+        return Some(format!("the force on atom {atom} is not finite"));
+    }
+    if !(temperature <= settings.highest_temperature) {
+        let highest = settings.highest_temperature;
+        return Some(format!("{temperature:.0} K is above the allowed {highest:.0} K"));
+    }
+    if structure.len() > 1 {
+        let lost = (0..structure.len()).find(|i| neighbours.of(*i).is_empty());
+        return lost.map(|atom| format!("atom {atom} has no neighbour within {:.2} Å", neighbours.cutoff()));
+    }
+    None
+}

@@ -1,0 +1,365 @@
+//! One turn of a walk: a function from an assignment to a report, with no state of its own.
+//!
+//! Whatever a walk remembers is in its [checkpoint](WalkState), so the same assignment gives the same report, whoever
+//! works on it and however often.
+
+use std::sync::Arc;
+
+use atoms::{NeighbourList, PotentialError, shortest_distance};
+use calm::neighbourhood::{Pair, neighbourhood_average};
+use calm::{GradeError, Mixture};
+use md::{Checkpoint, Dynamics, DynamicsError, Langevin, NoseHooverChain, State, Stream, Thermostat, VolumeRamp};
+use potentials::grace::GraceModel;
+use potentials::{Zbl, ZblRangeError};
+use serde::{Deserialize, Serialize};
+use wire::messages::{Assignment, End, Outcome, Progress, Report, Verdict};
+use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin};
+
+use crate::bias::{BiasState, BiasedPotential};
+use crate::guard;
+use crate::settings::{ThermostatKind, WalkSettings};
+
+/// Checkpoints to go back to that are kept; the oldest is used, so that a return leads out of the trap.
+const KEPT_CHECKPOINTS: usize = 2;
+/// Steps between two reports of progress to those who watch.
+const PROGRESS_INTERVAL: u64 = 20;
+
+/// What every walk of a campaign shares.
+#[derive(Clone)]
+pub struct WalkContext {
+    /// The model.
+    pub model: Arc<GraceModel>,
+    /// The settings.
+    pub settings: Arc<WalkSettings>,
+}
+
+/// The checkpoint of a walk.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct WalkState {
+    dynamics: Checkpoint,
+    bias: BiasState,
+    tau: f64,
+    segment: u32,
+    returns: u32,
+    refused: u64,
+    refusals_in_a_row: u32,
+    /// First step at which a candidate may be offered again.
+    next_offer: u64,
+    /// The guard's shortest distance, Å.
+    least_distance: f64,
+    /// Places to go back to, oldest first.
+    good: Vec<(Checkpoint, BiasState)>,
+    gamma_max: f64,
+}
+
+/// Why a walk cannot go on.
+#[derive(Debug, thiserror::Error)]
+enum WalkError {
+    #[error(transparent)]
+    Dynamics(#[from] DynamicsError),
+    #[error(transparent)]
+    Potential(#[from] PotentialError),
+    #[error(transparent)]
+    Grade(#[from] GradeError),
+    #[error(transparent)]
+    Zbl(#[from] ZblRangeError),
+    #[error("the walk's checkpoint cannot be read: {0}")]
+    Checkpoint(#[from] postcard::Error),
+    #[error("{0}")]
+    BlewUp(String),
+}
+
+/// Works on a turn until it ends: with a candidate, at its last step, with the walk itself, or when `stopping` says so.
+/// `watch` is told now and then where the walk stands.
+pub fn advance(
+    context: &WalkContext,
+    assignment: &Assignment,
+    mixture: Arc<Mixture>,
+    stopping: impl Fn() -> bool,
+    watch: impl Fn(Progress),
+) -> Report {
+    let (walk, turn) = (assignment.walk, assignment.turn);
+    let mut running = match Walk::open(context, assignment, mixture) {
+        Ok(running) => running,
+        Err(error) => {
+            let end = End::BadStart { reason: error.to_string() };
+            let checkpoint = assignment.checkpoint.clone().unwrap_or_default();
+            return Report { walk, turn, outcome: Outcome::Ended(end), checkpoint, progress: Progress::default() };
+        }
+    };
+    let outcome = running.run(&stopping, &watch).unwrap_or_else(|error| {
+        Outcome::Ended(End::BlewUp { reason: format!("at step {}: {error}", running.step()) })
+    });
+    Report { walk, turn, outcome, checkpoint: running.encode(), progress: running.progress() }
+}
+
+/// A walk in the hands of a walker.
+struct Walk<'a> {
+    settings: &'a WalkSettings,
+    assignment: &'a Assignment,
+    model: &'a GraceModel,
+    mixture_version: u64,
+    dynamics: Dynamics,
+    potential: BiasedPotential,
+    state: WalkState,
+}
+
+impl<'a> Walk<'a> {
+    fn open(
+        context: &'a WalkContext,
+        assignment: &'a Assignment,
+        mixture: Arc<Mixture>,
+    ) -> Result<Self, WalkError> {
+        let WalkContext { model, settings } = context;
+        let species = &assignment.seed_structure.species;
+        let zbl = settings.zbl.map(|(inner, outer)| Zbl::new(species, inner, outer)).transpose()?;
+        let mixture_version = mixture.version();
+        let average_steps = settings.average_steps;
+        let mut potential = BiasedPotential::new(Arc::clone(model), mixture, zbl, average_steps, species)?;
+        let (dynamics, state) = match &assignment.checkpoint {
+            None => begin(settings, assignment, &mut potential)?,
+            Some(bytes) => {
+                let state: WalkState = postcard::from_bytes(bytes)?;
+                let cutoff = atoms::Potential::cutoff(&potential);
+                (Dynamics::resume(state.dynamics.clone(), cutoff, settings.skin)?, state)
+            }
+        };
+        potential.state = state.bias;
+        let mut walk = Self { settings, assignment, model, mixture_version, dynamics, potential, state };
+        walk.take_verdict();
+        Ok(walk)
+    }
+
+    /// After a collection the walk waits out the gap; after a refusal by the selector, a shorter one.
+    fn take_verdict(&mut self) {
+        self.state.next_offer = match &self.assignment.verdict {
+            None => self.state.next_offer,
+            Some(Verdict::Accepted) => self.step() + self.settings.gap,
+            Some(Verdict::Declined(_)) => self.step() + self.settings.declined_gap,
+        };
+    }
+
+    fn run(&mut self, stopping: &impl Fn() -> bool, watch: &impl Fn(Progress)) -> Result<Outcome, WalkError> {
+        let last = self.settings.equilibration + self.settings.steps;
+        loop {
+            if self.step() >= last {
+                return Ok(Outcome::Ended(End::Steps));
+            }
+            if self.step() >= self.assignment.until {
+                return Ok(Outcome::Turn);
+            }
+            if stopping() {
+                return Ok(Outcome::Paused);
+            }
+            self.advance_one_step()?;
+            if let Some(outcome) = self.look()? {
+                return Ok(outcome);
+            }
+            if self.step() % PROGRESS_INTERVAL == 0 {
+                watch(self.progress());
+            }
+        }
+    }
+
+    fn step(&self) -> u64 {
+        self.dynamics.state().step
+    }
+
+    fn is_control(&self) -> bool {
+        self.assignment.origin == Origin::Control
+    }
+
+    fn advance_one_step(&mut self) -> Result<(), WalkError> {
+        let biased = !self.is_control() && self.step() >= self.settings.equilibration;
+        self.potential.tau = if biased { self.state.tau } else { 0.0 };
+        self.dynamics.step(&mut self.potential)?;
+        let (structure, neighbours) = (self.dynamics.structure(), self.dynamics.neighbours());
+        let (evaluation, temperature) = (self.dynamics.evaluation(), self.dynamics.temperature());
+        match guard::blown_up(&self.settings.guard, structure, neighbours, evaluation, temperature) {
+            Some(reason) => Err(WalkError::BlewUp(reason)),
+            None => Ok(()),
+        }
+    }
+
+    /// What the new step means: a wanted frame, a candidate, a refusal, or nothing.
+    fn look(&mut self) -> Result<Option<Outcome>, WalkError> {
+        let step = self.step();
+        if self.is_control() {
+            let wanted = self.assignment.wanted.contains(&step);
+            return if wanted { Ok(Some(Outcome::Candidate(self.candidate()?))) } else { Ok(None) };
+        }
+        if step <= self.settings.equilibration {
+            return Ok(None);
+        }
+        let gamma = &self.potential.grades()?.gamma;
+        self.state.gamma_max = calm::grade::maximum(gamma);
+        let collects = step >= self.state.next_offer && self.settings.collection.is_met(gamma);
+        let least = self.state.least_distance;
+        let too_close = || guard::too_close(self.dynamics.structure(), self.dynamics.neighbours(), least);
+        if collects {
+            if too_close() {
+                return Ok(self.refuse()?);
+            }
+            self.state.refusals_in_a_row = 0;
+            return Ok(Some(Outcome::Candidate(self.candidate()?)));
+        }
+        if step % self.settings.guard.checkpoint_interval == 0 && !too_close() {
+            self.keep_checkpoint();
+        }
+        Ok(None)
+    }
+
+    fn keep_checkpoint(&mut self) {
+        if self.state.good.len() == KEPT_CHECKPOINTS {
+            self.state.good.remove(0);
+        }
+        self.state.good.push((self.dynamics.checkpoint().clone(), self.potential.state));
+    }
+
+    /// Counts a refusal by the shortest-bond guard; after too many in a row the walk goes back, or ends.
+    fn refuse(&mut self) -> Result<Option<Outcome>, WalkError> {
+        let guard = &self.settings.guard;
+        self.state.refused += 1;
+        self.state.refusals_in_a_row += 1;
+        self.state.next_offer = self.step() + self.settings.declined_gap;
+        if self.state.refusals_in_a_row < guard.refusals_in_a_row {
+            return Ok(None);
+        }
+        if self.state.returns == guard.most_returns || self.state.good.is_empty() {
+            return Ok(Some(Outcome::Ended(End::Trapped { guard: guard::SHORTEST_BOND.to_owned() })));
+        }
+        self.go_back()?;
+        Ok(None)
+    }
+
+    /// Goes back to the oldest good checkpoint as a new segment: smaller τ, new random numbers.
+    fn go_back(&mut self) -> Result<(), WalkError> {
+        let (mut checkpoint, bias) = self.state.good.swap_remove(0);
+        self.state.good.clear();
+        self.state.segment += 1;
+        self.state.returns += 1;
+        self.state.refusals_in_a_row = 0;
+        self.state.tau *= self.settings.guard.tau_factor;
+        checkpoint.stream = self.stream();
+        let cutoff = self.dynamics.neighbours().cutoff();
+        self.dynamics = Dynamics::resume(checkpoint, cutoff, self.settings.skin)?;
+        self.potential.state = bias;
+        self.state.next_offer = self.step() + self.settings.declined_gap;
+        self.keep_checkpoint();
+        Ok(())
+    }
+
+    fn stream(&self) -> Stream {
+        Stream::new(self.settings.rng_seed, self.assignment.random_walk.0, self.state.segment)
+    }
+
+    fn candidate(&mut self) -> Result<CandidateBlock, WalkError> {
+        let gamma = self.potential.grades()?.gamma.clone();
+        let structure = self.dynamics.structure().clone();
+        let pairs = self.pairs(self.dynamics.neighbours());
+        let gamma_nbr = neighbourhood_average(&gamma, pairs).expect("pairs of these very atoms");
+        let physical = self.potential.physical();
+        let id = CandidateId {
+            campaign: self.assignment.campaign,
+            walk: self.assignment.walk,
+            segment: self.state.segment,
+            step: self.step(),
+            content: ContentHash::of(&structure),
+        };
+        Ok(CandidateBlock::encode(&Candidate {
+            id,
+            origin: self.assignment.origin,
+            mixture_version: self.mixture_version,
+            temperature: self.dynamics.temperature(),
+            relative_volume: self.relative_volume(),
+            energy: physical.energy(),
+            virial: physical.virial,
+            structure,
+            forces: physical.forces.clone(),
+            gamma,
+            gamma_nbr,
+            features: self.potential.features().to_vec(),
+        }))
+    }
+
+    /// Directed pairs within their cutoffs, for γ_nbr.
+    fn pairs(&self, neighbours: &NeighbourList) -> Vec<Pair> {
+        let (structure, elements) = (self.dynamics.structure(), self.potential.elements());
+        let (mut pairs, mut bonds) = (Vec::new(), Vec::new());
+        for i in 0..structure.len() {
+            neighbours.bonds_within(structure, i, self.model.cutoff(), &mut bonds);
+            pairs.extend(bonds.iter().map(|bond| {
+                let j = bond.atom as usize;
+                Pair { i, j, distance: bond.r, cutoff: self.model.pair_cutoff(elements[i], elements[j]) }
+            }));
+        }
+        pairs
+    }
+
+    fn relative_volume(&self) -> f64 {
+        self.dynamics.checkpoint().ramp.map_or(1.0, |ramp| ramp.relative_volume(self.step()))
+    }
+
+    fn progress(&self) -> Progress {
+        Progress {
+            step: self.step(),
+            segment: self.state.segment,
+            tau: self.state.tau,
+            temperature: self.dynamics.temperature(),
+            relative_volume: self.relative_volume(),
+            gamma_max: self.state.gamma_max,
+            refused: self.state.refused,
+            returns: self.state.returns,
+        }
+    }
+
+    fn encode(&mut self) -> Vec<u8> {
+        self.state.dynamics = self.dynamics.checkpoint().clone();
+        self.state.bias = self.potential.state;
+        postcard::to_stdvec(&self.state).expect("plain data is encoded into memory")
+    }
+}
+
+/// The start of a walk: thermal velocities at the seed structure.
+fn begin(
+    settings: &WalkSettings,
+    assignment: &Assignment,
+    potential: &mut BiasedPotential,
+) -> Result<(Dynamics, WalkState), WalkError> {
+    let structure = assignment.seed_structure.clone();
+    let stream = Stream::new(settings.rng_seed, assignment.random_walk.0, 0);
+    let time_step = settings.time_step.unwrap_or_else(|| md::default_time_step(&structure.species));
+    let start = State::thermal(structure, settings.temperature, &stream);
+    let ramp = settings.volume_ramp.map(|(from, to)| {
+        let ramp = VolumeRamp::new(&start, from, to, settings.steps);
+        VolumeRamp { start: settings.equilibration, ..ramp }
+    });
+    let thermostat = thermostat(settings);
+    let run = md::Settings { time_step, thermostat, ramp, stream, skin: settings.skin };
+    let dynamics = Dynamics::new(start, run, potential)?;
+    let shortest = shortest_distance(dynamics.structure(), dynamics.neighbours()).map(|(_, _, d)| d);
+    let state = WalkState {
+        dynamics: dynamics.checkpoint().clone(),
+        bias: BiasState::default(),
+        tau: settings.tau,
+        segment: 0,
+        returns: 0,
+        refused: 0,
+        refusals_in_a_row: 0,
+        next_offer: 0,
+        least_distance: guard::least_distance(&settings.guard, shortest),
+        good: Vec::new(),
+        gamma_max: 0.0,
+    };
+    Ok((dynamics, state))
+}
+
+fn thermostat(settings: &WalkSettings) -> Thermostat {
+    let temperature = settings.temperature;
+    match settings.thermostat {
+        ThermostatKind::Langevin { friction } => Thermostat::Langevin(Langevin { temperature, friction }),
+        ThermostatKind::NoseHoover { relaxation_time, chain_length } => {
+            Thermostat::NoseHooverChain(NoseHooverChain::new(temperature, relaxation_time, chain_length))
+        }
+    }
+}
