@@ -45,6 +45,8 @@ struct WalkState {
     refusals_in_a_row: u32,
     /// First step at which a candidate may be offered again.
     next_offer: u64,
+    /// Step of the last collection.
+    last_accepted: Option<u64>,
     /// The guard's shortest distance, Å.
     least_distance: f64,
     /// Places to go back to, oldest first.
@@ -132,11 +134,15 @@ impl<'a> Walk<'a> {
 
     /// After a collection the walk waits out the gap; after a refusal by the selector, a shorter one.
     fn take_verdict(&mut self) {
-        self.state.next_offer = match &self.assignment.verdict {
-            None => self.state.next_offer,
-            Some(Verdict::Accepted) => self.step() + self.settings.gap,
-            Some(Verdict::Declined(_)) => self.step() + self.settings.declined_gap,
-        };
+        let step = self.step();
+        match &self.assignment.verdict {
+            None => {}
+            Some(Verdict::Accepted) => {
+                self.state.last_accepted = Some(step);
+                self.state.next_offer = step + self.settings.gap;
+            }
+            Some(Verdict::Declined(_)) => self.state.next_offer = step + self.settings.declined_gap,
+        }
     }
 
     fn run(&mut self, stopping: &impl Fn() -> bool, watch: &impl Fn(Progress)) -> Result<Outcome, WalkError> {
@@ -170,8 +176,8 @@ impl<'a> Walk<'a> {
     }
 
     fn advance_one_step(&mut self) -> Result<(), WalkError> {
-        let biased = !self.is_control() && self.step() >= self.settings.equilibration;
-        self.potential.tau = if biased { self.state.tau } else { 0.0 };
+        let equilibrated = self.step() >= self.settings.equilibration;
+        self.potential.tau = if equilibrated { self.state.tau } else { 0.0 };
         self.dynamics.step(&mut self.potential)?;
         let (structure, neighbours) = (self.dynamics.structure(), self.dynamics.neighbours());
         let (evaluation, temperature) = (self.dynamics.evaluation(), self.dynamics.temperature());
@@ -188,25 +194,31 @@ impl<'a> Walk<'a> {
             let wanted = self.assignment.wanted.contains(&step);
             return if wanted { Ok(Some(Outcome::Candidate(self.candidate()?))) } else { Ok(None) };
         }
-        if step <= self.settings.equilibration {
+        let biased_steps = step.checked_sub(self.settings.equilibration);
+        let Some(biased_steps) = biased_steps else { return Ok(None) };
+        let too_close = self.is_too_close();
+        if biased_steps % self.settings.guard.checkpoint_interval == 0 && !too_close {
+            self.keep_checkpoint();
+        }
+        if biased_steps == 0 {
             return Ok(None);
         }
         let gamma = &self.potential.grades()?.gamma;
         self.state.gamma_max = calm::grade::maximum(gamma);
         let collects = step >= self.state.next_offer && self.settings.collection.is_met(gamma);
-        let least = self.state.least_distance;
-        let too_close = || guard::too_close(self.dynamics.structure(), self.dynamics.neighbours(), least);
-        if collects {
-            if too_close() {
-                return Ok(self.refuse()?);
+        match (collects, too_close) {
+            (false, _) => Ok(None),
+            (true, true) => self.refuse(),
+            (true, false) => {
+                self.state.refusals_in_a_row = 0;
+                Ok(Some(Outcome::Candidate(self.candidate()?)))
             }
-            self.state.refusals_in_a_row = 0;
-            return Ok(Some(Outcome::Candidate(self.candidate()?)));
         }
-        if step % self.settings.guard.checkpoint_interval == 0 && !too_close() {
-            self.keep_checkpoint();
-        }
-        Ok(None)
+    }
+
+    fn is_too_close(&self) -> bool {
+        let least = self.state.least_distance;
+        guard::too_close(self.dynamics.structure(), self.dynamics.neighbours(), least)
     }
 
     fn keep_checkpoint(&mut self) {
@@ -244,9 +256,21 @@ impl<'a> Walk<'a> {
         let cutoff = self.dynamics.neighbours().cutoff();
         self.dynamics = Dynamics::resume(checkpoint, cutoff, self.settings.skin)?;
         self.potential.state = bias;
-        self.state.next_offer = self.step() + self.settings.declined_gap;
+        self.state.next_offer = self.offer_after_return();
         self.keep_checkpoint();
         Ok(())
+    }
+
+    /// The first offer after a return to where the walk now stands. The gap to the last collection counts along the path that
+    /// joins the two: back from the collection, if that lies on the abandoned piece, and forward again.
+    fn offer_after_return(&self) -> u64 {
+        let (step, gap) = (self.step(), self.settings.gap);
+        let apart = match self.state.last_accepted {
+            None => step,
+            Some(collected) if collected > step => step + gap.saturating_sub(collected - step),
+            Some(collected) => collected + gap,
+        };
+        apart.max(step + self.settings.declined_gap)
     }
 
     fn stream(&self) -> Stream {
@@ -341,12 +365,13 @@ fn begin(
     let state = WalkState {
         dynamics: dynamics.checkpoint().clone(),
         bias: BiasState::default(),
-        tau: settings.tau,
+        tau: if assignment.origin == Origin::Control { 0.0 } else { settings.tau },
         segment: 0,
         returns: 0,
         refused: 0,
         refusals_in_a_row: 0,
         next_offer: 0,
+        last_accepted: None,
         least_distance: guard::least_distance(&settings.guard, shortest),
         good: Vec::new(),
         gamma_max: 0.0,
