@@ -1,3 +1,27 @@
-//! calmwalk: expands the training set of an interatomic potential.
+//! calmwalk expands the training set of an interatomic potential: walkers run molecular dynamics biased along the
+//! gradient of the CALM extrapolation grade, a selector decides what is new, and what is new is labelled.
 
-fn main() {}
+mod campaign;
+mod cli;
+mod config;
+mod frames;
+mod interrupt;
+mod output;
+mod progress;
+mod summary;
+mod whole_file;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+fn main() -> ExitCode {
+    let arguments = cli::Arguments::parse();
+    match cli::run(arguments) {
+        Ok(ended) => ended.exit_code(),
+        Err(failure) => {
+            eprintln!("calmwalk: {failure}");
+            failure.exit_code()
+        }
+    }
+}

@@ -1,0 +1,268 @@
+//! `calmwalk run`: all actors of a campaign as tasks and threads of one process.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+
+use orchestrator::reactor::{self, Reactor};
+use orchestrator::selector::{Selector, Snapshot};
+use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError, this_host, unix_milliseconds};
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use wire::transport::{InProcess, Incoming};
+use workers::labeller::{self, Closing, LabellerSettings, ReferenceMethod};
+use workers::walk::WalkContext;
+use workers::walker;
+
+use super::{Ended, Failure, block_on};
+use crate::campaign::Campaign;
+use crate::config::compare;
+use crate::progress::Display;
+use crate::summary;
+
+/// Reports under way between walkers and reactor.
+const CHANNEL: usize = 64;
+
+/// Run a campaign to its end, or go on with one that was interrupted
+///
+/// The same command starts a campaign and continues it, whatever stopped it. Ctrl-C or SIGTERM stops in order within
+/// seconds; a second one at once.
+#[derive(Debug, clap::Args)]
+pub struct Run {
+    /// Configuration of the campaign
+    #[arg(value_name = "CONFIG")]
+    config: PathBuf,
+    /// Directory of the campaign [default: the name of the configuration without its extension, here]
+    #[arg(long, value_name = "DIR")]
+    directory: Option<PathBuf>,
+}
+
+impl Run {
+    pub fn run(self) -> Result<Ended, Failure> {
+        let campaign = Campaign::load(&self.config)?;
+        let stem = self.config.file_stem().unwrap_or_default();
+        let directory = self.directory.unwrap_or_else(|| PathBuf::from(stem));
+        fs::create_dir_all(&directory)
+            .map_err(|source| StoreError::Directory { directory: directory.clone(), source })?;
+        store::check_directory(&directory)?;
+        let _lock = CampaignLock::acquire(&directory, "calmwalk run")?;
+        let ended = block_on(run(&campaign, &directory))??;
+        if ended == Ended::Interrupted {
+            eprintln!("stopped in order; the same command goes on with the campaign");
+        }
+        Ok(ended)
+    }
+}
+
+async fn run(campaign: &Campaign, directory: &Path) -> Result<Ended, Failure> {
+    let store = open_store(campaign, directory).await?;
+    let process = register(&store).await?;
+    let selector = restore_selector(campaign, &store).await?;
+    let actors = Actors::start(campaign, selector, &store, &process)?;
+    let ended = actors.finish().await?;
+    store.release_all(&process.id, unix_milliseconds()).await?;
+    store.remove_process(&process.id).await?;
+    if ended == reactor::Ended::Stopped {
+        store.close().await;
+        return Ok(Ended::Interrupted);
+    }
+    let summary = summary::of(&store).await?;
+    println!("{summary}");
+    let shown = directory.display();
+    println!("the campaign is in {shown}/{DATABASE}; look further with");
+    println!("  calmwalk status {shown}");
+    println!("  calmwalk queue {shown} list");
+    println!("  calmwalk export {shown} --output dataset.extxyz");
+    store.close().await;
+    Ok(Ended::Done)
+}
+
+/// Begins the campaign, or opens the one that is there and checks that it is the same.
+async fn open_store(campaign: &Campaign, directory: &Path) -> Result<Store, Failure> {
+    let now = unix_milliseconds();
+    let resolved = campaign.resolved();
+    let store = if directory.join(DATABASE).exists() {
+        let store = Store::open(directory).await?;
+        let in_force = store.campaign().await?.configuration_in_force;
+        let before = serde_json::from_str(&in_force).map_err(Failure::failed)?;
+        for change in compare(&before, &resolved).map_err(Failure::input)? {
+            eprintln!("configuration: {} is now {} (was {})", change.key, change.after, change.before);
+        }
+        store.add_seed_structures(&campaign.stored_seeds()).await?;
+        store.set_configuration_in_force(&resolved.to_string(), now).await?;
+        store
+    } else {
+        let record = store::Campaign {
+            id: campaign.id(),
+            program_version: env!("CARGO_PKG_VERSION").to_owned(),
+            mode: serde_json::to_value(campaign.config.campaign.mode).map_err(Failure::failed)?.to_string(),
+            configuration: campaign.text.clone(),
+            resolved_configuration: resolved.to_string(),
+            configuration_in_force: resolved.to_string(),
+        };
+        Store::create(directory, &record, &campaign.stored_seeds(), now).await?
+    };
+    store.add_protocol(&campaign.protocol, now).await?;
+    Ok(store)
+}
+
+/// Makes this process known, and takes back what dead ones held: the lock says that there is no other.
+async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
+    let now = unix_milliseconds();
+    for dead in store.status().await?.processes {
+        store.release_stale_leases_of(&dead.id, now).await?;
+    }
+    let (pid, host) = (process::id(), this_host());
+    let id = format!("{host}-{pid}-{now}");
+    let (kind, state) = ("orchestrator".to_owned(), "running".to_owned());
+    let record = ProcessRecord { id, kind, pid, host, started: now, last_seen: now, state };
+    store.upsert_process(&record).await?;
+    Ok(record)
+}
+
+async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector, Failure> {
+    let snapshot = Snapshot {
+        walks: store.load_walks().await?,
+        components: store.load_components().await?,
+        known: store.known_hashes().await?,
+        values: store.values().await?,
+    };
+    let mut selector = Selector::restore(
+        campaign.selector_settings(),
+        store.campaign().await?.id,
+        campaign.seeds.iter().map(|named| named.seed.clone()).collect(),
+        campaign.grader(),
+        Arc::new(campaign.artifact.mixture.clone()),
+        campaign.training.clone(),
+        snapshot,
+    )
+    .map_err(Failure::failed)?;
+    let begun = selector.begin_walks();
+    if !begun.walks.is_empty() {
+        store.commit(&begun).await?;
+    }
+    Ok(selector)
+}
+
+/// Walkers, reactor and labellers at work.
+struct Actors {
+    walkers: Vec<JoinHandle<()>>,
+    labellers: JoinSet<Result<(), StoreError>>,
+    reactor: tokio::task::JoinHandle<Result<reactor::Ended, reactor::ReactorError>>,
+    closing: Arc<Closing>,
+    stopping: Arc<AtomicBool>,
+}
+
+impl Actors {
+    fn start(
+        campaign: &Campaign,
+        selector: Selector,
+        store: &Store,
+        process: &ProcessRecord,
+    ) -> Result<Self, Failure> {
+        let stopping = Arc::new(AtomicBool::new(false));
+        let closing = Arc::new(Closing::default());
+        stop_on_signals(Arc::clone(&stopping), Arc::clone(&closing))?;
+        let (to_reactor, incoming) = mpsc::channel(CHANNEL);
+        let walkers = start_walkers(campaign, &to_reactor, &stopping)?;
+        let labellers = start_labellers(campaign, store, process, &closing)?;
+        let walk_steps = campaign.config.walk.equilibration + campaign.config.walk.steps.get();
+        let mut display = Display::new(walk_steps, selector.standing(walk_steps));
+        let reactor = Reactor {
+            selector,
+            store: store.clone(),
+            incoming,
+            stopping: Arc::clone(&stopping),
+            queue_limit: u64::from(campaign.config.label.queue_limit.get()),
+        };
+        let reactor = tokio::spawn(async move {
+            let ended = reactor.run(|notice| display.notice(&notice)).await;
+            display.finish();
+            ended
+        });
+        Ok(Self { walkers, labellers, reactor, closing, stopping })
+    }
+
+    /// Waits for all of them.
+    async fn finish(mut self) -> Result<reactor::Ended, Failure> {
+        let ended = self.reactor.await.map_err(Failure::failed)?;
+        if ended.is_err() {
+            self.stopping.store(true, Ordering::Relaxed);
+            self.closing.stopping.store(true, Ordering::Relaxed);
+        }
+        self.closing.no_more_jobs.store(true, Ordering::Relaxed);
+        let panicked = self.walkers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
+        while let Some(labeller) = self.labellers.join_next().await {
+            labeller.map_err(Failure::failed)??;
+        }
+        if panicked > 0 {
+            return Err(Failure::Failed(format!("{panicked} walkers crashed: see the message above")));
+        }
+        ended.map_err(Failure::failed)
+    }
+}
+
+fn start_walkers(
+    campaign: &Campaign,
+    to_reactor: &mpsc::Sender<Incoming>,
+    stopping: &Arc<AtomicBool>,
+) -> Result<Vec<JoinHandle<()>>, Failure> {
+    let context =
+        WalkContext { model: Arc::clone(&campaign.model), settings: Arc::new(campaign.walk_settings()) };
+    let wanted = campaign.config.run.walkers;
+    let cores = thread::available_parallelism().map_or(1, |cores| cores.get());
+    let start = |number| {
+        let mut transport = InProcess::new(number, to_reactor.clone(), Arc::clone(stopping));
+        let context = context.clone();
+        thread::Builder::new()
+            .name(format!("walker-{number}"))
+            .spawn(move || walker::run(&context, &mut transport))
+            .map_err(|error| Failure::Failed(format!("cannot start walker {number}: {error}")))
+    };
+    (0..if wanted == 0 { cores } else { wanted }).map(|number| start(number as u32)).collect()
+}
+
+fn start_labellers(
+    campaign: &Campaign,
+    store: &Store,
+    process: &ProcessRecord,
+    closing: &Arc<Closing>,
+) -> Result<JoinSet<Result<(), StoreError>>, Failure> {
+    let label = &campaign.config.label;
+    let mut labellers = JoinSet::new();
+    for slot in 0..label.slots.get() {
+        let method = ReferenceMethod::new(campaign.reference_potential().map_err(Failure::Input)?);
+        let settings = LabellerSettings {
+            holder: format!("{}/{slot}", process.id),
+            protocol: campaign.protocol.clone(),
+            attempts: label.attempts.get(),
+            largest_force: label.largest_force.get(),
+        };
+        let (store, closing) = (store.clone(), Arc::clone(closing));
+        labellers.spawn(async move {
+            labeller::run(store, method, settings, &closing, unix_milliseconds).await
+        });
+    }
+    Ok(labellers)
+}
+
+/// Ctrl-C and SIGTERM: the first stops in order, the second at once (which is safe too).
+fn stop_on_signals(stopping: Arc<AtomicBool>, closing: Arc<Closing>) -> Result<(), Failure> {
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
+    tokio::spawn(async move {
+        loop {
+            tokio::select! { _ = interrupt.recv() => (), _ = terminate.recv() => () };
+            if stopping.swap(true, Ordering::Relaxed) {
+                process::exit(130);
+            }
+            closing.stopping.store(true, Ordering::Relaxed);
+            eprintln!("stopping: walks are checkpointed …");
+        }
+    });
+    Ok(())
+}

@@ -1,0 +1,52 @@
+//! Potentials that a configuration names: the label source and the potential of `calmwalk md`.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use atoms::Potential;
+use potentials::grace::{Grace, GraceModel};
+use potentials::{Eam, EamStyle, StillingerWeber};
+use serde::{Deserialize, Serialize};
+use toml::Spanned;
+
+/// What a potential file holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PotentialKind {
+    /// GRACE, the exported `kokkos.npz`.
+    Grace,
+    /// Embedded atom, setfl (`.eam.alloy`).
+    EamAlloy,
+    /// Embedded atom with Finnis–Sinclair densities, setfl (`.eam.fs`).
+    EamFs,
+    /// Stillinger–Weber (`.sw`).
+    StillingerWeber,
+}
+
+/// `{ kind, file }`
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct PotentialFile {
+    /// What it holds.
+    pub kind: PotentialKind,
+    /// Where it is.
+    pub file: Spanned<PathBuf>,
+}
+
+impl PotentialFile {
+    /// Reads it; an error names the file and what is wrong with it.
+    pub fn load(&self) -> Result<Box<dyn Potential>, String> {
+        let path = self.file.get_ref();
+        let eam = |style| Eam::load_as(path, style).map(|p| Box::new(p) as Box<dyn Potential>);
+        match self.kind {
+            PotentialKind::Grace => GraceModel::load(path)
+                .map(|model| Box::new(Grace::new(Arc::new(model))) as Box<dyn Potential>)
+                .map_err(|error| error.to_string()),
+            PotentialKind::EamAlloy => eam(EamStyle::Alloy).map_err(|error| error.to_string()),
+            PotentialKind::EamFs => eam(EamStyle::FinnisSinclair).map_err(|error| error.to_string()),
+            PotentialKind::StillingerWeber => StillingerWeber::load(path)
+                .map(|p| Box::new(p) as Box<dyn Potential>)
+                .map_err(|error| error.to_string()),
+        }
+    }
+}

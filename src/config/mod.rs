@@ -1,0 +1,401 @@
+//! The configuration of a campaign: one TOML file that denies unknown keys and validates itself.
+
+mod changes;
+mod error;
+mod files;
+
+use std::num::{NonZeroU32, NonZeroU64, NonZeroUsize};
+use std::path::{Path, PathBuf};
+
+use calm::rules::{Combination, Fraction, Positive};
+use calm::{CollectionRule, UpdateSettings};
+use orchestrator::selector::{Mode, UpdateProtocol};
+use serde::{Deserialize, Serialize};
+use toml::Spanned;
+use workers::settings::ThermostatKind;
+
+pub use changes::{compare, without_changeable};
+pub use error::{ConfigError, place, place_of_offset};
+pub use files::PotentialFile;
+
+/// A whole campaign.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Mode and random seed.
+    #[serde(default)]
+    pub campaign: CampaignSection,
+    /// The GRACE model that drives the walks.
+    pub potential: PotentialSection,
+    /// Its CALM mixture.
+    pub calm: CalmSection,
+    /// Where walks start.
+    pub seeds: SeedsSection,
+    /// Dynamics and bias.
+    pub walk: WalkSection,
+    /// When a structure is collected.
+    pub collect: CollectSection,
+    /// What keeps walks physical.
+    #[serde(default)]
+    pub guard: GuardSection,
+    /// How collected structures are labelled.
+    pub label: LabelSection,
+    /// Processes and rounds.
+    #[serde(default)]
+    pub run: RunSection,
+}
+
+/// `[campaign]`
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CampaignSection {
+    /// Reproducible or live.
+    pub mode: Mode,
+    /// Random seed of all walks.
+    pub rng_seed: u64,
+    /// Whether biased walks that collected something are followed by their unbiased control.
+    pub control: bool,
+}
+
+/// `[potential]`
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct PotentialSection {
+    /// The exported model, `kokkos.npz`.
+    pub model: Spanned<PathBuf>,
+}
+
+/// `[calm]`
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct CalmSection {
+    /// `gmm_artifacts.npz` with scatter and counts.
+    pub artifact: Spanned<PathBuf>,
+    /// The frames the mixture was built from, whose grades are watched under the live mixture.
+    #[serde(default)]
+    pub training_frames: Option<Spanned<PathBuf>>,
+    /// Alarm when more than this share of the training atoms has γ > 1 under the live mixture.
+    #[serde(default = "defaults::forgetting_alarm")]
+    pub forgetting_alarm: Fraction,
+    /// Carried, restarted or never.
+    #[serde(default = "defaults::update")]
+    pub update: UpdateProtocol,
+    /// Convex or additive.
+    #[serde(default)]
+    pub combination: Combination,
+    /// The α to try; left out, those of the paper.
+    #[serde(default)]
+    pub ladder: Option<calm::rules::AlphaLadder>,
+}
+
+/// `[seeds]`
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct SeedsSection {
+    /// extended XYZ or POSCAR files; every frame is a seed structure.
+    pub files: Vec<Spanned<PathBuf>>,
+}
+
+/// `[walk]`
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct WalkSection {
+    /// K.
+    pub temperature: Positive,
+    /// Biased steps.
+    pub steps: NonZeroU64,
+    /// Unbiased steps before them.
+    #[serde(default = "defaults::equilibration")]
+    pub equilibration: u64,
+    /// Uncertainty-force scale τ.
+    pub tau: Positive,
+    /// fs; left out, 2 fs, or 0.5 fs with H, He, Li or Be.
+    #[serde(default)]
+    pub time_step: Option<Positive>,
+    /// Langevin or Nosé–Hoover.
+    #[serde(default = "defaults::thermostat")]
+    pub thermostat: ThermostatKind,
+    /// Linear volume ramp over the biased steps; left out, the cell is fixed.
+    #[serde(default)]
+    pub volume_ramp: Option<VolumeRampSection>,
+    /// Steps over which the norms of τ_r are averaged.
+    #[serde(default = "defaults::average_steps")]
+    pub average_steps: NonZeroU64,
+    /// Skin of the neighbour list, Å.
+    #[serde(default = "defaults::skin")]
+    pub skin: Positive,
+}
+
+/// `volume_ramp = { from, to }`, V/V₀.
+#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct VolumeRampSection {
+    /// At the first biased step.
+    pub from: Positive,
+    /// At the last.
+    pub to: Positive,
+}
+
+/// `[collect]`
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct CollectSection {
+    /// When a structure is a candidate.
+    pub when: CollectionRule,
+    /// When an update has done enough.
+    pub until: calm::UpdateRule,
+    /// Least steps between two collections of a walk.
+    #[serde(default = "defaults::gap")]
+    pub gap: u64,
+    /// Least steps after a candidate that was declined or refused.
+    #[serde(default = "defaults::declined_gap")]
+    pub declined_gap: NonZeroU64,
+    /// Most structures from one seed structure.
+    #[serde(default = "defaults::per_seed")]
+    pub per_seed: NonZeroU32,
+    /// Most structures in the campaign.
+    #[serde(default)]
+    pub total: Option<NonZeroU32>,
+    /// MB of feature vectors of declined candidates that are kept.
+    #[serde(default = "defaults::declined_features")]
+    pub declined_features_mb: u64,
+}
+
+/// `[guard]`
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GuardSection {
+    /// Å.
+    pub least_distance: Positive,
+    /// Of the seed structure's shortest distance.
+    pub least_distance_fraction: Fraction,
+    /// Switched ZBL repulsion.
+    pub zbl: Option<ZblSection>,
+    /// K.
+    pub highest_temperature: Positive,
+    /// Refusals in a row after which a walk goes back.
+    pub refusals_in_a_row: NonZeroU32,
+    /// Returns after which it ends.
+    pub most_returns: u32,
+    /// Factor on τ at each return.
+    pub tau_factor: Fraction,
+    /// Steps between checkpoints to go back to.
+    pub checkpoint_interval: NonZeroU64,
+}
+
+/// `zbl = { inner, outer }`, Å.
+#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ZblSection {
+    /// Full strength below.
+    pub inner: Positive,
+    /// Nothing beyond.
+    pub outer: Positive,
+}
+
+/// `[label]`
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct LabelSection {
+    /// The method.
+    pub method: LabelMethod,
+    /// Name of the protocol, as exports and imports call it.
+    #[serde(default = "defaults::protocol")]
+    pub protocol: String,
+    /// Labels calculated side by side.
+    #[serde(default = "defaults::slots")]
+    pub slots: NonZeroUsize,
+    /// Attempts before a label counts as failed.
+    #[serde(default = "defaults::attempts")]
+    pub attempts: NonZeroU32,
+    /// Largest force that is believed, eV/Å.
+    #[serde(default = "defaults::largest_force")]
+    pub largest_force: Positive,
+    /// Walkers wait while more jobs than this are unfinished.
+    #[serde(default = "defaults::queue_limit")]
+    pub queue_limit: NonZeroU32,
+}
+
+/// How labels are made.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LabelMethod {
+    /// Any potential that calmwalk evaluates.
+    Reference(PotentialFile),
+}
+
+/// `[run]`
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RunSection {
+    /// Walkers side by side; 0 for one a processor core.
+    pub walkers: usize,
+    /// Biased walks that advance together (reproducible mode).
+    pub walks_per_round: NonZeroUsize,
+    /// Steps of a turn.
+    pub turn_steps: NonZeroU64,
+}
+
+impl Config {
+    /// Reads and validates a configuration. Paths in it are taken relative to its own directory.
+    pub fn load(path: &Path) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+        let mut config: Self = toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
+        config.resolve_paths(path.parent().unwrap_or(Path::new("")));
+        config.check(path, &text)?;
+        Ok(config)
+    }
+
+    /// The rules that no single value can check.
+    fn check(&self, path: &Path, text: &str) -> Result<(), ConfigError> {
+        let wrong = |key: &str, found: String, expected: &str| {
+            Err(ConfigError::Value { at: error::place(path, text, key), key: key.into(), found, expected: expected.into() })
+        };
+        if self.calm.update == UpdateProtocol::Restarted
+            && (self.campaign.mode == Mode::Live || self.run.walks_per_round.get() > 1)
+        {
+            let expected = "mode = \"reproducible\" and run.walks_per_round = 1: the mixture can be restarted for each \
+                            seed structure only if walks follow one another";
+            return wrong("calm.update", "\"restarted\"".into(), expected);
+        }
+        if let Some(zbl) = self.guard.zbl
+            && zbl.inner >= zbl.outer
+        {
+            return wrong("guard.zbl", format!("inner {} and outer {}", zbl.inner.get(), zbl.outer.get()), "inner below outer");
+        }
+        if let ThermostatKind::Langevin { friction: x } | ThermostatKind::NoseHoover { relaxation_time: x, .. } =
+            self.walk.thermostat
+            && !(x.is_finite() && x > 0.0)
+        {
+            return wrong("walk.thermostat", x.to_string(), "a number above 0");
+        }
+        if let ThermostatKind::NoseHoover { chain_length: 0, .. } = self.walk.thermostat {
+            return wrong("walk.thermostat", "chain_length 0".into(), "at least 1");
+        }
+        if self.seeds.files.is_empty() {
+            return wrong("seeds.files", "an empty list".into(), "at least one file with seed structures");
+        }
+        Ok(())
+    }
+
+    fn resolve_paths(&mut self, directory: &Path) {
+        let resolve = |path: &mut Spanned<PathBuf>| *path.get_mut() = directory.join(path.get_ref());
+        resolve(&mut self.potential.model);
+        resolve(&mut self.calm.artifact);
+        self.calm.training_frames.iter_mut().for_each(resolve);
+        self.seeds.files.iter_mut().for_each(resolve);
+        let LabelMethod::Reference(potential) = &mut self.label.method;
+        resolve(&mut potential.file);
+    }
+
+    /// What the update search needs.
+    pub fn update_settings(&self) -> UpdateSettings {
+        let (combination, ladder) = (self.calm.combination, self.calm.ladder.clone());
+        UpdateSettings { combination, ladder, stop: self.collect.until }
+    }
+}
+
+impl Default for CampaignSection {
+    fn default() -> Self {
+        Self { mode: Mode::Reproducible, rng_seed: 1, control: true }
+    }
+}
+
+impl Default for GuardSection {
+    fn default() -> Self {
+        Self {
+            least_distance: defaults::positive(1.2),
+            least_distance_fraction: defaults::fraction(0.75),
+            zbl: None,
+            highest_temperature: defaults::positive(20_000.0),
+            refusals_in_a_row: defaults::nonzero(10),
+            most_returns: 3,
+            tau_factor: defaults::fraction(0.5),
+            checkpoint_interval: defaults::nonzero(100).into(),
+        }
+    }
+}
+
+impl Default for RunSection {
+    fn default() -> Self {
+        Self { walkers: 0, walks_per_round: NonZeroUsize::MIN, turn_steps: defaults::nonzero(250).into() }
+    }
+}
+
+/// Values of keys that are left out.
+mod defaults {
+    use super::*;
+
+    pub fn positive(x: f64) -> Positive {
+        Positive::try_from(x).expect("a default above 0")
+    }
+
+    pub fn fraction(x: f64) -> Fraction {
+        Fraction::try_from(x).expect("a default between 0 and 1")
+    }
+
+    pub fn nonzero(x: u32) -> NonZeroU32 {
+        NonZeroU32::new(x).expect("a default above 0")
+    }
+
+    pub fn forgetting_alarm() -> Fraction {
+        fraction(0.2)
+    }
+
+    pub fn update() -> UpdateProtocol {
+        UpdateProtocol::Carried
+    }
+
+    pub fn equilibration() -> u64 {
+        500
+    }
+
+    pub fn thermostat() -> ThermostatKind {
+        ThermostatKind::Langevin { friction: 0.01 }
+    }
+
+    pub fn average_steps() -> NonZeroU64 {
+        nonzero(10).into()
+    }
+
+    pub fn skin() -> Positive {
+        positive(0.5)
+    }
+
+    pub fn gap() -> u64 {
+        200
+    }
+
+    pub fn declined_gap() -> NonZeroU64 {
+        nonzero(20).into()
+    }
+
+    pub fn per_seed() -> NonZeroU32 {
+        nonzero(3)
+    }
+
+    pub fn declined_features() -> u64 {
+        1000
+    }
+
+    pub fn protocol() -> String {
+        "reference".to_owned()
+    }
+
+    pub fn slots() -> NonZeroUsize {
+        NonZeroUsize::MIN
+    }
+
+    pub fn attempts() -> NonZeroU32 {
+        nonzero(3)
+    }
+
+    pub fn largest_force() -> Positive {
+        positive(1000.0)
+    }
+
+    pub fn queue_limit() -> NonZeroU32 {
+        nonzero(1000)
+    }
+}

@@ -1,0 +1,134 @@
+//! What a run shows while it lasts: bars on a terminal, plain lines otherwise.
+
+use std::collections::BTreeMap;
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use orchestrator::reactor::Notice;
+use store::Fate;
+use wire::{Origin, WalkId};
+
+/// Time between two plain lines that only say where the walks stand.
+const LINE_INTERVAL: Duration = Duration::from_secs(10);
+
+/// Follows a run.
+pub struct Display {
+    bars: Option<Bars>,
+    names: BTreeMap<WalkId, String>,
+    steps: BTreeMap<WalkId, u64>,
+    /// Steps of a whole walk.
+    walk_steps: u64,
+    accepted: u64,
+    last_line: Instant,
+}
+
+struct Bars {
+    steps: ProgressBar,
+    message: ProgressBar,
+    _all: MultiProgress,
+}
+
+impl Display {
+    /// Follows walks of `walk_steps` steps each; `walks` are (walk, seed structure, where it stands).
+    pub fn new(walk_steps: u64, walks: Vec<(WalkId, String, u64)>) -> Self {
+        let (mut names, mut steps) = (BTreeMap::new(), BTreeMap::new());
+        for (walk, name, step) in walks {
+            names.insert(walk, name);
+            steps.insert(walk, step);
+        }
+        let bars = std::io::stderr().is_terminal().then(Bars::new);
+        let mut display = Self { bars, names, steps, walk_steps, accepted: 0, last_line: Instant::now() };
+        display.draw();
+        display
+    }
+
+    /// Takes in one notice.
+    pub fn notice(&mut self, notice: &Notice<'_>) {
+        match notice {
+            Notice::Progress(walk, progress) => {
+                self.steps.insert(*walk, progress.step);
+            }
+            Notice::Committed(commit) => self.committed(commit),
+            Notice::QueueFull(jobs) => self.say(&format!("walkers wait: {jobs} structures are waiting for labels")),
+        }
+        self.draw();
+    }
+
+    /// Takes the bars away.
+    pub fn finish(self) {
+        if let Some(bars) = self.bars {
+            bars.steps.finish_and_clear();
+            bars.message.finish_and_clear();
+        }
+    }
+
+    fn committed(&mut self, commit: &store::Commit) {
+        for record in &commit.walks {
+            if let Some(partner) = record.partner {
+                let name = format!("{} (control)", self.name(partner));
+                self.names.entry(record.walk).or_insert(name);
+            }
+            self.steps.insert(record.walk, record.progress.step);
+        }
+        for candidate in &commit.candidates {
+            let view = candidate.block.view();
+            let (id, gamma_max) = (view.id(), calm::grade::maximum(view.gamma));
+            let what = match candidate.fate {
+                Fate::Accepted if view.origin() == Origin::Control => "control frame".to_owned(),
+                Fate::Accepted => "accepted".to_owned(),
+                Fate::Declined(reason) => format!("declined ({})", reason.name()),
+            };
+            self.accepted += u64::from(candidate.fate == Fate::Accepted && view.origin() == Origin::Biased);
+            self.say(&format!("{}: step {}, γ_max {gamma_max:.2}, {what}", self.name(id.walk), id.step));
+        }
+        let alarm = |decision: &&store::Decision| decision.detail["forgetting_alarm"] == true;
+        if let Some(decision) = commit.decisions.iter().rfind(alarm) {
+            let share = &decision.detail["training_frames"]["share_above_one"];
+            self.say(&format!("ALARM: the mixture forgets its training data (share above γ = 1: {share})"));
+        }
+        for decision in commit.decisions.iter().filter(|decision| decision.kind == "ended") {
+            if let Some(walk) = decision.walk {
+                // Whatever was left of its steps will not be made.
+                self.steps.insert(walk, self.walk_steps);
+                let end = decision.detail["end"].as_str().unwrap_or_default().replace('_', " ");
+                self.say(&format!("{}: ended ({end}) at step {}", self.name(walk), decision.detail["step"]));
+            }
+        }
+    }
+
+    fn name(&self, walk: WalkId) -> &str {
+        self.names.get(&walk).map_or("?", String::as_str)
+    }
+
+    fn say(&self, line: &str) {
+        match &self.bars {
+            Some(bars) => bars.message.set_message(line.to_owned()),
+            None => eprintln!("{line}"),
+        }
+    }
+
+    fn draw(&mut self) {
+        let (done, all) = (self.steps.values().sum::<u64>(), self.steps.len() as u64 * self.walk_steps);
+        if let Some(bars) = &self.bars {
+            bars.steps.set_length(all);
+            bars.steps.set_position(done.min(all));
+            bars.steps.set_message(format!("{} accepted", self.accepted));
+        } else if self.last_line.elapsed() > LINE_INTERVAL {
+            self.last_line = Instant::now();
+            eprintln!("{done} of {all} steps, {} accepted in this run", self.accepted);
+        }
+    }
+}
+
+impl Bars {
+    fn new() -> Self {
+        let all = MultiProgress::new();
+        let style = |template| ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
+        let steps = all.add(ProgressBar::new(0));
+        steps.set_style(style("walks  {bar:32} {pos}/{len} steps  {eta} left  {msg}"));
+        let message = all.add(ProgressBar::new_spinner());
+        message.set_style(style("{wide_msg}"));
+        Self { steps, message, _all: all }
+    }
+}

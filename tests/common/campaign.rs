@@ -1,0 +1,129 @@
+//! A campaign of seconds: two seed structures of aluminium, short hot walks, thresholds low enough to collect.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::config;
+use store::{ComponentRecord, ExportFilter, Store};
+
+/// Keys that tests vary.
+#[derive(Clone, Debug)]
+pub struct Small {
+    pub mode: &'static str,
+    pub walkers: usize,
+    pub walks_per_round: usize,
+    pub steps: u64,
+    pub seeds: &'static [&'static str],
+}
+
+impl Default for Small {
+    fn default() -> Self {
+        let seeds = &["fcc-100", "vacancy"];
+        Self { mode: "reproducible", walkers: 2, walks_per_round: 2, steps: 240, seeds }
+    }
+}
+
+impl Small {
+    /// The configuration as text.
+    pub fn text(&self) -> String {
+        let Self { mode, walkers, walks_per_round, steps, .. } = self;
+        let file = |path: &str| config(path).display().to_string();
+        format!(
+            r#"
+[campaign]
+mode = "{mode}"
+rng_seed = 7
+[potential]
+model = "{model}"
+[calm]
+artifact = "{artifact}"
+training_frames = "{frames}"
+[seeds]
+files = ["seeds.extxyz"]
+[walk]
+temperature = 700.0
+steps = {steps}
+equilibration = 20
+tau = 0.3
+volume_ramp = {{ from = 1.0, to = 1.25 }}
+[collect]
+when = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1 }}
+until = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1, target = 1.25 }}
+gap = 30
+declined_gap = 5
+per_seed = 4
+[guard]
+zbl = {{ inner = 1.6, outer = 2.4 }}
+[label]
+method = {{ reference = {{ kind = "eam_fs", file = "{label}" }} }}
+[run]
+walkers = {walkers}
+walks_per_round = {walks_per_round}
+turn_steps = 40
+"#,
+            model = file("data/al_eam_1l/kokkos.npz"),
+            artifact = file("data/al_eam_1l/gmm_artifacts.npz"),
+            frames = file("data/al_eam_1l/seed_frames.extxyz"),
+            label = file("data/Al_mm.eam.fs"),
+        )
+    }
+
+    /// Writes configuration and seed structures into `directory`; returns the configuration's path.
+    pub fn write(&self, directory: &Path) -> PathBuf {
+        let frames = atoms::read_extxyz(&config("data/aluminium_seeds.extxyz")).expect("the demo's seed structures");
+        let mut seeds = Vec::new();
+        for name in self.seeds {
+            let named = |frame: &&atoms::extxyz::Frame| frame.info["name"].text() == Some(name);
+            let frame = frames.iter().find(named).expect("a seed structure of that name");
+            atoms::extxyz::write_frame(&mut seeds, frame).expect("memory");
+        }
+        fs::write(directory.join("seeds.extxyz"), seeds).expect("a directory to write in");
+        let path = directory.join("campaign.toml");
+        fs::write(&path, self.text()).expect("a directory to write in");
+        path
+    }
+}
+
+/// Everything of a campaign that must be the same bytes however it was interrupted.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Outcome {
+    pub decisions: String,
+    pub components: Vec<ComponentRecord>,
+    pub walks: Vec<(u32, String, u64, Option<Vec<u8>>)>,
+    pub dataset: Vec<u8>,
+}
+
+/// Reads the outcome of the campaign in `directory` and checks that nothing is lost or doubled in it.
+pub fn outcome(directory: &Path) -> Outcome {
+    let output = directory.join("dataset.extxyz");
+    let arguments = ["export", &directory.display().to_string(), "--control", "--output"];
+    super::succeed(directory, arguments.iter().map(|a| (*a).to_owned()).chain([output.display().to_string()]));
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+    runtime.block_on(async {
+        let store = Store::open_read_only(directory).await.expect("the campaign's database");
+        check_books(&store).await;
+        let walks = store.load_walks().await.expect("walks").into_iter();
+        Outcome {
+            decisions: store.decision_log_text().await.expect("decisions"),
+            components: store.load_components().await.expect("components"),
+            walks: walks.map(|walk| (walk.walk.0, walk.state, walk.turn, walk.checkpoint)).collect(),
+            dataset: fs::read(&output).expect("the exported data set"),
+        }
+    })
+}
+
+/// Every accepted candidate has one label, decisions are numbered without gaps, nothing is left in the queue.
+async fn check_books(store: &Store) {
+    let status = store.status().await.expect("status");
+    assert!(status.finished, "{status:?}");
+    let decisions = store.decisions(1..=i64::MAX).await.expect("decisions");
+    assert!(decisions.iter().zip(1..).all(|(decision, number)| decision.sequence == number));
+    let kinds = |kind: &str| decisions.iter().filter(|decision| decision.kind == kind).count();
+    assert_eq!(status.candidates.accepted as usize, kinds("accepted"));
+    assert_eq!(status.candidates.control as usize, kinds("control"));
+    assert_eq!((status.labels.queued, status.labels.leased, status.labels.failed), (0, 0, 0));
+    let protocol = store.protocols().await.expect("protocols")[0].hash;
+    let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+    let rows = store.labelled(&filter, None, u32::MAX).await.expect("labels");
+    assert_eq!(rows.len(), kinds("accepted") + kinds("control"));
+}

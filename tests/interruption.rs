@@ -1,0 +1,106 @@
+//! A campaign outlives whatever happens to its process, and ends as if nothing had happened.
+
+mod common;
+
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use common::campaign::{Outcome, Small, outcome};
+use common::{Running, program};
+
+/// Kills in one test; `CALMWALK_KILLS=200 cargo test --test interruption` for the long version.
+fn kills() -> u64 {
+    std::env::var("CALMWALK_KILLS").ok().and_then(|text| text.parse().ok()).unwrap_or(20)
+}
+
+/// A small deterministic sequence for instants (SplitMix64).
+fn random(seed: u64) -> u64 {
+    let mut z = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x9e37_79b9_7f4a_7c15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
+
+fn start(directory: &std::path::Path) -> Running {
+    let mut command = program(directory);
+    let command = command.args(["run", "campaign.toml", "--directory", "."]);
+    Running(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("the program starts"))
+}
+
+fn signal(running: &Running, name: &str) {
+    let status = Command::new("kill").args([format!("-{name}"), running.0.id().to_string()]).status();
+    assert!(status.expect("kill runs").success());
+}
+
+/// Runs to the end without any disturbance.
+fn undisturbed(small: &Small) -> (Outcome, Duration) {
+    let directory = tempfile::tempdir().unwrap();
+    small.write(directory.path());
+    let begun = Instant::now();
+    assert_eq!(start(directory.path()).0.wait().unwrap().code(), Some(0));
+    (outcome(directory.path()), begun.elapsed())
+}
+
+#[test]
+fn kills_at_random_instants_change_nothing() {
+    let small = Small::default();
+    let (expected, takes) = undisturbed(&Small { walkers: 1, ..small.clone() });
+    assert!(expected.decisions.matches("\"kind\":\"accepted\"").count() >= 4, "{}", expected.decisions);
+    assert!(expected.decisions.contains("\"kind\":\"control\""));
+    let (mut done, mut campaigns) = (0, 0);
+    while done < kills() {
+        let directory = tempfile::tempdir().unwrap();
+        campaigns += 1;
+        // A few kills in each campaign, at any instant from the very start on, with one walker or two.
+        let mut finished = false;
+        while !finished {
+            Small { walkers: 1 + (random(done) % 2) as usize, ..small.clone() }.write(directory.path());
+            let mut running = start(directory.path());
+            let instant = takes.mul_f64((random(1000 + done) % 1000) as f64 / 1500.0);
+            std::thread::sleep(instant);
+            finished = running.0.try_wait().unwrap().is_some();
+            if !finished {
+                running.0.kill().unwrap();
+                running.0.wait().unwrap();
+                done += 1;
+                if done >= kills() {
+                    assert_eq!(start(directory.path()).0.wait().unwrap().code(), Some(0));
+                    finished = true;
+                }
+            }
+        }
+        assert_eq!(outcome(directory.path()), expected, "after {done} kills in {campaigns} campaigns");
+    }
+}
+
+#[test]
+fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
+    let small = Small::default();
+    let (expected, takes) = undisturbed(&small);
+    for name in ["INT", "TERM"] {
+        let directory = tempfile::tempdir().unwrap();
+        small.write(directory.path());
+        let mut running = start(directory.path());
+        std::thread::sleep(takes.mul_f64(0.4));
+        signal(&running, name);
+        assert_eq!(running.0.wait().unwrap().code(), Some(130), "{name}");
+        assert_eq!(start(directory.path()).0.wait().unwrap().code(), Some(0));
+        assert_eq!(outcome(directory.path()), expected, "{name}");
+    }
+}
+
+#[test]
+fn live_mode_loses_and_doubles_nothing() {
+    let small = Small { mode: "live", ..Small::default() };
+    let (_, takes) = undisturbed(&small);
+    let directory = tempfile::tempdir().unwrap();
+    small.write(directory.path());
+    for kill in 0..5 {
+        let mut running = start(directory.path());
+        std::thread::sleep(takes.mul_f64((random(kill) % 1000) as f64 / 2000.0));
+        running.0.kill().unwrap();
+        running.0.wait().unwrap();
+    }
+    assert_eq!(start(directory.path()).0.wait().unwrap().code(), Some(0));
+    outcome(directory.path());
+}
