@@ -1,0 +1,298 @@
+//! `calmwalk calm info`
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use atoms::Species;
+use calm::{Artifact, Mixture};
+use potentials::grace::GraceModel;
+use serde::Serialize;
+
+use super::archive::Archive;
+use crate::cli::{Ended, Failure};
+use crate::output::{Table, decimals, print, print_json};
+
+/// Components shown; JSON has them all.
+const SHOWN: usize = 40;
+
+/// Show what a model or an artifact is made of
+///
+/// Which of the two a file is, is seen from what it holds.
+#[derive(Debug, clap::Args)]
+pub struct Info {
+    /// GRACE model (kokkos.npz) or CALM artifact (gmm_artifacts.npz)
+    #[arg(value_name = "MODEL_OR_ARTIFACT")]
+    file: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a file is made of.
+#[derive(Debug, Serialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+enum Content {
+    Model(Box<Model>),
+    Artifact(MixtureInfo),
+}
+
+#[derive(Debug, Serialize)]
+struct Model {
+    architecture: String,
+    elements: Vec<Species>,
+    /// Å
+    cutoff: f64,
+    /// Å, of the pairs of elements whose cutoff is another.
+    pair_cutoffs: Vec<PairCutoff>,
+    lmax: usize,
+    radial_basis_size: usize,
+    channels: usize,
+    basis_functions: Vec<String>,
+    basis_dimension: usize,
+    feature_dimension: usize,
+    weights: usize,
+    radial_tables: Vec<RadialTable>,
+    mixture: Option<MixtureInfo>,
+}
+
+#[derive(Debug, Serialize)]
+struct PairCutoff {
+    centre: Species,
+    neighbour: Species,
+    /// Å
+    cutoff: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct RadialTable {
+    intervals: usize,
+    /// The larger of those of values and of derivatives, each relative to the largest.
+    error: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct MixtureInfo {
+    schema: u32,
+    elements: Vec<String>,
+    feature_dimension: usize,
+    basis_dimension: usize,
+    projected_dimension: usize,
+    normalised: bool,
+    asinh: bool,
+    density_channels: bool,
+    threshold_mode: Option<String>,
+    can_be_updated: bool,
+    components: Vec<ComponentInfo>,
+}
+
+#[derive(Debug, Serialize)]
+struct ComponentInfo {
+    element: String,
+    component: usize,
+    /// Calibrated threshold θ of σ.
+    threshold: f64,
+    /// Environments.
+    count: Option<f64>,
+    /// Sum of their weights.
+    effective_count: Option<f64>,
+    /// Of the covariance, as the build found it.
+    condition_number: Option<f64>,
+}
+
+impl Info {
+    pub fn run(self) -> Result<Ended, Failure> {
+        let content = inspect(&self.file)?;
+        if self.json {
+            print_json(&content)?;
+        } else {
+            print(|out| content.write(&self.file, out))?;
+        }
+        Ok(Ended::Done)
+    }
+}
+
+fn inspect(path: &Path) -> Result<Content, Failure> {
+    let mut archive = Archive::open(path)?;
+    if archive.has("__schema_version__") {
+        let artifact = Artifact::load(path).map_err(Failure::input)?;
+        return Ok(Content::Artifact(MixtureInfo::new(&artifact, "__schema_version__", &mut archive)));
+    }
+    if !archive.has("element_names") {
+        return Err(Failure::Input(format!(
+            "{}: neither a GRACE model (no array 'element_names') nor a CALM artifact (no array '__schema_version__')",
+            path.display()
+        )));
+    }
+    let model = GraceModel::load(path).map_err(Failure::input)?;
+    let mixture = match archive.has("uq_schema_version") {
+        true => {
+            let artifact = Artifact::load_export(path).map_err(Failure::input)?;
+            Some(MixtureInfo::new(&artifact, "uq_schema_version", &mut archive))
+        }
+        false => None,
+    };
+    Ok(Content::Model(Box::new(Model::new(&model, mixture))))
+}
+
+impl Model {
+    fn new(model: &GraceModel, mixture: Option<MixtureInfo>) -> Self {
+        let description = model.description().clone();
+        let elements = &description.elements;
+        let n = elements.len();
+        let pairs = (0..n * n).map(|pair| (pair / n, pair % n)).filter(|_| description.pair_cutoffs);
+        let pair_cutoffs = pairs.map(|(i, j)| PairCutoff {
+            centre: elements[i],
+            neighbour: elements[j],
+            cutoff: model.pair_cutoff(i, j),
+        });
+        let tables = description.radial_tables.iter();
+        Self {
+            architecture: description.architecture.to_string(),
+            elements: elements.clone(),
+            cutoff: description.cutoff,
+            pair_cutoffs: pair_cutoffs.collect(),
+            lmax: description.lmax,
+            radial_basis_size: description.radial_basis_size,
+            channels: description.channels,
+            basis_functions: description.basis_functions,
+            basis_dimension: description.basis_dimension,
+            feature_dimension: description.feature_dimension,
+            weights: description.weights,
+            radial_tables: tables
+                .map(|(intervals, error)| RadialTable {
+                    intervals: *intervals,
+                    error: error[0].max(error[1]),
+                })
+                .collect(),
+            mixture,
+        }
+    }
+
+    fn write(&self, out: &mut dyn Write) -> io::Result<()> {
+        let elements: Vec<_> = self.elements.iter().map(|species| species.symbol()).collect();
+        line(out, "architecture", &self.architecture)?;
+        line(out, "elements", elements.join(" "))?;
+        line(out, "cutoff", format!("{} Å", self.cutoff))?;
+        for PairCutoff { centre, neighbour, cutoff } in &self.pair_cutoffs {
+            line(out, "", format!("{cutoff} Å for {centre}–{neighbour}"))?;
+        }
+        line(out, "angular momenta", format!("l ≤ {}", self.lmax))?;
+        line(
+            out,
+            "radial channels",
+            format!("{} from {} polynomials", self.channels, self.radial_basis_size),
+        )?;
+        let basis = self.basis_functions.join(", ");
+        line(out, "invariants", format!("{} of {basis}", self.basis_dimension))?;
+        line(out, "weights", self.weights)?;
+        for RadialTable { intervals, error } in &self.radial_tables {
+            line(
+                out,
+                "radial table",
+                format!("{intervals} intervals, error of values and slopes below {error:.1e} of the largest"),
+            )?;
+        }
+        match &self.mixture {
+            Some(mixture) => mixture.write(out),
+            None => {
+                line(out, "mixture", "none: exported without CALM arrays (uq_*), so nothing can be graded")
+            }
+        }
+    }
+}
+
+impl MixtureInfo {
+    fn new(artifact: &Artifact, schema_key: &str, archive: &mut Archive) -> Self {
+        let Artifact { symbols, mixture, projection } = artifact;
+        Self {
+            schema: archive.number(schema_key).unwrap_or_default() as u32,
+            elements: symbols.clone(),
+            feature_dimension: mixture.dimension(),
+            basis_dimension: projection.rows,
+            projected_dimension: projection.columns,
+            normalised: projection.normalised,
+            asinh: projection.asinh,
+            density_channels: projection.density_channels,
+            threshold_mode: archive.text("threshold_mode"),
+            can_be_updated: mixture.can_be_updated(),
+            components: components(symbols, mixture, archive),
+        }
+    }
+
+    fn write(&self, out: &mut dyn Write) -> io::Result<()> {
+        line(out, "CALM schema", self.schema)?;
+        let sizes = (self.feature_dimension, self.projected_dimension, self.basis_dimension);
+        line(
+            out,
+            "features",
+            format!("{}, of them {} projected from {} invariants", sizes.0, sizes.1, sizes.2),
+        )?;
+        let flags = [
+            (self.normalised, "normalised basis"),
+            (self.asinh, "asinh"),
+            (self.density_channels, "density channels"),
+        ];
+        let flags: Vec<_> = flags.into_iter().filter(|(set, _)| *set).map(|(_, name)| name).collect();
+        line(out, "feature map", if flags.is_empty() { "linear".to_owned() } else { flags.join(", ") })?;
+        if let Some(mode) = &self.threshold_mode {
+            line(out, "thresholds", mode)?;
+        }
+        let updates =
+            if self.can_be_updated { "yes" } else { "no: without scatter matrices it can only grade" };
+        line(out, "can be updated", updates)?;
+        line(out, "components", format!("{} for {}", self.components.len(), self.elements.join(" ")))?;
+        writeln!(out)?;
+        let mut table =
+            Table::new(&["element", ">component", ">θ", ">environments", ">weighted", ">condition"]);
+        for component in self.components.iter().take(SHOWN) {
+            table.push(vec![
+                component.element.clone(),
+                component.component.to_string(),
+                format!("{:.4}", component.threshold),
+                decimals(component.count, 0),
+                decimals(component.effective_count, 1),
+                component.condition_number.map_or("–".into(), |condition| format!("{condition:.1e}")),
+            ]);
+        }
+        table.write(out)?;
+        match self.components.len().saturating_sub(SHOWN) {
+            0 => Ok(()),
+            more => writeln!(out, "… and {more} more: --json shows all"),
+        }
+    }
+}
+
+fn components(symbols: &[String], mixture: &Mixture, archive: &mut Archive) -> Vec<ComponentInfo> {
+    let condition_numbers: Vec<_> = (0..symbols.len())
+        .map(|element| archive.numbers(&format!("cond_number_{element}")).unwrap_or_default())
+        .collect();
+    let component =
+        |(element, slot, component): (usize, usize, &std::sync::Arc<calm::Component>)| ComponentInfo {
+            element: symbols.get(element).cloned().unwrap_or_default(),
+            component: slot,
+            threshold: component.threshold(),
+            count: component.statistics().map(|statistics| statistics.count),
+            effective_count: component.statistics().map(|statistics| statistics.effective_count),
+            condition_number: condition_numbers.get(element).and_then(|numbers| numbers.get(slot)).copied(),
+        };
+    mixture.iter().map(component).collect()
+}
+
+impl Content {
+    fn write(&self, path: &Path, out: &mut dyn Write) -> io::Result<()> {
+        let what = match self {
+            Self::Model(_) => "a GRACE model",
+            Self::Artifact(_) => "a CALM artifact",
+        };
+        writeln!(out, "{} is {what}", path.display())?;
+        match self {
+            Self::Model(model) => model.write(out),
+            Self::Artifact(mixture) => mixture.write(out),
+        }
+    }
+}
+
+/// A name and its value.
+fn line(out: &mut dyn Write, name: &str, value: impl std::fmt::Display) -> io::Result<()> {
+    writeln!(out, "  {name:<16}{value}")
+}

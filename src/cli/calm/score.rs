@@ -1,0 +1,157 @@
+//! `calmwalk calm score`
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use atoms::FileError;
+use atoms::extxyz::{Column, Entries, Frame, Value, write_frame};
+use calm::Artifact;
+use npyz::{NpyWriter, WriterBuilder};
+use potentials::grace::GraceModel;
+
+use super::scorer::Scorer;
+use crate::cli::{Ended, Failure};
+use crate::frames::Frames;
+use crate::output::{Bar, print};
+use crate::whole_file::{WholeFile, cannot_write};
+
+/// What a calculation says of a frame, by the names that other programs read.
+const LABELS: [&str; 5] = ["energy", "free_energy", "forces", "stress", "virial"];
+
+const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
+
+/// Grade structures: energy, forces, stress and extrapolation grades of every atom
+///
+/// Every frame is written with the model's energy (eV), forces (eV/Å) and, if it is periodic in all directions, stress
+/// (eV/Å³, tension positive), and with these columns: gamma (extrapolation grade γ), gamma_nbr (its neighbourhood
+/// average), sigma (Mahalanobis distance σ), component (the nearest one of the atom's element, from 0).
+///
+/// All else in the frame is kept. Energy, forces, stress and virial that it came with are kept as REF_energy,
+/// REF_forces … unless it has such reference labels already: then the plain ones, another model's, are replaced.
+#[derive(Debug, clap::Args)]
+pub struct Score {
+    /// GRACE model (kokkos.npz)
+    #[arg(long, value_name = "MODEL.npz")]
+    model: PathBuf,
+    /// CALM artifact (gmm_artifacts.npz) [default: the mixture that the model was exported with]
+    #[arg(long, value_name = "CALM.npz")]
+    artifact: Option<PathBuf>,
+    /// Structures to grade, extended XYZ
+    #[arg(value_name = "IN.extxyz")]
+    input: PathBuf,
+    /// Graded structures; an existing file is replaced when all are done
+    #[arg(long, short, value_name = "OUT.extxyz")]
+    output: PathBuf,
+    /// Write the column gamma_gradient too: the gradient of the sum of all γ, 1/Å
+    #[arg(long)]
+    gradient: bool,
+    /// Write the features z of all atoms, [atoms × D] in the order of the file, f64
+    #[arg(long, value_name = "FILE.npy")]
+    features: Option<PathBuf>,
+}
+
+impl Score {
+    pub fn run(self) -> Result<Ended, Failure> {
+        let (model, artifact) = load(&self.model, self.artifact.as_deref())?;
+        let dimension = artifact.mixture.dimension();
+        let mut scorer = Scorer::new(Arc::new(model), Arc::new(artifact.mixture));
+        let mut frames = Frames::open(&self.input).map_err(Failure::input)?;
+        let bar = Bar::new(frames.length, BAR);
+        let mut output = WholeFile::create(&self.output)?;
+        let cannot = |error| cannot_write(self.features.as_deref().unwrap_or(Path::new("")), error);
+        let mut feature_file = self.features.as_deref().map(WholeFile::create).transpose()?;
+        let matrix = feature_file.as_mut().map(|file| feature_matrix(file, dimension));
+        let mut matrix = matrix.transpose().map_err(cannot)?;
+        let mut count = 0_u64;
+        while let Some(frame) = frames.next() {
+            let mut frame = frame.map_err(Failure::input)?;
+            let line = frame.line;
+            scorer.score(&frame.structure, self.gradient).map_err(|error| self.at(line, error))?;
+            write_scores(&mut frame, &scorer, self.gradient);
+            write_frame(&mut output, &frame).map_err(|error| self.at(line, error))?;
+            if let Some(matrix) = &mut matrix {
+                matrix.extend(scorer.features().iter().copied()).map_err(cannot)?;
+            }
+            count += 1;
+            bar.set(frames.position(), || format!("{count} frames"));
+        }
+        if count == 0 {
+            return Err(Failure::input(FileError::Empty(self.input)));
+        }
+        matrix.map_or(Ok(()), NpyWriter::finish).map_err(cannot)?;
+        feature_file.map_or(Ok(()), WholeFile::finish)?;
+        output.finish()?;
+        drop(bar);
+        print(|out| writeln!(out, "graded {count} structures into {}", self.output.display()))?;
+        Ok(Ended::Done)
+    }
+
+    fn at(&self, line: usize, error: impl std::fmt::Display) -> Failure {
+        Failure::Input(format!("{}:{line}: {error}", self.input.display()))
+    }
+}
+
+/// The model and the mixture that grades its features.
+fn load(model: &Path, artifact: Option<&Path>) -> Result<(GraceModel, Artifact), Failure> {
+    let export = model;
+    let model = GraceModel::load(export).map_err(Failure::input)?;
+    if model.projection().is_none() {
+        let message = "the model has no CALM arrays (uq_*): export it with its CALM artifact";
+        return Err(Failure::Input(format!("{}: {message}", export.display())));
+    }
+    let own = Artifact::load_export(export).map_err(Failure::input)?;
+    let Some(path) = artifact else { return Ok((model, own)) };
+    let artifact = Artifact::load(path).map_err(Failure::input)?;
+    artifact
+        .check_belongs_to(&own.symbols, &own.projection)
+        .map_err(|error| Failure::Input(format!("{}: {error}", path.display())))?;
+    Ok((model, artifact))
+}
+
+/// Puts what was computed into the frame, and its own labels out of the way.
+fn write_scores(frame: &mut Frame, scorer: &Scorer, gradient: bool) {
+    keep_labels(frame);
+    let evaluation = &scorer.evaluation;
+    frame.info.insert("energy".into(), evaluation.energy().into());
+    if frame.structure.periodic == [true; 3] {
+        let stress = evaluation.stress(frame.structure.cell.volume());
+        frame.info.insert("stress".into(), stress.into());
+    }
+    let scalars = |values: &[f64]| Column { width: 1, entries: Entries::Real(values.to_vec()) };
+    let component = scorer.grades.component.iter().map(|slot| *slot as i64).collect();
+    let mut insert = |name: &str, column| frame.arrays.insert(name.to_owned(), column);
+    insert("forces", Column::vectors(&evaluation.forces));
+    insert("gamma", scalars(&scorer.grades.gamma));
+    insert("gamma_nbr", scalars(&scorer.gamma_nbr));
+    insert("sigma", scalars(&scorer.grades.sigma));
+    insert("component", Column { width: 1, entries: Entries::Int(component) });
+    if gradient {
+        insert("gamma_gradient", Column::vectors(&scorer.pull_back.gradient));
+    }
+}
+
+/// Renames the plain labels to `REF_`, or removes them where there are such.
+fn keep_labels(frame: &mut Frame) {
+    let reference = LABELS.map(|label| format!("REF_{label}"));
+    let kept = reference.iter().any(|key| frame.info.contains_key(key) || frame.arrays.contains_key(key));
+    for (label, reference) in LABELS.into_iter().zip(reference) {
+        let (info, array) = (frame.info.remove(label), frame.arrays.remove(label));
+        if kept {
+            continue;
+        }
+        if let Some(column) = array {
+            frame.arrays.insert(reference.clone(), column);
+        }
+        if let Some(value) = info {
+            // Nine numbers in a row are what MACE reads as REF_stress.
+            let flat = value.numbers().filter(|numbers| numbers.len() > 1).map(Value::from);
+            frame.info.insert(reference, flat.unwrap_or(value));
+        }
+    }
+}
+
+/// Begins the matrix of all features in NumPy's format; the number of rows is written at the end.
+fn feature_matrix(file: &mut WholeFile, dimension: usize) -> io::Result<NpyWriter<f64, &mut WholeFile>> {
+    npyz::WriteOptions::new().default_dtype().writer(file).begin_2d(dimension as u64)
+}

@@ -1,0 +1,98 @@
+//! Energy, grades and their gradient for one structure after another.
+
+use std::sync::Arc;
+
+use atoms::{Evaluation, NeighbourList, PotentialError, Structure, StructureError};
+use calm::neighbourhood::{Pair, PairError};
+use calm::{GradeError, Grades, Mixture, neighbourhood_average};
+use potentials::grace::{Grace, GraceModel, PullBack};
+
+/// A model, a mixture that grades its features, and the work arrays of both.
+pub struct Scorer {
+    grace: Grace,
+    mixture: Arc<Mixture>,
+    neighbours: NeighbourList,
+    cotangent: Vec<f64>,
+    /// σ, γ and component at the last structure.
+    pub grades: Grades,
+    /// γ_nbr at the last structure, [n].
+    pub gamma_nbr: Vec<f64>,
+    /// Energy and forces at the last structure.
+    pub evaluation: Evaluation,
+    /// ∂Σγ/∂r at the last structure, if it was asked for; zero otherwise.
+    pub pull_back: PullBack,
+}
+
+/// Why a structure cannot be graded.
+#[derive(Debug, thiserror::Error)]
+pub enum ScoreError {
+    /// A structure that is none.
+    #[error(transparent)]
+    Structure(#[from] StructureError),
+    /// An element that the model does not know.
+    #[error(transparent)]
+    Potential(#[from] PotentialError),
+    /// Features that cannot be graded.
+    #[error(transparent)]
+    Grade(#[from] GradeError),
+    /// Bonds that do not fit the grades.
+    #[error(transparent)]
+    Pair(#[from] PairError),
+    /// Overlapping atoms.
+    #[error("the energy is {0} eV: do atoms overlap?")]
+    NotFinite(f64),
+}
+
+impl Scorer {
+    /// `mixture` must belong to `model`.
+    pub fn new(model: Arc<GraceModel>, mixture: Arc<Mixture>) -> Self {
+        Self {
+            neighbours: NeighbourList::new(model.cutoff(), 0.0),
+            grace: Grace::new(model),
+            mixture,
+            cotangent: Vec::new(),
+            grades: Grades::default(),
+            gamma_nbr: Vec::new(),
+            evaluation: Evaluation::default(),
+            pull_back: PullBack::default(),
+        }
+    }
+
+    /// Features z at the last structure, [n × D].
+    pub fn features(&self) -> &[f64] {
+        self.grace.features()
+    }
+
+    /// Evaluates and grades `structure`; with `gradient` the gradient of Σγ too.
+    pub fn score(&mut self, structure: &Structure, gradient: bool) -> Result<(), ScoreError> {
+        let elements = self.grace.model().element_indices(&structure.species)?;
+        self.neighbours.update(structure)?;
+        self.grace.forward(structure, &self.neighbours)?;
+        let energy: f64 = self.grace.atomic_energies().iter().sum();
+        if !energy.is_finite() {
+            return Err(ScoreError::NotFinite(energy));
+        }
+        let features = self.grace.features();
+        self.cotangent.resize(features.len(), 0.0);
+        let cotangent = gradient.then_some(self.cotangent.as_mut_slice());
+        self.grades.evaluate(&self.mixture, &elements, features, cotangent)?;
+        let pairs = self.pairs(structure, &elements);
+        self.gamma_nbr = neighbourhood_average(&self.grades.gamma, pairs)?;
+        let cotangent = gradient.then_some(self.cotangent.as_slice());
+        self.grace.backward(cotangent, &mut self.evaluation, &mut self.pull_back);
+        Ok(())
+    }
+
+    /// The directed bonds within their pair cutoffs.
+    fn pairs(&self, structure: &Structure, elements: &[usize]) -> Vec<Pair> {
+        let (model, mut bonds, mut pairs) = (self.grace.model(), Vec::new(), Vec::new());
+        for (i, centre) in elements.iter().enumerate() {
+            self.neighbours.bonds_within(structure, i, model.cutoff(), &mut bonds);
+            pairs.extend(bonds.iter().map(|bond| {
+                let j = bond.atom as usize;
+                Pair { i, j, distance: bond.r, cutoff: model.pair_cutoff(*centre, elements[j]) }
+            }));
+        }
+        pairs
+    }
+}

@@ -1,0 +1,128 @@
+//! `calmwalk import`
+
+use std::path::{Path, PathBuf};
+
+use atoms::extxyz::{Frame, Labels};
+use atoms::{FileError, Structure};
+use store::records::{Label, Protocol};
+use store::{CampaignLock, Imported, Store, unix_milliseconds};
+use wire::ContentHash;
+
+use super::{CampaignDirectory, Ended, Failure, block_on};
+use crate::frames::Frames;
+use crate::output::print;
+
+/// Take in labelled structures that exist already
+///
+/// Every frame needs energy and forces, as energy and forces or REF_energy and REF_forces; stress is taken if there is
+/// one. If one frame is not right, nothing is taken from any file. An import may be repeated: what is known is left as
+/// it is, and other numbers for a structure that has its label are kept as checks beside it.
+#[derive(Debug, clap::Args)]
+pub struct Import {
+    #[command(flatten)]
+    directory: CampaignDirectory,
+    /// Extended XYZ
+    #[arg(value_name = "FILES", required = true)]
+    files: Vec<PathBuf>,
+    /// Protocol by which they were labelled; a new name makes a new protocol [default: that of the campaign]
+    #[arg(long, value_name = "NAME")]
+    protocol: Option<String>,
+}
+
+/// Frames of one file, each with its number in it.
+struct File {
+    name: String,
+    frames: Vec<(u64, Structure, Label)>,
+}
+
+impl Import {
+    pub fn run(self) -> Result<Ended, Failure> {
+        let files: Vec<_> = self.files.iter().map(|path| read(path)).collect::<Result<_, _>>()?;
+        let (protocol, imported) = block_on(self.import(&files))??;
+        let Imported { labels, checks, known } = imported;
+        print(|out| {
+            let name = &protocol.name;
+            writeln!(out, "{labels} labels, {checks} checks, {known} known already, by protocol '{name}'")
+        })?;
+        Ok(Ended::Done)
+    }
+
+    async fn import(&self, files: &[File]) -> Result<(Protocol, Imported), Failure> {
+        let directory = &self.directory.directory;
+        let store = Store::open(directory).await?;
+        let protocol = match &self.protocol {
+            Some(name) => protocol_named(&store, directory, name).await?,
+            None => own_protocol(&store).await?,
+        };
+        let mut all = Imported::default();
+        for File { name, frames } in files {
+            let imported = store.import(protocol.hash, name, frames, unix_milliseconds()).await?;
+            all.labels += imported.labels;
+            all.checks += imported.checks;
+            all.known += imported.known;
+        }
+        store.close().await;
+        Ok((protocol, all))
+    }
+}
+
+fn read(path: &Path) -> Result<File, Failure> {
+    let name = path.display().to_string();
+    let mut frames = Vec::new();
+    for (number, frame) in Frames::open(path).map_err(Failure::input)?.enumerate() {
+        let frame = frame.map_err(Failure::input)?;
+        let label =
+            label(&frame).map_err(|error| Failure::Input(format!("{name}:{}: {error}", frame.line)))?;
+        frames.push((number as u64, frame.structure, label));
+    }
+    if frames.is_empty() {
+        return Err(Failure::input(FileError::Empty(path.to_owned())));
+    }
+    Ok(File { name, frames })
+}
+
+fn label(frame: &Frame) -> Result<Label, String> {
+    match frame
+        .labels()
+        .map_err(|error| format!("{} is {}, expected {}", error.key, error.found, error.expected))?
+    {
+        Labels { energy: Some(energy), forces: Some(forces), stress } => Ok(Label { energy, forces, stress }),
+        Labels { energy, .. } => {
+            let missing = if energy.is_none() { "energy" } else { "forces" };
+            Err(format!("the frame has no {missing}: expected {missing} or REF_{missing}"))
+        }
+    }
+}
+
+/// The protocol by which the campaign itself labels.
+async fn own_protocol(store: &Store) -> Result<Protocol, Failure> {
+    let configuration = store.campaign().await?.configuration_in_force;
+    let configuration: serde_json::Value = serde_json::from_str(&configuration).map_err(Failure::failed)?;
+    let name = configuration["label"]["protocol"].as_str().unwrap_or_default();
+    let own = store.protocols().await?.into_iter().find(|protocol| protocol.name == name);
+    own.ok_or_else(|| {
+        Failure::Input(
+            "the campaign has no label protocol yet: run it first, or name one with --protocol".to_owned(),
+        )
+    })
+}
+
+/// The protocol of that name, made if the campaign has none so named.
+async fn protocol_named(store: &Store, directory: &Path, name: &str) -> Result<Protocol, Failure> {
+    if let Some(known) = store.protocols().await?.into_iter().find(|protocol| protocol.name == name) {
+        return Ok(known);
+    }
+    if name.trim().is_empty() {
+        return Err(Failure::Input("--protocol is empty; expected a name".to_owned()));
+    }
+    let settings = serde_json::json!({ "method": "import" });
+    let hash = ContentHash(*blake3::hash(format!("calmwalk import protocol {name}").as_bytes()).as_bytes());
+    let protocol = Protocol { hash, name: name.to_owned(), settings };
+    // A protocol that is added becomes that of new label jobs, so the campaign's own is put back; no run may be under
+    // way in between. Whoever is killed here does no harm: a run begins by putting its own protocol in force.
+    let _lock = CampaignLock::acquire(directory, "calmwalk import")?;
+    let own = own_protocol(store).await?;
+    store.add_protocol(&protocol, unix_milliseconds()).await?;
+    store.add_protocol(&own, unix_milliseconds()).await?;
+    Ok(protocol)
+}

@@ -1,0 +1,166 @@
+//! The configuration of `calmwalk md`: one TOML file that denies unknown keys.
+
+use std::num::{NonZeroU64, NonZeroUsize};
+use std::path::{Path, PathBuf};
+
+use atoms::{Potential, extxyz::Frame, read_structures};
+use calm::rules::Positive;
+use md::{Langevin, NoseHooverChain, Thermostat};
+use serde::Deserialize;
+use toml::Spanned;
+
+use crate::config::{ConfigError, PotentialFile, place, place_of_offset};
+
+/// Longer chains than this are a mistake.
+const LONGEST_CHAIN: usize = 100;
+
+/// Everything in the file. Paths to read are relative to its own directory, those to write to the working directory.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MdConfig {
+    /// Where it starts: the first frame of this file.
+    pub structure: Spanned<PathBuf>,
+    /// What drives it.
+    pub potential: PotentialFile,
+    /// How it moves.
+    pub dynamics: DynamicsSection,
+    /// What is kept of it.
+    pub output: OutputSection,
+}
+
+/// `[dynamics]`
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DynamicsSection {
+    /// Number of steps.
+    pub steps: u64,
+    /// Of the initial velocities and of the thermostat, K.
+    pub temperature: Positive,
+    /// fs; left out, 2 fs, or 0.5 fs with H, He, Li or Be.
+    pub time_step: Option<Positive>,
+    /// Random seed of initial velocities and Langevin forces.
+    #[serde(default = "one")]
+    pub rng_seed: u64,
+    /// What keeps the temperature.
+    pub thermostat: ThermostatSection,
+    /// Skin of the neighbour list, Å; has no influence on the numbers.
+    #[serde(default = "skin")]
+    pub skin: Positive,
+}
+
+/// `thermostat = { none = {} }`, `{ langevin = { … } }` or `{ nose_hoover = { … } }`
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum ThermostatSection {
+    /// Constant energy.
+    None {},
+    /// Langevin dynamics, BAOAB.
+    Langevin {
+        /// 1/fs.
+        friction: Positive,
+    },
+    /// Nosé–Hoover chain.
+    NoseHoover {
+        /// fs.
+        relaxation_time: Positive,
+        /// Thermostats in the chain.
+        #[serde(default = "chain_length")]
+        chain_length: NonZeroUsize,
+    },
+}
+
+/// `[output]`
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OutputSection {
+    /// Extended XYZ; an existing file is overwritten.
+    pub trajectory: PathBuf,
+    /// Steps from frame to frame.
+    #[serde(default = "hundred")]
+    pub every: NonZeroU64,
+    /// Steps from line to line on the standard error; left out, as `every`.
+    pub log_every: Option<NonZeroU64>,
+}
+
+impl MdConfig {
+    /// Reads and checks the configuration, its structure and its potential.
+    pub fn load(path: &Path) -> Result<(Self, Frame, Box<dyn Potential>), ConfigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+        let mut config: Self =
+            toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
+        let directory = path.parent().unwrap_or(Path::new(""));
+        for file in [&mut config.structure, &mut config.potential.file] {
+            *file.get_mut() = directory.join(file.get_ref());
+        }
+        if let ThermostatSection::NoseHoover { chain_length, .. } = config.dynamics.thermostat
+            && chain_length.get() > LONGEST_CHAIN
+        {
+            let (at, key) = (place(path, &text, "dynamics.thermostat"), "dynamics.thermostat".to_owned());
+            let (found, expected) =
+                (format!("chain_length {chain_length}"), format!("at most {LONGEST_CHAIN}"));
+            return Err(ConfigError::Value { at, key, found, expected });
+        }
+        let wrong = |key: &str, file: &Spanned<PathBuf>, message: String| ConfigError::File {
+            at: place_of_offset(path, &text, file.span().start),
+            key: key.to_owned(),
+            message,
+        };
+        let potential_file = &config.potential.file;
+        let potential =
+            config.potential.load().map_err(|error| wrong("potential.file", potential_file, error))?;
+        let start =
+            config.start(&*potential).map_err(|error| wrong("structure", &config.structure, error))?;
+        Ok((config, start, potential))
+    }
+
+    /// The first frame of the structure file, of elements that the potential knows.
+    fn start(&self, potential: &dyn Potential) -> Result<Frame, String> {
+        let path = self.structure.get_ref();
+        let frames = read_structures(path).map_err(|error| error.to_string())?;
+        let start = frames.into_iter().next().ok_or_else(|| format!("{}: no structures", path.display()))?;
+        let at = format!("{}:{}", path.display(), start.line);
+        start.structure.validate().map_err(|error| format!("{at}: {error}"))?;
+        let known = potential.species();
+        if let Some((atom, species)) =
+            start.structure.species.iter().enumerate().find(|(_, s)| !known.contains(s))
+        {
+            let known: Vec<_> = known.iter().map(|species| species.symbol()).collect();
+            return Err(format!("{at}: atom {atom} is {species}; the potential knows {}", known.join(", ")));
+        }
+        Ok(start)
+    }
+}
+
+impl DynamicsSection {
+    /// The thermostat at rest.
+    pub fn thermostat(&self) -> Thermostat {
+        let temperature = self.temperature.get();
+        match self.thermostat {
+            ThermostatSection::None {} => Thermostat::None,
+            ThermostatSection::Langevin { friction } => {
+                Thermostat::Langevin(Langevin { temperature, friction: friction.get() })
+            }
+            ThermostatSection::NoseHoover { relaxation_time, chain_length } => {
+                let chain = NoseHooverChain::new(temperature, relaxation_time.get(), chain_length.get());
+                Thermostat::NoseHooverChain(chain)
+            }
+        }
+    }
+}
+
+fn one() -> u64 {
+    1
+}
+
+fn skin() -> Positive {
+    Positive::try_from(0.5).expect("a number above 0")
+}
+
+fn chain_length() -> NonZeroUsize {
+    NonZeroUsize::new(NoseHooverChain::LENGTH).expect("a number above 0")
+}
+
+fn hundred() -> NonZeroU64 {
+    NonZeroU64::new(100).expect("a number above 0")
+}

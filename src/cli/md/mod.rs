@@ -1,0 +1,153 @@
+//! `calmwalk md`: unbiased dynamics of any supported potential.
+
+mod config;
+mod trajectory;
+
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use std::time::Instant;
+
+use atoms::Potential;
+use md::{Dynamics, Settings, State, Stream, default_time_step};
+
+use self::config::{DynamicsSection, MdConfig, OutputSection};
+use self::trajectory::{Trajectory, time};
+use super::{Ended, Failure};
+use crate::interrupt;
+use crate::output::{Bar, decimals, print};
+
+const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
+
+/// Unbiased molecular dynamics of any supported potential
+///
+/// Writes an extended XYZ trajectory with energy (eV), forces (eV/Å), stress (eV/Å³, tension positive, without its
+/// kinetic part), momenta (as ASE reads them), step, time_fs and temperature (K; 3n − 3 degrees of freedom where the
+/// momentum is conserved, 3n with Langevin). Ctrl-C or SIGTERM ends it in order, with the last step in the trajectory.
+#[derive(Debug, clap::Args)]
+pub struct Md {
+    /// Configuration (TOML): structure, [potential], [dynamics], [output]; see configs/md-aluminium.toml
+    #[arg(value_name = "CONFIG")]
+    config: PathBuf,
+    /// Trajectory, instead of output.trajectory
+    #[arg(long, short, value_name = "FILE.extxyz")]
+    output: Option<PathBuf>,
+}
+
+impl Md {
+    pub fn run(self) -> Result<Ended, Failure> {
+        let (config, start, mut potential) = MdConfig::load(&self.config)?;
+        let path = self.output.unwrap_or_else(|| config.output.trajectory.clone());
+        refuse_same_file(&path, config.structure.get_ref())?;
+        let state = initial_state(&config.dynamics, start.structure);
+        let settings = settings(&config.dynamics, &state);
+        let mut dynamics = Dynamics::new(state, settings, &mut *potential).map_err(|error| {
+            Failure::Input(format!("{}:{}: {error}", config.structure.get_ref().display(), start.line))
+        })?;
+        let stopping = interrupt::flag()?;
+        let mut trajectory = Trajectory::create(&path)?;
+        let begun = Instant::now();
+        let watch = Watch::new(&config);
+        let followed = follow(&mut dynamics, &mut *potential, config.dynamics.steps, |dynamics| {
+            watch.see(dynamics);
+            if dynamics.state().step.is_multiple_of(config.output.every.get()) {
+                trajectory.push(dynamics)?;
+            }
+            Ok(!stopping.load(Ordering::Relaxed))
+        });
+        drop(watch);
+        let (frames, shown) = (trajectory.frames, path.display());
+        followed.map_err(|failure| match failure {
+            Failure::Failed(message) => Failure::Failed(format!("{message}; {frames} frames are in {shown}")),
+            other => other,
+        })?;
+        trajectory.push(&dynamics)?;
+        print(|out| {
+            let (steps, seconds) = (dynamics.state().step, begun.elapsed().as_secs_f64());
+            let (frames, atoms) = (trajectory.frames, dynamics.structure().len());
+            writeln!(out, "{steps} steps of {atoms} atoms in {seconds:.1} s, {frames} frames in {shown}")
+        })?;
+        let interrupted = dynamics.state().step < config.dynamics.steps;
+        Ok(if interrupted { Ended::Interrupted } else { Ended::Done })
+    }
+}
+
+/// Maxwell–Boltzmann velocities.
+fn initial_state(dynamics: &DynamicsSection, structure: atoms::Structure) -> State {
+    State::thermal(structure, dynamics.temperature.get(), &Stream::new(dynamics.rng_seed, 0, 0))
+}
+
+fn settings(dynamics: &DynamicsSection, state: &State) -> Settings {
+    let usual = default_time_step(&state.structure.species);
+    Settings {
+        time_step: dynamics.time_step.map_or(usual, |time_step| time_step.get()),
+        thermostat: dynamics.thermostat(),
+        ramp: None,
+        stream: Stream::new(dynamics.rng_seed, 0, 0),
+        skin: dynamics.skin.get(),
+    }
+}
+
+/// Makes `steps` steps, or fewer if `see`, which is shown every one of them and the start, says to stop.
+fn follow(
+    dynamics: &mut Dynamics,
+    potential: &mut dyn Potential,
+    steps: u64,
+    mut see: impl FnMut(&Dynamics) -> Result<bool, Failure>,
+) -> Result<(), Failure> {
+    while see(dynamics)? && dynamics.state().step < steps {
+        let step = dynamics.state().step + 1;
+        dynamics.step(potential).map_err(|error| Failure::Failed(format!("step {step}: {error}")))?;
+    }
+    Ok(())
+}
+
+fn refuse_same_file(trajectory: &Path, structure: &Path) -> Result<(), Failure> {
+    match (trajectory.canonicalize(), structure.canonicalize()) {
+        (Ok(a), Ok(b)) if a == b => {
+            let shown = trajectory.display();
+            Err(Failure::Input(format!(
+                "{shown} is the structure to start from: name another file for the trajectory"
+            )))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Shows how the run goes: a bar on a terminal, lines otherwise.
+struct Watch {
+    every: u64,
+    bar: Option<Bar>,
+}
+
+impl Watch {
+    fn new(config: &MdConfig) -> Self {
+        let OutputSection { every, log_every, .. } = config.output;
+        let bar = std::io::stderr().is_terminal().then(|| Bar::new(Some(config.dynamics.steps), BAR));
+        if bar.is_none() {
+            say(["step", "time (ps)", "energy (eV)", "temperature (K)", "conserved (eV)"].map(str::to_owned));
+        }
+        Self { every: log_every.unwrap_or(every).get(), bar }
+    }
+
+    fn see(&self, dynamics: &Dynamics) {
+        let step = dynamics.state().step;
+        if let Some(bar) = &self.bar {
+            bar.set(step, || format!("{:.0} K", dynamics.temperature()));
+        } else if step.is_multiple_of(self.every) {
+            say([
+                step.to_string(),
+                format!("{:.3}", time(dynamics) / 1000.0),
+                format!("{:.6}", dynamics.evaluation().energy()),
+                format!("{:.1}", dynamics.temperature()),
+                decimals(dynamics.conserved_energy(), 6),
+            ]);
+        }
+    }
+}
+
+/// A line on the standard error; nobody has to read it.
+fn say([step, time, energy, temperature, conserved]: [String; 5]) {
+    let mut out = std::io::stderr().lock();
+    let _ = writeln!(out, "{step:>10}  {time:>10}  {energy:>16}  {temperature:>15}  {conserved:>16}");
+}

@@ -1,0 +1,230 @@
+//! `calmwalk queue`
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use store::{Attempt, Job, JobDetails, JobState, Store, unix_milliseconds};
+
+use super::{CampaignDirectory, Ended, Failure, block_on};
+use crate::output::{Table, decimals, print, print_json};
+
+/// List, show, drop, retry or prioritise the structures in the label queue
+///
+/// A structure is named by its candidate's id, or by the beginning of it if no other begins so; the campaign's part of
+/// the id may be left out.
+#[derive(Debug, clap::Args)]
+#[command(subcommand_required = true, arg_required_else_help = true)]
+pub struct Queue {
+    #[command(flatten)]
+    directory: CampaignDirectory,
+    #[command(subcommand)]
+    action: Action,
+    /// Print JSON
+    #[arg(long, global = true)]
+    json: bool,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Action {
+    /// List jobs: those in one state in the order in which they would be labelled, or all as they came
+    List(List),
+    /// Show everything about one, with its attempts and the logs of those that failed
+    Show {
+        /// Candidate
+        id: String,
+    },
+    /// Take structures out of the queue and out of exports
+    Drop {
+        /// Candidates
+        #[arg(value_name = "ID", required = true)]
+        ids: Vec<String>,
+    },
+    /// Put failed or dropped structures back into the queue
+    Retry {
+        /// Candidates
+        #[arg(value_name = "ID", required = true)]
+        ids: Vec<String>,
+    },
+    /// Give a structure that waits another priority
+    Prioritise {
+        /// Candidate
+        id: String,
+        /// Higher first; structures begin with 10, frames of control walks with 0
+        #[arg(allow_negative_numbers = true)]
+        priority: i32,
+    },
+}
+
+#[derive(Debug, clap::Args)]
+struct List {
+    /// Only those in this state
+    #[arg(long, value_parser = parse_state)]
+    state: Option<JobState>,
+    /// Show at most this many
+    #[arg(long, default_value_t = 50)]
+    limit: u32,
+    /// Leave out this many first
+    #[arg(long, default_value_t = 0)]
+    offset: u32,
+}
+
+fn parse_state(name: &str) -> Result<JobState, String> {
+    JobState::named(name)
+        .ok_or_else(|| format!("expected one of {}", JobState::ALL.map(JobState::name).join(", ")))
+}
+
+impl Queue {
+    pub fn run(self) -> Result<Ended, Failure> {
+        let directory = &self.directory.directory;
+        match &self.action {
+            Action::List(list) => {
+                let jobs = block_on(read_list(directory, list))??;
+                if self.json { print_json(&jobs)? } else { print(|out| write_list(out, &jobs, list))? }
+            }
+            Action::Show { id } => {
+                let details = block_on(read_details(directory, id))??;
+                if self.json { print_json(&details)? } else { print(|out| write_details(out, &details))? }
+            }
+            action => self.change(directory, action)?,
+        }
+        Ok(Ended::Done)
+    }
+
+    /// Changes one job after the other, and tells of each how it stands then.
+    fn change(&self, directory: &Path, action: &Action) -> Result<(), Failure> {
+        let mut changed = Vec::new();
+        let ended = block_on(change(directory, action, &mut changed))?;
+        if self.json {
+            print_json(&changed)?;
+        } else {
+            print(|out| changed.iter().try_for_each(|job| writeln!(out, "{}", outcome(action, job))))?;
+        }
+        ended
+    }
+}
+
+async fn read_list(directory: &Path, list: &List) -> Result<Vec<Job>, Failure> {
+    let store = Store::open_read_only(directory).await?;
+    Ok(store.queue_list(list.state, list.limit, list.offset).await?)
+}
+
+async fn read_details(directory: &Path, id: &str) -> Result<JobDetails, Failure> {
+    let store = Store::open_read_only(directory).await?;
+    Ok(store.queue_show(id).await?)
+}
+
+async fn change(directory: &Path, action: &Action, changed: &mut Vec<Job>) -> Result<(), Failure> {
+    let store = Store::open(directory).await?;
+    let ids = match action {
+        Action::Drop { ids } | Action::Retry { ids } => ids.as_slice(),
+        Action::Show { id } | Action::Prioritise { id, .. } => std::slice::from_ref(id),
+        Action::List(_) => &[],
+    };
+    for id in ids {
+        let now = unix_milliseconds();
+        let candidate = match action {
+            Action::Drop { .. } => store.drop_job(id, now).await?,
+            Action::Retry { .. } => store.retry_job(id, now).await?,
+            Action::Prioritise { priority, .. } => store.prioritise_job(id, *priority, now).await?,
+            Action::List(_) | Action::Show { .. } => id.clone(),
+        };
+        changed.push(store.queue_show(&candidate).await?.job);
+    }
+    store.close().await;
+    Ok(())
+}
+
+fn outcome(action: &Action, job: &Job) -> String {
+    let Job { candidate, state, priority, .. } = job;
+    match action {
+        Action::Drop { .. } => format!("{candidate} is dropped: it will not be labelled, and not exported"),
+        Action::Prioritise { .. } => format!("{candidate} has priority {priority} now"),
+        _ => format!("{candidate} is {state} again"),
+    }
+}
+
+fn write_list(out: &mut dyn Write, jobs: &[Job], list: &List) -> io::Result<()> {
+    if jobs.is_empty() {
+        let state = list.state.map_or(String::new(), |state| format!(" that are {state}"));
+        return writeln!(out, "no jobs{state} beyond the first {}", list.offset);
+    }
+    let mut table = Table::new(&[
+        "id",
+        "state",
+        ">priority",
+        ">atoms",
+        "formula",
+        ">γ_max",
+        ">attempts",
+        ">failed",
+        "protocol",
+    ]);
+    for job in jobs {
+        table.push(vec![
+            job.candidate.clone(),
+            job.state.to_string(),
+            job.priority.to_string(),
+            job.atoms.to_string(),
+            job.formula.clone(),
+            decimals(job.original_gamma, 2),
+            job.attempts.to_string(),
+            job.failures.to_string(),
+            job.protocol.clone(),
+        ]);
+    }
+    table.write(out)?;
+    if jobs.len() as u64 == u64::from(list.limit) {
+        let next = u64::from(list.offset) + u64::from(list.limit);
+        writeln!(out, "… there may be more: --offset {next} goes on, --limit changes the number")?;
+    }
+    Ok(())
+}
+
+fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
+    let Job {
+        job,
+        candidate,
+        protocol,
+        state,
+        priority,
+        holder,
+        expires,
+        atoms,
+        formula,
+        original_gamma,
+        ..
+    } = &details.job;
+    writeln!(out, "{candidate}")?;
+    writeln!(out, "  job       {job}, protocol '{protocol}'")?;
+    writeln!(out, "  state     {state}, priority {priority}")?;
+    if let (Some(holder), Some(expires)) = (holder, expires) {
+        let left = (expires - unix_milliseconds()) / 1000;
+        writeln!(out, "  held by   {holder}, for {left} s more")?;
+    }
+    writeln!(out, "  atoms     {atoms}, {formula}")?;
+    writeln!(out, "  γ_max     {} (original mixture)", decimals(*original_gamma, 3))?;
+    for (standing, energy) in &details.energies {
+        let standing = format!("{standing:?}").to_lowercase();
+        writeln!(out, "  {standing:<9} energy {energy:.6} eV, {:.6} eV/atom", energy / f64::from(*atoms))?;
+    }
+    writeln!(
+        out,
+        "  attempts  {}, {} failed since it was queued",
+        details.job.attempts, details.job.failures
+    )?;
+    details.attempts_made.iter().try_for_each(|attempt| write_attempt(out, attempt))
+}
+
+fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
+    let Attempt { attempt: number, holder, calculation, started, ended, outcome, class, log } = attempt;
+    let outcome = outcome.as_deref().unwrap_or("under way");
+    let lasted = ended.map(|ended| (ended - started) as f64 / 1000.0);
+    let lasted = lasted.map_or(String::new(), |seconds| format!(" after {seconds:.1} s"));
+    let class = class.as_ref().map_or(String::new(), |class| format!(" ({class})"));
+    writeln!(out, "    {number}: {outcome}{class}{lasted}, by {holder}")?;
+    if let Some(calculation) = calculation {
+        writeln!(out, "       calculation {calculation}")?;
+    }
+    let log = log.as_deref().unwrap_or_default();
+    log.lines().try_for_each(|line| writeln!(out, "       | {line}"))
+}

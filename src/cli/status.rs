@@ -1,0 +1,210 @@
+//! `calmwalk status`
+
+use std::io::{self, Write};
+
+use store::{Candidates, Labels, Status as Standing, Store, WalkStatus, unix_milliseconds};
+
+use super::{CampaignDirectory, Ended, Failure, block_on};
+use crate::output::{Table, decimals, print, print_json};
+
+/// Walks shown unless all are asked for.
+const SHOWN: usize = 20;
+
+/// Show how a campaign stands
+///
+/// Works while it runs and after it ended, and changes nothing.
+#[derive(Debug, clap::Args)]
+pub struct Status {
+    #[command(flatten)]
+    directory: CampaignDirectory,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    /// Show every walk, not only 20 of them (JSON always has all)
+    #[arg(long)]
+    all: bool,
+}
+
+impl Status {
+    pub fn run(self) -> Result<Ended, Failure> {
+        let (campaign, standing) = block_on(self.read())??;
+        if self.json {
+            let mut json = serde_json::to_value(&standing).map_err(Failure::failed)?;
+            json["campaign"] = campaign.id.to_string().into();
+            json["mode"] = mode(&campaign).into();
+            print_json(&json)?;
+        } else {
+            print(|out| write_status(out, &campaign, &standing, self.all))?;
+        }
+        Ok(Ended::Done)
+    }
+
+    async fn read(&self) -> Result<(store::Campaign, Standing), Failure> {
+        let store = Store::open_read_only(&self.directory.directory).await?;
+        let read = (store.campaign().await?, store.status().await?);
+        store.close().await;
+        Ok(read)
+    }
+}
+
+fn mode(campaign: &store::Campaign) -> &str {
+    campaign.mode.trim_matches('"')
+}
+
+fn write_status(
+    out: &mut dyn Write,
+    campaign: &store::Campaign,
+    status: &Standing,
+    all: bool,
+) -> io::Result<()> {
+    let walks = &status.walks;
+    let under_way = walks.iter().filter(|walk| is_under_way(walk)).count();
+    writeln!(out, "campaign    {}, {} mode", campaign.id, mode(campaign))?;
+    writeln!(out, "state       {}", state(status))?;
+    writeln!(
+        out,
+        "walks       {under_way} under way, {} ended; round {}",
+        walks.len() - under_way,
+        status.round
+    )?;
+    writeln!(out, "mixture     version {}", status.mixture_version)?;
+    write_candidates(out, &status.candidates)?;
+    write_labels(out, &status.labels, status.imported)?;
+    write_walks(out, walks, all)?;
+    write_processes(out, status)
+}
+
+fn state(status: &Standing) -> &'static str {
+    let alive = status.processes.iter().any(|process| process.state != "gone");
+    match (status.finished, alive) {
+        (true, _) => "finished",
+        (false, true) => "running",
+        (false, false) => "not running; the same calmwalk run goes on with it",
+    }
+}
+
+fn write_candidates(out: &mut dyn Write, candidates: &Candidates) -> io::Result<()> {
+    let Candidates { seen, accepted, declined, control, refused_by_walkers } = candidates;
+    let reasons = [
+        ("covered", declined.covered),
+        ("duplicate", declined.duplicate),
+        ("guard", declined.guard),
+        ("budget", declined.budget),
+    ];
+    let all: u64 = reasons.iter().map(|(_, count)| count).sum();
+    let reasons = reasons.map(|(reason, count)| format!("{count} {reason}")).join(", ");
+    writeln!(out, "candidates  {seen} seen, {accepted} accepted, {all} declined ({reasons})")?;
+    writeln!(out, "            {control} control frames; {refused_by_walkers} refused by walkers' guards")
+}
+
+fn write_labels(out: &mut dyn Write, labels: &Labels, imported: u64) -> io::Result<()> {
+    let Labels { queued, leased, labelled, failed, dropped } = labels;
+    writeln!(
+        out,
+        "labels      {queued} queued, {leased} leased, {labelled} labelled, {failed} failed, {dropped} dropped; \
+         {imported} structures imported"
+    )
+}
+
+fn is_under_way(walk: &WalkStatus) -> bool {
+    matches!(walk.state.as_str(), "waiting" | "running")
+}
+
+/// Those under way first, then those that began last; in order of their numbers.
+fn shown(walks: &[WalkStatus], all: bool) -> Vec<&WalkStatus> {
+    let mut shown: Vec<_> = walks.iter().collect();
+    if !all && shown.len() > SHOWN {
+        shown.sort_by_key(|walk| (!is_under_way(walk), std::cmp::Reverse(walk.walk)));
+        shown.truncate(SHOWN);
+        shown.sort_by_key(|walk| walk.walk);
+    }
+    shown
+}
+
+fn write_walks(out: &mut dyn Write, walks: &[WalkStatus], all: bool) -> io::Result<()> {
+    if walks.is_empty() {
+        return Ok(());
+    }
+    let shown = shown(walks, all);
+    let mut table = Table::new(&[
+        ">walk",
+        "seed structure",
+        "origin",
+        "state",
+        ">step",
+        ">segment",
+        ">τ",
+        ">T (K)",
+        ">V/V₀",
+        ">γ_max",
+        ">accepted",
+        ">refused",
+        ">returns",
+    ]);
+    for walk in &shown {
+        table.push(vec![
+            walk.walk.to_string(),
+            walk.seed_structure.clone(),
+            walk.origin.clone(),
+            walk.state.replace('_', " "),
+            walk.step.to_string(),
+            walk.segment.to_string(),
+            decimals(walk.tau, 3),
+            decimals(walk.temperature, 0),
+            decimals(walk.relative_volume, 3),
+            // Walks without bias are not graded.
+            decimals(walk.gamma_max.filter(|gamma| *gamma > 0.0), 2),
+            walk.accepted.to_string(),
+            walk.refused.to_string(),
+            walk.returns.to_string(),
+        ]);
+    }
+    writeln!(out)?;
+    table.write(out)?;
+    if shown.len() < walks.len() {
+        writeln!(out, "… and {} more walks: --all shows them", walks.len() - shown.len())?;
+    }
+    Ok(())
+}
+
+fn write_processes(out: &mut dyn Write, status: &Standing) -> io::Result<()> {
+    if status.processes.is_empty() {
+        return Ok(());
+    }
+    let now = unix_milliseconds();
+    let mut table = Table::new(&["process", "host", ">number", "state", ">started", ">last seen"]);
+    for process in &status.processes {
+        table.push(vec![
+            process.kind.clone(),
+            process.host.clone(),
+            process.pid.to_string(),
+            process.state.clone(),
+            ago(now - process.started),
+            ago(now - process.last_seen),
+        ]);
+    }
+    writeln!(out)?;
+    table.write(out)
+}
+
+/// A time that has passed, given in ms.
+fn ago(milliseconds: i64) -> String {
+    let seconds = milliseconds.max(0) / 1000;
+    match (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60, seconds % 60) {
+        (0, 0, 0, s) => format!("{s} s ago"),
+        (0, 0, m, s) => format!("{m} min {s} s ago"),
+        (0, h, m, _) => format!("{h} h {m} min ago"),
+        (d, h, ..) => format!("{d} d {h} h ago"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_have_two_units() {
+        let times = [999, 61_000, 3_660_000, 90_000_000].map(ago);
+        assert_eq!(times, ["0 s ago", "1 min 1 s ago", "1 h 1 min ago", "1 d 1 h ago"]);
+    }
+}

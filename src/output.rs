@@ -1,0 +1,120 @@
+//! What commands print: text and JSON on the standard output, tables with aligned columns, a bar for long work.
+
+use std::io::{self, BufWriter, ErrorKind, Write};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde::Serialize;
+
+use crate::cli::Failure;
+
+/// Work that ends sooner than this shows no bar.
+const BAR_AFTER: Duration = Duration::from_secs(1);
+
+/// Writes to the standard output. A reader who has seen enough (`| head`) is no failure.
+pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Failure> {
+    let mut out = BufWriter::new(io::stdout().lock());
+    match write(&mut out).and_then(|()| out.flush()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => {
+            Err(Failure::Failed(format!("cannot write to the standard output: {error}")))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Writes JSON to the standard output.
+pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
+    let text = serde_json::to_string_pretty(value).map_err(Failure::failed)?;
+    print(|out| writeln!(out, "{text}"))
+}
+
+/// `x` with a number of decimals, or a dash where there is none.
+pub fn decimals(x: Option<f64>, decimals: usize) -> String {
+    x.map_or("–".to_owned(), |x| format!("{x:.decimals$}"))
+}
+
+/// Lines whose columns stand below each other.
+pub struct Table {
+    /// Each column's width so far, and whether it holds numbers, which stand to the right.
+    columns: Vec<(usize, bool)>,
+    rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    /// A table with these column titles; those of numbers begin with `>`.
+    pub fn new(titles: &[&str]) -> Self {
+        let columns = titles.iter().map(|title| (0, title.starts_with('>'))).collect();
+        let mut table = Self { columns, rows: Vec::new() };
+        table.push(titles.iter().map(|title| title.trim_start_matches('>').to_owned()).collect());
+        table
+    }
+
+    /// Adds a line.
+    pub fn push(&mut self, row: Vec<String>) {
+        for ((width, _), cell) in self.columns.iter_mut().zip(&row) {
+            *width = (*width).max(cell.chars().count());
+        }
+        self.rows.push(row);
+    }
+
+    /// Writes all lines.
+    pub fn write(&self, out: &mut dyn Write) -> io::Result<()> {
+        for row in &self.rows {
+            let cells = row.iter().zip(&self.columns).map(|(cell, (width, number))| match number {
+                true => format!("{cell:>width$}"),
+                false => format!("{cell:<width$}"),
+            });
+            writeln!(out, "{}", cells.collect::<Vec<_>>().join("  ").trim_end())?;
+        }
+        Ok(())
+    }
+}
+
+/// A progress bar, only on a terminal and only for work that lasts.
+pub struct Bar {
+    bar: ProgressBar,
+    begun: Instant,
+}
+
+impl Bar {
+    /// A bar of this length (none: unknown) by an indicatif template.
+    pub fn new(length: Option<u64>, template: &str) -> Self {
+        let bar = ProgressBar::with_draw_target(length, ProgressDrawTarget::hidden());
+        bar.set_style(
+            ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()),
+        );
+        Self { bar, begun: Instant::now() }
+    }
+
+    /// Moves it.
+    pub fn set(&self, position: u64, message: impl FnOnce() -> String) {
+        if self.bar.is_hidden() && self.begun.elapsed() > BAR_AFTER {
+            self.bar.set_draw_target(ProgressDrawTarget::stderr());
+        }
+        if !self.bar.is_hidden() {
+            self.bar.set_message(message());
+        }
+        self.bar.set_position(position);
+    }
+}
+
+impl Drop for Bar {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_are_aligned_by_characters() {
+        let mut table = Table::new(&["name", ">γ_max"]);
+        table.push(vec!["é".into(), "1.50".into()]);
+        table.push(vec!["fcc".into(), "12.00".into()]);
+        let mut text = Vec::new();
+        table.write(&mut text).unwrap();
+        assert_eq!(String::from_utf8(text).unwrap(), "name  γ_max\né      1.50\nfcc   12.00\n");
+    }
+}

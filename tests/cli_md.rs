@@ -1,0 +1,186 @@
+//! `calmwalk md`: dynamics of a potential, from a configuration to a trajectory.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use atoms::cell::dot;
+use atoms::extxyz::Frame;
+use atoms::units::{ACCELERATION, BOLTZMANN};
+use atoms::{Evaluation, NeighbourList, Potential, read_extxyz};
+use common::{Running, config, deviation, program, refuse, succeed};
+use potentials::{Eam, EamStyle};
+
+/// A configuration for `steps` steps of the first aluminium seed structure.
+fn configuration(steps: u64, rng_seed: u64, thermostat: &str) -> String {
+    let (structure, potential) = (config("data/aluminium_seeds.extxyz"), config("data/Al_mm.eam.fs"));
+    format!(
+        "structure = {structure:?}\n\
+         [potential]\nkind = \"eam_fs\"\nfile = {potential:?}\n\
+         [dynamics]\nsteps = {steps}\ntemperature = 300\nrng_seed = {rng_seed}\nthermostat = {thermostat}\n\
+         [output]\ntrajectory = \"out.extxyz\"\nevery = 20\n"
+    )
+}
+
+fn run(here: &Path, configuration: &str) -> Vec<Frame> {
+    fs::write(here.join("md.toml"), configuration).unwrap();
+    succeed(here, ["md", "md.toml"]);
+    read_extxyz(&here.join("out.extxyz")).unwrap()
+}
+
+/// ½ Σ p²/m, eV, of momenta in ASE's unit √(u eV).
+fn kinetic_energy(frame: &Frame) -> f64 {
+    let momenta = frame.arrays["momenta"].reals().unwrap();
+    let masses = frame.structure.species.iter().map(|species| species.mass());
+    momenta.as_chunks::<3>().0.iter().zip(masses).map(|(p, m)| dot(*p, *p) / (2.0 * m)).sum()
+}
+
+fn number(frame: &Frame, key: &str) -> f64 {
+    frame.info[key].number().unwrap()
+}
+
+#[test]
+fn energy_is_conserved_and_frames_say_what_the_potential_says() {
+    let directory = tempfile::tempdir().unwrap();
+    let frames = run(directory.path(), &configuration(100, 1, "{ none = {} }"));
+    let steps: Vec<_> = frames.iter().map(|frame| number(frame, "step")).collect();
+    assert_eq!(steps, [0.0, 20.0, 40.0, 60.0, 80.0, 100.0]);
+    let mut potential = Eam::load_as(config("data/Al_mm.eam.fs"), EamStyle::FinnisSinclair).unwrap();
+    let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
+    let mut totals = Vec::new();
+    for frame in &frames {
+        let mut expected = Evaluation::default();
+        neighbours.update(&frame.structure).unwrap();
+        potential.evaluate(&frame.structure, &neighbours, &mut expected).unwrap();
+        let labels = frame.labels().unwrap();
+        assert!(deviation(&[labels.energy.unwrap()], &[expected.energy()]) < 1e-12);
+        assert!((number(frame, "time_fs") - 2.0 * number(frame, "step")).abs() < 1e-9);
+        if number(frame, "step") > 0.0 {
+            // At the start, a perfect crystal, forces and shear stress are nothing but rounding.
+            let volume = frame.structure.cell.volume();
+            assert!(deviation(&labels.forces.unwrap().concat(), &expected.forces.concat()) < 1e-10);
+            assert!(deviation(&labels.stress.unwrap().concat(), &expected.stress(volume).concat()) < 1e-10);
+        }
+        let freedom = 3.0 * (frame.structure.len() - 1) as f64;
+        let temperature = 2.0 * kinetic_energy(frame) / (freedom * BOLTZMANN);
+        assert!(deviation(&[number(frame, "temperature")], &[temperature]) < 1e-12);
+        totals.push(labels.energy.unwrap() + kinetic_energy(frame));
+    }
+    assert!((number(&frames[0], "temperature") - 300.0).abs() < 1e-9);
+    // Half of the kinetic energy has become potential energy meanwhile; Verlet's error is of order (ω dt)²/24 ≈ 10⁻³
+    // of what is exchanged.
+    let exchanged = kinetic_energy(&frames[0]);
+    let spread = totals.iter().fold(0.0, |worst: f64, total| worst.max((total - totals[0]).abs()));
+    assert!(spread < 5e-3 * exchanged, "{spread} of {exchanged} eV");
+}
+
+#[test]
+fn momenta_are_the_motion_of_the_atoms() {
+    let directory = tempfile::tempdir().unwrap();
+    let text = configuration(2, 1, "{ none = {} }").replace("every = 20", "every = 1");
+    let frames =
+        run(directory.path(), &text.replace("temperature = 300", "temperature = 300\ntime_step = 0.01"));
+    // Central difference over two steps of 0.01 fs: its error, x⃛ dt²/6 ≈ 10⁻⁹ Å/fs, is 10⁻⁷ of the velocities.
+    let (before, after) = (&frames[0].structure.positions, &frames[2].structure.positions);
+    let velocities = before.iter().zip(after).flat_map(|(a, b)| [0, 1, 2].map(|k| (b[k] - a[k]) / 0.02));
+    let mass = frames[1].structure.species[0].mass();
+    let momenta: Vec<_> = velocities.map(|v| mass * v / ACCELERATION.sqrt()).collect();
+    assert!(deviation(&momenta, &frames[1].arrays["momenta"].reals().unwrap()) < 1e-6);
+}
+
+#[test]
+fn the_same_random_seed_gives_the_same_bytes() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let trajectory = |rng_seed, thermostat: &str| {
+        run(here, &configuration(40, rng_seed, thermostat));
+        fs::read(here.join("out.extxyz")).unwrap()
+    };
+    for thermostat in ["{ langevin = { friction = 0.01 } }", "{ nose_hoover = { relaxation_time = 50 } }"] {
+        let first = trajectory(7, thermostat);
+        assert_eq!(first, trajectory(7, thermostat));
+        assert_ne!(first, trajectory(8, thermostat));
+    }
+}
+
+#[test]
+fn the_configuration_in_configs_runs() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let printed =
+        succeed(here, ["md", config("md-aluminium.toml").to_str().unwrap(), "--output", "t.extxyz"]);
+    assert!(printed.starts_with("2000 steps of 32 atoms"), "{printed}");
+    let frames = read_extxyz(&here.join("t.extxyz")).unwrap();
+    assert_eq!(frames.len(), 21);
+    // The mean of 20 frames that know little of each other: √(2/93/20) of 300 K is 10 K.
+    let mean = frames[1..].iter().map(|frame| number(frame, "temperature")).sum::<f64>() / 20.0;
+    assert!((mean - 300.0).abs() < 50.0, "{mean} K");
+}
+
+#[test]
+fn an_interrupted_run_leaves_a_valid_trajectory() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let endless = configuration(1_000_000_000, 1, "{ langevin = { friction = 0.01 } }");
+    fs::write(here.join("md.toml"), endless).unwrap();
+    let log = fs::File::create(here.join("log")).unwrap();
+    let mut run = Running(program(here).args(["md", "md.toml"]).stderr(log).spawn().unwrap());
+    let begun = Instant::now();
+    while fs::metadata(here.join("out.extxyz")).map_or(0, |found| found.len()) < 20_000 {
+        assert!(begun.elapsed() < Duration::from_secs(60), "no frames");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    assert!(Command::new("kill").args(["-INT", &run.0.id().to_string()]).status().unwrap().success());
+    assert_eq!(run.0.wait().unwrap().code(), Some(130));
+    assert!(fs::read_to_string(here.join("log")).unwrap().contains("energy (eV)"));
+    let frames = read_extxyz(&here.join("out.extxyz")).unwrap();
+    let steps: Vec<_> = frames.iter().map(|frame| number(frame, "step")).collect();
+    assert!(steps.is_sorted_by(|a, b| a < b) && steps.len() > 3, "{steps:?}");
+}
+
+#[test]
+fn mistakes_are_named_with_their_line() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let good = configuration(10, 1, "{ none = {} }");
+    let refused = |text: String| {
+        fs::write(here.join("md.toml"), text).unwrap();
+        refuse(here, ["md", "md.toml"])
+    };
+    let silicon = config("data/silicon_seeds.extxyz");
+    let aluminium = config("data/aluminium_seeds.extxyz");
+    for (text, place, reason) in [
+        (good.replace("temperature", "temprature"), "md.toml:7:1:", "did you mean `temperature`?"),
+        (good.replace("= 300", "= -300"), "md.toml:7:15:", "expected a finite number above 0"),
+        (good.replace("none = {}", "nose_hover = {}"), "md.toml:9:", "did you mean `nose_hoover`?"),
+        (good.replace("none = {}", "none = { friction = 1 }"), "md.toml:9:", "friction"),
+        (good.replace("eam_fs", "eam_sf"), "md.toml:3:8:", "did you mean `eam_fs`?"),
+        (good.replace("eam_fs", "stillinger_weber"), "md.toml:4: potential.file:", "Al_mm.eam.fs"),
+        (good.replace("Al_mm.eam.fs", "missing"), "md.toml:4: potential.file:", "missing"),
+        (
+            good.replace(aluminium.to_str().unwrap(), silicon.to_str().unwrap()),
+            "md.toml:1: structure:",
+            "silicon_seeds.extxyz:1: atom 0 is Si; the potential knows Al",
+        ),
+        (
+            good.replace("none = {}", "nose_hoover = { relaxation_time = 9, chain_length = 1000000000000 }"),
+            "md.toml:9:",
+            "at most 100",
+        ),
+        (good.replace("steps = 10", ""), "md.toml:5:1:", "missing field `steps`"),
+    ] {
+        let message = refused(text);
+        assert!(
+            message.contains(place) && message.contains(reason),
+            "{message}\nexpected {place} … {reason}"
+        );
+    }
+    assert!(refuse(here, ["md", "absent.toml"]).contains("cannot read absent.toml"));
+    assert!(!here.join("out.extxyz").exists());
+    fs::copy(&aluminium, here.join("seed.extxyz")).unwrap();
+    fs::write(here.join("md.toml"), good.replace(aluminium.to_str().unwrap(), "seed.extxyz")).unwrap();
+    assert!(refuse(here, ["md", "md.toml", "--output", "seed.extxyz"]).contains("name another file"));
+}

@@ -1,0 +1,77 @@
+//! Running the program as its users do.
+#![allow(dead_code)] // Each test program uses a part.
+
+pub mod campaign;
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output};
+
+use atoms::extxyz::{Frame, write_frame};
+
+/// A file of `configs/`.
+pub fn config(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("configs").join(path)
+}
+
+/// The program, to be run in `directory`.
+pub fn program(directory: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_calmwalk"));
+    command.current_dir(directory);
+    command
+}
+
+/// Runs it to its end.
+pub fn calmwalk<A: AsRef<std::ffi::OsStr>>(
+    directory: &Path,
+    arguments: impl IntoIterator<Item = A>,
+) -> Output {
+    program(directory).args(arguments).output().expect("the program starts")
+}
+
+/// The same, and it must succeed; returns its standard output.
+pub fn succeed<A: AsRef<std::ffi::OsStr>>(
+    directory: &Path,
+    arguments: impl IntoIterator<Item = A>,
+) -> String {
+    let output = calmwalk(directory, arguments);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    String::from_utf8(output.stdout).expect("text")
+}
+
+/// The same, and it must fail with exit code 2; returns its standard error.
+pub fn refuse<A: AsRef<std::ffi::OsStr>>(directory: &Path, arguments: impl IntoIterator<Item = A>) -> String {
+    let output = calmwalk(directory, arguments);
+    assert_eq!(output.status.code(), Some(2), "{}", stderr(&output));
+    stderr(&output)
+}
+
+/// A process that is killed in the end, also when a test fails.
+pub struct Running(pub Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// What it wrote to the standard error.
+pub fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Writes frames as extended XYZ.
+pub fn write_frames(path: &Path, frames: &[Frame]) {
+    let mut text = Vec::new();
+    for frame in frames {
+        write_frame(&mut text, frame).expect("a frame that can be written");
+    }
+    std::fs::write(path, text).expect("a file that can be written");
+}
+
+/// Largest deviation of two lists relative to the largest number of the second.
+pub fn deviation(found: &[f64], expected: &[f64]) -> f64 {
+    assert_eq!(found.len(), expected.len());
+    let largest = expected.iter().fold(0.0, |largest: f64, x| largest.max(x.abs()));
+    found.iter().zip(expected).fold(0.0, |worst: f64, (a, b)| worst.max((a - b).abs())) / largest
+}
