@@ -1,0 +1,216 @@
+//! Turns of a walk: pure functions, the bias force, and the way out of a trap.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use atoms::{Evaluation, NeighbourList, Potential, Structure, Vec3, cell, read_extxyz};
+use calm::{Artifact, CollectionRule, Grades, Mixture};
+use potentials::grace::{Grace, GraceModel, PullBack};
+use wire::messages::{Assignment, End, Outcome, Report, Verdict};
+use wire::{CampaignId, Origin, WalkId};
+use workers::bias::BiasedPotential;
+use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
+use workers::walk::{WalkContext, advance};
+
+fn data(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data").join(path)
+}
+
+fn seed(name: &str) -> Structure {
+    let frames = read_extxyz(&data("aluminium_seeds.extxyz")).unwrap();
+    frames.into_iter().find(|frame| frame.info["name"].text() == Some(name)).unwrap().structure
+}
+
+fn model() -> Arc<GraceModel> {
+    Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap())
+}
+
+fn mixture() -> Arc<Mixture> {
+    Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture)
+}
+
+fn settings() -> WalkSettings {
+    WalkSettings {
+        rng_seed: 3,
+        temperature: 600.0,
+        thermostat: ThermostatKind::Langevin { friction: 0.01 },
+        time_step: None,
+        equilibration: 20,
+        steps: 600,
+        tau: 0.15,
+        average_steps: 10,
+        volume_ramp: Some((1.0, 1.4)),
+        skin: 0.5,
+        collection: toml::from_str("rule = 'atom_count'").unwrap(),
+        gap: 200,
+        declined_gap: 20,
+        zbl: Some((1.6, 2.4)),
+        guard: GuardSettings {
+            least_distance: 1.2,
+            least_distance_fraction: 0.75,
+            highest_temperature: 20_000.0,
+            refusals_in_a_row: 5,
+            most_returns: 3,
+            tau_factor: 0.5,
+            checkpoint_interval: 100,
+        },
+    }
+}
+
+fn assignment(structure: Structure, until: u64) -> Assignment {
+    Assignment {
+        campaign: CampaignId([1; 16]),
+        walk: WalkId(0),
+        turn: 0,
+        origin: Origin::Biased,
+        random_walk: WalkId(0),
+        seed_structure: structure,
+        checkpoint: None,
+        verdict: None,
+        until,
+        wanted: Vec::new(),
+    }
+}
+
+fn go(settings: &WalkSettings, assignment: &Assignment) -> Report {
+    let context = WalkContext { model: model(), settings: Arc::new(settings.clone()) };
+    advance(&context, assignment, mixture(), || false, |_| {})
+}
+
+/// Works on a walk turn by turn, with every candidate accepted, until it ends.
+fn whole_walk(settings: &WalkSettings, structure: Structure, turn_steps: u64) -> Vec<Report> {
+    let mut turn = assignment(structure, turn_steps);
+    let mut reports = Vec::new();
+    loop {
+        let report = go(settings, &turn);
+        turn.checkpoint = Some(report.checkpoint.clone());
+        turn.until = report.progress.step + turn_steps;
+        turn.turn += 1;
+        turn.verdict = matches!(report.outcome, Outcome::Candidate(_)).then_some(Verdict::Accepted);
+        let ended = matches!(report.outcome, Outcome::Ended(_));
+        reports.push(report);
+        if ended {
+            return reports;
+        }
+    }
+}
+
+#[test]
+fn a_turn_in_pieces_is_the_same_turn() {
+    let settings = WalkSettings { collection: never(), ..settings() };
+    let whole = go(&settings, &assignment(seed("vacancy"), 120));
+    assert_eq!((&whole.outcome, whole.progress.step), (&Outcome::Turn, 120));
+    let mut turn = assignment(seed("vacancy"), 0);
+    for until in [1, 19, 20, 21, 33, 90, 120] {
+        turn.until = until;
+        turn.checkpoint = Some(go(&settings, &turn).checkpoint);
+    }
+    assert_eq!(turn.checkpoint, Some(whole.checkpoint));
+}
+
+fn never() -> CollectionRule {
+    toml::from_str("rule = 'maximum_grade'\nthreshold = 1e9").unwrap()
+}
+
+#[test]
+fn the_bias_is_the_hal_force() {
+    let (model, mixture, structure) = (model(), mixture(), seed("slab-111"));
+    let species = &structure.species;
+    let mut biased = BiasedPotential::new(Arc::clone(&model), Arc::clone(&mixture), None, 10, species).unwrap();
+    biased.tau = 0.3;
+    let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
+    let (mut force_norm, mut gradient_norm) = (0.0, 0.0);
+    for call in 0..14 {
+        let mut moved = structure.clone();
+        let shift = |r: &mut Vec3, k: usize| r[k % 3] += 0.02 * ((7 * k + 3 * call) as f64).sin();
+        moved.positions.iter_mut().enumerate().for_each(|(k, r)| shift(r, k));
+        neighbours.update(&moved).unwrap();
+        let mut out = Evaluation::default();
+        biased.evaluate(&moved, &neighbours, &mut out).unwrap();
+        let (physical, gradient) = reference(&model, &mixture, &moved, &neighbours);
+        let sum = |vectors: &[Vec3]| vectors.iter().map(|v| cell::norm(*v)).sum::<f64>();
+        let weight = if call == 0 { 1.0 } else { 0.1 };
+        force_norm += weight * (sum(&physical.forces) - force_norm);
+        gradient_norm += weight * (sum(&gradient.gradient) - gradient_norm);
+        let scale = if call < 10 { 0.0 } else { 0.3 * force_norm / gradient_norm };
+        for (found, (force, gradient)) in out.forces.iter().zip(physical.forces.iter().zip(&gradient.gradient)) {
+            let expected = cell::add(*force, cell::scale(*gradient, scale));
+            assert!(cell::norm(cell::sub(*found, expected)) <= 1e-10 * (1.0 + cell::norm(expected)));
+        }
+        assert_eq!(biased.physical(), &physical);
+    }
+}
+
+/// Forces of the potential alone and ∇Σγ.
+fn reference(
+    model: &Arc<GraceModel>,
+    mixture: &Mixture,
+    structure: &Structure,
+    neighbours: &NeighbourList,
+) -> (Evaluation, PullBack) {
+    let mut grace = Grace::new(Arc::clone(model));
+    grace.forward(structure, neighbours).unwrap();
+    let elements = model.element_indices(&structure.species).unwrap();
+    let (mut grades, mut cotangent) = (Grades::default(), vec![0.0; grace.features().len()]);
+    grades.evaluate(mixture, &elements, grace.features(), Some(&mut cotangent)).unwrap();
+    let (mut evaluation, mut pull_back) = (Evaluation::default(), PullBack::default());
+    grace.backward(Some(&cotangent), &mut evaluation, &mut pull_back);
+    (evaluation, pull_back)
+}
+
+/// The trap that the reference's walker fell into: τ = 2.0 on a model of one phase, and a ZBL that ends at 1.8 Å.
+#[test]
+fn a_trapped_walk_goes_back_with_a_smaller_bias() {
+    let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), ..settings() };
+    let reports = whole_walk(&settings, seed("fcc-100"), 150);
+    let last = reports.last().unwrap();
+    assert!(last.progress.returns >= 1, "{last:?}");
+    assert_eq!(last.progress.segment, last.progress.returns);
+    assert_eq!(last.progress.tau, 2.0 * 0.5_f64.powi(last.progress.returns as i32));
+    assert!(last.progress.refused >= u64::from(5 * last.progress.returns));
+    let candidates = reports.iter().filter(|report| matches!(report.outcome, Outcome::Candidate(_))).count();
+    assert!(candidates >= 2, "after its return the walk collects again");
+}
+
+#[test]
+fn a_walk_without_a_way_out_ends() {
+    let guard = GuardSettings { least_distance: 3.0, ..settings().guard };
+    let collection: CollectionRule = toml::from_str("rule = 'maximum_grade'\nthreshold = 0.01").unwrap();
+    let settings = WalkSettings { collection, guard, volume_ramp: None, ..settings() };
+    let reports = whole_walk(&settings, seed("fcc-100"), 150);
+    let last = reports.last().unwrap();
+    assert!(matches!(&last.outcome, Outcome::Ended(End::Trapped { guard }) if guard == "shortest-bond"), "{last:?}");
+    assert!(last.progress.step < 600);
+}
+
+#[test]
+fn a_walk_that_blows_up_ends_with_its_reason() {
+    let guard = GuardSettings { highest_temperature: 900.0, ..settings().guard };
+    let settings = WalkSettings { temperature: 2500.0, collection: never(), guard, ..settings() };
+    let report = go(&settings, &assignment(seed("fcc-100"), 600));
+    let Outcome::Ended(End::BlewUp { reason }) = report.outcome else { panic!("{report:?}") };
+    assert!(reason.contains("above the allowed 900 K"), "{reason}");
+}
+
+#[test]
+fn a_control_walk_gives_the_wanted_frames_and_follows_the_biased_one_until_the_bias_speaks() {
+    let settings = settings();
+    let mut control = assignment(seed("slab-111"), 90);
+    control.origin = Origin::Control;
+    control.walk = WalkId(9);
+    control.wanted = vec![25, 90];
+    let report = go(&settings, &control);
+    let Outcome::Candidate(block) = &report.outcome else { panic!("{report:?}") };
+    assert_eq!((block.view().id().step, block.view().origin()), (25, Origin::Control));
+    // The bias is silent for its first ten evaluations: up to step 30 both are the same trajectory.
+    let same = |until: u64| {
+        let quiet = WalkSettings { collection: never(), ..settings.clone() };
+        let biased = go(&quiet, &assignment(seed("slab-111"), until));
+        let mut control = Assignment { wanted: Vec::new(), ..control.clone() };
+        control.until = until;
+        let state = |report: &Report| (report.progress.temperature, report.progress.relative_volume);
+        state(&biased) == state(&go(&quiet, &control))
+    };
+    assert!(same(30));
+    assert!(!same(60));
+}
