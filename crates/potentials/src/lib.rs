@@ -2,6 +2,7 @@
 
 mod eam;
 mod eam_spline;
+pub mod grace;
 mod pairs;
 mod potential_file;
 mod setfl;

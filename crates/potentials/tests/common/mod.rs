@@ -63,7 +63,10 @@ pub fn assert_close(what: &str, found: &[f64], expected: &[f64], tolerance: f64)
     let scale = expected.iter().fold(0.0, |m: f64, x| m.max(x.abs()));
     for (k, (f, e)) in found.iter().zip(expected).enumerate() {
         let error = (f - e).abs();
-        assert!(error <= tolerance * scale, "{what}[{k}]: {f} is not {e} (largest {scale}, error {error:.2e})");
+        assert!(
+            error <= tolerance * scale,
+            "{what}[{k}]: {f} is not {e} (largest {scale}, error {error:.2e})"
+        );
     }
 }
 

@@ -1,0 +1,271 @@
+//! The sum over bonds: from neighbours to the atomic density A, and from its cotangents back to forces.
+//!
+//! A_a,lm,n = Σ_j R_nl(r) Y_lm(v) ζ_n(μ_j), with d = r_j − r_a, r = √(d·d + 10⁻¹⁰) and v = d / r.
+
+use atoms::{NeighbourList, Structure, Vec3};
+
+use super::matrix::{LANES, Lanes, ZERO, add_product, add_scaled, product};
+use super::model::GraceModel;
+use super::radial::RadialWork;
+
+/// Keeps r differentiable at d = 0, Å².
+const SQUARE_FLOOR: f64 = 1e-10;
+
+/// A bond within the cutoff of its pair.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Bond {
+    /// Index of the neighbour.
+    pub neighbour: u32,
+    /// Its element index.
+    pub element: u32,
+    /// d, Å
+    pub d: Vec3,
+    /// r, Å
+    pub r: f64,
+}
+
+/// The bonds of all atoms, in the order of the neighbour list, and what the forward pass leaves of them for
+/// the reverse sweep.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Bonds {
+    offsets: Vec<usize>,
+    bonds: Vec<Bond>,
+    /// First block of eight bonds of each atom.
+    block_offsets: Vec<usize>,
+    /// R_nl ζ_n, \[block\]\[l\]\[channel\]\[bond\]
+    values: Vec<Lanes>,
+    /// dR_nl/dr ζ_n
+    derivatives: Vec<Lanes>,
+}
+
+impl Bonds {
+    /// Collects the bonds that are shorter than the cutoff of their pair.
+    pub fn update(
+        &mut self,
+        model: &GraceModel,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        elements: &[usize],
+    ) {
+        self.offsets.clear();
+        self.offsets.push(0);
+        self.block_offsets.clear();
+        self.block_offsets.push(0);
+        self.bonds.clear();
+        let mut blocks = 0;
+        for (i, centre) in elements.iter().enumerate() {
+            for neighbour in neighbours.of(i) {
+                let element = elements[neighbour.atom as usize];
+                let d = neighbour.displacement(structure, i);
+                let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + SQUARE_FLOOR).sqrt();
+                if r < model.radial.cutoff(model.radial.pair(*centre, element)) {
+                    self.bonds.push(Bond { neighbour: neighbour.atom, element: element as u32, d, r });
+                }
+            }
+            blocks += (self.bonds.len() - self.offsets[i]).div_ceil(LANES);
+            self.offsets.push(self.bonds.len());
+            self.block_offsets.push(blocks);
+        }
+        let lanes = LANES * model.radial.output_lanes();
+        self.values.resize(blocks * lanes, ZERO);
+        self.derivatives.resize(blocks * lanes, ZERO);
+    }
+}
+
+/// Work arrays for eight bonds of one atom.
+#[derive(Clone, Debug, Default)]
+pub(super) struct BondWork {
+    /// Y_lm, \[lm\]\[bond\]
+    harmonics: Vec<Lanes>,
+    /// ∂Y_lm/∂v
+    gradients: Vec<[Lanes; 3]>,
+    /// R_nl ζ_n, \[bond\]\[l\]\[channel\]
+    values: Vec<Lanes>,
+    /// dR_nl/dr ζ_n
+    derivatives: Vec<Lanes>,
+    radial: RadialWork,
+}
+
+impl BondWork {
+    pub fn new(model: &GraceModel) -> Self {
+        let (functions, lanes) = (model.harmonics.len(), LANES * model.radial.output_lanes());
+        Self {
+            harmonics: vec![ZERO; functions],
+            gradients: vec![[ZERO; 3]; functions],
+            values: vec![ZERO; lanes],
+            derivatives: vec![ZERO; lanes],
+            radial: RadialWork::default(),
+        }
+    }
+
+    /// R_nl(r) ζ_n and derivatives of up to eight bonds, zero where there are fewer.
+    #[inline(always)]
+    fn radial(&mut self, model: &GraceModel, centre: usize, bonds: &[Bond], r: &Lanes) {
+        let (lanes, mut pairs) = (model.radial.output_lanes(), [0; LANES]);
+        for (pair, bond) in pairs.iter_mut().zip(bonds) {
+            *pair = model.radial.pair(centre, bond.element as usize);
+        }
+        let (values, derivatives) = (&mut self.values[..], &mut self.derivatives[..]);
+        model.radial.evaluate(bonds.len(), &pairs, r, &mut self.radial, values, derivatives);
+        for (b, bond) in bonds.iter().enumerate() {
+            let (row, embedding) = (b * lanes..(b + 1) * lanes, &model.embedding[bond.element as usize][..]);
+            multiply_channels(&mut values[row.clone()], embedding);
+            multiply_channels(&mut derivatives[row], embedding);
+        }
+        values[bonds.len() * lanes..].fill(ZERO);
+        derivatives[bonds.len() * lanes..].fill(ZERO);
+    }
+}
+
+#[inline(always)]
+fn multiply_channels(orders: &mut [Lanes], embedding: &[Lanes]) {
+    let mut channels = embedding.iter().cycle();
+    for (x, e) in orders.iter_mut().zip(&mut channels) {
+        *x = product(x, e);
+    }
+}
+
+/// \[bond\]\[function\] → \[function\]\[bond\] for eight bonds.
+#[inline(always)]
+fn transpose(rows: &[Lanes], columns: &mut [Lanes]) {
+    let lanes = rows.len() / LANES;
+    for (c, block) in columns.chunks_exact_mut(LANES).enumerate() {
+        for b in 0..LANES {
+            let row = &rows[b * lanes + c];
+            for k in 0..LANES {
+                block[k][b] = row[k];
+            }
+        }
+    }
+}
+
+/// v and r of up to eight bonds; v is zero where there are fewer.
+#[inline(always)]
+fn directions(bonds: &[Bond]) -> ([Lanes; 3], Lanes) {
+    let (mut v, mut r) = ([ZERO; 3], [1.0; LANES]);
+    for (b, bond) in bonds.iter().enumerate() {
+        r[b] = bond.r;
+        for (v, d) in v.iter_mut().zip(bond.d) {
+            v[b] = d;
+        }
+    }
+    for axis in &mut v {
+        for b in 0..LANES {
+            axis[b] /= r[b];
+        }
+    }
+    (v, r)
+}
+
+impl Bonds {
+    /// Adds the bonds of atom `i` of element `centre` to its density, \[lm\]\[channel\].
+    #[inline(always)]
+    pub fn accumulate(
+        &mut self,
+        i: usize,
+        model: &GraceModel,
+        centre: usize,
+        density: &mut [Lanes],
+        work: &mut BondWork,
+    ) {
+        let (lanes, first) = (model.radial.output_lanes(), self.block_offsets[i]);
+        for (k, bonds) in self.bonds[self.offsets[i]..self.offsets[i + 1]].chunks(LANES).enumerate() {
+            let (v, r) = directions(bonds);
+            model.harmonics.evaluate::<false>(&v, &mut work.harmonics, &mut work.gradients);
+            work.radial(model, centre, bonds, &r);
+            let block = (first + k) * LANES * lanes..(first + k + 1) * LANES * lanes;
+            transpose(&work.values, &mut self.values[block.clone()]);
+            transpose(&work.derivatives, &mut self.derivatives[block]);
+            add_eight(model, density, work);
+        }
+    }
+
+    /// ∂/∂d of Σ A·Ā for each bond of atom `i` and for `N` cotangents Ā of its density at once, handed to
+    /// `sink` bond by bond.
+    ///
+    /// With c_lm = Σ_n Ā_lm,n R_nl ζ_n and c′_lm from dR/dr it is g v + (G − (G·v) v)/r, where
+    /// g = Σ c′_lm Y_lm and G = Σ c_lm ∂Y_lm/∂v.
+    #[inline(always)]
+    pub fn reverse<const N: usize>(
+        &self,
+        i: usize,
+        model: &GraceModel,
+        cotangents: [&[Lanes]; N],
+        work: &mut BondWork,
+        mut sink: impl FnMut(&Bond, [Vec3; N]),
+    ) {
+        let (lanes, first) = (model.radial.output_lanes(), self.block_offsets[i]);
+        for (k, bonds) in self.bonds[self.offsets[i]..self.offsets[i + 1]].chunks(LANES).enumerate() {
+            let (v, r) = directions(bonds);
+            model.harmonics.evaluate::<true>(&v, &mut work.harmonics, &mut work.gradients);
+            let block = (first + k) * LANES * lanes..(first + k + 1) * LANES * lanes;
+            let radial = (&self.values[block.clone()], &self.derivatives[block]);
+            let mut gradients = [[ZERO; 3]; N];
+            for (gradient, cotangent) in gradients.iter_mut().zip(cotangents) {
+                *gradient = gradient_of_eight(model, &v, &r, cotangent, radial, work);
+            }
+            for (b, bond) in bonds.iter().enumerate() {
+                let mut of_bond = [[0.0; 3]; N];
+                for (of_bond, gradient) in of_bond.iter_mut().zip(&gradients) {
+                    *of_bond = [gradient[0][b], gradient[1][b], gradient[2][b]];
+                }
+                sink(bond, of_bond);
+            }
+        }
+    }
+}
+
+/// A_lm,n += Σ_b Y_lm(v_b) R_nl(r_b) ζ_n over eight bonds.
+#[inline(always)]
+fn add_eight(model: &GraceModel, density: &mut [Lanes], work: &BondWork) {
+    let (width, lanes) = (model.density.width, model.radial.output_lanes());
+    let mut rows = density.chunks_exact_mut(width).zip(&work.harmonics);
+    for l in 0..=model.harmonics.lmax() {
+        for (row, y) in rows.by_ref().take(2 * l + 1) {
+            for (c, sum) in row.iter_mut().enumerate() {
+                let mut density = *sum;
+                for (y, values) in y.iter().zip(work.values.chunks_exact(lanes)) {
+                    add_scaled(&mut density, *y, &values[l * width + c]);
+                }
+                *sum = density;
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn gradient_of_eight(
+    model: &GraceModel,
+    v: &[Lanes; 3],
+    r: &Lanes,
+    cotangent: &[Lanes],
+    (values, derivatives): (&[Lanes], &[Lanes]),
+    work: &BondWork,
+) -> [Lanes; 3] {
+    let (width, channels) = (model.density.width, model.density.channels);
+    let (mut along, mut across) = (ZERO, [ZERO; 3]);
+    let mut functions = cotangent.chunks_exact(width).zip(work.harmonics.iter().zip(&work.gradients));
+    let orders = values.chunks_exact(width * LANES).zip(derivatives.chunks_exact(width * LANES));
+    for (l, (values, derivatives)) in orders.enumerate() {
+        for (row, (y, gradient)) in functions.by_ref().take(2 * l + 1) {
+            let (mut c, mut c_prime) = (ZERO, ZERO);
+            let row = &row.as_flattened()[..channels];
+            for ((a, value), derivative) in row.iter().zip(values).zip(derivatives) {
+                add_scaled(&mut c, *a, value);
+                add_scaled(&mut c_prime, *a, derivative);
+            }
+            add_product(&mut along, y, &c_prime);
+            for (across, gradient) in across.iter_mut().zip(gradient) {
+                add_product(across, gradient, &c);
+            }
+        }
+    }
+    let mut result = [ZERO; 3];
+    for b in 0..LANES {
+        let radial = across[0][b] * v[0][b] + across[1][b] * v[1][b] + across[2][b] * v[2][b];
+        for axis in 0..3 {
+            result[axis][b] = along[b] * v[axis][b] + (across[axis][b] - radial * v[axis][b]) / r[b];
+        }
+    }
+    result
+}

@@ -1,0 +1,189 @@
+//! Radial functions as splines of degree seven.
+
+use super::matrix::{LANES, Lanes, ZERO, add_scaled, scaled};
+use super::radial::{RadialNetwork, RadialWork};
+
+/// Intervals to begin with, and the most that are tried.
+const INTERVALS: std::ops::RangeInclusive<usize> = 256..=16384;
+
+/// The errors of values and of derivatives, each relative to the largest, at which refinement ends.
+const TARGET_ERRORS: [f64; 2] = [1e-11, 1e-11];
+
+/// Degree of the spline.
+const DEGREE: usize = 7;
+
+/// DEGREE!
+const FACTORIAL: f64 = 5040.0;
+
+/// B-splines that are not zero within an interval.
+pub(super) const SUPPORT: usize = DEGREE + 1;
+
+/// Roots of the B-spline polynomial inside the unit circle (M. Unser, A. Aldroubi and M. Eden,
+/// IEEE Trans. Signal Process. 41, 821 (1993)).
+const POLES: [f64; 3] = [-0.535_280_430_796_438_2, -0.122_554_615_192_326_69, -0.009_148_694_809_608_277];
+
+/// Samples beyond both ends, over which the effect of the unknown end conditions decays: the largest pole
+/// to this power is 10⁻¹⁷.
+const MARGIN: usize = 64;
+
+/// R_nl(r) for one cutoff as the spline Σ_k c_k β(r/h − k), β the cardinal B-spline of degree seven, through
+/// the exact values at the equidistant knots r = k h. It has six continuous derivatives, and its own
+/// derivative gives the forces, so energy is conserved.
+#[derive(Clone, Debug)]
+pub struct RadialTable {
+    cutoff: f64,
+    intervals: usize,
+    /// 1/h, 1/Å
+    knots_per_length: f64,
+    errors: [f64; 2],
+    /// Lanes of one row: all R_nl of a bond.
+    lanes: usize,
+    /// c_k from k = −3, [intervals + 7, lanes].
+    coefficients: Vec<Lanes>,
+}
+
+impl RadialTable {
+    /// Halves the spacing until the errors are small enough.
+    pub(super) fn new(network: &RadialNetwork, cutoff: f64) -> Self {
+        let mut table = Self::with_intervals(network, cutoff, *INTERVALS.start());
+        while table.is_coarse() && table.intervals < *INTERVALS.end() {
+            table = Self::with_intervals(network, cutoff, 2 * table.intervals);
+        }
+        table
+    }
+
+    /// The network is a smooth function beyond both ends too, so the samples simply go on there.
+    fn with_intervals(network: &RadialNetwork, cutoff: f64, intervals: usize) -> Self {
+        let mut work = RadialWork::default();
+        let (lanes, spacing) = (network.output_lanes(), cutoff / intervals as f64);
+        let mut samples = Vec::new();
+        for k in 0..=intervals + 2 * MARGIN {
+            let r = (k as f64 - MARGIN as f64) * spacing;
+            samples.extend_from_slice(&network.evaluate(r, cutoff, &mut work)[0]);
+        }
+        to_coefficients(&mut samples, lanes);
+        let coefficients = samples[(MARGIN - 3) * lanes..(MARGIN + intervals + 4) * lanes].to_vec();
+        let knots_per_length = intervals as f64 / cutoff;
+        let mut table = Self { cutoff, intervals, knots_per_length, errors: [0.0; 2], lanes, coefficients };
+        table.errors = table.measure(network);
+        table
+    }
+
+    fn is_coarse(&self) -> bool {
+        self.errors.iter().zip(TARGET_ERRORS).any(|(error, target)| *error > target)
+    }
+
+    /// The largest error of values and of derivatives between knots, relative to the largest of each. They
+    /// are largest near the middle and near the quarters of an interval.
+    fn measure(&self, network: &RadialNetwork) -> [f64; 2] {
+        let mut work = RadialWork::default();
+        let mut found = [vec![ZERO; self.lanes], vec![ZERO; self.lanes]];
+        let (mut errors, mut largest) = ([0.0_f64; 2], [f64::MIN_POSITIVE; 2]);
+        for k in 0..2 * self.intervals {
+            let within = if k % 2 == 0 { 0.5 } else { 0.25 };
+            let r = ((k / 2) as f64 + within) * self.cutoff / self.intervals as f64;
+            let [values, derivatives] = &mut found;
+            self.evaluate_one(r, values, derivatives);
+            let exact = network.evaluate(r, self.cutoff, &mut work);
+            for (order, found) in found.iter().enumerate() {
+                for (found, exact) in found.as_flattened().iter().zip(exact[order].as_flattened()) {
+                    errors[order] = errors[order].max((found - exact).abs());
+                    largest[order] = largest[order].max(exact.abs());
+                }
+            }
+        }
+        [errors[0] / largest[0], errors[1] / largest[1]]
+    }
+
+    /// The cutoff it was made for, Å.
+    pub fn cutoff(&self) -> f64 {
+        self.cutoff
+    }
+
+    /// Number of intervals between r = 0 and the cutoff.
+    pub fn intervals(&self) -> usize {
+        self.intervals
+    }
+
+    /// The measured errors of values and of derivatives, relative to the largest of each.
+    pub fn errors(&self) -> [f64; 2] {
+        self.errors
+    }
+
+    /// The interval of r and the place within it, from 0 to 1; 0 ≤ r ≤ cutoff, Å.
+    #[inline(always)]
+    pub(super) fn locate(&self, r: f64) -> (usize, f64) {
+        let position = r * self.knots_per_length;
+        let interval = (position as usize).min(self.intervals - 1);
+        (interval, position - interval as f64)
+    }
+
+    /// Σ_k weights\[k\]\[bond\] c_(interval + k), all R_nl of one bond, and dR_nl/dr in the same way.
+    #[inline(always)]
+    pub(super) fn combine(
+        &self,
+        interval: usize,
+        bond: usize,
+        (weights, slopes): &([Lanes; SUPPORT], [Lanes; SUPPORT]),
+        values: &mut [Lanes],
+        derivatives: &mut [Lanes],
+    ) {
+        let n = self.lanes;
+        let rows = &self.coefficients[interval * n..][..SUPPORT * n];
+        for (c, (value, derivative)) in values.iter_mut().zip(derivatives).enumerate() {
+            let (mut sum, mut slope) = (ZERO, ZERO);
+            for k in 0..SUPPORT {
+                let row = &rows[k * n + c];
+                add_scaled(&mut sum, weights[k][bond], row);
+                add_scaled(&mut slope, slopes[k][bond], row);
+            }
+            *value = sum;
+            *derivative = scaled(self.knots_per_length, &slope);
+        }
+    }
+
+    /// R_nl(r) and its derivative.
+    pub(super) fn evaluate_one(&self, r: f64, values: &mut [Lanes], derivatives: &mut [Lanes]) {
+        let (interval, t) = self.locate(r);
+        self.combine(interval, 0, &b_splines(&[t; LANES]), values, derivatives);
+    }
+}
+
+/// The B-splines of degree p = 7 within an interval and their derivatives, at places t of eight bonds:
+/// p b_j^p = (p − j + t) b_(j−1)^(p−1) + (j + 1 − t) b_j^(p−1) and db_j^p/dt = b_(j−1)^(p−1) − b_j^(p−1).
+#[inline(always)]
+pub(super) fn b_splines(t: &Lanes) -> ([Lanes; SUPPORT], [Lanes; SUPPORT]) {
+    let (mut b, mut slopes) = ([ZERO; SUPPORT], [ZERO; SUPPORT]);
+    b[0] = [1.0 / FACTORIAL; LANES];
+    for p in 1..=DEGREE {
+        let mut before = ZERO;
+        for j in 0..=p {
+            let (here, mut next, mut slope) = (b[j], ZERO, ZERO);
+            for k in 0..LANES {
+                let (rising, falling) = ((p - j) as f64 + t[k], (j + 1) as f64 - t[k]);
+                next[k] = rising * before[k] + falling * here[k];
+                slope[k] = DEGREE as f64 * (before[k] - here[k]);
+            }
+            slopes[j] = slope;
+            (before, b[j]) = (here, next);
+        }
+    }
+    (b, slopes)
+}
+
+/// Turns samples at equidistant knots, [knots, lanes], into spline coefficients by the recursive filter of
+/// Unser, Aldroubi and Eden; near the ends they belong to some other end condition.
+fn to_coefficients(samples: &mut [Lanes], lanes: usize) {
+    let gain: f64 = POLES.iter().map(|z| (1.0 - z) * (1.0 - 1.0 / z)).product();
+    samples.as_flattened_mut().iter_mut().for_each(|x| *x *= gain);
+    for z in POLES {
+        for k in lanes..samples.len() {
+            let before = samples[k - lanes];
+            add_scaled(&mut samples[k], z, &before);
+        }
+        for k in (0..samples.len() - lanes).rev() {
+            let after = samples[k + lanes];
+            samples[k] = std::array::from_fn(|l| z * (after[l] - samples[k][l]));
+        }
+    }
+}

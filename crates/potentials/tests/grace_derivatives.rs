@@ -1,0 +1,177 @@
+//! GRACE derivatives against finite differences, and that results depend on nothing but the structure.
+
+mod common;
+#[path = "common/golden.rs"]
+mod golden;
+
+use std::sync::Arc;
+
+use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
+use common::{assert_close, check_forces, check_virial, position_gradient, strain_gradient};
+use golden::{committed, peer};
+use potentials::grace::{Architecture, Grace, GraceError, GraceModel, PullBack, RadialPath};
+
+fn model(name: &str, path: RadialPath) -> Arc<GraceModel> {
+    Arc::new(GraceModel::load_with(&committed(name).join("kokkos.npz"), path).unwrap())
+}
+
+/// Numbers in [−½, ½), the same in every run.
+fn noise(seed: u64) -> impl FnMut() -> f64 {
+    let mut state = seed;
+    move || {
+        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        (state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
+    }
+}
+
+/// Four atoms in a skewed cell much smaller than the cutoff, periodic in the directions given.
+fn small(symbol: &str, spacing: f64, periodic: [bool; 3]) -> Structure {
+    let a = spacing;
+    let mut noise = noise(7);
+    let sites = [[0.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]];
+    Structure {
+        species: vec![symbol.parse::<Species>().unwrap(); 4],
+        positions: sites.map(|site| site.map(|x| a * x + 0.4 * noise())).to_vec(),
+        cell: Cell([[a, 0.1, 0.0], [-0.2, 1.05 * a, 0.1], [0.3, 0.0, 0.97 * a]]),
+        periodic,
+    }
+}
+
+fn structures() -> Vec<(&'static str, Structure)> {
+    vec![
+        ("al_eam_1l", small("Al", 4.1, [true; 3])),
+        ("al_eam_1l", small("Al", 4.1, [true, true, false])),
+        ("si_sw_1l", small("Si", 4.3, [true, false, false])),
+        ("si_sw_1l", small("Si", 4.3, [false; 3])),
+    ]
+}
+
+#[test]
+fn forces_and_virial_are_differences_of_the_energy() {
+    for (name, structure) in structures() {
+        for path in [RadialPath::Exact, RadialPath::Table] {
+            let mut grace = Grace::new(model(name, path));
+            check_forces(&mut grace, &structure, 1e-3, 1e-8);
+            check_virial(&mut grace, &structure, 1e-4, 1e-8);
+        }
+    }
+}
+
+fn features(grace: &mut Grace, structure: &Structure) -> Vec<f64> {
+    let mut neighbours = NeighbourList::new(grace.cutoff(), 0.0);
+    neighbours.update(structure).unwrap();
+    grace.forward(structure, &neighbours).unwrap();
+    grace.features().to_vec()
+}
+
+#[test]
+fn the_pull_back_is_the_gradient_of_any_linear_function_of_the_features() {
+    for (name, structure) in structures() {
+        let mut grace = Grace::new(model(name, RadialPath::Table));
+        let n = features(&mut grace, &structure).len();
+        let mut noise = noise(11);
+        let cotangent: Vec<f64> = (0..n).map(|_| noise()).collect();
+        let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
+        grace.backward(Some(&cotangent), &mut energy, &mut pull_back);
+
+        let mut linear = |structure: &Structure| {
+            let z = features(&mut grace, structure);
+            z.iter().zip(&cotangent).map(|(z, c)| z * c).sum::<f64>()
+        };
+        let gradient = position_gradient(&structure, 4e-4, &mut linear);
+        assert_close("gradient", pull_back.gradient.as_flattened(), gradient.as_flattened(), 1e-8);
+        let virial = strain_gradient(&structure, 1e-4, &mut linear);
+        assert_close("virial", pull_back.virial.as_flattened(), virial.as_flattened(), 1e-8);
+
+        // The energy's derivatives are the same bits with and without a second cotangent.
+        assert_eq!(energy, common::evaluate(&mut grace, &structure));
+    }
+}
+
+#[test]
+fn an_atom_without_neighbours_has_a_finite_feature_and_no_gradient() {
+    let mut grace = Grace::new(model("al_eam_1l", RadialPath::Table));
+    let alone = Structure {
+        species: vec!["Al".parse().unwrap(); 3],
+        positions: vec![[0.0; 3], [2.8, 0.0, 0.0], [30.0, 0.0, 0.0]],
+        cell: Cell::orthorhombic(1.0, 1.0, 1.0),
+        periodic: [false; 3],
+    };
+    let z = features(&mut grace, &alone);
+    let d = grace.model().feature_dimension();
+    assert!(z.iter().all(|x| x.is_finite()));
+    assert!(z[2 * d..3 * d - 2].iter().all(|x| *x == 0.0));
+    assert!((z[3 * d - 1] - 1.001e-12_f64.ln()).abs() < 1e-12);
+    let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
+    grace.backward(Some(&vec![1.0; 3 * d]), &mut energy, &mut pull_back);
+    assert_eq!((energy.forces[2], pull_back.gradient[2]), ([0.0; 3], [0.0; 3]));
+    assert!(pull_back.gradient[0][0].is_finite() && pull_back.gradient[0][0] != 0.0);
+}
+
+#[test]
+fn equal_structures_give_equal_bits() {
+    let golden = golden::golden(&committed("al_eam_1l"));
+    let structure = &golden[2].structure;
+    let model = model("al_eam_1l", RadialPath::Table);
+    let run = |grace: &mut Grace, skin: f64| {
+        let mut neighbours = NeighbourList::new(grace.cutoff(), skin);
+        neighbours.update(structure).unwrap();
+        grace.forward(structure, &neighbours).unwrap();
+        let z = grace.features().to_vec();
+        let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
+        grace.backward(Some(&z), &mut energy, &mut pull_back);
+        (z, energy, pull_back)
+    };
+    let mut used = Grace::new(model.clone());
+    let first = run(&mut used, 0.0);
+    features(&mut used, &golden[3].structure); // another number of atoms in between
+    for skin in [0.0, 0.3, 1.1] {
+        assert_eq!(run(&mut used, skin), first);
+        assert_eq!(run(&mut Grace::new(model.clone()), skin), first);
+    }
+}
+
+#[test]
+fn what_cannot_be_evaluated_is_refused() {
+    let mut grace = Grace::new(model("al_eam_1l", RadialPath::Table));
+    let copper = small("Cu", 4.1, [true; 3]);
+    let mut neighbours = NeighbourList::new(grace.cutoff(), 0.0);
+    neighbours.update(&copper).unwrap();
+    let error = grace.forward(&copper, &neighbours).unwrap_err();
+    assert_eq!(error.to_string(), "atom 0 is Cu, which the potential does not know (it knows Al)");
+    let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
+    grace.backward(None, &mut energy, &mut pull_back);
+    assert!(energy.forces.is_empty());
+
+    let aluminium = small("Al", 4.1, [true; 3]);
+    let mut short = NeighbourList::new(6.0, 1.0);
+    short.update(&aluminium).unwrap();
+    assert!(matches!(grace.forward(&aluminium, &short), Err(PotentialError::Cutoff { .. })));
+}
+
+#[test]
+fn a_model_describes_itself() {
+    let model = model("si_sw_1l", RadialPath::Table);
+    let description = model.description();
+    assert_eq!(description.architecture, Architecture::OneLayer);
+    assert_eq!((description.lmax, description.channels, description.radial_basis_size), (3, 8, 8));
+    assert_eq!((description.basis_dimension, description.feature_dimension), (328, 130));
+    assert_eq!(description.basis_functions, ["A", "AA", "AAA", "AAAA"]);
+    assert_eq!(description.weights, 14_680);
+    assert_eq!((model.cutoff(), model.pair_cutoff(0, 0)), (5.0, 5.0));
+    let other = GraceModel::load(&committed("al_eam_1l").join("kokkos.npz")).unwrap();
+    let fingerprint = |model: &GraceModel| model.projection().unwrap().fingerprint();
+    assert_eq!(fingerprint(&model), fingerprint(&model.clone()));
+    // Both were made with the same seed and the same shape of basis.
+    assert_eq!(fingerprint(&model), fingerprint(&other));
+}
+
+#[test]
+fn deeper_models_are_refused() {
+    for (name, reason) in [("grace2l_tiny", "two-layer"), ("grace3l_tiny", "three-layer")] {
+        let Some(model) = peer(name) else { return };
+        let error = GraceModel::load(&model.join("kokkos.npz")).unwrap_err();
+        assert!(matches!(&error, GraceError::Unsupported { .. }));
+        assert!(error.to_string().contains(&format!("{reason} models are not supported yet")), "{error}");
+    }
+}
