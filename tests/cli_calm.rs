@@ -138,7 +138,7 @@ fn what_a_frame_came_with_is_kept() {
     labelled.info.insert("note".into(), "mine".into());
     // A cluster has no stress, and reference labels that stand beside a model's are left alone.
     let mut cluster = labelled.clone();
-    cluster.structure.periodic = [true, true, false];
+    cluster.structure.periodic = [false; 3];
     cluster.info.remove("stress");
     cluster.info.insert("REF_energy".into(), (-1.5).into());
     write_frames(&here.join("in.extxyz"), &[labelled.clone(), cluster]);

@@ -1,14 +1,17 @@
 //! `calmwalk run`: all actors of a campaign as tasks and threads of one process.
 
 use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::process;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
+use std::time::Duration;
 
 use orchestrator::reactor::{self, Reactor};
 use orchestrator::selector::{Selector, Snapshot};
+use serde_json::json;
 use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError, this_host, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
@@ -20,10 +23,13 @@ use workers::walker;
 
 use super::{Ended, Failure, block_on};
 use crate::campaign::Campaign;
-use crate::config::compare;
+use crate::config::{Change, compare, place};
+use crate::output::print;
 use crate::progress::Display;
 use crate::summary;
 
+/// Time between two signs of life.
+const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
 /// Reports under way between walkers and reactor.
 const CHANNEL: usize = 64;
 
@@ -46,11 +52,13 @@ impl Run {
         let campaign = Campaign::load(&self.config)?;
         let stem = self.config.file_stem().unwrap_or_default();
         let directory = self.directory.unwrap_or_else(|| PathBuf::from(stem));
-        fs::create_dir_all(&directory)
-            .map_err(|source| StoreError::Directory { directory: directory.clone(), source })?;
+        fs::create_dir_all(&directory).map_err(|source| match source.kind() {
+            ErrorKind::StorageFull => StoreError::DiskFull,
+            _ => StoreError::Directory { directory: directory.clone(), source },
+        })?;
         store::check_directory(&directory)?;
         let _lock = CampaignLock::acquire(&directory, "calmwalk run")?;
-        let ended = block_on(run(&campaign, &directory))??;
+        let ended = block_on(run(&campaign, &directory))?.map_err(|failure| failure.in_campaign(&directory))?;
         if ended == Ended::Interrupted {
             eprintln!("stopped in order; the same command goes on with the campaign");
         }
@@ -63,20 +71,23 @@ async fn run(campaign: &Campaign, directory: &Path) -> Result<Ended, Failure> {
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
     let actors = Actors::start(campaign, selector, &store, &process)?;
+    let alive = tokio::spawn(say_alive(store.clone(), process.clone()));
     let ended = actors.finish().await?;
-    store.release_all(&process.id, unix_milliseconds()).await?;
-    store.remove_process(&process.id).await?;
+    alive.abort();
+    leave(&store, &process, ended).await?;
     if ended == reactor::Ended::Stopped {
         store.close().await;
         return Ok(Ended::Interrupted);
     }
     let summary = summary::of(&store).await?;
-    println!("{summary}");
     let shown = directory.display();
-    println!("the campaign is in {shown}/{DATABASE}; look further with");
-    println!("  calmwalk status {shown}");
-    println!("  calmwalk queue {shown} list");
-    println!("  calmwalk export {shown} --output dataset.extxyz");
+    print(|out| {
+        writeln!(out, "{summary}")?;
+        writeln!(out, "the campaign is in {shown}/{DATABASE}; look further with")?;
+        writeln!(out, "  calmwalk status {shown}")?;
+        writeln!(out, "  calmwalk queue {shown} list")?;
+        writeln!(out, "  calmwalk export {shown} --output dataset.extxyz")
+    })?;
     store.close().await;
     Ok(Ended::Done)
 }
@@ -87,19 +98,13 @@ async fn open_store(campaign: &Campaign, directory: &Path) -> Result<Store, Fail
     let resolved = campaign.resolved();
     let store = if directory.join(DATABASE).exists() {
         let store = Store::open(directory).await?;
-        let in_force = store.campaign().await?.configuration_in_force;
-        let before = serde_json::from_str(&in_force).map_err(Failure::failed)?;
-        for change in compare(&before, &resolved).map_err(Failure::input)? {
-            eprintln!("configuration: {} is now {} (was {})", change.key, change.after, change.before);
-        }
-        store.add_seed_structures(&campaign.stored_seeds()).await?;
-        store.set_configuration_in_force(&resolved.to_string(), now).await?;
+        go_on(campaign, &resolved, &store, now).await?;
         store
     } else {
         let record = store::Campaign {
             id: campaign.id(),
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
-            mode: serde_json::to_value(campaign.config.campaign.mode).map_err(Failure::failed)?.to_string(),
+            mode: campaign.config.campaign.mode.name().to_owned(),
             configuration: campaign.text.clone(),
             resolved_configuration: resolved.to_string(),
             configuration_in_force: resolved.to_string(),
@@ -108,6 +113,32 @@ async fn open_store(campaign: &Campaign, directory: &Path) -> Result<Store, Fail
     };
     store.add_protocol(&campaign.protocol, now).await?;
     Ok(store)
+}
+
+/// Checks that the campaign in the store is this one, and applies what may have changed.
+async fn go_on(
+    campaign: &Campaign,
+    resolved: &serde_json::Value,
+    store: &Store,
+    now: i64,
+) -> Result<(), Failure> {
+    let in_force = store.campaign().await?.configuration_in_force;
+    let before = serde_json::from_str(&in_force).map_err(|error| {
+        Failure::Failed(format!("damaged database: the configuration in force: {error}; restore it from a copy"))
+    })?;
+    let changes = compare(&before, resolved).map_err(|refused| {
+        let at = place(&campaign.path, &campaign.text, refused.key());
+        Failure::Input(format!("{at}: {refused}"))
+    })?;
+    if changes.is_empty() {
+        return Ok(());
+    }
+    for change in &changes {
+        eprintln!("configuration: {change}");
+    }
+    store.add_seed_structures(&campaign.stored_seeds()).await?;
+    let details: Vec<_> = changes.iter().map(Change::detail).collect();
+    Ok(store.set_configuration_in_force(&resolved.to_string(), &details, now).await?)
 }
 
 /// Makes this process known, and takes back what dead ones held: the lock says that there is no other.
@@ -121,7 +152,31 @@ async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
     let (kind, state) = ("orchestrator".to_owned(), "running".to_owned());
     let record = ProcessRecord { id, kind, pid, host, started: now, last_seen: now, state };
     store.upsert_process(&record).await?;
+    let detail = json!({ "process": record.id, "program_version": env!("CARGO_PKG_VERSION") });
+    store.log_operation(now, "started", &detail).await?;
     Ok(record)
+}
+
+/// Gives back what is held, at an end in order.
+async fn leave(store: &Store, process: &ProcessRecord, ended: reactor::Ended) -> Result<(), StoreError> {
+    let now = unix_milliseconds();
+    store.release_all(&process.id, now).await?;
+    store.remove_process(&process.id).await?;
+    let how = match ended {
+        reactor::Ended::Done => "done",
+        reactor::Ended::Stopped => "stopped",
+    };
+    store.log_operation(now, "ended", &json!({ "process": process.id, "how": how })).await
+}
+
+/// Keeps the sign of life in `status` fresh.
+async fn say_alive(store: Store, mut process: ProcessRecord) {
+    loop {
+        tokio::time::sleep(SIGN_OF_LIFE).await;
+        process.last_seen = unix_milliseconds();
+        // A busy database can do without this one.
+        let _ = store.upsert_process(&process).await;
+    }
 }
 
 async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector, Failure> {

@@ -2,6 +2,7 @@
 
 use std::io::{self, Write};
 
+use serde_json::Value;
 use store::{Candidates, Labels, Status as Standing, Store, WalkStatus, unix_milliseconds};
 
 use super::{CampaignDirectory, Ended, Failure, block_on};
@@ -27,39 +28,41 @@ pub struct Status {
 
 impl Status {
     pub fn run(self) -> Result<Ended, Failure> {
-        let (campaign, standing) = block_on(self.read())??;
+        let (campaign, standing, training) = block_on(self.read())??;
         if self.json {
             let mut json = serde_json::to_value(&standing).map_err(Failure::failed)?;
             json["campaign"] = campaign.id.to_string().into();
-            json["mode"] = mode(&campaign).into();
+            json["mode"] = campaign.mode.clone().into();
+            json["training_frames"] = training;
             print_json(&json)?;
         } else {
-            print(|out| write_status(out, &campaign, &standing, self.all))?;
+            print(|out| write_status(out, &campaign, &standing, &training, self.all))?;
         }
         Ok(Ended::Done)
     }
 
-    async fn read(&self) -> Result<(store::Campaign, Standing), Failure> {
+    /// Campaign, standing, and the grades of the training frames under the newest mixture (null if not watched).
+    async fn read(&self) -> Result<(store::Campaign, Standing, Value), Failure> {
         let store = Store::open_read_only(&self.directory.directory).await?;
-        let read = (store.campaign().await?, store.status().await?);
+        let values = store.values().await?;
+        let watched = values.iter().find(|(name, _)| name == "training_frames");
+        let watched = watched.and_then(|(_, text)| serde_json::from_str(text).ok()).unwrap_or_default();
+        let read = (store.campaign().await?, store.status().await?, watched);
         store.close().await;
         Ok(read)
     }
-}
-
-fn mode(campaign: &store::Campaign) -> &str {
-    campaign.mode.trim_matches('"')
 }
 
 fn write_status(
     out: &mut dyn Write,
     campaign: &store::Campaign,
     status: &Standing,
+    training: &Value,
     all: bool,
 ) -> io::Result<()> {
     let walks = &status.walks;
     let under_way = walks.iter().filter(|walk| is_under_way(walk)).count();
-    writeln!(out, "campaign    {}, {} mode", campaign.id, mode(campaign))?;
+    writeln!(out, "campaign    {}, {} mode", campaign.id, campaign.mode)?;
     writeln!(out, "state       {}", state(status))?;
     writeln!(
         out,
@@ -68,10 +71,21 @@ fn write_status(
         status.round
     )?;
     writeln!(out, "mixture     version {}", status.mixture_version)?;
+    write_training(out, training)?;
     write_candidates(out, &status.candidates)?;
     write_labels(out, &status.labels, status.imported)?;
     write_walks(out, walks, all)?;
     write_processes(out, status)
+}
+
+fn write_training(out: &mut dyn Write, training: &Value) -> io::Result<()> {
+    let number = |key: &str| training[key].as_f64();
+    if let (Some(median), Some(share)) = (number("median"), number("share_above_one")) {
+        let alarm = if training["alarm"] == true { "; ALARM: the mixture forgets them" } else { "" };
+        let share = 100.0 * share;
+        writeln!(out, "            training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}")?;
+    }
+    Ok(())
 }
 
 fn state(status: &Standing) -> &'static str {

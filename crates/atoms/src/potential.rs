@@ -33,9 +33,12 @@ impl Evaluation {
         self.atomic_energies.iter().sum()
     }
 
-    /// Stress = −virial / volume, eV/Å³, tension positive.
-    pub fn stress(&self, volume: f64) -> Matrix3 {
-        self.virial.map(|row| row.map(|w| -w / volume))
+    /// Stress = −virial / volume, eV/Å³, tension positive. For a slab or wire that of its whole cell, vacuum included;
+    /// `None` where nothing repeats or the lattice vectors do not span space.
+    pub fn stress(&self, structure: &Structure) -> Option<Matrix3> {
+        let volume = structure.cell.volume();
+        let defined = structure.periodic != [false; 3] && volume > 0.0;
+        defined.then(|| self.virial.map(|row| row.map(|w| -w / volume)))
     }
 }
 

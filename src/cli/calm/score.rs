@@ -23,7 +23,7 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
 /// Grade structures: energy, forces, stress and extrapolation grades of every atom
 ///
-/// Every frame is written with the model's energy (eV), forces (eV/Å) and, if it is periodic in all directions, stress
+/// Every frame is written with the model's energy (eV), forces (eV/Å) and, if it has a cell that repeats, stress
 /// (eV/Å³, tension positive), and with these columns: gamma (extrapolation grade γ), gamma_nbr (its neighbourhood
 /// average), sigma (Mahalanobis distance σ), component (the nearest one of the atom's element, from 0).
 ///
@@ -114,8 +114,7 @@ fn write_scores(frame: &mut Frame, scorer: &Scorer, gradient: bool) {
     keep_labels(frame);
     let evaluation = &scorer.evaluation;
     frame.info.insert("energy".into(), evaluation.energy().into());
-    if frame.structure.periodic == [true; 3] {
-        let stress = evaluation.stress(frame.structure.cell.volume());
+    if let Some(stress) = evaluation.stress(&frame.structure) {
         frame.info.insert("stress".into(), stress.into());
     }
     let scalars = |values: &[f64]| Column { width: 1, entries: Entries::Real(values.to_vec()) };

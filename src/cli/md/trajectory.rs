@@ -41,11 +41,10 @@ impl Trajectory {
 /// Energy (eV), forces (eV/Å), stress (eV/Å³, without its kinetic part), step, time (fs), temperature (K) and momenta.
 fn frame(dynamics: &Dynamics) -> Frame {
     let (state, evaluation) = (dynamics.state(), dynamics.evaluation());
-    let volume = state.structure.cell.volume();
     let labels = Labels {
         energy: Some(evaluation.energy()),
         forces: Some(evaluation.forces.clone()),
-        stress: (state.structure.periodic == [true; 3]).then(|| evaluation.stress(volume)),
+        stress: evaluation.stress(&state.structure),
     };
     // ASE has momenta in u Å per its own unit of time, Å √(u/eV): one fs is √(acceleration of 1 u by 1 eV/Å) of it.
     let unit = ACCELERATION.sqrt();

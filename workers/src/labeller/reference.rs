@@ -39,17 +39,16 @@ impl ReferenceMethod {
         Self { potential, evaluation: Evaluation::default() }
     }
 
-    /// Energy, forces and, where all directions are periodic, stress.
+    /// Energy, forces and, where it is defined, stress.
     pub fn label(&mut self, structure: &Structure) -> Result<Label, LabelFailure> {
         let mut neighbours = NeighbourList::new(self.potential.cutoff(), 0.0);
         neighbours.update(structure)?;
         self.potential.evaluate(structure, &neighbours, &mut self.evaluation)?;
         let evaluation = &self.evaluation;
-        let bulk = structure.periodic == [true; 3];
         Ok(Label {
             energy: evaluation.energy(),
             forces: evaluation.forces.clone(),
-            stress: bulk.then(|| evaluation.stress(structure.cell.volume())),
+            stress: evaluation.stress(structure),
         })
     }
 }
