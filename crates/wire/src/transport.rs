@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use calm::Mixture;
+use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
 use crate::ids::WalkId;
@@ -46,10 +47,15 @@ pub enum Incoming {
     },
     /// Where a walk stands.
     Progress(WalkId, Progress),
+    /// A walker is no more, with or without a turn in hand.
+    Gone {
+        /// Which walker.
+        walker: u32,
+    },
 }
 
 /// The transport between threads of one process: values move, nothing is encoded.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct InProcess {
     walker: u32,
     to_reactor: mpsc::Sender<Incoming>,
@@ -78,5 +84,15 @@ impl Transport for InProcess {
 
     fn stopping(&self) -> bool {
         self.stopping.load(Ordering::Relaxed)
+    }
+}
+
+/// Also when the walker's thread panics: its turn must not be waited for.
+impl Drop for InProcess {
+    fn drop(&mut self) {
+        let gone = Incoming::Gone { walker: self.walker };
+        if let Err(TrySendError::Full(gone)) = self.to_reactor.try_send(gone) {
+            let _ = self.to_reactor.blocking_send(gone);
+        }
     }
 }

@@ -105,6 +105,10 @@ fn sealed(content: &[u8]) -> Vec<u8> {
     [b"CALM\x01".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat()
 }
 
+fn is_about_the_candidate(found: &Result<Message, ControlError>) -> bool {
+    matches!(found, Err(ControlError::Candidate { .. }))
+}
+
 proptest! {
     #[test]
     fn messages_come_back(message in message()) {
@@ -133,7 +137,8 @@ proptest! {
         let trailing = ControlError::Trailing(added.len());
         prop_assert_eq!(decode(&sealed(&content), beside(&message)), Err(trailing));
         let shorter = &bytes[9..bytes.len() - 1];
-        prop_assert!(matches!(decode(&sealed(shorter), beside(&message)), Err(ControlError::Content(_))));
+        let found = decode(&sealed(shorter), beside(&message));
+        prop_assert!(matches!(found, Err(ControlError::Content(_))), "{found:?}");
     }
 
     #[test]
@@ -164,9 +169,8 @@ proptest! {
         let other = CandidateBlock::encode(&other);
         let beside = beside(&Message::Report(report));
         prop_assume!(beside.as_ref() != Some(&other));
-        let refused = |found| matches!(found, Err(ControlError::Candidate { .. }));
-        prop_assert!(refused(decode(&bytes, Some(other))));
-        prop_assert_eq!(refused(decode(&bytes, None)), beside.is_some());
+        prop_assert!(is_about_the_candidate(&decode(&bytes, Some(other))));
+        prop_assert_eq!(is_about_the_candidate(&decode(&bytes, None)), beside.is_some());
     }
 
     #[test]
@@ -176,7 +180,7 @@ proptest! {
         let walk = WalkId(candidate.id.walk.0 ^ 1);
         let report = Report { walk, turn: 0, outcome, checkpoint: Vec::new(), progress: Progress::default() };
         let found = decode(&encode(&Message::Report(report)), Some(block));
-        prop_assert!(matches!(found, Err(ControlError::Candidate { .. })));
+        prop_assert!(is_about_the_candidate(&found));
     }
 
     #[test]
