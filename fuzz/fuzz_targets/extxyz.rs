@@ -1,0 +1,13 @@
+//! Any text is a list of frames or an error with its line, and what was read can be used.
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|bytes: &[u8]| {
+    for frame in atoms::extxyz::Reader::new(bytes).take(100) {
+        let Ok(frame) = frame else { break };
+        let _ = frame.structure.validate();
+        let mut written = Vec::new();
+        let _ = atoms::extxyz::write_frame(&mut written, &frame);
+    }
+});
