@@ -1,6 +1,6 @@
 //! The shell round the selector: takes reports from the channel, has every commit written, then answers.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -8,6 +8,7 @@ use std::time::Duration;
 use store::records::Commit;
 use store::{Store, StoreError};
 use tokio::sync::{mpsc, oneshot};
+use tokio::time::MissedTickBehavior;
 use wire::WalkId;
 use wire::messages::Progress;
 use wire::transport::{Incoming, Work};
@@ -44,7 +45,7 @@ pub enum Notice<'a> {
 pub enum Ended {
     /// Every walk is over.
     Done,
-    /// It was asked to stop; the campaign can go on later.
+    /// Walks are left, but it was asked to stop, or every walker is gone; the campaign can go on later.
     Stopped,
 }
 
@@ -62,78 +63,99 @@ pub struct Reactor {
     pub queue_limit: u64,
 }
 
+/// The walkers, as far as the reactor must know of them.
+#[derive(Default)]
+struct Walkers {
+    /// Those that wait for a turn, in the order in which they came.
+    waiting: VecDeque<(u32, oneshot::Sender<Option<Work>>)>,
+    /// The walk that each of the others has in hand.
+    at_work: HashMap<u32, WalkId>,
+}
+
 impl Reactor {
     /// Runs until every walker has been sent home: all walks over, or stopped.
     pub async fn run(mut self, mut watch: impl FnMut(Notice<'_>)) -> Result<Ended, ReactorError> {
-        let mut waiting = VecDeque::new();
-        let mut ended = Ended::Done;
+        let mut walkers = Walkers::default();
+        // An interval, not a time since the last message: walkers at work may report progress without a pause.
+        let mut look = tokio::time::interval(QUEUE_LOOK);
+        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             let message = tokio::select! {
                 message = self.incoming.recv() => message,
-                () = tokio::time::sleep(QUEUE_LOOK), if !waiting.is_empty() => {
-                    ended = self.answer(&mut waiting, &mut watch).await?.unwrap_or(ended);
+                _ = look.tick(), if !walkers.waiting.is_empty() => {
+                    self.answer(&mut walkers, &mut watch).await?;
                     continue;
                 }
             };
             match message {
                 // Every walker has gone home.
-                None => return Ok(ended),
+                None => return Ok(if self.selector.is_done() { Ended::Done } else { Ended::Stopped }),
                 Some(Incoming::Progress(walk, progress)) => watch(Notice::Progress(walk, progress)),
-                Some(Incoming::Free { report, reply, .. }) => {
+                Some(Incoming::Free { walker, report, reply }) => {
+                    walkers.at_work.remove(&walker);
                     let commit = report.map(|report| self.selector.report(report)).transpose()?.flatten();
                     if let Some(commit) = commit {
                         self.store.commit(&commit).await?;
                         watch(Notice::Committed(&commit));
                     }
-                    waiting.push_back(reply);
-                    ended = self.answer(&mut waiting, &mut watch).await?.unwrap_or(ended);
+                    walkers.waiting.push_back((walker, reply));
+                    self.answer(&mut walkers, &mut watch).await?;
+                }
+                Some(Incoming::Gone { walker }) => {
+                    if let Some(walk) = walkers.at_work.remove(&walker) {
+                        self.selector.lost(walk);
+                        self.answer(&mut walkers, &mut watch).await?;
+                    }
                 }
             }
         }
     }
 
-    /// Gives turns to waiting walkers as far as there are any; says how it ended once it sends walkers home.
+    /// Gives turns to waiting walkers as far as there are any, or sends them home.
     async fn answer(
         &mut self,
-        waiting: &mut VecDeque<oneshot::Sender<Option<Work>>>,
+        walkers: &mut Walkers,
         watch: &mut impl FnMut(Notice<'_>),
-    ) -> Result<Option<Ended>, ReactorError> {
+    ) -> Result<(), ReactorError> {
         if self.stopping.load(Ordering::Relaxed) {
-            send_home(waiting);
-            return Ok(Some(Ended::Stopped));
+            walkers.send_home();
+            return Ok(());
         }
         let unfinished = self.store.unfinished_jobs().await?;
         if unfinished > self.queue_limit {
             watch(Notice::QueueFull(unfinished));
-            return Ok(None);
+            return Ok(());
         }
-        while let Some(reply) = waiting.pop_front() {
-            match self.selector.next() {
+        while let Some((walker, reply)) = walkers.waiting.pop_front() {
+            match self.selector.next_turn() {
                 Next::Turn(assignment) => {
                     let walk = assignment.walk;
                     let work = Work { assignment: *assignment, mixture: Arc::clone(self.selector.mixture()) };
-                    if reply.send(Some(work)).is_err() {
+                    if reply.send(Some(work)).is_ok() {
+                        walkers.at_work.insert(walker, walk);
+                    } else {
                         self.selector.lost(walk);
                     }
                 }
                 Next::Wait => {
-                    waiting.push_front(reply);
-                    return Ok(None);
+                    walkers.waiting.push_front((walker, reply));
+                    return Ok(());
                 }
                 Next::Done => {
-                    waiting.push_front(reply);
-                    send_home(waiting);
-                    return Ok(Some(Ended::Done));
+                    walkers.waiting.push_front((walker, reply));
+                    walkers.send_home();
                 }
             }
         }
-        Ok(None)
+        Ok(())
     }
 }
 
-fn send_home(waiting: &mut VecDeque<oneshot::Sender<Option<Work>>>) {
-    for reply in waiting.drain(..) {
-        // A walker that is gone already needs no answer.
-        let _ = reply.send(None);
+impl Walkers {
+    fn send_home(&mut self) {
+        for (_, reply) in self.waiting.drain(..) {
+            // A walker that is gone already needs no answer.
+            let _ = reply.send(None);
+        }
     }
 }

@@ -70,7 +70,8 @@ impl Selector {
     fn take_in(&mut self, report: &Report, commit: &mut Commit) {
         let turn_steps = self.settings.turn_steps;
         let walk = self.walks.get_mut(&report.walk).expect("checked when the report came in");
-        let returned = report.progress.segment > walk.record.progress.segment;
+        let returned = report.progress.segment > walk.memory.segment;
+        walk.memory.segment = walk.memory.segment.max(report.progress.segment);
         walk.record.turn += 1;
         walk.record.checkpoint = Some(report.checkpoint.clone());
         walk.record.progress = report.progress.clone();
@@ -184,8 +185,9 @@ impl Selector {
         if let Some(training) = &self.training {
             let live = training.grades(&self.mixture)?;
             detail["training_frames"] = json!(live);
-            detail["forgetting_alarm"] = json!(self.settings.forgetting_alarm.is_raised(&training.original, &live));
-            commit.values.push(("training_frames".to_owned(), json!(live).to_string()));
+            let alarm = self.settings.forgetting_alarm.is_raised(&training.original, &live);
+            detail["forgetting_alarm"] = json!(alarm);
+            commit.values.push(training_frames(&live, alarm));
         }
         Ok(())
     }
@@ -228,7 +230,9 @@ impl Selector {
         walk.record.accepted += 1;
         walk.memory.wanted.retain(|step| *step > candidate.step);
         let (done, seed_structure) = (walk.memory.wanted.is_empty(), walk.record.seed_structure);
-        commit.decisions.push(Decision { candidate: Some(candidate), ..self.decision("control", id, detail) });
+        commit
+            .decisions
+            .push(Decision { candidate: Some(candidate), ..self.decision("control", id, detail) });
         commit.candidates.push(CandidateRecord {
             block,
             fate: Fate::Accepted,
@@ -257,6 +261,9 @@ impl Selector {
             self.mixture = Arc::new(self.original.at_version(next_version));
             commit.components.clear();
             commit.restart_mixture = true;
+            if let Some(training) = &self.training {
+                commit.values.push(training_frames(&training.original, false));
+            }
         }
         commit.decisions.push(self.decision("ended", id, detail));
     }
@@ -275,6 +282,13 @@ impl Selector {
         self.walks.insert(control_id, control);
         Some(control_id)
     }
+}
+
+/// The value by which those who watch see what the mixture still knows.
+fn training_frames(grades: &GradeDistribution, alarm: bool) -> (String, String) {
+    let mut value = json!(grades);
+    value["alarm"] = json!(alarm);
+    ("training_frames".to_owned(), value.to_string())
 }
 
 fn grade_summary(gamma: &[f64], mixture_version: u64) -> serde_json::Value {

@@ -1,6 +1,6 @@
 //! The selector: owns the one mixture, decides on every candidate, and hands out the turns of walks.
 //!
-//! It is driven by three calls. [`Selector::next`] gives the next turn for a free walker, [`Selector::report`] takes
+//! It is driven by three calls. [`Selector::next_turn`] gives the next turn for a free walker, [`Selector::report`] takes
 //! what came of a turn and returns what must be committed, and nothing is given out again before the caller has
 //! committed it. All state that matters goes through a [`Commit`], so [`Selector::restore`] continues from the store
 //! as if nothing had happened.
@@ -33,6 +33,16 @@ pub enum Mode {
     Reproducible,
     /// Updates are applied as candidates arrive.
     Live,
+}
+
+impl Mode {
+    /// `"reproducible"` or `"live"`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Reproducible => "reproducible",
+            Self::Live => "live",
+        }
+    }
 }
 
 /// What becomes of the mixture from one seed structure to the next.
@@ -189,8 +199,7 @@ impl Selector {
         let (round, version) = (value("round")?, value("mixture_version")?);
         let declined_feature_bytes = value("declined_feature_bytes")?;
         let mixture = Arc::new(restored_mixture(&original, version, &snapshot.components)?);
-        let walks = snapshot.walks.into_iter().map(|record| Ok((record.walk, Walk::restore(record)?)));
-        let walks: BTreeMap<_, _> = walks.collect::<Result<_, SelectorError>>()?;
+        let walks = restored_walks(snapshot.walks, seeds.len())?;
         let accepted = walks.values().filter(|walk| walk.is_biased()).map(|walk| walk.record.accepted).sum();
         Ok(Self {
             settings,
@@ -210,7 +219,7 @@ impl Selector {
         })
     }
 
-    /// The mixture of the turns that [`Selector::next`] gives out.
+    /// The mixture of the turns that [`Selector::next_turn`] gives out.
     pub fn mixture(&self) -> &Arc<Mixture> {
         &self.mixture
     }
@@ -278,6 +287,22 @@ fn least_distances(
         Err(source) => Err(SelectorError::SeedStructure { name: seed.name.clone(), source }),
     };
     seeds.iter().map(of).collect()
+}
+
+/// The stored walks, which are numbered from 0 and start from known seed structures.
+fn restored_walks(records: Vec<WalkRecord>, seeds: usize) -> Result<BTreeMap<WalkId, Walk>, SelectorError> {
+    let restored = records.into_iter().enumerate().map(|(number, record)| {
+        let (id, seed) = (record.walk, record.seed_structure);
+        if id.0 as usize != number {
+            return Err(SelectorError::Snapshot(format!("walk {id} stands where walk {number} should")));
+        }
+        if seed as usize >= seeds {
+            let problem = format!("walk {id} starts from seed structure {seed}, but there are {seeds}");
+            return Err(SelectorError::Snapshot(problem));
+        }
+        Ok((id, Walk::restore(record)?))
+    });
+    restored.collect()
 }
 
 fn restored_mixture(

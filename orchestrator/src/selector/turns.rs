@@ -41,7 +41,7 @@ impl Selector {
     }
 
     /// The next turn for a free walker.
-    pub fn next(&mut self) -> Next {
+    pub fn next_turn(&mut self) -> Next {
         if self.settings.mode == Mode::Reproducible && self.in_round.is_empty() {
             self.begin_round();
         }
@@ -55,7 +55,12 @@ impl Selector {
         if let Some(id) = self.walks.iter().find_map(ready) {
             return Next::Turn(Box::new(self.assign(id)));
         }
-        if self.walks.values().all(Walk::has_ended) { Next::Done } else { Next::Wait }
+        if self.is_done() { Next::Done } else { Next::Wait }
+    }
+
+    /// Whether every walk is over.
+    pub fn is_done(&self) -> bool {
+        self.walks.values().all(Walk::has_ended)
     }
 
     /// A walker was lost with its turn: the turn is given out again.
@@ -68,7 +73,8 @@ impl Selector {
     /// A round takes the first unfinished biased walks, and as many control walks beside them.
     fn begin_round(&mut self) {
         for biased in [true, false] {
-            let unfinished = self.walks.values().filter(|walk| !walk.has_ended() && walk.is_biased() == biased);
+            let unfinished =
+                self.walks.values().filter(|walk| !walk.has_ended() && walk.is_biased() == biased);
             let taken = unfinished.take(self.settings.walks_per_round).map(|walk| (walk.record.walk, None));
             self.in_round.extend(taken);
         }

@@ -20,6 +20,8 @@ pub(super) struct Walk {
 pub(super) struct Memory {
     /// The answer to the candidate that the last turn ended with.
     pub verdict: Option<Verdict>,
+    /// Segment of the last turn that ended; the walk may be further since, if it was interrupted.
+    pub segment: u32,
     /// Last step of the turn.
     pub until: u64,
     /// Control walk: steps whose frames are still wanted.

@@ -1,0 +1,207 @@
+//! A campaign without a potential: a mixture made up, structures made up, and features as a test wants them.
+#![allow(dead_code, reason = "each test file uses its part")]
+
+pub mod memory;
+pub mod scripted;
+
+use std::sync::Arc;
+
+use atoms::{Cell, Species, Structure};
+use calm::rules::Positive;
+use calm::watch::ForgettingAlarm;
+use calm::{CollectionRule, Combination, Component, Mixture, Statistics, UpdateRule, UpdateSettings};
+use orchestrator::grader::Grader;
+use orchestrator::selector::{
+    Mode, Next, SeedStructure, Selector, Settings, Snapshot, TrainingFrames, UpdateProtocol,
+};
+use store::records::Commit;
+use wire::messages::{Assignment, End, Outcome, Progress, Report};
+use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash};
+
+pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
+pub const DIMENSION: usize = 3;
+pub const ATOMS: usize = 2;
+/// Shortest distance of the seed structures, Å: candidates must keep three quarters of it.
+pub const SHORTEST: f64 = 2.8;
+
+/// Where the two components have their centroids.
+const CENTROIDS: [[f64; DIMENSION]; 2] = [[0.0; DIMENSION], [20.0, 0.0, 0.0]];
+
+pub fn aluminium() -> Species {
+    "Al".parse().unwrap()
+}
+
+/// Two components of unit covariance and θ = 1: γ is the distance of **z** from the nearer centroid.
+pub fn mixture() -> Arc<Mixture> {
+    let identity: Vec<f64> =
+        (0..DIMENSION * DIMENSION).map(|k| f64::from(k % (DIMENSION + 1) == 0)).collect();
+    let component = |centroid: [f64; DIMENSION]| {
+        let scatter = identity.iter().map(|value| 100.0 * value).collect();
+        let statistics = Statistics { scatter, count: 100.0, effective_count: 100.0 };
+        Arc::new(Component::new(centroid.to_vec(), identity.clone(), 1.0, Some(statistics)).unwrap())
+    };
+    Arc::new(Mixture::new(0, vec![CENTROIDS.map(component).to_vec()]).unwrap())
+}
+
+/// Two aluminium atoms so far apart, Å, in a cell that tells structures of different numbers apart.
+pub fn structure(number: u64, distance: f64) -> Structure {
+    Structure {
+        species: vec![aluminium(); ATOMS],
+        positions: vec![[1e-6 * number as f64, 0.0, 0.0], [1e-6 * number as f64, distance, 0.0]],
+        cell: Cell::orthorhombic(12.0, 12.0, 12.0),
+        periodic: [true; 3],
+    }
+}
+
+pub fn seed(number: usize) -> SeedStructure {
+    SeedStructure {
+        name: format!("seed-{number}"),
+        structure: structure(1_000_000 + number as u64, SHORTEST),
+    }
+}
+
+pub fn grader() -> Grader {
+    Grader::new(vec![aluminium()], vec![4.0])
+}
+
+pub fn positive(number: f64) -> Positive {
+    number.try_into().unwrap()
+}
+
+pub fn settings(mode: Mode) -> Settings {
+    Settings {
+        mode,
+        walks_per_round: 2,
+        turn_steps: 10,
+        update: UpdateProtocol::Carried,
+        search: UpdateSettings {
+            combination: Combination::Convex,
+            ladder: None,
+            stop: UpdateRule::MaximumGrade { target: positive(1.25) },
+        },
+        forgetting_alarm: ForgettingAlarm::default(),
+        collection: CollectionRule::MaximumGrade { threshold: positive(1.5) },
+        per_seed: 3,
+        total: None,
+        control: false,
+        least_distance: (1.2, 0.75),
+        declined_feature_bytes: 1 << 20,
+    }
+}
+
+pub fn restore(settings: &Settings, seeds: usize, snapshot: Snapshot) -> Selector {
+    try_restore(settings, seeds, None, snapshot).unwrap()
+}
+
+pub fn try_restore(
+    settings: &Settings,
+    seeds: usize,
+    training: Option<TrainingFrames>,
+    snapshot: Snapshot,
+) -> Result<Selector, orchestrator::selector::SelectorError> {
+    let seeds = (0..seeds).map(seed).collect();
+    Selector::restore(settings.clone(), CAMPAIGN, seeds, grader(), mixture(), training, snapshot)
+}
+
+/// A selector at the start of a campaign, its walks begun.
+pub fn begin(settings: &Settings, seeds: usize) -> Selector {
+    let mut selector = restore(settings, seeds, Snapshot::default());
+    selector.begin_walks();
+    selector
+}
+
+/// The next turn, which there must be.
+pub fn turn(selector: &mut Selector) -> Assignment {
+    match selector.next_turn() {
+        Next::Turn(assignment) => *assignment,
+        other => panic!("expected a turn, found {other:?}"),
+    }
+}
+
+/// Features of a structure: the first atom at the first centroid, the second so far from it, γ = |z|.
+pub fn features(z: [f64; DIMENSION]) -> Vec<f64> {
+    [CENTROIDS[0], z].concat()
+}
+
+/// The largest γ of those features.
+pub fn gamma_max(mixture: &Mixture, z: [f64; DIMENSION]) -> f64 {
+    let mut grades = calm::Grades::default();
+    grades.evaluate(mixture, &[0; ATOMS], &features(z), None).unwrap();
+    grades.maximum()
+}
+
+/// What a walker would send of a structure with these features.
+pub fn block(
+    assignment: &Assignment,
+    mixture: &Mixture,
+    progress: &Progress,
+    structure: Structure,
+    z: [f64; DIMENSION],
+) -> CandidateBlock {
+    let features = features(z);
+    let grades = grader().bonds(&structure).unwrap().grade(mixture, &features).unwrap();
+    CandidateBlock::encode(&Candidate {
+        id: CandidateId {
+            campaign: assignment.campaign,
+            walk: assignment.walk,
+            segment: progress.segment,
+            step: progress.step,
+            content: ContentHash::of(&structure),
+        },
+        origin: assignment.origin,
+        mixture_version: mixture.version(),
+        temperature: progress.temperature,
+        relative_volume: 1.0,
+        energy: -3.0,
+        virial: [[0.5; 3]; 3],
+        forces: vec![[0.1, -0.2, 0.3]; structure.len()],
+        structure,
+        gamma: grades.gamma,
+        gamma_nbr: grades.gamma_nbr,
+        features,
+    })
+}
+
+pub fn at(step: u64) -> Progress {
+    Progress { step, temperature: 300.0, relative_volume: 1.0, ..Progress::default() }
+}
+
+pub fn report(assignment: &Assignment, outcome: Outcome, progress: Progress) -> Report {
+    let checkpoint = format!("step {}", progress.step).into_bytes();
+    Report { walk: assignment.walk, turn: assignment.turn, outcome, checkpoint, progress }
+}
+
+/// A report of a candidate at a step: the structure of that number with these features.
+pub fn offer(
+    selector: &Selector,
+    assignment: &Assignment,
+    step: u64,
+    structure: Structure,
+    z: [f64; DIMENSION],
+) -> Report {
+    let block = block(assignment, selector.mixture(), &at(step), structure, z);
+    report(assignment, Outcome::Candidate(block), at(step))
+}
+
+pub fn ended(assignment: &Assignment, step: u64, end: End) -> Report {
+    report(assignment, Outcome::Ended(end), at(step))
+}
+
+/// What the selector decides on a report that needs no other.
+pub fn decided(selector: &mut Selector, report: Report) -> Commit {
+    selector.report(report).unwrap().expect("no other report is waited for")
+}
+
+/// Kind of each decision, with the reason where it declines.
+pub fn kinds(commit: &Commit) -> Vec<String> {
+    let kind = |decision: &store::records::Decision| match decision.detail.get("reason") {
+        Some(reason) if decision.kind == "declined" => format!("declined {}", reason.as_str().unwrap()),
+        _ => decision.kind.to_owned(),
+    };
+    commit.decisions.iter().map(kind).collect()
+}
+
+pub fn value<'a>(commit: &'a Commit, name: &str) -> &'a str {
+    let mut found = commit.values.iter().rev().filter(|(key, _)| key == name);
+    &found.next().unwrap_or_else(|| panic!("no value {name}")).1
+}

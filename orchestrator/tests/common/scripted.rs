@@ -1,0 +1,94 @@
+//! A walk by script instead of dynamics. Like a real one it is a function of assignment and mixture: the same turn gives
+//! the same report, whoever works on it, however often, and with pauses in between or not.
+
+use calm::Mixture;
+use serde::{Deserialize, Serialize};
+use wire::Origin;
+use wire::messages::{Assignment, End, Outcome, Progress, Report};
+
+use super::{DIMENSION, SHORTEST, at, block, gamma_max, structure};
+
+/// What a walk meets at each of its steps, in order.
+pub type Script = Vec<Event>;
+
+#[derive(Clone, Debug)]
+pub enum Event {
+    Nothing,
+    /// A structure of this number and features of its second atom; `close` if its atoms are too close.
+    Structure {
+        number: u64,
+        z: [f64; DIMENSION],
+        close: bool,
+    },
+    /// A return to the checkpoint of two steps before.
+    Return,
+    BlowUp,
+}
+
+/// The checkpoint of a scripted walk.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+struct State {
+    /// Events behind it.
+    events: usize,
+    step: u64,
+    segment: u32,
+}
+
+/// The turn, paused after so many steps if it lasts longer.
+pub fn advance(
+    script: &Script,
+    assignment: &Assignment,
+    mixture: &Mixture,
+    pause_after: Option<u64>,
+) -> Report {
+    let mut state = assignment
+        .checkpoint
+        .as_ref()
+        .map_or_else(State::default, |bytes| serde_json::from_slice(bytes).unwrap());
+    let mut steps = 0;
+    let outcome = loop {
+        let Some(event) = script.get(state.events) else { break Outcome::Ended(End::Steps) };
+        if state.step >= assignment.until {
+            break Outcome::Turn;
+        }
+        if pause_after == Some(steps) {
+            break Outcome::Paused;
+        }
+        steps += 1;
+        state.step += 1;
+        state.events += 1;
+        if let Some(outcome) = meet(event, assignment, mixture, &mut state) {
+            break outcome;
+        }
+    };
+    let checkpoint = serde_json::to_vec(&state).unwrap();
+    Report { walk: assignment.walk, turn: assignment.turn, outcome, checkpoint, progress: progress(&state) }
+}
+
+fn meet(event: &Event, assignment: &Assignment, mixture: &Mixture, state: &mut State) -> Option<Outcome> {
+    if assignment.origin == Origin::Control {
+        // No bias, so it meets nothing of the script; frames are those of another walk.
+        let number = 2_000_000 + 1000 * u64::from(assignment.walk.0) + state.step;
+        let frame =
+            || block(assignment, mixture, &progress(state), structure(number, SHORTEST), [0.5; DIMENSION]);
+        return assignment.wanted.contains(&state.step).then(|| Outcome::Candidate(frame()));
+    }
+    match *event {
+        Event::Nothing => None,
+        Event::Structure { number, z, close } => {
+            let distance = if close { 0.7 * SHORTEST } else { SHORTEST };
+            let candidate = || block(assignment, mixture, &progress(state), structure(number, distance), z);
+            (gamma_max(mixture, z) > 1.5).then(|| Outcome::Candidate(candidate()))
+        }
+        Event::Return => {
+            state.segment += 1;
+            state.step = state.step.saturating_sub(2);
+            None
+        }
+        Event::BlowUp => Some(Outcome::Ended(End::BlewUp { reason: format!("at step {}", state.step) })),
+    }
+}
+
+fn progress(state: &State) -> Progress {
+    Progress { segment: state.segment, returns: state.segment, ..at(state.step) }
+}

@@ -1,0 +1,326 @@
+//! What becomes of candidates: every reason to decline, updates of the mixture, budgets, and what is logged.
+
+mod common;
+
+use std::sync::Arc;
+
+use calm::grade::maximum;
+use common::{
+    SHORTEST, begin, decided, ended, features, gamma_max, kinds, mixture, offer, positive, settings,
+    structure, try_restore, turn, value,
+};
+use orchestrator::selector::{Mode, Selector, Settings, Snapshot, TrainingFrames, UpdateProtocol};
+use store::records::{Commit, Fate};
+use wire::messages::{Decline, End, Verdict};
+
+/// γ = 3 in the first component.
+const NEW: [f64; 3] = [0.0, 3.0, 0.0];
+/// γ = 1 there.
+const KNOWN: [f64; 3] = [0.0, 1.0, 0.0];
+
+fn live() -> Settings {
+    settings(Mode::Live)
+}
+
+/// A walk's next candidate: the structure of that number with these features.
+fn next_candidate(selector: &mut Selector, step: u64, number: u64, z: [f64; 3]) -> Commit {
+    let assignment = turn(selector);
+    let report = offer(selector, &assignment, step, structure(number, SHORTEST), z);
+    decided(selector, report)
+}
+
+#[test]
+fn what_is_accepted_is_covered_from_then_on() {
+    let mut selector = begin(&live(), 1);
+    let commit = next_candidate(&mut selector, 5, 1, NEW);
+    assert_eq!(kinds(&commit), ["accepted"]);
+    let [candidate] = commit.candidates.as_slice() else { panic!("{commit:?}") };
+    assert_eq!(
+        (candidate.fate, candidate.seed_structure, candidate.keep_features),
+        (Fate::Accepted, 0, true)
+    );
+    assert_eq!((commit.decisions[0].mixture_version, value(&commit, "mixture_version")), (1, "1"));
+    assert_eq!(commit.decisions[0].candidate, Some(candidate.block.view().id()));
+    // One component was touched by both atoms, the other by none.
+    assert_eq!(commit.components.iter().map(|c| (c.element, c.slot)).collect::<Vec<_>>(), [(0, 0)]);
+    assert_eq!((commit.walks.len(), commit.walks[0].accepted, commit.walks[0].turn), (1, 1, 1));
+    assert!(gamma_max(selector.mixture(), NEW) < 1.25);
+    assert!(
+        gamma_max(selector.mixture(), NEW)
+            < commit.decisions[0].detail["selector"]["gamma_max"].as_f64().unwrap()
+    );
+
+    let commit = next_candidate(&mut selector, 6, 2, NEW);
+    assert_eq!(kinds(&commit), ["declined covered"]);
+    assert_eq!(commit.candidates[0].fate, Fate::Declined(Decline::Covered));
+    assert_eq!((selector.mixture().version(), commit.components.len()), (1, 0));
+}
+
+/// Three grades are kept: the walker's, the selector's at the decision, that of the original mixture.
+#[test]
+fn each_candidate_has_three_grades() {
+    let mut selector = begin(&live(), 2);
+    let (first, second) = (turn(&mut selector), turn(&mut selector));
+    // Both walkers have the original mixture; the second candidate comes when the first has been learned.
+    let reports = [
+        offer(&selector, &first, 5, structure(1, SHORTEST), NEW),
+        offer(&selector, &second, 5, structure(2, SHORTEST), [0.0, 0.0, 3.5]),
+    ];
+    let [first, second] = reports.map(|report| decided(&mut selector, report));
+    for (commit, z) in [(&first, 3.0), (&second, 3.5)] {
+        let (candidate, detail) = (&commit.candidates[0], &commit.decisions[0].detail);
+        assert_eq!(candidate.block.view().mixture_version(), 0);
+        assert_eq!(detail["walker"]["mixture_version"], 0);
+        assert!((maximum(candidate.block.view().gamma) - z).abs() < 1e-5);
+        assert!((maximum(&candidate.original.gamma) - z).abs() < 1e-5);
+        assert!((detail["original"]["gamma_max"].as_f64().unwrap() - z).abs() < 1e-5);
+        // The two atoms are bonded, so the average lies between their grades.
+        assert!(candidate.original.gamma_nbr.iter().all(|gamma| 0.0 < *gamma && *gamma < z));
+        assert_eq!(detail["walker"]["atoms_above_1"], 1);
+    }
+    assert_eq!(second.decisions[0].detail["selector"]["mixture_version"], 1);
+    let (seen, newest) =
+        (maximum(second.candidates[0].block.view().gamma), maximum(&second.candidates[0].selector.gamma));
+    assert!(
+        newest > seen * 1.01,
+        "the convex update shrinks the direction that it did not visit: {newest}, {seen}"
+    );
+}
+
+#[test]
+fn atoms_too_close_are_declined() {
+    let mut selector = begin(&live(), 1);
+    let least = 0.75 * SHORTEST;
+    for (number, distance, kind) in [(1, least - 1e-6, "declined guard"), (2, least + 1e-6, "accepted")] {
+        let assignment = turn(&mut selector);
+        let report = offer(&selector, &assignment, number, structure(number, distance), NEW);
+        assert_eq!(kinds(&decided(&mut selector, report)), [kind]);
+    }
+}
+
+/// The guard's fixed distance holds where a fraction of the seed structure's own is less.
+#[test]
+fn the_least_distance_is_the_larger_of_two() {
+    let mut selector = begin(&Settings { least_distance: (2.5, 0.75), ..live() }, 1);
+    let assignment = turn(&mut selector);
+    let report = offer(&selector, &assignment, 1, structure(1, 2.45), NEW);
+    assert_eq!(kinds(&decided(&mut selector, report)), ["declined guard"]);
+}
+
+#[test]
+fn a_known_structure_is_declined() {
+    let never = Settings { update: UpdateProtocol::Never, ..live() };
+    let mut selector = begin(&never, 2);
+    assert_eq!(kinds(&next_candidate(&mut selector, 5, 1, NEW)), ["accepted"]);
+    let commit = next_candidate(&mut selector, 6, 1, NEW);
+    assert_eq!(kinds(&commit), ["declined duplicate"]);
+    assert_eq!(value(&commit, "mixture_version"), "0");
+    // Imported structures are known from the start.
+    let known = vec![wire::ContentHash::of(&structure(7, SHORTEST))];
+    let mut selector = common::restore(&never, 1, Snapshot { known, ..Snapshot::default() });
+    selector.begin_walks();
+    assert_eq!(kinds(&next_candidate(&mut selector, 5, 7, NEW)), ["declined duplicate"]);
+}
+
+#[test]
+fn without_updates_all_that_is_new_to_the_original_is_accepted() {
+    let mut selector = begin(&Settings { update: UpdateProtocol::Never, ..live() }, 1);
+    for number in 1..=2 {
+        let commit = next_candidate(&mut selector, number, number, NEW);
+        assert_eq!(kinds(&commit), ["accepted"]);
+        assert!(commit.components.is_empty() && commit.decisions[0].detail.get("update").is_none());
+    }
+    assert_eq!(selector.mixture().as_ref(), mixture().as_ref());
+}
+
+#[test]
+fn a_seed_structure_gives_only_so_many() {
+    let mut selector = begin(&Settings { update: UpdateProtocol::Never, per_seed: 2, ..live() }, 2);
+    assert_eq!(kinds(&next_candidate(&mut selector, 5, 1, NEW)), ["accepted"]);
+    let commit = next_candidate(&mut selector, 6, 2, NEW);
+    assert_eq!(kinds(&commit), ["accepted", "ended"]);
+    assert_eq!((commit.walks[0].state.as_str(), commit.walks[0].accepted), ("collected", 2));
+    assert_eq!(turn(&mut selector).walk.0, 1);
+}
+
+/// The limit may be lowered while a walk is on its way.
+#[test]
+fn a_walk_beyond_its_budget_ends_with_its_next_candidate() {
+    let mut store = common::memory::MemoryStore::default();
+    let more = Settings { update: UpdateProtocol::Never, per_seed: 3, ..live() };
+    let mut selector = common::restore(&more, 1, Snapshot::default());
+    store.commit(&selector.begin_walks());
+    for number in 1..=2 {
+        store.commit(&next_candidate(&mut selector, number, number, NEW));
+    }
+    let mut selector = common::restore(&Settings { per_seed: 2, ..more }, 1, store.snapshot());
+    let commit = next_candidate(&mut selector, 3, 3, NEW);
+    assert_eq!(kinds(&commit), ["declined budget", "ended"]);
+    assert!(selector.is_done());
+}
+
+#[test]
+fn a_campaign_collects_only_so_many() {
+    let limited = Settings { update: UpdateProtocol::Never, total: Some(2), ..live() };
+    let mut selector = begin(&limited, 3);
+    let assignments = [(); 3].map(|()| turn(&mut selector));
+    let kinds: Vec<_> = (1..)
+        .zip(&assignments)
+        .flat_map(|(number, assignment)| {
+            let report = offer(&selector, assignment, 5, structure(number, SHORTEST), NEW);
+            kinds(&decided(&mut selector, report))
+        })
+        .collect();
+    assert_eq!(kinds, ["accepted", "accepted", "declined budget"]);
+}
+
+#[test]
+fn the_first_reason_is_given() {
+    let limited = Settings { per_seed: 1, total: Some(1), ..live() };
+    let known =
+        vec![wire::ContentHash::of(&structure(1, 1.0)), wire::ContentHash::of(&structure(2, SHORTEST))];
+    let mut selector = common::restore(&limited, 4, Snapshot { known, ..Snapshot::default() });
+    selector.begin_walks();
+    assert_eq!(kinds(&next_candidate(&mut selector, 1, 9, NEW)), ["accepted", "ended"]);
+    let assignments = [(); 3].map(|()| turn(&mut selector));
+    // Close and known; known and covered; covered and beyond the budget.
+    let offers =
+        [(structure(1, 1.0), KNOWN), (structure(2, SHORTEST), KNOWN), (structure(3, SHORTEST), KNOWN)];
+    let reasons = assignments.iter().zip(offers).flat_map(|(assignment, (structure, z))| {
+        let report = offer(&selector, assignment, 1, structure, z);
+        kinds(&decided(&mut selector, report))
+    });
+    assert_eq!(reasons.collect::<Vec<_>>(), ["declined guard", "declined duplicate", "declined budget"]);
+}
+
+#[test]
+fn the_verdict_goes_with_the_next_turn() {
+    let mut selector = begin(&live(), 1);
+    assert_eq!(turn(&mut selector).verdict, None);
+    selector.lost(wire::WalkId(0));
+    next_candidate(&mut selector, 4, 1, NEW);
+    let assignment = turn(&mut selector);
+    assert_eq!(
+        (assignment.verdict.clone(), assignment.turn, assignment.until),
+        (Some(Verdict::Accepted), 1, 14)
+    );
+    assert_eq!(assignment.checkpoint.as_deref(), Some(b"step 4".as_slice()));
+    let report = offer(&selector, &assignment, 9, structure(2, SHORTEST), NEW);
+    decided(&mut selector, report);
+    let assignment = turn(&mut selector);
+    assert_eq!(assignment.verdict, Some(Verdict::Declined(Decline::Covered)));
+    // Interrupted: the walk has taken the verdict in, and it is not given twice.
+    let paused = common::report(&assignment, wire::messages::Outcome::Paused, common::at(11));
+    let commit = decided(&mut selector, paused);
+    assert!(commit.decisions.is_empty() && commit.values.is_empty());
+    let again = turn(&mut selector);
+    assert_eq!((again.verdict, again.turn, again.until), (None, assignment.turn, assignment.until));
+    assert_eq!(again.checkpoint.as_deref(), Some(b"step 11".as_slice()));
+}
+
+#[test]
+fn features_of_declined_candidates_have_a_budget() {
+    let size = size_of_val(features(NEW).as_slice()) as u64;
+    let limited = Settings { declined_feature_bytes: 2 * size + 1, ..live() };
+    let mut store = common::memory::MemoryStore::default();
+    let mut selector = common::restore(&limited, 1, Snapshot::default());
+    store.commit(&selector.begin_walks());
+    for (number, keep, bytes) in [(1, true, size), (2, true, 2 * size), (3, false, 2 * size)] {
+        // What is used up is known after a restart, too.
+        selector = common::restore(&limited, 1, store.snapshot());
+        let commit = next_candidate(&mut selector, number, number, KNOWN);
+        assert_eq!(kinds(&commit), ["declined covered"]);
+        assert_eq!(commit.candidates[0].keep_features, keep);
+        assert_eq!(value(&commit, "declined_feature_bytes"), bytes.to_string());
+        store.commit(&commit);
+    }
+    let commit = next_candidate(&mut selector, 4, 4, NEW);
+    assert!(commit.candidates[0].keep_features, "those of accepted ones are always kept");
+}
+
+#[test]
+fn the_mixture_is_carried_from_one_seed_structure_to_the_next() {
+    let mut selector = begin(&settings(Mode::Reproducible), 2);
+    end_first_walk_after_a_collection(&mut selector);
+    assert_eq!(selector.mixture().version(), 1);
+    assert!(gamma_max(selector.mixture(), NEW) < 1.25);
+}
+
+#[test]
+fn the_mixture_is_restarted_for_the_next_seed_structure() {
+    let restarted =
+        Settings { update: UpdateProtocol::Restarted, walks_per_round: 1, ..settings(Mode::Reproducible) };
+    let training = TrainingFrames::new(vec![0], vec![0.0, 0.0, 0.9], &mixture()).unwrap();
+    let mut selector = try_restore(&restarted, 2, Some(training), Snapshot::default()).unwrap();
+    selector.begin_walks();
+    let commit = end_first_walk_after_a_collection(&mut selector);
+    assert!(commit.restart_mixture && commit.components.is_empty());
+    // The versions go on: no two mixtures share a number.
+    assert_eq!((value(&commit, "mixture_version"), selector.mixture().version()), ("2", 2));
+    assert_eq!(selector.mixture().at_version(0), *mixture());
+    let watched: serde_json::Value = serde_json::from_str(value(&commit, "training_frames")).unwrap();
+    assert!((watched["maximum"].as_f64().unwrap() - 0.9).abs() < 1e-5, "{watched}");
+}
+
+/// A candidate is accepted from the first walk, which then ends. Returns the last commit.
+fn end_first_walk_after_a_collection(selector: &mut Selector) -> Commit {
+    let mut reports = Vec::new();
+    while let orchestrator::selector::Next::Turn(assignment) = selector.next_turn() {
+        let number = u64::from(assignment.walk.0);
+        let z = if number == 0 { NEW } else { KNOWN };
+        reports.push(offer(selector, &assignment, 5, structure(number, SHORTEST), z));
+    }
+    let last = reports.into_iter().filter_map(|report| selector.report(report).unwrap()).last().unwrap();
+    assert_eq!(kinds(&last)[0], "accepted");
+    let mut reports = Vec::new();
+    while let orchestrator::selector::Next::Turn(assignment) = selector.next_turn() {
+        let turn = wire::messages::Outcome::Turn;
+        reports.push(match assignment.walk.0 {
+            0 => ended(&assignment, 10, End::Steps),
+            _ => common::report(&assignment, turn, common::at(10)),
+        });
+    }
+    let last = reports.into_iter().filter_map(|report| selector.report(report).unwrap()).last().unwrap();
+    assert_eq!(kinds(&last), ["ended"]);
+    last
+}
+
+#[test]
+fn forgetting_is_recorded_and_raises_an_alarm() {
+    // Training frames along one direction; the candidates teach another.
+    let features: Vec<f64> = (0..20).flat_map(|k| [0.0, 0.0, 0.045 * f64::from(k) + 0.09]).collect();
+    let training = TrainingFrames::new(vec![0; 20], features, &mixture()).unwrap();
+    let share = training.original.share_above_one;
+    assert_eq!(share, 0.0);
+    let mut patient = Settings { per_seed: 50, ..live() };
+    patient.search.stop = calm::UpdateRule::MaximumGrade { target: positive(2.9) };
+    let mut selector = try_restore(&patient, 1, Some(training), Snapshot::default()).unwrap();
+    selector.begin_walks();
+    let mut alarms = Vec::new();
+    for number in 1..=8 {
+        let z = [0.0, 1.5 * 2_f64.powi(number as i32), 0.0];
+        let commit = next_candidate(&mut selector, number, number, z);
+        assert_eq!(kinds(&commit), ["accepted"]);
+        let detail = &commit.decisions[0].detail;
+        let alarm = detail["forgetting_alarm"].as_bool().unwrap();
+        let mut watched: serde_json::Value = serde_json::from_str(value(&commit, "training_frames")).unwrap();
+        assert_eq!(watched.as_object_mut().unwrap().remove("alarm"), Some(alarm.into()));
+        let live = &detail["training_frames"];
+        assert_eq!(*live, watched);
+        assert_eq!(alarm, live["share_above_one"].as_f64().unwrap() > 0.2);
+        alarms.push(alarm);
+    }
+    assert!(!alarms[0] && alarms[7], "{alarms:?}");
+}
+
+/// The update's rule reaches the search, not only the collection's.
+#[test]
+fn the_update_target_is_the_one_of_the_settings() {
+    let mut strict = live();
+    strict.search.stop = calm::UpdateRule::MaximumGrade { target: positive(0.8) };
+    let mut selector = begin(&strict, 1);
+    let commit = next_candidate(&mut selector, 5, 1, NEW);
+    let after = commit.decisions[0].detail["update"]["gamma_max_after"].as_f64().unwrap();
+    assert!(after < 0.8 && (after - gamma_max(selector.mixture(), NEW)).abs() < 1e-12);
+    assert!(!Arc::ptr_eq(selector.mixture(), &mixture()));
+}

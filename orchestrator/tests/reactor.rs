@@ -1,0 +1,266 @@
+//! The reactor with a real database and walkers on threads of their own: nothing is lost, and nothing hangs.
+
+mod common;
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use common::scripted::{Event, Script, advance};
+use common::{CAMPAIGN, restore, seed, settings};
+use orchestrator::reactor::{Ended, Notice, Reactor};
+use orchestrator::selector::{Mode, Settings, Snapshot};
+use store::{Campaign, JobState, Protocol, SeedStructure, Store};
+use tokio::sync::mpsc;
+use wire::messages::{Progress, Report};
+use wire::transport::{InProcess, Incoming, Transport, Work};
+use wire::{ContentHash, WalkId};
+
+const PROTOCOL: ContentHash = ContentHash([7; 32]);
+
+/// Walks of 60 steps, each with something new every 7 and a return to a checkpoint.
+fn scripts() -> Vec<Script> {
+    let event = |walk: u64, step: u64| match step {
+        31 => Event::Return,
+        step if step % 7 == 0 => {
+            let mut z = [0.0; 3];
+            z[(step / 7 % 3) as usize] = 1.6 * 1.3_f64.powi((step / 7) as i32);
+            Event::Structure { number: 100 * walk + step, z, close: false }
+        }
+        _ => Event::Nothing,
+    };
+    (0..3).map(|walk| (1..=60).map(|step| event(walk, step)).collect()).collect()
+}
+
+fn rounds() -> Settings {
+    Settings { per_seed: 9, control: true, ..settings(Mode::Reproducible) }
+}
+
+/// The campaign's database, made if there is none.
+async fn open(directory: &Path) -> Store {
+    if directory.join(store::DATABASE).exists() {
+        return Store::open(directory).await.unwrap();
+    }
+    let campaign = Campaign {
+        id: CAMPAIGN,
+        program_version: "0.1.0".into(),
+        mode: "reproducible".into(),
+        configuration: String::new(),
+        resolved_configuration: "{}".into(),
+        configuration_in_force: "{}".into(),
+    };
+    let seeds: Vec<_> = (0..3)
+        .map(|index| SeedStructure {
+            index,
+            name: seed(index as usize).name,
+            source: "seeds.extxyz".into(),
+            structure: seed(index as usize).structure,
+        })
+        .collect();
+    let store = Store::create(directory, &campaign, &seeds, 0).await.unwrap();
+    let protocol = Protocol { hash: PROTOCOL, name: "reference".into(), settings: serde_json::json!({}) };
+    store.add_protocol(&protocol, 0).await.unwrap();
+    store
+}
+
+/// A reactor that goes on with what the database holds, and the way to it.
+async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::Sender<Incoming>) {
+    let snapshot = Snapshot {
+        walks: store.load_walks().await.unwrap(),
+        components: store.load_components().await.unwrap(),
+        known: store.known_hashes().await.unwrap(),
+        values: store.values().await.unwrap(),
+    };
+    let mut selector = restore(&rounds(), 3, snapshot);
+    let begun = selector.begin_walks();
+    if !begun.walks.is_empty() {
+        store.commit(&begun).await.unwrap();
+    }
+    let (to_reactor, incoming) = mpsc::channel(2);
+    let (store, stopping, queue_limit) = (store.clone(), Arc::clone(stopping), 1000);
+    (Reactor { selector, store, incoming, stopping, queue_limit }, to_reactor)
+}
+
+/// The turn as a scripted walker does it: interrupted after a few steps if it was asked to stop.
+fn work_on(work: &Work, transport: &InProcess) -> Report {
+    let assignment = &work.assignment;
+    let seed = (0..3).find(|number| seed(*number).structure == assignment.seed_structure).unwrap();
+    let pause = transport.stopping().then_some(2);
+    let report = advance(&scripts()[seed], assignment, &work.mixture, pause);
+    transport.progress(report.walk, report.progress.clone());
+    report
+}
+
+/// Walkers on threads; dropping the sender afterwards is what ends the reactor.
+fn start_walkers(
+    number: u32,
+    to_reactor: mpsc::Sender<Incoming>,
+    stopping: &Arc<AtomicBool>,
+) -> Vec<thread::JoinHandle<()>> {
+    let start = |walker| {
+        let mut transport = InProcess::new(walker, to_reactor.clone(), Arc::clone(stopping));
+        thread::spawn(move || {
+            let mut report = None;
+            while let Some(work) = transport.exchange(report.take()) {
+                report = Some(work_on(&work, &transport));
+            }
+        })
+    };
+    (0..number).map(start).collect()
+}
+
+/// How a reactor ends; its walkers are freed also if it hangs.
+async fn end_of(reactor: Reactor, watch: impl FnMut(Notice<'_>)) -> Ended {
+    let ended = tokio::time::timeout(Duration::from_secs(120), reactor.run(watch)).await;
+    ended.expect("the reactor hangs").unwrap()
+}
+
+/// Runs until it is over, or until `stop_after` commits.
+async fn run(store: &Store, walkers: u32, stop_after: usize) -> Ended {
+    let stopping = Arc::new(AtomicBool::new(false));
+    let (reactor, to_reactor) = reactor(store, &stopping).await;
+    let threads = start_walkers(walkers, to_reactor, &stopping);
+    let mut commits = 0;
+    let watch = |notice: Notice<'_>| {
+        commits += usize::from(matches!(notice, Notice::Committed(_)));
+        if commits >= stop_after {
+            stopping.store(true, Ordering::Relaxed);
+        }
+    };
+    let ended = end_of(reactor, watch).await;
+    threads.into_iter().for_each(|thread| thread.join().unwrap());
+    ended
+}
+
+/// All of a database that two runs of one campaign must share.
+async fn content(store: &Store) -> (String, String) {
+    let mut candidates = String::new();
+    for (_, id) in store.candidate_ids(0, 1000).await.unwrap() {
+        candidates += &format!("{:?}\n", store.candidate(&id).await.unwrap());
+    }
+    let rest = (
+        store.load_walks().await.unwrap(),
+        store.load_components().await.unwrap(),
+        store.values().await.unwrap(),
+    );
+    (store.decision_log_text().await.unwrap(), format!("{candidates}{rest:?}"))
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nothing_is_lost_when_a_campaign_is_stopped_again_and_again() {
+    let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    let whole = open(folders[0].path()).await;
+    assert_eq!(run(&whole, 1, usize::MAX).await, Ended::Done);
+    let (log, rest) = content(&whole).await;
+    let log_has = |kind: &str| log.contains(kind);
+    assert!(["accepted", "declined", "control", "segment", "ended"].into_iter().all(log_has), "{log}");
+
+    let mut times = 0;
+    let stopped = loop {
+        let store = open(folders[1].path()).await;
+        if run(&store, 3, 1 + times % 3).await == Ended::Done {
+            break store;
+        }
+        store.close().await;
+        times += 1;
+        assert!(times < 500, "the campaign does not advance");
+    };
+    assert!(times > 5);
+    let (log_of_stopped, rest_of_stopped) = content(&stopped).await;
+    assert_eq!(log_of_stopped, log);
+    assert_eq!(rest_of_stopped, rest);
+    assert_eq!(run(&stopped, 2, usize::MAX).await, Ended::Done, "a campaign that is over stays so");
+    assert_eq!(content(&stopped).await.0, log);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn walkers_wait_while_the_label_queue_is_full() {
+    const LIMIT: u64 = 2;
+    let folder = tempfile::tempdir().unwrap();
+    let store = open(folder.path()).await;
+    let stopping = Arc::new(AtomicBool::new(false));
+    let (reactor, to_reactor) = reactor(&store, &stopping).await;
+    let reactor = Reactor { queue_limit: LIMIT, ..reactor };
+    let threads = start_walkers(2, to_reactor, &stopping);
+    let (full, mut seen_full) = mpsc::unbounded_channel();
+    let commits = Arc::new(AtomicUsize::new(0));
+    let count = Arc::clone(&commits);
+    let running = tokio::spawn(end_of(reactor, move |notice| match notice {
+        Notice::QueueFull(unfinished) => full.send(unfinished).unwrap(),
+        Notice::Committed(_) => drop(count.fetch_add(1, Ordering::Relaxed)),
+        Notice::Progress(..) => {}
+    }));
+    let mut times = 0;
+    while let Some(unfinished) = seen_full.recv().await {
+        assert!((LIMIT + 1..=LIMIT + 4).contains(&unfinished), "{unfinished}: the limit and at most a round");
+        if store.unfinished_jobs().await.unwrap() <= LIMIT {
+            continue; // It was full before the jobs below were taken out.
+        }
+        // While it is full, only the round in hand may still come in.
+        let before = commits.load(Ordering::Relaxed);
+        tokio::time::sleep(Duration::from_millis(450)).await;
+        assert!(commits.load(Ordering::Relaxed) <= before + 1);
+        for job in store.queue_list(Some(JobState::Queued), 10, 0).await.unwrap() {
+            store.drop_job(&job.candidate, 0).await.unwrap();
+        }
+        times += 1;
+    }
+    assert!(times > 2);
+    assert_eq!(running.await.unwrap(), Ended::Done);
+    threads.into_iter().for_each(|thread| thread.join().unwrap());
+}
+
+/// A campaign whose only walker waits can be stopped, also while somebody reports progress without a pause.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_waiting_walker_is_sent_home_when_the_campaign_is_stopped() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = open(folder.path()).await;
+    let stopping = Arc::new(AtomicBool::new(false));
+    let (reactor, to_reactor) = reactor(&store, &stopping).await;
+    let reactor = Reactor { queue_limit: 0, ..reactor };
+    let talker = InProcess::new(9, to_reactor.clone(), Arc::clone(&stopping));
+    let walker = start_walkers(1, to_reactor, &stopping).remove(0);
+    let talking = thread::spawn(move || {
+        while !walker.is_finished() {
+            talker.progress(WalkId(0), Progress::default());
+            thread::sleep(Duration::from_millis(2));
+        }
+    });
+    let watch = move |notice: Notice<'_>| {
+        if matches!(notice, Notice::QueueFull(_)) {
+            stopping.store(true, Ordering::Relaxed);
+        }
+    };
+    assert_eq!(end_of(reactor, watch).await, Ended::Stopped);
+    talking.join().unwrap();
+}
+
+/// A walker that dies with a turn in hand leaves it to the others.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_turn_of_a_walker_that_dies_is_done_by_another() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = open(folder.path()).await;
+    let stopping = Arc::new(AtomicBool::new(false));
+    let (reactor, to_reactor) = reactor(&store, &stopping).await;
+    let mut mortal = InProcess::new(9, to_reactor.clone(), Arc::clone(&stopping));
+    let dying = thread::spawn(move || {
+        let work = mortal.exchange(None).expect("the first to ask gets a turn");
+        drop(work);
+    });
+    let running = tokio::spawn(end_of(reactor, |_| ()));
+    tokio::task::spawn_blocking(|| dying.join().unwrap()).await.unwrap();
+    let threads = start_walkers(2, to_reactor, &stopping);
+    assert_eq!(running.await.unwrap(), Ended::Done);
+    threads.into_iter().for_each(|thread| thread.join().unwrap());
+}
+
+#[tokio::test]
+async fn a_campaign_whose_walkers_are_all_gone_is_not_done() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = open(folder.path()).await;
+    let (reactor, to_reactor) = reactor(&store, &Arc::default()).await;
+    drop(to_reactor);
+    assert_eq!(end_of(reactor, |_| ()).await, Ended::Stopped);
+}

@@ -1,0 +1,298 @@
+//! Walks in turns and rounds: beginning, waiting, control walks, returns, losses, ends.
+
+mod common;
+
+use common::memory::MemoryStore;
+use common::{
+    SHORTEST, at, begin, decided, ended, kinds, offer, restore, settings, structure, try_restore, turn, value,
+};
+use orchestrator::selector::{Mode, Next, Selector, SelectorError, Settings, Snapshot, UpdateProtocol};
+use store::records::{ComponentRecord, Fate};
+use wire::messages::{End, Outcome, Progress};
+use wire::{Origin, WalkId};
+
+const NEW: [f64; 3] = [0.0, 3.0, 0.0];
+
+fn is_waiting(selector: &mut Selector) -> bool {
+    matches!(selector.next_turn(), Next::Wait)
+}
+
+#[test]
+fn every_seed_structure_gets_one_walk() {
+    let mut store = MemoryStore::default();
+    let mut selector = restore(&settings(Mode::Live), 2, Snapshot::default());
+    assert!(selector.is_done(), "no walks yet");
+    let commit = selector.begin_walks();
+    assert_eq!(kinds(&commit), ["begun", "begun"]);
+    assert_eq!(commit.decisions[1].detail["seed_structure"], "seed-1");
+    store.commit(&commit);
+    assert!(selector.begin_walks().walks.is_empty());
+    // Another seed structure is added to the campaign.
+    let mut selector = restore(&settings(Mode::Live), 3, store.snapshot());
+    let commit = selector.begin_walks();
+    assert_eq!(
+        (kinds(&commit), commit.walks[0].walk, commit.walks[0].seed_structure),
+        (vec!["begun".into()], WalkId(2), 2)
+    );
+    let assignments = [(); 3].map(|()| turn(&mut selector));
+    for (seed, assignment) in assignments.iter().enumerate() {
+        assert_eq!(assignment.seed_structure, common::seed(seed).structure);
+        assert_eq!((assignment.campaign, assignment.random_walk), (common::CAMPAIGN, assignment.walk));
+        assert_eq!((assignment.turn, assignment.until, assignment.checkpoint.is_none()), (0, 10, true));
+    }
+    assert!(is_waiting(&mut selector));
+    let names: Vec<_> = selector.standing(100).into_iter().map(|(_, name, step)| (name, step)).collect();
+    assert_eq!(names, [("seed-0".into(), 0), ("seed-1".into(), 0), ("seed-2".into(), 0)]);
+}
+
+#[test]
+fn a_round_is_decided_when_all_its_reports_are_in_and_in_walk_order() {
+    let mut selector = begin(&settings(Mode::Reproducible), 3);
+    let (first, second) = (turn(&mut selector), turn(&mut selector));
+    assert!(is_waiting(&mut selector), "the third walk is not in the round");
+    let reports = [
+        offer(&selector, &second, 5, structure(2, SHORTEST), NEW),
+        offer(&selector, &first, 6, structure(1, SHORTEST), NEW),
+    ];
+    let [later, earlier] = reports;
+    assert!(selector.report(later).unwrap().is_none());
+    assert!(is_waiting(&mut selector));
+    let commit = decided(&mut selector, earlier);
+    assert_eq!(kinds(&commit), ["accepted", "declined covered"]);
+    let walks: Vec<_> = commit.decisions.iter().map(|decision| (decision.walk, decision.round)).collect();
+    assert_eq!(walks, [(Some(WalkId(0)), 1), (Some(WalkId(1)), 1)]);
+    assert_eq!((value(&commit, "round"), selector.mixture().version()), ("1", 1));
+    // A walk that ends makes room for the next.
+    let (first, second) = (turn(&mut selector), turn(&mut selector));
+    assert!(selector.report(ended(&first, 20, End::Steps)).unwrap().is_none());
+    decided(&mut selector, common::report(&second, Outcome::Turn, at(15)));
+    assert_eq!([turn(&mut selector).walk, turn(&mut selector).walk], [WalkId(1), WalkId(2)]);
+}
+
+#[test]
+fn live_walks_do_not_wait_for_each_other() {
+    let mut selector = begin(&settings(Mode::Live), 3);
+    let assignments = [(); 3].map(|()| turn(&mut selector));
+    for assignment in assignments.iter().rev() {
+        let report = offer(&selector, assignment, 5, structure(assignment.walk.0.into(), SHORTEST), NEW);
+        let commit = decided(&mut selector, report);
+        assert_eq!(commit.decisions[0].walk, Some(assignment.walk));
+        assert_eq!(commit.decisions[0].round, 0);
+        assert_eq!(turn(&mut selector).walk, assignment.walk, "its next turn is there at once");
+    }
+}
+
+#[test]
+fn reports_that_nobody_asked_for_are_refused() {
+    let mut selector = begin(&settings(Mode::Live), 1);
+    let assignment = turn(&mut selector);
+    let unasked = |selector: &mut Selector, report| {
+        let error = selector.report(report).unwrap_err();
+        assert!(matches!(error, SelectorError::Unasked { .. }), "{error}");
+    };
+    let report = common::report(&assignment, Outcome::Turn, at(10));
+    unasked(&mut selector, wire::messages::Report { walk: WalkId(1), ..report.clone() });
+    unasked(&mut selector, wire::messages::Report { turn: 1, ..report.clone() });
+    decided(&mut selector, report.clone());
+    unasked(&mut selector, report.clone());
+    turn(&mut selector);
+    unasked(&mut selector, report);
+}
+
+#[test]
+fn the_turn_of_a_lost_walker_is_given_out_again() {
+    for mode in [Mode::Live, Mode::Reproducible] {
+        let mut selector = begin(&settings(mode), 1);
+        let first = turn(&mut selector);
+        assert!(is_waiting(&mut selector));
+        selector.lost(first.walk);
+        let second = turn(&mut selector);
+        assert_eq!(first, second);
+        selector.lost(WalkId(7));
+        let commit = decided(&mut selector, ended(&second, 30, End::Steps));
+        assert_eq!(kinds(&commit), ["ended"]);
+        selector.lost(second.walk);
+        assert!(matches!(selector.next_turn(), Next::Done), "what has ended is not given out again");
+    }
+}
+
+fn returned(segment: u32, step: u64) -> Progress {
+    Progress { segment, returns: segment, tau: 0.125, ..at(step) }
+}
+
+#[test]
+fn a_return_to_a_checkpoint_is_logged_once() {
+    let mut selector = begin(&settings(Mode::Live), 1);
+    let assignment = turn(&mut selector);
+    let commit = decided(&mut selector, common::report(&assignment, Outcome::Turn, returned(2, 8)));
+    assert_eq!(kinds(&commit), ["segment"]);
+    let detail = &commit.decisions[0].detail;
+    assert_eq!(*detail, serde_json::json!({ "segment": 2, "step": 8, "tau": 0.125, "returns": 2 }));
+    assert_eq!(commit.walks[0].progress.segment, 2);
+    let assignment = turn(&mut selector);
+    assert_eq!(assignment.until, 18);
+    let commit = decided(&mut selector, common::report(&assignment, Outcome::Turn, returned(2, 18)));
+    assert_eq!(kinds(&commit), [""; 0]);
+}
+
+/// An interruption after the return does not take it out of the log.
+#[test]
+fn a_return_before_an_interruption_is_logged_as_well() {
+    let mut store = MemoryStore::default();
+    let mut selector = restore(&settings(Mode::Live), 1, Snapshot::default());
+    store.commit(&selector.begin_walks());
+    let assignment = turn(&mut selector);
+    store.commit(&decided(&mut selector, common::report(&assignment, Outcome::Paused, returned(1, 4))));
+    let mut selector = restore(&settings(Mode::Live), 1, store.snapshot());
+    let assignment = turn(&mut selector);
+    let commit = decided(&mut selector, common::report(&assignment, Outcome::Turn, returned(1, 10)));
+    assert_eq!(kinds(&commit), ["segment"]);
+}
+
+#[test]
+fn every_end_is_logged_with_its_reason() {
+    let reason = || "forces are not finite".to_owned();
+    let ends = [
+        (End::Steps, "steps", ""),
+        (
+            End::Trapped { guard: "shortest-bond".into() },
+            "trapped",
+            "refused by the shortest-bond guard again and again",
+        ),
+        (End::BlewUp { reason: reason() }, "blew_up", "forces are not finite"),
+        (End::BadStart { reason: reason() }, "bad_start", "forces are not finite"),
+    ];
+    let mut selector = begin(&settings(Mode::Live), ends.len());
+    let assignments = [(); 4].map(|()| turn(&mut selector));
+    for (assignment, (end, name, reason)) in assignments.iter().zip(ends) {
+        let commit = decided(&mut selector, ended(assignment, 3, end));
+        let detail = &commit.decisions[0].detail;
+        assert_eq!(*detail, serde_json::json!({ "end": name, "reason": reason, "step": 3, "accepted": 0 }));
+        assert_eq!((commit.walks[0].state.as_str(), commit.walks[0].reason.as_str()), (name, reason));
+    }
+    assert!(selector.is_done());
+}
+
+/// With control, collections at these steps, then the end of the biased walk.
+fn with_control(store: &mut MemoryStore, steps: &[u64]) -> Selector {
+    let controlled = Settings {
+        control: true,
+        per_seed: 9,
+        update: UpdateProtocol::Never,
+        ..settings(Mode::Reproducible)
+    };
+    let mut selector = restore(&controlled, 1, Snapshot::default());
+    store.commit(&selector.begin_walks());
+    for (number, step) in (1..).zip(steps) {
+        let assignment = turn(&mut selector);
+        let report = offer(&selector, &assignment, *step, structure(number, SHORTEST), NEW);
+        store.commit(&decided(&mut selector, report));
+    }
+    let assignment = turn(&mut selector);
+    let commit = decided(&mut selector, ended(&assignment, 30, End::BlewUp { reason: "hot".into() }));
+    store.commit(&commit);
+    selector
+}
+
+#[test]
+fn a_control_walk_follows_the_biased_one_and_gives_the_frames_at_its_steps() {
+    let mut store = MemoryStore::default();
+    // After a return to a checkpoint a step can come twice.
+    let mut selector = with_control(&mut store, &[5, 12, 5]);
+    let begun = store.decisions.last().unwrap();
+    assert_eq!((begun.kind, begun.walk), ("begun", Some(WalkId(1))));
+    assert_eq!(begun.detail, serde_json::json!({ "control_of": 0, "wanted": [5, 12] }));
+    for (step, wanted, kinds_then) in
+        [(5, vec![5, 12], vec!["control"]), (12, vec![12], vec!["control", "ended"])]
+    {
+        let assignment = turn(&mut selector);
+        assert_eq!(
+            (assignment.walk, assignment.origin, assignment.random_walk),
+            (WalkId(1), Origin::Control, WalkId(0))
+        );
+        assert_eq!((assignment.wanted.clone(), assignment.until), (wanted, 12));
+        assert_eq!(assignment.seed_structure, common::seed(0).structure);
+        // An unremarkable structure: a control frame is taken whatever its grade.
+        let report = offer(&selector, &assignment, step, structure(100 + step, SHORTEST), [0.1; 3]);
+        let commit = decided(&mut selector, report);
+        assert_eq!(kinds(&commit), kinds_then);
+        let candidate = &commit.candidates[0];
+        assert_eq!((candidate.fate, candidate.keep_features), (Fate::Accepted, true));
+        assert!(candidate.priority < 10, "labels of the campaign come first");
+        assert!(candidate.selector.gamma.len() == 2 && candidate.original.gamma.len() == 2);
+        store.commit(&commit);
+    }
+    assert!(matches!(selector.next_turn(), Next::Done), "a control has no control");
+    assert_eq!(store.walks[&WalkId(1)].state, "collected");
+    assert_eq!(store.known.len(), 3, "control frames are not what later candidates are compared with");
+}
+
+#[test]
+fn a_walk_that_collected_nothing_has_no_control() {
+    let mut selector = with_control(&mut MemoryStore::default(), &[]);
+    assert!(matches!(selector.next_turn(), Next::Done));
+}
+
+#[test]
+fn control_frames_do_not_use_up_the_budget_or_the_mixture() {
+    let mut store = MemoryStore::default();
+    drop(with_control(&mut store, &[5]));
+    let limited = Settings { control: true, total: Some(2), ..settings(Mode::Reproducible) };
+    let mut selector = restore(&limited, 2, store.snapshot());
+    store.commit(&selector.begin_walks());
+    let (control, biased) = (turn(&mut selector), turn(&mut selector));
+    assert_eq!(
+        (control.origin, biased.origin),
+        (Origin::Control, Origin::Biased),
+        "side by side in one round"
+    );
+    let frame = offer(&selector, &control, 5, structure(100, SHORTEST), NEW);
+    let candidate = offer(&selector, &biased, 5, structure(101, SHORTEST), NEW);
+    assert!(selector.report(candidate).unwrap().is_none());
+    let commit = decided(&mut selector, frame);
+    assert_eq!(kinds(&commit), ["control", "ended", "accepted"]);
+    assert_eq!(commit.decisions[1].mixture_version, 0);
+    store.commit(&commit);
+    // The second of two: had the control frame counted, there would be no room left for it.
+    let again = restore(&limited, 2, store.snapshot());
+    assert_eq!(again.mixture(), selector.mixture());
+}
+
+#[test]
+fn a_database_that_does_not_fit_is_refused() {
+    let mut store = MemoryStore::default();
+    store.commit(&restore(&settings(Mode::Live), 2, Snapshot::default()).begin_walks());
+    let good = store.snapshot();
+    let refused = |seeds: usize, change: &dyn Fn(&mut Snapshot)| {
+        let mut snapshot = good.clone();
+        change(&mut snapshot);
+        let error = try_restore(&settings(Mode::Live), seeds, None, snapshot).err();
+        error.expect("refused").to_string()
+    };
+    assert!(try_restore(&settings(Mode::Live), 2, None, good.clone()).is_ok());
+    assert!(refused(1, &|_| ()).contains("walk 1 starts from seed structure 1, but there are 1"));
+    assert!(refused(2, &|s| drop(s.walks.remove(0))).contains("walk 1 stands where walk 0 should"));
+    assert!(refused(2, &|s| s.walks[1].selector_state.clear()).contains("state of walk 1 is damaged"));
+    assert!(refused(2, &|s| s.values[0].1.push('x')).contains("not a number"));
+    let component = |bytes| ComponentRecord { element: 0, slot: 9, bytes };
+    assert!(refused(2, &|s| s.components.push(component(vec![1]))).contains("component 9 of element 0"));
+    let bytes = common::mixture().component(0, 0).unwrap().to_bytes();
+    assert!(refused(2, &|s| s.components.push(component(bytes.clone()))).contains("no component 9"));
+}
+
+#[test]
+fn a_seed_structure_that_cannot_be_graded_is_named() {
+    let mut seed = common::seed(0);
+    seed.structure.species[1] = "Cu".parse().unwrap();
+    let found = Selector::restore(
+        settings(Mode::Live),
+        common::CAMPAIGN,
+        vec![seed],
+        common::grader(),
+        common::mixture(),
+        None,
+        Snapshot::default(),
+    );
+    let message = found.err().expect("refused").to_string();
+    assert_eq!(message, "seed structure 'seed-0': atom 1 is Cu, which the model does not know");
+}
