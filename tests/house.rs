@@ -1,0 +1,161 @@
+//! The edges of the house: which package may know which, as docs and design say, read from the manifests.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use toml::{Table, Value};
+
+/// Every package, where it lives, and the packages that it may depend on.
+const HOUSE: [(&str, &str, &[&str]); 9] = [
+    ("atoms", "crates/atoms", &[]),
+    ("calm", "crates/calm", &[]),
+    ("potentials", "crates/potentials", &["atoms"]),
+    ("md", "crates/md", &["atoms"]),
+    ("wire", "crates/wire", &["atoms", "calm"]),
+    ("store", "store", &["atoms", "wire"]),
+    ("workers", "workers", &["atoms", "calm", "potentials", "md", "wire", "store"]),
+    ("orchestrator", "orchestrator", &["atoms", "calm", "wire", "store"]),
+    ("calmwalk", "", &["atoms", "calm", "potentials", "md", "wire", "store", "workers", "orchestrator"]),
+];
+
+/// Files of `workers` that may use the store: a walker never opens the database.
+const USERS_OF_THE_STORE: [&str; 3] = ["labeller", "refitter", "lib.rs"];
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+fn manifest(folder: &Path) -> Table {
+    let path = folder.join("Cargo.toml");
+    let text = std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    text.parse().unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+fn table<'a>(manifest: &'a Table, key: &str) -> Option<&'a Table> {
+    manifest.get(key).and_then(Value::as_table)
+}
+
+/// Folders of the members of the workspace, the root package included.
+fn members() -> BTreeSet<PathBuf> {
+    let workspace = manifest(root());
+    let patterns = workspace["workspace"]["members"].as_array().unwrap();
+    let mut folders = BTreeSet::from([root().to_owned()]);
+    for pattern in patterns.iter().map(|pattern| pattern.as_str().unwrap()) {
+        match pattern.strip_suffix("/*") {
+            None => drop(folders.insert(root().join(pattern))),
+            Some(parent) => {
+                let inside =
+                    std::fs::read_dir(root().join(parent)).unwrap().map(|entry| entry.unwrap().path());
+                folders.extend(inside.filter(|folder| folder.join("Cargo.toml").exists()));
+            }
+        }
+    }
+    folders
+}
+
+fn name(manifest: &Table) -> String {
+    manifest["package"]["name"].as_str().unwrap().to_owned()
+}
+
+/// The packages of the workspace that this one is built with, however they are written down. What only its tests
+/// need does not count.
+fn edges(manifest: &Table, packages: &BTreeSet<String>) -> BTreeSet<String> {
+    let mut tables = vec![manifest];
+    tables.extend(table(manifest, "target").into_iter().flat_map(Table::values).filter_map(Value::as_table));
+    let sections = ["dependencies", "build-dependencies"];
+    let dependencies = tables.iter().flat_map(|of| sections.iter().filter_map(|section| table(of, section)));
+    dependencies
+        .flatten()
+        .map(|(key, value)| package_name(key, value))
+        .filter(|n| packages.contains(n))
+        .collect()
+}
+
+/// The name of the package behind a dependency, which may be used under another name.
+fn package_name(key: &str, value: &Value) -> String {
+    let renamed = |value: &Value| value.get("package").and_then(Value::as_str).map(str::to_owned);
+    let shared = || renamed(manifest(root()).get("workspace")?.get("dependencies")?.get(key)?);
+    renamed(value).or_else(shared).unwrap_or_else(|| key.to_owned())
+}
+
+#[test]
+fn every_package_is_in_the_house() {
+    let found: BTreeMap<_, _> =
+        members().into_iter().map(|folder| (name(&manifest(&folder)), folder)).collect();
+    let planned: BTreeMap<_, _> =
+        HOUSE.iter().map(|(name, folder, _)| ((*name).to_owned(), root().join(folder))).collect();
+    let clean = |folders: BTreeMap<String, PathBuf>| -> BTreeMap<String, PathBuf> {
+        folders.into_iter().map(|(name, folder)| (name, folder.components().collect())).collect()
+    };
+    assert_eq!(clean(found), clean(planned));
+}
+
+#[test]
+fn packages_know_only_what_they_may() {
+    let packages = HOUSE.iter().map(|(name, ..)| (*name).to_owned()).collect();
+    for (name, folder, allowed) in HOUSE {
+        let edges = edges(&manifest(&root().join(folder)), &packages);
+        let forbidden: Vec<_> = edges.iter().filter(|edge| !allowed.contains(&edge.as_str())).collect();
+        assert!(forbidden.is_empty(), "{name} may not depend on {forbidden:?}");
+    }
+}
+
+/// What the table means, and what must not come in by a roundabout way either.
+#[test]
+fn nobody_reaches_what_is_not_theirs() {
+    let packages: BTreeSet<_> = HOUSE.iter().map(|(name, ..)| (*name).to_owned()).collect();
+    let edges_of: BTreeMap<_, _> = HOUSE
+        .iter()
+        .map(|(name, folder, _)| ((*name).to_owned(), edges(&manifest(&root().join(folder)), &packages)))
+        .collect();
+    for (from, never) in [
+        ("md", &["calm", "potentials", "wire", "store"][..]),
+        ("calm", &["atoms"]),
+        ("potentials", &["calm", "md"]),
+        ("store", &["potentials", "md", "workers", "orchestrator"]),
+        ("orchestrator", &["potentials", "md", "workers"]),
+        ("workers", &["orchestrator"]),
+    ] {
+        let mut reached = BTreeSet::new();
+        let mut open = vec![from.to_owned()];
+        while let Some(package) = open.pop() {
+            open.extend(edges_of[&package].iter().filter(|edge| reached.insert((*edge).clone())).cloned());
+        }
+        let wrong: Vec<_> = never.iter().filter(|package| reached.contains(**package)).collect();
+        assert!(wrong.is_empty(), "{from} reaches {wrong:?}");
+    }
+}
+
+/// Only labeller and refitter speak to the database.
+#[test]
+fn walkers_do_not_open_the_store() {
+    let mut open = vec![root().join("workers/src")];
+    let mut read = 0;
+    while let Some(path) = open.pop() {
+        let name = path.file_name().unwrap().to_string_lossy();
+        if USERS_OF_THE_STORE.iter().any(|user| name == *user || name == format!("{user}.rs")) {
+            continue;
+        }
+        if path.is_dir() {
+            open.extend(std::fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path()));
+            continue;
+        }
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert!(!text.contains("store::"), "{} uses the store", path.display());
+        read += 1;
+    }
+    assert!(read > 1);
+}
+
+#[test]
+fn every_package_obeys_the_lints() {
+    let workspace = manifest(root());
+    let lints = &workspace["workspace"]["lints"]["rust"];
+    assert!(["deny", "forbid"].contains(&lints["unsafe_code"].as_str().unwrap()));
+    assert!(["warn", "deny"].contains(&lints["missing_docs"].as_str().unwrap()));
+    for folder in members() {
+        let inherited =
+            table(&manifest(&folder), "lints").and_then(|lints| lints.get("workspace")?.as_bool());
+        assert_eq!(inherited, Some(true), "{} needs [lints] workspace = true", folder.display());
+    }
+}
