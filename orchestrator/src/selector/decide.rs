@@ -7,7 +7,7 @@ use calm::grade::maximum;
 use calm::watch::{GradeDistribution, grade_distribution};
 use calm::{GradeError, Mixture, UpdateOutcome};
 use serde_json::json;
-use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate};
+use store::records::{AtomGrades, CandidateRecord, Commit, ComponentRecord, Decision, Fate};
 use wire::messages::{Decline, End, Outcome, Report, Verdict};
 use wire::{CandidateBlock, ContentHash, WalkId};
 
@@ -41,6 +41,14 @@ impl TrainingFrames {
         grade_distribution(mixture, &self.elements, &self.features)
             .map_err(|source| SelectorError::Training { source })
     }
+}
+
+/// A candidate with its grades.
+struct Graded {
+    block: CandidateBlock,
+    bonds: Bonds,
+    selector: AtomGrades,
+    original: AtomGrades,
 }
 
 impl Selector {
@@ -88,38 +96,90 @@ impl Selector {
         }
     }
 
+    /// Grades a block under the mixture in force and under the original one.
+    fn grade(&self, block: CandidateBlock) -> Result<Graded, SelectorError> {
+        let view = block.view();
+        let failed = |source| SelectorError::Grade { candidate: view.id(), source };
+        let bonds = self.grader.bonds(&view.structure()).map_err(failed)?;
+        let selector = bonds.grade(&self.mixture, view.features).map_err(failed)?;
+        let original = bonds.grade(&self.original, view.features).map_err(failed)?;
+        Ok(Graded { block, bonds, selector, original })
+    }
+
     fn decide_candidate(
         &mut self,
         id: WalkId,
         block: CandidateBlock,
         commit: &mut Commit,
     ) -> Result<(), SelectorError> {
-        let candidate = block.view().id();
-        let failed = |source| SelectorError::Grade { candidate, source };
-        let bonds = self.grader.bonds(&block.view().structure()).map_err(failed)?;
-        let selector = bonds.grade(&self.mixture, block.view().features).map_err(failed)?;
-        let original = bonds.grade(&self.original, block.view().features).map_err(failed)?;
-        let decline = self.reason_to_decline(id, candidate.content, &bonds, &selector.gamma);
+        let graded = self.grade(block)?;
+        let view = graded.block.view();
+        let candidate = view.id();
         let mut detail = json!({
-            "walker": grade_summary(block.view().gamma, block.view().mixture_version()),
-            "selector": grade_summary(&selector.gamma, self.mixture.version()),
-            "original": grade_summary(&original.gamma, 0),
+            "walker": grade_summary(view.gamma, view.mixture_version()),
+            "selector": grade_summary(&graded.selector.gamma, self.mixture.version()),
+            "original": grade_summary(&graded.original.gamma, 0),
         });
-        let (fate, verdict, kind) = match decline {
+        let (fate, verdict) = match self.reason_to_decline(id, candidate.content, &graded) {
             Some(reason) => {
                 detail["reason"] = json!(reason.name());
-                (Fate::Declined(reason), Verdict::Declined(reason), "declined")
+                (Fate::Declined(reason), Verdict::Declined(reason))
             }
             None => {
-                self.update(&block, &bonds, commit, &mut detail)?;
+                self.update(&graded, commit, &mut detail)?;
                 self.accept(id, candidate.content, candidate.step);
-                (Fate::Accepted, Verdict::Accepted, "accepted")
+                (Fate::Accepted, Verdict::Accepted)
             }
         };
-        let keep_features = self.keeps_features(fate, &block);
-        let seed_structure = self.walks[&id].record.seed_structure;
-        let priority = BIASED_PRIORITY;
-        commit.decisions.push(Decision { candidate: Some(candidate), ..self.decision(kind, id, detail) });
+        let keep_features = self.keeps_features(fate, &graded.block);
+        self.put_down(id, graded, fate, keep_features, detail, commit);
+        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
+        walk.memory.verdict = Some(verdict);
+        if walk.record.accepted >= self.settings.per_seed {
+            self.end_walk(id, &End::Collected, commit);
+        }
+        Ok(())
+    }
+
+    /// A wanted frame of a control walk: labelled like a candidate, but no mixture learns from it.
+    fn keep_control_frame(
+        &mut self,
+        id: WalkId,
+        block: CandidateBlock,
+        commit: &mut Commit,
+    ) -> Result<(), SelectorError> {
+        let graded = self.grade(block)?;
+        let step = graded.block.view().id().step;
+        let detail = json!({ "original": grade_summary(&graded.original.gamma, 0) });
+        self.put_down(id, graded, Fate::Accepted, true, detail, commit);
+        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
+        walk.record.accepted += 1;
+        walk.memory.wanted.retain(|wanted| *wanted > step);
+        if walk.memory.wanted.is_empty() {
+            self.end_walk(id, &End::Collected, commit);
+        }
+        Ok(())
+    }
+
+    /// Puts a decision and the candidate that it is about into the commit.
+    fn put_down(
+        &self,
+        id: WalkId,
+        graded: Graded,
+        fate: Fate,
+        keep_features: bool,
+        detail: serde_json::Value,
+        commit: &mut Commit,
+    ) {
+        let Graded { block, selector, original, .. } = graded;
+        let (walk, candidate) = (&self.walks[&id], Some(block.view().id()));
+        let (kind, priority) = match fate {
+            _ if !walk.is_biased() => ("control", CONTROL_PRIORITY),
+            Fate::Accepted => ("accepted", BIASED_PRIORITY),
+            Fate::Declined(_) => ("declined", BIASED_PRIORITY),
+        };
+        let seed_structure = walk.record.seed_structure;
+        commit.decisions.push(Decision { candidate, ..self.decision(kind, id, detail) });
         commit.candidates.push(CandidateRecord {
             block,
             fate,
@@ -129,31 +189,19 @@ impl Selector {
             keep_features,
             priority,
         });
-        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
-        walk.memory.verdict = Some(verdict);
-        if walk.record.accepted >= self.settings.per_seed {
-            self.end_walk(id, &End::Collected, commit);
-        }
-        Ok(())
     }
 
     /// The first reason, if any, in the order: guard, duplicate, budget, covered.
-    fn reason_to_decline(
-        &self,
-        id: WalkId,
-        content: ContentHash,
-        bonds: &Bonds,
-        gamma: &[f64],
-    ) -> Option<Decline> {
+    fn reason_to_decline(&self, id: WalkId, content: ContentHash, graded: &Graded) -> Option<Decline> {
         let walk = &self.walks[&id].record;
         let used_up = self.settings.total.is_some_and(|total| self.accepted >= total);
-        if bonds.shortest < self.least_distances[walk.seed_structure as usize] {
+        if graded.bonds.shortest < self.least_distances[walk.seed_structure as usize] {
             Some(Decline::Guard)
         } else if self.known.contains(&content) {
             Some(Decline::Duplicate)
         } else if walk.accepted >= self.settings.per_seed || used_up {
             Some(Decline::Budget)
-        } else if !self.settings.collection.is_met(gamma) {
+        } else if !self.settings.collection.is_met(&graded.selector.gamma) {
             Some(Decline::Covered)
         } else {
             None
@@ -163,19 +211,17 @@ impl Selector {
     /// Makes the mixture cover the candidate: the next version, in the commit.
     fn update(
         &mut self,
-        block: &CandidateBlock,
-        bonds: &Bonds,
+        graded: &Graded,
         commit: &mut Commit,
         detail: &mut serde_json::Value,
     ) -> Result<(), SelectorError> {
         if self.settings.update == UpdateProtocol::Never {
             return Ok(());
         }
-        let candidate = block.view().id();
-        let failed = |source| SelectorError::Update { candidate, source };
-        let features = block.view().features;
-        let outcome =
-            calm::update(&self.mixture, &bonds.elements, features, &self.settings.search).map_err(failed)?;
+        let view = graded.block.view();
+        let elements = &graded.bonds.elements;
+        let outcome = calm::update(&self.mixture, elements, view.features, &self.settings.search)
+            .map_err(|source| SelectorError::Update { candidate: view.id(), source })?;
         self.mixture = Arc::new(self.mixture.with_changes(&outcome.changed)?);
         for change in &outcome.changed {
             let (element, slot) = (change.element as u32, change.slot as u32);
@@ -211,41 +257,6 @@ impl Selector {
             self.declined_feature_bytes += bytes;
         }
         keeps
-    }
-
-    /// A wanted frame of a control walk: labelled like a candidate, but no mixture learns from it.
-    fn keep_control_frame(
-        &mut self,
-        id: WalkId,
-        block: CandidateBlock,
-        commit: &mut Commit,
-    ) -> Result<(), SelectorError> {
-        let candidate = block.view().id();
-        let failed = |source| SelectorError::Grade { candidate, source };
-        let bonds = self.grader.bonds(&block.view().structure()).map_err(failed)?;
-        let original = bonds.grade(&self.original, block.view().features).map_err(failed)?;
-        let detail = json!({ "original": grade_summary(&original.gamma, 0) });
-        let selector = bonds.grade(&self.mixture, block.view().features).map_err(failed)?;
-        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
-        walk.record.accepted += 1;
-        walk.memory.wanted.retain(|step| *step > candidate.step);
-        let (done, seed_structure) = (walk.memory.wanted.is_empty(), walk.record.seed_structure);
-        commit
-            .decisions
-            .push(Decision { candidate: Some(candidate), ..self.decision("control", id, detail) });
-        commit.candidates.push(CandidateRecord {
-            block,
-            fate: Fate::Accepted,
-            seed_structure,
-            selector,
-            original,
-            keep_features: true,
-            priority: CONTROL_PRIORITY,
-        });
-        if done {
-            self.end_walk(id, &End::Collected, commit);
-        }
-        Ok(())
     }
 
     fn end_walk(&mut self, id: WalkId, end: &End, commit: &mut Commit) {
