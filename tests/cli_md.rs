@@ -169,7 +169,7 @@ fn mistakes_are_named_with_their_line() {
             "md.toml:9:",
             "at most 100",
         ),
-        (good.replace("steps = 10", ""), "md.toml:5:1:", "missing field `steps`"),
+        (good.replace("steps = 10", ""), "md.toml:5:1:", "missing key `steps`"),
     ] {
         let message = refused(text);
         assert!(

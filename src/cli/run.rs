@@ -58,7 +58,8 @@ impl Run {
         })?;
         store::check_directory(&directory)?;
         let _lock = CampaignLock::acquire(&directory, "calmwalk run")?;
-        let ended = block_on(run(&campaign, &directory))?.map_err(|failure| failure.in_campaign(&directory))?;
+        let ended =
+            block_on(run(&campaign, &directory))?.map_err(|failure| failure.in_campaign(&directory))?;
         if ended == Ended::Interrupted {
             eprintln!("stopped in order; the same command goes on with the campaign");
         }
@@ -124,7 +125,9 @@ async fn go_on(
 ) -> Result<(), Failure> {
     let in_force = store.campaign().await?.configuration_in_force;
     let before = serde_json::from_str(&in_force).map_err(|error| {
-        Failure::Failed(format!("damaged database: the configuration in force: {error}; restore it from a copy"))
+        Failure::Failed(format!(
+            "damaged database: the configuration in force: {error}; restore it from a copy"
+        ))
     })?;
     let changes = compare(&before, resolved).map_err(|refused| {
         let at = place(&campaign.path, &campaign.text, refused.key());
@@ -298,9 +301,8 @@ fn start_labellers(
             largest_force: label.largest_force.get(),
         };
         let (store, closing) = (store.clone(), Arc::clone(closing));
-        labellers.spawn(async move {
-            labeller::run(store, method, settings, &closing, unix_milliseconds).await
-        });
+        labellers
+            .spawn(async move { labeller::run(store, method, settings, &closing, unix_milliseconds).await });
     }
     Ok(labellers)
 }

@@ -1,9 +1,13 @@
 //! `calmwalk validate`
 
-use std::path::PathBuf;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use calm::Artifact;
 
 use super::{Ended, Failure};
 use crate::campaign::Campaign;
+use crate::output::print;
 
 /// Check a configuration and every file that it names
 #[derive(Debug, clap::Args)]
@@ -16,14 +20,27 @@ pub struct Validate {
 impl Validate {
     pub fn run(self) -> Result<Ended, Failure> {
         let campaign = Campaign::load(&self.config)?;
-        let atoms: Vec<_> = campaign.seeds.iter().map(|named| named.seed.structure.len()).collect();
-        let elements: Vec<_> = campaign.model.elements().iter().map(|species| species.symbol()).collect();
-        println!("{} is a valid campaign", self.config.display());
-        println!("  potential        GRACE, {}, cutoff {} Å", elements.join(" "), campaign.model.cutoff());
-        println!("  mixture          {} features an atom", campaign.artifact.mixture.dimension());
-        let (least, most) = (atoms.iter().min().unwrap_or(&0), atoms.iter().max().unwrap_or(&0));
-        println!("  seed structures  {} ({least} to {most} atoms)", atoms.len());
-        println!("  labels           protocol '{}'", campaign.protocol.name);
+        print(|out| write(out, &self.config, &campaign))?;
         Ok(Ended::Done)
     }
+}
+
+fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()> {
+    let Campaign { model, artifact: Artifact { mixture, .. }, seeds, .. } = campaign;
+    let elements: Vec<_> = model.elements().iter().map(|species| species.symbol()).collect();
+    let architecture = model.description().architecture;
+    let atoms = || seeds.iter().map(|named| named.seed.structure.len());
+    let (least, most) = (atoms().min().unwrap_or(0), atoms().max().unwrap_or(0));
+    writeln!(out, "{} is a valid campaign", path.display())?;
+    writeln!(out, "  potential        {architecture}, {}, cutoff {} Å", elements.join(" "), model.cutoff())?;
+    let (components, features) = (mixture.iter().count(), mixture.dimension());
+    writeln!(out, "  mixture          {components} components, {features} features an atom")?;
+    if !mixture.can_be_updated() {
+        writeln!(
+            out,
+            "                   without scatter and counts: it can be scored with but not updated"
+        )?;
+    }
+    writeln!(out, "  seed structures  {}, of {least} to {most} atoms", seeds.len())?;
+    writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)
 }

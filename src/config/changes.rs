@@ -1,6 +1,8 @@
 //! What may change while a campaign lasts, and what may not.
 
-use serde_json::Value;
+use std::fmt;
+
+use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
 const CHANGEABLE: [&str; 11] = [
@@ -17,48 +19,155 @@ const CHANGEABLE: [&str; 11] = [
     "guard.highest_temperature",
 ];
 
-/// One key with another value than before.
+/// Something that is not as the campaign has it, and that holds from now on.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Change {
-    /// Dotted key.
-    pub key: String,
-    /// The value that the campaign has.
-    pub before: Value,
-    /// The value in the file now.
-    pub after: Value,
+pub enum Change {
+    /// One key with another value than before.
+    Key {
+        /// Dotted key.
+        key: String,
+        /// The value that the campaign has.
+        before: Value,
+        /// The value in the file now.
+        after: Value,
+    },
+    /// Seed structures behind those that the campaign has.
+    SeedStructures {
+        /// How many it has.
+        before: usize,
+        /// Names and contents of the new ones.
+        added: Vec<String>,
+    },
 }
 
 /// A change that is not possible.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error(
-    "{key} is {after}, but this campaign began with {before}: {reason}. Put the old value back, or start another \
-     campaign with --directory"
-)]
-pub struct Refused {
-    key: String,
-    before: Value,
-    after: Value,
-    reason: &'static str,
+pub enum Refused {
+    /// A key that cannot change.
+    #[error(
+        "{key} is {after}, but this campaign began with {before}: {}. Put the old value back, or start another campaign \
+         with --directory",
+        reason(key)
+    )]
+    Key {
+        /// Dotted key.
+        key: String,
+        /// The value that the campaign has.
+        before: Value,
+        /// The value in the file now.
+        after: Value,
+    },
+    /// A file with other content.
+    #[error(
+        "{key}: the file has another content (BLAKE3 {after}) than when this campaign began ({before}): {OTHER_PHYSICS}. \
+         Put the old file back, or start another campaign with --directory"
+    )]
+    File {
+        /// Dotted key of the configuration that names the file.
+        key: String,
+        /// The hash that the campaign has.
+        before: String,
+        /// The hash now.
+        after: String,
+    },
+    /// A seed structure that is gone or changed.
+    #[error(
+        "seeds.files: seed structure {number} is {after}, but this campaign has {before} there: seed structures can be \
+         added behind those that it has, but not changed, moved or taken away. Put it back, or start another campaign \
+         with --directory"
+    )]
+    SeedStructure {
+        /// Its number, from 0.
+        number: usize,
+        /// Name and content that the campaign has.
+        before: String,
+        /// Name and content now.
+        after: String,
+    },
 }
 
-/// The keys that differ between the configuration a campaign has and the one it is continued with.
+const OTHER_PHYSICS: &str =
+    "its walks, decisions and labels so far would not belong together with what follows";
+
+fn reason(key: &str) -> &'static str {
+    match key {
+        "instructions" => {
+            "this machine's processor gives other last digits than the one on which it began, which mode = \
+             \"reproducible\" promises not to happen"
+        }
+        _ => OTHER_PHYSICS,
+    }
+}
+
+impl Refused {
+    /// The key of the configuration that is at fault.
+    pub fn key(&self) -> &str {
+        match self {
+            Self::Key { key, .. } | Self::File { key, .. } => key,
+            Self::SeedStructure { .. } => "seeds.files",
+        }
+    }
+}
+
+impl Change {
+    /// Key, value before and value after, for the operations log.
+    pub fn detail(&self) -> Value {
+        match self {
+            Self::Key { key, before, after } => json!({ "key": key, "before": before, "after": after }),
+            Self::SeedStructures { before, added } => {
+                json!({ "key": "seeds", "before": before, "after": before + added.len(), "added": added })
+            }
+        }
+    }
+}
+
+impl fmt::Display for Change {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Key { key, before, after } => write!(f, "{key} is now {after} (was {before})"),
+            Self::SeedStructures { before, added } => {
+                let added: Vec<_> = added.iter().map(|seed| short(seed)).collect();
+                write!(f, "{} seed structures added to {before}: {}", added.len(), added.join(", "))
+            }
+        }
+    }
+}
+
+/// What differs between the configuration a campaign has and the one it is continued with.
 pub fn compare(before: &Value, after: &Value) -> Result<Vec<Change>, Refused> {
     let mut changes = Vec::new();
     differences("", before, after, &mut changes);
-    for change in &changes {
-        let Change { key, before, after } = change.clone();
-        let changeable = CHANGEABLE.contains(&key.as_str());
-        let shrunk = key == "seeds" && !is_extension(&before, &after);
-        if !changeable || shrunk {
-            let reason = if shrunk {
-                "seed structures can be added, behind those that it has, but not taken away"
-            } else {
-                "its walks, decisions and labels so far would not belong together with what follows"
-            };
-            return Err(Refused { key, before, after, reason });
-        }
+    changes.into_iter().map(|(key, before, after)| judge(key, before, after)).collect()
+}
+
+fn judge(key: String, before: Value, after: Value) -> Result<Change, Refused> {
+    if key == "seeds" {
+        return seed_structures(&before, &after);
     }
-    Ok(changes)
+    if let Some(key) = key.strip_prefix("files.") {
+        let shown =
+            |hash: &Value| hash.as_str().map_or("no file".to_owned(), |hash| excerpt(hash).to_owned());
+        return Err(Refused::File { key: key.to_owned(), before: shown(&before), after: shown(&after) });
+    }
+    if CHANGEABLE.contains(&key.as_str()) {
+        Ok(Change::Key { key, before, after })
+    } else {
+        Err(Refused::Key { key, before, after })
+    }
+}
+
+fn seed_structures(before: &Value, after: &Value) -> Result<Change, Refused> {
+    let list = |value: &Value| -> Vec<String> {
+        let values = value.as_array().into_iter().flatten();
+        values.map(|seed| seed.as_str().unwrap_or_default().to_owned()).collect()
+    };
+    let (before, mut after) = (list(before), list(after));
+    if let Some(number) = (0..before.len()).find(|number| before.get(*number) != after.get(*number)) {
+        let after = after.get(number).map_or("missing".to_owned(), |seed| short(seed));
+        return Err(Refused::SeedStructure { number, before: short(&before[number]), after });
+    }
+    let added = after.split_off(before.len());
+    Ok(Change::SeedStructures { before: before.len(), added })
 }
 
 /// A configuration without the keys that may change.
@@ -73,7 +182,19 @@ pub fn without_changeable(configuration: &Value) -> Value {
     fixed
 }
 
-fn differences(key: &str, before: &Value, after: &Value, changes: &mut Vec<Change>) {
+/// Name and content of a seed structure.
+fn short(seed: &str) -> String {
+    let (name, hash) = seed.rsplit_once(' ').unwrap_or((seed, ""));
+    format!("'{name}' (content {})", excerpt(hash))
+}
+
+/// As much of a hash as tells it from others.
+fn excerpt(hash: &str) -> &str {
+    hash.get(..12).unwrap_or(hash)
+}
+
+/// (key, before, after) of every leaf that differs.
+fn differences(key: &str, before: &Value, after: &Value, changes: &mut Vec<(String, Value, Value)>) {
     if let (Value::Object(old), Value::Object(new)) = (before, after) {
         let names: std::collections::BTreeSet<_> = old.keys().chain(new.keys()).collect();
         for name in names {
@@ -82,36 +203,48 @@ fn differences(key: &str, before: &Value, after: &Value, changes: &mut Vec<Chang
             differences(&key, &of(old), &of(new), changes);
         }
     } else if before != after {
-        changes.push(Change { key: key.to_owned(), before: before.clone(), after: after.clone() });
-    }
-}
-
-fn is_extension(before: &Value, after: &Value) -> bool {
-    match (before.as_array(), after.as_array()) {
-        (Some(before), Some(after)) => after.starts_with(before),
-        _ => false,
+        changes.push((key.to_owned(), before.clone(), after.clone()));
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use serde_json::json;
 
     #[test]
     fn budgets_and_new_seed_structures_are_applied() {
-        let before = json!({ "run": { "walkers": 1 }, "seeds": ["a"] });
-        let after = json!({ "run": { "walkers": 2 }, "seeds": ["a", "b"] });
-        let keys: Vec<_> = compare(&before, &after).unwrap().into_iter().map(|change| change.key).collect();
-        assert_eq!(keys, ["run.walkers", "seeds"]);
+        let before = json!({ "run": { "walkers": 1 }, "seeds": ["a 1"] });
+        let after = json!({ "run": { "walkers": 2 }, "seeds": ["a 1", "b 2"] });
+        let changes = compare(&before, &after).unwrap();
+        let shown: Vec<_> = changes.iter().map(Change::to_string).collect();
+        assert_eq!(shown, ["run.walkers is now 2 (was 1)", "1 seed structures added to 1: 'b' (content 2)"]);
+        assert_eq!(changes[0].detail(), json!({ "key": "run.walkers", "before": 1, "after": 2 }));
+        assert_eq!(changes[1].detail(), json!({ "key": "seeds", "before": 1, "after": 2, "added": ["b 2"] }));
+        assert_eq!(compare(&after, &after), Ok(Vec::new()));
     }
 
     #[test]
-    fn physics_and_lost_seed_structures_are_refused() {
-        let before = json!({ "walk": { "tau": 0.15 }, "seeds": ["a", "b"] });
-        let hotter = json!({ "walk": { "tau": 0.2 }, "seeds": ["a", "b"] });
-        assert!(compare(&before, &hotter).unwrap_err().to_string().starts_with("walk.tau is 0.2"));
-        let fewer = json!({ "walk": { "tau": 0.15 }, "seeds": ["b"] });
-        assert!(compare(&before, &fewer).is_err());
+    fn physics_files_and_lost_seed_structures_are_refused() {
+        let before =
+            json!({ "walk": { "tau": 0.15 }, "files": { "potential.model": "ab" }, "seeds": ["a 1", "b 2"] });
+        let refused = |pointer: &str, value: Value| {
+            let mut after = before.clone();
+            *after.pointer_mut(pointer).unwrap() = value;
+            let refused = compare(&before, &after).unwrap_err();
+            (refused.key().to_owned(), refused.to_string())
+        };
+        let (key, message) = refused("/walk/tau", json!(0.2));
+        assert!(message.starts_with("walk.tau is 0.2, but this campaign began with 0.15"), "{message}");
+        assert_eq!(key, "walk.tau");
+        let (key, message) = refused("/files/potential.model", json!("cd"));
+        assert!(message.contains("(BLAKE3 cd)") && message.contains("(ab)"), "{message}");
+        assert_eq!(key, "potential.model");
+        for (seeds, found) in
+            [(json!(["a 1"]), "1 is missing"), (json!(["a 3", "b 2"]), "0 is 'a' (content 3)")]
+        {
+            let (key, message) = refused("/seeds", seeds);
+            assert!(message.contains(&format!("seed structure {found}, but this campaign has")), "{message}");
+            assert_eq!(key, "seeds.files");
+        }
     }
 }

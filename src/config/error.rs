@@ -13,6 +13,14 @@ pub enum ConfigError {
         /// Why.
         source: std::io::Error,
     },
+    /// A file that is no text.
+    #[error("{}:{line}: found bytes that are not text; expected a configuration in TOML (UTF-8)", path.display())]
+    Encoding {
+        /// The file.
+        path: PathBuf,
+        /// Where the first of them stands.
+        line: usize,
+    },
     /// TOML that is none, an unknown key, a value of the wrong kind.
     #[error("{at}: {message}")]
     Parse {
@@ -46,37 +54,79 @@ pub enum ConfigError {
 }
 
 impl ConfigError {
-    /// The place of a TOML error, with a suggestion for an unknown key.
+    /// The place of a TOML error in plain words, with a suggestion for an unknown key.
     pub(crate) fn parse(path: &Path, text: &str, error: &toml::de::Error) -> Self {
         let (line, column) = error.span().map_or((1, 1), |span| line_and_column(text, span.start));
         let at = format!("{}:{line}:{column}", path.display());
-        let mut message = error.message().trim().replace('\n', "; ");
         let shown = text.lines().nth(line - 1).unwrap_or_default().trim();
+        let mut message = in_plain_words(&error.message().trim().replace('\n', "; "));
         if let Some(suggestion) = suggestion(&message) {
             message += &format!("; did you mean `{suggestion}`?");
         }
-        if !shown.is_empty() {
+        // What the whole file lacks has no line of its own.
+        if !shown.is_empty() && !((line, column) == (1, 1) && message.starts_with("missing")) {
             message += &format!("\n  {line} | {shown}");
         }
         Self::Parse { at, message }
     }
 }
 
-/// `file:line` of a dotted key; the file alone where it is not written out.
+/// The text of a configuration.
+pub fn read_text(path: &Path) -> Result<String, ConfigError> {
+    let bytes = std::fs::read(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+    String::from_utf8(bytes).map_err(|error| {
+        let before = &error.as_bytes()[..error.utf8_error().valid_up_to()];
+        let line = 1 + before.iter().filter(|byte| **byte == b'\n').count();
+        ConfigError::Encoding { path: path.to_owned(), line }
+    })
+}
+
+/// The words of the parser, which are those of Rust, in the words of those who write configurations.
+fn in_plain_words(message: &str) -> String {
+    let words = [
+        ("unknown field", "unknown key"),
+        ("missing field", "missing key"),
+        ("unknown variant", "unknown value"),
+        ("expected a nonzero u64", "expected a whole number above 0"),
+        ("expected a nonzero u32", "expected a whole number above 0"),
+        ("expected a nonzero usize", "expected a whole number above 0"),
+        ("expected u64", "expected a whole number, 0 or more"),
+        ("expected u32", "expected a whole number, 0 or more"),
+        ("expected usize", "expected a whole number, 0 or more"),
+        ("expected f64", "expected a number"),
+        ("expected a sequence", "expected a list in [ ]"),
+    ];
+    let message = words.iter().fold(message.to_owned(), |message, (from, to)| message.replace(from, to));
+    match message
+        .strip_prefix("unexpected keys in table: ")
+        .and_then(|rest| rest.split_once(", available keys: "))
+    {
+        Some((found, known)) => format!("unknown key `{found}`, expected `{}`", known.replace(", ", "`, `")),
+        None => message,
+    }
+}
+
+/// `file:line` of a dotted key; that of its section where it is not written out, or the file alone.
 pub fn place(path: &Path, text: &str, key: &str) -> String {
     let (section, name) = key.rsplit_once('.').unwrap_or(("", key));
     let mut current = "";
+    let mut nearest = path.display().to_string();
     for (index, line) in text.lines().enumerate() {
         let line = line.trim();
         if let Some(header) = line.strip_prefix('[').and_then(|rest| rest.split(']').next()) {
-            current = header;
+            current = header.trim();
+            if current == section {
+                nearest = format!("{}:{}", path.display(), index + 1);
+            }
         }
         let found = line.split('=').next().map(str::trim);
-        if line.contains('=') && (found == Some(key) && current.is_empty() || found == Some(name) && current == section) {
+        if line.contains('=')
+            && (found == Some(key) && current.is_empty() || found == Some(name) && current == section)
+        {
             return format!("{}:{}", path.display(), index + 1);
         }
     }
-    path.display().to_string()
+    nearest
 }
 
 /// `file:line` of a byte offset.
@@ -90,7 +140,7 @@ fn line_and_column(text: &str, offset: usize) -> (usize, usize) {
     (before.matches('\n').count() + 1, column + 1)
 }
 
-/// The nearest of the names in "unknown field `x`, expected one of `a`, `b`", if one is near.
+/// The nearest of the names in "unknown key `x`, expected one of `a`, `b`", if one is near.
 fn suggestion(message: &str) -> Option<&str> {
     let mut names = message.split('`').skip(1).step_by(2);
     if !message.starts_with("unknown") {
@@ -107,9 +157,9 @@ mod tests {
 
     #[test]
     fn an_unknown_key_gets_the_nearest_name() {
-        let message = "unknown field `temprature`, expected one of `steps`, `temperature`, `tau`";
+        let message = "unknown key `temprature`, expected one of `steps`, `temperature`, `tau`";
         assert_eq!(suggestion(message), Some("temperature"));
-        assert_eq!(suggestion("unknown field `zzz`, expected `steps`"), None);
+        assert_eq!(suggestion("unknown key `zzz`, expected `steps`"), None);
         assert_eq!(suggestion("invalid type: string `steps`, expected u64"), None);
     }
 
@@ -117,6 +167,7 @@ mod tests {
     fn keys_are_found_in_their_section() {
         let text = "[a]\nx = 1\n[b]\n# x\nx = 2\n";
         assert_eq!(place(Path::new("f"), text, "b.x"), "f:5");
+        assert_eq!(place(Path::new("f"), text, "b.y"), "f:3");
         assert_eq!(place(Path::new("f"), text, "c.x"), "f");
         assert_eq!(place_of_offset(Path::new("f"), text, 5), "f:2");
     }

@@ -1,6 +1,7 @@
 //! The configuration of a campaign: one TOML file that denies unknown keys and validates itself.
 
 mod changes;
+mod check;
 mod error;
 mod files;
 
@@ -14,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use toml::Spanned;
 use workers::settings::ThermostatKind;
 
-pub use changes::{compare, without_changeable};
+pub use changes::{Change, compare, without_changeable};
 pub use error::{ConfigError, place, place_of_offset};
 pub use files::PotentialFile;
 
@@ -69,8 +70,10 @@ pub struct PotentialSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct CalmSection {
-    /// `gmm_artifacts.npz` with scatter and counts.
-    pub artifact: Spanned<PathBuf>,
+    /// `gmm_artifacts.npz` with scatter and counts; left out, the mixture that the model was exported with, which
+    /// cannot be updated.
+    #[serde(default)]
+    pub artifact: Option<Spanned<PathBuf>>,
     /// The frames the mixture was built from, whose grades are watched under the live mixture.
     #[serde(default)]
     pub training_frames: Option<Spanned<PathBuf>>,
@@ -237,52 +240,26 @@ pub struct RunSection {
 }
 
 impl Config {
-    /// Reads and validates a configuration. Paths in it are taken relative to its own directory.
-    pub fn load(path: &Path) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
-        let mut config: Self = toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
+    /// Reads and validates a configuration, and gives its text beside it. Paths in it are taken relative to its own
+    /// directory.
+    pub fn load(path: &Path) -> Result<(Self, String), ConfigError> {
+        let text = error::read_text(path)?;
+        let mut config: Self =
+            toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
         config.resolve_paths(path.parent().unwrap_or(Path::new("")));
-        config.check(path, &text)?;
-        Ok(config)
-    }
-
-    /// The rules that no single value can check.
-    fn check(&self, path: &Path, text: &str) -> Result<(), ConfigError> {
-        let wrong = |key: &str, found: String, expected: &str| {
-            Err(ConfigError::Value { at: error::place(path, text, key), key: key.into(), found, expected: expected.into() })
-        };
-        if self.calm.update == UpdateProtocol::Restarted
-            && (self.campaign.mode == Mode::Live || self.run.walks_per_round.get() > 1)
-        {
-            let expected = "mode = \"reproducible\" and run.walks_per_round = 1: the mixture can be restarted for each \
-                            seed structure only if walks follow one another";
-            return wrong("calm.update", "\"restarted\"".into(), expected);
-        }
-        if let Some(zbl) = self.guard.zbl
-            && zbl.inner >= zbl.outer
-        {
-            return wrong("guard.zbl", format!("inner {} and outer {}", zbl.inner.get(), zbl.outer.get()), "inner below outer");
-        }
-        if let ThermostatKind::Langevin { friction: x } | ThermostatKind::NoseHoover { relaxation_time: x, .. } =
-            self.walk.thermostat
-            && !(x.is_finite() && x > 0.0)
-        {
-            return wrong("walk.thermostat", x.to_string(), "a number above 0");
-        }
-        if let ThermostatKind::NoseHoover { chain_length: 0, .. } = self.walk.thermostat {
-            return wrong("walk.thermostat", "chain_length 0".into(), "at least 1");
-        }
-        if self.seeds.files.is_empty() {
-            return wrong("seeds.files", "an empty list".into(), "at least one file with seed structures");
-        }
-        Ok(())
+        check::check(&config).map_err(|(key, found, expected)| ConfigError::Value {
+            at: place(path, &text, key),
+            key: key.to_owned(),
+            found,
+            expected,
+        })?;
+        Ok((config, text))
     }
 
     fn resolve_paths(&mut self, directory: &Path) {
         let resolve = |path: &mut Spanned<PathBuf>| *path.get_mut() = directory.join(path.get_ref());
         resolve(&mut self.potential.model);
-        resolve(&mut self.calm.artifact);
+        self.calm.artifact.iter_mut().for_each(resolve);
         self.calm.training_frames.iter_mut().for_each(resolve);
         self.seeds.files.iter_mut().for_each(resolve);
         let LabelMethod::Reference(potential) = &mut self.label.method;

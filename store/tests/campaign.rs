@@ -31,11 +31,13 @@ async fn a_campaign_is_begun_once_and_opened_often() {
     assert_eq!((seeds.len(), seeds[0].name.as_str()), (1, "diamond"));
     assert_eq!(seeds[0].structure, structure(0.0));
     assert_eq!(store.protocols().await.unwrap(), [protocol("dft")]);
-    store.set_configuration_in_force("{\"walkers\":2}", 7).await.unwrap();
+    let change = serde_json::json!({ "key": "walkers", "before": 1, "after": 2 });
+    store.set_configuration_in_force("{\"walkers\":2}", std::slice::from_ref(&change), 7).await.unwrap();
     assert_eq!(store.campaign().await.unwrap().configuration_in_force, "{\"walkers\":2}");
     let operations = store.operations(0, 10).await.unwrap();
     let kinds: Vec<_> = operations.iter().map(|o| (o.time, o.kind.as_str())).collect();
     assert_eq!(kinds, [(0, "created"), (0, "protocol"), (7, "configuration")]);
+    assert_eq!(operations[2].detail, change);
 }
 
 #[tokio::test]

@@ -230,16 +230,18 @@ impl Projection {
         differs("basis normalisation", self.normalised, model.normalised)?;
         differs("use of density channels", self.density_channels, model.density_channels)?;
         differs("density scale", self.density_scale, model.density_scale)?;
-        let different =
-            self.matrix.iter().zip(&model.matrix).position(|(a, b)| a.to_bits() != b.to_bits()).map(
-                |index| {
-                    let describe = |matrix: &[f32]| format!("{:?} at number {index}", matrix.get(index));
-                    (describe(&self.matrix), describe(&model.matrix))
-                },
-            );
-        match different {
-            Some((artifact, model)) => Err(ProjectionMismatch { what: "projection matrix", artifact, model }),
-            None => differs("projection matrix length", self.matrix.len(), model.matrix.len()),
+        differs("projection matrix length", self.matrix.len(), model.matrix.len())?;
+        let mut pairs = self.matrix.iter().zip(&model.matrix).enumerate();
+        match pairs.find(|(_, (a, b))| a.to_bits() != b.to_bits()) {
+            Some((index, (a, b))) => {
+                let describe = |value| format!("{value} at number {index}");
+                Err(ProjectionMismatch {
+                    what: "projection matrix",
+                    artifact: describe(a),
+                    model: describe(b),
+                })
+            }
+            None => Ok(()),
         }
     }
 

@@ -66,15 +66,19 @@ impl Store {
         value.ok_or_else(|| StoreError::damaged("the campaign", format!("it has no {key}")))
     }
 
-    /// From now on the campaign runs by another configuration (JSON); one that is in force already changes nothing.
-    pub async fn set_configuration_in_force(&self, configuration: &str, now: i64) -> Result<()> {
-        if self.campaign_value("configuration_in_force").await? == configuration {
-            return Ok(());
-        }
+    /// From now on the campaign runs by another configuration (JSON). Each of the changes (JSON objects) that make it
+    /// another gets a line `configuration` in the operations log.
+    pub async fn set_configuration_in_force(
+        &self,
+        configuration: &str,
+        changes: &[serde_json::Value],
+        now: i64,
+    ) -> Result<()> {
         let mut transaction = self.begin().await?;
         set_campaign_value(&mut transaction, "configuration_in_force", configuration).await?;
-        let detail = serde_json::json!({ "configuration": configuration });
-        insert_operation(&mut transaction, now, "configuration", &detail).await?;
+        for change in changes {
+            insert_operation(&mut transaction, now, "configuration", change).await?;
+        }
         Ok(transaction.commit().await?)
     }
 

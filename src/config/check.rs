@@ -1,0 +1,103 @@
+//! The rules of a configuration that no single value can check.
+
+use orchestrator::selector::{Mode, UpdateProtocol};
+use workers::settings::ThermostatKind;
+
+use super::Config;
+
+/// Longer Nosé–Hoover chains than this are a mistake.
+const LONGEST_CHAIN: usize = 100;
+
+/// A value that does not go: its key, what was found, what was expected.
+pub type Wrong = (&'static str, String, String);
+
+/// Checks a configuration as a whole; the first thing that is wrong.
+pub fn check(config: &Config) -> Result<(), Wrong> {
+    check_limits(config)?;
+    check_mixture(config)?;
+    check_thermostat(config)?;
+    check_guard(config)?;
+    if config.seeds.files.is_empty() {
+        return wrong("seeds.files", "an empty list", "at least one file with seed structures");
+    }
+    Ok(())
+}
+
+fn wrong(key: &'static str, found: impl ToString, expected: impl ToString) -> Result<(), Wrong> {
+    Err((key, found.to_string(), expected.to_string()))
+}
+
+/// Larger values than these are slips of the pen, and some would exhaust the machine.
+fn check_limits(config: &Config) -> Result<(), Wrong> {
+    let Config { walk, collect, guard, label, run, .. } = config;
+    let ramp = walk.volume_ramp.map_or(0.0, |ramp| ramp.from.get().max(ramp.to.get()));
+    let most_steps = 1e12;
+    let limits = [
+        ("walk.temperature", walk.temperature.get(), 1e6),
+        ("walk.steps", walk.steps.get() as f64, most_steps),
+        ("walk.equilibration", walk.equilibration as f64, most_steps),
+        ("walk.tau", walk.tau.get(), 1e3),
+        ("walk.time_step", walk.time_step.map_or(0.0, |time_step| time_step.get()), 100.0),
+        ("walk.volume_ramp", ramp, 1e3),
+        ("walk.average_steps", walk.average_steps.get() as f64, most_steps),
+        ("walk.skin", walk.skin.get(), 10.0),
+        ("collect.gap", collect.gap as f64, most_steps),
+        ("collect.declined_gap", collect.declined_gap.get() as f64, most_steps),
+        ("collect.declined_features_mb", collect.declined_features_mb as f64, 1e9),
+        ("guard.checkpoint_interval", guard.checkpoint_interval.get() as f64, most_steps),
+        ("label.slots", label.slots.get() as f64, 1024.0),
+        ("run.walkers", run.walkers as f64, 1024.0),
+        ("run.turn_steps", run.turn_steps.get() as f64, most_steps),
+    ];
+    match limits.into_iter().find(|(_, found, limit)| found > limit) {
+        Some((key, found, limit)) => wrong(key, found, format!("at most {limit}")),
+        None => Ok(()),
+    }
+}
+
+fn check_mixture(config: &Config) -> Result<(), Wrong> {
+    let Config { campaign, calm, run, .. } = config;
+    let one_by_one = campaign.mode == Mode::Reproducible && run.walks_per_round.get() == 1;
+    if calm.update == UpdateProtocol::Restarted && !one_by_one {
+        let expected = "mode = \"reproducible\" and run.walks_per_round = 1: the mixture can be restarted for each seed \
+                        structure only if walks follow one another";
+        return wrong("calm.update", "\"restarted\"", expected);
+    }
+    if calm.update != UpdateProtocol::Never && calm.artifact.is_none() {
+        let expected = "the gmm_artifacts.npz of the model: an export alone has no scatter matrices and counts, so its \
+                        mixture can be scored with but not updated (with update = \"never\" the artifact may be left out)";
+        return wrong("calm.artifact", "left out", expected);
+    }
+    Ok(())
+}
+
+fn check_thermostat(config: &Config) -> Result<(), Wrong> {
+    let (name, number) = match config.walk.thermostat {
+        ThermostatKind::Langevin { friction } => ("friction", friction),
+        ThermostatKind::NoseHoover { chain_length, .. } if !(1..=LONGEST_CHAIN).contains(&chain_length) => {
+            let found = format!("chain_length {chain_length}");
+            return wrong("walk.thermostat", found, format!("1 to {LONGEST_CHAIN}"));
+        }
+        ThermostatKind::NoseHoover { relaxation_time, .. } => ("relaxation_time", relaxation_time),
+    };
+    if number.is_finite() && number > 0.0 {
+        return Ok(());
+    }
+    wrong("walk.thermostat", format!("{name} {number}"), "a finite number above 0")
+}
+
+fn check_guard(config: &Config) -> Result<(), Wrong> {
+    let Config { walk, guard, .. } = config;
+    if let Some(zbl) = guard.zbl
+        && zbl.inner >= zbl.outer
+    {
+        let found = format!("inner {} and outer {}", zbl.inner.get(), zbl.outer.get());
+        return wrong("guard.zbl", found, "inner below outer");
+    }
+    let (highest, temperature) = (guard.highest_temperature.get(), walk.temperature.get());
+    if highest <= temperature {
+        let expected = format!("more than walk.temperature = {temperature} K: every walk would end at once");
+        return wrong("guard.highest_temperature", highest, expected);
+    }
+    Ok(())
+}
