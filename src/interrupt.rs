@@ -7,7 +7,7 @@ use std::thread;
 
 use tokio::signal::unix::{SignalKind, signal};
 
-use crate::cli::Failure;
+use crate::outcome::Failure;
 
 /// A flag that the first signal sets, so that work can stop in order; the second signal ends the process at once.
 pub fn flag() -> Result<Arc<AtomicBool>, Failure> {

@@ -1,11 +1,13 @@
 //! calmwalk expands the training set of an interatomic potential: walkers run molecular dynamics biased along the
 //! gradient of the CALM extrapolation grade, a selector decides what is new, and what is new is labelled.
 
+mod actors;
 mod campaign;
 mod cli;
 mod config;
 mod frames;
 mod interrupt;
+mod outcome;
 mod output;
 mod progress;
 mod summary;

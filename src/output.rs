@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
-use crate::cli::Failure;
+use crate::outcome::Failure;
 
 /// Work that ends sooner than this shows no bar.
 const BAR_AFTER: Duration = Duration::from_secs(1);

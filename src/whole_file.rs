@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use tempfile::{Builder, TempPath};
 
-use crate::cli::Failure;
+use crate::outcome::Failure;
 
 /// A file written beside its place and put there when it is complete: whoever is killed leaves no half file, and what
 /// was there before stays until then.

@@ -3,35 +3,23 @@
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::process;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use orchestrator::reactor::{self, Reactor};
+use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
 use serde_json::json;
 use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError, this_host, unix_milliseconds};
-use tokio::signal::unix::{SignalKind, signal};
-use tokio::sync::mpsc;
-use tokio::task::JoinSet;
-use wire::transport::{InProcess, Incoming};
-use workers::labeller::{self, Closing, LabellerSettings, ReferenceMethod};
-use workers::walk::WalkContext;
-use workers::walker;
 
 use super::{Ended, Failure, block_on};
+use crate::actors::Actors;
 use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
 use crate::output::print;
-use crate::progress::Display;
 use crate::summary;
 
 /// Time between two signs of life.
 const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
-/// Reports under way between walkers and reactor.
-const CHANNEL: usize = 64;
 
 /// Run a campaign to its end, or go on with one that was interrupted
 ///
@@ -150,7 +138,7 @@ async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
     for dead in store.status().await?.processes {
         store.release_stale_leases_of(&dead.id, now).await?;
     }
-    let (pid, host) = (process::id(), this_host());
+    let (pid, host) = (std::process::id(), this_host());
     let id = format!("{host}-{pid}-{now}");
     let (kind, state) = ("orchestrator".to_owned(), "running".to_owned());
     let record = ProcessRecord { id, kind, pid, host, started: now, last_seen: now, state };
@@ -204,122 +192,4 @@ async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector
         store.commit(&begun).await?;
     }
     Ok(selector)
-}
-
-/// Walkers, reactor and labellers at work.
-struct Actors {
-    walkers: Vec<JoinHandle<()>>,
-    labellers: JoinSet<Result<(), StoreError>>,
-    reactor: tokio::task::JoinHandle<Result<reactor::Ended, reactor::ReactorError>>,
-    closing: Arc<Closing>,
-    stopping: Arc<AtomicBool>,
-}
-
-impl Actors {
-    fn start(
-        campaign: &Campaign,
-        selector: Selector,
-        store: &Store,
-        process: &ProcessRecord,
-    ) -> Result<Self, Failure> {
-        let stopping = Arc::new(AtomicBool::new(false));
-        let closing = Arc::new(Closing::default());
-        stop_on_signals(Arc::clone(&stopping), Arc::clone(&closing))?;
-        let (to_reactor, incoming) = mpsc::channel(CHANNEL);
-        let walkers = start_walkers(campaign, &to_reactor, &stopping)?;
-        let labellers = start_labellers(campaign, store, process, &closing)?;
-        let walk_steps = campaign.config.walk.equilibration + campaign.config.walk.steps.get();
-        let mut display = Display::new(walk_steps, selector.standing(walk_steps));
-        let reactor = Reactor {
-            selector,
-            store: store.clone(),
-            incoming,
-            stopping: Arc::clone(&stopping),
-            queue_limit: u64::from(campaign.config.label.queue_limit.get()),
-        };
-        let reactor = tokio::spawn(async move {
-            let ended = reactor.run(|notice| display.notice(&notice)).await;
-            display.finish();
-            ended
-        });
-        Ok(Self { walkers, labellers, reactor, closing, stopping })
-    }
-
-    /// Waits for all of them.
-    async fn finish(mut self) -> Result<reactor::Ended, Failure> {
-        let ended = self.reactor.await.map_err(Failure::failed)?;
-        if ended.is_err() {
-            self.stopping.store(true, Ordering::Relaxed);
-            self.closing.stopping.store(true, Ordering::Relaxed);
-        }
-        self.closing.no_more_jobs.store(true, Ordering::Relaxed);
-        let panicked = self.walkers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
-        while let Some(labeller) = self.labellers.join_next().await {
-            labeller.map_err(Failure::failed)??;
-        }
-        if panicked > 0 {
-            return Err(Failure::Failed(format!("{panicked} walkers crashed: see the message above")));
-        }
-        ended.map_err(Failure::failed)
-    }
-}
-
-fn start_walkers(
-    campaign: &Campaign,
-    to_reactor: &mpsc::Sender<Incoming>,
-    stopping: &Arc<AtomicBool>,
-) -> Result<Vec<JoinHandle<()>>, Failure> {
-    let context =
-        WalkContext { model: Arc::clone(&campaign.model), settings: Arc::new(campaign.walk_settings()) };
-    let wanted = campaign.config.run.walkers;
-    let cores = thread::available_parallelism().map_or(1, |cores| cores.get());
-    let start = |number| {
-        let mut transport = InProcess::new(number, to_reactor.clone(), Arc::clone(stopping));
-        let context = context.clone();
-        thread::Builder::new()
-            .name(format!("walker-{number}"))
-            .spawn(move || walker::run(&context, &mut transport))
-            .map_err(|error| Failure::Failed(format!("cannot start walker {number}: {error}")))
-    };
-    (0..if wanted == 0 { cores } else { wanted }).map(|number| start(number as u32)).collect()
-}
-
-fn start_labellers(
-    campaign: &Campaign,
-    store: &Store,
-    process: &ProcessRecord,
-    closing: &Arc<Closing>,
-) -> Result<JoinSet<Result<(), StoreError>>, Failure> {
-    let label = &campaign.config.label;
-    let mut labellers = JoinSet::new();
-    for slot in 0..label.slots.get() {
-        let method = ReferenceMethod::new(campaign.reference_potential().map_err(Failure::Input)?);
-        let settings = LabellerSettings {
-            holder: format!("{}/{slot}", process.id),
-            protocol: campaign.protocol.clone(),
-            attempts: label.attempts.get(),
-            largest_force: label.largest_force.get(),
-        };
-        let (store, closing) = (store.clone(), Arc::clone(closing));
-        labellers
-            .spawn(async move { labeller::run(store, method, settings, &closing, unix_milliseconds).await });
-    }
-    Ok(labellers)
-}
-
-/// Ctrl-C and SIGTERM: the first stops in order, the second at once (which is safe too).
-fn stop_on_signals(stopping: Arc<AtomicBool>, closing: Arc<Closing>) -> Result<(), Failure> {
-    let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
-    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
-    tokio::spawn(async move {
-        loop {
-            tokio::select! { _ = interrupt.recv() => (), _ = terminate.recv() => () };
-            if stopping.swap(true, Ordering::Relaxed) {
-                process::exit(130);
-            }
-            closing.stopping.store(true, Ordering::Relaxed);
-            eprintln!("stopping: walks are checkpointed …");
-        }
-    });
-    Ok(())
 }

@@ -30,7 +30,7 @@ pub fn blown_up(
     if let Some(atom) = evaluation.forces.iter().position(|f| f.iter().any(|x| !x.is_finite())) {
         return Some(format!("the force on atom {atom} is not finite"));
     }
-    if !(temperature <= settings.highest_temperature) {
+    if temperature.is_nan() || temperature > settings.highest_temperature {
         let highest = settings.highest_temperature;
         return Some(format!("{temperature:.0} K is above the allowed {highest:.0} K"));
     }

@@ -8,7 +8,9 @@ use std::sync::Arc;
 use atoms::{NeighbourList, PotentialError, shortest_distance};
 use calm::neighbourhood::{Pair, neighbourhood_average};
 use calm::{GradeError, Mixture};
-use md::{Checkpoint, Dynamics, DynamicsError, Langevin, NoseHooverChain, State, Stream, Thermostat, VolumeRamp};
+use md::{
+    Checkpoint, Dynamics, DynamicsError, Langevin, NoseHooverChain, State, Stream, Thermostat, VolumeRamp,
+};
 use potentials::grace::GraceModel;
 use potentials::{Zbl, ZblRangeError};
 use serde::{Deserialize, Serialize};
@@ -86,7 +88,13 @@ pub fn advance(
         Err(error) => {
             let end = End::BadStart { reason: error.to_string() };
             let checkpoint = assignment.checkpoint.clone().unwrap_or_default();
-            return Report { walk, turn, outcome: Outcome::Ended(end), checkpoint, progress: Progress::default() };
+            return Report {
+                walk,
+                turn,
+                outcome: Outcome::Ended(end),
+                checkpoint,
+                progress: Progress::default(),
+            };
         }
     };
     let outcome = running.run(&stopping, &watch).unwrap_or_else(|error| {
@@ -161,7 +169,7 @@ impl<'a> Walk<'a> {
             if let Some(outcome) = self.look()? {
                 return Ok(outcome);
             }
-            if self.step() % PROGRESS_INTERVAL == 0 {
+            if self.step().is_multiple_of(PROGRESS_INTERVAL) {
                 watch(self.progress());
             }
         }

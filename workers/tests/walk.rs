@@ -116,7 +116,8 @@ fn never() -> CollectionRule {
 fn the_bias_is_the_hal_force() {
     let (model, mixture, structure) = (model(), mixture(), seed("slab-111"));
     let species = &structure.species;
-    let mut biased = BiasedPotential::new(Arc::clone(&model), Arc::clone(&mixture), None, 10, species).unwrap();
+    let mut biased =
+        BiasedPotential::new(Arc::clone(&model), Arc::clone(&mixture), None, 10, species).unwrap();
     biased.tau = 0.3;
     let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
     let (mut force_norm, mut gradient_norm) = (0.0, 0.0);
@@ -133,7 +134,9 @@ fn the_bias_is_the_hal_force() {
         force_norm += weight * (sum(&physical.forces) - force_norm);
         gradient_norm += weight * (sum(&gradient.gradient) - gradient_norm);
         let scale = if call < 10 { 0.0 } else { 0.3 * force_norm / gradient_norm };
-        for (found, (force, gradient)) in out.forces.iter().zip(physical.forces.iter().zip(&gradient.gradient)) {
+        for (found, (force, gradient)) in
+            out.forces.iter().zip(physical.forces.iter().zip(&gradient.gradient))
+        {
             let expected = cell::add(*force, cell::scale(*gradient, scale));
             assert!(cell::norm(cell::sub(*found, expected)) <= 1e-10 * (1.0 + cell::norm(expected)));
         }
@@ -179,7 +182,10 @@ fn a_walk_without_a_way_out_ends() {
     let settings = WalkSettings { collection, guard, volume_ramp: None, ..settings() };
     let reports = whole_walk(&settings, seed("fcc-100"), 150);
     let last = reports.last().unwrap();
-    assert!(matches!(&last.outcome, Outcome::Ended(End::Trapped { guard }) if guard == "shortest-bond"), "{last:?}");
+    assert!(
+        matches!(&last.outcome, Outcome::Ended(End::Trapped { guard }) if guard == "shortest-bond"),
+        "{last:?}"
+    );
     assert!(last.progress.step < 600);
 }
 
