@@ -61,7 +61,12 @@ fn energy_is_conserved_and_frames_say_what_the_potential_says() {
         if number(frame, "step") > 0.0 {
             // At the start, a perfect crystal, forces and shear stress are nothing but rounding.
             assert!(deviation(&labels.forces.unwrap().concat(), &expected.forces.concat()) < 1e-10);
-            assert!(deviation(&labels.stress.unwrap().concat(), &expected.stress(&frame.structure).unwrap().concat()) < 1e-10);
+            assert!(
+                deviation(
+                    &labels.stress.unwrap().concat(),
+                    &expected.stress(&frame.structure).unwrap().concat()
+                ) < 1e-10
+            );
         }
         let freedom = 3.0 * (frame.structure.len() - 1) as f64;
         let temperature = 2.0 * kinetic_energy(frame) / (freedom * BOLTZMANN);

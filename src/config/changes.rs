@@ -45,8 +45,10 @@ pub enum Change {
 pub enum Refused {
     /// A key that cannot change.
     #[error(
-        "{key} is {after}, but this campaign began with {before}: {}. Put the old value back, or start another campaign \
+        "{key} is {}, but this campaign began with {}: {}. Put the old value back, or start another campaign \
          with --directory",
+        shown(after),
+        shown(before),
         reason(key)
     )]
     Key {
@@ -124,10 +126,12 @@ impl Change {
 impl fmt::Display for Change {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Key { key, before, after } => write!(f, "{key} is now {after} (was {before})"),
+            Self::Key { key, before, after } => {
+                write!(f, "{key} is now {} (was {})", shown(after), shown(before))
+            }
             Self::SeedStructures { before, added } => {
                 let added: Vec<_> = added.iter().map(|seed| short(seed)).collect();
-                write!(f, "{} seed structures added to {before}: {}", added.len(), added.join(", "))
+                write!(f, "seed structures added to the {before} that it has: {}", added.join(", "))
             }
         }
     }
@@ -144,10 +148,13 @@ fn judge(key: String, before: Value, after: Value) -> Result<Change, Refused> {
     if key == "seeds" {
         return seed_structures(&before, &after);
     }
-    if let Some(key) = key.strip_prefix("files.") {
-        let shown =
-            |hash: &Value| hash.as_str().map_or("no file".to_owned(), |hash| excerpt(hash).to_owned());
-        return Err(Refused::File { key: key.to_owned(), before: shown(&before), after: shown(&after) });
+    if let Some(key) = key.strip_prefix("files.").map(str::to_owned) {
+        return Err(match (before.as_str(), after.as_str()) {
+            (Some(before), Some(after)) => {
+                Refused::File { key, before: excerpt(before).to_owned(), after: excerpt(after).to_owned() }
+            }
+            _ => Refused::Key { key, before, after },
+        });
     }
     if CHANGEABLE.contains(&key.as_str()) {
         Ok(Change::Key { key, before, after })
@@ -180,6 +187,11 @@ pub fn without_changeable(configuration: &Value) -> Value {
         }
     }
     fixed
+}
+
+/// A value as a configuration has it.
+fn shown(value: &Value) -> String {
+    if value.is_null() { "left out".to_owned() } else { value.to_string() }
 }
 
 /// Name and content of a seed structure.
@@ -217,7 +229,10 @@ mod tests {
         let after = json!({ "run": { "walkers": 2 }, "seeds": ["a 1", "b 2"] });
         let changes = compare(&before, &after).unwrap();
         let shown: Vec<_> = changes.iter().map(Change::to_string).collect();
-        assert_eq!(shown, ["run.walkers is now 2 (was 1)", "1 seed structures added to 1: 'b' (content 2)"]);
+        assert_eq!(
+            shown,
+            ["run.walkers is now 2 (was 1)", "seed structures added to the 1 that it has: 'b' (content 2)"]
+        );
         assert_eq!(changes[0].detail(), json!({ "key": "run.walkers", "before": 1, "after": 2 }));
         assert_eq!(changes[1].detail(), json!({ "key": "seeds", "before": 1, "after": 2, "added": ["b 2"] }));
         assert_eq!(compare(&after, &after), Ok(Vec::new()));

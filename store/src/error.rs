@@ -188,6 +188,11 @@ impl StoreError {
     }
 }
 
+/// No space for the database.
+const FULL: i32 = 13;
+/// No space for the index of the write-ahead log.
+const IOERR_SHMSIZE: i32 = 4874;
+
 impl From<sqlx::Error> for StoreError {
     fn from(error: sqlx::Error) -> Self {
         // The low byte of SQLite's extended result codes, https://www.sqlite.org/rescode.html
@@ -199,11 +204,11 @@ impl From<sqlx::Error> for StoreError {
             }
             _ => None,
         };
-        match code.map(|code| code & 0xff) {
+        match code.map(|code| if code == IOERR_SHMSIZE { FULL } else { code & 0xff }) {
             Some(5 | 6) => Self::Busy,
             Some(8) => Self::ReadOnly,
-            Some(11 | 26) => Self::damaged("the file", error),
-            Some(13) => Self::DiskFull,
+            Some(11 | 26) => Self::damaged(crate::DATABASE, error),
+            Some(FULL) => Self::DiskFull,
             _ => Self::Database(error),
         }
     }

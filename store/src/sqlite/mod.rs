@@ -70,7 +70,7 @@ impl Store {
         MIGRATIONS.run(&writer).await.map_err(schema_error)?;
         let store = Self { readers: writer.clone(), writer: Some(writer) };
         store.write_campaign(campaign, seeds, now).await?;
-        // The last connection to close empties the write-ahead log into the file.
+        store.empty_log().await?;
         store.close().await;
         publish(directory, &unfinished, &path)?;
         Self::open(directory).await
@@ -109,6 +109,14 @@ impl Store {
         if let Some(writer) = &self.writer {
             writer.close().await;
         }
+    }
+
+    /// Moves the write-ahead log into the database: it bears the database's name and would be lost under another.
+    /// Closing does the same, but says nothing when the disk is full.
+    async fn empty_log(&self) -> Result<()> {
+        let checkpoint = sqlx::query_as("PRAGMA wal_checkpoint(TRUNCATE)").fetch_one(&self.readers);
+        let (busy, _, _): (bool, i64, i64) = checkpoint.await?;
+        if busy { Err(StoreError::Busy) } else { Ok(()) }
     }
 
     /// A transaction that has the right to write from its first statement on: one that asked for it later could be
