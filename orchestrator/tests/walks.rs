@@ -97,6 +97,16 @@ fn reports_that_nobody_asked_for_are_refused() {
     unasked(&mut selector, report.clone());
     turn(&mut selector);
     unasked(&mut selector, report);
+    // Twice in one round, and from a walker that was given up.
+    let mut selector = begin(&settings(Mode::Reproducible), 2);
+    let [first, second] =
+        [(); 2].map(|()| turn(&mut selector)).map(|a| common::report(&a, Outcome::Turn, at(10)));
+    assert!(selector.report(first.clone()).unwrap().is_none());
+    unasked(&mut selector, first);
+    selector.lost(second.walk);
+    unasked(&mut selector, second.clone());
+    turn(&mut selector);
+    decided(&mut selector, second);
 }
 
 #[test]
