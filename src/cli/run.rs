@@ -42,6 +42,10 @@ impl Run {
         let directory = self.directory.unwrap_or_else(|| PathBuf::from(stem));
         fs::create_dir_all(&directory).map_err(|source| match source.kind() {
             ErrorKind::StorageFull => StoreError::DiskFull,
+            ErrorKind::AlreadyExists => {
+                let source = std::io::Error::new(ErrorKind::NotADirectory, "it is a file");
+                StoreError::Directory { directory: directory.clone(), source }
+            }
             _ => StoreError::Directory { directory: directory.clone(), source },
         })?;
         store::check_directory(&directory)?;
@@ -69,12 +73,16 @@ async fn run(campaign: &Campaign, directory: &Path) -> Result<Ended, Failure> {
         return Ok(Ended::Interrupted);
     }
     let summary = summary::of(&store).await?;
+    let failed = store.status().await?.labels.failed;
     let shown = directory.display();
     print(|out| {
         writeln!(out, "{summary}")?;
         writeln!(out, "the campaign is in {shown}/{DATABASE}; look further with")?;
         writeln!(out, "  calmwalk status {shown}")?;
         writeln!(out, "  calmwalk queue {shown} list")?;
+        if failed > 0 {
+            writeln!(out, "  calmwalk queue {shown} list --state failed")?;
+        }
         writeln!(out, "  calmwalk export {shown} --output dataset.extxyz")
     })?;
     store.close().await;

@@ -2,6 +2,7 @@
 #![allow(dead_code)] // Each test program uses a part.
 
 pub mod campaign;
+pub mod desk;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output};
@@ -11,6 +12,12 @@ use atoms::extxyz::{Frame, write_frame};
 /// A file of `configs/`.
 pub fn config(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("configs").join(path)
+}
+
+/// The text of a file of `configs/`, with the data that it names where they are.
+pub fn demo(name: &str) -> String {
+    let text = std::fs::read_to_string(config(name)).expect("a configuration of the project");
+    text.replace("\"data/", &format!("\"{}/", config("data").display()))
 }
 
 /// The program, to be run in `directory`.

@@ -1,7 +1,7 @@
 //! Arrays of an `.npz` archive, with every size checked against the data before it is used.
 
 use std::fs::File;
-use std::io::{BufReader, Read};
+use std::io::{BufReader, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
 use npyz::npz::NpzArchive;
@@ -26,8 +26,11 @@ pub(crate) struct Array {
 
 impl Archive {
     pub fn open(path: &Path) -> Result<Self, ArtifactError> {
-        let zip = NpzArchive::open(path)
-            .map_err(|source| ArtifactError::Open { path: path.to_path_buf(), source })?;
+        let opened = match path.is_dir() {
+            true => Err(ErrorKind::IsADirectory.into()),
+            false => NpzArchive::open(path),
+        };
+        let zip = opened.map_err(|source| ArtifactError::Open { path: path.to_path_buf(), source })?;
         Ok(Self { path: path.to_path_buf(), zip })
     }
 

@@ -1,0 +1,255 @@
+//! Wrong configurations and wrong files: exit code 2, a message that says where, what was found and what was expected,
+//! and nothing written.
+
+mod common;
+
+use std::fs;
+use std::io::{Cursor, Read, Write};
+use std::path::Path;
+
+use common::desk::{Desk, changed, line};
+use common::{calmwalk, config, refuse, stderr, succeed};
+use npyz::npz::{NpzArchive, NpzWriter, file_name_from_array_name};
+
+const MODEL: &str = "data/al_eam_1l/kokkos.npz";
+const ARTIFACT: &str = "data/al_eam_1l/gmm_artifacts.npz";
+
+#[test]
+fn every_wrong_key_is_named_with_its_line() {
+    let desk = Desk::new();
+    let langevin = "# thermostat = { langevin = { friction = 0.01 } }";
+    for (from, to, expected) in [
+        ("temperature = 600.0", "temprature = 600.0", "unknown key `temprature`, expected one of"),
+        ("temperature = 600.0", "temprature = 600.0", "did you mean `temperature`?"),
+        ("[guard]", "[gaurd]", "did you mean `guard`?"),
+        ("temperature = 600.0", "temperature = -600.0", "found -600, expected a finite number above 0"),
+        ("temperature = 600.0", "temperature = nan", "found NaN, expected a finite number above 0"),
+        ("temperature = 600.0", "temperature = inf", "found inf, expected a finite number above 0"),
+        ("temperature = 600.0", "temperature = \"600\"", "string \"600\", expected a number"),
+        ("temperature = 600.0", "temperature = = 600", "extra `=`"),
+        ("temperature = 600.0", "temperature = 600.0\ntemperature = 600.0", "duplicate key"),
+        ("steps = 2000 ", "steps = 0 ", "integer `0`, expected a whole number above 0"),
+        ("steps = 2000 ", "steps = -1 ", "integer `-1`, expected a whole number above 0"),
+        ("steps = 2000 ", "steps = 20.5 ", "floating point `20.5`, expected a whole number above 0"),
+        (
+            "steps = 2000 ",
+            "steps = 9223372036854775807 ",
+            "walk.steps is 9223372036854776000; expected at most",
+        ),
+        ("tau = 0.15", "tau = 0", "found 0, expected a finite number above 0"),
+        ("# mode = \"reproducible\"", "mode = \"reproducable\"", "did you mean `reproducible`?"),
+        ("rule = \"atom_count\"", "rule = \"atom_cont\"", "did you mean `atom_count`?"),
+        ("fraction = 0.15", "fracton = 0.15", "did you mean `fraction`?"),
+        ("fraction = 0.15", "fraction = 1.5", "found 1.5, expected a number above 0 and not above 1"),
+        (
+            "# forgetting_alarm = 0.2",
+            "forgetting_alarm = 20",
+            "found 20, expected a number above 0 and not above 1",
+        ),
+        ("# ladder = [0.05, 0.1,", "ladder = [0.05, 0.01,", "expected at least one value, ascending"),
+        (
+            "# ladder = [0.05, 0.1, 0.2, 0.4, 0.7, 1.0]",
+            "ladder = []",
+            "expected at least one value, ascending",
+        ),
+        (langevin, "thermostat = { langevin = { friction = 0 } }", "walk.thermostat is friction 0; expected"),
+        (langevin, "thermostat = { langevin = { fricton = 1 } }", "did you mean `friction`?"),
+        (langevin, "thermostat = { langvin = { friction = 1 } }", "did you mean `langevin`?"),
+        (
+            langevin,
+            "thermostat = { nose_hoover = { relaxation_time = 100, chain_length = 0 } }",
+            "walk.thermostat is chain_length 0; expected 1 to 100",
+        ),
+        ("from = 1.0, to = 1.4", "from = 0.0, to = 1.4", "found 0, expected a finite number above 0"),
+        (
+            "inner = 1.6, outer = 2.4",
+            "inner = 2.6, outer = 2.4",
+            "inner 2.6 and outer 2.4; expected inner below outer",
+        ),
+        (
+            "inner = 1.6, outer = 2.4",
+            "inner = 1.6, outer = 7",
+            "expected at most the cutoff of the model, 6.5 Å",
+        ),
+        ("inner = 1.6, outer = 2.4", "inner = 1.6", "missing key `outer`"),
+        (
+            "# highest_temperature = 20000.0",
+            "highest_temperature = 500",
+            "more than walk.temperature = 600 K",
+        ),
+        (
+            "# update = \"carried\"",
+            "update = \"restarted\"",
+            "expected mode = \"reproducible\" and run.walks_per_round = 1",
+        ),
+        ("files = [\"", "files = [] # [\"", "seeds.files is an empty list"),
+        ("# total = 100", "total = 0", "expected a whole number above 0"),
+        ("# walkers = 0", "walkers = -1", "integer `-1`, expected a whole number, 0 or more"),
+        ("# walkers = 0", "walkers = 100000", "run.walkers is 100000; expected at most 1024"),
+        (
+            "kind = \"eam_fs\"",
+            "kind = \"eam\"",
+            "expected one of `grace`, `eam_alloy`, `eam_fs`, `stillinger_weber`",
+        ),
+        ("method = { reference", "method = { dft", "unknown value `dft`, expected `reference`"),
+    ] {
+        let message = desk.refused(changed(from, to));
+        let line = line(from);
+        let at = [format!("c.toml:{line}: "), format!("c.toml:{line}:"), format!("c.toml:{}:", line + 1)];
+        assert!(at.iter().any(|at| message.contains(at)), "{message}\nexpected line {line} for {to}");
+        assert!(message.contains(expected), "{message}\nexpected {expected}");
+    }
+}
+
+#[test]
+fn whole_sections_and_files_that_are_none_are_told() {
+    let desk = Desk::new();
+    desk.refused_with("[potential]\nmodel", "model", &["c.toml:", "`model`"]);
+    desk.refused_with("tau = 0.15 ", "# ", &["missing key `tau`", "[walk]"]);
+    desk.refused_with("[seeds]", "[walk]", &[&format!("c.toml:{}:", line("[walk]")), "duplicate key"]);
+    assert!(desk.refused("").contains("c.toml:1:1: missing key `potential`"));
+    let binary: Vec<u8> = (0..=255).collect();
+    assert!(
+        desk.refused(binary)
+            .contains("c.toml:2: found bytes that are not text; expected a configuration in TOML")
+    );
+    assert!(desk.refused("[walk\n").contains("c.toml:1:"));
+    fs::remove_file(desk.path().join("c.toml")).unwrap();
+    assert!(refuse(desk.path(), ["run", "c.toml"]).contains("cannot read c.toml: No such file"));
+    fs::create_dir(desk.path().join("c.toml")).unwrap();
+    assert!(refuse(desk.path(), ["run", "c.toml"]).contains("cannot read c.toml: Is a directory"));
+}
+
+/// The bytes of an npz file without some of its arrays.
+fn without(file: &str, unwanted: impl Fn(&str) -> bool) -> Vec<u8> {
+    let bytes = fs::read(config(file)).unwrap();
+    let mut source = NpzArchive::new(Cursor::new(&bytes[..])).unwrap();
+    let mut names: Vec<_> = source.array_names().map(str::to_owned).collect();
+    names.sort();
+    let mut out = NpzWriter::new(Cursor::new(Vec::new()));
+    for name in names.into_iter().filter(|name| !unwanted(name)) {
+        let file = file_name_from_array_name(&name);
+        let mut array = Vec::new();
+        source.zip_archive().by_name(&file).unwrap().read_to_end(&mut array).unwrap();
+        out.zip_writer().start_file(file, Default::default()).unwrap();
+        out.zip_writer().write_all(&array).unwrap();
+    }
+    out.zip_writer().finish().unwrap().into_inner()
+}
+
+/// The path of a data file as the demo writes it.
+fn path(file: &str) -> String {
+    config(file).display().to_string()
+}
+
+#[test]
+fn broken_models_and_artifacts_are_named() {
+    let desk = Desk::new();
+    for (file, key) in [(MODEL, "potential.model"), (ARTIFACT, "calm.artifact")] {
+        let at = format!("c.toml:{}: {key}: ", line(&path(file)));
+        let whole = fs::read(config(file)).unwrap();
+        for size in [0, 1, 100, whole.len() / 10, whole.len() / 2, whole.len() - 1] {
+            desk.write("cut.npz", &whole[..size]);
+            desk.refused_with(&path(file), "cut.npz", &[&at, "cut.npz", "npz a"]);
+        }
+        for place in 1..10 {
+            let mut damaged = whole.clone();
+            damaged[whole.len() * place / 10] ^= 0xff;
+            desk.write("cut.npz", damaged);
+            desk.refused_with(&path(file), "cut.npz", &["c.toml:", "cut.npz"]);
+        }
+        desk.write("cut.npz", "units metal\natom_style atomic\n");
+        desk.refused_with(&path(file), "cut.npz", &[&at, "cut.npz", "npz archive"]);
+        desk.refused_with(&path(file), "absent.npz", &[&at, "absent.npz", "No such file"]);
+        desk.refused_with(&path(file), ".", &[&at, "directory"]);
+    }
+    desk.refused_with(&path(MODEL), &path(ARTIFACT), &["gmm_artifacts.npz", "not a kokkos.npz export"]);
+}
+
+#[test]
+fn a_model_without_feature_arrays_cannot_be_graded_with() {
+    let desk = Desk::new();
+    desk.write("bare.npz", without(MODEL, |name| name.starts_with("uq_")));
+    desk.refused_with(
+        &path(MODEL),
+        "bare.npz",
+        &["potential.model: bare.npz: no feature projection (uq_* arrays)"],
+    );
+}
+
+#[test]
+fn an_artifact_must_belong_to_the_model() {
+    let desk = Desk::new();
+    let silicon = path("data/si_sw_1l/gmm_artifacts.npz");
+    let expected =
+        ["calm.artifact: ", &silicon, "another model: its list of elements is Si, that of the model Al"];
+    desk.refused_with(&path(ARTIFACT), &silicon, &expected);
+}
+
+#[test]
+fn a_mixture_without_statistics_can_be_scored_with_but_not_updated() {
+    let desk = Desk::new();
+    let advice =
+        "scored with but not updated; give the gmm_artifacts.npz of the build, or leave calm.artifact out";
+    let export = path(MODEL);
+    desk.refused_with(&path(ARTIFACT), &export, &["calm.artifact: ", &export, advice]);
+    desk.write("stripped.npz", without(ARTIFACT, |name| name.starts_with("scatter_")));
+    desk.refused_with(&path(ARTIFACT), "stripped.npz", &["stripped.npz", advice]);
+    let left_out = desk.refused(changed("artifact = ", "# artifact = "));
+    assert!(
+        left_out.contains(&format!("c.toml:{}: calm.artifact is left out", line("[calm]"))),
+        "{left_out}"
+    );
+
+    // Without updates the export is enough.
+    let never = changed("artifact = ", "update = \"never\" # ").replace("steps = 2000 ", "steps = 60 ");
+    desk.write("c.toml", never.replace("# equilibration = 500", "equilibration = 10"));
+    let valid = succeed(desk.path(), ["validate", "c.toml"]);
+    assert!(valid.contains("it can be scored with but not updated"), "{valid}");
+    let summary = succeed(desk.path(), ["run", "c.toml"]);
+    assert!(summary.contains("mixture          version 0"), "{summary}");
+}
+
+#[test]
+fn models_of_more_layers_are_told_to_be_unsupported() {
+    let Ok(peers) = std::env::var("CALMWALK_PEER_DATA") else {
+        eprintln!("skipped: CALMWALK_PEER_DATA is not set");
+        return;
+    };
+    let desk = Desk::new();
+    let model = Path::new(&peers).join("grace/grace2l_tiny/kokkos.npz").display().to_string();
+    desk.refused_with(
+        &path(MODEL),
+        &model,
+        &["potential.model: ", &model, "two-layer models are not supported"],
+    );
+}
+
+#[test]
+fn training_frames_and_label_potentials_must_fit() {
+    let desk = Desk::new();
+    let (frames, label) = (path("data/al_eam_1l/seed_frames.extxyz"), path("data/Al_mm.eam.fs"));
+    desk.refused_with(&frames, "absent.extxyz", &["calm.training_frames: absent.extxyz"]);
+    let silicon = path("data/si_sw_1l/seed_frames.extxyz");
+    desk.refused_with(&frames, &silicon, &[&format!("{silicon}:1: atom 0 is Si"), "knows Al"]);
+    desk.refused_with(&label, "absent.eam", &["label.method.reference.file: ", "absent.eam", "No such file"]);
+    desk.refused_with(&label, &path("data/Si.sw"), &["label.method.reference.file: ", "Si.sw"]);
+    desk.refused_with("\"eam_fs\"", "\"stillinger_weber\"", &["Al_mm.eam.fs, line 2: found 22 words"]);
+    let of_silicon = format!("{{ kind = \"stillinger_weber\", file = \"{}\" }}", path("data/Si.sw"));
+    let expected = ["Si.sw: the label potential knows Si, but seed structure 'fcc-100' (", "has Al"];
+    desk.refused_with(&format!("{{ kind = \"eam_fs\", file = \"{label}\" }}"), &of_silicon, &expected);
+    for size in [0, 20, 2000] {
+        desk.write("cut.eam", &fs::read(&label).unwrap()[..size]);
+        desk.refused_with(&label, "cut.eam", &["label.method.reference.file: ", "cut.eam"]);
+    }
+}
+
+#[test]
+fn an_unknown_command_line_is_refused() {
+    let here = tempfile::tempdir().unwrap();
+    for arguments in [vec!["rnu"], vec!["run"], vec!["run", "c.toml", "--directry", "x"], vec![]] {
+        let output = calmwalk(here.path(), &arguments);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {}", stderr(&output));
+        assert!(stderr(&output).contains("Usage: calmwalk"), "{}", stderr(&output));
+    }
+}
