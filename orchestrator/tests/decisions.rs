@@ -171,7 +171,35 @@ fn a_campaign_collects_only_so_many() {
             kinds(&decided(&mut selector, report))
         })
         .collect();
-    assert_eq!(kinds, ["accepted", "accepted", "declined budget"]);
+    // The last of them ends the walks that nobody has in hand, a walk in hand ends with its report.
+    assert_eq!(kinds, ["accepted", "accepted", "ended", "ended", "declined budget", "ended"]);
+    assert!(selector.is_done());
+}
+
+#[test]
+fn walks_that_ended_by_a_budget_go_on_when_it_grows() {
+    let limited = Settings { update: UpdateProtocol::Never, total: Some(1), control: true, ..live() };
+    let mut selector = common::restore(&limited, 2, Snapshot::default());
+    let mut walks = std::collections::BTreeMap::new();
+    let mut keep = |commit: &Commit| walks.extend(commit.walks.iter().map(|walk| (walk.walk, walk.clone())));
+    keep(&selector.begin_walks());
+    let commit = next_candidate(&mut selector, 5, 1, NEW);
+    assert_eq!(kinds(&commit), ["accepted", "ended", "ended", "begun"]);
+    keep(&commit);
+    let stored = Snapshot { walks: walks.values().cloned().collect(), ..Snapshot::default() };
+    // With the same budget nothing goes on but the control walk.
+    let mut same = common::restore(&limited, 2, stored.clone());
+    assert!(same.begin_walks().decisions.is_empty());
+    assert_eq!(turn(&mut same).walk, wire::WalkId(2));
+    // With a larger one both walks do, from where they stood, and only what is new gets another control.
+    let mut larger = common::restore(&Settings { total: Some(2), ..limited }, 2, stored);
+    assert_eq!(kinds(&larger.begin_walks()), ["resumed", "resumed"]);
+    let assignment = turn(&mut larger);
+    assert_eq!((assignment.turn, assignment.verdict.clone()), (1, Some(Verdict::Accepted)));
+    let report = offer(&larger, &assignment, 9, structure(2, SHORTEST), NEW);
+    let commit = decided(&mut larger, report);
+    assert_eq!(kinds(&commit), ["accepted", "ended", "ended", "begun"]);
+    assert_eq!(commit.decisions[3].detail["wanted"], serde_json::json!([9]));
 }
 
 #[test]
@@ -181,8 +209,9 @@ fn the_first_reason_is_given() {
         vec![wire::ContentHash::of(&structure(1, 1.0)), wire::ContentHash::of(&structure(2, SHORTEST))];
     let mut selector = common::restore(&limited, 4, Snapshot { known, ..Snapshot::default() });
     selector.begin_walks();
-    assert_eq!(kinds(&next_candidate(&mut selector, 1, 9, NEW)), ["accepted", "ended"]);
-    let assignments = [(); 3].map(|()| turn(&mut selector));
+    let [first, assignments @ ..] = [(); 4].map(|()| turn(&mut selector));
+    let report = offer(&selector, &first, 1, structure(9, SHORTEST), NEW);
+    assert_eq!(kinds(&decided(&mut selector, report)), ["accepted", "ended"]);
     // Close and known; known and covered; covered and beyond the budget.
     let offers =
         [(structure(1, 1.0), KNOWN), (structure(2, SHORTEST), KNOWN), (structure(3, SHORTEST), KNOWN)];
@@ -190,7 +219,8 @@ fn the_first_reason_is_given() {
         let report = offer(&selector, assignment, 1, structure, z);
         kinds(&decided(&mut selector, report))
     });
-    assert_eq!(reasons.collect::<Vec<_>>(), ["declined guard", "declined duplicate", "declined budget"]);
+    let reasons: Vec<_> = reasons.filter(|kind| kind != "ended").collect();
+    assert_eq!(reasons, ["declined guard", "declined duplicate", "declined budget"]);
 }
 
 #[test]

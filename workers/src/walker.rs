@@ -1,6 +1,9 @@
 //! A walker: asks for a turn, works on it, delivers what came of it.
 
-use wire::transport::Transport;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use wire::messages::{End, Outcome, Progress, Report};
+use wire::transport::{Transport, Work};
 
 use crate::walk::{WalkContext, advance};
 
@@ -8,9 +11,26 @@ use crate::walk::{WalkContext, advance};
 pub fn run(context: &WalkContext, transport: &mut impl Transport) {
     let mut report = None;
     while let Some(work) = transport.exchange(report.take()) {
-        let walk = work.assignment.walk;
-        let stopping = || transport.stopping();
-        let watch = |progress| transport.progress(walk, progress);
-        report = Some(advance(context, &work.assignment, work.mixture, stopping, watch));
+        // A crash is a defect of this program; it ends the walk that met it, not the campaign.
+        let turn = catch_unwind(AssertUnwindSafe(|| work_on(context, &work, transport)));
+        report = Some(turn.unwrap_or_else(|_| crashed(&work)));
+    }
+}
+
+fn work_on(context: &WalkContext, work: &Work, transport: &impl Transport) -> Report {
+    let walk = work.assignment.walk;
+    let stopping = || transport.stopping();
+    let watch = |progress| transport.progress(walk, progress);
+    advance(context, &work.assignment, work.mixture.clone(), stopping, watch)
+}
+
+fn crashed(work: &Work) -> Report {
+    let end = End::BadStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
+    Report {
+        walk: work.assignment.walk,
+        turn: work.assignment.turn,
+        outcome: Outcome::Ended(end),
+        checkpoint: work.assignment.checkpoint.clone().unwrap_or_default(),
+        progress: Progress::default(),
     }
 }

@@ -93,6 +93,8 @@ pub enum End {
     Steps,
     /// Its seed structure has given as many structures as it may.
     Collected,
+    /// The campaign has as many structures as it may have.
+    Budget,
     /// A guard refused it too often, after the allowed number of returns to a checkpoint.
     Trapped {
         /// The guard.
@@ -111,11 +113,12 @@ pub enum End {
 }
 
 impl End {
-    /// `"steps"`, `"collected"`, `"trapped"`, `"blew_up"`, `"bad_start"`.
+    /// `"steps"`, `"collected"`, `"budget"`, `"trapped"`, `"blew_up"`, `"bad_start"`.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Steps => "steps",
             Self::Collected => "collected",
+            Self::Budget => "budget",
             Self::Trapped { .. } => "trapped",
             Self::BlewUp { .. } => "blew_up",
             Self::BadStart { .. } => "bad_start",

@@ -65,10 +65,13 @@ impl Selector {
                 }
                 Outcome::Candidate(block) => self.keep_control_frame(id, block, &mut commit)?,
                 Outcome::Ended(end) => self.end_walk(id, &end, &mut commit),
+                // A control walk whose frames did not come will not give them in another turn either.
+                Outcome::Turn if !self.walks[&id].is_biased() => self.end_walk(id, &End::Steps, &mut commit),
                 Outcome::Turn | Outcome::Paused => {}
             }
-            touched.extend(self.begin_control(id, &mut commit));
         }
+        touched.extend(self.end_by_budget(&mut commit));
+        touched.extend(self.begin_controls(&mut commit));
         commit.walks = touched.iter().map(|id| self.walks[id].to_record()).collect();
         self.seal(&mut commit);
         Ok(commit)
@@ -81,8 +84,10 @@ impl Selector {
         let returned = report.progress.segment > walk.memory.segment;
         walk.memory.segment = walk.memory.segment.max(report.progress.segment);
         walk.record.turn += 1;
-        walk.record.checkpoint = Some(report.checkpoint.clone());
-        walk.record.progress = report.progress.clone();
+        if !matches!(report.outcome, Outcome::Ended(End::BadStart { .. })) {
+            walk.record.checkpoint = Some(report.checkpoint.clone());
+            walk.record.progress = report.progress.clone();
+        }
         walk.memory.verdict = None;
         if walk.is_biased() {
             walk.memory.until = report.progress.step + turn_steps;
@@ -194,12 +199,11 @@ impl Selector {
     /// The first reason, if any, in the order: guard, duplicate, budget, covered.
     fn reason_to_decline(&self, id: WalkId, content: ContentHash, graded: &Graded) -> Option<Decline> {
         let walk = &self.walks[&id].record;
-        let used_up = self.settings.total.is_some_and(|total| self.accepted >= total);
         if graded.bonds.shortest < self.least_distances[walk.seed_structure as usize] {
             Some(Decline::Guard)
         } else if self.known.contains(&content) {
             Some(Decline::Duplicate)
-        } else if walk.accepted >= self.settings.per_seed || used_up {
+        } else if walk.accepted >= self.settings.per_seed || self.is_used_up() {
             Some(Decline::Budget)
         } else if !self.settings.collection.is_met(&graded.selector.gamma) {
             Some(Decline::Covered)
@@ -279,19 +283,35 @@ impl Selector {
         commit.decisions.push(self.decision("ended", id, detail));
     }
 
-    /// The control of a biased walk that has ended and had something accepted.
-    fn begin_control(&mut self, id: WalkId, commit: &mut Commit) -> Option<WalkId> {
-        let walk = &self.walks[&id];
-        let wanted = walk.is_biased() && walk.has_ended() && walk.record.accepted > 0;
-        if !(wanted && self.settings.control) {
-            return None;
+    /// Ends the biased walks that nobody has in hand once the campaign has as many structures as it may have.
+    fn end_by_budget(&mut self, commit: &mut Commit) -> Vec<WalkId> {
+        if !self.is_used_up() {
+            return Vec::new();
         }
-        let control_id = self.next_walk_id();
-        let control = walk.control_of(control_id);
-        let detail = json!({ "control_of": id, "wanted": control.memory.wanted });
-        commit.decisions.push(self.decision("begun", control_id, detail));
-        self.walks.insert(control_id, control);
-        Some(control_id)
+        let idle = self.walks.values().filter(|walk| walk.is_biased() && !walk.has_ended() && !walk.out);
+        let idle: Vec<_> = idle.map(|walk| walk.record.walk).collect();
+        idle.iter().for_each(|id| self.end_walk(*id, &End::Budget, commit));
+        idle
+    }
+
+    /// The controls of biased walks that have ended; touches both.
+    fn begin_controls(&mut self, commit: &mut Commit) -> Vec<WalkId> {
+        let mut touched = Vec::new();
+        if !self.settings.control {
+            return touched;
+        }
+        let ended: Vec<_> =
+            self.walks.iter().filter(|(_, walk)| walk.needs_control()).map(|(id, _)| *id).collect();
+        for id in ended {
+            let control_id = self.next_walk_id();
+            let walk = self.walks.get_mut(&id).expect("taken from the table");
+            let control = walk.control(control_id);
+            let detail = json!({ "control_of": id, "wanted": control.memory.wanted });
+            commit.decisions.push(self.decision("begun", control_id, detail));
+            self.walks.insert(control_id, control);
+            touched.extend([id, control_id]);
+        }
+        touched
     }
 }
 

@@ -138,14 +138,6 @@ pub enum SelectorError {
         /// Why.
         source: GraderError,
     },
-    /// A report about a walk or turn that was not given out.
-    #[error("a report about turn {turn} of walk {walk}, which nobody was asked for")]
-    Unasked {
-        /// Walk.
-        walk: WalkId,
-        /// Turn.
-        turn: u64,
-    },
     /// A database that does not fit the campaign.
     #[error("the campaign's database cannot be continued: {0}")]
     Snapshot(String),
@@ -236,10 +228,11 @@ impl Selector {
     }
 
     /// Takes what came of a turn. What it returns must be committed before anything else is asked of the selector.
+    /// A report of a turn that nobody has in hand (sent twice, or by one that was taken for lost) changes nothing.
     pub fn report(&mut self, report: Report) -> Result<Option<Commit>, SelectorError> {
         let (id, turn) = (report.walk, report.turn);
-        let walk = self.walks.get_mut(&id).filter(|walk| walk.out && walk.record.turn == turn);
-        let walk = walk.ok_or(SelectorError::Unasked { walk: id, turn })?;
+        let asked = |walk: &&mut Walk| walk.out && walk.record.turn == turn;
+        let Some(walk) = self.walks.get_mut(&id).filter(asked) else { return Ok(None) };
         walk.out = false;
         if report.outcome == Outcome::Paused {
             walk.pause(report);

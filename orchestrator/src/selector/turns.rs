@@ -20,9 +20,11 @@ pub enum Next {
 
 impl Selector {
     /// Makes a walk for every seed structure that has none: at the start of a campaign, or when seed structures were
-    /// added to it. The commit is empty if there was nothing to do.
+    /// added to it. Walks that had ended by a budget which has grown since go on. The commit is empty if there was
+    /// nothing to do.
     pub fn begin_walks(&mut self) -> Commit {
         let mut commit = Commit::default();
+        self.resume_walks(&mut commit);
         let begun = self.walks.values().filter(|walk| walk.is_biased()).count();
         for seed in begun..self.seeds.len() {
             let id = self.next_walk_id();
@@ -34,6 +36,27 @@ impl Selector {
         }
         self.seal(&mut commit);
         commit
+    }
+
+    fn resume_walks(&mut self, commit: &mut Commit) {
+        if self.is_used_up() {
+            return;
+        }
+        let (mut resumed, per_seed) = (Vec::new(), self.settings.per_seed);
+        for walk in self.walks.values_mut() {
+            if walk.ended_by_budget() && walk.record.accepted < per_seed {
+                walk.record.state = "waiting".to_owned();
+                commit.walks.push(walk.to_record());
+                resumed.push(walk.record.walk);
+            }
+        }
+        let resumed = resumed.into_iter().map(|id| self.decision("resumed", id, serde_json::json!({})));
+        commit.decisions.extend(resumed);
+    }
+
+    /// Whether the campaign has as many structures as it may have.
+    pub(super) fn is_used_up(&self) -> bool {
+        self.settings.total.is_some_and(|total| self.accepted >= total)
     }
 
     pub(super) fn next_walk_id(&self) -> WalkId {

@@ -26,8 +26,10 @@ pub(super) struct Memory {
     pub until: u64,
     /// Control walk: steps whose frames are still wanted.
     pub wanted: Vec<u64>,
-    /// Biased walk: steps at which structures were accepted, for its control.
+    /// Biased walk: steps at which structures were accepted.
     pub accepted_steps: Vec<u64>,
+    /// Of them, those whose control frames a control walk was begun for.
+    pub controlled: usize,
 }
 
 impl Walk {
@@ -48,13 +50,19 @@ impl Walk {
         Self { record, memory: Memory { until, ..Memory::default() }, out: false }
     }
 
+    /// Whether structures were accepted from it that no control walk was begun for.
+    pub fn needs_control(&self) -> bool {
+        self.is_biased() && self.has_ended() && self.memory.controlled < self.memory.accepted_steps.len()
+    }
+
     /// The unbiased control of a biased walk: frames at the steps at which that one collected.
-    pub fn control_of(&self, walk: WalkId) -> Self {
+    pub fn control(&mut self, walk: WalkId) -> Self {
         let mut control = Self::new(walk, self.record.seed_structure, 0);
         control.record.origin = Origin::Control;
         control.record.partner = Some(self.record.walk);
         let wanted = &mut control.memory.wanted;
-        wanted.clone_from(&self.memory.accepted_steps);
+        wanted.extend(&self.memory.accepted_steps[self.memory.controlled..]);
+        self.memory.controlled = self.memory.accepted_steps.len();
         wanted.sort_unstable();
         wanted.dedup();
         control.memory.until = wanted.last().copied().unwrap_or(0);
@@ -89,10 +97,15 @@ impl Walk {
         self.memory.verdict = None;
     }
 
+    /// Whether it ended for no other reason than a budget.
+    pub fn ended_by_budget(&self) -> bool {
+        self.is_biased() && [End::Collected, End::Budget].iter().any(|end| self.record.state == end.name())
+    }
+
     pub fn end(&mut self, end: &End) {
         self.record.state = end.name().to_owned();
         self.record.reason = match end {
-            End::Steps | End::Collected => String::new(),
+            End::Steps | End::Collected | End::Budget => String::new(),
             End::Trapped { guard } => format!("refused by the {guard} guard again and again"),
             End::BlewUp { reason } | End::BadStart { reason } => reason.clone(),
         };
