@@ -1,0 +1,221 @@
+//! Directories and databases that a campaign cannot be run in: told, and left as they are.
+
+mod common;
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use common::campaign::{Small, outcome};
+use common::{Running, calmwalk, program, refuse, stderr, succeed};
+use tempfile::TempDir;
+
+const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
+
+/// A campaign small enough to be run again and again.
+fn small() -> Small {
+    Small { steps: 60, ..Small::default() }
+}
+
+fn written(small: &Small) -> TempDir {
+    let directory = tempfile::tempdir().unwrap();
+    small.write(directory.path());
+    directory
+}
+
+fn assert_plain(output: &Output, code: i32) -> String {
+    let message = stderr(output);
+    assert_eq!(output.status.code(), Some(code), "{message}");
+    assert!(!message.contains("panicked") && !message.contains("RUST_BACKTRACE"), "{message}");
+    message
+}
+
+#[test]
+fn other_files_in_the_place_of_the_database_are_refused_unchanged() {
+    let directory = written(&small());
+    succeed(directory.path(), RUN);
+    let database = directory.path().join("here/campaign.sqlite");
+    let good = fs::read(&database).unwrap();
+    // https://www.sqlite.org/fileformat.html: user version at byte 60, application id at byte 68, big-endian.
+    let patched = |place: usize, value: u32| {
+        let mut bytes = good.clone();
+        bytes[place..place + 4].copy_from_slice(&value.to_be_bytes());
+        bytes
+    };
+    for (content, words) in [
+        (patched(60, 7), "has a schema of version 7; this program reads version 1"),
+        (patched(60, 0), "has a schema of version 0; this program reads version 1"),
+        (patched(68, 5), "is a database of another program (application id 0x5,"),
+        (b"units metal\natom_style atomic\n".to_vec(), "is no SQLite database: it begins with 'units metal"),
+        (Vec::new(), "is no SQLite database: it begins with ''"),
+    ] {
+        fs::write(&database, &content).unwrap();
+        let message = assert_plain(&calmwalk(directory.path(), RUN), 2);
+        assert!(message.contains("here/campaign.sqlite ") && message.contains(words), "{message}");
+        assert_eq!(fs::read(&database).unwrap(), content);
+    }
+    fs::write(&database, &good).unwrap();
+    succeed(directory.path(), RUN);
+}
+
+#[test]
+fn a_damaged_database_is_told_and_left_alone() {
+    let directory = written(&small());
+    succeed(directory.path(), RUN);
+    let database = directory.path().join("here/campaign.sqlite");
+    let good = fs::read(&database).unwrap();
+    let damaged = |range: std::ops::Range<usize>| {
+        let mut bytes = good.clone();
+        bytes[range].fill(0xa5);
+        bytes
+    };
+    let n = good.len();
+    for content in [damaged(4096..n), damaged(n / 20..n / 2), good[..n / 2].to_vec(), good[..100].to_vec()] {
+        fs::write(&database, &content).unwrap();
+        let message = assert_plain(&calmwalk(directory.path(), RUN), 1);
+        assert!(message.contains("campaign in here: damaged database: "), "{message}");
+        assert!(message.contains("restore it from a copy"), "{message}");
+        assert_eq!(fs::read(&database).unwrap(), content);
+    }
+    fs::write(&database, &good).unwrap();
+    succeed(directory.path(), RUN);
+}
+
+#[test]
+fn a_directory_that_is_none_is_told() {
+    let directory = written(&small());
+    let text = fs::read(directory.path().join("campaign.toml")).unwrap();
+    for (place, reason) in [("campaign.toml", "it is a file"), ("campaign.toml/here", "Not a directory")] {
+        let message = refuse(directory.path(), ["run", "campaign.toml", "--directory", place]);
+        assert!(message.contains(&format!("cannot work in the directory {place} ({reason}")), "{message}");
+    }
+    assert_eq!(fs::read(directory.path().join("campaign.toml")).unwrap(), text);
+    let message = refuse(directory.path(), ["status", "."]);
+    assert!(message.contains("there is no campaign in .: it has no campaign.sqlite"), "{message}");
+}
+
+/// The program as a user without any rights, if we may become one; `None` if that cannot be tried here.
+fn unprivileged(directory: &Path) -> Option<Command> {
+    let rights = ["--reuid=65534", "--regid=65534", "--clear-groups"];
+    let program = env!("CARGO_BIN_EXE_calmwalk");
+    let works = Command::new("setpriv").args(rights).args([program, "--version"]).output();
+    if !works.is_ok_and(|output| output.status.success()) {
+        eprintln!("skipped: cannot become an unprivileged user here");
+        return None;
+    }
+    let mut command = Command::new("setpriv");
+    command.args(rights).arg(program).current_dir(directory);
+    Some(command)
+}
+
+#[test]
+fn a_directory_without_write_permission_is_told() {
+    let directory = written(&small());
+    fs::set_permissions(directory.path(), fs::Permissions::from_mode(0o755)).unwrap();
+    let Some(mut command) = unprivileged(directory.path()) else { return };
+    let message = assert_plain(&command.args(RUN).output().unwrap(), 2);
+    assert!(message.contains("cannot work in the directory here (Permission denied"), "{message}");
+    assert!(!directory.path().join("here").exists());
+
+    // Nor can another's campaign be gone on with.
+    succeed(directory.path(), RUN);
+    let database = directory.path().join("here/campaign.sqlite");
+    let before = fs::read(&database).unwrap();
+    let mut command = unprivileged(directory.path()).expect("as before");
+    let message = assert_plain(&command.args(RUN).output().unwrap(), 2);
+    assert!(message.contains("cannot work in the directory here (Permission denied"), "{message}");
+    assert_eq!(fs::read(&database).unwrap(), before);
+}
+
+/// A small file system of its own, gone in the end.
+struct Disk<'a>(&'a Path);
+
+impl<'a> Disk<'a> {
+    fn mount(place: &'a Path, size: &str) -> Option<Self> {
+        let arguments = ["-t", "tmpfs", "-o", size, "tmpfs"];
+        let mounted = Command::new("mount").args(arguments).arg(place).output();
+        mounted.is_ok_and(|output| output.status.success()).then_some(Self(place))
+    }
+
+    fn enlarge(&self) {
+        let status = Command::new("mount").args(["-o", "remount,size=50m"]).arg(self.0).status();
+        assert!(status.unwrap().success());
+    }
+}
+
+impl Drop for Disk<'_> {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("--lazy").arg(self.0).status();
+    }
+}
+
+#[test]
+fn a_full_disk_loses_nothing() {
+    let small = Small::default();
+    let undisturbed = written(&small);
+    succeed(undisturbed.path(), RUN);
+    let expected = outcome(&undisturbed.path().join("here"));
+    // Full when the database is begun, when it is published, when it is opened, in mid-campaign.
+    for size in ["size=4k", "size=64k", "size=200k", "size=300k", "size=600k", "size=800k"] {
+        let directory = written(&small);
+        let here = directory.path().join("here");
+        fs::create_dir(&here).unwrap();
+        let Some(disk) = Disk::mount(&here, size) else {
+            eprintln!("skipped: cannot mount a file system here");
+            return;
+        };
+        let message = assert_plain(&calmwalk(directory.path(), RUN), 1);
+        assert!(message.contains("the disk is full: nothing was written"), "{size}: {message}");
+        disk.enlarge();
+        succeed(directory.path(), RUN);
+        assert_eq!(outcome(&here), expected, "{size}");
+    }
+}
+
+#[test]
+fn a_second_run_of_a_campaign_names_the_first() {
+    let small = Small::default();
+    let undisturbed = written(&small);
+    succeed(undisturbed.path(), RUN);
+    let directory = written(&small);
+    let mut first = program(directory.path());
+    let first = first.args(RUN).stdout(Stdio::null()).stderr(Stdio::null());
+    let mut first = Running(first.spawn().unwrap());
+    let signal = |name: &str, pid: u32| {
+        assert!(Command::new("kill").args([name, &pid.to_string()]).status().unwrap().success());
+    };
+    let lock = directory.path().join("here/campaign.lock");
+    while !fs::read_to_string(&lock).is_ok_and(|text| text.contains("process")) {
+        assert!(first.0.try_wait().unwrap().is_none(), "the first run ended too early to be met");
+        std::thread::yield_now();
+    }
+    // Stopped, it cannot end before the second comes.
+    signal("-STOP", first.0.id());
+    let second = calmwalk(directory.path(), RUN);
+    signal("-CONT", first.0.id());
+    let message = assert_plain(&second, 2);
+    assert!(message.contains(&format!("being run by process {} (calmwalk run)", first.0.id())), "{message}");
+    assert_eq!(first.0.wait().unwrap().code(), Some(0));
+    assert_eq!(outcome(&directory.path().join("here")), outcome(&undisturbed.path().join("here")));
+}
+
+#[test]
+fn labels_that_fail_do_not_stop_a_campaign() {
+    let small = small();
+    let directory = written(&small);
+    let text = small.text().replace("[label]", "[label]\nlargest_force = 1e-6\nattempts = 2");
+    fs::write(directory.path().join("campaign.toml"), text).unwrap();
+    let summary = succeed(directory.path(), RUN);
+    assert!(summary.contains("labels           0 labelled (0 biased, 0 control)"), "{summary}");
+    assert!(summary.contains("calmwalk queue here list --state failed"), "{summary}");
+    let status = succeed(directory.path(), ["status", "here", "--json"]);
+    let status: serde_json::Value = serde_json::from_str(&status).unwrap();
+    assert!(status["labels"]["failed"].as_u64().unwrap() > 0, "{status}");
+    assert_eq!((&status["labels"]["queued"], &status["finished"]), (&0.into(), &true.into()), "{status}");
+    let jobs = succeed(directory.path(), ["queue", "here", "list", "--state", "failed", "--json"]);
+    let jobs: serde_json::Value = serde_json::from_str(&jobs).unwrap();
+    let candidate = jobs[0]["candidate"].as_str().unwrap();
+    let details = succeed(directory.path(), ["queue", "here", "show", candidate]);
+    assert_eq!(details.matches("above the allowed").count(), 2, "{details}");
+}
