@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-const CHANGEABLE: [&str; 11] = [
+pub(super) const CHANGEABLE: [&str; 11] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -206,7 +206,12 @@ fn excerpt(hash: &str) -> &str {
 }
 
 /// (key, before, after) of every leaf that differs.
-fn differences(key: &str, before: &Value, after: &Value, changes: &mut Vec<(String, Value, Value)>) {
+pub(super) fn differences(
+    key: &str,
+    before: &Value,
+    after: &Value,
+    changes: &mut Vec<(String, Value, Value)>,
+) {
     if let (Value::Object(old), Value::Object(new)) = (before, after) {
         let names: std::collections::BTreeSet<_> = old.keys().chain(new.keys()).collect();
         for name in names {

@@ -64,7 +64,8 @@ impl ConfigError {
             message += &format!("; did you mean `{suggestion}`?");
         }
         // What the whole file lacks has no line of its own.
-        if !shown.is_empty() && !((line, column) == (1, 1) && message.starts_with("missing")) {
+        let of_whole = (line, column) == (1, 1) && message.starts_with("missing");
+        if !(shown.is_empty() || of_whole) {
             message += &format!("\n  {line} | {shown}");
         }
         Self::Parse { at, message }

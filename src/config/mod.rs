@@ -2,6 +2,8 @@
 
 mod changes;
 mod check;
+#[cfg(test)]
+mod documented;
 mod error;
 mod files;
 

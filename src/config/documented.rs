@@ -1,0 +1,143 @@
+//! Whether the files of `configs/` and `docs/configuration.md` say what is so.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use atoms::Species;
+use calm::Combination;
+use serde_json::{Value, json};
+
+use super::Config;
+use super::changes::differences;
+
+const CAMPAIGNS: [&str; 3] = ["aluminium.toml", "silicon.toml", "foundation-expansion.toml"];
+
+fn read(path: &str) -> String {
+    std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()
+}
+
+/// A configuration with every default filled in.
+fn resolved(text: &str) -> Value {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("c.toml");
+    std::fs::write(&path, text).unwrap();
+    let (mut config, _) = Config::load(&path).unwrap();
+    config.seeds.files.truncate(1);
+    let text = serde_json::to_string(&config).unwrap();
+    serde_json::from_str(&text.replace(&directory.path().display().to_string(), "")).unwrap()
+}
+
+/// (section, key, whether it is commented out) of every line `key = …` or `# key = …`, and the number of the line.
+fn keys(text: &str) -> Vec<(String, String, bool, usize)> {
+    let (mut section, mut keys) = (String::new(), Vec::new());
+    for (number, line) in text.lines().enumerate() {
+        if let Some(header) = line.strip_prefix('[').and_then(|rest| rest.split(']').next()) {
+            section = header.to_owned();
+        }
+        let (commented, rest) = line.strip_prefix("# ").map_or((false, line), |rest| (true, rest));
+        let name = rest.split_once(" = ").map(|(name, _)| name);
+        let is_key = |name: &&str| name.chars().all(|c| c.is_ascii_lowercase() || c == '_');
+        keys.extend(name.filter(is_key).map(|name| (section.clone(), name.to_owned(), commented, number)));
+    }
+    keys
+}
+
+/// The text with every commented key put in force, but for alternatives of keys that are in force already.
+fn uncommented(text: &str) -> String {
+    let found = keys(text);
+    let mut in_force: BTreeSet<_> =
+        found.iter().filter(|key| !key.2).map(|(section, key, ..)| (section, key)).collect();
+    let mut lines: Vec<_> = text.lines().collect();
+    for (section, key, _, number) in found.iter().filter(|key| key.2) {
+        if in_force.insert((section, key)) {
+            lines[*number] = &lines[*number][2..];
+        }
+    }
+    lines.join("\n")
+}
+
+/// What the file says behind a key: the comment of its line and of the lines below that go on with it.
+fn comment_of(text: &str, section: &str, key: &str) -> String {
+    let place =
+        keys(text).into_iter().find(|(s, k, ..)| (s.as_str(), k.as_str()) == (section, key)).unwrap().3;
+    let mut lines = text.lines().skip(place);
+    let first = lines.next().unwrap().to_owned();
+    lines.take_while(|line| line.starts_with("   ")).fold(first, |all, line| all + line)
+}
+
+#[test]
+fn keys_that_are_commented_out_show_their_defaults() {
+    for name in CAMPAIGNS {
+        let text = read(&format!("configs/{name}"));
+        let (mut differ, before) = (Vec::new(), resolved(&text));
+        differences("", &before, &resolved(&uncommented(&text)), &mut differ);
+        for (key, before, after) in differ {
+            let expected = match key.as_str() {
+                // These have no default value: what holds without them is the same as this value here …
+                "calm.ladder" => json!(Combination::Convex.default_ladder()),
+                "walk.time_step" => json!(md::default_time_step(&["Al".parse::<Species>().unwrap()])),
+                // … or said in words.
+                _ => {
+                    let (section, key) = key.split_once('.').unwrap();
+                    assert!(
+                        comment_of(&text, section, key).to_lowercase().contains("left out"),
+                        "{name}: {key}"
+                    );
+                    after.clone()
+                }
+            };
+            assert_eq!((&before, &after), (&Value::Null, &expected), "{name}: {key}");
+        }
+    }
+}
+
+/// The keys of each section.
+fn all_keys() -> Vec<(String, BTreeSet<String>)> {
+    let resolved = resolved(&read("configs/aluminium.toml"));
+    let sections = resolved.as_object().unwrap().iter();
+    sections
+        .map(|(name, section)| (name.clone(), section.as_object().unwrap().keys().cloned().collect()))
+        .collect()
+}
+
+#[test]
+fn every_key_is_listed() {
+    for name in CAMPAIGNS {
+        let listed = keys(&read(&format!("configs/{name}")));
+        for (section, keys) in all_keys() {
+            let of_section = listed.iter().filter(|key| key.0 == section).map(|key| key.1.clone());
+            assert_eq!(of_section.collect::<BTreeSet<_>>(), keys, "{name}: [{section}]");
+        }
+    }
+}
+
+#[test]
+fn the_reference_describes_every_key() {
+    let text = read("docs/configuration.md");
+    for (section, keys) in all_keys() {
+        let heading = format!("\n## `[{section}]`");
+        let chapter = text.split(&heading).nth(1).unwrap_or_else(|| panic!("no chapter on [{section}]"));
+        let chapter = chapter.split("\n## ").next().unwrap_or_default();
+        let rows = chapter.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
+        let described: BTreeSet<_> =
+            rows.map(|key| key.split('.').next().unwrap_or(key).to_owned()).collect();
+        assert_eq!(described, keys, "docs/configuration.md: [{section}]");
+    }
+}
+
+#[test]
+fn the_reference_says_which_keys_may_change() {
+    let text = read("docs/configuration.md");
+    let mut section = "";
+    let mut changeable = BTreeSet::new();
+    for line in text.lines() {
+        section = line.strip_prefix("## `[").and_then(|rest| rest.split(']').next()).unwrap_or(section);
+        let cells: Vec<_> = line.split('|').map(str::trim).collect();
+        if let [_, key, .., "yes", _] = cells[..] {
+            changeable.insert(format!("{section}.{}", key.trim_matches('`')));
+        }
+    }
+    let expected =
+        super::changes::CHANGEABLE.map(|key| if key == "seeds" { "seeds.files" } else { key }.to_owned());
+    assert_eq!(changeable, BTreeSet::from(expected));
+}

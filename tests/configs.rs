@@ -1,0 +1,175 @@
+//! Every file of `configs/` runs as it stands, and what comes of it can be read.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use atoms::extxyz::Frame;
+use atoms::{Evaluation, NeighbourList, Potential, read_extxyz, shortest_distance};
+use common::{config, deviation, refuse, stderr, succeed};
+use potentials::{Eam, EamStyle, StillingerWeber};
+use serde_json::Value;
+
+/// Runs a demo to its end and checks its books; returns its labelled frames, control walks included.
+fn campaign(directory: &Path, name: &str) -> Vec<Frame> {
+    let file = config(name).display().to_string();
+    let summary = succeed(directory, ["run", &file]);
+    assert!(summary.contains("walks            8 biased"), "{summary}");
+    let here = directory.join(Path::new(name).file_stem().unwrap()).display().to_string();
+    let status: Value = serde_json::from_str(&succeed(directory, ["status", &here, "--json"])).unwrap();
+    assert_eq!(status["finished"], true, "{status}");
+    let labels = &status["labels"];
+    assert_eq!((&labels["queued"], &labels["leased"], &labels["failed"]), (&0.into(), &0.into(), &0.into()));
+    let walks = status["walks"].as_array().unwrap();
+    let biased: Vec<_> = walks.iter().filter(|walk| walk["origin"] == "biased").collect();
+    let collected = biased.iter().filter(|walk| walk["accepted"].as_u64() > Some(0)).count();
+    assert!(2 * collected > biased.len(), "most walks find something: {status}");
+    assert!(biased.iter().all(|walk| walk["state"] == "collected" || walk["state"] == "steps"), "{status}");
+    let accepted = status["candidates"]["accepted"].as_u64().unwrap();
+    let control = status["candidates"]["control"].as_u64().unwrap();
+
+    let output = directory.join("dataset.extxyz");
+    let arguments = ["export", &here, "--control", "--output", &output.display().to_string()];
+    succeed(directory, arguments);
+    let frames = read_extxyz(&output).unwrap();
+    assert_eq!(frames.len() as u64, accepted + control);
+    check_frames(&frames, accepted as usize);
+    read_by_ase(&output, &frames);
+    frames
+}
+
+fn text<'a>(frame: &'a Frame, key: &str) -> &'a str {
+    frame.info[key].text().unwrap()
+}
+
+/// Structures are physical, and those of biased walks are new to the model.
+fn check_frames(frames: &[Frame], accepted: usize) {
+    let mut neighbours = NeighbourList::new(6.0, 0.0);
+    let mut biased = 0;
+    for frame in frames {
+        neighbours.update(&frame.structure).unwrap();
+        let (_, _, shortest) = shortest_distance(&frame.structure, &neighbours).unwrap();
+        assert!(shortest > 1.2, "{shortest} Å");
+        let volume: f64 = frame.info["relative_volume"].number().unwrap();
+        assert!((1.0..=1.4).contains(&volume), "V/V₀ = {volume}");
+        if text(frame, "origin") == "biased" {
+            biased += 1;
+            let gamma = frame.arrays["gamma"].reals().unwrap();
+            assert!(gamma.iter().any(|gamma| *gamma > 1.0), "{gamma:?}");
+        }
+    }
+    assert_eq!(biased, accepted);
+}
+
+/// The labels are those of the potential that the configuration names.
+fn check_labels(frames: &[Frame], potential: &mut dyn Potential) {
+    let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
+    let mut expected = Evaluation::default();
+    for frame in frames {
+        neighbours.update(&frame.structure).unwrap();
+        potential.evaluate(&frame.structure, &neighbours, &mut expected).unwrap();
+        let labels = frame.labels().unwrap();
+        let close = |found: &[f64], expected: &[f64]| deviation(found, expected) < 1e-12;
+        assert!(close(&[labels.energy.unwrap()], &[expected.energy()]));
+        assert!(close(labels.forces.unwrap().as_flattened(), expected.forces.as_flattened()));
+        let stress = expected.stress(&frame.structure).unwrap();
+        assert!(close(labels.stress.unwrap().as_flattened(), stress.as_flattened()));
+    }
+}
+
+/// ASE reads the same structures and labels.
+fn read_by_ase(path: &Path, frames: &[Frame]) {
+    let Some(python) = std::env::var_os("CALMWALK_PYTHON") else {
+        eprintln!("CALMWALK_PYTHON is not set: no comparison with ASE");
+        return;
+    };
+    let script = "import json, sys, ase.io\n\
+                  frames = ase.io.read(sys.argv[1], ':')\n\
+                  print(json.dumps([dict(symbols=list(a.symbols), positions=a.positions.ravel().tolist(),\n\
+                      cell=a.cell.array.ravel().tolist(), energy=a.get_potential_energy(),\n\
+                      forces=a.get_forces().ravel().tolist(), stress=a.get_stress(voigt=False).ravel().tolist(),\n\
+                      gamma=a.arrays['gamma'].tolist(), walk=int(a.info['walk'])) for a in frames]))";
+    let output = Command::new(python).args(["-c", script]).arg(path).env("PYTHONUTF8", "1").output().unwrap();
+    assert!(output.status.success(), "{}", stderr(&output));
+    let read: Vec<Value> = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(read.len(), frames.len());
+    for (found, frame) in read.iter().zip(frames) {
+        let labels = frame.labels().unwrap();
+        let numbers = |key: &str| -> Vec<f64> { serde_json::from_value(found[key].clone()).unwrap() };
+        let symbols: Vec<_> = frame.structure.species.iter().map(|species| species.symbol()).collect();
+        assert_eq!(found["symbols"], serde_json::json!(symbols));
+        assert_eq!(numbers("positions"), frame.structure.positions.as_flattened());
+        assert_eq!(numbers("cell"), frame.structure.cell.0.as_flattened());
+        assert_eq!(found["energy"].as_f64(), labels.energy);
+        assert_eq!(numbers("forces"), labels.forces.unwrap().as_flattened());
+        // ASE goes by Voigt components, which are those of the symmetric stress.
+        assert!(deviation(&numbers("stress"), labels.stress.unwrap().as_flattened()) < 1e-12);
+        assert_eq!(numbers("gamma"), frame.arrays["gamma"].reals().unwrap());
+    }
+}
+
+#[test]
+fn aluminium_runs_as_it_stands() {
+    let directory = tempfile::tempdir().unwrap();
+    let frames = campaign(directory.path(), "aluminium.toml");
+    let mut potential = Eam::load_as(config("data/Al_mm.eam.fs"), EamStyle::FinnisSinclair).unwrap();
+    check_labels(&frames, &mut potential);
+}
+
+#[test]
+fn silicon_runs_as_it_stands() {
+    let directory = tempfile::tempdir().unwrap();
+    let frames = campaign(directory.path(), "silicon.toml");
+    check_labels(&frames, &mut StillingerWeber::load(config("data/Si.sw")).unwrap());
+}
+
+#[test]
+fn unbiased_dynamics_run_as_they_stand() {
+    let directory = tempfile::tempdir().unwrap();
+    succeed(directory.path(), ["md", &config("md-aluminium.toml").display().to_string()]);
+    let frames = read_extxyz(&directory.path().join("md-aluminium.extxyz")).unwrap();
+    assert_eq!(frames.len(), 21);
+    let mut potential = Eam::load_as(config("data/Al_mm.eam.fs"), EamStyle::FinnisSinclair).unwrap();
+    check_labels(&frames, &mut potential);
+}
+
+#[test]
+fn the_foundation_expansion_runs_once_its_files_are_there() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let text = fs::read_to_string(config("foundation-expansion.toml")).unwrap();
+    fs::write(here.join("campaign.toml"), &text).unwrap();
+    let message = refuse(here, ["validate", "campaign.toml"]);
+    assert!(message.contains("potential.model: model/kokkos.npz: cannot be read"), "{message}");
+    for (file, from) in [
+        ("model/kokkos.npz", "data/al_eam_1l/kokkos.npz"),
+        ("model/gmm_artifacts.npz", "data/al_eam_1l/gmm_artifacts.npz"),
+        ("reference/kokkos.npz", "data/al_eam_1l/kokkos.npz"),
+        ("seeds.extxyz", "data/aluminium_seeds.extxyz"),
+    ] {
+        let place = here.join(file);
+        fs::create_dir_all(place.parent().unwrap()).unwrap();
+        fs::copy(config(from), place).unwrap();
+    }
+    succeed(here, ["validate", "campaign.toml"]);
+    assert!(text.contains("\nsteps = 15000") && text.contains("\n# equilibration = 500"));
+    let short = text.replace("\nsteps = 15000", "\nsteps = 200");
+    fs::write(here.join("campaign.toml"), short.replace("\n# equilibration = 500", "\nequilibration = 20"))
+        .unwrap();
+    let summary = succeed(here, ["run", "campaign.toml"]);
+    assert!(summary.contains("walks            8 biased"), "{summary}");
+    let status: Value = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();
+    assert_eq!(status["finished"], true, "{status}");
+}
+
+#[test]
+fn every_file_of_configs_is_run_by_a_test() {
+    let run = ["aluminium.toml", "foundation-expansion.toml", "md-aluminium.toml", "silicon.toml"];
+    let entries =
+        fs::read_dir(config("")).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    let mut files: Vec<_> = entries.filter(|name| name.ends_with(".toml")).collect();
+    files.sort();
+    assert_eq!(files, run);
+}
