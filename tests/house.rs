@@ -6,16 +6,21 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 /// Every package, where it lives, and the packages that it may depend on.
-const HOUSE: [(&str, &str, &[&str]); 9] = [
+const HOUSE: [(&str, &str, &[&str]); 10] = [
     ("atoms", "crates/atoms", &[]),
-    ("calm", "crates/calm", &[]),
-    ("potentials", "crates/potentials", &["atoms"]),
+    ("npz", "crates/npz", &[]),
+    ("calm", "crates/calm", &["npz"]),
+    ("potentials", "crates/potentials", &["atoms", "npz"]),
     ("md", "crates/md", &["atoms"]),
     ("wire", "crates/wire", &["atoms", "calm"]),
     ("store", "store", &["atoms", "wire"]),
     ("workers", "workers", &["atoms", "calm", "potentials", "md", "wire", "store"]),
     ("orchestrator", "orchestrator", &["atoms", "calm", "wire", "store"]),
-    ("calmwalk", "", &["atoms", "calm", "potentials", "md", "wire", "store", "workers", "orchestrator"]),
+    (
+        "calmwalk",
+        "",
+        &["atoms", "npz", "calm", "potentials", "md", "wire", "store", "workers", "orchestrator"],
+    ),
 ];
 
 /// Files of `workers` that may use the store: a walker never opens the database.

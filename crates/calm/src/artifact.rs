@@ -3,9 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use npz::{Archive, Error};
+
 use crate::component::{Component, ComponentError, Statistics};
 use crate::mixture::{Mixture, MixtureError};
-use crate::npz::Archive;
 
 /// Schema versions that can be read: 3 (linear features), 4 (asinh), 6 (normalised, with density channels).
 pub const SCHEMAS: [usize; 3] = [3, 4, 6];
@@ -113,6 +114,26 @@ pub enum ArtifactError {
     },
 }
 
+impl From<Error> for ArtifactError {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Open { path, source } | Error::NotAnArchive { path, source } => {
+                Self::Open { path, source }
+            }
+            Error::Missing { path, key } => Self::Missing { path, key },
+            Error::Type { path, key, found, expected } => {
+                Self::Invalid { path, key, found: format!("type {found}"), expected }
+            }
+            Error::Shape { path, key, found, expected } => {
+                Self::Invalid { path, key, found: format!("shape {found}"), expected }
+            }
+            Error::Damaged { path, key, found, expected } | Error::Value { path, key, found, expected } => {
+                Self::Invalid { path, key, found, expected }
+            }
+        }
+    }
+}
+
 impl Artifact {
     /// Loads `gmm_artifacts.npz`: a mixture that can be graded with and updated.
     ///
@@ -123,30 +144,30 @@ impl Artifact {
     /// Missing or ill-shaped arrays and unknown schema versions, with file, key, what was found and expected.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, ArtifactError> {
         let path = path.as_ref();
-        let mut file = Archive::open(path)?;
-        check_schema(&mut file, "__schema_version__")?;
+        let file = &Archive::open(path)?;
+        check_schema(file, "__schema_version__")?;
         if file.contains("uq_feature_mode") {
             let mode = file.strings("uq_feature_mode")?.concat();
             if mode != "basis_rp" {
-                return Err(file.invalid("uq_feature_mode", mode, "basis_rp"));
+                return Err(invalid(file, "uq_feature_mode", mode, "basis_rp"));
             }
         }
         let symbols = file.strings("element_map")?;
-        let thresholds = thresholds(&mut file, symbols.len())?;
+        let thresholds = thresholds(file, symbols.len())?;
         let mut elements = vec![None; symbols.len()];
         let mut dimension = 0;
-        for number in file.array("elements")?.numbers {
-            let element = file.as_count("elements", number)?;
+        for number in file.numbers("elements")?.data {
+            let element = as_count(file, "elements", number)?;
             let place = elements.get_mut(element);
             let place = place.ok_or_else(|| {
-                file.invalid("elements", element, format!("an index below {}", symbols.len()))
+                invalid(file, "elements", element, format!("an index below {}", symbols.len()))
             })?;
-            let slots = Slots::read(&mut file, element, thresholds.get(element))?;
+            let slots = Slots::read(file, element, thresholds.get(element))?;
             dimension = slots.dimension;
             *place = Some(slots.components(path, element)?);
         }
         if dimension == 0 {
-            return Err(file.invalid("elements", "no element", "at least one"));
+            return Err(invalid(file, "elements", "no element", "at least one"));
         }
         let unknown = || vec![Arc::new(Component::unknown_element(dimension))];
         let elements = elements.into_iter().map(|element| element.unwrap_or_else(unknown)).collect();
@@ -157,9 +178,9 @@ impl Artifact {
         let asinh = match transform.as_str() {
             "" | "none" | "linear" | "identity" => false,
             "asinh" => true,
-            _ => return Err(file.invalid("uq_feature_transform", transform, "none or asinh")),
+            _ => return Err(invalid(file, "uq_feature_transform", transform, "none or asinh")),
         };
-        finish(path, &mut file, symbols, elements, asinh)
+        finish(path, file, symbols, elements, asinh)
     }
 
     /// Loads the CALM arrays (`uq_*`) of an exported model: a mixture to grade with, which cannot be updated.
@@ -168,19 +189,19 @@ impl Artifact {
     /// As [`Artifact::load`].
     pub fn load_export(path: impl AsRef<Path>) -> Result<Self, ArtifactError> {
         let path = path.as_ref();
-        let mut file = Archive::open(path)?;
-        check_schema(&mut file, "uq_schema_version")?;
+        let file = &Archive::open(path)?;
+        check_schema(file, "uq_schema_version")?;
         let symbols = file.strings("element_names")?;
-        let element_count = file.count("uq_n_elements")?;
+        let element_count = count(file, "uq_n_elements")?;
         if element_count != symbols.len() {
-            return Err(file.invalid("uq_n_elements", element_count, symbols.len()));
+            return Err(invalid(file, "uq_n_elements", element_count, symbols.len()));
         }
-        let (slots, dimension) = (file.count("uq_max_clusters")?, file.count("uq_feature_dim")?);
-        let centroids = file.shaped("uq_centroids", &[element_count, slots, dimension])?;
-        let inverses = file.shaped("uq_inv_cov", &[element_count, slots, dimension, dimension])?;
-        let thresholds = file.shaped("uq_interp_thresholds", &[element_count, slots])?;
+        let (slots, dimension) = (count(file, "uq_max_clusters")?, count(file, "uq_feature_dim")?);
+        let centroids = file.numbers("uq_centroids")?.shaped(&[element_count, slots, dimension])?;
+        let inverses = file.numbers("uq_inv_cov")?.shaped(&[element_count, slots, dimension, dimension])?;
+        let thresholds = file.numbers("uq_interp_thresholds")?.shaped(&[element_count, slots])?;
         if slots == 0 || dimension == 0 {
-            return Err(file.invalid("uq_centroids", "no centroid", "at least one an element"));
+            return Err(invalid(file, "uq_centroids", "no centroid", "at least one an element"));
         }
         let mut elements = Vec::new();
         let rows = thresholds.chunks_exact(slots).zip(centroids.chunks_exact(slots * dimension));
@@ -197,9 +218,9 @@ impl Artifact {
         }
         let asinh = file.scalar_or("uq_feature_transform", 0.0)?;
         if asinh != 0.0 && asinh != 1.0 {
-            return Err(file.invalid("uq_feature_transform", asinh, "0 (none) or 1 (asinh)"));
+            return Err(invalid(file, "uq_feature_transform", asinh, "0 (none) or 1 (asinh)"));
         }
-        finish(path, &mut file, symbols, elements, asinh == 1.0)
+        finish(path, file, symbols, elements, asinh == 1.0)
     }
 
     /// Checks that this artifact belongs to a model, itself known by its export: same elements in the same order
@@ -269,24 +290,40 @@ fn differs<T: PartialEq + ToString>(
     Err(ProjectionMismatch { what, artifact: artifact.to_string(), model: model.to_string() })
 }
 
-fn check_schema(file: &mut Archive, key: &str) -> Result<(), ArtifactError> {
-    let schema = file.count(key)?;
+fn invalid(file: &Archive, key: &str, found: impl ToString, expected: impl ToString) -> ArtifactError {
+    file.invalid(key, found, expected).into()
+}
+
+/// One number that counts something; some builds store it as a floating-point number.
+fn count(file: &Archive, key: &str) -> Result<usize, ArtifactError> {
+    as_count(file, key, file.scalar(key)?)
+}
+
+fn as_count(file: &Archive, key: &str, found: f64) -> Result<usize, ArtifactError> {
+    if found.fract() == 0.0 && (0.0..=u32::MAX as f64).contains(&found) {
+        return Ok(found as usize);
+    }
+    Err(invalid(file, key, found, "a whole number that is not negative"))
+}
+
+fn check_schema(file: &Archive, key: &str) -> Result<(), ArtifactError> {
+    let schema = count(file, key)?;
     if SCHEMAS.contains(&schema) {
         return Ok(());
     }
-    Err(file.invalid(key, format!("schema version {schema}"), "version 3, 4 or 6; build the artifact again"))
+    Err(invalid(file, key, format!("schema version {schema}"), "version 3, 4 or 6; build the artifact again"))
 }
 
 /// θ, `[elements][slots]`: the weighted thresholds where there are some.
-fn thresholds(file: &mut Archive, elements: usize) -> Result<Vec<Vec<f64>>, ArtifactError> {
+fn thresholds(file: &Archive, elements: usize) -> Result<Vec<Vec<f64>>, ArtifactError> {
     let weighted = file.contains("eff_interp_thresholds");
     let key = if weighted { "eff_interp_thresholds" } else { "interp_thresholds" };
-    let found = file.array(key)?;
+    let found = file.numbers(key)?;
     match found.shape[..] {
         [rows, slots] if rows == elements && slots > 0 => {
-            Ok(found.numbers.chunks_exact(slots).map(<[f64]>::to_vec).collect())
+            Ok(found.data.chunks_exact(slots).map(<[f64]>::to_vec).collect())
         }
-        _ => Err(file.invalid(key, format!("shape {:?}", found.shape), format!("shape [{elements}, K]"))),
+        _ => Err(invalid(file, key, format!("shape {:?}", found.shape), format!("shape [{elements}, K]"))),
     }
 }
 
@@ -300,29 +337,28 @@ struct Slots {
 }
 
 impl Slots {
-    fn read(
-        file: &mut Archive,
-        element: usize,
-        thresholds: Option<&Vec<f64>>,
-    ) -> Result<Self, ArtifactError> {
+    fn read(file: &Archive, element: usize, thresholds: Option<&Vec<f64>>) -> Result<Self, ArtifactError> {
         let key = format!("centroids_{element}");
-        let centroids = file.array(&key)?;
+        let centroids = file.numbers(&key)?;
         let [slots, dimension] = centroids.shape[..] else {
-            return Err(file.invalid(&key, format!("shape {:?}", centroids.shape), "shape [K, D]"));
+            return Err(invalid(file, &key, format!("shape {:?}", centroids.shape), "shape [K, D]"));
         };
         let thresholds = thresholds.filter(|row| row.len() >= slots).cloned();
         let thresholds = thresholds
-            .ok_or_else(|| file.invalid(&key, format!("{slots} slots"), "at most one for each threshold"))?;
+            .ok_or_else(|| invalid(file, &key, format!("{slots} slots"), "at most one for each threshold"))?;
         if slots == 0 || dimension == 0 {
-            return Err(file.invalid(&key, format!("shape {:?}", centroids.shape), "at least one centroid"));
+            return Err(invalid(file, &key, format!("shape {:?}", centroids.shape), "at least one centroid"));
         }
         let square = [slots, dimension, dimension];
-        let inverses = file.shaped(&format!("inv_cov_{element}"), &square)?;
-        let scatters = file.shaped(&format!("scatter_{element}"), &square)?;
-        let counts = file.shaped(&format!("counts_{element}"), &[slots])?;
+        let inverses = file.numbers(&format!("inv_cov_{element}"))?.shaped(&square)?;
+        let scatters = file.numbers(&format!("scatter_{element}"))?.shaped(&square)?;
+        let counts = file.numbers(&format!("counts_{element}"))?.shaped(&[slots])?;
         let weighted = format!("effective_count_{element}");
-        let effective =
-            if file.contains(&weighted) { file.shaped(&weighted, &[slots])? } else { counts.clone() };
+        let effective = if file.contains(&weighted) {
+            file.numbers(&weighted)?.shaped(&[slots])?
+        } else {
+            counts.clone()
+        };
         let statistics = scatters.chunks_exact(dimension * dimension).zip(counts.iter().zip(effective));
         let statistics = statistics
             .map(|(scatter, (&count, effective_count))| Statistics {
@@ -331,7 +367,7 @@ impl Slots {
                 effective_count,
             })
             .collect();
-        Ok(Self { dimension, thresholds, centroids: centroids.numbers, inverses, statistics })
+        Ok(Self { dimension, thresholds, centroids: centroids.data, inverses, statistics })
     }
 
     /// The components of the slots up to the last that can be the nearest: trailing sentinels and repetitions of
@@ -357,23 +393,23 @@ impl Slots {
 /// Reads the projection, whose keys both files share, and puts all together.
 fn finish(
     path: &Path,
-    file: &mut Archive,
+    file: &Archive,
     symbols: Vec<String>,
     elements: Vec<Vec<Arc<Component>>>,
     asinh: bool,
 ) -> Result<Artifact, ArtifactError> {
     let mixture = Mixture::new(0, elements)
         .map_err(|source| ArtifactError::Mixture { path: path.to_path_buf(), source })?;
-    let matrix = file.array("uq_rp_matrix")?;
+    let matrix = file.numbers("uq_rp_matrix")?;
     let [rows, columns] = matrix.shape[..] else {
-        return Err(file.invalid("uq_rp_matrix", format!("shape {:?}", matrix.shape), "shape [D_basis, d]"));
+        return Err(invalid(file, "uq_rp_matrix", format!("shape {:?}", matrix.shape), "shape [D_basis, d]"));
     };
-    let announced = file.count("uq_rp_dim")?;
+    let announced = count(file, "uq_rp_dim")?;
     if announced != columns {
-        return Err(file.invalid("uq_rp_dim", announced, format!("{columns}, the columns of uq_rp_matrix")));
+        return Err(invalid(file, "uq_rp_dim", announced, format!("{columns}, the columns of uq_rp_matrix")));
     }
     let projection = Projection {
-        matrix: matrix.numbers.iter().map(|&value| value as f32).collect(),
+        matrix: matrix.data.iter().map(|&value| value as f32).collect(),
         rows,
         columns,
         feature_dimension: mixture.dimension(),
@@ -386,7 +422,8 @@ fn finish(
     let fits = if projection.density_channels { extra >= Some(2) } else { extra == Some(0) };
     if !fits {
         let found = format!("{columns} columns for {} features", projection.feature_dimension);
-        return Err(file.invalid(
+        return Err(invalid(
+            file,
             "uq_rp_matrix",
             found,
             "as many, or at least two less with density channels",

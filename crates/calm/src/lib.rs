@@ -17,7 +17,6 @@ mod ladder;
 mod linear;
 pub mod mixture;
 pub mod neighbourhood;
-mod npz;
 pub mod rules;
 pub mod search;
 pub mod update;

@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 
 use atoms::Species;
 use calm::{Artifact, Mixture};
+use npz::Archive;
 use potentials::grace::GraceModel;
 use serde::Serialize;
 
-use super::archive::Archive;
 use crate::cli::{Ended, Failure};
 use crate::output::{Table, decimals, print, print_json};
 
@@ -112,22 +112,23 @@ impl Info {
 }
 
 fn inspect(path: &Path) -> Result<Content, Failure> {
-    let mut archive = Archive::open(path)?;
-    if archive.has("__schema_version__") {
+    let archive = &Archive::open(path)
+        .map_err(|error| Failure::Input(format!("{error} (kokkos.npz or gmm_artifacts.npz)")))?;
+    if archive.contains("__schema_version__") {
         let artifact = Artifact::load(path).map_err(Failure::input)?;
-        return Ok(Content::Artifact(MixtureInfo::new(&artifact, "__schema_version__", &mut archive)));
+        return Ok(Content::Artifact(MixtureInfo::new(&artifact, "__schema_version__", archive)));
     }
-    if !archive.has("element_names") {
+    if !archive.contains("element_names") {
         return Err(Failure::Input(format!(
             "{}: neither a GRACE model (no array 'element_names') nor a CALM artifact (no array '__schema_version__')",
             path.display()
         )));
     }
     let model = GraceModel::load(path).map_err(Failure::input)?;
-    let mixture = match archive.has("uq_schema_version") {
+    let mixture = match archive.contains("uq_schema_version") {
         true => {
             let artifact = Artifact::load_export(path).map_err(Failure::input)?;
-            Some(MixtureInfo::new(&artifact, "uq_schema_version", &mut archive))
+            Some(MixtureInfo::new(&artifact, "uq_schema_version", archive))
         }
         false => None,
     };
@@ -202,10 +203,10 @@ impl Model {
 }
 
 impl MixtureInfo {
-    fn new(artifact: &Artifact, schema_key: &str, archive: &mut Archive) -> Self {
+    fn new(artifact: &Artifact, schema_key: &str, archive: &Archive) -> Self {
         let Artifact { symbols, mixture, projection } = artifact;
         Self {
-            schema: archive.number(schema_key).unwrap_or_default() as u32,
+            schema: archive.scalar(schema_key).unwrap_or_default() as u32,
             elements: symbols.clone(),
             feature_dimension: mixture.dimension(),
             basis_dimension: projection.rows,
@@ -213,7 +214,7 @@ impl MixtureInfo {
             normalised: projection.normalised,
             asinh: projection.asinh,
             density_channels: projection.density_channels,
-            threshold_mode: archive.text("threshold_mode"),
+            threshold_mode: text(archive, "threshold_mode"),
             can_be_updated: mixture.can_be_updated(),
             components: components(symbols, mixture, archive),
         }
@@ -262,9 +263,15 @@ impl MixtureInfo {
     }
 }
 
-fn components(symbols: &[String], mixture: &Mixture, archive: &mut Archive) -> Vec<ComponentInfo> {
+/// A single text; none if it is absent or cannot be read.
+fn text(archive: &Archive, key: &str) -> Option<String> {
+    archive.strings(key).ok().filter(|texts| texts.len() == 1).map(|texts| texts.concat())
+}
+
+fn components(symbols: &[String], mixture: &Mixture, archive: &Archive) -> Vec<ComponentInfo> {
     let condition_numbers: Vec<_> = (0..symbols.len())
-        .map(|element| archive.numbers(&format!("cond_number_{element}")).unwrap_or_default())
+        .map(|element| archive.numbers(&format!("cond_number_{element}")))
+        .map(|numbers| numbers.map_or_else(|_| Vec::new(), |numbers| numbers.data))
         .collect();
     let component =
         |(element, slot, component): (usize, usize, &std::sync::Arc<calm::Component>)| ComponentInfo {

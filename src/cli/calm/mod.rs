@@ -1,6 +1,5 @@
 //! `calmwalk calm`: what has to do with a mixture and needs no campaign.
 
-mod archive;
 mod info;
 mod score;
 mod scorer;

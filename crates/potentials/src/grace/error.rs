@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use npz::{Archive, Error};
+
 /// A GRACE model file that cannot be read or is not supported.
 #[derive(Debug, thiserror::Error)]
 pub enum GraceError {
@@ -55,4 +57,41 @@ pub enum GraceError {
         /// The feature that is not supported.
         reason: String,
     },
+}
+
+impl From<Error> for GraceError {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Open { path, source } => Self::Read { path, source },
+            Error::NotAnArchive { path, source } => {
+                Self::Damaged { path, key: None, reason: source.to_string() }
+            }
+            Error::Missing { path, key } => Self::Missing { path, key },
+            Error::Damaged { path, key, found, expected } => {
+                Self::Damaged { path, key: Some(key), reason: format!("{found}, expected {expected}") }
+            }
+            Error::Type { path, key, found, expected } => {
+                Self::Mismatch { path, key, found: format!("of type {found}"), expected }
+            }
+            Error::Shape { path, key, found, expected } => {
+                Self::Mismatch { path, key, found: format!("of shape {found}"), expected }
+            }
+            Error::Value { path, key, found, expected } => Self::Mismatch { path, key, found, expected },
+        }
+    }
+}
+
+/// An array does not go with the rest of the model.
+pub(super) fn mismatch(
+    archive: &Archive,
+    key: &str,
+    found: impl ToString,
+    expected: impl ToString,
+) -> GraceError {
+    archive.invalid(key, found, expected).into()
+}
+
+/// The model is of a kind that is not supported.
+pub(super) fn unsupported(archive: &Archive, reason: impl Into<String>) -> GraceError {
+    GraceError::Unsupported { path: archive.path().to_owned(), reason: reason.into() }
 }

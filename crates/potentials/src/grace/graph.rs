@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use super::archive::Archive;
-use super::error::GraceError;
+use npz::Archive;
+
+use super::error::{GraceError, mismatch, unsupported};
 use super::matrix::{LANES, Matrix, lanes_for};
 use super::readout::with_transpose;
 use super::tape::{Gather, Linear, LinearPart, Operation, Product, ProductOutput, Tensor, Term};
@@ -48,9 +49,10 @@ impl<'a> Graph<'a> {
     fn push(&mut self, name: &str, components: usize, channels: usize) -> Result<Tensor, GraceError> {
         let tensor = Tensor { start: self.end, components, channels, width: lanes_for(channels) };
         if components.saturating_mul(tensor.width) > LONGEST_TAPE - self.end {
-            return Err(self
-                .archive
-                .unsupported(format!("'{name}' has {components} components of {channels}")));
+            return Err(unsupported(
+                self.archive,
+                format!("'{name}' has {components} components of {channels}"),
+            ));
         }
         self.named.push((name.to_owned(), tensor));
         self.end = tensor.end();
@@ -63,10 +65,10 @@ impl<'a> Graph<'a> {
         let (archive, key) = (self.archive, |suffix: &str| format!("fc_{name}_{suffix}"));
         let channels = archive.count(&key("n_out"), 1, 1 << 16)?;
         let out = self.push(name, left.components, channels)?;
-        let factors = archive.float_array(&key("norm_out_factor"))?.data;
+        let factors = archive.numbers(&key("norm_out_factor"))?.finite()?.data;
         if factors.len() != out.components {
             let found = format!("a list of {}", factors.len());
-            return Err(archive.mismatch(&key("norm_out_factor"), found, out.components.to_string()));
+            return Err(mismatch(archive, &key("norm_out_factor"), found, out.components.to_string()));
         }
         let mut rows: BTreeMap<(bool, usize, u64), Vec<(u32, u32)>> = BTreeMap::new();
         let mut add = |is_right: bool, tile: usize, from: usize, component: usize| {
@@ -78,12 +80,12 @@ impl<'a> Graph<'a> {
             let weights = self.channel_weights(&key("w_left"), channels, left.channels)?;
             let tiles = archive.exactly_indices(&key("w_tile_left"), left.components, weights.tiles)?;
             tiles.iter().enumerate().for_each(|(w, tile)| add(false, *tile, left.row(w), w));
-            weights.scaled(archive.float(&key("norm_left"))?)
+            weights.scaled(archive.scalar(&key("norm_left"))?)
         } else {
             (0..left.components).for_each(|w| add(false, 0, left.row(w), w));
             if left.channels != channels {
                 let found = format!("{channels} but its left input keeps {} channels", left.channels);
-                return Err(archive.mismatch(&key("n_out"), found, left.channels.to_string()));
+                return Err(mismatch(archive, &key("n_out"), found, left.channels.to_string()));
             }
             ChannelWeights::identity(channels)
         };
@@ -94,7 +96,7 @@ impl<'a> Graph<'a> {
         for ((to, from), tile) in to.iter().zip(&from).zip(&tiles) {
             add(true, *tile, right.row(*from), *to);
         }
-        let right_weights = right_weights.scaled(archive.float(&key("norm_right"))?);
+        let right_weights = right_weights.scaled(archive.scalar(&key("norm_right"))?);
 
         let part = |((is_right, tile, factor), rows): ((bool, usize, u64), Vec<(u32, u32)>)| {
             let weights = if is_right { &right_weights } else { &left_weights };
@@ -118,7 +120,7 @@ impl<'a> Graph<'a> {
         let ([k, n, tiles], weights) = self.archive.tensor::<3>(key)?;
         if [k, n] != [outputs, inputs] {
             let found = format!("of shape {:?}", [k, n, tiles]);
-            return Err(self.archive.mismatch(key, found, format!("shape [{outputs}, {inputs}, …]")));
+            return Err(mismatch(self.archive, key, found, format!("shape [{outputs}, {inputs}, …]")));
         }
         self.weights += weights.len();
         Ok(ChannelWeights { inputs, tiles, weights })
@@ -128,10 +130,13 @@ impl<'a> Graph<'a> {
     pub fn product(&mut self, name: &str, left: Tensor, right: Tensor) -> Result<Tensor, GraceError> {
         let (archive, key) = (self.archive, |suffix: &str| format!("prod_{name}_{suffix}"));
         if left.channels != right.channels {
-            return Err(archive.unsupported(format!(
-                "the factors of '{name}' have {} and {} channels, a product needs equal numbers",
-                left.channels, right.channels
-            )));
+            return Err(unsupported(
+                archive,
+                format!(
+                    "the factors of '{name}' have {} and {} channels, a product needs equal numbers",
+                    left.channels, right.channels
+                ),
+            ));
         }
         let lefts = archive.indices(&key("left_ind"), left.components)?;
         let rights = archive.exactly_indices(&key("right_ind"), lefts.len(), right.components)?;
@@ -186,10 +191,10 @@ impl<'a> Graph<'a> {
             };
             if shape[..3] != [n_types, n_out, source.channels] {
                 let expected = format!("[{n_types}, {n_out}, {}, …]", source.channels);
-                return Err(archive.mismatch(&weights_key, format!("of shape {shape:?}"), expected));
+                return Err(mismatch(archive, &weights_key, format!("of shape {shape:?}"), expected));
             }
             let tiles = archive.exactly_indices(&key("w_l_tile"), collect.len(), shape[3])?;
-            let norm = archive.float(&format!("{prefix}_reduce_{name}_norm"))?;
+            let norm = archive.scalar(&format!("{prefix}_reduce_{name}_norm"))?;
             archive.expect_count(&key("n_in"), source.channels)?;
             archive.expect_count(&key("w_shape"), shape[3])?;
             archive.ignore(&key("total_sum_ind"));
@@ -215,7 +220,7 @@ impl<'a> Graph<'a> {
     fn named(&self, name: &str) -> Result<Tensor, GraceError> {
         let found = self.named.iter().find(|(known, _)| known == name);
         found.map(|(_, tensor)| *tensor).ok_or_else(|| {
-            self.archive.unsupported(format!("the energy takes '{name}', which the graph does not make"))
+            unsupported(self.archive, format!("the energy takes '{name}', which the graph does not make"))
         })
     }
 

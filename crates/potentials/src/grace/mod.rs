@@ -21,7 +21,6 @@
 //! # }
 //! ```
 
-mod archive;
 mod bonds;
 mod error;
 mod evaluate;

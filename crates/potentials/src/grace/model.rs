@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use atoms::{PotentialError, Species};
+use npz::Archive;
 
-use super::archive::Archive;
-use super::error::GraceError;
+use super::error::{GraceError, unsupported};
 use super::harmonics::Harmonics;
 use super::matrix::Lanes;
 use super::one_layer;
@@ -101,8 +101,10 @@ impl GraceModel {
         let archive = Archive::open(path)?;
         match detect(&archive) {
             Architecture::OneLayer => one_layer::read(&archive, radial),
-            Architecture::TwoLayer => Err(archive.unsupported("two-layer models are not supported yet")),
-            Architecture::ThreeLayer => Err(archive.unsupported("three-layer models are not supported yet")),
+            Architecture::TwoLayer => Err(unsupported(&archive, "two-layer models are not supported yet")),
+            Architecture::ThreeLayer => {
+                Err(unsupported(&archive, "three-layer models are not supported yet"))
+            }
         }
     }
 
@@ -175,9 +177,9 @@ impl GraceModel {
 
 /// The lists of single-particle basis functions that only deeper models have.
 fn detect(archive: &Archive) -> Architecture {
-    if archive.has("spbf_names") {
+    if archive.contains("spbf_names") {
         Architecture::ThreeLayer
-    } else if archive.has("spb_names") {
+    } else if archive.contains("spb_names") {
         Architecture::TwoLayer
     } else {
         Architecture::OneLayer

@@ -4,9 +4,9 @@
 //! of which the energy takes the invariants of as many as the model's maximum order says.
 
 use atoms::Species;
+use npz::Archive;
 
-use super::archive::Archive;
-use super::error::GraceError;
+use super::error::{GraceError, mismatch, unsupported};
 use super::graph::Graph;
 use super::harmonics::Harmonics;
 use super::matrix::{LANES, Lanes, Matrix, to_lanes};
@@ -45,12 +45,16 @@ pub(super) fn read(archive: &Archive, path: RadialPath) -> Result<GraceModel, Gr
     let densities = graph.invariants("rho", &names, elements.len())?;
     let readout = readout(archive, densities, &mut graph)?;
     let projection = projection(archive, &graph)?;
-    let left_over = archive.not_asked(&["uq_"]);
+    let mut left_over = archive.not_asked();
+    left_over.retain(|name| !name.starts_with("uq_"));
     if !left_over.is_empty() {
-        return Err(archive.unsupported(format!(
-            "arrays that a one-layer model is not known to have, and that may change its energy: {}",
-            left_over.join(", ")
-        )));
+        return Err(unsupported(
+            archive,
+            format!(
+                "arrays that a one-layer model is not known to have, and that may change its energy: {}",
+                left_over.join(", ")
+            ),
+        ));
     }
 
     let radial_basis_size = network.basis_size;
@@ -93,7 +97,7 @@ fn elements(archive: &Archive) -> Result<Vec<Species>, GraceError> {
     for name in &names {
         match name.parse() {
             Ok(element) if !elements.contains(&element) => elements.push(element),
-            _ => return Err(archive.mismatch("element_names", format!("{names:?}"), "distinct symbols")),
+            _ => return Err(mismatch(archive, "element_names", format!("{names:?}"), "distinct symbols")),
         }
     }
     Ok(elements)
@@ -109,8 +113,8 @@ fn refuse_other_variants(archive: &Archive) -> Result<(), GraceError> {
         ("A_indicator_l_depend", 0, "an indicator that depends on l"),
         ("A_sum_neighbors", 1, "a basis that is not summed over neighbours"),
     ] {
-        if archive.has(key) && archive.count(key, 0, usize::MAX)? != supported {
-            return Err(archive.unsupported(format!("'{key}' asks for {meaning}, which is not supported")));
+        if archive.contains(key) && archive.count(key, 0, usize::MAX)? != supported {
+            return Err(unsupported(archive, format!("'{key}' asks for {meaning}, which is not supported")));
         }
     }
     Ok(())
@@ -124,7 +128,7 @@ fn radial_network(
 ) -> Result<RadialNetwork, GraceError> {
     let basis_size = archive.count("nradbase", 1, 1024)?;
     archive.expect_count("mlp_rad_lmax", lmax)?;
-    if archive.has("nradmax") {
+    if archive.contains("nradmax") {
         archive.expect_count("nradmax", channels)?;
     }
     let n_layers = archive.count("mlp_rad_n_layers", 1, 64)?;
@@ -134,7 +138,8 @@ fn radial_network(
         graph.weights += weights.len();
         let last = k + 1 == n_layers;
         if last && outputs != channels * (lmax + 1) {
-            return Err(archive.mismatch(
+            return Err(mismatch(
+                archive,
                 &format!("mlp_rad_W{k}"),
                 format!("{outputs} columns wide"),
                 format!("{channels} channels × {} orders", lmax + 1),
@@ -159,23 +164,23 @@ fn dense(archive: &Archive, prefix: &str, k: usize, inputs: usize) -> Result<(us
     let key = format!("{prefix}_W{k}");
     let ([rows, outputs], mut weights) = archive.tensor::<2>(&key)?;
     if rows != inputs {
-        return Err(archive.mismatch(&key, format!("{rows} rows high"), format!("{inputs} rows")));
+        return Err(mismatch(archive, &key, format!("{rows} rows high"), format!("{inputs} rows")));
     }
-    let norm = archive.float(&format!("{prefix}_norm{k}"))?;
+    let norm = archive.scalar(&format!("{prefix}_norm{k}"))?;
     weights.iter_mut().for_each(|w| *w *= norm);
     Ok((outputs, weights))
 }
 
 /// r_c for centre and neighbour element, [n_elements²], Å.
 fn cutoffs(archive: &Archive, n_elements: usize) -> Result<Vec<f64>, GraceError> {
-    let rcut = archive.float("rcut")?;
+    let rcut = archive.scalar("rcut")?;
     let (key, cutoffs) = if archive.count("has_bond_specific_cutoff", 0, 1)? == 1 {
         ("bond_cutoff_map", archive.floats("bond_cutoff_map", &[n_elements, n_elements])?)
     } else {
         ("rcut", vec![rcut; n_elements * n_elements])
     };
     match cutoffs.iter().find(|cutoff| !(0.1..=100.0).contains(*cutoff)) {
-        Some(cutoff) => Err(archive.mismatch(key, format!("{cutoff} Å"), "a cutoff from 0.1 to 100 Å")),
+        Some(cutoff) => Err(mismatch(archive, key, format!("{cutoff} Å"), "a cutoff from 0.1 to 100 Å")),
         None => Ok(cutoffs),
     }
 }
@@ -189,17 +194,18 @@ fn embedding(
 ) -> Result<Vec<Vec<Lanes>>, GraceError> {
     let ([rows, size], embedding) = archive.tensor::<2>("chem_embedding")?;
     if rows != n_elements {
-        return Err(archive.mismatch(
+        return Err(mismatch(
+            archive,
             "chem_embedding",
             format!("{rows} rows"),
             format!("{n_elements} elements"),
         ));
     }
-    for key in ["embedding_size", "chem_embedding_size"].into_iter().filter(|key| archive.has(key)) {
+    for key in ["embedding_size", "chem_embedding_size"].into_iter().filter(|key| archive.contains(key)) {
         archive.expect_count(key, size)?;
     }
     let transform = archive.floats("A_lin_transform_W", &[size, channels])?;
-    let scale = archive.float("A_lin_transform_norm")? * archive.float("A_inv_avg_n_neigh")?;
+    let scale = archive.scalar("A_lin_transform_norm")? * archive.scalar("A_inv_avg_n_neigh")?;
     graph.weights += embedding.len() + transform.len();
     let channel = |element: usize, n: usize| -> f64 {
         (0..size).map(|k| embedding[element * size + k] * transform[k * channels + n]).sum::<f64>() * scale
@@ -216,7 +222,8 @@ fn highest_order(archive: &Archive, names: &[String]) -> Result<usize, GraceErro
         match BASIS_FUNCTIONS.iter().position(|known| known == name) {
             Some(order) if !orders.contains(&order) => orders.push(order),
             _ => {
-                return Err(archive.mismatch(
+                return Err(mismatch(
+                    archive,
                     "rho_instruction_names",
                     format!("{names:?}"),
                     "some of A, AA, AAA, AAAA, each once",
@@ -224,11 +231,9 @@ fn highest_order(archive: &Archive, names: &[String]) -> Result<usize, GraceErro
             }
         }
     }
-    orders
-        .iter()
-        .max()
-        .map(|order| order + 1)
-        .ok_or_else(|| archive.mismatch("rho_instruction_names", "empty", "at least one of A, AA, AAA, AAAA"))
+    orders.iter().max().map(|order| order + 1).ok_or_else(|| {
+        mismatch(archive, "rho_instruction_names", "empty", "at least one of A, AA, AAA, AAAA")
+    })
 }
 
 fn readout(
@@ -238,7 +243,7 @@ fn readout(
 ) -> Result<Readout, GraceError> {
     let n_elements = archive.count("n_elements", 1, 118)?;
     let n_densities = archive.count("rho_n_out", 1, 4096)?;
-    let n_layers = match archive.has("energy_mlp_n_layers") {
+    let n_layers = match archive.contains("energy_mlp_n_layers") {
         true => archive.count("energy_mlp_n_layers", 1, 64)?,
         false if n_densities == 1 => 0,
         false => archive.count("energy_mlp_n_layers", 1, 64)?,
@@ -248,7 +253,8 @@ fn readout(
         let (outputs, weights) = dense(archive, "energy_mlp", k, inputs)?;
         graph.weights += weights.len();
         if k + 1 == n_layers && outputs != 1 {
-            return Err(archive.mismatch(
+            return Err(mismatch(
+                archive,
                 &format!("energy_mlp_W{k}"),
                 format!("{outputs} columns wide"),
                 "one column",
@@ -261,24 +267,24 @@ fn readout(
         }));
         inputs = outputs;
     }
-    let activation = match archive.has("energy_mlp_activation") {
+    let activation = match archive.contains("energy_mlp_activation") {
         true if archive.count("energy_mlp_activation", 0, 1)? == 1 => Activation::Tanh,
         _ => Activation::Silu,
     };
-    let shifts = match archive.has("shift_values") {
+    let shifts = match archive.contains("shift_values") {
         true => archive.floats("shift_values", &[n_elements])?,
         false => vec![0.0; n_elements],
     };
-    Ok(Readout { densities, layers, activation, scale: archive.float_or("output_scale", 1.0)?, shifts })
+    Ok(Readout { densities, layers, activation, scale: archive.scalar_or("output_scale", 1.0)?, shifts })
 }
 
 fn projection(archive: &Archive, graph: &Graph) -> Result<Option<Projection>, GraceError> {
-    if !archive.has("uq_schema_version") {
+    if !archive.contains("uq_schema_version") {
         return Ok(None);
     }
     let version = archive.count("uq_schema_version", 0, usize::MAX)?;
     let dimension = archive.count("uq_rp_dim", 1, 1 << 16)?;
-    let matrix = archive.singles("uq_rp_matrix", &[graph.basis_dimension(), dimension])?;
+    let matrix = archive.singles("uq_rp_matrix")?.finite()?.shaped(&[graph.basis_dimension(), dimension])?;
     let normalize = archive.flag_or("uq_rp_normalize", false)?;
     let density_channels = archive.flag_or("uq_rp_add_density_channel", false)?;
     let asinh = archive.flag_or("uq_feature_transform", false)?;
@@ -288,14 +294,15 @@ fn projection(archive: &Archive, graph: &Graph) -> Result<Option<Projection>, Gr
         (false, false) => 3,
     };
     if version != expected {
-        return Err(archive.mismatch(
+        return Err(mismatch(
+            archive,
             "uq_schema_version",
             version.to_string(),
             format!("{expected}, which its flags mean"),
         ));
     }
     let maps = ProjectionMaps::new(&matrix, dimension, &rows_of_projection(graph.basis_sources()));
-    let density_scale = archive.float_or("uq_rp_density_scale", 1.0)? as f32;
+    let density_scale = archive.scalar_or("uq_rp_density_scale", 1.0)? as f32;
     let projection =
         Projection { matrix, dimension, normalize, density_channels, density_scale, asinh, maps };
     archive.expect_count("uq_feature_dim", projection.feature_dimension())?;

@@ -1,0 +1,222 @@
+//! Opening an archive and reading its arrays.
+
+use std::cell::RefCell;
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::{BufReader, Cursor, ErrorKind, Read, Seek};
+use std::path::{Path, PathBuf};
+
+use npyz::npz::{NpzArchive, file_name_from_array_name};
+use npyz::{DType, Deserialize, TypeChar, TypeRead};
+
+use crate::array::Array;
+use crate::error::{Error, Place};
+use crate::header::Header;
+
+/// Larger arrays than this are taken for damage, bytes.
+const LARGEST: u64 = 1 << 32;
+
+/// An open archive. Arrays are read when asked for, and the archive remembers which ones were.
+pub struct Archive<R: Read + Seek = BufReader<File>> {
+    path: PathBuf,
+    names: BTreeSet<String>,
+    zip: RefCell<NpzArchive<R>>,
+    asked: RefCell<BTreeSet<String>>,
+}
+
+impl Archive {
+    /// Opens a file.
+    ///
+    /// # Errors
+    /// If it cannot be opened or is no archive.
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let opened = match path.is_dir() {
+            true => Err(ErrorKind::IsADirectory.into()),
+            false => File::open(path),
+        };
+        let file = opened.map_err(|source| Error::Open { path: path.to_owned(), source })?;
+        Self::read(path, BufReader::new(file))
+    }
+}
+
+impl<'a> Archive<Cursor<&'a [u8]>> {
+    /// Reads an archive in memory; errors call it `name`.
+    ///
+    /// # Errors
+    /// If the bytes are no archive.
+    pub fn from_bytes(name: impl AsRef<Path>, bytes: &'a [u8]) -> Result<Self, Error> {
+        Self::read(name.as_ref(), Cursor::new(bytes))
+    }
+}
+
+impl<R: Read + Seek> Archive<R> {
+    fn read(path: &Path, source: R) -> Result<Self, Error> {
+        let zip = NpzArchive::new(source)
+            .map_err(|source| Error::NotAnArchive { path: path.to_owned(), source })?;
+        let names = zip.array_names().map(str::to_owned).collect();
+        Ok(Self { path: path.to_owned(), names, zip: zip.into(), asked: RefCell::default() })
+    }
+
+    /// The file, as errors name it.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Whether there is an array of that name.
+    pub fn contains(&self, key: &str) -> bool {
+        self.names.contains(key)
+    }
+
+    /// Names of all arrays, in alphabetical order.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.names.iter().map(String::as_str)
+    }
+
+    /// Names of the arrays that were neither asked for nor ignored.
+    pub fn not_asked(&self) -> Vec<&str> {
+        let asked = self.asked.borrow();
+        self.names().filter(|name| !asked.contains(*name)).collect()
+    }
+
+    /// Notes that an array needs no reading.
+    pub fn ignore(&self, key: &str) {
+        self.asked.borrow_mut().insert(key.to_owned());
+    }
+
+    /// An error about the values of an array.
+    pub fn invalid(&self, key: &str, found: impl ToString, expected: impl ToString) -> Error {
+        self.place(key).wrong_value(found, expected)
+    }
+
+    /// Floating-point numbers, integers and truth values of any usual type, as `f64`.
+    ///
+    /// # Errors
+    /// If there is no such array, or it is damaged or of another type.
+    pub fn numbers(&self, key: &str) -> Result<Array<f64>, Error> {
+        let entry = self.entry(key)?;
+        match entry.kind() {
+            (TypeChar::Float, 8) => entry.decode(|value: f64| value),
+            (TypeChar::Float, 4) => entry.decode(|value: f32| f64::from(value)),
+            (TypeChar::Int, 8) => entry.decode(|value: i64| value as f64),
+            (TypeChar::Int, 4) => entry.decode(|value: i32| f64::from(value)),
+            (TypeChar::Bool, _) => entry.decode(|value: bool| f64::from(value)),
+            _ => Err(entry.wrong_type("numbers (f4, f8, i4, i8 or b1)")),
+        }
+    }
+
+    /// Integers.
+    ///
+    /// # Errors
+    /// As [`Archive::numbers`].
+    pub fn integers(&self, key: &str) -> Result<Array<i64>, Error> {
+        let entry = self.entry(key)?;
+        match entry.kind() {
+            (TypeChar::Int, 8) => entry.decode(|value: i64| value),
+            (TypeChar::Int, 4) => entry.decode(|value: i32| i64::from(value)),
+            _ => Err(entry.wrong_type("an array of integers (i4 or i8)")),
+        }
+    }
+
+    /// Single-precision numbers as stored.
+    ///
+    /// # Errors
+    /// As [`Archive::numbers`].
+    pub fn singles(&self, key: &str) -> Result<Array<f32>, Error> {
+        let entry = self.entry(key)?;
+        match entry.kind() {
+            (TypeChar::Float, 4) => entry.decode(|value: f32| value),
+            _ => Err(entry.wrong_type("an array of single-precision numbers (f4)")),
+        }
+    }
+
+    /// Texts, stored as bytes (`S`) or as characters (`U`), without their NUL padding.
+    ///
+    /// # Errors
+    /// As [`Archive::numbers`].
+    pub fn strings(&self, key: &str) -> Result<Vec<String>, Error> {
+        let entry = self.entry(key)?;
+        let unpadded = |text: &str| text.trim_end_matches('\0').to_owned();
+        let array = match entry.kind() {
+            (TypeChar::UnicodeStr, _) => entry.decode(|text: String| unpadded(&text)),
+            (TypeChar::ByteStr, _) => entry.decode(|text: Vec<u8>| unpadded(&String::from_utf8_lossy(&text))),
+            _ => Err(entry.wrong_type("text (S or U)")),
+        };
+        Ok(array?.data)
+    }
+
+    fn place(&self, key: &str) -> Place {
+        Place { path: self.path.clone(), key: key.to_owned() }
+    }
+
+    /// Header and data of an array, the length of the data being what the header announces.
+    ///
+    /// The header is compared with the size that the archive announces before any of the data are read, and these are
+    /// read to their end, where the archive compares their checksum.
+    fn entry(&self, key: &str) -> Result<Entry, Error> {
+        let place = self.place(key);
+        if !self.contains(key) {
+            return Err(place.missing());
+        }
+        self.ignore(key);
+        let readable = |error: &dyn ToString| place.damaged(error.to_string(), "a readable array");
+        let mut zip = self.zip.borrow_mut();
+        let file = zip.zip_archive().by_name(&file_name_from_array_name(key));
+        let mut file = file.map_err(|error| readable(&error))?;
+        let stored = file.size();
+        if stored > LARGEST {
+            return Err(place.damaged(format!("{stored} bytes"), "at most 4 GiB"));
+        }
+        let header =
+            Header::read(&mut file).map_err(|found| place.damaged(found, "a plain array in .npy format"))?;
+        if header.kind.num_bytes().is_none() {
+            return Err(place.wrong_type(header.kind, "numbers or text"));
+        }
+        let stored = stored.saturating_sub(header.length);
+        let wrong_length = |stored: u64| {
+            let found = format!("{stored} bytes of data for shape {:?} of {}", header.shape, header.kind);
+            place.damaged(found, "as many as shape and type need")
+        };
+        let (items, needed) = header.size().ok_or_else(|| wrong_length(stored))?;
+        if needed != stored || (needed == 0 && items > 0) {
+            return Err(wrong_length(stored));
+        }
+        let mut data = Vec::new();
+        file.take(needed + 1).read_to_end(&mut data).map_err(|error| readable(&error))?;
+        if data.len() as u64 != needed {
+            return Err(wrong_length(data.len() as u64));
+        }
+        if header.fortran_order && header.shape.len() > 1 {
+            return Err(place.wrong_shape(format!("{:?} in Fortran order", header.shape), "C order"));
+        }
+        Ok(Entry { place, header, items, data })
+    }
+}
+
+/// An array as stored.
+struct Entry {
+    place: Place,
+    header: Header,
+    items: usize,
+    data: Vec<u8>,
+}
+
+impl Entry {
+    fn kind(&self) -> (TypeChar, u64) {
+        (self.header.kind.type_char(), self.header.kind.size_field())
+    }
+
+    fn wrong_type(&self, expected: &str) -> Error {
+        self.place.wrong_type(&self.header.kind, expected)
+    }
+
+    fn decode<T: Deserialize, U>(self, convert: impl Fn(T) -> U) -> Result<Array<U>, Error> {
+        let Self { place, header, items, data } = self;
+        let readable = |error: &dyn ToString| place.damaged(error.to_string(), "readable data");
+        let reader = T::reader(&DType::Plain(header.kind)).map_err(|error| readable(&error))?;
+        let mut rest = &data[..];
+        let values: Result<Vec<U>, _> =
+            (0..items).map(|_| reader.read_one(&mut rest).map(&convert)).collect();
+        let data = values.map_err(|error| readable(&error))?;
+        Ok(Array { shape: header.shape, data, place })
+    }
+}

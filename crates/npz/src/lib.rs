@@ -1,0 +1,20 @@
+//! Arrays of NumPy `.npz` archives, with every size checked against the data before it is used.
+//!
+//! ```no_run
+//! # fn read() -> Result<(), npz::Error> {
+//! let archive = npz::Archive::open("kokkos.npz".as_ref())?;
+//! let layers = archive.count("n_layers", 1, 64)?;
+//! let weights = archive.floats("weights", &[layers, 3])?;
+//! # Ok(())
+//! # }
+//! ```
+
+mod archive;
+mod array;
+mod error;
+mod header;
+mod numbers;
+
+pub use archive::Archive;
+pub use array::Array;
+pub use error::Error;
