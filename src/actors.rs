@@ -18,6 +18,7 @@ use workers::walker;
 
 use crate::campaign::Campaign;
 use crate::outcome::Failure;
+use crate::output::say;
 use crate::progress::Display;
 
 /// Reports under way between walkers and reactor.
@@ -146,7 +147,7 @@ fn stop_on_signals(stopping: Arc<AtomicBool>, closing: Arc<Closing>) -> Result<(
                 process::exit(130);
             }
             closing.stopping.store(true, Ordering::Relaxed);
-            eprintln!("stopping: walks are checkpointed …");
+            say("stopping: walks are checkpointed …");
         }
     });
     Ok(())

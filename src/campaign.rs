@@ -84,7 +84,7 @@ impl Campaign {
     /// The configuration with every default filled in, files by their content instead of their paths: what a campaign
     /// that goes on is compared with.
     pub fn resolved(&self) -> Value {
-        let mut value = serde_json::to_value(&self.config).expect("plain data becomes JSON");
+        let mut value = serde_json::to_value(self.config.without_paths()).expect("plain data becomes JSON");
         for pointer in FILE_KEYS {
             if let Some(path) = value.pointer_mut(pointer) {
                 *path = Value::Null;

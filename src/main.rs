@@ -22,7 +22,7 @@ fn main() -> ExitCode {
     match cli::run(arguments) {
         Ok(ended) => ended.exit_code(),
         Err(failure) => {
-            eprintln!("calmwalk: {failure}");
+            output::say(format_args!("calmwalk: {failure}"));
             failure.exit_code()
         }
     }

@@ -1,5 +1,6 @@
 //! What commands print: text and JSON on the standard output, tables with aligned columns, a bar for long work.
 
+use std::fmt::Display;
 use std::io::{self, BufWriter, ErrorKind, Write};
 use std::time::{Duration, Instant};
 
@@ -20,6 +21,11 @@ pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(),
         }
         _ => Ok(()),
     }
+}
+
+/// Writes a line to the standard error. That nobody reads it, or that it cannot be kept, stops no work.
+pub fn say(line: impl Display) {
+    let _ = writeln!(io::stderr().lock(), "{line}");
 }
 
 /// Writes JSON to the standard output.

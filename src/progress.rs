@@ -9,6 +9,8 @@ use orchestrator::reactor::Notice;
 use store::Fate;
 use wire::{Origin, WalkId};
 
+use crate::output::say;
+
 /// Time between two plain lines that only say where the walks stand.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
@@ -50,7 +52,9 @@ impl Display {
                 self.steps.insert(*walk, progress.step);
             }
             Notice::Committed(commit) => self.committed(commit),
-            Notice::QueueFull(jobs) => self.say(&format!("walkers wait: {jobs} structures are waiting for labels")),
+            Notice::QueueFull(jobs) => {
+                self.say(&format!("walkers wait: {jobs} structures are waiting for labels"))
+            }
         }
         self.draw();
     }
@@ -104,7 +108,7 @@ impl Display {
     fn say(&self, line: &str) {
         match &self.bars {
             Some(bars) => bars.message.set_message(line.to_owned()),
-            None => eprintln!("{line}"),
+            None => say(line),
         }
     }
 
@@ -116,7 +120,7 @@ impl Display {
             bars.steps.set_message(format!("{} accepted", self.accepted));
         } else if self.last_line.elapsed() > LINE_INTERVAL {
             self.last_line = Instant::now();
-            eprintln!("{done} of {all} steps, {} accepted in this run", self.accepted);
+            say(format_args!("{done} of {all} steps, {} accepted in this run", self.accepted));
         }
     }
 }
@@ -124,7 +128,9 @@ impl Display {
 impl Bars {
     fn new() -> Self {
         let all = MultiProgress::new();
-        let style = |template| ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
+        let style = |template| {
+            ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
+        };
         let steps = all.add(ProgressBar::new(0));
         steps.set_style(style("walks  {bar:32} {pos}/{len} steps  {eta} left  {msg}"));
         let message = all.add(ProgressBar::new_spinner());

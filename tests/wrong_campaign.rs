@@ -2,7 +2,9 @@
 
 mod common;
 
+use std::ffi::{OsStr, OsString};
 use std::fs;
+use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -95,6 +97,22 @@ fn a_directory_that_is_none_is_told() {
     assert!(message.contains("there is no campaign in .: it has no campaign.sqlite"), "{message}");
 }
 
+#[test]
+fn names_need_not_be_text_but_for_sqlite() {
+    let above = tempfile::tempdir().unwrap();
+    let directory = above.path().join(OsStr::from_bytes(b"no \xff text"));
+    fs::create_dir(&directory).unwrap();
+    small().write(&directory);
+    let config = directory.join("campaign.toml");
+    succeed(above.path(), [OsStr::new("validate"), config.as_os_str()]);
+    let run = |place: &OsStr| {
+        [OsStr::new("run"), config.as_os_str(), OsStr::new("--directory"), place].map(OsString::from)
+    };
+    let message = refuse(above.path(), run(directory.as_os_str()));
+    assert!(message.contains("(its name is not UTF-8, as SQLite needs it)"), "{message}");
+    assert!(succeed(above.path(), run(OsStr::new("here"))).contains("look further with"));
+}
+
 /// The program as a user without any rights, if we may become one; `None` if that cannot be tried here.
 fn unprivileged(directory: &Path) -> Option<Command> {
     let rights = ["--reuid=65534", "--regid=65534", "--clear-groups"];
@@ -171,6 +189,20 @@ fn a_full_disk_loses_nothing() {
         succeed(directory.path(), RUN);
         assert_eq!(outcome(&here), expected, "{size}");
     }
+}
+
+#[test]
+fn a_log_that_cannot_be_kept_stops_no_campaign() {
+    let directory = written(&small());
+    let full = fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let output = program(directory.path()).args(RUN).stderr(full).output().unwrap();
+    assert_eq!(output.status.code(), Some(0));
+    // The summary is what was asked for: that it cannot be given is a failure, and the next run gives it.
+    let full = fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let output = program(directory.path()).args(RUN).stdout(full).output().unwrap();
+    let message = assert_plain(&output, 1);
+    assert!(message.contains("cannot write to the standard output: No space left"), "{message}");
+    assert_eq!(succeed(directory.path(), RUN).lines().next(), Some("walks            2 biased, 2 control"));
 }
 
 #[test]

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::{Ended, Failure};
+use crate::output::print;
 
 /// Write a commented campaign.toml and a small example that runs
 #[derive(Debug, clap::Args)]
@@ -36,13 +37,17 @@ impl Init {
         let files: Vec<_> = files.chain([(config.clone(), CAMPAIGN)]).collect();
         if let Some((existing, _)) = files.iter().find(|(path, _)| path.exists()) {
             let existing = existing.display();
-            return Err(Failure::Input(format!("{existing} exists already: name another directory, or remove it")));
+            return Err(Failure::Input(format!(
+                "{existing} exists already: name another directory, or remove it"
+            )));
         }
         for (path, content) in &files {
             write(path, content)?;
         }
-        println!("wrote {} and the files it names", config.display());
-        println!("run it with: calmwalk run {}", config.display());
+        print(|out| {
+            writeln!(out, "wrote {} and the files it names", config.display())?;
+            writeln!(out, "run it with: calmwalk run {}", config.display())
+        })?;
         Ok(Ended::Done)
     }
 }

@@ -15,7 +15,7 @@ use super::{Ended, Failure, block_on};
 use crate::actors::Actors;
 use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
-use crate::output::print;
+use crate::output::{print, say};
 use crate::summary;
 
 /// Time between two signs of life.
@@ -53,7 +53,7 @@ impl Run {
         let ended =
             block_on(run(&campaign, &directory))?.map_err(|failure| failure.in_campaign(&directory))?;
         if ended == Ended::Interrupted {
-            eprintln!("stopped in order; the same command goes on with the campaign");
+            say("stopped in order; the same command goes on with the campaign");
         }
         Ok(ended)
     }
@@ -133,7 +133,7 @@ async fn go_on(
         return Ok(());
     }
     for change in &changes {
-        eprintln!("configuration: {change}");
+        say(format_args!("configuration: {change}"));
     }
     store.add_seed_structures(&campaign.stored_seeds()).await?;
     let details: Vec<_> = changes.iter().map(Change::detail).collect();

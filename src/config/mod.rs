@@ -258,14 +258,23 @@ impl Config {
         Ok((config, text))
     }
 
+    /// Every path in it.
+    fn paths(&mut self) -> impl Iterator<Item = &mut PathBuf> {
+        let LabelMethod::Reference(reference) = &mut self.label.method;
+        let required = [&mut self.potential.model, &mut reference.file];
+        let optional = self.calm.artifact.iter_mut().chain(&mut self.calm.training_frames);
+        required.into_iter().chain(optional).chain(&mut self.seeds.files).map(Spanned::get_mut)
+    }
+
     fn resolve_paths(&mut self, directory: &Path) {
-        let resolve = |path: &mut Spanned<PathBuf>| *path.get_mut() = directory.join(path.get_ref());
-        resolve(&mut self.potential.model);
-        self.calm.artifact.iter_mut().for_each(resolve);
-        self.calm.training_frames.iter_mut().for_each(resolve);
-        self.seeds.files.iter_mut().for_each(resolve);
-        let LabelMethod::Reference(potential) = &mut self.label.method;
-        resolve(&mut potential.file);
+        self.paths().for_each(|path| *path = directory.join(&*path));
+    }
+
+    /// The same without any path: a campaign depends on what is in files, not on where they are.
+    pub fn without_paths(&self) -> Self {
+        let mut config = self.clone();
+        config.paths().for_each(PathBuf::clear);
+        config
     }
 
     /// What the update search needs.

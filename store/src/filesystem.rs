@@ -1,14 +1,19 @@
 //! Where a database may live: SQLite's write-ahead log needs memory that all its processes share, so a
 //! directory that several hosts see is refused.
 
+use std::io;
 use std::path::Path;
 
 use rustix::fs::Access;
 
 use crate::error::{Result, StoreError};
 
-/// Checks that `directory` exists, may be written to, and is on a disk of this machine.
+/// Checks that `directory` exists, may be written to, is on a disk of this machine, and has a name that SQLite takes.
 pub fn check_directory(directory: &Path) -> Result<()> {
+    if directory.to_str().is_none() {
+        let source = io::Error::new(io::ErrorKind::InvalidInput, "its name is not UTF-8, as SQLite needs it");
+        return Err(StoreError::Directory { directory: directory.into(), source });
+    }
     let denied = |source: rustix::io::Errno| StoreError::Directory {
         directory: directory.into(),
         source: source.into(),
