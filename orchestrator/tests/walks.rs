@@ -216,15 +216,16 @@ fn a_control_walk_follows_the_biased_one_and_gives_the_frames_at_its_steps() {
     let begun = store.decisions.last().unwrap();
     assert_eq!((begun.kind, begun.walk), ("begun", Some(WalkId(1))));
     assert_eq!(begun.detail, serde_json::json!({ "control_of": 0, "wanted": [5, 12] }));
-    for (step, wanted, kinds_then) in
-        [(5, vec![5, 12], vec!["control"]), (12, vec![12], vec!["control", "ended"])]
+    // A turn is no longer than any other, and ends at the last wanted frame.
+    for (step, wanted, until, kinds_then) in
+        [(5, vec![5, 12], 10, vec!["control"]), (12, vec![12], 12, vec!["control", "ended"])]
     {
         let assignment = turn(&mut selector);
         assert_eq!(
             (assignment.walk, assignment.origin, assignment.random_walk),
             (WalkId(1), Origin::Control, WalkId(0))
         );
-        assert_eq!((assignment.wanted.clone(), assignment.until), (wanted, 12));
+        assert_eq!((assignment.wanted.clone(), assignment.until), (wanted, until));
         assert_eq!(assignment.seed_structure, common::seed(0).structure);
         // An unremarkable structure: a control frame is taken whatever its grade.
         let report = offer(&selector, &assignment, step, structure(100 + step, SHORTEST), [0.1; 3]);

@@ -1,6 +1,6 @@
 //! What keeps a walk physical: which structures are not offered, and when a walk is over.
 
-use atoms::{Evaluation, NeighbourList, Structure, shortest_distance};
+use atoms::{Evaluation, Neighbour, NeighbourList, Structure, cell, shortest_distance};
 
 use crate::settings::GuardSettings;
 
@@ -35,7 +35,11 @@ pub fn blown_up(
         return Some(format!("{temperature:.0} K is above the allowed {highest:.0} K"));
     }
     if structure.len() > 1 {
-        let lost = (0..structure.len()).find(|i| neighbours.of(*i).is_empty());
+        // The list itself also holds pairs within its skin, and those depend on when it was built.
+        let lost = (0..structure.len()).find(|i| {
+            let distance = |neighbour: &Neighbour| cell::norm(neighbour.displacement(structure, *i));
+            !neighbours.of(*i).iter().any(|neighbour| distance(neighbour) < neighbours.cutoff())
+        });
         return lost.map(|atom| format!("atom {atom} has no neighbour within {:.2} Å", neighbours.cutoff()));
     }
     None

@@ -47,13 +47,20 @@ struct WalkState {
     refusals_in_a_row: u32,
     /// First step at which a candidate may be offered again.
     next_offer: u64,
-    /// Step of the last collection.
-    last_accepted: Option<u64>,
+    /// Where structures were collected.
+    collected: Vec<Collected>,
     /// The guard's shortest distance, Å.
     least_distance: f64,
     /// Places to go back to, oldest first.
     good: Vec<(Checkpoint, BiasState)>,
     gamma_max: f64,
+}
+
+/// A collection, seen from the piece of the walk that goes on: it lies `beyond` steps from step `branch`.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+struct Collected {
+    branch: u64,
+    beyond: u64,
 }
 
 /// Why a walk cannot go on.
@@ -146,7 +153,7 @@ impl<'a> Walk<'a> {
         match &self.assignment.verdict {
             None => {}
             Some(Verdict::Accepted) => {
-                self.state.last_accepted = Some(step);
+                self.state.collected.push(Collected { branch: step, beyond: 0 });
                 self.state.next_offer = step + self.settings.gap;
             }
             Some(Verdict::Declined(_)) => self.state.next_offer = step + self.settings.declined_gap,
@@ -206,6 +213,10 @@ impl<'a> Walk<'a> {
         let Some(biased_steps) = biased_steps else { return Ok(None) };
         let too_close = self.is_too_close();
         if biased_steps % self.settings.guard.checkpoint_interval == 0 && !too_close {
+            if biased_steps == 0 {
+                // From here on the start of the walk, which needs equilibration, is no place to go back to.
+                self.state.good.clear();
+            }
             self.keep_checkpoint();
         }
         if biased_steps == 0 {
@@ -269,16 +280,16 @@ impl<'a> Walk<'a> {
         Ok(())
     }
 
-    /// The first offer after a return to where the walk now stands. The gap to the last collection counts along the path that
-    /// joins the two: back from the collection, if that lies on the abandoned piece, and forward again.
-    fn offer_after_return(&self) -> u64 {
+    /// The first offer after a return to where the walk now stands. The gap to a collection counts along the path that
+    /// joins the two: back from the collection, as far as it lies on an abandoned piece, and forward again.
+    fn offer_after_return(&mut self) -> u64 {
         let (step, gap) = (self.step(), self.settings.gap);
-        let apart = match self.state.last_accepted {
-            None => step,
-            Some(collected) if collected > step => step + gap.saturating_sub(collected - step),
-            Some(collected) => collected + gap,
-        };
-        apart.max(step + self.settings.declined_gap)
+        for collected in self.state.collected.iter_mut().filter(|collected| collected.branch > step) {
+            collected.beyond += collected.branch - step;
+            collected.branch = step;
+        }
+        let offers = self.state.collected.iter().map(|c| c.branch + gap.saturating_sub(c.beyond));
+        offers.max().unwrap_or(0).max(step + self.settings.declined_gap)
     }
 
     fn stream(&self) -> Stream {
@@ -329,7 +340,9 @@ impl<'a> Walk<'a> {
     }
 
     fn relative_volume(&self) -> f64 {
-        self.dynamics.checkpoint().ramp.map_or(1.0, |ramp| ramp.relative_volume(self.step()))
+        let ramp =
+            self.dynamics.checkpoint().ramp.filter(|_| self.dynamics.structure().periodic != [false; 3]);
+        ramp.map_or(1.0, |ramp| ramp.relative_volume(self.step()))
     }
 
     fn progress(&self) -> Progress {
@@ -379,9 +392,9 @@ fn begin(
         refused: 0,
         refusals_in_a_row: 0,
         next_offer: 0,
-        last_accepted: None,
+        collected: Vec::new(),
         least_distance: guard::least_distance(&settings.guard, shortest),
-        good: Vec::new(),
+        good: vec![(dynamics.checkpoint().clone(), BiasState::default())],
         gamma_max: 0.0,
     };
     Ok((dynamics, state))

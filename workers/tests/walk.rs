@@ -175,6 +175,50 @@ fn a_trapped_walk_goes_back_with_a_smaller_bias() {
     assert!(candidates >= 2, "after its return the walk collects again");
 }
 
+/// Steps between two candidates along the path that joins them, whatever returns lie between.
+#[test]
+fn the_gap_between_collections_holds_across_returns() {
+    let guard = GuardSettings { tau_factor: 0.8, most_returns: 6, ..settings().guard };
+    let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), gap: 120, guard, ..settings() };
+    let reports = whole_walk(&settings, seed("fcc-097"), 150);
+    let candidate = |report: &Report| match &report.outcome {
+        Outcome::Candidate(block) => Some((block.view().id().segment, block.view().id().step)),
+        _ => None,
+    };
+    let candidates: Vec<_> = reports.iter().filter_map(candidate).collect();
+    let segments = reports.last().unwrap().progress.segment;
+    assert!(segments >= 2 && candidates.len() >= 2, "{segments} {candidates:?}");
+    // Two candidates of one segment are on one path; of two segments, at least as far apart as their steps.
+    for (k, (segment, step)) in candidates.iter().enumerate() {
+        for (earlier, at) in &candidates[..k] {
+            let apart = if segment == earlier {
+                step.abs_diff(*at)
+            } else {
+                step.saturating_sub(20) + at.saturating_sub(20)
+            };
+            assert!(apart >= 120, "{candidates:?}");
+        }
+    }
+}
+
+#[test]
+fn the_skin_changes_nothing() {
+    // A cluster that loses an atom: when that is noticed must not depend on when the list was built.
+    let mut cluster = seed("fcc-100");
+    cluster.periodic = [false; 3];
+    cluster.species.truncate(5);
+    cluster.positions.truncate(5);
+    let ends = [0.1, 0.5, 3.0].map(|skin| {
+        let settings =
+            WalkSettings { skin, temperature: 6000.0, steps: 4000, collection: never(), ..settings() };
+        let report = go(&settings, &assignment(cluster.clone(), 4020));
+        (report.outcome, report.progress.step)
+    });
+    let lost = |outcome: &Outcome| matches!(outcome, Outcome::Ended(End::BlewUp { reason }) if reason.contains("no neighbour"));
+    assert!(lost(&ends[0].0), "{:?}", ends[0]);
+    assert!(ends.iter().all(|end| *end == ends[0]), "{ends:?}");
+}
+
 #[test]
 fn a_walk_without_a_way_out_ends() {
     let guard = GuardSettings { least_distance: 3.0, ..settings().guard };
@@ -186,6 +230,7 @@ fn a_walk_without_a_way_out_ends() {
         matches!(&last.outcome, Outcome::Ended(End::Trapped { guard }) if guard == "shortest-bond"),
         "{last:?}"
     );
+    assert_eq!(last.progress.returns, settings.guard.most_returns);
     assert!(last.progress.step < 600);
 }
 

@@ -66,7 +66,9 @@ impl Selector {
                 Outcome::Candidate(block) => self.keep_control_frame(id, block, &mut commit)?,
                 Outcome::Ended(end) => self.end_walk(id, &end, &mut commit),
                 // A control walk whose frames did not come will not give them in another turn either.
-                Outcome::Turn if !self.walks[&id].is_biased() => self.end_walk(id, &End::Steps, &mut commit),
+                Outcome::Turn if self.walks[&id].missed_its_frames() => {
+                    self.end_walk(id, &End::Steps, &mut commit);
+                }
                 Outcome::Turn | Outcome::Paused => {}
             }
         }
@@ -89,9 +91,7 @@ impl Selector {
             walk.record.progress = report.progress.clone();
         }
         walk.memory.verdict = None;
-        if walk.is_biased() {
-            walk.memory.until = report.progress.step + turn_steps;
-        }
+        walk.set_until(turn_steps);
         if returned {
             let progress = &report.progress;
             let detail = json!({
@@ -305,7 +305,7 @@ impl Selector {
         for id in ended {
             let control_id = self.next_walk_id();
             let walk = self.walks.get_mut(&id).expect("taken from the table");
-            let control = walk.control(control_id);
+            let control = walk.control(control_id, self.settings.turn_steps);
             let detail = json!({ "control_of": id, "wanted": control.memory.wanted });
             commit.decisions.push(self.decision("begun", control_id, detail));
             self.walks.insert(control_id, control);

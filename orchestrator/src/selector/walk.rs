@@ -56,7 +56,7 @@ impl Walk {
     }
 
     /// The unbiased control of a biased walk: frames at the steps at which that one collected.
-    pub fn control(&mut self, walk: WalkId) -> Self {
+    pub fn control(&mut self, walk: WalkId, turn_steps: u64) -> Self {
         let mut control = Self::new(walk, self.record.seed_structure, 0);
         control.record.origin = Origin::Control;
         control.record.partner = Some(self.record.walk);
@@ -65,7 +65,7 @@ impl Walk {
         self.memory.controlled = self.memory.accepted_steps.len();
         wanted.sort_unstable();
         wanted.dedup();
-        control.memory.until = wanted.last().copied().unwrap_or(0);
+        control.set_until(turn_steps);
         control
     }
 
@@ -87,6 +87,17 @@ impl Walk {
 
     pub fn has_ended(&self) -> bool {
         !matches!(self.record.state.as_str(), "waiting" | "running")
+    }
+
+    /// The next turn ends after `turn_steps` at the latest, that of a control walk at its last wanted frame.
+    pub fn set_until(&mut self, turn_steps: u64) {
+        let until = self.record.progress.step + turn_steps;
+        self.memory.until = self.memory.wanted.last().map_or(until, |last| until.min(*last));
+    }
+
+    /// Whether a control walk has passed its last wanted frame without giving it.
+    pub fn missed_its_frames(&self) -> bool {
+        self.memory.wanted.last().is_some_and(|last| self.record.progress.step >= *last)
     }
 
     /// Keeps where a turn was interrupted: the same turn goes on from there. A verdict that the turn began with is

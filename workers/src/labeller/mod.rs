@@ -10,9 +10,9 @@ use store::{Store, StoreError};
 
 pub use reference::{LabelFailure, ReferenceMethod};
 
-/// How long a job is leased, seconds. A reference label takes far less; a labeller that has not delivered by then
-/// is taken for dead.
-const LEASE_SECONDS: u32 = 600;
+/// How long a job is leased, seconds: longer than any reference label takes. What a dead process held is taken back
+/// when the next one starts.
+const LEASE_SECONDS: u32 = 86_400;
 /// How long a labeller without work waits before it looks again.
 const IDLE: Duration = Duration::from_millis(50);
 
