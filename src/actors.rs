@@ -10,7 +10,7 @@ use orchestrator::selector::Selector;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
-use tokio::task::JoinSet;
+use tokio::task::{JoinError, JoinSet};
 use wire::transport::{InProcess, Incoming};
 use workers::labeller::{self, Closing, LabellerSettings, ReferenceMethod};
 use workers::walk::WalkContext;
@@ -71,7 +71,7 @@ impl Actors {
             tokio::select! {
                 ended = &mut self.reactor => break ended.map_err(Failure::failed)?,
                 Some(labeller) = self.labellers.join_next() => {
-                    failure = labeller.map_err(Failure::failed)?.err().or(failure);
+                    failure = failure_of(labeller).or(failure);
                     self.stopping.store(true, Ordering::Relaxed);
                 }
             }
@@ -83,13 +83,26 @@ impl Actors {
         }
         let panicked = self.walkers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
         while let Some(labeller) = self.labellers.join_next().await {
-            failure = labeller.map_err(Failure::failed)?.err().or(failure);
+            failure = failure_of(labeller).or(failure);
         }
         if panicked > 0 {
             return Err(Failure::Failed(format!("{panicked} walkers crashed: see the message above")));
         }
         let ended = ended.map_err(Failure::failed)?;
-        failure.map_or(Ok(ended), |failure| Err(failure.into()))
+        match failure {
+            Some(failure) => Err(failure),
+            // Every walk is over, but the labellers were asked to stop and may have left jobs.
+            None if self.closing.stopping.load(Ordering::Relaxed) => Ok(reactor::Ended::Stopped),
+            None => Ok(ended),
+        }
+    }
+}
+
+/// Why a labeller ended, if it could not go on.
+fn failure_of(labeller: Result<Result<(), StoreError>, JoinError>) -> Option<Failure> {
+    match labeller {
+        Ok(ended) => ended.err().map(Failure::from),
+        Err(crash) => Some(Failure::Failed(format!("a labeller crashed: {crash}"))),
     }
 }
 

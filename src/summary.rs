@@ -5,7 +5,7 @@ use std::fmt;
 use atoms::cell::{norm, sub};
 use calm::watch::GradeDistribution;
 use store::{ExportFilter, ExportSource, Status, Store, StoreError};
-use wire::Origin;
+use wire::{ContentHash, Origin};
 
 /// Rows read from the store at a time.
 const PAGE: u32 = 256;
@@ -33,26 +33,24 @@ pub struct Summary {
     training: Option<GradeDistribution>,
 }
 
-/// Gathers the summary of a campaign.
-pub async fn of(store: &Store) -> Result<Summary, StoreError> {
+/// Gathers the summary of a campaign, with the labels of one protocol.
+pub async fn of(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
     let status = store.status().await?;
     let (mut biased, mut control) = (ForceErrors::default(), ForceErrors::default());
-    for protocol in store.protocols().await? {
-        let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: false };
-        let mut after = None;
-        loop {
-            let page = store.labelled(&filter, after, PAGE).await?;
-            let Some(last) = page.last() else { break };
-            after = Some(last.place);
-            for row in &page {
-                let ExportSource::Candidate { origin, block, original, .. } = &row.source else { continue };
-                let into = if *origin == Origin::Biased { &mut biased } else { &mut control };
-                let pairs = block.view().forces.iter().zip(&row.label.forces);
-                into.structures += 1;
-                into.errors.extend(pairs.map(|(model, label)| norm(sub(*model, *label))));
-                into.gamma.extend(&original.gamma);
-                into.gamma_nbr.extend(&original.gamma_nbr);
-            }
+    let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+    let mut after = None;
+    loop {
+        let page = store.labelled(&filter, after, PAGE).await?;
+        let Some(last) = page.last() else { break };
+        after = Some(last.place);
+        for row in &page {
+            let ExportSource::Candidate { origin, block, original, .. } = &row.source else { continue };
+            let into = if *origin == Origin::Biased { &mut biased } else { &mut control };
+            let pairs = block.view().forces.iter().zip(&row.label.forces);
+            into.structures += 1;
+            into.errors.extend(pairs.map(|(model, label)| norm(sub(*model, *label))));
+            into.gamma.extend(&original.gamma);
+            into.gamma_nbr.extend(&original.gamma_nbr);
         }
     }
     let values = store.values().await?;
@@ -68,7 +66,8 @@ impl fmt::Display for Summary {
         writeln!(f, "walks            {} biased, {} control", count("biased"), count("control"))?;
         let mut ends: Vec<_> = walks.iter().map(|walk| walk.state.as_str()).collect();
         ends.sort_unstable();
-        let ends: Vec<_> = ends.chunk_by(|a, b| a == b).map(|run| format!("{} {}", run.len(), run[0])).collect();
+        let ends: Vec<_> =
+            ends.chunk_by(|a, b| a == b).map(|run| format!("{} {}", run.len(), run[0])).collect();
         writeln!(f, "                 ended: {}", ends.join(", ").replace('_', " "))?;
         let declined = &candidates.declined;
         let all = declined.covered + declined.duplicate + declined.guard + declined.budget;
@@ -85,13 +84,16 @@ impl fmt::Display for Summary {
         writeln!(f, "                 {} refused by walkers' own guards", candidates.refused_by_walkers)?;
         writeln!(
             f,
-            "labels           {} labelled ({} biased, {} control), {} failed, {} dropped",
-            labels.labelled, self.biased.structures, self.control.structures, labels.failed, labels.dropped
+            "labels           {} biased and {} control structures labelled, {} failed, {} dropped",
+            self.biased.structures, self.control.structures, labels.failed, labels.dropped
         )?;
         writeln!(f, "mixture          version {mixture_version}")?;
         if let Some(training) = &self.training {
             let (share, median) = (100.0 * training.share_above_one, training.median);
-            writeln!(f, "                 training atoms under it: median γ {median:.2}, {share:.1} % above 1")?;
+            writeln!(
+                f,
+                "                 training atoms under it: median γ {median:.2}, {share:.1} % above 1"
+            )?;
         }
         writeln!(f, "force error of the potential against the grade of the original mixture:")?;
         writeln!(f, "           atoms   mean error   γ > 1   γ_nbr > 1   ρ(γ, error)   ρ(γ_nbr, error)")?;

@@ -21,7 +21,7 @@ pub struct WholeFile {
 impl WholeFile {
     /// Begins a file that will stand at `target`.
     pub fn create(target: &Path) -> Result<Self, Failure> {
-        let cannot = |error| cannot_write(target, error);
+        let cannot = |error| cannot_create(target, error);
         // Through a symbolic link the file it leads to is replaced, not the link.
         let target = target.canonicalize().unwrap_or_else(|_| target.to_owned());
         if fs::metadata(&target).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
@@ -55,6 +55,34 @@ impl WholeFile {
 /// The failure to write an output file.
 pub fn cannot_write(path: &Path, error: impl std::fmt::Display) -> Failure {
     Failure::Failed(format!("cannot write {}: {error}", path.display()))
+}
+
+/// The failure to begin an output file: a wrong path is wrong input.
+pub fn cannot_create(path: &Path, error: io::Error) -> Failure {
+    use io::ErrorKind as Kind;
+    let message = format!("cannot write {}: {error}", path.display());
+    match error.kind() {
+        Kind::NotFound | Kind::NotADirectory | Kind::IsADirectory | Kind::PermissionDenied => {
+            Failure::Input(message)
+        }
+        _ => Failure::Failed(message),
+    }
+}
+
+/// Refuses an output that would take the place of one of these files; each comes with what it is.
+pub fn refuse_to_replace<'a>(
+    output: &Path,
+    files: impl IntoIterator<Item = (&'a Path, &'a str)>,
+) -> Result<(), Failure> {
+    let Ok(output_file) = output.canonicalize() else { return Ok(()) };
+    let same = |(file, _): &(&Path, &str)| file.canonicalize().is_ok_and(|file| file == output_file);
+    match files.into_iter().find(same) {
+        Some((_, what)) => {
+            let shown = output.display();
+            Err(Failure::Input(format!("{shown} is {what}: name another file for the output")))
+        }
+        None => Ok(()),
+    }
 }
 
 impl Write for WholeFile {

@@ -163,6 +163,15 @@ fn an_export_holds_labels_and_grades_in_decision_order() {
     let all = read_extxyz(&here.join("all.extxyz")).unwrap();
     assert_eq!(all.iter().filter(|frame| text(frame, "origin") == "control").count(), 4);
 
+    // Never in the place of the campaign itself, and not where no file can be.
+    for (output, reason) in
+        [("small/campaign.sqlite", "a file of the campaign itself"), ("missing/all.extxyz", "cannot write")]
+    {
+        let message = refuse(here, ["export", "small", "--output", output]);
+        assert!(message.contains(reason), "{message}");
+    }
+    succeed(here, ["status", "small"]);
+
     // Another run of the same campaign, with another number of walkers, exports the same bytes.
     let again = tempfile::tempdir().unwrap();
     write_campaign(again.path(), &[("walkers = 2", "walkers = 1")]);
@@ -339,11 +348,11 @@ fn status_works_while_a_campaign_runs_and_after_it_was_killed() {
         "1\nProperties=species:S:1:pos:R:3:forces:R:3 energy=1\nAl 0 0 0 0 0 0\n",
     )
     .unwrap();
-    assert!(succeed(here, ["import", "small", "l.extxyz"]).starts_with("1 labels"));
-    // A new protocol would be that of new jobs for a moment.
-    let message = refuse(here, ["import", "small", "l.extxyz", "--protocol", "new"]);
+    // What is known decides what is a duplicate: not while decisions are made.
+    let message = refuse(here, ["import", "small", "l.extxyz"]);
     assert!(message.contains("only one process may run a campaign"), "{message}");
     drop(run);
+    assert!(succeed(here, ["import", "small", "l.extxyz"]).starts_with("1 labels"));
     let killed = json(here, ["status", "small"]);
     assert_eq!(killed["processes"][0]["state"], "gone");
     assert!(

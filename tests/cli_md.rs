@@ -146,6 +146,23 @@ fn an_interrupted_run_leaves_a_valid_trajectory() {
 }
 
 #[test]
+fn a_trajectory_takes_the_place_of_no_input() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let potential = here.join("own.eam.fs");
+    fs::copy(config("data/Al_mm.eam.fs"), &potential).unwrap();
+    let text = configuration(10, 1, "{ none = {} }");
+    let text = text.replace(config("data/Al_mm.eam.fs").to_str().unwrap(), "own.eam.fs");
+    fs::write(here.join("md.toml"), &text).unwrap();
+    for (output, what) in [("own.eam.fs", "the potential"), ("md.toml", "the configuration")] {
+        let message = refuse(here, ["md", "md.toml", "--output", output]);
+        assert!(message.contains(what), "{message}");
+    }
+    assert_eq!(fs::read_to_string(here.join("md.toml")).unwrap(), text);
+    assert_eq!(fs::read(potential).unwrap(), fs::read(config("data/Al_mm.eam.fs")).unwrap());
+}
+
+#[test]
 fn mistakes_are_named_with_their_line() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();

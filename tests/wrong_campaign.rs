@@ -239,7 +239,7 @@ fn labels_that_fail_do_not_stop_a_campaign() {
     let text = small.text().replace("[label]", "[label]\nlargest_force = 1e-6\nattempts = 2");
     fs::write(directory.path().join("campaign.toml"), text).unwrap();
     let summary = succeed(directory.path(), RUN);
-    assert!(summary.contains("labels           0 labelled (0 biased, 0 control)"), "{summary}");
+    assert!(summary.contains("labels           0 biased and 0 control structures labelled"), "{summary}");
     assert!(summary.contains("calmwalk queue here list --state failed"), "{summary}");
     let status = succeed(directory.path(), ["status", "here", "--json"]);
     let status: serde_json::Value = serde_json::from_str(&status).unwrap();

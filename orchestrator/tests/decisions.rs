@@ -177,6 +177,21 @@ fn a_campaign_collects_only_so_many() {
 }
 
 #[test]
+fn imports_are_logged_once_when_they_begin_to_count() {
+    let snapshot = |values| Snapshot { imported: 3, values, ..Snapshot::default() };
+    let mut selector = common::restore(&live(), 1, snapshot(Vec::new()));
+    let commit = selector.begin_walks();
+    assert_eq!(kinds(&commit), ["imported", "begun"]);
+    assert_eq!(
+        (commit.decisions[0].walk, &commit.decisions[0].detail["structures"]),
+        (None, &serde_json::json!(3))
+    );
+    let mut again =
+        common::restore(&live(), 1, Snapshot { walks: commit.walks.clone(), ..snapshot(commit.values) });
+    assert!(again.begin_walks().decisions.is_empty());
+}
+
+#[test]
 fn walks_that_ended_by_a_budget_go_on_when_it_grows() {
     let limited = Settings { update: UpdateProtocol::Never, total: Some(1), control: true, ..live() };
     let mut selector = common::restore(&limited, 2, Snapshot::default());

@@ -68,6 +68,7 @@ async fn open(directory: &Path) -> Store {
 /// A reactor that goes on with what the database holds, and the way to it.
 async fn reactor(store: &Store, stopping: &Arc<AtomicBool>) -> (Reactor, mpsc::Sender<Incoming>) {
     let snapshot = Snapshot {
+        imported: 0,
         walks: store.load_walks().await.unwrap(),
         components: store.load_components().await.unwrap(),
         known: store.known_hashes().await.unwrap(),

@@ -5,11 +5,11 @@ use std::path::PathBuf;
 
 use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, Value, write_frame};
 use store::records::Protocol;
-use store::{ExportFilter, ExportRow, ExportSource, Store};
+use store::{DATABASE, ExportFilter, ExportRow, ExportSource, LOCK, Store};
 
 use super::{CampaignDirectory, Ended, Failure, block_on};
 use crate::output::{Bar, print};
-use crate::whole_file::{WholeFile, cannot_write};
+use crate::whole_file::{WholeFile, cannot_write, refuse_to_replace};
 
 /// Structures read at a time.
 const PAGE: u32 = 200;
@@ -88,6 +88,11 @@ impl Export {
         let store = Store::open_read_only(&self.directory.directory).await?;
         let protocol = self.choose_protocol(&store).await?;
         let filter = self.filter(&protocol);
+        let directory = &self.directory.directory;
+        let [database, log, lock] = [DATABASE.to_owned(), format!("{DATABASE}-wal"), LOCK.to_owned()]
+            .map(|name| directory.join(name));
+        let own = [&database, &log, &lock].map(|file| (file.as_path(), "a file of the campaign itself"));
+        refuse_to_replace(&self.output, own)?;
         let mut output = WholeFile::create(&self.output)?;
         let (mut count, mut last, bar) = (Count::default(), None, Bar::new(None, BAR));
         loop {

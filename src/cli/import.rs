@@ -17,6 +17,9 @@ use crate::output::print;
 /// Every frame needs energy and forces, as energy and forces or REF_energy and REF_forces; stress is taken if there is
 /// one. If one frame is not right, nothing is taken from any file. An import may be repeated: what is known is left as
 /// it is, and other numbers for a structure that has its label are kept as checks beside it.
+///
+/// Not while the campaign runs: what is known decides what is a duplicate, so it changes between two runs only, and the
+/// decision log says when.
 #[derive(Debug, clap::Args)]
 pub struct Import {
     #[command(flatten)]
@@ -50,8 +53,10 @@ impl Import {
     async fn import(&self, files: &[File]) -> Result<(Protocol, Imported), Failure> {
         let directory = &self.directory.directory;
         let store = Store::open(directory).await?;
+        // What is known decides what is a duplicate: it changes between two runs, not within one.
+        let _lock = CampaignLock::acquire(directory, "calmwalk import")?;
         let protocol = match &self.protocol {
-            Some(name) => protocol_named(&store, directory, name).await?,
+            Some(name) => protocol_named(&store, name).await?,
             None => own_protocol(&store).await?,
         };
         let mut all = Imported::default();
@@ -108,7 +113,7 @@ async fn own_protocol(store: &Store) -> Result<Protocol, Failure> {
 }
 
 /// The protocol of that name, made if the campaign has none so named.
-async fn protocol_named(store: &Store, directory: &Path, name: &str) -> Result<Protocol, Failure> {
+async fn protocol_named(store: &Store, name: &str) -> Result<Protocol, Failure> {
     if let Some(known) = store.protocols().await?.into_iter().find(|protocol| protocol.name == name) {
         return Ok(known);
     }
@@ -118,9 +123,8 @@ async fn protocol_named(store: &Store, directory: &Path, name: &str) -> Result<P
     let settings = serde_json::json!({ "method": "import" });
     let hash = ContentHash(*blake3::hash(format!("calmwalk import protocol {name}").as_bytes()).as_bytes());
     let protocol = Protocol { hash, name: name.to_owned(), settings };
-    // A protocol that is added becomes that of new label jobs, so the campaign's own is put back; no run may be under
-    // way in between. Whoever is killed here does no harm: a run begins by putting its own protocol in force.
-    let _lock = CampaignLock::acquire(directory, "calmwalk import")?;
+    // A protocol that is added becomes that of new label jobs, so the campaign's own is put back. Whoever is killed
+    // here does no harm: a run begins by putting its own protocol in force.
     let own = own_protocol(store).await?;
     store.add_protocol(&protocol, unix_milliseconds()).await?;
     store.add_protocol(&own, unix_milliseconds()).await?;

@@ -68,11 +68,11 @@ async fn run(campaign: &Campaign, directory: &Path) -> Result<Ended, Failure> {
     let ended = actors.finish().await?;
     alive.abort();
     leave(&store, &process, ended).await?;
-    if ended == reactor::Ended::Stopped {
+    if ended == reactor::Ended::Stopped && !store.status().await?.finished {
         store.close().await;
         return Ok(Ended::Interrupted);
     }
-    let summary = summary::of(&store).await?;
+    let summary = summary::of(&store, campaign.protocol.hash).await?;
     let failed = store.status().await?.labels.failed;
     let shown = directory.display();
     print(|out| {
@@ -183,6 +183,7 @@ async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector
         walks: store.load_walks().await?,
         components: store.load_components().await?,
         known: store.known_hashes().await?,
+        imported: store.status().await?.imported,
         values: store.values().await?,
     };
     let mut selector = Selector::restore(
@@ -196,7 +197,7 @@ async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector
     )
     .map_err(Failure::failed)?;
     let begun = selector.begin_walks();
-    if !begun.walks.is_empty() {
+    if !begun.decisions.is_empty() {
         store.commit(&begun).await?;
     }
     Ok(selector)

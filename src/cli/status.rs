@@ -83,7 +83,10 @@ fn write_training(out: &mut dyn Write, training: &Value) -> io::Result<()> {
     if let (Some(median), Some(share)) = (number("median"), number("share_above_one")) {
         let alarm = if training["alarm"] == true { "; ALARM: the mixture forgets them" } else { "" };
         let share = 100.0 * share;
-        writeln!(out, "            training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}")?;
+        writeln!(
+            out,
+            "            training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}"
+        )?;
     }
     Ok(())
 }

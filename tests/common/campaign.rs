@@ -70,7 +70,8 @@ turn_steps = 40
 
     /// Writes configuration and seed structures into `directory`; returns the configuration's path.
     pub fn write(&self, directory: &Path) -> PathBuf {
-        let frames = atoms::read_extxyz(&config("data/aluminium_seeds.extxyz")).expect("the demo's seed structures");
+        let frames =
+            atoms::read_extxyz(&config("data/aluminium_seeds.extxyz")).expect("the demo's seed structures");
         let mut seeds = Vec::new();
         for name in self.seeds {
             let named = |frame: &&atoms::extxyz::Frame| frame.info["name"].text() == Some(name);
@@ -97,7 +98,10 @@ pub struct Outcome {
 pub fn outcome(directory: &Path) -> Outcome {
     let output = directory.join("dataset.extxyz");
     let arguments = ["export", &directory.display().to_string(), "--control", "--output"];
-    super::succeed(directory, arguments.iter().map(|a| (*a).to_owned()).chain([output.display().to_string()]));
+    super::succeed(
+        directory,
+        arguments.iter().map(|a| (*a).to_owned()).chain([output.display().to_string()]),
+    );
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     runtime.block_on(async {
         let store = Store::open_read_only(directory).await.expect("the campaign's database");

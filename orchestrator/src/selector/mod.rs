@@ -104,6 +104,8 @@ pub struct Snapshot {
     pub components: Vec<ComponentRecord>,
     /// Hashes of the structures that are known already.
     pub known: Vec<ContentHash>,
+    /// How many of them were imported.
+    pub imported: u64,
     /// The values of past commits.
     pub values: Vec<(String, String)>,
 }
@@ -168,6 +170,8 @@ pub struct Selector {
     in_round: BTreeMap<WalkId, Option<Report>>,
     accepted: u32,
     declined_feature_bytes: u64,
+    /// Imported structures among the known ones: now, and when the log last spoke of them.
+    imported: (u64, u64),
 }
 
 impl Selector {
@@ -189,7 +193,7 @@ impl Selector {
             text.parse().map_err(|_| SelectorError::Snapshot(format!("{name} is '{text}', not a number")))
         };
         let (round, version) = (value("round")?, value("mixture_version")?);
-        let declined_feature_bytes = value("declined_feature_bytes")?;
+        let (declined_feature_bytes, imported) = (value("declined_feature_bytes")?, value("imported")?);
         let mixture = Arc::new(restored_mixture(&original, version, &snapshot.components)?);
         let walks = restored_walks(snapshot.walks, seeds.len())?;
         let accepted = walks.values().filter(|walk| walk.is_biased()).map(|walk| walk.record.accepted).sum();
@@ -208,6 +212,7 @@ impl Selector {
             in_round: BTreeMap::new(),
             accepted,
             declined_feature_bytes,
+            imported: (snapshot.imported, imported),
         })
     }
 
@@ -257,6 +262,7 @@ impl Selector {
             ("round", self.round),
             ("mixture_version", self.mixture.version()),
             ("declined_feature_bytes", self.declined_feature_bytes),
+            ("imported", self.imported.0),
         ];
         commit.values.extend(values.map(|(name, value)| (name.to_owned(), value.to_string())));
     }

@@ -1,6 +1,6 @@
 //! Which walk goes next.
 
-use store::records::Commit;
+use store::records::{Commit, Decision};
 use wire::WalkId;
 use wire::messages::Assignment;
 
@@ -24,6 +24,12 @@ impl Selector {
     /// nothing to do.
     pub fn begin_walks(&mut self) -> Commit {
         let mut commit = Commit::default();
+        if self.imported.0 != self.imported.1 {
+            // From here on candidates can be duplicates of them.
+            let detail = serde_json::json!({ "structures": self.imported.0 });
+            commit.decisions.push(Decision { walk: None, ..self.decision("imported", WalkId(0), detail) });
+            self.imported.1 = self.imported.0;
+        }
         self.resume_walks(&mut commit);
         let begun = self.walks.values().filter(|walk| walk.is_biased()).count();
         for seed in begun..self.seeds.len() {

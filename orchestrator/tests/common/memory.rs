@@ -43,6 +43,7 @@ impl MemoryStore {
     pub fn snapshot(&self) -> Snapshot {
         let components = self.components.iter();
         Snapshot {
+            imported: 0,
             walks: self.walks.values().cloned().collect(),
             components: components
                 .map(|(&(element, slot), bytes)| ComponentRecord { element, slot, bytes: bytes.clone() })

@@ -4,7 +4,7 @@ mod config;
 mod trajectory;
 
 use std::io::{IsTerminal, Write};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
@@ -16,6 +16,7 @@ use self::trajectory::{Trajectory, time};
 use super::{Ended, Failure};
 use crate::interrupt;
 use crate::output::{Bar, decimals, print};
+use crate::whole_file::refuse_to_replace;
 
 const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
 
@@ -38,7 +39,12 @@ impl Md {
     pub fn run(self) -> Result<Ended, Failure> {
         let (config, start, mut potential) = MdConfig::load(&self.config)?;
         let path = self.output.unwrap_or_else(|| config.output.trajectory.clone());
-        refuse_same_file(&path, config.structure.get_ref())?;
+        let inputs = [
+            (self.config.as_path(), "the configuration"),
+            (config.structure.get_ref().as_path(), "the structure to start from"),
+            (config.potential.file.get_ref().as_path(), "the potential"),
+        ];
+        refuse_to_replace(&path, inputs)?;
         let state = initial_state(&config.dynamics, start.structure);
         let settings = settings(&config.dynamics, &state);
         let mut dynamics = Dynamics::new(state, settings, &mut *potential).map_err(|error| {
@@ -100,18 +106,6 @@ fn follow(
         dynamics.step(potential).map_err(|error| Failure::Failed(format!("step {step}: {error}")))?;
     }
     Ok(())
-}
-
-fn refuse_same_file(trajectory: &Path, structure: &Path) -> Result<(), Failure> {
-    match (trajectory.canonicalize(), structure.canonicalize()) {
-        (Ok(a), Ok(b)) if a == b => {
-            let shown = trajectory.display();
-            Err(Failure::Input(format!(
-                "{shown} is the structure to start from: name another file for the trajectory"
-            )))
-        }
-        _ => Ok(()),
-    }
 }
 
 /// Shows how the run goes: a bar on a terminal, lines otherwise.

@@ -8,7 +8,7 @@ use atoms::units::ACCELERATION;
 use md::Dynamics;
 
 use crate::cli::Failure;
-use crate::whole_file::cannot_write;
+use crate::whole_file::{cannot_create, cannot_write};
 
 /// A trajectory that is being written: after every frame it is a valid file.
 pub struct Trajectory {
@@ -22,7 +22,7 @@ pub struct Trajectory {
 impl Trajectory {
     /// Begins it, in the place of a file that may be there.
     pub fn create(path: &Path) -> Result<Self, Failure> {
-        let file = File::create(path).map_err(|error| cannot_write(path, error))?;
+        let file = File::create(path).map_err(|error| cannot_create(path, error))?;
         Ok(Self { path: path.to_owned(), file, frames: 0, last_step: None })
     }
 
