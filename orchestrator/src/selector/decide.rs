@@ -82,7 +82,7 @@ impl Selector {
     /// Moves the walk to where its turn ended, and logs returns to a checkpoint.
     fn take_in(&mut self, report: &Report, commit: &mut Commit) {
         let turn_steps = self.settings.turn_steps;
-        let walk = self.walks.get_mut(&report.walk).expect("checked when the report came in");
+        let walk = self.walk_mut(report.walk);
         let returned = report.progress.segment > walk.memory.segment;
         walk.memory.segment = walk.memory.segment.max(report.progress.segment);
         walk.record.turn += 1;
@@ -138,7 +138,7 @@ impl Selector {
         };
         let keep_features = self.keeps_features(fate, &graded.block);
         self.put_down(id, graded, fate, keep_features, detail, commit);
-        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
+        let walk = self.walk_mut(id);
         walk.memory.verdict = Some(verdict);
         if walk.record.accepted >= self.settings.per_seed {
             self.end_walk(id, &End::Collected, commit);
@@ -157,7 +157,7 @@ impl Selector {
         let step = graded.block.view().id().step;
         let detail = json!({ "original": grade_summary(&graded.original.gamma, 0) });
         self.put_down(id, graded, Fate::Accepted, true, detail, commit);
-        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
+        let walk = self.walk_mut(id);
         walk.record.accepted += 1;
         walk.memory.wanted.retain(|wanted| *wanted > step);
         if walk.memory.wanted.is_empty() {
@@ -245,7 +245,7 @@ impl Selector {
     fn accept(&mut self, id: WalkId, content: ContentHash, step: u64) {
         self.accepted += 1;
         self.known.insert(content);
-        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
+        let walk = self.walk_mut(id);
         walk.record.accepted += 1;
         walk.memory.accepted_steps.push(step);
     }
@@ -264,7 +264,7 @@ impl Selector {
     }
 
     fn end_walk(&mut self, id: WalkId, end: &End, commit: &mut Commit) {
-        let walk = self.walks.get_mut(&id).expect("checked when the report came in");
+        let walk = self.walk_mut(id);
         walk.end(end);
         let detail = json!({
             "end": end.name(), "reason": walk.record.reason, "step": walk.record.progress.step,
@@ -303,9 +303,8 @@ impl Selector {
         let ended: Vec<_> =
             self.walks.iter().filter(|(_, walk)| walk.needs_control()).map(|(id, _)| *id).collect();
         for id in ended {
-            let control_id = self.next_walk_id();
-            let walk = self.walks.get_mut(&id).expect("taken from the table");
-            let control = walk.control(control_id, self.settings.turn_steps);
+            let (control_id, turn_steps) = (self.next_walk_id(), self.settings.turn_steps);
+            let control = self.walk_mut(id).control(control_id, turn_steps);
             let detail = json!({ "control_of": id, "wanted": control.memory.wanted });
             commit.decisions.push(self.decision("begun", control_id, detail));
             self.walks.insert(control_id, control);

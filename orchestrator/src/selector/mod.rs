@@ -256,6 +256,11 @@ impl Selector {
         self.decide(reports).map(Some)
     }
 
+    /// A walk that is known to be there: none is ever taken out of the table.
+    fn walk_mut(&mut self, id: WalkId) -> &mut Walk {
+        self.walks.get_mut(&id).expect("walks stay in the table")
+    }
+
     /// Seals a commit: what holds after it.
     fn seal(&self, commit: &mut Commit) {
         let values = [
