@@ -126,7 +126,7 @@ fn the_turn_of_a_lost_walker_is_given_out_again() {
 }
 
 fn returned(segment: u32, step: u64) -> Progress {
-    Progress { segment, returns: segment, tau: 0.125, ..at(step) }
+    Progress { segment, returns: segment, tau: 0.125, last_return: Some((7, 3)), ..at(step) }
 }
 
 #[test]
@@ -136,7 +136,7 @@ fn a_return_to_a_checkpoint_is_logged_once() {
     let commit = decided(&mut selector, common::report(&assignment, Outcome::Turn, returned(2, 8)));
     assert_eq!(kinds(&commit), ["segment"]);
     let detail = &commit.decisions[0].detail;
-    assert_eq!(*detail, serde_json::json!({ "segment": 2, "step": 8, "tau": 0.125, "returns": 2 }));
+    assert_eq!(*detail, serde_json::json!({ "segment": 2, "from": 7, "to": 3, "tau": 0.125, "returns": 2 }));
     assert_eq!(commit.walks[0].progress.segment, 2);
     let assignment = turn(&mut selector);
     assert_eq!(assignment.until, 18);

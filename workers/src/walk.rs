@@ -43,6 +43,8 @@ struct WalkState {
     tau: f64,
     segment: u32,
     returns: u32,
+    /// Steps from which and to which it last returned.
+    last_return: Option<(u64, u64)>,
     refused: u64,
     refusals_in_a_row: u32,
     /// First step at which a candidate may be offered again.
@@ -273,6 +275,7 @@ impl<'a> Walk<'a> {
         self.state.tau *= self.settings.guard.tau_factor;
         checkpoint.stream = self.stream();
         let cutoff = self.dynamics.neighbours().cutoff();
+        self.state.last_return = Some((self.step(), checkpoint.state.step));
         self.dynamics = Dynamics::resume(checkpoint, cutoff, self.settings.skin)?;
         self.potential.state = bias;
         self.state.next_offer = self.offer_after_return();
@@ -355,6 +358,7 @@ impl<'a> Walk<'a> {
             gamma_max: self.state.gamma_max,
             refused: self.state.refused,
             returns: self.state.returns,
+            last_return: self.state.last_return,
         }
     }
 
@@ -389,6 +393,7 @@ fn begin(
         tau: if assignment.origin == Origin::Control { 0.0 } else { settings.tau },
         segment: 0,
         returns: 0,
+        last_return: None,
         refused: 0,
         refusals_in_a_row: 0,
         next_offer: 0,

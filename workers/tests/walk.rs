@@ -169,6 +169,7 @@ fn a_trapped_walk_goes_back_with_a_smaller_bias() {
     let last = reports.last().unwrap();
     assert!(last.progress.returns >= 1, "{last:?}");
     assert_eq!(last.progress.segment, last.progress.returns);
+    assert!(last.progress.last_return.is_some_and(|(from, to)| from > to && to >= settings.equilibration));
     assert_eq!(last.progress.tau, 2.0 * 0.5_f64.powi(last.progress.returns as i32));
     assert!(last.progress.refused >= u64::from(5 * last.progress.returns));
     let candidates = reports.iter().filter(|report| matches!(report.outcome, Outcome::Candidate(_))).count();

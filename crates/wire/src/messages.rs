@@ -160,4 +160,6 @@ pub struct Progress {
     pub refused: u64,
     /// Returns to a checkpoint so far.
     pub returns: u32,
+    /// The steps from which and to which it last returned, for the decision log; not stored beside it.
+    pub last_return: Option<(u64, u64)>,
 }

@@ -29,16 +29,19 @@ fn end() -> impl Strategy<Value = End> {
 
 fn progress() -> impl Strategy<Value = Progress> {
     let numbers = [(); 4].map(|()| -1e3..1e9);
-    (any::<u64>(), any::<u32>(), numbers, any::<u64>(), any::<u32>()).prop_map(
-        |(step, segment, [tau, temperature, relative_volume, gamma_max], refused, returns)| Progress {
-            step,
-            segment,
-            tau,
-            temperature,
-            relative_volume,
-            gamma_max,
-            refused,
-            returns,
+    (any::<u64>(), any::<u32>(), numbers, any::<u64>(), any::<u32>(), any::<Option<(u64, u64)>>()).prop_map(
+        |(step, segment, [tau, temperature, relative_volume, gamma_max], refused, returns, last_return)| {
+            Progress {
+                step,
+                segment,
+                tau,
+                temperature,
+                relative_volume,
+                gamma_max,
+                refused,
+                returns,
+                last_return,
+            }
         },
     )
 }

@@ -94,8 +94,9 @@ impl Selector {
         walk.set_until(turn_steps);
         if returned {
             let progress = &report.progress;
+            let (from, to) = progress.last_return.unzip();
             let detail = json!({
-                "segment": progress.segment, "step": progress.step, "tau": progress.tau, "returns": progress.returns,
+                "segment": progress.segment, "from": from, "to": to, "tau": progress.tau, "returns": progress.returns,
             });
             commit.decisions.push(self.decision("segment", report.walk, detail));
         }

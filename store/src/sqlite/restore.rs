@@ -114,6 +114,7 @@ impl WalkRow {
                 gamma_max: number(self.gamma_max),
                 refused: self.refused,
                 returns: self.returns,
+                last_return: None,
             },
             selector_state: self.selector_state,
             checkpoint: self.checkpoint,
