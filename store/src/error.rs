@@ -116,19 +116,6 @@ pub enum StoreError {
     /// The candidate is there already: an error of the caller, who must look before.
     #[error("candidate {0} was committed before")]
     DuplicateCandidate(String),
-    /// Not a walk of this campaign.
-    #[error("the campaign has no walk {0}")]
-    UnknownWalk(u32),
-    /// A checkpoint older than the stored one.
-    #[error("a checkpoint of turn {found} of walk {walk}, which is at turn {stored} already")]
-    OldTurn {
-        /// The walk.
-        walk: u32,
-        /// Turn of the checkpoint.
-        found: u64,
-        /// Turn that is stored.
-        stored: u64,
-    },
     /// No such job.
     #[error("no label job belongs to '{id}'; {}", neighbours(near))]
     UnknownJob {

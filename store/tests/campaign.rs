@@ -8,8 +8,8 @@ use common::*;
 use store::{
     CampaignLock, CandidateRecord, Commit, ComponentRecord, DATABASE, Fate, ProcessRecord, Store, StoreError,
 };
-use wire::messages::{Decline, Progress};
-use wire::{Origin, WalkId};
+use wire::Origin;
+use wire::messages::Decline;
 
 #[tokio::test]
 async fn a_campaign_is_begun_once_and_opened_often() {
@@ -210,21 +210,23 @@ async fn a_contradictory_commit_leaves_nothing() {
     assert_eq!(store.commit(&commit_of(vec![fresh()])).await.unwrap(), 5..6);
 }
 
+/// A walk that is interrupted in its turn is committed without any decision.
 #[tokio::test]
 async fn a_checkpoint_is_kept_between_decisions() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     store.commit(&mixed_commit()).await.unwrap();
-    let progress = Progress { step: 150, gamma_max: f64::NAN, ..Progress::default() };
-    store.save_checkpoint(WalkId(0), 1, &progress, b"state").await.unwrap();
+    let decisions = store.decision_log_text().await.unwrap();
+    let mut paused = walk(0, 1);
+    paused.progress.step = 150;
+    paused.progress.gamma_max = f64::NAN;
+    paused.checkpoint = Some(b"state".to_vec());
+    store.commit(&Commit { walks: vec![paused], ..Commit::default() }).await.unwrap();
     let walks = store.load_walks().await.unwrap();
     assert_eq!((walks[0].progress.step, walks[0].checkpoint.as_deref()), (150, Some(&b"state"[..])));
     assert!(walks[0].progress.gamma_max.is_nan());
     assert_eq!(walks[1], walk(1, 1));
-    let old = store.save_checkpoint(WalkId(0), 0, &progress, b"").await;
-    assert!(matches!(old, Err(StoreError::OldTurn { found: 0, stored: 1, .. })));
-    let unknown = store.save_checkpoint(WalkId(5), 0, &progress, b"").await;
-    assert!(matches!(unknown, Err(StoreError::UnknownWalk(5))));
+    assert_eq!(store.decision_log_text().await.unwrap(), decisions);
 }
 
 #[tokio::test]

@@ -4,8 +4,7 @@ use std::collections::HashMap;
 use std::ops::Range;
 
 use atoms::Structure;
-use wire::messages::Progress;
-use wire::{CandidateView, ContentHash, WalkId};
+use wire::{CandidateView, ContentHash};
 
 use super::{Store, Transaction, protocols};
 use crate::compress::compress;
@@ -64,41 +63,6 @@ impl Store {
         }
         transaction.commit().await?;
         Ok(first..sequence)
-    }
-
-    /// Keeps where a walk was interrupted in its turn, without any decision.
-    pub async fn save_checkpoint(
-        &self,
-        walk: WalkId,
-        turn: u64,
-        progress: &Progress,
-        checkpoint: &[u8],
-    ) -> Result<()> {
-        let mut transaction = self.begin().await?;
-        let stored = sqlx::query_scalar("SELECT turn FROM walk WHERE walk = ?").bind(walk.0);
-        let stored: Option<u64> = stored.fetch_optional(&mut *transaction).await?;
-        let stored = stored.ok_or(StoreError::UnknownWalk(walk.0))?;
-        if turn < stored {
-            return Err(StoreError::OldTurn { walk: walk.0, found: turn, stored });
-        }
-        let sql =
-            "UPDATE walk SET turn = ?, step = ?, segment = ?, tau = ?, temperature = ?, relative_volume = ?,
-                          gamma_max = ?, refused = ?, returns = ?, checkpoint = ? WHERE walk = ?";
-        sqlx::query(sql)
-            .bind(integer("turn", turn)?)
-            .bind(integer("step", progress.step)?)
-            .bind(progress.segment)
-            .bind(progress.tau)
-            .bind(progress.temperature)
-            .bind(progress.relative_volume)
-            .bind(progress.gamma_max)
-            .bind(integer("number of refusals", progress.refused)?)
-            .bind(progress.returns)
-            .bind(checkpoint)
-            .bind(walk.0)
-            .execute(&mut *transaction)
-            .await?;
-        Ok(transaction.commit().await?)
     }
 }
 
