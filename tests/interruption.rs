@@ -104,3 +104,34 @@ fn live_mode_loses_and_doubles_nothing() {
     assert_eq!(start(directory.path()).0.wait().unwrap().code(), Some(0));
     outcome(directory.path());
 }
+
+/// All walks are over, but a label is still being made elsewhere: whoever stops then must not be told that all is done.
+#[test]
+fn a_stop_while_labels_are_still_made_is_no_end() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let text = Small::default().text().replace("[label]", "[label]\nlargest_force = 1e-6\nattempts = 1");
+    std::fs::write(Small::default().write(here), text).unwrap();
+    assert_eq!(start(here).0.wait().unwrap().code(), Some(0));
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    runtime.block_on(async {
+        let store = store::Store::open(here).await.unwrap();
+        let now = store::unix_milliseconds();
+        let failed = store.queue_list(Some(store::JobState::Failed), 1, 0).await.unwrap();
+        store.retry_job(&failed[0].candidate, now).await.unwrap();
+        let protocol = store.protocols().await.unwrap()[0].hash;
+        store.lease(protocol, "elsewhere", now, 600, 1).await.unwrap().expect("the job that was put back");
+        store.close().await;
+    });
+    let mut running = start(here);
+    let begun = Instant::now();
+    while !common::succeed(here, ["status", ".", "--json"]).contains("\"orchestrator\"") {
+        assert!(begun.elapsed() < Duration::from_secs(60), "the run has not begun");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    // Long enough to find every walk ended and nothing to lease.
+    std::thread::sleep(Duration::from_millis(1500));
+    assert!(running.0.try_wait().unwrap().is_none(), "it waits for the label");
+    signal(&running, "INT");
+    assert_eq!(running.0.wait().unwrap().code(), Some(130));
+}
