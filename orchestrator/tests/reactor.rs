@@ -105,7 +105,7 @@ fn start_walkers(
         thread::spawn(move || {
             let mut report = None;
             while let Some(work) = transport.exchange(report.take()) {
-                report = Some(work_on(&work, &transport));
+                report = Some(work_on(&work, &transport).map_candidate(|block| block.view().to_candidate()));
             }
         })
     };

@@ -15,7 +15,7 @@ use potentials::grace::GraceModel;
 use potentials::{Zbl, ZblRangeError};
 use serde::{Deserialize, Serialize};
 use wire::messages::{Assignment, End, Outcome, Progress, Report, Verdict};
-use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin};
+use wire::{Candidate, CandidateId, ContentHash, Origin};
 
 use crate::bias::{BiasState, BiasedPotential};
 use crate::guard;
@@ -23,8 +23,6 @@ use crate::settings::{ThermostatKind, WalkSettings};
 
 /// Checkpoints to go back to that are kept; the oldest is used, so that a return leads out of the trap.
 const KEPT_CHECKPOINTS: usize = 2;
-/// Steps between two reports of progress to those who watch.
-const PROGRESS_INTERVAL: u64 = 20;
 
 /// What every walk of a campaign shares.
 #[derive(Clone)]
@@ -83,14 +81,14 @@ enum WalkError {
 }
 
 /// Works on a turn until it ends: with a candidate, at its last step, with the walk itself, or when `stopping` says so.
-/// `watch` is told now and then where the walk stands.
+/// `watch` is told after each step where the walk stands.
 pub fn advance(
     context: &WalkContext,
     assignment: &Assignment,
     mixture: Arc<Mixture>,
     stopping: impl Fn() -> bool,
     watch: impl Fn(Progress),
-) -> Report {
+) -> Report<Candidate> {
     let (walk, turn) = (assignment.walk, assignment.turn);
     let mut running = match Walk::open(context, assignment, mixture) {
         Ok(running) => running,
@@ -162,7 +160,11 @@ impl<'a> Walk<'a> {
         }
     }
 
-    fn run(&mut self, stopping: &impl Fn() -> bool, watch: &impl Fn(Progress)) -> Result<Outcome, WalkError> {
+    fn run(
+        &mut self,
+        stopping: &impl Fn() -> bool,
+        watch: &impl Fn(Progress),
+    ) -> Result<Outcome<Candidate>, WalkError> {
         let last = self.settings.equilibration + self.settings.steps;
         loop {
             if self.step() >= last {
@@ -178,9 +180,7 @@ impl<'a> Walk<'a> {
             if let Some(outcome) = self.look()? {
                 return Ok(outcome);
             }
-            if self.step().is_multiple_of(PROGRESS_INTERVAL) {
-                watch(self.progress());
-            }
+            watch(self.progress());
         }
     }
 
@@ -205,7 +205,7 @@ impl<'a> Walk<'a> {
     }
 
     /// What the new step means: a wanted frame, a candidate, a refusal, or nothing.
-    fn look(&mut self) -> Result<Option<Outcome>, WalkError> {
+    fn look(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let step = self.step();
         if self.is_control() {
             let wanted = self.assignment.wanted.contains(&step);
@@ -250,7 +250,7 @@ impl<'a> Walk<'a> {
     }
 
     /// Counts a refusal by the shortest-bond guard; after too many in a row the walk goes back, or ends.
-    fn refuse(&mut self) -> Result<Option<Outcome>, WalkError> {
+    fn refuse(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let guard = &self.settings.guard;
         self.state.refused += 1;
         self.state.refusals_in_a_row += 1;
@@ -299,7 +299,7 @@ impl<'a> Walk<'a> {
         Stream::new(self.settings.rng_seed, self.assignment.random_walk.0, self.state.segment)
     }
 
-    fn candidate(&mut self) -> Result<CandidateBlock, WalkError> {
+    fn candidate(&mut self) -> Result<Candidate, WalkError> {
         let gamma = self.potential.grades()?.gamma.clone();
         let structure = self.dynamics.structure().clone();
         let pairs = self.pairs(self.dynamics.neighbours());
@@ -312,7 +312,7 @@ impl<'a> Walk<'a> {
             step: self.step(),
             content: ContentHash::of(&structure),
         };
-        Ok(CandidateBlock::encode(&Candidate {
+        Ok(Candidate {
             id,
             origin: self.assignment.origin,
             mixture_version: self.mixture_version,
@@ -325,7 +325,7 @@ impl<'a> Walk<'a> {
             gamma,
             gamma_nbr,
             features: self.potential.features().to_vec(),
-        }))
+        })
     }
 
     /// Directed pairs within their cutoffs, for γ_nbr.

@@ -1,11 +1,17 @@
 //! A walker: asks for a turn, works on it, delivers what came of it.
 
+use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::{Duration, Instant};
 
+use wire::Candidate;
 use wire::messages::{End, Outcome, Progress, Report};
 use wire::transport::{Transport, Work};
 
 use crate::walk::{WalkContext, advance};
+
+/// Time between two signs of life, at least; a longer step makes it longer.
+const PROGRESS_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Works until there is nothing more to do or the walker is asked to stop.
 pub fn run(context: &WalkContext, transport: &mut impl Transport) {
@@ -17,14 +23,20 @@ pub fn run(context: &WalkContext, transport: &mut impl Transport) {
     }
 }
 
-fn work_on(context: &WalkContext, work: &Work, transport: &impl Transport) -> Report {
+fn work_on(context: &WalkContext, work: &Work, transport: &impl Transport) -> Report<Candidate> {
     let walk = work.assignment.walk;
     let stopping = || transport.stopping();
-    let watch = |progress| transport.progress(walk, progress);
+    let last = Cell::new(Instant::now());
+    let watch = |progress| {
+        if last.get().elapsed() >= PROGRESS_INTERVAL {
+            last.set(Instant::now());
+            transport.progress(walk, progress);
+        }
+    };
     advance(context, &work.assignment, work.mixture.clone(), stopping, watch)
 }
 
-fn crashed(work: &Work) -> Report {
+fn crashed(work: &Work) -> Report<Candidate> {
     let end = End::BadStart { reason: "the walker crashed: this is a defect of calmwalk".to_owned() };
     Report {
         walk: work.assignment.walk,

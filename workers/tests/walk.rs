@@ -7,7 +7,7 @@ use atoms::{Evaluation, NeighbourList, Potential, Structure, Vec3, cell, read_ex
 use calm::{Artifact, CollectionRule, Grades, Mixture};
 use potentials::grace::{Grace, GraceModel, PullBack};
 use wire::messages::{Assignment, End, Outcome, Report, Verdict};
-use wire::{CampaignId, Origin, WalkId};
+use wire::{CampaignId, Candidate, Origin, WalkId};
 use workers::bias::BiasedPotential;
 use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
 use workers::walk::{WalkContext, advance};
@@ -72,13 +72,13 @@ fn assignment(structure: Structure, until: u64) -> Assignment {
     }
 }
 
-fn go(settings: &WalkSettings, assignment: &Assignment) -> Report {
+fn go(settings: &WalkSettings, assignment: &Assignment) -> Report<Candidate> {
     let context = WalkContext { model: model(), settings: Arc::new(settings.clone()) };
     advance(&context, assignment, mixture(), || false, |_| {})
 }
 
 /// Works on a walk turn by turn, with every candidate accepted, until it ends.
-fn whole_walk(settings: &WalkSettings, structure: Structure, turn_steps: u64) -> Vec<Report> {
+fn whole_walk(settings: &WalkSettings, structure: Structure, turn_steps: u64) -> Vec<Report<Candidate>> {
     let mut turn = assignment(structure, turn_steps);
     let mut reports = Vec::new();
     loop {
@@ -182,8 +182,8 @@ fn the_gap_between_collections_holds_across_returns() {
     let guard = GuardSettings { tau_factor: 0.8, most_returns: 6, ..settings().guard };
     let settings = WalkSettings { tau: 2.0, zbl: Some((1.0, 1.8)), gap: 120, guard, ..settings() };
     let reports = whole_walk(&settings, seed("fcc-097"), 150);
-    let candidate = |report: &Report| match &report.outcome {
-        Outcome::Candidate(block) => Some((block.view().id().segment, block.view().id().step)),
+    let candidate = |report: &Report<Candidate>| match &report.outcome {
+        Outcome::Candidate(candidate) => Some((candidate.id.segment, candidate.id.step)),
         _ => None,
     };
     let candidates: Vec<_> = reports.iter().filter_map(candidate).collect();
@@ -215,7 +215,7 @@ fn the_skin_changes_nothing() {
         let report = go(&settings, &assignment(cluster.clone(), 4020));
         (report.outcome, report.progress.step)
     });
-    let lost = |outcome: &Outcome| matches!(outcome, Outcome::Ended(End::BlewUp { reason }) if reason.contains("no neighbour"));
+    let lost = |outcome: &Outcome<Candidate>| matches!(outcome, Outcome::Ended(End::BlewUp { reason }) if reason.contains("no neighbour"));
     assert!(lost(&ends[0].0), "{:?}", ends[0]);
     assert!(ends.iter().all(|end| *end == ends[0]), "{ends:?}");
 }
@@ -252,15 +252,16 @@ fn a_control_walk_gives_the_wanted_frames_and_follows_the_biased_one_until_the_b
     control.walk = WalkId(9);
     control.wanted = vec![25, 90];
     let report = go(&settings, &control);
-    let Outcome::Candidate(block) = &report.outcome else { panic!("{report:?}") };
-    assert_eq!((block.view().id().step, block.view().origin()), (25, Origin::Control));
+    let Outcome::Candidate(candidate) = &report.outcome else { panic!("{report:?}") };
+    assert_eq!((candidate.id.step, candidate.origin), (25, Origin::Control));
     // The bias is silent for its first ten evaluations: up to step 30 both are the same trajectory.
     let same = |until: u64| {
         let quiet = WalkSettings { collection: never(), ..settings.clone() };
         let biased = go(&quiet, &assignment(seed("slab-111"), until));
         let mut control = Assignment { wanted: Vec::new(), ..control.clone() };
         control.until = until;
-        let state = |report: &Report| (report.progress.temperature, report.progress.relative_volume);
+        let state =
+            |report: &Report<Candidate>| (report.progress.temperature, report.progress.relative_volume);
         state(&biased) == state(&go(&quiet, &control))
     };
     assert!(same(30));

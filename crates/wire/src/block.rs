@@ -13,6 +13,9 @@
 //! The arrays follow the header (see [`Header`]) in this order without gaps, so their places follow from
 //! n and D; the header repeats the length of the whole, and a CRC-32 of everything after itself.
 
+use std::fmt;
+use std::sync::Arc;
+
 use atoms::{Cell, Matrix3, Species, Structure, Vec3};
 use zerocopy::{CastError, FromBytes, Immutable, IntoBytes, KnownLayout};
 
@@ -125,9 +128,12 @@ pub enum BlockError {
     },
 }
 
-/// An owned, checked block.
-#[derive(Clone, Debug, PartialEq)]
-pub struct CandidateBlock(Vec<u64>);
+/// A checked block, in memory of this process or in memory that a walker shares. Clones share it.
+#[derive(Clone)]
+pub struct CandidateBlock(Arc<dyn AsRef<[u8]> + Send + Sync>);
+
+/// Memory of this process, aligned to 8.
+struct Words(Vec<u64>);
 
 /// A block read in place.
 #[derive(Clone, Debug)]
@@ -152,41 +158,30 @@ fn length(atoms: u64, features: u64) -> u64 {
     HEADER as u64 + 8 * atoms * (1 + 3 + 3 + 1 + 1 + features)
 }
 
-impl CandidateBlock {
-    /// Encodes a candidate. The arrays must have the lengths their documentation gives, and its name the hash of its
-    /// structure.
+impl Candidate {
+    /// Bytes of its block.
+    pub fn encoded_len(&self) -> usize {
+        length(self.structure.len() as u64, self.feature_dimension() as u64) as usize
+    }
+
+    /// Features an atom, D.
+    fn feature_dimension(&self) -> usize {
+        self.features.len().checked_div(self.structure.len()).unwrap_or(0)
+    }
+
+    /// Writes its block to `out`, [`Candidate::encoded_len`] bytes. The arrays must have the lengths their
+    /// documentation gives, and its name the hash of its structure.
     ///
     /// # Panics
     /// If they have not: that is an error of the caller, not of input.
-    pub fn encode(candidate: &Candidate) -> Self {
-        let Candidate { structure, forces, gamma, gamma_nbr, features, .. } = candidate;
+    pub fn encode_into(&self, out: &mut [u8]) {
+        let Self { structure, forces, gamma, gamma_nbr, features, .. } = self;
         let n = structure.len();
         assert!([structure.positions.len(), forces.len(), gamma.len(), gamma_nbr.len()] == [n; 4] && n > 0);
         assert_eq!(features.len() % n, 0, "features of every atom");
-        assert_eq!(candidate.id.content, ContentHash::of(structure), "the hash of this very structure");
-        let dimension = (features.len() / n) as u64;
-        let header = Header {
-            magic: MAGIC,
-            version: VERSION,
-            checksum: 0,
-            length: length(n as u64, dimension),
-            atoms: n as u64,
-            features: dimension,
-            campaign: candidate.id.campaign.0,
-            content: candidate.id.content.0,
-            walk: candidate.id.walk.0,
-            segment: candidate.id.segment,
-            step: candidate.id.step,
-            mixture_version: candidate.mixture_version,
-            origin: candidate.origin as u32,
-            periodic: [structure.periodic[0], structure.periodic[1], structure.periodic[2], false]
-                .map(u8::from),
-            temperature: candidate.temperature,
-            relative_volume: candidate.relative_volume,
-            energy: candidate.energy,
-            cell: flatten(&structure.cell.0),
-            virial: flatten(&candidate.virial),
-        };
+        assert_eq!(self.id.content, ContentHash::of(structure), "the hash of this very structure");
+        assert_eq!(out.len(), self.encoded_len(), "room for the block");
+        let header = self.header();
         let numbers: Vec<u64> = structure.species.iter().map(|s| u64::from(s.atomic_number())).collect();
         let parts = [
             header.as_bytes(),
@@ -197,17 +192,61 @@ impl CandidateBlock {
             gamma_nbr.as_bytes(),
             features.as_bytes(),
         ];
-        let mut words = vec![0_u64; header.length as usize / 8];
-        let mut rest = words.as_mut_bytes();
+        let mut rest = &mut *out;
         for part in parts {
             let (place, behind) = rest.split_at_mut(part.len());
             place.copy_from_slice(part);
             rest = behind;
         }
-        let bytes = words.as_mut_bytes();
-        let checksum = crc32fast::hash(&bytes[CHECKED_FROM..]);
-        bytes[CHECKED_FROM - 4..CHECKED_FROM].copy_from_slice(&checksum.to_le_bytes());
-        Self(words)
+        let checksum = crc32fast::hash(&out[CHECKED_FROM..]);
+        out[CHECKED_FROM - 4..CHECKED_FROM].copy_from_slice(&checksum.to_le_bytes());
+    }
+
+    fn header(&self) -> Header {
+        let Self { id, structure, .. } = self;
+        let [x, y, z] = structure.periodic.map(u8::from);
+        Header {
+            magic: MAGIC,
+            version: VERSION,
+            checksum: 0,
+            length: self.encoded_len() as u64,
+            atoms: structure.len() as u64,
+            features: self.feature_dimension() as u64,
+            campaign: id.campaign.0,
+            content: id.content.0,
+            walk: id.walk.0,
+            segment: id.segment,
+            step: id.step,
+            mixture_version: self.mixture_version,
+            origin: self.origin as u32,
+            periodic: [x, y, z, 0],
+            temperature: self.temperature,
+            relative_volume: self.relative_volume,
+            energy: self.energy,
+            cell: flatten(&structure.cell.0),
+            virial: flatten(&self.virial),
+        }
+    }
+}
+
+impl CandidateBlock {
+    /// Encodes a candidate into memory of this process.
+    ///
+    /// # Panics
+    /// As [`Candidate::encode_into`].
+    pub fn encode(candidate: &Candidate) -> Self {
+        let mut words = vec![0_u64; candidate.encoded_len() / 8];
+        candidate.encode_into(words.as_mut_bytes());
+        Self(Arc::new(Words(words)))
+    }
+
+    /// Checks a block where it stands and keeps its owner, copying nothing. The bytes must not change any more.
+    ///
+    /// # Errors
+    /// Other or damaged bytes, bytes that are not aligned to 8.
+    pub fn in_place(owner: Arc<dyn AsRef<[u8]> + Send + Sync>) -> Result<Self, BlockError> {
+        CandidateView::new((*owner).as_ref())?;
+        Ok(Self(owner))
     }
 
     /// Copies and checks `bytes`.
@@ -216,17 +255,17 @@ impl CandidateBlock {
         let (copy, _) = words.as_mut_bytes().split_at_mut(bytes.len());
         copy.copy_from_slice(bytes);
         CandidateView::new(copy)?;
-        Ok(Self(words))
+        Ok(Self(Arc::new(Words(words))))
     }
 
     /// The bytes, 8-byte aligned.
     pub fn as_bytes(&self) -> &[u8] {
-        self.0.as_bytes()
+        (*self.0).as_ref()
     }
 
     /// The block read in place.
     pub fn view(&self) -> CandidateView<'_> {
-        CandidateView::split(self.0.as_bytes()).expect("checked when the block was made")
+        CandidateView::split(self.as_bytes()).expect("checked when the block was made")
     }
 
     /// The same block without its features, for a store that keeps those apart.
@@ -234,6 +273,24 @@ impl CandidateBlock {
         let mut candidate = self.view().to_candidate();
         candidate.features.clear();
         Self::encode(&candidate)
+    }
+}
+
+impl AsRef<[u8]> for Words {
+    fn as_ref(&self) -> &[u8] {
+        self.0.as_bytes()
+    }
+}
+
+impl PartialEq for CandidateBlock {
+    fn eq(&self, other: &Self) -> bool {
+        self.as_bytes() == other.as_bytes()
+    }
+}
+
+impl fmt::Debug for CandidateBlock {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "CandidateBlock({}, {} bytes)", self.view().id(), self.as_bytes().len())
     }
 }
 

@@ -72,11 +72,12 @@ impl Decline {
     }
 }
 
-/// How a turn ended.
+/// How a turn ended. A walker gives its candidate as a [`crate::Candidate`], which the transport encodes where it is
+/// to be read; it arrives as a block.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Outcome {
+pub enum Outcome<C = CandidateBlock> {
     /// With a candidate (or, in a control walk, a wanted frame).
-    Candidate(CandidateBlock),
+    Candidate(C),
     /// At its last step.
     Turn,
     /// Before that, because the process was asked to stop: the same turn goes on later.
@@ -128,17 +129,31 @@ impl End {
 
 /// What came of a turn.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Report {
+pub struct Report<C = CandidateBlock> {
     /// The walk.
     pub walk: WalkId,
     /// The turn it answers.
     pub turn: u64,
     /// How it ended.
-    pub outcome: Outcome,
+    pub outcome: Outcome<C>,
     /// The walker's state of the walk from which the next turn goes on.
     pub checkpoint: Vec<u8>,
     /// Where the walk stands.
     pub progress: Progress,
+}
+
+impl<C> Report<C> {
+    /// The same report with its candidate in another form.
+    pub fn map_candidate<D>(self, form: impl FnOnce(C) -> D) -> Report<D> {
+        let outcome = match self.outcome {
+            Outcome::Candidate(candidate) => Outcome::Candidate(form(candidate)),
+            Outcome::Turn => Outcome::Turn,
+            Outcome::Paused => Outcome::Paused,
+            Outcome::Ended(end) => Outcome::Ended(end),
+        };
+        let Self { walk, turn, checkpoint, progress, .. } = self;
+        Report { walk, turn, outcome, checkpoint, progress }
+    }
 }
 
 /// Where a walk stands; also sent while a turn lasts, for those who watch.

@@ -8,6 +8,7 @@ use calm::Mixture;
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
+use crate::block::{Candidate, CandidateBlock};
 use crate::ids::WalkId;
 use crate::messages::{Assignment, Progress, Report};
 
@@ -24,7 +25,7 @@ pub struct Work {
 pub trait Transport: Send {
     /// Delivers what came of the last turn (nothing at first) and waits for the next; `None` when there is
     /// no more work, or nobody to give it. A report is safe only once this has returned `Some`.
-    fn exchange(&mut self, report: Option<Report>) -> Option<Work>;
+    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<Work>;
 
     /// Tells those who watch where a walk stands. May be lost.
     fn progress(&self, walk: WalkId, progress: Progress);
@@ -54,7 +55,7 @@ pub enum Incoming {
     },
 }
 
-/// The transport between threads of one process: values move, nothing is encoded.
+/// The transport between threads of one process: values move, only the candidate takes its one form.
 #[derive(Debug)]
 pub struct InProcess {
     walker: u32,
@@ -70,7 +71,9 @@ impl InProcess {
 }
 
 impl Transport for InProcess {
-    fn exchange(&mut self, report: Option<Report>) -> Option<Work> {
+    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<Work> {
+        let report =
+            report.map(|report| report.map_candidate(|candidate| CandidateBlock::encode(&candidate)));
         let (reply, answer) = oneshot::channel();
         let message = Incoming::Free { walker: self.walker, report, reply };
         self.to_reactor.blocking_send(message).ok()?;

@@ -190,3 +190,32 @@ fn a_candidate_with_the_name_of_another_is_not_encoded() {
     candidate.structure.positions[0][0] = 1.0;
     CandidateBlock::encode(&candidate);
 }
+
+/// Memory that somebody else owns.
+struct Lent(Vec<u64>, usize);
+
+impl AsRef<[u8]> for Lent {
+    fn as_ref(&self) -> &[u8] {
+        &zerocopy::IntoBytes::as_bytes(self.0.as_slice())[self.1..]
+    }
+}
+
+#[test]
+fn a_block_in_place_is_checked_and_not_copied() {
+    let block = some_block();
+    let mut words = vec![0_u64; block.as_bytes().len() / 8 + 1];
+    zerocopy::IntoBytes::as_mut_bytes(words.as_mut_slice())[8..].copy_from_slice(block.as_bytes());
+    let (whole, damaged) = (words.clone(), {
+        words[7] ^= 1;
+        words
+    });
+    let lent = std::sync::Arc::new(Lent(whole, 8));
+    let place = lent.as_ref().as_ref().as_ptr();
+    let found = CandidateBlock::in_place(lent).unwrap();
+    assert_eq!(found, block);
+    assert_eq!(found.as_bytes().as_ptr(), place);
+    assert!(matches!(
+        CandidateBlock::in_place(std::sync::Arc::new(Lent(damaged, 8))),
+        Err(BlockError::Checksum { .. })
+    ));
+}
