@@ -12,7 +12,7 @@ use serde_json::json;
 use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError, this_host, unix_milliseconds};
 
 use super::{Ended, Failure, block_on};
-use crate::actors::Actors;
+use crate::actors::in_process;
 use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
 use crate::output::{print, say};
@@ -63,9 +63,8 @@ async fn run(campaign: &Campaign, directory: &Path) -> Result<Ended, Failure> {
     let store = open_store(campaign, directory).await?;
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
-    let actors = Actors::start(campaign, selector, &store, &process)?;
     let alive = tokio::spawn(say_alive(store.clone(), process.clone()));
-    let ended = actors.finish().await?;
+    let ended = in_process::work(campaign, selector, &store, &process).await?;
     alive.abort();
     leave(&store, &process, ended).await?;
     if ended == reactor::Ended::Stopped && !store.status().await?.finished {

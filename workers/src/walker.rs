@@ -13,14 +13,27 @@ use crate::walk::{WalkContext, advance};
 /// Time between two signs of life, at least; a longer step makes it longer.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(100);
 
+/// How a walker's work ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ended {
+    /// There was no more work for it.
+    SentHome,
+    /// It was asked to stop; its last turn, if it got one, is somebody else's.
+    Stopped,
+}
+
 /// Works until there is nothing more to do or the walker is asked to stop.
-pub fn run(context: &WalkContext, transport: &mut impl Transport) {
+pub fn run(context: &WalkContext, transport: &mut impl Transport) -> Ended {
     let mut report = None;
     while let Some(work) = transport.exchange(report.take()) {
+        if transport.stopping() {
+            return Ended::Stopped;
+        }
         // A crash is a defect of this program; it ends the walk that met it, not the campaign.
         let turn = catch_unwind(AssertUnwindSafe(|| work_on(context, &work, transport)));
         report = Some(turn.unwrap_or_else(|_| crashed(&work)));
     }
+    Ended::SentHome
 }
 
 fn work_on(context: &WalkContext, work: &Work, transport: &impl Transport) -> Report<Candidate> {

@@ -1,14 +1,12 @@
-//! The actors of a campaign at work: walkers as threads, reactor and labellers as tasks of one process.
+//! Everything in one process: walkers as threads, reactor and labellers as tasks.
 
-use std::process;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 
-use orchestrator::reactor::{self, Reactor};
+use orchestrator::reactor;
 use orchestrator::selector::Selector;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
 use wire::transport::{InProcess, Incoming};
@@ -16,26 +14,32 @@ use workers::labeller::{self, Closing, LabellerSettings, ReferenceMethod};
 use workers::walk::WalkContext;
 use workers::walker;
 
+use super::{CHANNEL, ReactorTask, start_reactor, stop_on_signals, wanted_walkers};
 use crate::campaign::Campaign;
 use crate::outcome::Failure;
-use crate::output::say;
-use crate::progress::Display;
 
-/// Reports under way between walkers and reactor.
-const CHANNEL: usize = 64;
+/// Runs the campaign until it is done or stopped.
+pub async fn work(
+    campaign: &Campaign,
+    selector: Selector,
+    store: &Store,
+    process: &ProcessRecord,
+) -> Result<reactor::Ended, Failure> {
+    Actors::start(campaign, selector, store, process)?.finish().await
+}
 
 /// Walkers, reactor and labellers at work.
-pub struct Actors {
-    walkers: Vec<JoinHandle<()>>,
+struct Actors {
+    walkers: Vec<JoinHandle<walker::Ended>>,
     labellers: JoinSet<Result<(), StoreError>>,
-    reactor: tokio::task::JoinHandle<Result<reactor::Ended, reactor::ReactorError>>,
+    reactor: ReactorTask,
     closing: Arc<Closing>,
     stopping: Arc<AtomicBool>,
 }
 
 impl Actors {
     /// Starts them all.
-    pub fn start(
+    fn start(
         campaign: &Campaign,
         selector: Selector,
         store: &Store,
@@ -43,29 +47,20 @@ impl Actors {
     ) -> Result<Self, Failure> {
         let stopping = Arc::new(AtomicBool::new(false));
         let closing = Arc::new(Closing::default());
-        stop_on_signals(Arc::clone(&stopping), Arc::clone(&closing))?;
+        let asked = (Arc::clone(&stopping), Arc::clone(&closing));
+        stop_on_signals(move || {
+            asked.0.store(true, Ordering::Relaxed);
+            asked.1.stopping.store(true, Ordering::Relaxed);
+        })?;
         let (to_reactor, incoming) = mpsc::channel(CHANNEL);
         let walkers = start_walkers(campaign, &to_reactor, &stopping)?;
         let labellers = start_labellers(campaign, store, process, &closing)?;
-        let walk_steps = campaign.config.walk.equilibration + campaign.config.walk.steps.get();
-        let mut display = Display::new(walk_steps, selector.standing(walk_steps));
-        let reactor = Reactor {
-            selector,
-            store: store.clone(),
-            incoming,
-            stopping: Arc::clone(&stopping),
-            queue_limit: u64::from(campaign.config.label.queue_limit.get()),
-        };
-        let reactor = tokio::spawn(async move {
-            let ended = reactor.run(|notice| display.notice(&notice)).await;
-            display.finish();
-            ended
-        });
+        let reactor = start_reactor(campaign, selector, store, incoming, &stopping);
         Ok(Self { walkers, labellers, reactor, closing, stopping })
     }
 
     /// Waits for all of them. A labeller that cannot go on stops the campaign: without labels its queue only grows.
-    pub async fn finish(mut self) -> Result<reactor::Ended, Failure> {
+    async fn finish(mut self) -> Result<reactor::Ended, Failure> {
         let mut failure = None;
         let ended = loop {
             tokio::select! {
@@ -110,11 +105,9 @@ fn start_walkers(
     campaign: &Campaign,
     to_reactor: &mpsc::Sender<Incoming>,
     stopping: &Arc<AtomicBool>,
-) -> Result<Vec<JoinHandle<()>>, Failure> {
+) -> Result<Vec<JoinHandle<walker::Ended>>, Failure> {
     let context =
         WalkContext { model: Arc::clone(&campaign.model), settings: Arc::new(campaign.walk_settings()) };
-    let wanted = campaign.config.run.walkers;
-    let cores = thread::available_parallelism().map_or(1, |cores| cores.get());
     let start = |number| {
         let mut transport = InProcess::new(number, to_reactor.clone(), Arc::clone(stopping));
         let context = context.clone();
@@ -123,7 +116,7 @@ fn start_walkers(
             .spawn(move || walker::run(&context, &mut transport))
             .map_err(|error| Failure::Failed(format!("cannot start walker {number}: {error}")))
     };
-    (0..if wanted == 0 { cores } else { wanted }).map(|number| start(number as u32)).collect()
+    (0..wanted_walkers(campaign)).map(start).collect()
 }
 
 fn start_labellers(
@@ -147,21 +140,4 @@ fn start_labellers(
             .spawn(async move { labeller::run(store, method, settings, &closing, unix_milliseconds).await });
     }
     Ok(labellers)
-}
-
-/// Ctrl-C and SIGTERM: the first stops in order, the second at once (which is safe too).
-fn stop_on_signals(stopping: Arc<AtomicBool>, closing: Arc<Closing>) -> Result<(), Failure> {
-    let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
-    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
-    tokio::spawn(async move {
-        loop {
-            tokio::select! { _ = interrupt.recv() => (), _ = terminate.recv() => () };
-            if stopping.swap(true, Ordering::Relaxed) {
-                process::exit(130);
-            }
-            closing.stopping.store(true, Ordering::Relaxed);
-            say("stopping: walks are checkpointed …");
-        }
-    });
-    Ok(())
 }

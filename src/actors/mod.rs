@@ -1,0 +1,76 @@
+//! The actors of a campaign at work: in processes of their own, or all in one.
+
+pub mod in_process;
+
+use std::process;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::thread;
+
+use orchestrator::reactor::{self, Reactor};
+use orchestrator::selector::Selector;
+use store::Store;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc;
+use wire::transport::Incoming;
+
+use crate::campaign::Campaign;
+use crate::outcome::Failure;
+use crate::output::say;
+use crate::progress::Display;
+
+/// Reports under way between walkers and reactor.
+const CHANNEL: usize = 64;
+
+/// The reactor at work.
+type ReactorTask = tokio::task::JoinHandle<Result<reactor::Ended, reactor::ReactorError>>;
+
+/// Starts the reactor, with a display of what it does.
+fn start_reactor(
+    campaign: &Campaign,
+    selector: Selector,
+    store: &Store,
+    incoming: mpsc::Receiver<Incoming>,
+    stopping: &Arc<AtomicBool>,
+) -> ReactorTask {
+    let walk_steps = campaign.config.walk.equilibration + campaign.config.walk.steps.get();
+    let mut display = Display::new(walk_steps, selector.standing(walk_steps));
+    let reactor = Reactor {
+        selector,
+        store: store.clone(),
+        incoming,
+        stopping: Arc::clone(stopping),
+        queue_limit: u64::from(campaign.config.label.queue_limit.get()),
+    };
+    tokio::spawn(async move {
+        let ended = reactor.run(|notice| display.notice(&notice)).await;
+        display.finish();
+        ended
+    })
+}
+
+/// Walkers side by side, as the configuration has it.
+fn wanted_walkers(campaign: &Campaign) -> u32 {
+    let cores = || thread::available_parallelism().map_or(1, |cores| cores.get());
+    match campaign.config.run.walkers {
+        0 => cores() as u32,
+        wanted => wanted as u32,
+    }
+}
+
+/// Ctrl-C and SIGTERM: the first calls `stop`, which stops in order, the second ends at once (which is safe too).
+fn stop_on_signals(stop: impl Fn() + Send + 'static) -> Result<(), Failure> {
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
+    tokio::spawn(async move {
+        for first in [true, false] {
+            tokio::select! { _ = interrupt.recv() => (), _ = terminate.recv() => () };
+            if !first {
+                process::exit(130);
+            }
+            stop();
+            say("stopping: walks are checkpointed …");
+        }
+    });
+    Ok(())
+}
