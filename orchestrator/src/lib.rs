@@ -7,3 +7,4 @@
 pub mod grader;
 pub mod reactor;
 pub mod selector;
+pub mod supervisor;

@@ -1,0 +1,143 @@
+//! How a process ended, in words.
+
+use std::fmt;
+use std::time::Duration;
+
+/// How a process ended. Its text is what `status` shows.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// It left with an exit code.
+    Exit {
+        /// 0 if it went home in order.
+        code: i32,
+        /// The last line that it wrote to its standard error.
+        words: Option<String>,
+    },
+    /// A signal ended it.
+    Signal {
+        /// Number of the signal.
+        signal: i32,
+        /// The last line that it wrote to its standard error.
+        words: Option<String>,
+    },
+    /// It gave no sign of life for so long, and was killed.
+    Silent(Duration),
+    /// It was still there so long after it was told to end, and was killed.
+    Lingering(Duration),
+    /// It could not be started, for this reason.
+    NotStarted(String),
+    /// It ended, and how is not for us to know: an adopted process is not our child.
+    Unseen,
+}
+
+impl Ending {
+    /// Whether it went home.
+    pub fn is_in_order(&self) -> bool {
+        matches!(self, Self::Exit { code: 0, .. })
+    }
+
+    /// Whether the process itself is to blame, what it computes or what it was given, so that the next one may well go the same
+    /// way. Otherwise the end came from outside: a SIGKILL of the kernel that was out of memory, a user's SIGTERM.
+    pub fn is_own_fault(&self) -> bool {
+        match self {
+            Self::Exit { code, .. } => *code != 0,
+            Self::Signal { signal, .. } => {
+                matches!(signal_name(*signal), "SIGSEGV" | "SIGABRT" | "SIGBUS" | "SIGILL" | "SIGFPE")
+            }
+            Self::Silent(_) | Self::Lingering(_) => true,
+            Self::NotStarted(_) | Self::Unseen => false,
+        }
+    }
+
+    /// Whether a process that was told to end by SIGTERM has done as it was told.
+    pub(super) fn is_what_stop_asks_for(&self) -> bool {
+        matches!(self, Self::Signal { signal, .. } if signal_name(*signal) == "SIGTERM")
+            || matches!(self, Self::Unseen)
+    }
+}
+
+impl fmt::Display for Ending {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Exit { code, words: Some(words) } => write!(f, "exit code {code}: {words}"),
+            Self::Exit { code, words: None } => write!(f, "exit code {code}"),
+            Self::Signal { signal, words } => {
+                write!(f, "killed by signal {signal}")?;
+                match signal_name(*signal) {
+                    "" => {}
+                    name => write!(f, " ({name})")?,
+                }
+                match words {
+                    // The last words before a death from outside have nothing to do with it.
+                    Some(words) if self.is_own_fault() => write!(f, ": {words}"),
+                    _ => Ok(()),
+                }
+            }
+            Self::Silent(silence) => write!(f, "silent for {} s, killed", silence.as_secs_f64()),
+            Self::Lingering(grace) => {
+                write!(f, "still there {} s after it was told to end, killed", grace.as_secs_f64())
+            }
+            Self::NotStarted(reason) => write!(f, "could not be started: {reason}"),
+            Self::Unseen => f.write_str("ended, it is not known how"),
+        }
+    }
+}
+
+/// Name of a signal, empty if it has none here.
+fn signal_name(signal: i32) -> &'static str {
+    match signal {
+        1 => "SIGHUP",
+        2 => "SIGINT",
+        3 => "SIGQUIT",
+        4 => "SIGILL",
+        5 => "SIGTRAP",
+        6 => "SIGABRT",
+        7 => "SIGBUS",
+        8 => "SIGFPE",
+        9 => "SIGKILL",
+        11 => "SIGSEGV",
+        13 => "SIGPIPE",
+        14 => "SIGALRM",
+        15 => "SIGTERM",
+        24 => "SIGXCPU",
+        25 => "SIGXFSZ",
+        31 => "SIGSYS",
+        _ => "",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn signal(signal: i32) -> Ending {
+        Ending::Signal { signal, words: Some("last words".to_owned()) }
+    }
+
+    #[test]
+    fn own_faults_and_deaths_from_outside_are_told_apart() {
+        use rustix::process::Signal;
+        for own in [Signal::SEGV, Signal::ABORT, Signal::BUS, Signal::ILL, Signal::FPE] {
+            assert!(signal(own.as_raw()).is_own_fault(), "{own:?}");
+        }
+        for outside in [Signal::KILL, Signal::TERM, Signal::INT, Signal::HUP, Signal::XCPU] {
+            assert!(!signal(outside.as_raw()).is_own_fault(), "{outside:?}");
+        }
+        assert!(Ending::Exit { code: 2, words: None }.is_own_fault());
+        assert!(!Ending::Exit { code: 0, words: None }.is_own_fault());
+        assert!(Ending::Silent(Duration::from_secs(1)).is_own_fault());
+        assert!(!Ending::NotStarted("no memory".to_owned()).is_own_fault() && !Ending::Unseen.is_own_fault());
+    }
+
+    #[test]
+    fn an_end_is_told_in_words() {
+        let exit =
+            |words: Option<&str>| Ending::Exit { code: 2, words: words.map(str::to_owned) }.to_string();
+        assert_eq!(exit(Some("no model")), "exit code 2: no model");
+        assert_eq!(exit(None), "exit code 2");
+        assert_eq!(signal(9).to_string(), "killed by signal 9 (SIGKILL)");
+        assert_eq!(signal(11).to_string(), "killed by signal 11 (SIGSEGV): last words");
+        assert_eq!(signal(35).to_string(), "killed by signal 35");
+        assert_eq!(Ending::Silent(Duration::from_secs(120)).to_string(), "silent for 120 s, killed");
+    }
+}
