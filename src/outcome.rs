@@ -78,9 +78,12 @@ impl From<store::StoreError> for Failure {
     fn from(error: store::StoreError) -> Self {
         use store::StoreError as E;
         match error {
-            E::Database(_) | E::DiskFull | E::Busy | E::Damaged { .. } | E::Inconsistent(_) => {
-                Self::failed(error)
-            }
+            E::Database(_)
+            | E::DiskFull
+            | E::Busy
+            | E::Damaged { .. }
+            | E::Inconsistent(_)
+            | E::Removed { .. } => Self::failed(error),
             _ => Self::input(error),
         }
     }

@@ -9,7 +9,7 @@ use std::time::Duration;
 use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
 use serde_json::json;
-use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError, this_host, unix_milliseconds};
+use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError, unix_milliseconds};
 
 use super::{Ended, Failure, block_on};
 use crate::actors::in_process;
@@ -142,13 +142,8 @@ async fn go_on(
 /// Makes this process known, and takes back what dead ones held: the lock says that there is no other.
 async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
     let now = unix_milliseconds();
-    for dead in store.status().await?.processes {
-        store.release_stale_leases_of(&dead.id, now).await?;
-    }
-    let (pid, host) = (std::process::id(), this_host());
-    let id = format!("{host}-{pid}-{now}");
-    let (kind, state) = ("orchestrator".to_owned(), "running".to_owned());
-    let record = ProcessRecord { id, kind, pid, host, started: now, last_seen: now, state };
+    store.take_over(now).await?;
+    let record = ProcessRecord::new(ProcessRecord::ORCHESTRATOR, None, std::process::id(), now);
     store.upsert_process(&record).await?;
     let detail = json!({ "process": record.id, "program_version": env!("CARGO_PKG_VERSION") });
     store.log_operation(now, "started", &detail).await?;

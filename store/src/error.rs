@@ -42,6 +42,12 @@ pub enum StoreError {
         /// What the system says.
         source: io::Error,
     },
+    /// The database is not the file any more that was opened.
+    #[error("{path} was deleted, moved or replaced while it was in use, and what is written now would be lost: put it back, or stop what works on it", path = path.display())]
+    Removed {
+        /// The database.
+        path: PathBuf,
+    },
     /// A directory that several hosts see.
     #[error("{directory} is on a network file system ({kind}), where SQLite loses data: put the campaign on a disk of this machine", directory = directory.display())]
     NetworkFileSystem {

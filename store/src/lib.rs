@@ -4,6 +4,7 @@
 //! it. Every writing function is one transaction that is on the disk when the function returns, so any process
 //! may be killed at any time. No function reads a clock: `now` is ms since 1970, see [`unix_milliseconds`].
 
+mod birth;
 mod compress;
 mod encoding;
 mod error;
@@ -18,6 +19,7 @@ mod status;
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
+pub use birth::process_birth;
 pub use compress::{DecompressError, compress, decompress};
 pub use error::{Result, StoreError};
 pub use export::{ExportFilter, ExportPlace, ExportRow, ExportSource};

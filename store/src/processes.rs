@@ -1,32 +1,91 @@
 //! Processes of a campaign, as far as this host can see them.
 
-use rustix::process::Pid;
 use serde::Serialize;
 
+use crate::birth::{is_of_another_boot, is_running, process_birth};
+
 /// A process that works for the campaign.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, sqlx::FromRow)]
+///
+/// What schema version 1 does not have is filled in when such a database is read.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, sqlx::FromRow)]
 pub struct ProcessRecord {
-    /// Its own name, never used twice (a UUID).
+    /// Its own name, never used twice and without `/`.
     pub id: String,
-    /// `orchestrator`, `labeller` …
+    /// [`Self::ORCHESTRATOR`], [`Self::WALKER`] or [`Self::LABELLER`].
     pub kind: String,
+    /// Which walker or labeller it is; an orchestrator has no number.
+    #[sqlx(default)]
+    pub number: Option<u32>,
     /// Process number on its host.
     pub pid: u32,
+    /// See [`process_birth`]; empty if unknown.
+    #[sqlx(default)]
+    pub birth: String,
     /// Name of its host, for people.
     pub host: String,
     /// When it started, ms since 1970.
     pub started: i64,
     /// When it was last heard of, ms since 1970.
     pub last_seen: i64,
-    /// What it says of itself (`running`, `stopping` …); read back as `gone` if it is of this host and no more.
+    /// What is said of it (`running`, `stopping`, `pausing`, `given up` …), see [`crate::Store::status`].
     pub state: String,
+    /// How often its predecessors were replaced in this run of the campaign.
+    #[sqlx(default)]
+    pub restarts: u32,
+    /// Hash of what a labeller was started with: one that was started with something else is not adopted.
+    #[sqlx(default)]
+    pub setup: Option<String>,
+    /// What is worth knowing besides: the last failure, messages that were dropped.
+    #[sqlx(default)]
+    pub remark: String,
 }
 
 impl ProcessRecord {
-    /// Whether it ran on this host and does so no longer. A process number that was given to another process
-    /// since is taken for the old one.
+    /// Kind of the process that runs a campaign.
+    pub const ORCHESTRATOR: &str = "orchestrator";
+    /// Kind of a process that advances walks. It ends with its orchestrator, which also writes its record.
+    pub const WALKER: &str = "walker";
+    /// Kind of a process that makes labels. It outlives its orchestrator, and writes its own record.
+    pub const LABELLER: &str = "labeller";
+
+    /// The process `pid` of this host, `running` since `now`.
+    pub fn new(kind: &str, number: Option<u32>, pid: u32, now: i64) -> Self {
+        let host = this_host();
+        Self {
+            id: format!("{host}-{pid}-{now}"),
+            kind: kind.to_owned(),
+            number,
+            pid,
+            birth: process_birth(pid).unwrap_or_default(),
+            host,
+            started: now,
+            last_seen: now,
+            state: "running".to_owned(),
+            ..Self::default()
+        }
+    }
+
+    /// Whether it ran on this host and does so no longer. One without a birth (written by version 1) is taken for
+    /// whatever process has its number now.
     pub fn is_gone(&self) -> bool {
-        self.host == this_host() && !is_alive(self.pid)
+        is_of_another_boot(&self.birth) || (self.host == this_host() && !is_running(self.pid, &self.birth))
+    }
+
+    /// Whether it runs the campaign and is not gone.
+    pub fn is_leading(&self) -> bool {
+        self.kind == Self::ORCHESTRATOR && !self.is_gone()
+    }
+
+    /// Whether it came after `other` to do the same, and is not gone itself.
+    pub fn replaces(&self, other: &Self) -> bool {
+        let place = |process: &Self| (process.kind.clone(), process.host.clone(), process.number);
+        let is_later = (self.started, &self.id) > (other.started, &other.id);
+        self.number.is_some() && place(self) == place(other) && is_later && !self.is_gone()
+    }
+
+    /// Whether a lease of `holder` is its own: `id`, or `id/part`.
+    pub fn is_holder(&self, holder: &str) -> bool {
+        holder.split('/').next() == Some(&self.id)
     }
 }
 
@@ -35,22 +94,37 @@ pub fn this_host() -> String {
     rustix::system::uname().nodename().to_string_lossy().into_owned()
 }
 
-fn is_alive(pid: u32) -> bool {
-    let pid = i32::try_from(pid).ok().and_then(Pid::from_raw);
-    // A process of another user answers EPERM: it is there.
-    pid.is_some_and(|pid| rustix::process::test_kill_process(pid) != Err(rustix::io::Errno::SRCH))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn own(kind: &str) -> ProcessRecord {
+        ProcessRecord::new(kind, Some(3), std::process::id(), 10)
+    }
+
     #[test]
-    fn living_and_dead_processes_are_told_apart() {
-        assert!(is_alive(std::process::id()));
-        assert!(!is_alive(0) && !is_alive(u32::MAX));
-        let mut child = std::process::Command::new("true").spawn().unwrap();
-        child.wait().unwrap();
-        assert!(!is_alive(child.id()));
+    fn what_ran_before_the_last_boot_is_gone_wherever_it_ran() {
+        let record = own(ProcessRecord::LABELLER);
+        assert!(!record.is_gone());
+        let elsewhere = ProcessRecord { host: "elsewhere".into(), pid: u32::MAX, ..record.clone() };
+        assert!(!elsewhere.is_gone(), "nobody can know from here");
+        for host in [this_host(), "elsewhere".to_owned()] {
+            assert!(ProcessRecord { host, birth: "another-boot/1".into(), ..record.clone() }.is_gone());
+        }
+        assert!(!ProcessRecord { birth: String::new(), ..record.clone() }.is_gone(), "version 1");
+        let reused = ProcessRecord { birth: format!("{}0", record.birth), ..record };
+        assert!(reused.is_gone());
+    }
+
+    #[test]
+    fn a_process_replaces_an_earlier_one_of_its_number() {
+        let first = own(ProcessRecord::LABELLER);
+        let second = ProcessRecord { id: "later".into(), started: 11, ..first.clone() };
+        assert!(second.replaces(&first) && !first.replaces(&second) && !first.replaces(&first));
+        let gone = ProcessRecord { pid: u32::MAX, ..second.clone() };
+        assert!(!gone.replaces(&first), "the first one is needed again");
+        assert!(!ProcessRecord { number: Some(4), ..second.clone() }.replaces(&first));
+        assert!(!ProcessRecord { number: None, ..second.clone() }.replaces(&first));
+        assert!(!ProcessRecord { kind: "walker".into(), ..second }.replaces(&first));
     }
 }

@@ -58,10 +58,10 @@ async fn other_files_and_versions_are_refused_with_what_was_found() {
     newer[63] = 7;
     fs::write(&path, &newer).unwrap();
     let message = Store::open(directory.path()).await.unwrap_err().to_string();
-    assert!(message.contains("version 7") && message.contains("reads version 1"), "{message}");
+    assert!(message.contains("version 7") && message.contains("reads version 2"), "{message}");
     assert!(matches!(
         Store::open_read_only(directory.path()).await,
-        Err(StoreError::Version { found: 7, reads: 1, .. })
+        Err(StoreError::Version { found: 7, reads: 2, .. })
     ));
     let mut foreign = whole.clone();
     foreign[68..72].copy_from_slice(&[0, 0, 0, 9]);
@@ -247,6 +247,7 @@ async fn status_counts_everything_once() {
         started: 5,
         last_seen: 6,
         state: "running".into(),
+        ..ProcessRecord::default()
     };
     store.upsert_process(&process("a", std::process::id())).await.unwrap();
     store.upsert_process(&process("b", dead.id())).await.unwrap();

@@ -7,7 +7,6 @@ use serde_json::Value;
 
 use super::{Store, Transaction};
 use crate::error::{Result, StoreError};
-use crate::processes::ProcessRecord;
 use crate::records::{LoggedDecision, Operation};
 
 /// Decisions read at a time.
@@ -75,39 +74,6 @@ impl Store {
                 Ok(Operation { number, time, kind, detail })
             })
             .collect()
-    }
-
-    /// Says that a process works for the campaign, or how it is now. One that appears for the first time takes the
-    /// place of those of its kind and host that are gone.
-    pub async fn upsert_process(&self, process: &ProcessRecord) -> Result<()> {
-        let mut transaction = self.begin().await?;
-        let sql = "SELECT * FROM process WHERE kind = ? AND host = ? AND id <> ?";
-        let query = sqlx::query_as(sql).bind(&process.kind).bind(&process.host).bind(&process.id);
-        let others: Vec<ProcessRecord> = query.fetch_all(&mut *transaction).await?;
-        for other in others.iter().filter(|other| other.is_gone()) {
-            sqlx::query("DELETE FROM process WHERE id = ?")
-                .bind(&other.id)
-                .execute(&mut *transaction)
-                .await?;
-        }
-        sqlx::query("INSERT OR REPLACE INTO process VALUES (?, ?, ?, ?, ?, ?, ?)")
-            .bind(&process.id)
-            .bind(&process.kind)
-            .bind(process.pid)
-            .bind(&process.host)
-            .bind(process.started)
-            .bind(process.last_seen)
-            .bind(&process.state)
-            .execute(&mut *transaction)
-            .await?;
-        Ok(transaction.commit().await?)
-    }
-
-    /// A process ended in order.
-    pub async fn remove_process(&self, id: &str) -> Result<()> {
-        let mut transaction = self.begin().await?;
-        sqlx::query("DELETE FROM process WHERE id = ?").bind(id).execute(&mut *transaction).await?;
-        Ok(transaction.commit().await?)
     }
 }
 

@@ -4,8 +4,10 @@ mod by_hand;
 mod commit;
 mod export;
 mod imports;
+mod in_place;
 mod labels;
 mod logs;
+mod processes;
 mod protocols;
 mod queue;
 mod restore;
@@ -23,6 +25,7 @@ use sqlx::sqlite::{
 };
 use sqlx::{ConnectOptions, Connection};
 
+use self::in_place::InPlace;
 use crate::error::{Result, StoreError};
 use crate::filesystem::check_directory;
 use crate::records::{Campaign, SeedStructure};
@@ -34,7 +37,7 @@ const UNFINISHED: &str = "campaign.sqlite.new";
 /// `PRAGMA application_id` of a campaign: "CALM".
 const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` that the newest migration leaves behind.
-const SCHEMA: i64 = 1;
+const SCHEMA: i64 = 2;
 /// How long another connection may hold the database.
 const PATIENCE: Duration = Duration::from_secs(30);
 const READERS: u32 = 4;
@@ -49,6 +52,8 @@ pub struct Store {
     /// One connection: who writes waits in line. None in a store that was opened to be read.
     writer: Option<SqlitePool>,
     readers: SqlitePool,
+    /// What every transaction that writes looks at first.
+    file: InPlace,
 }
 
 impl Store {
@@ -68,7 +73,8 @@ impl Store {
         remove_database(&unfinished)?;
         let writer = writer(&unfinished).await?;
         MIGRATIONS.run(&writer).await.map_err(schema_error)?;
-        let store = Self { readers: writer.clone(), writer: Some(writer) };
+        let file = InPlace::of(&unfinished)?;
+        let store = Self { readers: writer.clone(), writer: Some(writer), file };
         store.write_campaign(campaign, seeds, now).await?;
         store.empty_log().await?;
         store.close().await;
@@ -76,18 +82,24 @@ impl Store {
         Self::open(directory).await
     }
 
-    /// Opens the campaign in `directory`.
+    /// Opens the campaign in `directory`, and brings its tables up to date.
     pub async fn open(directory: &Path) -> Result<Self> {
         let path = existing(directory)?;
         check_directory(directory)?;
-        identify(&path, false).await?;
+        let found = identify(&path, false).await?;
         let writer = writer(&path).await?;
-        MIGRATIONS.run(&writer).await.map_err(schema_error)?;
+        let mut migrated = MIGRATIONS.run(&writer).await;
+        if migrated.is_err() && found < SCHEMA {
+            // Another process that opened it at the same time was faster: then there is nothing left to do.
+            migrated = MIGRATIONS.run(&writer).await;
+        }
+        migrated.map_err(schema_error)?;
         let readers = readers(options(&path).read_only(true));
-        Ok(Self { writer: Some(writer), readers })
+        Ok(Self { writer: Some(writer), readers, file: InPlace::of(&path)? })
     }
 
-    /// Opens the campaign in `directory` to look at it, also where nothing may be written.
+    /// Opens the campaign in `directory` to look at it, also where nothing may be written. Tables of an earlier version
+    /// stay as they are: what they lack is filled in where they are read.
     pub async fn open_read_only(directory: &Path) -> Result<Self> {
         let path = existing(directory)?;
         let immutable = match check_directory(directory) {
@@ -96,11 +108,9 @@ impl Store {
             Err(StoreError::Directory { .. }) => !directory.join(format!("{DATABASE}-wal")).exists(),
             Err(error) => return Err(error),
         };
-        let found = identify(&path, immutable).await?;
-        if found < SCHEMA {
-            return Err(StoreError::Version { path, found, reads: SCHEMA });
-        }
-        Ok(Self { writer: None, readers: readers(options(&path).read_only(true).immutable(immutable)) })
+        identify(&path, immutable).await?;
+        let readers = readers(options(&path).read_only(true).immutable(immutable));
+        Ok(Self { writer: None, readers, file: InPlace::of(&path)? })
     }
 
     /// Closes every connection. What was committed is safe without it.
@@ -123,6 +133,7 @@ impl Store {
     /// refused in spite of the time limit.
     async fn begin(&self) -> Result<Transaction> {
         let writer = self.writer.as_ref().ok_or(StoreError::ReadOnly)?;
+        self.file.check()?;
         Ok(writer.begin_with("BEGIN IMMEDIATE").await?)
     }
 }
@@ -185,7 +196,8 @@ async fn pragma(connection: &mut SqliteConnection, pragma: &'static str) -> Resu
 
 fn schema_error(error: sqlx::migrate::MigrateError) -> StoreError {
     match error {
-        sqlx::migrate::MigrateError::Execute(error) => error.into(),
+        sqlx::migrate::MigrateError::Execute(error)
+        | sqlx::migrate::MigrateError::ExecuteMigration(error, _) => error.into(),
         error => StoreError::Schema(error),
     }
 }

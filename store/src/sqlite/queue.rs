@@ -169,7 +169,12 @@ pub(super) async fn end_attempt(
 }
 
 /// Puts a job back into the queue with `failures` more, or gives it up if that makes `limit`. Returns which.
-async fn requeue(transaction: &mut Transaction, job: i64, failures: u32, limit: u32) -> Result<JobState> {
+pub(super) async fn requeue(
+    transaction: &mut Transaction,
+    job: i64,
+    failures: u32,
+    limit: u32,
+) -> Result<JobState> {
     let failures = job_row(transaction, job).await?.failures + failures;
     let state = if failures >= limit { JobState::Failed } else { JobState::Queued };
     let sql = "UPDATE job SET state = ?, failures = ?, holder = NULL, expires = NULL WHERE number = ?";

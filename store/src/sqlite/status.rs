@@ -16,7 +16,8 @@ const WALKS: &str =
     FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure ORDER BY walk";
 
 impl Store {
-    /// Everything at one instant.
+    /// Everything at one instant. A process that is gone has the state `gone`, whatever was said of it before, unless
+    /// it was `given up`, or is `pausing` and an orchestrator lives.
     pub async fn status(&self) -> Result<Status> {
         let mut transaction = self.readers.begin().await?;
         let fates: Vec<(String, String, u64)> = sqlx::query_as(FATES).fetch_all(&mut *transaction).await?;
@@ -41,7 +42,7 @@ impl Store {
             finished: !walks.is_empty() && !walks.iter().any(under_way) && labels.queued + labels.leased == 0,
             labels,
             walks,
-            processes: processes.into_iter().map(seen_from_here).collect(),
+            processes: seen_from_here(processes),
         })
     }
 }
@@ -78,7 +79,16 @@ fn labels(states: &[(String, u64)]) -> Labels {
     }
 }
 
-fn seen_from_here(process: ProcessRecord) -> ProcessRecord {
-    let state = if process.is_gone() { "gone".to_owned() } else { process.state };
-    ProcessRecord { state, ..process }
+/// One that is gone has no other state, but for what the orchestrator says of those that it does not start again: they
+/// were given up, or their pause is not over.
+fn seen_from_here(mut processes: Vec<ProcessRecord>) -> Vec<ProcessRecord> {
+    let led = processes.iter().any(ProcessRecord::is_leading);
+    for process in processes.iter_mut().filter(|process| process.is_gone()) {
+        let state = process.state.as_str();
+        let stays = state.starts_with("given up") || (led && state.starts_with("pausing"));
+        if !stays {
+            process.state = "gone".to_owned();
+        }
+    }
+    processes
 }

@@ -1,0 +1,108 @@
+//! Which process a process number belongs to: numbers are given out again, moments of birth are not.
+
+use std::fs;
+
+use rustix::process::Pid;
+
+/// When the process `pid` of this host began: the boot of the system and the clock ticks from then on, as
+/// `boot/ticks`. No other process with this number has the same. `None` where there is no such process, and where
+/// the system does not tell.
+pub fn process_birth(pid: u32) -> Option<String> {
+    stat(pid).map(|stat| format!("{}/{}", boot(), stat.ticks))
+}
+
+/// Whether the process `pid` of this host that began at `birth` runs. Without a birth any process with that number
+/// is taken for it.
+pub(crate) fn is_running(pid: u32, birth: &str) -> bool {
+    match stat(pid) {
+        Some(stat) => !stat.ended && (birth.is_empty() || birth == format!("{}/{}", boot(), stat.ticks)),
+        // Not there, or hidden from this user.
+        None => has_number(pid),
+    }
+}
+
+/// Whether that birth was before the system was last started (or on another system): whatever was born then is gone.
+pub(crate) fn is_of_another_boot(birth: &str) -> bool {
+    let (then, now) = (birth.split('/').next().unwrap_or_default(), boot());
+    !then.is_empty() && !now.is_empty() && then != now
+}
+
+/// Identifier of this boot of the system; empty where there is none.
+fn boot() -> String {
+    fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default().trim().to_owned()
+}
+
+struct Stat {
+    /// It ended, and only waits for its parent to notice.
+    ended: bool,
+    /// Its beginning in clock ticks after the boot.
+    ticks: u64,
+}
+
+fn stat(pid: u32) -> Option<Stat> {
+    parse(&fs::read_to_string(format!("/proc/{pid}/stat")).ok()?)
+}
+
+/// A line of /proc/pid/stat: the name of the program, field 2, may hold blanks and parentheses. The state is field 3,
+/// the beginning field 22.
+fn parse(line: &str) -> Option<Stat> {
+    let (_, fields) = line.rsplit_once(')')?;
+    let mut fields = fields.split_whitespace();
+    let ended = matches!(fields.next()?, "Z" | "X" | "x");
+    Some(Stat { ended, ticks: fields.nth(18)?.parse().ok()? })
+}
+
+fn has_number(pid: u32) -> bool {
+    let pid = i32::try_from(pid).ok().and_then(Pid::from_raw);
+    // A process of another user answers EPERM: it is there.
+    pid.is_some_and(|pid| rustix::process::test_kill_process(pid) != Err(rustix::io::Errno::SRCH))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::process::{Command, Stdio};
+    use std::time::{Duration, Instant};
+
+    use super::*;
+
+    #[test]
+    fn living_and_dead_processes_are_told_apart() {
+        let own = process_birth(std::process::id()).unwrap();
+        assert!(is_running(std::process::id(), &own) && is_running(std::process::id(), ""));
+        assert!(!is_running(0, "") && !is_running(u32::MAX, ""));
+        assert_eq!(process_birth(u32::MAX), None);
+        let mut child = Command::new("cat").stdin(Stdio::piped()).spawn().unwrap();
+        let birth = process_birth(child.id()).unwrap();
+        assert!(is_running(child.id(), &birth) && process_birth(child.id()).as_ref() == Some(&birth));
+        assert!(!is_of_another_boot(&birth));
+        // It ends, and nobody has asked yet how.
+        drop(child.stdin.take());
+        let begun = Instant::now();
+        while is_running(child.id(), &birth) {
+            assert!(begun.elapsed() < Duration::from_secs(60), "an ended process is taken for a running one");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        assert!(has_number(child.id()) && !is_running(child.id(), ""));
+        child.wait().unwrap();
+        assert!(!is_running(child.id(), &birth) && !is_running(child.id(), ""));
+    }
+
+    #[test]
+    fn a_number_that_was_given_out_again_fools_nobody() {
+        let (pid, own) = (std::process::id(), process_birth(std::process::id()).unwrap());
+        let (boot, ticks) = own.split_once('/').unwrap();
+        let earlier = format!("{boot}/{}", ticks.parse::<u64>().unwrap() - 1);
+        assert!(is_running(pid, &own) && !is_running(pid, &earlier));
+        assert!(is_of_another_boot(&format!("another/{ticks}")));
+        assert!(!is_of_another_boot(&earlier) && !is_of_another_boot(""));
+    }
+
+    #[test]
+    fn names_of_programs_do_not_confuse() {
+        let rest = "0 ".repeat(18);
+        let stat = parse(&format!("7 (a) Z (b) S {rest}123456 0")).unwrap();
+        assert!(!stat.ended && stat.ticks == 123_456);
+        assert!(parse(&format!("7 (sh) Z {rest}1")).unwrap().ended);
+        assert!(parse("7 (sh) S 1 2").is_none() && parse("").is_none());
+    }
+}

@@ -1,0 +1,123 @@
+//! The processes of a campaign, and what comes back of those that are gone.
+
+use serde_json::json;
+
+use super::logs::insert_operation;
+use super::queue::{end_attempt, requeue};
+use super::{Store, Transaction};
+use crate::error::Result;
+use crate::processes::ProcessRecord;
+
+pub(super) const LEASED: &str = "SELECT number, holder FROM job WHERE state = 'leased'";
+
+impl Store {
+    /// The processes of a kind, or all, in the order in which they started.
+    pub async fn processes(&self, kind: Option<&str>) -> Result<Vec<ProcessRecord>> {
+        let sql = "SELECT * FROM process WHERE ?1 IS NULL OR kind = ?1 ORDER BY started, id";
+        Ok(sqlx::query_as(sql).bind(kind).fetch_all(&self.readers).await?)
+    }
+
+    /// See [`Self::upsert_processes`].
+    pub async fn upsert_process(&self, process: &ProcessRecord) -> Result<()> {
+        self.upsert_processes(std::slice::from_ref(process)).await
+    }
+
+    /// Says that these processes work for the campaign, or how they are now. Each takes the place of those of its
+    /// kind, host and number that are gone. A predecessor that still lives keeps its record, since its leases count
+    /// for as long as it has one.
+    pub async fn upsert_processes(&self, processes: &[ProcessRecord]) -> Result<()> {
+        let mut transaction = self.begin().await?;
+        for process in processes {
+            let sql = "SELECT * FROM process WHERE kind = ? AND host = ? AND number IS ? AND id <> ?";
+            let query = sqlx::query_as(sql).bind(&process.kind).bind(&process.host);
+            let query = query.bind(process.number).bind(&process.id);
+            let others: Vec<ProcessRecord> = query.fetch_all(&mut *transaction).await?;
+            for other in others.iter().filter(|other| other.is_gone()) {
+                remove(&mut transaction, &other.id).await?;
+            }
+            insert(&mut transaction, process).await?;
+        }
+        Ok(transaction.commit().await?)
+    }
+
+    /// A process ended in order. With an orchestrator go the walkers that it started.
+    pub async fn remove_process(&self, id: &str) -> Result<()> {
+        let mut transaction = self.begin().await?;
+        let sql = "DELETE FROM process WHERE kind = 'walker'
+                   AND EXISTS (SELECT 1 FROM process WHERE id = ? AND kind = 'orchestrator')";
+        sqlx::query(sql).bind(id).execute(&mut *transaction).await?;
+        remove(&mut transaction, id).await?;
+        Ok(transaction.commit().await?)
+    }
+
+    /// Takes back the leases whose holders are gone, or are no processes of this campaign at all: a process has its
+    /// record before it leases anything, and only one that is gone loses it. Does not count as failed attempts.
+    /// Returns their number.
+    pub async fn release_leases_of_gone_processes(&self, now: i64) -> Result<usize> {
+        let mut transaction = self.begin().await?;
+        let mut living = all(&mut transaction).await?;
+        living.retain(|process| !process.is_gone());
+        let released = release_all_but_of(&living, &mut transaction, now).await?;
+        transaction.commit().await?;
+        Ok(released)
+    }
+
+    /// What a process does that begins to run the campaign: it holds the [`crate::CampaignLock`], and is not among the
+    /// processes yet. So none of them works for the campaign any longer but labellers that live on. The records of all
+    /// others are removed, and what they had leased comes back, see [`Self::release_leases_of_gone_processes`].
+    /// Returns the number of leases that came back.
+    pub async fn take_over(&self, now: i64) -> Result<usize> {
+        let mut transaction = self.begin().await?;
+        let lives_on =
+            |process: &ProcessRecord| process.kind == ProcessRecord::LABELLER && !process.is_gone();
+        let (living, gone): (Vec<_>, Vec<_>) = all(&mut transaction).await?.into_iter().partition(lives_on);
+        for process in &gone {
+            remove(&mut transaction, &process.id).await?;
+        }
+        let leases = release_all_but_of(&living, &mut transaction, now).await?;
+        let lost = gone.iter().filter(|process| process.kind != ProcessRecord::WALKER);
+        let lost: Vec<_> = lost.map(|process| process.id.as_str()).collect();
+        if leases > 0 || !lost.is_empty() {
+            let detail = json!({ "processes": lost, "leases": leases });
+            insert_operation(&mut transaction, now, "lost", &detail).await?;
+        }
+        transaction.commit().await?;
+        Ok(leases)
+    }
+}
+
+async fn all(transaction: &mut Transaction) -> Result<Vec<ProcessRecord>> {
+    Ok(sqlx::query_as("SELECT * FROM process ORDER BY started, id").fetch_all(&mut **transaction).await?)
+}
+
+async fn insert(transaction: &mut Transaction, process: &ProcessRecord) -> Result<()> {
+    let sql = "INSERT OR REPLACE INTO process
+        (id, kind, number, pid, birth, host, started, last_seen, state, restarts, setup, remark)
+        VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)";
+    let query = sqlx::query(sql).bind(&process.id).bind(&process.kind).bind(process.number);
+    let query = query.bind(process.pid).bind(&process.birth).bind(&process.host);
+    let query = query.bind(process.started).bind(process.last_seen).bind(&process.state);
+    let query = query.bind(process.restarts).bind(&process.setup).bind(&process.remark);
+    query.execute(&mut **transaction).await?;
+    Ok(())
+}
+
+async fn remove(transaction: &mut Transaction, id: &str) -> Result<()> {
+    sqlx::query("DELETE FROM process WHERE id = ?").bind(id).execute(&mut **transaction).await?;
+    Ok(())
+}
+
+async fn release_all_but_of(
+    living: &[ProcessRecord],
+    transaction: &mut Transaction,
+    now: i64,
+) -> Result<usize> {
+    let leased: Vec<(i64, String)> = sqlx::query_as(LEASED).fetch_all(&mut **transaction).await?;
+    let is_lost = |holder: &str| !living.iter().any(|process| process.is_holder(holder));
+    let lost: Vec<_> = leased.iter().filter(|(_, holder)| is_lost(holder)).collect();
+    for (job, _) in &lost {
+        end_attempt(transaction, *job, "lost", now).await?;
+        requeue(transaction, *job, 0, u32::MAX).await?;
+    }
+    Ok(lost.len())
+}

@@ -1,0 +1,114 @@
+//! Campaigns that earlier versions of the program began.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+
+use common::*;
+use sqlx::migrate::Migrator;
+use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
+use sqlx::{AssertSqlSafe, ConnectOptions, Connection};
+use store::{DATABASE, JobState, ProcessRecord, Store};
+
+const FIRST: &str = "0001_campaign.sql";
+
+async fn connect(path: &Path) -> SqliteConnection {
+    SqliteConnectOptions::new().filename(path).create_if_missing(true).connect().await.unwrap()
+}
+
+async fn version(directory: &Path) -> i64 {
+    let mut connection = connect(&directory.join(DATABASE)).await;
+    sqlx::query_scalar("PRAGMA user_version").fetch_one(&mut connection).await.unwrap()
+}
+
+/// A campaign as version 1 leaves it when it is killed: one job is leased. Returns its decision log.
+async fn version_1(directory: &Path) -> String {
+    let now = tempfile::tempdir().unwrap();
+    let store = create(now.path()).await;
+    accept(&store, 2).await;
+    store.lease(protocol("dft").hash, "old/0", 0, 86_400, 3).await.unwrap().unwrap();
+    let log = store.decision_log_text().await.unwrap();
+    store.close().await;
+
+    let migrations = tempfile::tempdir().unwrap();
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("migrations/sqlite").join(FIRST);
+    fs::copy(source, migrations.path().join(FIRST)).unwrap();
+    let mut connection = connect(&directory.join(DATABASE)).await;
+    Migrator::new(migrations.path()).await.unwrap().run(&mut connection).await.unwrap();
+    let other = now.path().join(DATABASE).to_str().unwrap().to_owned();
+    sqlx::query("ATTACH ? AS other").bind(other).execute(&mut connection).await.unwrap();
+    sqlx::query("PRAGMA foreign_keys = OFF").execute(&mut connection).await.unwrap();
+    let sql =
+        "SELECT name FROM sqlite_schema WHERE type = 'table' AND name NOT IN ('process', '_sqlx_migrations')";
+    let tables: Vec<String> = sqlx::query_scalar(sql).fetch_all(&mut connection).await.unwrap();
+    assert!(tables.len() > 10);
+    for table in tables {
+        let copy = AssertSqlSafe(format!("INSERT INTO main.{table} SELECT * FROM other.{table}"));
+        sqlx::query(copy).execute(&mut connection).await.unwrap();
+    }
+    let sql = "INSERT INTO process VALUES ('old', 'orchestrator', ?, ?, 5, 6, 'running')";
+    let query = sqlx::query(sql).bind(std::process::id()).bind(store::this_host());
+    query.execute(&mut connection).await.unwrap();
+    connection.close().await.unwrap();
+    assert_eq!(version(directory).await, 1);
+    log
+}
+
+fn old_process() -> ProcessRecord {
+    ProcessRecord {
+        id: "old".into(),
+        kind: "orchestrator".into(),
+        pid: std::process::id(),
+        host: store::this_host(),
+        started: 5,
+        last_seen: 6,
+        state: "running".into(),
+        ..ProcessRecord::default()
+    }
+}
+
+#[tokio::test]
+async fn a_campaign_of_version_1_is_looked_at_as_it_is() {
+    let directory = tempfile::tempdir().unwrap();
+    let log = version_1(directory.path()).await;
+    let before = fs::read(directory.path().join(DATABASE)).unwrap();
+    let store = Store::open_read_only(directory.path()).await.unwrap();
+    let status = store.status().await.unwrap();
+    assert_eq!((status.labels.leased, status.processes), (1, vec![old_process()]));
+    assert_eq!(store.processes(Some("orchestrator")).await.unwrap(), [old_process()]);
+    assert_eq!(store.decision_log_text().await.unwrap(), log);
+    store.close().await;
+    assert_eq!(fs::read(directory.path().join(DATABASE)).unwrap(), before);
+}
+
+#[tokio::test]
+async fn a_campaign_of_version_1_goes_on() {
+    let directory = tempfile::tempdir().unwrap();
+    let log = version_1(directory.path()).await;
+    let store = Store::open(directory.path()).await.unwrap();
+    assert_eq!(version(directory.path()).await, 2);
+    assert_eq!(store.decision_log_text().await.unwrap(), log);
+    assert_eq!(store.processes(None).await.unwrap(), [old_process()]);
+    // Its number is in use again, but the lock says that it cannot be the same process.
+    assert!(!old_process().is_gone());
+    assert_eq!(store.take_over(7).await.unwrap(), 1);
+    assert_eq!(store.processes(None).await.unwrap(), []);
+    let queued = store.queue_list(Some(JobState::Queued), 9, 0).await.unwrap();
+    assert_eq!((queued.len(), queued[0].failures), (2, 0));
+    store.close().await;
+    Store::open(directory.path()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn several_processes_may_bring_it_up_to_date() {
+    for _ in 0..10 {
+        let directory = tempfile::tempdir().unwrap();
+        version_1(directory.path()).await;
+        let path = directory.path().to_owned();
+        let open = |path: std::path::PathBuf| tokio::spawn(async move { Store::open(&path).await });
+        for opened in [open(path.clone()), open(path.clone()), open(path)] {
+            opened.await.unwrap().unwrap().processes(None).await.unwrap();
+        }
+    }
+}

@@ -1,0 +1,171 @@
+//! Who works for a campaign, and what comes back of those who are gone.
+
+mod common;
+
+use std::fs;
+
+use common::*;
+use store::{DATABASE, JobState, Lease, ProcessRecord, Store, StoreError, process_birth};
+
+/// A living process (this one).
+fn living(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
+    ProcessRecord { id: id.into(), ..ProcessRecord::new(kind, number, std::process::id(), 1) }
+}
+
+/// Its number belongs to another process by now.
+fn gone(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
+    let living = living(id, kind, number);
+    ProcessRecord { birth: format!("{}0", living.birth), ..living }
+}
+
+async fn names(store: &Store) -> Vec<String> {
+    store.processes(None).await.unwrap().into_iter().map(|process| process.id).collect()
+}
+
+async fn lease(store: &Store, holder: &str, now: i64) -> Lease {
+    store.lease(protocol("dft").hash, holder, now, 600, 3).await.unwrap().unwrap()
+}
+
+/// Holders of the leases, in order.
+async fn holders(store: &Store) -> Vec<String> {
+    let leased = store.queue_list(Some(JobState::Leased), 100, 0).await.unwrap();
+    let mut holders: Vec<_> = leased.into_iter().filter_map(|job| job.holder).collect();
+    holders.sort();
+    holders
+}
+
+#[tokio::test]
+async fn a_record_comes_back_as_it_was_written() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let mut record = living("l", ProcessRecord::LABELLER, Some(7));
+    assert_eq!(Some(&record.birth), process_birth(std::process::id()).as_ref());
+    record.restarts = 2;
+    record.setup = Some("hash".into());
+    record.remark = "killed by signal 9".into();
+    store.upsert_process(&record).await.unwrap();
+    assert_eq!(store.processes(Some("labeller")).await.unwrap(), [record.clone()]);
+    assert_eq!(store.processes(Some("walker")).await.unwrap(), []);
+    record.last_seen = 99;
+    record.state = "stopping".into();
+    store.upsert_process(&record).await.unwrap();
+    assert_eq!(store.processes(None).await.unwrap(), [record.clone()]);
+    assert_eq!(store.status().await.unwrap().processes, [record]);
+}
+
+#[tokio::test]
+async fn a_replacement_takes_the_place_of_its_predecessor() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let walkers =
+        [gone("w0", "walker", Some(0)), gone("w1", "walker", Some(1)), living("o", "orchestrator", None)];
+    store.upsert_processes(&walkers).await.unwrap();
+    store.upsert_process(&living("w1 again", "walker", Some(1))).await.unwrap();
+    let mut found = names(&store).await;
+    found.sort();
+    assert_eq!(found, ["o", "w0", "w1 again"]);
+    // One that lives on keeps its record.
+    store.upsert_process(&living("w1 again again", "walker", Some(1))).await.unwrap();
+    assert_eq!(names(&store).await.len(), 4);
+    store.upsert_process(&living("l", "labeller", Some(1))).await.unwrap();
+    store.remove_process("w0").await.unwrap();
+    assert_eq!(names(&store).await.len(), 4);
+    store.remove_process("o").await.unwrap();
+    assert_eq!(names(&store).await, ["l"]);
+}
+
+#[tokio::test]
+async fn leases_of_the_living_last_and_those_of_the_gone_come_back() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 5).await;
+    let processes = [
+        living("living", "labeller", Some(0)),
+        gone("gone", "labeller", Some(1)),
+        living("leading", "orchestrator", None),
+    ];
+    store.upsert_processes(&processes).await.unwrap();
+    for holder in ["living", "gone", "gone/3", "leading/0", "without record"] {
+        lease(&store, holder, 0).await;
+    }
+    assert_eq!(store.release_leases_of_gone_processes(1).await.unwrap(), 3);
+    assert_eq!(holders(&store).await, ["leading/0", "living"]);
+    assert_eq!(store.release_leases_of_gone_processes(1).await.unwrap(), 0);
+    let waiting = store.queue_list(Some(JobState::Queued), 9, 0).await.unwrap();
+    assert!(waiting.len() == 3 && waiting.iter().all(|job| job.failures == 0));
+    let attempts = store.queue_show(&waiting[0].candidate).await.unwrap().attempts_made;
+    assert_eq!(attempts[0].outcome.as_deref(), Some("lost"));
+}
+
+#[tokio::test]
+async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 5).await;
+    let processes = [
+        living("living", "labeller", Some(0)),
+        gone("gone", "labeller", Some(1)),
+        // Whoever holds the lock knows better than the table.
+        living("earlier", "orchestrator", None),
+        living("w", "walker", Some(0)),
+    ];
+    store.upsert_processes(&processes).await.unwrap();
+    let kept = lease(&store, "living", 0).await;
+    for holder in ["gone", "earlier/0", "earlier/1", "without record"] {
+        lease(&store, holder, 0).await;
+    }
+    assert_eq!(store.take_over(1).await.unwrap(), 4);
+    assert_eq!((names(&store).await, holders(&store).await), (vec!["living".into()], vec!["living".into()]));
+    assert!(store.renew(&kept, 2, 600).await.unwrap());
+    let logged = store.operations(0, 100).await.unwrap().pop().unwrap();
+    assert_eq!((logged.time, logged.kind.as_str()), (1, "lost"));
+    assert_eq!(logged.detail, serde_json::json!({ "processes": ["earlier", "gone"], "leases": 4 }));
+    // Nothing more to take over, and nothing to tell.
+    assert_eq!(store.take_over(2).await.unwrap(), 0);
+    assert_eq!(store.operations(logged.number, 100).await.unwrap(), []);
+}
+
+#[tokio::test]
+async fn status_says_who_is_gone_and_who_was_given_up() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let said = |id: &str, number, state: &str| ProcessRecord {
+        state: state.into(),
+        ..gone(id, "walker", Some(number))
+    };
+    let processes = [
+        said("a", 0, "running"),
+        said("b", 1, "given up"),
+        said("c", 2, "pausing"),
+        living("o", "orchestrator", None),
+    ];
+    store.upsert_processes(&processes).await.unwrap();
+    let states = async || -> Vec<String> {
+        store.status().await.unwrap().processes.into_iter().map(|process| process.state).collect()
+    };
+    assert_eq!(states().await, ["gone", "given up", "pausing", "running"]);
+    // Without its orchestrator nobody starts the third again.
+    store.upsert_process(&gone("o", "orchestrator", None)).await.unwrap();
+    assert_eq!(states().await, ["gone", "given up", "gone", "gone"]);
+}
+
+#[tokio::test]
+async fn nothing_is_written_into_a_file_that_is_not_there_any_more() {
+    let directory = tempfile::tempdir().unwrap();
+    let (path, moved) = (directory.path().join(DATABASE), directory.path().join("moved"));
+    let store = create(directory.path()).await;
+    accept(&store, 1).await;
+    let record = living("l", "labeller", Some(0));
+    store.upsert_process(&record).await.unwrap();
+    fs::rename(&path, &moved).unwrap();
+    for _ in 0..2 {
+        let error = store.upsert_process(&record).await.unwrap_err();
+        assert!(matches!(&error, StoreError::Removed { path: found } if *found == path), "{error}");
+        let refused = store.lease(protocol("dft").hash, "l", 0, 9, 3).await;
+        assert!(matches!(refused, Err(StoreError::Removed { .. })));
+        // Another file in its place is not the same.
+        fs::copy(&moved, &path).unwrap();
+    }
+    fs::rename(&moved, &path).unwrap();
+    lease(&store, "l", 0).await;
+}
