@@ -10,7 +10,7 @@ use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
 use wire::transport::{InProcess, Incoming};
-use workers::labeller::{self, Closing, LabellerSettings, ReferenceMethod};
+use workers::labeller::{self, Closing, LabellerSettings, ReferenceMethod, Timing};
 use workers::walk::WalkContext;
 use workers::walker;
 
@@ -134,6 +134,7 @@ fn start_labellers(
             protocol: campaign.protocol.clone(),
             attempts: label.attempts.get(),
             largest_force: label.largest_force.get(),
+            timing: Timing::default(),
         };
         let (store, closing) = (store.clone(), Arc::clone(closing));
         labellers

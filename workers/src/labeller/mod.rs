@@ -1,25 +1,31 @@
 //! A labeller leases a job, has its method work on it, judges what comes of it and delivers.
+//!
+//! [`run`] is one of the tasks of a process, [`serve`] a process of its own, which outlives its orchestrator.
 
+mod judge;
+mod presence;
 pub mod reference;
 
+use std::panic;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use store::records::{Label, Lease, Protocol};
 use store::{Store, StoreError};
+use tokio::task::{JoinError, spawn_blocking};
 
+pub use presence::serve;
 pub use reference::{LabelFailure, ReferenceMethod};
 
-/// How long a job is leased, seconds: longer than any reference label takes. What a dead process held is taken back
-/// when the next one starts.
-const LEASE_SECONDS: u32 = 86_400;
-/// How long a labeller without work waits before it looks again.
-const IDLE: Duration = Duration::from_millis(50);
+/// The longest time between two looks at the queue.
+const LONGEST_IDLE: Duration = Duration::from_secs(1);
+/// Which part of the time without work passes until the next look, and so how late work may be found.
+const IDLE_PART: u32 = 8;
 
 /// What a labeller needs to know.
 #[derive(Clone, Debug)]
 pub struct LabellerSettings {
-    /// Whose leases these are.
+    /// Whose leases these are: the name of a process that works for the campaign, or `process/part`.
     pub holder: String,
     /// Under which settings labels are made.
     pub protocol: Protocol,
@@ -27,6 +33,37 @@ pub struct LabellerSettings {
     pub attempts: u32,
     /// Largest force that is believed, eV/Å.
     pub largest_force: f64,
+    /// How often it does what has to be done again and again.
+    pub timing: Timing,
+}
+
+/// How often a labeller does what has to be done again and again.
+#[derive(Clone, Copy, Debug)]
+pub struct Timing {
+    /// How long a job is leased, in whole seconds. The lease is renewed at a third of it while the label is made,
+    /// however long that takes; a job whose labeller hangs comes back after this time.
+    pub lease: Duration,
+    /// How long a labeller that has just run out of work waits before it looks again. The longer it has had none, the
+    /// longer it waits, up to a second: each look costs some tenths of a millisecond.
+    pub idle: Duration,
+    /// Between two signs of life of a labeller that is a process.
+    pub sign_of_life: Duration,
+}
+
+impl Default for Timing {
+    fn default() -> Self {
+        Self {
+            lease: Duration::from_secs(600),
+            idle: Duration::from_millis(50),
+            sign_of_life: Duration::from_secs(5),
+        }
+    }
+}
+
+impl Timing {
+    fn lease_seconds(&self) -> u32 {
+        u32::try_from(self.lease.as_secs()).unwrap_or(u32::MAX).max(1)
+    }
 }
 
 /// When a labeller may go home.
@@ -38,7 +75,10 @@ pub struct Closing {
     pub stopping: AtomicBool,
 }
 
-/// Labels until there is nothing more to do.
+/// Labels until there is nothing more to do. `now` is asked for ms since 1970.
+///
+/// # Errors
+/// Whatever the database says; the label in hand is lost then, and its job comes back.
 pub async fn run(
     store: Store,
     mut method: ReferenceMethod,
@@ -46,26 +86,78 @@ pub async fn run(
     closing: &Closing,
     now: impl Fn() -> i64,
 ) -> Result<(), StoreError> {
+    let mut idle = Duration::ZERO;
     while !closing.stopping.load(Ordering::Relaxed) {
         let last_look = closing.no_more_jobs.load(Ordering::Relaxed);
         let unfinished = store.unfinished_jobs().await?;
         if unfinished == 0 && last_look {
             break;
         }
-        let protocol = settings.protocol.hash;
+        let (protocol, seconds) = (settings.protocol.hash, settings.timing.lease_seconds());
         let lease = match unfinished {
             0 => None,
-            _ => store.lease(protocol, &settings.holder, now(), LEASE_SECONDS, settings.attempts).await?,
+            _ => store.lease(protocol, &settings.holder, now(), seconds, settings.attempts).await?,
         };
         let Some(lease) = lease else {
-            tokio::time::sleep(IDLE).await;
+            let wait = (idle / IDLE_PART).min(LONGEST_IDLE).max(settings.timing.idle);
+            nap(wait, settings.timing.idle, closing, last_look).await;
+            idle += wait;
             continue;
         };
-        let made = tokio::task::block_in_place(|| method.label(&lease.structure));
-        let judged = made.and_then(|label| judge(label, &lease, settings.largest_force));
+        idle = Duration::ZERO;
+        let made;
+        (method, made) = make(&store, method, &lease, &settings.timing, &now).await?;
+        let judged = made.and_then(|label| judge::judge(label, &lease, settings.largest_force));
         deliver(&store, &lease, judged, &settings, now()).await?;
     }
     Ok(())
+}
+
+/// Waits in steps of `step`, so that it ends at once when there may be a reason to go home.
+async fn nap(wait: Duration, step: Duration, closing: &Closing, last_look: bool) {
+    let mut left = wait;
+    while !left.is_zero()
+        && !closing.stopping.load(Ordering::Relaxed)
+        && closing.no_more_jobs.load(Ordering::Relaxed) == last_look
+    {
+        tokio::time::sleep(left.min(step)).await;
+        left = left.saturating_sub(step);
+    }
+}
+
+/// Makes a label on a thread of its own, and renews the lease meanwhile. A label whose lease was lost is made to its
+/// end: if another is first, it becomes a check.
+async fn make(
+    store: &Store,
+    mut method: ReferenceMethod,
+    lease: &Lease,
+    timing: &Timing,
+    now: impl Fn() -> i64,
+) -> Result<(ReferenceMethod, Result<Label, LabelFailure>), StoreError> {
+    let structure = lease.structure.clone();
+    let mut making = spawn_blocking(move || {
+        let made = method.label(&structure);
+        (method, made)
+    });
+    let mut held = true;
+    loop {
+        let seconds = timing.lease_seconds();
+        tokio::select! {
+            made = &mut making => return made.or_else(crashed),
+            () = tokio::time::sleep(Duration::from_secs(seconds.into()) / 3), if held => {
+                held = match store.renew(lease, now(), seconds).await {
+                    // There is time for another try.
+                    Err(error) if error.is_transient() => true,
+                    renewed => renewed?,
+                };
+            }
+        }
+    }
+}
+
+/// A method that panics takes its labeller with it.
+fn crashed<T>(crash: JoinError) -> Result<T, StoreError> {
+    panic::resume_unwind(crash.into_panic())
 }
 
 async fn deliver(
@@ -81,22 +173,4 @@ async fn deliver(
             store.fail(lease, failure.class(), &failure.to_string(), settings.attempts, now).await.map(|_| ())
         }
     }
-}
-
-/// A label is believed only if its numbers are finite, belong to the atoms asked for and are not absurd.
-fn judge(label: Label, lease: &Lease, largest_force: f64) -> Result<Label, LabelFailure> {
-    let (found, expected) = (label.forces.len(), lease.structure.len());
-    if found != expected {
-        return Err(LabelFailure::Implausible(format!("{found} forces for {expected} atoms")));
-    }
-    let stress = label.stress.iter().flatten().flatten();
-    if !label.forces.iter().flatten().chain(stress).chain([&label.energy]).all(|x| x.is_finite()) {
-        return Err(LabelFailure::Implausible("numbers that are not finite".to_owned()));
-    }
-    let largest = label.forces.iter().map(|f| atoms::cell::norm(*f)).fold(0.0, f64::max);
-    if largest > largest_force {
-        let message = format!("a force of {largest:.1} eV/Å, above the allowed {largest_force:.1}");
-        return Err(LabelFailure::Implausible(message));
-    }
-    Ok(label)
 }

@@ -1,0 +1,96 @@
+//! A labeller as a process of its own: it says that it lives, and sees whether it is still needed.
+
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use store::{ProcessRecord, Store, StoreError};
+
+use super::{Closing, LabellerSettings, ReferenceMethod, run};
+
+/// Labels as the process `process`, whose record it keeps and in whose name it leases.
+///
+/// It does not need the orchestrator that started it: while none lives, it goes on until the queue is empty and then
+/// goes home; one that starts meanwhile adopts it. It also goes home, after the label in hand, when another labeller
+/// of its number has taken its place.
+///
+/// # Errors
+/// Whatever the database says, also that it was deleted or replaced. Leases are given back and the record says why,
+/// where that is still possible.
+pub async fn serve(
+    store: Store,
+    method: ReferenceMethod,
+    settings: LabellerSettings,
+    process: ProcessRecord,
+    closing: &Closing,
+    now: impl Fn() -> i64,
+) -> Result<(), StoreError> {
+    let (every, settings) =
+        (settings.timing.sign_of_life, LabellerSettings { holder: process.id.clone(), ..settings });
+    // A lease without a record of its holder would be taken back.
+    store.upsert_process(&process).await?;
+    let ended = tokio::select! {
+        ended = run(store.clone(), method, settings, closing, &now) => ended,
+        error = live(&store, process.clone(), closing, every, &now) => Err(error),
+    };
+    match ended {
+        Ok(()) => store.remove_process(&process.id).await,
+        Err(error) => match fail(&store, process, &error, now()).await {
+            // Why everything else fails.
+            Err(removed @ StoreError::Removed { .. }) => Err(removed),
+            _ => Err(error),
+        },
+    }
+}
+
+/// Gives signs of life until that is impossible.
+async fn live(
+    store: &Store,
+    mut process: ProcessRecord,
+    closing: &Closing,
+    every: Duration,
+    now: impl Fn() -> i64,
+) -> StoreError {
+    loop {
+        match sign_of_life(store, &mut process, closing, now()).await {
+            Err(error) if !error.is_transient() => return error,
+            // A full disk or a busy database: the next one may come through.
+            _ => tokio::time::sleep(every).await,
+        }
+    }
+}
+
+async fn sign_of_life(
+    store: &Store,
+    process: &mut ProcessRecord,
+    closing: &Closing,
+    now: i64,
+) -> Result<(), StoreError> {
+    let others = store.processes(None).await?;
+    if others.iter().any(|other| other.replaces(process)) {
+        closing.stopping.store(true, Ordering::Relaxed);
+    }
+    let led = others.iter().any(ProcessRecord::is_leading);
+    closing.no_more_jobs.store(!led, Ordering::Relaxed);
+    if !led {
+        // Nobody else does.
+        store.release_leases_of_gone_processes(now).await?;
+    }
+    process.last_seen = now;
+    if closing.stopping.load(Ordering::Relaxed) {
+        process.state = "stopping".to_owned();
+    }
+    store.upsert_process(process).await
+}
+
+async fn fail(
+    store: &Store,
+    mut process: ProcessRecord,
+    error: &StoreError,
+    now: i64,
+) -> Result<(), StoreError> {
+    store.release_all(&process.id, now).await?;
+    process.last_seen = now;
+    process.state = "failed".to_owned();
+    process.remark = error.to_string();
+    store.upsert_process(&process).await
+}

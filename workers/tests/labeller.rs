@@ -1,0 +1,297 @@
+//! Labellers: leases that last as long as the label takes, and processes that outlive their orchestrator.
+
+#[path = "../../store/tests/common/mod.rs"]
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
+use common::*;
+use store::{
+    JobState, LabelRecord, ProcessRecord, Standing, Store, StoreError, this_host, unix_milliseconds,
+};
+use tokio::task::JoinHandle;
+use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Timing, run, serve};
+
+/// A method that begins labels at once and ends them only while it is open.
+#[derive(Clone, Default)]
+struct Gate {
+    open: Arc<AtomicBool>,
+    begun: Arc<AtomicUsize>,
+}
+
+impl Gate {
+    fn opened() -> Self {
+        let gate = Self::default();
+        gate.open.store(true, Ordering::Relaxed);
+        gate
+    }
+
+    fn method(&self) -> ReferenceMethod {
+        ReferenceMethod::new(Box::new(self.clone()))
+    }
+
+    async fn wait_for_labels(&self, begun: usize) {
+        until("no label is begun", async || self.begun.load(Ordering::Relaxed) >= begun).await;
+    }
+}
+
+/// No runtime waits for a label that never ends.
+impl Drop for Gate {
+    fn drop(&mut self) {
+        self.open.store(true, Ordering::Relaxed);
+    }
+}
+
+impl Potential for Gate {
+    fn cutoff(&self) -> f64 {
+        1.0
+    }
+
+    fn species(&self) -> &[Species] {
+        &[]
+    }
+
+    fn evaluate(
+        &mut self,
+        structure: &Structure,
+        _: &NeighbourList,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        self.begun.fetch_add(1, Ordering::Relaxed);
+        while !self.open.load(Ordering::Relaxed) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        out.reset(structure.len());
+        Ok(())
+    }
+}
+
+async fn until(or: &str, condition: impl AsyncFn() -> bool) {
+    let begun = Instant::now();
+    while !condition().await {
+        assert!(begun.elapsed() < Duration::from_secs(60), "{or}");
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+fn settings(holder: &str) -> LabellerSettings {
+    LabellerSettings {
+        holder: holder.into(),
+        protocol: protocol("dft"),
+        attempts: 3,
+        largest_force: 100.0,
+        timing: Timing {
+            lease: Duration::from_secs(1),
+            idle: Duration::from_millis(5),
+            sign_of_life: Duration::from_millis(20),
+        },
+    }
+}
+
+/// A living process (this one).
+fn living(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
+    let process = ProcessRecord::new(kind, number, std::process::id(), unix_milliseconds());
+    ProcessRecord { id: id.into(), ..process }
+}
+
+/// Its number belongs to another process by now.
+fn gone(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
+    let living = living(id, kind, number);
+    ProcessRecord { birth: format!("{}0", living.birth), ..living }
+}
+
+struct Labeller {
+    closing: Arc<Closing>,
+    task: JoinHandle<Result<(), StoreError>>,
+}
+
+impl Labeller {
+    /// A labeller "l" with number 0 and its own connections, as a process has them.
+    async fn serving(directory: &Path, gate: &Gate) -> Self {
+        Self::with(directory, gate, settings("")).await
+    }
+
+    async fn with(directory: &Path, gate: &Gate, settings: LabellerSettings) -> Self {
+        let store = Store::open(directory).await.unwrap();
+        let (method, closing) = (gate.method(), Arc::new(Closing::default()));
+        let (process, asked) = (living("l", ProcessRecord::LABELLER, Some(0)), Arc::clone(&closing));
+        let task = async move { serve(store, method, settings, process, &asked, unix_milliseconds).await };
+        Self { closing, task: tokio::spawn(task) }
+    }
+
+    async fn ended(self) -> Result<(), StoreError> {
+        let ended = tokio::time::timeout(Duration::from_secs(60), self.task).await;
+        ended.expect("the labeller does not go home").unwrap()
+    }
+}
+
+async fn number(store: &Store, state: JobState) -> usize {
+    store.queue_list(Some(state), 100, 0).await.unwrap().len()
+}
+
+async fn names(store: &Store) -> Vec<String> {
+    store.processes(None).await.unwrap().into_iter().map(|process| process.id).collect()
+}
+
+async fn history(store: &Store) -> Vec<LabelRecord> {
+    let structure = store.known_hashes().await.unwrap()[0];
+    store.label_history(structure, protocol("dft").hash).await.unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_lease_lasts_as_long_as_the_label_takes() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let candidates = accept(&store, 1).await;
+    let gate = Gate::default();
+    let closing = Closing { no_more_jobs: true.into(), ..Closing::default() };
+    let (method, own, mut settings) = (gate.method(), store.clone(), settings("a/0"));
+    settings.timing.lease = Duration::from_secs(3);
+    let labeller = tokio::spawn(async move { run(own, method, settings, &closing, unix_milliseconds).await });
+    gate.wait_for_labels(1).await;
+    let begun = Instant::now();
+    while begun.elapsed() < Duration::from_millis(4500) {
+        let now = unix_milliseconds();
+        assert!(store.lease(protocol("dft").hash, "b", now, 1, 3).await.unwrap().is_none());
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    gate.open.store(true, Ordering::Relaxed);
+    labeller.await.unwrap().unwrap();
+    let job = store.queue_show(&candidates[0]).await.unwrap();
+    assert_eq!((job.job.state, job.job.attempts), (JobState::Labelled, 1));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_result_whose_lease_was_lost_becomes_a_check() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 1).await;
+    let gate = Gate::default();
+    let labeller = Labeller::serving(directory.path(), &gate).await;
+    gate.wait_for_labels(1).await;
+    let now = unix_milliseconds();
+    store.release_stale_leases_of("l", now).await.unwrap();
+    let other = store.lease(protocol("dft").hash, "other", now, 600, 3).await.unwrap().unwrap();
+    store.complete(&other, &label(-1.0), now).await.unwrap();
+    // It has found out by now.
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    gate.open.store(true, Ordering::Relaxed);
+    labeller.ended().await.unwrap();
+    let history = history(&store).await;
+    let found: Vec<_> = history.iter().map(|record| (record.standing, record.label.energy)).collect();
+    assert_eq!(found, [(Standing::Label, -1.0), (Standing::Check, 0.0)]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_labeller_stays_while_an_orchestrator_lives_and_goes_when_it_is_gone() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    store.upsert_process(&living("o", ProcessRecord::ORCHESTRATOR, None)).await.unwrap();
+    let labeller = Labeller::serving(directory.path(), &Gate::opened()).await;
+    accept(&store, 2).await;
+    until("no label comes", async || number(&store, JobState::Labelled).await == 2).await;
+    let seen = async || store.processes(Some("labeller")).await.unwrap()[0].last_seen;
+    let first = seen().await;
+    until("no sign of life comes", async || seen().await > first).await;
+    assert!(!labeller.task.is_finished());
+    store.upsert_process(&gone("o", ProcessRecord::ORCHESTRATOR, None)).await.unwrap();
+    labeller.ended().await.unwrap();
+    assert_eq!(names(&store).await, ["o"]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn without_an_orchestrator_the_queue_is_emptied_first() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 4).await;
+    let lost = [gone("o", ProcessRecord::ORCHESTRATOR, None), gone("dead", ProcessRecord::LABELLER, Some(1))];
+    store.upsert_processes(&lost).await.unwrap();
+    // Longer than this test has time: they come back because their holders are gone.
+    for holder in ["dead", "o/0"] {
+        let now = unix_milliseconds();
+        store.lease(protocol("dft").hash, holder, now, 86_400, 3).await.unwrap().unwrap();
+    }
+    Labeller::serving(directory.path(), &Gate::opened()).await.ended().await.unwrap();
+    let jobs = store.queue_list(None, 10, 0).await.unwrap();
+    assert!(jobs.iter().all(|job| (job.state, job.failures) == (JobState::Labelled, 0)), "{jobs:?}");
+    assert!(!names(&store).await.contains(&"l".to_owned()));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_waits_for_the_label_in_hand_and_signs_of_life_go_on() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 2).await;
+    let gate = Gate::default();
+    let labeller = Labeller::serving(directory.path(), &gate).await;
+    gate.wait_for_labels(1).await;
+    labeller.closing.stopping.store(true, Ordering::Relaxed);
+    let own = async || store.processes(Some("labeller")).await.unwrap().remove(0);
+    until("nobody can see that it stops", async || own().await.state == "stopping").await;
+    let first = own().await.last_seen;
+    until("no sign of life comes", async || own().await.last_seen > first).await;
+    assert!(!labeller.task.is_finished());
+    gate.open.store(true, Ordering::Relaxed);
+    labeller.ended().await.unwrap();
+    let numbers = (number(&store, JobState::Labelled).await, number(&store, JobState::Queued).await);
+    assert_eq!((numbers, names(&store).await), ((1, 1), vec![]));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn of_two_labellers_with_one_number_the_earlier_goes_home() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    store.upsert_process(&living("o", ProcessRecord::ORCHESTRATOR, None)).await.unwrap();
+    let labeller = Labeller::serving(directory.path(), &Gate::opened()).await;
+    until("it is not known", async || names(&store).await.contains(&"l".to_owned())).await;
+    let newer = living("newer", ProcessRecord::LABELLER, Some(0));
+    let newer = ProcessRecord { started: newer.started + 1000, ..newer };
+    store.upsert_process(&ProcessRecord { number: Some(1), ..newer.clone() }).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    assert!(!labeller.task.is_finished(), "another number");
+    store.upsert_process(&newer).await.unwrap();
+    labeller.ended().await.unwrap();
+    assert_eq!(names(&store).await, ["o", "newer"]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_labeller_ends_when_its_campaign_was_deleted() {
+    for at_work in [false, true] {
+        let directory = tempfile::tempdir().unwrap();
+        let store = create(directory.path()).await;
+        store.upsert_process(&living("o", ProcessRecord::ORCHESTRATOR, None)).await.unwrap();
+        let gate = Gate::default();
+        let labeller = Labeller::serving(directory.path(), &gate).await;
+        if at_work {
+            accept(&store, 1).await;
+            gate.wait_for_labels(1).await;
+        }
+        until("it is not known", async || names(&store).await.contains(&"l".to_owned())).await;
+        fs::remove_dir_all(directory.path()).unwrap();
+        // Not even another campaign in the same place is its own.
+        fs::create_dir(directory.path()).unwrap();
+        let other = create(directory.path()).await;
+        let error = labeller.ended().await.unwrap_err();
+        assert!(matches!(error, StoreError::Removed { .. }), "{error}");
+        assert_eq!(names(&other).await, Vec::<String>::new());
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_ends_a_labeller_is_kept_in_its_record() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 1).await;
+    let wrong = LabellerSettings { protocol: protocol("unknown"), ..settings("") };
+    let labeller = Labeller::with(directory.path(), &Gate::opened(), wrong).await;
+    let error = labeller.ended().await.unwrap_err();
+    assert!(matches!(error, StoreError::UnknownProtocol(_)), "{error}");
+    let own = store.processes(Some("labeller")).await.unwrap().remove(0);
+    assert_eq!((own.state.as_str(), own.host), ("failed", this_host()));
+    assert!(own.remark.contains("no label protocol"), "{}", own.remark);
+}
