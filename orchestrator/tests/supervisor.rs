@@ -167,6 +167,22 @@ fn a_stop_terminates_and_then_kills() {
 }
 
 #[test]
+fn who_was_interrupted_by_others_is_started_again() {
+    let interrupted = Ending::Exit { code: 130, words: None };
+    let mut supervisor = started(1);
+    let ended = supervisor.ended(0, interrupted.clone(), s(0)).unwrap();
+    assert_eq!(ended.then, Standing::Pausing { left: s(1) });
+    supervisor.due(s(1));
+    supervisor.stop(s(1));
+    assert_eq!(supervisor.ended(0, crash(), s(1)).unwrap().then, Standing::GoneHome);
+    assert_eq!(status(&supervisor, 0, s(1)).last_failure, Some(crash()));
+    let mut supervisor = started(1);
+    supervisor.stop(s(1));
+    supervisor.ended(0, interrupted, s(1));
+    assert_eq!(status(&supervisor, 0, s(1)).last_failure, None, "as it was told");
+}
+
+#[test]
 fn a_child_that_cannot_be_started_counts_as_failed() {
     let mut supervisor = started(1);
     let reason = Ending::NotStarted("out of memory".to_owned());

@@ -68,7 +68,7 @@ impl Child {
 
     /// Decides what becomes of it without its process.
     pub fn leave(&mut self, ending: &Ending, limits: &Limits, stopping: bool, now: Duration) {
-        let failed = !ending.is_in_order() && !(stopping && ending.is_what_stop_asks_for());
+        let failed = !(ending.is_in_order() || stopping && ending.is_what_stop_asks_for());
         if failed {
             self.failures = self.failures.saturating_add(1);
             self.last_failure = Some(ending.clone());

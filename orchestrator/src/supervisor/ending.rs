@@ -8,7 +8,7 @@ use std::time::Duration;
 pub enum Ending {
     /// It left with an exit code.
     Exit {
-        /// 0 if it went home in order.
+        /// 0 if it went home; 130 or 143 if it was interrupted and left in order.
         code: i32,
         /// The last line that it wrote to its standard error.
         words: Option<String>,
@@ -40,7 +40,7 @@ impl Ending {
     /// way. Otherwise the end came from outside: a SIGKILL of the kernel that was out of memory, a user's SIGTERM.
     pub fn is_own_fault(&self) -> bool {
         match self {
-            Self::Exit { code, .. } => *code != 0,
+            Self::Exit { code, .. } => *code != 0 && !is_interrupted(*code),
             Self::Signal { signal, .. } => {
                 matches!(signal_name(*signal), "SIGSEGV" | "SIGABRT" | "SIGBUS" | "SIGILL" | "SIGFPE")
             }
@@ -51,8 +51,12 @@ impl Ending {
 
     /// Whether a process that was told to end by SIGTERM has done as it was told.
     pub(super) fn is_what_stop_asks_for(&self) -> bool {
-        matches!(self, Self::Signal { signal, .. } if signal_name(*signal) == "SIGTERM")
-            || matches!(self, Self::Unseen)
+        match self {
+            Self::Exit { code, .. } => is_interrupted(*code),
+            Self::Signal { signal, .. } => signal_name(*signal) == "SIGTERM",
+            // Of a process that is not our child nothing more can be known.
+            other => matches!(other, Self::Unseen),
+        }
     }
 }
 
@@ -81,6 +85,11 @@ impl fmt::Display for Ending {
             Self::Unseen => f.write_str("ended, it is not known how"),
         }
     }
+}
+
+/// Whether a process that caught SIGINT or SIGTERM says so by its exit code: 128 and the signal, as shells have it.
+fn is_interrupted(code: i32) -> bool {
+    matches!(code, 130 | 143)
 }
 
 /// Name of a signal, empty if it has none here.
@@ -124,7 +133,9 @@ mod tests {
             assert!(!signal(outside.as_raw()).is_own_fault(), "{outside:?}");
         }
         assert!(Ending::Exit { code: 2, words: None }.is_own_fault());
-        assert!(!Ending::Exit { code: 0, words: None }.is_own_fault());
+        for not_own in [0, 130, 143] {
+            assert!(!Ending::Exit { code: not_own, words: None }.is_own_fault(), "{not_own}");
+        }
         assert!(Ending::Silent(Duration::from_secs(1)).is_own_fault());
         assert!(!Ending::NotStarted("no memory".to_owned()).is_own_fault() && !Ending::Unseen.is_own_fault());
     }

@@ -1,0 +1,74 @@
+//! Processes on this host: started, listened to, waited for, and signalled.
+//!
+//! **The thread that starts a process must live as long as this one.** A child that ends with its parent
+//! ([`end_with_parent`]) does so when the *thread* that started it ends, so a thread of a pool will not do.
+//! [`Children`] starts processes where [`Children::next`] is awaited: that has to be the future that `block_on` runs on the
+//! main thread, not a spawned task.
+//!
+//! **A child that outlives its parent** ([`own_session`]) has nobody any more who reads its standard error: what it
+//! writes there fails from then on (`EPIPE`), and `eprintln!` panics of that. It has to use `writeln!` and let it fail.
+
+mod child_side;
+mod children;
+mod lines;
+mod process;
+mod signs;
+#[cfg(test)]
+mod tests;
+mod watch;
+
+use std::ffi::OsString;
+use std::io;
+use std::path::PathBuf;
+use std::process::Stdio;
+
+use tokio::process::{Child, Command};
+
+pub use child_side::{ParentGone, end_with_parent, own_session};
+pub use children::{Children, Event};
+pub use process::AdoptError;
+pub use signs::Signs;
+
+/// What to start.
+#[derive(Clone, Debug)]
+pub struct Launch {
+    program: PathBuf,
+    name: OsString,
+    arguments: Vec<OsString>,
+    setup: Vec<u8>,
+    own_group: bool,
+}
+
+impl Launch {
+    /// This program once more, the very file that runs now even if another has taken its place on the disk since. It
+    /// reads `setup` from its standard input up to the end.
+    ///
+    /// It has a process group of its own, so that Ctrl-C at the terminal reaches its parent only.
+    pub fn this_program(arguments: impl IntoIterator<Item = impl Into<OsString>>, setup: Vec<u8>) -> Self {
+        Self {
+            program: PathBuf::from("/proc/self/exe"),
+            // The name that this process was called by; people look for it in lists of processes.
+            name: std::env::args_os().next().unwrap_or_else(|| "calmwalk".into()),
+            arguments: arguments.into_iter().map(Into::into).collect(),
+            setup,
+            own_group: true,
+        }
+    }
+
+    /// Leaves it in the process group of its parent, as whoever calls [`own_session`] needs it: the leader of a group
+    /// cannot begin a session.
+    pub fn for_own_session(self) -> Self {
+        Self { own_group: false, ..self }
+    }
+
+    /// Starts it, and gives it away to be watched together with what it is to read.
+    fn start(self) -> io::Result<(Child, Vec<u8>)> {
+        let mut command = Command::new(&self.program);
+        command.arg0(&self.name).args(&self.arguments);
+        command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
+        if self.own_group {
+            command.process_group(0);
+        }
+        Ok((command.spawn()?, self.setup))
+    }
+}

@@ -1,0 +1,74 @@
+//! Signs of life, given from any thread for the price of storing a number.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+/// Where signs of life of the children are left; clones leave them at the same place. Nobody is woken by them: they are
+/// looked at before anything is decided.
+#[derive(Clone, Debug)]
+pub struct Signs {
+    begun: Instant,
+    children: Arc<[Sign]>,
+}
+
+#[derive(Debug, Default)]
+struct Sign {
+    /// When it was last heard, ns since the beginning and at least 1; 0 if not since the last look.
+    heard: AtomicU64,
+    useful: AtomicBool,
+}
+
+impl Signs {
+    pub(super) fn new(children: u32) -> Self {
+        Self { begun: Instant::now(), children: (0..children).map(|_| Sign::default()).collect() }
+    }
+
+    /// The child is alive.
+    pub fn heard(&self, number: u32) {
+        if let Some(sign) = self.sign(number) {
+            let now = u64::try_from(self.now().as_nanos()).unwrap_or(u64::MAX);
+            sign.heard.fetch_max(now.max(1), Ordering::Relaxed);
+        }
+    }
+
+    /// The child is alive and has delivered something.
+    pub fn useful(&self, number: u32) {
+        self.heard(number);
+        if let Some(sign) = self.sign(number) {
+            sign.useful.store(true, Ordering::Relaxed);
+        }
+    }
+
+    /// Time since the beginning.
+    pub(super) fn now(&self) -> Duration {
+        self.begun.elapsed()
+    }
+
+    /// The instant so long after the beginning, if there is one.
+    pub(super) fn instant(&self, since_beginning: Duration) -> Option<Instant> {
+        self.begun.checked_add(since_beginning)
+    }
+
+    /// When each child was last heard since the last look, and whether it was useful: number, time, useful.
+    pub(super) fn collect(&self) -> impl Iterator<Item = (u32, Duration, bool)> {
+        (0..).zip(self.children.iter()).filter_map(|(number, sign)| {
+            let useful = sign.useful.swap(false, Ordering::Relaxed);
+            match sign.heard.swap(0, Ordering::Relaxed) {
+                0 if !useful => None,
+                heard => Some((number, Duration::from_nanos(heard), useful)),
+            }
+        })
+    }
+
+    /// Forgets that a child was heard: it was the process before the one that begins now.
+    pub(super) fn begin(&self, number: u32) {
+        if let Some(sign) = self.sign(number) {
+            sign.heard.store(0, Ordering::Relaxed);
+        }
+    }
+
+    fn sign(&self, number: u32) -> Option<&Sign> {
+        self.children.get(usize::try_from(number).ok()?)
+    }
+}

@@ -1,0 +1,419 @@
+//! Real processes, small ones.
+
+use std::io::{Read, Write};
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use rustix::process::{Pid, Signal, getpgid, getpid, getsid, kill_process};
+use tokio::time::timeout;
+
+use super::*;
+use crate::supervisor::{Ended, Ending, Limits, Standing};
+
+/// Long enough for anything here on a busy machine.
+const LONG: Duration = Duration::from_secs(120);
+
+const LIMITS: Limits = Limits {
+    silence: LONG,
+    first_pause: Duration::from_millis(5),
+    longest_pause: Duration::from_millis(20),
+    restarts: 2,
+    grace: LONG,
+};
+
+const NO_RESTART: Limits = Limits { restarts: 0, ..LIMITS };
+
+impl Launch {
+    fn shell(script: &str) -> Self {
+        let program = Path::new("/bin/sh").to_owned();
+        Self { program, ..Self::this_program(["-c", script], Vec::new()) }
+    }
+}
+
+fn children(scripts: &'static [&'static str], limits: Limits) -> Children {
+    let launch = |number, _| Launch::shell(scripts[number as usize]);
+    Children::new(scripts.len() as u32, limits, launch)
+}
+
+async fn next(children: &mut Children) -> Event {
+    timeout(LONG, children.next()).await.expect("an event")
+}
+
+/// Everything that happens from here to the end; of each process nothing is left then.
+async fn rest(children: &mut Children) -> Vec<Event> {
+    let mut events = Vec::new();
+    loop {
+        match next(children).await {
+            Event::AllGone => break,
+            event => events.push(event),
+        }
+    }
+    for event in &events {
+        if let Event::Started { pid, .. } = event {
+            assert!(!Path::new(&format!("/proc/{pid}")).exists(), "process {pid} is left");
+        }
+    }
+    events
+}
+
+fn ends(events: &[Event]) -> Vec<(u32, &Ended)> {
+    let end = |event| match event {
+        &Event::Ended { number, ref ended } => Some((number, ended)),
+        _ => None,
+    };
+    events.iter().filter_map(end).collect()
+}
+
+fn lines(events: &[Event]) -> Vec<&str> {
+    let line = |event| match event {
+        &Event::Said { ref line, .. } => Some(line.as_str()),
+        _ => None,
+    };
+    events.iter().filter_map(line).collect()
+}
+
+fn exit(code: i32, words: Option<&str>) -> Ending {
+    Ending::Exit { code, words: words.map(str::to_owned) }
+}
+
+fn signal(pid: u32, signal: Signal) {
+    kill_process(Pid::from_raw(pid as i32).unwrap(), signal).unwrap();
+}
+
+/// Stops a process, and waits until it stands still: a SIGTERM that it gets at the same time would come first.
+async fn hold(pid: u32) {
+    signal(pid, Signal::STOP);
+    while !std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap().contains(") T ") {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+}
+
+#[tokio::test]
+async fn an_exit_code_comes_with_the_last_words() {
+    let mut children = children(&["echo first >&2; printf 'last words' >&2; exit 3"], NO_RESTART);
+    let events = rest(&mut children).await;
+    assert!(matches!(events[0], Event::Started { number: 0, incarnation: 1, .. }), "{events:?}");
+    assert_eq!(lines(&events), ["first", "last words"]);
+    let ended = Ended { incarnation: 1, ending: exit(3, Some("last words")), then: Standing::GivenUp };
+    assert_eq!(ends(&events), [(0, &ended)]);
+    assert_eq!(ended.ending.to_string(), "exit code 3: last words");
+    let nothing_more = timeout(Duration::from_millis(50), children.next()).await;
+    assert!(nothing_more.is_err(), "all gone is the end");
+}
+
+#[tokio::test]
+async fn a_setup_larger_than_a_pipe_arrives_whole() {
+    let numbers: Vec<String> = (0..100_000).map(|number| number.to_string()).collect();
+    let setup = numbers.join("\n").into_bytes();
+    let launch = move |_, _| Launch { setup: setup.clone(), ..Launch::shell("cat >&2") };
+    let mut children = Children::new(1, NO_RESTART, launch);
+    let mut found = Vec::new();
+    let ended = loop {
+        // Whoever waits may be called away at any time.
+        match timeout(Duration::from_micros(200), children.next()).await {
+            Ok(Event::Said { line, .. }) => found.push(line),
+            Ok(Event::Ended { ended, .. }) => break ended,
+            Ok(Event::Started { .. }) | Err(_) => {}
+            Ok(Event::AllGone) => panic!("without an end"),
+        }
+    };
+    assert_eq!(found, numbers);
+    assert_eq!((ended.ending, ended.then), (exit(0, Some("99999")), Standing::GoneHome));
+}
+
+#[tokio::test]
+async fn a_setup_that_nobody_reads_hinders_nobody() {
+    let launch = |_, _| Launch { setup: vec![b'x'; 1 << 20], ..Launch::shell("exit 5") };
+    let mut children = Children::new(1, NO_RESTART, launch);
+    assert_eq!(ends(&rest(&mut children).await)[0].1.ending, exit(5, None));
+}
+
+#[tokio::test]
+async fn what_fails_again_and_again_is_given_up_and_the_others_go_on() {
+    let mut children = children(&["echo no model >&2; exit 7", "exec sleep 1000"], LIMITS);
+    let (mut incarnations, mut pauses) = (Vec::new(), Vec::new());
+    loop {
+        match next(&mut children).await {
+            Event::Started { number: 0, incarnation, .. } => incarnations.push(incarnation),
+            Event::Ended { number, ended } => {
+                assert_eq!((number, ended.ending), (0, exit(7, Some("no model"))));
+                match ended.then {
+                    Standing::Pausing { left } => pauses.push(left.as_millis()),
+                    then => break assert_eq!(then, Standing::GivenUp),
+                }
+            }
+            Event::Started { .. } | Event::Said { .. } => {}
+            Event::AllGone => panic!("one is left"),
+        }
+    }
+    assert_eq!((incarnations, pauses), (vec![1, 2, 3], vec![5, 10]));
+    let status = children.status();
+    assert_eq!((status[0].standing, status[0].restarts), (Standing::GivenUp, 2));
+    assert_eq!(status[1].standing, Standing::Starting);
+    children.signs().heard(1);
+    assert_eq!(children.status()[1].standing, Standing::Running);
+    children.stop();
+    assert_eq!(ends(&rest(&mut children).await).len(), 1);
+    assert_eq!(children.status()[1].last_failure, None);
+}
+
+#[tokio::test]
+async fn a_delivery_before_the_end_begins_a_new_row() {
+    let mut children = children(&["echo done >&2; exit 1"], Limits { restarts: 1, ..LIMITS });
+    for _ in 0..5 {
+        loop {
+            match next(&mut children).await {
+                Event::Said { number, .. } => children.signs().useful(number),
+                Event::Ended { ended, .. } => {
+                    break assert!(matches!(ended.then, Standing::Pausing { .. }), "{ended:?}");
+                }
+                _ => {}
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_process_that_says_nothing_from_its_start_is_killed() {
+    let silence = Duration::from_millis(200);
+    let mut children = children(&["exec sleep 1000"], Limits { silence, ..NO_RESTART });
+    let events = rest(&mut children).await;
+    assert_eq!(ends(&events)[0].1.ending, Ending::Silent(silence));
+}
+
+#[tokio::test]
+async fn a_stopped_process_is_killed_and_started_again() {
+    let silence = Duration::from_secs(1);
+    let beat = "while :; do echo alive >&2; sleep 0.05; done";
+    let launch = move |_, _| Launch::shell(beat);
+    let mut children = Children::new(1, Limits { silence, ..LIMITS }, launch);
+    let (mut beats, mut first) = (0, 0);
+    loop {
+        match next(&mut children).await {
+            Event::Started { incarnation: 1, pid, .. } => first = pid,
+            Event::Started { incarnation, .. } => break assert_eq!(incarnation, 2),
+            Event::Said { .. } => {
+                beats += 1;
+                children.signs().heard(0);
+                // After more than the time of silence: it lives as long as it speaks.
+                if beats == 25 {
+                    signal(first, Signal::STOP);
+                }
+            }
+            Event::Ended { ended, .. } => {
+                assert!(beats >= 25, "killed while it spoke");
+                assert_eq!(ended.ending, Ending::Silent(silence));
+                assert!(!Path::new(&format!("/proc/{first}")).exists());
+            }
+            Event::AllGone => panic!("it is to be started again"),
+        }
+    }
+    children.stop();
+    rest(&mut children).await;
+}
+
+#[tokio::test]
+async fn a_stop_ends_those_that_obey_and_kills_those_that_do_not() {
+    const SCRIPTS: [&str; 3] = [
+        "trap 'exit 130' TERM; echo ready >&2; while :; do sleep 0.02; done",
+        "trap '' TERM; echo ready >&2; while :; do sleep 0.02; done",
+        "echo ready >&2; exec sleep 1000",
+    ];
+    let grace = Duration::from_millis(500);
+    let mut children = children(&SCRIPTS, Limits { grace, ..LIMITS });
+    let (mut ready, mut last) = (0, 0);
+    while ready < SCRIPTS.len() {
+        match next(&mut children).await {
+            Event::Started { number: 2, pid, .. } => last = pid,
+            event => ready += usize::from(matches!(event, Event::Said { .. })),
+        }
+    }
+    hold(last).await;
+    children.stop();
+    children.stop();
+    let events = rest(&mut children).await;
+    let mut ends = ends(&events);
+    ends.sort_by_key(|(number, _)| *number);
+    let endings: Vec<_> = ends.iter().map(|(_, ended)| ended.ending.clone()).collect();
+    let lingering = Ending::Lingering(grace);
+    assert_eq!(endings, [exit(130, Some("ready")), lingering.clone(), lingering]);
+    assert!(ends.iter().all(|(_, ended)| ended.then == Standing::GoneHome));
+}
+
+#[tokio::test]
+async fn a_death_by_signal_is_told() {
+    let mut children = children(&["kill -9 $$", "kill -SEGV $$"], NO_RESTART);
+    let events = rest(&mut children).await;
+    let mut told: Vec<_> =
+        ends(&events).iter().map(|(number, ended)| (*number, ended.ending.to_string())).collect();
+    told.sort();
+    assert_eq!(told[0].1, "killed by signal 9 (SIGKILL)");
+    assert_eq!(told[1].1, "killed by signal 11 (SIGSEGV)");
+}
+
+#[tokio::test]
+async fn what_a_process_leaves_behind_does_not_keep_it() {
+    // The one left behind holds the pipe of the standard error open.
+    let mut children = children(&["echo here >&2; sleep 20 & printf last >&2; exit 4"], NO_RESTART);
+    let begun = std::time::Instant::now();
+    let events = rest(&mut children).await;
+    assert_eq!(ends(&events)[0].1.ending, exit(4, Some("last")));
+    assert!(begun.elapsed() < Duration::from_secs(20), "waited for the wrong process");
+}
+
+#[tokio::test]
+async fn what_cannot_be_started_is_told() {
+    let launch = |_, _| Launch { program: "/no/such/program".into(), ..Launch::shell("") };
+    let mut children = Children::new(1, LIMITS, launch);
+    let events = rest(&mut children).await;
+    let ends = ends(&events);
+    assert_eq!((events.len(), ends.len()), (3, 3), "nothing but ends");
+    assert!(ends[0].1.ending.to_string().contains("No such file"), "{}", ends[0].1.ending);
+}
+
+/// A process that is nobody's child here.
+fn stranger() -> (u32, String) {
+    let script = "sleep 1000 <&- >&- 2>&- & echo $!";
+    let output = Command::new("/bin/sh").args(["-c", script]).output().unwrap();
+    let pid = String::from_utf8(output.stdout).unwrap().trim().parse().unwrap();
+    (pid, store::process_birth(pid).unwrap())
+}
+
+#[tokio::test]
+async fn an_adopted_process_is_watched_and_ended() {
+    let (pid, birth) = stranger();
+    let mut children = children(&["exit 0", "exit 0"], LIMITS);
+    children.adopt(1, pid, &birth).unwrap();
+    assert!(matches!(children.adopt(1, pid, &birth), Err(AdoptError::Taken { number: 1, .. })));
+    assert!(matches!(children.adopt(2, pid, &birth), Err(AdoptError::Taken { number: 2, .. })));
+    // The other one comes and goes meanwhile.
+    while !matches!(next(&mut children).await, Event::Ended { number: 0, .. }) {}
+    assert_eq!(children.status()[1].incarnation, 0);
+    children.stop();
+    let ended = Ended { incarnation: 0, ending: Ending::Unseen, then: Standing::GoneHome };
+    assert_eq!(ends(&rest(&mut children).await), [(1, &ended)]);
+}
+
+#[tokio::test]
+async fn an_adopted_process_that_dies_is_replaced() {
+    let (pid, birth) = stranger();
+    let mut children = children(&["exit 0"], LIMITS);
+    children.adopt(0, pid, &birth).unwrap();
+    signal(pid, Signal::KILL);
+    let events = rest(&mut children).await;
+    let ended = ends(&events);
+    assert_eq!((ended[0].1.incarnation, &ended[0].1.ending), (0, &Ending::Unseen));
+    assert_eq!((ended[1].1.incarnation, ended[1].1.then), (1, Standing::GoneHome));
+}
+
+#[tokio::test]
+async fn another_process_under_an_old_number_is_not_adopted() {
+    let own = std::process::id();
+    let mut children = children(&["exit 0"], LIMITS);
+    for (pid, birth) in [(own, "another/1"), (own, ""), (0, ""), (u32::MAX, ""), (i32::MAX as u32, "")] {
+        assert!(matches!(children.adopt(0, pid, birth), Err(AdoptError::Gone { .. })), "{pid}");
+    }
+    // Nothing came of it: the child is started as if nothing had been.
+    assert!(matches!(next(&mut children).await, Event::Started { incarnation: 1, .. }));
+    rest(&mut children).await;
+}
+
+/// The arguments with which this test program runs but one of its tests, one that is not run otherwise.
+fn only(test: &str) -> [String; 4] {
+    [format!("launcher::tests::{test}"), "--exact".into(), "--ignored".into(), "--nocapture".into()]
+}
+
+#[tokio::test]
+async fn the_program_starts_itself() {
+    let mut children = Children::new(1, NO_RESTART, |_, _| {
+        Launch::this_program(only("reads_its_setup"), b"the setup".to_vec())
+    });
+    let events = rest(&mut children).await;
+    assert_eq!(lines(&events), ["read: the setup"]);
+    assert_eq!(ends(&events)[0].1.then, Standing::GoneHome);
+}
+
+#[test]
+#[ignore = "runs in a process that another test starts"]
+fn reads_its_setup() {
+    let mut setup = String::new();
+    std::io::stdin().read_to_string(&mut setup).unwrap();
+    writeln!(std::io::stderr(), "read: {setup}").unwrap();
+}
+
+#[tokio::test]
+async fn groups_and_sessions_are_as_asked_for() {
+    let mut children = Children::new(2, LIMITS, |number, _| match number {
+        0 => Launch::this_program(only("waits"), b"in its parent's session".to_vec()),
+        _ => Launch::this_program(only("waits"), b"in its own".to_vec()).for_own_session(),
+    });
+    let (mut pids, mut ready) = ([None; 2], 0);
+    while ready < 2 {
+        match next(&mut children).await {
+            Event::Started { number, pid, .. } => pids[number as usize] = Pid::from_raw(pid as i32),
+            Event::Said { .. } => ready += 1,
+            event => panic!("{event:?}"),
+        }
+    }
+    assert_eq!(getpgid(pids[0]).unwrap(), pids[0].unwrap(), "Ctrl-C does not reach it");
+    assert_eq!(getsid(pids[0]).unwrap(), getsid(Some(getpid())).unwrap());
+    assert_eq!(getsid(pids[1]).unwrap(), pids[1].unwrap());
+    children.stop();
+    rest(&mut children).await;
+}
+
+#[test]
+#[ignore = "runs in a process that another test starts"]
+fn waits() {
+    let mut setup = String::new();
+    std::io::stdin().read_to_string(&mut setup).unwrap();
+    if setup == "in its own" {
+        own_session().unwrap();
+    }
+    writeln!(std::io::stderr(), "ready").unwrap();
+    std::thread::sleep(LONG);
+}
+
+/// Starts [`tied`] from a thread that ends when the process has tied itself, or has failed to.
+fn tied_to(parent: u32) -> (std::process::ExitStatus, String) {
+    let start = move || {
+        let mut command = Command::new("/proc/self/exe");
+        command.args(only("tied")).stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        child.stdin.take().unwrap().write_all(parent.to_string().as_bytes()).unwrap();
+        let mut said = [0; 4];
+        child.stderr.as_mut().unwrap().read_exact(&mut said).unwrap();
+        (child, String::from_utf8(said.to_vec()).unwrap())
+    };
+    let (mut child, said) = std::thread::spawn(start).join().unwrap();
+    (child.wait().unwrap(), said)
+}
+
+#[test]
+fn a_process_ends_with_the_thread_that_started_it() {
+    use std::os::unix::process::ExitStatusExt;
+    let (status, said) = tied_to(std::process::id());
+    assert_eq!((status.signal(), said.as_str()), (Some(9), "tied"));
+}
+
+#[test]
+fn a_process_without_its_parent_does_not_go_on() {
+    let (_, said) = tied_to(std::process::id() + 1);
+    assert_eq!(said, "gone");
+}
+
+#[test]
+#[ignore = "runs in a process that another test starts"]
+fn tied() {
+    let mut parent = String::new();
+    std::io::stdin().read_to_string(&mut parent).unwrap();
+    match end_with_parent(parent.parse().unwrap()) {
+        Ok(()) => {
+            write!(std::io::stderr(), "tied").unwrap();
+            std::thread::sleep(LONG);
+        }
+        Err(ParentGone::Other { .. }) => write!(std::io::stderr(), "gone").unwrap(),
+        Err(error) => panic!("{error}"),
+    }
+}
