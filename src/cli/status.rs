@@ -1,14 +1,16 @@
 //! `calmwalk status`
 
+mod processes;
+
 use std::io::{self, Write};
 
 use serde_json::Value;
-use store::{Candidates, Labels, Status as Standing, Store, WalkStatus, unix_milliseconds};
+use store::{Candidates, Labels, Status as Standing, Store, WalkStatus};
 
 use super::{CampaignDirectory, Ended, Failure, block_on};
 use crate::output::{Table, decimals, print, print_json};
 
-/// Walks shown unless all are asked for.
+/// Walks, and processes, shown unless all are asked for.
 const SHOWN: usize = 20;
 
 /// Show how a campaign stands
@@ -21,7 +23,7 @@ pub struct Status {
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Show every walk, not only 20 of them (JSON always has all)
+    /// Show every walk and process, not only 20 of them (JSON always has all)
     #[arg(long)]
     all: bool,
 }
@@ -63,7 +65,7 @@ fn write_status(
     let walks = &status.walks;
     let under_way = walks.iter().filter(|walk| is_under_way(walk)).count();
     writeln!(out, "campaign    {}, {} mode", campaign.id, campaign.mode)?;
-    writeln!(out, "state       {}", state(status))?;
+    writeln!(out, "state       {}", processes::state(status))?;
     writeln!(
         out,
         "walks       {under_way} under way, {} ended; round {}",
@@ -75,7 +77,7 @@ fn write_status(
     write_candidates(out, &status.candidates)?;
     write_labels(out, &status.labels, status.imported)?;
     write_walks(out, walks, all)?;
-    write_processes(out, status)
+    processes::write(out, &status.processes, all)
 }
 
 fn write_training(out: &mut dyn Write, training: &Value) -> io::Result<()> {
@@ -89,15 +91,6 @@ fn write_training(out: &mut dyn Write, training: &Value) -> io::Result<()> {
         )?;
     }
     Ok(())
-}
-
-fn state(status: &Standing) -> &'static str {
-    let alive = status.processes.iter().any(|process| process.state != "gone");
-    match (status.finished, alive) {
-        (true, _) => "finished",
-        (false, true) => "running",
-        (false, false) => "not running; the same calmwalk run goes on with it",
-    }
 }
 
 fn write_candidates(out: &mut dyn Write, candidates: &Candidates) -> io::Result<()> {
@@ -182,46 +175,4 @@ fn write_walks(out: &mut dyn Write, walks: &[WalkStatus], all: bool) -> io::Resu
         writeln!(out, "… and {} more walks: --all shows them", walks.len() - shown.len())?;
     }
     Ok(())
-}
-
-fn write_processes(out: &mut dyn Write, status: &Standing) -> io::Result<()> {
-    if status.processes.is_empty() {
-        return Ok(());
-    }
-    let now = unix_milliseconds();
-    let mut table = Table::new(&["process", "host", ">number", "state", ">started", ">last seen"]);
-    for process in &status.processes {
-        table.push(vec![
-            process.kind.clone(),
-            process.host.clone(),
-            process.pid.to_string(),
-            process.state.clone(),
-            ago(now - process.started),
-            ago(now - process.last_seen),
-        ]);
-    }
-    writeln!(out)?;
-    table.write(out)
-}
-
-/// A time that has passed, given in ms.
-fn ago(milliseconds: i64) -> String {
-    let seconds = milliseconds.max(0) / 1000;
-    match (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60, seconds % 60) {
-        (0, 0, 0, s) => format!("{s} s ago"),
-        (0, 0, m, s) => format!("{m} min {s} s ago"),
-        (0, h, m, _) => format!("{h} h {m} min ago"),
-        (d, h, ..) => format!("{d} d {h} h ago"),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn times_have_two_units() {
-        let times = [999, 61_000, 3_660_000, 90_000_000].map(ago);
-        assert_eq!(times, ["0 s ago", "1 min 1 s ago", "1 h 1 min ago", "1 d 1 h ago"]);
-    }
 }

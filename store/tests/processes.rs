@@ -143,10 +143,10 @@ async fn status_says_who_is_gone_and_who_was_given_up() {
     let states = async || -> Vec<String> {
         store.status().await.unwrap().processes.into_iter().map(|process| process.state).collect()
     };
-    assert_eq!(states().await, ["gone", "given up", "pausing", "running"]);
+    assert_eq!(states().await, ["running", "gone", "given up", "pausing"]);
     // Without its orchestrator nobody starts the third again.
     store.upsert_process(&gone("o", "orchestrator", None)).await.unwrap();
-    assert_eq!(states().await, ["gone", "given up", "gone", "gone"]);
+    assert_eq!(states().await, ["gone", "gone", "given up", "gone"]);
 }
 
 #[tokio::test]

@@ -16,7 +16,7 @@ const WALKS: &str =
     FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure ORDER BY walk";
 
 impl Store {
-    /// Everything at one instant. A process that is gone has the state `gone`, whatever was said of it before, unless
+    /// Everything at one instant. Processes are in order of kind and number. A process that is gone has the state `gone`, whatever was said of it before, unless
     /// it was `given up`, or is `pausing` and an orchestrator lives.
     pub async fn status(&self) -> Result<Status> {
         let mut transaction = self.readers.begin().await?;
@@ -79,9 +79,12 @@ fn labels(states: &[(String, u64)]) -> Labels {
     }
 }
 
-/// One that is gone has no other state, but for what the orchestrator says of those that it does not start again: they
+/// In order of kind and number. One that is gone has no other state, but for what the orchestrator says of those that it does not start again: they
 /// were given up, or their pause is not over.
 fn seen_from_here(mut processes: Vec<ProcessRecord>) -> Vec<ProcessRecord> {
+    let ranks = [ProcessRecord::ORCHESTRATOR, ProcessRecord::WALKER, ProcessRecord::LABELLER];
+    let rank = |kind: &str| ranks.iter().position(|k| *k == kind).unwrap_or(ranks.len());
+    processes.sort_by_key(|process| (rank(&process.kind), process.number));
     let led = processes.iter().any(ProcessRecord::is_leading);
     for process in processes.iter_mut().filter(|process| process.is_gone()) {
         let state = process.state.as_str();
