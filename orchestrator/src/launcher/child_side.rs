@@ -1,5 +1,8 @@
 //! What a started process does about the one that started it.
 
+use std::ffi::CStr;
+use std::io;
+
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal, setsid};
 
 /// Why a process cannot, or need not, go on with the one that started it.
@@ -27,7 +30,13 @@ pub fn end_with_parent(parent: u32) -> Result<(), ParentGone> {
 
 /// Takes this process out of its parent's session: neither Ctrl-C nor a closed terminal reaches it any more. It must have
 /// been started with [`super::Launch::for_own_session`].
-pub fn own_session() -> std::io::Result<()> {
+pub fn own_session() -> io::Result<()> {
     setsid()?;
     Ok(())
+}
+
+/// Gives the calling thread a name of at most 15 bytes; that of the main thread is the one under which `top` and `pgrep`
+/// know the process. Without it a process that was started by [`super::Launch::this_program`] is called `exe`.
+pub fn be_called(name: &CStr) -> io::Result<()> {
+    Ok(rustix::thread::set_name(name)?)
 }

@@ -24,9 +24,9 @@ use std::process::Stdio;
 
 use tokio::process::{Child, Command};
 
-pub use child_side::{ParentGone, end_with_parent, own_session};
+pub use child_side::{ParentGone, be_called, end_with_parent, own_session};
 pub use children::{Children, Event};
-pub use process::AdoptError;
+pub use process::{AdoptError, ask_to_end};
 pub use signs::Signs;
 
 /// What to start.

@@ -8,7 +8,7 @@ use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-/// Why a process was not adopted.
+/// Why a process that was started elsewhere cannot be had.
 #[derive(Debug, thiserror::Error)]
 pub enum AdoptError {
     /// No process has this number, or another one has it now.
@@ -27,8 +27,8 @@ pub enum AdoptError {
         /// The child.
         number: u32,
     },
-    /// The system refused to watch it.
-    #[error("process {pid} cannot be watched: {error}")]
+    /// The system refused.
+    #[error("process {pid} cannot be watched or signalled: {error}")]
     Refused {
         /// Its process number.
         pid: u32,
@@ -78,6 +78,13 @@ impl Process {
             Err(error) => Err(error.into()),
         }
     }
+}
+
+/// Asks the process `pid` that was born at `birth` ([`store::process_birth`]) to end in order (SIGTERM), and does not wait
+/// for it: a labeller of an earlier run, say, that cannot be adopted because it works to another protocol.
+pub fn ask_to_end(pid: u32, birth: &str) -> Result<(), AdoptError> {
+    let sent = Process::find(pid, birth)?.signal(Signal::TERM);
+    sent.map_err(|error| AdoptError::Refused { pid, error })
 }
 
 fn open(pid: u32) -> Result<OwnedFd, Errno> {

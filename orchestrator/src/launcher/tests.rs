@@ -58,19 +58,19 @@ async fn rest(children: &mut Children) -> Vec<Event> {
 }
 
 fn ends(events: &[Event]) -> Vec<(u32, &Ended)> {
-    let end = |event| match event {
-        &Event::Ended { number, ref ended } => Some((number, ended)),
+    let end = events.iter().filter_map(|event| match event {
+        Event::Ended { number, ended } => Some((*number, ended)),
         _ => None,
-    };
-    events.iter().filter_map(end).collect()
+    });
+    end.collect()
 }
 
 fn lines(events: &[Event]) -> Vec<&str> {
-    let line = |event| match event {
-        &Event::Said { ref line, .. } => Some(line.as_str()),
+    let lines = events.iter().filter_map(|event| match event {
+        Event::Said { line, .. } => Some(line.as_str()),
         _ => None,
-    };
-    events.iter().filter_map(line).collect()
+    });
+    lines.collect()
 }
 
 fn exit(code: i32, words: Option<&str>) -> Ending {
@@ -307,6 +307,27 @@ async fn an_adopted_process_that_dies_is_replaced() {
     assert_eq!((ended[1].1.incarnation, ended[1].1.then), (1, Standing::GoneHome));
 }
 
+#[test]
+fn a_stranger_is_asked_to_end() {
+    let (pid, birth) = stranger();
+    assert!(matches!(ask_to_end(pid, "another/1"), Err(AdoptError::Gone { .. })));
+    assert!(store::process_birth(pid).is_some());
+    ask_to_end(pid, &birth).unwrap();
+    let begun = std::time::Instant::now();
+    let lives =
+        || std::fs::read_to_string(format!("/proc/{pid}/stat")).is_ok_and(|stat| !stat.contains(") Z "));
+    while lives() {
+        assert!(begun.elapsed() < LONG, "it is still there");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+#[test]
+fn a_name_is_what_lists_of_processes_show() {
+    be_called(c"calm-walker").unwrap();
+    assert_eq!(std::fs::read_to_string("/proc/thread-self/comm").unwrap(), "calm-walker\n");
+}
+
 #[tokio::test]
 async fn another_process_under_an_old_number_is_not_adopted() {
     let own = std::process::id();
@@ -372,7 +393,7 @@ fn waits() {
         own_session().unwrap();
     }
     writeln!(std::io::stderr(), "ready").unwrap();
-    std::thread::sleep(LONG);
+    std::thread::sleep(if setup.is_empty() { Duration::ZERO } else { LONG });
 }
 
 /// Starts [`tied`] from a thread that ends when the process has tied itself, or has failed to.
@@ -408,7 +429,8 @@ fn a_process_without_its_parent_does_not_go_on() {
 fn tied() {
     let mut parent = String::new();
     std::io::stdin().read_to_string(&mut parent).unwrap();
-    match end_with_parent(parent.parse().unwrap()) {
+    let Ok(parent) = parent.parse() else { return };
+    match end_with_parent(parent) {
         Ok(()) => {
             write!(std::io::stderr(), "tied").unwrap();
             std::thread::sleep(LONG);
