@@ -7,28 +7,35 @@ const LONGEST: usize = 8192;
 #[derive(Debug, Default)]
 pub(super) struct Lines {
     bytes: Vec<u8>,
+    /// So many of them have been given away.
+    given: usize,
 }
 
 impl Lines {
     pub fn push(&mut self, bytes: &[u8]) {
+        self.bytes.drain(..self.given);
+        self.given = 0;
         self.bytes.extend_from_slice(bytes);
     }
 
     /// The next whole line, without its end.
     pub fn next_line(&mut self) -> Option<String> {
-        let window = &self.bytes[..self.bytes.len().min(LONGEST)];
+        let left = &self.bytes[self.given..];
+        let window = &left[..left.len().min(LONGEST)];
         let length = match window.iter().position(|byte| *byte == b'\n') {
             Some(end) => end + 1,
             None if window.len() == LONGEST => LONGEST,
             None => return None,
         };
-        Some(text(self.bytes.drain(..length).as_slice()))
+        self.given += length;
+        Some(text(&window[..length]))
     }
 
     /// What is left at the end, without an end of line.
     pub fn rest(&mut self) -> Option<String> {
-        let rest = std::mem::take(&mut self.bytes);
-        (!rest.is_empty()).then(|| text(&rest))
+        let rest = std::mem::take(self);
+        let rest = &rest.bytes[rest.given..];
+        (!rest.is_empty()).then(|| text(rest))
     }
 }
 

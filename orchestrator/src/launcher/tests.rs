@@ -263,6 +263,24 @@ async fn what_a_process_leaves_behind_does_not_keep_it() {
 }
 
 #[tokio::test]
+async fn last_words_wait_for_a_slow_listener() {
+    let mut children = children(&["seq 5000 >&2; echo the reason >&2; exit 4"], NO_RESTART);
+    let mut found = 0;
+    let ending = loop {
+        match next(&mut children).await {
+            Event::Said { .. } => found += 1,
+            Event::Ended { ended, .. } => break ended.ending,
+            event => assert!(matches!(event, Event::Started { .. })),
+        }
+        // It has ended long before everything is heard.
+        if found % 500 == 0 {
+            tokio::time::sleep(watch::LAST_WORDS).await;
+        }
+    };
+    assert_eq!((found, ending), (5001, exit(4, Some("the reason"))));
+}
+
+#[tokio::test]
 async fn what_cannot_be_started_is_told() {
     let launch = |_, _| Launch { program: "/no/such/program".into(), ..Launch::shell("") };
     let mut children = Children::new(1, LIMITS, launch);

@@ -16,7 +16,10 @@ use crate::supervisor::Ending;
 
 /// How long the last words of a process are waited for when it has ended. They are in the pipe already; only what it
 /// started itself and left behind can keep the pipe open.
-const LAST_WORDS: Duration = Duration::from_millis(100);
+pub(super) const LAST_WORDS: Duration = Duration::from_millis(100);
+
+/// No more than so many bytes are in a pipe, as Linux has it.
+const LARGEST_PIPE: usize = 1 << 20;
 
 /// What there is to tell of a process.
 #[derive(Debug)]
@@ -51,10 +54,10 @@ pub(super) async fn child(mut child: Child, setup: Vec<u8>, teller: Teller) {
             Some(line) = words.next() => teller.tell(News::Said(line)).await,
         }
     };
-    // Whatever came until the time is over has been told.
-    let _ = tokio::time::timeout(LAST_WORDS, words.tell_all(&teller)).await;
-    words.stderr = None;
-    words.tell_all(&teller).await;
+    words.read_last().await;
+    while let Some(line) = words.next().await {
+        teller.tell(News::Said(line)).await;
+    }
     teller.tell(News::Ended(ending(status, words.last))).await;
 }
 
@@ -94,14 +97,12 @@ impl Words {
     /// The next line; `None` when there will be no more. Dropped while it waits, it has lost nothing.
     async fn next(&mut self) -> Option<String> {
         let line = loop {
-            if let Some(line) = self.lines.next_line() {
-                break line;
-            }
-            let Some(stderr) = &mut self.stderr else { break self.lines.rest()? };
-            let mut bytes = [0; 4096];
-            match stderr.read(&mut bytes).await {
-                Ok(length) if length > 0 => self.lines.push(&bytes[..length]),
-                Ok(_) | Err(_) => self.stderr = None,
+            match self.lines.next_line() {
+                Some(line) => break line,
+                None if self.stderr.is_none() => break self.lines.rest()?,
+                None => {
+                    self.read().await;
+                }
             }
         };
         if says_why(&line) {
@@ -110,9 +111,31 @@ impl Words {
         Some(line)
     }
 
-    async fn tell_all(&mut self, teller: &Teller) {
-        while let Some(line) = self.next().await {
-            teller.tell(News::Said(line)).await;
+    /// Reads what is in the pipe when the process has ended, however slowly the lines are taken; nothing is read after it.
+    async fn read_last(&mut self) {
+        let all = async {
+            let mut left = LARGEST_PIPE;
+            while left > 0
+                && let Some(length) = self.read().await
+            {
+                left = left.saturating_sub(length);
+            }
+        };
+        // Whatever came until the time is over counts.
+        let _ = tokio::time::timeout(LAST_WORDS, all).await;
+        self.stderr = None;
+    }
+
+    /// Reads some bytes; `None` at the end.
+    async fn read(&mut self) -> Option<usize> {
+        let mut bytes = [0; 4096];
+        // An error is an end, too.
+        let length = self.stderr.as_mut()?.read(&mut bytes).await.unwrap_or(0);
+        if length == 0 {
+            self.stderr = None;
+            return None;
         }
+        self.lines.push(&bytes[..length]);
+        Some(length)
     }
 }
