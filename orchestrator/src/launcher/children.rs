@@ -178,7 +178,6 @@ impl Children {
     }
 
     fn start(&mut self, number: u32, incarnation: u32) -> io::Result<u32> {
-        self.signs.begin(number);
         let (mut child, setup) = (self.launch)(number, incarnation).start()?;
         let pid = child.id().ok_or_else(|| io::Error::other("it ended before it could be watched"))?;
         let process = Process::of_child(pid).inspect_err(|_| {

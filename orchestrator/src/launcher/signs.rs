@@ -61,13 +61,6 @@ impl Signs {
         })
     }
 
-    /// Forgets that a child was heard: it was the process before the one that begins now.
-    pub(super) fn begin(&self, number: u32) {
-        if let Some(sign) = self.sign(number) {
-            sign.heard.store(0, Ordering::Relaxed);
-        }
-    }
-
     fn sign(&self, number: u32) -> Option<&Sign> {
         self.children.get(usize::try_from(number).ok()?)
     }

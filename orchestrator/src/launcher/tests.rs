@@ -175,6 +175,31 @@ async fn a_delivery_before_the_end_begins_a_new_row() {
 }
 
 #[tokio::test]
+async fn a_delivery_that_nobody_has_looked_at_yet_counts() {
+    let directory = tempfile::tempdir().unwrap();
+    let go = directory.path().join("go");
+    let script = format!("cd {}; until rm go; do sleep 0.01; done 2>&-; exit 1", directory.path().display());
+    let launch = move |_, _| Launch::shell(&script);
+    let mut children = Children::new(1, Limits { restarts: 1, ..LIMITS }, launch);
+    // After a first failure without one, only a delivery keeps the next from being the last.
+    for delivers in [false, true, true] {
+        assert!(matches!(next(&mut children).await, Event::Started { .. }));
+        let signs = children.signs();
+        let deliver = async {
+            // The end is waited for by now.
+            tokio::time::sleep(Duration::from_millis(20)).await;
+            if delivers {
+                signs.useful(0);
+            }
+            std::fs::write(&go, "").unwrap();
+        };
+        let (event, ()) = tokio::join!(next(&mut children), deliver);
+        let Event::Ended { ended, .. } = event else { panic!("{event:?}") };
+        assert_eq!(ended.then, Standing::Pausing { left: LIMITS.first_pause });
+    }
+}
+
+#[tokio::test]
 async fn a_process_that_says_nothing_from_its_start_is_killed() {
     let silence = Duration::from_millis(200);
     let mut children = children(&["exec sleep 1000"], Limits { silence, ..NO_RESTART });
