@@ -1,0 +1,114 @@
+//! This test program as its own child.
+
+use std::io::{Read, Write};
+use std::process::Command;
+
+use rustix::process::{getpgid, getpid, getsid};
+
+use super::*;
+
+/// The arguments with which this test program runs but one of its tests, one that is not run otherwise.
+fn only(test: &str) -> [String; 4] {
+    [format!("launcher::tests::itself::{test}"), "--exact".into(), "--ignored".into(), "--nocapture".into()]
+}
+
+#[tokio::test]
+async fn the_program_starts_itself() {
+    let mut children = Children::new(1, NO_RESTART, |_, _| {
+        Launch::this_program(only("reads_its_setup"), b"the setup".to_vec())
+    });
+    let events = rest(&mut children).await;
+    assert_eq!(lines(&events), ["read: the setup"]);
+    assert_eq!(ends(&events)[0].1.then, Standing::GoneHome);
+}
+
+#[test]
+#[ignore = "runs in a process that another test starts"]
+fn reads_its_setup() {
+    let mut setup = String::new();
+    std::io::stdin().read_to_string(&mut setup).unwrap();
+    writeln!(std::io::stderr(), "read: {setup}").unwrap();
+}
+
+#[tokio::test]
+async fn groups_and_sessions_are_as_asked_for() {
+    let mut children = Children::new(2, LIMITS, |number, _| match number {
+        0 => Launch::this_program(only("waits"), b"in its parent's session".to_vec()),
+        _ => Launch::this_program(only("waits"), b"in its own".to_vec()).for_own_session(),
+    });
+    let (mut pids, mut ready) = ([None; 2], 0);
+    while ready < 2 {
+        match next(&mut children).await {
+            Event::Started { number, pid, .. } => pids[number as usize] = Pid::from_raw(pid as i32),
+            Event::Said { .. } => ready += 1,
+            event => panic!("{event:?}"),
+        }
+    }
+    assert_eq!(getpgid(pids[0]).unwrap(), pids[0].unwrap(), "Ctrl-C does not reach it");
+    assert_eq!(getsid(pids[0]).unwrap(), getsid(Some(getpid())).unwrap());
+    assert_eq!(getsid(pids[1]).unwrap(), pids[1].unwrap());
+    children.stop();
+    rest(&mut children).await;
+}
+
+#[test]
+#[ignore = "runs in a process that another test starts"]
+fn waits() {
+    let mut setup = String::new();
+    std::io::stdin().read_to_string(&mut setup).unwrap();
+    if setup == "in its own" {
+        own_session().unwrap();
+    }
+    writeln!(std::io::stderr(), "ready").unwrap();
+    std::thread::sleep(if setup.is_empty() { Duration::ZERO } else { LONG });
+}
+
+/// Starts [`tied`] from a thread that ends when the process has tied itself, or has failed to.
+fn tied_to(parent: u32) -> (std::process::ExitStatus, String) {
+    let start = move || {
+        let mut command = Command::new("/proc/self/exe");
+        command.args(only("tied")).stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        child.stdin.take().unwrap().write_all(parent.to_string().as_bytes()).unwrap();
+        let mut said = [0; 4];
+        child.stderr.as_mut().unwrap().read_exact(&mut said).unwrap();
+        (child, String::from_utf8(said.to_vec()).unwrap())
+    };
+    let (mut child, said) = std::thread::spawn(start).join().unwrap();
+    (child.wait().unwrap(), said)
+}
+
+#[test]
+fn a_process_ends_with_the_thread_that_started_it() {
+    use std::os::unix::process::ExitStatusExt;
+    let (status, said) = tied_to(std::process::id());
+    assert_eq!((status.signal(), said.as_str()), (Some(9), "tied"));
+}
+
+#[test]
+fn a_process_without_its_parent_does_not_go_on() {
+    let (_, said) = tied_to(std::process::id() + 1);
+    assert_eq!(said, "gone");
+}
+
+#[test]
+#[ignore = "runs in a process that another test starts"]
+fn tied() {
+    let mut parent = String::new();
+    std::io::stdin().read_to_string(&mut parent).unwrap();
+    let Ok(parent) = parent.parse() else { return };
+    match end_with_parent(parent) {
+        Ok(()) => {
+            write!(std::io::stderr(), "tied").unwrap();
+            std::thread::sleep(LONG);
+        }
+        Err(ParentGone::Other { .. }) => write!(std::io::stderr(), "gone").unwrap(),
+        Err(error) => panic!("{error}"),
+    }
+}
+
+#[test]
+fn a_name_is_what_lists_of_processes_show() {
+    be_called(c"calm-walker").unwrap();
+    assert_eq!(std::fs::read_to_string("/proc/thread-self/comm").unwrap(), "calm-walker\n");
+}
