@@ -97,14 +97,18 @@ pub enum ControlError {
 #[derive(Serialize, Deserialize)]
 enum Encoded<'a> {
     Assignment(Cow<'a, Assignment>),
-    Report {
-        walk: WalkId,
-        turn: u64,
-        outcome: EncodedOutcome<'a>,
-        checkpoint: &'a [u8],
-        progress: Cow<'a, Progress>,
-    },
+    Report(#[serde(borrow)] EncodedReport<'a>),
     Progress(WalkId, Cow<'a, Progress>),
+}
+
+/// A [`Report`] with the name of the candidate in its place.
+#[derive(Serialize, Deserialize)]
+pub(crate) struct EncodedReport<'a> {
+    walk: WalkId,
+    turn: u64,
+    outcome: EncodedOutcome<'a>,
+    checkpoint: &'a [u8],
+    progress: Cow<'a, Progress>,
 }
 
 /// An [`Outcome`] with the name of the candidate in its place.
@@ -121,22 +125,43 @@ pub fn encode(message: &Message) -> Vec<u8> {
     let encoded = match message {
         Message::Assignment(assignment) => Encoded::Assignment(Cow::Borrowed(assignment)),
         Message::Progress(walk, progress) => Encoded::Progress(*walk, Cow::Borrowed(progress)),
-        Message::Report(report) => Encoded::Report {
-            walk: report.walk,
-            turn: report.turn,
-            outcome: match &report.outcome {
-                Outcome::Candidate(block) => EncodedOutcome::Candidate(block.view().id()),
-                Outcome::Turn => EncodedOutcome::Turn,
-                Outcome::Paused => EncodedOutcome::Paused,
-                Outcome::Ended(end) => EncodedOutcome::Ended(Cow::Borrowed(end)),
-            },
-            checkpoint: &report.checkpoint,
-            progress: Cow::Borrowed(&report.progress),
-        },
+        Message::Report(report) => Encoded::Report(EncodedReport::new(report, |block| block.view().id())),
     };
-    let content = postcard::to_stdvec(&encoded).expect("plain data is encoded into memory");
+    seal(&encoded)
+}
+
+impl<'a> EncodedReport<'a> {
+    /// The report whose candidate has the name that `id` gives.
+    pub(crate) fn new<C>(report: &'a Report<C>, id: impl FnOnce(&C) -> CandidateId) -> Self {
+        let outcome = match &report.outcome {
+            Outcome::Candidate(candidate) => EncodedOutcome::Candidate(id(candidate)),
+            Outcome::Turn => EncodedOutcome::Turn,
+            Outcome::Paused => EncodedOutcome::Paused,
+            Outcome::Ended(end) => EncodedOutcome::Ended(Cow::Borrowed(end)),
+        };
+        let (checkpoint, progress) = (report.checkpoint.as_slice(), Cow::Borrowed(&report.progress));
+        Self { walk: report.walk, turn: report.turn, outcome, checkpoint, progress }
+    }
+
+    /// The report with the candidate that came beside it.
+    pub(crate) fn complete(self, candidate: Option<CandidateBlock>) -> Result<Report, ControlError> {
+        let Self { walk, turn, outcome, checkpoint, progress } = self;
+        let outcome = checked_outcome(walk, outcome, candidate)?;
+        Ok(Report { walk, turn, outcome, checkpoint: checkpoint.to_vec(), progress: progress.into_owned() })
+    }
+}
+
+/// Encodes plain data and puts the fixed part before it.
+pub(crate) fn seal(content: &impl Serialize) -> Vec<u8> {
+    let content = postcard::to_stdvec(content).expect("plain data is encoded into memory");
     let checksum = crc32fast::hash(&content).to_le_bytes();
     [MAGIC.as_slice(), &[VERSION], &checksum, &content].concat()
+}
+
+/// Checks the fixed part and decodes what is behind it.
+pub(crate) fn unseal<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, ControlError> {
+    let (message, rest) = postcard::take_from_bytes(content(bytes)?)?;
+    if rest.is_empty() { Ok(message) } else { Err(ControlError::Trailing(rest.len())) }
 }
 
 /// Decodes a message and checks all of it; `candidate` is the block that came beside it, if one did.
@@ -145,20 +170,12 @@ pub fn encode(message: &Message) -> Vec<u8> {
 /// Other, damaged or left-over bytes; an assignment that cannot be worked on; a report without the candidate that it
 /// names, or with another.
 pub fn decode(bytes: &[u8], candidate: Option<CandidateBlock>) -> Result<Message, ControlError> {
-    let (encoded, rest) = postcard::take_from_bytes(content(bytes)?)?;
-    if !rest.is_empty() {
-        return Err(ControlError::Trailing(rest.len()));
-    }
-    match encoded {
+    match unseal(bytes)? {
         Encoded::Assignment(assignment) => {
             checked_assignment(assignment.into_owned()).map(Message::Assignment)
         }
         Encoded::Progress(walk, progress) => Ok(Message::Progress(walk, progress.into_owned())),
-        Encoded::Report { walk, turn, outcome, checkpoint, progress } => {
-            let outcome = checked_outcome(walk, outcome, candidate)?;
-            let (checkpoint, progress) = (checkpoint.to_vec(), progress.into_owned());
-            Ok(Message::Report(Report { walk, turn, outcome, checkpoint, progress }))
-        }
+        Encoded::Report(report) => report.complete(candidate).map(Message::Report),
     }
 }
 
@@ -178,7 +195,8 @@ fn content(bytes: &[u8]) -> Result<&[u8], ControlError> {
     if found == expected { Ok(content) } else { Err(ControlError::Checksum { found, expected }) }
 }
 
-fn checked_assignment(assignment: Assignment) -> Result<Assignment, ControlError> {
+/// An assignment that can be worked on.
+pub(crate) fn checked_assignment(assignment: Assignment) -> Result<Assignment, ControlError> {
     let Assignment { walk, origin, ref wanted, ref seed_structure, .. } = assignment;
     seed_structure.validate().map_err(|source| ControlError::SeedStructure { walk, source })?;
     let wrong = |expected| Err(ControlError::Wanted { walk, origin, wanted: wanted.clone(), expected });

@@ -4,7 +4,9 @@
 pub mod block;
 pub mod control;
 pub mod ids;
+pub mod ipc;
 pub mod messages;
+pub mod place;
 pub mod transport;
 
 pub use block::{BlockError, Candidate, CandidateBlock, CandidateView};

@@ -1,0 +1,204 @@
+//! How iceoryx2 is set up. Nothing is left to its defaults that loses messages, blocks on a dead process, or reaches
+//! beyond the campaign's place: the creator of a service sets every limit.
+
+use std::path::Path;
+
+use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::config::Config;
+use iceoryx2::node::{Node, NodeBuilder};
+use iceoryx2::port::client::Client;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::server::Server;
+use iceoryx2::prelude::{Alignment, AllocationStrategy, BackpressureStrategy, FileName, SignalHandlingMode};
+use iceoryx2::prelude::{SemanticString, ServiceName, ipc_threadsafe};
+use iceoryx2::service::port_factory::request_response;
+
+use super::message::Caller;
+use super::{IpcError, Sizes};
+
+pub(super) type Service = ipc_threadsafe::Service;
+pub(super) type ServerPort = Server<Service, [u8], (), [u8], ()>;
+pub(super) type ClientPort = Client<Service, [u8], (), [u8], ()>;
+pub(super) type Request = ActiveRequest<Service, [u8], (), [u8], ()>;
+type Requests = request_response::PortFactory<Service, [u8], (), [u8], ()>;
+
+/// Candidates of one walker that are read where the walker wrote them. Beyond this number (a reproducible round of many
+/// walks) the server copies them, which frees the walker's memory.
+pub(super) const IN_PLACE: usize = 4;
+/// The same of all walkers, the dead ones among them, whose memory lasts as long as a candidate in it.
+pub(super) const IN_PLACE_IN_ALL: usize = 256;
+/// Requests of one walker that the server may hold: the above, an offer, questions, progress.
+const ACTIVE_REQUESTS: usize = IN_PLACE + 4;
+/// Requests that a walker has memory for. More of them, or larger ones, make iceoryx2 add a segment.
+const REQUEST_BUFFERS: usize = ACTIVE_REQUESTS + 2;
+/// Answers to one walker that the server has memory for.
+const ANSWER_BUFFERS: usize = 3;
+/// Bytes that iceoryx2 uses for the connection with one walker, and for everything else, measured and doubled.
+const CONNECTION_BYTES: u64 = 1 << 18;
+const TABLE_BYTES: u64 = 4 << 20;
+
+/// Shared memory that the messages of a campaign need at most, bytes.
+pub fn space_needed(sizes: &Sizes) -> u64 {
+    let message = sizes.message_bytes as u64 + 4096;
+    let walker = (REQUEST_BUFFERS + ANSWER_BUFFERS) as u64 * message + CONNECTION_BYTES;
+    TABLE_BYTES + u64::from(sizes.walkers) * walker
+}
+
+/// Processes that may be connected: those at work, and dead ones until they are cleaned away.
+fn processes(sizes: &Sizes) -> usize {
+    2 * sizes.walkers as usize + 16
+}
+
+/// This process in the campaign's place. Dead nodes are cleaned away by the server alone, which knows who is dead.
+pub(super) fn node(directory: &Path, prefix: &str) -> Result<Node<Service>, IpcError> {
+    let root = directory.to_str().and_then(|path| iceoryx2::prelude::Path::new(path.as_bytes()).ok());
+    let prefix = FileName::new(prefix.as_bytes()).ok();
+    let (Some(root), Some(prefix)) = (root, prefix) else {
+        return Err(IpcError::new("name its files in", directory.display()));
+    };
+    let mut config = Config::default();
+    config.global.set_root_path(&root);
+    config.global.prefix = prefix;
+    // The path of a socket has at most 107 bytes.
+    config.global.service.event_connection_suffix =
+        FileName::new(b".e").map_err(|e| IpcError::new("name a socket", e))?;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    let messages = &mut config.defaults.request_response;
+    messages.server_expired_connection_buffer = IN_PLACE_IN_ALL;
+    messages.client_expired_connection_buffer = 4;
+    NodeBuilder::new()
+        .config(&config)
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create()
+        .map_err(|e| IpcError::new("begin", e))
+}
+
+fn name(text: &str) -> Result<ServiceName, IpcError> {
+    text.try_into().map_err(|e| IpcError::new("name a service", e))
+}
+
+/// The requests of a session; the server creates them.
+pub(super) fn create_requests(
+    node: &Node<Service>,
+    sizes: &Sizes,
+    session: u64,
+) -> Result<Requests, IpcError> {
+    let alignment = Alignment::new(8).expect("a power of two");
+    node.service_builder(&name(&requests_of(session))?)
+        .request_response::<[u8], [u8]>()
+        .request_payload_alignment(alignment)
+        .response_payload_alignment(alignment)
+        .enable_safe_overflow_for_requests(false)
+        .enable_safe_overflow_for_responses(false)
+        // So that progress is heard although nobody waits for an answer to it.
+        .enable_fire_and_forget_requests(true)
+        .max_active_requests_per_client(ACTIVE_REQUESTS)
+        .max_loaned_requests(1)
+        .max_response_buffer_size(1)
+        .max_borrowed_responses_per_pending_response(1)
+        .max_servers(1)
+        .max_clients(processes(sizes))
+        .max_nodes(processes(sizes))
+        .create()
+        .map_err(|e| IpcError::new("create the requests of the session", e))
+}
+
+pub(super) fn open_requests(node: &Node<Service>, session: u64) -> Result<Requests, IpcError> {
+    let alignment = Alignment::new(8).expect("a power of two");
+    node.service_builder(&name(&requests_of(session))?)
+        .request_response::<[u8], [u8]>()
+        .request_payload_alignment(alignment)
+        .response_payload_alignment(alignment)
+        .open()
+        .map_err(|e| IpcError::new("find the orchestrator: it has ended, or this walker is of another run", e))
+}
+
+/// A full buffer drops the answer, and the walker's next question brings it: the server waits for nobody.
+pub(super) fn server_port(requests: &Requests, sizes: &Sizes) -> Result<ServerPort, IpcError> {
+    let buffers = ANSWER_BUFFERS * sizes.walkers as usize + 1;
+    requests
+        .server_builder()
+        .backpressure_strategy(BackpressureStrategy::DiscardData)
+        .max_loaned_responses_per_request(1)
+        .override_response_preallocation(move |_| buffers)
+        .initial_max_slice_len(sizes.message_bytes)
+        .allocation_strategy(AllocationStrategy::PowerOfTwo)
+        .create()
+        .map_err(|e| IpcError::new("open the orchestrator's end", e))
+}
+
+/// A full buffer drops the request, which the walker sees and sends it again.
+pub(super) fn client_port(requests: &Requests, message_bytes: usize) -> Result<ClientPort, IpcError> {
+    requests
+        .client_builder()
+        .backpressure_strategy(BackpressureStrategy::DiscardData)
+        .override_request_preallocation(|_| REQUEST_BUFFERS)
+        .initial_max_slice_len(message_bytes)
+        .allocation_strategy(AllocationStrategy::PowerOfTwo)
+        .create()
+        .map_err(|e| IpcError::new("open a walker's end", e))
+}
+
+/// What wakes the server; the server creates it.
+pub(super) fn create_server_bell(
+    node: &Node<Service>,
+    sizes: &Sizes,
+    session: u64,
+) -> Result<Listener<Service>, IpcError> {
+    create_bell(node, &server_bell_of(session), processes(sizes))
+}
+
+pub(super) fn server_bell(node: &Node<Service>, session: u64) -> Result<Notifier<Service>, IpcError> {
+    open_bell(node, &server_bell_of(session))
+}
+
+/// What wakes a walker. Each process creates its own, so that one which dies while it does harms nobody else.
+pub(super) fn create_walker_bell(node: &Node<Service>, caller: Caller) -> Result<Listener<Service>, IpcError> {
+    create_bell(node, &walker_bell_of(caller), 4)
+}
+
+pub(super) fn walker_bell(node: &Node<Service>, caller: Caller) -> Result<Notifier<Service>, IpcError> {
+    open_bell(node, &walker_bell_of(caller))
+}
+
+fn create_bell(
+    node: &Node<Service>,
+    bell: &str,
+    processes: usize,
+) -> Result<Listener<Service>, IpcError> {
+    let events = node
+        .service_builder(&name(bell)?)
+        .event()
+        .max_listeners(1)
+        .max_notifiers(processes)
+        .max_nodes(processes)
+        .event_id_max_value(1)
+        .disable_deadline()
+        .disable_notifier_created_event()
+        .disable_notifier_dropped_event()
+        .disable_notifier_dead_event()
+        .create()
+        .map_err(|e| IpcError::new("create the events", e))?;
+    events.listener_builder().create().map_err(|e| IpcError::new("listen to events", e))
+}
+
+fn open_bell(node: &Node<Service>, bell: &str) -> Result<Notifier<Service>, IpcError> {
+    let events = node.service_builder(&name(bell)?).event().open();
+    let events = events.map_err(|e| IpcError::new("open the events", e))?;
+    events.notifier_builder().create().map_err(|e| IpcError::new("open the events", e))
+}
+
+fn requests_of(session: u64) -> String {
+    format!("{session:016x}/requests")
+}
+
+fn server_bell_of(session: u64) -> String {
+    format!("{session:016x}/server")
+}
+
+fn walker_bell_of(Caller { session, walker, incarnation }: Caller) -> String {
+    format!("{session:016x}/walker/{walker}/{incarnation}")
+}

@@ -1,0 +1,192 @@
+//! A walker's end.
+
+use std::borrow::Cow;
+use std::cell::Cell;
+use std::mem::MaybeUninit;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use iceoryx2::node::Node;
+use iceoryx2::pending_response::PendingResponse;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+
+use super::config::{self, ClientPort, Service};
+use super::message::{Answer, Caller, Decision, Letter, Words};
+use super::seam::Pins;
+use super::{Door, IpcError, frame};
+use crate::block::Candidate;
+use crate::control::{EncodedReport, seal};
+use crate::ids::WalkId;
+use crate::messages::{Outcome, Progress, Report};
+use crate::transport::{Transport, Work};
+
+/// A walker that waits for an answer asks this often.
+const ASK_EVERY: Duration = Duration::from_secs(2);
+/// It gives up when the orchestrator has been silent for this long: it is stopped or hangs …
+const PATIENCE: Duration = Duration::from_secs(600);
+/// … and earlier when the walker was asked to stop.
+const PATIENCE_WHEN_STOPPING: Duration = Duration::from_secs(20);
+/// An offer that the orchestrator says it never had is made this often.
+const OFFERS: u32 = 5;
+/// At most one report of progress in this time.
+const PROGRESS_EVERY: Duration = Duration::from_millis(100);
+
+type Pending = PendingResponse<Service, [u8], (), [u8], ()>;
+
+/// A walker's end of the transport.
+pub struct IpcWalker {
+    caller: Caller,
+    port: ClientPort,
+    bell: Listener<Service>,
+    server_bell: Notifier<Service>,
+    mixtures: Box<dyn Pins>,
+    stopping: Arc<AtomicBool>,
+    sequence: u64,
+    last_progress: Cell<Option<Instant>>,
+    failure: Option<IpcError>,
+    _node: Node<Service>,
+}
+
+impl IpcWalker {
+    /// Connects to the orchestrator. Setting `stopping` asks the walker to stop.
+    ///
+    /// # Errors
+    /// An orchestrator that is not there, or whatever iceoryx2 says.
+    pub fn connect(door: &Door, mixtures: Box<dyn Pins>, stopping: Arc<AtomicBool>) -> Result<Self, IpcError> {
+        let Door { caller, .. } = *door;
+        let node = config::node(&door.directory, &door.prefix)?;
+        let bell = config::create_walker_bell(&node, caller)?;
+        let server_bell = config::server_bell(&node, caller.session)?;
+        let port = config::client_port(&config::open_requests(&node, caller.session)?, door.message_bytes)?;
+        let (last_progress, failure) = (Cell::new(None), None);
+        Ok(Self {
+            caller,
+            port,
+            bell,
+            server_bell,
+            mixtures,
+            stopping,
+            sequence: 0,
+            last_progress,
+            failure,
+            _node: node,
+        })
+    }
+
+    /// Why the last exchange ended without a turn; none if the walker was sent home.
+    pub fn failure(&self) -> Option<&IpcError> {
+        self.failure.as_ref()
+    }
+
+    /// Offers the report until there is an answer.
+    fn converse(&mut self, report: Option<&Report<Candidate>>) -> Result<Option<Work>, IpcError> {
+        self.sequence += 1;
+        let (mut offer, mut question) = (self.offer(report)?, None);
+        let (mut offers, mut asked, mut heard) = (1, Instant::now(), Instant::now());
+        loop {
+            let decision = match self.answer(offer.as_ref())? {
+                None => self.answer(question.as_ref())?,
+                decision => decision,
+            };
+            match decision {
+                None => self.wait_for(asked, heard)?,
+                Some(Decision::Wait) => heard = Instant::now(),
+                Some(Decision::Home) => return Ok(None),
+                Some(Decision::Turn { mixture_version, assignment }) => {
+                    let mixture = self.mixtures.pin(mixture_version);
+                    let mixture = mixture.map_err(|e| IpcError::new("read the mixture", e))?;
+                    return Ok(Some(Work { assignment: assignment.into_owned(), mixture }));
+                }
+                Some(Decision::Unknown) if offers == OFFERS => return Err(IpcError::Refused { times: OFFERS }),
+                Some(Decision::Unknown) => {
+                    (offer, question) = (self.offer(report)?, None);
+                    (offers, heard) = (offers + 1, Instant::now());
+                }
+            }
+            if asked.elapsed() >= ASK_EVERY {
+                asked = Instant::now();
+                question = self.send(Words::Ask { sequence: self.sequence }, None)?;
+            }
+        }
+    }
+
+    /// Sleeps until the server rings or it is time to ask again. A signal may end it earlier.
+    fn wait_for(&self, asked: Instant, heard: Instant) -> Result<(), IpcError> {
+        let patience = if self.stopping() { PATIENCE_WHEN_STOPPING } else { PATIENCE };
+        if heard.elapsed() > patience {
+            return Err(IpcError::Silence { seconds: patience.as_secs() });
+        }
+        let due = ASK_EVERY.saturating_sub(asked.elapsed());
+        let _ = self.bell.timed_wait(|_| {}, due);
+        Ok(())
+    }
+
+    fn offer(&self, report: Option<&Report<Candidate>>) -> Result<Option<Pending>, IpcError> {
+        let candidate = report.and_then(|report| match &report.outcome {
+            Outcome::Candidate(candidate) => Some(candidate),
+            _ => None,
+        });
+        let report = report.map(|report| EncodedReport::new(report, |candidate| candidate.id));
+        self.send(Words::Offer { sequence: self.sequence, report }, candidate)
+    }
+
+    /// Sends a message and wakes the server; `None` if it could not be delivered.
+    fn send(&self, words: Words<'_>, candidate: Option<&Candidate>) -> Result<Option<Pending>, IpcError> {
+        let control = seal(&Letter { caller: self.caller, words });
+        let length = frame::length(control.len(), candidate);
+        let mut memory =
+            self.port.loan_slice_uninit(length).map_err(|e| IpcError::new("find memory for a message", e))?;
+        frame::fill(initialised(memory.payload_mut()), &control, candidate);
+        // SAFETY: every byte of shared memory has a value.
+        #[allow(unsafe_code)]
+        let memory = unsafe { memory.assume_init() };
+        let pending = memory.send().map_err(|e| IpcError::new("send a message", e))?;
+        if pending.number_of_server_connections() == 0 {
+            return Ok(None);
+        }
+        // A bell that cannot be rung because its buffer is full rings already.
+        let _ = self.server_bell.notify();
+        Ok(Some(pending))
+    }
+
+    /// What has been answered to the present offer.
+    fn answer(&self, pending: Option<&Pending>) -> Result<Option<Decision<'static>>, IpcError> {
+        let Some(pending) = pending else { return Ok(None) };
+        let received = pending.receive().map_err(|e| IpcError::new("receive an answer", e))?;
+        let Some(received) = received else { return Ok(None) };
+        let answer = Answer::decode(received.payload()).map_err(|e| IpcError::new("read an answer", e))?;
+        Ok((answer.sequence == self.sequence).then_some(answer.decision))
+    }
+}
+
+impl Transport for IpcWalker {
+    fn exchange(&mut self, report: Option<Report<Candidate>>) -> Option<Work> {
+        let answer = self.converse(report.as_ref());
+        answer.unwrap_or_else(|failure| {
+            self.failure = Some(failure);
+            None
+        })
+    }
+
+    fn progress(&self, walk: WalkId, progress: Progress) {
+        if self.last_progress.get().is_none_or(|last| last.elapsed() >= PROGRESS_EVERY) {
+            self.last_progress.set(Some(Instant::now()));
+            // May be lost: whoever watches can do without this one.
+            let _ = self.send(Words::Progress(walk, Cow::Owned(progress)), None);
+        }
+    }
+
+    fn stopping(&self) -> bool {
+        self.stopping.load(Ordering::Relaxed)
+    }
+}
+
+/// Lent memory, to be written to.
+#[allow(unsafe_code)]
+fn initialised(memory: &mut [MaybeUninit<u8>]) -> &mut [u8] {
+    // SAFETY: the memory is a file that is mapped: the kernel gave each byte its first value, a zero or what was
+    // written there before.
+    unsafe { &mut *(std::ptr::from_mut(memory) as *mut [u8]) }
+}
