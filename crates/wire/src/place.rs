@@ -292,6 +292,7 @@ fn io_error(what: &'static str, path: &Path) -> impl FnOnce(io::Error) -> PlaceE
 
 #[cfg(test)]
 mod tests {
+    use std::iter::repeat_n;
     use std::os::unix::fs::symlink;
 
     use super::*;
@@ -314,5 +315,14 @@ mod tests {
         symlink(&path, &link).unwrap();
         let message = make_private(&link, user()).unwrap_err().to_string();
         assert!(message.contains("no directory"), "{message}");
+    }
+
+    /// `sockaddr_un` has room for 108 bytes with the zero at the end.
+    #[test]
+    fn the_longest_path_of_a_socket_is_short_enough() {
+        let home = format!("{SHARED_MEMORY}/calmwalk-{}", u32::MAX);
+        let name: String = repeat_n('f', DIGITS).collect();
+        let path = format!("{home}/{name}/{}{}.e", Place::named(&name).prefix, u128::MAX);
+        assert_eq!(path.len(), 107);
     }
 }

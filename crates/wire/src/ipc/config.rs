@@ -113,7 +113,9 @@ pub(super) fn open_requests(node: &Node<Service>, session: u64) -> Result<Reques
         .request_payload_alignment(alignment)
         .response_payload_alignment(alignment)
         .open()
-        .map_err(|e| IpcError::new("find the orchestrator: it has ended, or this walker is of another run", e))
+        .map_err(|e| {
+            IpcError::new("find the orchestrator: it has ended, or this walker is of another run", e)
+        })
 }
 
 /// A full buffer drops the answer, and the walker's next question brings it: the server waits for nobody.
@@ -156,7 +158,10 @@ pub(super) fn server_bell(node: &Node<Service>, session: u64) -> Result<Notifier
 }
 
 /// What wakes a walker. Each process creates its own, so that one which dies while it does harms nobody else.
-pub(super) fn create_walker_bell(node: &Node<Service>, caller: Caller) -> Result<Listener<Service>, IpcError> {
+pub(super) fn create_walker_bell(
+    node: &Node<Service>,
+    caller: Caller,
+) -> Result<Listener<Service>, IpcError> {
     create_bell(node, &walker_bell_of(caller), 4)
 }
 
@@ -164,11 +169,7 @@ pub(super) fn walker_bell(node: &Node<Service>, caller: Caller) -> Result<Notifi
     open_bell(node, &walker_bell_of(caller))
 }
 
-fn create_bell(
-    node: &Node<Service>,
-    bell: &str,
-    processes: usize,
-) -> Result<Listener<Service>, IpcError> {
+fn create_bell(node: &Node<Service>, bell: &str, processes: usize) -> Result<Listener<Service>, IpcError> {
     let events = node
         .service_builder(&name(bell)?)
         .event()

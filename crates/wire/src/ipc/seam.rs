@@ -1,6 +1,6 @@
 //! Until the shared mixture is there.
-use std::sync::Arc;
 use calm::Mixture;
+use std::sync::Arc;
 
 /// The writer.
 pub trait Mixtures: Send {

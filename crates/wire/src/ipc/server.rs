@@ -126,7 +126,11 @@ impl Server {
                 biased;
                 order = self.orders.recv() => match order {
                     Some(Order::Expect { walker, incarnation }) => desk.expect(walker, incarnation),
-                    Some(Order::Gone { walker }) => desk.gone(walker),
+                    Some(Order::Gone { walker }) => {
+                        desk.gone(walker);
+                        // Lets go of the connection as well.
+                        more = take_in(&self.port, &mut desk, &mut heard)?;
+                    }
                     Some(Order::Close) | None => return Ok(()),
                 },
                 (walker, work) = poll_fn(|context| desk.poll_decision(context)) => desk.decided(walker, work)?,
@@ -169,7 +173,8 @@ fn take_in(
 #[allow(unsafe_code)]
 fn descriptor(bell: &Listener<Service>) -> io::Result<AsyncFd<OwnedFd>> {
     // SAFETY: the listener, which owns the descriptor, outlives this function; what is kept is a duplicate.
-    let duplicate = unsafe { BorrowedFd::borrow_raw(bell.file_descriptor().native_handle()) }.try_clone_to_owned()?;
+    let duplicate =
+        unsafe { BorrowedFd::borrow_raw(bell.file_descriptor().native_handle()) }.try_clone_to_owned()?;
     // SAFETY: the duplicate is owned by what is returned, which never gives it away, and is closed with it.
     Ok(unsafe { AsyncFd::register(duplicate) }?)
 }

@@ -54,7 +54,11 @@ impl IpcWalker {
     ///
     /// # Errors
     /// An orchestrator that is not there, or whatever iceoryx2 says.
-    pub fn connect(door: &Door, mixtures: Box<dyn Pins>, stopping: Arc<AtomicBool>) -> Result<Self, IpcError> {
+    pub fn connect(
+        door: &Door,
+        mixtures: Box<dyn Pins>,
+        stopping: Arc<AtomicBool>,
+    ) -> Result<Self, IpcError> {
         let Door { caller, .. } = *door;
         let node = config::node(&door.directory, &door.prefix)?;
         let bell = config::create_walker_bell(&node, caller)?;
@@ -99,7 +103,9 @@ impl IpcWalker {
                     let mixture = mixture.map_err(|e| IpcError::new("read the mixture", e))?;
                     return Ok(Some(Work { assignment: assignment.into_owned(), mixture }));
                 }
-                Some(Decision::Unknown) if offers == OFFERS => return Err(IpcError::Refused { times: OFFERS }),
+                Some(Decision::Unknown) if offers == OFFERS => {
+                    return Err(IpcError::Refused { times: OFFERS });
+                }
                 Some(Decision::Unknown) => {
                     (offer, question) = (self.offer(report)?, None);
                     (offers, heard) = (offers + 1, Instant::now());

@@ -1,0 +1,185 @@
+//! Round trip walker → server → walker: a walker's process offers candidates, a task that decides nothing answers.
+//! `cargo bench -p wire --bench round_trip`
+//!
+//! `encode` and `check` are measured apart, on the same candidate in private memory: the fill of the walker's memory
+//! with its checksums, and the checks of what arrived. What remains of the whole is the transport: loan, two wake-ups of
+//! sleeping processes, the answer. The whole is what a walker waits.
+
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use atoms::{Cell, Species, Structure};
+use calm::{Component, Mixture};
+use tokio::sync::mpsc;
+use wire::ipc::{Door, IpcWalker, Server, Sizes, seam, space_needed};
+use wire::messages::{Assignment, Outcome, Progress, Report};
+use wire::place::Place;
+use wire::transport::{Incoming, Transport, Work};
+use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, CandidateView, ContentHash, Origin, WalkId};
+
+const DOOR: &str = "CALMWALK_BENCH_DOOR";
+const TRIPS: usize = 2_000;
+/// Not counted: memory that is touched for the first time.
+const WARM_UP: usize = 100;
+
+/// Atoms and features: 1 kB to 4 MB. The fourth is a candidate as the paper has them.
+const SIZES: [(usize, usize); 6] = [(8, 4), (32, 24), (108, 32), (108, 131), (500, 131), (1000, 515)];
+
+fn main() {
+    match std::env::var(DOOR) {
+        Ok(door) => walk(&serde_json::from_str(&door).expect("a door")),
+        Err(_) => tokio::runtime::Runtime::new().expect("a runtime").block_on(orchestrate()),
+    }
+}
+
+/// The walker's process: all sizes one after the other.
+fn walk(door: &Door) {
+    let mut walker =
+        IpcWalker::connect(door, Box::new(One), Arc::new(AtomicBool::new(false))).expect("an orchestrator");
+    walker.exchange(None).expect("a turn");
+    println!("    bytes   whole µs (99 %)     encode   check   transport µs (99 %)");
+    for (atoms, features) in SIZES {
+        let candidate = candidate(atoms, features);
+        let mut whole = Vec::with_capacity(TRIPS);
+        for trip in 0..WARM_UP + TRIPS {
+            let outcome = Outcome::Candidate(candidate.clone());
+            let checkpoint = vec![0; 200 * atoms];
+            let progress = Progress::default();
+            let report = Report { walk: WalkId(0), turn: trip as u64, outcome, checkpoint, progress };
+            let begin = Instant::now();
+            walker.exchange(Some(report)).expect("a turn");
+            if trip >= WARM_UP {
+                whole.push(begin.elapsed());
+            }
+        }
+        show(&candidate, whole);
+    }
+}
+
+fn show(candidate: &Candidate, whole: Vec<Duration>) {
+    let block = CandidateBlock::encode(candidate);
+    let mut words = vec![0_u64; candidate.encoded_len() / 8];
+    let out: &mut [u8] = zerocopy::IntoBytes::as_mut_bytes(words.as_mut_slice());
+    let encode = quantiles((0..TRIPS).map(|_| timed(|| candidate.encode_into(out))).collect());
+    let check = quantiles((0..TRIPS).map(|_| timed(|| drop(CandidateView::new(block.as_bytes())))).collect());
+    let whole = quantiles(whole);
+    let rest = |of: fn((f64, f64)) -> f64| of(whole) - encode.0 - check.0;
+    println!(
+        "{:9} {:8.1} ({:6.1})  {:8.1} {:8.1}  {:8.1} ({:6.1})",
+        block.as_bytes().len(),
+        whole.0,
+        whole.1,
+        encode.0,
+        check.0,
+        rest(|q| q.0),
+        rest(|q| q.1),
+    );
+}
+
+fn timed(work: impl FnOnce()) -> Duration {
+    let begin = Instant::now();
+    work();
+    begin.elapsed()
+}
+
+/// Median and 99th percentile, µs.
+fn quantiles(mut times: Vec<Duration>) -> (f64, f64) {
+    times.sort_unstable();
+    let at = |share: f64| times[(share * (times.len() - 1) as f64) as usize].as_secs_f64() * 1e6;
+    (at(0.5), at(0.99))
+}
+
+async fn orchestrate() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let place = Place::of(directory.path()).expect("a place");
+    let sizes = Sizes { walkers: 1, message_bytes: 5 << 20 };
+    place.prepare(space_needed(&sizes)).expect("enough shared memory");
+    let server = Server::open(&place, sizes, 1).expect("a transport");
+    let handle = server.handle();
+    handle.expect(0, 1);
+    let door = serde_json::to_string(&handle.door(0, 1)).expect("plain data");
+    let (to_reactor, mut incoming) = mpsc::channel(64);
+    let running = tokio::spawn(server.run(One, to_reactor, |_| {}));
+    let deciding = tokio::spawn(async move {
+        let mixture = Arc::new(mixture());
+        while let Some(incoming) = incoming.recv().await {
+            if let Incoming::Free { report, reply, .. } = incoming {
+                let atoms = report.as_ref().map_or(1, |report| report.checkpoint.len() / 200);
+                let _ =
+                    reply.send(Some(Work { assignment: assignment(atoms), mixture: Arc::clone(&mixture) }));
+            }
+        }
+    });
+    let this = std::env::current_exe().expect("this program");
+    let mut walker = Command::new(this).env(DOOR, door).stdin(Stdio::null()).spawn().expect("a process");
+    tokio::task::spawn_blocking(move || walker.wait()).await.expect("a wait").expect("a process");
+    handle.gone(0);
+    handle.close();
+    running.await.expect("a task").expect("a transport");
+    deciding.await.expect("a task");
+    println!("{:?}, {:?} removed", handle.traffic(), place.remove().expect("a place"));
+}
+
+fn structure(atoms: usize) -> Structure {
+    let positions = (0..atoms).map(|k| [4.0 * k as f64, 0.25, 0.5]).collect();
+    let cell = Cell([[4.0 * atoms as f64, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]]);
+    let species = vec![Species::from_atomic_number(13).expect("aluminium"); atoms];
+    Structure { species, positions, cell, periodic: [true; 3] }
+}
+
+/// The next turn, with a checkpoint of the usual size.
+fn assignment(atoms: usize) -> Assignment {
+    Assignment {
+        campaign: CampaignId([7; 16]),
+        walk: WalkId(0),
+        turn: 1,
+        origin: Origin::Biased,
+        random_walk: WalkId(0),
+        seed_structure: structure(atoms.max(1)),
+        checkpoint: Some(vec![1; 200 * atoms]),
+        verdict: None,
+        until: 1000,
+        wanted: Vec::new(),
+    }
+}
+
+fn candidate(atoms: usize, features: usize) -> Candidate {
+    let structure = structure(atoms);
+    let numbers = |count: usize| (0..count).map(|k| (k as f64).sin()).collect();
+    let content = ContentHash::of(&structure);
+    Candidate {
+        id: CandidateId { campaign: CampaignId([7; 16]), walk: WalkId(0), segment: 0, step: 1, content },
+        origin: Origin::Biased,
+        mixture_version: 1,
+        temperature: 300.0,
+        relative_volume: 1.0,
+        energy: -1.0,
+        virial: [[1.0; 3]; 3],
+        structure,
+        forces: vec![[0.5; 3]; atoms],
+        gamma: numbers(atoms),
+        gamma_nbr: numbers(atoms),
+        features: numbers(atoms * features),
+    }
+}
+
+fn mixture() -> Mixture {
+    Mixture::new(1, vec![vec![Arc::new(Component::unknown_element(2))]]).expect("a mixture")
+}
+
+struct One;
+
+impl seam::Mixtures for One {
+    fn publish(&mut self, _: &Arc<Mixture>) -> Result<(), String> {
+        Ok(())
+    }
+    fn release(&mut self, _: u32) {}
+}
+
+impl seam::Pins for One {
+    fn pin(&mut self, _: u64) -> Result<Arc<Mixture>, String> {
+        Ok(Arc::new(mixture()))
+    }
+}

@@ -1,0 +1,98 @@
+//! Campaigns beside each other, and what lies where.
+
+use std::fs;
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+
+use wire::place::{Place, PlaceError};
+
+use crate::desk::{Desk, files_of};
+use crate::process::Role;
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_campaigns_do_not_see_each_other() {
+    let directories = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+    let [mut here, mut there] =
+        directories.each_ref().map(|directory| Desk::open(directory.path(), 1, 1 << 16));
+    let mut walkers = [&here, &there].map(|desk| desk.start(0, 1, Role::Walker));
+    let (mut first, mut second) = (here.offer().await, there.offer().await);
+    for turn in 1..20 {
+        first = here.go_on(first, turn, (3, 4)).await;
+        second = there.go_on(second, turn + 100, (4, 3)).await;
+    }
+    // The end of one, with all that it has, is nothing to the other.
+    first.reply.send(None).unwrap();
+    assert!(walkers[0].wait().unwrap().success());
+    assert_eq!(here.handle.traffic().dropped, 0);
+    here.close().await;
+    second = there.go_on(second, 200, (4, 3)).await;
+    second.reply.send(None).unwrap();
+    assert!(walkers[1].wait().unwrap().success());
+    assert_eq!(there.handle.traffic().dropped, 0);
+    there.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn everything_is_the_users_alone_and_in_the_campaigns_place() {
+    let directory = tempfile::tempdir().unwrap();
+    let elsewhere = || ["/tmp/iceoryx2", "/dev/shm/iox2_"].map(|path| Path::new(path).exists());
+    let before = elsewhere();
+    let mut desk = Desk::open(directory.path(), 1, 1 << 16);
+    let mut walker = desk.start(0, 1, Role::Walker);
+    let offer = desk.offer().await;
+    let offer = desk.go_on(offer, 1, (3, 4)).await;
+
+    let place = desk.place.clone();
+    assert_eq!(place.campaign_directory(), Some(directory.path().canonicalize().unwrap().as_path()));
+    assert!(Place::all().unwrap().contains(&place));
+    let home = place.directory().parent().unwrap();
+    for directory in [home, place.directory()] {
+        assert_eq!(directory.metadata().unwrap().mode() & 0o777, 0o700, "{}", directory.display());
+    }
+    let segments: Vec<_> = files_of(&place).into_iter().filter(|name| !name.starts_with('/')).collect();
+    assert!(segments.len() > 8, "{segments:?}");
+    for name in segments {
+        let file = Path::new("/dev/shm").join(&name).symlink_metadata().unwrap();
+        assert_eq!(file.mode() & 0o077, 0, "{name} has mode {:o}", file.mode());
+    }
+    assert_eq!(elsewhere(), before);
+
+    offer.reply.send(None).unwrap();
+    assert!(walker.wait().unwrap().success());
+    desk.close().await;
+    assert!(!Place::all().unwrap().contains(&place));
+}
+
+#[test]
+fn too_little_space_is_said_before_anything_is_made() {
+    let directory = tempfile::tempdir().unwrap();
+    let place = Place::of(directory.path()).unwrap();
+    let error = place.prepare(u64::MAX).unwrap_err();
+    assert!(matches!(error, PlaceError::Space { needed: u64::MAX, free } if free > 0));
+    assert!(error.to_string().contains("enlarge /dev/shm"), "{error}");
+    assert_eq!(files_of(&place), Vec::<String>::new());
+}
+
+#[test]
+fn a_place_is_wiped_before_it_is_used_and_after() {
+    let directory = tempfile::tempdir().unwrap();
+    let place = Place::of(directory.path()).unwrap();
+    place.prepare(0).unwrap();
+    fs::create_dir(place.directory().join("deep")).unwrap();
+    fs::write(place.directory().join("deep/left"), [1; 10_000]).unwrap();
+    let segment = Path::new("/dev/shm").join(format!("{}left", place.prefix()));
+    fs::write(&segment, [1; 5_000]).unwrap();
+
+    let removed = place.prepare(0).unwrap();
+    // With the file that names the campaign.
+    assert_eq!((removed.files, removed.bytes), (3, 12_288 + 8_192 + 4_096));
+    fs::write(&segment, b"again").unwrap();
+    fs::remove_dir_all(place.directory()).unwrap();
+    assert!(
+        Place::all().unwrap().iter().any(|other| other.directory() == place.directory()),
+        "without directory"
+    );
+    assert_eq!(place.remove().unwrap().files, 1);
+    assert_eq!(files_of(&place), Vec::<String>::new());
+    assert_eq!(place.remove().unwrap(), wire::place::Removed::default());
+}

@@ -1,0 +1,133 @@
+//! The other processes of these tests: this very binary, told by its environment what to be.
+
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::thread::sleep;
+use std::time::Duration;
+
+use atoms::{Cell, Species, Structure};
+use rustix::process::{Signal, set_parent_process_death_signal};
+use serde::{Deserialize, Serialize};
+use wire::ipc::{Door, IpcWalker};
+use wire::messages::{Assignment, Outcome, Report};
+use wire::transport::Transport;
+use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
+
+use crate::desk::{Desk, pins};
+
+const ROLE: &str = "CALMWALK_TEST_ROLE";
+
+/// What a process is to be.
+#[derive(Serialize, Deserialize)]
+pub enum Role {
+    /// Ends each turn with [`candidate`] until it is sent home.
+    Walker(Door),
+    /// Takes a turn and never ends it.
+    Stuck(Door),
+    /// An orchestrator of the campaign in that directory with a walker at work.
+    Orchestrator(String),
+}
+
+/// Begins a process.
+pub fn start(role: &Role) -> Child {
+    Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "process::child", "--ignored"])
+        .env(ROLE, serde_json::to_string(role).unwrap())
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap()
+}
+
+/// No test, but what [`start`] runs.
+#[test]
+#[ignore = "run by the others"]
+fn child() {
+    let Ok(role) = std::env::var(ROLE) else { return };
+    set_parent_process_death_signal(Some(Signal::KILL)).unwrap();
+    match serde_json::from_str(&role).unwrap() {
+        Role::Walker(door) => walk(&door, false),
+        Role::Stuck(door) => walk(&door, true),
+        Role::Orchestrator(directory) => orchestrate(&directory),
+    }
+}
+
+fn walk(door: &Door, stuck: bool) {
+    let mut walker = IpcWalker::connect(door, pins(), Arc::new(AtomicBool::new(false))).unwrap();
+    let mut report = None;
+    while let Some(work) = walker.exchange(report.take()) {
+        let Assignment { walk, turn, .. } = work.assignment;
+        let candidate = candidate(&work.assignment);
+        let (checkpoint, progress) = (turn.to_le_bytes().to_vec(), progress(turn));
+        walker.progress(walk, progress.clone());
+        assert_eq!(work.mixture.version(), turn, "the version of the turn");
+        if stuck {
+            sleep(Duration::MAX);
+        }
+        let outcome = Outcome::Candidate(candidate);
+        report = Some(Report { walk, turn, outcome, checkpoint, progress });
+    }
+    assert!(walker.failure().is_none(), "{:?}", walker.failure());
+}
+
+fn orchestrate(directory: &str) {
+    tokio::runtime::Runtime::new().unwrap().block_on(async {
+        let mut desk = Desk::open(Path::new(directory), 2, 1 << 16);
+        let _walker = desk.start(0, 1, Role::Walker);
+        let mut last = desk.offer().await;
+        for turn in 1.. {
+            last = desk.go_on(last, turn, (2, 3)).await;
+        }
+    });
+}
+
+pub fn progress(step: u64) -> wire::messages::Progress {
+    wire::messages::Progress { step, ..Default::default() }
+}
+
+/// A turn at whose end a candidate of so many atoms with so many features is wanted.
+pub fn assignment(walk: u32, turn: u64, (atoms, features): (usize, usize)) -> Assignment {
+    let walk = WalkId(walk);
+    Assignment {
+        campaign: CampaignId([7; 16]),
+        walk,
+        turn,
+        origin: Origin::Biased,
+        random_walk: walk,
+        seed_structure: structure(atoms),
+        checkpoint: Some(vec![turn as u8; 100]),
+        verdict: None,
+        until: features as u64,
+        wanted: Vec::new(),
+    }
+}
+
+fn structure(atoms: usize) -> Structure {
+    let positions = (0..atoms).map(|k| [4.0 * k as f64, 0.25, 0.5]).collect();
+    let cell = Cell([[4.0 * atoms as f64, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]]);
+    let species = vec![Species::from_atomic_number(13).unwrap(); atoms];
+    Structure { species, positions, cell, periodic: [true; 3] }
+}
+
+/// The candidate with which a walker of these tests ends this turn.
+pub fn candidate(assignment: &Assignment) -> Candidate {
+    let Assignment { campaign, walk, turn, ref seed_structure, until: features, .. } = *assignment;
+    let n = seed_structure.len();
+    let numbers = |count: usize, shift: f64| (0..count).map(|k| k as f64 + shift + turn as f64).collect();
+    let content = ContentHash::of(seed_structure);
+    Candidate {
+        id: CandidateId { campaign, walk, segment: 0, step: turn, content },
+        origin: Origin::Biased,
+        mixture_version: turn,
+        temperature: 300.0,
+        relative_volume: 1.0,
+        energy: turn as f64,
+        virial: [[1.0; 3]; 3],
+        structure: seed_structure.clone(),
+        forces: vec![[0.5; 3]; n],
+        gamma: numbers(n, 0.1),
+        gamma_nbr: numbers(n, 0.2),
+        features: numbers(n * features as usize, 0.3),
+    }
+}
