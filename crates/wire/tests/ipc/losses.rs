@@ -78,6 +78,8 @@ async fn a_killed_walker_is_replaced() {
     let offer = desk.offer().await;
     let offer = desk.go_on(offer, 1, (3, 4)).await;
     offer.reply.send(None).unwrap();
+    // Its candidate would keep the walker's memory.
+    drop(offer.report);
     assert!(walker.wait().unwrap().success());
     desk.handle.gone(0);
     assert!(matches!(desk.next().await, Incoming::Gone { walker: 0 }));
