@@ -13,8 +13,9 @@ use std::time::{Duration, Instant};
 use atoms::{Cell, Species, Structure};
 use calm::{Component, Mixture};
 use tokio::sync::mpsc;
-use wire::ipc::{Door, IpcWalker, Server, Sizes, seam, space_needed};
+use wire::ipc::{Door, IpcWalker, Server, Sizes, space_needed};
 use wire::messages::{Assignment, Outcome, Progress, Report};
+use wire::mixture::SharedMixture;
 use wire::place::Place;
 use wire::transport::{Incoming, Transport, Work};
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, CandidateView, ContentHash, Origin, WalkId};
@@ -37,7 +38,7 @@ fn main() {
 /// The walker's process: all sizes one after the other.
 fn walk(door: &Door) {
     let mut walker =
-        IpcWalker::connect(door, Box::new(One), Arc::new(AtomicBool::new(false))).expect("an orchestrator");
+        IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).expect("an orchestrator");
     walker.exchange(None).expect("a turn");
     println!("    bytes   whole µs (99 %)     encode   check   transport µs (99 %)");
     for (atoms, features) in SIZES {
@@ -96,12 +97,13 @@ async fn orchestrate() {
     let place = Place::of(directory.path()).expect("a place");
     let sizes = Sizes { walkers: 1, message_bytes: 5 << 20 };
     place.prepare(space_needed(&sizes)).expect("enough shared memory");
+    let mixtures = SharedMixture::create(&place.mixture(), &mixture(), 1).expect("a shared mixture");
     let server = Server::open(&place, sizes, 1).expect("a transport");
     let handle = server.handle();
     handle.expect(0, 1);
     let door = serde_json::to_string(&handle.door(0, 1)).expect("plain data");
     let (to_reactor, mut incoming) = mpsc::channel(64);
-    let running = tokio::spawn(server.run(One, to_reactor, |_| {}));
+    let running = tokio::spawn(server.run(mixtures, to_reactor, |_| {}));
     let deciding = tokio::spawn(async move {
         let mixture = Arc::new(mixture());
         while let Some(incoming) = incoming.recv().await {
@@ -167,19 +169,4 @@ fn candidate(atoms: usize, features: usize) -> Candidate {
 
 fn mixture() -> Mixture {
     Mixture::new(1, vec![vec![Arc::new(Component::unknown_element(2))]]).expect("a mixture")
-}
-
-struct One;
-
-impl seam::Mixtures for One {
-    fn publish(&mut self, _: &Arc<Mixture>) -> Result<(), String> {
-        Ok(())
-    }
-    fn release(&mut self, _: u32) {}
-}
-
-impl seam::Pins for One {
-    fn pin(&mut self, _: u64) -> Result<Arc<Mixture>, String> {
-        Ok(Arc::new(mixture()))
-    }
 }

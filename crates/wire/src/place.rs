@@ -20,6 +20,7 @@ use std::path::{Path, PathBuf};
 const SHARED_MEMORY: &str = "/dev/shm";
 /// The file that names the campaign's directory.
 const CAMPAIGN: &str = "campaign";
+const MIXTURE: &str = "mixture";
 /// Hexadecimal digits of a name.
 const DIGITS: usize = 16;
 
@@ -130,6 +131,11 @@ impl Place {
     /// The directory, for sockets, tables and the mixture.
     pub fn directory(&self) -> &Path {
         &self.directory
+    }
+
+    /// The file of the shared mixture.
+    pub fn mixture(&self) -> PathBuf {
+        self.directory.join(MIXTURE)
     }
 
     /// What the names of the campaign's segments in `/dev/shm` begin with.

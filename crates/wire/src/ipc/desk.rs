@@ -12,24 +12,24 @@ use super::frame::FrameError;
 use super::lent::Lent;
 use super::lines::Lines;
 use super::message::{Answer, Caller, Decision, Letter, Words};
-use super::seam::Mixtures;
 use crate::block::{BlockError, CandidateBlock};
 use crate::control::{ControlError, EncodedReport, seal, unseal};
 use crate::ids::WalkId;
 use crate::messages::Progress;
+use crate::mixture::SharedMixture;
 use crate::transport::{Incoming, Work};
 
 /// More progress than this is not kept for a busy reactor.
 const PROGRESS_KEPT: usize = 64;
 
-pub(super) struct Desk<M> {
-    pub(super) mixtures: M,
+pub(super) struct Desk {
     /// What the reactor has not taken yet: at most an offer of each walker, its end, and some progress.
     pub(super) outbox: VecDeque<Incoming>,
     conversations: Conversations,
     lines: Lines,
     /// Candidates that may still be read in place.
     in_place: Vec<(Caller, Weak<Lent>)>,
+    mixtures: SharedMixture,
 }
 
 /// Why a message is dropped.
@@ -47,10 +47,10 @@ pub(super) enum Dropped {
     Beside(usize),
 }
 
-impl<M: Mixtures> Desk<M> {
-    pub(super) fn new(session: u64, mixtures: M, lines: Lines) -> Self {
+impl Desk {
+    pub(super) fn new(session: u64, mixtures: SharedMixture, lines: Lines) -> Self {
         let conversations = Conversations::new(session);
-        Self { mixtures, outbox: VecDeque::new(), conversations, lines, in_place: Vec::new() }
+        Self { outbox: VecDeque::new(), conversations, lines, in_place: Vec::new(), mixtures }
     }
 
     pub(super) fn expect(&mut self, walker: u32, incarnation: u32) {
@@ -163,7 +163,7 @@ impl<M: Mixtures> Desk<M> {
         let Some((caller, sequence)) = self.conversations.undecided(walker) else { return Ok(()) };
         let decision = match &work {
             Some(Work { assignment, mixture }) => {
-                self.mixtures.publish(mixture).map_err(|e| IpcError::new("share the mixture", e))?;
+                self.mixtures.publish(mixture)?;
                 Decision::Turn { mixture_version: mixture.version(), assignment: Cow::Borrowed(assignment) }
             }
             None => Decision::Home,

@@ -19,7 +19,6 @@ mod frame;
 mod lent;
 mod lines;
 mod message;
-pub mod seam;
 mod server;
 mod walker;
 
@@ -27,6 +26,8 @@ use std::fmt;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+
+use crate::mixture::SharedMixtureError;
 
 pub use config::space_needed;
 pub use frame::FrameError;
@@ -50,6 +51,7 @@ pub struct Sizes {
 pub struct Door {
     directory: PathBuf,
     prefix: String,
+    mixture: PathBuf,
     message_bytes: usize,
     caller: message::Caller,
 }
@@ -65,6 +67,9 @@ pub enum IpcError {
         /// What iceoryx2 or the operating system says.
         why: String,
     },
+    /// The mixture cannot be shared or read.
+    #[error(transparent)]
+    Mixture(#[from] SharedMixtureError),
     /// The orchestrator does not answer.
     #[error("the orchestrator has not answered for {seconds} s")]
     Silence {

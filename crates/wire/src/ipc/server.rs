@@ -15,8 +15,8 @@ use super::config::{self, ServerPort, Service};
 use super::desk::Desk;
 use super::lines::{Lines, Traffic};
 use super::message::Caller;
-use super::seam::Mixtures;
 use super::{Door, IpcError, Sizes};
+use crate::mixture::SharedMixture;
 use crate::place::Place;
 use crate::transport::Incoming;
 
@@ -96,6 +96,7 @@ impl Server {
         let door = Door {
             directory: place.directory().to_owned(),
             prefix: place.prefix().to_owned(),
+            mixture: place.mixture(),
             message_bytes: sizes.message_bytes,
             caller: Caller { session, walker: 0, incarnation: 0 },
         };
@@ -114,7 +115,7 @@ impl Server {
     /// Shared memory or sockets that fail, a mixture that cannot be shared.
     pub async fn run(
         mut self,
-        mixtures: impl Mixtures,
+        mixtures: SharedMixture,
         to_reactor: mpsc::Sender<Incoming>,
         mut heard: impl FnMut(u32) + Send + 'static,
     ) -> Result<(), IpcError> {
@@ -154,7 +155,7 @@ impl Server {
 /// Takes in what has come; whether there may be more.
 fn take_in(
     port: &ServerPort,
-    desk: &mut Desk<impl Mixtures>,
+    desk: &mut Desk,
     heard: &mut impl FnMut(u32),
 ) -> Result<bool, IpcError> {
     for _ in 0..BATCH {

@@ -14,12 +14,12 @@ use iceoryx2::port::notifier::Notifier;
 
 use super::config::{self, ClientPort, Service};
 use super::message::{Answer, Caller, Decision, Letter, Words};
-use super::seam::Pins;
 use super::{Door, IpcError, frame};
 use crate::block::Candidate;
 use crate::control::{EncodedReport, seal};
 use crate::ids::WalkId;
 use crate::messages::{Outcome, Progress, Report};
+use crate::mixture::MixtureReader;
 use crate::transport::{Transport, Work};
 
 /// A walker that waits for an answer asks this often.
@@ -41,7 +41,7 @@ pub struct IpcWalker {
     port: ClientPort,
     bell: Listener<Service>,
     server_bell: Notifier<Service>,
-    mixtures: Box<dyn Pins>,
+    mixtures: MixtureReader,
     stopping: Arc<AtomicBool>,
     sequence: u64,
     last_progress: Cell<Option<Instant>>,
@@ -64,6 +64,7 @@ impl IpcWalker {
         let bell = config::create_walker_bell(&node, caller)?;
         let server_bell = config::server_bell(&node, caller.session)?;
         let port = config::client_port(&config::open_requests(&node, caller.session)?, door.message_bytes)?;
+        let mixtures = MixtureReader::open(&door.mixture, caller.walker)?;
         let (last_progress, failure) = (Cell::new(None), None);
         Ok(Self {
             caller,
@@ -99,8 +100,7 @@ impl IpcWalker {
                 Some(Decision::Wait) => heard = Instant::now(),
                 Some(Decision::Home) => return Ok(None),
                 Some(Decision::Turn { mixture_version, assignment }) => {
-                    let mixture = self.mixtures.pin(mixture_version);
-                    let mixture = mixture.map_err(|e| IpcError::new("read the mixture", e))?;
+                    let mixture = self.mixtures.pin(mixture_version)?;
                     return Ok(Some(Work { assignment: assignment.into_owned(), mixture }));
                 }
                 Some(Decision::Unknown) if offers == OFFERS => {

@@ -10,8 +10,9 @@ use calm::{Component, Mixture};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
-use wire::ipc::{Door, Handle, IpcError, Server, Sizes, seam, space_needed};
+use wire::ipc::{Door, Handle, IpcError, Server, Sizes, space_needed};
 use wire::messages::{Outcome, Report};
+use wire::mixture::SharedMixture;
 use wire::place::Place;
 use wire::transport::{Incoming, Work};
 use wire::{CandidateBlock, WalkId};
@@ -46,6 +47,7 @@ impl Desk {
         let place = Place::of(directory).unwrap();
         let sizes = Sizes { walkers, message_bytes };
         place.prepare(space_needed(&sizes)).unwrap();
+        let mixtures = SharedMixture::create(&place.mixture(), &mixture(0), walkers).unwrap();
         let session = SESSION.fetch_add(1, Ordering::Relaxed);
         let server = Server::open(&place, sizes, session).unwrap();
         let handle = server.handle();
@@ -53,7 +55,7 @@ impl Desk {
         let heard = Arc::new(Mutex::new(Vec::new()));
         let note = Arc::clone(&heard);
         let note = move |walker| note.lock().unwrap().push(walker);
-        let task = tokio::spawn(server.run(Published, to_reactor, note));
+        let task = tokio::spawn(server.run(mixtures, to_reactor, note));
         Self { place, handle, incoming, heard, task }
     }
 
@@ -130,23 +132,4 @@ pub fn files_of(place: &Place) -> Vec<String> {
 
 fn mixture(version: u64) -> Mixture {
     Mixture::new(version, vec![vec![Arc::new(Component::unknown_element(2))]]).unwrap()
-}
-
-struct Published;
-
-impl seam::Mixtures for Published {
-    fn publish(&mut self, _: &Arc<Mixture>) -> Result<(), String> {
-        Ok(())
-    }
-    fn release(&mut self, _: u32) {}
-}
-
-impl seam::Pins for Published {
-    fn pin(&mut self, version: u64) -> Result<Arc<Mixture>, String> {
-        Ok(Arc::new(mixture(version)))
-    }
-}
-
-pub fn pins() -> Box<dyn seam::Pins> {
-    Box::new(Published)
 }

@@ -15,7 +15,7 @@ use wire::messages::{Assignment, Outcome, Report};
 use wire::transport::Transport;
 use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 
-use crate::desk::{Desk, pins};
+use crate::desk::Desk;
 
 const ROLE: &str = "CALMWALK_TEST_ROLE";
 
@@ -54,7 +54,7 @@ fn child() {
 }
 
 fn walk(door: &Door, stuck: bool) {
-    let mut walker = IpcWalker::connect(door, pins(), Arc::new(AtomicBool::new(false))).unwrap();
+    let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).unwrap();
     let mut report = None;
     while let Some(work) = walker.exchange(report.take()) {
         let Assignment { walk, turn, .. } = work.assignment;
