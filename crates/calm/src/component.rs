@@ -1,6 +1,9 @@
 //! One Gaussian of the mixture: immutable, shared by reference counting.
 
+use std::sync::Arc;
+
 use crate::linear::{self, LinearError, regularised_inverse, symmetrised, view};
+use crate::numbers::{Lender, Numbers};
 
 /// A component, as slices: what the grade needs. Made from a [`Component`] or from a block of shared memory.
 #[derive(Debug, Clone, Copy)]
@@ -38,8 +41,7 @@ impl Statistics {
 /// One Gaussian of the mixture, of one species. Immutable: an update makes a new one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Component {
-    centroid: Vec<f64>,
-    inverse: Vec<f64>,
+    numbers: Numbers,
     threshold: f64,
     statistics: Option<Statistics>,
 }
@@ -93,7 +95,29 @@ impl Component {
         not_negative("threshold", threshold)?;
         let inverse = symmetric("inverse covariance", &inverse, dimension)?;
         let statistics = statistics.map(|found| checked_statistics(found, dimension)).transpose()?;
-        Ok(Self { centroid, inverse, threshold, statistics })
+        Ok(Self { numbers: Numbers::Owned { centroid, inverse }, threshold, statistics })
+    }
+
+    /// A component of dimension D evaluated in place: `lender` has S, `[D × D]`, and behind it **μ**, `[D]`. It has no
+    /// statistics.
+    ///
+    /// The numbers themselves are taken as they are, since looking at all of them would cost as much as a copy: the
+    /// lender vouches that they come from a component made by [`Component::new`]. Others give grades of no meaning,
+    /// or [`crate::GradeError::Distance`].
+    ///
+    /// # Errors
+    /// A dimension of zero, a length that is not D² + D, a threshold that is negative or not finite.
+    pub fn lent(lender: Arc<Lender>, dimension: usize, threshold: f64) -> Result<Self, ComponentError> {
+        if dimension == 0 {
+            return Err(ComponentError::Empty);
+        }
+        not_negative("threshold", threshold)?;
+        let (found, expected) =
+            ((*lender).as_ref().len(), dimension.saturating_mul(dimension.saturating_add(1)));
+        if found != expected {
+            return Err(ComponentError::Length { what: "lent component", found, expected });
+        }
+        Ok(Self { numbers: Numbers::Lent { lender, dimension }, threshold, statistics: None })
     }
 
     /// The stand-in for an element that the artifact does not hold: **μ** = 0, S = 10⁶ I, θ = 1, no data.
@@ -104,8 +128,7 @@ impl Component {
         inverse.iter_mut().step_by(dimension + 1).for_each(|value| *value = 1.0 / linear::REGULARISATION);
         let scatter = vec![0.0; dimension * dimension];
         Self {
-            centroid: vec![0.0; dimension],
-            inverse,
+            numbers: Numbers::Owned { centroid: vec![0.0; dimension], inverse },
             threshold: 1.0,
             statistics: Some(Statistics { scatter, count: 0.0, effective_count: 0.0 }),
         }
@@ -121,8 +144,7 @@ impl Component {
         let inverse = regularised_inverse(covariance, self.dimension())?;
         let scatter = covariance.iter().map(|value| value * effective_count).collect();
         Ok(Self {
-            centroid: self.centroid.clone(),
-            inverse,
+            numbers: Numbers::Owned { centroid: self.centroid().to_vec(), inverse },
             threshold: self.threshold,
             statistics: Some(Statistics { scatter, count, effective_count }),
         })
@@ -130,17 +152,17 @@ impl Component {
 
     /// Feature dimension D.
     pub fn dimension(&self) -> usize {
-        self.centroid.len()
+        self.numbers.dimension()
     }
 
     /// Centroid **μ**, `[D]`: fixed for the whole campaign.
     pub fn centroid(&self) -> &[f64] {
-        &self.centroid
+        self.numbers.centroid()
     }
 
     /// Inverse covariance S, `[D × D]`, exactly symmetric.
     pub fn inverse(&self) -> &[f64] {
-        &self.inverse
+        self.numbers.inverse()
     }
 
     /// Calibrated threshold θ: fixed for the whole campaign.
@@ -148,14 +170,14 @@ impl Component {
         self.threshold
     }
 
-    /// Scatter and counts; `None` when the mixture came from an export alone and cannot be updated.
+    /// Scatter and counts; `None` when the mixture came from an export alone, or is lent, and cannot be updated.
     pub fn statistics(&self) -> Option<&Statistics> {
         self.statistics.as_ref()
     }
 
     /// The slices that the grade needs.
     pub fn view(&self) -> ComponentView<'_> {
-        ComponentView { centroid: &self.centroid, inverse: &self.inverse, threshold: self.threshold }
+        ComponentView { centroid: self.centroid(), inverse: self.inverse(), threshold: self.threshold }
     }
 }
 

@@ -3,8 +3,9 @@
 mod common;
 
 use std::path::Path;
+use std::sync::Arc;
 
-use calm::{Artifact, Grades, Pair, neighbourhood_average};
+use calm::{Artifact, Component, ComponentError, Grades, Mixture, Pair, neighbourhood_average};
 use common::{assert_close, data, indices, niobium, numbers, optional, peer};
 
 /// Both sides compute in f64 from the same f32 inverse; only the order of summation differs.
@@ -185,4 +186,46 @@ fn a_pair_counts_by_its_cosine_weight() {
     assert_close("average", &averaged, &[(1.0 + 0.5 * 3.0 + 0.75) / (1.0 + 0.5 + 0.75), 3.0], 1e-15);
     let error = neighbourhood_average(&[1.0], pairs).unwrap_err();
     assert_eq!((error.i, error.j, error.atoms), (0, 1, 1));
+}
+
+/// Numbers lent by somebody else give the same bits, and are equal to owned ones.
+#[test]
+fn a_lent_component_is_as_good_as_an_owned_one() {
+    struct Block(Vec<f64>);
+    impl AsRef<[f64]> for Block {
+        fn as_ref(&self) -> &[f64] {
+            &self.0
+        }
+    }
+    let owned = niobium().mixture;
+    let block = |component: &Component| Block([component.inverse(), component.centroid()].concat());
+    let lend = |component: &Arc<Component>| {
+        let lent = Component::lent(Arc::new(block(component)), 130, component.threshold()).unwrap();
+        assert_eq!(lent.view().centroid, component.centroid());
+        Arc::new(lent)
+    };
+    let elements = 0..owned.element_count();
+    let elements = elements.map(|element| owned.components(element).unwrap().iter().map(lend).collect());
+    let lent = Mixture::new(0, elements.collect()).unwrap();
+    assert!(!lent.can_be_updated());
+    let features = numbers(&data("niobium_reference.npz"), "features");
+    let elements = vec![1; features.len() / 130];
+    let grade = |mixture: &Mixture| {
+        let (mut grades, mut gradient) = (Grades::default(), vec![0.0; features.len()]);
+        grades.evaluate(mixture, &elements, &features, Some(&mut gradient)).unwrap();
+        (grades, gradient)
+    };
+    assert_eq!(grade(&lent), grade(&owned));
+
+    let lent = |length: usize, dimension, threshold| {
+        Component::lent(Arc::new(Block(vec![0.0; length])), dimension, threshold)
+    };
+    assert_eq!(lent(0, 0, 1.0), Err(ComponentError::Empty));
+    let length = |found| ComponentError::Length { what: "lent component", found, expected: 12 };
+    assert_eq!(lent(11, 3, 1.0), Err(length(11)));
+    assert_eq!(lent(13, 3, 1.0), Err(length(13)));
+    assert!(matches!(lent(12, 3, -1.0), Err(ComponentError::Number { what: "threshold", .. })));
+    assert!(matches!(lent(12, 3, f64::NAN), Err(ComponentError::Number { what: "threshold", .. })));
+    let private = Component::new(vec![0.0; 3], vec![0.0; 9], 1.0, None);
+    assert_eq!(lent(12, 3, 1.0), private);
 }
