@@ -1,0 +1,60 @@
+//! The words by which the processes speak to each other.
+
+use std::fs::File;
+use std::io;
+use std::sync::atomic::{AtomicU32, AtomicU64};
+
+use super::layout::{LINE, Layout};
+use super::memory::Map;
+use super::protocol::NONE;
+
+/// Newest version, slots of the readers, version words and rows.
+#[derive(Debug)]
+pub(super) struct Control {
+    map: Map,
+    layout: Layout,
+}
+
+impl Control {
+    pub fn map(file: &File, layout: &Layout) -> io::Result<Self> {
+        let map = Map::shared(file, layout.control_at, layout.control_bytes)?;
+        Ok(Self { map, layout: layout.clone() })
+    }
+
+    /// The highest version published.
+    pub fn newest(&self) -> &AtomicU64 {
+        self.map.word(0)
+    }
+
+    /// Process id of who has the slot, 0 for nobody.
+    pub fn owner(&self, reader: u32) -> &AtomicU64 {
+        self.map.word(LINE * (1 + u64::from(reader)))
+    }
+
+    /// The version that a reader looks at just now.
+    pub fn pin(&self, reader: u32) -> &AtomicU64 {
+        self.map.word(LINE * (1 + u64::from(reader)) + 8)
+    }
+
+    pub fn pins(&self) -> impl Iterator<Item = &AtomicU64> {
+        (0..self.layout.readers).map(|reader| self.pin(reader))
+    }
+
+    /// The version whose blocks stand in a row.
+    pub fn version(&self, row: u32) -> &AtomicU64 {
+        self.map.word(self.layout.versions_at + 8 * u64::from(row))
+    }
+
+    /// Block number of each component. A row is written before its version word and read under a pin.
+    pub fn row(&self, row: u32) -> impl Iterator<Item = &AtomicU32> {
+        let start = self.layout.rows_at + self.layout.row_bytes * u64::from(row);
+        (0..self.layout.components).map(move |place| self.map.half_word(start + 4 * u64::from(place)))
+    }
+
+    /// No version anywhere, no pins.
+    pub fn clear(&self) {
+        use super::protocol::Word;
+        self.pins().for_each(|pin| pin.put(NONE));
+        (0..self.layout.rows).for_each(|row| self.version(row).put(NONE));
+    }
+}

@@ -1,0 +1,228 @@
+//! Where everything stands in the file.
+
+use std::fs::File;
+use std::os::unix::fs::FileExt;
+use std::path::Path;
+
+use calm::Mixture;
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+
+use super::error::SharedMixtureError;
+
+const MAGIC: [u8; 8] = *b"CALMMIXT";
+const FORMAT: u32 = 1;
+
+/// Sections and blocks start at multiples of this, so that memory is reserved and given back by whole pages.
+const PAGE: u64 = 4096;
+/// Words of different readers are on lines of their own, so that they do not slow each other.
+pub(super) const LINE: u64 = 64;
+/// Versions alive at once: one a walker is the rule, and this for those who look on.
+const SPARE_ROWS: u32 = 64;
+/// Bytes in front of the numbers of a block.
+pub(super) const BLOCK_HEADER: u64 = 64;
+
+/// The first bytes of the file; the number of components of each element (u32) follow.
+#[derive(Debug, Clone, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[repr(C)]
+struct Header {
+    magic: [u8; 8],
+    format: u32,
+    /// CRC-32 of all that follows it in the header, and of the shape.
+    checksum: u32,
+    dimension: u32,
+    elements: u32,
+    readers: u32,
+    rows: u32,
+    extent_blocks: u32,
+    reserved: u32,
+}
+
+const HEADER: usize = size_of::<Header>();
+const CHECKED_FROM: usize = 16;
+
+/// Sizes and places, in bytes from the start of the file if nothing else is said.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Layout {
+    /// Features, D.
+    pub dimension: u32,
+    /// Number of components of each element.
+    pub shape: Vec<u32>,
+    /// Number of all components: the length of a row.
+    pub components: u32,
+    /// Slots for readers.
+    pub readers: u32,
+    /// Rows for versions.
+    pub rows: u32,
+    /// Blocks in an extent.
+    pub extent_blocks: u32,
+    /// The words that processes speak by.
+    pub control_at: u64,
+    /// Their length.
+    pub control_bytes: u64,
+    /// Version words, from the start of the control words.
+    pub versions_at: u64,
+    /// Rows, from the start of the control words.
+    pub rows_at: u64,
+    /// Bytes from row to row.
+    pub row_bytes: u64,
+    /// The first extent.
+    pub extents_at: u64,
+    /// Holds of one reader in an extent.
+    pub reader_holds_bytes: u64,
+    /// Holds of all readers in an extent: its first part.
+    pub holds_bytes: u64,
+    /// One block.
+    pub block_bytes: u64,
+    /// One extent.
+    pub extent_bytes: u64,
+}
+
+impl Layout {
+    /// The layout for mixtures with the shape of `mixture`. An extent has room for two of each component.
+    pub fn of(mixture: &Mixture, readers: u32) -> Result<Self, SharedMixtureError> {
+        let (elements, dimension) = (mixture.element_count(), mixture.dimension());
+        let components = |element| mixture.components(element).unwrap_or_default().len().try_into().ok();
+        let layout = || {
+            let shape: Vec<u32> = (0..elements).map(components).collect::<Option<_>>()?;
+            let count = shape.iter().try_fold(0_u32, |sum, &count| sum.checked_add(count))?;
+            let rows = readers.checked_mul(4)?.checked_add(SPARE_ROWS)?;
+            Self::new(dimension.try_into().ok()?, shape, readers, rows, count.checked_mul(2)?)
+        };
+        layout().ok_or(SharedMixtureError::TooLarge { elements, dimension, readers })
+    }
+
+    /// `None` when the sizes overflow or there is nothing to store.
+    fn new(dimension: u32, shape: Vec<u32>, readers: u32, rows: u32, extent_blocks: u32) -> Option<Self> {
+        let up = |bytes: u64, to: u64| bytes.checked_next_multiple_of(to);
+        let components = shape.iter().try_fold(0_u32, |sum, &count| sum.checked_add(count))?;
+        if dimension == 0 || components == 0 || extent_blocks == 0 {
+            return None;
+        }
+        let control_at = up(HEADER as u64 + 4 * shape.len() as u64, PAGE)?;
+        let versions_at = LINE * (1 + u64::from(readers));
+        let rows_at = up(versions_at + 8 * u64::from(rows), LINE)?;
+        let row_bytes = up(4 * u64::from(components), LINE)?;
+        let control_bytes = up(row_bytes.checked_mul(rows.into())?.checked_add(rows_at)?, PAGE)?;
+        let reader_holds_bytes = up(4 * u64::from(extent_blocks), LINE)?;
+        let holds_bytes = up(reader_holds_bytes.checked_mul(readers.into())?, PAGE)?;
+        let numbers = u64::from(dimension) * (u64::from(dimension) + 1);
+        let block_bytes = up(numbers.checked_mul(8)?.checked_add(BLOCK_HEADER)?, PAGE)?;
+        let extent_bytes = block_bytes.checked_mul(extent_blocks.into())?.checked_add(holds_bytes)?;
+        let extents_at = control_at.checked_add(control_bytes)?;
+        Some(Self {
+            dimension,
+            shape,
+            components,
+            readers,
+            rows,
+            extent_blocks,
+            control_at,
+            control_bytes,
+            versions_at,
+            rows_at,
+            row_bytes,
+            extents_at,
+            reader_holds_bytes,
+            holds_bytes,
+            block_bytes,
+            extent_bytes,
+        })
+    }
+
+    /// Reads and checks the header of a file.
+    pub fn read(file: &File, path: &Path) -> Result<Self, SharedMixtureError> {
+        let damaged = |what: &str| SharedMixtureError::Damaged { path: path.into(), what: what.into() };
+        let cannot =
+            |source| SharedMixtureError::File { path: path.into(), doing: "read the header", source };
+        let length = file.metadata().map_err(cannot)?.len();
+        let mut bytes = [0; HEADER];
+        if length < HEADER as u64 {
+            return Err(damaged("it is shorter than its header"));
+        }
+        file.read_exact_at(&mut bytes, 0).map_err(cannot)?;
+        let header = Header::read_from_bytes(&bytes).map_err(|_| damaged("it is shorter than its header"))?;
+        if header.magic != MAGIC {
+            return Err(SharedMixtureError::Magic { path: path.into(), found: header.magic });
+        }
+        if header.format != FORMAT {
+            let (found, expected) = (header.format, FORMAT);
+            return Err(SharedMixtureError::Format { path: path.into(), found, expected });
+        }
+        if length < HEADER as u64 + 4 * u64::from(header.elements) {
+            return Err(damaged("it is shorter than its list of elements"));
+        }
+        let mut shape = vec![0_u32; header.elements as usize];
+        file.read_exact_at(shape.as_mut_bytes(), HEADER as u64).map_err(cannot)?;
+        if checksum(&header, &shape) != header.checksum {
+            return Err(damaged("its header has a wrong checksum"));
+        }
+        let Header { dimension, readers, rows, extent_blocks, .. } = header;
+        let layout = Self::new(dimension, shape, readers, rows, extent_blocks)
+            .ok_or_else(|| damaged("its sizes overflow"))?;
+        if layout.end(1).is_none_or(|end| length < end) {
+            return Err(damaged("it is shorter than its header says"));
+        }
+        Ok(layout)
+    }
+
+    /// Writes the header: from now on readers take the file for a shared mixture.
+    pub fn write(&self, file: &File) -> std::io::Result<()> {
+        let mut header = Header {
+            magic: MAGIC,
+            format: FORMAT,
+            checksum: 0,
+            dimension: self.dimension,
+            elements: self.shape.len() as u32,
+            readers: self.readers,
+            rows: self.rows,
+            extent_blocks: self.extent_blocks,
+            reserved: 0,
+        };
+        header.checksum = checksum(&header, &self.shape);
+        file.write_all_at(self.shape.as_bytes(), HEADER as u64)?;
+        file.write_all_at(header.as_bytes(), 0)
+    }
+
+    /// Element and number among its components, of every component in the order of a row.
+    pub fn places(&self) -> impl Iterator<Item = (u32, u32)> {
+        (0..).zip(&self.shape).flat_map(|(element, &count)| (0..count).map(move |slot| (element, slot)))
+    }
+
+    /// Numbers in a block: S and **μ**.
+    pub fn numbers(&self) -> usize {
+        let dimension = self.dimension as usize;
+        dimension * (dimension + 1)
+    }
+
+    /// The extent of a block, and its number there.
+    pub fn extent_of(&self, block: u32) -> (u32, u32) {
+        (block / self.extent_blocks, block % self.extent_blocks)
+    }
+
+    /// The start of an extent; `None` beyond what can be addressed.
+    pub fn extent_at(&self, extent: u32) -> Option<u64> {
+        self.extent_bytes.checked_mul(extent.into())?.checked_add(self.extents_at)
+    }
+
+    /// The length of a file with so many extents.
+    pub fn end(&self, extents: u32) -> Option<u64> {
+        self.extent_at(extents).filter(|&end| i64::try_from(end).is_ok())
+    }
+
+    /// A block's place from the start of the blocks of its extent.
+    pub fn block_at(&self, index: u32) -> u64 {
+        u64::from(index) * self.block_bytes
+    }
+
+    /// Place of the holds of a reader on a block, from the start of its extent.
+    pub fn hold_at(&self, reader: u32, index: u32) -> u64 {
+        u64::from(reader) * self.reader_holds_bytes + 4 * u64::from(index)
+    }
+}
+
+fn checksum(header: &Header, shape: &[u32]) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(header.as_bytes().get(CHECKED_FROM..).unwrap_or_default());
+    hasher.update(shape.as_bytes());
+    hasher.finalize()
+}

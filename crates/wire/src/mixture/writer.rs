@@ -1,0 +1,220 @@
+//! The writer: the one process that holds the campaign's lock.
+
+use std::fs::{self, File, OpenOptions};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Weak};
+use std::{fmt, io};
+
+use calm::{Component, Mixture};
+
+use super::blocks::{Blocks, SPARE};
+use super::control::Control;
+use super::error::SharedMixtureError;
+use super::layout::Layout;
+use super::protocol::{NONE, Word, take_away};
+
+/// The mixture in shared memory, to be published to. There must be one for a file.
+///
+/// Dropping it leaves the file, which readers may still have open: whoever owns the place removes it.
+pub struct SharedMixture {
+    layout: Layout,
+    control: Control,
+    blocks: Blocks,
+    /// What stands in each row.
+    living: Vec<Option<Living>>,
+    /// The components of the newest version, in the order of a row: what others are compared with.
+    latest: Vec<Placed>,
+}
+
+/// A component and the block it was written to.
+struct Placed {
+    component: Arc<Component>,
+    block: u32,
+}
+
+/// A version that readers can pin.
+#[derive(Debug)]
+struct Living {
+    version: u64,
+    /// Block of each component.
+    blocks: Vec<u32>,
+    /// Those who have the version in this process, and may have promised it to a reader.
+    owners: Vec<Weak<Mixture>>,
+}
+
+/// Without its numbers.
+impl fmt::Debug for SharedMixture {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let living: Vec<u64> = self.living.iter().flatten().map(|known| known.version).collect();
+        f.debug_struct("SharedMixture").field("living", &living).finish_non_exhaustive()
+    }
+}
+
+impl SharedMixture {
+    /// Bytes of shared memory for a mixture and so many readers at the start. Components that change while readers
+    /// hold older ones come on top, about 8 D² bytes each.
+    ///
+    /// # Errors
+    /// The size overflows.
+    pub fn space_needed(mixture: &Mixture, readers: u32) -> Result<u64, SharedMixtureError> {
+        Layout::of(mixture, readers).map(|layout| reserved(&layout))
+    }
+
+    /// Makes the file, for the user alone (mode 0600), with `mixture` as its newest version and slots for `readers`
+    /// readers. A file that is there already is removed: those who have it open keep it for themselves.
+    ///
+    /// # Errors
+    /// Too little shared memory, sizes that overflow, a path that cannot be written.
+    pub fn create(path: &Path, mixture: &Mixture, readers: u32) -> Result<Self, SharedMixtureError> {
+        let layout = Layout::of(mixture, readers)?;
+        let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
+        match fs::remove_file(path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                return Err(failed("remove what is there", error));
+            }
+            _ => {}
+        }
+        let file = OpenOptions::new().read(true).write(true).create_new(true).mode(0o600).open(path);
+        let file = file.map_err(|source| failed("create", source))?;
+        let made = Self::fill(&file, path, layout, mixture);
+        if made.is_err() {
+            let _ = fs::remove_file(path);
+        }
+        made
+    }
+
+    fn fill(file: &File, path: &Path, layout: Layout, mixture: &Mixture) -> Result<Self, SharedMixtureError> {
+        let failed = |doing, source| SharedMixtureError::File { path: path.into(), doing, source };
+        let copy = file.try_clone().map_err(|source| failed("open", source))?;
+        file.set_len(reserved(&layout)).map_err(|source| failed("grow", source))?;
+        let mut blocks = Blocks::new(layout.clone(), copy, path.into());
+        blocks.reserve(0, reserved(&layout))?;
+        blocks.grow(initial_blocks(&layout))?;
+        let control = Control::map(file, &layout).map_err(|source| failed("map", source))?;
+        control.clear();
+        let mut living = Vec::new();
+        living.resize_with(layout.rows as usize, || None);
+        let mut shared = Self { layout, control, blocks, living, latest: Vec::new() };
+        let placed = shared.write(mixture)?;
+        shared.enter(0, mixture, placed, Vec::new());
+        shared.layout.write(file).map_err(|source| failed("write the header", source))?;
+        Ok(shared)
+    }
+
+    /// Makes `mixture` readable for all readers, and keeps it so while it is the newest or this `Arc` lives: hand a
+    /// reader its number only then, and keep the `Arc` until the reader no longer needs to pin it. A version is
+    /// known by its number: one that is there already is not written again.
+    ///
+    /// # Errors
+    /// Too little shared memory (the versions that were there stay), another shape, or more versions in use at once
+    /// than there are rows for.
+    pub fn publish(&mut self, mixture: &Arc<Mixture>) -> Result<(), SharedMixtureError> {
+        let version = mixture.version();
+        if let Some(known) = self.living.iter_mut().flatten().find(|known| known.version == version) {
+            known.owners.retain(|owner| owner.strong_count() > 0);
+            if !known.owners.iter().any(|owner| owner.as_ptr() == Arc::as_ptr(mixture)) {
+                known.owners.push(Arc::downgrade(mixture));
+            }
+            return Ok(());
+        }
+        if version == NONE || !has_shape(mixture, &self.layout) {
+            return Err(SharedMixtureError::Shape { version });
+        }
+        self.retire();
+        let row = self.living.iter().position(Option::is_none);
+        let living = self.living.len();
+        let row = row.ok_or(SharedMixtureError::TooManyVersions { version, living })?;
+        let placed = self.write(mixture)?;
+        self.enter(row, mixture, placed, vec![Arc::downgrade(mixture)]);
+        Ok(())
+    }
+
+    /// Frees the slot of a reader and all that it held. Its process must be dead, or at least must not touch the mixture
+    /// any more: what it reads from then on may change under its eyes.
+    pub fn release(&mut self, reader: u32) {
+        if reader < self.layout.readers {
+            self.control.pin(reader).put(NONE);
+            self.blocks.release(reader);
+            self.control.owner(reader).store(0, Ordering::Release);
+        }
+    }
+
+    /// The block of each component of a version: those of the latest for what did not change, new ones for the rest.
+    fn write(&mut self, mixture: &Mixture) -> Result<Vec<Placed>, SharedMixtureError> {
+        let (mut all, mut written) = (Vec::with_capacity(self.latest.len()), Vec::new());
+        for (index, (place, (.., component))) in self.layout.places().zip(mixture.iter()).enumerate() {
+            let known = self.latest.get(index).filter(|known| Arc::ptr_eq(&known.component, component));
+            let block = match known {
+                Some(known) => known.block,
+                None => match self.blocks.write(place, mixture.version(), component) {
+                    Ok(block) => *written.push_mut(block),
+                    Err(error) => {
+                        self.blocks.give_back(written.into_iter());
+                        return Err(error);
+                    }
+                },
+            };
+            all.push(Placed { component: Arc::clone(component), block });
+        }
+        Ok(all)
+    }
+
+    /// Lets readers see a version, of which the blocks are written, in a free row.
+    fn enter(&mut self, row: usize, mixture: &Mixture, placed: Vec<Placed>, owners: Vec<Weak<Mixture>>) {
+        let version = mixture.version();
+        let blocks: Vec<u32> = placed.iter().map(|placed| placed.block).collect();
+        self.blocks.refer(&blocks);
+        for (word, &block) in self.control.row(row as u32).zip(&blocks) {
+            word.store(block, Ordering::Relaxed);
+        }
+        self.control.version(row as u32).put(version);
+        if self.latest.is_empty() || version > self.newest() {
+            self.control.newest().put(version);
+            self.latest = placed;
+        }
+        if let Some(place) = self.living.get_mut(row) {
+            *place = Some(Living { version, blocks, owners });
+        }
+    }
+
+    /// Takes away the versions that nobody in this process has, and frees blocks.
+    fn retire(&mut self) {
+        let newest = self.newest();
+        for (row, place) in self.living.iter_mut().enumerate() {
+            let unowned = |known: &Living| known.owners.iter().all(|owner| owner.strong_count() == 0);
+            let old = place.take_if(|known| {
+                known.version != newest
+                    && unowned(known)
+                    && take_away(self.control.version(row as u32), known.version, self.control.pins())
+            });
+            if let Some(old) = old {
+                self.blocks.let_go(&old.blocks);
+            }
+        }
+        self.blocks.collect();
+    }
+
+    fn newest(&self) -> u64 {
+        self.control.newest().look()
+    }
+}
+
+/// Blocks at the start: one for each component and a few to change.
+fn initial_blocks(layout: &Layout) -> u32 {
+    layout.components.saturating_add(SPARE).min(layout.extent_blocks)
+}
+
+/// Bytes to reserve at the start.
+fn reserved(layout: &Layout) -> u64 {
+    layout.extents_at + layout.holds_bytes + layout.block_at(initial_blocks(layout))
+}
+
+fn has_shape(mixture: &Mixture, layout: &Layout) -> bool {
+    let count = |element| mixture.components(element).map(<[_]>::len);
+    let mut shape = layout.shape.iter().enumerate();
+    mixture.dimension() == layout.dimension as usize
+        && mixture.element_count() == layout.shape.len()
+        && shape.all(|(element, &components)| count(element) == Some(components as usize))
+}
