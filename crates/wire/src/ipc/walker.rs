@@ -56,7 +56,6 @@ impl IpcWalker {
     /// An orchestrator that is not there, or whatever iceoryx2 says.
     pub fn connect(
         door: &Door,
-        mixtures: Box<dyn Pins>,
         stopping: Arc<AtomicBool>,
     ) -> Result<Self, IpcError> {
         let Door { caller, .. } = *door;
