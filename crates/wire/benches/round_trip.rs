@@ -37,8 +37,7 @@ fn main() {
 
 /// The walker's process: all sizes one after the other.
 fn walk(door: &Door) {
-    let mut walker =
-        IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).expect("an orchestrator");
+    let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).expect("an orchestrator");
     walker.exchange(None).expect("a turn");
     println!("    bytes   whole µs (99 %)     encode   check   transport µs (99 %)");
     for (atoms, features) in SIZES {

@@ -153,11 +153,7 @@ impl Server {
 }
 
 /// Takes in what has come; whether there may be more.
-fn take_in(
-    port: &ServerPort,
-    desk: &mut Desk,
-    heard: &mut impl FnMut(u32),
-) -> Result<bool, IpcError> {
+fn take_in(port: &ServerPort, desk: &mut Desk, heard: &mut impl FnMut(u32)) -> Result<bool, IpcError> {
     for _ in 0..BATCH {
         match port.receive() {
             Ok(Some(request)) => desk.receive(request).into_iter().for_each(&mut *heard),

@@ -54,10 +54,7 @@ impl IpcWalker {
     ///
     /// # Errors
     /// An orchestrator that is not there, or whatever iceoryx2 says.
-    pub fn connect(
-        door: &Door,
-        stopping: Arc<AtomicBool>,
-    ) -> Result<Self, IpcError> {
+    pub fn connect(door: &Door, stopping: Arc<AtomicBool>) -> Result<Self, IpcError> {
         let Door { caller, .. } = *door;
         let node = config::node(&door.directory, &door.prefix)?;
         let bell = config::create_walker_bell(&node, caller)?;
