@@ -1,9 +1,9 @@
 //! Round trip walker → server → walker: a walker's process offers candidates, a task that decides nothing answers.
 //! `cargo bench -p wire --bench round_trip`
 //!
-//! `encode` and `check` are measured apart, on the same candidate in private memory: the fill of the walker's memory
-//! with its checksums, and the checks of what arrived. What remains of the whole is the transport: loan, two wake-ups of
-//! sleeping processes, the answer. The whole is what a walker waits.
+//! `encode` is the walker's part: control message and candidate, written once. `check` is the server's: checksums,
+//! content hash, decoding. What remains of the whole is the transport: two wake-ups of sleeping processes, the answer,
+//! the end of the old report. The whole is what a walker waits.
 
 use std::process::{Command, Stdio};
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use wire::messages::{Assignment, Outcome, Progress, Report};
 use wire::mixture::SharedMixture;
 use wire::place::Place;
 use wire::transport::{Incoming, Transport, Work};
-use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, CandidateView, ContentHash, Origin, WalkId};
+use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 
 const DOOR: &str = "CALMWALK_BENCH_DOOR";
 const TRIPS: usize = 2_000;
@@ -27,6 +27,9 @@ const WARM_UP: usize = 100;
 
 /// Atoms and features: 1 kB to 4 MB. The fourth is a candidate as the paper has them.
 const SIZES: [(usize, usize); 6] = [(8, 4), (32, 24), (108, 32), (108, 131), (500, 131), (1000, 515)];
+
+/// Bytes of a checkpoint of 108 atoms. It goes with each report and comes with each turn, whatever the candidate.
+const CHECKPOINT: usize = 20_000;
 
 fn main() {
     match std::env::var(DOOR) {
@@ -38,50 +41,40 @@ fn main() {
 /// The walker's process: all sizes one after the other.
 fn walk(door: &Door) {
     let mut walker = IpcWalker::connect(door, Arc::new(AtomicBool::new(false))).expect("an orchestrator");
-    walker.exchange(None).expect("a turn");
+    let mut checked = walker.exchange(None).expect("a turn").assignment.turn;
     println!("    bytes   whole µs (99 %)     encode   check   transport µs (99 %)");
     for (atoms, features) in SIZES {
         let candidate = candidate(atoms, features);
-        let mut whole = Vec::with_capacity(TRIPS);
+        let mut times = Vec::with_capacity(TRIPS);
         for trip in 0..WARM_UP + TRIPS {
             let outcome = Outcome::Candidate(candidate.clone());
-            let checkpoint = vec![0; 200 * atoms];
+            let checkpoint = vec![0; CHECKPOINT];
             let progress = Progress::default();
             let report = Report { walk: WalkId(0), turn: trip as u64, outcome, checkpoint, progress };
-            let begin = Instant::now();
-            walker.exchange(Some(report)).expect("a turn");
+            let (begin, encoding) = (Instant::now(), walker.encoding());
+            let work = walker.exchange(Some(report)).expect("a turn");
+            let (whole, encode) = (begin.elapsed(), walker.encoding() - encoding);
+            // The server's clock comes with the turn.
+            let check = Duration::from_nanos(
+                work.assignment.turn - std::mem::replace(&mut checked, work.assignment.turn),
+            );
             if trip >= WARM_UP {
-                whole.push(begin.elapsed());
+                times.push([whole, encode, check, whole.saturating_sub(encode + check)]);
             }
         }
-        show(&candidate, whole);
+        let column = |k: usize| quantiles(times.iter().map(|time| time[k]).collect());
+        let [whole, encode, check, transport] = [0, 1, 2, 3].map(column);
+        println!(
+            "{:9} {:8.1} ({:6.1})  {:8.1} {:8.1}  {:8.1} ({:6.1})",
+            candidate.encoded_len(),
+            whole.0,
+            whole.1,
+            encode.0,
+            check.0,
+            transport.0,
+            transport.1,
+        );
     }
-}
-
-fn show(candidate: &Candidate, whole: Vec<Duration>) {
-    let block = CandidateBlock::encode(candidate);
-    let mut words = vec![0_u64; candidate.encoded_len() / 8];
-    let out: &mut [u8] = zerocopy::IntoBytes::as_mut_bytes(words.as_mut_slice());
-    let encode = quantiles((0..TRIPS).map(|_| timed(|| candidate.encode_into(out))).collect());
-    let check = quantiles((0..TRIPS).map(|_| timed(|| drop(CandidateView::new(block.as_bytes())))).collect());
-    let whole = quantiles(whole);
-    let rest = |of: fn((f64, f64)) -> f64| of(whole) - encode.0 - check.0;
-    println!(
-        "{:9} {:8.1} ({:6.1})  {:8.1} {:8.1}  {:8.1} ({:6.1})",
-        block.as_bytes().len(),
-        whole.0,
-        whole.1,
-        encode.0,
-        check.0,
-        rest(|q| q.0),
-        rest(|q| q.1),
-    );
-}
-
-fn timed(work: impl FnOnce()) -> Duration {
-    let begin = Instant::now();
-    work();
-    begin.elapsed()
 }
 
 /// Median and 99th percentile, µs.
@@ -103,13 +96,15 @@ async fn orchestrate() {
     let door = serde_json::to_string(&handle.door(0, 1)).expect("plain data");
     let (to_reactor, mut incoming) = mpsc::channel(64);
     let running = tokio::spawn(server.run(mixtures, to_reactor, |_| {}));
+    let clock = handle.clone();
     let deciding = tokio::spawn(async move {
         let mixture = Arc::new(mixture());
         while let Some(incoming) = incoming.recv().await {
             if let Incoming::Free { report, reply, .. } = incoming {
-                let atoms = report.as_ref().map_or(1, |report| report.checkpoint.len() / 200);
-                let _ =
-                    reply.send(Some(Work { assignment: assignment(atoms), mixture: Arc::clone(&mixture) }));
+                drop(report);
+                let checking = clock.traffic().checking.as_nanos() as u64;
+                let _ = reply
+                    .send(Some(Work { assignment: assignment(checking), mixture: Arc::clone(&mixture) }));
             }
         }
     });
@@ -130,16 +125,16 @@ fn structure(atoms: usize) -> Structure {
     Structure { species, positions, cell, periodic: [true; 3] }
 }
 
-/// The next turn, with a checkpoint of the usual size.
-fn assignment(atoms: usize) -> Assignment {
+/// The next turn.
+fn assignment(turn: u64) -> Assignment {
     Assignment {
         campaign: CampaignId([7; 16]),
         walk: WalkId(0),
-        turn: 1,
+        turn,
         origin: Origin::Biased,
         random_walk: WalkId(0),
-        seed_structure: structure(atoms.max(1)),
-        checkpoint: Some(vec![1; 200 * atoms]),
+        seed_structure: structure(108),
+        checkpoint: Some(vec![1; CHECKPOINT]),
         verdict: None,
         until: 1000,
         wanted: Vec::new(),

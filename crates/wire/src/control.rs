@@ -107,6 +107,7 @@ pub(crate) struct EncodedReport<'a> {
     walk: WalkId,
     turn: u64,
     outcome: EncodedOutcome<'a>,
+    #[serde(serialize_with = "crate::bytes::serialize")]
     checkpoint: &'a [u8],
     progress: Cow<'a, Progress>,
 }

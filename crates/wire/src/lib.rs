@@ -2,6 +2,7 @@
 //! messages, and the [`transport`] that carries them.
 
 pub mod block;
+mod bytes;
 pub mod control;
 pub mod ids;
 pub mod ipc;

@@ -24,6 +24,7 @@ pub struct Assignment {
     /// Where it starts.
     pub seed_structure: Structure,
     /// The walker's own state of the walk; none at the start of it.
+    #[serde(with = "crate::bytes::optional")]
     pub checkpoint: Option<Vec<u8>>,
     /// What became of the candidate that its last turn ended with.
     pub verdict: Option<Verdict>,

@@ -4,6 +4,7 @@ use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::sync::{Arc, Weak};
 use std::task::{Context, Poll};
+use std::time::Instant;
 
 use super::IpcError;
 use super::config::{IN_PLACE, IN_PLACE_IN_ALL, Request};
@@ -73,9 +74,9 @@ impl Desk {
 
     /// Takes in a message; the walker that it is of, unless it is dropped.
     pub(super) fn receive(&mut self, request: Request) -> Option<u32> {
-        let bytes = request.payload().len() as u64;
+        let (begin, bytes) = (Instant::now(), request.payload().len() as u64);
         let heard = self.listen(request);
-        self.lines.count(bytes, heard.as_ref().err());
+        self.lines.count(bytes, begin.elapsed(), heard.as_ref().err());
         heard.ok()
     }
 

@@ -5,6 +5,7 @@ use std::fmt;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
+use std::time::Duration;
 
 use calm::Mixture;
 use iceoryx2::node::Node;
@@ -24,6 +25,8 @@ pub struct Traffic {
     pub received: u64,
     /// Their bytes.
     pub bytes: u64,
+    /// Time spent on checking and decoding them.
+    pub checking: Duration,
     /// Messages that were not listened to.
     pub dropped: u64,
     /// Why the last of them was not.
@@ -119,11 +122,12 @@ impl Lines {
         }
     }
 
-    /// Counts a message and, if it was dropped, why.
-    pub(super) fn count(&self, bytes: u64, dropped: Option<&impl fmt::Display>) {
+    /// Counts a message, how long it took, and, if it was dropped, why.
+    pub(super) fn count(&self, bytes: u64, took: Duration, dropped: Option<&impl fmt::Display>) {
         let mut traffic = self.traffic.lock().unwrap_or_else(PoisonError::into_inner);
         traffic.received += 1;
         traffic.bytes += bytes;
+        traffic.checking += took;
         if let Some(reason) = dropped {
             traffic.dropped += 1;
             traffic.last_dropped = Some(reason.to_string());

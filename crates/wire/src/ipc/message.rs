@@ -53,6 +53,7 @@ pub(super) struct Answer<'a> {
 }
 
 #[derive(Serialize, Deserialize)]
+#[expect(clippy::large_enum_variant, reason = "there is never more than one")]
 pub(super) enum Decision<'a> {
     /// Committed; this is the next turn.
     Turn { mixture_version: u64, assignment: Cow<'a, Assignment> },

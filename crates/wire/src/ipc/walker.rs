@@ -46,6 +46,7 @@ pub struct IpcWalker {
     sequence: u64,
     last_progress: Cell<Option<Instant>>,
     failure: Option<IpcError>,
+    encoding: Cell<Duration>,
     _node: Node<Service>,
 }
 
@@ -61,7 +62,7 @@ impl IpcWalker {
         let server_bell = config::server_bell(&node, caller.session)?;
         let port = config::client_port(&config::open_requests(&node, caller.session)?, door.message_bytes)?;
         let mixtures = MixtureReader::open(&door.mixture, caller.walker)?;
-        let (last_progress, failure) = (Cell::new(None), None);
+        let (last_progress, failure, encoding) = (Cell::new(None), None, Cell::default());
         Ok(Self {
             caller,
             port,
@@ -72,6 +73,7 @@ impl IpcWalker {
             sequence: 0,
             last_progress,
             failure,
+            encoding,
             _node: node,
         })
     }
@@ -79,6 +81,11 @@ impl IpcWalker {
     /// Why the last exchange ended without a turn; none if the walker was sent home.
     pub fn failure(&self) -> Option<&IpcError> {
         self.failure.as_ref()
+    }
+
+    /// Time spent so far on encoding messages.
+    pub fn encoding(&self) -> Duration {
+        self.encoding.get()
     }
 
     /// Offers the report until there is an answer.
@@ -136,6 +143,7 @@ impl IpcWalker {
 
     /// Sends a message and wakes the server; `None` if it could not be delivered.
     fn send(&self, words: Words<'_>, candidate: Option<&Candidate>) -> Result<Option<Pending>, IpcError> {
+        let begin = Instant::now();
         let control = seal(&Letter { caller: self.caller, words });
         let length = frame::length(control.len(), candidate);
         let mut memory =
@@ -144,6 +152,7 @@ impl IpcWalker {
         // SAFETY: every byte of shared memory has a value.
         #[allow(unsafe_code)]
         let memory = unsafe { memory.assume_init() };
+        self.encoding.set(self.encoding.get() + begin.elapsed());
         let pending = memory.send().map_err(|e| IpcError::new("send a message", e))?;
         if pending.number_of_server_connections() == 0 {
             return Ok(None);
