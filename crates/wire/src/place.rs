@@ -220,7 +220,7 @@ fn user() -> u32 {
 }
 
 /// Bytes that may still be written to shared memory.
-fn free_space() -> Result<u64, PlaceError> {
+pub(crate) fn free_space() -> Result<u64, PlaceError> {
     let statistics = rustix::fs::statvfs(SHARED_MEMORY)
         .map_err(|source| io_error("ask for the free space of", Path::new(SHARED_MEMORY))(source.into()))?;
     Ok(statistics.f_bavail.saturating_mul(statistics.f_frsize))

@@ -16,6 +16,7 @@ use iceoryx2::service::port_factory::request_response;
 
 use super::message::Caller;
 use super::{IpcError, Sizes};
+use crate::place;
 
 pub(super) type Service = ipc_threadsafe::Service;
 pub(super) type ServerPort = Server<Service, [u8], (), [u8], ()>;
@@ -34,15 +35,29 @@ const ACTIVE_REQUESTS: usize = IN_PLACE + 4;
 const REQUEST_BUFFERS: usize = ACTIVE_REQUESTS + 2;
 /// Answers to one walker that the server has memory for.
 const ANSWER_BUFFERS: usize = 3;
-/// Bytes that iceoryx2 uses for the connection with one walker, and for everything else, measured and doubled.
-const CONNECTION_BYTES: u64 = 1 << 18;
-const TABLE_BYTES: u64 = 4 << 20;
+/// Bytes that iceoryx2 uses for the connection with one walker (measured: 270 kB), and for everything else (100 kB).
+const CONNECTION_BYTES: u64 = 1 << 19;
+const TABLE_BYTES: u64 = 1 << 20;
 
 /// Shared memory that the messages of a campaign need at most, bytes.
 pub fn space_needed(sizes: &Sizes) -> u64 {
     let message = sizes.message_bytes as u64 + 4096;
     let walker = (REQUEST_BUFFERS + ANSWER_BUFFERS) as u64 * message + CONNECTION_BYTES;
     TABLE_BYTES + u64::from(sizes.walkers) * walker
+}
+
+/// Whether a message is as large as was expected, or there is room for a larger one: without room, writing it would be
+/// the end of the process.
+pub(super) fn check_room(length: usize, message_bytes: usize) -> Result<(), IpcError> {
+    if length > message_bytes {
+        let free = place::free_space().map_err(|e| IpcError::new("look for room", e))?;
+        if free < 2 * length as u64 {
+            let why =
+                format!("it has {length} bytes, more than expected, and /dev/shm has {free} bytes free");
+            return Err(IpcError::new("carry a message", why));
+        }
+    }
+    Ok(())
 }
 
 /// Processes that may be connected: those at work, and dead ones until they are cleaned away.

@@ -41,6 +41,7 @@ pub(super) struct Lines {
     node: Node<Service>,
     walkers: BTreeMap<u32, Line>,
     traffic: Arc<Mutex<Traffic>>,
+    message_bytes: usize,
 }
 
 #[derive(Default)]
@@ -56,8 +57,8 @@ struct Line {
 }
 
 impl Lines {
-    pub(super) fn new(node: Node<Service>, traffic: Arc<Mutex<Traffic>>) -> Self {
-        Self { node, walkers: BTreeMap::new(), traffic }
+    pub(super) fn new(node: Node<Service>, traffic: Arc<Mutex<Traffic>>, message_bytes: usize) -> Self {
+        Self { node, walkers: BTreeMap::new(), traffic, message_bytes }
     }
 
     pub(super) fn open(&mut self, walker: u32) {
@@ -114,7 +115,9 @@ impl Lines {
     /// Sends an answer and wakes the walker. If it is lost the walker asks again.
     pub(super) fn send(&mut self, caller: Caller, route: &Lent, answer: &[u8]) {
         let Some(line) = self.walkers.get_mut(&caller.walker) else { return };
-        let sent = route.answer(answer).and_then(|()| line.ring(&self.node, caller));
+        let sent = config::check_room(answer.len(), self.message_bytes)
+            .and_then(|()| route.answer(answer))
+            .and_then(|()| line.ring(&self.node, caller));
         if let Err(reason) = sent {
             let mut traffic = self.traffic.lock().unwrap_or_else(PoisonError::into_inner);
             traffic.unsent += 1;

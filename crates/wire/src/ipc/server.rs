@@ -101,7 +101,7 @@ impl Server {
             caller: Caller { session, walker: 0, incarnation: 0 },
         };
         let handle = Handle { door, orders: sender, traffic: Arc::clone(&traffic) };
-        Ok(Self { port, bell, lines: Lines::new(node, traffic), orders, handle })
+        Ok(Self { port, bell, lines: Lines::new(node, traffic, sizes.message_bytes), orders, handle })
     }
 
     /// For whoever starts and ends walkers.

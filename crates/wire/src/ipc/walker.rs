@@ -47,6 +47,7 @@ pub struct IpcWalker {
     last_progress: Cell<Option<Instant>>,
     failure: Option<IpcError>,
     encoding: Cell<Duration>,
+    message_bytes: usize,
     _node: Node<Service>,
 }
 
@@ -74,6 +75,7 @@ impl IpcWalker {
             last_progress,
             failure,
             encoding,
+            message_bytes: door.message_bytes,
             _node: node,
         })
     }
@@ -146,6 +148,7 @@ impl IpcWalker {
         let begin = Instant::now();
         let control = seal(&Letter { caller: self.caller, words });
         let length = frame::length(control.len(), candidate);
+        config::check_room(length, self.message_bytes)?;
         let mut memory =
             self.port.loan_slice_uninit(length).map_err(|e| IpcError::new("find memory for a message", e))?;
         frame::fill(initialised(memory.payload_mut()), &control, candidate);

@@ -71,6 +71,7 @@ fn walk(door: &Door, stuck: bool) {
     assert!(walker.failure().is_none(), "{:?}", walker.failure());
 }
 
+#[expect(clippy::zombie_processes, reason = "killed, and its walker with it")]
 fn orchestrate(directory: &str) {
     tokio::runtime::Runtime::new().unwrap().block_on(async {
         let mut desk = Desk::open(Path::new(directory), 2, 1 << 16);
