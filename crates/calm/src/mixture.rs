@@ -4,12 +4,13 @@ use std::sync::Arc;
 
 use crate::component::Component;
 
-/// The components of every element of a model. Cloning copies references, not matrices.
+/// The components of every element of a model. Cloning copies a reference an element, not matrices.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mixture {
     version: u64,
     dimension: usize,
-    elements: Vec<Vec<Arc<Component>>>,
+    /// A version shares the elements that did not change with the one before.
+    elements: Vec<Arc<Vec<Arc<Component>>>>,
 }
 
 /// A new component and the place it takes.
@@ -79,6 +80,7 @@ impl Mixture {
             }
         }
         let dimension = dimension.ok_or(MixtureError::NoElement)?;
+        let elements = elements.into_iter().map(Arc::new).collect();
         Ok(Self { version, dimension, elements })
     }
 
@@ -94,7 +96,8 @@ impl Mixture {
             if found != self.dimension {
                 return Err(MixtureError::Dimension { element, slot, found, expected: self.dimension });
             }
-            let place = next.elements.get_mut(element).and_then(|components| components.get_mut(slot));
+            let components = next.elements.get_mut(element).map(Arc::make_mut);
+            let place = components.and_then(|components| components.get_mut(slot));
             *place.ok_or(MixtureError::NoPlace { element, slot })? = Arc::clone(component);
         }
         Ok(next)
@@ -122,7 +125,7 @@ impl Mixture {
 
     /// The components of an element; `None` for an element the model does not have.
     pub fn components(&self, element: usize) -> Option<&[Arc<Component>]> {
-        self.elements.get(element).map(Vec::as_slice)
+        self.elements.get(element).map(|components| components.as_slice())
     }
 
     /// One component.

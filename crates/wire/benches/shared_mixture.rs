@@ -146,7 +146,7 @@ impl Case {
     fn new(size: Size, mixture: &Mixture, atoms: usize) -> Self {
         let mut random = Random(2);
         // An alloy of at most five elements spread over the table.
-        let element = |atom| (atom % 5 * size.elements / 5).min(size.elements - 1);
+        let element = |atom: usize| (atom % 5 * size.elements / 5).min(size.elements - 1);
         let elements: Vec<usize> = (0..atoms).map(element).collect();
         let features = elements.iter().enumerate().flat_map(|(atom, &element)| {
             let component = mixture.component(element, atom / 5 % size.components).expect("a place");

@@ -11,19 +11,11 @@ use rustix::io::{Errno, retry_on_intr};
 use zerocopy::IntoBytes;
 
 use super::error::SharedMixtureError;
-use super::layout::{BLOCK_HEADER, Layout};
+use super::layout::{BlockHeader, Layout};
 use super::memory::Map;
 
 /// Free blocks beyond this give their memory back to the system.
 pub(super) const SPARE: u32 = 16;
-
-/// What stands in front of the numbers of a block, as words of 8 bytes.
-pub(super) mod header {
-    pub const ELEMENT: u64 = 0;
-    pub const SLOT: u64 = 8;
-    /// θ.
-    pub const THRESHOLD: u64 = 32;
-}
 
 /// All blocks of the file.
 #[derive(Debug)]
@@ -47,16 +39,8 @@ impl Blocks {
     /// The account of a file without extents.
     pub fn new(layout: Layout, file: File, path: PathBuf) -> Self {
         let (holds, references) = (Vec::new(), Vec::new());
-        Self {
-            layout,
-            file,
-            path,
-            holds,
-            references,
-            ready: Vec::new(),
-            bare: Vec::new(),
-            lingering: Vec::new(),
-        }
+        let (ready, bare, lingering) = (Vec::new(), Vec::new(), Vec::new());
+        Self { layout, file, path, holds, references, ready, bare, lingering }
     }
 
     /// Adds an extent, and reserves memory for its holds and its first `blocks` blocks.
@@ -88,16 +72,15 @@ impl Blocks {
         let block = self.free()?;
         let (count, effective_count) =
             component.statistics().map_or((f64::NAN, f64::NAN), |known| (known.count, known.effective_count));
-        let header: [u64; BLOCK_HEADER as usize / 8] = [
-            element.into(),
-            slot.into(),
+        let header = BlockHeader {
+            element: element.into(),
+            slot: slot.into(),
             version,
-            0,
-            component.threshold().to_bits(),
-            count.to_bits(),
-            effective_count.to_bits(),
-            0,
-        ];
+            threshold: component.threshold(),
+            count,
+            effective_count,
+            reserved: [0; 2],
+        };
         let mut place = self.place(block);
         for part in [header.as_bytes(), component.inverse().as_bytes(), component.centroid().as_bytes()] {
             if let Err(source) = self.file.write_all_at(part, place) {
@@ -138,10 +121,9 @@ impl Blocks {
 
     /// Frees what nobody refers to and no reader holds.
     pub fn collect(&mut self) {
-        let (held, free) =
-            std::mem::take(&mut self.lingering).into_iter().partition(|&block| self.held(block));
+        let lingering = std::mem::take(&mut self.lingering);
+        let (held, free): (Vec<u32>, Vec<u32>) = lingering.into_iter().partition(|&block| self.held(block));
         self.lingering = held;
-        let free: Vec<u32> = free;
         for block in free {
             let spare = self.ready.len() >= SPARE as usize;
             if spare && self.punch(block) { &mut self.bare } else { &mut self.ready }.push(block);

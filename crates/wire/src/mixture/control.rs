@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU32, AtomicU64};
 
 use super::layout::{LINE, Layout};
 use super::memory::Map;
-use super::protocol::NONE;
+use super::protocol::{NONE, Word};
 
 /// Newest version, slots of the readers, version words and rows.
 #[derive(Debug)]
@@ -53,7 +53,6 @@ impl Control {
 
     /// No version anywhere, no pins.
     pub fn clear(&self) {
-        use super::protocol::Word;
         self.pins().for_each(|pin| pin.put(NONE));
         (0..self.layout.rows).for_each(|row| self.version(row).put(NONE));
     }

@@ -18,8 +18,6 @@ const PAGE: u64 = 4096;
 pub(super) const LINE: u64 = 64;
 /// Versions alive at once: one a walker is the rule, and this for those who look on.
 const SPARE_ROWS: u32 = 64;
-/// Bytes in front of the numbers of a block.
-pub(super) const BLOCK_HEADER: u64 = 64;
 
 /// The first bytes of the file; the number of components of each element (u32) follow.
 #[derive(Debug, Clone, FromBytes, IntoBytes, Immutable, KnownLayout)]
@@ -36,6 +34,26 @@ struct Header {
     extent_blocks: u32,
     reserved: u32,
 }
+
+/// What stands in front of the numbers of a block: S, `[D × D]`, and **μ**, `[D]`.
+#[derive(Debug, Clone, IntoBytes, Immutable)]
+#[repr(C)]
+pub(super) struct BlockHeader {
+    pub element: u64,
+    pub slot: u64,
+    /// The version that the component came with.
+    pub version: u64,
+    /// θ.
+    pub threshold: f64,
+    /// Environments behind the component, not a number when that is not known.
+    pub count: f64,
+    /// Sum of their weights, likewise.
+    pub effective_count: f64,
+    pub reserved: [u64; 2],
+}
+
+/// A whole line, so that S begins with one.
+pub(super) const BLOCK_HEADER: u64 = size_of::<BlockHeader>() as u64;
 
 const HEADER: usize = size_of::<Header>();
 const CHECKED_FROM: usize = 16;
@@ -104,7 +122,7 @@ impl Layout {
         let row_bytes = up(4 * u64::from(components), LINE)?;
         let control_bytes = up(row_bytes.checked_mul(rows.into())?.checked_add(rows_at)?, PAGE)?;
         let reader_holds_bytes = up(4 * u64::from(extent_blocks), LINE)?;
-        let holds_bytes = up(reader_holds_bytes.checked_mul(readers.into())?, PAGE)?;
+        let holds_bytes = up(reader_holds_bytes.checked_mul(readers.into())?.max(1), PAGE)?;
         let numbers = u64::from(dimension) * (u64::from(dimension) + 1);
         let block_bytes = up(numbers.checked_mul(8)?.checked_add(BLOCK_HEADER)?, PAGE)?;
         let extent_bytes = block_bytes.checked_mul(extent_blocks.into())?.checked_add(holds_bytes)?;

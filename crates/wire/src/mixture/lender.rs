@@ -1,16 +1,16 @@
 //! What a reader has in its hands: its slot, the extents it has mapped, its holds on blocks.
 
 use std::fs::File;
+use std::mem::offset_of;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use calm::Component;
 
-use super::blocks::header;
 use super::control::Control;
 use super::error::SharedMixtureError;
-use super::layout::{BLOCK_HEADER, Layout};
+use super::layout::{BLOCK_HEADER, BlockHeader, Layout};
 use super::memory::Map;
 
 /// Makes components of blocks.
@@ -55,13 +55,13 @@ impl Lender {
         let (extent, index) = self.layout.extent_of(block);
         let extent = self.extent(extent)?;
         let at = self.layout.block_at(index);
-        let word = |offset: u64| extent.blocks.word(at + offset).load(Ordering::Relaxed);
-        let found = (word(header::ELEMENT), word(header::SLOT));
+        let word = |field: usize| extent.blocks.word(at + field as u64).load(Ordering::Relaxed);
+        let found = (word(offset_of!(BlockHeader, element)), word(offset_of!(BlockHeader, slot)));
         if found != (place.0.into(), place.1.into()) {
             let what = format!("block {block} is of component {found:?}, expected {place:?}");
             return Err(SharedMixtureError::Damaged { path: self.path.clone(), what });
         }
-        let threshold = f64::from_bits(word(header::THRESHOLD));
+        let threshold = f64::from_bits(word(offset_of!(BlockHeader, threshold)));
         let hold =
             Hold::new(&extent, &self.slot, self.layout.hold_at(self.slot.reader, index), at, &self.layout);
         Ok(Arc::new(Component::lent(Arc::new(hold), self.layout.dimension as usize, threshold)?))

@@ -1,11 +1,12 @@
 //! A reader: a walker's process.
 
+use std::fmt;
 use std::fs::OpenOptions;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use calm::{Component, Mixture};
+use calm::{ChangedComponent, Component, Mixture};
 
 use super::control::Control;
 use super::error::SharedMixtureError;
@@ -23,10 +24,16 @@ pub struct MixtureReader {
 }
 
 /// A version as it was made from its row.
-#[derive(Debug)]
 struct Current {
     mixture: Arc<Mixture>,
     row: Vec<u32>,
+}
+
+/// Without its numbers.
+impl fmt::Debug for Current {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Current").field("version", &self.mixture.version()).finish_non_exhaustive()
+    }
 }
 
 impl MixtureReader {
@@ -75,30 +82,38 @@ impl MixtureReader {
         let pin = slot.control.pin(slot.reader);
         let _pinned = Pinned::new(pin, slot.control.version(row), version).ok_or_else(gone)?;
         let row: Vec<u32> = slot.control.row(row).map(|block| block.load(Ordering::Relaxed)).collect();
-        let mixture =
-            Arc::new(Mixture::new(version, elements(&mut self.lender, self.current.as_ref(), &row)?)?);
+        let mixture = match &self.current {
+            Some(current) => following(&mut self.lender, current, &row)?.at_version(version),
+            None => Mixture::new(version, elements(&mut self.lender, &row)?)?,
+        };
+        let mixture = Arc::new(mixture);
         self.current = Some(Current { mixture: Arc::clone(&mixture), row });
         Ok(mixture)
     }
 }
 
-/// The components of a pinned row: those of the current version where the block is the same, new ones elsewhere.
-///
-/// A block that the current version holds cannot have been used anew, so the same number is the same component.
-fn elements(
-    lender: &mut Lender,
-    current: Option<&Current>,
-    row: &[u32],
-) -> Result<Vec<Vec<Arc<Component>>>, SharedMixtureError> {
-    let known = current.into_iter().flat_map(|current| current.row.iter().zip(current.mixture.iter()));
-    let (mut known, mut blocks) = (known.map(|(&block, (.., component))| (block, component)), row.iter());
+/// All components of a pinned row.
+fn elements(lender: &mut Lender, row: &[u32]) -> Result<Vec<Vec<Arc<Component>>>, SharedMixtureError> {
+    let mut blocks = row.iter();
     let shape = lender.layout.shape.clone();
     let elements = (0..).zip(shape).map(|(element, count)| {
-        let components = (0..count).zip(blocks.by_ref()).map(|(slot, &block)| match known.next() {
-            Some((same, component)) if same == block => Ok(Arc::clone(component)),
-            _ => lender.lend((element, slot), block),
-        });
-        components.collect()
+        let components = (0..count).zip(blocks.by_ref());
+        components.map(|(slot, &block)| lender.lend((element, slot), block)).collect()
     });
     elements.collect()
+}
+
+/// The current mixture with the components that have other blocks in a pinned row.
+///
+/// A block that the current version holds cannot have been used anew, so the same number is the same component.
+fn following(lender: &mut Lender, current: &Current, row: &[u32]) -> Result<Mixture, SharedMixtureError> {
+    let blocks = row.iter().zip(&current.row).zip(lender.layout.places());
+    let other = blocks.filter(|((new, old), _)| new != old).map(|((&block, _), place)| (place, block));
+    let other: Vec<_> = other.collect();
+    let changed = other.into_iter().map(|((element, slot), block)| {
+        let component = lender.lend((element, slot), block)?;
+        Ok(ChangedComponent { element: element as usize, slot: slot as usize, component })
+    });
+    let changed = changed.collect::<Result<Vec<_>, SharedMixtureError>>()?;
+    Ok(current.mixture.with_changes(&changed)?)
 }

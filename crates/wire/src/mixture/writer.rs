@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::sync::{Arc, Weak};
 use std::{fmt, io};
 
-use calm::{Component, Mixture};
+use calm::Mixture;
 
 use super::blocks::{Blocks, SPARE};
 use super::control::Control;
@@ -24,14 +24,8 @@ pub struct SharedMixture {
     blocks: Blocks,
     /// What stands in each row.
     living: Vec<Option<Living>>,
-    /// The components of the newest version, in the order of a row: what others are compared with.
-    latest: Vec<Placed>,
-}
-
-/// A component and the block it was written to.
-struct Placed {
-    component: Arc<Component>,
-    block: u32,
+    /// The newest version and its blocks, in the order of a row: what others are compared with.
+    latest: Option<(Mixture, Vec<u32>)>,
 }
 
 /// A version that readers can pin.
@@ -96,9 +90,9 @@ impl SharedMixture {
         control.clear();
         let mut living = Vec::new();
         living.resize_with(layout.rows as usize, || None);
-        let mut shared = Self { layout, control, blocks, living, latest: Vec::new() };
-        let placed = shared.write(mixture)?;
-        shared.enter(0, mixture, placed, Vec::new());
+        let mut shared = Self { layout, control, blocks, living, latest: None };
+        let blocks = shared.write(mixture)?;
+        shared.enter(0, mixture, blocks, Vec::new());
         shared.layout.write(file).map_err(|source| failed("write the header", source))?;
         Ok(shared)
     }
@@ -126,8 +120,8 @@ impl SharedMixture {
         let row = self.living.iter().position(Option::is_none);
         let living = self.living.len();
         let row = row.ok_or(SharedMixtureError::TooManyVersions { version, living })?;
-        let placed = self.write(mixture)?;
-        self.enter(row, mixture, placed, vec![Arc::downgrade(mixture)]);
+        let blocks = self.write(mixture)?;
+        self.enter(row, mixture, blocks, vec![Arc::downgrade(mixture)]);
         Ok(())
     }
 
@@ -142,13 +136,13 @@ impl SharedMixture {
     }
 
     /// The block of each component of a version: those of the latest for what did not change, new ones for the rest.
-    fn write(&mut self, mixture: &Mixture) -> Result<Vec<Placed>, SharedMixtureError> {
-        let (mut all, mut written) = (Vec::with_capacity(self.latest.len()), Vec::new());
-        for (index, (place, (.., component))) in self.layout.places().zip(mixture.iter()).enumerate() {
-            let known = self.latest.get(index).filter(|known| Arc::ptr_eq(&known.component, component));
-            let block = match known {
-                Some(known) => known.block,
-                None => match self.blocks.write(place, mixture.version(), component) {
+    fn write(&mut self, mixture: &Mixture) -> Result<Vec<u32>, SharedMixtureError> {
+        let (mut row, mut written) = (Vec::with_capacity(self.layout.components as usize), Vec::new());
+        let mut latest = self.latest.iter().flat_map(|(latest, blocks)| latest.iter().zip(blocks));
+        for (place, (.., component)) in self.layout.places().zip(mixture.iter()) {
+            let block = match latest.next() {
+                Some(((.., same), &block)) if Arc::ptr_eq(same, component) => block,
+                _ => match self.blocks.write(place, mixture.version(), component) {
                     Ok(block) => *written.push_mut(block),
                     Err(error) => {
                         self.blocks.give_back(written.into_iter());
@@ -156,23 +150,22 @@ impl SharedMixture {
                     }
                 },
             };
-            all.push(Placed { component: Arc::clone(component), block });
+            row.push(block);
         }
-        Ok(all)
+        Ok(row)
     }
 
     /// Lets readers see a version, of which the blocks are written, in a free row.
-    fn enter(&mut self, row: usize, mixture: &Mixture, placed: Vec<Placed>, owners: Vec<Weak<Mixture>>) {
+    fn enter(&mut self, row: usize, mixture: &Mixture, blocks: Vec<u32>, owners: Vec<Weak<Mixture>>) {
         let version = mixture.version();
-        let blocks: Vec<u32> = placed.iter().map(|placed| placed.block).collect();
         self.blocks.refer(&blocks);
         for (word, &block) in self.control.row(row as u32).zip(&blocks) {
             word.store(block, Ordering::Relaxed);
         }
         self.control.version(row as u32).put(version);
-        if self.latest.is_empty() || version > self.newest() {
+        if self.latest.is_none() || version > self.newest() {
             self.control.newest().put(version);
-            self.latest = placed;
+            self.latest = Some((mixture.clone(), blocks.clone()));
         }
         if let Some(place) = self.living.get_mut(row) {
             *place = Some(Living { version, blocks, owners });
