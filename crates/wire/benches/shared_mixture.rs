@@ -122,7 +122,9 @@ fn evaluation(folder: &Path, size: Size, mixture: &Mixture) {
                 let [a, b] = if (round + place) % 2 == 0 { times } else { [times[1], times[0]] };
                 // The first round takes the pages in.
                 if round > 0 {
-                    (private.push(a), shared.push(b), ratios.push(b / a));
+                    private.push(a);
+                    shared.push(b);
+                    ratios.push(b / a);
                 }
             }
         }
@@ -180,7 +182,7 @@ fn visibility(path: &Path, size: Size, mut mixture: Arc<Mixture>) {
     let mut readers: Vec<Child> = (0..READERS).map(|number| start(path, number)).collect();
     let (mut random, mut seen) = (Random(3), [const { Vec::new() }; 4]);
     for turn in 0..400 {
-        let place = (turn * 7 % (size.elements * size.components)) as usize;
+        let place = turn * 7 % (size.elements * size.components);
         let (element, slot) = (place / size.components, place % size.components);
         let component = component(&mut random, size.dimension);
         let next = mixture.with_changes(&[ChangedComponent { element, slot, component }]);

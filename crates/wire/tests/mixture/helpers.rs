@@ -38,9 +38,9 @@ pub fn first() -> Arc<Mixture> {
     Arc::new(Mixture::new(0, elements.to_vec()).unwrap())
 }
 
-/// Number of components that change with each version: about half of them.
+/// Whether a component changes with a version: about every other one does.
 pub fn changes(version: u64, place: usize) -> bool {
-    version > 0 && Random(version * 64 + place as u64).next() % 2 == 0
+    version > 0 && Random(version * 64 + place as u64).below(2) == 0
 }
 
 /// The version at which a component of `version` was made.

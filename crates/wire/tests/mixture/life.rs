@@ -173,10 +173,13 @@ fn the_same_version_is_the_same_mixture_and_unchanged_components_are_shared() {
 fn another_shape_is_refused() {
     let (_folder, path) = place();
     let mut shared = SharedMixture::create(&path, &first(), 1).unwrap();
-    let fewer = vec![vec![stamped(1); 3], vec![stamped(1)], vec![stamped(1)]];
-    let small =
-        Component::new(vec![0.0; DIMENSION - 1], vec![0.0; (DIMENSION - 1).pow(2)], 1.0, None).unwrap();
-    let smaller = [3, 1, 2].map(|count| vec![Arc::new(small.clone()); count]).to_vec();
+    let number = DIMENSION - 1;
+    let small = || Component::new(vec![0.0; number], vec![0.0; number * number], 1.0, None).unwrap();
+    let elements = |shape: [usize; 3], component: &dyn Fn() -> Arc<Component>| {
+        shape.map(|count| (0..count).map(|_| component()).collect()).to_vec()
+    };
+    let fewer = elements([3, 1, 1], &|| stamped(1));
+    let smaller = elements([3, 1, 2], &|| Arc::new(small()));
     for elements in [fewer, smaller] {
         let mixture = Arc::new(Mixture::new(1, elements).unwrap());
         let refused = shared.publish(&mixture);
@@ -205,4 +208,11 @@ fn a_leak_of_versions_is_an_error_that_passes() {
     kept.remove(1);
     shared.publish(&mixture).unwrap();
     check(&reader.pin(mixture.version()).unwrap());
+}
+
+#[test]
+fn both_ends_may_go_from_thread_to_thread() {
+    fn may_go<T: Send>() {}
+    may_go::<SharedMixture>();
+    may_go::<MixtureReader>();
 }
