@@ -1,4 +1,10 @@
 //! The shell round the selector: takes reports from the channel, has every commit written, then answers.
+//!
+//! To have a transaction on the disk takes longer than most decisions. So the reactor takes all that has arrived
+//! meanwhile, has it decided one after the other, and commits it as one group; everybody is answered after that.
+
+mod arrivals;
+pub mod group;
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -13,10 +19,13 @@ use wire::WalkId;
 use wire::messages::Progress;
 use wire::transport::{Incoming, Work};
 
+use self::arrivals::{Arrival, Arrivals};
 use crate::selector::{Next, Selector, SelectorError};
 
 /// How often a full label queue is looked at again.
 const QUEUE_LOOK: Duration = Duration::from_millis(200);
+/// Messages of a group, at most: those who came first should not wait for long.
+const GROUP: usize = 64;
 
 /// Why a campaign cannot go on.
 #[derive(Debug, thiserror::Error)]
@@ -63,10 +72,13 @@ pub struct Reactor {
     pub queue_limit: u64,
 }
 
-/// The walkers, as far as the reactor must know of them.
-#[derive(Default)]
-struct Walkers {
-    /// Those that wait for a turn, in the order in which they came.
+/// The reactor at work: what it works with, and the walkers as far as it must know of them.
+struct Shell {
+    selector: Selector,
+    store: Store,
+    stopping: Arc<AtomicBool>,
+    queue_limit: u64,
+    /// Walkers that wait for a turn, in the order in which they came.
     waiting: VecDeque<(u32, oneshot::Sender<Option<Work>>)>,
     /// The walk that each of the others has in hand.
     at_work: HashMap<u32, WalkId>,
@@ -74,51 +86,73 @@ struct Walkers {
 
 impl Reactor {
     /// Runs until every walker has been sent home: all walks over, or stopped.
-    pub async fn run(mut self, mut watch: impl FnMut(Notice<'_>)) -> Result<Ended, ReactorError> {
-        let mut walkers = Walkers::default();
+    pub async fn run(self, mut watch: impl FnMut(Notice<'_>)) -> Result<Ended, ReactorError> {
+        let Self { selector, store, incoming, stopping, queue_limit } = self;
+        let mut arrivals = Arrivals::new(incoming, selector.examiner().clone(), selector.mixture());
+        let (waiting, at_work) = (VecDeque::new(), HashMap::new());
+        let mut shell = Shell { selector, store, stopping, queue_limit, waiting, at_work };
         // An interval, not a time since the last message: walkers at work may report progress without a pause.
         let mut look = tokio::time::interval(QUEUE_LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
-            let message = tokio::select! {
-                message = self.incoming.recv() => message,
-                _ = look.tick(), if !walkers.waiting.is_empty() => {
-                    self.answer(&mut walkers, &mut watch).await?;
+            let group = tokio::select! {
+                group = arrivals.take(GROUP) => group,
+                _ = look.tick(), if !shell.waiting.is_empty() => {
+                    shell.answer(&mut watch).await?;
                     continue;
                 }
             };
-            match message {
+            if group.is_empty() {
                 // Every walker has gone home.
-                None => return Ok(if self.selector.is_done() { Ended::Done } else { Ended::Stopped }),
-                Some(Incoming::Progress(walk, progress)) => watch(Notice::Progress(walk, progress)),
-                Some(Incoming::Free { walker, report, reply }) => {
-                    walkers.at_work.remove(&walker);
-                    let commit = report.map(|report| self.selector.report(report)).transpose()?.flatten();
-                    if let Some(commit) = commit {
-                        self.store.commit(&commit).await?;
-                        watch(Notice::Committed(&commit));
+                return Ok(if shell.selector.is_done() { Ended::Done } else { Ended::Stopped });
+            }
+            let answer = group.iter().any(|arrival| !matches!(arrival, Arrival::Progress(..)));
+            let commit = shell.decide(group, &mut watch).await?;
+            arrivals.in_force(shell.selector.mixture());
+            if let Some(commit) = commit {
+                shell.store.commit(&commit).await?;
+                watch(Notice::Committed(&commit));
+            }
+            if answer {
+                shell.answer(&mut watch).await?;
+            }
+        }
+    }
+}
+
+impl Shell {
+    /// Takes a group in, in the order in which it arrived. Returns what is to be committed before anybody is answered.
+    async fn decide(
+        &mut self,
+        group: Vec<Arrival>,
+        watch: &mut impl FnMut(Notice<'_>),
+    ) -> Result<Option<Commit>, ReactorError> {
+        let mut whole = None;
+        for arrival in group {
+            match arrival {
+                Arrival::Progress(walk, progress) => watch(Notice::Progress(walk, progress)),
+                Arrival::Free { walker, report, reply } => {
+                    self.at_work.remove(&walker);
+                    self.waiting.push_back((walker, reply));
+                    let Some(report) = report else { continue };
+                    if let Some(commit) = self.selector.examined(report.done().await)? {
+                        group::append(whole.get_or_insert_default(), commit);
                     }
-                    walkers.waiting.push_back((walker, reply));
-                    self.answer(&mut walkers, &mut watch).await?;
                 }
-                Some(Incoming::Gone { walker }) => {
-                    if let Some(walk) = walkers.at_work.remove(&walker) {
+                Arrival::Gone { walker } => {
+                    if let Some(walk) = self.at_work.remove(&walker) {
                         self.selector.lost(walk);
-                        self.answer(&mut walkers, &mut watch).await?;
                     }
                 }
             }
         }
+        Ok(whole)
     }
 
     /// Gives turns to waiting walkers as far as there are any, or sends them home.
-    async fn answer(
-        &mut self,
-        walkers: &mut Walkers,
-        watch: &mut impl FnMut(Notice<'_>),
-    ) -> Result<(), ReactorError> {
+    async fn answer(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<(), ReactorError> {
         if self.stopping.load(Ordering::Relaxed) {
-            walkers.send_home();
+            self.send_home();
             return Ok(());
         }
         let unfinished = self.store.unfinished_jobs().await?;
@@ -126,32 +160,30 @@ impl Reactor {
             watch(Notice::QueueFull(unfinished));
             return Ok(());
         }
-        while let Some((walker, reply)) = walkers.waiting.pop_front() {
+        while let Some((walker, reply)) = self.waiting.pop_front() {
             match self.selector.next_turn() {
                 Next::Turn(assignment) => {
                     let walk = assignment.walk;
                     let work = Work { assignment: *assignment, mixture: Arc::clone(self.selector.mixture()) };
                     if reply.send(Some(work)).is_ok() {
-                        walkers.at_work.insert(walker, walk);
+                        self.at_work.insert(walker, walk);
                     } else {
                         self.selector.lost(walk);
                     }
                 }
                 Next::Wait => {
-                    walkers.waiting.push_front((walker, reply));
+                    self.waiting.push_front((walker, reply));
                     return Ok(());
                 }
                 Next::Done => {
-                    walkers.waiting.push_front((walker, reply));
-                    walkers.send_home();
+                    self.waiting.push_front((walker, reply));
+                    self.send_home();
                 }
             }
         }
         Ok(())
     }
-}
 
-impl Walkers {
     fn send_home(&mut self) {
         for (_, reply) in self.waiting.drain(..) {
             // A walker that is gone already needs no answer.

@@ -7,12 +7,11 @@ use calm::grade::maximum;
 use calm::watch::{GradeDistribution, grade_distribution};
 use calm::{GradeError, Mixture, UpdateOutcome};
 use serde_json::json;
-use store::records::{AtomGrades, CandidateRecord, Commit, ComponentRecord, Decision, Fate};
-use wire::messages::{Decline, End, Outcome, Report, Verdict};
+use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate};
+use wire::messages::{Decline, End, Outcome, Verdict};
 use wire::{CandidateBlock, ContentHash, WalkId};
 
-use super::{Selector, SelectorError, UpdateProtocol};
-use crate::grader::Bonds;
+use super::{Examined, ExaminedReport, Selector, SelectorError, UpdateProtocol};
 
 /// Priority of the label jobs of biased candidates; control frames come after them.
 const BIASED_PRIORITY: i32 = 10;
@@ -43,16 +42,8 @@ impl TrainingFrames {
     }
 }
 
-/// A candidate with its grades.
-struct Graded {
-    block: CandidateBlock,
-    bonds: Bonds,
-    selector: AtomGrades,
-    original: AtomGrades,
-}
-
 impl Selector {
-    pub(super) fn decide(&mut self, reports: Vec<Report>) -> Result<Commit, SelectorError> {
+    pub(super) fn decide(&mut self, reports: Vec<ExaminedReport>) -> Result<Commit, SelectorError> {
         let mut commit = Commit::default();
         let mut touched = BTreeSet::new();
         for report in reports {
@@ -60,10 +51,10 @@ impl Selector {
             touched.insert(id);
             self.take_in(&report, &mut commit);
             match report.outcome {
-                Outcome::Candidate(block) if self.walks[&id].is_biased() => {
-                    self.decide_candidate(id, block, &mut commit)?;
+                Outcome::Candidate(examined) if self.walks[&id].is_biased() => {
+                    self.decide_candidate(id, examined?, &mut commit)?;
                 }
-                Outcome::Candidate(block) => self.keep_control_frame(id, block, &mut commit)?,
+                Outcome::Candidate(examined) => self.keep_control_frame(id, examined?, &mut commit)?,
                 Outcome::Ended(end) => self.end_walk(id, &end, &mut commit),
                 // A control walk whose frames did not come will not give them in another turn either.
                 Outcome::Turn if self.walks[&id].missed_its_frames() => {
@@ -80,7 +71,7 @@ impl Selector {
     }
 
     /// Moves the walk to where its turn ended, and logs returns to a checkpoint.
-    fn take_in(&mut self, report: &Report, commit: &mut Commit) {
+    fn take_in(&mut self, report: &ExaminedReport, commit: &mut Commit) {
         let turn_steps = self.settings.turn_steps;
         let walk = self.walk_mut(report.walk);
         let returned = report.progress.segment > walk.memory.segment;
@@ -102,23 +93,13 @@ impl Selector {
         }
     }
 
-    /// Grades a block under the mixture in force and under the original one.
-    fn grade(&self, block: CandidateBlock) -> Result<Graded, SelectorError> {
-        let view = block.view();
-        let failed = |source| SelectorError::Grade { candidate: view.id(), source };
-        let bonds = self.grader.bonds(&view.structure()).map_err(failed)?;
-        let selector = bonds.grade(&self.mixture, view.features).map_err(failed)?;
-        let original = bonds.grade(&self.original, view.features).map_err(failed)?;
-        Ok(Graded { block, bonds, selector, original })
-    }
-
     fn decide_candidate(
         &mut self,
         id: WalkId,
-        block: CandidateBlock,
+        examined: Examined,
         commit: &mut Commit,
     ) -> Result<(), SelectorError> {
-        let graded = self.grade(block)?;
+        let graded = examined.under(&self.mixture)?;
         let view = graded.block.view();
         let candidate = view.id();
         let mut detail = json!({
@@ -151,10 +132,10 @@ impl Selector {
     fn keep_control_frame(
         &mut self,
         id: WalkId,
-        block: CandidateBlock,
+        examined: Examined,
         commit: &mut Commit,
     ) -> Result<(), SelectorError> {
-        let graded = self.grade(block)?;
+        let graded = examined.under(&self.mixture)?;
         let step = graded.block.view().id().step;
         let detail = json!({ "original": grade_summary(&graded.original.gamma, 0) });
         self.put_down(id, graded, Fate::Accepted, true, detail, commit);
@@ -171,13 +152,13 @@ impl Selector {
     fn put_down(
         &self,
         id: WalkId,
-        graded: Graded,
+        graded: Examined,
         fate: Fate,
         keep_features: bool,
         detail: serde_json::Value,
         commit: &mut Commit,
     ) {
-        let Graded { block, selector, original, .. } = graded;
+        let Examined { block, selector, original, .. } = graded;
         let (walk, candidate) = (&self.walks[&id], Some(block.view().id()));
         let (kind, priority) = match fate {
             _ if !walk.is_biased() => ("control", CONTROL_PRIORITY),
@@ -198,7 +179,7 @@ impl Selector {
     }
 
     /// The first reason, if any, in the order: guard, duplicate, budget, covered.
-    fn reason_to_decline(&self, id: WalkId, content: ContentHash, graded: &Graded) -> Option<Decline> {
+    fn reason_to_decline(&self, id: WalkId, content: ContentHash, graded: &Examined) -> Option<Decline> {
         let walk = &self.walks[&id].record;
         if graded.bonds.shortest < self.least_distances[walk.seed_structure as usize] {
             Some(Decline::Guard)
@@ -216,7 +197,7 @@ impl Selector {
     /// Makes the mixture cover the candidate: the next version, in the commit.
     fn update(
         &mut self,
-        graded: &Graded,
+        graded: &Examined,
         commit: &mut Commit,
         detail: &mut serde_json::Value,
     ) -> Result<(), SelectorError> {
@@ -274,7 +255,7 @@ impl Selector {
         let restart = walk.is_biased() && self.settings.update == UpdateProtocol::Restarted;
         if restart {
             let next_version = self.mixture.version() + 1;
-            self.mixture = Arc::new(self.original.at_version(next_version));
+            self.mixture = Arc::new(self.examiner.original.at_version(next_version));
             commit.components.clear();
             commit.restart_mixture = true;
             if let Some(training) = &self.training {

@@ -1,11 +1,12 @@
 //! The selector: owns the one mixture, decides on every candidate, and hands out the turns of walks.
 //!
 //! It is driven by three calls. [`Selector::next_turn`] gives the next turn for a free walker, [`Selector::report`] takes
-//! what came of a turn and returns what must be committed, and nothing is given out again before the caller has
+//! what came of a turn and returns what must be committed, and no turn is given out again before the caller has
 //! committed it. All state that matters goes through a [`Commit`], so [`Selector::restore`] continues from the store
 //! as if nothing had happened.
 
 mod decide;
+mod examine;
 mod turns;
 mod walk;
 
@@ -22,6 +23,7 @@ use wire::{CampaignId, CandidateId, ContentHash, WalkId};
 
 use crate::grader::{Grader, GraderError};
 pub use decide::TrainingFrames;
+pub use examine::{Examined, ExaminedReport, Examiner};
 pub use turns::Next;
 use walk::Walk;
 
@@ -158,8 +160,7 @@ pub struct Selector {
     seeds: Vec<SeedStructure>,
     /// Shortest distance of each seed structure that a candidate must keep, Å.
     least_distances: Vec<f64>,
-    grader: Grader,
-    original: Arc<Mixture>,
+    examiner: Examiner,
     mixture: Arc<Mixture>,
     training: Option<TrainingFrames>,
     walks: BTreeMap<WalkId, Walk>,
@@ -167,7 +168,7 @@ pub struct Selector {
     /// Rounds begun; always 0 in live mode.
     round: u64,
     /// Walks of the round in hand, with the reports that have come in.
-    in_round: BTreeMap<WalkId, Option<Report>>,
+    in_round: BTreeMap<WalkId, Option<ExaminedReport>>,
     accepted: u32,
     declined_feature_bytes: u64,
     /// Imported structures among the known ones: now, and when the log last spoke of them.
@@ -202,8 +203,7 @@ impl Selector {
             campaign,
             seeds,
             least_distances,
-            grader,
-            original,
+            examiner: Examiner { grader: Arc::new(grader), original },
             mixture,
             training,
             walks,
@@ -232,14 +232,27 @@ impl Selector {
         self.walks.values().map(standing).collect()
     }
 
-    /// Takes what came of a turn. What it returns must be committed before anything else is asked of the selector.
+    /// Takes what came of a turn. What it returns must be committed before a next turn is asked for; further reports may
+    /// be taken before that, if what they return is committed with it or after it.
     /// A report of a turn that nobody has in hand (sent twice, or by one that was taken for lost) changes nothing.
     pub fn report(&mut self, report: Report) -> Result<Option<Commit>, SelectorError> {
+        let examined = self.examiner.examine(report, &self.mixture);
+        self.examined(examined)
+    }
+
+    /// What a report's candidate needs to be examined elsewhere, for [`Selector::examined`].
+    pub fn examiner(&self) -> &Examiner {
+        &self.examiner
+    }
+
+    /// [`Selector::report`] of a report whose candidate has been examined already. What comes of it is the same, whenever
+    /// that was.
+    pub fn examined(&mut self, report: ExaminedReport) -> Result<Option<Commit>, SelectorError> {
         let (id, turn) = (report.walk, report.turn);
         let asked = |walk: &&mut Walk| walk.out && walk.record.turn == turn;
         let Some(walk) = self.walks.get_mut(&id).filter(asked) else { return Ok(None) };
         walk.out = false;
-        if report.outcome == Outcome::Paused {
+        if matches!(report.outcome, Outcome::Paused) {
             walk.pause(report);
             return Ok(Some(Commit { walks: vec![walk.to_record()], ..Commit::default() }));
         }

@@ -102,7 +102,7 @@ impl Walk {
 
     /// Keeps where a turn was interrupted: the same turn goes on from there. A verdict that the turn began with is
     /// in the checkpoint by now.
-    pub fn pause(&mut self, report: Report) {
+    pub fn pause<C>(&mut self, report: Report<C>) {
         self.record.checkpoint = Some(report.checkpoint);
         self.record.progress = report.progress;
         self.memory.verdict = None;

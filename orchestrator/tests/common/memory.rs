@@ -6,7 +6,7 @@ use orchestrator::selector::Snapshot;
 use store::records::{Commit, ComponentRecord, Decision, Fate, WalkRecord};
 use wire::{ContentHash, Origin, WalkId};
 
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct MemoryStore {
     pub decisions: Vec<Decision>,
     pub candidates: BTreeSet<String>,

@@ -1,0 +1,70 @@
+//! What can be found out about a candidate before its turn to be decided comes: on any thread, in any order.
+
+use std::sync::Arc;
+
+use calm::Mixture;
+use store::records::AtomGrades;
+use wire::CandidateBlock;
+use wire::messages::Report;
+
+use super::SelectorError;
+use crate::grader::{Bonds, Grader};
+
+/// Grades candidates ahead of the decisions about them. Clones share what they need.
+#[derive(Clone)]
+pub struct Examiner {
+    pub(super) grader: Arc<Grader>,
+    pub(super) original: Arc<Mixture>,
+}
+
+/// A candidate with its grades.
+pub struct Examined {
+    pub(super) block: CandidateBlock,
+    pub(super) bonds: Bonds,
+    /// Under the original mixture.
+    pub(super) original: AtomGrades,
+    /// The mixture of the grades below.
+    pub(super) mixture: Arc<Mixture>,
+    pub(super) selector: AtomGrades,
+}
+
+/// A report with its candidate examined, or why it cannot be: an error if it comes to a decision about it.
+pub type ExaminedReport = Report<Result<Examined, SelectorError>>;
+
+impl Examiner {
+    /// Examines the candidate of a report, if it has one. `mixture` is the one that is likely to be in force when it is
+    /// decided; under any other it will be graded again.
+    pub fn examine(&self, report: Report, mixture: &Arc<Mixture>) -> ExaminedReport {
+        report.map_candidate(|block| self.examine_block(block, mixture))
+    }
+
+    fn examine_block(
+        &self,
+        block: CandidateBlock,
+        mixture: &Arc<Mixture>,
+    ) -> Result<Examined, SelectorError> {
+        let view = block.view();
+        let failed = |source| SelectorError::Grade { candidate: view.id(), source };
+        let bonds = self.grader.bonds(&view.structure()).map_err(failed)?;
+        let selector = bonds.grade(mixture, view.features).map_err(failed)?;
+        let original = if Arc::ptr_eq(mixture, &self.original) {
+            selector.clone()
+        } else {
+            bonds.grade(&self.original, view.features).map_err(failed)?
+        };
+        Ok(Examined { block, bonds, original, mixture: Arc::clone(mixture), selector })
+    }
+}
+
+impl Examined {
+    /// The same under the mixture in force.
+    pub(super) fn under(mut self, mixture: &Arc<Mixture>) -> Result<Self, SelectorError> {
+        if !Arc::ptr_eq(mixture, &self.mixture) {
+            let view = self.block.view();
+            let failed = |source| SelectorError::Grade { candidate: view.id(), source };
+            self.selector = self.bonds.grade(mixture, view.features).map_err(failed)?;
+            self.mixture = Arc::clone(mixture);
+        }
+        Ok(self)
+    }
+}
