@@ -1,11 +1,13 @@
 //! What becomes of the reports of a round, one after the other in walk order.
 
 use std::collections::BTreeSet;
+use std::panic::resume_unwind;
 use std::sync::Arc;
+use std::thread::{self, available_parallelism};
 
 use calm::grade::maximum;
 use calm::watch::{GradeDistribution, grade_distribution};
-use calm::{GradeError, Mixture, UpdateOutcome};
+use calm::{GradeError, Grades, Mixture, UpdateOutcome};
 use serde_json::json;
 use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate};
 use wire::messages::{Decline, End, Outcome, Verdict};
@@ -36,10 +38,28 @@ impl TrainingFrames {
         Ok(Self { elements, features, original })
     }
 
+    /// Their grades under another mixture, on every core: no atom's grade depends on the others.
     fn grades(&self, mixture: &Mixture) -> Result<GradeDistribution, SelectorError> {
-        grade_distribution(mixture, &self.elements, &self.features)
-            .map_err(|source| SelectorError::Training { source })
+        let cores = available_parallelism().map_or(1, |cores| cores.get());
+        let atoms = self.elements.len().div_ceil(cores).max(1);
+        let parts = self.elements.chunks(atoms).zip(self.features.chunks(atoms * mixture.dimension()));
+        let gamma = thread::scope(|scope| {
+            let parts: Vec<_> = parts
+                .map(|(elements, features)| scope.spawn(move || gamma(mixture, elements, features)))
+                .collect();
+            let gammas =
+                parts.into_iter().map(|part| part.join().unwrap_or_else(|panic| resume_unwind(panic)));
+            gammas.collect::<Result<Vec<_>, _>>()
+        });
+        let gamma = gamma.map_err(|source| SelectorError::Training { source })?;
+        Ok(GradeDistribution::of(&gamma.concat()))
     }
+}
+
+fn gamma(mixture: &Mixture, elements: &[usize], features: &[f64]) -> Result<Vec<f64>, GradeError> {
+    let mut grades = Grades::default();
+    grades.evaluate(mixture, elements, features, None)?;
+    Ok(grades.gamma)
 }
 
 impl Selector {
