@@ -1,0 +1,193 @@
+//! A campaign in live mode whose walkers offer what was recorded, as fast as it is taken.
+
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use calm::rules::Positive;
+use calm::watch::ForgettingAlarm;
+use calm::{CollectionRule, Combination, UpdateRule, UpdateSettings};
+use orchestrator::reactor::{Notice, Reactor};
+use orchestrator::selector::{Mode, SeedStructure, Selector, Settings, Snapshot, UpdateProtocol};
+use store::{Campaign, Fate, Protocol, Store};
+use tokio::sync::{mpsc, oneshot};
+use wire::messages::{Assignment, End, Outcome, Report};
+use wire::transport::Incoming;
+use wire::{CandidateBlock, ContentHash};
+
+use crate::recording::{CAMPAIGN, Model, crystal, progress};
+
+/// Bytes of a walk's checkpoint with 108 atoms: three states of positions, velocities, forces and energies.
+pub const CHECKPOINT: usize = 27_000;
+/// Reports under way between walkers and reactor, as in a campaign.
+const CHANNEL: usize = 64;
+
+/// The paper's rules for aluminium; structures are collected from `threshold` on (the paper: γ_max > 1.5).
+pub fn settings(threshold: f64) -> Settings {
+    let positive = |number: f64| Positive::try_from(number).unwrap();
+    Settings {
+        mode: Mode::Live,
+        walks_per_round: 1,
+        turn_steps: 1000,
+        update: UpdateProtocol::Carried,
+        search: UpdateSettings {
+            combination: Combination::Convex,
+            ladder: None,
+            stop: UpdateRule::MaximumGrade { target: positive(1.25) },
+        },
+        forgetting_alarm: ForgettingAlarm::default(),
+        collection: CollectionRule::MaximumGrade { threshold: positive(threshold) },
+        per_seed: u32::MAX,
+        total: None,
+        control: false,
+        least_distance: (1.2, 0.75),
+        declined_feature_bytes: 1_000_000_000,
+    }
+}
+
+/// A selector at the start of the campaign, one seed structure a walk.
+pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
+    let seeds =
+        (0..walks).map(|k| SeedStructure { name: format!("fcc-{k}"), structure: crystal() }).collect();
+    let (grader, original) = (model.grader.clone(), Arc::clone(&model.original));
+    let training = Some(model.training.clone());
+    Selector::restore(settings.clone(), CAMPAIGN, seeds, grader, original, training, Snapshot::default())
+        .unwrap()
+}
+
+/// The campaign's database, with a label protocol, so that every accept queues a job.
+pub async fn create_store(directory: &Path, walks: usize) -> Store {
+    let campaign = Campaign {
+        id: CAMPAIGN,
+        program_version: "bench".into(),
+        mode: "live".into(),
+        configuration: String::new(),
+        resolved_configuration: "{}".into(),
+        configuration_in_force: "{}".into(),
+    };
+    let seed = |index| store::SeedStructure {
+        index,
+        name: format!("fcc-{index}"),
+        source: "bench".into(),
+        structure: crystal(),
+    };
+    let seeds: Vec<_> = (0..walks as u32).map(seed).collect();
+    let store = Store::create(directory, &campaign, &seeds, 0).await.unwrap();
+    let hash = ContentHash([7; 32]);
+    let protocol = Protocol { hash, name: "reference".into(), settings: serde_json::json!({}) };
+    store.add_protocol(&protocol, 0).await.unwrap();
+    store
+}
+
+/// What a walk offers next, or its end.
+pub fn report(assignment: &Assignment, block: Option<CandidateBlock>) -> Report {
+    let mut checkpoint = vec![0; CHECKPOINT];
+    checkpoint[..8].copy_from_slice(&assignment.turn.to_le_bytes());
+    Report {
+        walk: assignment.walk,
+        turn: assignment.turn,
+        outcome: block.map_or(Outcome::Ended(End::Steps), Outcome::Candidate),
+        checkpoint,
+        progress: progress(assignment.turn),
+    }
+}
+
+/// How the whole way through reactor, selector and database went.
+#[derive(Default)]
+pub struct Run {
+    pub wall: Duration,
+    /// Of all threads.
+    pub processor: Duration,
+    pub candidates: usize,
+    pub accepted: usize,
+    pub covered: usize,
+    pub commits: usize,
+}
+
+/// Every recorded candidate from walkers side by side, through the reactor, into the database.
+pub async fn run(
+    model: &Model,
+    settings: &Settings,
+    recording: &[Vec<CandidateBlock>],
+    directory: &Path,
+) -> Run {
+    let walks = recording.len();
+    let store = create_store(directory, walks).await;
+    let mut selector = selector(model, walks, settings);
+    store.commit(&selector.begin_walks()).await.unwrap();
+    let (to_reactor, incoming) = mpsc::channel(CHANNEL);
+    let reactor =
+        Reactor { selector, store: store.clone(), incoming, stopping: Arc::default(), queue_limit: u64::MAX };
+    let offers: Arc<Vec<_>> =
+        Arc::new(recording.iter().map(|blocks| Mutex::new(blocks.clone().into_iter())).collect());
+    let (begun, used) = (Instant::now(), processor_time());
+    let walkers: Vec<_> = (0..walks as u32)
+        .map(|walker| {
+            let (to_reactor, offers) = (to_reactor.clone(), Arc::clone(&offers));
+            tokio::spawn(async move { walk(walker, &to_reactor, &offers).await })
+        })
+        .collect();
+    drop(to_reactor);
+    let mut run = Run::default();
+    reactor.run(|notice| run.take_in(&notice)).await.unwrap();
+    (run.wall, run.processor) = (begun.elapsed(), processor_time() - used);
+    for walker in walkers {
+        walker.await.unwrap();
+    }
+    store.close().await;
+    run
+}
+
+/// A walker as the reactor sees it: whatever walk it is given, the next of what was recorded of it is offered. The
+/// bytes are checked where they stand, as those from another process are.
+async fn walk(
+    walker: u32,
+    to_reactor: &mpsc::Sender<Incoming>,
+    offers: &[Mutex<std::vec::IntoIter<CandidateBlock>>],
+) {
+    let mut next = None;
+    loop {
+        let (reply, answer) = oneshot::channel();
+        to_reactor.send(Incoming::Free { walker, report: next.take(), reply }).await.unwrap();
+        let Ok(Some(work)) = answer.await else { return };
+        let block = offers[work.assignment.walk.0 as usize].lock().unwrap().next();
+        next = Some(report(&work.assignment, block.map(checked)));
+    }
+}
+
+/// The block once more, its bytes checked.
+pub fn checked(block: CandidateBlock) -> CandidateBlock {
+    CandidateBlock::in_place(Arc::new(Bytes(block))).unwrap()
+}
+
+struct Bytes(CandidateBlock);
+
+impl AsRef<[u8]> for Bytes {
+    fn as_ref(&self) -> &[u8] {
+        self.0.as_bytes()
+    }
+}
+
+impl Run {
+    fn take_in(&mut self, notice: &Notice<'_>) {
+        let Notice::Committed(commit) = notice else { return };
+        self.commits += 1;
+        for candidate in &commit.candidates {
+            self.candidates += 1;
+            match candidate.fate {
+                Fate::Accepted => self.accepted += 1,
+                Fate::Declined(wire::messages::Decline::Covered) => self.covered += 1,
+                Fate::Declined(_) => {}
+            }
+        }
+    }
+}
+
+/// Time that all threads of this process have spent on processors, in steps of 10 ms (Linux).
+fn processor_time() -> Duration {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
+    let ticks =
+        |field: usize| fields.get(field).and_then(|text| text.parse::<u64>().ok()).unwrap_or_default();
+    Duration::from_millis(10 * (ticks(11) + ticks(12)))
+}

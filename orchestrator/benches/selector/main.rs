@@ -1,0 +1,90 @@
+//! Recorded candidates through reactor, selector and SQLite as fast as they go, and where the time goes.
+//!
+//! `cargo bench -p orchestrator --bench selector`; the figures are in `docs/benchmarks.md`.
+
+mod campaign;
+mod random;
+mod recording;
+mod stages;
+
+use std::time::Duration;
+
+use recording::{Model, Plan};
+use stages::{Stages, plain_inserts};
+use wire::CandidateBlock;
+
+/// Walks, and walkers side by side.
+const WALKS: usize = 16;
+/// A walker's threshold of γ_max (paper).
+const THRESHOLD: f64 = 1.5;
+/// One so low that every candidate is accepted.
+const ALL: f64 = 0.1;
+
+fn main() {
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
+    let model = Model::load();
+    let plan = Plan {
+        walks: WALKS,
+        kinds: 200,
+        of_kind: 12,
+        collection: campaign::settings(THRESHOLD).collection,
+        least_distance: 2.15,
+    };
+    println!("mostly covered");
+    runtime.block_on(measure(&model, &model.record(plan), THRESHOLD));
+    println!("\nall accepted");
+    let plan = Plan { kinds: 320, of_kind: 1, ..plan };
+    runtime.block_on(measure(&model, &model.record(plan), ALL));
+}
+
+/// One setting: the whole way, then each stage alone.
+async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], threshold: f64) {
+    let folder = || tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+    let settings = campaign::settings(threshold);
+    let (whole, apart, plain) = (folder(), folder(), folder());
+    let run = campaign::run(model, &settings, recording, whole.path()).await;
+    let n = run.candidates;
+    let group = n.div_ceil(run.commits.max(1));
+    let stages = Stages::measure(model, &settings, recording, group, apart.path()).await;
+    let stored = std::fs::metadata(whole.path().join(store::DATABASE)).unwrap().len() as usize;
+    let bytes = stored / n + campaign::CHECKPOINT;
+    let plain = plain_inserts(n, bytes, group, plain.path()).await;
+
+    let rate = |count: usize, time: Duration| count as f64 / time.as_secs_f64();
+    let (dimension, share) = (model.original.dimension(), 100.0 * run.accepted as f64 / n as f64);
+    println!(
+        "  {n} candidates, 108 atoms, {dimension} features; {} accepted ({share:.1} %), {} covered",
+        run.accepted, run.covered
+    );
+    println!(
+        "  {:.0} candidates/s, {:.0} durable accepts/s",
+        rate(n, run.wall),
+        rate(run.accepted, run.wall)
+    );
+    println!(
+        "  {:.2} s, {:.2} processors busy; {} commits, {group} candidates each",
+        run.wall.as_secs_f64(),
+        run.processor.as_secs_f64() / run.wall.as_secs_f64(),
+        run.commits
+    );
+    println!("  {:.0}/s plain inserts of {bytes} bytes in the same groups", rate(n, plain));
+    println!("  {:<32} {:>13} {:>10}", "alone, on one thread", "µs/candidate", "of the sum");
+    let sum = stages.check + stages.decide + stages.commit;
+    let parts = stages.bonds + stages.grades + stages.search + stages.watch;
+    for (name, time) in [
+        ("check of the block", stages.check),
+        ("decide", stages.decide),
+        ("  bonds", stages.bonds),
+        ("  grades (live and original)", stages.grades),
+        ("  search for α, inverses", stages.search),
+        ("  watch over training frames", stages.watch),
+        ("  rest", stages.decide.saturating_sub(parts)),
+        ("commit", stages.commit),
+        ("  compress", stages.compress),
+        ("  rest: SQLite, flush", stages.commit.saturating_sub(stages.compress)),
+    ] {
+        let (each, of_sum) =
+            (1e6 * time.as_secs_f64() / n as f64, 100.0 * time.as_secs_f64() / sum.as_secs_f64());
+        println!("  {name:<32} {each:>13.0} {of_sum:>9.0} %");
+    }
+}

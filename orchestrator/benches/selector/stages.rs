@@ -1,0 +1,157 @@
+//! The stages of a candidate's way, each alone on one thread, with the candidates of the whole run.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use calm::Mixture;
+use calm::watch::grade_distribution;
+use orchestrator::reactor::group;
+use orchestrator::selector::{Next, Settings};
+use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
+use sqlx::{ConnectOptions, Connection};
+use store::{Commit, compress};
+use wire::CandidateBlock;
+
+use crate::campaign::{checked, create_store, report, selector};
+use crate::recording::Model;
+
+/// Time spent in each stage; the indented ones are parts of the one before.
+#[derive(Default)]
+pub struct Stages {
+    pub check: Duration,
+    pub decide: Duration,
+    pub bonds: Duration,
+    pub grades: Duration,
+    pub search: Duration,
+    pub watch: Duration,
+    pub commit: Duration,
+    pub compress: Duration,
+}
+
+fn timed<T>(total: &mut Duration, work: impl FnOnce() -> T) -> T {
+    let begun = Instant::now();
+    let result = work();
+    *total += begun.elapsed();
+    result
+}
+
+impl Stages {
+    /// Everything through the selector, without a reactor, and each part of a decision again by itself; then the commits
+    /// into a database, in groups of this size.
+    pub async fn measure(
+        model: &Model,
+        settings: &Settings,
+        recording: &[Vec<CandidateBlock>],
+        group: usize,
+        directory: &Path,
+    ) -> Self {
+        let mut stages = Self::default();
+        let commits = stages.decide(model, settings, recording);
+        stages.commit(commits, recording.len(), group, directory).await;
+        stages
+    }
+
+    fn decide(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        recording: &[Vec<CandidateBlock>],
+    ) -> Vec<Commit> {
+        let mut selector = selector(model, recording.len(), settings);
+        let mut commits = vec![selector.begin_walks()];
+        let mut offers: Vec<_> = recording.iter().map(|blocks| blocks.iter()).collect();
+        let mut turns = Vec::new();
+        loop {
+            while let Next::Turn(assignment) = selector.next_turn() {
+                turns.push(assignment);
+            }
+            if turns.is_empty() {
+                return commits;
+            }
+            for assignment in turns.drain(..) {
+                let block = offers[assignment.walk.0 as usize].next();
+                let before = Arc::clone(selector.mixture());
+                let report = report(&assignment, block.cloned());
+                commits.extend(timed(&mut self.decide, || selector.report(report)).unwrap());
+                if let Some(block) = block {
+                    self.parts(model, settings, block, &before, selector.mixture());
+                }
+            }
+        }
+    }
+
+    /// The parts of a decision, done once more.
+    fn parts(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        block: &CandidateBlock,
+        before: &Arc<Mixture>,
+        after: &Arc<Mixture>,
+    ) {
+        timed(&mut self.check, || checked(block.clone()));
+        let view = block.view();
+        let bonds = timed(&mut self.bonds, || model.grader.bonds(&view.structure())).unwrap();
+        timed(&mut self.grades, || bonds.grade(before, view.features)).unwrap();
+        if !Arc::ptr_eq(before, &model.original) {
+            timed(&mut self.grades, || bonds.grade(&model.original, view.features)).unwrap();
+        }
+        if !Arc::ptr_eq(before, after) {
+            let search = || calm::update(before, &bonds.elements, view.features, &settings.search);
+            timed(&mut self.search, search).unwrap();
+            let training = &model.training;
+            let watch = || grade_distribution(after, &training.elements, &training.features);
+            timed(&mut self.watch, watch).unwrap();
+        }
+    }
+
+    async fn commit(&mut self, commits: Vec<Commit>, walks: usize, size: usize, directory: &Path) {
+        let store = create_store(directory, walks).await;
+        let mut commits = commits.into_iter().peekable();
+        while commits.peek().is_some() {
+            let mut whole = Commit::default();
+            commits.by_ref().take(size).for_each(|commit| group::append(&mut whole, commit));
+            timed(&mut self.compress, || compress_arrays(&whole));
+            let begun = Instant::now();
+            store.commit(&whole).await.unwrap();
+            self.commit += begun.elapsed();
+        }
+        store.close().await;
+    }
+}
+
+/// What the store compresses of a commit.
+fn compress_arrays(commit: &Commit) {
+    for candidate in &commit.candidates {
+        if candidate.keep_features {
+            compress(candidate.block.view().features).unwrap();
+        }
+        for grades in [&candidate.selector, &candidate.original] {
+            compress(&[grades.gamma.as_slice(), &grades.gamma_nbr].concat()).unwrap();
+        }
+    }
+}
+
+/// Time that SQLite itself takes for as many rows of so many bytes, in transactions of a group each.
+pub async fn plain_inserts(rows: usize, bytes: usize, group: usize, directory: &Path) -> Duration {
+    let options =
+        SqliteConnectOptions::new().filename(directory.join("plain.sqlite")).create_if_missing(true);
+    let options = options.journal_mode(SqliteJournalMode::Wal).synchronous(SqliteSynchronous::Full);
+    let mut connection: SqliteConnection = options.connect().await.unwrap();
+    sqlx::query("CREATE TABLE row (number INTEGER PRIMARY KEY, bytes BLOB)")
+        .execute(&mut connection)
+        .await
+        .unwrap();
+    let row = vec![0x5a_u8; bytes];
+    let begun = Instant::now();
+    for first in (0..rows).step_by(group) {
+        let mut transaction = connection.begin().await.unwrap();
+        for _ in first..rows.min(first + group) {
+            let insert = sqlx::query("INSERT INTO row (bytes) VALUES (?)").bind(&row);
+            insert.execute(&mut *transaction).await.unwrap();
+        }
+        transaction.commit().await.unwrap();
+    }
+    begun.elapsed()
+}
