@@ -62,9 +62,10 @@ async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], threshold: f6
         rate(run.accepted, run.wall)
     );
     println!(
-        "  {:.2} s, {:.2} processors busy; {} commits, {group} candidates each",
+        "  {:.2} s, {:.2} processors busy, {:.2} ms of them a candidate; {} commits, {group} candidates each",
         run.wall.as_secs_f64(),
         run.processor.as_secs_f64() / run.wall.as_secs_f64(),
+        1e3 * run.processor.as_secs_f64() / n as f64,
         run.commits
     );
     println!("  {:.0}/s plain inserts of {bytes} bytes in the same groups", rate(n, plain));

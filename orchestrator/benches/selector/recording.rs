@@ -67,7 +67,7 @@ impl Model {
         Self { grace, grader, original, training }
     }
 
-    /// Blocks of each walk in the order in which the walk offers them, as the bytes that a walker sends.
+    /// Blocks of each walk in the order in which the walk offers them.
     pub fn record(&self, plan: Plan) -> Vec<Vec<CandidateBlock>> {
         let cores = thread::available_parallelism().map_or(1, |cores| cores.get());
         let kinds = (0..plan.kinds).collect::<Vec<_>>();
@@ -179,14 +179,8 @@ impl State {
     /// Stretched by up to 14 %, sheared, and each coordinate displaced by 0.1 to 0.35 Å.
     fn draw(random: &mut Random) -> Self {
         let stretch = 1.0 + 0.14 * random.uniform();
-        let mut deformation: Matrix3 = [[0.0; 3]; 3];
-        for i in 0..3 {
-            for j in 0..=i {
-                deformation[i][j] = 0.05 * random.normal();
-                deformation[j][i] = deformation[i][j];
-            }
-            deformation[i][i] += stretch;
-        }
+        let [xx, yy, zz, yz, xz, xy] = [(); 6].map(|()| 0.05 * random.normal());
+        let deformation: Matrix3 = [[stretch + xx, xy, xz], [xy, stretch + yy, yz], [xz, yz, stretch + zz]];
         let mut structure = crystal();
         structure.cell.0 = structure.cell.0.map(|row| cell::row_times(row, &deformation));
         for position in &mut structure.positions {
