@@ -69,6 +69,22 @@ impl Launch {
         if self.own_group {
             command.process_group(0);
         }
+        keep_to_ourselves(&mut command);
         Ok((command.spawn()?, self.setup))
     }
+}
+
+/// Lets the child inherit nothing but its three standard streams. What is opened for shared memory is not marked to be
+/// closed, and a labeller, which outlives this process, would keep that memory.
+#[allow(unsafe_code)]
+fn keep_to_ourselves(command: &mut Command) {
+    let close_the_rest = || {
+        // SAFETY: a system call that takes numbers and touches no memory.
+        match unsafe { libc::close_range(3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC as libc::c_int) } {
+            0 => Ok(()),
+            _ => Err(io::Error::last_os_error()),
+        }
+    };
+    // SAFETY: between fork and exec nothing is done but that system call; it allocates nothing and takes no lock.
+    unsafe { command.pre_exec(close_the_rest) };
 }
