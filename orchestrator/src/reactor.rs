@@ -24,6 +24,8 @@ use crate::selector::{Next, Selector, SelectorError};
 
 /// How often a full label queue is looked at again.
 const QUEUE_LOOK: Duration = Duration::from_millis(200);
+/// A turn may cost so many walkers, which ended by their own fault with it in hand; then its walk is over.
+const MOST_WALKERS: u32 = 3;
 /// Messages of a group, at most: those who came first should not wait for long.
 const GROUP: usize = 64;
 
@@ -82,6 +84,8 @@ struct Shell {
     waiting: VecDeque<(u32, oneshot::Sender<Option<Work>>)>,
     /// The walk that each of the others has in hand.
     at_work: HashMap<u32, WalkId>,
+    /// Walkers that the present turn of a walk has cost, one after the other.
+    costs: HashMap<WalkId, u32>,
 }
 
 impl Reactor {
@@ -89,8 +93,8 @@ impl Reactor {
     pub async fn run(self, mut watch: impl FnMut(Notice<'_>)) -> Result<Ended, ReactorError> {
         let Self { selector, store, incoming, stopping, queue_limit } = self;
         let mut arrivals = Arrivals::new(incoming, selector.examiner().clone(), selector.mixture());
-        let (waiting, at_work) = (VecDeque::new(), HashMap::new());
-        let mut shell = Shell { selector, store, stopping, queue_limit, waiting, at_work };
+        let (waiting, at_work, costs) = (VecDeque::new(), HashMap::new(), HashMap::new());
+        let mut shell = Shell { selector, store, stopping, queue_limit, waiting, at_work, costs };
         // An interval, not a time since the last message: walkers at work may report progress without a pause.
         let mut look = tokio::time::interval(QUEUE_LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -135,18 +139,35 @@ impl Shell {
                     self.at_work.remove(&walker);
                     self.waiting.push_back((walker, reply));
                     let Some(report) = report else { continue };
-                    if let Some(commit) = self.selector.examined(report.done().await)? {
+                    let report = report.done().await;
+                    self.costs.remove(&report.walk);
+                    if let Some(commit) = self.selector.examined(report)? {
                         group::append(whole.get_or_insert_default(), commit);
                     }
                 }
-                Arrival::Gone { walker } => {
-                    if let Some(walk) = self.at_work.remove(&walker) {
-                        self.selector.lost(walk);
+                Arrival::Gone { walker, fault } => {
+                    let Some(walk) = self.at_work.remove(&walker) else { continue };
+                    if let Some(commit) = self.lost(walk, fault)? {
+                        group::append(whole.get_or_insert_default(), commit);
                     }
                 }
             }
         }
         Ok(whole)
+    }
+
+    /// A walker was lost with a turn in hand: another gets it, unless it is the turn that kills them.
+    fn lost(&mut self, walk: WalkId, fault: Option<String>) -> Result<Option<Commit>, ReactorError> {
+        if let Some(fault) = fault {
+            let cost = self.costs.entry(walk).or_default();
+            *cost += 1;
+            if *cost == MOST_WALKERS {
+                let reason = format!("{MOST_WALKERS} walkers in a row ended in this turn; the last: {fault}");
+                return Ok(self.selector.give_up(walk, reason)?);
+            }
+        }
+        self.selector.lost(walk);
+        Ok(None)
     }
 
     /// Gives turns to waiting walkers as far as there are any, or sends them home.

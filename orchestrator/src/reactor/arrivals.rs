@@ -29,7 +29,7 @@ pub(super) struct Arrivals {
 pub(super) enum Arrival {
     Free { walker: u32, report: Option<Examining>, reply: oneshot::Sender<Option<Work>> },
     Progress(WalkId, Progress),
-    Gone { walker: u32 },
+    Gone { walker: u32, fault: Option<String> },
 }
 
 /// An examination under way.
@@ -89,7 +89,7 @@ async fn bring(
     while let Some(message) = incoming.recv().await {
         let arrival = match message {
             Incoming::Progress(walk, progress) => Arrival::Progress(walk, progress),
-            Incoming::Gone { walker } => Arrival::Gone { walker },
+            Incoming::Gone { walker, fault } => Arrival::Gone { walker, fault },
             Incoming::Free { walker, report, reply } => {
                 let report = match report {
                     Some(report) => Some(examine(report).await),

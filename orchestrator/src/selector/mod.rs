@@ -18,7 +18,7 @@ use calm::watch::ForgettingAlarm;
 use calm::{ChangedComponent, Component, Mixture, MixtureError};
 use serde::{Deserialize, Serialize};
 use store::records::{Commit, ComponentRecord, Decision, WalkRecord};
-use wire::messages::{Outcome, Report};
+use wire::messages::{End, Outcome, Report};
 use wire::{CampaignId, CandidateId, ContentHash, WalkId};
 
 use crate::grader::{Grader, GraderError};
@@ -238,6 +238,14 @@ impl Selector {
     pub fn report(&mut self, report: Report) -> Result<Option<Commit>, SelectorError> {
         let examined = self.examiner.examine(report, &self.mixture);
         self.examined(examined)
+    }
+
+    /// Ends a walk whose turn, which a walker had in hand, cannot be worked on; as a report of that would.
+    pub fn give_up(&mut self, id: WalkId, reason: String) -> Result<Option<Commit>, SelectorError> {
+        let Some(walk) = self.walks.get(&id) else { return Ok(None) };
+        let WalkRecord { turn, checkpoint, progress, .. } = walk.record.clone();
+        let (checkpoint, outcome) = (checkpoint.unwrap_or_default(), Outcome::Ended(End::BlewUp { reason }));
+        self.report(Report { walk: id, turn, outcome, checkpoint, progress })
     }
 
     /// What a report's candidate needs to be examined elsewhere, for [`Selector::examined`].

@@ -56,7 +56,7 @@ impl Desk {
 
     pub(super) fn expect(&mut self, walker: u32, incarnation: u32) {
         if self.lines.close(walker) {
-            self.gone(walker);
+            self.gone(walker, None);
         }
         self.conversations.expect(walker, incarnation);
         self.lines.open(walker);
@@ -64,32 +64,33 @@ impl Desk {
 
     /// The walker's process is dead. Its decision is dropped before the reactor hears of it, so that a turn which is
     /// given to it meanwhile is known to be lost one way or the other.
-    pub(super) fn gone(&mut self, walker: u32) {
+    pub(super) fn gone(&mut self, walker: u32, fault: Option<String>) {
         self.conversations.forget(walker);
         self.lines.close(walker);
         self.lines.clean();
         self.mixtures.release(walker);
-        self.outbox.push_back(Incoming::Gone { walker });
+        self.outbox.push_back(Incoming::Gone { walker, fault });
     }
 
-    /// Takes in a message; the walker that it is of, unless it is dropped.
-    pub(super) fn receive(&mut self, request: Request) -> Option<u32> {
+    /// Takes in a message; the walker that it is of and whether it brings a report, unless it is dropped.
+    pub(super) fn receive(&mut self, request: Request) -> Option<(u32, bool)> {
         let (begin, bytes) = (Instant::now(), request.payload().len() as u64);
         let heard = self.listen(request);
         self.lines.count(bytes, begin.elapsed(), heard.as_ref().err());
         heard.ok()
     }
 
-    fn listen(&mut self, request: Request) -> Result<u32, Dropped> {
+    fn listen(&mut self, request: Request) -> Result<(u32, bool), Dropped> {
         let lent = Arc::new(Lent::new(request)?);
         let Letter { caller, words } = unseal(lent.control())?;
         self.conversations.check(caller)?;
+        let reports = matches!(words, Words::Offer { report: Some(_), .. });
         match words {
             Words::Offer { sequence, report } => self.offer(caller, sequence, report, &lent)?,
             Words::Ask { sequence } => self.ask(caller, sequence, &lent)?,
             Words::Progress(walk, progress) => self.progress(walk, progress.into_owned()),
         }
-        Ok(caller.walker)
+        Ok((caller.walker, reports))
     }
 
     fn offer(

@@ -43,7 +43,7 @@ pub struct Handle {
 #[derive(Debug)]
 enum Order {
     Expect { walker: u32, incarnation: u32 },
-    Gone { walker: u32 },
+    Gone { walker: u32, fault: Option<String> },
     Close,
 }
 
@@ -60,9 +60,10 @@ impl Handle {
         self.order(Order::Expect { walker, incarnation });
     }
 
-    /// The walker's process is dead and has been waited for: what it held is freed, and the reactor hears of it.
-    pub fn gone(&self, walker: u32) {
-        self.order(Order::Gone { walker });
+    /// The walker's process is dead and has been waited for: what it held is freed, and the reactor hears of it, and how
+    /// it ended if that was its own fault.
+    pub fn gone(&self, walker: u32, fault: Option<String>) {
+        self.order(Order::Gone { walker, fault });
     }
 
     /// No walker will come any more, and none is alive: [`Server::run`] ends.
@@ -109,7 +110,8 @@ impl Server {
         self.handle.clone()
     }
 
-    /// Listens to walkers and hands on to the reactor until [`Handle::close`]. `heard` is told of each walker's messages.
+    /// Listens to walkers and hands on to the reactor until [`Handle::close`]. `heard` is told of each walker's messages, and
+    /// whether they brought a report.
     ///
     /// # Errors
     /// Shared memory or sockets that fail, a mixture that cannot be shared.
@@ -117,7 +119,7 @@ impl Server {
         mut self,
         mixtures: SharedMixture,
         to_reactor: mpsc::Sender<Incoming>,
-        mut heard: impl FnMut(u32) + Send + 'static,
+        mut heard: impl FnMut(u32, bool) + Send + 'static,
     ) -> Result<(), IpcError> {
         let mut desk = Desk::new(self.handle.door.caller.session, mixtures, self.lines);
         let rung = descriptor(&self.bell).map_err(|e| IpcError::new("wait for events", e))?;
@@ -127,8 +129,8 @@ impl Server {
                 biased;
                 order = self.orders.recv() => match order {
                     Some(Order::Expect { walker, incarnation }) => desk.expect(walker, incarnation),
-                    Some(Order::Gone { walker }) => {
-                        desk.gone(walker);
+                    Some(Order::Gone { walker, fault }) => {
+                        desk.gone(walker, fault);
                         // Lets go of the connection as well.
                         more = take_in(&self.port, &mut desk, &mut heard)?;
                     }
@@ -153,10 +155,14 @@ impl Server {
 }
 
 /// Takes in what has come; whether there may be more.
-fn take_in(port: &ServerPort, desk: &mut Desk, heard: &mut impl FnMut(u32)) -> Result<bool, IpcError> {
+fn take_in(port: &ServerPort, desk: &mut Desk, heard: &mut impl FnMut(u32, bool)) -> Result<bool, IpcError> {
     for _ in 0..BATCH {
         match port.receive() {
-            Ok(Some(request)) => desk.receive(request).into_iter().for_each(&mut *heard),
+            Ok(Some(request)) => {
+                if let Some((walker, reports)) = desk.receive(request) {
+                    heard(walker, reports);
+                }
+            }
             // Of a walker that sends without end, or that died while it connected: the others ring again.
             Ok(None) | Err(ReceiveError::ExceedsMaxBorrows | ReceiveError::ConnectionFailure(_)) => {
                 return Ok(false);

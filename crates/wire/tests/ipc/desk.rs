@@ -54,7 +54,7 @@ impl Desk {
         let (to_reactor, incoming) = mpsc::channel(4);
         let heard = Arc::new(Mutex::new(Vec::new()));
         let note = Arc::clone(&heard);
-        let note = move |walker| note.lock().unwrap().push(walker);
+        let note = move |walker, _| note.lock().unwrap().push(walker);
         let task = tokio::spawn(server.run(mixtures, to_reactor, note));
         Self { place, handle, incoming, heard, task }
     }

@@ -61,7 +61,7 @@ async fn a_killed_walker_is_replaced() {
         offer.reply.send(Some(work(0, 1, (3, 4)))).unwrap();
         assert!(matches!(desk.incoming.recv().await, Some(Incoming::Progress(..))), "it is at work");
         kill(&mut stuck);
-        desk.handle.gone(0);
+        desk.handle.gone(0, None);
         assert!(matches!(desk.next().await, Incoming::Gone { walker: 0 }));
 
         // Killed while it waits for the answer to a candidate.
@@ -81,7 +81,7 @@ async fn a_killed_walker_is_replaced() {
     // Its candidate would keep the walker's memory.
     drop(offer.report);
     assert!(walker.wait().unwrap().success());
-    desk.handle.gone(0);
+    desk.handle.gone(0, None);
     assert!(matches!(desk.next().await, Incoming::Gone { walker: 0 }));
     assert_eq!(files_of(&desk.place).len(), SERVER_FILES, "{:#?}", files_of(&desk.place));
     desk.close().await;
