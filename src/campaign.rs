@@ -81,6 +81,20 @@ impl Campaign {
         potential.load()
     }
 
+    /// The hash of a file that the configuration names under this key.
+    pub fn hash_of(&self, key: &str) -> String {
+        let hashes = self.file_hashes.iter().find(|(name, _)| name == key);
+        hashes.map(|(_, hash)| hash.clone()).unwrap_or_default()
+    }
+
+    /// Bytes of the largest message between walker and selector: a candidate of the largest seed structure, and the
+    /// checkpoints of its walk (three states with velocities and forces, each with what is found again in it).
+    pub fn largest_message(&self) -> usize {
+        let atoms = self.seeds.iter().map(|named| named.seed.structure.len()).max().unwrap_or(0);
+        let features = self.artifact.mixture.dimension();
+        8 * atoms * (9 + features) + 512 * atoms + 16_384
+    }
+
     /// The configuration with every default filled in, files by their content instead of their paths: what a campaign
     /// that goes on is compared with.
     pub fn resolved(&self) -> Value {

@@ -10,6 +10,7 @@ mod interrupt;
 mod outcome;
 mod output;
 mod progress;
+mod setup;
 mod summary;
 mod whole_file;
 

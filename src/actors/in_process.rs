@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
+use std::time::Duration;
 
 use orchestrator::reactor;
 use orchestrator::selector::Selector;
@@ -18,6 +19,9 @@ use super::{CHANNEL, ReactorTask, start_reactor, stop_on_signals, wanted_walkers
 use crate::campaign::Campaign;
 use crate::outcome::Failure;
 
+/// Time between two signs of life.
+const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
+
 /// Runs the campaign until it is done or stopped.
 pub async fn work(
     campaign: &Campaign,
@@ -25,7 +29,21 @@ pub async fn work(
     store: &Store,
     process: &ProcessRecord,
 ) -> Result<reactor::Ended, Failure> {
-    Actors::start(campaign, selector, store, process)?.finish().await
+    let actors = Actors::start(campaign, selector, store, process)?;
+    let alive = tokio::spawn(say_alive(store.clone(), process.clone()));
+    let ended = actors.finish().await;
+    alive.abort();
+    ended
+}
+
+/// Keeps the sign of life in `status` fresh.
+async fn say_alive(store: Store, mut process: ProcessRecord) {
+    loop {
+        tokio::time::sleep(SIGN_OF_LIFE).await;
+        process.last_seen = unix_milliseconds();
+        // A busy database can do without this one.
+        let _ = store.upsert_process(&process).await;
+    }
 }
 
 /// Walkers, reactor and labellers at work.

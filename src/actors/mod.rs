@@ -1,6 +1,9 @@
 //! The actors of a campaign at work: in processes of their own, or all in one.
 
+mod crew;
 pub mod in_process;
+pub mod processes;
+mod starts;
 
 use std::process;
 use std::sync::Arc;

@@ -1,14 +1,17 @@
 //! The command line: one file a command.
 
 mod calm;
+mod clean;
 mod export;
 mod import;
 mod init;
+mod labeller;
 mod md;
 mod queue;
 mod run;
 mod status;
 mod validate;
+mod walker;
 
 use std::future::Future;
 use std::path::PathBuf;
@@ -40,6 +43,11 @@ enum Command {
     Calm(calm::Calm),
     Import(import::Import),
     Md(md::Md),
+    Clean(clean::Clean),
+    #[command(hide = true)]
+    Walker(walker::Walker),
+    #[command(hide = true)]
+    Labeller(labeller::Labeller),
 }
 
 /// Carries out a command.
@@ -54,6 +62,9 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Calm(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Md(command) => command.run(),
+        Command::Clean(command) => command.run(),
+        Command::Walker(command) => command.run(),
+        Command::Labeller(command) => command.run(),
     }
 }
 

@@ -1,10 +1,9 @@
-//! `calmwalk run`: all actors of a campaign as tasks and threads of one process.
+//! `calmwalk run`
 
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
 use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
@@ -12,14 +11,11 @@ use serde_json::json;
 use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError, unix_milliseconds};
 
 use super::{Ended, Failure, block_on};
-use crate::actors::in_process;
+use crate::actors::{in_process, processes};
 use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
 use crate::output::{print, say};
 use crate::summary;
-
-/// Time between two signs of life.
-const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
 
 /// Run a campaign to its end, or go on with one that was interrupted
 ///
@@ -33,6 +29,9 @@ pub struct Run {
     /// Directory of the campaign [default: the name of the configuration without its extension, here]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
+    /// Walkers and labellers as threads of this process, not as processes of their own; needs no shared memory
+    #[arg(long)]
+    in_process: bool,
 }
 
 impl Run {
@@ -50,8 +49,8 @@ impl Run {
         })?;
         store::check_directory(&directory)?;
         let _lock = CampaignLock::acquire(&directory, "calmwalk run")?;
-        let ended =
-            block_on(run(&campaign, &directory))?.map_err(|failure| failure.in_campaign(&directory))?;
+        let ended = block_on(run(&campaign, &directory, self.in_process))?
+            .map_err(|failure| failure.in_campaign(&directory))?;
         if ended == Ended::Interrupted {
             say("stopped in order; the same command goes on with the campaign");
         }
@@ -59,13 +58,15 @@ impl Run {
     }
 }
 
-async fn run(campaign: &Campaign, directory: &Path) -> Result<Ended, Failure> {
+async fn run(campaign: &Campaign, directory: &Path, in_process: bool) -> Result<Ended, Failure> {
     let store = open_store(campaign, directory).await?;
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
-    let alive = tokio::spawn(say_alive(store.clone(), process.clone()));
-    let ended = in_process::work(campaign, selector, &store, &process).await?;
-    alive.abort();
+    let ended = if in_process {
+        in_process::work(campaign, selector, &store, &process).await?
+    } else {
+        processes::work(campaign, selector, &store, &process, directory).await?
+    };
     leave(&store, &process, ended).await?;
     if ended == reactor::Ended::Stopped && !store.status().await?.finished {
         store.close().await;
@@ -160,16 +161,6 @@ async fn leave(store: &Store, process: &ProcessRecord, ended: reactor::Ended) ->
         reactor::Ended::Stopped => "stopped",
     };
     store.log_operation(now, "ended", &json!({ "process": process.id, "how": how })).await
-}
-
-/// Keeps the sign of life in `status` fresh.
-async fn say_alive(store: Store, mut process: ProcessRecord) {
-    loop {
-        tokio::time::sleep(SIGN_OF_LIFE).await;
-        process.last_seen = unix_milliseconds();
-        // A busy database can do without this one.
-        let _ = store.upsert_process(&process).await;
-    }
 }
 
 async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector, Failure> {

@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 11] = [
+pub(super) const CHANGEABLE: [&str; 13] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -16,6 +16,8 @@ pub(super) const CHANGEABLE: [&str; 11] = [
     "label.largest_force",
     "label.queue_limit",
     "run.walkers",
+    "run.silence_limit",
+    "run.restarts",
     "guard.highest_temperature",
 ];
 

@@ -47,6 +47,7 @@ fn check_limits(config: &Config) -> Result<(), Wrong> {
         ("guard.checkpoint_interval", guard.checkpoint_interval.get() as f64, most_steps),
         ("label.slots", label.slots.get() as f64, 1024.0),
         ("run.walkers", run.walkers as f64, 1024.0),
+        ("run.silence_limit", run.silence_limit.get(), 1e6),
         ("run.turn_steps", run.turn_steps.get() as f64, most_steps),
     ];
     match limits.into_iter().find(|(_, found, limit)| found > limit) {

@@ -1,6 +1,6 @@
 //! Potentials that a configuration names: the label source and the potential of `calmwalk md`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use atoms::Potential;
@@ -36,15 +36,21 @@ pub struct PotentialFile {
 impl PotentialFile {
     /// Reads it; an error names the file and what is wrong with it.
     pub fn load(&self) -> Result<Box<dyn Potential>, String> {
-        let path = self.file.get_ref();
+        self.kind.load(self.file.get_ref())
+    }
+}
+
+impl PotentialKind {
+    /// Reads a file of this kind; an error names the file and what is wrong with it.
+    pub fn load(self, path: &Path) -> Result<Box<dyn Potential>, String> {
         let eam = |style| Eam::load_as(path, style).map(|p| Box::new(p) as Box<dyn Potential>);
-        match self.kind {
-            PotentialKind::Grace => GraceModel::load(path)
+        match self {
+            Self::Grace => GraceModel::load(path)
                 .map(|model| Box::new(Grace::new(Arc::new(model))) as Box<dyn Potential>)
                 .map_err(|error| error.to_string()),
-            PotentialKind::EamAlloy => eam(EamStyle::Alloy).map_err(|error| error.to_string()),
-            PotentialKind::EamFs => eam(EamStyle::FinnisSinclair).map_err(|error| error.to_string()),
-            PotentialKind::StillingerWeber => StillingerWeber::load(path)
+            Self::EamAlloy => eam(EamStyle::Alloy).map_err(|error| error.to_string()),
+            Self::EamFs => eam(EamStyle::FinnisSinclair).map_err(|error| error.to_string()),
+            Self::StillingerWeber => StillingerWeber::load(path)
                 .map(|p| Box::new(p) as Box<dyn Potential>)
                 .map_err(|error| error.to_string()),
         }

@@ -19,7 +19,7 @@ use workers::settings::ThermostatKind;
 
 pub use changes::{Change, compare, without_changeable};
 pub use error::{ConfigError, place, place_of_offset};
-pub use files::PotentialFile;
+pub use files::{PotentialFile, PotentialKind};
 
 /// A whole campaign.
 #[derive(Clone, Debug, Deserialize, Serialize)]
@@ -235,6 +235,10 @@ pub enum LabelMethod {
 pub struct RunSection {
     /// Walkers side by side; 0 for one a processor core.
     pub walkers: usize,
+    /// A process that gives no sign of life for so long is hung and replaced, s.
+    pub silence_limit: Positive,
+    /// Starts of a process in a row after failures, with nothing delivered between them; then it is given up.
+    pub restarts: u32,
     /// Biased walks that advance together (reproducible mode).
     pub walks_per_round: NonZeroUsize,
     /// Steps of a turn.
@@ -307,7 +311,13 @@ impl Default for GuardSection {
 
 impl Default for RunSection {
     fn default() -> Self {
-        Self { walkers: 0, walks_per_round: NonZeroUsize::MIN, turn_steps: defaults::nonzero(250).into() }
+        Self {
+            walkers: 0,
+            silence_limit: defaults::positive(120.0),
+            restarts: 5,
+            walks_per_round: NonZeroUsize::MIN,
+            turn_steps: defaults::nonzero(250).into(),
+        }
     }
 }
 

@@ -21,7 +21,7 @@ pub enum ThermostatKind {
 }
 
 /// Dynamics, bias and guards of every walk of a campaign.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct WalkSettings {
     /// Keys the random numbers.
     pub rng_seed: u64,
@@ -56,7 +56,7 @@ pub struct WalkSettings {
 }
 
 /// What keeps a walk physical.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct GuardSettings {
     /// Shortest distance below which a structure is refused, Å.
     pub least_distance: f64,

@@ -1,0 +1,152 @@
+//! Walkers and labellers in processes of their own: started, listened to, replaced.
+//!
+//! Walkers end with this process; labellers go on without it, and the next run adopts them.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use orchestrator::launcher::Children;
+use orchestrator::reactor;
+use orchestrator::selector::Selector;
+use orchestrator::supervisor::Limits;
+use store::{ProcessRecord, Store};
+use tokio::sync::{Notify, mpsc};
+use tokio::task::{JoinError, JoinHandle};
+use wire::ipc::{IpcError, Server, Sizes, space_needed};
+use wire::mixture::SharedMixture;
+use wire::place::Place;
+
+use super::crew::{self, Crew};
+use super::{CHANNEL, ReactorTask, start_reactor, starts, stop_on_signals, wanted_walkers};
+use crate::campaign::Campaign;
+use crate::outcome::Failure;
+
+/// Runs the campaign until it is done or stopped. To be awaited on the main thread: the walkers end with the thread that
+/// starts them.
+pub async fn work(
+    campaign: &Campaign,
+    selector: Selector,
+    store: &Store,
+    process: &ProcessRecord,
+    directory: &Path,
+) -> Result<reactor::Ended, Failure> {
+    let place = Place::of(directory).map_err(Failure::failed)?;
+    let ended = work_in(&place, campaign, selector, store, process, directory).await;
+    // Nobody is left who could need it. What cannot be removed now is at the next start.
+    let removed = place.remove().map_err(Failure::failed);
+    let ended = ended?;
+    removed?;
+    Ok(ended)
+}
+
+async fn work_in(
+    place: &Place,
+    campaign: &Campaign,
+    selector: Selector,
+    store: &Store,
+    process: &ProcessRecord,
+    directory: &Path,
+) -> Result<reactor::Ended, Failure> {
+    let walkers = wanted_walkers(campaign);
+    let mixture = Arc::clone(selector.mixture());
+    let sizes = Sizes { walkers, message_bytes: campaign.largest_message() };
+    let needed =
+        SharedMixture::space_needed(&mixture, walkers).map_err(Failure::failed)? + space_needed(&sizes);
+    place.prepare(needed).map_err(Failure::failed)?;
+    let shared = SharedMixture::create(&place.mixture(), &mixture, walkers);
+    let shared = shared.map_err(Failure::failed)?;
+    let server = Server::open(place, sizes, session(process)).map_err(Failure::failed)?;
+
+    let (stopping, stop) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
+    let asked = (Arc::clone(&stopping), Arc::clone(&stop));
+    stop_on_signals(move || {
+        asked.0.store(true, Ordering::Relaxed);
+        asked.1.notify_one();
+    })?;
+    let limits = Limits {
+        silence: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
+        restarts: campaign.config.run.restarts,
+        ..Limits::default()
+    };
+    let line = server.handle();
+    let walkers = Children::new(walkers, limits, starts::walker(campaign, line.clone())?);
+    let labellers = starts::labellers(campaign, directory, store, limits).await?;
+    let crew = Crew::new(store, process.clone(), line, walkers, labellers);
+
+    let (to_reactor, incoming) = mpsc::channel(CHANNEL);
+    let serving = tokio::spawn(server.run(shared, to_reactor, crew.listener()));
+    let reactor = start_reactor(campaign, selector, store, incoming, &stopping);
+    lead(crew, reactor, serving, &stop).await
+}
+
+/// Tells the walkers of this run from those of any other.
+fn session(process: &ProcessRecord) -> u64 {
+    let hash = blake3::hash(process.id.as_bytes());
+    let [a, b, c, d, e, f, g, h, ..] = *hash.as_bytes();
+    u64::from_le_bytes([a, b, c, d, e, f, g, h])
+}
+
+/// What the leader of a crew has to answer.
+enum Happened {
+    /// To a process.
+    InCrew(crew::Event),
+    /// Somebody asked to stop.
+    Asked,
+    /// The reactor has ended.
+    Decided(Result<reactor::Ended, Failure>),
+    /// The transport has ended.
+    Closed(Result<(), Failure>),
+}
+
+/// Leads the crew until all walks are over and every structure has its label, or until somebody asks to stop; then until
+/// everybody is gone.
+async fn lead(
+    mut crew: Crew<'_>,
+    mut reactor: ReactorTask,
+    mut serving: JoinHandle<Result<(), IpcError>>,
+    stop: &Notify,
+) -> Result<reactor::Ended, Failure> {
+    let (mut decided, mut closed, mut asked) = (None, None, false);
+    while decided.is_none() || closed.is_none() || !crew.is_gone() {
+        let happened = tokio::select! {
+            event = crew.event() => Happened::InCrew(event),
+            () = stop.notified() => Happened::Asked,
+            ended = &mut reactor, if decided.is_none() => Happened::Decided(plain(ended)),
+            ended = &mut serving, if closed.is_none() => Happened::Closed(plain(ended)),
+        };
+        match happened {
+            Happened::InCrew(event) => crew.take_in(event).await?,
+            Happened::Asked => {
+                asked = true;
+                crew.stop();
+            }
+            Happened::Decided(ended) => {
+                match ended {
+                    Ok(reactor::Ended::Done) => crew.wait_for_labels(),
+                    _ => crew.stop(),
+                }
+                decided = Some(ended);
+            }
+            Happened::Closed(ended) => {
+                if ended.is_err() {
+                    crew.stop();
+                }
+                closed = Some(ended);
+            }
+        }
+    }
+    closed.transpose()?;
+    crew.failure()?;
+    match decided.transpose()? {
+        Some(reactor::Ended::Done) if !asked => Ok(reactor::Ended::Done),
+        // Every walk may be over, but the labellers were asked to stop and may have left jobs.
+        _ => Ok(reactor::Ended::Stopped),
+    }
+}
+
+/// A task's own result; a crash is one too.
+fn plain<T>(ended: Result<Result<T, impl ToString>, JoinError>) -> Result<T, Failure> {
+    ended.map_err(Failure::failed)?.map_err(Failure::failed)
+}

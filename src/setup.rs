@@ -1,0 +1,99 @@
+//! What the processes of a campaign are started with: they read it from standard input, as JSON, and nothing else of the
+//! configuration, so a file that is edited meanwhile changes nothing.
+
+use std::io::{self, Read};
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use potentials::grace::GraceModel;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use store::Protocol;
+use wire::ipc::Door;
+use workers::settings::WalkSettings;
+
+use crate::config::PotentialKind;
+use crate::outcome::Failure;
+
+/// What a walker's process needs to know.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct WalkerSetup {
+    /// The process that it works for, and with which it ends.
+    pub parent: u32,
+    /// Its way to the orchestrator.
+    pub door: Door,
+    /// The exported model.
+    pub model: PathBuf,
+    /// BLAKE3 of that file.
+    pub model_hash: String,
+    /// Dynamics, bias and guards.
+    pub settings: WalkSettings,
+}
+
+/// What a labeller's process needs to know.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct LabellerSetup {
+    /// Its number among those of the campaign.
+    pub number: u32,
+    /// How often one of its number was started again in this run.
+    pub restarts: u32,
+    /// Directory of the campaign.
+    pub directory: PathBuf,
+    /// What the potential's file holds.
+    pub kind: PotentialKind,
+    /// The potential that gives the labels.
+    pub file: PathBuf,
+    /// BLAKE3 of that file.
+    pub file_hash: String,
+    /// The protocol.
+    pub protocol: Protocol,
+    /// Attempts before a label counts as failed.
+    pub attempts: u32,
+    /// Largest force that is believed, eV/Å.
+    pub largest_force: f64,
+}
+
+/// Reads the setup of this process.
+pub fn read<T: DeserializeOwned>() -> Result<T, Failure> {
+    let mut text = String::new();
+    io::stdin().read_to_string(&mut text).map_err(Failure::failed)?;
+    serde_json::from_str(&text).map_err(|error| {
+        Failure::Input(format!("standard input: {error}; calmwalk run starts this command, not people"))
+    })
+}
+
+/// A setup as the bytes that are written to the process.
+pub fn bytes(setup: &impl Serialize) -> Vec<u8> {
+    serde_json::to_vec(setup).expect("plain data becomes JSON")
+}
+
+/// What tells two setups of labellers apart, whatever their numbers: one that was started with another must be replaced.
+impl LabellerSetup {
+    pub fn hash(&self) -> String {
+        blake3::hash(&bytes(&Self { number: 0, restarts: 0, ..self.clone() })).to_string()
+    }
+}
+
+impl WalkerSetup {
+    /// Reads the model, which must be the one that the campaign's run began with.
+    pub fn load_model(&self) -> Result<Arc<GraceModel>, Failure> {
+        unchanged(&self.model, &self.model_hash)?;
+        Ok(Arc::new(GraceModel::load(&self.model).map_err(Failure::input)?))
+    }
+}
+
+/// Checks that a file is the one that the orchestrator read.
+pub fn unchanged(path: &std::path::Path, expected: &str) -> Result<(), Failure> {
+    let bytes = std::fs::read(path)
+        .map_err(|error| Failure::Input(format!("cannot read {}: {error}", path.display())))?;
+    let found = blake3::hash(&bytes).to_string();
+    if found == expected {
+        return Ok(());
+    }
+    Err(Failure::Input(format!(
+        "{}: the file has another content (BLAKE3 {found}) than when this run began ({expected}); put the old file back",
+        path.display()
+    )))
+}
