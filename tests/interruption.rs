@@ -2,10 +2,12 @@
 
 mod common;
 
-use std::process::{Command, Stdio};
+use std::path::Path;
+use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use common::campaign::{Outcome, Small, outcome};
+use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
 use common::{Running, program};
 
 /// Kills in one test; `CALMWALK_KILLS=200 cargo test --test interruption` for the long version.
@@ -21,56 +23,76 @@ fn random(seed: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-fn start(directory: &std::path::Path) -> Running {
+fn start(directory: &Path, options: &[&str]) -> Running {
     let mut command = program(directory);
-    let command = command.args(["run", "campaign.toml", "--directory", "."]);
+    let command = command.args(["run", "campaign.toml", "--directory", "."]).args(options);
     Running(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("the program starts"))
 }
 
-fn signal(running: &Running, name: &str) {
-    let status = Command::new("kill").args([format!("-{name}"), running.0.id().to_string()]).status();
-    assert!(status.expect("kill runs").success());
-}
-
-/// Runs to the end without any disturbance.
+/// Runs to the end without any disturbance, all in one process.
 fn undisturbed(small: &Small) -> (Outcome, Duration) {
     let directory = tempfile::tempdir().unwrap();
     small.write(directory.path());
     let begun = Instant::now();
-    assert_eq!(start(directory.path()).0.wait().unwrap().code(), Some(0));
+    assert_eq!(start(directory.path(), &["--in-process"]).0.wait().unwrap().code(), Some(0));
     (outcome(directory.path()), begun.elapsed())
 }
 
-#[test]
-fn kills_at_random_instants_change_nothing() {
-    let small = Small::default();
+/// Kills one process of the campaign, or all of them at once.
+fn kill(directory: &Path, running: &Running, choice: u64) {
+    let mut victims = match choice % 4 {
+        0 => vec![running.0.id()],
+        1 => carrying_out(directory, "walker"),
+        2 => carrying_out(directory, "labeller"),
+        _ => processes_in(directory).iter().map(|process| process.pid).collect(),
+    };
+    if choice % 4 != 3 && !victims.is_empty() {
+        victims = vec![victims[(choice / 4) as usize % victims.len()]];
+    }
+    victims.into_iter().for_each(|pid| signal(pid, "KILL"));
+}
+
+/// A few kills in each campaign, at any instant from the very start on, with one walker or two.
+fn disturbed(small: &Small, options: &[&str], kills: u64) {
     let (expected, takes) = undisturbed(&Small { walkers: 1, ..small.clone() });
     assert!(expected.decisions.matches("\"kind\":\"accepted\"").count() >= 4, "{}", expected.decisions);
     assert!(expected.decisions.contains("\"kind\":\"control\""));
     let (mut done, mut campaigns) = (0, 0);
-    while done < kills() {
+    while done < kills {
         let directory = tempfile::tempdir().unwrap();
         campaigns += 1;
-        // A few kills in each campaign, at any instant from the very start on, with one walker or two.
         let mut finished = false;
         while !finished {
             Small { walkers: 1 + (random(done) % 2) as usize, ..small.clone() }.write(directory.path());
-            let mut running = start(directory.path());
-            let instant = takes.mul_f64((random(1000 + done) % 1000) as f64 / 1500.0);
-            std::thread::sleep(instant);
-            finished = running.0.try_wait().unwrap().is_some();
-            if !finished {
-                running.0.kill().unwrap();
-                running.0.wait().unwrap();
-                done += 1;
-                if done >= kills() {
-                    assert_eq!(start(directory.path()).0.wait().unwrap().code(), Some(0));
-                    finished = true;
+            let mut running = start(directory.path(), options);
+            let ended = loop {
+                let instant = takes.mul_f64((random(1000 + done) % 1000) as f64 / 1500.0);
+                std::thread::sleep(instant);
+                let ended = running.0.try_wait().unwrap();
+                if ended.is_some() || done == kills {
+                    break ended.unwrap_or_else(|| running.0.wait().unwrap());
                 }
-            }
+                kill(directory.path(), &running, random(5000 + done));
+                done += 1;
+                // Of a process that was killed there may be a moment's delay until it is seen to be so.
+                std::thread::sleep(Duration::from_millis(5));
+            };
+            assert!(matches!(ended.code(), Some(0) | None), "{ended} after {done} kills");
+            finished = ended.code() == Some(0);
         }
         assert_eq!(outcome(directory.path()), expected, "after {done} kills in {campaigns} campaigns");
+        nothing_is_left(directory.path());
     }
+}
+
+#[test]
+fn kills_at_random_instants_change_nothing() {
+    disturbed(&Small::default(), &[], kills());
+}
+
+#[test]
+fn kills_of_the_one_process_change_nothing() {
+    disturbed(&Small::default(), &["--in-process"], kills().div_ceil(4));
 }
 
 #[test]
@@ -80,11 +102,12 @@ fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
     for name in ["INT", "TERM"] {
         let directory = tempfile::tempdir().unwrap();
         small.write(directory.path());
-        let mut running = start(directory.path());
-        std::thread::sleep(takes.mul_f64(0.4));
-        signal(&running, name);
+        let mut running = start(directory.path(), &[]);
+        wait_until("walkers are at work", || !carrying_out(directory.path(), "walker").is_empty());
+        std::thread::sleep(takes.mul_f64(0.2));
+        signal(running.0.id(), name);
         assert_eq!(running.0.wait().unwrap().code(), Some(130), "{name}");
-        assert_eq!(start(directory.path()).0.wait().unwrap().code(), Some(0));
+        assert_eq!(start(directory.path(), &[]).0.wait().unwrap().code(), Some(0));
         assert_eq!(outcome(directory.path()), expected, "{name}");
     }
 }
@@ -96,12 +119,12 @@ fn live_mode_loses_and_doubles_nothing() {
     let directory = tempfile::tempdir().unwrap();
     small.write(directory.path());
     for kill in 0..5 {
-        let mut running = start(directory.path());
+        let mut running = start(directory.path(), &[]);
         std::thread::sleep(takes.mul_f64((random(kill) % 1000) as f64 / 2000.0));
         running.0.kill().unwrap();
         running.0.wait().unwrap();
     }
-    assert_eq!(start(directory.path()).0.wait().unwrap().code(), Some(0));
+    assert_eq!(start(directory.path(), &[]).0.wait().unwrap().code(), Some(0));
     outcome(directory.path());
 }
 
@@ -112,7 +135,7 @@ fn a_stop_while_labels_are_still_made_is_no_end() {
     let here = directory.path();
     let text = Small::default().text().replace("[label]", "[label]\nlargest_force = 1e-6\nattempts = 1");
     std::fs::write(Small::default().write(here), text).unwrap();
-    assert_eq!(start(here).0.wait().unwrap().code(), Some(0));
+    assert_eq!(start(here, &[]).0.wait().unwrap().code(), Some(0));
     let runtime = tokio::runtime::Runtime::new().unwrap();
     runtime.block_on(async {
         let store = store::Store::open(here).await.unwrap();
@@ -130,7 +153,7 @@ fn a_stop_while_labels_are_still_made_is_no_end() {
         store.lease(protocol, "elsewhere", now, 600, 1).await.unwrap().expect("the job that was put back");
         store.close().await;
     });
-    let mut running = start(here);
+    let mut running = start(here, &[]);
     let begun = Instant::now();
     while !common::succeed(here, ["status", ".", "--json"]).contains("\"orchestrator\"") {
         assert!(begun.elapsed() < Duration::from_secs(60), "the run has not begun");
@@ -139,6 +162,6 @@ fn a_stop_while_labels_are_still_made_is_no_end() {
     // Long enough to find every walk ended and nothing to lease.
     std::thread::sleep(Duration::from_millis(1500));
     assert!(running.0.try_wait().unwrap().is_none(), "it waits for the label");
-    signal(&running, "INT");
+    signal(running.0.id(), "INT");
     assert_eq!(running.0.wait().unwrap().code(), Some(130));
 }

@@ -3,6 +3,7 @@
 
 pub mod campaign;
 pub mod desk;
+pub mod processes;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output};

@@ -1,0 +1,60 @@
+//! The processes of a campaign, as the system sees them.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use wire::place::Place;
+
+/// A process that works in a directory: its number and the command that it carries out.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Process {
+    pub pid: u32,
+    pub command: String,
+}
+
+/// Every living process of the program that works in `directory`.
+pub fn processes_in(directory: &Path) -> Vec<Process> {
+    let directory = directory.canonicalize().expect("the campaign's directory");
+    let numbers = fs::read_dir("/proc").expect("/proc").flatten();
+    let numbers = numbers.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+    let process = |pid: u32| {
+        let here = fs::read_link(format!("/proc/{pid}/cwd")).ok()? == directory;
+        let line = fs::read_to_string(format!("/proc/{pid}/cmdline")).ok()?;
+        let mut words = line.split('\0');
+        let ours = words.next()?.ends_with("calmwalk") && here;
+        ours.then(|| words.next().map(|command| Process { pid, command: command.to_owned() }))?
+    };
+    numbers.filter_map(process).collect()
+}
+
+/// Those that carry out `command`.
+pub fn carrying_out(directory: &Path, command: &str) -> Vec<u32> {
+    processes_in(directory).into_iter().filter(|p| p.command == command).map(|p| p.pid).collect()
+}
+
+/// Sends a signal; nothing happens to a process that is gone.
+pub fn signal(pid: u32, name: &str) {
+    let sent = Command::new("kill").args([format!("-{name}"), pid.to_string()]).output();
+    sent.expect("kill runs");
+}
+
+/// Waits until something is so.
+pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !is_so() {
+        assert!(begun.elapsed() < Duration::from_secs(120), "waited in vain until {what}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// Checks that a campaign that came to its end left no process and nothing in shared memory.
+pub fn nothing_is_left(directory: &Path) {
+    wait_until("every process is gone", || processes_in(directory).is_empty());
+    let place = Place::of(directory).expect("the campaign's directory");
+    assert!(!place.directory().exists(), "{} is left", place.directory().display());
+    let files = fs::read_dir("/dev/shm").expect("/dev/shm").flatten();
+    let left: Vec<_> = files.map(|file| file.file_name().to_string_lossy().into_owned()).collect();
+    assert!(!left.iter().any(|name| name.starts_with(place.prefix())), "{left:?}");
+}

@@ -1,0 +1,310 @@
+//! Walkers and labellers are processes of their own: whatever happens to one of them, the campaign comes to the same end.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use common::campaign::{Outcome, Small, outcome};
+use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
+use common::{Running, calmwalk, config, program, refuse, succeed};
+use serde_json::Value;
+use store::Store;
+
+const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
+
+fn start(directory: &Path) -> Running {
+    let errors = fs::File::create(directory.join("stderr")).expect("a file");
+    let mut command = program(directory);
+    Running(command.args(RUN).stdout(Stdio::null()).stderr(errors).spawn().expect("the program starts"))
+}
+
+fn wait(running: &mut Running) -> Option<i32> {
+    running.0.wait().expect("a child").code()
+}
+
+/// What it has said so far.
+fn said(directory: &Path) -> String {
+    fs::read_to_string(directory.join("stderr")).expect("its standard error")
+}
+
+/// The same campaign, all in one process.
+fn expected(small: &Small) -> Outcome {
+    let directory = tempfile::tempdir().unwrap();
+    small.write(directory.path());
+    succeed(directory.path(), RUN.into_iter().chain(["--in-process"]));
+    outcome(directory.path())
+}
+
+/// Long enough for processes to fail and be replaced meanwhile.
+fn long() -> Small {
+    Small { steps: 900, ..Small::default() }
+}
+
+/// Adds keys to the section `[run]`.
+fn with_keys(path: &Path, keys: &str) {
+    let text = fs::read_to_string(path).unwrap().replace("[run]", &format!("[run]\n{keys}"));
+    fs::write(path, text).unwrap();
+}
+
+/// A campaign with a model of its own, which can be spoiled.
+fn with_own_model(small: &Small, directory: &Path) {
+    let path = small.write(directory);
+    let model = config("data/al_eam_1l/kokkos.npz");
+    fs::copy(&model, directory.join("model.npz")).unwrap();
+    let text = fs::read_to_string(&path).unwrap().replace(&model.display().to_string(), "model.npz");
+    fs::write(path, text).unwrap();
+}
+
+/// The processes in `status`.
+fn shown(directory: &Path) -> Vec<Value> {
+    let output = calmwalk(directory, ["status", ".", "--json"]);
+    // There may be no database yet.
+    let Ok(status) = serde_json::from_slice::<Value>(&output.stdout) else { return Vec::new() };
+    status["processes"].as_array().cloned().unwrap_or_default()
+}
+
+/// What the operations log says of ended processes.
+fn endings(directory: &Path) -> Vec<String> {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let operations = runtime.block_on(async {
+        let store = Store::open_read_only(directory).await.unwrap();
+        store.operations(0, 10_000).await.unwrap()
+    });
+    let ended = operations.into_iter().filter(|operation| operation.kind == "process_ended");
+    ended.map(|operation| operation.detail.to_string()).collect()
+}
+
+/// Waits until both walkers are at work.
+fn wait_for_work(directory: &Path) {
+    wait_until("walkers advance", || {
+        let output = calmwalk(directory, ["status", ".", "--json"]);
+        let status = serde_json::from_slice::<Value>(&output.stdout).unwrap_or_default();
+        status["mixture_version"].as_u64().is_some_and(|version| version > 0)
+    });
+    assert_eq!(carrying_out(directory, "walker").len(), 2);
+}
+
+#[test]
+fn a_hung_walker_is_killed_and_replaced() {
+    let small = long();
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    with_keys(&small.write(here), "silence_limit = 2.0");
+    let mut running = start(here);
+    wait_for_work(here);
+    let walker = carrying_out(here, "walker")[0];
+    signal(walker, "STOP");
+    assert_eq!(wait(&mut running), Some(0), "{}", said(here));
+    assert!(!processes_in(here).iter().any(|process| process.pid == walker));
+    let endings = endings(here);
+    assert!(endings.iter().any(|ending| ending.contains("silent for 2 s, killed")), "{endings:?}");
+    assert_eq!(outcome(here), expected(&small));
+    nothing_is_left(here);
+}
+
+#[test]
+fn a_walker_that_is_told_to_end_leaves_its_walk_to_another() {
+    let small = long();
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    small.write(here);
+    let mut running = start(here);
+    wait_for_work(here);
+    signal(carrying_out(here, "walker")[0], "TERM");
+    assert_eq!(wait(&mut running), Some(0), "{}", said(here));
+    assert!(endings(here).iter().any(|ending| ending.contains("exit code 130")), "{:?}", endings(here));
+    assert_eq!(outcome(here), expected(&small));
+    nothing_is_left(here);
+}
+
+#[test]
+fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
+    let small = Small { steps: 1800, ..Small::default() };
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    with_own_model(&small, here);
+    with_keys(&here.join("campaign.toml"), "restarts = 1");
+    let mut running = start(here);
+    wait_for_work(here);
+    let model = fs::read(here.join("model.npz")).unwrap();
+    fs::write(here.join("model.npz"), b"spoiled").unwrap();
+    signal(carrying_out(here, "walker")[0], "KILL");
+    let given_up = |process: &Value| {
+        let remark = process["remark"].as_str().unwrap_or_default();
+        process["kind"] == "walker" && process["state"] == "given up" && remark.contains("another content")
+    };
+    wait_until("status shows it", || shown(here).iter().any(given_up));
+    let table = succeed(here, ["status", "."]);
+    assert!(table.contains("given up") && table.contains("another content"), "{table}");
+    assert_eq!(wait(&mut running), Some(0), "{}", said(here));
+    fs::write(here.join("model.npz"), model).unwrap();
+    assert_eq!(outcome(here), expected(&small));
+    nothing_is_left(here);
+}
+
+#[test]
+fn without_any_walker_the_campaign_fails_and_can_go_on() {
+    let small = long();
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    with_own_model(&small, here);
+    with_keys(&here.join("campaign.toml"), "restarts = 1");
+    let mut running = start(here);
+    wait_for_work(here);
+    let model = fs::read(here.join("model.npz")).unwrap();
+    fs::write(here.join("model.npz"), b"spoiled").unwrap();
+    carrying_out(here, "walker").into_iter().for_each(|walker| signal(walker, "KILL"));
+    assert_eq!(wait(&mut running), Some(1), "{}", said(here));
+    let message = said(here);
+    assert!(message.contains("no walker is left") && message.contains("another content"), "{message}");
+    nothing_is_left(here);
+    fs::write(here.join("model.npz"), model).unwrap();
+    assert_eq!(wait(&mut start(here)), Some(0), "{}", said(here));
+    assert_eq!(outcome(here), expected(&small));
+    nothing_is_left(here);
+}
+
+#[test]
+fn walkers_end_with_their_orchestrator_and_labellers_are_adopted() {
+    let small = long();
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    small.write(here);
+    let mut running = start(here);
+    wait_for_work(here);
+    let labellers = carrying_out(here, "labeller");
+    assert_eq!(labellers.len(), 1);
+    // So that it does not just look whether anybody needs it.
+    signal(labellers[0], "STOP");
+    running.0.kill().unwrap();
+    running.0.wait().unwrap();
+    wait_until("walkers are gone", || carrying_out(here, "walker").is_empty());
+    let mut running = start(here);
+    wait_until("there are walkers again", || carrying_out(here, "walker").len() == 2);
+    signal(labellers[0], "CONT");
+    assert_eq!(carrying_out(here, "labeller"), labellers);
+    let second = refuse(here, RUN);
+    assert!(second.contains(&format!("process {}", running.0.id())), "{second}");
+    assert_eq!(wait(&mut running), Some(0), "{}", said(here));
+    assert_eq!(outcome(here), expected(&small));
+    nothing_is_left(here);
+}
+
+#[test]
+fn a_labeller_finishes_the_queue_without_an_orchestrator_and_leaves() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    long().write(here);
+    let mut running = start(here);
+    wait_for_work(here);
+    running.0.kill().unwrap();
+    running.0.wait().unwrap();
+    wait_until("every process is gone", || processes_in(here).is_empty());
+    let status: Value = serde_json::from_str(&succeed(here, ["status", ".", "--json"])).unwrap();
+    let labels = &status["labels"];
+    assert_eq!((&labels["queued"], &labels["leased"]), (&0.into(), &0.into()), "{labels}");
+    assert!(labels["labelled"].as_u64().unwrap() > 0);
+    succeed(here, ["clean"]);
+    nothing_is_left(here);
+}
+
+#[test]
+fn two_campaigns_on_one_host_do_not_see_each_other() {
+    let small = Small::default();
+    let directories = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+    let mut running: Vec<_> = directories
+        .iter()
+        .map(|directory| {
+            small.write(directory.path());
+            start(directory.path())
+        })
+        .collect();
+    for (running, directory) in running.iter_mut().zip(&directories) {
+        assert_eq!(wait(running), Some(0), "{}", said(directory.path()));
+    }
+    let expected = expected(&small);
+    for directory in &directories {
+        assert_eq!(outcome(directory.path()), expected);
+        nothing_is_left(directory.path());
+    }
+}
+
+#[test]
+fn clean_removes_what_killed_processes_left_and_nothing_else() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    long().write(here);
+    let mut running = start(here);
+    wait_for_work(here);
+    let message = refuse(here, ["clean", "."]);
+    assert!(message.contains(&format!("process {}", running.0.id())), "{message}");
+    processes_in(here).iter().for_each(|process| signal(process.pid, "KILL"));
+    running.0.wait().unwrap();
+    wait_until("every process is gone", || processes_in(here).is_empty());
+    let place = wire::place::Place::of(here).unwrap();
+    assert!(place.directory().exists());
+    let said = succeed(here, ["clean", "."]);
+    assert!(said.contains("files removed from shared memory") && !said.contains(": 0 files"), "{said}");
+    nothing_is_left(here);
+}
+
+/// The program with a shared memory of its own, of `megabytes` with `filled` of them taken.
+fn with_shared_memory(directory: &Path, megabytes: u32, filled: u32) -> Option<Command> {
+    let mut unshare = Command::new("unshare");
+    unshare.args(["--user", "--map-root-user", "--mount"]).current_dir(directory);
+    let permitted = Command::new("unshare").args(["--user", "--map-root-user", "--mount", "true"]).output();
+    if !permitted.is_ok_and(|output| output.status.success()) {
+        assert!(std::env::var_os("CI").is_none(), "unshare(1) must be permitted in CI");
+        eprintln!("not tested: unshare(1) is not permitted here");
+        return None;
+    }
+    let script = format!(
+        "mount -t tmpfs -o size={megabytes}m tmpfs /dev/shm && head -c {filled}M /dev/zero > /dev/shm/filled && exec {} {}",
+        env!("CARGO_BIN_EXE_calmwalk"),
+        RUN.join(" ")
+    );
+    unshare.args(["sh", "-c", &script]);
+    Some(unshare)
+}
+
+#[test]
+fn sixteen_megabytes_of_shared_memory_are_enough_or_the_need_is_said() {
+    let small = Small::default();
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    small.write(here);
+    let Some(mut full) = with_shared_memory(here, 16, 15) else { return };
+    let output = full.output().unwrap();
+    let message = common::stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{message}");
+    assert!(message.contains("MB of shared memory") && message.contains("--shm-size"), "{message}");
+    let Some(mut enough) = with_shared_memory(here, 16, 0) else { return };
+    let output = enough.output().unwrap();
+    assert_eq!(output.status.code(), Some(0), "{}", common::stderr(&output));
+    assert_eq!(outcome(here), expected(&small));
+}
+
+#[test]
+fn shared_memory_is_the_users_alone() {
+    use std::os::unix::fs::MetadataExt;
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    long().write(here);
+    let mut running = start(here);
+    wait_for_work(here);
+    let place = wire::place::Place::of(here).unwrap();
+    assert_eq!(fs::metadata(place.directory()).unwrap().mode() & 0o777, 0o700);
+    for file in fs::read_dir("/dev/shm").unwrap().flatten() {
+        if file.file_name().to_string_lossy().starts_with(place.prefix()) {
+            let mode = file.metadata().unwrap().mode();
+            assert_eq!(mode & 0o077, 0, "{:?} {mode:o}", file.path());
+        }
+    }
+    signal(running.0.id(), "TERM");
+    assert_eq!(wait(&mut running), Some(130));
+    std::thread::sleep(Duration::from_millis(100));
+    nothing_is_left(here);
+}
