@@ -164,7 +164,7 @@ impl<'a> Crew<'a> {
             launcher::Event::Said { number, line } => say(format_args!("walker {number}: {line}")),
             launcher::Event::Ended { number, ended } => {
                 let fault = ended.ending.is_own_fault().then(|| ended.ending.to_string());
-                self.line.gone(number, fault);
+                self.line.gone(number, ended.incarnation, fault);
                 if let Some(record) = self.records.remove(&number) {
                     let record = self.ended(record, &ended).await?;
                     self.records.extend(record.map(|record| (number, record)));

@@ -95,7 +95,7 @@ async fn orchestrate() {
     handle.expect(0, 1);
     let door = serde_json::to_string(&handle.door(0, 1)).expect("plain data");
     let (to_reactor, mut incoming) = mpsc::channel(64);
-    let running = tokio::spawn(server.run(mixtures, to_reactor, |_| {}));
+    let running = tokio::spawn(server.run(mixtures, to_reactor, |_, _| {}));
     let clock = handle.clone();
     let deciding = tokio::spawn(async move {
         let mixture = Arc::new(mixture());
@@ -111,7 +111,7 @@ async fn orchestrate() {
     let this = std::env::current_exe().expect("this program");
     let mut walker = Command::new(this).env(DOOR, door).stdin(Stdio::null()).spawn().expect("a process");
     tokio::task::spawn_blocking(move || walker.wait()).await.expect("a wait").expect("a process");
-    handle.gone(0, None);
+    handle.gone(0, 1, None);
     handle.close();
     running.await.expect("a task").expect("a transport");
     deciding.await.expect("a task");

@@ -56,6 +56,11 @@ impl Conversations {
         self.walkers.insert(walker, Conversation { incarnation, sequence: 0, answer: None });
     }
 
+    /// The incarnation of the walker that is heard.
+    pub(super) fn expected(&self, walker: u32) -> Option<u32> {
+        self.walkers.get(&walker).map(|conversation| conversation.incarnation)
+    }
+
     /// The walker is heard no more.
     pub(super) fn forget(&mut self, walker: u32) {
         self.walkers.remove(&walker);

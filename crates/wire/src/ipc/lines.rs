@@ -65,9 +65,8 @@ impl Lines {
         self.walkers.insert(walker, Line::default());
     }
 
-    /// Whether there was a line.
-    pub(super) fn close(&mut self, walker: u32) -> bool {
-        self.walkers.remove(&walker).is_some()
+    pub(super) fn close(&mut self, walker: u32) {
+        self.walkers.remove(&walker);
     }
 
     /// Removes what dead processes left behind in iceoryx2's tables.

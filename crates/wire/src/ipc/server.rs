@@ -43,7 +43,7 @@ pub struct Handle {
 #[derive(Debug)]
 enum Order {
     Expect { walker: u32, incarnation: u32 },
-    Gone { walker: u32, fault: Option<String> },
+    Gone { walker: u32, incarnation: u32, fault: Option<String> },
     Close,
 }
 
@@ -54,16 +54,17 @@ impl Handle {
         Door { caller, ..self.door.clone() }
     }
 
-    /// From now on this incarnation of the walker is heard and no other. To be called before its process is started and,
-    /// if there was another, after [`Handle::gone`].
+    /// From now on this incarnation of the walker is heard and no other. To be called before its process is started and
+    /// after another, if there was one, has ended: if [`Handle::gone`] has not said so, this does.
     pub fn expect(&self, walker: u32, incarnation: u32) {
         self.order(Order::Expect { walker, incarnation });
     }
 
     /// The walker's process is dead and has been waited for: what it held is freed, and the reactor hears of it, and how
-    /// it ended if that was its own fault.
-    pub fn gone(&self, walker: u32, fault: Option<String>) {
-        self.order(Order::Gone { walker, fault });
+    /// it ended if that was its own fault. Nothing happens if this incarnation is not the expected one any more: what it
+    /// held has been freed, and what is held now belongs to its successor.
+    pub fn gone(&self, walker: u32, incarnation: u32, fault: Option<String>) {
+        self.order(Order::Gone { walker, incarnation, fault });
     }
 
     /// No walker will come any more, and none is alive: [`Server::run`] ends.
@@ -129,8 +130,8 @@ impl Server {
                 biased;
                 order = self.orders.recv() => match order {
                     Some(Order::Expect { walker, incarnation }) => desk.expect(walker, incarnation),
-                    Some(Order::Gone { walker, fault }) => {
-                        desk.gone(walker, fault);
+                    Some(Order::Gone { walker, incarnation, fault }) => {
+                        desk.gone(walker, incarnation, fault);
                         // Lets go of the connection as well.
                         more = take_in(&self.port, &mut desk, &mut heard)?;
                     }
