@@ -10,12 +10,22 @@
 //! `/dev/shm` and nothing in `/tmp`, where cleaners remove old files under a campaign that lasts for weeks. It is short
 //! because the path of a socket has at most 107 bytes.
 
+mod error;
+mod files;
+mod private;
+
 use std::ffi::OsStr;
-use std::fs::{self, DirBuilder, Metadata, Permissions};
-use std::io;
+use std::fs::{self, Permissions};
 use std::os::unix::ffi::OsStrExt;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
+
+pub use error::PlaceError;
+pub use files::Removed;
+
+use error::io_error;
+use files::{entries, remove_file, remove_tree};
+use private::{check_private, make_private, user};
 
 const SHARED_MEMORY: &str = "/dev/shm";
 /// The file that names the campaign's directory.
@@ -30,61 +40,6 @@ pub struct Place {
     directory: PathBuf,
     prefix: String,
     campaign: Option<PathBuf>,
-}
-
-/// What was removed.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Removed {
-    /// Files, directories not counted.
-    pub files: usize,
-    /// Bytes of memory that they held.
-    pub bytes: u64,
-}
-
-/// Why a place cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum PlaceError {
-    /// The operating system says no.
-    #[error("cannot {what} {}: {source}", path.display())]
-    Io {
-        /// What was tried.
-        what: &'static str,
-        /// With which file.
-        path: PathBuf,
-        /// What came of it.
-        source: io::Error,
-    },
-    /// Somebody else made it, or others may write to it.
-    #[error(
-        "{} {found}, expected a directory of user {uid} with mode 0700: whoever made it must remove it, \
-         or use `--in-process`",
-        path.display()
-    )]
-    NotOurs {
-        /// The directory.
-        path: PathBuf,
-        /// What it is instead.
-        found: String,
-        /// This user.
-        uid: u32,
-    },
-    /// Shared memory is too small. Going on would end with SIGBUS in the middle of a write.
-    #[error(
-        "the campaign needs {} of shared memory and /dev/shm has {} free: enlarge /dev/shm (in a container \
-         `--shm-size`), use fewer walkers, or use `--in-process`; `calmwalk clean` removes what dead campaigns left",
-        megabytes(*needed),
-        megabytes(*free)
-    )]
-    Space {
-        /// Bytes.
-        needed: u64,
-        /// Bytes.
-        free: u64,
-    },
-}
-
-fn megabytes(bytes: u64) -> String {
-    format!("{:.1} MB", bytes as f64 / 1e6)
 }
 
 impl Place {
@@ -215,10 +170,6 @@ fn home() -> PathBuf {
     Path::new(SHARED_MEMORY).join(format!("calmwalk-{}", user()))
 }
 
-fn user() -> u32 {
-    rustix::process::geteuid().as_raw()
-}
-
 /// Bytes that may still be written to shared memory.
 pub(crate) fn free_space() -> Result<u64, PlaceError> {
     let statistics = rustix::fs::statvfs(SHARED_MEMORY)
@@ -236,92 +187,11 @@ fn segments(prefix: &str) -> Result<Vec<PathBuf>, PlaceError> {
     Ok(paths)
 }
 
-/// What is in a directory; nothing if there is no such directory.
-fn entries(directory: &Path) -> Result<Vec<PathBuf>, PlaceError> {
-    let listed = match fs::read_dir(directory) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-        listed => listed.map_err(io_error("list", directory))?,
-    };
-    listed.map(|entry| entry.map(|entry| entry.path()).map_err(io_error("list", directory))).collect()
-}
-
-fn remove_tree(path: &Path, removed: &mut Removed) -> Result<(), PlaceError> {
-    match path.symlink_metadata() {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
-        Err(error) => Err(io_error("look at", path)(error)),
-        Ok(found) if found.is_dir() => {
-            entries(path)?.iter().try_for_each(|entry| remove_tree(entry, removed))?;
-            missing_is_fine(fs::remove_dir(path)).map_err(io_error("remove", path))
-        }
-        Ok(_) => remove_file(path, removed),
-    }
-}
-
-fn remove_file(path: &Path, removed: &mut Removed) -> Result<(), PlaceError> {
-    let blocks = path.symlink_metadata().map_or(0, |file| file.blocks());
-    missing_is_fine(fs::remove_file(path)).map_err(io_error("remove", path))?;
-    removed.files += 1;
-    removed.bytes += 512 * blocks;
-    Ok(())
-}
-
-fn missing_is_fine(result: io::Result<()>) -> io::Result<()> {
-    if result.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::NotFound) { Ok(()) } else { result }
-}
-
-/// Makes a directory for this user alone, or checks that the one that is there is such a directory.
-fn make_private(path: &Path, uid: u32) -> Result<(), PlaceError> {
-    match DirBuilder::new().mode(0o700).create(path) {
-        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
-        made => made.map_err(io_error("make", path))?,
-    }
-    check_private(path, uid)
-}
-
-/// Everybody may write to `/dev/shm`: what has the right name may be a trap.
-fn check_private(path: &Path, uid: u32) -> Result<(), PlaceError> {
-    let found = path.symlink_metadata().map_err(io_error("look at", path))?;
-    if found.is_dir() && found.uid() == uid && found.mode() & 0o777 == 0o700 {
-        return Ok(());
-    }
-    Err(PlaceError::NotOurs { path: path.to_owned(), found: describe(&found), uid })
-}
-
-fn describe(found: &Metadata) -> String {
-    let kind = if found.is_dir() { "a directory" } else { "no directory" };
-    format!("is {kind} of user {} with mode {:04o}", found.uid(), found.mode() & 0o7777)
-}
-
-fn io_error(what: &'static str, path: &Path) -> impl FnOnce(io::Error) -> PlaceError {
-    move |source| PlaceError::Io { what, path: path.to_owned(), source }
-}
-
 #[cfg(test)]
 mod tests {
     use std::iter::repeat_n;
-    use std::os::unix::fs::symlink;
 
     use super::*;
-
-    #[test]
-    fn a_directory_that_others_made_or_may_write_to_is_refused() {
-        let here = tempfile::tempdir().unwrap();
-        let path = here.path().join("home");
-        make_private(&path, user()).unwrap();
-        make_private(&path, user()).unwrap();
-
-        let message = check_private(&path, user() + 1).unwrap_err().to_string();
-        assert!(message.contains(&format!("a directory of user {} with mode 0700", user())), "{message}");
-        fs::set_permissions(&path, Permissions::from_mode(0o770)).unwrap();
-        let message = make_private(&path, user()).unwrap_err().to_string();
-        assert!(message.contains("with mode 0770"), "{message}");
-
-        let link = here.path().join("link");
-        fs::set_permissions(&path, Permissions::from_mode(0o700)).unwrap();
-        symlink(&path, &link).unwrap();
-        let message = make_private(&link, user()).unwrap_err().to_string();
-        assert!(message.contains("no directory"), "{message}");
-    }
 
     /// `sockaddr_un` has room for 108 bytes with the zero at the end.
     #[test]
