@@ -54,7 +54,7 @@ async fn work_in(
     let sizes = Sizes { walkers, message_bytes: campaign.largest_message() };
     let needed =
         SharedMixture::space_needed(&mixture, walkers).map_err(Failure::failed)? + space_needed(&sizes);
-    place.prepare(needed).map_err(Failure::failed)?;
+    let _prepared = place.prepare(needed).map_err(Failure::failed)?;
     let shared = SharedMixture::create(&place.mixture(), &mixture, walkers);
     let shared = shared.map_err(Failure::failed)?;
     let server = Server::open(place, sizes, session(process)).map_err(Failure::failed)?;

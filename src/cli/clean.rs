@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use store::CampaignLock;
-use wire::place::{Place, Removed};
+use wire::place::{Place, PlaceError, Removed};
 
 use super::{Ended, Failure};
 use crate::output::print;
@@ -44,7 +44,11 @@ fn clean(place: &Place, campaign: Option<&Path>) -> Result<Removed, Failure> {
     // Where the directory is gone there is no campaign left to run.
     let campaign = campaign.filter(|directory| directory.is_dir());
     let _lock = campaign.map(|directory| CampaignLock::acquire(directory, "calmwalk clean")).transpose()?;
-    place.remove().map_err(Failure::failed)
+    place.remove().map_err(|error| match error {
+        // Its directory may not be visible here, or may have been renamed.
+        PlaceError::InUse { .. } => Failure::input(error),
+        error => Failure::failed(error),
+    })
 }
 
 fn report(directory: &Path, removed: Removed) -> Result<(), Failure> {

@@ -88,7 +88,7 @@ async fn orchestrate() {
     let directory = tempfile::tempdir().expect("a directory");
     let place = Place::of(directory.path()).expect("a place");
     let sizes = Sizes { walkers: 1, message_bytes: 5 << 20 };
-    place.prepare(space_needed(&sizes)).expect("enough shared memory");
+    let prepared = place.prepare(space_needed(&sizes)).expect("enough shared memory");
     let mixtures = SharedMixture::create(&place.mixture(), &mixture(), 1).expect("a shared mixture");
     let server = Server::open(&place, sizes, 1).expect("a transport");
     let handle = server.handle();
@@ -115,6 +115,7 @@ async fn orchestrate() {
     handle.close();
     running.await.expect("a task").expect("a transport");
     deciding.await.expect("a task");
+    drop(prepared);
     println!("{:?}, {:?} removed", handle.traffic(), place.remove().expect("a place"));
 }
 

@@ -30,6 +30,18 @@ pub enum PlaceError {
         /// This user.
         uid: u32,
     },
+    /// A run that is alive.
+    #[error(
+        "a process that runs the campaign{campaign} holds {}: wait for it or stop it first (it may be in a container \
+         that shares /dev/shm)",
+        path.display()
+    )]
+    InUse {
+        /// The directory of the place.
+        path: PathBuf,
+        /// Where the campaign is, as far as that is known.
+        campaign: String,
+    },
     /// Shared memory is too small. Going on would end with SIGBUS in the middle of a write.
     #[error(
         "the campaign needs {} of shared memory and /dev/shm has {} free: enlarge /dev/shm (in a container \

@@ -9,9 +9,12 @@
 //! `<name>` is a hash of user and campaign directory, so that campaigns do not see each other. All of it is in
 //! `/dev/shm` and nothing in `/tmp`, where cleaners remove old files under a campaign that lasts for weeks. It is short
 //! because the path of a socket has at most 107 bytes.
+//!
+//! A run holds its place (see [`hold`]), so that nobody else wipes it, whatever can be told of its campaign.
 
 mod error;
 mod files;
+mod hold;
 mod private;
 
 use std::ffi::OsStr;
@@ -25,7 +28,8 @@ pub use files::Removed;
 
 use error::io_error;
 use files::{entries, remove_file, remove_tree};
-use private::{check_private, make_private, user};
+use hold::{Hold, Turn};
+use private::{make_private, user};
 
 const SHARED_MEMORY: &str = "/dev/shm";
 /// The file that names the campaign's directory.
@@ -40,6 +44,14 @@ pub struct Place {
     directory: PathBuf,
     prefix: String,
     campaign: Option<PathBuf>,
+}
+
+/// A place that is ready: this process's until this is dropped.
+#[derive(Debug)]
+pub struct Prepared {
+    /// What dead processes had left there.
+    pub removed: Removed,
+    _hold: Hold,
 }
 
 impl Place {
@@ -104,28 +116,24 @@ impl Place {
     }
 
     /// Makes the place ready: removes what dead processes left, makes the directory, and checks that `needed` bytes are
-    /// free. The caller holds the campaign's lock, so that nobody is there.
+    /// free. Nobody else can prepare or remove it while what is returned lives.
     ///
     /// # Errors
-    /// Files of somebody else, too little space.
-    pub fn prepare(&self, needed: u64) -> Result<Removed, PlaceError> {
+    /// A run that is alive, files of somebody else, too little space.
+    pub fn prepare(&self, needed: u64) -> Result<Prepared, PlaceError> {
+        let _turn = Turn::wait()?;
         let removed = self.wipe()?;
         let free = free_space()?;
         if free < needed {
             return Err(PlaceError::Space { needed, free });
         }
-        // Twice, because another campaign that ends may just remove the empty directory above.
-        self.make().or_else(|_| self.make())?;
+        make_private(&self.directory, user())?;
+        let hold = self.hold()?;
         if let Some(campaign) = &self.campaign {
             let file = self.directory.join(CAMPAIGN);
             fs::write(&file, campaign.as_os_str().as_bytes()).map_err(io_error("write", &file))?;
         }
-        Ok(removed)
-    }
-
-    fn make(&self) -> Result<(), PlaceError> {
-        make_private(&home(), user())?;
-        make_private(&self.directory, user())
+        Ok(Prepared { removed, _hold: hold })
     }
 
     /// Takes from others the right to read and write the campaign's segments, which iceoryx2 gives them for one of them
@@ -141,21 +149,23 @@ impl Place {
         Ok(())
     }
 
-    /// Removes everything of this campaign. No process of it may be alive.
+    /// Removes everything of this campaign, unless a run of it is alive.
     ///
     /// # Errors
-    /// Files of somebody else.
+    /// A run that is alive ([`PlaceError::InUse`]), files of somebody else.
     pub fn remove(&self) -> Result<Removed, PlaceError> {
-        let removed = self.wipe()?;
-        // Other campaigns may have theirs there.
-        let _ = fs::remove_dir(home());
-        Ok(removed)
+        let _turn = Turn::wait()?;
+        self.wipe()
+    }
+
+    fn hold(&self) -> Result<Hold, PlaceError> {
+        Hold::take(&self.directory, self.campaign_directory())
     }
 
     fn wipe(&self) -> Result<Removed, PlaceError> {
         let mut removed = Removed::default();
-        if home().symlink_metadata().is_ok() {
-            check_private(&home(), user())?;
+        if self.directory.symlink_metadata().is_ok() {
+            let _hold = self.hold()?;
             remove_tree(&self.directory, &mut removed)?;
         }
         for path in segments(&self.prefix)? {

@@ -13,7 +13,7 @@ use tokio::time::timeout;
 use wire::ipc::{Door, Handle, IpcError, Server, Sizes, space_needed};
 use wire::messages::{Outcome, Report};
 use wire::mixture::SharedMixture;
-use wire::place::Place;
+use wire::place::{Place, Prepared};
 use wire::transport::{Incoming, Work};
 use wire::{CandidateBlock, WalkId};
 
@@ -28,6 +28,7 @@ static SESSION: AtomicU64 = AtomicU64::new(1);
 /// An orchestrator in this process.
 pub struct Desk {
     pub place: Place,
+    prepared: Prepared,
     pub handle: Handle,
     pub incoming: mpsc::Receiver<Incoming>,
     /// The walkers that were heard, in order.
@@ -46,7 +47,7 @@ impl Desk {
     pub fn open(directory: &Path, walkers: u32, message_bytes: usize) -> Self {
         let place = Place::of(directory).unwrap();
         let sizes = Sizes { walkers, message_bytes };
-        place.prepare(space_needed(&sizes)).unwrap();
+        let prepared = place.prepare(space_needed(&sizes)).unwrap();
         let mixtures = SharedMixture::create(&place.mixture(), &mixture(0), walkers).unwrap();
         let session = SESSION.fetch_add(1, Ordering::Relaxed);
         let server = Server::open(&place, sizes, session).unwrap();
@@ -56,7 +57,7 @@ impl Desk {
         let note = Arc::clone(&heard);
         let note = move |walker, _| note.lock().unwrap().push(walker);
         let task = tokio::spawn(server.run(mixtures, to_reactor, note));
-        Self { place, handle, incoming, heard, task }
+        Self { place, prepared, handle, incoming, heard, task }
     }
 
     /// Expects a walker and starts its process.
@@ -97,6 +98,7 @@ impl Desk {
     pub async fn close(self) {
         self.handle.close();
         timeout(LIMIT, self.task).await.expect("in time").unwrap().unwrap();
+        drop(self.prepared);
         self.place.remove().unwrap();
         assert_eq!(files_of(&self.place), Vec::<String>::new());
     }

@@ -83,7 +83,7 @@ fn a_place_is_wiped_before_it_is_used_and_after() {
     let segment = Path::new("/dev/shm").join(format!("{}left", place.prefix()));
     fs::write(&segment, [1; 5_000]).unwrap();
 
-    let removed = place.prepare(0).unwrap();
+    let removed = place.prepare(0).unwrap().removed;
     // With the file that names the campaign.
     assert_eq!((removed.files, removed.bytes), (3, 12_288 + 8_192 + 4_096));
     fs::write(&segment, b"again").unwrap();
@@ -95,4 +95,53 @@ fn a_place_is_wiped_before_it_is_used_and_after() {
     assert_eq!(place.remove().unwrap().files, 1);
     assert_eq!(files_of(&place), Vec::<String>::new());
     assert_eq!(place.remove().unwrap(), wire::place::Removed::default());
+}
+
+/// Also one whose campaign cannot be told: the file that names it is not yet written, or names what is not visible here.
+#[test]
+fn a_place_in_use_is_not_removed() {
+    let directory = tempfile::tempdir().unwrap();
+    let place = Place::of(directory.path()).unwrap();
+    let prepared = place.prepare(0).unwrap();
+    let segment = Path::new("/dev/shm").join(format!("{}used", place.prefix()));
+    fs::write(&segment, b"used").unwrap();
+    for refused in [place.remove().unwrap_err(), place.prepare(0).unwrap_err()] {
+        assert!(matches!(refused, PlaceError::InUse { .. }), "{refused}");
+        assert!(refused.to_string().contains(directory.path().to_str().unwrap()), "{refused}");
+    }
+    let file = place.directory().join("campaign");
+    for content in [Some("/nowhere"), Some(""), None] {
+        match content {
+            Some(content) => fs::write(&file, content).unwrap(),
+            None => fs::remove_file(&file).unwrap(),
+        }
+        let all = Place::all().unwrap();
+        let found = all.iter().find(|found| found.directory() == place.directory()).unwrap();
+        let refused = found.remove().unwrap_err();
+        assert!(matches!(refused, PlaceError::InUse { .. }), "{content:?}: {refused}");
+    }
+    assert!(segment.exists() && place.directory().exists());
+
+    drop(prepared);
+    assert_eq!(place.remove().unwrap().files, 1);
+    assert_eq!(files_of(&place), Vec::<String>::new());
+}
+
+/// Places that come and go at the same time do not disturb each other.
+#[test]
+fn the_directory_of_all_places_may_come_and_go() {
+    std::thread::scope(|scope| {
+        for _ in 0..4 {
+            scope.spawn(|| {
+                let directory = tempfile::tempdir().unwrap();
+                let place = Place::of(directory.path()).unwrap();
+                for _ in 0..200 {
+                    let prepared = place.prepare(0).unwrap();
+                    assert!(place.directory().join("campaign").exists());
+                    drop(prepared);
+                    assert_eq!(place.remove().unwrap().files, 1);
+                }
+            });
+        }
+    });
 }
