@@ -1,7 +1,7 @@
 //! σ, γ and the gradient of γ with respect to the feature vector.
 
-use crate::component::ComponentView;
-use crate::linear::{dot, squared_distance, symmetric_product};
+use crate::component::Component;
+use crate::linear::{TOGETHER, dot, squared_distance, symmetric_products};
 use crate::mixture::Mixture;
 
 /// Added under the square root of σ.
@@ -19,6 +19,8 @@ pub struct Grades {
     pub gamma: Vec<f64>,
     /// Index of the nearest component among those of the atom's element, `[atoms]`.
     pub component: Vec<usize>,
+    /// The atoms, those of a component together.
+    order: Vec<usize>,
     delta: Vec<f64>,
     product: Vec<f64>,
 }
@@ -79,7 +81,7 @@ impl Grades {
         mixture: &Mixture,
         elements: &[usize],
         features: &[f64],
-        gradient: Option<&mut [f64]>,
+        mut gradient: Option<&mut [f64]>,
     ) -> Result<(), GradeError> {
         let (atoms, dimension) = (elements.len(), mixture.dimension());
         let fits = |what, found| {
@@ -93,48 +95,82 @@ impl Grades {
         if let Some(gradient) = gradient.as_deref() {
             fits("gradient", gradient.len())?;
         }
-        self.clear(dimension);
-        let mut rows = gradient.map(|gradient| gradient.chunks_exact_mut(dimension));
-        for (atom, (&element, z)) in elements.iter().zip(features.chunks_exact(dimension)).enumerate() {
-            let row = rows.as_mut().and_then(Iterator::next);
-            self.push(mixture, atom, element, z, row)?;
+        self.assign(mixture, elements, features)?;
+        self.measure(mixture, elements, features, gradient.as_deref_mut());
+        self.scale(mixture, elements, gradient)
+    }
+
+    /// Finds the nearest component of each atom.
+    fn assign(&mut self, mixture: &Mixture, elements: &[usize], features: &[f64]) -> Result<(), GradeError> {
+        self.component.clear();
+        let rows = features.chunks_exact(mixture.dimension());
+        for (atom, (&element, z)) in elements.iter().zip(rows).enumerate() {
+            let unknown = || GradeError::Element { atom, element, elements: mixture.element_count() };
+            let components = mixture.components(element).ok_or_else(unknown)?;
+            self.component.push(nearest(components.iter().map(|component| component.centroid()), z));
         }
         Ok(())
     }
 
-    fn clear(&mut self, dimension: usize) {
-        self.sigma.clear();
-        self.gamma.clear();
-        self.component.clear();
-        self.delta.resize(dimension, 0.0);
-        self.product.resize(dimension, 0.0);
-    }
-
-    fn push(
+    /// Leaves **δ**ᵀS**δ** of each atom in `sigma`, and S**δ** in the gradient.
+    ///
+    /// A few atoms of the same component at a time, which share the reading of its matrix.
+    fn measure(
         &mut self,
         mixture: &Mixture,
-        atom: usize,
-        element: usize,
-        z: &[f64],
+        elements: &[usize],
+        features: &[f64],
+        mut gradient: Option<&mut [f64]>,
+    ) {
+        let dimension = mixture.dimension();
+        let Self { sigma, component: slots, order, delta, product, .. } = self;
+        let place = |atom: usize| (elements[atom], slots[atom]);
+        sigma.clear();
+        sigma.resize(elements.len(), 0.0);
+        order.clear();
+        order.extend(0..elements.len());
+        order.sort_unstable_by_key(|&atom| (place(atom), atom));
+        for atoms in order.chunk_by(|&a, &b| place(a) == place(b)).flat_map(|atoms| atoms.chunks(TOGETHER)) {
+            let component = component(mixture, place(atoms[0]));
+            delta.clear();
+            for atom in atoms {
+                let z = &features[atom * dimension..][..dimension];
+                delta.extend(z.iter().zip(component.centroid()).map(|(z, centre)| z - centre));
+            }
+            product.resize(delta.len(), 0.0);
+            symmetric_products(component.inverse(), dimension, delta, product);
+            let rows = delta.chunks_exact(dimension).zip(product.chunks_exact(dimension));
+            for (&atom, (delta, product)) in atoms.iter().zip(rows) {
+                sigma[atom] = dot(delta, product);
+                if let Some(gradient) = gradient.as_deref_mut() {
+                    gradient[atom * dimension..][..dimension].copy_from_slice(product);
+                }
+            }
+        }
+    }
+
+    /// Makes σ and γ of **δ**ᵀS**δ**, and ∂γ/∂**z** of S**δ**.
+    fn scale(
+        &mut self,
+        mixture: &Mixture,
+        elements: &[usize],
         gradient: Option<&mut [f64]>,
     ) -> Result<(), GradeError> {
-        let unknown = || GradeError::Element { atom, element, elements: mixture.element_count() };
-        let components = mixture.components(element).ok_or_else(unknown)?;
-        let slot = nearest(components.iter().map(|component| component.centroid()), z);
-        let component = components.get(slot).ok_or_else(unknown)?.view();
-        let squared = squared_mahalanobis(component, z, &mut self.delta, &mut self.product);
-        let sigma = (squared + DISTANCE_FLOOR).sqrt();
-        if !(sigma.is_finite() && sigma > 0.0) {
-            return Err(GradeError::Distance { atom, element, slot, found: squared });
+        self.gamma.clear();
+        let mut rows = gradient.map(|gradient| gradient.chunks_exact_mut(mixture.dimension()));
+        let places = elements.iter().zip(&self.component);
+        for (atom, (sigma, (&element, &slot))) in self.sigma.iter_mut().zip(places).enumerate() {
+            let squared = std::mem::replace(sigma, (*sigma + DISTANCE_FLOOR).sqrt());
+            if !(sigma.is_finite() && *sigma > 0.0) {
+                return Err(GradeError::Distance { atom, element, slot, found: squared });
+            }
+            let threshold = component(mixture, (element, slot)).threshold().max(THRESHOLD_FLOOR);
+            self.gamma.push(*sigma / threshold);
+            if let Some(row) = rows.as_mut().and_then(Iterator::next) {
+                let scale = 1.0 / (*sigma * threshold);
+                row.iter_mut().for_each(|value| *value *= scale);
+            }
         }
-        let threshold = component.threshold.max(THRESHOLD_FLOOR);
-        if let Some(gradient) = gradient {
-            let scale = 1.0 / (sigma * threshold);
-            gradient.iter_mut().zip(&self.product).for_each(|(out, value)| *out = scale * value);
-        }
-        self.sigma.push(sigma);
-        self.gamma.push(sigma / threshold);
-        self.component.push(slot);
         Ok(())
     }
 
@@ -163,21 +199,13 @@ pub fn nearest<'a>(centroids: impl Iterator<Item = &'a [f64]>, z: &[f64]) -> usi
     best
 }
 
-/// **δ**ᵀS**δ** with **δ** = **z** − **μ**; leaves **δ** and S**δ** in the buffers (`[D]` each).
-pub fn squared_mahalanobis(
-    component: ComponentView<'_>,
-    z: &[f64],
-    delta: &mut [f64],
-    product: &mut [f64],
-) -> f64 {
-    for (out, (z, centre)) in delta.iter_mut().zip(z.iter().zip(component.centroid)) {
-        *out = z - centre;
-    }
-    quadratic_form(component.inverse, delta, product)
+/// The component at a place that has been looked up before.
+fn component(mixture: &Mixture, (element, slot): (usize, usize)) -> &Component {
+    mixture.component(element, slot).expect("the nearest component is one of the mixture")
 }
 
 /// **δ**ᵀS**δ**; leaves S**δ** in the buffer.
 pub(crate) fn quadratic_form(inverse: &[f64], delta: &[f64], product: &mut [f64]) -> f64 {
-    symmetric_product(inverse, delta, product);
+    symmetric_products(inverse, delta.len(), delta, product);
     dot(delta, product)
 }

@@ -145,27 +145,70 @@ pub(crate) fn regularised(covariance: &[f64], dimension: usize) -> Vec<f64> {
     out
 }
 
-/// out = S v for a symmetric row-major S, summed over rows four at a time in a fixed order.
+/// Vectors that [`symmetric_products`] takes through the matrix together.
+pub(crate) const TOGETHER: usize = 2;
+
+/// S v of each of some vectors, for a symmetric row-major S of this dimension; `vectors` and `out` are `[vectors × D]`.
 ///
-/// Every lane adds the same terms in the same order whatever the vector width, without fused multiply-add,
-/// so the bits do not depend on the processor.
-pub(crate) fn symmetric_product(matrix: &[f64], vector: &[f64], out: &mut [f64]) {
-    let dimension = vector.len();
-    out.fill(0.0);
-    let mut rows = matrix.chunks_exact(4 * dimension);
-    let mut factors = vector.chunks_exact(4);
-    for (block, factor) in rows.by_ref().zip(factors.by_ref()) {
-        let (first, second) = block.split_at(2 * dimension);
-        let (row_0, row_1) = first.split_at(dimension);
-        let (row_2, row_3) = second.split_at(dimension);
-        let [v_0, v_1, v_2, v_3] = *factor else { continue };
-        let terms = row_0.iter().zip(row_1).zip(row_2.iter().zip(row_3));
-        for (sum, ((a, b), (c, d))) in out.iter_mut().zip(terms) {
-            *sum += (a * v_0 + b * v_1) + (c * v_2 + d * v_3);
+/// Two vectors at a time, so that the matrix is read half as often: it does not fit into the first-level cache. Rows are
+/// summed four at a time in a fixed order. Every sum adds the same terms in the same order in any company and whatever
+/// the vector width, without fused multiply-add, so the bits depend neither on the other vectors nor on the processor;
+/// the widest vectors that it has are used.
+pub(crate) fn symmetric_products(matrix: &[f64], dimension: usize, vectors: &[f64], out: &mut [f64]) {
+    pulp::Arch::new().dispatch(SymmetricProducts { matrix, dimension, vectors, out });
+}
+
+struct SymmetricProducts<'a> {
+    matrix: &'a [f64],
+    dimension: usize,
+    vectors: &'a [f64],
+    out: &'a mut [f64],
+}
+
+impl pulp::WithSimd for SymmetricProducts<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: pulp::Simd>(self, _: S) {
+        let Self { matrix, dimension, vectors, out } = self;
+        let width = TOGETHER * dimension;
+        let (mut pairs, mut sums) = (vectors.chunks_exact(width), out.chunks_exact_mut(width));
+        for (pair, sums) in pairs.by_ref().zip(sums.by_ref()) {
+            let (left, right) = sums.split_at_mut(dimension);
+            multiply(matrix, pair.split_at(dimension).into(), [left, right]);
+        }
+        let last = pairs.remainder();
+        if !last.is_empty() {
+            multiply(matrix, [last], [sums.into_remainder()]);
         }
     }
-    for (row, factor) in rows.remainder().chunks_exact(dimension).zip(factors.remainder()) {
-        out.iter_mut().zip(row).for_each(|(sum, value)| *sum += value * factor);
+}
+
+/// out_n = S v_n for each n.
+#[inline(always)]
+fn multiply<const N: usize>(matrix: &[f64], vectors: [&[f64]; N], mut out: [&mut [f64]; N]) {
+    let dimension = vectors[0].len();
+    let whole = dimension - dimension % 4;
+    out.iter_mut().for_each(|sums| sums.fill(0.0));
+    for first in (0..whole).step_by(4) {
+        // Slices of one known length, and columns inside: the loop over columns becomes vector instructions.
+        let row = |k: usize| &matrix[(first + k) * dimension..][..dimension];
+        let rows: [&[f64]; 4] = std::array::from_fn(row);
+        let factors: [[f64; 4]; N] = vectors.map(|vector| std::array::from_fn(|k| vector[first + k]));
+        let mut sums = out.each_mut().map(|sums| &mut sums[..dimension]);
+        for column in 0..dimension {
+            let [a, b, c, d] = rows.map(|row| row[column]);
+            for (sums, [v_0, v_1, v_2, v_3]) in sums.iter_mut().zip(factors) {
+                sums[column] += (a * v_0 + b * v_1) + (c * v_2 + d * v_3);
+            }
+        }
+    }
+    for row in whole..dimension {
+        let values = &matrix[row * dimension..][..dimension];
+        for (sums, vector) in out.iter_mut().zip(vectors) {
+            let factor = vector[row];
+            sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += value * factor);
+        }
     }
 }
 
@@ -197,4 +240,48 @@ pub(crate) fn squared_distance(left: &[f64], right: &[f64]) -> f64 {
         }
     }
     (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// S v as its documentation says, one number after the other.
+    fn plain_product(matrix: &[f64], vector: &[f64]) -> Vec<f64> {
+        let dimension = vector.len();
+        let term = |row: usize, column: usize| matrix[row * dimension + column] * vector[row];
+        let whole = dimension - dimension % 4;
+        let sum = |column| {
+            let four = |row| {
+                (term(row, column) + term(row + 1, column)) + (term(row + 2, column) + term(row + 3, column))
+            };
+            let sum = (0..whole).step_by(4).fold(0.0, |sum, row| sum + four(row));
+            (whole..dimension).fold(sum, |sum, row| sum + term(row, column))
+        };
+        (0..dimension).map(sum).collect()
+    }
+
+    #[test]
+    fn a_product_keeps_its_bits_in_any_company() {
+        // Numbers of many magnitudes, so that another order of additions or a fused one shows.
+        let number = |k: usize| ((k * k + 7 * k) as f64).sin() * 10_f64.powi((k * 31 % 9) as i32 - 4);
+        let bits = |numbers: &[f64]| numbers.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+        for dimension in (1..40).chain([63, 64, 65, 130, 131]) {
+            let matrix: Vec<f64> = (0..dimension * dimension).map(number).collect();
+            let matrix = symmetrised(view(&matrix, dimension, dimension));
+            for count in 0..7 {
+                let vectors: Vec<f64> = (0..count * dimension).map(|k| number(3 * k + 11)).collect();
+                let mut together = vec![f64::NAN; vectors.len()];
+                symmetric_products(&matrix, dimension, &vectors, &mut together);
+                for (vector, together) in
+                    vectors.chunks_exact(dimension).zip(together.chunks_exact(dimension))
+                {
+                    let mut alone = vec![f64::NAN; dimension];
+                    symmetric_products(&matrix, dimension, vector, &mut alone);
+                    assert_eq!(bits(together), bits(&alone), "{dimension} {count}");
+                    assert_eq!(bits(&alone), bits(&plain_product(&matrix, vector)), "{dimension} {count}");
+                }
+            }
+        }
+    }
 }
