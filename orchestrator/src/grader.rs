@@ -64,7 +64,7 @@ impl Grader {
                 let cutoff = self.pair_cutoffs[bonds.elements[i] * self.elements.len() + bonds.elements[j]];
                 bonds.shortest = bonds.shortest.min(distance);
                 if distance < cutoff {
-                    bonds.pairs.push(Pair { i, j, distance, cutoff });
+                    bonds.pairs.push(Pair::new(i, j, distance, cutoff));
                 }
             }
         }
@@ -77,7 +77,7 @@ impl Grader {
 pub struct Bonds {
     /// Element index of each atom.
     pub elements: Vec<usize>,
-    /// Directed pairs within their cutoffs.
+    /// Directed pairs within their cutoffs, weighted.
     pub pairs: Vec<Pair>,
     /// Shortest distance, Å; infinite without neighbours.
     pub shortest: f64,

@@ -336,7 +336,7 @@ impl<'a> Walk<'a> {
             neighbours.bonds_within(structure, i, self.model.cutoff(), &mut bonds);
             pairs.extend(bonds.iter().map(|bond| {
                 let j = bond.atom as usize;
-                Pair { i, j, distance: bond.r, cutoff: self.model.pair_cutoff(elements[i], elements[j]) }
+                Pair::new(i, j, bond.r, self.model.pair_cutoff(elements[i], elements[j]))
             }));
         }
         pairs

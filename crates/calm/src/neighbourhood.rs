@@ -9,10 +9,18 @@ pub struct Pair {
     pub i: usize,
     /// Neighbour (the atom whose image it is); may equal `i`.
     pub j: usize,
-    /// Distance r_ij, Å.
-    pub distance: f64,
-    /// Cutoff r_c,ij of this pair of species, Å.
-    pub cutoff: f64,
+    /// How much `j` counts at `i`, 0 to 1.
+    pub weight: f64,
+}
+
+impl Pair {
+    /// The pair with its weight w_ij = ½[1 + cos(π r_ij / r_c,ij)] (paper, Eq. 3), 0 at or beyond the cutoff.
+    ///
+    /// `distance` is r_ij, `cutoff` the r_c,ij of this pair of species, Å.
+    pub fn new(i: usize, j: usize, distance: f64, cutoff: f64) -> Self {
+        let weight = if distance < cutoff { 0.5 * (1.0 + (PI * distance / cutoff).cos()) } else { 0.0 };
+        Self { i, j, weight }
+    }
 }
 
 /// A pair that names an atom which has no grade.
@@ -29,8 +37,7 @@ pub struct PairError {
 
 /// γ_nbr,i = (γ_i + Σ_j w_ij γ_j) / (1 + Σ_j w_ij), w_ij = ½[1 + cos(π r_ij / r_c,ij)] (paper, Eq. 3).
 ///
-/// `gamma` is `[atoms]` and so is the result. Pairs at or beyond their cutoff have no weight. The sum runs in the
-/// order of the pairs: give them in a fixed order.
+/// `gamma` is `[atoms]` and so is the result. The sum runs in the order of the pairs: give them in a fixed order.
 ///
 /// # Errors
 /// A pair that names an atom without a grade.
@@ -39,13 +46,10 @@ pub fn neighbourhood_average(
     pairs: impl IntoIterator<Item = Pair>,
 ) -> Result<Vec<f64>, PairError> {
     let mut sums: Vec<(f64, f64)> = gamma.iter().map(|&grade| (grade, 1.0)).collect();
-    for Pair { i, j, distance, cutoff } in pairs {
+    for Pair { i, j, weight } in pairs {
         let error = PairError { i, j, atoms: gamma.len() };
         let (sum, grade) = (sums.get_mut(i).ok_or(error)?, gamma.get(j).ok_or(error)?);
-        if distance < cutoff {
-            let weight = 0.5 * (1.0 + (PI * distance / cutoff).cos());
-            *sum = (sum.0 + weight * grade, sum.1 + weight);
-        }
+        *sum = (sum.0 + weight * grade, sum.1 + weight);
     }
     Ok(sums.into_iter().map(|(sum, weight)| sum / weight).collect())
 }

@@ -107,7 +107,7 @@ fn brute_force_pairs(golden: &Path, structure: &str, elements: &[usize], element
                 };
                 let distance = (0..3).map(|axis| component(axis).powi(2)).sum::<f64>().sqrt();
                 if distance < cutoff && (i != j || image != [0; 3]) {
-                    pairs.push(Pair { i, j, distance, cutoff });
+                    pairs.push(Pair::new(i, j, distance, cutoff));
                 }
             }
         }
@@ -177,11 +177,7 @@ fn what_cannot_be_graded_is_an_error() {
 
 #[test]
 fn a_pair_counts_by_its_cosine_weight() {
-    let pairs = [
-        Pair { i: 0, j: 1, distance: 2.0, cutoff: 4.0 },
-        Pair { i: 0, j: 0, distance: 4.0 / 3.0, cutoff: 4.0 },
-        Pair { i: 1, j: 0, distance: 4.0, cutoff: 4.0 },
-    ];
+    let pairs = [Pair::new(0, 1, 2.0, 4.0), Pair::new(0, 0, 4.0 / 3.0, 4.0), Pair::new(1, 0, 4.0, 4.0)];
     let averaged = neighbourhood_average(&[1.0, 3.0], pairs).unwrap();
     assert_close("average", &averaged, &[(1.0 + 0.5 * 3.0 + 0.75) / (1.0 + 0.5 + 0.75), 3.0], 1e-15);
     let error = neighbourhood_average(&[1.0], pairs).unwrap_err();

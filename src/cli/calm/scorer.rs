@@ -90,7 +90,7 @@ impl Scorer {
             self.neighbours.bonds_within(structure, i, model.cutoff(), &mut bonds);
             pairs.extend(bonds.iter().map(|bond| {
                 let j = bond.atom as usize;
-                Pair { i, j, distance: bond.r, cutoff: model.pair_cutoff(*centre, elements[j]) }
+                Pair::new(i, j, bond.r, model.pair_cutoff(*centre, elements[j]))
             }));
         }
         pairs

@@ -58,26 +58,34 @@ impl LinkedCells {
         i: usize,
         mut visit: impl FnMut(Neighbour) -> Result<(), E>,
     ) -> Result<(), E> {
-        let range = |k: usize| {
-            let (low, high) = (self.bins[i][k] - self.span[k], self.bins[i][k] + self.span[k]);
-            if self.periodic[k] { low..=high } else { low.max(0)..=high.min(self.counts[k] - 1) }
-        };
-        for a in range(0) {
-            for b in range(1) {
-                for c in range(2) {
-                    let target = [a, b, c];
-                    let bin = std::array::from_fn(|k| target[k].rem_euclid(self.counts[k]));
-                    let image: [i32; 3] = std::array::from_fn(|k| target[k].div_euclid(self.counts[k]));
-                    let index = flat(bin, self.counts);
+        for (a, image_a) in self.nearby(i, 0) {
+            for (b, image_b) in self.nearby(i, 1) {
+                for (c, image_c) in self.nearby(i, 2) {
+                    let index = flat([a, b, c], self.counts);
                     for &atom in &self.members[self.starts[index]..self.starts[index + 1]] {
                         let wrap = self.wraps[atom as usize];
-                        let image = std::array::from_fn(|k| image[k] + self.wraps[i][k] - wrap[k]);
-                        visit(Neighbour { atom, image })?;
+                        visit(Neighbour {
+                            atom,
+                            image: [image_a - wrap[0], image_b - wrap[1], image_c - wrap[2]],
+                        })?;
                     }
                 }
             }
         }
         Ok(())
+    }
+
+    /// The bins along direction `k` within the reach of atom `i`, each with the lattice translation to it from the atom.
+    fn nearby(&self, i: usize, k: usize) -> impl Iterator<Item = (i32, i32)> {
+        let (own, span, count) = (self.bins[i][k], self.span[k], self.counts[k]);
+        let (low, high) = (own - span, own + span);
+        let (low, high) = if self.periodic[k] { (low, high) } else { (low.max(0), high.min(count - 1)) };
+        let first = (low.rem_euclid(count), low.div_euclid(count) + self.wraps[i][k]);
+        // Counted on, since a division for each bin would take longer than the rest of the search.
+        let next = move |&(bin, image): &(i32, i32)| {
+            Some(if bin + 1 == count { (0, image + 1) } else { (bin + 1, image) })
+        };
+        std::iter::successors(Some(first), next).take((high - low + 1).max(0) as usize)
     }
 }
 
