@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use wire::{BlockError, ContentHash};
 
 use crate::JobState;
-use crate::compress::DecompressError;
+use crate::numbers::NumbersError;
 
 /// What the functions of this crate return.
 pub type Result<T> = std::result::Result<T, StoreError>;
@@ -213,9 +213,9 @@ impl From<BlockError> for StoreError {
     }
 }
 
-impl From<DecompressError> for StoreError {
-    fn from(error: DecompressError) -> Self {
-        Self::damaged("compressed numbers", error)
+impl From<NumbersError> for StoreError {
+    fn from(error: NumbersError) -> Self {
+        Self::damaged("an array of numbers", error)
     }
 }
 

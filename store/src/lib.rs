@@ -5,13 +5,13 @@
 //! may be killed at any time. No function reads a clock: `now` is ms since 1970, see [`unix_milliseconds`].
 
 mod birth;
-mod compress;
 mod encoding;
 mod error;
 mod export;
 mod filesystem;
 mod jobs;
 mod lock;
+mod numbers;
 mod processes;
 pub mod records;
 mod sqlite;
@@ -20,12 +20,12 @@ mod status;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 pub use birth::process_birth;
-pub use compress::{DecompressError, compress, decompress};
 pub use error::{Result, StoreError};
 pub use export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
 pub use filesystem::{check_directory, network_file_system};
 pub use jobs::{Attempt, Completed, Failed, Imported, Job, JobDetails, LabelRecord, LabelSource, Standing};
 pub use lock::{CampaignLock, LOCK};
+pub use numbers::NumbersError;
 pub use processes::{ProcessRecord, this_host};
 pub use records::*;
 pub use sqlite::{DATABASE, Store};

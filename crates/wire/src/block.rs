@@ -158,6 +158,12 @@ fn length(atoms: u64, features: u64) -> u64 {
     HEADER as u64 + 8 * atoms * (1 + 3 + 3 + 1 + 1 + features)
 }
 
+/// Writes the checksum of a block into its header.
+fn seal(block: &mut [u8]) {
+    let checksum = crc32fast::hash(&block[CHECKED_FROM..]);
+    block[CHECKED_FROM - 4..CHECKED_FROM].copy_from_slice(&checksum.to_le_bytes());
+}
+
 impl Candidate {
     /// Bytes of its block.
     pub fn encoded_len(&self) -> usize {
@@ -198,8 +204,7 @@ impl Candidate {
             place.copy_from_slice(part);
             rest = behind;
         }
-        let checksum = crc32fast::hash(&out[CHECKED_FROM..]);
-        out[CHECKED_FROM - 4..CHECKED_FROM].copy_from_slice(&checksum.to_le_bytes());
+        seal(out);
     }
 
     fn header(&self) -> Header {
@@ -270,9 +275,15 @@ impl CandidateBlock {
 
     /// The same block without its features, for a store that keeps those apart.
     pub fn without_features(&self) -> Self {
-        let mut candidate = self.view().to_candidate();
-        candidate.features.clear();
-        Self::encode(&candidate)
+        let header = self.view().header;
+        let length = length(header.atoms, 0);
+        let mut words = vec![0_u64; length as usize / 8];
+        let bytes = words.as_mut_bytes();
+        // The features are what stands last.
+        bytes.copy_from_slice(&self.as_bytes()[..bytes.len()]);
+        bytes[..HEADER].copy_from_slice(Header { length, features: 0, ..header.clone() }.as_bytes());
+        seal(bytes);
+        Self(Arc::new(Words(words)))
     }
 }
 

@@ -9,6 +9,7 @@ mod stages;
 
 use std::time::Duration;
 
+use orchestrator::selector::Settings;
 use recording::{Model, Plan};
 use stages::{Stages, plain_inserts};
 use wire::CandidateBlock;
@@ -30,17 +31,20 @@ fn main() {
         collection: campaign::settings(THRESHOLD).collection,
         least_distance: 2.15,
     };
+    let recording = model.record(plan);
     println!("mostly covered");
-    runtime.block_on(measure(&model, &model.record(plan), THRESHOLD));
+    runtime.block_on(measure(&model, &recording, campaign::settings(THRESHOLD)));
+    println!("\nmostly covered, features of declined candidates no longer kept");
+    let settings = Settings { declined_feature_bytes: 0, ..campaign::settings(THRESHOLD) };
+    runtime.block_on(measure(&model, &recording, settings));
     println!("\nall accepted");
     let plan = Plan { kinds: 320, of_kind: 1, ..plan };
-    runtime.block_on(measure(&model, &model.record(plan), ALL));
+    runtime.block_on(measure(&model, &model.record(plan), campaign::settings(ALL)));
 }
 
 /// One setting: the whole way, then each stage alone.
-async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], threshold: f64) {
+async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], settings: Settings) {
     let folder = || tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
-    let settings = campaign::settings(threshold);
     let (whole, apart, plain) = (folder(), folder(), folder());
     let run = campaign::run(model, &settings, recording, whole.path()).await;
     let n = run.candidates;
@@ -80,9 +84,7 @@ async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], threshold: f6
         ("  search for α, inverses", stages.search),
         ("  watch over training frames", stages.watch),
         ("  rest", stages.decide.saturating_sub(parts)),
-        ("commit", stages.commit),
-        ("  compress", stages.compress),
-        ("  rest: SQLite, flush", stages.commit.saturating_sub(stages.compress)),
+        ("commit: copies, SQLite, flush", stages.commit),
     ] {
         let (each, of_sum) =
             (1e6 * time.as_secs_f64() / n as f64, 100.0 * time.as_secs_f64() / sum.as_secs_f64());

@@ -10,7 +10,7 @@ use orchestrator::reactor::group;
 use orchestrator::selector::{Next, Settings};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection};
-use store::{Commit, compress};
+use store::Commit;
 use wire::CandidateBlock;
 
 use crate::campaign::{checked, create_store, report, selector};
@@ -26,7 +26,6 @@ pub struct Stages {
     pub search: Duration,
     pub watch: Duration,
     pub commit: Duration,
-    pub compress: Duration,
 }
 
 fn timed<T>(total: &mut Duration, work: impl FnOnce() -> T) -> T {
@@ -112,7 +111,6 @@ impl Stages {
         while commits.peek().is_some() {
             let mut whole = Commit::default();
             commits.by_ref().take(size).for_each(|commit| group::append(&mut whole, commit));
-            timed(&mut self.compress, || compress_arrays(&whole));
             let begun = Instant::now();
             store.commit(&whole).await.unwrap();
             self.commit += begun.elapsed();
@@ -121,19 +119,8 @@ impl Stages {
     }
 }
 
-/// What the store compresses of a commit.
-fn compress_arrays(commit: &Commit) {
-    for candidate in &commit.candidates {
-        if candidate.keep_features {
-            compress(candidate.block.view().features).unwrap();
-        }
-        for grades in [&candidate.selector, &candidate.original] {
-            compress(&[grades.gamma.as_slice(), &grades.gamma_nbr].concat()).unwrap();
-        }
-    }
-}
-
-/// Time that SQLite itself takes for as many rows of so many bytes, in transactions of a group each.
+/// Time that SQLite itself, with its own settings of pages and log, takes for as many rows of so many bytes, in
+/// transactions of a group each.
 pub async fn plain_inserts(rows: usize, bytes: usize, group: usize, directory: &Path) -> Duration {
     let options =
         SqliteConnectOptions::new().filename(directory.join("plain.sqlite")).create_if_missing(true);

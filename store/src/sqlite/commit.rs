@@ -7,9 +7,9 @@ use atoms::Structure;
 use wire::{CandidateView, ContentHash};
 
 use super::{Store, Transaction, protocols};
-use crate::compress::compress;
 use crate::encoding::{encode_structure, integer};
 use crate::error::{Result, StoreError};
+use crate::numbers::encode_numbers;
 use crate::records::{AtomGrades, CandidateRecord, Commit, ComponentRecord, Decision, Fate, WalkRecord};
 
 impl Store {
@@ -21,7 +21,7 @@ impl Store {
     /// [`StoreError::DuplicateCandidate`] and [`StoreError::Inconsistent`] are errors of the caller. Nothing is
     /// written after any error.
     pub async fn commit(&self, commit: &Commit) -> Result<Range<i64>> {
-        // Compression is done before anyone has to wait for the transaction.
+        // Everything is copied before anyone has to wait for the transaction.
         let prepared = commit.candidates.iter().map(Prepared::new).collect::<Result<Vec<_>>>()?;
         let mut transaction = self.begin().await?;
         let first = next_sequence(&mut transaction).await?;
@@ -36,7 +36,7 @@ impl Store {
             sequence += 1;
         }
         let protocol = protocols::in_force(&mut transaction).await?;
-        for candidate in &prepared {
+        for candidate in prepared {
             let decision = decided.remove(&candidate.id).ok_or_else(|| {
                 StoreError::Inconsistent(format!("candidate {} without a decision", candidate.id))
             })?;
@@ -82,26 +82,23 @@ impl<'a> Prepared<'a> {
     fn new(record: &'a CandidateRecord) -> Result<Self> {
         let view = record.block.view();
         let id = view.id().to_string();
-        let failed = |error| StoreError::damaged("compressing", error);
         let grades = |grades: &AtomGrades| {
             let n = view.numbers.len();
             match (grades.gamma.len(), grades.gamma_nbr.len()) {
                 (0, 0) => Ok(None),
                 (a, b) if (a, b) == (n, n) => {
-                    let both = [grades.gamma.as_slice(), &grades.gamma_nbr].concat();
-                    compress(&both).map(Some).map_err(failed)
+                    Ok(Some(encode_numbers(&[grades.gamma.as_slice(), &grades.gamma_nbr].concat())))
                 }
                 (a, b) => Err(StoreError::Inconsistent(format!(
                     "{a} and {b} grades for the {n} atoms of candidate {id}"
                 ))),
             }
         };
-        let features = record.keep_features.then(|| compress(view.features).map_err(failed)).transpose()?;
         Ok(Self {
             record,
             structure: view.structure(),
             block: record.block.without_features().as_bytes().to_vec(),
-            features,
+            features: record.keep_features.then(|| encode_numbers(view.features)),
             selector_grades: grades(&record.selector)?,
             original_grades: grades(&record.original)?,
             id,
@@ -134,28 +131,25 @@ async fn insert_decision(transaction: &mut Transaction, sequence: i64, decision:
 async fn insert_candidate(
     transaction: &mut Transaction,
     decision: i64,
-    candidate: &Prepared<'_>,
+    candidate: Prepared<'_>,
     protocol: Option<i64>,
 ) -> Result<()> {
-    let Prepared { record, view, id, .. } = candidate;
-    let known = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM candidate WHERE id = ?)").bind(id);
-    if known.fetch_one(&mut **transaction).await? {
-        return Err(StoreError::DuplicateCandidate(id.clone()));
-    }
+    let Prepared { record, view, id, structure: atoms, .. } = candidate;
     let content = view.id().content;
     let (fate, reason) = match record.fate {
         Fate::Accepted => ("accepted", None),
         Fate::Declined(reason) => ("declined", Some(reason.name())),
     };
     let structure = match record.fate {
-        Fate::Accepted => Some(structure_number(transaction, &candidate.structure, content).await?),
+        Fate::Accepted => Some(structure_number(transaction, &atoms, content).await?),
         Fate::Declined(_) => None,
     };
     let sql = "INSERT INTO candidate VALUES
-               (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)";
+               (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
+               ON CONFLICT (id) DO NOTHING";
     let mut query = sqlx::query(sql)
         .bind(decision)
-        .bind(id)
+        .bind(&id)
         .bind(&content.0[..])
         .bind(structure)
         .bind(view.id().walk.0)
@@ -166,8 +160,8 @@ async fn insert_candidate(
         .bind(fate)
         .bind(reason)
         .bind(integer("mixture version", view.mixture_version())?)
-        .bind(count(candidate.structure.len())?)
-        .bind(candidate.structure.formula())
+        .bind(count(atoms.len())?)
+        .bind(atoms.formula())
         .bind(view.temperature())
         .bind(view.relative_volume())
         .bind(view.energy());
@@ -183,15 +177,17 @@ async fn insert_candidate(
             .bind(gamma_nbr.iter().copied().reduce(f64::max))
             .bind(above.map(count).transpose()?);
     }
-    query.execute(&mut **transaction).await?;
+    if query.execute(&mut **transaction).await?.rows_affected() == 0 {
+        return Err(StoreError::DuplicateCandidate(id));
+    }
     let sql = "INSERT INTO candidate_data (decision, block, features, selector_grades, original_grades)
                VALUES (?, ?, ?, ?, ?)";
     sqlx::query(sql)
         .bind(decision)
-        .bind(&candidate.block)
-        .bind(candidate.features.as_deref())
-        .bind(candidate.selector_grades.as_deref())
-        .bind(candidate.original_grades.as_deref())
+        .bind(candidate.block)
+        .bind(candidate.features)
+        .bind(candidate.selector_grades)
+        .bind(candidate.original_grades)
         .execute(&mut **transaction)
         .await?;
     if let (Some(structure), Some(protocol)) = (structure, protocol) {

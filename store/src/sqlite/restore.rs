@@ -4,9 +4,9 @@ use wire::messages::{Decline, Progress};
 use wire::{CandidateBlock, ContentHash, Origin, WalkId};
 
 use super::Store;
-use crate::compress::decompress;
 use crate::encoding::decode_hash;
 use crate::error::{Result, StoreError};
+use crate::numbers::decode_numbers;
 use crate::records::{AtomGrades, ComponentRecord, Fate, StoredCandidate, WalkRecord};
 
 #[derive(sqlx::FromRow)]
@@ -135,7 +135,7 @@ impl CandidateRow {
             seed_structure: self.seed_structure,
             selector: grades(self.selector_grades.as_deref())?,
             original: grades(self.original_grades.as_deref())?,
-            features: self.features.map(|bytes| decompress(&bytes)).transpose()?,
+            features: self.features.map(|bytes| decode_numbers(&bytes)).transpose()?,
         })
     }
 }
@@ -148,7 +148,7 @@ pub(super) fn origin(name: &str) -> Result<Origin> {
 /// γ and γ_nbr, one behind the other in the column.
 pub(super) fn grades(column: Option<&[u8]>) -> Result<AtomGrades> {
     let Some(bytes) = column else { return Ok(AtomGrades::default()) };
-    let mut gamma = decompress(bytes)?;
+    let mut gamma = decode_numbers(bytes)?;
     let gamma_nbr = gamma.split_off(gamma.len() / 2);
     Ok(AtomGrades { gamma, gamma_nbr })
 }
