@@ -50,7 +50,7 @@ async fn what_is_asked_often_goes_through_indexes() {
 }
 
 #[tokio::test]
-async fn connections_are_safe_against_a_loss_of_power() {
+async fn connections_are_safe_against_a_loss_of_power_and_write_large_pages() {
     let directory = tempfile::tempdir().unwrap();
     let store = store(directory.path()).await;
     let pool = store.writer.as_ref().unwrap();
@@ -59,6 +59,8 @@ async fn connections_are_safe_against_a_loss_of_power() {
     for (sql, expected) in [
         ("PRAGMA synchronous", 2),
         ("PRAGMA foreign_keys", 1),
+        ("PRAGMA page_size", i64::from(PAGE)),
+        ("PRAGMA wal_autocheckpoint", i64::from(LOG_PAGES)),
         ("PRAGMA application_id", APPLICATION),
         ("PRAGMA user_version", SCHEMA),
     ] {
