@@ -6,11 +6,12 @@ use std::path::Path;
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::config::Config;
 use iceoryx2::node::{Node, NodeBuilder};
+use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::Client;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::server::Server;
-use iceoryx2::prelude::{Alignment, AllocationStrategy, BackpressureStrategy, FileName, SignalHandlingMode};
+use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, FileName, SignalHandlingMode};
 use iceoryx2::prelude::{SemanticString, ServiceName, ipc_threadsafe};
 use iceoryx2::service::port_factory::request_response;
 
@@ -19,10 +20,12 @@ use super::{IpcError, Sizes};
 use crate::place;
 
 pub(super) type Service = ipc_threadsafe::Service;
-pub(super) type ServerPort = Server<Service, [u8], (), [u8], ()>;
-pub(super) type ClientPort = Client<Service, [u8], (), [u8], ()>;
-pub(super) type Request = ActiveRequest<Service, [u8], (), [u8], ()>;
-type Requests = request_response::PortFactory<Service, [u8], (), [u8], ()>;
+// Messages are words of 8 bytes: bytes aligned to 8 take eight times their number in iceoryx2's segments.
+pub(super) type ServerPort = Server<Service, [u64], (), [u64], ()>;
+pub(super) type ClientPort = Client<Service, [u64], (), [u64], ()>;
+pub(super) type Request = ActiveRequest<Service, [u64], (), [u64], ()>;
+pub(super) type Pending = PendingResponse<Service, [u64], (), [u64], ()>;
+type Requests = request_response::PortFactory<Service, [u64], (), [u64], ()>;
 
 /// Candidates of one walker that are read where the walker wrote them. Beyond this number (a reproducible round of many
 /// walks) the server copies them, which frees the walker's memory.
@@ -35,15 +38,17 @@ const ACTIVE_REQUESTS: usize = IN_PLACE + 4;
 const REQUEST_BUFFERS: usize = ACTIVE_REQUESTS + 2;
 /// Answers to one walker that the server has memory for.
 const ANSWER_BUFFERS: usize = 3;
+/// Bytes of a message beside what it was expected to have: iceoryx2's header, the frame.
+const MESSAGE_MARGIN: usize = 4096;
 /// Bytes that iceoryx2 uses for the connection with one walker (measured: 270 kB), and for everything else (100 kB).
 const CONNECTION_BYTES: u64 = 1 << 19;
 const TABLE_BYTES: u64 = 1 << 20;
 
-/// Shared memory that the messages of a campaign need at most, bytes.
+/// Shared memory that the messages of a campaign need at most, bytes. Each end reserves its part when it is opened.
 pub fn space_needed(sizes: &Sizes) -> u64 {
-    let message = sizes.message_bytes as u64 + 4096;
-    let walker = (REQUEST_BUFFERS + ANSWER_BUFFERS) as u64 * message + CONNECTION_BYTES;
-    TABLE_BYTES + u64::from(sizes.walkers) * walker
+    let message = (sizes.message_bytes + 2 * MESSAGE_MARGIN) as u64;
+    let messages = REQUEST_BUFFERS * sizes.walkers as usize + answer_buffers(sizes);
+    TABLE_BYTES + messages as u64 * message + u64::from(sizes.walkers) * CONNECTION_BYTES
 }
 
 /// Whether a message is as large as was expected, or there is room for a larger one: without room, writing it would be
@@ -58,6 +63,16 @@ pub(super) fn check_room(length: usize, message_bytes: usize) -> Result<(), IpcE
         }
     }
     Ok(())
+}
+
+/// Answers that the server has memory for.
+fn answer_buffers(sizes: &Sizes) -> usize {
+    ANSWER_BUFFERS * sizes.walkers as usize + 1
+}
+
+/// Words that a message of the expected length has at most.
+fn words(message_bytes: usize) -> usize {
+    (message_bytes + MESSAGE_MARGIN).div_ceil(8)
 }
 
 /// Processes that may be connected: those at work, and dead ones until they are cleaned away.
@@ -101,11 +116,8 @@ pub(super) fn create_requests(
     sizes: &Sizes,
     session: u64,
 ) -> Result<Requests, IpcError> {
-    let alignment = Alignment::new(8).expect("a power of two");
     node.service_builder(&name(&requests_of(session))?)
-        .request_response::<[u8], [u8]>()
-        .request_payload_alignment(alignment)
-        .response_payload_alignment(alignment)
+        .request_response::<[u64], [u64]>()
         .enable_safe_overflow_for_requests(false)
         .enable_safe_overflow_for_responses(false)
         // So that progress is heard although nobody waits for an answer to it.
@@ -122,26 +134,20 @@ pub(super) fn create_requests(
 }
 
 pub(super) fn open_requests(node: &Node<Service>, session: u64) -> Result<Requests, IpcError> {
-    let alignment = Alignment::new(8).expect("a power of two");
-    node.service_builder(&name(&requests_of(session))?)
-        .request_response::<[u8], [u8]>()
-        .request_payload_alignment(alignment)
-        .response_payload_alignment(alignment)
-        .open()
-        .map_err(|e| {
-            IpcError::new("find the orchestrator: it has ended, or this walker is of another run", e)
-        })
+    node.service_builder(&name(&requests_of(session))?).request_response::<[u64], [u64]>().open().map_err(
+        |e| IpcError::new("find the orchestrator: it has ended, or this walker is of another run", e),
+    )
 }
 
 /// A full buffer drops the answer, and the walker's next question brings it: the server waits for nobody.
 pub(super) fn server_port(requests: &Requests, sizes: &Sizes) -> Result<ServerPort, IpcError> {
-    let buffers = ANSWER_BUFFERS * sizes.walkers as usize + 1;
+    let buffers = answer_buffers(sizes);
     requests
         .server_builder()
         .backpressure_strategy(BackpressureStrategy::DiscardData)
         .max_loaned_responses_per_request(1)
         .override_response_preallocation(move |_| buffers)
-        .initial_max_slice_len(sizes.message_bytes)
+        .initial_max_slice_len(words(sizes.message_bytes))
         .allocation_strategy(AllocationStrategy::PowerOfTwo)
         .create()
         .map_err(|e| IpcError::new("open the orchestrator's end", e))
@@ -153,7 +159,7 @@ pub(super) fn client_port(requests: &Requests, message_bytes: usize) -> Result<C
         .client_builder()
         .backpressure_strategy(BackpressureStrategy::DiscardData)
         .override_request_preallocation(|_| REQUEST_BUFFERS)
-        .initial_max_slice_len(message_bytes)
+        .initial_max_slice_len(words(message_bytes))
         .allocation_strategy(AllocationStrategy::PowerOfTwo)
         .create()
         .map_err(|e| IpcError::new("open a walker's end", e))

@@ -78,7 +78,7 @@ impl Desk {
 
     /// Takes in a message; the walker that it is of and whether it brings a report, unless it is dropped.
     pub(super) fn receive(&mut self, request: Request) -> Option<(u32, bool)> {
-        let (begin, bytes) = (Instant::now(), request.payload().len() as u64);
+        let (begin, bytes) = (Instant::now(), size_of_val(request.payload()) as u64);
         let heard = self.listen(request);
         self.lines.count(bytes, begin.elapsed(), heard.as_ref().err());
         heard.ok()

@@ -1,4 +1,4 @@
-//! A request as it lies in shared memory: the control message and, behind it, the candidate.
+//! A message as it lies in shared memory: the control message and, behind it, the candidate.
 //!
 //! | bytes | content |
 //! | --- | --- |
@@ -6,7 +6,9 @@
 //! | that length, filled up with zeros to a multiple of 8 | the control message |
 //! | rest | the candidate block, or nothing |
 //!
-//! So the block is aligned to 8, and read where it stands. An answer is a control message and nothing else.
+//! So the block is aligned to 8, and read where it stands. An answer is a control message without a block.
+
+use zerocopy::IntoBytes;
 
 use crate::block::Candidate;
 
@@ -28,12 +30,12 @@ pub enum FrameError {
     },
 }
 
-/// Bytes of a request.
+/// Bytes of a message, a multiple of 8.
 pub(super) fn length(control: usize, candidate: Option<&Candidate>) -> usize {
     PREFIX + control.next_multiple_of(8) + candidate.map_or(0, Candidate::encoded_len)
 }
 
-/// Writes a request to `out`, which is aligned to 8 and has [`length`] bytes.
+/// Writes a message to `out`, which is aligned to 8 and has [`length`] bytes.
 pub(super) fn fill(out: &mut [u8], control: &[u8], candidate: Option<&Candidate>) {
     let (prefix, rest) = out.split_at_mut(PREFIX);
     prefix.copy_from_slice(&(control.len() as u64).to_le_bytes());
@@ -44,6 +46,13 @@ pub(super) fn fill(out: &mut [u8], control: &[u8], candidate: Option<&Candidate>
     if let Some(candidate) = candidate {
         candidate.encode_into(block);
     }
+}
+
+/// An answer.
+pub(super) fn answer(control: &[u8]) -> Vec<u64> {
+    let mut words = vec![0; length(control.len(), None) / 8];
+    fill(words.as_mut_bytes(), control, None);
+    words
 }
 
 /// The control message and the bytes behind it.

@@ -3,6 +3,8 @@
 use std::ptr::NonNull;
 use std::sync::{Mutex, PoisonError};
 
+use zerocopy::IntoBytes;
+
 use super::IpcError;
 use super::config::Request;
 use super::frame::{self, FrameError};
@@ -27,7 +29,7 @@ unsafe impl Sync for Lent {}
 impl Lent {
     /// Finds the parts of a request. The length is read once, here, and not trusted to stay what it is.
     pub(super) fn new(request: Request) -> Result<Self, FrameError> {
-        let (control, block) = frame::split(request.payload())?;
+        let (control, block) = frame::split(request.payload().as_bytes())?;
         let (control, block) = (NonNull::from(control), NonNull::from(block));
         Ok(Self { request: Mutex::new(request), control, block })
     }
@@ -47,11 +49,12 @@ impl Lent {
     }
 
     /// Answers the request. An answer may be lost without an error; the walker asks for it then.
-    pub(super) fn answer(&self, bytes: &[u8]) -> Result<(), IpcError> {
+    pub(super) fn answer(&self, control: &[u8]) -> Result<(), IpcError> {
+        let words = frame::answer(control);
         let request = self.request.lock().unwrap_or_else(PoisonError::into_inner);
-        let memory = request.loan_slice_uninit(bytes.len());
+        let memory = request.loan_slice_uninit(words.len());
         let memory = memory.map_err(|e| IpcError::new("find memory for an answer", e))?;
-        memory.write_from_slice(bytes).send().map_err(|e| IpcError::new("send an answer", e))
+        memory.write_from_slice(&words).send().map_err(|e| IpcError::new("send an answer", e))
     }
 }
 

@@ -14,6 +14,7 @@ use tokio::sync::oneshot;
 
 use super::IpcError;
 use super::config::{self, Service};
+use super::frame;
 use super::lent::Lent;
 use super::message::Caller;
 use crate::transport::Work;
@@ -114,7 +115,7 @@ impl Lines {
     /// Sends an answer and wakes the walker. If it is lost the walker asks again.
     pub(super) fn send(&mut self, caller: Caller, route: &Lent, answer: &[u8]) {
         let Some(line) = self.walkers.get_mut(&caller.walker) else { return };
-        let sent = config::check_room(answer.len(), self.message_bytes)
+        let sent = config::check_room(frame::length(answer.len(), None), self.message_bytes)
             .and_then(|()| route.answer(answer))
             .and_then(|()| line.ring(&self.node, caller));
         if let Err(reason) = sent {

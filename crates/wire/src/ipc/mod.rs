@@ -30,7 +30,6 @@ use serde::{Deserialize, Serialize};
 use crate::mixture::SharedMixtureError;
 
 pub use config::space_needed;
-pub use frame::FrameError;
 pub use lines::Traffic;
 pub use server::{Handle, Server};
 pub use walker::IpcWalker;

@@ -17,7 +17,7 @@ use super::lines::{Lines, Traffic};
 use super::message::Caller;
 use super::{Door, IpcError, Sizes};
 use crate::mixture::SharedMixture;
-use crate::place::Place;
+use crate::place::{self, Place};
 use crate::transport::Incoming;
 
 /// Messages that are taken in before the server looks at anything else.
@@ -93,6 +93,7 @@ impl Server {
         let bell = config::create_server_bell(&node, &sizes, session)?;
         let port = config::server_port(&config::create_requests(&node, &sizes, session)?, &sizes)?;
         place.close_to_others().map_err(|e| IpcError::new("close its files to other users", e))?;
+        place::reserve(place.prefix(), None).map_err(|e| IpcError::new("reserve its memory", e))?;
         let (sender, orders) = mpsc::unbounded_channel();
         let traffic = Arc::default();
         let door = Door {

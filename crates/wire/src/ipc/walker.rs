@@ -2,17 +2,18 @@
 
 use std::borrow::Cow;
 use std::cell::Cell;
+use std::fmt::Display;
 use std::mem::MaybeUninit;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use iceoryx2::node::Node;
-use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
+use zerocopy::IntoBytes;
 
-use super::config::{self, ClientPort, Service};
+use super::config::{self, ClientPort, Pending, Service};
 use super::message::{Answer, Caller, Decision, Letter, Words};
 use super::{Door, IpcError, frame};
 use crate::block::Candidate;
@@ -20,6 +21,7 @@ use crate::control::{EncodedReport, seal};
 use crate::ids::WalkId;
 use crate::messages::{Outcome, Progress, Report};
 use crate::mixture::MixtureReader;
+use crate::place;
 use crate::transport::{Transport, Work};
 
 /// A walker that waits for an answer asks this often.
@@ -30,10 +32,6 @@ const PATIENCE: Duration = Duration::from_secs(600);
 const PATIENCE_WHEN_STOPPING: Duration = Duration::from_secs(20);
 /// An offer that the orchestrator says it never had is made this often.
 const OFFERS: u32 = 5;
-/// At most one report of progress in this time.
-const PROGRESS_EVERY: Duration = Duration::from_millis(100);
-
-type Pending = PendingResponse<Service, [u8], (), [u8], ()>;
 
 /// A walker's end of the transport.
 pub struct IpcWalker {
@@ -44,7 +42,6 @@ pub struct IpcWalker {
     mixtures: MixtureReader,
     stopping: Arc<AtomicBool>,
     sequence: u64,
-    last_progress: Cell<Option<Instant>>,
     failure: Option<IpcError>,
     encoding: Cell<Duration>,
     message_bytes: usize,
@@ -62,8 +59,9 @@ impl IpcWalker {
         let bell = config::create_walker_bell(&node, caller)?;
         let server_bell = config::server_bell(&node, caller.session)?;
         let port = config::client_port(&config::open_requests(&node, caller.session)?, door.message_bytes)?;
+        place::reserve(&door.prefix, Some(port.id().value()))
+            .map_err(|e| IpcError::new("reserve its memory", e))?;
         let mixtures = MixtureReader::open(&door.mixture, caller.walker)?;
-        let (last_progress, failure, encoding) = (Cell::new(None), None, Cell::default());
         Ok(Self {
             caller,
             port,
@@ -72,9 +70,8 @@ impl IpcWalker {
             mixtures,
             stopping,
             sequence: 0,
-            last_progress,
-            failure,
-            encoding,
+            failure: None,
+            encoding: Cell::default(),
             message_bytes: door.message_bytes,
             _node: node,
         })
@@ -149,10 +146,12 @@ impl IpcWalker {
         let control = seal(&Letter { caller: self.caller, words });
         let length = frame::length(control.len(), candidate);
         config::check_room(length, self.message_bytes)?;
-        let mut memory =
-            self.port.loan_slice_uninit(length).map_err(|e| IpcError::new("find memory for a message", e))?;
-        frame::fill(initialised(memory.payload_mut()), &control, candidate);
-        // SAFETY: every byte of shared memory has a value.
+        let mut memory = self
+            .port
+            .loan_slice_uninit(length / 8)
+            .map_err(|e| IpcError::new("find memory for a message", e))?;
+        frame::fill(initialised(memory.payload_mut()).as_mut_bytes(), &control, candidate);
+        // SAFETY: every word of shared memory has a value.
         #[allow(unsafe_code)]
         let memory = unsafe { memory.assume_init() };
         self.encoding.set(self.encoding.get() + begin.elapsed());
@@ -170,7 +169,9 @@ impl IpcWalker {
         let Some(pending) = pending else { return Ok(None) };
         let received = pending.receive().map_err(|e| IpcError::new("receive an answer", e))?;
         let Some(received) = received else { return Ok(None) };
-        let answer = Answer::decode(received.payload()).map_err(|e| IpcError::new("read an answer", e))?;
+        let unreadable = |why: &dyn Display| IpcError::new("read an answer", why);
+        let (control, _) = frame::split(received.payload().as_bytes()).map_err(|e| unreadable(&e))?;
+        let answer = Answer::decode(control).map_err(|e| unreadable(&e))?;
         Ok((answer.sequence == self.sequence).then_some(answer.decision))
     }
 }
@@ -185,11 +186,8 @@ impl Transport for IpcWalker {
     }
 
     fn progress(&self, walk: WalkId, progress: Progress) {
-        if self.last_progress.get().is_none_or(|last| last.elapsed() >= PROGRESS_EVERY) {
-            self.last_progress.set(Some(Instant::now()));
-            // May be lost: whoever watches can do without this one.
-            let _ = self.send(Words::Progress(walk, Cow::Owned(progress)), None);
-        }
+        // May be lost: whoever watches can do without this one.
+        let _ = self.send(Words::Progress(walk, Cow::Owned(progress)), None);
     }
 
     fn stopping(&self) -> bool {
@@ -199,8 +197,8 @@ impl Transport for IpcWalker {
 
 /// Lent memory, to be written to.
 #[allow(unsafe_code)]
-fn initialised(memory: &mut [MaybeUninit<u8>]) -> &mut [u8] {
+fn initialised(memory: &mut [MaybeUninit<u64>]) -> &mut [u64] {
     // SAFETY: the memory is a file that is mapped: the kernel gave each byte its first value, a zero or what was
     // written there before.
-    unsafe { &mut *(std::ptr::from_mut(memory) as *mut [u8]) }
+    unsafe { &mut *(std::ptr::from_mut(memory) as *mut [u64]) }
 }

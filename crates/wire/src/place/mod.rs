@@ -18,10 +18,13 @@ mod hold;
 mod private;
 
 use std::ffi::OsStr;
-use std::fs::{self, Permissions};
+use std::fs::{self, OpenOptions, Permissions};
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
+
+use rustix::fs::{FallocateFlags, fallocate};
+use rustix::io::{Errno, retry_on_intr};
 
 pub use error::PlaceError;
 pub use files::Removed;
@@ -185,6 +188,28 @@ pub(crate) fn free_space() -> Result<u64, PlaceError> {
     let statistics = rustix::fs::statvfs(SHARED_MEMORY)
         .map_err(|source| io_error("ask for the free space of", Path::new(SHARED_MEMORY))(source.into()))?;
     Ok(statistics.f_bavail.saturating_mul(statistics.f_frsize))
+}
+
+/// Reserves the memory of the campaign's segments, or of those of one port of iceoryx2 alone, whose names have its number
+/// in them. They are made sparse, and a write to what cannot be had any more would be the end of the process.
+pub(crate) fn reserve(prefix: &str, port: Option<u128>) -> Result<(), PlaceError> {
+    let port = port.map_or_else(String::new, |port| format!("_{port}"));
+    for path in segments(prefix)? {
+        if path.to_str().is_some_and(|path| path.contains(&port)) {
+            reserve_file(&path)?;
+        }
+    }
+    Ok(())
+}
+
+fn reserve_file(path: &Path) -> Result<(), PlaceError> {
+    let file = OpenOptions::new().write(true).open(path).map_err(io_error("open", path))?;
+    let needed = file.metadata().map_err(io_error("look at", path))?.len();
+    match retry_on_intr(|| fallocate(&file, FallocateFlags::empty(), 0, needed)) {
+        Ok(()) => Ok(()),
+        Err(Errno::NOSPC) => Err(PlaceError::Space { needed, free: free_space()? }),
+        Err(error) => Err(io_error("reserve the memory of", path)(error.into())),
+    }
 }
 
 /// This user's files in `/dev/shm` whose names begin with `prefix`.

@@ -4,6 +4,7 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
+use wire::ipc::{Sizes, space_needed};
 use wire::place::{Place, PlaceError};
 
 use crate::desk::{Desk, files_of};
@@ -61,6 +62,41 @@ async fn everything_is_the_users_alone_and_in_the_campaigns_place() {
     assert!(walker.wait().unwrap().success());
     desk.close().await;
     assert!(!Place::all().unwrap().contains(&place));
+}
+
+/// Sparse segments would end a process in the middle of a write.
+#[tokio::test(flavor = "multi_thread")]
+async fn memory_is_reserved_and_no_more_than_was_asked_for() {
+    let directory = tempfile::tempdir().unwrap();
+    let sizes = Sizes { walkers: 2, message_bytes: 1 << 20 };
+    let mut desk = Desk::open(directory.path(), sizes.walkers, sizes.message_bytes);
+    let mut walkers = [0, 1].map(|walker| desk.start(walker, 1, Role::Walker));
+    let offers = [desk.offer().await, desk.offer().await];
+
+    let mut bytes = 0;
+    for name in files_of(&desk.place).into_iter().filter(|name| !name.starts_with('/')) {
+        let file = Path::new("/dev/shm").join(&name).symlink_metadata().unwrap();
+        assert!(
+            512 * file.blocks() >= file.len(),
+            "{name}: {} bytes reserved of {}",
+            512 * file.blocks(),
+            file.len()
+        );
+        bytes += 512 * file.blocks();
+    }
+    // Ten reports of each walker, seven answers.
+    let messages = 27 * sizes.message_bytes as u64;
+    assert!(
+        messages < bytes && bytes < space_needed(&sizes),
+        "{messages} < {bytes} < {}",
+        space_needed(&sizes)
+    );
+
+    for offer in offers {
+        offer.reply.send(None).unwrap();
+    }
+    assert!(walkers.iter_mut().all(|walker| walker.wait().unwrap().success()));
+    desk.close().await;
 }
 
 #[test]

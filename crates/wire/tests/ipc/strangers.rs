@@ -6,7 +6,7 @@ use iceoryx2::config::Config;
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::port::client::Client;
 use iceoryx2::port::notifier::Notifier;
-use iceoryx2::prelude::{Alignment, FileName, Path, SemanticString, ServiceName, ipc_threadsafe};
+use iceoryx2::prelude::{FileName, Path, SemanticString, ServiceName, ipc_threadsafe};
 use serde_json::Value;
 use wire::{Candidate, CandidateBlock};
 
@@ -18,7 +18,7 @@ type Service = ipc_threadsafe::Service;
 /// Somebody who knows the way in and sends what it likes.
 struct Stranger {
     session: u64,
-    port: Client<Service, [u8], (), [u8], ()>,
+    port: Client<Service, [u64], (), [u64], ()>,
     bell: Notifier<Service>,
     _node: Node<Service>,
 }
@@ -36,21 +36,17 @@ impl Stranger {
         let name =
             |what: &str| -> ServiceName { format!("{session:016x}/{what}").as_str().try_into().unwrap() };
         let bell = node.service_builder(&name("server")).event().open().unwrap();
-        let requests = node
-            .service_builder(&name("requests"))
-            .request_response::<[u8], [u8]>()
-            .request_payload_alignment(Alignment::new(8).unwrap())
-            .response_payload_alignment(Alignment::new(8).unwrap())
-            .open()
-            .unwrap();
-        let port = requests.client_builder().initial_max_slice_len(1 << 20).create().unwrap();
+        let requests =
+            node.service_builder(&name("requests")).request_response::<[u64], [u64]>().open().unwrap();
+        let port = requests.client_builder().initial_max_slice_len(1 << 17).create().unwrap();
         let bell = bell.notifier_builder().create().unwrap();
         Self { session, port, bell, _node: node }
     }
 
     fn send(&self, bytes: &[u8]) {
+        let words = words(bytes);
         let pending =
-            self.port.loan_slice_uninit(bytes.len()).unwrap().write_from_slice(bytes).send().unwrap();
+            self.port.loan_slice_uninit(words.len()).unwrap().write_from_slice(&words).send().unwrap();
         self.bell.notify().unwrap();
         assert_eq!(pending.number_of_server_connections(), 1);
     }
@@ -71,6 +67,12 @@ impl Stranger {
         let caller = postcard::to_stdvec(&(self.session, walker, incarnation)).unwrap();
         [caller.as_slice(), words].concat()
     }
+}
+
+/// Bytes as they are sent, filled up to whole words.
+fn words(bytes: &[u8]) -> Vec<u64> {
+    let word = |bytes: &[u8]| std::array::from_fn(|k| bytes.get(k).copied().unwrap_or(0));
+    bytes.chunks(8).map(|bytes| u64::from_le_bytes(word(bytes))).collect()
 }
 
 /// Plain data as a control message.
@@ -102,9 +104,9 @@ async fn what_is_no_message_is_dropped_and_counted() {
     let mut last = desk.offer().await;
     let stranger = Stranger::enter(&desk);
 
-    stranger.refused(&desk, &[1; 7], "a request of 7 bytes").await;
+    stranger.refused(&desk, &[], "a request of 0 bytes").await;
     stranger
-        .refused(&desk, &[0xff; 300], "a request of 300 bytes with a control message of 18446744073709551615")
+        .refused(&desk, &[0xff; 304], "a request of 304 bytes with a control message of 18446744073709551615")
         .await;
     stranger.refused(&desk, &framed(b"", b""), "a control message of 0 bytes").await;
     last = desk.go_on(last, 1, (3, 4)).await;
@@ -158,7 +160,7 @@ async fn an_offer_whose_candidate_is_wrong_changes_nothing() {
         )
         .await;
     stranger.refused(&desk, &with(&one, b""), "the block beside it is none").await;
-    stranger.refused(&desk, &with(&one, &block.as_bytes()[..100]), "a candidate block of 100 bytes").await;
+    stranger.refused(&desk, &with(&one, &block.as_bytes()[..104]), "a candidate block of 104 bytes").await;
     let mut damaged = block.as_bytes().to_vec();
     *damaged.last_mut().unwrap() ^= 1;
     stranger.refused(&desk, &with(&one, &damaged), "a damaged candidate block").await;
@@ -193,9 +195,9 @@ async fn a_flood_is_survived() {
     let stranger = Stranger::enter(&desk);
     let flood = std::thread::spawn(move || {
         for k in 0..20_000_u32 {
-            let bytes: Vec<u8> = k.to_le_bytes().into_iter().cycle().take(k as usize % 500 + 1).collect();
+            let words = vec![u64::from(k) << 32 | u64::from(k); k as usize % 60 + 1];
             // Full buffers drop.
-            let _ = stranger.port.loan_slice_uninit(bytes.len()).unwrap().write_from_slice(&bytes).send();
+            let _ = stranger.port.loan_slice_uninit(words.len()).unwrap().write_from_slice(&words).send();
             let _ = stranger.bell.notify();
         }
     });
