@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use orchestrator::launcher::{Children, Launch, ask_to_end};
 use orchestrator::supervisor::Limits;
-use store::{ProcessRecord, Store, this_host};
+use store::{ProcessRecord, Store};
 use wire::ipc::Handle;
 
 use crate::campaign::Campaign;
@@ -59,7 +59,7 @@ pub async fn labellers(
         Launch::this_program(["labeller"], setup::bytes(&setup)).for_own_session()
     });
     for found in store.processes(Some(ProcessRecord::LABELLER)).await? {
-        if found.host != this_host() || found.is_gone() {
+        if !found.is_local() || found.is_gone() {
             continue;
         }
         let wanted = found.number.filter(|_| found.setup.as_ref() == Some(&hash) && found.state == "running");

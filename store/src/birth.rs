@@ -1,21 +1,25 @@
 //! Which process a process number belongs to: numbers are given out again, moments of birth are not.
 
 use std::fs;
+use std::os::unix::fs::MetadataExt;
 
 use rustix::process::Pid;
 
-/// When the process `pid` of this host began: the boot of the system and the clock ticks from then on, as
-/// `boot/ticks`. No other process with this number has the same. `None` where there is no such process, and where
-/// the system does not tell.
+/// When and where the process `pid`, as this process numbers them, began: the boot of the system, the namespace of
+/// process numbers (two containers of one system have the same boot, and each its own numbers) and the clock ticks
+/// from the boot on, as `boot/namespace/ticks`. No other process with this number has the same. `None` where there is
+/// no such process, and where the system does not tell.
 pub fn process_birth(pid: u32) -> Option<String> {
-    stat(pid).map(|stat| format!("{}/{}", boot(), stat.ticks))
+    stat(pid).map(|stat| format!("{}/{}/{}", boot(), namespace(), stat.ticks))
 }
 
-/// Whether the process `pid` of this host that began at `birth` runs. Without a birth any process with that number
-/// is taken for it.
+/// Whether the process `pid` that began at `birth`, which [`is_local`], runs. Without a birth any process with that
+/// number is taken for it.
 pub(crate) fn is_running(pid: u32, birth: &str) -> bool {
     match stat(pid) {
-        Some(stat) => !stat.ended && (birth.is_empty() || birth == format!("{}/{}", boot(), stat.ticks)),
+        Some(stat) => {
+            !stat.ended && Birth::parse(birth).is_none_or(|birth| birth.ticks == stat.ticks.to_string())
+        }
         // Not there, or hidden from this user.
         None => has_number(pid),
     }
@@ -23,8 +27,37 @@ pub(crate) fn is_running(pid: u32, birth: &str) -> bool {
 
 /// Whether that birth was before the system was last started (or on another system): whatever was born then is gone.
 pub(crate) fn is_of_another_boot(birth: &str) -> bool {
-    let (then, now) = (birth.split('/').next().unwrap_or_default(), boot());
-    !then.is_empty() && !now.is_empty() && then != now
+    let now = boot();
+    Birth::parse(birth).is_some_and(|birth| !now.is_empty() && birth.boot != now)
+}
+
+/// Whether who was born then has its number from where this process has its own, so that the number means something
+/// here. `None` without a birth.
+pub(crate) fn is_local(birth: &str) -> Option<bool> {
+    let Birth { boot: then, namespace: place, .. } = Birth::parse(birth)?;
+    Some(then == boot() && place.is_none_or(|place| place == namespace().to_string()))
+}
+
+/// What a birth is made of.
+struct Birth<'a> {
+    boot: &'a str,
+    /// Not in births that were written before it was of interest.
+    namespace: Option<&'a str>,
+    ticks: &'a str,
+}
+
+impl<'a> Birth<'a> {
+    fn parse(birth: &'a str) -> Option<Self> {
+        let (place, ticks) = birth.rsplit_once('/')?;
+        let (boot, namespace) =
+            place.split_once('/').map_or((place, None), |(boot, namespace)| (boot, Some(namespace)));
+        Some(Self { boot, namespace, ticks })
+    }
+}
+
+/// Identifier of the namespace of process numbers; 0 where there is none.
+fn namespace() -> u64 {
+    fs::metadata("/proc/self/ns/pid").map_or(0, |namespace| namespace.ino())
 }
 
 /// Identifier of this boot of the system; empty where there is none.
@@ -90,11 +123,24 @@ mod tests {
     #[test]
     fn a_number_that_was_given_out_again_fools_nobody() {
         let (pid, own) = (std::process::id(), process_birth(std::process::id()).unwrap());
-        let (boot, ticks) = own.split_once('/').unwrap();
-        let earlier = format!("{boot}/{}", ticks.parse::<u64>().unwrap() - 1);
+        let (place, ticks) = own.rsplit_once('/').unwrap();
+        let earlier = format!("{place}/{}", ticks.parse::<u64>().unwrap() - 1);
         assert!(is_running(pid, &own) && !is_running(pid, &earlier));
         assert!(is_of_another_boot(&format!("another/{ticks}")));
         assert!(!is_of_another_boot(&earlier) && !is_of_another_boot(""));
+    }
+
+    #[test]
+    fn numbers_of_other_containers_mean_nothing_here() {
+        let (pid, own) = (std::process::id(), process_birth(std::process::id()).unwrap());
+        let [boot, namespace, ticks] = own.split('/').collect::<Vec<_>>().try_into().unwrap();
+        assert_eq!(is_local(&own), Some(true));
+        assert_eq!(is_local(&format!("{boot}/{namespace}0/{ticks}")), Some(false));
+        assert_eq!(is_local(&format!("another/{namespace}/{ticks}")), Some(false));
+        assert_eq!(is_local(""), None);
+        let without_namespace = format!("{boot}/{ticks}");
+        assert_eq!(is_local(&without_namespace), Some(true));
+        assert!(is_running(pid, &without_namespace) && !is_running(pid, &format!("{boot}/{ticks}0")));
     }
 
     #[test]

@@ -1,8 +1,12 @@
-//! Processes of a campaign, as far as this host can see them.
+//! Processes of a campaign, as far as this one can see them.
 
 use serde::Serialize;
 
-use crate::birth::{is_of_another_boot, is_running, process_birth};
+use crate::birth::{self, process_birth};
+
+/// A process of this system may be silent for so long (ms) without having lost what it holds: the whole system slept,
+/// or its clock was put right. One that hangs for longer does not keep its jobs for ever.
+const SLEEP: i64 = 24 * 3600 * 1000;
 
 /// A process that works for the campaign.
 ///
@@ -48,7 +52,7 @@ impl ProcessRecord {
     /// Kind of a process that makes labels. It outlives its orchestrator, and writes its own record.
     pub const LABELLER: &str = "labeller";
 
-    /// The process `pid` of this host, `running` since `now`.
+    /// The process `pid`, as this process numbers them, `running` since `now`.
     pub fn new(kind: &str, number: Option<u32>, pid: u32, now: i64) -> Self {
         let host = this_host();
         Self {
@@ -65,10 +69,24 @@ impl ProcessRecord {
         }
     }
 
-    /// Whether it ran on this host and does so no longer. One without a birth (written by version 1) is taken for
-    /// whatever process has its number now.
+    /// Whether its number is one that this process sees: both were born since the system was last started, and in the
+    /// same container. Names of hosts change, so they count only where there is no birth (written by version 1).
+    pub fn is_local(&self) -> bool {
+        birth::is_local(&self.birth).unwrap_or_else(|| self.host == this_host())
+    }
+
+    /// Whether it runs no longer, as far as can be seen from here. One without a birth is taken for whatever process has
+    /// its number now.
     pub fn is_gone(&self) -> bool {
-        is_of_another_boot(&self.birth) || (self.host == this_host() && !is_running(self.pid, &self.birth))
+        birth::is_of_another_boot(&self.birth)
+            || (self.is_local() && !birth::is_running(self.pid, &self.birth))
+    }
+
+    /// Whether it may be at work on something that it leased for `seconds`, although that time is over: see
+    /// [`crate::Store::lease`].
+    pub(crate) fn may_be_at_work(&self, now: i64, seconds: u32) -> bool {
+        let silence = if self.is_local() { SLEEP } else { 1000 * i64::from(seconds) };
+        !self.is_gone() && now.saturating_sub(self.last_seen) < silence
     }
 
     /// Whether it runs the campaign and is not gone.
@@ -76,11 +94,11 @@ impl ProcessRecord {
         self.kind == Self::ORCHESTRATOR && !self.is_gone()
     }
 
-    /// Whether it came after `other` to do the same, and is not gone itself.
+    /// Whether it came after `other` to do the same here, and is not gone itself.
     pub fn replaces(&self, other: &Self) -> bool {
-        let place = |process: &Self| (process.kind.clone(), process.host.clone(), process.number);
+        let place = |process: &Self| (process.kind.clone(), process.number, process.is_local());
         let is_later = (self.started, &self.id) > (other.started, &other.id);
-        self.number.is_some() && place(self) == place(other) && is_later && !self.is_gone()
+        self.number.is_some() && self.is_local() && place(self) == place(other) && is_later && !self.is_gone()
     }
 
     /// Whether a lease of `holder` is its own: `id`, or `id/part`.
@@ -102,16 +120,26 @@ mod tests {
         ProcessRecord::new(kind, Some(3), std::process::id(), 10)
     }
 
+    /// The same in another container of this system.
+    fn elsewhere(record: &ProcessRecord) -> ProcessRecord {
+        let (boot, ticks) =
+            (record.birth.split('/').next().unwrap(), record.birth.rsplit('/').next().unwrap());
+        ProcessRecord { birth: format!("{boot}/1/{ticks}"), ..record.clone() }
+    }
+
     #[test]
     fn what_ran_before_the_last_boot_is_gone_wherever_it_ran() {
         let record = own(ProcessRecord::LABELLER);
         assert!(!record.is_gone());
-        let elsewhere = ProcessRecord { host: "elsewhere".into(), pid: u32::MAX, ..record.clone() };
-        assert!(!elsewhere.is_gone(), "nobody can know from here");
-        for host in [this_host(), "elsewhere".to_owned()] {
-            assert!(ProcessRecord { host, birth: "another-boot/1".into(), ..record.clone() }.is_gone());
-        }
-        assert!(!ProcessRecord { birth: String::new(), ..record.clone() }.is_gone(), "version 1");
+        let elsewhere = ProcessRecord { pid: u32::MAX, ..elsewhere(&record) };
+        assert!(!elsewhere.is_local() && !elsewhere.is_gone(), "nobody can know from here");
+        let renamed = ProcessRecord { host: "another name".into(), ..record.clone() };
+        assert!(renamed.is_local() && !renamed.is_gone());
+        assert!(ProcessRecord { pid: u32::MAX, ..renamed.clone() }.is_gone());
+        assert!(ProcessRecord { birth: "another-boot/1/1".into(), ..record.clone() }.is_gone());
+        let version_1 = |record: &ProcessRecord| ProcessRecord { birth: String::new(), ..record.clone() };
+        assert!(version_1(&record).is_local() && !version_1(&record).is_gone());
+        assert!(!version_1(&renamed).is_local());
         let reused = ProcessRecord { birth: format!("{}0", record.birth), ..record };
         assert!(reused.is_gone());
     }
@@ -123,6 +151,7 @@ mod tests {
         assert!(second.replaces(&first) && !first.replaces(&second) && !first.replaces(&first));
         let gone = ProcessRecord { pid: u32::MAX, ..second.clone() };
         assert!(!gone.replaces(&first), "the first one is needed again");
+        assert!(!elsewhere(&second).replaces(&first) && !second.replaces(&elsewhere(&first)));
         assert!(!ProcessRecord { number: Some(4), ..second.clone() }.replaces(&first));
         assert!(!ProcessRecord { number: None, ..second.clone() }.replaces(&first));
         assert!(!ProcessRecord { kind: "walker".into(), ..second }.replaces(&first));
