@@ -142,15 +142,15 @@ fn a_stop_while_labels_are_still_made_is_no_end() {
         let now = store::unix_milliseconds();
         let failed = store.queue_list(Some(store::JobState::Failed), 1, 0).await.unwrap();
         store.retry_job(&failed[0].candidate, now).await.unwrap();
-        // Whether a labeller of another host lives cannot be seen from here.
-        let elsewhere = store::ProcessRecord {
-            id: "elsewhere".into(),
-            host: "elsewhere".into(),
-            ..store::ProcessRecord::new(store::ProcessRecord::LABELLER, Some(0), std::process::id(), now)
-        };
+        // Whether a labeller in another container lives cannot be seen from here.
+        let here =
+            store::ProcessRecord::new(store::ProcessRecord::LABELLER, Some(0), std::process::id(), now);
+        let (place, ticks) = here.birth.rsplit_once('/').unwrap();
+        let birth = format!("{place}0/{ticks}");
+        let elsewhere = store::ProcessRecord { id: "elsewhere".into(), birth, ..here };
         store.upsert_process(&elsewhere).await.unwrap();
         let protocol = store.protocols().await.unwrap()[0].hash;
-        store.lease(protocol, "elsewhere", now, 600, 1).await.unwrap().expect("the job that was put back");
+        store.lease(protocol, "elsewhere", now, 600).await.unwrap().expect("the job that was put back");
         store.close().await;
     });
     let mut running = start(here, &[]);

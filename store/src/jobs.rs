@@ -54,7 +54,7 @@ pub struct Job {
     pub expires: Option<i64>,
     /// Attempts begun.
     pub attempts: u32,
-    /// Those that failed or ran out of time since the job was last put into the queue.
+    /// Those that failed since the job was last put into the queue by hand.
     pub failures: u32,
     /// Number of atoms.
     pub atoms: u32,
@@ -79,7 +79,7 @@ pub struct Attempt {
     pub ended: Option<i64>,
     /// `labelled`, `check`, `failed`, `expired`, `released`, `lost`, `dropped`, `overtaken`; none while it lasts.
     pub outcome: Option<String>,
-    /// Class of a failure.
+    /// Class of a failure; `lost_too_often` with the loss after which the job was given up.
     pub class: Option<String>,
     /// Log of a failure.
     pub log: Option<String>,

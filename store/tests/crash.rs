@@ -47,13 +47,13 @@ async fn work(directory: &Path) {
         opened => opened.unwrap(),
     };
     store.add_protocol(&protocol("dft"), 0).await.unwrap();
-    store.release_stale_leases_of("host", 0).await.unwrap();
+    store.release_leases_of_gone_processes(0).await.unwrap();
     let mut next = commits(&store).await + 1;
     loop {
         store.commit(&numbered_commit(next)).await.unwrap();
         tell("committed", next);
         for _ in 0..2 {
-            let lease = store.lease(protocol("dft").hash, "host/a", 0, 10, LIMIT).await.unwrap().unwrap();
+            let lease = store.lease(protocol("dft").hash, "host/a", 0, 10).await.unwrap().unwrap();
             if lease.job % 5 == 0 {
                 store.fail(&lease, "class", "log", LIMIT, 0).await.unwrap();
                 continue;

@@ -27,7 +27,7 @@ async fn version_1(directory: &Path) -> String {
     let now = tempfile::tempdir().unwrap();
     let store = create(now.path()).await;
     accept(&store, 2).await;
-    store.lease(protocol("dft").hash, "old/0", 0, 86_400, 3).await.unwrap().unwrap();
+    store.lease(protocol("dft").hash, "old/0", 0, 86_400).await.unwrap().unwrap();
     let log = store.decision_log_text().await.unwrap();
     store.close().await;
 

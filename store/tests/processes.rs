@@ -23,7 +23,7 @@ async fn names(store: &Store) -> Vec<String> {
 }
 
 async fn lease(store: &Store, holder: &str, now: i64) -> Lease {
-    store.lease(protocol("dft").hash, holder, now, 600, 3).await.unwrap().unwrap()
+    store.lease(protocol("dft").hash, holder, now, 600).await.unwrap().unwrap()
 }
 
 /// Holders of the leases, in order.
@@ -98,6 +98,38 @@ async fn leases_of_the_living_last_and_those_of_the_gone_come_back() {
 }
 
 #[tokio::test]
+async fn a_lease_that_ran_out_is_kept_by_a_process_that_may_be_at_work() {
+    const HOUR: i64 = 3_600_000;
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 6).await;
+    let elsewhere = |id: &str, last_seen| {
+        let here = living(id, "labeller", Some(7));
+        let (place, ticks) = here.birth.rsplit_once('/').unwrap();
+        ProcessRecord { birth: format!("{place}0/{ticks}"), last_seen, ..here }
+    };
+    let hangs = ProcessRecord { last_seen: -20 * HOUR, ..living("hangs", "labeller", Some(1)) };
+    let processes = [
+        living("asleep", "labeller", Some(0)),
+        hangs,
+        gone("gone", "labeller", Some(2)),
+        elsewhere("heard elsewhere", 8 * HOUR - 599_000),
+        elsewhere("silent elsewhere", 8 * HOUR - 600_000),
+    ];
+    store.upsert_processes(&processes).await.unwrap();
+    for holder in ["asleep/3", "hangs", "gone", "heard elsewhere", "silent elsewhere"] {
+        lease(&store, holder, 0).await;
+    }
+    let asleep = lease(&store, "asleep", 0).await;
+    // The computer slept for eight hours.
+    lease(&store, "first awake", 8 * HOUR).await;
+    assert_eq!(holders(&store).await, ["asleep", "asleep/3", "first awake", "heard elsewhere"]);
+    assert!(store.renew(&asleep, 8 * HOUR, 600).await.unwrap());
+    let waiting = store.queue_list(Some(JobState::Queued), 9, 0).await.unwrap();
+    assert!(waiting.len() == 2 && waiting.iter().all(|job| job.failures == 0));
+}
+
+#[tokio::test]
 async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
@@ -161,7 +193,7 @@ async fn nothing_is_written_into_a_file_that_is_not_there_any_more() {
     for _ in 0..2 {
         let error = store.upsert_process(&record).await.unwrap_err();
         assert!(matches!(&error, StoreError::Removed { path: found } if *found == path), "{error}");
-        let refused = store.lease(protocol("dft").hash, "l", 0, 9, 3).await;
+        let refused = store.lease(protocol("dft").hash, "l", 0, 9).await;
         assert!(matches!(refused, Err(StoreError::Removed { .. })));
         // Another file in its place is not the same.
         fs::copy(&moved, &path).unwrap();

@@ -14,7 +14,7 @@ use wire::{ContentHash, Origin};
 const LIMIT: u32 = 2;
 
 async fn lease(store: &Store, holder: &str, now: i64) -> Option<Lease> {
-    store.lease(protocol("dft").hash, holder, now, 10, LIMIT).await.unwrap()
+    store.lease(protocol("dft").hash, holder, now, 10).await.unwrap()
 }
 
 async fn state(store: &Store, candidate: &str) -> JobState {
@@ -45,9 +45,9 @@ async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
     assert_eq!((again.candidate.as_str(), again.attempt), (names[2].as_str(), 2));
     assert_eq!(again.earlier_calculation.as_deref(), Some("slurm 17"));
     assert!(!store.renew(&first, 65_000, 60).await.unwrap());
-    // The job whose time ran out twice is given up, the others are not.
-    assert_eq!(state(&store, &names[0]).await, JobState::Failed);
+    // That time ran out says nothing about the job.
     let details = store.queue_show(&names[0]).await.unwrap();
+    assert_eq!((details.job.state, details.job.failures), (JobState::Queued, 0));
     let outcomes: Vec<_> = details.attempts_made.iter().map(|a| a.outcome.as_deref()).collect();
     assert_eq!(outcomes, [Some("expired"), Some("expired")]);
 }
@@ -106,7 +106,7 @@ async fn failures_count_and_releases_do_not() {
         assert_eq!(released.await.unwrap(), 1);
     }
     lease(&store, "h-1/c", 1).await.unwrap();
-    assert_eq!(store.release_stale_leases_of("h-1", 2).await.unwrap(), 1);
+    assert_eq!(store.release_leases_of_gone_processes(2).await.unwrap(), 1);
     let first = lease(&store, "h", 2).await.unwrap();
     assert_eq!(first.attempt, 5);
     assert_eq!(store.fail(&first, "not converged", "SCF", LIMIT, 3).await.unwrap(), Failed::Requeued);
@@ -121,6 +121,62 @@ async fn failures_count_and_releases_do_not() {
     assert!(lease(&store, "h", 5).await.is_none());
     store.retry_job(&names[0], 6).await.unwrap();
     assert_eq!(lease(&store, "h", 7).await.unwrap().attempt, 7);
+}
+
+#[tokio::test]
+async fn a_job_that_crashes_its_labellers_is_given_up() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let names = accept(&store, 2).await;
+    for crash in 1..=2 {
+        let holder = format!("h-{crash}");
+        assert_eq!(lease(&store, &holder, 0).await.unwrap().candidate, names[0]);
+        assert_eq!(store.fail_leases_of("other", "crashed", "", LIMIT, 1).await.unwrap(), 0);
+        assert_eq!(store.fail_leases_of(&holder, "crashed", "SIGSEGV", LIMIT, 1).await.unwrap(), 1);
+    }
+    let details = store.queue_show(&names[0]).await.unwrap();
+    assert_eq!((details.job.state, details.job.failures), (JobState::Failed, 2));
+    let last = &details.attempts_made[1];
+    assert_eq!((last.outcome.as_deref(), last.class.as_deref()), (Some("failed"), Some("crashed")));
+    assert_eq!((last.log.as_deref(), last.ended), (Some("SIGSEGV"), Some(1)));
+    assert_eq!(lease(&store, "h-3", 2).await.unwrap().candidate, names[1]);
+}
+
+#[tokio::test]
+async fn a_job_that_is_lost_again_and_again_is_given_up() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let names = accept(&store, 1).await;
+    let lose = async |losses: usize| {
+        for loss in 0..losses {
+            let now = 10_000 * loss as i64;
+            lease(&store, "h", now).await.unwrap();
+            let released = match loss % 3 {
+                0 => store.release_all("h", now).await.unwrap(),
+                1 => store.release_leases_of_gone_processes(now).await.unwrap(),
+                // It runs out.
+                _ => continue,
+            };
+            assert_eq!(released, 1);
+        }
+    };
+    lose(24).await;
+    let failing = lease(&store, "h", 240_000).await.unwrap();
+    assert_eq!(store.fail(&failing, "not converged", "SCF", LIMIT, 0).await.unwrap(), Failed::Requeued);
+    // Each time with as many attempts as at first: after a failure, and when it is queued by hand.
+    for attempts in [50, 75] {
+        lose(25).await;
+        let details = store.queue_show(&names[0]).await.unwrap();
+        assert_eq!((details.job.state, details.job.attempts), (JobState::Failed, attempts));
+        let last = details.attempts_made.last().unwrap();
+        assert_eq!(
+            (last.outcome.as_deref(), last.class.as_deref()),
+            (Some("released"), Some("lost_too_often"))
+        );
+        assert!(last.log.as_ref().unwrap().starts_with("25 attempts in a row"));
+        assert!(lease(&store, "h", 300_000).await.is_none());
+        store.retry_job(&names[0], 0).await.unwrap();
+    }
 }
 
 #[tokio::test]
@@ -174,7 +230,7 @@ async fn candidates_found_before_there_is_a_protocol_get_their_jobs_later() {
     let store = Store::create(directory.path(), &campaign(), &[], 0).await.unwrap();
     let names = accept(&store, 2).await;
     assert_eq!(store.unfinished_jobs().await.unwrap(), 0);
-    let unknown = store.lease(protocol("dft").hash, "a", 0, 10, LIMIT).await;
+    let unknown = store.lease(protocol("dft").hash, "a", 0, 10).await;
     assert!(matches!(unknown, Err(StoreError::UnknownProtocol(_))));
     for _ in 0..2 {
         store.add_protocol(&protocol("dft"), 1).await.unwrap();
@@ -186,7 +242,7 @@ async fn candidates_found_before_there_is_a_protocol_get_their_jobs_later() {
     assert!(matches!(store.add_protocol(&other, 3).await, Err(StoreError::ProtocolName(_))));
     // A new protocol holds for new candidates only.
     store.add_protocol(&protocol("finer"), 4).await.unwrap();
-    assert!(store.lease(protocol("finer").hash, "a", 5, 10, LIMIT).await.unwrap().is_none());
+    assert!(store.lease(protocol("finer").hash, "a", 5, 10).await.unwrap().is_none());
 }
 
 #[tokio::test]

@@ -59,6 +59,11 @@ impl ModelJob {
         (self.state, self.holder, self.expires) = (state, None, None);
     }
 
+    /// In so few steps no job is lost so often that it is given up.
+    fn lose(&mut self) {
+        self.change_to(JobState::Queued);
+    }
+
     fn fail(&mut self) {
         self.failures += 1;
         self.change_to(if self.failures >= LIMIT { JobState::Failed } else { JobState::Queued });
@@ -71,7 +76,7 @@ struct Model(BTreeMap<usize, ModelJob>);
 impl Model {
     fn lease(&mut self, holder: &str, now: i64) -> Option<usize> {
         for job in self.0.values_mut().filter(|job| job.expires.is_some_and(|expires| expires <= now)) {
-            job.fail();
+            job.lose();
         }
         let queued = self.0.iter_mut().filter(|(_, job)| job.state == JobState::Queued);
         let (place, job) = queued.max_by_key(|(place, job)| (job.priority, std::cmp::Reverse(*place)))?;
@@ -126,7 +131,7 @@ impl Run {
             }
             Step::Lease(holder) => {
                 let holder = format!("host/{holder}");
-                let leased = store.lease(protocol("dft").hash, &holder, now, SECONDS, LIMIT).await.unwrap();
+                let leased = store.lease(protocol("dft").hash, &holder, now, SECONDS).await.unwrap();
                 let expected = self.model.lease(&holder, now);
                 assert_eq!(leased.as_ref().map(|lease| &lease.candidate), expected.map(|k| &self.names[k]));
                 self.leases.extend(expected.zip(leased));
@@ -167,7 +172,7 @@ impl Run {
                 let held = |job: &&mut ModelJob| job.holder.as_ref() == Some(&holder);
                 let held: Vec<_> = self.model.0.values_mut().filter(held).collect();
                 assert_eq!(store.release_all(&holder, now).await.unwrap(), held.len());
-                held.into_iter().for_each(|job| job.change_to(JobState::Queued));
+                held.into_iter().for_each(ModelJob::lose);
             }
             by_hand => self.by_hand(by_hand).await,
         }

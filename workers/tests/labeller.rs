@@ -157,7 +157,7 @@ async fn a_lease_lasts_as_long_as_the_label_takes() {
     let begun = Instant::now();
     while begun.elapsed() < Duration::from_millis(4500) {
         let now = unix_milliseconds();
-        assert!(store.lease(protocol("dft").hash, "b", now, 1, 3).await.unwrap().is_none());
+        assert!(store.lease(protocol("dft").hash, "b", now, 1).await.unwrap().is_none());
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
     gate.open.store(true, Ordering::Relaxed);
@@ -175,8 +175,8 @@ async fn a_result_whose_lease_was_lost_becomes_a_check() {
     let labeller = Labeller::serving(directory.path(), &gate).await;
     gate.wait_for_labels(1).await;
     let now = unix_milliseconds();
-    store.release_stale_leases_of("l", now).await.unwrap();
-    let other = store.lease(protocol("dft").hash, "other", now, 600, 3).await.unwrap().unwrap();
+    store.release_all("l", now).await.unwrap();
+    let other = store.lease(protocol("dft").hash, "other", now, 600).await.unwrap().unwrap();
     store.complete(&other, &label(-1.0), now).await.unwrap();
     // It has found out by now.
     tokio::time::sleep(Duration::from_millis(500)).await;
@@ -214,7 +214,7 @@ async fn without_an_orchestrator_the_queue_is_emptied_first() {
     // Longer than this test has time: they come back because their holders are gone.
     for holder in ["dead", "o/0"] {
         let now = unix_milliseconds();
-        store.lease(protocol("dft").hash, holder, now, 86_400, 3).await.unwrap().unwrap();
+        store.lease(protocol("dft").hash, holder, now, 86_400).await.unwrap().unwrap();
     }
     Labeller::serving(directory.path(), &Gate::opened()).await.ended().await.unwrap();
     let jobs = store.queue_list(None, 10, 0).await.unwrap();

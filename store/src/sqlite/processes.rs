@@ -3,7 +3,7 @@
 use serde_json::json;
 
 use super::logs::insert_operation;
-use super::queue::{end_attempt, requeue};
+use super::queue::{InVain, end_in_vain};
 use super::{Store, Transaction};
 use crate::error::Result;
 use crate::processes::ProcessRecord;
@@ -23,14 +23,13 @@ impl Store {
     }
 
     /// Says that these processes work for the campaign, or how they are now. Each takes the place of those of its
-    /// kind, host and number that are gone. A predecessor that still lives keeps its record, since its leases count
+    /// kind and number that are gone. A predecessor that still lives keeps its record, since its leases count
     /// for as long as it has one.
     pub async fn upsert_processes(&self, processes: &[ProcessRecord]) -> Result<()> {
         let mut transaction = self.begin().await?;
         for process in processes {
-            let sql = "SELECT * FROM process WHERE kind = ? AND host = ? AND number IS ? AND id <> ?";
-            let query = sqlx::query_as(sql).bind(&process.kind).bind(&process.host);
-            let query = query.bind(process.number).bind(&process.id);
+            let sql = "SELECT * FROM process WHERE kind = ? AND number IS ? AND id <> ?";
+            let query = sqlx::query_as(sql).bind(&process.kind).bind(process.number).bind(&process.id);
             let others: Vec<ProcessRecord> = query.fetch_all(&mut *transaction).await?;
             for other in others.iter().filter(|other| other.is_gone()) {
                 remove(&mut transaction, &other.id).await?;
@@ -86,7 +85,7 @@ impl Store {
     }
 }
 
-async fn all(transaction: &mut Transaction) -> Result<Vec<ProcessRecord>> {
+pub(super) async fn all(transaction: &mut Transaction) -> Result<Vec<ProcessRecord>> {
     Ok(sqlx::query_as("SELECT * FROM process ORDER BY started, id").fetch_all(&mut **transaction).await?)
 }
 
@@ -116,8 +115,7 @@ async fn release_all_but_of(
     let is_lost = |holder: &str| !living.iter().any(|process| process.is_holder(holder));
     let lost: Vec<_> = leased.iter().filter(|(_, holder)| is_lost(holder)).collect();
     for (job, _) in &lost {
-        end_attempt(transaction, *job, "lost", now).await?;
-        requeue(transaction, *job, 0, u32::MAX).await?;
+        end_in_vain(transaction, *job, InVain::Lost("lost"), now).await?;
     }
     Ok(lost.len())
 }

@@ -1,12 +1,18 @@
 //! The label queue: leases, and how they end.
+//!
+//! An attempt that brings nothing ends in one of two ways. It *failed* if its labeller says so, or crashed over it: a few
+//! of these and the job is given up. It was *lost* if its labeller went away or fell silent, which says nothing about
+//! the job. But a job that costs its labellers all their memory looks like that too, since the system kills them: one
+//! that is lost [`LOSS_LIMIT`] times in a row is given up as well.
 
 use atoms::Structure;
 use wire::ContentHash;
 
-use super::{Store, Transaction, protocols};
+use super::{Store, Transaction, processes, protocols};
 use crate::encoding::decode_structure;
 use crate::error::{Result, StoreError};
 use crate::jobs::Failed;
+use crate::processes::ProcessRecord;
 use crate::records::{JobState, Lease};
 
 /// The next job by priority, then in decision order. One statement: two labellers never get the same job.
@@ -16,12 +22,33 @@ pub(super) const LEASE: &str =
                     ORDER BY priority DESC, decision LIMIT 1)
     RETURNING number, attempts, structure, decision";
 
-pub(super) const EXPIRED: &str = "SELECT number FROM job WHERE state = 'leased' AND expires <= ?";
+pub(super) const EXPIRED: &str = "SELECT number, holder FROM job WHERE state = 'leased' AND expires <= ?";
 
 pub(super) const UNFINISHED: &str = "SELECT count(*) FROM job WHERE state IN ('queued', 'leased')";
 
 pub(super) const HELD: &str = "SELECT number FROM job WHERE state = 'leased'
     AND (holder = ?1 OR substr(holder, 1, length(?1) + 1) = ?1 || '/')";
+
+/// Attempts of a job that were lost in a row; those before it was last given up for that do not count.
+pub(super) const LOSSES: &str = "SELECT count(*) FROM attempt WHERE job = ?1 AND attempt > (
+        SELECT coalesce(max(attempt), 0) FROM attempt WHERE job = ?1
+        AND (outcome NOT IN ('released', 'lost', 'expired') OR class = 'lost_too_often'))";
+
+/// So many attempts in a row may be lost. Labellers that are killed at random while they make a label in half of the
+/// cases lose one job so often once in thirty million.
+const LOSS_LIMIT: u32 = 25;
+
+/// Class of the attempt with which that was reached.
+const LOST_TOO_OFTEN: &str = "lost_too_often";
+
+/// How an attempt ended that brought nothing.
+#[derive(Clone, Copy)]
+pub(super) enum InVain<'a> {
+    /// It failed: the job is given up after `limit` of these.
+    Failed { class: &'a str, log: &'a str, limit: u32 },
+    /// Nobody works on it any longer: `released`, `lost` or `expired`.
+    Lost(&'static str),
+}
 
 /// A job as the ends of its leases need it.
 #[derive(sqlx::FromRow)]
@@ -34,25 +61,23 @@ pub(super) struct JobRow {
 }
 
 impl Store {
-    /// The next job of that protocol for `holder`, for `seconds` from `now` on. Leases that ran out before now end
-    /// first; such a job goes back into the queue, or is given up if `attempt_limit` attempts have failed by then.
+    /// The next job of that protocol for `holder` (`process` or `process/part`), for `seconds` from `now` on.
     ///
-    /// `holder` is `process` or `process/part`, see [`Store::release_stale_leases_of`].
+    /// Leases that ran out end first, and their jobs go back into the queue, which does not count as failed attempts. But
+    /// a clock on the wall is no proof: after the sleep of a computer every lease has run out, and whoever is first
+    /// awake must not take the others' work from them. So a lease lasts on while its holder is a process that may be
+    /// at work: on this system one that runs and gave a sign of life within a day, elsewhere one that gave a sign of
+    /// life within `seconds`.
     pub async fn lease(
         &self,
         protocol: ContentHash,
         holder: &str,
         now: i64,
         seconds: u32,
-        attempt_limit: u32,
     ) -> Result<Option<Lease>> {
         let mut transaction = self.begin().await?;
         let protocol_number = protocols::number(&mut transaction, protocol).await?;
-        let expired: Vec<i64> = sqlx::query_scalar(EXPIRED).bind(now).fetch_all(&mut *transaction).await?;
-        for job in expired {
-            end_attempt(&mut transaction, job, "expired", now).await?;
-            requeue(&mut transaction, job, 1, attempt_limit).await?;
-        }
+        end_expired(&mut transaction, now, seconds).await?;
         let expires = now.saturating_add(1000 * i64::from(seconds));
         let leased = sqlx::query_as(LEASE).bind(holder).bind(expires).bind(protocol_number);
         let leased: Option<(i64, u32, i64, i64)> = leased.fetch_optional(&mut *transaction).await?;
@@ -110,40 +135,44 @@ impl Store {
     ) -> Result<Failed> {
         let mut transaction = self.begin().await?;
         let job = job_row(&mut transaction, lease.job).await?;
-        let sql = "UPDATE attempt SET class = ?, log = ? WHERE job = ? AND attempt = ?";
-        let query = sqlx::query(sql).bind(class).bind(log).bind(lease.job).bind(lease.attempt);
-        query.execute(&mut *transaction).await?;
         let failed = if job.state == "leased" && job.attempts == lease.attempt {
-            end_attempt(&mut transaction, lease.job, "failed", now).await?;
-            match requeue(&mut transaction, lease.job, 1, attempt_limit).await? {
+            let how = InVain::Failed { class, log, limit: attempt_limit };
+            match end_in_vain(&mut transaction, lease.job, how, now).await? {
                 JobState::Failed => Failed::GivenUp,
                 _ => Failed::Requeued,
             }
         } else {
+            explain(&mut transaction, lease.job, lease.attempt, class, log).await?;
             Failed::LeaseLost
         };
         transaction.commit().await?;
         Ok(failed)
     }
 
-    /// Gives back every lease of `holder` (and of its parts), at a stop in order. Does not count as failed attempts.
-    /// Returns their number.
+    /// Gives back every lease of `holder` and of its parts (`holder/part`), at a stop in order. Does not count as failed
+    /// attempts. Returns their number.
     pub async fn release_all(&self, holder: &str, now: i64) -> Result<usize> {
-        self.release(holder, "released", now).await
+        self.release(holder, InVain::Lost("released"), now).await
     }
 
-    /// Takes back every lease of `process` and of its parts (`process/part`), which is known to be dead. Does not count as
-    /// failed attempts. Returns their number.
-    pub async fn release_stale_leases_of(&self, process: &str, now: i64) -> Result<usize> {
-        self.release(process, "lost", now).await
+    /// Takes back every lease of `process` and of its parts, which crashed with them in hand: each counts as a failed
+    /// attempt of that class, and a job that has `attempt_limit` of them is given up. Returns their number.
+    pub async fn fail_leases_of(
+        &self,
+        process: &str,
+        class: &str,
+        log: &str,
+        attempt_limit: u32,
+        now: i64,
+    ) -> Result<usize> {
+        self.release(process, InVain::Failed { class, log, limit: attempt_limit }, now).await
     }
 
-    async fn release(&self, holder: &str, outcome: &str, now: i64) -> Result<usize> {
+    async fn release(&self, holder: &str, how: InVain<'_>, now: i64) -> Result<usize> {
         let mut transaction = self.begin().await?;
         let jobs: Vec<i64> = sqlx::query_scalar(HELD).bind(holder).fetch_all(&mut *transaction).await?;
         for job in &jobs {
-            end_attempt(&mut transaction, *job, outcome, now).await?;
-            requeue(&mut transaction, *job, 0, u32::MAX).await?;
+            end_in_vain(&mut transaction, *job, how, now).await?;
         }
         transaction.commit().await?;
         Ok(jobs.len())
@@ -153,6 +182,23 @@ impl Store {
     pub async fn unfinished_jobs(&self) -> Result<u64> {
         Ok(sqlx::query_scalar(UNFINISHED).fetch_one(&self.readers).await?)
     }
+}
+
+/// Ends the leases that ran out and whose holders cannot be at work.
+async fn end_expired(transaction: &mut Transaction, now: i64, seconds: u32) -> Result<()> {
+    let expired: Vec<(i64, String)> = sqlx::query_as(EXPIRED).bind(now).fetch_all(&mut **transaction).await?;
+    if expired.is_empty() {
+        return Ok(());
+    }
+    let processes = processes::all(transaction).await?;
+    let holds_on = |process: &&ProcessRecord| process.may_be_at_work(now, seconds);
+    let at_work: Vec<_> = processes.iter().filter(holds_on).collect();
+    for (job, holder) in expired {
+        if !at_work.iter().any(|process| process.is_holder(&holder)) {
+            end_in_vain(transaction, job, InVain::Lost("expired"), now).await?;
+        }
+    }
+    Ok(())
 }
 
 /// Ends the attempt that is under way, if any.
@@ -168,19 +214,50 @@ pub(super) async fn end_attempt(
     Ok(())
 }
 
-/// Puts a job back into the queue with `failures` more, or gives it up if that makes `limit`. Returns which.
-pub(super) async fn requeue(
+/// Ends the attempt that is under way without a result: the job waits for another, or is given up. Returns which.
+pub(super) async fn end_in_vain(
     transaction: &mut Transaction,
     job: i64,
-    failures: u32,
-    limit: u32,
+    how: InVain<'_>,
+    now: i64,
 ) -> Result<JobState> {
-    let failures = job_row(transaction, job).await?.failures + failures;
-    let state = if failures >= limit { JobState::Failed } else { JobState::Queued };
+    let JobRow { attempts, mut failures, .. } = job_row(transaction, job).await?;
+    let given_up = match how {
+        InVain::Failed { class, log, limit } => {
+            end_attempt(transaction, job, "failed", now).await?;
+            explain(transaction, job, attempts, class, log).await?;
+            failures += 1;
+            failures >= limit
+        }
+        InVain::Lost(outcome) => {
+            end_attempt(transaction, job, outcome, now).await?;
+            let losses: u32 = sqlx::query_scalar(LOSSES).bind(job).fetch_one(&mut **transaction).await?;
+            if losses >= LOSS_LIMIT {
+                let log = format!("{losses} attempts in a row ended without a word from their labellers");
+                explain(transaction, job, attempts, LOST_TOO_OFTEN, &log).await?;
+            }
+            losses >= LOSS_LIMIT
+        }
+    };
+    let state = if given_up { JobState::Failed } else { JobState::Queued };
     let sql = "UPDATE job SET state = ?, failures = ?, holder = NULL, expires = NULL WHERE number = ?";
     let query = sqlx::query(sql).bind(state.name()).bind(failures).bind(job);
     query.execute(&mut **transaction).await?;
     Ok(state)
+}
+
+/// Keeps with an attempt why it failed.
+async fn explain(
+    transaction: &mut Transaction,
+    job: i64,
+    attempt: u32,
+    class: &str,
+    log: &str,
+) -> Result<()> {
+    let sql = "UPDATE attempt SET class = ?, log = ? WHERE job = ? AND attempt = ?";
+    let query = sqlx::query(sql).bind(class).bind(log).bind(job).bind(attempt);
+    query.execute(&mut **transaction).await?;
+    Ok(())
 }
 
 pub(super) async fn job_row(transaction: &mut Transaction, job: i64) -> Result<JobRow> {

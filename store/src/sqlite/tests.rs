@@ -34,6 +34,7 @@ async fn what_is_asked_often_goes_through_indexes() {
         queue::EXPIRED,
         queue::UNFINISHED,
         queue::HELD,
+        queue::LOSSES,
         by_hand::LIST,
         by_hand::FIND,
         export::CANDIDATES,

@@ -96,7 +96,7 @@ pub async fn run(
         let (protocol, seconds) = (settings.protocol.hash, settings.timing.lease_seconds());
         let lease = match unfinished {
             0 => None,
-            _ => store.lease(protocol, &settings.holder, now(), seconds, settings.attempts).await?,
+            _ => store.lease(protocol, &settings.holder, now(), seconds).await?,
         };
         let Some(lease) = lease else {
             let wait = (idle / IDLE_PART).min(LONGEST_IDLE).max(settings.timing.idle);
