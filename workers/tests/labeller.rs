@@ -11,8 +11,10 @@ use std::time::{Duration, Instant};
 
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
 use common::*;
+use sqlx::ConnectOptions;
+use sqlx::sqlite::SqliteConnectOptions;
 use store::{
-    JobState, LabelRecord, ProcessRecord, Standing, Store, StoreError, this_host, unix_milliseconds,
+    DATABASE, JobState, LabelRecord, ProcessRecord, Standing, Store, StoreError, this_host, unix_milliseconds,
 };
 use tokio::task::JoinHandle;
 use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Timing, run, serve};
@@ -113,7 +115,7 @@ struct Labeller {
 impl Labeller {
     /// A labeller "l" with number 0 and its own connections, as a process has them.
     async fn serving(directory: &Path, gate: &Gate) -> Self {
-        Self::with(directory, gate, settings("")).await
+        Self::with(directory, gate, settings("l")).await
     }
 
     async fn with(directory: &Path, gate: &Gate, settings: LabellerSettings) -> Self {
@@ -185,6 +187,28 @@ async fn a_result_whose_lease_was_lost_becomes_a_check() {
     let history = history(&store).await;
     let found: Vec<_> = history.iter().map(|record| (record.standing, record.label.energy)).collect();
     assert_eq!(found, [(Standing::Label, -1.0), (Standing::Check, 0.0)]);
+}
+
+/// For longer than a connection waits for the database; the labeller is asked to stop meanwhile.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_label_is_not_lost_while_the_database_is_locked() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    accept(&store, 1).await;
+    let gate = Gate::default();
+    let labeller = Labeller::serving(directory.path(), &gate).await;
+    gate.wait_for_labels(1).await;
+    let other = SqliteConnectOptions::new().filename(directory.path().join(DATABASE));
+    let mut other = other.connect().await.unwrap();
+    sqlx::query("BEGIN IMMEDIATE").execute(&mut other).await.unwrap();
+    gate.open.store(true, Ordering::Relaxed);
+    labeller.closing.stopping.store(true, Ordering::Relaxed);
+    tokio::time::sleep(Duration::from_secs(35)).await;
+    assert!(!labeller.task.is_finished());
+    assert_eq!(number(&store, JobState::Labelled).await, 0);
+    sqlx::query("ROLLBACK").execute(&mut other).await.unwrap();
+    labeller.ended().await.unwrap();
+    assert_eq!((number(&store, JobState::Labelled).await, names(&store).await), (1, vec![]));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -287,7 +311,7 @@ async fn what_ends_a_labeller_is_kept_in_its_record() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     accept(&store, 1).await;
-    let wrong = LabellerSettings { protocol: protocol("unknown"), ..settings("") };
+    let wrong = LabellerSettings { protocol: protocol("unknown"), ..settings("l") };
     let labeller = Labeller::with(directory.path(), &Gate::opened(), wrong).await;
     let error = labeller.ended().await.unwrap_err();
     assert!(matches!(error, StoreError::UnknownProtocol(_)), "{error}");

@@ -2,6 +2,7 @@
 //!
 //! [`run`] is one of the tasks of a process, [`serve`] a process of its own, which outlives its orchestrator.
 
+mod insist;
 mod judge;
 mod presence;
 pub mod reference;
@@ -14,6 +15,7 @@ use store::records::{Label, Lease, Protocol};
 use store::{Store, StoreError};
 use tokio::task::{JoinError, spawn_blocking};
 
+use insist::insist;
 pub use presence::serve;
 pub use reference::{LabelFailure, ReferenceMethod};
 
@@ -25,7 +27,7 @@ const IDLE_PART: u32 = 8;
 /// What a labeller needs to know.
 #[derive(Clone, Debug)]
 pub struct LabellerSettings {
-    /// Whose leases these are: the name of a process that works for the campaign, or `process/part`.
+    /// Whose leases these are: the name of a process that has its record in the store, or `process/part`.
     pub holder: String,
     /// Under which settings labels are made.
     pub protocol: Protocol,
@@ -41,7 +43,8 @@ pub struct LabellerSettings {
 #[derive(Clone, Copy, Debug)]
 pub struct Timing {
     /// How long a job is leased, in whole seconds. The lease is renewed at a third of it while the label is made,
-    /// however long that takes; a job whose labeller hangs comes back after this time.
+    /// however long that takes, and so also for a method that never comes to an end. It is for processes that nobody
+    /// can see to be gone, see [`Store::lease`].
     pub lease: Duration,
     /// How long a labeller that has just run out of work waits before it looks again. The longer it has had none, the
     /// longer it waits, up to a second: each look costs some tenths of a millisecond.
@@ -75,10 +78,21 @@ pub struct Closing {
     pub stopping: AtomicBool,
 }
 
+/// What a look at the queue finds.
+enum Found {
+    Job(Box<Lease>),
+    Nothing,
+    /// Nothing, and nothing will come.
+    TheEnd,
+}
+
 /// Labels until there is nothing more to do. `now` is asked for ms since 1970.
 ///
+/// A database that is busy or full is no reason to end: the queue is looked at again later, and a label that was made is
+/// brought again and again, after `closing` asks to stop for a minute more.
+///
 /// # Errors
-/// Whatever the database says; the label in hand is lost then, and its job comes back.
+/// Whatever else the database says; the label in hand is lost then, and its job comes back.
 pub async fn run(
     store: Store,
     mut method: ReferenceMethod,
@@ -89,28 +103,38 @@ pub async fn run(
     let mut idle = Duration::ZERO;
     while !closing.stopping.load(Ordering::Relaxed) {
         let last_look = closing.no_more_jobs.load(Ordering::Relaxed);
-        let unfinished = store.unfinished_jobs().await?;
-        if unfinished == 0 && last_look {
-            break;
-        }
-        let (protocol, seconds) = (settings.protocol.hash, settings.timing.lease_seconds());
-        let lease = match unfinished {
-            0 => None,
-            _ => store.lease(protocol, &settings.holder, now(), seconds).await?,
-        };
-        let Some(lease) = lease else {
-            let wait = (idle / IDLE_PART).min(LONGEST_IDLE).max(settings.timing.idle);
-            nap(wait, settings.timing.idle, closing, last_look).await;
-            idle += wait;
-            continue;
+        let lease = match look(&store, &settings, last_look, now()).await {
+            Ok(Found::Job(lease)) => lease,
+            Ok(Found::TheEnd) => break,
+            Err(error) if !error.is_transient() => return Err(error),
+            Ok(Found::Nothing) | Err(_) => {
+                let wait = (idle / IDLE_PART).min(LONGEST_IDLE).max(settings.timing.idle);
+                nap(wait, settings.timing.idle, closing, last_look).await;
+                idle += wait;
+                continue;
+            }
         };
         idle = Duration::ZERO;
         let made;
         (method, made) = make(&store, method, &lease, &settings.timing, &now).await?;
         let judged = made.and_then(|label| judge::judge(label, &lease, settings.largest_force));
-        deliver(&store, &lease, judged, &settings, now()).await?;
+        insist(closing, || deliver(&store, &lease, &judged, &settings, now())).await?;
     }
     Ok(())
+}
+
+async fn look(
+    store: &Store,
+    settings: &LabellerSettings,
+    last_look: bool,
+    now: i64,
+) -> Result<Found, StoreError> {
+    if store.unfinished_jobs().await? == 0 {
+        return Ok(if last_look { Found::TheEnd } else { Found::Nothing });
+    }
+    let (protocol, seconds) = (settings.protocol.hash, settings.timing.lease_seconds());
+    let lease = store.lease(protocol, &settings.holder, now, seconds).await?;
+    Ok(lease.map_or(Found::Nothing, |lease| Found::Job(Box::new(lease))))
 }
 
 /// Waits in steps of `step`, so that it ends at once when there may be a reason to go home.
@@ -163,12 +187,12 @@ fn crashed<T>(crash: JoinError) -> Result<T, StoreError> {
 async fn deliver(
     store: &Store,
     lease: &Lease,
-    judged: Result<Label, LabelFailure>,
+    judged: &Result<Label, LabelFailure>,
     settings: &LabellerSettings,
     now: i64,
 ) -> Result<(), StoreError> {
     match judged {
-        Ok(label) => store.complete(lease, &label, now).await.map(|_| ()),
+        Ok(label) => store.complete(lease, label, now).await.map(|_| ()),
         Err(failure) => {
             store.fail(lease, failure.class(), &failure.to_string(), settings.attempts, now).await.map(|_| ())
         }

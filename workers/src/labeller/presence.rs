@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use store::{ProcessRecord, Store, StoreError};
 
-use super::{Closing, LabellerSettings, ReferenceMethod, run};
+use super::{Closing, LabellerSettings, ReferenceMethod, insist, run};
 
-/// Labels as the process `process`, whose record it keeps and in whose name it leases.
+/// Labels as the process `process`, whose record it keeps; `settings.holder` is its name.
 ///
 /// It does not need the orchestrator that started it: while none lives, it goes on until the queue is empty and then
 /// goes home; one that starts meanwhile adopts it. It also goes home, after the label in hand, when another labeller
@@ -24,16 +24,15 @@ pub async fn serve(
     closing: &Closing,
     now: impl Fn() -> i64,
 ) -> Result<(), StoreError> {
-    let (every, settings) =
-        (settings.timing.sign_of_life, LabellerSettings { holder: process.id.clone(), ..settings });
+    let every = settings.timing.sign_of_life;
     // A lease without a record of its holder would be taken back.
-    store.upsert_process(&process).await?;
+    insist(closing, || store.upsert_process(&process)).await?;
     let ended = tokio::select! {
         ended = run(store.clone(), method, settings, closing, &now) => ended,
         error = live(&store, process.clone(), closing, every, &now) => Err(error),
     };
     match ended {
-        Ok(()) => store.remove_process(&process.id).await,
+        Ok(()) => insist(closing, || store.remove_process(&process.id)).await,
         Err(error) => match fail(&store, process, &error, now()).await {
             // Why everything else fails.
             Err(removed @ StoreError::Removed { .. }) => Err(removed),
