@@ -24,7 +24,7 @@ use crate::selector::{Next, Selector, SelectorError};
 
 /// How often a full label queue is looked at again.
 const QUEUE_LOOK: Duration = Duration::from_millis(200);
-/// A turn may cost so many walkers, which ended by their own fault with it in hand; then its walk is over.
+/// A turn may cost so many walkers, which crashed with it in hand; then its walk is over.
 const MOST_WALKERS: u32 = 3;
 /// Messages of a group, at most: those who came first should not wait for long.
 const GROUP: usize = 64;
@@ -84,7 +84,7 @@ struct Shell {
     waiting: VecDeque<(u32, oneshot::Sender<Option<Work>>)>,
     /// The walk that each of the others has in hand.
     at_work: HashMap<u32, WalkId>,
-    /// Walkers that the present turn of a walk has cost, one after the other.
+    /// Walkers that crashed with the present turn of a walk.
     costs: HashMap<WalkId, u32>,
 }
 
@@ -158,11 +158,12 @@ impl Shell {
 
     /// A walker was lost with a turn in hand: another gets it, unless it is the turn that kills them.
     fn lost(&mut self, walk: WalkId, fault: Option<String>) -> Result<Option<Commit>, ReactorError> {
-        if let Some(fault) = fault {
+        if fault.is_some() {
             let cost = self.costs.entry(walk).or_default();
             *cost += 1;
             if *cost == MOST_WALKERS {
-                let reason = format!("{MOST_WALKERS} walkers in a row ended in this turn; the last: {fault}");
+                // Not how: the last words of a process are not the same twice.
+                let reason = format!("{MOST_WALKERS} walkers crashed in this turn");
                 return Ok(self.selector.give_up(walk, reason)?);
             }
         }

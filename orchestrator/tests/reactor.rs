@@ -287,7 +287,7 @@ async fn a_turn_that_kills_its_walkers_ends_its_walk() {
         assert_eq!(running.await.unwrap(), Ended::Done);
         threads.into_iter().for_each(|thread| thread.join().unwrap());
         let walk = store.load_walks().await.unwrap().remove(0);
-        let expected = "3 walkers in a row ended in this turn; the last: exit code 101: a defect";
+        let expected = "3 walkers crashed in this turn";
         assert_eq!((walk.state == "blew_up", walk.reason == expected), (fault.is_some(), fault.is_some()));
         let log = store.decision_log_text().await.unwrap();
         assert_eq!(log.contains(expected), fault.is_some(), "{log}");

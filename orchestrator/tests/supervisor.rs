@@ -12,6 +12,7 @@ const LIMITS: Limits = Limits {
     longest_pause: Duration::from_secs(6),
     restarts: 5,
     grace: Duration::from_secs(30),
+    outlives: false,
 };
 
 fn s(seconds: u64) -> Duration {
@@ -44,6 +45,37 @@ fn started(children: u32) -> Supervisor {
     let orders: Vec<_> = (0..children).map(|number| start(number, 1)).collect();
     assert_eq!(supervisor.due(s(0)), orders);
     supervisor
+}
+
+#[test]
+fn who_outlives_its_parent_stays_while_there_is_work_and_is_not_killed() {
+    let mut supervisor = Supervisor::new(2, Limits { outlives: true, ..LIMITS });
+    assert_eq!(supervisor.due(s(0)), [start(0, 1), start(1, 1)]);
+    let left = supervisor.ended(0, home(), s(5)).unwrap();
+    assert_eq!(left.then, Standing::Pausing { left: s(1) });
+    assert_eq!(supervisor.due(s(6)), [start(0, 2)]);
+    assert_eq!(supervisor.stop(s(10)), [Order::Terminate { number: 0 }, Order::Terminate { number: 1 }]);
+    assert_eq!(
+        supervisor.ended(0, Ending::Exit { code: 130, words: None }, s(11)).unwrap().then,
+        Standing::GoneHome
+    );
+    // The other still has something in hand when its time of grace is over.
+    assert_eq!((supervisor.due(s(39)), supervisor.is_over()), (vec![], false));
+    assert_eq!((supervisor.due(s(40)), supervisor.is_over()), (vec![], true));
+}
+
+#[test]
+fn nobody_is_started_when_there_is_no_more_work() {
+    let mut supervisor = started(2);
+    supervisor.ended(0, crash(), s(1)).unwrap();
+    supervisor.close();
+    assert_eq!(
+        (supervisor.due(s(100)), status(&supervisor, 0, s(100)).standing),
+        (vec![], Standing::GoneHome)
+    );
+    assert!(!supervisor.is_over());
+    supervisor.ended(1, home(), s(101)).unwrap();
+    assert!(supervisor.is_over());
 }
 
 #[test]

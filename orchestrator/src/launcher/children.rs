@@ -108,6 +108,11 @@ impl Children {
         self.obey(orders);
     }
 
+    /// There is no more work: nobody is started any more.
+    pub fn close(&mut self) {
+        self.supervisor.close();
+    }
+
     /// Where the children stand.
     pub fn status(&mut self) -> Vec<ChildStatus> {
         self.collect_signs();
@@ -118,6 +123,10 @@ impl Children {
     /// this is not awaited. To be awaited on the main thread: see [`crate::launcher`]. Dropped while it waits, it has lost nothing.
     pub async fn next(&mut self) -> Event {
         loop {
+            // Whoever is told of an end has to know of it before the next start.
+            if let Some(event) = self.events.pop_front() {
+                return event;
+            }
             self.collect_signs();
             let orders = self.supervisor.due(self.signs.now());
             self.obey(orders);

@@ -68,7 +68,8 @@ impl Child {
 
     /// Decides what becomes of it without its process.
     pub fn leave(&mut self, ending: &Ending, limits: &Limits, stopping: bool, now: Duration) {
-        let failed = !(ending.is_in_order() || stopping && ending.is_what_stop_asks_for());
+        let may_leave = stopping || !limits.outlives;
+        let failed = !(may_leave && ending.is_in_order() || stopping && ending.is_what_stop_asks_for());
         if failed {
             self.failures = self.failures.saturating_add(1);
             self.last_failure = Some(ending.clone());
@@ -96,6 +97,10 @@ impl Child {
             }
             State::Running { .. } => {
                 (State::Killed { overdue: Overdue::Silent(limits.silence) }, Order::Kill { number })
+            }
+            State::Leaving { .. } if limits.outlives => {
+                self.state = State::Home;
+                return None;
             }
             State::Leaving { .. } => {
                 (State::Killed { overdue: Overdue::Lingering(limits.grace) }, Order::Kill { number })

@@ -3,6 +3,9 @@
 use std::fmt;
 use std::time::Duration;
 
+/// Exit code of a program that panicked.
+const PANIC: i32 = 101;
+
 /// How a process ended. Its text is what `status` shows.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Ending {
@@ -36,16 +39,16 @@ impl Ending {
         matches!(self, Self::Exit { code: 0, .. })
     }
 
-    /// Whether the process itself is to blame, what it computes or what it was given, so that the next one may well go the same
-    /// way. Otherwise the end came from outside: a SIGKILL of the kernel that was out of memory, a user's SIGTERM.
+    /// Whether the process crashed, so that the next one with the same work may well go the same way. Otherwise the end
+    /// came from outside (a SIGKILL of the kernel that was out of memory, a user's SIGTERM, a host that is too busy to
+    /// give signs of life), or the process itself said why it left.
     pub fn is_own_fault(&self) -> bool {
         match self {
-            Self::Exit { code, .. } => *code != 0 && !is_interrupted(*code),
+            Self::Exit { code, .. } => *code == PANIC,
             Self::Signal { signal, .. } => {
                 matches!(signal_name(*signal), "SIGSEGV" | "SIGABRT" | "SIGBUS" | "SIGILL" | "SIGFPE")
             }
-            Self::Silent(_) | Self::Lingering(_) => true,
-            Self::NotStarted(_) | Self::Unseen => false,
+            Self::Silent(_) | Self::Lingering(_) | Self::NotStarted(_) | Self::Unseen => false,
         }
     }
 
@@ -132,11 +135,11 @@ mod tests {
         for outside in [Signal::KILL, Signal::TERM, Signal::INT, Signal::HUP, Signal::XCPU] {
             assert!(!signal(outside.as_raw()).is_own_fault(), "{outside:?}");
         }
-        assert!(Ending::Exit { code: 2, words: None }.is_own_fault());
-        for not_own in [0, 130, 143] {
+        assert!(Ending::Exit { code: PANIC, words: None }.is_own_fault());
+        for not_own in [0, 1, 2, 130, 143] {
             assert!(!Ending::Exit { code: not_own, words: None }.is_own_fault(), "{not_own}");
         }
-        assert!(Ending::Silent(Duration::from_secs(1)).is_own_fault());
+        assert!(!Ending::Silent(Duration::from_secs(1)).is_own_fault());
         assert!(!Ending::NotStarted("no memory".to_owned()).is_own_fault() && !Ending::Unseen.is_own_fault());
     }
 

@@ -26,8 +26,11 @@ pub struct Limits {
     pub longest_pause: Duration,
     /// A child is started again so many times in a row without having been useful; the failure after that is its last.
     pub restarts: u32,
-    /// What is left so long after it was told to end is killed.
+    /// What is left so long after it was told to end is killed; if it outlives its parent, it is left to itself.
     pub grace: Duration,
+    /// The children work for the campaign, not for the parent: they may go on without it, and one that leaves while
+    /// there is work has failed, whatever its exit code.
+    pub outlives: bool,
 }
 
 impl Default for Limits {
@@ -39,6 +42,7 @@ impl Default for Limits {
             longest_pause: seconds(60),
             restarts: 5,
             grace: seconds(30),
+            outlives: false,
         }
     }
 }
@@ -177,19 +181,25 @@ impl Supervisor {
         Some(Ended { incarnation: child.incarnation, ending, then: child.standing(now) })
     }
 
+    /// There is no more work: nothing is started any more.
+    pub fn close(&mut self) {
+        self.stopping = true;
+        for child in &mut self.children {
+            if let State::Waiting { .. } = child.state {
+                child.state = State::Home;
+            }
+        }
+    }
+
     /// The whole set is to end: nothing is started any more, what runs is told to end, and killed by [`Self::due`]
     /// when its time of grace is over.
     pub fn stop(&mut self, now: Duration) -> Vec<Order> {
-        self.stopping = true;
+        self.close();
         let mut orders = Vec::new();
         for (number, child) in (0..).zip(&mut self.children) {
-            match child.state {
-                State::Waiting { .. } => child.state = State::Home,
-                State::Running { .. } => {
-                    child.state = State::Leaving { since: now };
-                    orders.push(Order::Terminate { number });
-                }
-                _ => {}
+            if let State::Running { .. } = child.state {
+                child.state = State::Leaving { since: now };
+                orders.push(Order::Terminate { number });
             }
         }
         orders

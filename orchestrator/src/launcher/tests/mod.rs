@@ -21,6 +21,7 @@ const LIMITS: Limits = Limits {
     longest_pause: Duration::from_millis(20),
     restarts: 2,
     grace: LONG,
+    outlives: false,
 };
 
 const NO_RESTART: Limits = Limits { restarts: 0, ..LIMITS };
