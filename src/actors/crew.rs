@@ -2,16 +2,17 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::time::Duration;
 
 use orchestrator::launcher::{self, Children};
 use orchestrator::supervisor::{Ended, Standing};
 use serde_json::json;
-use store::{ProcessRecord, Store, unix_milliseconds};
+use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::time::{Interval, MissedTickBehavior, interval};
 use wire::ipc::Handle;
 
+use super::labellers::Labellers;
 use crate::outcome::Failure;
 use crate::output::say;
 
@@ -19,7 +20,7 @@ use crate::output::say;
 const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
 /// Between two looks whether labels are still to be made, once no more structures will come.
 const LAST_LABELS: Duration = Duration::from_millis(100);
-/// A labeller that has lived for so long is of use: what it was started with is in order.
+/// A labeller that has lived for so long (ms) is of use: what it was started with is in order.
 const PROVEN: i64 = 10_000;
 
 /// Walkers and labellers at work.
@@ -29,18 +30,22 @@ pub struct Crew<'a> {
     process: ProcessRecord,
     line: Handle,
     walkers: Children,
-    labellers: Children,
+    labellers: Labellers,
     /// Walkers, as `status` shows them.
     records: BTreeMap<u32, ProcessRecord>,
     /// When each walker was last heard, ms since 1970.
     heard: Arc<[AtomicI64]>,
-    /// When each labeller last gave a sign of life, ms since 1970.
-    seen: BTreeMap<u32, i64>,
     look: Interval,
     last_labels: Option<Interval>,
+    /// Whether every walker is gone, every labeller.
     gone: [bool; 2],
-    stopping: bool,
+    /// Tells the reactor to send walkers home.
+    stopping: Arc<AtomicBool>,
     failure: Option<String>,
+    /// Messages dropped that were spoken of.
+    dropped: u64,
+    /// Whether the database could not be written to at the last try.
+    deaf: bool,
 }
 
 /// What there is to react to.
@@ -62,7 +67,8 @@ impl<'a> Crew<'a> {
         process: ProcessRecord,
         line: Handle,
         mut walkers: Children,
-        labellers: Children,
+        labellers: Labellers,
+        stopping: Arc<AtomicBool>,
     ) -> Self {
         let mut look = interval(SIGN_OF_LIFE);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -75,12 +81,13 @@ impl<'a> Crew<'a> {
             labellers,
             records: BTreeMap::new(),
             heard,
-            seen: BTreeMap::new(),
             look,
             last_labels: None,
             gone: [false; 2],
-            stopping: false,
+            stopping,
             failure: None,
+            dropped: 0,
+            deaf: false,
         }
     }
 
@@ -105,38 +112,44 @@ impl<'a> Crew<'a> {
         };
         tokio::select! {
             event = self.walkers.next() => Event::Walker(event),
-            event = self.labellers.next() => Event::Labeller(event),
+            event = self.labellers.children.next() => Event::Labeller(event),
             _ = self.look.tick() => Event::Look,
             _ = last_labels => Event::LastLabels,
         }
     }
 
-    /// Does what is to be done about it.
-    pub async fn take_in(&mut self, event: Event) -> Result<(), Failure> {
-        match event {
+    /// Does what is to be done about it. A database that is busy or full for a moment is no reason to leave: what could
+    /// not be said is said at the next look.
+    pub async fn take_in(&mut self, event: Event) {
+        let done = match event {
             Event::Walker(event) => self.walker(event).await,
             Event::Labeller(event) => self.labeller(event).await,
             Event::Look => self.look().await,
-            Event::LastLabels => {
-                if self.store.unfinished_jobs().await? == 0 {
-                    self.last_labels = None;
-                    self.labellers.stop();
+            Event::LastLabels => self.look_for_labels().await,
+        };
+        match done {
+            Ok(()) => self.deaf = false,
+            Err(error) if error.is_transient() => {
+                if !std::mem::replace(&mut self.deaf, true) {
+                    say(format_args!("signs of life wait: {error}"));
                 }
-                Ok(())
+                // They cannot be seen to be alive now.
+                self.labellers.all_are_heard();
             }
+            Err(error) => self.fail(error.to_string()),
         }
     }
 
     /// Asks everybody to end in order.
     pub fn stop(&mut self) {
-        self.stopping = true;
+        self.stopping.store(true, Ordering::Relaxed);
         self.walkers.stop();
-        self.labellers.stop();
+        self.labellers.children.stop();
     }
 
     /// No more structures will come: the labellers end when those that are there have their labels.
     pub fn wait_for_labels(&mut self) {
-        if !self.stopping {
+        if !self.is_stopping() {
             self.last_labels = Some(interval(LAST_LABELS));
         }
     }
@@ -151,125 +164,142 @@ impl<'a> Crew<'a> {
         self.failure.clone().map_or(Ok(()), |failure| Err(Failure::Failed(failure)))
     }
 
-    async fn walker(&mut self, event: launcher::Event) -> Result<(), Failure> {
+    fn is_stopping(&self) -> bool {
+        self.stopping.load(Ordering::Relaxed)
+    }
+
+    fn fail(&mut self, why: String) {
+        self.failure.get_or_insert(why);
+        self.stop();
+    }
+
+    async fn walker(&mut self, event: launcher::Event) -> Result<(), StoreError> {
         match event {
             launcher::Event::Started { number, incarnation, pid } => {
-                let now = unix_milliseconds();
                 let restarts = incarnation.saturating_sub(1);
-                let record = ProcessRecord::new(ProcessRecord::WALKER, Some(number), pid, now);
+                let record = new_record(ProcessRecord::WALKER, number, pid);
                 let record = ProcessRecord { restarts, ..record };
+                self.records.insert(number, record.clone());
                 self.store.upsert_process(&record).await?;
-                self.records.insert(number, record);
             }
             launcher::Event::Said { number, line } => say(format_args!("walker {number}: {line}")),
             launcher::Event::Ended { number, ended } => {
                 let fault = ended.ending.is_own_fault().then(|| ended.ending.to_string());
                 self.line.gone(number, ended.incarnation, fault);
-                if let Some(record) = self.records.remove(&number) {
-                    let record = self.ended(record, &ended).await?;
-                    self.records.extend(record.map(|record| (number, record)));
+                if ended.then == Standing::GoneHome {
+                    // There is no more work for the others either.
+                    self.walkers.close();
                 }
+                let record = self.records.remove(&number);
+                // One that could not even be started has none.
+                let record = record.unwrap_or_else(|| new_record(ProcessRecord::WALKER, number, 0));
+                let record = judged(record, &ended);
+                if ended.then != Standing::GoneHome {
+                    self.records.insert(number, record.clone());
+                }
+                self.say_how_it_ended(&record, &ended).await?;
             }
             launcher::Event::AllGone => {
                 self.gone[0] = true;
                 self.line.close();
                 let given_up = all_given_up(&mut self.walkers);
-                self.failed("walker", given_up);
+                self.nobody_is_left("walker", given_up);
             }
         }
         Ok(())
     }
 
-    async fn labeller(&mut self, event: launcher::Event) -> Result<(), Failure> {
+    async fn labeller(&mut self, event: launcher::Event) -> Result<(), StoreError> {
         match event {
-            launcher::Event::Started { .. } => {}
+            launcher::Event::Started { number, pid, .. } => self.labellers.started(number, pid),
             launcher::Event::Said { number, line } => say(format_args!("labeller {number}: {line}")),
             launcher::Event::Ended { number, ended } => {
-                let labellers = self.store.processes(Some(ProcessRecord::LABELLER)).await?;
-                // One that could not even be started has no record yet.
-                let record = labellers.into_iter().rfind(|record| record.number == Some(number));
-                let now = unix_milliseconds();
-                let record = record
-                    .unwrap_or_else(|| ProcessRecord::new(ProcessRecord::LABELLER, Some(number), 0, now));
-                self.ended(record, &ended).await?;
-                self.store.release_leases_of_gone_processes(now).await?;
+                let record = self.labellers.ended(self.store, number, &ended).await?;
+                let record = record.unwrap_or_else(|| new_record(ProcessRecord::LABELLER, number, 0));
+                self.say_how_it_ended(&judged(record, &ended), &ended).await?;
             }
             launcher::Event::AllGone => {
                 self.gone[1] = true;
-                let given_up = all_given_up(&mut self.labellers);
-                self.failed("labeller", given_up);
-            }
-        }
-        Ok(())
-    }
-
-    /// Writes down how a process ended; its record, if it is to be kept.
-    async fn ended(
-        &mut self,
-        mut record: ProcessRecord,
-        ended: &Ended,
-    ) -> Result<Option<ProcessRecord>, Failure> {
-        if matches!(ended.then, Standing::GoneHome) {
-            self.store.remove_process(&record.id).await?;
-            return Ok(None);
-        }
-        let (now, kind, number) = (unix_milliseconds(), record.kind.clone(), record.number);
-        let shown = number.map_or_else(|| kind.clone(), |number| format!("{kind} {number}"));
-        say(format_args!("{shown}: {}; {}", ended.ending, ended.then));
-        let detail = json!({
-            "kind": kind, "number": number, "incarnation": ended.incarnation, "how": ended.ending.to_string(),
-            "then": ended.then.to_string(),
-        });
-        self.store.log_operation(now, "process_ended", &detail).await?;
-        record.state = match ended.then {
-            Standing::Pausing { .. } => "pausing".to_owned(),
-            then => then.to_string(),
-        };
-        record.remark = ended.ending.to_string();
-        self.store.upsert_process(&record).await?;
-        Ok(Some(record))
-    }
-
-    /// Signs of life: this process and its walkers give them in the database, labellers by themselves.
-    async fn look(&mut self) -> Result<(), Failure> {
-        let now = unix_milliseconds();
-        self.process.last_seen = now;
-        let traffic = self.line.traffic();
-        if traffic.dropped > 0 {
-            self.process.remark = format!(
-                "{} messages dropped; the last: {}",
-                traffic.dropped,
-                traffic.last_dropped.unwrap_or_default()
-            );
-        }
-        for (number, record) in &mut self.records {
-            let heard = self.heard.get(*number as usize).map_or(0, |heard| heard.load(Ordering::Relaxed));
-            record.last_seen = record.last_seen.max(heard);
-        }
-        let records: Vec<_> = self.records.values().chain([&self.process]).cloned().collect();
-        self.store.upsert_processes(&records).await?;
-        let signs = self.labellers.signs();
-        for labeller in self.store.processes(Some(ProcessRecord::LABELLER)).await? {
-            let Some(number) = labeller.number.filter(|_| labeller.state == "running") else { continue };
-            if self.seen.insert(number, labeller.last_seen) == Some(labeller.last_seen) {
-                continue;
-            }
-            if labeller.last_seen - labeller.started > PROVEN {
-                signs.useful(number);
-            } else {
-                signs.heard(number);
+                let given_up = all_given_up(&mut self.labellers.children);
+                self.nobody_is_left("labeller", given_up);
             }
         }
         Ok(())
     }
 
     /// Nobody of a kind is left to do the work.
-    fn failed(&mut self, kind: &str, given_up: Option<String>) {
-        if let Some(given_up) = given_up.filter(|_| !self.stopping) {
-            self.failure = Some(format!("no {kind} is left: {given_up}"));
-            self.stop();
+    fn nobody_is_left(&mut self, kind: &str, given_up: Option<String>) {
+        if let Some(given_up) = given_up.filter(|_| !self.is_stopping()) {
+            self.fail(format!("no {kind} is left: {given_up}"));
         }
     }
+
+    /// Writes down how a process ended.
+    async fn say_how_it_ended(&self, record: &ProcessRecord, ended: &Ended) -> Result<(), StoreError> {
+        if ended.then == Standing::GoneHome {
+            return self.store.remove_process(&record.id).await;
+        }
+        let ProcessRecord { kind, number, .. } = record;
+        let shown = number.map_or_else(|| kind.clone(), |number| format!("{kind} {number}"));
+        say(format_args!("{shown}: {}; {}", ended.ending, ended.then));
+        self.store.upsert_process(record).await?;
+        let detail = json!({
+            "kind": kind, "number": number, "incarnation": ended.incarnation, "how": ended.ending.to_string(),
+            "then": ended.then.to_string(),
+        });
+        self.store.log_operation(unix_milliseconds(), "process_ended", &detail).await
+    }
+
+    /// Signs of life: this process and its walkers give them in the database, labellers by themselves.
+    async fn look(&mut self) -> Result<(), StoreError> {
+        let now = unix_milliseconds();
+        self.process.last_seen = now;
+        for (number, record) in &mut self.records {
+            let heard = self.heard.get(*number as usize).map_or(0, |heard| heard.load(Ordering::Relaxed));
+            record.last_seen = record.last_seen.max(heard);
+        }
+        let traffic = self.line.traffic();
+        let strangers = (traffic.dropped > self.dropped).then(|| {
+            let last = traffic.last_dropped.unwrap_or_default();
+            format!("{} messages dropped; the last: {last}", traffic.dropped)
+        });
+        if let Some(strangers) = &strangers {
+            self.process.remark.clone_from(strangers);
+        }
+        let records: Vec<_> = self.records.values().chain([&self.process]).cloned().collect();
+        self.store.upsert_processes(&records).await?;
+        if let Some(strangers) = strangers {
+            say(&strangers);
+            let detail = json!({ "dropped": traffic.dropped, "remark": strangers });
+            self.store.log_operation(now, "messages_dropped", &detail).await?;
+            self.dropped = traffic.dropped;
+        }
+        // Also of those whose end could not be written down at once.
+        self.store.release_leases_of_gone_processes(now).await?;
+        self.labellers.look(self.store, PROVEN).await
+    }
+
+    async fn look_for_labels(&mut self) -> Result<(), StoreError> {
+        if self.store.unfinished_jobs().await? == 0 {
+            self.last_labels = None;
+            self.labellers.children.stop();
+        }
+        Ok(())
+    }
+}
+
+fn new_record(kind: &str, number: u32, pid: u32) -> ProcessRecord {
+    ProcessRecord::new(kind, Some(number), pid, unix_milliseconds())
+}
+
+/// The record of a process that ended.
+fn judged(mut record: ProcessRecord, ended: &Ended) -> ProcessRecord {
+    record.state = match ended.then {
+        Standing::Pausing { .. } => "pausing".to_owned(),
+        then => then.to_string(),
+    };
+    record.remark = ended.ending.to_string();
+    record
 }
 
 /// How the last of them failed, if all were given up.

@@ -1,5 +1,6 @@
 //! Everything in one process: walkers as threads, reactor and labellers as tasks.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
@@ -10,11 +11,13 @@ use orchestrator::selector::Selector;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
+use wire::place::Place;
 use wire::transport::{InProcess, Incoming};
 use workers::labeller::{self, Closing, LabellerSettings, ReferenceMethod, Timing};
 use workers::walk::WalkContext;
 use workers::walker;
 
+use super::starts::no_labellers;
 use super::{CHANNEL, ReactorTask, start_reactor, stop_on_signals, wanted_walkers};
 use crate::campaign::Campaign;
 use crate::outcome::Failure;
@@ -28,7 +31,13 @@ pub async fn work(
     selector: Selector,
     store: &Store,
     process: &ProcessRecord,
+    directory: &Path,
 ) -> Result<reactor::Ended, Failure> {
+    if let Ok(place) = Place::of(directory) {
+        // What a killed run left; this one needs nothing there.
+        let _ = place.remove();
+    }
+    no_labellers(store).await?;
     let actors = Actors::start(campaign, selector, store, process)?;
     let alive = tokio::spawn(say_alive(store.clone(), process.clone()));
     let ended = actors.finish().await;

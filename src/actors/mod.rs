@@ -2,6 +2,7 @@
 
 mod crew;
 pub mod in_process;
+mod labellers;
 pub mod processes;
 mod starts;
 
@@ -61,13 +62,14 @@ fn wanted_walkers(campaign: &Campaign) -> u32 {
     }
 }
 
-/// Ctrl-C and SIGTERM: the first calls `stop`, which stops in order, the second ends at once (which is safe too).
+/// Ctrl-C, SIGTERM and a closed terminal: the first calls `stop`, which stops in order, the second ends at once (which is safe too).
 fn stop_on_signals(stop: impl Fn() + Send + 'static) -> Result<(), Failure> {
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
+    let mut hangup = signal(SignalKind::hangup()).map_err(Failure::failed)?;
     tokio::spawn(async move {
         for first in [true, false] {
-            tokio::select! { _ = interrupt.recv() => (), _ = terminate.recv() => () };
+            tokio::select! { _ = interrupt.recv() => (), _ = terminate.recv() => (), _ = hangup.recv() => () };
             if !first {
                 process::exit(130);
             }

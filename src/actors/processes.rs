@@ -23,6 +23,9 @@ use super::{CHANNEL, ReactorTask, start_reactor, starts, stop_on_signals, wanted
 use crate::campaign::Campaign;
 use crate::outcome::Failure;
 
+/// Labellers give their signs of life in the database, which may be busy for a while.
+const LABELLER_SILENCE: Duration = Duration::from_secs(60);
+
 /// Runs the campaign until it is done or stopped. To be awaited on the main thread: the walkers end with the thread that
 /// starts them.
 pub async fn work(
@@ -72,8 +75,9 @@ async fn work_in(
     };
     let line = server.handle();
     let walkers = Children::new(walkers, limits, starts::walker(campaign, line.clone())?);
+    let limits = Limits { silence: limits.silence.max(LABELLER_SILENCE), outlives: true, ..limits };
     let labellers = starts::labellers(campaign, directory, store, limits).await?;
-    let crew = Crew::new(store, process.clone(), line, walkers, labellers);
+    let crew = Crew::new(store, process.clone(), line, walkers, labellers, Arc::clone(&stopping));
 
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
     let serving = tokio::spawn(server.run(shared, to_reactor, crew.listener()));
@@ -117,7 +121,7 @@ async fn lead(
             ended = &mut serving, if closed.is_none() => Happened::Closed(plain(ended)),
         };
         match happened {
-            Happened::InCrew(event) => crew.take_in(event).await?,
+            Happened::InCrew(event) => crew.take_in(event).await,
             Happened::Asked => {
                 asked = true;
                 crew.stop();

@@ -1,5 +1,6 @@
 //! What the processes of a campaign are started with, and which of those that live are taken over.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use orchestrator::launcher::{Children, Launch, ask_to_end};
@@ -7,6 +8,7 @@ use orchestrator::supervisor::Limits;
 use store::{ProcessRecord, Store};
 use wire::ipc::Handle;
 
+use super::labellers::Labellers;
 use crate::campaign::Campaign;
 use crate::config::LabelMethod;
 use crate::outcome::Failure;
@@ -39,7 +41,7 @@ pub async fn labellers(
     directory: &Path,
     store: &Store,
     limits: Limits,
-) -> Result<Children, Failure> {
+) -> Result<Labellers, Failure> {
     let LabelMethod::Reference(potential) = &campaign.config.label.method;
     let setup = LabellerSetup {
         number: 0,
@@ -58,18 +60,29 @@ pub async fn labellers(
         let setup = LabellerSetup { number, restarts: incarnation.saturating_sub(1), ..setup.clone() };
         Launch::this_program(["labeller"], setup::bytes(&setup)).for_own_session()
     });
+    let mut adopted = BTreeMap::new();
     for found in store.processes(Some(ProcessRecord::LABELLER)).await? {
         if !found.is_local() || found.is_gone() {
             continue;
         }
         let wanted = found.number.filter(|_| found.setup.as_ref() == Some(&hash) && found.state == "running");
-        let adopted = wanted.is_some_and(|number| labellers.adopt(number, found.pid, &found.birth).is_ok());
-        if !adopted {
+        match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.birth).is_ok()) {
+            Some(number) => drop(adopted.insert(number, found.pid)),
             // One that ended meanwhile needs no asking.
+            None => drop(ask_to_end(found.pid, &found.birth)),
+        }
+    }
+    Ok(Labellers::new(labellers, adopted, campaign.config.label.attempts.get()))
+}
+
+/// Asks the labellers that an earlier run left to end: this run makes its labels itself.
+pub async fn no_labellers(store: &Store) -> Result<(), Failure> {
+    for found in store.processes(Some(ProcessRecord::LABELLER)).await? {
+        if found.is_local() && !found.is_gone() {
             let _ = ask_to_end(found.pid, &found.birth);
         }
     }
-    Ok(labellers)
+    Ok(())
 }
 
 fn absolute(path: &Path) -> Result<PathBuf, Failure> {

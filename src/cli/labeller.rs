@@ -25,15 +25,15 @@ impl Labeller {
         let setup: LabellerSetup = setup::read()?;
         unchanged(&setup.file, &setup.file_hash)?;
         let method = ReferenceMethod::new(setup.kind.load(&setup.file).map_err(Failure::Input)?);
-        block_on(label(setup, method))??;
-        Ok(Ended::Done)
+        let closing = Arc::new(Closing::default());
+        block_on(label(setup, method, &closing))??;
+        Ok(if closing.stopping.load(Ordering::Relaxed) { Ended::Interrupted } else { Ended::Done })
     }
 }
 
-async fn label(setup: LabellerSetup, method: ReferenceMethod) -> Result<(), Failure> {
-    let closing = Arc::new(Closing::default());
+async fn label(setup: LabellerSetup, method: ReferenceMethod, closing: &Arc<Closing>) -> Result<(), Failure> {
     let (mut terminate, asked) =
-        (signal(SignalKind::terminate()).map_err(Failure::failed)?, Arc::clone(&closing));
+        (signal(SignalKind::terminate()).map_err(Failure::failed)?, Arc::clone(closing));
     tokio::spawn(async move {
         while terminate.recv().await.is_some() {
             asked.stopping.store(true, Ordering::Relaxed);
@@ -54,7 +54,7 @@ async fn label(setup: LabellerSetup, method: ReferenceMethod) -> Result<(), Fail
         largest_force: setup.largest_force,
         timing: Timing::default(),
     };
-    serve(store.clone(), method, settings, record, &closing, unix_milliseconds).await?;
+    serve(store.clone(), method, settings, record, closing, unix_milliseconds).await?;
     store.close().await;
     Ok(())
 }

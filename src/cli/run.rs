@@ -63,12 +63,12 @@ async fn run(campaign: &Campaign, directory: &Path, in_process: bool) -> Result<
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
     let ended = if in_process {
-        in_process::work(campaign, selector, &store, &process).await?
+        in_process::work(campaign, selector, &store, &process, directory).await?
     } else {
         processes::work(campaign, selector, &store, &process, directory).await?
     };
     leave(&store, &process, ended).await?;
-    if ended == reactor::Ended::Stopped && !store.status().await?.finished {
+    if !store.status().await?.finished {
         store.close().await;
         return Ok(Ended::Interrupted);
     }

@@ -5,6 +5,8 @@ use workers::settings::ThermostatKind;
 
 use super::Config;
 
+/// Signs of life are seconds apart.
+const LEAST_SILENCE: f64 = 5.0;
 /// Longer Nosé–Hoover chains than this are a mistake.
 const LONGEST_CHAIN: usize = 100;
 
@@ -50,6 +52,10 @@ fn check_limits(config: &Config) -> Result<(), Wrong> {
         ("run.silence_limit", run.silence_limit.get(), 1e6),
         ("run.turn_steps", run.turn_steps.get() as f64, most_steps),
     ];
+    let silence = run.silence_limit.get();
+    if silence < LEAST_SILENCE {
+        return wrong("run.silence_limit", silence, format!("at least {LEAST_SILENCE} s"));
+    }
     match limits.into_iter().find(|(_, found, limit)| found > limit) {
         Some((key, found, limit)) => wrong(key, found, format!("at most {limit}")),
         None => Ok(()),
