@@ -10,7 +10,8 @@ use common::campaign::{Outcome, Small, outcome};
 use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
 use common::{Running, program};
 
-/// Kills in one test; `CALMWALK_KILLS=200 cargo test --test interruption` for the long version.
+/// Kills in one test; `CALMWALK_KILLS=200 cargo test --test interruption kills` for the long
+/// version, 1000 for a longer one.
 fn kills() -> u64 {
     std::env::var("CALMWALK_KILLS").ok().and_then(|text| text.parse().ok()).unwrap_or(20)
 }
@@ -38,7 +39,7 @@ fn undisturbed(small: &Small) -> (Outcome, Duration) {
     (outcome(directory.path()), begun.elapsed())
 }
 
-/// Kills one process of the campaign, or all of them at once.
+/// Kills one process of the campaign, or all of them at once; the orchestrator if there is no such process now.
 fn kill(directory: &Path, running: &Running, choice: u64) {
     let mut victims = match choice % 4 {
         0 => vec![running.0.id()],
@@ -46,7 +47,9 @@ fn kill(directory: &Path, running: &Running, choice: u64) {
         2 => carrying_out(directory, "labeller"),
         _ => processes_in(directory).iter().map(|process| process.pid).collect(),
     };
-    if choice % 4 != 3 && !victims.is_empty() {
+    if victims.is_empty() {
+        victims.push(running.0.id());
+    } else if choice % 4 != 3 {
         victims = vec![victims[(choice / 4) as usize % victims.len()]];
     }
     victims.into_iter().for_each(|pid| signal(pid, "KILL"));
@@ -109,6 +112,7 @@ fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
         assert_eq!(running.0.wait().unwrap().code(), Some(130), "{name}");
         assert_eq!(start(directory.path(), &[]).0.wait().unwrap().code(), Some(0));
         assert_eq!(outcome(directory.path()), expected, "{name}");
+        nothing_is_left(directory.path());
     }
 }
 
@@ -126,6 +130,7 @@ fn live_mode_loses_and_doubles_nothing() {
     }
     assert_eq!(start(directory.path(), &[]).0.wait().unwrap().code(), Some(0));
     outcome(directory.path());
+    nothing_is_left(directory.path());
 }
 
 /// All walks are over, but a label is still being made elsewhere: whoever stops then must not be told that all is done.

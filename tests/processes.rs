@@ -92,7 +92,7 @@ fn a_hung_walker_is_killed_and_replaced() {
     let small = long();
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
-    with_keys(&small.write(here), "silence_limit = 2.0");
+    with_keys(&small.write(here), "silence_limit = 5.0");
     let mut running = start(here);
     wait_for_work(here);
     let walker = carrying_out(here, "walker")[0];
@@ -100,7 +100,9 @@ fn a_hung_walker_is_killed_and_replaced() {
     assert_eq!(wait(&mut running), Some(0), "{}", said(here));
     assert!(!processes_in(here).iter().any(|process| process.pid == walker));
     let endings = endings(here);
-    assert!(endings.iter().any(|ending| ending.contains("silent for 2 s, killed")), "{endings:?}");
+    let hung =
+        |ending: &String| ending.contains("silent for 5 s, killed") && ending.contains(r#""kind":"walker""#);
+    assert_eq!(endings.iter().filter(|ending| hung(ending)).count(), 1, "{endings:?}");
     assert_eq!(outcome(here), expected(&small));
     nothing_is_left(here);
 }
@@ -116,6 +118,24 @@ fn a_walker_that_is_told_to_end_leaves_its_walk_to_another() {
     signal(carrying_out(here, "walker")[0], "TERM");
     assert_eq!(wait(&mut running), Some(0), "{}", said(here));
     assert!(endings(here).iter().any(|ending| ending.contains("exit code 130")), "{:?}", endings(here));
+    assert_eq!(outcome(here), expected(&small));
+    nothing_is_left(here);
+}
+
+#[test]
+fn a_labeller_that_is_told_to_end_is_replaced() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let small = long();
+    small.write(here);
+    let mut running = start(here);
+    wait_for_work(here);
+    let labeller = carrying_out(here, "labeller")[0];
+    signal(labeller, "TERM");
+    wait_until("another is there", || {
+        carrying_out(here, "labeller").first().is_some_and(|other| *other != labeller)
+    });
+    assert_eq!(wait(&mut running), Some(0), "{}", said(here));
     assert_eq!(outcome(here), expected(&small));
     nothing_is_left(here);
 }
