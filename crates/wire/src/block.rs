@@ -130,7 +130,18 @@ pub enum BlockError {
 
 /// A checked block, in memory of this process or in memory that a walker shares. Clones share it.
 #[derive(Clone)]
-pub struct CandidateBlock(Arc<dyn AsRef<[u8]> + Send + Sync>);
+pub struct CandidateBlock {
+    owner: Arc<dyn AsRef<[u8]> + Send + Sync>,
+    /// As they were checked: what a walker might write to its memory afterwards moves no array.
+    counts: Counts,
+}
+
+/// Numbers of atoms and of features an atom.
+#[derive(Clone, Copy, Debug)]
+struct Counts {
+    atoms: usize,
+    features: usize,
+}
 
 /// Memory of this process, aligned to 8.
 struct Words(Vec<u64>);
@@ -139,6 +150,7 @@ struct Words(Vec<u64>);
 #[derive(Clone, Debug)]
 pub struct CandidateView<'a> {
     header: &'a Header,
+    counts: Counts,
     /// Atomic numbers, [n].
     pub numbers: &'a [u64],
     /// Positions, [n], Å.
@@ -242,7 +254,8 @@ impl CandidateBlock {
     pub fn encode(candidate: &Candidate) -> Self {
         let mut words = vec![0_u64; candidate.encoded_len() / 8];
         candidate.encode_into(words.as_mut_bytes());
-        Self(Arc::new(Words(words)))
+        let counts = Counts { atoms: candidate.structure.len(), features: candidate.feature_dimension() };
+        Self { owner: Arc::new(Words(words)), counts }
     }
 
     /// Checks a block where it stands and keeps its owner, copying nothing. The bytes must not change any more.
@@ -250,8 +263,8 @@ impl CandidateBlock {
     /// # Errors
     /// Other or damaged bytes, bytes that are not aligned to 8.
     pub fn in_place(owner: Arc<dyn AsRef<[u8]> + Send + Sync>) -> Result<Self, BlockError> {
-        CandidateView::new((*owner).as_ref())?;
-        Ok(Self(owner))
+        let counts = CandidateView::new((*owner).as_ref())?.counts;
+        Ok(Self { owner, counts })
     }
 
     /// Copies and checks `bytes`.
@@ -259,31 +272,35 @@ impl CandidateBlock {
         let mut words = vec![0_u64; bytes.len().div_ceil(8)];
         let (copy, _) = words.as_mut_bytes().split_at_mut(bytes.len());
         copy.copy_from_slice(bytes);
-        CandidateView::new(copy)?;
-        Ok(Self(Arc::new(Words(words))))
+        let counts = CandidateView::new(copy)?.counts;
+        Ok(Self { owner: Arc::new(Words(words)), counts })
     }
 
     /// The bytes, 8-byte aligned.
     pub fn as_bytes(&self) -> &[u8] {
-        (*self.0).as_ref()
+        (*self.owner).as_ref()
     }
 
     /// The block read in place.
     pub fn view(&self) -> CandidateView<'_> {
-        CandidateView::split(self.as_bytes()).expect("checked when the block was made")
+        CandidateView::arrays(self.as_bytes(), self.counts)
+            .expect("its owner gives the bytes that were checked")
     }
 
     /// The same block without its features, for a store that keeps those apart.
     pub fn without_features(&self) -> Self {
         let header = self.view().header;
-        let length = length(header.atoms, 0);
+        let counts = Counts { features: 0, ..self.counts };
+        let length = length(counts.atoms as u64, 0);
         let mut words = vec![0_u64; length as usize / 8];
         let bytes = words.as_mut_bytes();
         // The features are what stands last.
         bytes.copy_from_slice(&self.as_bytes()[..bytes.len()]);
-        bytes[..HEADER].copy_from_slice(Header { length, features: 0, ..header.clone() }.as_bytes());
+        bytes[..HEADER].copy_from_slice(
+            Header { length, atoms: counts.atoms as u64, features: 0, ..header.clone() }.as_bytes(),
+        );
         seal(bytes);
-        Self(Arc::new(Words(words)))
+        Self { owner: Arc::new(Words(words)), counts }
     }
 }
 
@@ -333,7 +350,7 @@ impl<'a> CandidateView<'a> {
     /// Places of the arrays, checked against the length at hand.
     fn split(bytes: &'a [u8]) -> Result<Self, BlockError> {
         let short = || BlockError::Short(bytes.len());
-        let (header, rest) = Header::ref_from_prefix(bytes).map_err(|error| match error {
+        let (header, _) = Header::ref_from_prefix(bytes).map_err(|error| match error {
             CastError::Alignment(_) => BlockError::Unaligned,
             _ => short(),
         })?;
@@ -350,14 +367,21 @@ impl<'a> CandidateView<'a> {
         if !plausible || header.length != expected || found != expected {
             return Err(BlockError::Length { found, expected });
         }
-        let n = atoms as usize;
+        Self::arrays(bytes, Counts { atoms: atoms as usize, features: features as usize })
+    }
+
+    /// Places of the arrays of a block with so many atoms and features.
+    fn arrays(bytes: &'a [u8], counts: Counts) -> Result<Self, BlockError> {
+        let short = || BlockError::Short(bytes.len());
+        let (header, rest) = Header::ref_from_prefix(bytes).map_err(|_| short())?;
+        let n = counts.atoms;
         let (numbers, rest) = <[u64]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
         let (positions, rest) = <[Vec3]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
         let (forces, rest) = <[Vec3]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
         let (gamma, rest) = <[f64]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
         let (gamma_nbr, rest) = <[f64]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
-        let features = <[f64]>::ref_from_bytes(rest).map_err(|_| short())?;
-        Ok(Self { header, numbers, positions, forces, gamma, gamma_nbr, features })
+        let features = <[f64]>::ref_from_bytes_with_elems(rest, n * counts.features).map_err(|_| short())?;
+        Ok(Self { header, counts, numbers, positions, forces, gamma, gamma_nbr, features })
     }
 
     /// Its name.
@@ -403,7 +427,7 @@ impl<'a> CandidateView<'a> {
 
     /// Features an atom, D.
     pub fn feature_dimension(&self) -> usize {
-        self.header.features as usize
+        self.counts.features
     }
 
     /// The structure, copied out.

@@ -219,3 +219,38 @@ fn a_block_in_place_is_checked_and_not_copied() {
         Err(BlockError::Checksum { .. })
     ));
 }
+
+/// Memory that is written to behind the back of whoever reads it.
+struct Unsteady {
+    now: std::sync::atomic::AtomicBool,
+    checked: Vec<u64>,
+    later: Vec<u64>,
+}
+
+impl AsRef<[u8]> for Unsteady {
+    fn as_ref(&self) -> &[u8] {
+        let later = self.now.load(std::sync::atomic::Ordering::Relaxed);
+        zerocopy::IntoBytes::as_bytes(if later { &*self.later } else { &*self.checked })
+    }
+}
+
+#[test]
+fn what_is_written_after_the_check_leads_nowhere() {
+    let block = some_block();
+    let words = |bytes: &[u8]| {
+        let mut words = vec![0_u64; bytes.len() / 8];
+        zerocopy::IntoBytes::as_mut_bytes(words.as_mut_slice()).copy_from_slice(bytes);
+        words
+    };
+    let checked = words(block.as_bytes());
+    let later = vec![u64::MAX; checked.len()];
+    let unsteady = std::sync::Arc::new(Unsteady { now: false.into(), checked, later });
+    let found = CandidateBlock::in_place(std::sync::Arc::clone(&unsteady) as _).unwrap();
+    let (atoms, features) = (block.view().numbers.len(), block.view().feature_dimension());
+    unsteady.now.store(true, std::sync::atomic::Ordering::Relaxed);
+    let view = found.view();
+    assert_eq!((view.numbers.len(), view.positions.len(), view.forces.len()), (atoms, atoms, atoms));
+    assert_eq!((view.gamma.len(), view.gamma_nbr.len()), (atoms, atoms));
+    assert_eq!((view.feature_dimension(), view.features.len()), (features, atoms * features));
+    assert_ne!(found, block);
+}

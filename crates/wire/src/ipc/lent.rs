@@ -19,7 +19,9 @@ pub(super) struct Lent {
 }
 
 // SAFETY: the pointers lead into memory that `request` keeps mapped, that nobody moves, and that no thread of this
-// process writes to; whoever has a `&Lent` can only read through them.
+// process writes to; whoever has a `&Lent` can only read through them. The walker could still write to it: it is a
+// program of the same user that is trusted not to, as with a debugger (see `super`). What it sent is checked once, with
+// the lengths that are kept from then on, so that no later write leads out of the request.
 #[allow(unsafe_code)]
 unsafe impl Send for Lent {}
 // SAFETY: as above; the request itself is behind a lock.
