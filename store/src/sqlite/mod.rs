@@ -16,7 +16,7 @@ mod status;
 use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use sqlx::migrate::Migrator;
 use sqlx::sqlite::{
@@ -41,6 +41,10 @@ const SCHEMA: i64 = 2;
 /// How long another connection may hold the database.
 const PATIENCE: Duration = Duration::from_secs(30);
 const READERS: u32 = 4;
+/// How often a database of an earlier version is brought up to date, against others that try the same.
+const MIGRATION_TRIES: u32 = 50;
+/// Between two tries to open a database.
+const OPENING_PAUSE: Duration = Duration::from_millis(20);
 /// Bytes of a page of a new database. A candidate with features is some 100 kB, and every page has its price; with
 /// larger ones short rows would cost too much.
 const PAGE: u32 = 1 << 14;
@@ -90,16 +94,32 @@ impl Store {
 
     /// Opens the campaign in `directory`, and brings its tables up to date.
     pub async fn open(directory: &Path) -> Result<Self> {
+        let begun = Instant::now();
+        loop {
+            match Self::open_now(directory).await {
+                // Others that open or close it at this moment: SQLite does not always wait for those by itself.
+                Err(StoreError::Busy) if begun.elapsed() < PATIENCE => {
+                    tokio::time::sleep(OPENING_PAUSE).await;
+                }
+                opened => return opened,
+            }
+        }
+    }
+
+    async fn open_now(directory: &Path) -> Result<Self> {
         let path = existing(directory)?;
         check_directory(directory)?;
         let found = identify(&path, false).await?;
         let writer = writer(&path).await?;
-        let mut migrated = MIGRATIONS.run(&writer).await;
-        if migrated.is_err() && found < SCHEMA {
-            // Another process that opened it at the same time was faster: then there is nothing left to do.
-            migrated = MIGRATIONS.run(&writer).await;
+        let mut tries = 1;
+        while let Err(error) = MIGRATIONS.run(&writer).await {
+            // Others that opened it at the same time are at it: once they are done there is nothing left to do.
+            if found == SCHEMA || tries == MIGRATION_TRIES {
+                return Err(schema_error(error));
+            }
+            tries += 1;
+            tokio::time::sleep(OPENING_PAUSE).await;
         }
-        migrated.map_err(schema_error)?;
         let readers = readers(options(&path).read_only(true));
         Ok(Self { writer: Some(writer), readers, file: InPlace::of(&path)? })
     }
