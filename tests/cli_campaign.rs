@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use atoms::extxyz::{Frame, Keys, Labels, Value};
 use atoms::{Evaluation, NeighbourList, Potential, read_extxyz};
+use common::processes::{nothing_is_left, wait_until};
 use common::{Running, config, deviation, program, refuse, succeed, write_frames};
 use potentials::{Eam, EamStyle};
 use serde_json::Value as Json;
@@ -355,7 +356,8 @@ fn status_works_while_a_campaign_runs_and_after_it_was_killed() {
     assert!(succeed(here, ["import", "small", "l.extxyz"]).starts_with("1 labels"));
     let killed = json(here, ["status", "small"]);
     assert_eq!(killed["processes"][0]["state"], "gone");
-    assert!(
-        succeed(here, ["status", "small"]).contains("not running; the same calmwalk run goes on with it")
-    );
+    let not_running = "not running; the same calmwalk run goes on with it";
+    wait_until("the labeller has left", || succeed(here, ["status", "small"]).contains(not_running));
+    assert!(succeed(here, ["clean", "small"]).contains("files removed"));
+    nothing_is_left(&here.join("small"));
 }
