@@ -5,7 +5,7 @@
 //! | 4 | `CALM` |
 //! | 1 | format version |
 //! | 4 | CRC-32 of the rest, little-endian |
-//! | rest | the message in [postcard](https://postcard.jamesmunns.com) encoding, the number of its variant first |
+//! | rest | the message in [postcard](https://postcard.jamesmunns.com) encoding |
 //!
 //! A candidate is not inside: its block travels beside the report that names it, as the bytes that it has already.
 
@@ -14,7 +14,7 @@ use std::borrow::Cow;
 use atoms::StructureError;
 use serde::{Deserialize, Serialize};
 
-use crate::block::CandidateBlock;
+use crate::block::{Candidate, CandidateBlock};
 use crate::ids::{CandidateId, Origin, WalkId};
 use crate::messages::{Assignment, End, Outcome, Progress, Report};
 
@@ -22,20 +22,9 @@ const MAGIC: [u8; 4] = *b"CALM";
 const VERSION: u8 = 1;
 const PREFIX: usize = MAGIC.len() + 1 + 4;
 
-/// What is sent between reactor and walkers.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Message {
-    /// To a walker: its next turn.
-    Assignment(Assignment),
-    /// From a walker: what came of its turn.
-    Report(Report),
-    /// From a walker: where its walk stands.
-    Progress(WalkId, Progress),
-}
-
 /// Why bytes are not a control message.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum ControlError {
+pub(crate) enum ControlError {
     /// Fewer bytes than the fixed part.
     #[error("a control message of {0} bytes: its fixed part alone has {PREFIX}")]
     Short(usize),
@@ -91,14 +80,9 @@ pub enum ControlError {
         /// Of the block.
         beside: Option<Box<CandidateId>>,
     },
-}
-
-/// A message as it is encoded.
-#[derive(Serialize, Deserialize)]
-enum Encoded<'a> {
-    Assignment(Cow<'a, Assignment>),
-    Report(#[serde(borrow)] EncodedReport<'a>),
-    Progress(WalkId, Cow<'a, Progress>),
+    /// A candidate that nothing names.
+    #[error("{0} bytes of a candidate beside a message that names none")]
+    Beside(usize),
 }
 
 /// A [`Report`] with the name of the candidate in its place.
@@ -121,21 +105,11 @@ enum EncodedOutcome<'a> {
     Ended(Cow<'a, End>),
 }
 
-/// Encodes a message. The block of a report's candidate is not in it and must be sent beside it.
-pub fn encode(message: &Message) -> Vec<u8> {
-    let encoded = match message {
-        Message::Assignment(assignment) => Encoded::Assignment(Cow::Borrowed(assignment)),
-        Message::Progress(walk, progress) => Encoded::Progress(*walk, Cow::Borrowed(progress)),
-        Message::Report(report) => Encoded::Report(EncodedReport::new(report, |block| block.view().id())),
-    };
-    seal(&encoded)
-}
-
 impl<'a> EncodedReport<'a> {
-    /// The report whose candidate has the name that `id` gives.
-    pub(crate) fn new<C>(report: &'a Report<C>, id: impl FnOnce(&C) -> CandidateId) -> Self {
+    /// The report without its candidate.
+    pub(crate) fn new(report: &'a Report<Candidate>) -> Self {
         let outcome = match &report.outcome {
-            Outcome::Candidate(candidate) => EncodedOutcome::Candidate(id(candidate)),
+            Outcome::Candidate(candidate) => EncodedOutcome::Candidate(candidate.id),
             Outcome::Turn => EncodedOutcome::Turn,
             Outcome::Paused => EncodedOutcome::Paused,
             Outcome::Ended(end) => EncodedOutcome::Ended(Cow::Borrowed(end)),
@@ -163,21 +137,6 @@ pub(crate) fn seal(content: &impl Serialize) -> Vec<u8> {
 pub(crate) fn unseal<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, ControlError> {
     let (message, rest) = postcard::take_from_bytes(content(bytes)?)?;
     if rest.is_empty() { Ok(message) } else { Err(ControlError::Trailing(rest.len())) }
-}
-
-/// Decodes a message and checks all of it; `candidate` is the block that came beside it, if one did.
-///
-/// # Errors
-/// Other, damaged or left-over bytes; an assignment that cannot be worked on; a report without the candidate that it
-/// names, or with another.
-pub fn decode(bytes: &[u8], candidate: Option<CandidateBlock>) -> Result<Message, ControlError> {
-    match unseal(bytes)? {
-        Encoded::Assignment(assignment) => {
-            checked_assignment(assignment.into_owned()).map(Message::Assignment)
-        }
-        Encoded::Progress(walk, progress) => Ok(Message::Progress(walk, progress.into_owned())),
-        Encoded::Report(report) => report.complete(candidate).map(Message::Report),
-    }
 }
 
 /// The checked bytes behind the fixed part.

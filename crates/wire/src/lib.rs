@@ -1,9 +1,13 @@
 //! What actors say to each other: identifiers, the candidate as one block of bytes, small control
 //! messages, and the [`transport`] that carries them.
 
+// Tests in here draw their candidates where those in `tests` do.
+#[cfg(test)]
+extern crate self as wire;
+
 pub mod block;
 mod bytes;
-pub mod control;
+mod control;
 pub mod ids;
 pub mod ipc;
 pub mod messages;

@@ -12,7 +12,7 @@ use super::conversation::{Conversations, Next, Stranger};
 use super::frame::FrameError;
 use super::lent::Lent;
 use super::lines::Lines;
-use super::message::{Answer, Caller, Decision, Letter, Words};
+use super::message::{Answer, Caller, Decision, Letter, Words, complete};
 use crate::block::{BlockError, CandidateBlock};
 use crate::control::{ControlError, EncodedReport, seal, unseal};
 use crate::ids::WalkId;
@@ -44,8 +44,6 @@ pub(super) enum Dropped {
     Stranger(#[from] Stranger),
     #[error(transparent)]
     Block(#[from] BlockError),
-    #[error("{0} bytes of a candidate beside a message that names none")]
-    Beside(usize),
 }
 
 impl Desk {
@@ -109,12 +107,7 @@ impl Desk {
             // The walker listens where it spoke last.
             Next::Wait => self.lines.route(caller, lent),
             Next::Take | Next::Unknown => {
-                let candidate = self.candidate(caller, lent)?;
-                let report = match report {
-                    Some(report) => Some(report.complete(candidate)?),
-                    None if candidate.is_none() => None,
-                    None => return Err(Dropped::Beside(lent.block().len())),
-                };
+                let report = complete(report, self.candidate(caller, lent)?)?;
                 self.conversations.take(caller.walker);
                 self.lines.route(caller, lent);
                 let reply = self.lines.decide(caller);

@@ -48,10 +48,10 @@ pub(super) fn fill(out: &mut [u8], control: &[u8], candidate: Option<&Candidate>
     }
 }
 
-/// An answer.
-pub(super) fn answer(control: &[u8]) -> Vec<u64> {
-    let mut words = vec![0; length(control.len(), None) / 8];
-    fill(words.as_mut_bytes(), control, None);
+/// A message in memory of this process.
+pub(super) fn words(control: &[u8], candidate: Option<&Candidate>) -> Vec<u64> {
+    let mut words = vec![0; length(control.len(), candidate) / 8];
+    fill(words.as_mut_bytes(), control, candidate);
     words
 }
 

@@ -52,7 +52,7 @@ impl Lent {
 
     /// Answers the request. An answer may be lost without an error; the walker asks for it then.
     pub(super) fn answer(&self, control: &[u8]) -> Result<(), IpcError> {
-        let words = frame::answer(control);
+        let words = frame::words(control, None);
         let request = self.request.lock().unwrap_or_else(PoisonError::into_inner);
         let memory = request.loan_slice_uninit(words.len());
         let memory = memory.map_err(|e| IpcError::new("find memory for an answer", e))?;

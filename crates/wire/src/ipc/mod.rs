@@ -15,6 +15,7 @@
 mod config;
 mod conversation;
 mod desk;
+mod echo;
 mod frame;
 mod lent;
 mod lines;
@@ -30,6 +31,8 @@ use serde::{Deserialize, Serialize};
 use crate::mixture::SharedMixtureError;
 
 pub use config::space_needed;
+#[doc(hidden)]
+pub use echo::echo;
 pub use lines::Traffic;
 pub use server::{Handle, Server};
 pub use walker::IpcWalker;

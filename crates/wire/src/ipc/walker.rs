@@ -17,9 +17,9 @@ use super::config::{self, ClientPort, Pending, Service};
 use super::message::{Answer, Caller, Decision, Letter, Words};
 use super::{Door, IpcError, frame};
 use crate::block::Candidate;
-use crate::control::{EncodedReport, seal};
+use crate::control::seal;
 use crate::ids::WalkId;
-use crate::messages::{Outcome, Progress, Report};
+use crate::messages::{Progress, Report};
 use crate::mixture::MixtureReader;
 use crate::place;
 use crate::transport::{Transport, Work};
@@ -132,12 +132,8 @@ impl IpcWalker {
     }
 
     fn offer(&self, report: Option<&Report<Candidate>>) -> Result<Option<Pending>, IpcError> {
-        let candidate = report.and_then(|report| match &report.outcome {
-            Outcome::Candidate(candidate) => Some(candidate),
-            _ => None,
-        });
-        let report = report.map(|report| EncodedReport::new(report, |candidate| candidate.id));
-        self.send(Words::Offer { sequence: self.sequence, report }, candidate)
+        let (offer, candidate) = Words::offer(self.sequence, report);
+        self.send(offer, candidate)
     }
 
     /// Sends a message and wakes the server; `None` if it could not be delivered.
