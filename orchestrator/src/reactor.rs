@@ -1,19 +1,22 @@
 //! The shell round the selector: takes reports from the channel, has every commit written, then answers.
 //!
-//! To have a transaction on the disk takes longer than most decisions. So the reactor takes all that has arrived
-//! meanwhile, has it decided one after the other, and commits it as one group; everybody is answered after that.
+//! To have a transaction on the disk takes longer than most decisions. So what arrives during a commit is decided
+//! meanwhile, one after the other, and committed as one group when that commit is done. Everybody is answered when
+//! what was decided about them, and all before it, is on the disk.
 
 mod arrivals;
 pub mod group;
 
 use std::collections::{HashMap, VecDeque};
+use std::panic::resume_unwind;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use store::records::Commit;
+use store::records::{Commit, Fate};
 use store::{Store, StoreError};
 use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinSet;
 use tokio::time::MissedTickBehavior;
 use wire::WalkId;
 use wire::messages::Progress;
@@ -26,8 +29,6 @@ use crate::selector::{Next, Selector, SelectorError};
 const QUEUE_LOOK: Duration = Duration::from_millis(200);
 /// A turn may cost so many walkers, which crashed with it in hand; then its walk is over.
 const MOST_WALKERS: u32 = 3;
-/// Messages of a group, at most: those who came first should not wait for long.
-const GROUP: usize = 64;
 
 /// Why a campaign cannot go on.
 #[derive(Debug, thiserror::Error)]
@@ -80,84 +81,142 @@ struct Shell {
     store: Store,
     stopping: Arc<AtomicBool>,
     queue_limit: u64,
+    /// What is decided and not yet on its way to the disk.
+    decided: Option<Commit>,
     /// Walkers that wait for a turn, in the order in which they came.
-    waiting: VecDeque<(u32, oneshot::Sender<Option<Work>>)>,
+    waiting: VecDeque<(u32, Reply)>,
+    /// Those whose answer is known and waits for the commit before it.
+    promised: Vec<Promise>,
     /// The walk that each of the others has in hand.
     at_work: HashMap<u32, WalkId>,
     /// Walkers that crashed with the present turn of a walk.
     costs: HashMap<WalkId, u32>,
 }
 
+type Reply = oneshot::Sender<Option<Work>>;
+
+/// The answer to a walker.
+struct Promise {
+    walker: u32,
+    reply: Reply,
+    work: Option<Work>,
+}
+
 impl Reactor {
     /// Runs until every walker has been sent home: all walks over, or stopped.
     pub async fn run(self, mut watch: impl FnMut(Notice<'_>)) -> Result<Ended, ReactorError> {
-        let Self { selector, store, incoming, stopping, queue_limit } = self;
-        let mut arrivals = Arrivals::new(incoming, selector.examiner().clone(), selector.mixture());
-        let (waiting, at_work, costs) = (VecDeque::new(), HashMap::new(), HashMap::new());
-        let mut shell = Shell { selector, store, stopping, queue_limit, waiting, at_work, costs };
+        let mut arrivals =
+            Arrivals::new(self.incoming, self.selector.examiner().clone(), self.selector.mixture());
+        let mut shell = Shell::new(self.selector, self.store, self.stopping, self.queue_limit);
         // An interval, not a time since the last message: walkers at work may report progress without a pause.
         let mut look = tokio::time::interval(QUEUE_LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        // One commit at a time.
+        let mut writing = JoinSet::new();
+        let mut open = true;
         loop {
-            let group = tokio::select! {
-                group = arrivals.take(GROUP) => group,
-                _ = look.tick(), if !shell.waiting.is_empty() => {
-                    shell.answer(&mut watch).await?;
-                    continue;
+            tokio::select! {
+                Some(written) = writing.join_next() => {
+                    let written: Result<Commit, StoreError> =
+                        written.unwrap_or_else(|error| resume_unwind(error.into_panic()));
+                    watch(Notice::Committed(&written?));
+                    shell.keep_promises();
                 }
-            };
-            if group.is_empty() {
-                // Every walker has gone home.
-                return Ok(if shell.selector.is_done() { Ended::Done } else { Ended::Stopped });
+                group = arrivals.take(), if open => {
+                    let group = group.unwrap_or_default();
+                    open = !group.is_empty();
+                    let told = group.iter().all(|arrival| matches!(arrival, Arrival::Progress(..)));
+                    shell.decide(group, &mut watch)?;
+                    if open && told {
+                        continue;
+                    }
+                    arrivals.in_force(shell.selector.mixture());
+                }
+                _ = look.tick(), if !shell.waiting.is_empty() => {}
             }
-            let answer = group.iter().any(|arrival| !matches!(arrival, Arrival::Progress(..)));
-            let commit = shell.decide(group, &mut watch).await?;
-            arrivals.in_force(shell.selector.mixture());
-            if let Some(commit) = commit {
-                shell.store.commit(&commit).await?;
-                watch(Notice::Committed(&commit));
+            if !writing.is_empty() {
+                continue;
             }
-            if answer {
-                shell.answer(&mut watch).await?;
+            shell.promise(&mut watch).await?;
+            if let Some(commit) = shell.decided.take() {
+                writing.spawn(write(shell.store.clone(), commit));
+            } else {
+                shell.keep_promises();
+                if !open {
+                    // Every walker has gone home.
+                    return Ok(if shell.selector.is_done() { Ended::Done } else { Ended::Stopped });
+                }
             }
         }
     }
 }
 
+async fn write(store: Store, commit: Commit) -> Result<Commit, StoreError> {
+    store.commit(&commit).await?;
+    Ok(commit)
+}
+
+/// Structures that a commit accepts: as many jobs, at most, come to the queue.
+fn accepted(commit: &Commit) -> u64 {
+    commit.candidates.iter().filter(|candidate| candidate.fate == Fate::Accepted).count() as u64
+}
+
 impl Shell {
-    /// Takes a group in, in the order in which it arrived. Returns what is to be committed before anybody is answered.
-    async fn decide(
+    fn new(selector: Selector, store: Store, stopping: Arc<AtomicBool>, queue_limit: u64) -> Self {
+        Self {
+            selector,
+            store,
+            stopping,
+            queue_limit,
+            decided: None,
+            waiting: VecDeque::new(),
+            promised: Vec::new(),
+            at_work: HashMap::new(),
+            costs: HashMap::new(),
+        }
+    }
+
+    /// Takes a group in, in the order in which it arrived.
+    fn decide(
         &mut self,
         group: Vec<Arrival>,
         watch: &mut impl FnMut(Notice<'_>),
-    ) -> Result<Option<Commit>, ReactorError> {
-        let mut whole = None;
+    ) -> Result<(), ReactorError> {
         for arrival in group {
-            match arrival {
-                Arrival::Progress(walk, progress) => watch(Notice::Progress(walk, progress)),
+            let commit = match arrival {
+                Arrival::Progress(walk, progress) => {
+                    watch(Notice::Progress(walk, progress));
+                    None
+                }
                 Arrival::Free { walker, report, reply } => {
                     self.at_work.remove(&walker);
                     self.waiting.push_back((walker, reply));
-                    let Some(report) = report else { continue };
-                    let report = report.done().await;
-                    self.costs.remove(&report.walk);
-                    if let Some(commit) = self.selector.examined(report)? {
-                        group::append(whole.get_or_insert_default(), commit);
+                    match report {
+                        Some(report) => {
+                            self.costs.remove(&report.walk);
+                            self.selector.examined(report)?
+                        }
+                        None => None,
                     }
                 }
-                Arrival::Gone { walker, fault } => {
-                    let Some(walk) = self.at_work.remove(&walker) else { continue };
-                    if let Some(commit) = self.lost(walk, fault)? {
-                        group::append(whole.get_or_insert_default(), commit);
-                    }
-                }
+                Arrival::Gone { walker, fault } => self.gone(walker, fault)?,
+            };
+            if let Some(commit) = commit {
+                group::append(self.decided.get_or_insert_default(), commit);
             }
         }
-        Ok(whole)
+        Ok(())
     }
 
-    /// A walker was lost with a turn in hand: another gets it, unless it is the turn that kills them.
-    fn lost(&mut self, walk: WalkId, fault: Option<String>) -> Result<Option<Commit>, ReactorError> {
+    /// A walker was lost. If it had a turn in hand, another gets it, unless it is the turn that kills them.
+    fn gone(&mut self, walker: u32, fault: Option<String>) -> Result<Option<Commit>, ReactorError> {
+        if let Some(index) = self.promised.iter().position(|promise| promise.walker == walker) {
+            if let Some(work) = self.promised.remove(index).work {
+                self.selector.lost(work.assignment.walk);
+            }
+            return Ok(None);
+        }
+        let Some(walk) = self.at_work.remove(&walker) else { return Ok(None) };
         if fault.is_some() {
             let cost = self.costs.entry(walk).or_default();
             *cost += 1;
@@ -171,8 +230,11 @@ impl Shell {
         Ok(None)
     }
 
-    /// Gives turns to waiting walkers as far as there are any, or sends them home.
-    async fn answer(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<(), ReactorError> {
+    /// Chooses turns for waiting walkers as far as there are any, or that they go home.
+    async fn promise(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<(), ReactorError> {
+        if self.waiting.is_empty() {
+            return Ok(());
+        }
         if self.stopping.load(Ordering::Relaxed) {
             self.send_home();
             return Ok(());
@@ -182,16 +244,17 @@ impl Shell {
             watch(Notice::QueueFull(unfinished));
             return Ok(());
         }
+        let accepted = self.decided.as_ref().map_or(0, accepted);
+        if unfinished + accepted > self.queue_limit {
+            // The queue may be full when these have come to it: it is looked at after their commit.
+            return Ok(());
+        }
         while let Some((walker, reply)) = self.waiting.pop_front() {
             match self.selector.next_turn() {
                 Next::Turn(assignment) => {
-                    let walk = assignment.walk;
-                    let work = Work { assignment: *assignment, mixture: Arc::clone(self.selector.mixture()) };
-                    if reply.send(Some(work)).is_ok() {
-                        self.at_work.insert(walker, walk);
-                    } else {
-                        self.selector.lost(walk);
-                    }
+                    let mixture = Arc::clone(self.selector.mixture());
+                    let work = Some(Work { assignment: *assignment, mixture });
+                    self.promised.push(Promise { walker, reply, work });
                 }
                 Next::Wait => {
                     self.waiting.push_front((walker, reply));
@@ -207,9 +270,20 @@ impl Shell {
     }
 
     fn send_home(&mut self) {
-        for (_, reply) in self.waiting.drain(..) {
-            // A walker that is gone already needs no answer.
-            let _ = reply.send(None);
+        let home = |(walker, reply)| Promise { walker, reply, work: None };
+        self.promised.extend(self.waiting.drain(..).map(home));
+    }
+
+    /// Sends the answers: all that they rest on is on the disk.
+    fn keep_promises(&mut self) {
+        for Promise { walker, reply, work } in self.promised.drain(..) {
+            let walk = work.as_ref().map(|work| work.assignment.walk);
+            match (reply.send(work), walk) {
+                (Ok(()), Some(walk)) => drop(self.at_work.insert(walker, walk)),
+                // A walker that is gone needs no answer, and another gets its turn.
+                (Err(_), Some(walk)) => self.selector.lost(walk),
+                (_, None) => {}
+            }
         }
     }
 }
