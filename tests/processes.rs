@@ -49,6 +49,26 @@ fn with_keys(path: &Path, keys: &str) {
     fs::write(path, text).unwrap();
 }
 
+/// Waits for the end of the campaign, which is in order, leaves nothing behind, and is that of an undisturbed run.
+fn ends_as_undisturbed(mut running: Running, directory: &Path, small: &Small) {
+    assert_eq!(wait(&mut running), Some(0), "{}", said(directory));
+    assert_eq!(outcome(directory), expected(small));
+    nothing_is_left(directory);
+}
+
+/// Runs a long campaign to its end. What `disturb` does to it when its walkers are at work must change nothing.
+fn disturbed(keys: &str, disturb: impl FnOnce(&Path)) -> tempfile::TempDir {
+    let small = long();
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    with_keys(&small.write(here), keys);
+    let running = start(here);
+    wait_for_work(here);
+    disturb(here);
+    ends_as_undisturbed(running, here, &small);
+    directory
+}
+
 /// A campaign with a model of its own, which can be spoiled.
 fn with_own_model(small: &Small, directory: &Path) {
     let path = small.write(directory);
@@ -89,55 +109,34 @@ fn wait_for_work(directory: &Path) {
 
 #[test]
 fn a_hung_walker_is_killed_and_replaced() {
-    let small = long();
-    let directory = tempfile::tempdir().unwrap();
-    let here = directory.path();
-    with_keys(&small.write(here), "silence_limit = 5.0");
-    let mut running = start(here);
-    wait_for_work(here);
-    let walker = carrying_out(here, "walker")[0];
-    signal(walker, "STOP");
-    assert_eq!(wait(&mut running), Some(0), "{}", said(here));
-    assert!(!processes_in(here).iter().any(|process| process.pid == walker));
-    let endings = endings(here);
+    let mut hung = 0;
+    let directory = disturbed("silence_limit = 5.0", |here| {
+        hung = carrying_out(here, "walker")[0];
+        signal(hung, "STOP");
+    });
+    assert!(!processes_in(directory.path()).iter().any(|process| process.pid == hung));
+    let endings = endings(directory.path());
     let hung =
         |ending: &String| ending.contains("silent for 5 s, killed") && ending.contains(r#""kind":"walker""#);
     assert_eq!(endings.iter().filter(|ending| hung(ending)).count(), 1, "{endings:?}");
-    assert_eq!(outcome(here), expected(&small));
-    nothing_is_left(here);
 }
 
 #[test]
 fn a_walker_that_is_told_to_end_leaves_its_walk_to_another() {
-    let small = long();
-    let directory = tempfile::tempdir().unwrap();
-    let here = directory.path();
-    small.write(here);
-    let mut running = start(here);
-    wait_for_work(here);
-    signal(carrying_out(here, "walker")[0], "TERM");
-    assert_eq!(wait(&mut running), Some(0), "{}", said(here));
-    assert!(endings(here).iter().any(|ending| ending.contains("exit code 130")), "{:?}", endings(here));
-    assert_eq!(outcome(here), expected(&small));
-    nothing_is_left(here);
+    let directory = disturbed("", |here| signal(carrying_out(here, "walker")[0], "TERM"));
+    let endings = endings(directory.path());
+    assert!(endings.iter().any(|ending| ending.contains("exit code 130")), "{endings:?}");
 }
 
 #[test]
 fn a_labeller_that_is_told_to_end_is_replaced() {
-    let directory = tempfile::tempdir().unwrap();
-    let here = directory.path();
-    let small = long();
-    small.write(here);
-    let mut running = start(here);
-    wait_for_work(here);
-    let labeller = carrying_out(here, "labeller")[0];
-    signal(labeller, "TERM");
-    wait_until("another is there", || {
-        carrying_out(here, "labeller").first().is_some_and(|other| *other != labeller)
+    disturbed("", |here| {
+        let labeller = carrying_out(here, "labeller")[0];
+        signal(labeller, "TERM");
+        wait_until("another is there", || {
+            carrying_out(here, "labeller").first().is_some_and(|other| *other != labeller)
+        });
     });
-    assert_eq!(wait(&mut running), Some(0), "{}", said(here));
-    assert_eq!(outcome(here), expected(&small));
-    nothing_is_left(here);
 }
 
 #[test]
@@ -147,7 +146,7 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
     let here = directory.path();
     with_own_model(&small, here);
     with_keys(&here.join("campaign.toml"), "restarts = 1");
-    let mut running = start(here);
+    let running = start(here);
     wait_for_work(here);
     let model = fs::read(here.join("model.npz")).unwrap();
     fs::write(here.join("model.npz"), b"spoiled").unwrap();
@@ -159,10 +158,8 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
     wait_until("status shows it", || shown(here).iter().any(given_up));
     let table = succeed(here, ["status", "."]);
     assert!(table.contains("given up") && table.contains("another content"), "{table}");
-    assert_eq!(wait(&mut running), Some(0), "{}", said(here));
     fs::write(here.join("model.npz"), model).unwrap();
-    assert_eq!(outcome(here), expected(&small));
-    nothing_is_left(here);
+    ends_as_undisturbed(running, here, &small);
 }
 
 #[test]
@@ -182,9 +179,7 @@ fn without_any_walker_the_campaign_fails_and_can_go_on() {
     assert!(message.contains("no walker is left") && message.contains("another content"), "{message}");
     nothing_is_left(here);
     fs::write(here.join("model.npz"), model).unwrap();
-    assert_eq!(wait(&mut start(here)), Some(0), "{}", said(here));
-    assert_eq!(outcome(here), expected(&small));
-    nothing_is_left(here);
+    ends_as_undisturbed(start(here), here, &small);
 }
 
 #[test]
@@ -202,15 +197,13 @@ fn walkers_end_with_their_orchestrator_and_labellers_are_adopted() {
     running.0.kill().unwrap();
     running.0.wait().unwrap();
     wait_until("walkers are gone", || carrying_out(here, "walker").is_empty());
-    let mut running = start(here);
+    let running = start(here);
     wait_until("there are walkers again", || carrying_out(here, "walker").len() == 2);
     signal(labellers[0], "CONT");
     assert_eq!(carrying_out(here, "labeller"), labellers);
     let second = refuse(here, RUN);
     assert!(second.contains(&format!("process {}", running.0.id())), "{second}");
-    assert_eq!(wait(&mut running), Some(0), "{}", said(here));
-    assert_eq!(outcome(here), expected(&small));
-    nothing_is_left(here);
+    ends_as_undisturbed(running, here, &small);
 }
 
 #[test]
