@@ -1,6 +1,5 @@
 //! Everything in one process: walkers as threads, reactor and labellers as tasks.
 
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
@@ -18,7 +17,7 @@ use workers::walk::WalkContext;
 use workers::walker;
 
 use super::starts::no_labellers;
-use super::{CHANNEL, ReactorTask, start_reactor, stop_on_signals, wanted_walkers};
+use super::{CHANNEL, ReactorTask, Run, start_reactor, stop_on_signals, wanted_walkers};
 use crate::campaign::Campaign;
 use crate::outcome::Failure;
 
@@ -26,20 +25,14 @@ use crate::outcome::Failure;
 const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
 
 /// Runs the campaign until it is done or stopped.
-pub async fn work(
-    campaign: &Campaign,
-    selector: Selector,
-    store: &Store,
-    process: &ProcessRecord,
-    directory: &Path,
-) -> Result<reactor::Ended, Failure> {
-    if let Ok(place) = Place::of(directory) {
+pub async fn work(run: Run<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
+    if let Ok(place) = Place::of(run.directory) {
         // What a killed run left; this one needs nothing there.
         let _ = place.remove();
     }
-    no_labellers(store).await?;
-    let actors = Actors::start(campaign, selector, store, process)?;
-    let alive = tokio::spawn(say_alive(store.clone(), process.clone()));
+    no_labellers(run.store).await?;
+    let actors = Actors::start(run, selector)?;
+    let alive = tokio::spawn(say_alive(run.store.clone(), run.process.clone()));
     let ended = actors.finish().await;
     alive.abort();
     ended
@@ -66,12 +59,7 @@ struct Actors {
 
 impl Actors {
     /// Starts them all.
-    fn start(
-        campaign: &Campaign,
-        selector: Selector,
-        store: &Store,
-        process: &ProcessRecord,
-    ) -> Result<Self, Failure> {
+    fn start(run: Run<'_>, selector: Selector) -> Result<Self, Failure> {
         let stopping = Arc::new(AtomicBool::new(false));
         let closing = Arc::new(Closing::default());
         let asked = (Arc::clone(&stopping), Arc::clone(&closing));
@@ -80,9 +68,9 @@ impl Actors {
             asked.1.stopping.store(true, Ordering::Relaxed);
         })?;
         let (to_reactor, incoming) = mpsc::channel(CHANNEL);
-        let walkers = start_walkers(campaign, &to_reactor, &stopping)?;
-        let labellers = start_labellers(campaign, store, process, &closing)?;
-        let reactor = start_reactor(campaign, selector, store, incoming, &stopping);
+        let walkers = start_walkers(run.campaign, &to_reactor, &stopping)?;
+        let labellers = start_labellers(run, &closing)?;
+        let reactor = start_reactor(run, selector, incoming, &stopping);
         Ok(Self { walkers, labellers, reactor, closing, stopping })
     }
 
@@ -146,12 +134,8 @@ fn start_walkers(
     (0..wanted_walkers(campaign)).map(start).collect()
 }
 
-fn start_labellers(
-    campaign: &Campaign,
-    store: &Store,
-    process: &ProcessRecord,
-    closing: &Arc<Closing>,
-) -> Result<JoinSet<Result<(), StoreError>>, Failure> {
+fn start_labellers(run: Run<'_>, closing: &Arc<Closing>) -> Result<JoinSet<Result<(), StoreError>>, Failure> {
+    let Run { campaign, store, process, .. } = run;
     let label = &campaign.config.label;
     let mut labellers = JoinSet::new();
     for slot in 0..label.slots.get() {

@@ -6,6 +6,7 @@ mod labellers;
 pub mod processes;
 mod starts;
 
+use std::path::Path;
 use std::process;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -13,7 +14,7 @@ use std::thread;
 
 use orchestrator::reactor::{self, Reactor};
 use orchestrator::selector::Selector;
-use store::Store;
+use store::{ProcessRecord, Store};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use wire::transport::Incoming;
@@ -26,25 +27,38 @@ use crate::progress::Display;
 /// Reports under way between walkers and reactor.
 const CHANNEL: usize = 64;
 
+/// A run of a campaign.
+#[derive(Clone, Copy)]
+pub struct Run<'a> {
+    /// All that its configuration names.
+    pub campaign: &'a Campaign,
+    /// Its database.
+    pub store: &'a Store,
+    /// The record of this process.
+    pub process: &'a ProcessRecord,
+    /// Its directory.
+    pub directory: &'a Path,
+}
+
 /// The reactor at work.
 type ReactorTask = tokio::task::JoinHandle<Result<reactor::Ended, reactor::ReactorError>>;
 
 /// Starts the reactor, with a display of what it does.
 fn start_reactor(
-    campaign: &Campaign,
+    run: Run<'_>,
     selector: Selector,
-    store: &Store,
     incoming: mpsc::Receiver<Incoming>,
     stopping: &Arc<AtomicBool>,
 ) -> ReactorTask {
-    let walk_steps = campaign.config.walk.equilibration + campaign.config.walk.steps.get();
+    let config = &run.campaign.config;
+    let walk_steps = config.walk.equilibration + config.walk.steps.get();
     let mut display = Display::new(walk_steps, selector.standing(walk_steps));
     let reactor = Reactor {
         selector,
-        store: store.clone(),
+        store: run.store.clone(),
         incoming,
         stopping: Arc::clone(stopping),
-        queue_limit: u64::from(campaign.config.label.queue_limit.get()),
+        queue_limit: u64::from(config.label.queue_limit.get()),
     };
     tokio::spawn(async move {
         let ended = reactor.run(|notice| display.notice(&notice)).await;

@@ -2,7 +2,6 @@
 //!
 //! Walkers end with this process; labellers go on without it, and the next run adopts them.
 
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -11,7 +10,7 @@ use orchestrator::launcher::Children;
 use orchestrator::reactor;
 use orchestrator::selector::Selector;
 use orchestrator::supervisor::Limits;
-use store::{ProcessRecord, Store};
+use store::ProcessRecord;
 use tokio::sync::{Notify, mpsc};
 use tokio::task::{JoinError, JoinHandle};
 use wire::ipc::{IpcError, Server, Sizes, space_needed};
@@ -19,8 +18,7 @@ use wire::mixture::SharedMixture;
 use wire::place::Place;
 
 use super::crew::{self, Crew};
-use super::{CHANNEL, ReactorTask, start_reactor, starts, stop_on_signals, wanted_walkers};
-use crate::campaign::Campaign;
+use super::{CHANNEL, ReactorTask, Run, start_reactor, starts, stop_on_signals, wanted_walkers};
 use crate::outcome::Failure;
 
 /// Labellers give their signs of life in the database, which may be busy for a while.
@@ -28,15 +26,9 @@ const LABELLER_SILENCE: Duration = Duration::from_secs(60);
 
 /// Runs the campaign until it is done or stopped. To be awaited on the main thread: the walkers end with the thread that
 /// starts them.
-pub async fn work(
-    campaign: &Campaign,
-    selector: Selector,
-    store: &Store,
-    process: &ProcessRecord,
-    directory: &Path,
-) -> Result<reactor::Ended, Failure> {
-    let place = Place::of(directory).map_err(Failure::failed)?;
-    let ended = work_in(&place, campaign, selector, store, process, directory).await;
+pub async fn work(run: Run<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
+    let place = Place::of(run.directory).map_err(Failure::failed)?;
+    let ended = work_in(&place, run, selector).await;
     // Nobody is left who could need it. What cannot be removed now is at the next start.
     let removed = place.remove().map_err(Failure::failed);
     let ended = ended?;
@@ -44,14 +36,8 @@ pub async fn work(
     Ok(ended)
 }
 
-async fn work_in(
-    place: &Place,
-    campaign: &Campaign,
-    selector: Selector,
-    store: &Store,
-    process: &ProcessRecord,
-    directory: &Path,
-) -> Result<reactor::Ended, Failure> {
+async fn work_in(place: &Place, run: Run<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
+    let Run { campaign, store, process, .. } = run;
     let walkers = wanted_walkers(campaign);
     let mixture = Arc::clone(selector.mixture());
     let sizes = Sizes { walkers, message_bytes: campaign.largest_message() };
@@ -76,12 +62,12 @@ async fn work_in(
     let line = server.handle();
     let walkers = Children::new(walkers, limits, starts::walker(campaign, line.clone())?);
     let limits = Limits { silence: limits.silence.max(LABELLER_SILENCE), outlives: true, ..limits };
-    let labellers = starts::labellers(campaign, directory, store, limits).await?;
+    let labellers = starts::labellers(run, limits).await?;
     let crew = Crew::new(store, process.clone(), line, walkers, labellers, Arc::clone(&stopping));
 
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
     let serving = tokio::spawn(server.run(shared, to_reactor, crew.listener()));
-    let reactor = start_reactor(campaign, selector, store, incoming, &stopping);
+    let reactor = start_reactor(run, selector, incoming, &stopping);
     lead(crew, reactor, serving, &stop).await
 }
 

@@ -8,6 +8,7 @@ use orchestrator::supervisor::Limits;
 use store::{ProcessRecord, Store};
 use wire::ipc::Handle;
 
+use super::Run;
 use super::labellers::Labellers;
 use crate::campaign::Campaign;
 use crate::config::LabelMethod;
@@ -36,12 +37,8 @@ pub fn walker(
 }
 
 /// The labellers: those that an earlier run left and that work as this one wants it, and new ones in the other places.
-pub async fn labellers(
-    campaign: &Campaign,
-    directory: &Path,
-    store: &Store,
-    limits: Limits,
-) -> Result<Labellers, Failure> {
+pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failure> {
+    let Run { campaign, store, directory, .. } = run;
     let LabelMethod::Reference(potential) = &campaign.config.label.method;
     let setup = LabellerSetup {
         number: 0,

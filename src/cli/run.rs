@@ -11,7 +11,7 @@ use serde_json::json;
 use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError, unix_milliseconds};
 
 use super::{Ended, Failure, block_on};
-use crate::actors::{in_process, processes};
+use crate::actors::{self, in_process, processes};
 use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
 use crate::output::{print, say};
@@ -62,10 +62,11 @@ async fn run(campaign: &Campaign, directory: &Path, in_process: bool) -> Result<
     let store = open_store(campaign, directory).await?;
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
+    let run = actors::Run { campaign, store: &store, process: &process, directory };
     let ended = if in_process {
-        in_process::work(campaign, selector, &store, &process, directory).await?
+        in_process::work(run, selector).await?
     } else {
-        processes::work(campaign, selector, &store, &process, directory).await?
+        processes::work(run, selector).await?
     };
     leave(&store, &process, ended).await?;
     if !store.status().await?.finished {
