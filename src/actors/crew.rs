@@ -1,18 +1,17 @@
-//! The processes of a campaign, and what is said of them: to those who watch, in `status`, in the operations log.
+//! The processes of a campaign: what happens to them, and what is done about it.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use orchestrator::launcher::{self, Children};
-use orchestrator::supervisor::{Ended, Standing};
-use serde_json::json;
+use orchestrator::supervisor::Standing;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::time::{Interval, MissedTickBehavior, interval};
 use wire::ipc::Handle;
 
 use super::labellers::Labellers;
+use super::records::Records;
 use crate::outcome::Failure;
 use crate::output::say;
 
@@ -26,15 +25,10 @@ const PROVEN: i64 = 10_000;
 /// Walkers and labellers at work.
 pub struct Crew<'a> {
     store: &'a Store,
-    /// The record of this process.
-    process: ProcessRecord,
+    records: Records<'a>,
     line: Handle,
     walkers: Children,
     labellers: Labellers,
-    /// Walkers, as `status` shows them.
-    records: BTreeMap<u32, ProcessRecord>,
-    /// When each walker was last heard, ms since 1970.
-    heard: Arc<[AtomicI64]>,
     look: Interval,
     last_labels: Option<Interval>,
     /// Whether every walker is gone, every labeller.
@@ -42,8 +36,6 @@ pub struct Crew<'a> {
     /// Tells the reactor to send walkers home.
     stopping: Arc<AtomicBool>,
     failure: Option<String>,
-    /// Messages dropped that were spoken of.
-    dropped: u64,
     /// Whether the database could not be written to at the last try.
     deaf: bool,
 }
@@ -72,32 +64,27 @@ impl<'a> Crew<'a> {
     ) -> Self {
         let mut look = interval(SIGN_OF_LIFE);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let heard = walkers.status().iter().map(|_| AtomicI64::default()).collect();
+        let records = Records::new(store, process, walkers.status().len());
         Self {
             store,
-            process,
+            records,
             line,
             walkers,
             labellers,
-            records: BTreeMap::new(),
-            heard,
             look,
             last_labels: None,
             gone: [false; 2],
             stopping,
             failure: None,
-            dropped: 0,
             deaf: false,
         }
     }
 
     /// To be told which walker was heard, and whether it delivered something.
     pub fn listener(&self) -> impl FnMut(u32, bool) + Send + 'static {
-        let (signs, heard) = (self.walkers.signs(), Arc::clone(&self.heard));
+        let (signs, heard) = (self.walkers.signs(), self.records.listener());
         move |walker, useful| {
-            if let Some(heard) = heard.get(walker as usize) {
-                heard.store(unix_milliseconds(), Ordering::Relaxed);
-            }
+            heard(walker);
             if useful { signs.useful(walker) } else { signs.heard(walker) }
         }
     }
@@ -176,11 +163,7 @@ impl<'a> Crew<'a> {
     async fn walker(&mut self, event: launcher::Event) -> Result<(), StoreError> {
         match event {
             launcher::Event::Started { number, incarnation, pid } => {
-                let restarts = incarnation.saturating_sub(1);
-                let record = new_record(ProcessRecord::WALKER, number, pid);
-                let record = ProcessRecord { restarts, ..record };
-                self.records.insert(number, record.clone());
-                self.store.upsert_process(&record).await?;
+                self.records.walker_started(number, incarnation, pid).await?;
             }
             launcher::Event::Said { number, line } => say(format_args!("walker {number}: {line}")),
             launcher::Event::Ended { number, ended } => {
@@ -190,14 +173,7 @@ impl<'a> Crew<'a> {
                     // There is no more work for the others either.
                     self.walkers.close();
                 }
-                let record = self.records.remove(&number);
-                // One that could not even be started has none.
-                let record = record.unwrap_or_else(|| new_record(ProcessRecord::WALKER, number, 0));
-                let record = judged(record, &ended);
-                if ended.then != Standing::GoneHome {
-                    self.records.insert(number, record.clone());
-                }
-                self.say_how_it_ended(&record, &ended).await?;
+                self.records.walker_ended(number, &ended).await?;
             }
             launcher::Event::AllGone => {
                 self.gone[0] = true;
@@ -215,8 +191,7 @@ impl<'a> Crew<'a> {
             launcher::Event::Said { number, line } => say(format_args!("labeller {number}: {line}")),
             launcher::Event::Ended { number, ended } => {
                 let record = self.labellers.ended(self.store, number, &ended).await?;
-                let record = record.unwrap_or_else(|| new_record(ProcessRecord::LABELLER, number, 0));
-                self.say_how_it_ended(&judged(record, &ended), &ended).await?;
+                self.records.labeller_ended(number, record, &ended).await?;
             }
             launcher::Event::AllGone => {
                 self.gone[1] = true;
@@ -234,48 +209,11 @@ impl<'a> Crew<'a> {
         }
     }
 
-    /// Writes down how a process ended.
-    async fn say_how_it_ended(&self, record: &ProcessRecord, ended: &Ended) -> Result<(), StoreError> {
-        if ended.then == Standing::GoneHome {
-            return self.store.remove_process(&record.id).await;
-        }
-        let ProcessRecord { kind, number, .. } = record;
-        let shown = number.map_or_else(|| kind.clone(), |number| format!("{kind} {number}"));
-        say(format_args!("{shown}: {}; {}", ended.ending, ended.then));
-        self.store.upsert_process(record).await?;
-        let detail = json!({
-            "kind": kind, "number": number, "incarnation": ended.incarnation, "how": ended.ending.to_string(),
-            "then": ended.then.to_string(),
-        });
-        self.store.log_operation(unix_milliseconds(), "process_ended", &detail).await
-    }
-
     /// Signs of life: this process and its walkers give them in the database, labellers by themselves.
     async fn look(&mut self) -> Result<(), StoreError> {
-        let now = unix_milliseconds();
-        self.process.last_seen = now;
-        for (number, record) in &mut self.records {
-            let heard = self.heard.get(*number as usize).map_or(0, |heard| heard.load(Ordering::Relaxed));
-            record.last_seen = record.last_seen.max(heard);
-        }
-        let traffic = self.line.traffic();
-        let strangers = (traffic.dropped > self.dropped).then(|| {
-            let last = traffic.last_dropped.unwrap_or_default();
-            format!("{} messages dropped; the last: {last}", traffic.dropped)
-        });
-        if let Some(strangers) = &strangers {
-            self.process.remark.clone_from(strangers);
-        }
-        let records: Vec<_> = self.records.values().chain([&self.process]).cloned().collect();
-        self.store.upsert_processes(&records).await?;
-        if let Some(strangers) = strangers {
-            say(&strangers);
-            let detail = json!({ "dropped": traffic.dropped, "remark": strangers });
-            self.store.log_operation(now, "messages_dropped", &detail).await?;
-            self.dropped = traffic.dropped;
-        }
+        self.records.look(self.line.traffic()).await?;
         // Also of those whose end could not be written down at once.
-        self.store.release_leases_of_gone_processes(now).await?;
+        self.store.release_leases_of_gone_processes(unix_milliseconds()).await?;
         self.labellers.look(self.store, PROVEN).await
     }
 
@@ -286,20 +224,6 @@ impl<'a> Crew<'a> {
         }
         Ok(())
     }
-}
-
-fn new_record(kind: &str, number: u32, pid: u32) -> ProcessRecord {
-    ProcessRecord::new(kind, Some(number), pid, unix_milliseconds())
-}
-
-/// The record of a process that ended.
-fn judged(mut record: ProcessRecord, ended: &Ended) -> ProcessRecord {
-    record.state = match ended.then {
-        Standing::Pausing { .. } => "pausing".to_owned(),
-        then => then.to_string(),
-    };
-    record.remark = ended.ending.to_string();
-    record
 }
 
 /// How the last of them failed, if all were given up.

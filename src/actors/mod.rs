@@ -4,6 +4,7 @@ mod crew;
 pub mod in_process;
 mod labellers;
 pub mod processes;
+mod records;
 mod starts;
 
 use std::path::Path;
