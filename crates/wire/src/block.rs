@@ -10,82 +10,22 @@
 //! | γ_nbr under the walker's mixture | f64 | n |
 //! | features z | f64 | n × D |
 //!
-//! The arrays follow the header (see [`Header`]) in this order without gaps, so their places follow from
+//! The arrays follow the header in this order without gaps, so their places follow from
 //! n and D; the header repeats the length of the whole, and a CRC-32 of everything after itself.
+
+mod candidate;
+mod layout;
+mod view;
 
 use std::fmt;
 use std::sync::Arc;
 
-use atoms::{Cell, Matrix3, Species, Structure, Vec3};
-use zerocopy::{CastError, FromBytes, Immutable, IntoBytes, KnownLayout};
+use zerocopy::IntoBytes;
 
-use crate::ids::{CampaignId, CandidateId, ContentHash, Origin, WalkId};
+use layout::{Counts, HEADER, Header, VERSION, length, seal};
 
-#[cfg(not(target_endian = "little"))]
-compile_error!("candidate blocks are little-endian and read in place");
-
-const MAGIC: [u8; 8] = *b"CALMCAND";
-const VERSION: u32 = 1;
-/// More atoms or features than this are taken for a damaged header.
-const LARGEST: u64 = 1 << 32;
-
-/// What a walker knows of a structure when it offers it.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Candidate {
-    /// Its name.
-    pub id: CandidateId,
-    /// Biased, or a frame of a control walk.
-    pub origin: Origin,
-    /// Version of the mixture that the walker saw.
-    pub mixture_version: u64,
-    /// Kinetic temperature, K.
-    pub temperature: f64,
-    /// V / V₀.
-    pub relative_volume: f64,
-    /// Energy of the potential, without bias and ZBL, eV.
-    pub energy: f64,
-    /// −∂E/∂ε of the same, eV.
-    pub virial: Matrix3,
-    /// The structure.
-    pub structure: Structure,
-    /// −∂E/∂r of the same, [n], eV/Å.
-    pub forces: Vec<Vec3>,
-    /// γ under the walker's mixture, [n].
-    pub gamma: Vec<f64>,
-    /// γ_nbr under the walker's mixture, [n].
-    pub gamma_nbr: Vec<f64>,
-    /// Features, [n × D].
-    pub features: Vec<f64>,
-}
-
-/// The fixed part of a block, 288 bytes.
-#[derive(Clone, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
-#[repr(C)]
-pub struct Header {
-    magic: [u8; 8],
-    version: u32,
-    checksum: u32,
-    length: u64,
-    atoms: u64,
-    features: u64,
-    campaign: [u8; 16],
-    content: [u8; 32],
-    walk: u32,
-    segment: u32,
-    step: u64,
-    mixture_version: u64,
-    origin: u32,
-    periodic: [u8; 4],
-    temperature: f64,
-    relative_volume: f64,
-    energy: f64,
-    cell: [f64; 9],
-    virial: [f64; 9],
-}
-
-const HEADER: usize = size_of::<Header>();
-/// The checksum covers everything behind itself.
-const CHECKED_FROM: usize = 16;
+pub use candidate::Candidate;
+pub use view::CandidateView;
 
 /// Why bytes are not a candidate.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -136,115 +76,8 @@ pub struct CandidateBlock {
     counts: Counts,
 }
 
-/// Numbers of atoms and of features an atom.
-#[derive(Clone, Copy, Debug)]
-struct Counts {
-    atoms: usize,
-    features: usize,
-}
-
 /// Memory of this process, aligned to 8.
 struct Words(Vec<u64>);
-
-/// A block read in place.
-#[derive(Clone, Debug)]
-pub struct CandidateView<'a> {
-    header: &'a Header,
-    counts: Counts,
-    /// Atomic numbers, [n].
-    pub numbers: &'a [u64],
-    /// Positions, [n], Å.
-    pub positions: &'a [Vec3],
-    /// Forces of the potential, [n], eV/Å.
-    pub forces: &'a [Vec3],
-    /// γ under the walker's mixture, [n].
-    pub gamma: &'a [f64],
-    /// γ_nbr under the walker's mixture, [n].
-    pub gamma_nbr: &'a [f64],
-    /// Features, [n × D].
-    pub features: &'a [f64],
-}
-
-/// Bytes of a block with `atoms` atoms and `features` features an atom.
-fn length(atoms: u64, features: u64) -> u64 {
-    HEADER as u64 + 8 * atoms * (1 + 3 + 3 + 1 + 1 + features)
-}
-
-/// Writes the checksum of a block into its header.
-fn seal(block: &mut [u8]) {
-    let checksum = crc32fast::hash(&block[CHECKED_FROM..]);
-    block[CHECKED_FROM - 4..CHECKED_FROM].copy_from_slice(&checksum.to_le_bytes());
-}
-
-impl Candidate {
-    /// Bytes of its block.
-    pub fn encoded_len(&self) -> usize {
-        length(self.structure.len() as u64, self.feature_dimension() as u64) as usize
-    }
-
-    /// Features an atom, D.
-    fn feature_dimension(&self) -> usize {
-        self.features.len().checked_div(self.structure.len()).unwrap_or(0)
-    }
-
-    /// Writes its block to `out`, [`Candidate::encoded_len`] bytes. The arrays must have the lengths their
-    /// documentation gives, and its name the hash of its structure.
-    ///
-    /// # Panics
-    /// If they have not: that is an error of the caller, not of input.
-    pub fn encode_into(&self, out: &mut [u8]) {
-        let Self { structure, forces, gamma, gamma_nbr, features, .. } = self;
-        let n = structure.len();
-        assert!([structure.positions.len(), forces.len(), gamma.len(), gamma_nbr.len()] == [n; 4] && n > 0);
-        assert_eq!(features.len() % n, 0, "features of every atom");
-        assert_eq!(self.id.content, ContentHash::of(structure), "the hash of this very structure");
-        assert_eq!(out.len(), self.encoded_len(), "room for the block");
-        let header = self.header();
-        let numbers: Vec<u64> = structure.species.iter().map(|s| u64::from(s.atomic_number())).collect();
-        let parts = [
-            header.as_bytes(),
-            numbers.as_bytes(),
-            structure.positions.as_bytes(),
-            forces.as_bytes(),
-            gamma.as_bytes(),
-            gamma_nbr.as_bytes(),
-            features.as_bytes(),
-        ];
-        let mut rest = &mut *out;
-        for part in parts {
-            let (place, behind) = rest.split_at_mut(part.len());
-            place.copy_from_slice(part);
-            rest = behind;
-        }
-        seal(out);
-    }
-
-    fn header(&self) -> Header {
-        let Self { id, structure, .. } = self;
-        let [x, y, z] = structure.periodic.map(u8::from);
-        Header {
-            magic: MAGIC,
-            version: VERSION,
-            checksum: 0,
-            length: self.encoded_len() as u64,
-            atoms: structure.len() as u64,
-            features: self.feature_dimension() as u64,
-            campaign: id.campaign.0,
-            content: id.content.0,
-            walk: id.walk.0,
-            segment: id.segment,
-            step: id.step,
-            mixture_version: self.mixture_version,
-            origin: self.origin as u32,
-            periodic: [x, y, z, 0],
-            temperature: self.temperature,
-            relative_volume: self.relative_volume,
-            energy: self.energy,
-            cell: flatten(&structure.cell.0),
-            virial: flatten(&self.virial),
-        }
-    }
-}
 
 impl CandidateBlock {
     /// Encodes a candidate into memory of this process.
@@ -320,152 +153,4 @@ impl fmt::Debug for CandidateBlock {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "CandidateBlock({}, {} bytes)", self.view().id(), self.as_bytes().len())
     }
-}
-
-impl<'a> CandidateView<'a> {
-    /// Reads `bytes` (8-byte aligned) in place after checking all of them.
-    pub fn new(bytes: &'a [u8]) -> Result<Self, BlockError> {
-        let view = Self::split(bytes)?;
-        let expected = view.header.checksum;
-        let found = crc32fast::hash(&bytes[CHECKED_FROM..]);
-        if found != expected {
-            return Err(BlockError::Checksum { found, expected });
-        }
-        let field = |field, value: String| Err(BlockError::Field { field, value });
-        if view.header.origin > 1 {
-            return field("origin", view.header.origin.to_string());
-        }
-        if let Some(number) = view.numbers.iter().find(|z| !(1..=118).contains(*z)) {
-            return field("atomic number", number.to_string());
-        }
-        if view.header.periodic.iter().any(|p| *p > 1) || view.header.periodic[3] != 0 {
-            return field("periodic", format!("{:?}", view.header.periodic));
-        }
-        if ContentHash::of(&view.structure()) != view.id().content {
-            return field("content hash", view.id().content.to_string());
-        }
-        Ok(view)
-    }
-
-    /// Places of the arrays, checked against the length at hand.
-    fn split(bytes: &'a [u8]) -> Result<Self, BlockError> {
-        let short = || BlockError::Short(bytes.len());
-        let (header, _) = Header::ref_from_prefix(bytes).map_err(|error| match error {
-            CastError::Alignment(_) => BlockError::Unaligned,
-            _ => short(),
-        })?;
-        if header.magic != MAGIC {
-            return Err(BlockError::Magic(header.magic));
-        }
-        if header.version != VERSION {
-            return Err(BlockError::Version(header.version));
-        }
-        let found = bytes.len() as u64;
-        let (atoms, features) = (header.atoms, header.features);
-        let plausible = (1..LARGEST).contains(&atoms) && atoms.saturating_mul(features) < LARGEST;
-        let expected = if plausible { length(atoms, features) } else { header.length };
-        if !plausible || header.length != expected || found != expected {
-            return Err(BlockError::Length { found, expected });
-        }
-        Self::arrays(bytes, Counts { atoms: atoms as usize, features: features as usize })
-    }
-
-    /// Places of the arrays of a block with so many atoms and features.
-    fn arrays(bytes: &'a [u8], counts: Counts) -> Result<Self, BlockError> {
-        let short = || BlockError::Short(bytes.len());
-        let (header, rest) = Header::ref_from_prefix(bytes).map_err(|_| short())?;
-        let n = counts.atoms;
-        let (numbers, rest) = <[u64]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
-        let (positions, rest) = <[Vec3]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
-        let (forces, rest) = <[Vec3]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
-        let (gamma, rest) = <[f64]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
-        let (gamma_nbr, rest) = <[f64]>::ref_from_prefix_with_elems(rest, n).map_err(|_| short())?;
-        let features = <[f64]>::ref_from_bytes_with_elems(rest, n * counts.features).map_err(|_| short())?;
-        Ok(Self { header, counts, numbers, positions, forces, gamma, gamma_nbr, features })
-    }
-
-    /// Its name.
-    pub fn id(&self) -> CandidateId {
-        CandidateId {
-            campaign: CampaignId(self.header.campaign),
-            walk: WalkId(self.header.walk),
-            segment: self.header.segment,
-            step: self.header.step,
-            content: ContentHash(self.header.content),
-        }
-    }
-
-    /// Biased or control.
-    pub fn origin(&self) -> Origin {
-        if self.header.origin == Origin::Control as u32 { Origin::Control } else { Origin::Biased }
-    }
-
-    /// Version of the mixture that the walker saw.
-    pub fn mixture_version(&self) -> u64 {
-        self.header.mixture_version
-    }
-
-    /// Kinetic temperature, K.
-    pub fn temperature(&self) -> f64 {
-        self.header.temperature
-    }
-
-    /// V / V₀.
-    pub fn relative_volume(&self) -> f64 {
-        self.header.relative_volume
-    }
-
-    /// Energy of the potential, eV.
-    pub fn energy(&self) -> f64 {
-        self.header.energy
-    }
-
-    /// −∂E/∂ε of the potential, eV.
-    pub fn virial(&self) -> Matrix3 {
-        unflatten(&self.header.virial)
-    }
-
-    /// Features an atom, D.
-    pub fn feature_dimension(&self) -> usize {
-        self.counts.features
-    }
-
-    /// The structure, copied out.
-    pub fn structure(&self) -> Structure {
-        let species =
-            self.numbers.iter().filter_map(|z| Species::from_atomic_number(*z as u8).ok()).collect();
-        let periodic = std::array::from_fn(|k| self.header.periodic[k] == 1);
-        Structure {
-            species,
-            positions: self.positions.to_vec(),
-            cell: Cell(unflatten(&self.header.cell)),
-            periodic,
-        }
-    }
-
-    /// Everything, copied out.
-    pub fn to_candidate(&self) -> Candidate {
-        Candidate {
-            id: self.id(),
-            origin: self.origin(),
-            mixture_version: self.mixture_version(),
-            temperature: self.temperature(),
-            relative_volume: self.relative_volume(),
-            energy: self.energy(),
-            virial: self.virial(),
-            structure: self.structure(),
-            forces: self.forces.to_vec(),
-            gamma: self.gamma.to_vec(),
-            gamma_nbr: self.gamma_nbr.to_vec(),
-            features: self.features.to_vec(),
-        }
-    }
-}
-
-fn flatten(m: &Matrix3) -> [f64; 9] {
-    std::array::from_fn(|k| m[k / 3][k % 3])
-}
-
-fn unflatten(m: &[f64; 9]) -> Matrix3 {
-    std::array::from_fn(|i| std::array::from_fn(|k| m[3 * i + k]))
 }
