@@ -3,26 +3,23 @@
 //! Whatever a walk remembers is in its [checkpoint](WalkState), so the same assignment gives the same report, whoever
 //! works on it and however often.
 
+mod candidate;
+mod state;
+
 use std::sync::Arc;
 
-use atoms::{NeighbourList, PotentialError, shortest_distance};
-use calm::neighbourhood::{Pair, neighbourhood_average};
+use atoms::PotentialError;
 use calm::{GradeError, Mixture};
-use md::{
-    Checkpoint, Dynamics, DynamicsError, Langevin, NoseHooverChain, State, Stream, Thermostat, VolumeRamp,
-};
+use md::{Dynamics, DynamicsError, Stream};
 use potentials::grace::GraceModel;
 use potentials::{Zbl, ZblRangeError};
-use serde::{Deserialize, Serialize};
 use wire::messages::{Assignment, End, Outcome, Progress, Report, Verdict};
-use wire::{Candidate, CandidateId, ContentHash, Origin};
+use wire::{Candidate, Origin};
 
-use crate::bias::{BiasState, BiasedPotential};
+use crate::bias::BiasedPotential;
 use crate::guard;
-use crate::settings::{ThermostatKind, WalkSettings};
-
-/// Checkpoints to go back to that are kept; the oldest is used, so that a return leads out of the trap.
-const KEPT_CHECKPOINTS: usize = 2;
+use crate::settings::WalkSettings;
+use state::{Collected, WalkState, begin};
 
 /// What every walk of a campaign shares.
 #[derive(Clone)]
@@ -31,36 +28,6 @@ pub struct WalkContext {
     pub model: Arc<GraceModel>,
     /// The settings.
     pub settings: Arc<WalkSettings>,
-}
-
-/// The checkpoint of a walk.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-struct WalkState {
-    dynamics: Checkpoint,
-    bias: BiasState,
-    tau: f64,
-    segment: u32,
-    returns: u32,
-    /// Steps from which and to which it last returned.
-    last_return: Option<(u64, u64)>,
-    refused: u64,
-    refusals_in_a_row: u32,
-    /// First step at which a candidate may be offered again.
-    next_offer: u64,
-    /// Where structures were collected.
-    collected: Vec<Collected>,
-    /// The guard's shortest distance, Å.
-    least_distance: f64,
-    /// Places to go back to, oldest first.
-    good: Vec<(Checkpoint, BiasState)>,
-    gamma_max: f64,
-}
-
-/// A collection, seen from the piece of the walk that goes on: it lies `beyond` steps from step `branch`.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-struct Collected {
-    branch: u64,
-    beyond: u64,
 }
 
 /// Why a walk cannot go on.
@@ -243,10 +210,7 @@ impl<'a> Walk<'a> {
     }
 
     fn keep_checkpoint(&mut self) {
-        if self.state.good.len() == KEPT_CHECKPOINTS {
-            self.state.good.remove(0);
-        }
-        self.state.good.push((self.dynamics.checkpoint().clone(), self.potential.state));
+        self.state.keep(self.dynamics.checkpoint(), self.potential.state);
     }
 
     /// Counts a refusal by the shortest-bond guard; after too many in a row the walk goes back, or ends.
@@ -278,68 +242,13 @@ impl<'a> Walk<'a> {
         self.state.last_return = Some((self.step(), checkpoint.state.step));
         self.dynamics = Dynamics::resume(checkpoint, cutoff, self.settings.skin)?;
         self.potential.state = bias;
-        self.state.next_offer = self.offer_after_return();
+        self.state.next_offer = self.state.offer_after_return(self.step(), self.settings);
         self.keep_checkpoint();
         Ok(())
     }
 
-    /// The first offer after a return to where the walk now stands. The gap to a collection counts along the path that
-    /// joins the two: back from the collection, as far as it lies on an abandoned piece, and forward again.
-    fn offer_after_return(&mut self) -> u64 {
-        let (step, gap) = (self.step(), self.settings.gap);
-        for collected in self.state.collected.iter_mut().filter(|collected| collected.branch > step) {
-            collected.beyond += collected.branch - step;
-            collected.branch = step;
-        }
-        let offers = self.state.collected.iter().map(|c| c.branch + gap.saturating_sub(c.beyond));
-        offers.max().unwrap_or(0).max(step + self.settings.declined_gap)
-    }
-
     fn stream(&self) -> Stream {
         Stream::new(self.settings.rng_seed, self.assignment.random_walk.0, self.state.segment)
-    }
-
-    fn candidate(&mut self) -> Result<Candidate, WalkError> {
-        let gamma = self.potential.grades()?.gamma.clone();
-        let structure = self.dynamics.structure().clone();
-        let pairs = self.pairs(self.dynamics.neighbours());
-        let gamma_nbr = neighbourhood_average(&gamma, pairs).expect("pairs of these very atoms");
-        let physical = self.potential.physical();
-        let id = CandidateId {
-            campaign: self.assignment.campaign,
-            walk: self.assignment.walk,
-            segment: self.state.segment,
-            step: self.step(),
-            content: ContentHash::of(&structure),
-        };
-        Ok(Candidate {
-            id,
-            origin: self.assignment.origin,
-            mixture_version: self.mixture_version,
-            temperature: self.dynamics.temperature(),
-            relative_volume: self.relative_volume(),
-            energy: physical.energy(),
-            virial: physical.virial,
-            structure,
-            forces: physical.forces.clone(),
-            gamma,
-            gamma_nbr,
-            features: self.potential.features().to_vec(),
-        })
-    }
-
-    /// Directed pairs within their cutoffs, for γ_nbr.
-    fn pairs(&self, neighbours: &NeighbourList) -> Vec<Pair> {
-        let (structure, elements) = (self.dynamics.structure(), self.potential.elements());
-        let (mut pairs, mut bonds) = (Vec::new(), Vec::new());
-        for i in 0..structure.len() {
-            neighbours.bonds_within(structure, i, self.model.cutoff(), &mut bonds);
-            pairs.extend(bonds.iter().map(|bond| {
-                let j = bond.atom as usize;
-                Pair::new(i, j, bond.r, self.model.pair_cutoff(elements[i], elements[j]))
-            }));
-        }
-        pairs
     }
 
     fn relative_volume(&self) -> f64 {
@@ -366,51 +275,5 @@ impl<'a> Walk<'a> {
         self.state.dynamics = self.dynamics.checkpoint().clone();
         self.state.bias = self.potential.state;
         postcard::to_stdvec(&self.state).expect("plain data is encoded into memory")
-    }
-}
-
-/// The start of a walk: thermal velocities at the seed structure.
-fn begin(
-    settings: &WalkSettings,
-    assignment: &Assignment,
-    potential: &mut BiasedPotential,
-) -> Result<(Dynamics, WalkState), WalkError> {
-    let structure = assignment.seed_structure.clone();
-    let stream = Stream::new(settings.rng_seed, assignment.random_walk.0, 0);
-    let time_step = settings.time_step.unwrap_or_else(|| md::default_time_step(&structure.species));
-    let start = State::thermal(structure, settings.temperature, &stream);
-    let ramp = settings.volume_ramp.map(|(from, to)| {
-        let ramp = VolumeRamp::new(&start, from, to, settings.steps);
-        VolumeRamp { start: settings.equilibration, ..ramp }
-    });
-    let thermostat = thermostat(settings);
-    let run = md::Settings { time_step, thermostat, ramp, stream, skin: settings.skin };
-    let dynamics = Dynamics::new(start, run, potential)?;
-    let shortest = shortest_distance(dynamics.structure(), dynamics.neighbours()).map(|(_, _, d)| d);
-    let state = WalkState {
-        dynamics: dynamics.checkpoint().clone(),
-        bias: BiasState::default(),
-        tau: if assignment.origin == Origin::Control { 0.0 } else { settings.tau },
-        segment: 0,
-        returns: 0,
-        last_return: None,
-        refused: 0,
-        refusals_in_a_row: 0,
-        next_offer: 0,
-        collected: Vec::new(),
-        least_distance: guard::least_distance(&settings.guard, shortest),
-        good: vec![(dynamics.checkpoint().clone(), BiasState::default())],
-        gamma_max: 0.0,
-    };
-    Ok((dynamics, state))
-}
-
-fn thermostat(settings: &WalkSettings) -> Thermostat {
-    let temperature = settings.temperature;
-    match settings.thermostat {
-        ThermostatKind::Langevin { friction } => Thermostat::Langevin(Langevin { temperature, friction }),
-        ThermostatKind::NoseHoover { relaxation_time, chain_length } => {
-            Thermostat::NoseHooverChain(NoseHooverChain::new(temperature, relaxation_time, chain_length))
-        }
     }
 }

@@ -1,0 +1,53 @@
+//! The structure that a walk offers, with all that is known of it.
+
+use atoms::NeighbourList;
+use calm::neighbourhood::{Pair, neighbourhood_average};
+use wire::{Candidate, CandidateId, ContentHash};
+
+use super::{Walk, WalkError};
+
+impl Walk<'_> {
+    /// Where the walk stands, as a candidate.
+    pub(super) fn candidate(&mut self) -> Result<Candidate, WalkError> {
+        let gamma = self.potential.grades()?.gamma.clone();
+        let structure = self.dynamics.structure().clone();
+        let pairs = self.pairs(self.dynamics.neighbours());
+        let gamma_nbr = neighbourhood_average(&gamma, pairs).expect("pairs of these very atoms");
+        let physical = self.potential.physical();
+        let id = CandidateId {
+            campaign: self.assignment.campaign,
+            walk: self.assignment.walk,
+            segment: self.state.segment,
+            step: self.step(),
+            content: ContentHash::of(&structure),
+        };
+        Ok(Candidate {
+            id,
+            origin: self.assignment.origin,
+            mixture_version: self.mixture_version,
+            temperature: self.dynamics.temperature(),
+            relative_volume: self.relative_volume(),
+            energy: physical.energy(),
+            virial: physical.virial,
+            structure,
+            forces: physical.forces.clone(),
+            gamma,
+            gamma_nbr,
+            features: self.potential.features().to_vec(),
+        })
+    }
+
+    /// Directed pairs within their cutoffs, for γ_nbr.
+    fn pairs(&self, neighbours: &NeighbourList) -> Vec<Pair> {
+        let (structure, elements) = (self.dynamics.structure(), self.potential.elements());
+        let (mut pairs, mut bonds) = (Vec::new(), Vec::new());
+        for i in 0..structure.len() {
+            neighbours.bonds_within(structure, i, self.model.cutoff(), &mut bonds);
+            pairs.extend(bonds.iter().map(|bond| {
+                let j = bond.atom as usize;
+                Pair::new(i, j, bond.r, self.model.pair_cutoff(elements[i], elements[j]))
+            }));
+        }
+        pairs
+    }
+}

@@ -1,0 +1,112 @@
+//! What a walk remembers between two turns, and its beginning.
+
+use atoms::shortest_distance;
+use md::{Checkpoint, Dynamics, Langevin, NoseHooverChain, State, Stream, Thermostat, VolumeRamp};
+use serde::{Deserialize, Serialize};
+use wire::Origin;
+use wire::messages::Assignment;
+
+use super::WalkError;
+use crate::bias::{BiasState, BiasedPotential};
+use crate::guard;
+use crate::settings::{ThermostatKind, WalkSettings};
+
+/// Checkpoints to go back to that are kept; the oldest is used, so that a return leads out of the trap.
+const KEPT_CHECKPOINTS: usize = 2;
+
+/// The checkpoint of a walk.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct WalkState {
+    pub dynamics: Checkpoint,
+    pub bias: BiasState,
+    pub tau: f64,
+    pub segment: u32,
+    pub returns: u32,
+    /// Steps from which and to which it last returned.
+    pub last_return: Option<(u64, u64)>,
+    pub refused: u64,
+    pub refusals_in_a_row: u32,
+    /// First step at which a candidate may be offered again.
+    pub next_offer: u64,
+    /// Where structures were collected.
+    pub collected: Vec<Collected>,
+    /// The guard's shortest distance, Å.
+    pub least_distance: f64,
+    /// Places to go back to, oldest first.
+    pub good: Vec<(Checkpoint, BiasState)>,
+    pub gamma_max: f64,
+}
+
+/// A collection, seen from the piece of the walk that goes on: it lies `beyond` steps from step `branch`.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub(super) struct Collected {
+    pub branch: u64,
+    pub beyond: u64,
+}
+
+impl WalkState {
+    /// Keeps where the walk stands as a place to go back to.
+    pub fn keep(&mut self, checkpoint: &Checkpoint, bias: BiasState) {
+        if self.good.len() == KEPT_CHECKPOINTS {
+            self.good.remove(0);
+        }
+        self.good.push((checkpoint.clone(), bias));
+    }
+
+    /// The first offer after a return to `step`. The gap to a collection counts along the path that joins the two: back
+    /// from the collection, as far as it lies on an abandoned piece, and forward again.
+    pub fn offer_after_return(&mut self, step: u64, settings: &WalkSettings) -> u64 {
+        for collected in self.collected.iter_mut().filter(|collected| collected.branch > step) {
+            collected.beyond += collected.branch - step;
+            collected.branch = step;
+        }
+        let offers = self.collected.iter().map(|c| c.branch + settings.gap.saturating_sub(c.beyond));
+        offers.max().unwrap_or(0).max(step + settings.declined_gap)
+    }
+}
+
+/// The start of a walk: thermal velocities at the seed structure.
+pub(super) fn begin(
+    settings: &WalkSettings,
+    assignment: &Assignment,
+    potential: &mut BiasedPotential,
+) -> Result<(Dynamics, WalkState), WalkError> {
+    let structure = assignment.seed_structure.clone();
+    let stream = Stream::new(settings.rng_seed, assignment.random_walk.0, 0);
+    let time_step = settings.time_step.unwrap_or_else(|| md::default_time_step(&structure.species));
+    let start = State::thermal(structure, settings.temperature, &stream);
+    let ramp = settings.volume_ramp.map(|(from, to)| {
+        let ramp = VolumeRamp::new(&start, from, to, settings.steps);
+        VolumeRamp { start: settings.equilibration, ..ramp }
+    });
+    let thermostat = thermostat(settings);
+    let run = md::Settings { time_step, thermostat, ramp, stream, skin: settings.skin };
+    let dynamics = Dynamics::new(start, run, potential)?;
+    let shortest = shortest_distance(dynamics.structure(), dynamics.neighbours()).map(|(_, _, d)| d);
+    let state = WalkState {
+        dynamics: dynamics.checkpoint().clone(),
+        bias: BiasState::default(),
+        tau: if assignment.origin == Origin::Control { 0.0 } else { settings.tau },
+        segment: 0,
+        returns: 0,
+        last_return: None,
+        refused: 0,
+        refusals_in_a_row: 0,
+        next_offer: 0,
+        collected: Vec::new(),
+        least_distance: guard::least_distance(&settings.guard, shortest),
+        good: vec![(dynamics.checkpoint().clone(), BiasState::default())],
+        gamma_max: 0.0,
+    };
+    Ok((dynamics, state))
+}
+
+fn thermostat(settings: &WalkSettings) -> Thermostat {
+    let temperature = settings.temperature;
+    match settings.thermostat {
+        ThermostatKind::Langevin { friction } => Thermostat::Langevin(Langevin { temperature, friction }),
+        ThermostatKind::NoseHoover { relaxation_time, chain_length } => {
+            Thermostat::NoseHooverChain(NoseHooverChain::new(temperature, relaxation_time, chain_length))
+        }
+    }
+}
