@@ -114,7 +114,7 @@ impl Grades {
 
     /// Leaves **δ**ᵀS**δ** of each atom in `sigma`, and S**δ** in the gradient.
     ///
-    /// A few atoms of the same component at a time, which share the reading of its matrix.
+    /// Some atoms of the same component at a time, which share the reading of its matrix.
     fn measure(
         &mut self,
         mixture: &Mixture,
@@ -202,10 +202,4 @@ pub fn nearest<'a>(centroids: impl Iterator<Item = &'a [f64]>, z: &[f64]) -> usi
 /// The component at a place that has been looked up before.
 fn component(mixture: &Mixture, (element, slot): (usize, usize)) -> &Component {
     mixture.component(element, slot).expect("the nearest component is one of the mixture")
-}
-
-/// **δ**ᵀS**δ**; leaves S**δ** in the buffer.
-pub(crate) fn quadratic_form(inverse: &[f64], delta: &[f64], product: &mut [f64]) -> f64 {
-    symmetric_products(inverse, delta.len(), delta, product);
-    dot(delta, product)
 }

@@ -2,6 +2,7 @@
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::{LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
+use faer::linalg::cholesky::llt::inverse::{inverse, inverse_scratch};
 use faer::linalg::evd::{ComputeEigenvectors, self_adjoint_evd, self_adjoint_evd_scratch};
 use faer::linalg::matmul::matmul;
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
@@ -114,12 +115,7 @@ pub(crate) fn solve_lower(factor: &Mat<f64>, right: &mut Mat<f64>) {
 /// # Errors
 /// A wrong length, an element that is not finite, or eigenvalues that do not converge.
 pub fn pseudo_inverse(matrix: &[f64], dimension: usize) -> Result<Vec<f64>, LinearError> {
-    if dimension.checked_mul(dimension) != Some(matrix.len()) {
-        return Err(LinearError::Size { dimension, found: matrix.len() });
-    }
-    if let Some(index) = matrix.iter().position(|value| !value.is_finite()) {
-        return Err(LinearError::NotFinite { row: index / dimension, column: index % dimension });
-    }
+    check(matrix, dimension)?;
     let Eigen { values, vectors } = eigen(view(matrix, dimension, dimension))?;
     let largest = values.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
     let kept = |value: f64| value.abs() > TRUNCATION * largest;
@@ -132,10 +128,49 @@ pub fn pseudo_inverse(matrix: &[f64], dimension: usize) -> Result<Vec<f64>, Line
 
 /// The regularised inverse (C + εI)⁺ of a covariance, ε = 10⁻⁶ (paper, Methods).
 ///
+/// It is (C + εI)⁻¹ by Cholesky factors, at a third of the cost of eigenvalues, unless some of those could be so small
+/// beside others that the pseudo-inverse leaves them out.
+///
 /// # Errors
 /// Those of [`pseudo_inverse`].
 pub fn regularised_inverse(covariance: &[f64], dimension: usize) -> Result<Vec<f64>, LinearError> {
-    pseudo_inverse(&regularised(covariance, dimension), dimension)
+    check(covariance, dimension)?;
+    let matrix = regularised(covariance, dimension);
+    let factor = if is_positive(trace(&matrix, dimension)) { cholesky(&matrix, dimension) } else { None };
+    factor.map_or_else(|| pseudo_inverse(&matrix, dimension), |factor| Ok(inverse_of(&factor)))
+}
+
+/// Whether no eigenvalue of a regularised covariance of this trace can be so small that the pseudo-inverse leaves it out.
+pub(crate) fn is_positive(trace: f64) -> bool {
+    TRUNCATION * trace < REGULARISATION
+}
+
+pub(crate) fn trace(matrix: &[f64], dimension: usize) -> f64 {
+    matrix.iter().step_by(dimension + 1).sum()
+}
+
+fn check(matrix: &[f64], dimension: usize) -> Result<(), LinearError> {
+    if dimension.checked_mul(dimension) != Some(matrix.len()) {
+        return Err(LinearError::Size { dimension, found: matrix.len() });
+    }
+    match matrix.iter().position(|value| !value.is_finite()) {
+        Some(index) => Err(LinearError::NotFinite { row: index / dimension, column: index % dimension }),
+        None => Ok(()),
+    }
+}
+
+/// A⁻¹ = L⁻ᵀL⁻¹ of A = LLᵀ, exactly symmetric.
+fn inverse_of(factor: &Mat<f64>) -> Vec<f64> {
+    let dimension = factor.nrows();
+    let mut out = Mat::zeros(dimension, dimension);
+    let scratch = inverse_scratch::<f64>(dimension, Par::Seq);
+    inverse(out.as_mut(), factor.as_ref(), Par::Seq, MemStack::new(&mut MemBuffer::new(scratch)));
+    // The lower triangle is all that was computed.
+    let mut full = Vec::with_capacity(dimension * dimension);
+    for row in 0..dimension {
+        full.extend((0..dimension).map(|column| out[(row.max(column), row.min(column))]));
+    }
+    full
 }
 
 /// C + εI.
@@ -145,15 +180,19 @@ pub(crate) fn regularised(covariance: &[f64], dimension: usize) -> Vec<f64> {
     out
 }
 
-/// Vectors that [`symmetric_products`] takes through the matrix together.
-pub(crate) const TOGETHER: usize = 2;
+/// Vectors worth handing to [`symmetric_products`] at once: as many as stay in the first-level cache beside a panel.
+pub(crate) const TOGETHER: usize = 16;
+
+/// Columns of a panel: two of the widest common vector registers.
+const PANEL: usize = 8;
 
 /// S v of each of some vectors, for a symmetric row-major S of this dimension; `vectors` and `out` are `[vectors × D]`.
 ///
-/// Two vectors at a time, so that the matrix is read half as often: it does not fit into the first-level cache. Rows are
-/// summed four at a time in a fixed order. Every sum adds the same terms in the same order in any company and whatever
-/// the vector width, without fused multiply-add, so the bits depend neither on the other vectors nor on the processor;
-/// the widest vectors that it has are used.
+/// The matrix does not fit into the first-level cache, a panel of some columns does: every vector goes through it before
+/// the next is read, two at a time, and their sums stay in registers. Rows are summed four at a time in a fixed order.
+/// Every sum adds the same terms in the same order in any company and whatever the vector width, without fused
+/// multiply-add, so the bits depend neither on the other vectors nor on the processor; the widest vectors that it has
+/// are used.
 pub(crate) fn symmetric_products(matrix: &[f64], dimension: usize, vectors: &[f64], out: &mut [f64]) {
     pulp::Arch::new().dispatch(SymmetricProducts { matrix, dimension, vectors, out });
 }
@@ -169,47 +208,66 @@ impl pulp::WithSimd for SymmetricProducts<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: pulp::Simd>(self, _: S) {
-        let Self { matrix, dimension, vectors, out } = self;
-        let width = TOGETHER * dimension;
-        let (mut pairs, mut sums) = (vectors.chunks_exact(width), out.chunks_exact_mut(width));
-        for (pair, sums) in pairs.by_ref().zip(sums.by_ref()) {
-            let (left, right) = sums.split_at_mut(dimension);
-            multiply(matrix, pair.split_at(dimension).into(), [left, right]);
-        }
-        let last = pairs.remainder();
-        if !last.is_empty() {
-            multiply(matrix, [last], [sums.into_remainder()]);
+    fn with_simd<S: pulp::Simd>(mut self, _: S) {
+        match self.dimension.checked_sub(PANEL) {
+            // The last panel overlaps the one before: the same sums once more.
+            Some(last) => {
+                (0..self.dimension).step_by(PANEL).for_each(|first| self.panel::<PANEL>(first.min(last)))
+            }
+            None => (0..self.dimension).for_each(|column| self.panel::<1>(column)),
         }
     }
 }
 
-/// out_n = S v_n for each n.
+impl SymmetricProducts<'_> {
+    /// The products in `W` columns, of every vector.
+    #[inline(always)]
+    fn panel<const W: usize>(&mut self, first: usize) {
+        let &mut Self { matrix, dimension, vectors, ref mut out } = self;
+        let (mut pairs, mut sums) =
+            (vectors.chunks_exact(2 * dimension), out.chunks_exact_mut(2 * dimension));
+        for (pair, out) in pairs.by_ref().zip(sums.by_ref()) {
+            let [left, right] = panel_products::<W, 2>(matrix, first, pair.split_at(dimension).into());
+            out[first..][..W].copy_from_slice(&left);
+            out[dimension + first..][..W].copy_from_slice(&right);
+        }
+        let last = pairs.remainder();
+        if !last.is_empty() {
+            let [sums_of_last] = panel_products::<W, 1>(matrix, first, [last]);
+            sums.into_remainder()[first..][..W].copy_from_slice(&sums_of_last);
+        }
+    }
+}
+
+/// `W` elements of S v_n from `first` on, for each n.
 #[inline(always)]
-fn multiply<const N: usize>(matrix: &[f64], vectors: [&[f64]; N], mut out: [&mut [f64]; N]) {
+fn panel_products<const W: usize, const N: usize>(
+    matrix: &[f64],
+    first: usize,
+    vectors: [&[f64]; N],
+) -> [[f64; W]; N] {
     let dimension = vectors[0].len();
-    let whole = dimension - dimension % 4;
-    out.iter_mut().for_each(|sums| sums.fill(0.0));
-    for first in (0..whole).step_by(4) {
-        // Slices of one known length, and columns inside: the loop over columns becomes vector instructions.
-        let row = |k: usize| &matrix[(first + k) * dimension..][..dimension];
-        let rows: [&[f64]; 4] = std::array::from_fn(row);
-        let factors: [[f64; 4]; N] = vectors.map(|vector| std::array::from_fn(|k| vector[first + k]));
-        let mut sums = out.each_mut().map(|sums| &mut sums[..dimension]);
-        for column in 0..dimension {
-            let [a, b, c, d] = rows.map(|row| row[column]);
-            for (sums, [v_0, v_1, v_2, v_3]) in sums.iter_mut().zip(factors) {
-                sums[column] += (a * v_0 + b * v_1) + (c * v_2 + d * v_3);
+    let mut sums = [[0.0; W]; N];
+    let mut blocks = matrix.chunks_exact(4 * dimension);
+    for (block, rows) in blocks.by_ref().enumerate() {
+        // Slices of one known length: the loops over them become vector instructions.
+        let rows: [&[f64]; 4] = std::array::from_fn(|k| &rows[k * dimension + first..][..W]);
+        for (sums, vector) in sums.iter_mut().zip(vectors) {
+            let factors = &vector[4 * block..][..4];
+            for column in 0..W {
+                let [a, b, c, d] = rows.map(|row| row[column]);
+                sums[column] += (a * factors[0] + b * factors[1]) + (c * factors[2] + d * factors[3]);
             }
         }
     }
-    for row in whole..dimension {
-        let values = &matrix[row * dimension..][..dimension];
-        for (sums, vector) in out.iter_mut().zip(vectors) {
-            let factor = vector[row];
-            sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += value * factor);
+    let whole = dimension - dimension % 4;
+    for (row, values) in blocks.remainder().chunks_exact(dimension).enumerate() {
+        for (sums, vector) in sums.iter_mut().zip(vectors) {
+            let factor = vector[whole + row];
+            sums.iter_mut().zip(&values[first..]).for_each(|(sum, value)| *sum += value * factor);
         }
     }
+    sums
 }
 
 /// Σ a_i b_i in order, in four interleaved sums (fixed bits, vectorisable).
@@ -269,7 +327,7 @@ mod tests {
         for dimension in (1..40).chain([63, 64, 65, 130, 131]) {
             let matrix: Vec<f64> = (0..dimension * dimension).map(number).collect();
             let matrix = symmetrised(view(&matrix, dimension, dimension));
-            for count in 0..7 {
+            for count in (0..7).chain([17]) {
                 let vectors: Vec<f64> = (0..count * dimension).map(|k| number(3 * k + 11)).collect();
                 let mut together = vec![f64::NAN; vectors.len()];
                 symmetric_products(&matrix, dimension, &vectors, &mut together);

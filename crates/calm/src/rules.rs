@@ -5,6 +5,7 @@ use std::num::NonZeroUsize;
 use serde::{Deserialize, Serialize};
 
 use crate::grade::maximum;
+use crate::update::CovarianceUpdate;
 
 /// A finite number above zero.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
@@ -166,6 +167,14 @@ pub enum Combination {
 }
 
 impl Combination {
+    /// This combination with a weight α.
+    pub fn with(self, alpha: f64) -> CovarianceUpdate {
+        match self {
+            Self::Convex => CovarianceUpdate::Convex { alpha },
+            Self::Additive => CovarianceUpdate::Additive { alpha },
+        }
+    }
+
     /// The α to try unless others are given.
     ///
     /// Convex: the paper's six. Additive: from 0.0005 to 1 in steps of about two (1, 2, 5 a decade), since without

@@ -85,7 +85,7 @@ pub fn update(
 ) -> Result<UpdateOutcome, UpdateError> {
     let batch = Batch::new(mixture, elements, features)?;
     let (trials, alpha, mut end) = choose(&batch, settings)?;
-    let mut changed = batch.updated(combine(settings.combination, alpha))?;
+    let mut changed = batch.updated(settings.combination.with(alpha))?;
     let mut inflations = Vec::new();
     if let (UpdateEnd::InflationExhausted, UpdateRule::MaximumGrade { target }) = (end, settings.stop) {
         (changed, inflations) = inflate(&batch, changed, target.get())?;
@@ -143,7 +143,7 @@ fn choose(batch: &Batch, settings: &UpdateSettings) -> Result<(Vec<Trial>, f64, 
     let ladder = TrialLadder::new(batch, settings.combination);
     let mut trials = Vec::new();
     for alpha in settings.alphas() {
-        let gamma = trial(batch, &ladder, combine(settings.combination, alpha), alpha, [threshold, target])?;
+        let gamma = trial(batch, &ladder, settings.combination.with(alpha), alpha, [threshold, target])?;
         let trial = Trial { alpha, gamma_max: maximum(&gamma), above: count_above(&gamma, threshold) };
         trials.push(trial);
         match limit {
@@ -174,12 +174,5 @@ fn trial(
     match ladder.gamma(alpha) {
         Some(gamma) if !gamma.iter().any(|&grade| near(grade)) => Ok(gamma),
         _ => Ok(batch.gamma_under(&batch.updated(update)?)),
-    }
-}
-
-fn combine(combination: Combination, alpha: f64) -> CovarianceUpdate {
-    match combination {
-        Combination::Convex => CovarianceUpdate::Convex { alpha },
-        Combination::Additive => CovarianceUpdate::Additive { alpha },
     }
 }

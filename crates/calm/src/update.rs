@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::component::{Component, Statistics};
-use crate::grade::{DISTANCE_FLOOR, GradeError, Grades, THRESHOLD_FLOOR, quadratic_form};
-use crate::linear::{LinearError, product, symmetrised, view};
+use crate::grade::{DISTANCE_FLOOR, GradeError, Grades, THRESHOLD_FLOOR};
+use crate::linear::{LinearError, TOGETHER, dot, product, symmetric_products, symmetrised, view};
 use crate::mixture::{ChangedComponent, Mixture};
 
 /// How the covariance of a touched component follows from the old one and that of the batch.
@@ -153,13 +153,8 @@ impl Batch {
     ///
     /// `changed` comes from [`Batch::updated`] or [`Batch::inflated`] of the same batch.
     pub fn gamma_under(&self, changed: &[ChangedComponent]) -> Vec<f64> {
-        self.spread(self.groups.iter().zip(changed).map(|(group, ChangedComponent { component, .. })| {
-            let mut product = vec![0.0; component.dimension()];
-            let deltas = group.deltas.chunks_exact(component.dimension());
-            deltas
-                .map(|delta| group.grade(quadratic_form(component.inverse(), delta, &mut product)))
-                .collect()
-        }))
+        let groups = self.groups.iter().zip(changed);
+        self.spread(groups.map(|(group, ChangedComponent { component, .. })| group.grades_under(component)))
     }
 
     /// Spreads a grade for each atom of each group over the atoms of the batch.
@@ -209,7 +204,7 @@ impl Group {
         })
     }
 
-    fn updated_covariance(&self, update: CovarianceUpdate) -> Vec<f64> {
+    pub(crate) fn updated_covariance(&self, update: CovarianceUpdate) -> Vec<f64> {
         let (old, new) = match update {
             CovarianceUpdate::Convex { alpha } => (1.0 - alpha, alpha),
             CovarianceUpdate::Additive { alpha } => (1.0, alpha),
@@ -237,6 +232,18 @@ impl Group {
 
     fn no_statistics(&self) -> UpdateError {
         UpdateError::NoStatistics { element: self.element, slot: self.slot }
+    }
+
+    /// γ of each atom under an updated component.
+    fn grades_under(&self, component: &Component) -> Vec<f64> {
+        let dimension = component.dimension();
+        let mut products = vec![0.0; self.deltas.len()];
+        let several = TOGETHER * dimension;
+        for (deltas, products) in self.deltas.chunks(several).zip(products.chunks_mut(several)) {
+            symmetric_products(component.inverse(), dimension, deltas, products);
+        }
+        let rows = self.deltas.chunks_exact(dimension).zip(products.chunks_exact(dimension));
+        rows.map(|(delta, product)| self.grade(dot(delta, product))).collect()
     }
 
     /// γ from σ² without its floor. An inverse so bad that σ² is negative gives γ = ∞: no trial passes by it.
