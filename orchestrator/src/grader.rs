@@ -57,18 +57,51 @@ impl Grader {
         let mut list = NeighbourList::new(self.largest_cutoff, 0.0);
         list.update(structure)?;
         let mut bonds = Bonds { elements, pairs: Vec::new(), shortest: f64::INFINITY };
-        for i in 0..structure.len() {
-            for neighbour in list.of(i) {
-                let j = neighbour.atom as usize;
-                let distance = cell::norm(neighbour.displacement(structure, i));
-                let cutoff = self.pair_cutoffs[bonds.elements[i] * self.elements.len() + bonds.elements[j]];
-                bonds.shortest = bonds.shortest.min(distance);
-                if distance < cutoff {
-                    bonds.pairs.push(Pair::new(i, j, distance, cutoff));
+        self.weigh(structure, &list, &mut bonds);
+        Ok(bonds)
+    }
+
+    /// The pairs in the order of the list, each bond and its reverse weighed at once.
+    ///
+    /// Going through the atoms in order fills the pairs of each from its first neighbour on. The images of a neighbour
+    /// stand in ascending order on both sides, so the first of one side is the reverse of the last of the other.
+    fn weigh(&self, structure: &Structure, list: &NeighbourList, bonds: &mut Bonds) {
+        let Bonds { elements, pairs, shortest } = bonds;
+        let cutoff = |i: usize, j: usize| self.pair_cutoffs[elements[i] * self.elements.len() + elements[j]];
+        let mut next = Vec::with_capacity(list.len());
+        let mut directed = 0;
+        for i in 0..list.len() {
+            next.push(directed);
+            directed += list.of(i).len();
+        }
+        pairs.resize(directed, Pair { i: 0, j: 0, weight: 0.0 });
+        for i in 0..list.len() {
+            let below = list.of(i).partition_point(|neighbour| (neighbour.atom as usize) < i);
+            for images in list.of(i)[below..].chunk_by(|a, b| a.atom == b.atom) {
+                let j = images[0].atom as usize;
+                for (k, neighbour) in images.iter().enumerate() {
+                    let distance = cell::norm(neighbour.displacement(structure, i));
+                    *shortest = shortest.min(distance);
+                    let pair = Pair::new(i, j, distance, cutoff(i, j));
+                    let reverse = if cutoff(j, i) == cutoff(i, j) {
+                        Pair { i: j, j: i, ..pair }
+                    } else {
+                        Pair::new(j, i, distance, cutoff(j, i))
+                    };
+                    // The place of the reverse first: that of an atom's own image is filled by the image itself.
+                    for (place, pair) in [(next[j] + images.len() - 1 - k, reverse), (next[i] + k, pair)] {
+                        // Rounding could leave a bond without its reverse only where atoms are absurdly far away.
+                        if let Some(slot) = pairs.get_mut(place) {
+                            *slot = pair;
+                        }
+                    }
+                }
+                next[i] += images.len();
+                if j != i {
+                    next[j] += images.len();
                 }
             }
         }
-        Ok(bonds)
     }
 }
 
@@ -77,7 +110,7 @@ impl Grader {
 pub struct Bonds {
     /// Element index of each atom.
     pub elements: Vec<usize>,
-    /// Directed pairs within their cutoffs, weighted.
+    /// Directed pairs within the largest cutoff, weighted: 0 beyond their own.
     pub pairs: Vec<Pair>,
     /// Shortest distance, Å; infinite without neighbours.
     pub shortest: f64,

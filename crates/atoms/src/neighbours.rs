@@ -123,23 +123,52 @@ impl NeighbourList {
     fn build(&mut self, structure: &Structure) -> Result<(), StructureError> {
         let reach = self.cutoff + self.skin;
         let cells = LinkedCells::new(structure, reach)?;
+        let mut found = Vec::with_capacity(self.neighbours.capacity());
+        let (mut ends, mut near) = (Vec::with_capacity(structure.len()), Vec::new());
         for i in 0..structure.len() {
-            let start = self.neighbours.len();
+            let start = found.len();
             let own = Neighbour { atom: i as u32, image: [0; 3] };
-            cells.candidates(i, |neighbour| {
+            let is_within = |neighbour: Neighbour| {
                 let d = neighbour.displacement(structure, i);
-                if cell::dot(d, d) <= reach * reach && neighbour != own {
-                    self.neighbours.push(neighbour);
+                cell::dot(d, d) <= reach * reach
+            };
+            cells.candidates(i, &mut near, |neighbour, certain| {
+                if (certain || is_within(neighbour)) && neighbour != own {
+                    found.push(neighbour);
                 }
-                if self.neighbours.len() - start > MOST_NEIGHBOURS {
+                if found.len() - start > MOST_NEIGHBOURS {
                     return Err(StructureError::Crowded { atom: i, limit: MOST_NEIGHBOURS, reach });
                 }
                 Ok(())
             })?;
-            self.neighbours[start..].sort_unstable();
-            self.offsets.push(self.neighbours.len());
+            ends.push(found.len());
         }
+        self.sort(&found, &ends);
         Ok(())
+    }
+
+    /// Fills the list with the reverse of each bond found: of i → j + image that is j → i − image.
+    ///
+    /// With each bond its reverse was found too, since d of one is −d of the other to the last bit. Going through the
+    /// atoms in order leaves the reverse bonds of each atom in order of their neighbours, and going backwards through
+    /// the images, which were found in ascending order, leaves these in order: the canonical order, without comparing.
+    fn sort(&mut self, found: &[Neighbour], ends: &[usize]) {
+        let mut next = vec![0; ends.len() + 1];
+        found.iter().for_each(|neighbour| next[neighbour.atom as usize + 1] += 1);
+        for i in 0..ends.len() {
+            next[i + 1] += next[i];
+        }
+        self.offsets.extend_from_slice(&next[1..]);
+        self.neighbours.resize(found.len(), Neighbour { atom: 0, image: [0; 3] });
+        let mut start = 0;
+        for (i, &end) in ends.iter().enumerate() {
+            for &Neighbour { atom, image } in found[start..end].iter().rev() {
+                let slot = &mut next[atom as usize];
+                self.neighbours[*slot] = Neighbour { atom: i as u32, image: image.map(|n| -n) };
+                *slot += 1;
+            }
+            start = end;
+        }
     }
 
     /// Whether no pair outside the list can have come within the cutoff.

@@ -1,7 +1,7 @@
 //! Linked cells: atoms sorted into bins, so that the search for neighbours looks nearby only.
 
 use super::Neighbour;
-use crate::cell::{Cell, Vec3};
+use crate::cell::{self, Cell, Vec3};
 use crate::structure::{Structure, StructureError};
 
 /// Atoms farther than this many lattice vectors (Å where nothing repeats) from the cell are refused.
@@ -10,21 +10,30 @@ const FARTHEST: f64 = 1e8;
 /// A search that would visit more bins than this for one atom is refused.
 const MOST_BINS_VISITED: f64 = 1e6;
 
+/// Relative to the reach: covers what rounding does to atoms on the edge of a bin or of the sphere.
+const HAIR: f64 = 1e-6;
+
 /// Every atom in the bin of its image inside the cell.
 pub(super) struct LinkedCells {
     periodic: [bool; 3],
+    /// With unit vectors where nothing repeats.
+    lattice: Cell,
+    /// Å
+    reach: f64,
     /// Number of bins in each direction.
     counts: [i32; 3],
     /// How many bins away the reach extends.
-    span: [i32; 3],
-    /// Bin of each atom.
-    bins: Vec<[i32; 3]>,
+    spans: Vec3,
+    /// Where each atom lies, in bins.
+    coordinates: Vec<Vec3>,
     /// Lattice translation of each atom from its image inside the cell.
     wraps: Vec<[i32; 3]>,
+    /// The image of each atom inside the cell, Å.
+    wrapped: Vec<Vec3>,
     /// Where each bin starts in `members`.
     starts: Vec<usize>,
-    /// Atoms, bin by bin.
-    members: Vec<u32>,
+    /// Atoms, bin by bin, and their images inside the cell.
+    members: Vec<(u32, Vec3)>,
 }
 
 impl LinkedCells {
@@ -32,42 +41,43 @@ impl LinkedCells {
     pub fn new(structure: &Structure, reach: f64) -> Result<Self, StructureError> {
         let periodic = structure.periodic;
         let lattice = structure.cell.completed(periodic);
-        // A hair more than the reach covers what rounding does to atoms on the edge of a bin.
-        let reach = reach * (1.0 + 1e-6);
-        let (fractional, wraps) = wrapped(structure, &lattice)?;
+        let (fractional, wraps) = fractional(structure, &lattice)?;
         let (origin, extent) = bounds(&fractional, periodic);
-        let widths: Vec3 = std::array::from_fn(|k| extent[k] * lattice.heights()[k]);
+        let heights = lattice.heights();
+        let widths: Vec3 = std::array::from_fn(|k| extent[k] * heights[k]);
         let counts = bin_counts(widths, reach, fractional.len());
-        let span = bin_span(widths, reach, counts, periodic)?;
-        let bins: Vec<[i32; 3]> = fractional
-            .iter()
-            .map(|f| {
-                std::array::from_fn(|k| {
-                    let bin = (f[k] - origin[k]) / extent[k] * f64::from(counts[k]);
-                    (bin as i32).clamp(0, counts[k] - 1)
-                })
-            })
-            .collect();
-        let (starts, members) = sort_into(&bins, counts);
-        Ok(Self { periodic, counts, span, bins, wraps, starts, members })
+        let spans = bin_spans(widths, reach * (1.0 + HAIR), counts, periodic)?;
+        let in_bins =
+            |f: &Vec3| std::array::from_fn(|k| (f[k] - origin[k]) / extent[k] * f64::from(counts[k]));
+        let coordinates: Vec<Vec3> = fractional.iter().map(in_bins).collect();
+        let inside = |(r, wrap): (&Vec3, &[i32; 3])| cell::sub(*r, lattice.translation(*wrap));
+        let wrapped: Vec<Vec3> = structure.positions.iter().zip(&wraps).map(inside).collect();
+        let (starts, members) = sort_into(&coordinates, &wrapped, counts);
+        Ok(Self { periodic, lattice, reach, counts, spans, coordinates, wraps, wrapped, starts, members })
     }
 
-    /// Shows `visit` every pair that may lie within the reach of atom `i`, each once, `i` itself included.
+    /// Shows `visit` every pair that may lie within the reach of atom `i`, each once, `i` itself included, the images
+    /// of the same neighbour in ascending order; and whether it is sure to. `near` is working memory.
     pub fn candidates<E>(
         &self,
         i: usize,
-        mut visit: impl FnMut(Neighbour) -> Result<(), E>,
+        near: &mut Vec<(u32, f64)>,
+        mut visit: impl FnMut(Neighbour, bool) -> Result<(), E>,
     ) -> Result<(), E> {
+        let runs = self.runs(i);
+        let (outer, inner) = ((self.reach * (1.0 + HAIR)).powi(2), (self.reach * (1.0 - HAIR)).powi(2));
+        near.resize(self.members.len(), (0, 0.0));
         for (a, image_a) in self.nearby(i, 0) {
             for (b, image_b) in self.nearby(i, 1) {
-                for (c, image_c) in self.nearby(i, 2) {
-                    let index = flat([a, b, c], self.counts);
-                    for &atom in &self.members[self.starts[index]..self.starts[index + 1]] {
-                        let wrap = self.wraps[atom as usize];
-                        visit(Neighbour {
-                            atom,
-                            image: [image_a - wrap[0], image_b - wrap[1], image_c - wrap[2]],
-                        })?;
+                let row = flat([a, b, 0], self.counts);
+                for &(first, last, image_c) in &runs {
+                    let image = [image_a, image_b, image_c];
+                    let centre = cell::sub(self.wrapped[i], self.lattice.translation(image));
+                    let members = &self.members[self.starts[row + first]..self.starts[row + last + 1]];
+                    for &(atom, square) in select(members, centre, outer, near) {
+                        let (from, to) = (self.wraps[i], self.wraps[atom as usize]);
+                        let image = std::array::from_fn(|k| image[k] + from[k] - to[k]);
+                        visit(Neighbour { atom, image }, square < inner)?;
                     }
                 }
             }
@@ -75,32 +85,67 @@ impl LinkedCells {
         Ok(())
     }
 
-    /// The bins along direction `k` within the reach of atom `i`, each with the lattice translation to it from the atom.
+    /// The bins along direction `k` within the reach of atom `i`, from the first to the last, counted on beyond the cell.
+    fn range(&self, i: usize, k: usize) -> (i32, i32) {
+        let (own, span) = (self.coordinates[i][k], self.spans[k]);
+        let (low, high) = ((own - span).floor() as i32, (own + span).floor() as i32);
+        if self.periodic[k] { (low, high) } else { (low.max(0), high.min(self.counts[k] - 1)) }
+    }
+
+    /// These bins one by one, each with the lattice translation to it from the cell.
     fn nearby(&self, i: usize, k: usize) -> impl Iterator<Item = (i32, i32)> {
-        let (own, span, count) = (self.bins[i][k], self.span[k], self.counts[k]);
-        let (low, high) = (own - span, own + span);
-        let (low, high) = if self.periodic[k] { (low, high) } else { (low.max(0), high.min(count - 1)) };
-        let first = (low.rem_euclid(count), low.div_euclid(count) + self.wraps[i][k]);
+        let ((low, high), count) = (self.range(i, k), self.counts[k]);
+        let first = (low.rem_euclid(count), low.div_euclid(count));
         // Counted on, since a division for each bin would take longer than the rest of the search.
         let next = move |&(bin, image): &(i32, i32)| {
             Some(if bin + 1 == count { (0, image + 1) } else { (bin + 1, image) })
         };
         std::iter::successors(Some(first), next).take((high - low + 1).max(0) as usize)
     }
+
+    /// These bins along the last direction, where neighbours in space are neighbours in memory: the first and the last
+    /// bin inside each image of the cell, and the lattice translation to it.
+    fn runs(&self, i: usize) -> Vec<(usize, usize, i32)> {
+        let ((low, high), count) = (self.range(i, 2), self.counts[2]);
+        let images = low.div_euclid(count)..=high.div_euclid(count);
+        let run = |image: i32| {
+            let (first, last) = (low.max(image * count), high.min(image * count + count - 1));
+            ((first - image * count) as usize, (last - image * count) as usize, image)
+        };
+        images.map(run).collect()
+    }
+}
+
+/// The members closer to the centre than the square root of `outer`, and their squared distances, Å².
+fn select<'a>(
+    members: &[(u32, Vec3)],
+    centre: Vec3,
+    outer: f64,
+    near: &'a mut [(u32, f64)],
+) -> &'a [(u32, f64)] {
+    let mut count = 0;
+    for &(atom, r) in members {
+        let d = cell::sub(r, centre);
+        let square = cell::dot(d, d);
+        // Written in any case and counted if it is near: a branch would be guessed wrongly every few atoms.
+        near[count] = (atom, square);
+        count += usize::from(square <= outer);
+    }
+    &near[..count]
 }
 
 /// Fractional coordinates brought into the cell where it repeats, and the translations taken off.
-fn wrapped(structure: &Structure, lattice: &Cell) -> Result<(Vec<Vec3>, Vec<[i32; 3]>), StructureError> {
+fn fractional(structure: &Structure, lattice: &Cell) -> Result<(Vec<Vec3>, Vec<[i32; 3]>), StructureError> {
     let reciprocal = lattice.reciprocal();
     let mut fractional = Vec::with_capacity(structure.len());
     let mut wraps = Vec::with_capacity(structure.len());
     for (atom, position) in structure.positions.iter().enumerate() {
-        let f = reciprocal.map(|b| crate::cell::dot(b, *position));
+        let f = reciprocal.map(|b| cell::dot(b, *position));
         if !f.iter().all(|x| x.abs() <= FARTHEST) {
             return Err(StructureError::FarAway { atom, limit: FARTHEST });
         }
         let wrap: Vec3 = std::array::from_fn(|k| if structure.periodic[k] { f[k].floor() } else { 0.0 });
-        fractional.push(crate::cell::sub(f, wrap));
+        fractional.push(cell::sub(f, wrap));
         wraps.push(wrap.map(|x| x as i32));
     }
     Ok((fractional, wraps))
@@ -130,37 +175,42 @@ fn bin_counts(widths: Vec3, reach: f64, atoms: usize) -> [i32; 3] {
 }
 
 /// How many bins away the reach extends in each direction.
-fn bin_span(
+fn bin_spans(
     widths: Vec3,
     reach: f64,
     counts: [i32; 3],
     periodic: [bool; 3],
-) -> Result<[i32; 3], StructureError> {
-    let mut span: Vec3 = std::array::from_fn(|k| (reach * f64::from(counts[k]) / widths[k]).ceil());
-    for k in (0..3).filter(|k| !periodic[*k]) {
-        span[k] = span[k].min(f64::from(counts[k] - 1));
-    }
-    if span.iter().map(|s| 2.0 * s + 1.0).product::<f64>() > MOST_BINS_VISITED {
+) -> Result<Vec3, StructureError> {
+    let spans: Vec3 = std::array::from_fn(|k| reach * f64::from(counts[k]) / widths[k]);
+    let visited = |k: usize| {
+        if periodic[k] {
+            2.0 * spans[k].ceil() + 1.0
+        } else {
+            f64::from(counts[k]).min(2.0 * spans[k].ceil() + 1.0)
+        }
+    };
+    if (0..3).map(visited).product::<f64>() > MOST_BINS_VISITED {
         let height = (0..3).filter(|k| periodic[*k]).map(|k| widths[k]).fold(f64::INFINITY, f64::min);
         return Err(StructureError::CellThin { height, reach });
     }
-    Ok(span.map(|s| s as i32))
+    Ok(spans)
 }
 
 /// Counting sort of the atoms by bin: the start of each bin, and the atoms bin by bin.
-fn sort_into(bins: &[[i32; 3]], counts: [i32; 3]) -> (Vec<usize>, Vec<u32>) {
+fn sort_into(coordinates: &[Vec3], wrapped: &[Vec3], counts: [i32; 3]) -> (Vec<usize>, Vec<(u32, Vec3)>) {
+    let bin = |x: &Vec3| flat(std::array::from_fn(|k| (x[k] as i32).clamp(0, counts[k] - 1)), counts);
     let mut starts = vec![0; counts.iter().map(|count| *count as usize).product::<usize>() + 1];
-    for bin in bins {
-        starts[flat(*bin, counts) + 1] += 1;
+    for x in coordinates {
+        starts[bin(x) + 1] += 1;
     }
     for index in 1..starts.len() {
         starts[index] += starts[index - 1];
     }
     let mut next = starts.clone();
-    let mut members = vec![0; bins.len()];
-    for (atom, bin) in bins.iter().enumerate() {
-        let slot = &mut next[flat(*bin, counts)];
-        members[*slot] = atom as u32;
+    let mut members = vec![(0, [0.0; 3]); coordinates.len()];
+    for (atom, x) in coordinates.iter().enumerate() {
+        let slot = &mut next[bin(x)];
+        members[*slot] = (atom as u32, wrapped[atom]);
         *slot += 1;
     }
     (starts, members)
