@@ -88,7 +88,7 @@ impl Grader {
                     } else {
                         Pair::new(j, i, distance, cutoff(j, i))
                     };
-                    // The place of the reverse first: that of an atom's own image is filled by the image itself.
+                    // An atom and its own image are each other's reverse, with the same weight.
                     for (place, pair) in [(next[j] + images.len() - 1 - k, reverse), (next[i] + k, pair)] {
                         // Rounding could leave a bond without its reverse only where atoms are absurdly far away.
                         if let Some(slot) = pairs.get_mut(place) {
@@ -123,5 +123,38 @@ impl Bonds {
         grades.evaluate(mixture, &self.elements, features, None)?;
         let gamma_nbr = neighbourhood_average(&grades.gamma, self.pairs.iter().copied())?;
         Ok(AtomGrades { gamma: grades.gamma, gamma_nbr })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A skew cell much smaller than the cutoffs, two elements, cutoffs that differ with the direction of a bond.
+    #[test]
+    fn pairs_are_those_of_each_bond_by_itself() {
+        let elements: Vec<Species> = vec!["Al".parse().unwrap(), "Si".parse().unwrap()];
+        let cutoffs = [6.0, 5.0, 4.5, 5.5];
+        for periodic in [[true; 3], [true, false, true], [false; 3]] {
+            let structure = Structure {
+                species: [0, 1, 0, 1].map(|k| elements[k]).to_vec(),
+                positions: vec![[0.1, 0.2, 0.3], [1.9, -7.2, 1.4], [0.4, 2.1, 9.7], [2.2, 1.8, 2.6]],
+                cell: atoms::Cell([[3.1, 0.2, 0.0], [-0.9, 4.2, 0.3], [0.6, 0.1, 3.7]]),
+                periodic,
+            };
+            let bonds = Grader::new(elements.clone(), cutoffs.to_vec()).bonds(&structure).unwrap();
+            let mut list = NeighbourList::new(6.0, 0.0);
+            list.update(&structure).unwrap();
+            let (mut expected, mut shortest) = (Vec::new(), f64::INFINITY);
+            for i in 0..structure.len() {
+                for neighbour in list.of(i) {
+                    let (j, r) = (neighbour.atom as usize, cell::norm(neighbour.displacement(&structure, i)));
+                    expected.push(Pair::new(i, j, r, cutoffs[i % 2 * 2 + j % 2]));
+                    shortest = f64::min(shortest, r);
+                }
+            }
+            assert_eq!(bonds.pairs, expected);
+            assert_eq!(bonds.shortest, shortest);
+        }
     }
 }
