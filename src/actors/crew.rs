@@ -9,14 +9,13 @@ use orchestrator::supervisor::Standing;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::time::{Interval, MissedTickBehavior, interval};
 use wire::ipc::Handle;
+use workers::labeller::SIGN_OF_LIFE;
 
 use super::labellers::Labellers;
 use super::records::Records;
 use crate::outcome::Failure;
 use crate::output::say;
 
-/// Between two signs of life in the database.
-const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
 /// Between two looks whether labels are still to be made, once no more structures will come.
 const LAST_LABELS: Duration = Duration::from_millis(100);
 /// A labeller that has lived for so long (ms) is of use: what it was started with is in order.

@@ -3,7 +3,6 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
 
 use orchestrator::reactor;
 use orchestrator::selector::Selector;
@@ -12,7 +11,7 @@ use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
 use wire::place::Place;
 use wire::transport::{InProcess, Incoming};
-use workers::labeller::{self, Closing, LabellerSettings, ReferenceMethod, Timing};
+use workers::labeller::{self, Closing, LabellerSettings, ReferenceMethod, SIGN_OF_LIFE, Timing};
 use workers::walk::WalkContext;
 use workers::walker;
 
@@ -20,9 +19,6 @@ use super::starts::no_labellers;
 use super::{CHANNEL, ReactorTask, Run, start_reactor, stop_on_signals, wanted_walkers};
 use crate::campaign::Campaign;
 use crate::outcome::Failure;
-
-/// Time between two signs of life.
-const SIGN_OF_LIFE: Duration = Duration::from_secs(10);
 
 /// Runs the campaign until it is done or stopped.
 pub async fn work(run: Run<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {

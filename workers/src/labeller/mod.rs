@@ -19,6 +19,8 @@ use insist::insist;
 pub use presence::serve;
 pub use reference::{LabelFailure, ReferenceMethod};
 
+/// Between two signs of life in the store, of every process that gives them there.
+pub const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
 /// The longest time between two looks at the queue.
 const LONGEST_IDLE: Duration = Duration::from_secs(1);
 /// Which part of the time without work passes until the next look, and so how late work may be found.
@@ -55,11 +57,7 @@ pub struct Timing {
 
 impl Default for Timing {
     fn default() -> Self {
-        Self {
-            lease: Duration::from_secs(600),
-            idle: Duration::from_millis(50),
-            sign_of_life: Duration::from_secs(5),
-        }
+        Self { lease: Duration::from_secs(600), idle: Duration::from_millis(50), sign_of_life: SIGN_OF_LIFE }
     }
 }
 
