@@ -209,7 +209,7 @@ impl Shell {
     }
 
     /// A walker was lost. If it had a turn in hand, another gets it, unless it is the turn that kills them.
-    fn gone(&mut self, walker: u32, fault: Option<String>) -> Result<Option<Commit>, ReactorError> {
+    fn gone(&mut self, walker: u32, fault: bool) -> Result<Option<Commit>, ReactorError> {
         if let Some(index) = self.promised.iter().position(|promise| promise.walker == walker) {
             if let Some(work) = self.promised.remove(index).work {
                 self.selector.lost(work.assignment.walk);
@@ -217,7 +217,7 @@ impl Shell {
             return Ok(None);
         }
         let Some(walk) = self.at_work.remove(&walker) else { return Ok(None) };
-        if fault.is_some() {
+        if fault {
             let cost = self.costs.entry(walk).or_default();
             *cost += 1;
             if *cost == MOST_WALKERS {

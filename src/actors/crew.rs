@@ -166,8 +166,7 @@ impl<'a> Crew<'a> {
             }
             launcher::Event::Said { number, line } => say(format_args!("walker {number}: {line}")),
             launcher::Event::Ended { number, ended } => {
-                let fault = ended.ending.is_own_fault().then(|| ended.ending.to_string());
-                self.line.gone(number, ended.incarnation, fault);
+                self.line.gone(number, ended.incarnation, ended.ending.is_own_fault());
                 if ended.then == Standing::GoneHome {
                     // There is no more work for the others either.
                     self.walkers.close();

@@ -111,7 +111,7 @@ async fn orchestrate() {
     let this = std::env::current_exe().expect("this program");
     let mut walker = Command::new(this).env(DOOR, door).stdin(Stdio::null()).spawn().expect("a process");
     tokio::task::spawn_blocking(move || walker.wait()).await.expect("a wait").expect("a process");
-    handle.gone(0, 1, None);
+    handle.gone(0, 1, false);
     handle.close();
     running.await.expect("a task").expect("a transport");
     deciding.await.expect("a task");

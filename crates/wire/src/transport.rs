@@ -52,8 +52,9 @@ pub enum Incoming {
     Gone {
         /// Which walker.
         walker: u32,
-        /// How it ended, if that was its own fault: the turn in its hand may do the same to the next one.
-        fault: Option<String>,
+        /// Whether it died by its own fault, as in a crash, and was not killed from outside: the turn in its hand may do
+        /// the same to the next one.
+        fault: bool,
     },
 }
 
@@ -95,7 +96,7 @@ impl Transport for InProcess {
 /// Also when the walker's thread panics: its turn must not be waited for.
 impl Drop for InProcess {
     fn drop(&mut self) {
-        let gone = Incoming::Gone { walker: self.walker, fault: None };
+        let gone = Incoming::Gone { walker: self.walker, fault: false };
         if let Err(TrySendError::Full(gone)) = self.to_reactor.try_send(gone) {
             let _ = self.to_reactor.blocking_send(gone);
         }

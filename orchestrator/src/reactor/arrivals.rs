@@ -33,7 +33,7 @@ pub(super) struct Arrivals {
 pub(super) enum Arrival<R = ExaminedReport> {
     Free { walker: u32, report: Option<R>, reply: oneshot::Sender<Option<Work>> },
     Progress(WalkId, Progress),
-    Gone { walker: u32, fault: Option<String> },
+    Gone { walker: u32, fault: bool },
 }
 
 impl Arrivals {

@@ -54,7 +54,7 @@ impl Desk {
 
     pub(super) fn expect(&mut self, walker: u32, incarnation: u32) {
         if let Some(previous) = self.conversations.expected(walker) {
-            self.gone(walker, previous, None);
+            self.gone(walker, previous, false);
         }
         self.conversations.expect(walker, incarnation);
         self.lines.open(walker);
@@ -63,7 +63,7 @@ impl Desk {
     /// The walker's process is dead. Its decision is dropped before the reactor hears of it, so that a turn which is
     /// given to it meanwhile is known to be lost one way or the other. News of a process that has a successor is no news: what the
     /// successor holds must not be freed.
-    pub(super) fn gone(&mut self, walker: u32, incarnation: u32, fault: Option<String>) {
+    pub(super) fn gone(&mut self, walker: u32, incarnation: u32, fault: bool) {
         if self.conversations.expected(walker) != Some(incarnation) {
             return;
         }

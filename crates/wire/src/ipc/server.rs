@@ -43,7 +43,7 @@ pub struct Handle {
 #[derive(Debug)]
 enum Order {
     Expect { walker: u32, incarnation: u32 },
-    Gone { walker: u32, incarnation: u32, fault: Option<String> },
+    Gone { walker: u32, incarnation: u32, fault: bool },
     Close,
 }
 
@@ -60,10 +60,10 @@ impl Handle {
         self.order(Order::Expect { walker, incarnation });
     }
 
-    /// The walker's process is dead and has been waited for: what it held is freed, and the reactor hears of it, and how
-    /// it ended if that was its own fault. Nothing happens if this incarnation is not the expected one any more: what it
+    /// The walker's process is dead and has been waited for: what it held is freed, and the reactor hears of it, and
+    /// whether that was its own fault. Nothing happens if this incarnation is not the expected one any more: what it
     /// held has been freed, and what is held now belongs to its successor.
-    pub fn gone(&self, walker: u32, incarnation: u32, fault: Option<String>) {
+    pub fn gone(&self, walker: u32, incarnation: u32, fault: bool) {
         self.order(Order::Gone { walker, incarnation, fault });
     }
 

@@ -17,8 +17,8 @@ async fn candidates_of_any_size_come_as_they_were() {
     }
     last.reply.send(None).unwrap();
     assert!(walker.wait().unwrap().success());
-    desk.handle.gone(0, 1, None);
-    assert!(matches!(desk.next().await, wire::transport::Incoming::Gone { walker: 0, fault: None }));
+    desk.handle.gone(0, 1, false);
+    assert!(matches!(desk.next().await, wire::transport::Incoming::Gone { walker: 0, fault: false }));
 
     let traffic = desk.handle.traffic();
     assert_eq!((traffic.dropped, traffic.unsent), (0, 0), "{traffic:?}");
@@ -46,8 +46,8 @@ async fn candidates_last_as_long_as_they_are_held() {
     }
     walker.kill().unwrap();
     walker.wait().unwrap();
-    desk.handle.gone(0, 1, None);
-    assert!(matches!(desk.next().await, wire::transport::Incoming::Gone { walker: 0, fault: None }));
+    desk.handle.gone(0, 1, false);
+    assert!(matches!(desk.next().await, wire::transport::Incoming::Gone { walker: 0, fault: false }));
     for report in &held {
         check(report, 0, report.turn, (20, 30));
     }
