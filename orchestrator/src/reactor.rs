@@ -11,7 +11,7 @@ use std::collections::{HashMap, VecDeque};
 use std::panic::resume_unwind;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use store::records::{Commit, Fate};
 use store::{Store, StoreError};
@@ -25,7 +25,7 @@ use wire::transport::{Incoming, Work};
 use self::arrivals::{Arrival, Arrivals};
 use crate::selector::{Next, Selector, SelectorError};
 
-/// How often a full label queue is looked at again.
+/// How often a full label queue is looked at again, and for how long a count of another is good.
 const QUEUE_LOOK: Duration = Duration::from_millis(200);
 /// A turn may cost so many walkers, which crashed with it in hand; then its walk is over.
 const MOST_WALKERS: u32 = 3;
@@ -91,6 +91,8 @@ struct Shell {
     at_work: HashMap<u32, WalkId>,
     /// Walkers that crashed with the present turn of a walk.
     costs: HashMap<WalkId, u32>,
+    /// Label jobs that are unfinished at most, and when they were counted.
+    unfinished: Option<(u64, Instant)>,
 }
 
 type Reply = oneshot::Sender<Option<Work>>;
@@ -173,6 +175,7 @@ impl Shell {
             promised: Vec::new(),
             at_work: HashMap::new(),
             costs: HashMap::new(),
+            unfinished: None,
         }
     }
 
@@ -202,6 +205,7 @@ impl Shell {
                 Arrival::Gone { walker, fault } => self.gone(walker, fault)?,
             };
             if let Some(commit) = commit {
+                self.unfinished.iter_mut().for_each(|(most, _)| *most += accepted(&commit));
                 group::append(self.decided.get_or_insert_default(), commit);
             }
         }
@@ -239,14 +243,7 @@ impl Shell {
             self.send_home();
             return Ok(());
         }
-        let unfinished = self.store.unfinished_jobs().await?;
-        if unfinished > self.queue_limit {
-            watch(Notice::QueueFull(unfinished));
-            return Ok(());
-        }
-        let accepted = self.decided.as_ref().map_or(0, accepted);
-        if unfinished + accepted > self.queue_limit {
-            // The queue may be full when these have come to it: it is looked at after their commit.
+        if self.is_queue_full(watch).await? {
             return Ok(());
         }
         while let Some((walker, reply)) = self.waiting.pop_front() {
@@ -267,6 +264,21 @@ impl Shell {
             }
         }
         Ok(())
+    }
+
+    /// Whether the label queue is full, or may be when what is decided has come to it: then it is looked at again after
+    /// the commit. It is not counted each time, since for a while it grows by what is decided here and nothing else.
+    async fn is_queue_full(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<bool, ReactorError> {
+        if self.unfinished.is_some_and(|(most, at)| most <= self.queue_limit && at.elapsed() < QUEUE_LOOK) {
+            return Ok(false);
+        }
+        let unfinished = self.store.unfinished_jobs().await?;
+        if unfinished > self.queue_limit {
+            watch(Notice::QueueFull(unfinished));
+        }
+        let most = unfinished + self.decided.as_ref().map_or(0, accepted);
+        self.unfinished = Some((most, Instant::now()));
+        Ok(most > self.queue_limit)
     }
 
     fn send_home(&mut self) {

@@ -14,8 +14,8 @@ use recording::{Model, Plan};
 use stages::{Stages, plain_inserts};
 use wire::CandidateBlock;
 
-/// Walks, and walkers side by side.
-const WALKS: usize = 16;
+/// Walks, and walkers side by side: as many as it takes at least to find so much.
+const WALKS: usize = 64;
 /// A walker's threshold of γ_max (paper).
 const THRESHOLD: f64 = 1.5;
 /// One so low that every candidate is accepted.
