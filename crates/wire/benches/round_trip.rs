@@ -3,11 +3,14 @@
 //!
 //! `encode` is the walker's part: control message and candidate, written once. `check` is the server's: checksums,
 //! content hash, decoding. What remains of the whole is the transport: two wake-ups of sleeping processes, the answer,
-//! the end of the old report. The whole is what a walker waits.
+//! the end of the old report. The whole is what a walker waits. Beside it, a byte to `cat` and back through pipes: two
+//! bare wake-ups. All that with processors at work, as they are in a campaign, and with idle ones, which take longer to wake.
 
-use std::process::{Command, Stdio};
+use std::io::{Read, Write};
+use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::thread::available_parallelism;
 use std::time::{Duration, Instant};
 
 use atoms::{Cell, Species, Structure};
@@ -34,8 +37,55 @@ const CHECKPOINT: usize = 20_000;
 fn main() {
     match std::env::var(DOOR) {
         Ok(door) => walk(&serde_json::from_str(&door).expect("a door")),
-        Err(_) => tokio::runtime::Runtime::new().expect("a runtime").block_on(orchestrate()),
+        Err(_) => {
+            let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+            let work = AtWork::on_all_processors();
+            println!("processors at work");
+            runtime.block_on(orchestrate());
+            drop(work);
+            println!("idle processors");
+            runtime.block_on(orchestrate());
+        }
     }
+}
+
+/// Processes that keep every processor awake and give way to all others.
+struct AtWork(Vec<Child>);
+
+impl AtWork {
+    fn on_all_processors() -> Self {
+        let spin = |_| {
+            let mut nice = Command::new("nice");
+            nice.args(["-n", "19", "sh", "-c", "while :; do :; done"]).spawn().expect("nice and sh")
+        };
+        Self((0..available_parallelism().map_or(1, usize::from)).map(spin).collect())
+    }
+}
+
+impl Drop for AtWork {
+    fn drop(&mut self) {
+        for process in &mut self.0 {
+            process.kill().expect("a process of ours");
+            process.wait().expect("a process of ours");
+        }
+    }
+}
+
+/// A byte to another process and back.
+fn bare_wake_ups() {
+    let mut cat =
+        Command::new("cat").stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("cat is there");
+    let (mut there, mut back) = (cat.stdin.take().expect("a pipe"), cat.stdout.take().expect("a pipe"));
+    let trip = |_| {
+        let begin = Instant::now();
+        there.write_all(b"x").expect("a living cat");
+        back.read_exact(&mut [0]).expect("a living cat");
+        begin.elapsed()
+    };
+    let (median, worst) = quantiles((0..TRIPS).map(trip).collect());
+    drop(there);
+    cat.wait().expect("cat ends");
+    println!("  bare wake-ups through pipes: {median:.1} µs ({worst:.1})");
 }
 
 /// The walker's process: all sizes one after the other.
@@ -85,6 +135,7 @@ fn quantiles(mut times: Vec<Duration>) -> (f64, f64) {
 }
 
 async fn orchestrate() {
+    tokio::task::spawn_blocking(bare_wake_ups).await.expect("a measurement");
     let directory = tempfile::tempdir().expect("a directory");
     let place = Place::of(directory.path()).expect("a place");
     let sizes = Sizes { walkers: 1, message_bytes: 5 << 20 };
