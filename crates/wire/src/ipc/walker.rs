@@ -6,6 +6,7 @@ use std::fmt::Display;
 use std::mem::MaybeUninit;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use iceoryx2::node::Node;
@@ -20,7 +21,7 @@ use crate::block::Candidate;
 use crate::control::seal;
 use crate::ids::WalkId;
 use crate::messages::{Progress, Report};
-use crate::mixture::MixtureReader;
+use crate::mixture::{MixtureReader, SharedMixtureError};
 use crate::place;
 use crate::transport::{Transport, Work};
 
@@ -30,6 +31,8 @@ const ASK_EVERY: Duration = Duration::from_secs(2);
 const PATIENCE: Duration = Duration::from_secs(600);
 /// … and earlier when the walker was asked to stop.
 const PATIENCE_WHEN_STOPPING: Duration = Duration::from_secs(20);
+/// What a predecessor held is free after so long at the latest.
+const PATIENCE_FOR_PREDECESSOR: Duration = Duration::from_secs(10);
 /// An offer that the orchestrator says it never had is made this often.
 const OFFERS: u32 = 5;
 
@@ -61,7 +64,7 @@ impl IpcWalker {
         let port = config::client_port(&config::open_requests(&node, caller.session)?, door.message_bytes)?;
         place::reserve(&door.prefix, Some(port.id().value()))
             .map_err(|e| IpcError::new("reserve its memory", e))?;
-        let mixtures = MixtureReader::open(&door.mixture, caller.walker)?;
+        let mixtures = reader(door)?;
         Ok(Self {
             caller,
             port,
@@ -169,6 +172,20 @@ impl IpcWalker {
         let (control, _) = frame::split(received.payload().as_bytes()).map_err(|e| unreadable(&e))?;
         let answer = Answer::decode(control).map_err(|e| unreadable(&e))?;
         Ok((answer.sequence == self.sequence).then_some(answer.decision))
+    }
+}
+
+/// Opens the mixture. What a predecessor held, the server frees when it hears of its end, which may be a moment later
+/// than the start of this process.
+fn reader(door: &Door) -> Result<MixtureReader, SharedMixtureError> {
+    let begun = Instant::now();
+    loop {
+        match MixtureReader::open(&door.mixture, door.caller.walker) {
+            Err(SharedMixtureError::Taken { .. }) if begun.elapsed() < PATIENCE_FOR_PREDECESSOR => {
+                sleep(Duration::from_millis(20));
+            }
+            opened => return opened,
+        }
     }
 }
 

@@ -13,7 +13,7 @@ use super::private::{make_private, user};
 
 /// The right to make and remove places of this user, for a moment. While somebody has it, no place comes, goes or
 /// changes its holder.
-pub(super) struct Turn(#[expect(dead_code, reason = "locked until it is closed")] File);
+pub(super) struct Turn(File);
 
 impl Turn {
     /// Waits for it.
@@ -39,12 +39,25 @@ impl Drop for Turn {
     fn drop(&mut self) {
         // Fails where there are places.
         let _ = fs::remove_dir(home());
+        unlock(&self.0);
     }
 }
 
 /// The directory of a place, locked.
 #[derive(Debug)]
-pub(super) struct Hold(#[expect(dead_code, reason = "locked until it is closed")] File);
+pub(super) struct Hold(File);
+
+impl Drop for Hold {
+    fn drop(&mut self) {
+        unlock(&self.0);
+    }
+}
+
+/// Closing the file is not enough at once: a process that is just being started has it too, until its program begins.
+fn unlock(file: &File) {
+    // What cannot be unlocked comes free with the last who has the file.
+    let _ = file.unlock();
+}
 
 impl Hold {
     /// Takes it, unless somebody else has it. To be called by whoever has the [`Turn`].

@@ -33,7 +33,7 @@ pub enum Role {
 /// Begins a process.
 pub fn start(role: &Role) -> Child {
     Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "process::child", "--ignored"])
+        .args(["--exact", "process::child", "--ignored", "--nocapture"])
         .env(ROLE, serde_json::to_string(role).unwrap())
         .stdout(Stdio::null())
         .spawn()
