@@ -3,6 +3,7 @@
 use std::io;
 use std::path::PathBuf;
 
+use sqlx::postgres::PgDatabaseError;
 use wire::{BlockError, ContentHash};
 
 use crate::JobState;
@@ -15,16 +16,40 @@ pub type Result<T> = std::result::Result<T, StoreError>;
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// Nothing there.
-    #[error("there is no campaign in {directory}: it has no {file}; name the directory of a campaign, or begin one there", directory = directory.display(), file = crate::DATABASE)]
+    #[error(
+        "there is no campaign in {location}: it has no {lacks}; name the place of a campaign, or begin one there"
+    )]
     Missing {
-        /// The directory looked at.
-        directory: PathBuf,
+        /// The directory or server looked at.
+        location: String,
+        /// What would be there.
+        lacks: &'static str,
     },
     /// Something there already.
     #[error("{path} exists already: a campaign is begun in a directory without one", path = path.display())]
     Exists {
         /// The database.
         path: PathBuf,
+    },
+    /// Another campaign there already.
+    #[error(
+        "campaign {wanted} cannot begin in {location}, which holds campaign {found}: a schema holds one campaign; name another one with ?schema=… in the URL"
+    )]
+    Occupied {
+        /// URL of the server.
+        location: String,
+        /// Id of the campaign that is there.
+        found: String,
+        /// Id of the one that was to be begun.
+        wanted: String,
+    },
+    /// Not the URL of a server.
+    #[error("'{url}' cannot be used: {reason}")]
+    Url {
+        /// The URL without its password.
+        url: String,
+        /// What is wrong with it.
+        reason: String,
     },
     /// No directory, or one where nothing may be written.
     #[error("cannot work in the directory {directory} ({source}): it must exist, and reading and writing there must be allowed", directory = directory.display())]
@@ -57,11 +82,23 @@ pub enum StoreError {
         kind: String,
     },
     /// Another process runs the campaign.
-    #[error("the campaign in {directory} is being run by {holder}: only one process may run a campaign; wait for it, or stop it", directory = directory.display())]
+    #[error(
+        "the campaign in {location} is being run by {holder}: only one process may run a campaign; wait for it, or stop it"
+    )]
     Locked {
-        /// The directory.
-        directory: PathBuf,
+        /// The directory or server.
+        location: String,
         /// Who holds the lock, with its process number.
+        holder: String,
+    },
+    /// Another process runs the campaign that this one ran.
+    #[error(
+        "the campaign in {location} was taken over by {holder} while this process had lost its connection: it writes nothing more"
+    )]
+    LockLost {
+        /// The server.
+        location: String,
+        /// Who holds the lock now.
         holder: String,
     },
     /// Not a file of SQLite.
@@ -81,6 +118,16 @@ pub enum StoreError {
         found: i64,
         /// That of this program.
         expected: i64,
+    },
+    /// Somebody else's tables.
+    #[error(
+        "the schema in {location} has a table '{found}' and is not of this program: name another one with ?schema=… in the URL"
+    )]
+    ForeignSchema {
+        /// URL of the server.
+        location: String,
+        /// A table in it.
+        found: String,
     },
     /// A database of another version of this program.
     #[error("{path} has a schema of version {found}; this program reads version {reads}: use the program that wrote it, or a newer one", path = path.display())]
@@ -108,6 +155,11 @@ pub enum StoreError {
     /// Another connection holds the database for longer than the time limit.
     #[error("the database is busy: another program holds it (a backup, an open transaction?); try again")]
     Busy,
+    /// The server cannot be reached, or the connection to it broke.
+    #[error(
+        "the database server does not answer ({0}): it may be restarting; see that it runs and can be reached, and try again"
+    )]
+    Unreachable(sqlx::Error),
     /// Content that this program cannot have written.
     #[error("damaged database: {what}: {reason}; restore it from a copy")]
     Damaged {
@@ -170,10 +222,10 @@ pub enum StoreError {
 }
 
 impl StoreError {
-    /// Whether the same call may succeed later without anyone changing the campaign: the disk is full, or the
-    /// database busy.
+    /// Whether the same call may succeed later without anyone changing the campaign: the disk is full, the database
+    /// busy, or its server away.
     pub fn is_transient(&self) -> bool {
-        matches!(self, Self::DiskFull | Self::Busy)
+        matches!(self, Self::DiskFull | Self::Busy | Self::Unreachable(_))
     }
 
     pub(crate) fn damaged(what: impl ToString, reason: impl ToString) -> Self {
@@ -188,22 +240,47 @@ const IOERR_SHMSIZE: i32 = 4874;
 
 impl From<sqlx::Error> for StoreError {
     fn from(error: sqlx::Error) -> Self {
-        // The low byte of SQLite's extended result codes, https://www.sqlite.org/rescode.html
-        let code = match &error {
-            sqlx::Error::Database(database) => database.code().and_then(|code| code.parse::<i32>().ok()),
-            sqlx::Error::PoolTimedOut => return Self::Busy,
-            sqlx::Error::ColumnDecode { .. } | sqlx::Error::Decode(_) => {
-                return Self::damaged("a row", error);
+        match &error {
+            sqlx::Error::Database(database) => {
+                let code = database.code().unwrap_or_default().into_owned();
+                if database.try_downcast_ref::<PgDatabaseError>().is_some() {
+                    from_postgres(&code, error)
+                } else {
+                    from_sqlite(code.parse().unwrap_or_default(), error)
+                }
             }
-            _ => None,
-        };
-        match code.map(|code| if code == IOERR_SHMSIZE { FULL } else { code & 0xff }) {
-            Some(5 | 6) => Self::Busy,
-            Some(8) => Self::ReadOnly,
-            Some(11 | 26) => Self::damaged(crate::DATABASE, error),
-            Some(FULL) => Self::DiskFull,
+            sqlx::Error::PoolTimedOut => Self::Busy,
+            // SQLite has no connections that break.
+            sqlx::Error::Io(_) => Self::Unreachable(error),
+            sqlx::Error::ColumnDecode { .. } | sqlx::Error::Decode(_) => Self::damaged("a row", error),
             _ => Self::Database(error),
         }
+    }
+}
+
+/// The low byte of SQLite's extended result codes, https://www.sqlite.org/rescode.html
+fn from_sqlite(code: i32, error: sqlx::Error) -> StoreError {
+    match if code == IOERR_SHMSIZE { FULL } else { code & 0xff } {
+        5 | 6 => StoreError::Busy,
+        8 => StoreError::ReadOnly,
+        11 | 26 => StoreError::damaged(crate::DATABASE, error),
+        FULL => StoreError::DiskFull,
+        _ => StoreError::Database(error),
+    }
+}
+
+/// https://www.postgresql.org/docs/current/errcodes-appendix.html
+fn from_postgres(code: &str, error: sqlx::Error) -> StoreError {
+    match code {
+        // Serialisation failure, deadlock, lock not available.
+        "40001" | "40P01" | "55P03" => StoreError::Busy,
+        "25006" => StoreError::ReadOnly,
+        "53100" => StoreError::DiskFull,
+        // Too many connections; it shuts down, has crashed, starts, or let the connection go.
+        "53300" | "57P01" | "57P02" | "57P03" | "57P05" => StoreError::Unreachable(error),
+        code if code.starts_with("08") => StoreError::Unreachable(error),
+        "XX001" | "XX002" => StoreError::damaged("the server's files", error),
+        _ => StoreError::Database(error),
     }
 }
 

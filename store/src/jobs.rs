@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use crate::database::from_columns;
 use crate::records::{JobState, Label};
 
 /// What became of a result that was brought.
@@ -65,7 +66,7 @@ pub struct Job {
 }
 
 /// An attempt at a job.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, sqlx::FromRow)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Attempt {
     /// Its number, from 1.
     pub attempt: u32,
@@ -84,6 +85,8 @@ pub struct Attempt {
     /// Log of a failure.
     pub log: Option<String>,
 }
+
+from_columns!(Attempt { attempt, holder, calculation, started, ended, outcome, class, log });
 
 /// A job with its attempts.
 #[derive(Clone, Debug, PartialEq, Serialize)]

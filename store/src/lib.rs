@@ -1,21 +1,26 @@
 //! The database of a campaign: what was decided, what is queued, what was labelled.
 //!
-//! One directory holds one campaign. Whoever runs it holds the [`CampaignLock`]; anyone may open the [`Store`] beside
+//! One directory holds one campaign, or one schema of a server ([`Location`]). Whoever runs it holds the [`CampaignLock`]; anyone may open the [`Store`] beside
 //! it. Every writing function is one transaction that is on the disk when the function returns, so any process
 //! may be killed at any time. No function reads a clock: `now` is ms since 1970, see [`unix_milliseconds`].
 
 mod birth;
+mod database;
 mod encoding;
 mod error;
 mod export;
 mod filesystem;
 mod jobs;
+mod location;
 mod lock;
 mod numbers;
+mod postgres;
 mod processes;
 pub mod records;
 mod sqlite;
 mod status;
+mod store;
+mod tables;
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -24,12 +29,14 @@ pub use error::{Result, StoreError};
 pub use export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
 pub use filesystem::{check_directory, network_file_system};
 pub use jobs::{Attempt, Completed, Failed, Imported, Job, JobDetails, LabelRecord, LabelSource, Standing};
+pub use location::{Location, ServerUrl};
 pub use lock::{CampaignLock, LOCK};
 pub use numbers::NumbersError;
 pub use processes::{ProcessRecord, this_host};
 pub use records::*;
-pub use sqlite::{DATABASE, Store};
+pub use sqlite::DATABASE;
 pub use status::{Candidates, Declined, Labels, Status, WalkStatus};
+pub use store::Store;
 
 /// The time now, ms since 1970.
 pub fn unix_milliseconds() -> i64 {

@@ -1,4 +1,4 @@
-//! One process runs a campaign: an advisory lock on a file beside the database. The system releases it when the
+//! One process runs a campaign: an advisory lock on a file beside the database, or of the server. It is released when the
 //! process ends, however it ends.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
@@ -6,17 +6,52 @@ use std::io::{self, Seek, Write};
 use std::path::Path;
 
 use crate::error::{Result, StoreError};
+use crate::location::Location;
+use crate::postgres::leadership::Leadership;
 
 /// Name of the file that is locked, in the campaign's directory.
 pub const LOCK: &str = "campaign.lock";
 
 /// The right to run a campaign, until it is dropped.
 #[derive(Debug)]
-pub struct CampaignLock {
-    _file: File,
+pub struct CampaignLock(Held);
+
+#[derive(Debug)]
+enum Held {
+    /// Closed, it is free.
+    File {
+        _file: File,
+    },
+    Session(Leadership),
 }
 
 impl CampaignLock {
+    /// Takes the lock of the campaign in a directory (see [`Self::acquire`]) or on a server, where its tables are made
+    /// if they are not there yet.
+    pub async fn acquire_at(location: impl Into<Location>, who: &str) -> Result<Self> {
+        match location.into() {
+            Location::Directory(directory) => Self::acquire(&directory, who),
+            Location::Server(url) => Ok(Self(Held::Session(Leadership::take(&url, who).await?))),
+        }
+    }
+
+    /// Waits until the lock is not held any longer, and says who has it. On a server a connection may break; it is taken
+    /// again then, if nobody else had it meanwhile. A file stays locked for as long as its process lives.
+    pub async fn lost(&self) -> StoreError {
+        match &self.0 {
+            Held::File { .. } => std::future::pending().await,
+            Held::Session(leadership) => leadership.lost().await,
+        }
+    }
+
+    /// What tells the transactions of this holder from those of earlier ones.
+    pub(crate) fn generation(&self) -> Option<i64> {
+        match &self.0 {
+            Held::File { .. } => None,
+            Held::Session(leadership) => Some(leadership.generation),
+        }
+    }
+
     /// Takes the lock of the campaign in `directory`, or says who has it. `who` is written into the file beside
     /// the process number, for the message that a second process gets.
     pub fn acquire(directory: &Path, who: &str) -> Result<Self> {
@@ -35,7 +70,8 @@ impl CampaignLock {
             Err(TryLockError::WouldBlock) => {
                 let holder = fs::read_to_string(&path).unwrap_or_default();
                 let holder = if holder.trim().is_empty() { "another process" } else { holder.trim() };
-                return Err(StoreError::Locked { directory: directory.into(), holder: holder.into() });
+                let location = directory.display().to_string();
+                return Err(StoreError::Locked { location, holder: holder.into() });
             }
             Err(TryLockError::Error(source)) => return Err(failed(source)),
         }
@@ -43,7 +79,7 @@ impl CampaignLock {
         file.set_len(0).map_err(failed)?;
         file.rewind().map_err(failed)?;
         file.write_all(line.as_bytes()).map_err(failed)?;
-        Ok(Self { _file: file })
+        Ok(Self(Held::File { _file: file }))
     }
 }
 

@@ -3,6 +3,8 @@
 use serde::Serialize;
 
 use crate::birth::{self, process_birth};
+use crate::database::{FromRow, Row};
+use crate::error::Result;
 
 /// A process of this system may be silent for so long (ms) without having lost what it holds: the whole system slept,
 /// or its clock was put right. One that hangs for longer does not keep its jobs for ever.
@@ -11,19 +13,17 @@ const SLEEP: i64 = 24 * 3600 * 1000;
 /// A process that works for the campaign.
 ///
 /// What schema version 1 does not have is filled in when such a database is read.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, sqlx::FromRow)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ProcessRecord {
     /// Its own name, never used twice and without `/`.
     pub id: String,
     /// [`Self::ORCHESTRATOR`], [`Self::WALKER`] or [`Self::LABELLER`].
     pub kind: String,
     /// Which walker or labeller it is; an orchestrator has no number.
-    #[sqlx(default)]
     pub number: Option<u32>,
     /// Process number on its host.
     pub pid: u32,
     /// See [`process_birth`]; empty if unknown.
-    #[sqlx(default)]
     pub birth: String,
     /// Name of its host, for people.
     pub host: String,
@@ -34,14 +34,30 @@ pub struct ProcessRecord {
     /// What is said of it (`running`, `stopping`, `pausing`, `given up` …), see [`crate::Store::status`].
     pub state: String,
     /// How often its predecessors were replaced in this run of the campaign.
-    #[sqlx(default)]
     pub restarts: u32,
     /// Hash of what a labeller was started with: one that was started with something else is not adopted.
-    #[sqlx(default)]
     pub setup: Option<String>,
     /// What is worth knowing besides: the last failure, messages that were dropped.
-    #[sqlx(default)]
     pub remark: String,
+}
+
+impl FromRow for ProcessRecord {
+    fn from_row(row: &Row) -> Result<Self> {
+        Ok(Self {
+            id: row.get("id")?,
+            kind: row.get("kind")?,
+            number: row.get_or_default("number")?,
+            pid: row.get("pid")?,
+            birth: row.get_or_default("birth")?,
+            host: row.get("host")?,
+            started: row.get("started")?,
+            last_seen: row.get("last_seen")?,
+            state: row.get("state")?,
+            restarts: row.get_or_default("restarts")?,
+            setup: row.get_or_default("setup")?,
+            remark: row.get_or_default("remark")?,
+        })
+    }
 }
 
 impl ProcessRecord {

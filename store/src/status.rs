@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use crate::database::from_columns;
 use crate::processes::ProcessRecord;
 
 /// Everything that `status` shows.
@@ -69,7 +70,7 @@ pub struct Labels {
 }
 
 /// Where a walk stands.
-#[derive(Clone, Debug, PartialEq, Serialize, sqlx::FromRow)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct WalkStatus {
     /// Its number.
     pub walk: u32,
@@ -100,3 +101,20 @@ pub struct WalkStatus {
     /// Returns to a checkpoint.
     pub returns: u32,
 }
+
+from_columns!(WalkStatus {
+    walk,
+    seed_structure,
+    origin,
+    state,
+    reason,
+    step,
+    segment,
+    tau,
+    temperature,
+    relative_volume,
+    gamma_max,
+    accepted,
+    refused,
+    returns
+});

@@ -1,31 +1,23 @@
 //! Beginning and opening campaigns; what is committed is what comes back.
 
+#[path = "common/mod.rs"]
 mod common;
 
-use std::fs;
-
 use common::*;
-use store::{
-    CampaignLock, CandidateRecord, Commit, ComponentRecord, DATABASE, Fate, ProcessRecord, Store, StoreError,
-};
+use store::{CandidateRecord, Commit, ComponentRecord, Fate, ProcessRecord, Store, StoreError};
 use wire::Origin;
 use wire::messages::Decline;
 
 #[tokio::test]
 async fn a_campaign_is_begun_once_and_opened_often() {
-    let directory = tempfile::tempdir().unwrap();
-    let error = Store::open(directory.path()).await.unwrap_err();
+    let home = Home::new();
+    let error = Store::open(home.location()).await.unwrap_err();
     assert!(matches!(error, StoreError::Missing { .. }), "{error}");
-    // What a creation that was killed may leave behind does not matter.
-    fs::write(directory.path().join("campaign.sqlite.new"), b"half a file").unwrap();
-    let store = create(directory.path()).await;
-    store.close().await;
-    let files = fs::read_dir(directory.path()).unwrap().count();
-    assert_eq!(files, 1, "only {DATABASE}");
-    let error = Store::create(directory.path(), &campaign(), &[], 0).await.unwrap_err();
-    assert!(matches!(error, StoreError::Exists { .. }), "{error}");
+    home.create().await.close().await;
+    let error = Store::create(home.location(), &campaign(), &[], 0).await.unwrap_err();
+    assert!(matches!(error, StoreError::Exists { .. } | StoreError::Occupied { .. }), "{error}");
 
-    let store = Store::open(directory.path()).await.unwrap();
+    let store = home.open().await;
     assert_eq!(store.campaign().await.unwrap(), campaign());
     let seeds = store.seed_structures().await.unwrap();
     assert_eq!((seeds.len(), seeds[0].name.as_str()), (1, "diamond"));
@@ -38,78 +30,6 @@ async fn a_campaign_is_begun_once_and_opened_often() {
     let kinds: Vec<_> = operations.iter().map(|o| (o.time, o.kind.as_str())).collect();
     assert_eq!(kinds, [(0, "created"), (0, "protocol"), (7, "configuration")]);
     assert_eq!(operations[2].detail, change);
-}
-
-#[tokio::test]
-async fn other_files_and_versions_are_refused_with_what_was_found() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join(DATABASE);
-    fs::write(&path, "units metal\natom_style atomic\n").unwrap();
-    let message = Store::open(directory.path()).await.unwrap_err().to_string();
-    assert!(message.contains("no SQLite database") && message.contains("units metal"), "{message}");
-    fs::write(&path, "").unwrap();
-    assert!(matches!(Store::open(directory.path()).await, Err(StoreError::NotADatabase { .. })));
-    fs::remove_file(&path).unwrap();
-
-    create(directory.path()).await.close().await;
-    let whole = fs::read(&path).unwrap();
-    // https://www.sqlite.org/fileformat.html: user version at byte 60, application id at byte 68, big-endian.
-    let mut newer = whole.clone();
-    newer[63] = 7;
-    fs::write(&path, &newer).unwrap();
-    let message = Store::open(directory.path()).await.unwrap_err().to_string();
-    assert!(message.contains("version 7") && message.contains("reads version 2"), "{message}");
-    assert!(matches!(
-        Store::open_read_only(directory.path()).await,
-        Err(StoreError::Version { found: 7, reads: 2, .. })
-    ));
-    let mut foreign = whole.clone();
-    foreign[68..72].copy_from_slice(&[0, 0, 0, 9]);
-    fs::write(&path, &foreign).unwrap();
-    assert!(matches!(Store::open(directory.path()).await, Err(StoreError::Foreign { found: 9, .. })));
-    assert_eq!(fs::read(&path).unwrap(), foreign, "a foreign database is left as it is");
-    // Bytes of a page in disorder.
-    let mut damaged = whole;
-    damaged[4096..].fill(0x55);
-    fs::write(&path, &damaged).unwrap();
-    let error = Store::open(directory.path()).await.unwrap_err();
-    assert!(error.to_string().contains("damaged") || matches!(error, StoreError::Schema(_)), "{error}");
-}
-
-#[tokio::test]
-async fn a_directory_that_cannot_be_written_is_named() {
-    let directory = tempfile::tempdir().unwrap();
-    let missing = directory.path().join("missing");
-    let error = Store::create(&missing, &campaign(), &[], 0).await.unwrap_err();
-    assert!(matches!(error, StoreError::Directory { .. }), "{error}");
-    let file = directory.path().join("file");
-    fs::write(&file, "").unwrap();
-    let error = Store::create(&file, &campaign(), &[], 0).await.unwrap_err();
-    assert!(error.to_string().contains("file"), "{error}");
-    assert!(matches!(CampaignLock::acquire(&file, "run"), Err(StoreError::Directory { .. })));
-}
-
-#[cfg(unix)]
-#[tokio::test]
-async fn a_campaign_can_be_looked_at_where_nothing_may_be_written() {
-    use std::os::unix::fs::PermissionsExt;
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
-    accept(&store, 2).await;
-    store.close().await;
-    let permit = |mode| fs::set_permissions(directory.path(), fs::Permissions::from_mode(mode)).unwrap();
-    permit(0o555);
-    let refused = Store::open(directory.path()).await;
-    let lock = CampaignLock::acquire(directory.path(), "run");
-    let seen = Store::open_read_only(directory.path()).await.unwrap().status().await.unwrap();
-    permit(0o755);
-    assert_eq!(seen.labels.queued, 2);
-    // Nothing is forbidden to the superuser.
-    if !rustix::process::geteuid().is_root() {
-        assert!(matches!(lock, Err(StoreError::Directory { .. })), "{lock:?}");
-        let error = refused.unwrap_err();
-        assert!(matches!(error, StoreError::Directory { .. }), "{error}");
-    }
 }
 
 fn mixed_commit() -> Commit {
@@ -134,13 +54,13 @@ fn mixed_commit() -> Commit {
 
 #[tokio::test]
 async fn what_is_committed_comes_back() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let commit = mixed_commit();
     assert_eq!(store.commit(&commit).await.unwrap(), 1..5);
     store.close().await;
 
-    let store = Store::open(directory.path()).await.unwrap();
+    let store = home.open().await;
     assert_eq!(store.load_walks().await.unwrap(), commit.walks);
     assert_eq!(store.load_components().await.unwrap(), commit.components[1..]);
     assert_eq!(store.values().await.unwrap(), commit.values);
@@ -185,8 +105,8 @@ async fn what_is_committed_comes_back() {
 
 #[tokio::test]
 async fn a_contradictory_commit_leaves_nothing() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     store.commit(&mixed_commit()).await.unwrap();
     let log = store.decision_log_text().await.unwrap();
 
@@ -213,8 +133,8 @@ async fn a_contradictory_commit_leaves_nothing() {
 /// A walk that is interrupted in its turn is committed without any decision.
 #[tokio::test]
 async fn a_checkpoint_is_kept_between_decisions() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     store.commit(&mixed_commit()).await.unwrap();
     let decisions = store.decision_log_text().await.unwrap();
     let mut paused = walk(0, 1);
@@ -231,8 +151,8 @@ async fn a_checkpoint_is_kept_between_decisions() {
 
 #[tokio::test]
 async fn status_counts_everything_once() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     assert!(!store.status().await.unwrap().finished);
     store.commit(&mixed_commit()).await.unwrap();
     let dft = protocol("dft").hash;
@@ -252,7 +172,7 @@ async fn status_counts_everything_once() {
     store.upsert_process(&process("a", std::process::id())).await.unwrap();
     store.upsert_process(&process("b", dead.id())).await.unwrap();
 
-    let reader = Store::open_read_only(directory.path()).await.unwrap();
+    let reader = home.open_read_only().await;
     let status = serde_json::to_value(reader.status().await.unwrap()).unwrap();
     let candidates = serde_json::json!({
         "seen": 3, "accepted": 1, "declined": { "covered": 1, "duplicate": 0, "guard": 1, "budget": 0 },

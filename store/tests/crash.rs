@@ -1,6 +1,7 @@
 //! A process that commits and labels without end is killed at random instants: whatever it was told to be safe is there,
 //! and everything else is there as a whole or not at all.
 
+#[path = "common/mod.rs"]
 mod common;
 
 use std::env;

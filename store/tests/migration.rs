@@ -1,5 +1,6 @@
 //! Campaigns that earlier versions of the program began.
 
+#[path = "common/mod.rs"]
 mod common;
 
 use std::fs;

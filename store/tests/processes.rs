@@ -1,11 +1,10 @@
 //! Who works for a campaign, and what comes back of those who are gone.
 
+#[path = "common/mod.rs"]
 mod common;
 
-use std::fs;
-
 use common::*;
-use store::{DATABASE, JobState, Lease, ProcessRecord, Store, StoreError, process_birth};
+use store::{JobState, Lease, ProcessRecord, Store, process_birth};
 
 /// A living process (this one).
 fn living(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
@@ -36,8 +35,8 @@ async fn holders(store: &Store) -> Vec<String> {
 
 #[tokio::test]
 async fn a_record_comes_back_as_it_was_written() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let mut record = living("l", ProcessRecord::LABELLER, Some(7));
     assert_eq!(Some(&record.birth), process_birth(std::process::id()).as_ref());
     record.restarts = 2;
@@ -55,8 +54,8 @@ async fn a_record_comes_back_as_it_was_written() {
 
 #[tokio::test]
 async fn a_replacement_takes_the_place_of_its_predecessor() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let walkers =
         [gone("w0", "walker", Some(0)), gone("w1", "walker", Some(1)), living("o", "orchestrator", None)];
     store.upsert_processes(&walkers).await.unwrap();
@@ -76,8 +75,8 @@ async fn a_replacement_takes_the_place_of_its_predecessor() {
 
 #[tokio::test]
 async fn leases_of_the_living_last_and_those_of_the_gone_come_back() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     accept(&store, 5).await;
     let processes = [
         living("living", "labeller", Some(0)),
@@ -100,8 +99,8 @@ async fn leases_of_the_living_last_and_those_of_the_gone_come_back() {
 #[tokio::test]
 async fn a_lease_that_ran_out_is_kept_by_a_process_that_may_be_at_work() {
     const HOUR: i64 = 3_600_000;
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     accept(&store, 6).await;
     let elsewhere = |id: &str, last_seen| {
         let here = living(id, "labeller", Some(7));
@@ -131,8 +130,8 @@ async fn a_lease_that_ran_out_is_kept_by_a_process_that_may_be_at_work() {
 
 #[tokio::test]
 async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     accept(&store, 5).await;
     let processes = [
         living("living", "labeller", Some(0)),
@@ -159,8 +158,8 @@ async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
 
 #[tokio::test]
 async fn status_says_who_is_gone_and_who_was_given_up() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let said = |id: &str, number, state: &str| ProcessRecord {
         state: state.into(),
         ..gone(id, "walker", Some(number))
@@ -179,25 +178,4 @@ async fn status_says_who_is_gone_and_who_was_given_up() {
     // Without its orchestrator nobody starts the third again.
     store.upsert_process(&gone("o", "orchestrator", None)).await.unwrap();
     assert_eq!(states().await, ["gone", "gone", "given up", "gone"]);
-}
-
-#[tokio::test]
-async fn nothing_is_written_into_a_file_that_is_not_there_any_more() {
-    let directory = tempfile::tempdir().unwrap();
-    let (path, moved) = (directory.path().join(DATABASE), directory.path().join("moved"));
-    let store = create(directory.path()).await;
-    accept(&store, 1).await;
-    let record = living("l", "labeller", Some(0));
-    store.upsert_process(&record).await.unwrap();
-    fs::rename(&path, &moved).unwrap();
-    for _ in 0..2 {
-        let error = store.upsert_process(&record).await.unwrap_err();
-        assert!(matches!(&error, StoreError::Removed { path: found } if *found == path), "{error}");
-        let refused = store.lease(protocol("dft").hash, "l", 0, 9).await;
-        assert!(matches!(refused, Err(StoreError::Removed { .. })));
-        // Another file in its place is not the same.
-        fs::copy(&moved, &path).unwrap();
-    }
-    fs::rename(&moved, &path).unwrap();
-    lease(&store, "l", 0).await;
 }

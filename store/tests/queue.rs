@@ -1,5 +1,6 @@
 //! The label queue step by step, imports and exports.
 
+#[path = "common/mod.rs"]
 mod common;
 
 use std::collections::BTreeSet;
@@ -23,8 +24,8 @@ async fn state(store: &Store, candidate: &str) -> JobState {
 
 #[tokio::test]
 async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let names = accept(&store, 3).await;
     store.prioritise_job(&names[2], 20, 0).await.unwrap();
     let first = lease(&store, "host-1/a", 0).await.unwrap();
@@ -54,8 +55,8 @@ async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
 
 #[tokio::test]
 async fn the_first_result_is_the_label_whoever_brings_it() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let names = accept(&store, 1).await;
     let lost = lease(&store, "a", 0).await.unwrap();
     let holds = lease(&store, "b", 10_000).await.unwrap();
@@ -79,8 +80,8 @@ async fn the_first_result_is_the_label_whoever_brings_it() {
 
 #[tokio::test]
 async fn results_that_cannot_be_true_are_refused() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     accept(&store, 1).await;
     let lease = lease(&store, "a", 0).await.unwrap();
     let mut short = label(-1.0);
@@ -96,8 +97,8 @@ async fn results_that_cannot_be_true_are_refused() {
 
 #[tokio::test]
 async fn failures_count_and_releases_do_not() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let names = accept(&store, 1).await;
     for (stop, holder) in [(true, "h-1/a"), (false, "h-1/b"), (true, "h-1")] {
         lease(&store, holder, 0).await.unwrap();
@@ -125,8 +126,8 @@ async fn failures_count_and_releases_do_not() {
 
 #[tokio::test]
 async fn a_job_that_crashes_its_labellers_is_given_up() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let names = accept(&store, 2).await;
     for crash in 1..=2 {
         let holder = format!("h-{crash}");
@@ -144,8 +145,8 @@ async fn a_job_that_crashes_its_labellers_is_given_up() {
 
 #[tokio::test]
 async fn a_job_that_is_lost_again_and_again_is_given_up() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let names = accept(&store, 1).await;
     let lose = async |losses: usize| {
         for loss in 0..losses {
@@ -181,8 +182,8 @@ async fn a_job_that_is_lost_again_and_again_is_given_up() {
 
 #[tokio::test]
 async fn jobs_are_found_by_name_or_a_beginning_of_it() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let error = store.drop_job("0.0.1", 0).await.unwrap_err();
     assert!(error.to_string().contains("queue is empty"), "{error}");
     let names = accept(&store, 12).await;
@@ -210,8 +211,8 @@ async fn jobs_are_found_by_name_or_a_beginning_of_it() {
 
 #[tokio::test]
 async fn a_dropped_job_stays_dropped_until_it_is_wanted_again() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let names = accept(&store, 1).await;
     let lease = lease(&store, "a", 0).await.unwrap();
     store.drop_job(&names[0], 1).await.unwrap();
@@ -226,8 +227,8 @@ async fn a_dropped_job_stays_dropped_until_it_is_wanted_again() {
 
 #[tokio::test]
 async fn candidates_found_before_there_is_a_protocol_get_their_jobs_later() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = Store::create(directory.path(), &campaign(), &[], 0).await.unwrap();
+    let home = Home::new();
+    let store = Store::create(home.location(), &campaign(), &[], 0).await.unwrap().by_the_callers_clock();
     let names = accept(&store, 2).await;
     assert_eq!(store.unfinished_jobs().await.unwrap(), 0);
     let unknown = store.lease(protocol("dft").hash, "a", 0, 10).await;
@@ -247,8 +248,8 @@ async fn candidates_found_before_there_is_a_protocol_get_their_jobs_later() {
 
 #[tokio::test]
 async fn imports_label_what_waits_and_can_be_repeated() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let names = accept(&store, 2).await;
     let dft = protocol("dft").hash;
     let frames = [(0, structure(50.0), label(-5.0)), (1, structure(1e-6), label(-1.0))];
@@ -274,8 +275,8 @@ async fn imports_label_what_waits_and_can_be_repeated() {
 
 /// A campaign whose labels come in the order `order`; the text of its export, read in pages of `page`.
 async fn export_text(order: &[usize], page: u32, filter: &ExportFilter) -> Vec<String> {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     accept(&store, 4).await;
     store.commit(&commit_of(vec![candidate(3, 5, Origin::Control, Fate::Accepted)])).await.unwrap();
     let imports = [(4, structure(50.0), label(-50.0)), (6, structure(40.0), label(-40.0))];
@@ -317,8 +318,8 @@ async fn exports_do_not_depend_on_the_order_of_labels() {
 
 #[tokio::test]
 async fn an_exported_row_tells_all_that_is_known() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let record = candidate(0, 1, Origin::Biased, Fate::Accepted);
     store.commit(&commit_of(vec![record.clone()])).await.unwrap();
     let lease = lease(&store, "a", 0).await.unwrap();
@@ -339,13 +340,13 @@ async fn an_exported_row_tells_all_that_is_known() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn two_connections_never_lease_the_same_job() {
-    let directory = tempfile::tempdir().unwrap();
-    let store = create(directory.path()).await;
+    let home = Home::new();
+    let store = home.create().await;
     let records = (1..=60).map(|step| candidate(0, step, Origin::Biased, Fate::Accepted)).collect();
     store.commit(&commit_of(records)).await.unwrap();
     let mut labellers = Vec::new();
     for holder in ["a", "b", "c"] {
-        let store = Store::open(directory.path()).await.unwrap();
+        let store = home.open().await;
         labellers.push(tokio::spawn(async move {
             let mut jobs = Vec::new();
             while let Some(lease) = lease(&store, holder, 0).await {

@@ -1,5 +1,6 @@
 //! The queue against a model of a few lines, under random operations and a clock of its own.
 
+#[path = "common/mod.rs"]
 mod common;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -89,7 +90,7 @@ impl Model {
 }
 
 struct Run {
-    directory: tempfile::TempDir,
+    home: Home,
     store: Store,
     names: Vec<String>,
     model: Model,
@@ -99,8 +100,8 @@ struct Run {
 
 impl Run {
     async fn new() -> Self {
-        let directory = tempfile::tempdir().unwrap();
-        let store = create(directory.path()).await;
+        let home = Home::new();
+        let store = home.create().await;
         let names = accept(&store, JOBS).await;
         let job = ModelJob {
             state: JobState::Queued,
@@ -112,7 +113,7 @@ impl Run {
             results: Vec::new(),
         };
         let model = Model((0..JOBS as usize).map(|place| (place, job.clone())).collect());
-        Self { directory, store, names, model, leases: Vec::new(), now: 0 }
+        Self { home, store, names, model, leases: Vec::new(), now: 0 }
     }
 
     /// Any lease ever given, lost or not.
@@ -127,7 +128,7 @@ impl Run {
             Step::Wait(milliseconds) => self.now += i64::from(milliseconds),
             Step::Reopen => {
                 store.close().await;
-                self.store = Store::open(self.directory.path()).await.unwrap();
+                self.store = self.home.open().await;
             }
             Step::Lease(holder) => {
                 let holder = format!("host/{holder}");

@@ -1,17 +1,6 @@
-//! The store in one SQLite file: making it, opening it, and the ways to its tables.
+//! The database in one SQLite file: making it and opening it.
 
-mod by_hand;
-mod commit;
-mod export;
-mod imports;
 mod in_place;
-mod labels;
-mod logs;
-mod processes;
-mod protocols;
-mod queue;
-mod restore;
-mod status;
 
 use std::fs::{self, File};
 use std::io::{self, Read};
@@ -26,9 +15,9 @@ use sqlx::sqlite::{
 use sqlx::{ConnectOptions, Connection};
 
 use self::in_place::InPlace;
+use crate::database::Database;
 use crate::error::{Result, StoreError};
 use crate::filesystem::check_directory;
-use crate::records::{Campaign, SeedStructure};
 
 /// Name of the database, in the campaign's directory.
 pub const DATABASE: &str = "campaign.sqlite";
@@ -54,26 +43,20 @@ const LOG_PAGES: u32 = 1 << 12;
 
 static MIGRATIONS: Migrator = sqlx::migrate!("migrations/sqlite");
 
-type Transaction = sqlx::Transaction<'static, Sqlite>;
-
-/// The database of one campaign. Clones share its connections.
+/// An open database file. Clones share its connections.
 #[derive(Clone, Debug)]
-pub struct Store {
+pub struct DatabaseFile {
     /// One connection: who writes waits in line. None in a store that was opened to be read.
     writer: Option<SqlitePool>,
-    readers: SqlitePool,
+    pub readers: SqlitePool,
     /// What every transaction that writes looks at first.
     file: InPlace,
 }
 
-impl Store {
-    /// Begins a campaign in `directory`, which must exist and whose [`crate::CampaignLock`] the caller holds. Either the whole database is there afterwards, or none.
-    pub async fn create(
-        directory: &Path,
-        campaign: &Campaign,
-        seeds: &[SeedStructure],
-        now: i64,
-    ) -> Result<Self> {
+impl DatabaseFile {
+    /// Makes the database in `directory`, which must exist; `fill` writes what it begins with. Either the whole
+    /// database is there afterwards, or none.
+    pub async fn create(directory: &Path, fill: impl AsyncFnOnce(&Database) -> Result<()>) -> Result<Self> {
         check_directory(directory)?;
         let path = directory.join(DATABASE);
         if path.exists() {
@@ -84,15 +67,15 @@ impl Store {
         let writer = writer(&unfinished).await?;
         MIGRATIONS.run(&writer).await.map_err(schema_error)?;
         let file = InPlace::of(&unfinished)?;
-        let store = Self { readers: writer.clone(), writer: Some(writer), file };
-        store.write_campaign(campaign, seeds, now).await?;
-        store.empty_log().await?;
-        store.close().await;
+        let made = Self { readers: writer.clone(), writer: Some(writer), file };
+        fill(&Database::Sqlite(made.clone())).await?;
+        made.empty_log().await?;
+        made.close().await;
         publish(directory, &unfinished, &path)?;
         Self::open(directory).await
     }
 
-    /// Opens the campaign in `directory`, and brings its tables up to date.
+    /// Opens the database in `directory`, and brings its tables up to date.
     pub async fn open(directory: &Path) -> Result<Self> {
         let begun = Instant::now();
         loop {
@@ -124,8 +107,8 @@ impl Store {
         Ok(Self { writer: Some(writer), readers, file: InPlace::of(&path)? })
     }
 
-    /// Opens the campaign in `directory` to look at it, also where nothing may be written. Tables of an earlier version
-    /// stay as they are: what they lack is filled in where they are read.
+    /// Opens the database in `directory` to look at it, also where nothing may be written. Tables of an earlier
+    /// version stay as they are: what they lack is filled in where they are read.
     pub async fn open_read_only(directory: &Path) -> Result<Self> {
         let path = existing(directory)?;
         let immutable = match check_directory(directory) {
@@ -139,7 +122,6 @@ impl Store {
         Ok(Self { writer: None, readers, file: InPlace::of(&path)? })
     }
 
-    /// Closes every connection. What was committed is safe without it.
     pub async fn close(&self) {
         self.readers.close().await;
         if let Some(writer) = &self.writer {
@@ -157,7 +139,7 @@ impl Store {
 
     /// A transaction that has the right to write from its first statement on: one that asked for it later could be
     /// refused in spite of the time limit.
-    async fn begin(&self) -> Result<Transaction> {
+    pub async fn begin(&self) -> Result<sqlx::Transaction<'static, Sqlite>> {
         let writer = self.writer.as_ref().ok_or(StoreError::ReadOnly)?;
         self.file.check()?;
         Ok(writer.begin_with("BEGIN IMMEDIATE").await?)
@@ -193,7 +175,11 @@ fn readers(options: SqliteConnectOptions) -> SqlitePool {
 
 fn existing(directory: &Path) -> Result<PathBuf> {
     let path = directory.join(DATABASE);
-    if path.exists() { Ok(path) } else { Err(StoreError::Missing { directory: directory.into() }) }
+    if path.exists() {
+        Ok(path)
+    } else {
+        Err(StoreError::Missing { location: directory.display().to_string(), lacks: DATABASE })
+    }
 }
 
 /// Checks that the file is a campaign that this program can read, without changing a byte of it. Returns the version of

@@ -4,9 +4,12 @@ use sqlx::AssertSqlSafe;
 use wire::CampaignId;
 
 use super::*;
-use crate::records::{Commit, ComponentRecord};
+use crate::Store;
+use crate::records::{Campaign, Commit, ComponentRecord};
+use crate::tables::{by_hand, export, labels, queue, status};
 
-async fn store(directory: &Path) -> Store {
+/// The store in a directory, and its file.
+async fn store(directory: &Path) -> (Store, DatabaseFile) {
     let campaign = Campaign {
         id: CampaignId([1; 16]),
         program_version: "0".into(),
@@ -15,22 +18,24 @@ async fn store(directory: &Path) -> Store {
         resolved_configuration: "{}".into(),
         configuration_in_force: "{}".into(),
     };
-    Store::create(directory, &campaign, &[], 0).await.unwrap()
+    let store = Store::create(directory, &campaign, &[], 0).await.unwrap();
+    let Database::Sqlite(file) = store.database.clone() else { panic!("a directory is on no server") };
+    (store, file)
 }
 
-async fn plan(store: &Store, sql: &str) -> String {
+async fn plan(file: &DatabaseFile, sql: &str) -> String {
     let explain = AssertSqlSafe(format!("EXPLAIN QUERY PLAN {sql}"));
     let rows: Vec<(i64, i64, i64, String)> =
-        sqlx::query_as(explain).fetch_all(store.writer.as_ref().unwrap()).await.unwrap();
+        sqlx::query_as(explain).fetch_all(file.writer.as_ref().unwrap()).await.unwrap();
     rows.into_iter().map(|(.., step)| step + "\n").collect()
 }
 
 #[tokio::test]
 async fn what_is_asked_often_goes_through_indexes() {
     let directory = tempfile::tempdir().unwrap();
-    let store = store(directory.path()).await;
+    let (_store, file) = store(directory.path()).await;
     for sql in [
-        queue::LEASE,
+        queue::NEXT,
         queue::EXPIRED,
         queue::UNFINISHED,
         queue::HELD,
@@ -41,11 +46,11 @@ async fn what_is_asked_often_goes_through_indexes() {
         export::IMPORTS,
         labels::CURRENT,
     ] {
-        let plan = plan(&store, sql).await.replace("SCAN CONSTANT ROW", "");
+        let plan = plan(&file, sql).await.replace("SCAN CONSTANT ROW", "");
         assert!(!plan.contains("SCAN") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");
     }
     for sql in [status::FATES, status::STATES] {
-        let plan = plan(&store, sql).await;
+        let plan = plan(&file, sql).await;
         assert!(plan.contains("COVERING INDEX") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");
     }
 }
@@ -53,8 +58,8 @@ async fn what_is_asked_often_goes_through_indexes() {
 #[tokio::test]
 async fn connections_are_safe_against_a_loss_of_power_and_write_large_pages() {
     let directory = tempfile::tempdir().unwrap();
-    let store = store(directory.path()).await;
-    let pool = store.writer.as_ref().unwrap();
+    let (_store, file) = store(directory.path()).await;
+    let pool = file.writer.as_ref().unwrap();
     let journal: String = sqlx::query_scalar("PRAGMA journal_mode").fetch_one(pool).await.unwrap();
     assert_eq!(journal, "wal");
     for (sql, expected) in [
@@ -74,14 +79,14 @@ async fn connections_are_safe_against_a_loss_of_power_and_write_large_pages() {
 #[tokio::test]
 async fn a_full_disk_says_so_and_loses_nothing() {
     let directory = tempfile::tempdir().unwrap();
-    let store = store(directory.path()).await;
+    let (store, file) = store(directory.path()).await;
     let component = |size| Commit {
         components: vec![ComponentRecord { element: 0, slot: 0, bytes: vec![7; size] }],
         ..Commit::default()
     };
     store.commit(&component(10)).await.unwrap();
     // SQLite answers a limit on the size of the file as it answers a full disk.
-    let pool = store.writer.as_ref().unwrap();
+    let pool = file.writer.as_ref().unwrap();
     let pages: i64 = sqlx::query_scalar("PRAGMA page_count").fetch_one(pool).await.unwrap();
     sqlx::query(AssertSqlSafe(format!("PRAGMA max_page_count = {}", pages + 2))).execute(pool).await.unwrap();
     let error = store.commit(&component(1_000_000)).await.unwrap_err();
@@ -95,11 +100,11 @@ async fn a_full_disk_says_so_and_loses_nothing() {
 #[tokio::test]
 async fn a_database_that_another_program_holds_is_busy() {
     let directory = tempfile::tempdir().unwrap();
-    let store = store(directory.path()).await;
-    let pool = store.writer.as_ref().unwrap();
+    let (store, file) = store(directory.path()).await;
+    let pool = file.writer.as_ref().unwrap();
     sqlx::query("PRAGMA busy_timeout = 20").execute(pool).await.unwrap();
     let other = Store::open(directory.path()).await.unwrap();
-    let held = other.begin().await.unwrap();
+    let held = other.database.begin().await.unwrap();
     let error = store.commit(&Commit::default()).await.unwrap_err();
     assert!(matches!(error, StoreError::Busy) && error.is_transient(), "{error:?}");
     drop(held);

@@ -1,16 +1,18 @@
 //! A small campaign to test with.
-#![allow(dead_code, reason = "each test file uses its part")]
+#![allow(dead_code, unused_imports, reason = "each test file uses its part")]
 
-use std::path::Path;
+mod home;
 
 use atoms::{Cell, Structure};
 use serde_json::json;
 use store::{
-    AtomGrades, Campaign, CandidateRecord, Commit, Decision, Fate, Label, Protocol, SeedStructure, Store,
-    WalkRecord,
+    AtomGrades, Campaign, CandidateRecord, Commit, Decision, Fate, Label, Location, Protocol, SeedStructure,
+    Store, WalkRecord,
 };
 use wire::messages::Progress;
 use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
+
+pub use home::{Home, server};
 
 pub const CAMPAIGN: CampaignId = CampaignId([0x9f; 16]);
 pub const ATOMS: usize = 2;
@@ -42,15 +44,19 @@ pub fn protocol(name: &str) -> Protocol {
     Protocol { hash: ContentHash(hash), name: name.into(), settings: json!({ "code": name }) }
 }
 
-/// A campaign with one seed structure and the protocol "dft" in force.
-pub async fn create(directory: &Path) -> Store {
+/// A campaign in a directory, with one seed structure and the protocol "dft" in force.
+pub async fn create(directory: &std::path::Path) -> Store {
+    create_at(directory.into()).await
+}
+
+pub async fn create_at(location: Location) -> Store {
     let seed = SeedStructure {
         index: 0,
         name: "diamond".into(),
         source: "seeds.extxyz".into(),
         structure: structure(0.0),
     };
-    let store = Store::create(directory, &campaign(), &[seed], 0).await.unwrap();
+    let store = Store::create(location, &campaign(), &[seed], 0).await.unwrap();
     store.add_protocol(&protocol("dft"), 0).await.unwrap();
     store
 }

@@ -5,7 +5,9 @@ use wire::ContentHash;
 
 use super::commit::structure_number;
 use super::labels::{add, check, finish_job};
-use super::{Store, Transaction, protocols};
+use super::protocols;
+use crate::Store;
+use crate::database::{Transaction, query};
 use crate::encoding::{encode_vectors, integer};
 use crate::error::Result;
 use crate::jobs::{Imported, LabelSource, Standing};
@@ -22,16 +24,16 @@ impl Store {
         frames: &[(u64, Structure, Label)],
         now: i64,
     ) -> Result<Imported> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin().await?;
         let protocol = protocols::number(&mut transaction, protocol).await?;
         let mut imported = Imported::default();
         for (frame, structure, label) in frames {
             let number = structure_number(&mut transaction, structure, ContentHash::of(structure)).await?;
             check(&mut transaction, number, label).await?;
-            let sql = "INSERT INTO import (structure, file, frame) VALUES (?, ?, ?)
+            let sql = "INSERT INTO import (structure, file, frame) VALUES ($1, $2, $3)
                        ON CONFLICT (structure) DO NOTHING";
-            let query = sqlx::query(sql).bind(number).bind(file).bind(integer("frame", *frame)?);
-            query.execute(&mut *transaction).await?;
+            let query = query(sql).bind(number).bind(file).bind(integer("frame", *frame)?);
+            query.execute(&mut transaction).await?;
             if is_known(&mut transaction, number, protocol, label).await? {
                 imported.known += 1;
                 continue;
@@ -55,13 +57,13 @@ async fn is_known(
     protocol: i64,
     label: &Label,
 ) -> Result<bool> {
-    let sql = "SELECT EXISTS (SELECT 1 FROM label WHERE structure = ? AND protocol = ? AND energy = ?
-                              AND forces = ? AND stress IS ?)";
-    let query = sqlx::query_scalar(sql)
+    let sql = "SELECT EXISTS (SELECT 1 FROM label WHERE structure = $1 AND protocol = $2 AND energy = $3
+                              AND forces = $4 AND stress IS NOT DISTINCT FROM $5)";
+    let query = query(sql)
         .bind(structure)
         .bind(protocol)
         .bind(label.energy)
         .bind(encode_vectors(&label.forces))
         .bind(label.stress.map(|stress| encode_vectors(&stress)));
-    Ok(query.fetch_one(&mut **transaction).await?)
+    query.fetch_one(&mut *transaction).await
 }

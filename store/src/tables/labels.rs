@@ -3,18 +3,19 @@
 
 use wire::ContentHash;
 
+use super::protocols;
 use super::queue::{end_attempt, job_row};
-use super::{Store, Transaction, protocols};
+use crate::Store;
+use crate::database::{Transaction, from_columns, query};
 use crate::encoding::{decode_matrix, decode_vectors, encode_vectors, integer};
 use crate::error::{Result, StoreError};
 use crate::jobs::{Completed, LabelRecord, LabelSource, Standing};
 use crate::records::{Label, Lease};
 
-pub(super) const CURRENT: &str =
-    "SELECT EXISTS (SELECT 1 FROM label WHERE structure = ? AND protocol = ? AND standing = 'label')";
+pub(crate) const CURRENT: &str =
+    "SELECT EXISTS (SELECT 1 FROM label WHERE structure = $1 AND protocol = $2 AND standing = 'label')";
 
 /// A label as a row.
-#[derive(sqlx::FromRow)]
 pub(super) struct LabelRow {
     standing: String,
     energy: f64,
@@ -28,6 +29,8 @@ pub(super) struct LabelRow {
     received: i64,
 }
 
+from_columns!(LabelRow { standing, energy, forces, stress, job, attempt, file, frame, correction, received });
+
 impl Store {
     /// Brings the result of a leased job. The first valid one for structure and protocol is the label, whether or not
     /// the lease still lasts; later ones are kept as checks. A job that was dropped meanwhile stays dropped. Bringing
@@ -36,13 +39,18 @@ impl Store {
     /// # Errors
     /// [`StoreError::InvalidLabel`] for a wrong number of forces, or numbers that are not finite.
     pub async fn complete(&self, lease: &Lease, label: &Label, now: i64) -> Result<Completed> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin().await?;
+        let structure = query("SELECT structure FROM job WHERE number = $1").bind(lease.job);
+        let structure: Option<i64> = structure.fetch_optional(&mut transaction).await?;
+        // First the structure, then its job: always in this order.
+        if let Some(structure) = structure {
+            check(&mut transaction, structure, label).await?;
+        }
         let job = job_row(&mut transaction, lease.job).await?;
-        check(&mut transaction, job.structure, label).await?;
         let sql =
-            "SELECT standing FROM label WHERE structure = ? AND protocol = ? AND job = ? AND attempt = ?";
-        let before = sqlx::query_scalar(sql).bind(job.structure).bind(job.protocol);
-        let before = before.bind(lease.job).bind(lease.attempt).fetch_optional(&mut *transaction).await?;
+            "SELECT standing FROM label WHERE structure = $1 AND protocol = $2 AND job = $3 AND attempt = $4";
+        let before = query(sql).bind(job.structure).bind(job.protocol);
+        let before = before.bind(lease.job).bind(lease.attempt).fetch_optional(&mut transaction).await?;
         let before: Option<String> = before;
         if let Some(standing) = before {
             let check = standing == Standing::Check.name();
@@ -51,9 +59,9 @@ impl Store {
         let source = LabelSource::Attempt { job: lease.job, attempt: lease.attempt };
         let standing = add(&mut transaction, job.structure, job.protocol, label, &source, now).await?;
         let outcome = if standing == Standing::Label { "labelled" } else { "check" };
-        let sql = "UPDATE attempt SET ended = ?, outcome = ? WHERE job = ? AND attempt = ?";
-        let query = sqlx::query(sql).bind(now).bind(outcome).bind(lease.job).bind(lease.attempt);
-        query.execute(&mut *transaction).await?;
+        let sql = "UPDATE attempt SET ended = $1, outcome = $2 WHERE job = $3 AND attempt = $4";
+        let query = query(sql).bind(now).bind(outcome).bind(lease.job).bind(lease.attempt);
+        query.execute(&mut transaction).await?;
         finish_job(&mut transaction, job.structure, job.protocol, now).await?;
         transaction.commit().await?;
         Ok(if standing == Standing::Label { Completed::Label } else { Completed::KeptAsCheck })
@@ -68,21 +76,21 @@ impl Store {
         reason: &str,
         now: i64,
     ) -> Result<()> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin().await?;
         let protocol = protocols::number(&mut transaction, protocol).await?;
-        let number = sqlx::query_scalar("SELECT number FROM structure WHERE hash = ?").bind(&structure.0[..]);
-        let number: Option<i64> = number.fetch_optional(&mut *transaction).await?;
+        let number = query("SELECT number FROM structure WHERE hash = $1").bind(&structure.0[..]);
+        let number: Option<i64> = number.fetch_optional(&mut transaction).await?;
         let number = number.ok_or(StoreError::NoLabel(structure))?;
         check(&mut transaction, number, label).await?;
         let sql = "UPDATE label SET standing = 'superseded'
-                   WHERE structure = ? AND protocol = ? AND standing = 'label'";
-        let query = sqlx::query(sql).bind(number).bind(protocol);
-        if query.execute(&mut *transaction).await?.rows_affected() == 0 {
+                   WHERE structure = $1 AND protocol = $2 AND standing = 'label'";
+        let superseded = query(sql).bind(number).bind(protocol);
+        if superseded.execute(&mut transaction).await? == 0 {
             return Err(StoreError::NoLabel(structure));
         }
         let source = LabelSource::Correction { reason: reason.to_owned() };
         add(&mut transaction, number, protocol, label, &source, now).await?;
-        Ok(transaction.commit().await?)
+        transaction.commit().await
     }
 
     /// Every label and check of a structure under a protocol, oldest first.
@@ -94,17 +102,18 @@ impl Store {
         let sql = "SELECT label.* FROM label
                    JOIN structure ON structure.number = label.structure
                    JOIN protocol ON protocol.number = label.protocol
-                   WHERE structure.hash = ? AND protocol.hash = ? ORDER BY label.number";
-        let query = sqlx::query_as(sql).bind(structure.0.to_vec()).bind(protocol.0.to_vec());
-        let rows: Vec<LabelRow> = query.fetch_all(&self.readers).await?;
+                   WHERE structure.hash = $1 AND protocol.hash = $2 ORDER BY label.number";
+        let query = query(sql).bind(structure.0.to_vec()).bind(protocol.0.to_vec());
+        let rows: Vec<LabelRow> = query.fetch_all(&self.database).await?;
         rows.into_iter().map(LabelRow::into_record).collect()
     }
 }
 
-/// Whether the label can be one of that structure.
+/// Whether the label can be one of that structure. Until the end of the transaction nobody else adds a label or a job for
+/// the structure.
 pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: &Label) -> Result<()> {
-    let atoms = sqlx::query_scalar("SELECT atoms FROM structure WHERE number = ?").bind(structure);
-    let atoms: u64 = atoms.fetch_one(&mut **transaction).await?;
+    let atoms = query("SELECT atoms FROM structure WHERE number = $1").bind(structure);
+    let atoms: u64 = atoms.locked().fetch_one(&mut *transaction).await?;
     let invalid = |reason: String| Err(StoreError::InvalidLabel(reason));
     if label.forces.len() as u64 != atoms {
         return invalid(format!("{} forces for {atoms} atoms", label.forces.len()));
@@ -128,8 +137,7 @@ pub(super) async fn add(
     source: &LabelSource,
     now: i64,
 ) -> Result<Standing> {
-    let labelled: bool =
-        sqlx::query_scalar(CURRENT).bind(structure).bind(protocol).fetch_one(&mut **transaction).await?;
+    let labelled: bool = query(CURRENT).bind(structure).bind(protocol).fetch_one(&mut *transaction).await?;
     let standing = if labelled { Standing::Check } else { Standing::Label };
     let (mut job, mut attempt, mut file, mut frame, mut correction) = (None, None, None, None, None);
     match source {
@@ -141,8 +149,8 @@ pub(super) async fn add(
     }
     let sql =
         "INSERT INTO label (structure, protocol, standing, energy, forces, stress, job, attempt, file, frame,
-                                  correction, received) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)";
-    sqlx::query(sql)
+                                  correction, received) VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12)";
+    query(sql)
         .bind(structure)
         .bind(protocol)
         .bind(standing.name())
@@ -155,7 +163,7 @@ pub(super) async fn add(
         .bind(frame)
         .bind(correction)
         .bind(now)
-        .execute(&mut **transaction)
+        .execute(&mut *transaction)
         .await?;
     Ok(standing)
 }
@@ -168,10 +176,10 @@ pub(super) async fn finish_job(
     now: i64,
 ) -> Result<()> {
     let sql = "UPDATE job SET state = 'labelled', holder = NULL, expires = NULL
-               WHERE structure = ? AND protocol = ? AND state IN ('queued', 'leased', 'failed')
+               WHERE structure = $1 AND protocol = $2 AND state IN ('queued', 'leased', 'failed')
                RETURNING number";
-    let job = sqlx::query_scalar(sql).bind(structure).bind(protocol);
-    if let Some(job) = job.fetch_optional(&mut **transaction).await? {
+    let job = query(sql).bind(structure).bind(protocol);
+    if let Some(job) = job.fetch_optional(&mut *transaction).await? {
         end_attempt(transaction, job, "overtaken", now).await?;
     }
     Ok(())

@@ -4,7 +4,8 @@ use serde_json::{Value, json};
 
 use super::logs::insert_operation;
 use super::queue::end_attempt;
-use super::{Store, Transaction};
+use crate::Store;
+use crate::database::{Transaction, from_columns, query};
 use crate::error::{Result, StoreError};
 use crate::jobs::{Attempt, Job, JobDetails, Standing};
 use crate::records::JobState;
@@ -12,27 +13,26 @@ use crate::records::JobState;
 /// Candidates shown when a name fits none or several.
 const SHOWN: usize = 5;
 
-pub(super) const LIST: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
+pub(crate) const LIST: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
     FROM job CROSS JOIN candidate ON candidate.decision = job.decision
     CROSS JOIN protocol ON protocol.number = job.protocol
-    WHERE state = ? ORDER BY job.priority DESC, job.decision LIMIT ? OFFSET ?";
+    WHERE state = $1 ORDER BY job.priority DESC, job.decision LIMIT $2 OFFSET $3";
 
 const LIST_ALL: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
     FROM job CROSS JOIN candidate ON candidate.decision = job.decision
     CROSS JOIN protocol ON protocol.number = job.protocol
-    ORDER BY job.number LIMIT ? OFFSET ?";
+    ORDER BY job.number LIMIT $1 OFFSET $2";
 
 const SHOW: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
     FROM job CROSS JOIN candidate ON candidate.decision = job.decision
     CROSS JOIN protocol ON protocol.number = job.protocol
-    WHERE job.number = ?";
+    WHERE job.number = $1";
 
 /// Candidates of one beginning, with the newest job of their structure.
-pub(super) const FIND: &str = "SELECT id, max(job.number) FROM candidate
+pub(crate) const FIND: &str = "SELECT id, max(job.number) FROM candidate
     CROSS JOIN job ON job.structure = candidate.structure
-    WHERE id >= ?1 AND id < ?1 || '~' GROUP BY id ORDER BY id LIMIT ?2";
+    WHERE id >= $1 AND id < $1 || '~' GROUP BY id ORDER BY id LIMIT $2";
 
-#[derive(sqlx::FromRow)]
 struct Row {
     number: i64,
     structure: i64,
@@ -49,27 +49,43 @@ struct Row {
     original_gamma: Option<f64>,
 }
 
+from_columns!(Row {
+    number,
+    structure,
+    id,
+    name,
+    state,
+    priority,
+    holder,
+    expires,
+    attempts,
+    failures,
+    atoms,
+    formula,
+    original_gamma
+});
+
 impl Store {
     /// The jobs in a state, in the order in which they would be leased; or all, in the order in which they came.
     pub async fn queue_list(&self, state: Option<JobState>, limit: u32, offset: u32) -> Result<Vec<Job>> {
         let query = match state {
-            Some(state) => sqlx::query_as(LIST).bind(state.name()),
-            None => sqlx::query_as(LIST_ALL),
+            Some(state) => query(LIST).bind(state.name()),
+            None => query(LIST_ALL),
         };
-        let rows: Vec<Row> = query.bind(limit).bind(offset).fetch_all(&self.readers).await?;
+        let rows: Vec<Row> = query.bind(limit).bind(offset).fetch_all(&self.database).await?;
         rows.into_iter().map(Row::into_job).collect()
     }
 
     /// A job by the name of its candidate or the beginning of it; the campaign's part of the name may be left out.
     pub async fn queue_show(&self, id: &str) -> Result<JobDetails> {
         let (job, _) = self.find(id).await?;
-        let row: Row = sqlx::query_as(SHOW).bind(job).fetch_one(&self.readers).await?;
-        let attempts = sqlx::query_as("SELECT * FROM attempt WHERE job = ? ORDER BY attempt").bind(job);
-        let attempts: Vec<Attempt> = attempts.fetch_all(&self.readers).await?;
-        let sql = "SELECT standing, energy FROM label WHERE structure = ?
-                   AND protocol = (SELECT protocol FROM job WHERE number = ?) ORDER BY number";
-        let energies = sqlx::query_as(sql).bind(row.structure).bind(job);
-        let energies: Vec<(String, f64)> = energies.fetch_all(&self.readers).await?;
+        let row: Row = query(SHOW).bind(job).fetch_one(&self.database).await?;
+        let attempts = query("SELECT * FROM attempt WHERE job = $1 ORDER BY attempt").bind(job);
+        let attempts: Vec<Attempt> = attempts.fetch_all(&self.database).await?;
+        let sql = "SELECT standing, energy FROM label WHERE structure = $1
+                   AND protocol = (SELECT protocol FROM job WHERE number = $2) ORDER BY number";
+        let energies = query(sql).bind(row.structure).bind(job);
+        let energies: Vec<(String, f64)> = energies.fetch_all(&self.database).await?;
         let standing = |(name, energy): (String, f64)| Some((Standing::named(&name)?, energy));
         Ok(JobDetails {
             job: row.into_job()?,
@@ -84,8 +100,8 @@ impl Store {
         let allowed = [Queued, Leased, Failed];
         let mut change = self.change("drop", id, &allowed, "queued, leased and failed").await?;
         end_attempt(&mut change.transaction, change.job, "dropped", now).await?;
-        let sql = "UPDATE job SET state = 'dropped', holder = NULL, expires = NULL WHERE number = ?";
-        sqlx::query(sql).bind(change.job).execute(&mut *change.transaction).await?;
+        let sql = "UPDATE job SET state = 'dropped', holder = NULL, expires = NULL WHERE number = $1";
+        query(sql).bind(change.job).execute(&mut change.transaction).await?;
         change.log("drop", json!({}), now).await
     }
 
@@ -97,8 +113,8 @@ impl Store {
         let sql = "UPDATE job SET failures = 0, state = CASE WHEN EXISTS (
                        SELECT 1 FROM label WHERE label.structure = job.structure
                        AND label.protocol = job.protocol AND standing = 'label'
-                   ) THEN 'labelled' ELSE 'queued' END WHERE number = ?";
-        sqlx::query(sql).bind(change.job).execute(&mut *change.transaction).await?;
+                   ) THEN 'labelled' ELSE 'queued' END WHERE number = $1";
+        query(sql).bind(change.job).execute(&mut change.transaction).await?;
         change.log("retry", json!({}), now).await
     }
 
@@ -107,8 +123,8 @@ impl Store {
     pub async fn prioritise_job(&self, id: &str, priority: i32, now: i64) -> Result<String> {
         let allowed = [JobState::Queued, JobState::Leased];
         let mut change = self.change("prioritise", id, &allowed, "queued and leased").await?;
-        let sql = "UPDATE job SET priority = ? WHERE number = ?";
-        sqlx::query(sql).bind(priority).bind(change.job).execute(&mut *change.transaction).await?;
+        let sql = "UPDATE job SET priority = $1 WHERE number = $2";
+        query(sql).bind(priority).bind(change.job).execute(&mut change.transaction).await?;
         change.log("prioritise", json!({ "priority": priority }), now).await
     }
 
@@ -120,9 +136,9 @@ impl Store {
         allowed_text: &'static str,
     ) -> Result<Change> {
         let (job, candidate) = self.find(id).await?;
-        let mut transaction = self.begin().await?;
-        let state = sqlx::query_scalar("SELECT state FROM job WHERE number = ?").bind(job);
-        let state = parse_state(state.fetch_one(&mut *transaction).await?)?;
+        let mut transaction = self.database.begin().await?;
+        let state = query("SELECT state FROM job WHERE number = $1").bind(job);
+        let state = parse_state(state.locked().fetch_one(&mut transaction).await?)?;
         if !allowed.contains(&state) {
             return Err(StoreError::WrongState { action, candidate, state, allowed: allowed_text });
         }
@@ -150,8 +166,8 @@ impl Store {
     }
 
     async fn beginning_with(&self, begin: &str) -> Result<Vec<(String, i64)>> {
-        let query = sqlx::query_as(FIND).bind(begin).bind(SHOWN as i64);
-        Ok(query.fetch_all(&self.readers).await?)
+        let query = query(FIND).bind(begin).bind(SHOWN as i64);
+        query.fetch_all(&self.database).await
     }
 
     /// The candidates whose names begin like `id` for as long as possible.

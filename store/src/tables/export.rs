@@ -2,38 +2,38 @@
 
 use wire::{CandidateBlock, ContentHash};
 
-use super::Store;
 use super::labels::decode_label;
 use super::restore::{grades, origin};
+use crate::Store;
+use crate::database::{FromRow, Row, from_columns, query};
 use crate::encoding::decode_structure;
 use crate::error::{Result, StoreError};
 use crate::export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
 
-pub(super) const CANDIDATES: &str = "SELECT candidate.decision, id, candidate.seed_structure,
+pub(crate) const CANDIDATES: &str = "SELECT candidate.decision, id, candidate.seed_structure,
         coalesce(seed_structure.name, '') AS seed_name, origin, decision.mixture_version AS version_after,
         block, original_grades, hash, data, label.energy, forces, stress
     FROM candidate
-    CROSS JOIN label ON label.structure = candidate.structure AND label.protocol = ?1 AND standing = 'label'
+    CROSS JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND standing = 'label'
     CROSS JOIN structure ON structure.number = candidate.structure
     CROSS JOIN decision ON decision.sequence = candidate.decision
     CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
     LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-    WHERE candidate.decision > ?2 AND CASE origin WHEN 'biased' THEN ?3 ELSE ?4 END
-    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure AND job.protocol = ?1
+    WHERE candidate.decision > $2 AND CASE origin WHEN 'biased' THEN $3 ELSE $4 END = 1
+    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure AND job.protocol = $1
                     AND state = 'dropped')
-    ORDER BY candidate.decision LIMIT ?5";
+    ORDER BY candidate.decision LIMIT $5";
 
 /// Imported structures that are not rows of candidates already.
-pub(super) const IMPORTS: &str =
+pub(crate) const IMPORTS: &str =
     "SELECT import.number, import.file, import.frame, hash, data, energy, forces, stress
     FROM import
-    CROSS JOIN label ON label.structure = import.structure AND label.protocol = ?1 AND standing = 'label'
+    CROSS JOIN label ON label.structure = import.structure AND label.protocol = $1 AND standing = 'label'
     CROSS JOIN structure ON structure.number = import.structure
-    WHERE import.number > ?2
+    WHERE import.number > $2
     AND NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.structure = import.structure)
-    ORDER BY import.number LIMIT ?3";
+    ORDER BY import.number LIMIT $3";
 
-#[derive(sqlx::FromRow)]
 struct CandidateRow {
     decision: i64,
     id: String,
@@ -43,20 +43,39 @@ struct CandidateRow {
     version_after: u64,
     block: Vec<u8>,
     original_grades: Option<Vec<u8>>,
-    #[sqlx(flatten)]
     labelled: Labelled,
 }
 
-#[derive(sqlx::FromRow)]
+impl FromRow for CandidateRow {
+    fn from_row(row: &Row) -> Result<Self> {
+        Ok(Self {
+            decision: row.get("decision")?,
+            id: row.get("id")?,
+            seed_structure: row.get("seed_structure")?,
+            seed_name: row.get("seed_name")?,
+            origin: row.get("origin")?,
+            version_after: row.get("version_after")?,
+            block: row.get("block")?,
+            original_grades: row.get("original_grades")?,
+            labelled: Labelled::from_row(row)?,
+        })
+    }
+}
+
 struct ImportRow {
     number: i64,
     file: String,
     frame: u64,
-    #[sqlx(flatten)]
     labelled: Labelled,
 }
 
-#[derive(sqlx::FromRow)]
+impl FromRow for ImportRow {
+    fn from_row(row: &Row) -> Result<Self> {
+        let (number, file, frame) = (row.get("number")?, row.get("file")?, row.get("frame")?);
+        Ok(Self { number, file, frame, labelled: Labelled::from_row(row)? })
+    }
+}
+
 struct Labelled {
     hash: Vec<u8>,
     data: Vec<u8>,
@@ -64,6 +83,8 @@ struct Labelled {
     forces: Vec<u8>,
     stress: Option<Vec<u8>>,
 }
+
+from_columns!(Labelled { hash, data, energy, forces, stress });
 
 impl Store {
     /// At most `limit` labelled structures behind `after` (`None`: from the first on): candidates in decision order, then
@@ -75,13 +96,12 @@ impl Store {
         after: Option<ExportPlace>,
         limit: u32,
     ) -> Result<Vec<ExportRow>> {
-        let name =
-            sqlx::query_scalar("SELECT name FROM protocol WHERE hash = ?").bind(filter.protocol.0.to_vec());
-        let name: Option<String> = name.fetch_optional(&self.readers).await?;
+        let name = query("SELECT name FROM protocol WHERE hash = $1").bind(filter.protocol.0.to_vec());
+        let name: Option<String> = name.fetch_optional(&self.database).await?;
         let name = name.ok_or_else(|| StoreError::UnknownProtocol(filter.protocol.to_string()))?;
-        let sql = "SELECT number FROM protocol WHERE hash = ?";
-        let number = sqlx::query_scalar(sql).bind(filter.protocol.0.to_vec());
-        let number: i64 = number.fetch_one(&self.readers).await?;
+        let sql = "SELECT number FROM protocol WHERE hash = $1";
+        let number = query(sql).bind(filter.protocol.0.to_vec());
+        let number: i64 = number.fetch_one(&self.database).await?;
         let (decision, import) = match after {
             None => (Some(0), 0),
             Some(ExportPlace::Candidate(decision)) => (Some(decision), 0),
@@ -89,17 +109,17 @@ impl Store {
         };
         let mut rows = Vec::new();
         if let Some(decision) = decision {
-            let query = sqlx::query_as(CANDIDATES).bind(number).bind(decision);
+            let query = query(CANDIDATES).bind(number).bind(decision);
             let query = query.bind(filter.biased).bind(filter.control).bind(limit);
-            let found: Vec<CandidateRow> = query.fetch_all(&self.readers).await?;
+            let found: Vec<CandidateRow> = query.fetch_all(&self.database).await?;
             for row in found {
                 rows.push(row.into_export(&name, filter.protocol)?);
             }
         }
         let left = limit.saturating_sub(rows.len() as u32);
         if filter.imported && left > 0 {
-            let query = sqlx::query_as(IMPORTS).bind(number).bind(import).bind(left);
-            let found: Vec<ImportRow> = query.fetch_all(&self.readers).await?;
+            let query = query(IMPORTS).bind(number).bind(import).bind(left);
+            let found: Vec<ImportRow> = query.fetch_all(&self.database).await?;
             for row in found {
                 rows.push(row.into_export(&name, filter.protocol)?);
             }

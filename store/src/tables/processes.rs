@@ -1,10 +1,13 @@
 //! The processes of a campaign, and what comes back of those that are gone.
 
+use std::collections::HashMap;
+
 use serde_json::json;
 
 use super::logs::insert_operation;
 use super::queue::{InVain, end_in_vain};
-use super::{Store, Transaction};
+use crate::Store;
+use crate::database::{Transaction, query};
 use crate::error::Result;
 use crate::processes::ProcessRecord;
 
@@ -13,8 +16,8 @@ pub(super) const LEASED: &str = "SELECT number, holder FROM job WHERE state = 'l
 impl Store {
     /// The processes of a kind, or all, in the order in which they started.
     pub async fn processes(&self, kind: Option<&str>) -> Result<Vec<ProcessRecord>> {
-        let sql = "SELECT * FROM process WHERE ?1 IS NULL OR kind = ?1 ORDER BY started, id";
-        Ok(sqlx::query_as(sql).bind(kind).fetch_all(&self.readers).await?)
+        let sql = "SELECT * FROM process WHERE $1 IS NULL OR kind = $1 ORDER BY started, id";
+        query(sql).bind(kind).fetch_all(&self.database).await
     }
 
     /// See [`Self::upsert_processes`].
@@ -26,37 +29,38 @@ impl Store {
     /// kind and number that are gone. A predecessor that still lives keeps its record, since its leases count
     /// for as long as it has one.
     pub async fn upsert_processes(&self, processes: &[ProcessRecord]) -> Result<()> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin().await?;
         for process in processes {
-            let sql = "SELECT * FROM process WHERE kind = ? AND number IS ? AND id <> ?";
-            let query = sqlx::query_as(sql).bind(&process.kind).bind(process.number).bind(&process.id);
-            let others: Vec<ProcessRecord> = query.fetch_all(&mut *transaction).await?;
+            let sql = "SELECT * FROM process WHERE kind = $1 AND number IS NOT DISTINCT FROM $2 AND id <> $3";
+            let query = query(sql).bind(&process.kind).bind(process.number).bind(&process.id);
+            let others: Vec<ProcessRecord> = query.fetch_all(&mut transaction).await?;
             for other in others.iter().filter(|other| other.is_gone()) {
                 remove(&mut transaction, &other.id).await?;
             }
             insert(&mut transaction, process).await?;
         }
-        Ok(transaction.commit().await?)
+        transaction.commit().await
     }
 
     /// A process ended in order. With an orchestrator go the walkers that it started.
     pub async fn remove_process(&self, id: &str) -> Result<()> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin().await?;
         let sql = "DELETE FROM process WHERE kind = 'walker'
-                   AND EXISTS (SELECT 1 FROM process WHERE id = ? AND kind = 'orchestrator')";
-        sqlx::query(sql).bind(id).execute(&mut *transaction).await?;
+                   AND EXISTS (SELECT 1 FROM process WHERE id = $1 AND kind = 'orchestrator')";
+        query(sql).bind(id).execute(&mut transaction).await?;
         remove(&mut transaction, id).await?;
-        Ok(transaction.commit().await?)
+        transaction.commit().await
     }
 
     /// Takes back the leases whose holders are gone, or are no processes of this campaign at all: a process has its
     /// record before it leases anything, and only one that is gone loses it. Does not count as failed attempts.
     /// Returns their number.
     pub async fn release_leases_of_gone_processes(&self, now: i64) -> Result<usize> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin().await?;
+        let leased = leased(&mut transaction).await?;
         let mut living = all(&mut transaction).await?;
         living.retain(|process| !process.is_gone());
-        let released = release_all_but_of(&living, &mut transaction, now).await?;
+        let released = release_all_but_of(&living, leased, &mut transaction, now).await?;
         transaction.commit().await?;
         Ok(released)
     }
@@ -66,14 +70,15 @@ impl Store {
     /// others are removed, and what they had leased comes back, see [`Self::release_leases_of_gone_processes`].
     /// Returns the number of leases that came back.
     pub async fn take_over(&self, now: i64) -> Result<usize> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin_to_lead().await?;
+        let leased = leased(&mut transaction).await?;
         let lives_on =
             |process: &ProcessRecord| process.kind == ProcessRecord::LABELLER && !process.is_gone();
         let (living, gone): (Vec<_>, Vec<_>) = all(&mut transaction).await?.into_iter().partition(lives_on);
         for process in &gone {
             remove(&mut transaction, &process.id).await?;
         }
-        let leases = release_all_but_of(&living, &mut transaction, now).await?;
+        let leases = release_all_but_of(&living, leased, &mut transaction, now).await?;
         let lost = gone.iter().filter(|process| process.kind != ProcessRecord::WALKER);
         let lost: Vec<_> = lost.map(|process| process.id.as_str()).collect();
         if leases > 0 || !lost.is_empty() {
@@ -86,32 +91,53 @@ impl Store {
 }
 
 pub(super) async fn all(transaction: &mut Transaction) -> Result<Vec<ProcessRecord>> {
-    Ok(sqlx::query_as("SELECT * FROM process ORDER BY started, id").fetch_all(&mut **transaction).await?)
+    query("SELECT * FROM process ORDER BY started, id").fetch_all(&mut *transaction).await
+}
+
+/// Every process, last seen when the clock by which leases go says so.
+pub(super) async fn all_as_heard(transaction: &mut Transaction) -> Result<Vec<ProcessRecord>> {
+    let mut processes = all(transaction).await?;
+    if transaction.has_a_clock() {
+        let heard: Vec<(String, i64)> = query("SELECT id, heard FROM process").fetch_all(transaction).await?;
+        let heard: HashMap<_, _> = heard.into_iter().collect();
+        for process in &mut processes {
+            process.last_seen = heard.get(&process.id).copied().unwrap_or(process.last_seen);
+        }
+    }
+    Ok(processes)
 }
 
 async fn insert(transaction: &mut Transaction, process: &ProcessRecord) -> Result<()> {
-    let sql = "INSERT OR REPLACE INTO process
+    let sql = "INSERT INTO process
         (id, kind, number, pid, birth, host, started, last_seen, state, restarts, setup, remark)
-        VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)";
-    let query = sqlx::query(sql).bind(&process.id).bind(&process.kind).bind(process.number);
+        VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12)
+        ON CONFLICT (id) DO UPDATE SET kind = $2, number = $3, pid = $4, birth = $5, host = $6, started = $7,
+            last_seen = $8, state = $9, restarts = $10, setup = $11, remark = $12";
+    let query = query(sql).bind(&process.id).bind(&process.kind).bind(process.number);
     let query = query.bind(process.pid).bind(&process.birth).bind(&process.host);
     let query = query.bind(process.started).bind(process.last_seen).bind(&process.state);
-    let query = query.bind(process.restarts).bind(&process.setup).bind(&process.remark);
-    query.execute(&mut **transaction).await?;
+    let query = query.bind(process.restarts).bind(process.setup.as_deref()).bind(&process.remark);
+    query.execute(&mut *transaction).await?;
     Ok(())
 }
 
 async fn remove(transaction: &mut Transaction, id: &str) -> Result<()> {
-    sqlx::query("DELETE FROM process WHERE id = ?").bind(id).execute(&mut **transaction).await?;
+    query("DELETE FROM process WHERE id = $1").bind(id).execute(&mut *transaction).await?;
     Ok(())
+}
+
+/// Every lease, before anybody asks for processes: who leases something has its record already.
+async fn leased(transaction: &mut Transaction) -> Result<Vec<(i64, String)>> {
+    query(LEASED).locked().fetch_all(transaction).await
 }
 
 async fn release_all_but_of(
     living: &[ProcessRecord],
+    leased: Vec<(i64, String)>,
     transaction: &mut Transaction,
     now: i64,
 ) -> Result<usize> {
-    let leased: Vec<(i64, String)> = sqlx::query_as(LEASED).fetch_all(&mut **transaction).await?;
+    let now = transaction.time(now).await?;
     let is_lost = |holder: &str| !living.iter().any(|process| process.is_holder(holder));
     let lost: Vec<_> = leased.iter().filter(|(_, holder)| is_lost(holder)).collect();
     for (job, _) in &lost {

@@ -4,7 +4,8 @@ use wire::ContentHash;
 
 use super::commit::{enqueue, structure_number};
 use super::logs::insert_operation;
-use super::{Store, Transaction};
+use crate::Store;
+use crate::database::{Database, Transaction, from_columns, query};
 use crate::encoding::{decode_hash, decode_structure};
 use crate::error::{Result, StoreError};
 use crate::records::{Campaign, Protocol, SeedStructure};
@@ -12,7 +13,6 @@ use crate::records::{Campaign, Protocol, SeedStructure};
 /// Priority of jobs that are made later than their candidate.
 const LATE_PRIORITY: i32 = 0;
 
-#[derive(sqlx::FromRow)]
 struct SeedRow {
     seed: u32,
     name: String,
@@ -21,32 +21,35 @@ struct SeedRow {
     data: Vec<u8>,
 }
 
-impl Store {
-    pub(super) async fn write_campaign(
-        &self,
-        campaign: &Campaign,
-        seeds: &[SeedStructure],
-        now: i64,
-    ) -> Result<()> {
-        let mut transaction = self.begin().await?;
-        for (key, value) in [
-            ("id", campaign.id.to_string().as_str()),
-            ("program_version", &campaign.program_version),
-            ("mode", &campaign.mode),
-            ("configuration", &campaign.configuration),
-            ("resolved_configuration", &campaign.resolved_configuration),
-            ("configuration_in_force", &campaign.configuration_in_force),
-        ] {
-            set_campaign_value(&mut transaction, key, value).await?;
-        }
-        for seed in seeds {
-            insert_seed_structure(&mut transaction, seed).await?;
-        }
-        let detail = serde_json::json!({ "program_version": campaign.program_version });
-        insert_operation(&mut transaction, now, "created", &detail).await?;
-        Ok(transaction.commit().await?)
-    }
+from_columns!(SeedRow { seed, name, source, hash, data });
 
+/// What a database begins with.
+pub(crate) async fn write_campaign(
+    database: &Database,
+    campaign: &Campaign,
+    seeds: &[SeedStructure],
+    now: i64,
+) -> Result<()> {
+    let mut transaction = database.begin_to_lead().await?;
+    for (key, value) in [
+        ("id", campaign.id.to_string().as_str()),
+        ("program_version", &campaign.program_version),
+        ("mode", &campaign.mode),
+        ("configuration", &campaign.configuration),
+        ("resolved_configuration", &campaign.resolved_configuration),
+        ("configuration_in_force", &campaign.configuration_in_force),
+    ] {
+        set_campaign_value(&mut transaction, key, value).await?;
+    }
+    for seed in seeds {
+        insert_seed_structure(&mut transaction, seed).await?;
+    }
+    let detail = serde_json::json!({ "program_version": campaign.program_version });
+    insert_operation(&mut transaction, now, "created", &detail).await?;
+    transaction.commit().await
+}
+
+impl Store {
     /// What the campaign is.
     pub async fn campaign(&self) -> Result<Campaign> {
         let id = self.campaign_value("id").await?;
@@ -61,8 +64,8 @@ impl Store {
     }
 
     pub(super) async fn campaign_value(&self, key: &str) -> Result<String> {
-        let value = sqlx::query_scalar("SELECT value FROM campaign WHERE key = ?").bind(key);
-        let value: Option<String> = value.fetch_optional(&self.readers).await?;
+        let value = query("SELECT value FROM campaign WHERE key = $1").bind(key);
+        let value: Option<String> = value.fetch_optional(&self.database).await?;
         value.ok_or_else(|| StoreError::damaged("the campaign", format!("it has no {key}")))
     }
 
@@ -74,28 +77,28 @@ impl Store {
         changes: &[serde_json::Value],
         now: i64,
     ) -> Result<()> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin_to_lead().await?;
         set_campaign_value(&mut transaction, "configuration_in_force", configuration).await?;
         for change in changes {
             insert_operation(&mut transaction, now, "configuration", change).await?;
         }
-        Ok(transaction.commit().await?)
+        transaction.commit().await
     }
 
     /// Adds seed structures; those with the index of one that is there replace it.
     pub async fn add_seed_structures(&self, seeds: &[SeedStructure]) -> Result<()> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin_to_lead().await?;
         for seed in seeds {
             insert_seed_structure(&mut transaction, seed).await?;
         }
-        Ok(transaction.commit().await?)
+        transaction.commit().await
     }
 
     /// Every seed structure, by index.
     pub async fn seed_structures(&self) -> Result<Vec<SeedStructure>> {
         let sql = "SELECT seed, name, source, hash, data FROM seed_structure
                    JOIN structure ON structure.number = seed_structure.structure ORDER BY seed";
-        let rows: Vec<SeedRow> = sqlx::query_as(sql).fetch_all(&self.readers).await?;
+        let rows: Vec<SeedRow> = query(sql).fetch_all(&self.database).await?;
         rows.into_iter()
             .map(|SeedRow { seed, name, source, hash, data }| {
                 let structure = decode_structure(&data, &hash)?;
@@ -107,40 +110,36 @@ impl Store {
     /// Makes `protocol` the one of new label jobs. Accepted candidates that have no job at all (there was no protocol
     /// when they were found) get one; those with a job of an earlier protocol keep that.
     pub async fn add_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin_to_lead().await?;
         let sql =
-            "INSERT INTO protocol (hash, name, settings) VALUES (?, ?, ?) ON CONFLICT (hash) DO NOTHING";
-        let query = sqlx::query(sql)
-            .bind(&protocol.hash.0[..])
-            .bind(&protocol.name)
-            .bind(protocol.settings.to_string());
-        let added = query.execute(&mut *transaction).await.map_err(|error| match &error {
-            sqlx::Error::Database(database) if database.is_unique_violation() => {
+            "INSERT INTO protocol (hash, name, settings) VALUES ($1, $2, $3) ON CONFLICT (hash) DO NOTHING";
+        let insert = query(sql).bind(&protocol.hash.0[..]).bind(&protocol.name);
+        let insert = insert.bind(protocol.settings.to_string());
+        let added = insert.execute(&mut transaction).await.map_err(|error| match error {
+            StoreError::Database(sqlx::Error::Database(error)) if error.is_unique_violation() => {
                 StoreError::ProtocolName(protocol.name.clone())
             }
-            _ => error.into(),
+            _ => error,
         })?;
         let hash = protocol.hash.to_string();
         set_campaign_value(&mut transaction, "protocol", &hash).await?;
-        if added.rows_affected() > 0 {
+        if added > 0 {
             let detail = serde_json::json!({ "name": protocol.name, "hash": hash });
             insert_operation(&mut transaction, now, "protocol", &detail).await?;
         }
         let number = number(&mut transaction, protocol.hash).await?;
-        let sql = "SELECT structure, min(decision) FROM candidate WHERE structure IS NOT NULL
+        let sql = "SELECT content, min(decision) FROM candidate WHERE structure IS NOT NULL
                    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure)
-                   GROUP BY structure ORDER BY min(decision)";
-        let late: Vec<(i64, i64)> = sqlx::query_as(sql).fetch_all(&mut *transaction).await?;
-        for (structure, decision) in late {
-            enqueue(&mut transaction, structure, number, decision, LATE_PRIORITY).await?;
-        }
-        Ok(transaction.commit().await?)
+                   GROUP BY content ORDER BY min(decision)";
+        let late: Vec<(Vec<u8>, i64)> = query(sql).fetch_all(&mut transaction).await?;
+        enqueue(&mut transaction, &late, number, LATE_PRIORITY).await?;
+        transaction.commit().await
     }
 
     /// Every protocol, in the order in which they were added.
     pub async fn protocols(&self) -> Result<Vec<Protocol>> {
         let sql = "SELECT hash, name, settings FROM protocol ORDER BY number";
-        let rows: Vec<(Vec<u8>, String, String)> = sqlx::query_as(sql).fetch_all(&self.readers).await?;
+        let rows: Vec<(Vec<u8>, String, String)> = query(sql).fetch_all(&self.database).await?;
         rows.into_iter()
             .map(|(hash, name, settings)| {
                 let settings = serde_json::from_str(&settings);
@@ -152,24 +151,25 @@ impl Store {
 }
 
 async fn set_campaign_value(transaction: &mut Transaction, key: &str, value: &str) -> Result<()> {
-    let sql = "INSERT INTO campaign (key, value) VALUES (?, ?)
+    let sql = "INSERT INTO campaign (key, value) VALUES ($1, $2)
                ON CONFLICT (key) DO UPDATE SET value = excluded.value";
-    sqlx::query(sql).bind(key).bind(value).execute(&mut **transaction).await?;
+    query(sql).bind(key).bind(value).execute(&mut *transaction).await?;
     Ok(())
 }
 
 async fn insert_seed_structure(transaction: &mut Transaction, seed: &SeedStructure) -> Result<()> {
     let structure = structure_number(transaction, &seed.structure, ContentHash::of(&seed.structure)).await?;
-    let sql = "INSERT OR REPLACE INTO seed_structure (seed, name, source, structure) VALUES (?, ?, ?, ?)";
-    let query = sqlx::query(sql).bind(seed.index).bind(&seed.name).bind(&seed.source).bind(structure);
-    query.execute(&mut **transaction).await?;
+    let sql = "INSERT INTO seed_structure (seed, name, source, structure) VALUES ($1, $2, $3, $4)
+               ON CONFLICT (seed) DO UPDATE SET name = $2, source = $3, structure = $4";
+    let query = query(sql).bind(seed.index).bind(&seed.name).bind(&seed.source).bind(structure);
+    query.execute(&mut *transaction).await?;
     Ok(())
 }
 
 /// Number of the protocol of new jobs.
 pub(super) async fn in_force(transaction: &mut Transaction) -> Result<Option<i64>> {
-    let hash = sqlx::query_scalar("SELECT value FROM campaign WHERE key = 'protocol'");
-    let hash: Option<String> = hash.fetch_optional(&mut **transaction).await?;
+    let hash = query("SELECT value FROM campaign WHERE key = 'protocol'");
+    let hash: Option<String> = hash.fetch_optional(&mut *transaction).await?;
     let Some(hash) = hash else { return Ok(None) };
     let hash = hash.parse().map_err(|error| StoreError::damaged("the protocol in force", error))?;
     number(transaction, hash).await.map(Some)
@@ -177,7 +177,7 @@ pub(super) async fn in_force(transaction: &mut Transaction) -> Result<Option<i64
 
 /// Number of the protocol's row.
 pub(super) async fn number(transaction: &mut Transaction, hash: ContentHash) -> Result<i64> {
-    let number = sqlx::query_scalar("SELECT number FROM protocol WHERE hash = ?").bind(hash.0.to_vec());
-    let number: Option<i64> = number.fetch_optional(&mut **transaction).await?;
+    let number = query("SELECT number FROM protocol WHERE hash = $1").bind(hash.0.to_vec());
+    let number: Option<i64> = number.fetch_optional(&mut *transaction).await?;
     number.ok_or_else(|| StoreError::UnknownProtocol(hash.to_string()))
 }

@@ -8,30 +8,29 @@
 use atoms::Structure;
 use wire::ContentHash;
 
-use super::{Store, Transaction, processes, protocols};
+use super::{processes, protocols};
+use crate::Store;
+use crate::database::{Transaction, from_columns, query};
 use crate::encoding::decode_structure;
 use crate::error::{Result, StoreError};
 use crate::jobs::Failed;
 use crate::processes::ProcessRecord;
 use crate::records::{JobState, Lease};
 
-/// The next job by priority, then in decision order. One statement: two labellers never get the same job.
-pub(super) const LEASE: &str =
-    "UPDATE job SET state = 'leased', holder = ?1, expires = ?2, attempts = attempts + 1
-    WHERE number = (SELECT number FROM job WHERE state = 'queued' AND protocol = ?3
-                    ORDER BY priority DESC, decision LIMIT 1)
-    RETURNING number, attempts, structure, decision";
+/// The next job by priority, then in decision order.
+pub(crate) const NEXT: &str = "SELECT number, attempts, structure, decision FROM job
+    WHERE state = 'queued' AND protocol = $1 ORDER BY priority DESC, decision LIMIT 1";
 
-pub(super) const EXPIRED: &str = "SELECT number, holder FROM job WHERE state = 'leased' AND expires <= ?";
+pub(crate) const EXPIRED: &str = "SELECT number, holder FROM job WHERE state = 'leased' AND expires <= $1";
 
-pub(super) const UNFINISHED: &str = "SELECT count(*) FROM job WHERE state IN ('queued', 'leased')";
+pub(crate) const UNFINISHED: &str = "SELECT count(*) FROM job WHERE state IN ('queued', 'leased')";
 
-pub(super) const HELD: &str = "SELECT number FROM job WHERE state = 'leased'
-    AND (holder = ?1 OR substr(holder, 1, length(?1) + 1) = ?1 || '/')";
+pub(crate) const HELD: &str = "SELECT number FROM job WHERE state = 'leased'
+    AND (holder = $1 OR substr(holder, 1, length($1) + 1) = $1 || '/')";
 
 /// Attempts of a job that were lost in a row; those before it was last given up for that do not count.
-pub(super) const LOSSES: &str = "SELECT count(*) FROM attempt WHERE job = ?1 AND attempt > (
-        SELECT coalesce(max(attempt), 0) FROM attempt WHERE job = ?1
+pub(crate) const LOSSES: &str = "SELECT count(*) FROM attempt WHERE job = $1 AND attempt > (
+        SELECT coalesce(max(attempt), 0) FROM attempt WHERE job = $1
         AND (outcome NOT IN ('released', 'lost', 'expired') OR class = 'lost_too_often'))";
 
 /// So many attempts in a row may be lost. Labellers that are killed at random while they make a label in half of the
@@ -51,7 +50,6 @@ pub(super) enum InVain<'a> {
 }
 
 /// A job as the ends of its leases need it.
-#[derive(sqlx::FromRow)]
 pub(super) struct JobRow {
     pub structure: i64,
     pub protocol: i64,
@@ -60,6 +58,8 @@ pub(super) struct JobRow {
     pub failures: u32,
 }
 
+from_columns!(JobRow { structure, protocol, state, attempts, failures });
+
 impl Store {
     /// The next job of that protocol for `holder` (`process` or `process/part`), for `seconds` from `now` on.
     ///
@@ -67,7 +67,7 @@ impl Store {
     /// a clock on the wall is no proof: after the sleep of a computer every lease has run out, and whoever is first
     /// awake must not take the others' work from them. So a lease lasts on while its holder is a process that may be
     /// at work: on this system one that runs and gave a sign of life within a day, elsewhere one that gave a sign of
-    /// life within `seconds`.
+    /// life within `seconds`. Where the database has a server, its clock counts, and `now` does not.
     pub async fn lease(
         &self,
         protocol: ContentHash,
@@ -75,19 +75,24 @@ impl Store {
         now: i64,
         seconds: u32,
     ) -> Result<Option<Lease>> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin().await?;
         let protocol_number = protocols::number(&mut transaction, protocol).await?;
+        let now = transaction.time(now).await?;
         end_expired(&mut transaction, now, seconds).await?;
-        let expires = now.saturating_add(1000 * i64::from(seconds));
-        let leased = sqlx::query_as(LEASE).bind(holder).bind(expires).bind(protocol_number);
-        let leased: Option<(i64, u32, i64, i64)> = leased.fetch_optional(&mut *transaction).await?;
-        let Some((job, attempt, structure, decision)) = leased else {
+        let next = query(NEXT).bind(protocol_number).unless_locked();
+        let next: Option<(i64, u32, i64, i64)> = next.fetch_optional(&mut transaction).await?;
+        let Some((job, attempts, structure, decision)) = next else {
             transaction.commit().await?;
             return Ok(None);
         };
-        let sql = "INSERT INTO attempt (job, attempt, holder, started) VALUES (?, ?, ?, ?)";
-        let query = sqlx::query(sql).bind(job).bind(attempt).bind(holder).bind(now);
-        query.execute(&mut *transaction).await?;
+        let attempt = attempts + 1;
+        let sql =
+            "UPDATE job SET state = 'leased', holder = $1, expires = $2, attempts = $3 WHERE number = $4";
+        let lease = query(sql).bind(holder).bind(end_of_lease(now, seconds)).bind(attempt).bind(job);
+        lease.execute(&mut transaction).await?;
+        let sql = "INSERT INTO attempt (job, attempt, holder, started) VALUES ($1, $2, $3, $4)";
+        let begun = query(sql).bind(job).bind(attempt).bind(holder).bind(now);
+        begun.execute(&mut transaction).await?;
         let lease = Lease {
             job,
             attempt,
@@ -104,11 +109,11 @@ impl Store {
     /// Makes a lease last for `seconds` from `now` on. Returns whether it is still held: if not, somebody else may
     /// have the job, but a result may still be brought.
     pub async fn renew(&self, lease: &Lease, now: i64, seconds: u32) -> Result<bool> {
-        let mut transaction = self.begin().await?;
-        let sql = "UPDATE job SET expires = ? WHERE number = ? AND state = 'leased' AND attempts = ?";
-        let expires = now.saturating_add(1000 * i64::from(seconds));
-        let renewed = sqlx::query(sql).bind(expires).bind(lease.job).bind(lease.attempt);
-        let renewed = renewed.execute(&mut *transaction).await?.rows_affected() > 0;
+        let mut transaction = self.database.begin().await?;
+        let sql = "UPDATE job SET expires = $1 WHERE number = $2 AND state = 'leased' AND attempts = $3";
+        let expires = end_of_lease(transaction.time(now).await?, seconds);
+        let renewed = query(sql).bind(expires).bind(lease.job).bind(lease.attempt);
+        let renewed = renewed.execute(&mut transaction).await? > 0;
         transaction.commit().await?;
         Ok(renewed)
     }
@@ -116,11 +121,11 @@ impl Store {
     /// Stores what finds a calculation again (process group, number in a batch system) before it is started. Whoever
     /// leases the job next gets it as [`Lease::earlier_calculation`].
     pub async fn record_calculation(&self, lease: &Lease, calculation: &str) -> Result<()> {
-        let mut transaction = self.begin().await?;
-        let sql = "UPDATE attempt SET calculation = ? WHERE job = ? AND attempt = ?";
-        let query = sqlx::query(sql).bind(calculation).bind(lease.job).bind(lease.attempt);
-        query.execute(&mut *transaction).await?;
-        Ok(transaction.commit().await?)
+        let mut transaction = self.database.begin().await?;
+        let sql = "UPDATE attempt SET calculation = $1 WHERE job = $2 AND attempt = $3";
+        let query = query(sql).bind(calculation).bind(lease.job).bind(lease.attempt);
+        query.execute(&mut transaction).await?;
+        transaction.commit().await
     }
 
     /// An attempt failed: the job waits for another, or is given up after `attempt_limit` failed ones. Class and
@@ -133,7 +138,8 @@ impl Store {
         attempt_limit: u32,
         now: i64,
     ) -> Result<Failed> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin().await?;
+        let now = transaction.time(now).await?;
         let job = job_row(&mut transaction, lease.job).await?;
         let failed = if job.state == "leased" && job.attempts == lease.attempt {
             let how = InVain::Failed { class, log, limit: attempt_limit };
@@ -169,8 +175,9 @@ impl Store {
     }
 
     async fn release(&self, holder: &str, how: InVain<'_>, now: i64) -> Result<usize> {
-        let mut transaction = self.begin().await?;
-        let jobs: Vec<i64> = sqlx::query_scalar(HELD).bind(holder).fetch_all(&mut *transaction).await?;
+        let mut transaction = self.database.begin().await?;
+        let now = transaction.time(now).await?;
+        let jobs: Vec<i64> = query(HELD).bind(holder).locked().fetch_all(&mut transaction).await?;
         for job in &jobs {
             end_in_vain(&mut transaction, *job, how, now).await?;
         }
@@ -180,17 +187,23 @@ impl Store {
 
     /// Number of jobs that are queued or leased.
     pub async fn unfinished_jobs(&self) -> Result<u64> {
-        Ok(sqlx::query_scalar(UNFINISHED).fetch_one(&self.readers).await?)
+        query(UNFINISHED).fetch_one(&self.database).await
     }
+}
+
+fn end_of_lease(now: i64, seconds: u32) -> i64 {
+    now.saturating_add(1000 * i64::from(seconds))
 }
 
 /// Ends the leases that ran out and whose holders cannot be at work.
 async fn end_expired(transaction: &mut Transaction, now: i64, seconds: u32) -> Result<()> {
-    let expired: Vec<(i64, String)> = sqlx::query_as(EXPIRED).bind(now).fetch_all(&mut **transaction).await?;
+    // Somebody else ends those that are locked.
+    let expired = query(EXPIRED).bind(now).unless_locked();
+    let expired: Vec<(i64, String)> = expired.fetch_all(&mut *transaction).await?;
     if expired.is_empty() {
         return Ok(());
     }
-    let processes = processes::all(transaction).await?;
+    let processes = processes::all_as_heard(transaction).await?;
     let holds_on = |process: &&ProcessRecord| process.may_be_at_work(now, seconds);
     let at_work: Vec<_> = processes.iter().filter(holds_on).collect();
     for (job, holder) in expired {
@@ -208,9 +221,9 @@ pub(super) async fn end_attempt(
     outcome: &str,
     now: i64,
 ) -> Result<()> {
-    let sql = "UPDATE attempt SET ended = ?, outcome = ? WHERE job = ? AND outcome IS NULL";
-    let query = sqlx::query(sql).bind(now).bind(outcome).bind(job);
-    query.execute(&mut **transaction).await?;
+    let sql = "UPDATE attempt SET ended = $1, outcome = $2 WHERE job = $3 AND outcome IS NULL";
+    let query = query(sql).bind(now).bind(outcome).bind(job);
+    query.execute(&mut *transaction).await?;
     Ok(())
 }
 
@@ -231,7 +244,7 @@ pub(super) async fn end_in_vain(
         }
         InVain::Lost(outcome) => {
             end_attempt(transaction, job, outcome, now).await?;
-            let losses: u32 = sqlx::query_scalar(LOSSES).bind(job).fetch_one(&mut **transaction).await?;
+            let losses: u32 = query(LOSSES).bind(job).fetch_one(&mut *transaction).await?;
             if losses >= LOSS_LIMIT {
                 let log = format!("{losses} attempts in a row ended without a word from their labellers");
                 explain(transaction, job, attempts, LOST_TOO_OFTEN, &log).await?;
@@ -240,9 +253,9 @@ pub(super) async fn end_in_vain(
         }
     };
     let state = if given_up { JobState::Failed } else { JobState::Queued };
-    let sql = "UPDATE job SET state = ?, failures = ?, holder = NULL, expires = NULL WHERE number = ?";
-    let query = sqlx::query(sql).bind(state.name()).bind(failures).bind(job);
-    query.execute(&mut **transaction).await?;
+    let sql = "UPDATE job SET state = $1, failures = $2, holder = NULL, expires = NULL WHERE number = $3";
+    let query = query(sql).bind(state.name()).bind(failures).bind(job);
+    query.execute(&mut *transaction).await?;
     Ok(state)
 }
 
@@ -254,15 +267,16 @@ async fn explain(
     class: &str,
     log: &str,
 ) -> Result<()> {
-    let sql = "UPDATE attempt SET class = ?, log = ? WHERE job = ? AND attempt = ?";
-    let query = sqlx::query(sql).bind(class).bind(log).bind(job).bind(attempt);
-    query.execute(&mut **transaction).await?;
+    let sql = "UPDATE attempt SET class = $1, log = $2 WHERE job = $3 AND attempt = $4";
+    let query = query(sql).bind(class).bind(log).bind(job).bind(attempt);
+    query.execute(&mut *transaction).await?;
     Ok(())
 }
 
+/// Nobody else changes the job until the end of the transaction.
 pub(super) async fn job_row(transaction: &mut Transaction, job: i64) -> Result<JobRow> {
-    let sql = "SELECT structure, protocol, state, attempts, failures FROM job WHERE number = ?";
-    let row = sqlx::query_as(sql).bind(job).fetch_optional(&mut **transaction).await?;
+    let sql = "SELECT structure, protocol, state, attempts, failures FROM job WHERE number = $1";
+    let row = query(sql).bind(job).locked().fetch_optional(&mut *transaction).await?;
     row.ok_or_else(|| StoreError::UnknownJob { id: job.to_string(), near: Vec::new() })
 }
 
@@ -271,21 +285,21 @@ async fn earlier_calculation(
     job: i64,
     attempt: u32,
 ) -> Result<Option<String>> {
-    let sql = "SELECT calculation FROM attempt WHERE job = ? AND attempt = ?
+    let sql = "SELECT calculation FROM attempt WHERE job = $1 AND attempt = $2
                AND outcome IN ('expired', 'lost', 'released')";
-    let query = sqlx::query_scalar(sql).bind(job).bind(attempt - 1);
-    let calculation: Option<Option<String>> = query.fetch_optional(&mut **transaction).await?;
+    let calculation = query(sql).bind(job).bind(attempt - 1);
+    let calculation: Option<Option<String>> = calculation.fetch_optional(&mut *transaction).await?;
     Ok(calculation.flatten())
 }
 
 async fn structure_of(transaction: &mut Transaction, number: i64) -> Result<Structure> {
-    let sql = "SELECT data, hash FROM structure WHERE number = ?";
-    let row = sqlx::query_as(sql).bind(number);
-    let (data, hash): (Vec<u8>, Vec<u8>) = row.fetch_one(&mut **transaction).await?;
+    let sql = "SELECT data, hash FROM structure WHERE number = $1";
+    let row = query(sql).bind(number);
+    let (data, hash): (Vec<u8>, Vec<u8>) = row.fetch_one(&mut *transaction).await?;
     decode_structure(&data, &hash)
 }
 
 async fn candidate_of(transaction: &mut Transaction, decision: i64) -> Result<String> {
-    let id = sqlx::query_scalar("SELECT id FROM candidate WHERE decision = ?").bind(decision);
-    Ok(id.fetch_one(&mut **transaction).await?)
+    let id = query("SELECT id FROM candidate WHERE decision = $1").bind(decision);
+    Ok(id.fetch_one(&mut *transaction).await?)
 }

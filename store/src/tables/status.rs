@@ -1,14 +1,15 @@
 //! The state of a campaign, from indexes.
 
-use super::Store;
+use crate::Store;
+use crate::database::query;
 use crate::error::Result;
 use crate::processes::ProcessRecord;
 use crate::status::{Candidates, Labels, Status, WalkStatus};
 
-pub(super) const FATES: &str =
+pub(crate) const FATES: &str =
     "SELECT origin, coalesce(reason, fate), count(*) FROM candidate GROUP BY origin, fate, reason";
 
-pub(super) const STATES: &str = "SELECT state, count(*) FROM job GROUP BY state";
+pub(crate) const STATES: &str = "SELECT state, count(*) FROM job GROUP BY state";
 
 const WALKS: &str =
     "SELECT walk, coalesce(name, '') AS seed_structure, origin, state, reason, step, segment, tau,
@@ -19,18 +20,18 @@ impl Store {
     /// Everything at one instant. Processes are in order of kind and number. A process that is gone has the state `gone`, whatever was said of it before, unless
     /// it was `given up`, or is `pausing` and an orchestrator lives.
     pub async fn status(&self) -> Result<Status> {
-        let mut transaction = self.readers.begin().await?;
-        let fates: Vec<(String, String, u64)> = sqlx::query_as(FATES).fetch_all(&mut *transaction).await?;
-        let states: Vec<(String, u64)> = sqlx::query_as(STATES).fetch_all(&mut *transaction).await?;
-        let walks: Vec<WalkStatus> = sqlx::query_as(WALKS).fetch_all(&mut *transaction).await?;
-        let refused = sqlx::query_scalar("SELECT coalesce(sum(refused), 0) FROM walk");
-        let refused: u64 = refused.fetch_one(&mut *transaction).await?;
+        let mut transaction = self.database.begin_to_read().await?;
+        let fates: Vec<(String, String, u64)> = query(FATES).fetch_all(&mut transaction).await?;
+        let states: Vec<(String, u64)> = query(STATES).fetch_all(&mut transaction).await?;
+        let walks: Vec<WalkStatus> = query(WALKS).fetch_all(&mut transaction).await?;
+        let refused = query("SELECT CAST(coalesce(sum(refused), 0) AS BIGINT) FROM walk");
+        let refused: u64 = refused.fetch_one(&mut transaction).await?;
         let sql = "SELECT mixture_version, round FROM decision ORDER BY sequence DESC LIMIT 1";
-        let last: Option<(u64, u64)> = sqlx::query_as(sql).fetch_optional(&mut *transaction).await?;
+        let last: Option<(u64, u64)> = query(sql).fetch_optional(&mut transaction).await?;
         let (mixture_version, round) = last.unwrap_or_default();
-        let imported = sqlx::query_scalar("SELECT count(*) FROM import").fetch_one(&mut *transaction).await?;
-        let processes = sqlx::query_as("SELECT * FROM process ORDER BY started, id");
-        let processes: Vec<ProcessRecord> = processes.fetch_all(&mut *transaction).await?;
+        let imported = query("SELECT count(*) FROM import").fetch_one(&mut transaction).await?;
+        let processes = query("SELECT * FROM process ORDER BY started, id");
+        let processes: Vec<ProcessRecord> = processes.fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         let labels = labels(&states);
         let under_way = |walk: &WalkStatus| matches!(walk.state.as_str(), "waiting" | "running");

@@ -5,14 +5,14 @@ use std::ops::RangeInclusive;
 
 use serde_json::Value;
 
-use super::{Store, Transaction};
+use crate::Store;
+use crate::database::{Transaction, from_columns, query};
 use crate::error::{Result, StoreError};
 use crate::records::{LoggedDecision, Operation};
 
 /// Decisions read at a time.
 const PAGE: usize = 1000;
 
-#[derive(sqlx::FromRow)]
 struct Row {
     sequence: i64,
     round: u64,
@@ -22,6 +22,8 @@ struct Row {
     mixture_version: u64,
     detail: String,
 }
+
+from_columns!(Row { sequence, round, kind, walk, candidate, mixture_version, detail });
 
 impl Store {
     /// The decisions with numbers (from 1) in `range`, in order.
@@ -36,9 +38,9 @@ impl Store {
     }
 
     async fn decision_rows(&self, range: RangeInclusive<i64>) -> Result<Vec<Row>> {
-        let sql = "SELECT * FROM decision WHERE sequence BETWEEN ? AND ? ORDER BY sequence";
-        let query = sqlx::query_as(sql).bind(*range.start()).bind(*range.end());
-        Ok(query.fetch_all(&self.readers).await?)
+        let sql = "SELECT * FROM decision WHERE sequence BETWEEN $1 AND $2 ORDER BY sequence";
+        let query = query(sql).bind(*range.start()).bind(*range.end());
+        query.fetch_all(&self.database).await
     }
 
     /// The whole decision log, one JSON object a line, keys in a fixed order: equal for two runs of a campaign in
@@ -57,16 +59,17 @@ impl Store {
 
     /// Adds a line to the operations log. What `kind` is, is up to the caller; `detail` is a JSON object.
     pub async fn log_operation(&self, now: i64, kind: &str, detail: &Value) -> Result<()> {
-        let mut transaction = self.begin().await?;
+        let mut transaction = self.database.begin().await?;
         insert_operation(&mut transaction, now, kind, detail).await?;
-        Ok(transaction.commit().await?)
+        transaction.commit().await
     }
 
     /// At most `limit` lines of the operations log after number `after`, in order.
     pub async fn operations(&self, after: i64, limit: u32) -> Result<Vec<Operation>> {
-        let sql = "SELECT number, time, kind, detail FROM operation WHERE number > ? ORDER BY number LIMIT ?";
+        let sql =
+            "SELECT number, time, kind, detail FROM operation WHERE number > $1 ORDER BY number LIMIT $2";
         let rows: Vec<(i64, i64, String, String)> =
-            sqlx::query_as(sql).bind(after).bind(limit).fetch_all(&self.readers).await?;
+            query(sql).bind(after).bind(limit).fetch_all(&self.database).await?;
         rows.into_iter()
             .map(|(number, time, kind, detail)| {
                 let detail = serde_json::from_str(&detail);
@@ -94,7 +97,7 @@ pub(super) async fn insert_operation(
     kind: &str,
     detail: &Value,
 ) -> Result<()> {
-    let sql = "INSERT INTO operation (time, kind, detail) VALUES (?, ?, ?)";
-    sqlx::query(sql).bind(now).bind(kind).bind(detail.to_string()).execute(&mut **transaction).await?;
+    let sql = "INSERT INTO operation (time, kind, detail) VALUES ($1, $2, $3)";
+    query(sql).bind(now).bind(kind).bind(detail.to_string()).execute(&mut *transaction).await?;
     Ok(())
 }

@@ -3,13 +3,13 @@
 use wire::messages::{Decline, Progress};
 use wire::{CandidateBlock, ContentHash, Origin, WalkId};
 
-use super::Store;
+use crate::Store;
+use crate::database::{from_columns, query};
 use crate::encoding::decode_hash;
 use crate::error::{Result, StoreError};
 use crate::numbers::decode_numbers;
 use crate::records::{AtomGrades, ComponentRecord, Fate, StoredCandidate, WalkRecord};
 
-#[derive(sqlx::FromRow)]
 struct WalkRow {
     walk: u32,
     origin: String,
@@ -31,7 +31,27 @@ struct WalkRow {
     checkpoint: Option<Vec<u8>>,
 }
 
-#[derive(sqlx::FromRow)]
+from_columns!(WalkRow {
+    walk,
+    origin,
+    partner,
+    seed_structure,
+    state,
+    reason,
+    turn,
+    accepted,
+    step,
+    segment,
+    tau,
+    temperature,
+    relative_volume,
+    gamma_max,
+    refused,
+    returns,
+    selector_state,
+    checkpoint
+});
+
 struct CandidateRow {
     decision: i64,
     seed_structure: u32,
@@ -43,24 +63,34 @@ struct CandidateRow {
     original_grades: Option<Vec<u8>>,
 }
 
+from_columns!(CandidateRow {
+    decision,
+    seed_structure,
+    fate,
+    reason,
+    block,
+    features,
+    selector_grades,
+    original_grades
+});
+
 impl Store {
     /// Every walk, in order.
     pub async fn load_walks(&self) -> Result<Vec<WalkRecord>> {
-        let rows: Vec<WalkRow> =
-            sqlx::query_as("SELECT * FROM walk ORDER BY walk").fetch_all(&self.readers).await?;
+        let rows: Vec<WalkRow> = query("SELECT * FROM walk ORDER BY walk").fetch_all(&self.database).await?;
         rows.into_iter().map(WalkRow::into_record).collect()
     }
 
     /// Every component that ever changed (since the mixture last began anew), by element and slot.
     pub async fn load_components(&self) -> Result<Vec<ComponentRecord>> {
         let sql = "SELECT element, slot, bytes FROM component ORDER BY element, slot";
-        let rows: Vec<(u32, u32, Vec<u8>)> = sqlx::query_as(sql).fetch_all(&self.readers).await?;
+        let rows: Vec<(u32, u32, Vec<u8>)> = query(sql).fetch_all(&self.database).await?;
         Ok(rows.into_iter().map(|(element, slot, bytes)| ComponentRecord { element, slot, bytes }).collect())
     }
 
     /// The selector's values, by name.
     pub async fn values(&self) -> Result<Vec<(String, String)>> {
-        Ok(sqlx::query_as("SELECT name, value FROM value ORDER BY name").fetch_all(&self.readers).await?)
+        query("SELECT name, value FROM value ORDER BY name").fetch_all(&self.database).await
     }
 
     /// Hashes of the structures that a new candidate must not repeat: accepted candidates of biased walks, in decision
@@ -68,10 +98,10 @@ impl Store {
     pub async fn known_hashes(&self) -> Result<Vec<ContentHash>> {
         let sql =
             "SELECT content FROM candidate WHERE origin = 'biased' AND fate = 'accepted' ORDER BY decision";
-        let mut hashes: Vec<Vec<u8>> = sqlx::query_scalar(sql).fetch_all(&self.readers).await?;
+        let mut hashes: Vec<Vec<u8>> = query(sql).fetch_all(&self.database).await?;
         let sql = "SELECT hash FROM import JOIN structure ON structure.number = import.structure
                    ORDER BY import.number";
-        hashes.extend(sqlx::query_scalar::<_, Vec<u8>>(sql).fetch_all(&self.readers).await?);
+        hashes.extend(query(sql).fetch_all(&self.database).await?);
         hashes.iter().map(|hash| decode_hash(hash)).collect()
     }
 
@@ -80,15 +110,15 @@ impl Store {
         let sql = "SELECT candidate.decision, seed_structure, fate, reason, block, features, selector_grades,
                           original_grades
                    FROM candidate JOIN candidate_data ON candidate_data.decision = candidate.decision
-                   WHERE id = ?";
-        let row: Option<CandidateRow> = sqlx::query_as(sql).bind(id).fetch_optional(&self.readers).await?;
+                   WHERE id = $1";
+        let row: Option<CandidateRow> = query(sql).bind(id).fetch_optional(&self.database).await?;
         row.map(CandidateRow::into_candidate).transpose()
     }
 
     /// Names of all candidates in decision order, at most `limit` after decision number `after`.
     pub async fn candidate_ids(&self, after: i64, limit: u32) -> Result<Vec<(i64, String)>> {
-        let sql = "SELECT decision, id FROM candidate WHERE decision > ? ORDER BY decision LIMIT ?";
-        Ok(sqlx::query_as(sql).bind(after).bind(limit).fetch_all(&self.readers).await?)
+        let sql = "SELECT decision, id FROM candidate WHERE decision > $1 ORDER BY decision LIMIT $2";
+        query(sql).bind(after).bind(limit).fetch_all(&self.database).await
     }
 }
 

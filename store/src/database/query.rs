@@ -1,0 +1,119 @@
+//! A query for either database.
+
+use std::borrow::Cow;
+
+use sqlx::{AssertSqlSafe, Executor, Postgres, Sqlite};
+
+use super::row::{FromRow, Row};
+use super::value::Value;
+use super::{Database, Target, Transaction, missing_row};
+use crate::error::Result;
+
+/// SQL with its values.
+pub struct Query {
+    sql: &'static str,
+    lock: &'static str,
+    values: Vec<Value>,
+}
+
+/// One statement; `$1` is what is bound first.
+pub fn query(sql: &'static str) -> Query {
+    Query { sql, lock: "", values: Vec::new() }
+}
+
+impl Query {
+    /// Binds the next value.
+    pub fn bind(mut self, value: impl Into<Value>) -> Self {
+        self.values.push(value.into());
+        self
+    }
+
+    /// Nobody else changes the rows that this finds until the end of the transaction. SQLite has one transaction that
+    /// writes at a time.
+    pub fn locked(self) -> Self {
+        Self { lock: " FOR NO KEY UPDATE", ..self }
+    }
+
+    /// The same, and leaves out rows that somebody else has locked.
+    pub fn unless_locked(self) -> Self {
+        Self { lock: " FOR NO KEY UPDATE SKIP LOCKED", ..self }
+    }
+
+    /// Returns the number of rows that were written.
+    pub async fn execute(self, target: impl Into<Target<'_>>) -> Result<u64> {
+        match target.into() {
+            Target::Database(Database::Sqlite(file)) => self.execute_sqlite(&file.readers).await,
+            Target::Database(Database::Postgres(server)) => {
+                self.execute_postgres(&mut *server.connection().await?).await
+            }
+            Target::Transaction(Transaction::Sqlite(transaction)) => {
+                self.execute_sqlite(&mut **transaction).await
+            }
+            Target::Transaction(Transaction::Postgres(transaction, _)) => {
+                self.execute_postgres(&mut **transaction).await
+            }
+        }
+    }
+
+    pub async fn fetch_all<T: FromRow>(self, target: impl Into<Target<'_>>) -> Result<Vec<T>> {
+        let rows = match target.into() {
+            Target::Database(Database::Sqlite(file)) => self.fetch_sqlite(&file.readers).await?,
+            Target::Database(Database::Postgres(server)) => {
+                self.fetch_postgres(&mut *server.connection().await?).await?
+            }
+            Target::Transaction(Transaction::Sqlite(transaction)) => {
+                self.fetch_sqlite(&mut **transaction).await?
+            }
+            Target::Transaction(Transaction::Postgres(transaction, _)) => {
+                self.fetch_postgres(&mut **transaction).await?
+            }
+        };
+        rows.iter().map(T::from_row).collect()
+    }
+
+    /// The first row, if there is one: queries that are asked for one find no more.
+    pub async fn fetch_optional<T: FromRow>(self, target: impl Into<Target<'_>>) -> Result<Option<T>> {
+        Ok(self.fetch_all(target).await?.into_iter().next())
+    }
+
+    pub async fn fetch_one<T: FromRow>(self, target: impl Into<Target<'_>>) -> Result<T> {
+        self.fetch_optional(target).await?.ok_or_else(missing_row)
+    }
+
+    async fn execute_sqlite(self, on: impl Executor<'_, Database = Sqlite>) -> Result<u64> {
+        let query =
+            self.values.into_iter().fold(sqlx::query(self.sql), |query, value| value.bind_sqlite(query));
+        Ok(query.execute(on).await?.rows_affected())
+    }
+
+    async fn fetch_sqlite(self, on: impl Executor<'_, Database = Sqlite>) -> Result<Vec<Row>> {
+        let query =
+            self.values.into_iter().fold(sqlx::query(self.sql), |query, value| value.bind_sqlite(query));
+        Ok(query.fetch_all(on).await?.into_iter().map(Row::Sqlite).collect())
+    }
+
+    async fn execute_postgres(self, on: impl Executor<'_, Database = Postgres>) -> Result<u64> {
+        let query = sqlx::query(AssertSqlSafe(for_postgres(self.sql, self.lock)));
+        let query = self.values.into_iter().fold(query, |query, value| value.bind_postgres(query));
+        Ok(query.execute(on).await?.rows_affected())
+    }
+
+    async fn fetch_postgres(self, on: impl Executor<'_, Database = Postgres>) -> Result<Vec<Row>> {
+        let query = sqlx::query(AssertSqlSafe(for_postgres(self.sql, self.lock)));
+        let query = self.values.into_iter().fold(query, |query, value| value.bind_postgres(query));
+        Ok(query.fetch_all(on).await?.into_iter().map(Row::Postgres).collect())
+    }
+}
+
+/// `CROSS JOIN … ON` tells SQLite in which order to join. PostgreSQL does not know it, and needs no telling.
+pub(super) fn for_postgres(sql: &'static str, lock: &'static str) -> String {
+    let mut sql = if sql.contains("CROSS JOIN") {
+        Cow::from(sql.replace("CROSS JOIN", "JOIN"))
+    } else {
+        Cow::from(sql)
+    };
+    if !lock.is_empty() {
+        sql.to_mut().push_str(lock);
+    }
+    sql.into_owned()
+}

@@ -1,0 +1,117 @@
+//! What comes out of a query.
+
+use sqlx::postgres::PgRow;
+use sqlx::sqlite::SqliteRow;
+use sqlx::{ColumnIndex, Row as _};
+
+use crate::error::{Result, StoreError};
+
+/// A row of either database.
+pub enum Row {
+    Sqlite(SqliteRow),
+    Postgres(PgRow),
+}
+
+/// The name of a column, or its place from 0 on.
+pub trait Index: ColumnIndex<SqliteRow> + ColumnIndex<PgRow> + std::fmt::Display + Copy {}
+impl<I: ColumnIndex<SqliteRow> + ColumnIndex<PgRow> + std::fmt::Display + Copy> Index for I {}
+
+/// What a column can be read as.
+pub trait FromColumn: Sized {
+    fn from_column(row: &Row, index: impl Index) -> Result<Self>;
+}
+
+/// What a row can be read as: a struct, a tuple, or the only column.
+pub trait FromRow: Sized {
+    fn from_row(row: &Row) -> Result<Self>;
+}
+
+impl Row {
+    /// The value of a column.
+    pub fn get<T: FromColumn>(&self, index: impl Index) -> Result<T> {
+        T::from_column(self, index)
+    }
+
+    /// The value of a column that earlier versions of the tables do not have.
+    pub fn get_or_default<T: FromColumn + Default>(&self, name: &str) -> Result<T> {
+        let is_there = match self {
+            Self::Sqlite(row) => row.try_column(name).is_ok(),
+            Self::Postgres(row) => row.try_column(name).is_ok(),
+        };
+        if is_there { self.get(name) } else { Ok(T::default()) }
+    }
+}
+
+macro_rules! columns {
+    ($($type:ty),*) => {$(
+        columns!(@ $type, $type);
+        columns!(@ $type, Option<$type>);
+    )*};
+    (@ $type:ty, $read:ty) => {
+        impl FromColumn for $read {
+            fn from_column(row: &Row, index: impl Index) -> Result<Self> {
+                Ok(match row {
+                    Row::Sqlite(row) => row.try_get(index)?,
+                    Row::Postgres(row) => row.try_get(index)?,
+                })
+            }
+        }
+    };
+}
+columns!(i64, f64, String, Vec<u8>, bool);
+
+macro_rules! small_integers {
+    ($($type:ty),*) => {$(
+        impl FromColumn for $type {
+            fn from_column(row: &Row, index: impl Index) -> Result<Self> {
+                Option::from_column(row, index)?.ok_or_else(|| StoreError::damaged("a row", format!("{index} is NULL")))
+            }
+        }
+        impl FromColumn for Option<$type> {
+            fn from_column(row: &Row, index: impl Index) -> Result<Self> {
+                let absurd = |number| StoreError::damaged("a row", format!("{index} is {number}"));
+                let number: Option<i64> = row.get(index)?;
+                number.map(|number| number.try_into().map_err(|_| absurd(number))).transpose()
+            }
+        }
+    )*};
+}
+small_integers!(u32, u64, i32);
+
+macro_rules! only_column {
+    ($($type:ty),*) => {$(
+        impl FromRow for $type {
+            fn from_row(row: &Row) -> Result<Self> {
+                row.get(0)
+            }
+        }
+    )*};
+}
+only_column!(i64, u32, u64, bool, String, Option<String>, Vec<u8>);
+
+macro_rules! tuples {
+    ($(($($type:ident $place:literal),*))*) => {$(
+        impl<$($type: FromColumn),*> FromRow for ($($type,)*) {
+            fn from_row(row: &Row) -> Result<Self> {
+                Ok(($(row.get::<$type>($place)?,)*))
+            }
+        }
+    )*};
+}
+tuples! {
+    (A 0, B 1)
+    (A 0, B 1, C 2)
+    (A 0, B 1, C 2, D 3)
+}
+
+/// Reads a struct from the columns that bear the names of its fields.
+macro_rules! from_columns {
+    ($type:ty { $($field:ident),* $(,)? }) => {
+        impl $crate::database::FromRow for $type {
+            fn from_row(row: &$crate::database::Row) -> $crate::error::Result<Self> {
+                Ok(Self { $($field: row.get(stringify!($field))?,)* })
+            }
+        }
+    };
+}
+pub(crate) use from_columns;

@@ -1,0 +1,121 @@
+//! Many rows in one statement.
+//!
+//! To PostgreSQL every statement is a journey, so all rows go along with the first, as one array a column. SQLite is in
+//! this process: there, one row after the other is the fastest.
+
+use std::sync::Arc;
+
+use sqlx::postgres::PgArguments;
+use sqlx::query::Query;
+use sqlx::{AssertSqlSafe, Postgres};
+
+use super::Transaction;
+use super::value::{Value, without_zeros};
+use crate::error::{Result, StoreError};
+
+/// Bytes that go along at once, about: arrays of PostgreSQL hold 1 GB, and its server copies them.
+const LOAD: usize = 1 << 25;
+
+/// Executes `sql` for every row: `{rows}` in it is a table named `new` of the rows, `{columns}` the names of its columns,
+/// separated by commas, `{excluded}` what takes over the new values of all columns but the first. Values of a column are
+/// all of one type. Returns the number of rows that were written.
+pub async fn for_rows(
+    transaction: &mut Transaction,
+    sql: &'static str,
+    columns: &'static [&'static str],
+    rows: Vec<Vec<Value>>,
+) -> Result<u64> {
+    let Some(first) = rows.first() else { return Ok(0) };
+    let excluded: Vec<_> = columns.iter().skip(1).map(|name| format!("{name} = excluded.{name}")).collect();
+    let sql = sql.replace("{columns}", &columns.join(", ")).replace("{excluded}", &excluded.join(", "));
+    let mut written = 0;
+    match transaction {
+        Transaction::Sqlite(transaction) => {
+            let sql: Arc<str> = sql.replace("{rows}", &one_row(columns)).into();
+            for row in rows {
+                let query = sqlx::query(AssertSqlSafe(Arc::clone(&sql)));
+                let query = row.into_iter().fold(query, |query, value| value.bind_sqlite(query));
+                written += query.execute(&mut **transaction).await?.rows_affected();
+            }
+        }
+        Transaction::Postgres(transaction, _) => {
+            let sql = sql.replace("{rows}", &arrays(columns, first)).replace("CROSS JOIN", "JOIN");
+            let mut rows = rows.into_iter().peekable();
+            while rows.peek().is_some() {
+                let load = load(&mut rows);
+                let mut query = sqlx::query(AssertSqlSafe(sql.clone()));
+                for column in transpose(columns.len(), load) {
+                    query = bind_column(query, column)?;
+                }
+                written += query.execute(&mut **transaction).await?.rows_affected();
+            }
+        }
+    }
+    Ok(written)
+}
+
+/// A table of one row, for SQLite.
+fn one_row(columns: &[&str]) -> String {
+    let columns: Vec<_> = columns.iter().zip(1..).map(|(name, k)| format!("${k} AS {name}")).collect();
+    format!("(SELECT {}) AS new", columns.join(", "))
+}
+
+/// A table of as many rows as each array has, for PostgreSQL.
+fn arrays(columns: &[&str], first: &[Value]) -> String {
+    let array = |(value, k): (&Value, usize)| {
+        let kind = match value {
+            Value::Integer(_) => "BIGINT",
+            Value::Real(_) => "DOUBLE PRECISION",
+            Value::Text(_) => "TEXT",
+            Value::Bytes(_) => "BYTEA",
+        };
+        format!("${k}::{kind}[]")
+    };
+    let arrays: Vec<_> = first.iter().zip(1..).map(array).collect();
+    format!("unnest({}) AS new ({})", arrays.join(", "), columns.join(", "))
+}
+
+/// The next rows, as many as go along at once.
+fn load(rows: &mut impl Iterator<Item = Vec<Value>>) -> Vec<Vec<Value>> {
+    let (mut load, mut bytes) = (Vec::new(), 0);
+    while bytes < LOAD
+        && let Some(row) = rows.next()
+    {
+        bytes += row.iter().map(Value::len).sum::<usize>();
+        load.push(row);
+    }
+    load
+}
+
+fn transpose(columns: usize, rows: Vec<Vec<Value>>) -> Vec<Vec<Value>> {
+    let mut transposed: Vec<Vec<Value>> = (0..columns).map(|_| Vec::with_capacity(rows.len())).collect();
+    for row in rows {
+        transposed.iter_mut().zip(row).for_each(|(column, value)| column.push(value));
+    }
+    transposed
+}
+
+type PostgresQuery<'q> = Query<'q, Postgres, PgArguments>;
+
+/// Binds a column as an array; its values are all of the type of the first.
+fn bind_column(query: PostgresQuery<'_>, column: Vec<Value>) -> Result<PostgresQuery<'_>> {
+    macro_rules! array {
+        ($variant:ident) => {{
+            let value = |value| match value {
+                Value::$variant(value) => Ok(value),
+                _ => Err(StoreError::Inconsistent("values of two types in one column".into())),
+            };
+            column.into_iter().map(value).collect::<Result<Vec<_>>>()?
+        }};
+    }
+    Ok(match column.first() {
+        Some(Value::Integer(_)) => query.bind(array!(Integer)),
+        Some(Value::Real(_)) => query.bind(array!(Real)),
+        Some(Value::Text(_)) => {
+            let texts = array!(Text);
+            query.bind(texts.into_iter().map(|text| text.map(without_zeros)).collect::<Vec<_>>())
+        }
+        Some(Value::Bytes(_)) => query.bind(array!(Bytes)),
+        None => query,
+    })
+}

@@ -1,0 +1,98 @@
+//! What is bound to a query.
+
+use std::borrow::Cow;
+
+use sqlx::postgres::PgArguments;
+use sqlx::query::Query;
+use sqlx::sqlite::SqliteArguments;
+use sqlx::{Postgres, Sqlite};
+
+/// A value of one of the types that both databases have. `None` is NULL.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Value {
+    Integer(Option<i64>),
+    /// Not a number is NULL, as SQLite has it.
+    Real(Option<f64>),
+    Text(Option<String>),
+    Bytes(Option<Vec<u8>>),
+}
+
+impl Value {
+    pub(super) fn bind_sqlite(
+        self,
+        query: Query<'_, Sqlite, SqliteArguments>,
+    ) -> Query<'_, Sqlite, SqliteArguments> {
+        match self {
+            Self::Integer(value) => query.bind(value),
+            Self::Real(value) => query.bind(value),
+            Self::Text(value) => query.bind(value),
+            Self::Bytes(value) => query.bind(value),
+        }
+    }
+
+    pub(super) fn bind_postgres(
+        self,
+        query: Query<'_, Postgres, PgArguments>,
+    ) -> Query<'_, Postgres, PgArguments> {
+        match self {
+            Self::Integer(value) => query.bind(value),
+            Self::Real(value) => query.bind(value),
+            Self::Text(value) => query.bind(value.map(without_zeros)),
+            Self::Bytes(value) => query.bind(value),
+        }
+    }
+
+    /// Bytes that it holds, about.
+    pub(super) fn len(&self) -> usize {
+        match self {
+            Self::Integer(_) | Self::Real(_) => 8,
+            Self::Text(text) => text.as_ref().map_or(0, String::len),
+            Self::Bytes(bytes) => bytes.as_ref().map_or(0, Vec::len),
+        }
+    }
+}
+
+/// PostgreSQL takes no zero bytes in text; last words of processes may hold some.
+pub(super) fn without_zeros(text: String) -> String {
+    if text.contains('\0') { text.replace('\0', "\u{fffd}") } else { text }
+}
+
+macro_rules! values {
+    ($($from:ty => $variant:ident, $convert:expr;)*) => {$(
+        impl From<$from> for Value {
+            fn from(value: $from) -> Self {
+                Self::from(Some(value))
+            }
+        }
+        impl From<Option<$from>> for Value {
+            fn from(value: Option<$from>) -> Self {
+                Self::$variant(value.map($convert))
+            }
+        }
+    )*};
+}
+
+values! {
+    i64 => Integer, |value| value;
+    i32 => Integer, i64::from;
+    u32 => Integer, i64::from;
+    bool => Integer, i64::from;
+    String => Text, |value| value;
+    &str => Text, str::to_owned;
+    &String => Text, String::clone;
+    Cow<'_, str> => Text, Cow::into_owned;
+    Vec<u8> => Bytes, |value| value;
+    &[u8] => Bytes, <[u8]>::to_vec;
+}
+
+impl From<f64> for Value {
+    fn from(value: f64) -> Self {
+        Self::from(Some(value))
+    }
+}
+
+impl From<Option<f64>> for Value {
+    fn from(value: Option<f64>) -> Self {
+        Self::Real(value.filter(|value| !value.is_nan()))
+    }
+}

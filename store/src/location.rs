@@ -1,0 +1,227 @@
+//! Where a campaign is kept: a directory of this host, or a server.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use sqlx::postgres::PgConnectOptions;
+
+use crate::error::{Result, StoreError};
+
+/// The schema of a database in which a campaign is kept, if the URL names none.
+const SCHEMA: &str = "public";
+/// Longest name of a schema: with what is added to it, it is a name of PostgreSQL, of 63 bytes at most.
+const LONGEST_SCHEMA: usize = 50;
+
+/// Where a campaign is kept.
+#[derive(Clone, Debug)]
+pub enum Location {
+    /// A directory of this host, with SQLite.
+    Directory(PathBuf),
+    /// A schema of a database on a server, with PostgreSQL.
+    Server(ServerUrl),
+}
+
+/// `postgres://user@host:port/database?schema=name` and what libpq takes besides; user, password and so on may also
+/// come from the environment (`PGPASSWORD` and the like) and from `~/.pgpass`. It never shows its password.
+#[derive(Clone)]
+pub struct ServerUrl {
+    pub(crate) options: PgConnectOptions,
+    pub(crate) schema: String,
+    shown: String,
+    has_password: bool,
+}
+
+impl ServerUrl {
+    /// The URL without its password.
+    pub fn as_str(&self) -> &str {
+        &self.shown
+    }
+
+    /// Whether a password stands in the URL itself, where it does not belong if the URL is written down.
+    pub fn has_password(&self) -> bool {
+        self.has_password
+    }
+}
+
+impl Location {
+    /// Whether a text means a server rather than a directory.
+    pub fn is_server(text: &str) -> bool {
+        text.starts_with("postgres://") || text.starts_with("postgresql://")
+    }
+}
+
+impl FromStr for Location {
+    type Err = StoreError;
+
+    /// A URL that begins with `postgres://` or `postgresql://`; anything else is a directory.
+    fn from_str(text: &str) -> Result<Self> {
+        if Self::is_server(text) { Ok(Self::Server(text.parse()?)) } else { Ok(Self::Directory(text.into())) }
+    }
+}
+
+impl FromStr for ServerUrl {
+    type Err = StoreError;
+
+    fn from_str(url: &str) -> Result<Self> {
+        let Parts { shown, plain, schema, has_password } = Parts::of(url)?;
+        let valid = |c: char| matches!(c, 'a'..='z' | '0'..='9' | '_');
+        if schema.is_empty() || schema.len() > LONGEST_SCHEMA || !schema.chars().all(valid) {
+            let reason = format!(
+                "the schema '{schema}' must be a name of at most {LONGEST_SCHEMA} small letters, digits and underscores"
+            );
+            return Err(StoreError::Url { url: shown, reason });
+        }
+        // What its parser says may show a part of what it was given.
+        let options: PgConnectOptions = plain.parse().map_err(|_| StoreError::Url {
+            url: shown.clone(),
+            reason: "it should look like postgres://user@host:5432/database?schema=name".into(),
+        })?;
+        Ok(Self { options, schema, shown, has_password })
+    }
+}
+
+/// A URL taken apart.
+struct Parts {
+    /// Without password.
+    shown: String,
+    /// Without schema.
+    plain: String,
+    schema: String,
+    has_password: bool,
+}
+
+impl Parts {
+    fn of(url: &str) -> Result<Self> {
+        let (begin, parameters) = url.split_once('?').unwrap_or((url, ""));
+        let (scheme, rest) = begin.split_once("://").unwrap_or(("", begin));
+        let (mut shown, mut plain) = (String::new(), begin.to_owned());
+        let mut has_password = false;
+        // A password may hold any character but '/', '?' and '#', which would end it.
+        let (authority, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+        match authority.rsplit_once('@') {
+            Some((user, host)) => {
+                let name = user.split(':').next().unwrap_or_default();
+                has_password = user.contains(':');
+                shown += &format!("{scheme}://{name}@{host}{path}");
+            }
+            None => shown += begin,
+        }
+        let (mut schema, mut separator) = (SCHEMA, ['?', '?']);
+        for parameter in parameters.split('&').filter(|parameter| !parameter.is_empty()) {
+            let (key, value) = parameter.split_once('=').unwrap_or((parameter, ""));
+            if key == "schema" {
+                schema = value;
+            } else {
+                plain += &format!("{}{parameter}", std::mem::replace(&mut separator[1], '&'));
+            }
+            if key == "password" {
+                has_password = true;
+            } else {
+                shown += &format!("{}{parameter}", std::mem::replace(&mut separator[0], '&'));
+            }
+        }
+        if path.contains('@') {
+            let reason = "the '/' in its password must be written as %2F".to_owned();
+            return Err(StoreError::Url { url: format!("{scheme}://…"), reason });
+        }
+        Ok(Self { shown, plain, schema: schema.to_owned(), has_password })
+    }
+}
+
+impl fmt::Display for Location {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Directory(directory) => directory.display().fmt(f),
+            Self::Server(url) => url.fmt(f),
+        }
+    }
+}
+
+impl fmt::Display for ServerUrl {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(&self.shown)
+    }
+}
+
+impl fmt::Debug for ServerUrl {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("ServerUrl").field(&self.shown).finish()
+    }
+}
+
+impl From<&Path> for Location {
+    fn from(directory: &Path) -> Self {
+        Self::Directory(directory.into())
+    }
+}
+
+impl From<&PathBuf> for Location {
+    fn from(directory: &PathBuf) -> Self {
+        Self::Directory(directory.clone())
+    }
+}
+
+impl From<PathBuf> for Location {
+    fn from(directory: PathBuf) -> Self {
+        Self::Directory(directory)
+    }
+}
+
+impl From<&Self> for Location {
+    fn from(place: &Self) -> Self {
+        place.clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_password_is_used_and_never_shown() {
+        for url in [
+            "postgres://anna:s3cret@host:5433/lab?schema=alloy",
+            "postgres://anna:s3c@ret@host:5433/lab?schema=alloy",
+            "postgresql://anna@host:5433/lab?password=s3cret&schema=alloy",
+        ] {
+            let location: Location = url.parse().unwrap();
+            let Location::Server(server) = &location else { panic!("{location}") };
+            assert!(server.has_password());
+            assert_eq!((server.schema.as_str(), server.options.get_host()), ("alloy", "host"));
+            assert_eq!((server.options.get_port(), server.options.get_username()), (5433, "anna"));
+            for shown in [format!("{location}"), format!("{location:?}"), server.as_str().to_owned()] {
+                assert!(!shown.contains("s3c") && !shown.contains("ret"), "{shown}");
+                assert!(shown.contains("anna@host:5433/lab?schema=alloy"), "{shown}");
+            }
+            let again: ServerUrl = server.as_str().parse().unwrap();
+            assert!(!again.has_password() && again.as_str() == server.as_str());
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_a_url_is_refused_without_showing_it() {
+        for url in [
+            "postgres://anna:s3/cret@host/lab",
+            "postgres://anna:s3cret@host:port/lab",
+            "postgres://anna:s3cret@host/lab?schema=Alloy",
+            "postgres://anna:s3cret@host/lab?schema=a;drop",
+            "postgres://anna:s3cret@host/lab?schema=",
+        ] {
+            let error = url.parse::<Location>().unwrap_err();
+            assert!(matches!(error, StoreError::Url { .. }));
+            for shown in [format!("{error}"), format!("{error:?}")] {
+                assert!(!shown.contains("s3") && !shown.contains("cret"), "{shown}");
+            }
+        }
+        let location: Location = "campaigns/alloy".parse().unwrap();
+        assert!(matches!(location, Location::Directory(directory) if directory.ends_with("alloy")));
+    }
+
+    #[test]
+    fn without_a_schema_it_is_the_one_that_every_database_has() {
+        let server: ServerUrl = "postgres://host/lab?host=/run/postgresql&port=5433".parse().unwrap();
+        assert_eq!(server.schema, "public");
+        assert_eq!(server.as_str(), "postgres://host/lab?host=/run/postgresql&port=5433");
+    }
+}

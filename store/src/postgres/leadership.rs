@@ -1,0 +1,133 @@
+//! One process leads a campaign: an advisory lock of the server, which belongs to a connection.
+//!
+//! A connection may break while the process lives, and somebody else may have the lock then. So each who takes it adds one to
+//! the generation in the table `leader`, under which it writes ([`Server::begin_to_lead`]): nobody of an earlier generation
+//! writes any more. Who loses the connection takes the lock again if nobody had it meanwhile.
+
+use std::time::{Duration, Instant};
+
+use sqlx::postgres::{PgConnectOptions, PgConnection};
+use sqlx::{ConnectOptions, Connection};
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
+
+use super::{Server, make_tables, options};
+use crate::birth::process_birth;
+use crate::error::{Result, StoreError};
+use crate::location::ServerUrl;
+use crate::processes::this_host;
+
+/// Between two looks at the connection, and between two tries to have it again.
+const LOOK: Duration = Duration::from_secs(1);
+/// Longest time for an answer.
+const ANSWER: Duration = Duration::from_secs(10);
+/// How long it may take until a server notices that the last holder has left.
+const LEAVING: Duration = Duration::from_secs(1);
+const LEAVING_PAUSE: Duration = Duration::from_millis(50);
+
+/// Returns whether the lock is this connection's now.
+const TAKE: &str = "SELECT pg_try_advisory_lock(hashtextextended('calmwalk ' || $1, 0))";
+
+/// The right to lead the campaign in one schema.
+#[derive(Debug)]
+pub struct Leadership {
+    pub generation: i64,
+    location: String,
+    /// Who leads it instead.
+    successor: watch::Receiver<Option<String>>,
+    keeper: JoinHandle<()>,
+}
+
+impl Leadership {
+    pub async fn take(url: &ServerUrl, who: &str) -> Result<Self> {
+        let server = Server::connect(url, true);
+        make_tables(url, &server).await?;
+        server.close().await;
+        let (options, begun) = (options(url), Instant::now());
+        let mut connection = options.connect().await?;
+        while !take(&mut connection, &url.schema).await? {
+            if begun.elapsed() > LEAVING {
+                let holder: String =
+                    sqlx::query_scalar("SELECT holder FROM leader").fetch_one(&mut connection).await?;
+                return Err(StoreError::Locked { location: url.to_string(), holder });
+            }
+            tokio::time::sleep(LEAVING_PAUSE).await;
+        }
+        let pid = std::process::id();
+        let sql =
+            "UPDATE leader SET generation = generation + 1, holder = $1, birth = $2 RETURNING generation";
+        let query = sqlx::query_scalar(sql).bind(format!("process {pid} ({who}) on {}", this_host()));
+        let query = query.bind(process_birth(pid).unwrap_or_default());
+        let generation = query.fetch_one(&mut connection).await?;
+        let (tell, successor) = watch::channel(None);
+        let keeper = keep(connection, options, url.schema.clone(), generation, tell);
+        Ok(Self { generation, location: url.to_string(), successor, keeper: tokio::spawn(keeper) })
+    }
+
+    /// Waits until another process leads the campaign.
+    pub async fn lost(&self) -> StoreError {
+        let mut successor = self.successor.clone();
+        let holder = match successor.wait_for(Option::is_some).await {
+            Ok(holder) => holder.clone().unwrap_or_default(),
+            // The keeper ends with the lock or with the runtime.
+            Err(_) => std::future::pending().await,
+        };
+        StoreError::LockLost { location: self.location.clone(), holder }
+    }
+}
+
+impl Drop for Leadership {
+    fn drop(&mut self) {
+        self.keeper.abort();
+    }
+}
+
+async fn take(connection: &mut PgConnection, schema: &str) -> Result<bool> {
+    Ok(sqlx::query_scalar(TAKE).bind(schema).fetch_one(connection).await?)
+}
+
+/// Holds the lock until another process has it.
+async fn keep(
+    mut connection: PgConnection,
+    options: PgConnectOptions,
+    schema: String,
+    generation: i64,
+    tell: watch::Sender<Option<String>>,
+) {
+    loop {
+        while matches!(timeout(ANSWER, connection.ping()).await, Ok(Ok(()))) {
+            tokio::time::sleep(LOOK).await;
+        }
+        connection = loop {
+            match timeout(ANSWER, take_again(&options, &schema, generation)).await {
+                Ok(Ok(Again::Held(connection))) => break connection,
+                Ok(Ok(Again::Lost(holder))) => {
+                    // Nobody may ask any more.
+                    let _ = tell.send(Some(holder));
+                    return;
+                }
+                // Not yet: the server is away, or has not noticed yet that the old connection broke.
+                _ => tokio::time::sleep(LOOK).await,
+            }
+        };
+    }
+}
+
+enum Again {
+    Held(PgConnection),
+    NotYet,
+    Lost(String),
+}
+
+async fn take_again(options: &PgConnectOptions, schema: &str, generation: i64) -> Result<Again> {
+    let mut connection = options.connect().await?;
+    let held = take(&mut connection, schema).await?;
+    let leader = sqlx::query_as("SELECT generation, holder FROM leader").fetch_one(&mut connection).await?;
+    let (newest, holder): (i64, String) = leader;
+    Ok(match (newest == generation, held) {
+        (true, true) => Again::Held(connection),
+        (true, false) => Again::NotYet,
+        (false, _) => Again::Lost(holder),
+    })
+}

@@ -1,0 +1,233 @@
+//! The database on a PostgreSQL server: making it and opening it.
+
+mod jobs;
+pub mod leadership;
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use sqlx::migrate::Migrator;
+use sqlx::pool::PoolConnection;
+use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, Postgres};
+use sqlx::{AssertSqlSafe, Executor};
+use wire::CampaignId;
+
+use self::jobs::Jobs;
+use crate::database::{Clock, Database, Transaction, query};
+use crate::error::{Result, StoreError};
+use crate::location::ServerUrl;
+
+/// The newest of the migrations.
+const SCHEMA: i64 = 1;
+/// Connections of a process, at most: one that writes and some that read.
+const CONNECTIONS: u32 = 5;
+/// Connections that nobody needs are closed after this time: a server has few.
+const IDLE: Duration = Duration::from_secs(60);
+/// How long a server may be away before what needs it fails, for a moment.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+static MIGRATIONS: Migrator = sqlx::migrate!("migrations/postgres");
+
+/// A campaign on a server. Clones share its connections.
+#[derive(Clone)]
+pub struct Server {
+    pool: PgPool,
+    /// URL without password.
+    shown: Arc<str>,
+    writes: bool,
+    pub clock: Clock,
+    /// That of the lock which its user holds, if it does.
+    pub generation: Option<i64>,
+    jobs: Arc<Jobs>,
+}
+
+impl Server {
+    /// Makes the tables, which must not hold a campaign yet.
+    pub async fn create(url: &ServerUrl, campaign: CampaignId) -> Result<Self> {
+        let server = Self::connect(url, true);
+        make_tables(url, &server).await?;
+        match server.campaign().await? {
+            None => Ok(server),
+            Some(found) => {
+                Err(StoreError::Occupied { location: url.to_string(), found, wanted: campaign.to_string() })
+            }
+        }
+    }
+
+    /// Opens the campaign, and brings its tables up to date if it is to write.
+    pub async fn open(url: &ServerUrl, writes: bool) -> Result<Self> {
+        let server = Self::connect(url, writes);
+        let missing = || StoreError::Missing {
+            location: url.to_string(),
+            lacks: "tables of a campaign in that schema",
+        };
+        let found = version(url, &mut *server.connection().await?).await?.ok_or_else(missing)?;
+        if found < SCHEMA && writes {
+            MIGRATIONS.run(&server.pool).await.map_err(schema_error)?;
+        }
+        server.campaign().await?.ok_or_else(missing)?;
+        Ok(server)
+    }
+
+    fn connect(url: &ServerUrl, writes: bool) -> Self {
+        let options = options(url);
+        let pool = PgPoolOptions::new()
+            .max_connections(CONNECTIONS)
+            .acquire_timeout(PATIENCE)
+            .idle_timeout(IDLE)
+            .connect_lazy_with(options.clone());
+        let jobs = Arc::new(Jobs::new(options, &url.schema));
+        Self { pool, shown: url.as_str().into(), writes, clock: Clock::Server, generation: None, jobs }
+    }
+
+    /// Id of the campaign, if there is one.
+    async fn campaign(&self) -> Result<Option<String>> {
+        let id = query("SELECT value FROM campaign WHERE key = 'id'");
+        id.fetch_optional(&Database::Postgres(self.clone())).await
+    }
+
+    /// A connection to read with, or to begin with.
+    pub async fn connection(&self) -> Result<PoolConnection<Postgres>> {
+        self.pool.acquire().await.map_err(unreachable)
+    }
+
+    pub async fn begin(&self) -> Result<Transaction> {
+        if !self.writes {
+            return Err(StoreError::ReadOnly);
+        }
+        self.begin_with("BEGIN ISOLATION LEVEL READ COMMITTED").await
+    }
+
+    pub async fn begin_to_read(&self) -> Result<Transaction> {
+        self.begin_with("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY").await
+    }
+
+    async fn begin_with(&self, statement: &'static str) -> Result<Transaction> {
+        let transaction = self.pool.begin_with(statement).await.map_err(unreachable)?;
+        Ok(Transaction::Postgres(transaction, self.clock))
+    }
+
+    /// A transaction that holds the leader's row, which must be that of its own lock, if it has one.
+    pub async fn begin_to_lead(&self) -> Result<Transaction> {
+        let mut transaction = self.begin().await?;
+        let leader = query("SELECT generation, holder FROM leader").locked();
+        self.check_leader(leader.fetch_one(&mut transaction).await?)?;
+        Ok(transaction)
+    }
+
+    /// See [`Database::begin_to_commit`]. The row of the leader is held from the first statement on, so this waits for an
+    /// earlier try that the server is still at.
+    pub async fn begin_to_commit(&self, mark: i64, again: bool) -> Result<(Transaction, bool)> {
+        let mut transaction = self.begin().await?;
+        if again {
+            let last: i64 = query("SELECT mark FROM leader").locked().fetch_one(&mut transaction).await?;
+            if last == mark {
+                return Ok((transaction, true));
+            }
+        }
+        let leader = query("UPDATE leader SET mark = $1 RETURNING generation, holder").bind(mark);
+        self.check_leader(leader.fetch_one(&mut transaction).await?)?;
+        Ok((transaction, false))
+    }
+
+    fn check_leader(&self, (generation, holder): (i64, String)) -> Result<()> {
+        match self.generation {
+            Some(own) if own != generation => {
+                Err(StoreError::LockLost { location: self.shown.to_string(), holder })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    pub async fn wait_for_jobs(&self, longest: Duration) {
+        self.jobs.wait(longest).await;
+    }
+
+    pub async fn close(&self) {
+        self.jobs.close();
+        self.pool.close().await;
+    }
+}
+
+impl fmt::Debug for Server {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Server").field("url", &self.shown).field("generation", &self.generation).finish()
+    }
+}
+
+/// How to connect: names without a schema are those of the campaign's.
+fn options(url: &ServerUrl) -> PgConnectOptions {
+    let name = url.options.get_application_name().unwrap_or("calmwalk").to_owned();
+    url.options
+        .clone()
+        .application_name(&name)
+        // What a server whose host is gone holds for us comes free within half a minute.
+        .options([
+            ("tcp_keepalives_idle", "10"),
+            ("tcp_keepalives_interval", "5"),
+            ("tcp_keepalives_count", "3"),
+        ])
+        .options([("search_path", url.schema.as_str()), ("synchronous_commit", "on")])
+}
+
+/// What a server says that cannot be asked.
+fn unreachable(error: sqlx::Error) -> StoreError {
+    match error {
+        sqlx::Error::PoolTimedOut => StoreError::Unreachable(error),
+        error => error.into(),
+    }
+}
+
+/// Makes the schema and the tables in it, where they are not there yet.
+async fn make_tables(url: &ServerUrl, server: &Server) -> Result<()> {
+    let mut connection = server.connection().await?;
+    if version(url, &mut connection).await? == Some(SCHEMA) {
+        return Ok(());
+    }
+    // Its name is made of letters, digits and underscores.
+    let create = AssertSqlSafe(format!("CREATE SCHEMA IF NOT EXISTS \"{}\"", url.schema));
+    let sql = "SELECT EXISTS (SELECT 1 FROM pg_namespace WHERE nspname = $1)";
+    let exists: bool = sqlx::query_scalar(sql).bind(&url.schema).fetch_one(&mut *connection).await?;
+    if !exists {
+        match connection.execute(create).await {
+            // Another process was faster.
+            Err(sqlx::Error::Database(error)) if error.is_unique_violation() => {}
+            made => drop(made?),
+        }
+    }
+    drop(connection);
+    MIGRATIONS.run(&server.pool).await.map_err(schema_error)
+}
+
+/// Version of the tables of a campaign in the schema; `None` without any.
+async fn version(url: &ServerUrl, connection: &mut PgConnection) -> Result<Option<i64>> {
+    let sql =
+        "SELECT tablename::TEXT FROM pg_tables WHERE schemaname = $1 ORDER BY tablename = 'leader' DESC, 1";
+    let tables: Vec<String> = sqlx::query_scalar(sql).bind(&url.schema).fetch_all(&mut *connection).await?;
+    match tables.first() {
+        None => return Ok(None),
+        // What a process that was killed while it made the tables leaves, at most.
+        Some(first) if first == "_sqlx_migrations" && tables.len() == 1 => return Ok(None),
+        Some(first) if first != "leader" => {
+            return Err(StoreError::ForeignSchema { location: url.to_string(), found: first.clone() });
+        }
+        _ => {}
+    }
+    let found: Option<i64> =
+        sqlx::query_scalar("SELECT max(version) FROM _sqlx_migrations").fetch_one(connection).await?;
+    match found {
+        Some(found) if found > SCHEMA => {
+            Err(StoreError::Version { path: url.as_str().into(), found, reads: SCHEMA })
+        }
+        found => Ok(found),
+    }
+}
+
+fn schema_error(error: sqlx::migrate::MigrateError) -> StoreError {
+    match error {
+        sqlx::migrate::MigrateError::Execute(error)
+        | sqlx::migrate::MigrateError::ExecuteMigration(error, _) => error.into(),
+        error => StoreError::Schema(error),
+    }
+}

@@ -1,0 +1,165 @@
+//! Accept is one transaction: what the selector decided is written as a whole or not at all.
+
+mod rows;
+
+use std::collections::HashSet;
+use std::hash::{BuildHasher, RandomState};
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+use atoms::Structure;
+use wire::ContentHash;
+
+use self::rows::{CANDIDATE, CANDIDATE_DATA, DECISION, JOB, Rows, STRUCTURE, WALK};
+use super::protocols;
+use crate::Store;
+use crate::database::{Transaction, for_rows, query};
+use crate::encoding::{encode_structure, integer};
+use crate::error::{Result, StoreError};
+use crate::records::Commit;
+
+/// How long a commit is tried while the server is away. Whoever waits for it has nothing else to do; a campaign that
+/// failed goes on from here just as well, but somebody has to start it.
+const SERVER_AWAY: Duration = Duration::from_secs(3600);
+const PAUSE: Duration = Duration::from_secs(1);
+
+const INSERT_DECISIONS: &str = "INSERT INTO decision ({columns}) SELECT * FROM {rows}";
+
+/// One that is there already is not changed but locked: whether it has a label must not change until its job is written.
+const INSERT_STRUCTURES: &str = "INSERT INTO structure ({columns}) SELECT * FROM {rows} WHERE TRUE
+    ON CONFLICT (hash) DO UPDATE SET atoms = excluded.atoms";
+
+const INSERT_CANDIDATES: &str = "INSERT INTO candidate ({columns}, structure)
+    SELECT new.*, (SELECT number FROM structure WHERE hash = new.content AND new.fate = 'accepted')
+    FROM {rows} WHERE TRUE ON CONFLICT (id) DO NOTHING";
+
+const INSERT_CANDIDATE_DATA: &str = "INSERT INTO candidate_data ({columns}) SELECT * FROM {rows}";
+
+/// A job for each structure, unless it has one; done already if the label is there.
+const INSERT_JOBS: &str = "INSERT INTO job (structure, protocol, decision, priority, state)
+    SELECT structure.number, new.protocol, new.decision, new.priority, CASE WHEN EXISTS (
+        SELECT 1 FROM label WHERE label.structure = structure.number AND label.protocol = new.protocol
+        AND standing = 'label') THEN 'labelled' ELSE 'queued' END
+    FROM {rows} CROSS JOIN structure ON structure.hash = new.hash WHERE TRUE
+    ON CONFLICT (structure, protocol) DO NOTHING";
+
+const UPSERT_COMPONENTS: &str = "INSERT INTO component ({columns}) SELECT * FROM {rows} WHERE TRUE
+    ON CONFLICT (element, slot) DO UPDATE SET bytes = excluded.bytes";
+
+const UPSERT_WALKS: &str = "INSERT INTO walk ({columns}) SELECT * FROM {rows} WHERE TRUE
+    ON CONFLICT (walk) DO UPDATE SET {excluded}";
+
+const UPSERT_VALUES: &str = "INSERT INTO value ({columns}) SELECT * FROM {rows} WHERE TRUE
+    ON CONFLICT (name) DO UPDATE SET value = excluded.value";
+
+impl Store {
+    /// Writes everything that was decided in one transaction, on the disk when this returns. Decisions get
+    /// consecutive numbers, which are returned. An accepted candidate gets a label job under the protocol in force,
+    /// if there is one.
+    ///
+    /// A server that is away for a while is waited for. Where the answer to a commit was lost, it is found out whether it
+    /// was made: it is never made twice.
+    ///
+    /// # Errors
+    /// [`StoreError::DuplicateCandidate`] and [`StoreError::Inconsistent`] are errors of the caller. Nothing is
+    /// written after any error. [`StoreError::LockLost`] if somebody else leads the campaign, see [`Store::led_by`].
+    pub async fn commit(&self, commit: &Commit) -> Result<Range<i64>> {
+        let mark = RandomState::new().hash_one("mark").cast_signed();
+        let (begun, mut again) = (Instant::now(), false);
+        loop {
+            match self.commit_once(commit, mark, again).await {
+                Err(StoreError::Unreachable(_)) if begun.elapsed() < SERVER_AWAY => again = true,
+                done => return done,
+            }
+            tokio::time::sleep(PAUSE).await;
+        }
+    }
+
+    /// One try; `again` if an earlier one may have come through.
+    async fn commit_once(&self, commit: &Commit, mark: i64, again: bool) -> Result<Range<i64>> {
+        // Everything is copied before anyone has to wait for the transaction.
+        let mut rows = Rows::of(commit)?;
+        let (mut transaction, made) = self.database.begin_to_commit(mark, again).await?;
+        let last = query("SELECT coalesce(max(sequence), 0) FROM decision");
+        let last: i64 = last.fetch_one(&mut transaction).await?;
+        let decisions = integer("number of decisions", commit.decisions.len() as u64)?;
+        if made {
+            return Ok(last - decisions + 1..last + 1);
+        }
+        let protocol =
+            if rows.jobs.is_empty() { None } else { protocols::in_force(&mut transaction).await? };
+        rows.number_from(last + 1, protocol);
+        write(&mut transaction, commit, rows, last).await?;
+        transaction.commit().await?;
+        Ok(last + 1..last + 1 + decisions)
+    }
+}
+
+/// `last` is the number of the last decision before.
+async fn write(transaction: &mut Transaction, commit: &Commit, rows: Rows, last: i64) -> Result<()> {
+    for_rows(transaction, INSERT_DECISIONS, &DECISION, rows.decisions).await?;
+    for_rows(transaction, INSERT_STRUCTURES, &STRUCTURE, rows.structures).await?;
+    let written = for_rows(transaction, INSERT_CANDIDATES, &CANDIDATE, rows.candidates).await?;
+    if written < commit.candidates.len() as u64 {
+        return Err(duplicate(transaction, commit, last).await?);
+    }
+    for_rows(transaction, INSERT_CANDIDATE_DATA, &CANDIDATE_DATA, rows.candidate_data).await?;
+    for_rows(transaction, INSERT_JOBS, &JOB, rows.jobs).await?;
+    if commit.restart_mixture {
+        query("DELETE FROM component").execute(&mut *transaction).await?;
+    }
+    for_rows(transaction, UPSERT_COMPONENTS, &["element", "slot", "bytes"], rows.components).await?;
+    for_rows(transaction, UPSERT_WALKS, &WALK, rows.walks).await?;
+    for_rows(transaction, UPSERT_VALUES, &["name", "value"], rows.values).await?;
+    Ok(())
+}
+
+/// Which of the candidates was there before.
+async fn duplicate(transaction: &mut Transaction, commit: &Commit, last: i64) -> Result<StoreError> {
+    for id in commit.candidates.iter().map(|candidate| candidate.block.view().id().to_string()) {
+        let before = query("SELECT id FROM candidate WHERE id = $1 AND decision <= $2").bind(&id).bind(last);
+        if let Some(id) = before.fetch_optional::<String>(&mut *transaction).await? {
+            return Ok(StoreError::DuplicateCandidate(id));
+        }
+    }
+    Ok(StoreError::Inconsistent("candidates were not written".into()))
+}
+
+/// Number of the structure's row, which is made if there is none. Until the end of the transaction nobody else adds a
+/// label or a job for it.
+pub(super) async fn structure_number(
+    transaction: &mut Transaction,
+    structure: &Structure,
+    hash: ContentHash,
+) -> Result<i64> {
+    let sql = "INSERT INTO structure (hash, atoms, formula, data) VALUES ($1, $2, $3, $4)
+               ON CONFLICT (hash) DO UPDATE SET atoms = excluded.atoms RETURNING number";
+    let row = query(sql).bind(&hash.0[..]).bind(integer("count", structure.len() as u64)?);
+    let row = row.bind(structure.formula()).bind(encode_structure(structure));
+    row.fetch_one(&mut *transaction).await
+}
+
+/// Jobs for candidates that are there already, as (structure, decision).
+pub(super) async fn enqueue(
+    transaction: &mut Transaction,
+    candidates: &[(Vec<u8>, i64)],
+    protocol: i64,
+    priority: i32,
+) -> Result<()> {
+    let row = |(hash, decision): &(Vec<u8>, i64)| {
+        vec![hash.clone().into(), protocol.into(), (*decision).into(), priority.into()]
+    };
+    for_rows(transaction, INSERT_JOBS, &JOB, candidates.iter().map(row).collect()).await?;
+    Ok(())
+}
+
+/// Of what has the same key only the newest, in order: one statement writes a row once.
+fn newest<'a, T, K: Eq + std::hash::Hash>(
+    records: &'a [T],
+    key: impl Fn(&'a T) -> K,
+) -> impl Iterator<Item = &'a T> {
+    let mut seen = HashSet::new();
+    let mut newest: Vec<_> = records.iter().rev().filter(|record| seen.insert(key(record))).collect();
+    newest.reverse();
+    newest.into_iter()
+}

@@ -1,0 +1,283 @@
+//! A commit as the rows that it writes.
+
+use std::collections::{HashMap, HashSet};
+
+use wire::CandidateView;
+
+use super::newest;
+use crate::database::Value;
+use crate::encoding::{encode_structure, integer};
+use crate::error::{Result, StoreError};
+use crate::numbers::encode_numbers;
+use crate::records::{AtomGrades, CandidateRecord, Commit, Decision, Fate, WalkRecord};
+
+type Row = Vec<Value>;
+
+pub(super) const DECISION: [&str; 7] =
+    ["sequence", "round", "kind", "walk", "candidate", "mixture_version", "detail"];
+pub(super) const STRUCTURE: [&str; 4] = ["hash", "atoms", "formula", "data"];
+pub(super) const CANDIDATE: [&str; 25] = [
+    "decision",
+    "id",
+    "content",
+    "walk",
+    "segment",
+    "step",
+    "seed_structure",
+    "origin",
+    "fate",
+    "reason",
+    "mixture_version",
+    "atoms",
+    "formula",
+    "temperature",
+    "relative_volume",
+    "energy",
+    "walker_gamma",
+    "walker_gamma_nbr",
+    "walker_above",
+    "selector_gamma",
+    "selector_gamma_nbr",
+    "selector_above",
+    "original_gamma",
+    "original_gamma_nbr",
+    "original_above",
+];
+pub(super) const CANDIDATE_DATA: [&str; 5] =
+    ["decision", "block", "features", "selector_grades", "original_grades"];
+pub(super) const JOB: [&str; 4] = ["hash", "protocol", "decision", "priority"];
+pub(super) const WALK: [&str; 18] = [
+    "walk",
+    "origin",
+    "partner",
+    "seed_structure",
+    "state",
+    "reason",
+    "turn",
+    "accepted",
+    "step",
+    "segment",
+    "tau",
+    "temperature",
+    "relative_volume",
+    "gamma_max",
+    "refused",
+    "returns",
+    "selector_state",
+    "checkpoint",
+];
+
+/// The rows of each table. Decisions are numbered from 1 on until it is known how many there are before them.
+pub(super) struct Rows {
+    pub decisions: Vec<Row>,
+    pub structures: Vec<Row>,
+    pub candidates: Vec<Row>,
+    pub candidate_data: Vec<Row>,
+    /// For every accepted candidate.
+    pub jobs: Vec<Row>,
+    pub components: Vec<Row>,
+    pub walks: Vec<Row>,
+    pub values: Vec<Row>,
+}
+
+impl Rows {
+    pub fn of(commit: &Commit) -> Result<Self> {
+        let mut rows = Self {
+            decisions: commit.decisions.iter().zip(1..).map(decision).collect::<Result<_>>()?,
+            structures: Vec::new(),
+            candidates: Vec::new(),
+            candidate_data: Vec::new(),
+            jobs: Vec::new(),
+            components: newest(&commit.components, |component| (component.element, component.slot))
+                .map(|component| {
+                    vec![component.element.into(), component.slot.into(), component.bytes.clone().into()]
+                })
+                .collect(),
+            walks: newest(&commit.walks, |walk| walk.walk).map(walk).collect::<Result<_>>()?,
+            values: newest(&commit.values, |(name, _)| name)
+                .map(|(name, value)| vec![name.into(), value.into()])
+                .collect(),
+        };
+        let (mut decided, mut structures) = (decided(commit)?, HashSet::new());
+        for record in &commit.candidates {
+            let id = record.block.view().id().to_string();
+            let decision = decided
+                .remove(&id)
+                .ok_or_else(|| StoreError::Inconsistent(format!("candidate {id} without a decision")))?;
+            rows.candidate(decision, id, record, &mut structures)?;
+        }
+        if let Some(id) = decided.into_keys().min() {
+            return Err(StoreError::Inconsistent(format!(
+                "a decision about candidate {id}, which is missing"
+            )));
+        }
+        Ok(rows)
+    }
+
+    fn candidate<'a>(
+        &mut self,
+        decision: i64,
+        id: String,
+        record: &'a CandidateRecord,
+        structures: &mut HashSet<[u8; 32]>,
+    ) -> Result<()> {
+        let view = record.block.view();
+        let data = vec![
+            decision.into(),
+            record.block.without_features().as_bytes().to_vec().into(),
+            record.keep_features.then(|| encode_numbers(view.features)).into(),
+            grades(&id, &view, &record.selector)?.into(),
+            grades(&id, &view, &record.original)?.into(),
+        ];
+        self.candidate_data.push(data);
+        let (structure, hash) = (view.structure(), view.id().content.0);
+        if record.fate == Fate::Accepted {
+            if structures.insert(hash) {
+                self.structures.push(vec![
+                    hash[..].into(),
+                    count(structure.len())?.into(),
+                    structure.formula().into(),
+                    encode_structure(&structure).into(),
+                ]);
+            }
+            // The protocol comes with the number of the decision.
+            self.jobs.push(vec![
+                hash[..].into(),
+                Value::Integer(None),
+                decision.into(),
+                record.priority.into(),
+            ]);
+        }
+        self.candidates.push(summary(decision, id, record, &view, structure.formula())?);
+        Ok(())
+    }
+
+    /// Numbers the decisions from `first` on. Without a protocol there are no jobs.
+    pub fn number_from(&mut self, first: i64, protocol: Option<i64>) {
+        let shift = |value: &mut Value| {
+            if let Value::Integer(Some(number)) = value {
+                *number += first - 1;
+            }
+        };
+        for rows in [&mut self.decisions, &mut self.candidates, &mut self.candidate_data] {
+            rows.iter_mut().filter_map(|row| row.first_mut()).for_each(shift);
+        }
+        self.jobs.retain(|_| protocol.is_some());
+        for row in &mut self.jobs {
+            row[1] = protocol.into();
+            shift(&mut row[2]);
+        }
+    }
+}
+
+/// Candidates with the place of the decision about each, from 1.
+fn decided(commit: &Commit) -> Result<HashMap<String, i64>> {
+    let mut decided = HashMap::new();
+    for (decision, place) in commit.decisions.iter().zip(1..) {
+        let id = decision.candidate.map(|id| id.to_string());
+        if let Some(twice) = id.filter(|id| decided.insert(id.clone(), place).is_some()) {
+            return Err(StoreError::Inconsistent(format!("two decisions about candidate {twice}")));
+        }
+    }
+    Ok(decided)
+}
+
+fn decision((decision, place): (&Decision, i64)) -> Result<Row> {
+    Ok(vec![
+        place.into(),
+        integer("round", decision.round)?.into(),
+        decision.kind.into(),
+        decision.walk.map(|walk| walk.0).into(),
+        decision.candidate.map(|id| id.to_string()).into(),
+        integer("mixture version", decision.mixture_version)?.into(),
+        decision.detail.to_string().into(),
+    ])
+}
+
+/// What summaries read of a candidate.
+fn summary(
+    decision: i64,
+    id: String,
+    record: &CandidateRecord,
+    view: &CandidateView<'_>,
+    formula: String,
+) -> Result<Row> {
+    let (fate, reason) = match record.fate {
+        Fate::Accepted => ("accepted", None),
+        Fate::Declined(reason) => ("declined", Some(reason.name())),
+    };
+    let mut row = vec![
+        decision.into(),
+        id.into(),
+        view.id().content.0[..].into(),
+        view.id().walk.0.into(),
+        view.id().segment.into(),
+        integer("step", view.id().step)?.into(),
+        record.seed_structure.into(),
+        view.origin().name().into(),
+        fate.into(),
+        reason.into(),
+        integer("mixture version", view.mixture_version())?.into(),
+        count(view.numbers.len())?.into(),
+        formula.into(),
+        view.temperature().into(),
+        view.relative_volume().into(),
+        view.energy().into(),
+    ];
+    let (selector, original) = (&record.selector, &record.original);
+    for (gamma, gamma_nbr) in [
+        (view.gamma, view.gamma_nbr),
+        (&selector.gamma, &selector.gamma_nbr),
+        (&original.gamma, &original.gamma_nbr),
+    ] {
+        let above = (!gamma.is_empty()).then(|| gamma.iter().filter(|g| **g > 1.0).count());
+        row.extend([
+            gamma.iter().copied().reduce(f64::max).into(),
+            gamma_nbr.iter().copied().reduce(f64::max).into(),
+            above.map(count).transpose()?.into(),
+        ]);
+    }
+    Ok(row)
+}
+
+/// γ and γ_nbr, one behind the other; `None` without any.
+fn grades(id: &str, view: &CandidateView<'_>, grades: &AtomGrades) -> Result<Option<Vec<u8>>> {
+    let n = view.numbers.len();
+    match (grades.gamma.len(), grades.gamma_nbr.len()) {
+        (0, 0) => Ok(None),
+        (a, b) if (a, b) == (n, n) => {
+            Ok(Some(encode_numbers(&[grades.gamma.as_slice(), &grades.gamma_nbr].concat())))
+        }
+        (a, b) => {
+            Err(StoreError::Inconsistent(format!("{a} and {b} grades for the {n} atoms of candidate {id}")))
+        }
+    }
+}
+
+fn walk(walk: &WalkRecord) -> Result<Row> {
+    let WalkRecord { progress, .. } = walk;
+    Ok(vec![
+        walk.walk.0.into(),
+        walk.origin.name().into(),
+        walk.partner.map(|partner| partner.0).into(),
+        walk.seed_structure.into(),
+        (&walk.state).into(),
+        (&walk.reason).into(),
+        integer("turn", walk.turn)?.into(),
+        walk.accepted.into(),
+        integer("step", progress.step)?.into(),
+        progress.segment.into(),
+        progress.tau.into(),
+        progress.temperature.into(),
+        progress.relative_volume.into(),
+        progress.gamma_max.into(),
+        integer("number of refusals", progress.refused)?.into(),
+        progress.returns.into(),
+        (&walk.selector_state).into(),
+        walk.checkpoint.clone().into(),
+    ])
+}
+
+fn count(number: usize) -> Result<i64> {
+    integer("count", number as u64)
+}

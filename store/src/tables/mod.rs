@@ -1,0 +1,13 @@
+//! What the functions of [`crate::Store`] do with its tables, a file a matter.
+
+pub mod by_hand;
+mod commit;
+pub mod export;
+mod imports;
+pub mod labels;
+mod logs;
+mod processes;
+pub mod protocols;
+pub mod queue;
+mod restore;
+pub mod status;

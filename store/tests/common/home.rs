@@ -1,0 +1,81 @@
+//! Where a test keeps its campaign.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use sqlx::postgres::PgConnectOptions;
+use sqlx::{AssertSqlSafe, ConnectOptions, Executor};
+use store::{Location, Store};
+use tempfile::TempDir;
+
+/// A directory; in the test target `postgres` a schema of its own.
+pub struct Home {
+    directory: TempDir,
+    schema: Option<String>,
+}
+
+/// URL of the server to test with.
+pub fn server() -> String {
+    std::env::var("CALMWALK_POSTGRES")
+        .expect("CALMWALK_POSTGRES must be the URL of a PostgreSQL server; '.ci/postgres start' makes one")
+}
+
+impl Home {
+    pub fn new() -> Self {
+        static NUMBER: AtomicU64 = AtomicU64::new(0);
+        let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+        let schema = (env!("CARGO_CRATE_NAME") == "postgres")
+            .then(|| format!("test_{}_{}_{number}", std::process::id(), store::unix_milliseconds()));
+        Self { directory: tempfile::tempdir().unwrap(), schema }
+    }
+
+    /// The schema, on a server.
+    pub fn schema(&self) -> &str {
+        self.schema.as_deref().expect("a directory has no schema")
+    }
+
+    pub fn location(&self) -> Location {
+        match &self.schema {
+            Some(schema) => {
+                let url = format!("{}?schema={schema}&application_name={schema}", server());
+                url.parse().unwrap()
+            }
+            None => self.directory.path().into(),
+        }
+    }
+
+    /// A campaign with one seed structure and the protocol "dft" in force, in which it is as late as the caller says.
+    pub async fn create(&self) -> Store {
+        super::create_at(self.location()).await.by_the_callers_clock()
+    }
+
+    pub async fn open(&self) -> Store {
+        Store::open(self.location()).await.unwrap().by_the_callers_clock()
+    }
+
+    pub async fn open_read_only(&self) -> Store {
+        Store::open_read_only(self.location()).await.unwrap().by_the_callers_clock()
+    }
+}
+
+impl Drop for Home {
+    fn drop(&mut self) {
+        let Some(schema) = self.schema.take() else { return };
+        let remove = async move {
+            let options: PgConnectOptions = server().parse().unwrap();
+            let mut connection = options.connect().await.unwrap();
+            // What the test dropped may not have been rolled back yet.
+            let end =
+                "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity WHERE application_name = $1";
+            sqlx::query(end).bind(&schema).execute(&mut connection).await.unwrap();
+            let sql = AssertSqlSafe(format!("DROP SCHEMA IF EXISTS {schema} CASCADE"));
+            connection.execute(sql).await.unwrap();
+        };
+        // A test has a runtime of its own, in which nothing can be waited for now.
+        let thread = std::thread::spawn(|| {
+            tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap().block_on(remove);
+        });
+        if thread.join().is_err() && !std::thread::panicking() {
+            panic!("the schema could not be removed");
+        }
+    }
+}

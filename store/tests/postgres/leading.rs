@@ -1,0 +1,138 @@
+//! One process leads a campaign, and one schema holds one.
+
+use std::time::Duration;
+
+use sqlx::postgres::{PgConnectOptions, PgConnection};
+use sqlx::{ConnectOptions, Executor};
+use store::{Campaign, CampaignLock, Fate, Store, StoreError};
+use wire::{CampaignId, Origin};
+
+use super::common::*;
+
+/// A connection to see and do what a store does not.
+pub async fn connect(home: &Home) -> PgConnection {
+    let options: PgConnectOptions = server().parse().unwrap();
+    options.options([("search_path", home.schema())]).connect().await.unwrap()
+}
+
+/// Ends the connection that holds the lock, as a break of the network would.
+async fn break_the_lock(home: &Home) {
+    let sql = "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity
+               WHERE application_name = $1 AND pid IN (SELECT pid FROM pg_locks WHERE locktype = 'advisory')";
+    let ended: Vec<bool> =
+        sqlx::query_scalar(sql).bind(home.schema()).fetch_all(&mut connect(home).await).await.unwrap();
+    assert_eq!(ended, [true]);
+}
+
+#[tokio::test]
+async fn a_second_holder_is_told_the_first_and_the_lock_comes_free() {
+    let home = Home::new();
+    let lock = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
+    let error = CampaignLock::acquire_at(home.location(), "second").await.unwrap_err();
+    assert!(matches!(error, StoreError::Locked { .. }), "{error}");
+    let message = error.to_string();
+    let first = format!("process {} (first) on {}", std::process::id(), store::this_host());
+    assert!(message.contains(&first) && message.contains(home.schema()), "{message}");
+    // Another schema is another campaign.
+    let other = Home::new();
+    CampaignLock::acquire_at(other.location(), "other").await.unwrap();
+    drop(lock);
+    CampaignLock::acquire_at(home.location(), "second").await.unwrap();
+}
+
+#[tokio::test]
+async fn a_lock_whose_connection_broke_is_taken_again() {
+    let home = Home::new();
+    let lock = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
+    let store = home.create().await.led_by(&lock);
+    break_the_lock(&home).await;
+    let lost = tokio::time::timeout(Duration::from_secs(4), lock.lost()).await;
+    assert!(lost.is_err(), "nobody else took it: {lost:?}");
+    let error = CampaignLock::acquire_at(home.location(), "second").await.unwrap_err();
+    assert!(matches!(error, StoreError::Locked { .. }), "{error}");
+    assert_eq!(accept(&store, 1).await.len(), 1);
+}
+
+#[tokio::test]
+async fn who_lost_the_lock_learns_it_and_writes_nothing_more() {
+    let home = Home::new();
+    let first = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
+    let old = home.create().await.led_by(&first);
+    accept(&old, 1).await;
+    break_the_lock(&home).await;
+    let second = CampaignLock::acquire_at(home.location(), "second").await.unwrap();
+    let new = home.open().await.led_by(&second);
+    let fresh = |step| commit_of(vec![candidate(0, step, Origin::Biased, Fate::Accepted)]);
+    // Before it learns it, too.
+    for error in [
+        old.commit(&fresh(7)).await.unwrap_err(),
+        old.add_protocol(&protocol("other"), 0).await.unwrap_err(),
+        old.take_over(0).await.unwrap_err(),
+        old.set_configuration_in_force("{}", &[], 0).await.unwrap_err(),
+    ] {
+        assert!(
+            matches!(&error, StoreError::LockLost { holder, .. } if holder.contains("second")),
+            "{error}"
+        );
+    }
+    assert_eq!(new.commit(&fresh(8)).await.unwrap(), 2..3);
+    let lost = tokio::time::timeout(Duration::from_secs(30), first.lost()).await.unwrap();
+    assert!(matches!(&lost, StoreError::LockLost { holder, .. } if holder.contains("second")), "{lost}");
+    assert_eq!(new.decisions(1..=9).await.unwrap().len(), 2);
+}
+
+#[tokio::test]
+async fn another_campaign_in_the_same_schema_is_refused_with_both_names() {
+    let home = Home::new();
+    home.create().await;
+    let other = Campaign { id: CampaignId([3; 16]), ..campaign() };
+    let error = Store::create(home.location(), &other, &[], 0).await.unwrap_err();
+    assert!(matches!(error, StoreError::Occupied { .. }), "{error}");
+    let message = error.to_string();
+    for part in [other.id.to_string(), CAMPAIGN.to_string(), home.schema().to_owned()] {
+        assert!(message.contains(&part), "{message}");
+    }
+}
+
+#[tokio::test]
+async fn foreign_tables_and_newer_versions_are_left_alone() {
+    let home = Home::new();
+    let mut connection = connect(&home).await;
+    let schema = sqlx::AssertSqlSafe(format!("CREATE SCHEMA {}", home.schema()));
+    connection.execute(schema).await.unwrap();
+    connection.execute("CREATE TABLE job (title TEXT)").await.unwrap();
+    for error in [
+        Store::create(home.location(), &campaign(), &[], 0).await.unwrap_err(),
+        Store::open(home.location()).await.unwrap_err(),
+        CampaignLock::acquire_at(home.location(), "first").await.unwrap_err(),
+    ] {
+        assert!(matches!(&error, StoreError::ForeignSchema { found, .. } if found == "job"), "{error}");
+    }
+    connection.execute("DROP TABLE job").await.unwrap();
+    home.create().await;
+    let newer = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
+                 VALUES (7, 'newer', true, '', 0)";
+    connection.execute(newer).await.unwrap();
+    for opened in [Store::open(home.location()).await, Store::open_read_only(home.location()).await] {
+        assert!(matches!(opened, Err(StoreError::Version { found: 7, reads: 1, .. })), "{opened:?}");
+    }
+}
+
+/// Several at once, so that none finds what another is still making.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn several_processes_may_make_the_tables() {
+    let home = Home::new();
+    let create = || {
+        let location = home.location();
+        tokio::spawn(async move { CampaignLock::acquire_at(location, "one of them").await })
+    };
+    let tries = [create(), create(), create()];
+    let mut held = Vec::new();
+    for tried in tries {
+        match tried.await.unwrap() {
+            Ok(lock) => held.push(lock),
+            Err(error) => assert!(matches!(error, StoreError::Locked { .. }), "{error}"),
+        }
+    }
+    assert_eq!(held.len(), 1);
+}

@@ -1,0 +1,18 @@
+//! The tests of the store on a PostgreSQL server, and what is peculiar to it.
+//!
+//! `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres`
+
+#[path = "../campaign.rs"]
+mod campaign;
+#[path = "../common/mod.rs"]
+mod common;
+mod leading;
+mod leases;
+#[path = "../processes.rs"]
+mod processes;
+#[path = "../queue.rs"]
+mod queue;
+#[path = "../queue_model.rs"]
+mod queue_model;
+mod restart;
+mod secrets;

@@ -1,0 +1,130 @@
+//! The server is restarted, as after a crash, while work goes on: nothing is lost, and nothing is there twice.
+
+use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
+
+use store::{CampaignLock, Commit, Completed, ComponentRecord, Fate, JobState, Store, StoreError};
+use wire::Origin;
+use wire::messages::Decline;
+
+use super::common::*;
+
+const RESTARTS: u64 = 4;
+const LABELLERS: usize = 3;
+
+fn restart() {
+    let command = std::env::var("CALMWALK_POSTGRES_RESTART")
+        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../.ci/postgres restart").into());
+    assert!(Command::new("sh").args(["-c", &command]).status().unwrap().success(), "{command}");
+}
+
+/// The commit with number `k`, from 1, which all its parts tell.
+fn numbered(k: u64) -> Commit {
+    let records = vec![
+        candidate(0, 2 * k, Origin::Biased, Fate::Accepted),
+        candidate(0, 2 * k + 1, Origin::Biased, Fate::Declined(Decline::Covered)),
+    ];
+    Commit {
+        components: vec![ComponentRecord { element: 0, slot: 0, bytes: k.to_le_bytes().to_vec() }],
+        walks: vec![walk(0, k)],
+        values: vec![("commits".into(), k.to_string())],
+        ..commit_of(records)
+    }
+}
+
+/// Does it until the server is there.
+async fn insist<T, F: Future<Output = Result<T, StoreError>>>(mut call: impl FnMut() -> F) -> T {
+    loop {
+        match call().await {
+            Err(error) if error.is_transient() => tokio::time::sleep(Duration::from_millis(20)).await,
+            done => return done.unwrap(),
+        }
+    }
+}
+
+/// Labels what there is until nothing will come; returns how many labels were accepted.
+async fn label_all(store: Store, number: usize, no_more_jobs: Arc<AtomicBool>) -> u64 {
+    let (holder, mut labelled) = (format!("l{number}"), 0);
+    loop {
+        let last_look = no_more_jobs.load(Ordering::Relaxed);
+        let found = insist(|| store.lease(protocol("dft").hash, &holder, 0, 1)).await;
+        let Some(lease) = found else {
+            // A lease whose answer was lost comes back when its time is over.
+            if last_look && insist(|| store.unfinished_jobs()).await == 0 {
+                return labelled;
+            }
+            store.wait_for_jobs(Duration::from_millis(50)).await;
+            continue;
+        };
+        let made = label(-1.0);
+        if insist(|| store.complete(&lease, &made, 0)).await == Completed::Label {
+            labelled += 1;
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nothing_is_lost_or_doubled_when_the_server_is_restarted() {
+    let home = Home::new();
+    let lock = CampaignLock::acquire_at(home.location(), "restart test").await.unwrap();
+    drop(home.create().await);
+    let store = Store::open(home.location()).await.unwrap().led_by(&lock);
+    let (done, committed) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
+    let no_more_jobs = Arc::new(AtomicBool::new(false));
+    let labellers: Vec<_> = (0..LABELLERS)
+        .map(|number| tokio::spawn(label_all(store.clone(), number, Arc::clone(&no_more_jobs))))
+        .collect();
+    let committing = tokio::spawn({
+        let (store, done, committed) = (store.clone(), Arc::clone(&done), Arc::clone(&committed));
+        async move {
+            for k in 1.. {
+                // Each is given once: to wait for the server is up to the store.
+                let numbers = store.commit(&numbered(k)).await.unwrap();
+                assert_eq!(numbers, 2 * k as i64 - 1..2 * k as i64 + 1);
+                committed.store(k, Ordering::Relaxed);
+                if done.load(Ordering::Relaxed) {
+                    return k;
+                }
+            }
+            unreachable!("it commits without end")
+        }
+    });
+    for _ in 0..RESTARTS {
+        let before = committed.load(Ordering::Relaxed);
+        while committed.load(Ordering::Relaxed) < before + 5 {
+            assert!(!committing.is_finished(), "it commits until it is told that it is done");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        tokio::task::spawn_blocking(restart).await.unwrap();
+    }
+    done.store(true, Ordering::Relaxed);
+    let commits = committing.await.unwrap();
+    no_more_jobs.store(true, Ordering::Relaxed);
+    for labeller in labellers {
+        labeller.await.unwrap();
+    }
+
+    let decisions = store.decisions(1..=i64::MAX).await.unwrap();
+    let expected: Vec<_> = (1..=commits).flat_map(|k| numbered(k).candidates).map(|c| name_of(&c)).collect();
+    let found: Vec<_> = decisions.into_iter().filter_map(|decision| decision.candidate).collect();
+    assert_eq!(found, expected);
+    assert_eq!(store.load_walks().await.unwrap(), numbered(commits).walks);
+    assert_eq!(store.load_components().await.unwrap(), numbered(commits).components);
+    let jobs = store.queue_list(None, u32::MAX, 0).await.unwrap();
+    assert_eq!(jobs.len() as u64, commits);
+    for job in jobs {
+        assert_eq!(job.state, JobState::Labelled);
+        let details = store.queue_show(&job.candidate).await.unwrap();
+        let labels = details.energies.iter().filter(|(standing, _)| *standing == store::Standing::Label);
+        assert_eq!(labels.count(), 1);
+        assert_eq!(details.attempts_made.len() as u32, job.attempts);
+        assert!(details.attempts_made.iter().all(|attempt| attempt.outcome.is_some()));
+    }
+    // The lock was taken again, since nobody else had it.
+    let lost = tokio::time::timeout(Duration::from_secs(3), lock.lost()).await;
+    assert!(lost.is_err(), "{lost:?}");
+    let error = CampaignLock::acquire_at(home.location(), "second").await.unwrap_err();
+    assert!(matches!(error, StoreError::Locked { .. }), "{error}");
+}
