@@ -106,6 +106,8 @@ impl Campaign {
         }
         let hashes = self.file_hashes.iter().map(|(key, hash)| (key.clone(), json!(hash)));
         value["files"] = Value::Object(hashes.collect());
+        // Where a campaign is kept is no part of what it is.
+        value["run"].as_object_mut().map(|run| run.remove("store"));
         if self.config.campaign.mode == Mode::Reproducible {
             value["instructions"] = json!(instructions());
         }

@@ -83,6 +83,8 @@ impl From<store::StoreError> for Failure {
             | E::Busy
             | E::Damaged { .. }
             | E::Inconsistent(_)
+            | E::LockLost { .. }
+            | E::Unreachable(_)
             | E::Removed { .. } => Self::failed(error),
             _ => Self::input(error),
         }

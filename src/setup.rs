@@ -41,6 +41,9 @@ pub struct LabellerSetup {
     pub restarts: u32,
     /// Directory of the campaign.
     pub directory: PathBuf,
+    /// URL of its database without password, if that is on a server.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub store: Option<String>,
     /// What the potential's file holds.
     pub kind: PotentialKind,
     /// The potential that gives the labels.

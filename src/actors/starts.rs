@@ -44,6 +44,7 @@ pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failur
         number: 0,
         restarts: 0,
         directory: absolute(directory)?,
+        store: campaign.config.run.store.clone(),
         kind: potential.kind,
         file: absolute(potential.file.get_ref())?,
         file_hash: campaign.hash_of("label.method.reference.file"),

@@ -7,7 +7,7 @@ use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, Value, write_frame};
 use store::records::Protocol;
 use store::{DATABASE, ExportFilter, ExportRow, ExportSource, LOCK, Store};
 
-use super::{CampaignDirectory, Ended, Failure, block_on};
+use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::output::{Bar, print};
 use crate::whole_file::{WholeFile, cannot_write, refuse_to_replace};
 
@@ -26,7 +26,7 @@ const BAR: &str = "{spinner} {pos} structures";
 #[derive(Debug, clap::Args)]
 pub struct Export {
     #[command(flatten)]
-    directory: CampaignDirectory,
+    location: CampaignLocation,
     /// File to write; an existing one is replaced when all is written
     #[arg(long, short, value_name = "FILE.extxyz")]
     output: PathBuf,
@@ -85,12 +85,11 @@ impl Export {
     }
 
     async fn export(&self) -> Result<(Count, store::Labels), Failure> {
-        let store = Store::open_read_only(&self.directory.directory).await?;
+        let store = Store::open_read_only(&self.location.get()?).await?;
         let protocol = self.choose_protocol(&store).await?;
         let filter = self.filter(&protocol);
-        let directory = &self.directory.directory;
-        let [database, log, lock] = [DATABASE.to_owned(), format!("{DATABASE}-wal"), LOCK.to_owned()]
-            .map(|name| directory.join(name));
+        let files = [DATABASE.to_owned(), format!("{DATABASE}-wal"), LOCK.to_owned()];
+        let [database, log, lock] = files.map(|name| self.location.location.join(name));
         let own = [&database, &log, &lock].map(|file| (file.as_path(), "a file of the campaign itself"));
         refuse_to_replace(&self.output, own)?;
         let mut output = WholeFile::create(&self.output)?;

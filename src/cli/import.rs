@@ -8,7 +8,7 @@ use store::records::{Label, Protocol};
 use store::{CampaignLock, Imported, Store, unix_milliseconds};
 use wire::ContentHash;
 
-use super::{CampaignDirectory, Ended, Failure, block_on};
+use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::frames::Frames;
 use crate::output::print;
 
@@ -23,7 +23,7 @@ use crate::output::print;
 #[derive(Debug, clap::Args)]
 pub struct Import {
     #[command(flatten)]
-    directory: CampaignDirectory,
+    location: CampaignLocation,
     /// Extended XYZ
     #[arg(value_name = "FILES", required = true)]
     files: Vec<PathBuf>,
@@ -51,10 +51,10 @@ impl Import {
     }
 
     async fn import(&self, files: &[File]) -> Result<(Protocol, Imported), Failure> {
-        let directory = &self.directory.directory;
-        let store = Store::open(directory).await?;
+        let location = self.location.get()?;
+        let store = Store::open(&location).await?;
         // What is known decides what is a duplicate: it changes between two runs, not within one.
-        let _lock = CampaignLock::acquire(directory, "calmwalk import")?;
+        let _lock = CampaignLock::acquire_at(&location, "calmwalk import").await?;
         let protocol = match &self.protocol {
             Some(name) => protocol_named(&store, name).await?,
             None => own_protocol(&store).await?,

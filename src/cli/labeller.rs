@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use orchestrator::launcher;
-use store::{ProcessRecord, Store, unix_milliseconds};
+use store::{Location, ProcessRecord, Store, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
 use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Timing, serve};
 
@@ -39,7 +39,10 @@ async fn label(setup: LabellerSetup, method: ReferenceMethod, closing: &Arc<Clos
             asked.stopping.store(true, Ordering::Relaxed);
         }
     });
-    let store = Store::open(&setup.directory).await?;
+    let store = match &setup.store {
+        Some(url) => Store::open(url.parse::<Location>()?).await?,
+        None => Store::open(&setup.directory).await?,
+    };
     let record = ProcessRecord::new(
         ProcessRecord::LABELLER,
         Some(setup.number),

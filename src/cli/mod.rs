@@ -17,6 +17,7 @@ use std::future::Future;
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
+use store::Location;
 
 use crate::outcome::{Ended, Failure};
 
@@ -68,12 +69,19 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
     }
 }
 
-/// The directory of a campaign, as an argument.
+/// Where a campaign is kept, as an argument.
 #[derive(Debug, clap::Args)]
-struct CampaignDirectory {
-    /// Directory of the campaign
+struct CampaignLocation {
+    /// Directory of the campaign, or the postgres:// URL of its store
     #[arg(value_name = "DIR")]
-    directory: PathBuf,
+    location: PathBuf,
+}
+
+impl CampaignLocation {
+    /// Not a type of the argument: what is shown of a wrong argument would show its password.
+    fn get(&self) -> Result<Location, Failure> {
+        Ok(self.location.to_str().map_or_else(|| Ok(Location::from(&self.location)), str::parse)?)
+    }
 }
 
 /// Runs what waits on the database.

@@ -1,11 +1,10 @@
 //! `calmwalk queue`
 
 use std::io::{self, Write};
-use std::path::Path;
 
-use store::{Attempt, Job, JobDetails, JobState, Store, unix_milliseconds};
+use store::{Attempt, Job, JobDetails, JobState, Location, Store, unix_milliseconds};
 
-use super::{CampaignDirectory, Ended, Failure, block_on};
+use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::output::{Table, decimals, print, print_json};
 
 /// List, show, drop, retry or prioritise the structures in the label queue
@@ -16,7 +15,7 @@ use crate::output::{Table, decimals, print, print_json};
 #[command(subcommand_required = true, arg_required_else_help = true)]
 pub struct Queue {
     #[command(flatten)]
-    directory: CampaignDirectory,
+    location: CampaignLocation,
     #[command(subcommand)]
     action: Action,
     /// Print JSON
@@ -75,25 +74,25 @@ fn parse_state(name: &str) -> Result<JobState, String> {
 
 impl Queue {
     pub fn run(self) -> Result<Ended, Failure> {
-        let directory = &self.directory.directory;
+        let location = &self.location.get()?;
         match &self.action {
             Action::List(list) => {
-                let jobs = block_on(read_list(directory, list))??;
+                let jobs = block_on(read_list(location, list))??;
                 if self.json { print_json(&jobs)? } else { print(|out| write_list(out, &jobs, list))? }
             }
             Action::Show { id } => {
-                let details = block_on(read_details(directory, id))??;
+                let details = block_on(read_details(location, id))??;
                 if self.json { print_json(&details)? } else { print(|out| write_details(out, &details))? }
             }
-            action => self.change(directory, action)?,
+            action => self.change(location, action)?,
         }
         Ok(Ended::Done)
     }
 
     /// Changes one job after the other, and tells of each how it stands then.
-    fn change(&self, directory: &Path, action: &Action) -> Result<(), Failure> {
+    fn change(&self, location: &Location, action: &Action) -> Result<(), Failure> {
         let mut changed = Vec::new();
-        let ended = block_on(change(directory, action, &mut changed))?;
+        let ended = block_on(change(location, action, &mut changed))?;
         if self.json {
             print_json(&changed)?;
         } else {
@@ -103,18 +102,18 @@ impl Queue {
     }
 }
 
-async fn read_list(directory: &Path, list: &List) -> Result<Vec<Job>, Failure> {
-    let store = Store::open_read_only(directory).await?;
+async fn read_list(location: &Location, list: &List) -> Result<Vec<Job>, Failure> {
+    let store = Store::open_read_only(location).await?;
     Ok(store.queue_list(list.state, list.limit, list.offset).await?)
 }
 
-async fn read_details(directory: &Path, id: &str) -> Result<JobDetails, Failure> {
-    let store = Store::open_read_only(directory).await?;
+async fn read_details(location: &Location, id: &str) -> Result<JobDetails, Failure> {
+    let store = Store::open_read_only(location).await?;
     Ok(store.queue_show(id).await?)
 }
 
-async fn change(directory: &Path, action: &Action, changed: &mut Vec<Job>) -> Result<(), Failure> {
-    let store = Store::open(directory).await?;
+async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>) -> Result<(), Failure> {
+    let store = Store::open(location).await?;
     let ids = match action {
         Action::Drop { ids } | Action::Retry { ids } => ids.as_slice(),
         Action::Show { id } | Action::Prioritise { id, .. } => std::slice::from_ref(id),

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
 use serde_json::json;
-use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError, unix_milliseconds};
+use store::{CampaignLock, DATABASE, Location, ProcessRecord, Store, StoreError, unix_milliseconds};
 
 use super::{Ended, Failure, block_on};
 use crate::actors::{self, in_process, processes};
@@ -59,14 +59,30 @@ impl Run {
 }
 
 async fn run(campaign: &Campaign, directory: &Path, in_process: bool) -> Result<Ended, Failure> {
-    let store = open_store(campaign, directory).await?;
+    let location = match &campaign.config.run.store {
+        Some(url) => url.parse()?,
+        None => Location::from(directory),
+    };
+    // On a server the directory's lock is not enough: the campaign may be run from another host.
+    let lock = match &location {
+        Location::Server(_) => Some(CampaignLock::acquire_at(&location, "calmwalk run").await?),
+        Location::Directory(_) => None,
+    };
+    let store = open_store(campaign, &location).await?;
+    let store = lock.iter().fold(store, Store::led_by);
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
     let run = actors::Run { campaign, store: &store, process: &process, directory };
-    let ended = if in_process {
-        in_process::work(run, selector).await?
-    } else {
-        processes::work(run, selector).await?
+    let work = async {
+        if in_process {
+            in_process::work(run, selector).await
+        } else {
+            processes::work(run, selector).await
+        }
+    };
+    let ended = tokio::select! {
+        ended = work => ended?,
+        error = lost(lock.as_ref()) => return Err(error.into()),
     };
     leave(&store, &process, ended).await?;
     if !store.status().await?.finished {
@@ -75,10 +91,14 @@ async fn run(campaign: &Campaign, directory: &Path, in_process: bool) -> Result<
     }
     let summary = summary::of(&store, campaign.protocol.hash).await?;
     let failed = store.status().await?.labels.failed;
-    let shown = directory.display();
+    let (shown, file) = match &location {
+        Location::Directory(_) => (location.to_string(), format!("/{DATABASE}")),
+        // The shell has uses of its own for '?' and '&'.
+        Location::Server(url) => (format!("'{url}'"), String::new()),
+    };
     print(|out| {
         writeln!(out, "{summary}")?;
-        writeln!(out, "the campaign is in {shown}/{DATABASE}; look further with")?;
+        writeln!(out, "the campaign is in {shown}{file}; look further with")?;
         writeln!(out, "  calmwalk status {shown}")?;
         writeln!(out, "  calmwalk queue {shown} list")?;
         if failed > 0 {
@@ -90,24 +110,35 @@ async fn run(campaign: &Campaign, directory: &Path, in_process: bool) -> Result<
     Ok(Ended::Done)
 }
 
+/// Waits until another process has the lock.
+async fn lost(lock: Option<&CampaignLock>) -> StoreError {
+    match lock {
+        Some(lock) => lock.lost().await,
+        None => std::future::pending().await,
+    }
+}
+
 /// Begins the campaign, or opens the one that is there and checks that it is the same.
-async fn open_store(campaign: &Campaign, directory: &Path) -> Result<Store, Failure> {
+async fn open_store(campaign: &Campaign, location: &Location) -> Result<Store, Failure> {
     let now = unix_milliseconds();
     let resolved = campaign.resolved();
-    let store = if directory.join(DATABASE).exists() {
-        let store = Store::open(directory).await?;
-        go_on(campaign, &resolved, &store, now).await?;
-        store
-    } else {
-        let record = store::Campaign {
-            id: campaign.id(),
-            program_version: env!("CARGO_PKG_VERSION").to_owned(),
-            mode: campaign.config.campaign.mode.name().to_owned(),
-            configuration: campaign.text.clone(),
-            resolved_configuration: resolved.to_string(),
-            configuration_in_force: resolved.to_string(),
-        };
-        Store::create(directory, &record, &campaign.stored_seeds(), now).await?
+    let store = match Store::open(location).await {
+        Err(StoreError::Missing { .. }) => {
+            let record = store::Campaign {
+                id: campaign.id(),
+                program_version: env!("CARGO_PKG_VERSION").to_owned(),
+                mode: campaign.config.campaign.mode.name().to_owned(),
+                configuration: campaign.text.clone(),
+                resolved_configuration: resolved.to_string(),
+                configuration_in_force: resolved.to_string(),
+            };
+            Store::create(location, &record, &campaign.stored_seeds(), now).await?
+        }
+        opened => {
+            let store = opened?;
+            go_on(campaign, &resolved, &store, now).await?;
+            store
+        }
     };
     store.add_protocol(&campaign.protocol, now).await?;
     Ok(store)

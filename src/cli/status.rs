@@ -7,7 +7,7 @@ use std::io::{self, Write};
 use serde_json::Value;
 use store::{Candidates, Labels, Status as Standing, Store, WalkStatus};
 
-use super::{CampaignDirectory, Ended, Failure, block_on};
+use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::output::{Table, decimals, print, print_json};
 
 /// Walks, and processes, shown unless all are asked for.
@@ -19,7 +19,7 @@ const SHOWN: usize = 20;
 #[derive(Debug, clap::Args)]
 pub struct Status {
     #[command(flatten)]
-    directory: CampaignDirectory,
+    location: CampaignLocation,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -45,7 +45,7 @@ impl Status {
 
     /// Campaign, standing, and the grades of the training frames under the newest mixture (null if not watched).
     async fn read(&self) -> Result<(store::Campaign, Standing, Value), Failure> {
-        let store = Store::open_read_only(&self.directory.directory).await?;
+        let store = Store::open_read_only(&self.location.get()?).await?;
         let values = store.values().await?;
         let watched = values.iter().find(|(name, _)| name == "training_frames");
         let watched = watched.and_then(|(_, text)| serde_json::from_str(text).ok()).unwrap_or_default();

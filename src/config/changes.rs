@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 13] = [
+pub(super) const CHANGEABLE: [&str; 14] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -18,6 +18,7 @@ pub(super) const CHANGEABLE: [&str; 13] = [
     "run.walkers",
     "run.silence_limit",
     "run.restarts",
+    "run.store",
     "guard.highest_temperature",
 ];
 

@@ -1,6 +1,7 @@
 //! The rules of a configuration that no single value can check.
 
 use orchestrator::selector::{Mode, UpdateProtocol};
+use store::ServerUrl;
 use workers::settings::ThermostatKind;
 
 use super::Config;
@@ -19,6 +20,7 @@ pub fn check(config: &Config) -> Result<(), Wrong> {
     check_mixture(config)?;
     check_thermostat(config)?;
     check_guard(config)?;
+    check_store(config)?;
     if config.seeds.files.is_empty() {
         return wrong("seeds.files", "an empty list", "at least one file with seed structures");
     }
@@ -59,6 +61,19 @@ fn check_limits(config: &Config) -> Result<(), Wrong> {
     match limits.into_iter().find(|(_, found, limit)| found > limit) {
         Some((key, found, limit)) => wrong(key, found, format!("at most {limit}")),
         None => Ok(()),
+    }
+}
+
+/// The text of a configuration is kept in the database, where no password belongs.
+fn check_store(config: &Config) -> Result<(), Wrong> {
+    let Some(store) = &config.run.store else { return Ok(()) };
+    match store.parse::<ServerUrl>() {
+        Ok(url) if url.has_password() => {
+            let expected = "a URL without its password: that is taken from PGPASSWORD or ~/.pgpass";
+            wrong("run.store", format!("{url} with a password"), expected)
+        }
+        Ok(_) => Ok(()),
+        Err(error) => wrong("run.store", error, "the URL of a PostgreSQL database"),
     }
 }
 

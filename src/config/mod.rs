@@ -243,6 +243,8 @@ pub struct RunSection {
     pub walks_per_round: NonZeroUsize,
     /// Steps of a turn.
     pub turn_steps: NonZeroU64,
+    /// URL of a PostgreSQL database, without password; left out, SQLite in the campaign's directory.
+    pub store: Option<String>,
 }
 
 impl Config {
@@ -317,6 +319,7 @@ impl Default for RunSection {
             restarts: 5,
             walks_per_round: NonZeroUsize::MIN,
             turn_steps: defaults::nonzero(250).into(),
+            store: None,
         }
     }
 }

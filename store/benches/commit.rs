@@ -13,7 +13,7 @@ use atoms::{Cell, Structure};
 use common::{CAMPAIGN, commit_of, server, walk};
 use sqlx::postgres::PgConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions, Executor};
-use store::{AtomGrades, CandidateRecord, Commit, ComponentRecord, Fate, Location, Store};
+use store::{AtomGrades, CandidateRecord, Commit, ComponentRecord, Fate, Location};
 use wire::messages::Decline;
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 

@@ -7,7 +7,7 @@ use sqlx::{AssertSqlSafe, ConnectOptions, Executor};
 use store::{Location, Store};
 use tempfile::TempDir;
 
-/// A directory; in the test target `postgres` a schema of its own.
+/// A directory; in the test targets `postgres…` a schema of its own.
 pub struct Home {
     directory: TempDir,
     schema: Option<String>,
@@ -23,7 +23,7 @@ impl Home {
     pub fn new() -> Self {
         static NUMBER: AtomicU64 = AtomicU64::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
-        let schema = (env!("CARGO_CRATE_NAME") == "postgres")
+        let schema = (env!("CARGO_CRATE_NAME").starts_with("postgres"))
             .then(|| format!("test_{}_{}_{number}", std::process::id(), store::unix_milliseconds()));
         Self { directory: tempfile::tempdir().unwrap(), schema }
     }

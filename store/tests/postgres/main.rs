@@ -14,5 +14,4 @@ mod processes;
 mod queue;
 #[path = "../queue_model.rs"]
 mod queue_model;
-mod restart;
 mod secrets;

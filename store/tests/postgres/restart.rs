@@ -1,4 +1,10 @@
-//! The server is restarted, as after a crash, while work goes on: nothing is lost, and nothing is there twice.
+//! The server is restarted, as after a crash, while work goes on: nothing is lost, and nothing is there twice. A test target
+//! of its own, since no other test can go on meanwhile.
+//!
+//! `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres_restart`
+
+#[path = "../common/mod.rs"]
+mod common;
 
 use std::process::Command;
 use std::sync::Arc;
@@ -9,7 +15,7 @@ use store::{CampaignLock, Commit, Completed, ComponentRecord, Fate, JobState, St
 use wire::Origin;
 use wire::messages::Decline;
 
-use super::common::*;
+use common::*;
 
 const RESTARTS: u64 = 4;
 const LABELLERS: usize = 3;
