@@ -74,11 +74,7 @@ async fn run(campaign: &Campaign, directory: &Path, in_process: bool) -> Result<
     let selector = restore_selector(campaign, &store).await?;
     let run = actors::Run { campaign, store: &store, process: &process, directory };
     let work = async {
-        if in_process {
-            in_process::work(run, selector).await
-        } else {
-            processes::work(run, selector).await
-        }
+        if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
     };
     let ended = tokio::select! {
         ended = work => ended?,

@@ -105,7 +105,7 @@ fn record(number: usize) -> CandidateRecord {
     });
     CandidateRecord {
         block,
-        fate: if number % 2 == 0 { Fate::Accepted } else { Fate::Declined(Decline::Covered) },
+        fate: if number.is_multiple_of(2) { Fate::Accepted } else { Fate::Declined(Decline::Covered) },
         seed_structure: 0,
         selector: grades(),
         original: grades(),

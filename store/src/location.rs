@@ -26,7 +26,7 @@ pub enum Location {
 /// come from the environment (`PGPASSWORD` and the like) and from `~/.pgpass`. It never shows its password.
 #[derive(Clone)]
 pub struct ServerUrl {
-    pub(crate) options: PgConnectOptions,
+    pub(crate) options: Box<PgConnectOptions>,
     pub(crate) schema: String,
     shown: String,
     has_password: bool,
@@ -77,7 +77,7 @@ impl FromStr for ServerUrl {
             url: shown.clone(),
             reason: "it should look like postgres://user@host:5432/database?schema=name".into(),
         })?;
-        Ok(Self { options, schema, shown, has_password })
+        Ok(Self { options: Box::new(options), schema, shown, has_password })
     }
 }
 

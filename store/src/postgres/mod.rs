@@ -159,8 +159,7 @@ impl fmt::Debug for Server {
 /// How to connect: names without a schema are those of the campaign's.
 fn options(url: &ServerUrl) -> PgConnectOptions {
     let name = url.options.get_application_name().unwrap_or("calmwalk").to_owned();
-    url.options
-        .clone()
+    PgConnectOptions::clone(&url.options)
         .application_name(&name)
         // What a server whose host is gone holds for us comes free within half a minute.
         .options([
@@ -191,9 +190,10 @@ async fn make_tables(url: &ServerUrl, server: &Server) -> Result<()> {
     let exists: bool = sqlx::query_scalar(sql).bind(&url.schema).fetch_one(&mut *connection).await?;
     if !exists {
         match connection.execute(create).await {
+            Ok(_) => {}
             // Another process was faster.
             Err(sqlx::Error::Database(error)) if error.is_unique_violation() => {}
-            made => drop(made?),
+            Err(error) => return Err(error.into()),
         }
     }
     drop(connection);

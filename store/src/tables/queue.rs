@@ -301,5 +301,5 @@ async fn structure_of(transaction: &mut Transaction, number: i64) -> Result<Stru
 
 async fn candidate_of(transaction: &mut Transaction, decision: i64) -> Result<String> {
     let id = query("SELECT id FROM candidate WHERE decision = $1").bind(decision);
-    Ok(id.fetch_one(&mut *transaction).await?)
+    id.fetch_one(&mut *transaction).await
 }

@@ -1,6 +1,10 @@
 //! The tests of the store on a PostgreSQL server, and what is peculiar to it.
 //!
 //! `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres`
+#![allow(
+    clippy::duplicate_mod,
+    reason = "files that are tests by themselves, on SQLite, each bring what is common"
+)]
 
 #[path = "../campaign.rs"]
 mod campaign;

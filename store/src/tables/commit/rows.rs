@@ -114,11 +114,11 @@ impl Rows {
         Ok(rows)
     }
 
-    fn candidate<'a>(
+    fn candidate(
         &mut self,
         decision: i64,
         id: String,
-        record: &'a CandidateRecord,
+        record: &CandidateRecord,
         structures: &mut HashSet<[u8; 32]>,
     ) -> Result<()> {
         let view = record.block.view();
