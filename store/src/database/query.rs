@@ -1,15 +1,21 @@
 //! A query for either database.
 
 use std::borrow::Cow;
+use std::time::{Duration, Instant};
 
 use sqlx::{AssertSqlSafe, Executor, Postgres, Sqlite};
 
 use super::row::{FromRow, Row};
 use super::value::Value;
 use super::{Database, Target, Transaction, missing_row};
-use crate::error::Result;
+use crate::error::{Result, StoreError};
+use crate::postgres::{PATIENCE, Server};
+
+/// Between two tries to read from a server that is away.
+const PAUSE: Duration = Duration::from_millis(100);
 
 /// SQL with its values.
+#[derive(Clone)]
 pub struct Query {
     sql: &'static str,
     lock: &'static str,
@@ -58,9 +64,7 @@ impl Query {
     pub async fn fetch_all<T: FromRow>(self, target: impl Into<Target<'_>>) -> Result<Vec<T>> {
         let rows = match target.into() {
             Target::Database(Database::Sqlite(file)) => self.fetch_sqlite(&file.readers).await?,
-            Target::Database(Database::Postgres(server)) => {
-                self.fetch_postgres(&mut *server.connection().await?).await?
-            }
+            Target::Database(Database::Postgres(server)) => self.read_from(server).await?,
             Target::Transaction(Transaction::Sqlite(transaction)) => {
                 self.fetch_sqlite(&mut **transaction).await?
             }
@@ -78,6 +82,23 @@ impl Query {
 
     pub async fn fetch_one<T: FromRow>(self, target: impl Into<Target<'_>>) -> Result<T> {
         self.fetch_optional(target).await?.ok_or_else(missing_row)
+    }
+
+    /// What a connection that breaks does not bring is read again through another.
+    async fn read_from(self, server: &Server) -> Result<Vec<Row>> {
+        let begun = Instant::now();
+        loop {
+            let read = match server.connection().await {
+                Ok(mut connection) => self.clone().fetch_postgres(&mut *connection).await,
+                Err(error) => Err(error),
+            };
+            match read {
+                Err(StoreError::Unreachable(_)) if begun.elapsed() < PATIENCE => {
+                    tokio::time::sleep(PAUSE).await
+                }
+                read => return read,
+            }
+        }
     }
 
     async fn execute_sqlite(self, on: impl Executor<'_, Database = Sqlite>) -> Result<u64> {

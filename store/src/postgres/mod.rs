@@ -25,7 +25,7 @@ const CONNECTIONS: u32 = 5;
 /// Connections that nobody needs are closed after this time: a server has few.
 const IDLE: Duration = Duration::from_secs(60);
 /// How long a server may be away before what needs it fails, for a moment.
-const PATIENCE: Duration = Duration::from_secs(10);
+pub const PATIENCE: Duration = Duration::from_secs(10);
 
 static MIGRATIONS: Migrator = sqlx::migrate!("migrations/postgres");
 
