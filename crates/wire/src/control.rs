@@ -14,7 +14,7 @@ use std::borrow::Cow;
 use atoms::StructureError;
 use serde::{Deserialize, Serialize};
 
-use crate::block::{Candidate, CandidateBlock};
+use crate::block::CandidateBlock;
 use crate::ids::{CandidateId, Origin, WalkId};
 use crate::messages::{Assignment, End, Outcome, Progress, Report};
 
@@ -106,10 +106,10 @@ enum EncodedOutcome<'a> {
 }
 
 impl<'a> EncodedReport<'a> {
-    /// The report without its candidate.
-    pub(crate) fn new(report: &'a Report<Candidate>) -> Self {
+    /// The report without its candidate, which has this id.
+    pub(crate) fn new<C>(report: &'a Report<C>, id: impl FnOnce(&C) -> CandidateId) -> Self {
         let outcome = match &report.outcome {
-            Outcome::Candidate(candidate) => EncodedOutcome::Candidate(candidate.id),
+            Outcome::Candidate(candidate) => EncodedOutcome::Candidate(id(candidate)),
             Outcome::Turn => EncodedOutcome::Turn,
             Outcome::Paused => EncodedOutcome::Paused,
             Outcome::Ended(end) => EncodedOutcome::Ended(Cow::Borrowed(end)),

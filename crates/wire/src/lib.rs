@@ -8,10 +8,12 @@ extern crate self as wire;
 pub mod block;
 mod bytes;
 mod control;
+mod exchange;
 pub mod ids;
 pub mod ipc;
 pub mod messages;
 pub mod mixture;
+pub mod net;
 pub mod place;
 pub mod transport;
 

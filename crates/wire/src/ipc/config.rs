@@ -15,8 +15,8 @@ use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, FileName, Sign
 use iceoryx2::prelude::{SemanticString, ServiceName, ipc_threadsafe};
 use iceoryx2::service::port_factory::request_response;
 
-use super::message::Caller;
 use super::{IpcError, Sizes};
+use crate::exchange::message::Caller;
 use crate::place;
 
 pub(super) type Service = ipc_threadsafe::Service;

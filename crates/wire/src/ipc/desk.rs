@@ -8,13 +8,13 @@ use std::time::Instant;
 
 use super::IpcError;
 use super::config::{IN_PLACE, IN_PLACE_IN_ALL, Request};
-use super::conversation::{Conversations, Next, Stranger};
-use super::frame::FrameError;
 use super::lent::Lent;
 use super::lines::Lines;
-use super::message::{Answer, Caller, Decision, Letter, Words, complete};
 use crate::block::{BlockError, CandidateBlock};
 use crate::control::{ControlError, EncodedReport, seal, unseal};
+use crate::exchange::conversation::{Conversations, Next, Stranger};
+use crate::exchange::frame::FrameError;
+use crate::exchange::message::{Answer, Caller, Decision, Letter, Words, complete};
 use crate::ids::WalkId;
 use crate::messages::Progress;
 use crate::mixture::SharedMixture;

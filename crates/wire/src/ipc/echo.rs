@@ -5,10 +5,10 @@ use serde::Serialize;
 use zerocopy::IntoBytes;
 
 use super::desk::Dropped;
-use super::frame;
-use super::message::{Answer, Letter, Words, complete};
 use crate::block::{Candidate, CandidateBlock};
 use crate::control::{seal, unseal};
+use crate::exchange::frame;
+use crate::exchange::message::{Answer, Letter, Words, complete};
 
 #[cfg(test)]
 mod tests;

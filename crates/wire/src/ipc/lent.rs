@@ -7,7 +7,7 @@ use zerocopy::IntoBytes;
 
 use super::IpcError;
 use super::config::Request;
-use super::frame::{self, FrameError};
+use crate::exchange::frame::{self, FrameError};
 
 /// A request with the places of its parts. The memory under them stays mapped as long as the request is kept, also when
 /// the walker that wrote it is dead and cleaned away.

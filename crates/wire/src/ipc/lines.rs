@@ -14,9 +14,9 @@ use tokio::sync::oneshot;
 
 use super::IpcError;
 use super::config::{self, Service};
-use super::frame;
 use super::lent::Lent;
-use super::message::Caller;
+use crate::exchange::frame;
+use crate::exchange::message::Caller;
 use crate::transport::Work;
 
 /// What came to the server.

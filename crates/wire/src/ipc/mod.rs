@@ -4,7 +4,7 @@
 //! - **One write.** A walker encodes its candidate into the memory in which the selector and the store read it. Nothing
 //!   is copied, unless the server holds more of one walker's candidates than [`config::IN_PLACE`].
 //! - **Delivery is acknowledged.** The answer to a report is sent after its commit; a walker keeps what is unanswered,
-//!   asks, and offers it again if it was lost (see [`message`]). Offered twice it is decided once.
+//!   asks, and offers it again if it was lost (see [`crate::exchange`]). Offered twice it is decided once.
 //! - **No polling.** Each end sleeps until the other rings. A walker that waits wakes every two seconds to ask, which is
 //!   its sign of life and finds what was lost.
 //! - **Nobody waits for the dead.** A full buffer drops a message and says so; no call blocks on another process.
@@ -13,13 +13,10 @@
 //!   by force can do harm, as it could with a debugger: this is no border between a user's own processes.
 
 mod config;
-mod conversation;
 mod desk;
 mod echo;
-mod frame;
 mod lent;
 mod lines;
-mod message;
 mod server;
 mod walker;
 
@@ -28,6 +25,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use crate::exchange::message::Caller;
 use crate::mixture::SharedMixtureError;
 
 pub use config::space_needed;
@@ -55,7 +53,7 @@ pub struct Door {
     prefix: String,
     mixture: PathBuf,
     message_bytes: usize,
-    caller: message::Caller,
+    caller: Caller,
 }
 
 /// Why the transport does not work.

@@ -15,10 +15,11 @@ use iceoryx2::port::notifier::Notifier;
 use zerocopy::IntoBytes;
 
 use super::config::{self, ClientPort, Pending, Service};
-use super::message::{Answer, Caller, Decision, Letter, Words};
-use super::{Door, IpcError, frame};
+use super::{Door, IpcError};
 use crate::block::Candidate;
 use crate::control::seal;
+use crate::exchange::frame;
+use crate::exchange::message::{Answer, Caller, Decision, Letter, Words};
 use crate::ids::WalkId;
 use crate::messages::{Progress, Report};
 use crate::mixture::{MixtureReader, SharedMixtureError};

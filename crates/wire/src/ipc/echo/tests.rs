@@ -7,9 +7,9 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::control::ControlError;
+use crate::exchange::frame::FrameError;
+use crate::exchange::message::Decision;
 use crate::ids::{Origin, WalkId};
-use crate::ipc::frame::FrameError;
-use crate::ipc::message::Decision;
 use crate::messages::{Assignment, Outcome, Progress, Report};
 use any::{answer, assignment, caller, given, offer, offered, report, request};
 use common::candidate;

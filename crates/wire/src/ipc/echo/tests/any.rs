@@ -9,8 +9,8 @@ use proptest::prelude::*;
 use super::common::{candidate, origin, usable_structure};
 use super::written;
 use crate::block::Candidate;
+use crate::exchange::message::{Answer, Caller, Decision, Letter, Words};
 use crate::ids::{CampaignId, Origin, WalkId};
-use crate::ipc::message::{Answer, Caller, Decision, Letter, Words};
 use crate::messages::{Assignment, Decline, End, Outcome, Progress, Report, Verdict};
 
 fn verdict() -> impl Strategy<Value = Verdict> {

@@ -1,4 +1,4 @@
-//! A message as it lies in shared memory: the control message and, behind it, the candidate.
+//! A message as it travels: the control message and, behind it, the candidate.
 //!
 //! | bytes | content |
 //! | --- | --- |
@@ -31,12 +31,12 @@ pub enum FrameError {
 }
 
 /// Bytes of a message, a multiple of 8.
-pub(super) fn length(control: usize, candidate: Option<&Candidate>) -> usize {
+pub(crate) fn length(control: usize, candidate: Option<&Candidate>) -> usize {
     PREFIX + control.next_multiple_of(8) + candidate.map_or(0, Candidate::encoded_len)
 }
 
 /// Writes a message to `out`, which is aligned to 8 and has [`length`] bytes.
-pub(super) fn fill(out: &mut [u8], control: &[u8], candidate: Option<&Candidate>) {
+pub(crate) fn fill(out: &mut [u8], control: &[u8], candidate: Option<&Candidate>) {
     let (prefix, rest) = out.split_at_mut(PREFIX);
     prefix.copy_from_slice(&(control.len() as u64).to_le_bytes());
     let (padded, block) = rest.split_at_mut(control.len().next_multiple_of(8));
@@ -49,14 +49,21 @@ pub(super) fn fill(out: &mut [u8], control: &[u8], candidate: Option<&Candidate>
 }
 
 /// A message in memory of this process.
-pub(super) fn words(control: &[u8], candidate: Option<&Candidate>) -> Vec<u64> {
+pub(crate) fn words(control: &[u8], candidate: Option<&Candidate>) -> Vec<u64> {
     let mut words = vec![0; length(control.len(), candidate) / 8];
     fill(words.as_mut_bytes(), control, candidate);
     words
 }
 
+/// The same with a candidate that is bytes already.
+pub(crate) fn beside(control: &[u8], block: Option<&[u8]>) -> Vec<u8> {
+    let mut bytes = words(control, None).as_bytes().to_vec();
+    bytes.extend_from_slice(block.unwrap_or_default());
+    bytes
+}
+
 /// The control message and the bytes behind it.
-pub(super) fn split(request: &[u8]) -> Result<(&[u8], &[u8]), FrameError> {
+pub(crate) fn split(request: &[u8]) -> Result<(&[u8], &[u8]), FrameError> {
     let Some((prefix, rest)) = request.split_first_chunk() else {
         return Err(FrameError::Short(request.len()));
     };

@@ -6,7 +6,7 @@ use super::message::Caller;
 
 /// The conversations of a session.
 #[derive(Debug)]
-pub(super) struct Conversations {
+pub(crate) struct Conversations {
     session: u64,
     walkers: BTreeMap<u32, Conversation>,
 }
@@ -22,7 +22,7 @@ struct Conversation {
 
 /// What to do about an offer or a question.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Next<'a> {
+pub(crate) enum Next<'a> {
     /// A new offer, to be decided.
     Take,
     /// It is being decided.
@@ -35,7 +35,7 @@ pub(super) enum Next<'a> {
 
 /// Why a message is not listened to.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub(super) enum Stranger {
+pub(crate) enum Stranger {
     #[error("a message of session {found:016x}; this is session {expected:016x}")]
     Session { found: u64, expected: u64 },
     #[error("a message of walker {0}, which is not expected")]
@@ -47,33 +47,33 @@ pub(super) enum Stranger {
 }
 
 impl Conversations {
-    pub(super) fn new(session: u64) -> Self {
+    pub(crate) fn new(session: u64) -> Self {
         Self { session, walkers: BTreeMap::new() }
     }
 
     /// From now on this incarnation of the walker is heard and no other.
-    pub(super) fn expect(&mut self, walker: u32, incarnation: u32) {
+    pub(crate) fn expect(&mut self, walker: u32, incarnation: u32) {
         self.walkers.insert(walker, Conversation { incarnation, sequence: 0, answer: None });
     }
 
     /// The incarnation of the walker that is heard.
-    pub(super) fn expected(&self, walker: u32) -> Option<u32> {
+    pub(crate) fn expected(&self, walker: u32) -> Option<u32> {
         self.walkers.get(&walker).map(|conversation| conversation.incarnation)
     }
 
     /// The walker is heard no more.
-    pub(super) fn forget(&mut self, walker: u32) {
+    pub(crate) fn forget(&mut self, walker: u32) {
         self.walkers.remove(&walker);
     }
 
     /// Whether a message comes from whom it should.
-    pub(super) fn check(&self, caller: Caller) -> Result<(), Stranger> {
+    pub(crate) fn check(&self, caller: Caller) -> Result<(), Stranger> {
         self.find(caller).map(|_| ())
     }
 
     /// What to do about an offer. It counts as taken after [`Conversations::take`] only, so that one whose content turns
     /// out to be damaged changes nothing.
-    pub(super) fn offer(&self, caller: Caller, sequence: u64) -> Result<Next<'_>, Stranger> {
+    pub(crate) fn offer(&self, caller: Caller, sequence: u64) -> Result<Next<'_>, Stranger> {
         let conversation = self.find(caller)?;
         match conversation.next(sequence) {
             Some(Next::Unknown) => Ok(Next::Take),
@@ -83,13 +83,13 @@ impl Conversations {
     }
 
     /// What to answer to a question.
-    pub(super) fn ask(&self, caller: Caller, sequence: u64) -> Result<Next<'_>, Stranger> {
+    pub(crate) fn ask(&self, caller: Caller, sequence: u64) -> Result<Next<'_>, Stranger> {
         let conversation = self.find(caller)?;
         conversation.next(sequence).ok_or_else(|| conversation.out_of_order(caller, sequence))
     }
 
     /// The walker's next offer is being decided.
-    pub(super) fn take(&mut self, walker: u32) {
+    pub(crate) fn take(&mut self, walker: u32) {
         if let Some(conversation) = self.walkers.get_mut(&walker) {
             conversation.sequence += 1;
             conversation.answer = None;
@@ -97,14 +97,14 @@ impl Conversations {
     }
 
     /// Who waits under this number to have an offer answered, and which one.
-    pub(super) fn undecided(&self, walker: u32) -> Option<(Caller, u64)> {
+    pub(crate) fn undecided(&self, walker: u32) -> Option<(Caller, u64)> {
         let Conversation { incarnation, sequence, answer } = self.walkers.get(&walker)?;
         let caller = Caller { session: self.session, walker, incarnation: *incarnation };
         (*sequence > 0 && answer.is_none()).then_some((caller, *sequence))
     }
 
     /// The walker's offer has been decided, and this is the answer.
-    pub(super) fn answered(&mut self, walker: u32, answer: Vec<u8>) {
+    pub(crate) fn answered(&mut self, walker: u32, answer: Vec<u8>) {
         if let Some(conversation) = self.walkers.get_mut(&walker) {
             conversation.answer = Some(answer);
         }

@@ -15,7 +15,7 @@ use crate::messages::{Assignment, Outcome, Progress, Report};
 
 /// Who speaks: a process that is to be heard, and no other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Caller {
+pub(crate) struct Caller {
     /// Of this run of the orchestrator.
     pub session: u64,
     /// The walker's number.
@@ -26,14 +26,14 @@ pub(super) struct Caller {
 
 /// From a walker.
 #[derive(Serialize, Deserialize)]
-pub(super) struct Letter<'a> {
+pub(crate) struct Letter<'a> {
     pub caller: Caller,
     #[serde(borrow)]
     pub words: Words<'a>,
 }
 
 #[derive(Serialize, Deserialize)]
-pub(super) enum Words<'a> {
+pub(crate) enum Words<'a> {
     /// What came of the last turn, and: what next?
     Offer {
         sequence: u64,
@@ -48,7 +48,7 @@ pub(super) enum Words<'a> {
 
 impl<'a> Words<'a> {
     /// An offer of what came of a turn, and the candidate that travels beside it.
-    pub(super) fn offer(
+    pub(crate) fn offer(
         sequence: u64,
         report: Option<&'a Report<Candidate>>,
     ) -> (Self, Option<&'a Candidate>) {
@@ -56,12 +56,18 @@ impl<'a> Words<'a> {
             Outcome::Candidate(candidate) => Some(candidate),
             _ => None,
         });
-        (Self::Offer { sequence, report: report.map(EncodedReport::new) }, candidate)
+        (
+            Self::Offer {
+                sequence,
+                report: report.map(|report| EncodedReport::new(report, |candidate| candidate.id)),
+            },
+            candidate,
+        )
     }
 }
 
 /// The report of an offer with the candidate that came beside it.
-pub(super) fn complete(
+pub(crate) fn complete(
     report: Option<EncodedReport<'_>>,
     candidate: Option<CandidateBlock>,
 ) -> Result<Option<Report>, ControlError> {
@@ -74,14 +80,14 @@ pub(super) fn complete(
 
 /// To a walker, about its offer `sequence`.
 #[derive(Serialize, Deserialize)]
-pub(super) struct Answer<'a> {
+pub(crate) struct Answer<'a> {
     pub sequence: u64,
     pub decision: Decision<'a>,
 }
 
 #[derive(Serialize, Deserialize)]
 #[expect(clippy::large_enum_variant, reason = "there is never more than one")]
-pub(super) enum Decision<'a> {
+pub(crate) enum Decision<'a> {
     /// Committed; this is the next turn.
     Turn { mixture_version: u64, assignment: Cow<'a, Assignment> },
     /// Committed if it could be; there is no more work.
@@ -94,7 +100,7 @@ pub(super) enum Decision<'a> {
 
 impl Answer<'static> {
     /// Decodes and checks an answer.
-    pub(super) fn decode(bytes: &[u8]) -> Result<Self, ControlError> {
+    pub(crate) fn decode(bytes: &[u8]) -> Result<Self, ControlError> {
         let Answer { sequence, decision } = unseal(bytes)?;
         let decision = match decision {
             Decision::Turn { mixture_version, assignment } => {

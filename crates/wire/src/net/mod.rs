@@ -1,0 +1,87 @@
+//! The transport between hosts, on [zenoh](https://zenoh.io): an orchestrator with a [`Hub`], on every other host an
+//! agent with an [`Uplink`].
+//!
+//! An agent takes part with a number of *slots*: to the reactor each is a walker like those of its own host. What an
+//! agent and the orchestrator say to each other about a slot is what a walker says over shared memory
+//! (`crate::exchange`): offers that are counted and idempotent, answers that come after the commit.
+//!
+//! - **zenoh promises nothing across a break**, so everything is a question with an answer, asked again until there is
+//!   one. Nothing is published that somebody needs.
+//! - **The mixture travels by components:** only those in which the agent's newest version differs from the one that it needs.
+//! - **Who is taken for dead stays dead.** An agent whose sign of life (a liveliness token) is gone for longer than the
+//!   orchestrator's patience loses its slots, and their walks go to others. Their numbers are never used again: if it comes back, it
+//!   joins anew.
+//! - **Explicit endpoints, no scouting.** Off loopback nothing listens or connects without TLS with certificates on both sides.
+
+mod changes;
+mod desk;
+mod door;
+mod files;
+mod hub;
+mod message;
+mod roster;
+mod slot;
+mod uplink;
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::PathBuf;
+
+pub use changes::ChangesError;
+pub use door::{Endpoint, EndpointError, Tls};
+pub use hub::{AgentEvent, Handle, Hub};
+pub use message::{Agent, AgentId};
+pub use slot::{Slot, Told};
+pub use uplink::{Joined, Parted, Uplink};
+
+/// What agents need to know of a campaign.
+#[derive(Clone, Debug, Default)]
+pub struct Welcome {
+    /// What walkers are started with.
+    pub setup: Vec<u8>,
+    /// Files that they read, by the BLAKE3 hash of their content (64 hexadecimal digits).
+    pub files: BTreeMap<String, PathBuf>,
+}
+
+/// Why there is no line between hosts.
+#[derive(Debug, thiserror::Error)]
+pub enum NetError {
+    /// Anybody could connect.
+    #[error(
+        "{endpoint} can be reached from other hosts, and nothing does that without certificates: \
+         name a directory with authority.pem, certificate.pem and key.pem (docs/hosts.md says how they are made), or use \
+         a loopback address, through an ssh tunnel for instance"
+    )]
+    Unprotected {
+        /// The endpoint.
+        endpoint: Endpoint,
+    },
+    /// A certificate or key.
+    #[error("cannot read {}: {source}", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+    /// zenoh cannot listen or connect.
+    #[error("cannot open {endpoint}: {why}")]
+    Open {
+        /// The endpoint.
+        endpoint: Endpoint,
+        /// What zenoh says.
+        why: String,
+    },
+    /// zenoh has ended.
+    #[error("the line between hosts has ended: {why}")]
+    Ended {
+        /// What zenoh says.
+        why: String,
+    },
+}
+
+impl NetError {
+    fn open(endpoint: &Endpoint, why: impl fmt::Display) -> Self {
+        Self::Open { endpoint: endpoint.clone(), why: why.to_string() }
+    }
+}

@@ -1,0 +1,144 @@
+//! The link breaks, agents and orchestrators die: nothing is lost and nothing comes twice.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::{sleep, timeout};
+use wire::net::{AgentEvent, Parted, Told};
+use wire::transport::Incoming;
+
+use crate::head::{Head, LIMIT, Wanted, agent, join, mixture, next_version, report, work};
+use crate::link::{Link, State};
+
+/// The link is cut, or dead without a word, before the offer, while it is being decided, and at the answer.
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_told_over_a_breaking_link_comes_once() {
+    let mut head = Head::open(Wanted::default()).await;
+    let link = Link::to(head.port).await;
+    let (_uplink, joined) = join(link.port, agent("a", 1)).await;
+    let mut slot = joined.slots().remove(0);
+    let line = Arc::clone(&joined);
+    let working = tokio::spawn(async move {
+        let mut told = Told::Nothing;
+        while let Some(work) = slot.exchange(&line, &told).await.unwrap() {
+            sleep(Duration::from_millis(300)).await;
+            told = Told::Report(report(&work.assignment));
+        }
+    });
+    let mut mixture = Arc::new(mixture());
+    let mut expected = None;
+    let breaks = [State::Cut, State::Dead, State::Cut];
+    for turn in 1..=6_u64 {
+        let offer = head.offer().await;
+        assert_eq!(offer.report, expected, "turn {turn}: each report once, in order");
+        mixture = next_version(&mixture, 0, 0);
+        let work = work(2, turn, &mixture);
+        expected = Some(report(&work.assignment));
+        let state = breaks[turn as usize % breaks.len()];
+        if turn % 2 == 0 {
+            // Cut while it is being decided.
+            link.set(state);
+            sleep(Duration::from_millis(500)).await;
+            offer.reply.send(Some(work)).unwrap();
+            sleep(Duration::from_millis(500)).await;
+        } else {
+            // Cut while the walker works.
+            offer.reply.send(Some(work)).unwrap();
+            sleep(Duration::from_millis(200)).await;
+            link.set(state);
+            sleep(Duration::from_secs(2)).await;
+        }
+        link.set(State::Whole);
+    }
+    let offer = head.offer().await;
+    assert_eq!(offer.report, expected);
+    offer.reply.send(None).unwrap();
+    timeout(LIMIT, working).await.expect("in time").unwrap();
+    joined.leave().await;
+    head.close().await;
+}
+
+/// Who was silent for too long has lost its slots before anybody hears of it, and is not heard when it comes back.
+#[tokio::test(flavor = "multi_thread")]
+async fn who_is_taken_for_dead_stays_dead_and_may_join_anew() {
+    let patience = Duration::from_millis(700);
+    let mut head = Head::open(Wanted { patience, ..Wanted::default() }).await;
+    let link = Link::to(head.port).await;
+    let (uplink, joined) = join(link.port, agent("a", 2)).await;
+    let mut slots = joined.slots();
+    let mixture = Arc::new(mixture());
+    let line = Arc::clone(&joined);
+    let mut slot = slots.remove(0);
+    let turn = tokio::spawn(async move { (slot.exchange(&line, &Told::Nothing).await, slot) });
+    let first = head.offer().await;
+    first.reply.send(Some(work(2, 1, &mixture))).unwrap();
+    let (given, mut slot) = turn.await.unwrap();
+    let assignment = given.unwrap().unwrap().assignment;
+    // The other slot waits for its turn.
+    let line = Arc::clone(&joined);
+    let mut other = slots.remove(0);
+    let waiting = tokio::spawn(async move { other.exchange(&line, &Told::Nothing).await.map(drop) });
+    let second = head.offer().await;
+
+    link.set(State::Cut);
+    head.event(|event| matches!(event, AgentEvent::Silent(_))).await;
+    for walker in [first.walker, second.walker] {
+        let gone = head.next().await;
+        assert!(matches!(gone, Incoming::Gone { walker: found, .. } if found == walker), "{gone:?}");
+    }
+    assert!(second.reply.send(Some(work(3, 1, &mixture))).is_err(), "nobody would get this turn");
+    head.event(|event| matches!(event, AgentEvent::Lost(_))).await;
+
+    link.set(State::Whole);
+    let told = Told::Report(report(&assignment));
+    let refused = timeout(LIMIT, slot.exchange(&joined, &told)).await.expect("in time");
+    assert!(matches!(refused, Err(Parted::Stranger(_))), "{refused:?}");
+    assert!(matches!(waiting.await.unwrap(), Err(Parted::Stranger(_))));
+    let joined = Arc::new(timeout(LIMIT, uplink.join()).await.expect("in time").unwrap());
+    let mut slot = joined.slots().remove(0);
+    let line = Arc::clone(&joined);
+    let telling = tokio::spawn(async move { slot.exchange(&line, &told).await.unwrap().is_none() });
+    let offer = head.offer().await;
+    assert!(offer.walker > second.walker, "numbers are never used again");
+    assert_eq!(offer.report, Some(report(&assignment)));
+    offer.reply.send(None).unwrap();
+    assert!(telling.await.unwrap());
+    joined.leave().await;
+    head.close().await;
+}
+
+/// An orchestrator dies and another takes its place at the same endpoint.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_finds_the_next_run_of_its_orchestrator() {
+    let mut head = Head::open(Wanted::default()).await;
+    let (uplink, joined) = join(head.port, agent("a", 1)).await;
+    let mut slot = joined.slots().remove(0);
+    let mixture = next_version(&mixture(), 1, 1);
+    let line = Arc::clone(&joined);
+    let turn = tokio::spawn(async move { (slot.exchange(&line, &Told::Nothing).await, slot) });
+    head.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
+    let (given, mut slot) = turn.await.unwrap();
+    let assignment = given.unwrap().unwrap().assignment;
+    let port = head.kill().await;
+    let told = Told::Report(report(&assignment));
+    let line = Arc::clone(&joined);
+    let telling = tokio::spawn(async move { slot.exchange(&line, &told).await.map(drop) });
+    sleep(Duration::from_millis(500)).await;
+    let mut head = Head::open(Wanted { port, session: 2, mixture, ..Wanted::default() }).await;
+    let refused = timeout(LIMIT, telling).await.expect("in time").unwrap();
+    assert!(matches!(refused, Err(Parted::Stranger(_))), "{refused:?}");
+    let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
+    assert_eq!(joined.newest().await.version(), 1);
+    let mut slot = joined.slots().remove(0);
+    let told = Told::Report(report(&assignment));
+    let telling = async { slot.exchange(&joined, &told).await.unwrap().is_none() };
+    let (home, found) = tokio::join!(telling, async {
+        let offer = head.offer().await;
+        offer.reply.send(None).unwrap();
+        offer.report
+    });
+    assert!(home);
+    assert_eq!(found, Some(report(&assignment)));
+    joined.leave().await;
+    head.close().await;
+}

@@ -1,0 +1,117 @@
+//! Turns, reports, mixtures and files come and go.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use wire::WalkId;
+use wire::messages::Progress;
+use wire::net::{AgentEvent, Parted, Told};
+use wire::transport::Incoming;
+
+use crate::head::{Head, Wanted, agent, join, mixture, next_version, report, work};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn turns_and_reports_come_as_they_were() {
+    let mut head = Head::open(Wanted::default()).await;
+    let (_uplink, joined) = join(head.port, agent("a", 1)).await;
+    assert_eq!(joined.setup, b"the setup");
+    let mut slot = joined.slots().remove(0);
+    let line = Arc::clone(&joined);
+    let working = tokio::spawn(async move {
+        let mut told = Told::Nothing;
+        let mut turns = 0;
+        while let Some(work) = slot.exchange(&line, &told).await.unwrap() {
+            turns += 1;
+            assert_eq!(work.assignment.turn, turns);
+            assert_eq!(work.mixture.version(), turns, "the version of the turn");
+            slot.progress(Arc::clone(&line), work.assignment.walk, Progress::default()).await;
+            told = Told::Report(report(&work.assignment));
+        }
+        turns
+    });
+    let mut mixture = Arc::new(mixture());
+    let mut expected = None;
+    for turn in 1..=20 {
+        let mut offer = head.next().await;
+        while let Incoming::Progress(walk, _) = offer {
+            assert_eq!(walk, WalkId(5));
+            offer = head.next().await;
+        }
+        let Incoming::Free { report: found, reply, .. } = offer else { panic!("{offer:?}") };
+        assert_eq!(found, expected);
+        mixture = next_version(&mixture, turn % 2, turn % 2);
+        let work = work(5, turn as u64, &mixture);
+        expected = Some(report(&work.assignment));
+        reply.send(Some(work)).unwrap();
+    }
+    let last = loop {
+        if let Incoming::Free { report, reply, .. } = head.next().await {
+            reply.send(None).unwrap();
+            break report;
+        }
+    };
+    assert_eq!(last, expected);
+    assert_eq!(working.await.unwrap(), 20);
+    // What was received is what was sent, bit by bit, whatever the way from version to version.
+    let newest = joined.newest().await;
+    assert_eq!(newest.version(), mixture.version());
+    for ((_, _, sent), (_, _, received)) in mixture.iter().zip(newest.iter()) {
+        assert_eq!(sent.to_bytes(), received.to_bytes());
+    }
+    joined.leave().await;
+    head.event(|event| matches!(event, AgentEvent::Left(_))).await;
+    head.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_walker_that_dies_is_told_of_and_its_slot_goes_on() {
+    let mut head = Head::open(Wanted::default()).await;
+    let (_uplink, joined) = join(head.port, agent("a", 2)).await;
+    let mut slot = joined.slots().remove(1);
+    let mixture = Arc::new(mixture());
+    for fault in [true, false] {
+        let line = Arc::clone(&joined);
+        let told = if fault { Told::Nothing } else { Told::Lost { fault: true } };
+        let turn = tokio::spawn(async move {
+            let work = slot.exchange(&line, &told).await.unwrap();
+            (slot, work)
+        });
+        if !fault {
+            let gone = head.next().await;
+            assert!(matches!(&gone, Incoming::Gone { fault, .. } if *fault), "{gone:?}");
+        }
+        let offer = head.offer().await;
+        assert_eq!(offer.report, None);
+        offer.reply.send(Some(work(1, 1, &mixture))).unwrap();
+        let work;
+        (slot, work) = turn.await.unwrap();
+        assert!(work.is_some());
+    }
+    joined.leave().await;
+    for _ in 0..2 {
+        assert!(matches!(head.next().await, Incoming::Gone { fault: false, .. }));
+    }
+    let told = Told::Nothing;
+    assert!(matches!(slot.exchange(&joined, &told).await, Err(Parted::Stranger(_))), "it has left");
+    head.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn files_come_by_their_hash_and_agents_are_told_to_stop() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model");
+    let content: Vec<u8> = (0..9_500_000_u32).map(|k| (k.wrapping_mul(2_654_435_761) >> 13) as u8).collect();
+    std::fs::write(&path, &content).unwrap();
+    let files = BTreeMap::from([("0123".to_owned(), path)]);
+    let head = Head::open(Wanted { files, ..Wanted::default() }).await;
+    let (_uplink, joined) = join(head.port, agent("a", 1)).await;
+    assert!(joined.file("0123").await.unwrap() == content);
+    let refused = joined.file("../../etc/passwd").await.unwrap_err();
+    assert!(matches!(&refused, Parted::Refused(why) if why.contains("no file with the hash")), "{refused}");
+    assert_eq!(joined.is_stopping().await.unwrap(), Some(false));
+    head.stopping.store(true, Ordering::Relaxed);
+    assert_eq!(joined.is_stopping().await.unwrap(), Some(true));
+    joined.leave().await;
+    head.close().await;
+}

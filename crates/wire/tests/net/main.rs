@@ -1,0 +1,7 @@
+//! The transport between hosts, over loopback.
+
+mod breaks;
+mod exchange;
+mod head;
+mod link;
+mod security;

@@ -1,0 +1,109 @@
+//! Strangers are not heard.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair};
+use tokio::time::timeout;
+use wire::net::{AgentEvent, Hub, NetError, Tls, Uplink, Welcome};
+
+use crate::head::{Head, LIMIT, PATIENCE, Wanted, agent, endpoint, join};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_listens_or_connects_off_loopback_without_certificates() {
+    let endpoint = "tcp/0.0.0.0:7447".parse().unwrap();
+    let refused = Hub::open(&endpoint, None, 1, PATIENCE, Welcome::default()).await.err();
+    assert!(matches!(refused, Some(NetError::Unprotected { .. })), "{refused:?}");
+    let endpoint = "tcp/head:7447".parse().unwrap();
+    let refused = Uplink::open(&endpoint, None, agent("a", 1), |_| {}).await.err();
+    assert!(matches!(refused, Some(NetError::Unprotected { .. })), "{refused:?}");
+    let tls = Tls::in_directory(Path::new("/nowhere"));
+    let refused = Uplink::open(&endpoint, Some(&tls), agent("a", 1), |_| {}).await.err();
+    assert!(refused.unwrap().to_string().contains("/nowhere/authority.pem"));
+}
+
+/// Whatever else comes under the orchestrator's key is dropped and answered with the reason.
+#[tokio::test(flavor = "multi_thread")]
+async fn foreign_messages_are_dropped_and_spoken_of() {
+    let head = Head::open(Wanted::default()).await;
+    let (_uplink, joined) = join(head.port, agent("a", 1)).await;
+    let mut config = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", "\"client\"".to_owned()),
+        ("connect/endpoints", format!("[\"{}\"]", endpoint(head.port))),
+        ("scouting/multicast/enabled", "false".to_owned()),
+    ] {
+        config.insert_json5(key, &value).unwrap();
+    }
+    let stranger = zenoh::open(config).await.unwrap();
+    let ask = async |payload: Vec<u8>| {
+        let replies = stranger.get("calmwalk/orchestrator").payload(payload).await.unwrap();
+        let reply = timeout(LIMIT, replies.recv_async()).await.expect("in time").unwrap();
+        String::from_utf8_lossy(&reply.result().unwrap().payload().to_bytes()).into_owned()
+    };
+    let other_version = [&9_u64.to_le_bytes()[..], b"CALM\x09\0\0\0\0\0\0\0\0\0\0\0"].concat();
+    let damaged = [&9_u64.to_le_bytes()[..], b"CALM\x01\0\0\0\x01\0\0\0\0\0\0\0"].concat();
+    let cases = [
+        (Vec::new(), "a request of 0 bytes"),
+        (vec![1, 2, 3], "its length alone has 8"),
+        (vec![0xff; 64], "with a control message of 18446744073709551615"),
+        (other_version, "a control message of version 9; this program reads version"),
+        (damaged, "checksum"),
+    ];
+    for (payload, expected) in cases {
+        let said = ask(payload).await;
+        assert!(said.contains(expected), "{said:?}: {expected}");
+        let spoken = |event: &AgentEvent| matches!(event, AgentEvent::Dropped(why) if why.contains(expected));
+        head.event(spoken).await;
+    }
+    joined.leave().await;
+    head.close().await;
+}
+
+/// An authority, and a directory with a certificate of it for every name.
+fn certificates(directory: &Path, names: &[&str]) {
+    let authority_key = KeyPair::generate().unwrap();
+    let mut authority = CertificateParams::default();
+    authority.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+    let authority_certificate = authority.self_signed(&authority_key).unwrap();
+    let issuer = Issuer::new(authority, authority_key);
+    for name in names {
+        let key = KeyPair::generate().unwrap();
+        let mut own = CertificateParams::new([(*name).to_owned()]).unwrap();
+        own.extended_key_usages =
+            vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
+        let own = own.signed_by(&key, &issuer).unwrap();
+        let directory = directory.join(name);
+        std::fs::create_dir(&directory).unwrap();
+        for (file, text) in [
+            ("authority.pem", authority_certificate.pem()),
+            ("certificate.pem", own.pem()),
+            ("key.pem", key.serialize_pem()),
+        ] {
+            std::fs::write(directory.join(file), text).unwrap();
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn only_who_has_a_certificate_of_the_campaign_takes_part() {
+    let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    certificates(folders[0].path(), &["localhost", "node1"]);
+    certificates(folders[1].path(), &["localhost"]);
+    let tls = |folder: usize, name: &str| Tls::in_directory(&folders[folder].path().join(name));
+    let head = Head::open(Wanted { tls: Some(tls(0, "localhost")), ..Wanted::default() }).await;
+    let endpoint = format!("tcp/localhost:{}", head.port).parse().unwrap();
+    let join = async |tls: Option<Tls>| {
+        let (agent, patience) = (agent("a", 1), Duration::from_secs(4));
+        let uplink = timeout(patience, Uplink::open(&endpoint, tls.as_ref(), agent, |_| {})).await.ok()?;
+        let uplink = Arc::new(uplink.ok()?);
+        let joined = timeout(patience, uplink.join()).await.ok()?;
+        Some((uplink, joined.unwrap()))
+    };
+    assert!(join(None).await.is_none(), "no certificate");
+    assert!(join(Some(tls(1, "localhost"))).await.is_none(), "one of another authority");
+    let (_uplink, joined) = join(Some(tls(0, "node1"))).await.expect("one of this authority");
+    joined.leave().await;
+    head.close().await;
+}
