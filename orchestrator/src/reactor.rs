@@ -105,7 +105,8 @@ struct Promise {
 }
 
 impl Reactor {
-    /// Runs until every walker has been sent home: all walks over, or stopped.
+    /// Runs until no walker has a turn in hand and there is none to be given out, because all walks are over or because
+    /// it is stopped; or until no walker can come any more.
     pub async fn run(self, mut watch: impl FnMut(Notice<'_>)) -> Result<Ended, ReactorError> {
         let mut arrivals =
             Arrivals::new(self.incoming, self.selector.examiner().clone(), self.selector.mixture());
@@ -144,8 +145,8 @@ impl Reactor {
                 writing.spawn(write(shell.store.clone(), commit));
             } else {
                 shell.keep_promises();
-                if !open {
-                    // Every walker has gone home.
+                if !open || shell.is_over() {
+                    // Whoever asks from now on has to be sent home by those who carry messages.
                     return Ok(if shell.selector.is_done() { Ended::Done } else { Ended::Stopped });
                 }
             }
@@ -194,7 +195,7 @@ impl Shell {
                 Arrival::Free { walker, report, reply } => {
                     self.at_work.remove(&walker);
                     self.waiting.push_back((walker, reply));
-                    match report {
+                    match report.filter(|report| !self.is_in_hand(report.walk)) {
                         Some(report) => {
                             self.costs.remove(&report.walk);
                             self.selector.examined(report)?
@@ -210,6 +211,20 @@ impl Shell {
             }
         }
         Ok(())
+    }
+
+    /// Whether a walker has a turn of the walk in hand, or is about to be given it. One that was taken for dead and comes
+    /// back with a report cannot speak for a walk that was handed on.
+    fn is_in_hand(&self, walk: WalkId) -> bool {
+        let promised = self.promised.iter().filter_map(|promise| promise.work.as_ref());
+        let mut in_hand = self.at_work.values().copied().chain(promised.map(|work| work.assignment.walk));
+        in_hand.any(|other| other == walk)
+    }
+
+    /// Whether nobody works, waits, or will be given a turn.
+    fn is_over(&self) -> bool {
+        let no_more = self.selector.is_done() || self.stopping.load(Ordering::Relaxed);
+        no_more && self.waiting.is_empty() && self.at_work.is_empty()
     }
 
     /// A walker was lost. If it had a turn in hand, another gets it, unless it is the turn that kills them.

@@ -232,9 +232,10 @@ impl Selector {
         self.walks.values().map(standing).collect()
     }
 
-    /// Takes what came of a turn. What it returns must be committed before a next turn is asked for; further reports may
-    /// be taken before that, if what they return is committed with it or after it.
-    /// A report of a turn that nobody has in hand (sent twice, or by one that was taken for lost) changes nothing.
+    /// Takes what came of a turn. What it returns must be committed before a turn that is asked for afterwards is given to
+    /// anybody; further reports may be taken before that, if what they return is committed with it or after it.
+    /// A report of a turn that is over changes nothing. One of the present turn counts also if nobody has it in hand as
+    /// far as is known here: it comes from a walker that was taken for lost, or from before a restart.
     pub fn report(&mut self, report: Report) -> Result<Option<Commit>, SelectorError> {
         let examined = self.examiner.examine(report, &self.mixture);
         self.examined(examined)
@@ -257,8 +258,12 @@ impl Selector {
     /// that was.
     pub fn examined(&mut self, report: ExaminedReport) -> Result<Option<Commit>, SelectorError> {
         let (id, turn) = (report.walk, report.turn);
-        let asked = |walk: &&mut Walk| walk.out && walk.record.turn == turn;
-        let Some(walk) = self.walks.get_mut(&id).filter(asked) else { return Ok(None) };
+        let in_round = match self.settings.mode {
+            Mode::Live => true,
+            Mode::Reproducible => self.in_round.get(&id).is_some_and(Option::is_none),
+        };
+        let present = |walk: &&mut Walk| in_round && walk.record.turn == turn && !walk.has_ended();
+        let Some(walk) = self.walks.get_mut(&id).filter(present) else { return Ok(None) };
         walk.out = false;
         if matches!(report.outcome, Outcome::Paused) {
             walk.pause(report);
