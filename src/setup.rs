@@ -31,6 +31,24 @@ pub struct WalkerSetup {
     pub settings: WalkSettings,
 }
 
+/// What an agent needs to know.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct AgentSetup {
+    /// The exported model, where the orchestrator finds it.
+    pub model: PathBuf,
+    /// BLAKE3 of that file.
+    pub model_hash: String,
+    /// Dynamics, bias and guards.
+    pub settings: WalkSettings,
+    /// Bytes of the largest message of a walker.
+    pub message_bytes: usize,
+    /// A walker without a sign of life for so long (s) is replaced …
+    pub silence_limit: f64,
+    /// … so many times.
+    pub restarts: u32,
+}
+
 /// What a labeller's process needs to know.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]

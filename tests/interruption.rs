@@ -1,4 +1,6 @@
 //! A campaign outlives whatever happens to its process, and ends as if nothing had happened.
+//!
+//! `CALMWALK_KILLS=200 cargo test --test interruption kills` for a long version, 1000 for a longer one.
 
 mod common;
 
@@ -8,21 +10,7 @@ use std::time::{Duration, Instant};
 
 use common::campaign::{Outcome, Small, outcome};
 use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
-use common::{Running, program};
-
-/// Kills in one test; `CALMWALK_KILLS=200 cargo test --test interruption kills` for the long
-/// version, 1000 for a longer one.
-fn kills() -> u64 {
-    std::env::var("CALMWALK_KILLS").ok().and_then(|text| text.parse().ok()).unwrap_or(20)
-}
-
-/// A small deterministic sequence for instants (SplitMix64).
-fn random(seed: u64) -> u64 {
-    let mut z = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x9e37_79b9_7f4a_7c15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
-}
+use common::{Running, kills, program, random};
 
 fn start(directory: &Path, options: &[&str]) -> Running {
     let mut command = program(directory);

@@ -225,7 +225,7 @@ impl<'a> Crew<'a> {
 }
 
 /// How the last of them failed, if all were given up.
-fn all_given_up(children: &mut Children) -> Option<String> {
+pub fn all_given_up(children: &mut Children) -> Option<String> {
     let status = children.status();
     let given_up = status.iter().all(|child| child.standing == Standing::GivenUp);
     let last = status.last().filter(|_| given_up)?;

@@ -1,5 +1,7 @@
 //! The actors of a campaign at work: in processes of their own, or all in one.
 
+pub mod agent;
+mod agents;
 mod crew;
 pub mod in_process;
 mod labellers;
@@ -18,6 +20,7 @@ use orchestrator::selector::Selector;
 use store::{ProcessRecord, Store};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
+use wire::net::{Endpoint, Tls};
 use wire::transport::Incoming;
 
 use crate::campaign::Campaign;
@@ -39,6 +42,17 @@ pub struct Run<'a> {
     pub process: &'a ProcessRecord,
     /// Its directory.
     pub directory: &'a Path,
+    /// Where agents of other hosts may join.
+    pub listen: Option<&'a Listen>,
+}
+
+/// Where agents of other hosts may join.
+#[derive(Clone, Debug)]
+pub struct Listen {
+    /// The address.
+    pub endpoint: Endpoint,
+    /// Needed for everything but loopback.
+    pub tls: Option<Tls>,
 }
 
 /// The reactor at work.
@@ -70,11 +84,15 @@ fn start_reactor(
 
 /// Walkers side by side, as the configuration has it.
 fn wanted_walkers(campaign: &Campaign) -> u32 {
-    let cores = || thread::available_parallelism().map_or(1, |cores| cores.get());
     match campaign.config.run.walkers {
-        0 => cores() as u32,
+        0 => cores(),
         wanted => wanted as u32,
     }
+}
+
+/// Processor cores that this process may use.
+pub fn cores() -> u32 {
+    thread::available_parallelism().map_or(1, |cores| cores.get()) as u32
 }
 
 /// Ctrl-C, SIGTERM and a closed terminal: the first calls `stop`, which stops in order, the second ends at once (which is safe too).

@@ -13,10 +13,11 @@ use orchestrator::supervisor::Limits;
 use store::ProcessRecord;
 use tokio::sync::{Notify, mpsc};
 use tokio::task::{JoinError, JoinHandle};
-use wire::ipc::{IpcError, Server, Sizes, space_needed};
+use wire::ipc::{Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
 use wire::place::Place;
 
+use super::agents::{self, Agents};
 use super::crew::{self, Crew};
 use super::{CHANNEL, ReactorTask, Run, start_reactor, starts, stop_on_signals, wanted_walkers};
 use crate::outcome::Failure;
@@ -66,9 +67,15 @@ async fn work_in(place: &Place, run: Run<'_>, selector: Selector) -> Result<reac
     let crew = Crew::new(store, process.clone(), line, walkers, labellers, Arc::clone(&stopping));
 
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
-    let serving = tokio::spawn(server.run(shared, to_reactor, crew.listener()));
+    let here = server.run(shared, to_reactor.clone(), crew.listener());
+    let agents = Agents::open(run, session(process), &mixture).await?;
+    let agents_line = agents.handle();
+    let elsewhere = agents.run(Arc::clone(&stopping), to_reactor);
+    let serving = tokio::spawn(async {
+        tokio::try_join!(async { here.await.map_err(Failure::failed) }, elsewhere).map(|_| ())
+    });
     let reactor = start_reactor(run, selector, incoming, &stopping);
-    lead(crew, reactor, serving, &stop).await
+    lead(crew, reactor, agents_line, serving, &stop).await
 }
 
 /// Tells the walkers of this run from those of any other.
@@ -95,7 +102,8 @@ enum Happened {
 async fn lead(
     mut crew: Crew<'_>,
     mut reactor: ReactorTask,
-    mut serving: JoinHandle<Result<(), IpcError>>,
+    agents: agents::Handle,
+    mut serving: JoinHandle<Result<(), Failure>>,
     stop: &Notify,
 ) -> Result<reactor::Ended, Failure> {
     let (mut decided, mut closed, mut asked) = (None, None, false);
@@ -113,6 +121,7 @@ async fn lead(
                 crew.stop();
             }
             Happened::Decided(ended) => {
+                agents.close();
                 match ended {
                     Ok(reactor::Ended::Done) => crew.wait_for_labels(),
                     _ => crew.stop(),

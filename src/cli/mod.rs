@@ -1,5 +1,6 @@
 //! The command line: one file a command.
 
+mod agent;
 mod calm;
 mod clean;
 mod export;
@@ -37,6 +38,7 @@ enum Command {
     Init(init::Init),
     Validate(validate::Validate),
     Run(run::Run),
+    Agent(agent::Agent),
     Status(status::Status),
     Queue(queue::Queue),
     Export(export::Export),
@@ -57,6 +59,7 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Init(command) => command.run(),
         Command::Validate(command) => command.run(),
         Command::Run(command) => command.run(),
+        Command::Agent(command) => command.run(),
         Command::Status(command) => command.run(),
         Command::Queue(command) => command.run(),
         Command::Export(command) => command.run(),

@@ -9,6 +9,7 @@ use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
 use serde_json::json;
 use store::{CampaignLock, DATABASE, Location, ProcessRecord, Store, StoreError, unix_milliseconds};
+use wire::net::{Endpoint, Tls};
 
 use super::{Ended, Failure, block_on};
 use crate::actors::{self, in_process, processes};
@@ -32,6 +33,12 @@ pub struct Run {
     /// Walkers and labellers as threads of this process, not as processes of their own; needs no shared memory
     #[arg(long)]
     in_process: bool,
+    /// Let agents of other hosts take part (calmwalk agent --join), as tcp/0.0.0.0:7447
+    #[arg(long, value_name = "ENDPOINT", conflicts_with = "in_process")]
+    listen: Option<Endpoint>,
+    /// Directory with authority.pem, certificate.pem and key.pem: needed for everything but loopback
+    #[arg(long, value_name = "DIR", requires = "listen")]
+    tls: Option<PathBuf>,
 }
 
 impl Run {
@@ -49,7 +56,9 @@ impl Run {
         })?;
         store::check_directory(&directory)?;
         let _lock = CampaignLock::acquire(&directory, "calmwalk run")?;
-        let ended = block_on(run(&campaign, &directory, self.in_process))?
+        let tls = self.tls.as_deref().map(Tls::in_directory);
+        let listen = self.listen.map(|endpoint| actors::Listen { endpoint, tls });
+        let ended = block_on(run(&campaign, &directory, self.in_process, listen.as_ref()))?
             .map_err(|failure| failure.in_campaign(&directory))?;
         if ended == Ended::Interrupted {
             say("stopped in order; the same command goes on with the campaign");
@@ -58,7 +67,12 @@ impl Run {
     }
 }
 
-async fn run(campaign: &Campaign, directory: &Path, in_process: bool) -> Result<Ended, Failure> {
+async fn run(
+    campaign: &Campaign,
+    directory: &Path,
+    in_process: bool,
+    listen: Option<&actors::Listen>,
+) -> Result<Ended, Failure> {
     let location = match &campaign.config.run.store {
         Some(url) => url.parse()?,
         None => Location::from(directory),
@@ -72,7 +86,7 @@ async fn run(campaign: &Campaign, directory: &Path, in_process: bool) -> Result<
     let store = lock.iter().fold(store, Store::led_by);
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
-    let run = actors::Run { campaign, store: &store, process: &process, directory };
+    let run = actors::Run { campaign, store: &store, process: &process, directory, listen };
     let work = async {
         if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
     };

@@ -17,6 +17,7 @@ pub(super) const CHANGEABLE: [&str; 14] = [
     "label.queue_limit",
     "run.walkers",
     "run.silence_limit",
+    "run.agent_silence_limit",
     "run.restarts",
     "run.store",
     "guard.highest_temperature",

@@ -52,6 +52,7 @@ fn check_limits(config: &Config) -> Result<(), Wrong> {
         ("label.slots", label.slots.get() as f64, 1024.0),
         ("run.walkers", run.walkers as f64, 1024.0),
         ("run.silence_limit", run.silence_limit.get(), 1e6),
+        ("run.agent_silence_limit", run.agent_silence_limit.get(), 1e6),
         ("run.turn_steps", run.turn_steps.get() as f64, most_steps),
     ];
     let silence = run.silence_limit.get();

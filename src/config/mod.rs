@@ -237,6 +237,8 @@ pub struct RunSection {
     pub walkers: usize,
     /// A process that gives no sign of life for so long is hung and replaced, s.
     pub silence_limit: Positive,
+    /// An agent on another host that gives no sign of life for so long is taken for dead: its walks go to others, s.
+    pub agent_silence_limit: Positive,
     /// Starts of a process in a row after failures, with nothing delivered between them; then it is given up.
     pub restarts: u32,
     /// Biased walks that advance together (reproducible mode).
@@ -316,6 +318,7 @@ impl Default for RunSection {
         Self {
             walkers: 0,
             silence_limit: defaults::positive(120.0),
+            agent_silence_limit: defaults::positive(60.0),
             restarts: 5,
             walks_per_round: NonZeroUsize::MIN,
             turn_steps: defaults::nonzero(250).into(),

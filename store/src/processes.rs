@@ -17,7 +17,7 @@ const SLEEP: i64 = 24 * 3600 * 1000;
 pub struct ProcessRecord {
     /// Its own name, never used twice and without `/`.
     pub id: String,
-    /// [`Self::ORCHESTRATOR`], [`Self::WALKER`] or [`Self::LABELLER`].
+    /// [`Self::ORCHESTRATOR`], [`Self::WALKER`], [`Self::AGENT`] or [`Self::LABELLER`].
     pub kind: String,
     /// Which walker or labeller it is; an orchestrator has no number.
     pub number: Option<u32>,
@@ -65,6 +65,8 @@ impl ProcessRecord {
     pub const ORCHESTRATOR: &str = "orchestrator";
     /// Kind of a process that advances walks. It ends with its orchestrator, which also writes its record.
     pub const WALKER: &str = "walker";
+    /// Kind of a process that starts walkers on another host. The orchestrator writes its record.
+    pub const AGENT: &str = "agent";
     /// Kind of a process that makes labels. It outlives its orchestrator, and writes its own record.
     pub const LABELLER: &str = "labeller";
 

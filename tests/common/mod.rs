@@ -10,6 +10,19 @@ use std::process::{Child, Command, Output};
 
 use atoms::extxyz::{Frame, write_frame};
 
+/// Kills in one test: 20, or `CALMWALK_KILLS`.
+pub fn kills() -> u64 {
+    std::env::var("CALMWALK_KILLS").ok().and_then(|text| text.parse().ok()).unwrap_or(20)
+}
+
+/// A small deterministic sequence for instants (SplitMix64).
+pub fn random(seed: u64) -> u64 {
+    let mut z = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x9e37_79b9_7f4a_7c15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
+
 /// A file of `configs/`.
 pub fn config(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("configs").join(path)

@@ -1,5 +1,6 @@
 //! The actors that do the work: the walker runs biased dynamics, the labeller gives structures their labels.
 
+pub mod agent;
 pub mod bias;
 pub mod guard;
 pub mod labeller;

@@ -1,0 +1,203 @@
+//! An agent at work: walkers in processes of their own on this host, and a line to the orchestrator on another.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use calm::Mixture;
+use orchestrator::launcher::{self, Children, Launch};
+use orchestrator::supervisor::{Limits, Standing};
+use tokio::sync::{Notify, mpsc};
+use tokio::task::JoinHandle;
+use wire::ipc::{self, IpcError, Server, Sizes, space_needed};
+use wire::mixture::SharedMixture;
+use wire::net::{Joined, Parted, Uplink};
+use wire::place::Place;
+use wire::transport::Incoming;
+use workers::agent::{self, Agent};
+
+use super::crew::all_given_up;
+use super::{CHANNEL, stop_on_signals};
+use crate::outcome::{Ended, Failure};
+use crate::output::say;
+use crate::setup::{self, AgentSetup, WalkerSetup};
+
+/// Names of directories in which agents keep what they need begin with this.
+pub const SCRATCH: &str = "calmwalk-agent-";
+
+/// Works for a campaign until it is over or this process is asked to stop. What is needed in the meantime lies in
+/// `directory`. To be awaited on the main thread: the walkers end with the thread that starts them.
+pub async fn work(
+    uplink: Uplink,
+    walkers: u32,
+    patience: Duration,
+    directory: &Path,
+) -> Result<Ended, Failure> {
+    let (stopping, stop) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
+    let asked = (Arc::clone(&stopping), Arc::clone(&stop));
+    stop_on_signals(move || {
+        asked.0.store(true, Ordering::Relaxed);
+        asked.1.notify_one();
+    })?;
+    let uplink = Arc::new(uplink);
+    let joined = tokio::select! {
+        joined = uplink.join() => joined.map_err(Failure::failed)?,
+        () = stop.notified() => return Ok(Ended::Interrupted),
+    };
+    let setup: AgentSetup = serde_json::from_slice(&joined.setup).map_err(|error| {
+        Failure::Failed(format!("the orchestrator's setup: {error}: run the same program everywhere"))
+    })?;
+    let setup = AgentSetup { model: model(&joined, &setup, directory).await?, ..setup };
+    say(format_args!("joined: {walkers} walkers, mixture version {}", joined.newest().await.version()));
+    clean();
+    let place = Place::of(directory).map_err(Failure::failed)?;
+    let mixture = joined.newest().await;
+    let (flag, asked) = (Arc::clone(&stopping), Arc::clone(&stop));
+    let deal = |incoming| {
+        tokio::spawn(Agent { uplink, joined, incoming, stopping, patience }.run(move || {
+            flag.store(true, Ordering::Relaxed);
+            asked.notify_one();
+        }))
+    };
+    let ended = work_in(&place, &setup, walkers, &mixture, deal, &stop).await;
+    let removed = place.remove().map_err(Failure::failed);
+    let ended = ended?;
+    removed?;
+    Ok(ended)
+}
+
+/// Removes what agents left that were killed on this host.
+fn clean() {
+    for place in Place::all().unwrap_or_default() {
+        let Some(directory) = place.campaign_directory() else { continue };
+        let name = directory.file_name().unwrap_or_default().to_string_lossy();
+        // Those of the living are in use and stay.
+        if name.starts_with(SCRATCH) && place.remove().is_ok() {
+            let _ = fs::remove_dir_all(directory);
+        }
+    }
+}
+
+/// The model's file: the orchestrator's own where this host sees it, else a copy.
+async fn model(joined: &Joined, setup: &AgentSetup, directory: &Path) -> Result<PathBuf, Failure> {
+    let hash = &setup.model_hash;
+    if setup::unchanged(&setup.model, hash).is_ok() {
+        return Ok(setup.model.clone());
+    }
+    let path = directory.join("kokkos.npz");
+    let bytes = joined.file(hash).await.map_err(Failure::failed)?;
+    fs::write(&path, bytes)
+        .map_err(|error| Failure::Failed(format!("cannot write {}: {error}", path.display())))?;
+    setup::unchanged(&path, hash).map_err(Failure::failed)?;
+    Ok(path)
+}
+
+/// The walkers of this host, and the task that deals turns to them.
+struct Host {
+    walkers: Children,
+    line: ipc::Handle,
+    dealing: Dealing,
+    serving: JoinHandle<Result<(), IpcError>>,
+    /// How the last of them failed, if all were given up.
+    given_up: Option<String>,
+}
+
+type Dealing = JoinHandle<Result<agent::Ended, Parted>>;
+
+async fn work_in(
+    place: &Place,
+    setup: &AgentSetup,
+    walkers: u32,
+    mixture: &Mixture,
+    deal: impl FnOnce(mpsc::Receiver<Incoming>) -> Dealing,
+    stop: &Notify,
+) -> Result<Ended, Failure> {
+    let sizes = Sizes { walkers, message_bytes: setup.message_bytes };
+    let needed =
+        SharedMixture::space_needed(mixture, walkers).map_err(Failure::failed)? + space_needed(&sizes);
+    let _prepared = place.prepare(needed).map_err(Failure::failed)?;
+    let shared = SharedMixture::create(&place.mixture(), mixture, walkers).map_err(Failure::failed)?;
+    let server = Server::open(place, sizes, u64::from(std::process::id())).map_err(Failure::failed)?;
+    let line = server.handle();
+    let limits = Limits {
+        silence: Duration::from_secs_f64(setup.silence_limit),
+        restarts: setup.restarts,
+        ..Limits::default()
+    };
+    let walkers = Children::new(walkers, limits, launch(setup, line.clone()));
+    let (to_agent, incoming) = mpsc::channel(CHANNEL);
+    let signs = walkers.signs();
+    let heard = move |walker, useful| if useful { signs.useful(walker) } else { signs.heard(walker) };
+    let serving = tokio::spawn(server.run(shared, to_agent, heard));
+    let dealing = deal(incoming);
+    Host { walkers, line, dealing, serving, given_up: None }.lead(stop).await
+}
+
+/// How walkers are started.
+fn launch(setup: &AgentSetup, line: ipc::Handle) -> impl FnMut(u32, u32) -> Launch + Send + 'static {
+    let (setup, parent) = (setup.clone(), std::process::id());
+    move |number, incarnation| {
+        line.expect(number, incarnation);
+        let setup = WalkerSetup {
+            parent,
+            door: line.door(number, incarnation),
+            model: setup.model.clone(),
+            model_hash: setup.model_hash.clone(),
+            settings: setup.settings.clone(),
+        };
+        Launch::this_program(["walker"], setup::bytes(&setup))
+    }
+}
+
+impl Host {
+    /// Until every walker is gone and everything is told.
+    async fn lead(mut self, stop: &Notify) -> Result<Ended, Failure> {
+        let (mut dealt, mut gone) = (None, false);
+        while dealt.is_none() || !gone {
+            tokio::select! {
+                event = self.walkers.next() => gone |= self.walker(event),
+                () = stop.notified() => self.walkers.stop(),
+                ended = &mut self.dealing, if dealt.is_none() => {
+                    let ended = ended.map_err(Failure::failed)?;
+                    match ended {
+                        Ok(agent::Ended::Done) => self.walkers.close(),
+                        _ => self.walkers.stop(),
+                    }
+                    dealt = Some(ended.map_err(Failure::failed));
+                }
+            }
+        }
+        self.serving.await.map_err(Failure::failed)?.map_err(Failure::failed)?;
+        match dealt.transpose()? {
+            Some(agent::Ended::Done) => Ok(Ended::Done),
+            _ => match self.given_up {
+                Some(how) => Err(Failure::Failed(format!("no walker is left: {how}"))),
+                None => Ok(Ended::Interrupted),
+            },
+        }
+    }
+
+    /// Whether nobody is left.
+    fn walker(&mut self, event: launcher::Event) -> bool {
+        match event {
+            launcher::Event::Started { .. } => {}
+            launcher::Event::Said { number, line } => say(format_args!("walker {number}: {line}")),
+            launcher::Event::Ended { number, ended } => {
+                self.line.gone(number, ended.incarnation, ended.ending.is_own_fault());
+                if ended.then == Standing::GoneHome {
+                    self.walkers.close();
+                } else {
+                    say(format_args!("walker {number}: {}; {}", ended.ending, ended.then));
+                }
+            }
+            launcher::Event::AllGone => {
+                self.line.close();
+                self.given_up = all_given_up(&mut self.walkers);
+                return true;
+            }
+        }
+        false
+    }
+}

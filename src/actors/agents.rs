@@ -1,0 +1,130 @@
+//! Agents of other hosts, as the orchestrator sees them.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+use calm::Mixture;
+use serde_json::json;
+use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
+use tokio::sync::mpsc;
+use wire::net::{self, AgentEvent, Hub, NetError, Welcome};
+use wire::transport::Incoming;
+
+use super::Run;
+use crate::outcome::Failure;
+use crate::output::say;
+use crate::setup::{self, AgentSetup};
+
+/// Where they join, if they may.
+pub struct Agents {
+    hub: Option<Hub>,
+    store: Store,
+    mixture: Arc<Mixture>,
+}
+
+/// Ends it.
+pub struct Handle(Option<net::Handle>);
+
+impl Handle {
+    /// There is no more work.
+    pub fn close(&self) {
+        self.0.iter().for_each(net::Handle::close);
+    }
+}
+
+impl Agents {
+    /// Listens where this run is to.
+    pub async fn open(run: Run<'_>, session: u64, mixture: &Arc<Mixture>) -> Result<Self, Failure> {
+        let (store, mixture) = (run.store.clone(), Arc::clone(mixture));
+        let Some(listen) = run.listen else { return Ok(Self { hub: None, store, mixture }) };
+        let config = &run.campaign.config;
+        let model = std::path::absolute(config.potential.model.get_ref()).map_err(Failure::failed)?;
+        let model_hash = run.campaign.hash_of("potential.model");
+        let setup = AgentSetup {
+            model: model.clone(),
+            model_hash: model_hash.clone(),
+            settings: run.campaign.walk_settings(),
+            message_bytes: run.campaign.largest_message(),
+            silence_limit: config.run.silence_limit.get(),
+            restarts: config.run.restarts,
+        };
+        let welcome = Welcome { setup: setup::bytes(&setup), files: BTreeMap::from([(model_hash, model)]) };
+        let patience = Duration::from_secs_f64(config.run.agent_silence_limit.get());
+        let hub = Hub::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
+        let hub = hub.map_err(|error| match error {
+            NetError::Ended { .. } => Failure::failed(error),
+            error => Failure::input(error),
+        })?;
+        say(format_args!("agents may join at {}", listen.endpoint));
+        Ok(Self { hub: Some(hub), store, mixture })
+    }
+
+    pub fn handle(&self) -> Handle {
+        Handle(self.hub.as_ref().map(Hub::handle))
+    }
+
+    /// Listens to them until there is no more work and the last has left.
+    pub async fn run(
+        self,
+        stopping: Arc<AtomicBool>,
+        to_reactor: mpsc::Sender<Incoming>,
+    ) -> Result<(), Failure> {
+        let Some(hub) = self.hub else { return Ok(()) };
+        let (sender, events) = mpsc::unbounded_channel();
+        let happened = move |event| drop(sender.send(event));
+        let (ended, ()) = tokio::join!(
+            hub.run(self.mixture, stopping, to_reactor, happened),
+            keep_records(&self.store, events)
+        );
+        ended.map_err(Failure::failed)
+    }
+}
+
+/// Says what happens to agents: here, in `status`, in the operations log. A database that is busy for a moment can do
+/// without.
+async fn keep_records(store: &Store, mut events: mpsc::UnboundedReceiver<AgentEvent>) {
+    let mut records = BTreeMap::new();
+    while let Some(event) = events.recv().await {
+        if let Err(error) = keep_record(store, &mut records, event).await {
+            say(format_args!("cannot write down what happened to an agent: {error}"));
+        }
+    }
+}
+
+async fn keep_record(
+    store: &Store,
+    records: &mut BTreeMap<String, ProcessRecord>,
+    event: AgentEvent,
+) -> Result<(), StoreError> {
+    let now = unix_milliseconds();
+    let (agent, what, state) = match event {
+        AgentEvent::Joined(agent) => (agent, "joined", "running"),
+        AgentEvent::Silent(agent) => (agent, "gives no sign of life", "silent"),
+        AgentEvent::Back(agent) => (agent, "is back", "running"),
+        AgentEvent::Lost(agent) => (agent, "was silent for too long: others get its walks", "lost"),
+        AgentEvent::Left(agent) => (agent, "left", "left"),
+        AgentEvent::Dropped(why) => {
+            say(format_args!("a message from another host was dropped: {why}"));
+            return store.log_operation(now, "messages_dropped", &json!({ "remark": why })).await;
+        }
+    };
+    say(format_args!("agent {} (process {}, {} walkers): {what}", agent.host, agent.pid, agent.walkers));
+    let record = records.entry(agent.id.clone()).or_insert_with(|| ProcessRecord {
+        id: agent.id.clone(),
+        host: agent.host.clone(),
+        // Not one that this host could see.
+        birth: String::new(),
+        ..ProcessRecord::new(ProcessRecord::AGENT, None, agent.pid, now)
+    });
+    (record.last_seen, record.state) = (now, state.to_owned());
+    record.remark = format!("{} walkers", agent.walkers);
+    if state == "left" {
+        store.remove_process(&agent.id).await?;
+    } else {
+        store.upsert_process(record).await?;
+    }
+    let detail = json!({ "id": agent.id, "host": agent.host, "pid": agent.pid, "walkers": agent.walkers, "what": what });
+    store.log_operation(now, "agent", &detail).await
+}

@@ -1,0 +1,72 @@
+//! `calmwalk agent`
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use store::ProcessRecord;
+use wire::net::{self, Endpoint, NetError, Tls, Uplink};
+
+use super::{Ended, Failure, block_on};
+use crate::actors::{agent, cores};
+use crate::output::say;
+
+/// Let this host take part in a campaign that `calmwalk run --listen` leads on another
+///
+/// Starts walkers here, holds one copy of the mixture for all of them, and carries what they find to the orchestrator. It
+/// waits for an orchestrator that is not there yet, and goes on through breaks of the line. Ends when the campaign has no
+/// more work (exit code 0), or on Ctrl-C or SIGTERM after its walks are checkpointed (130): a batch system's notice
+/// before the end of a job is enough.
+#[derive(Debug, clap::Args)]
+pub struct Agent {
+    /// Where the orchestrator listens, as tcp/head:7447
+    #[arg(long, value_name = "ENDPOINT")]
+    join: Endpoint,
+    /// Walkers to start here [default: one a core]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    walkers: Option<u32>,
+    /// Turns to take beyond one a walker: so many candidates may wait for their verdict before walkers have to. Only of
+    /// use where a campaign has more walks than walkers
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=4096))]
+    ahead: u32,
+    /// Give up when the orchestrator has been silent for so long, min
+    #[arg(long, value_name = "MINUTES", default_value_t = 60.0, value_parser = minutes)]
+    patience: f64,
+    /// Directory with authority.pem, certificate.pem and key.pem: needed for everything but loopback
+    #[arg(long, value_name = "DIR")]
+    tls: Option<PathBuf>,
+}
+
+impl Agent {
+    pub fn run(self) -> Result<Ended, Failure> {
+        let walkers = self.walkers.unwrap_or_else(cores);
+        let patience = Duration::from_secs_f64(60.0 * self.patience);
+        let tls = self.tls.as_deref().map(Tls::in_directory);
+        let scratch = tempfile::Builder::new().prefix(agent::SCRATCH).tempdir();
+        let scratch = scratch.map_err(|error| {
+            Failure::Failed(format!("cannot make a directory in {}: {error}", std::env::temp_dir().display()))
+        })?;
+        let process =
+            ProcessRecord::new(ProcessRecord::AGENT, None, std::process::id(), store::unix_milliseconds());
+        let agent = net::Agent {
+            // A host that was cloned has the same name, process numbers and clock.
+            id: blake3::hash(format!("{process:?} {}", scratch.path().display()).as_bytes()).to_hex()[..32]
+                .to_owned(),
+            host: process.host,
+            pid: process.pid,
+            program_version: env!("CARGO_PKG_VERSION").to_owned(),
+            walkers,
+            ahead: self.ahead,
+        };
+        block_on(async {
+            let waiting = |why: &NetError| say(format_args!("waiting for the orchestrator: {why}"));
+            let uplink = Uplink::open(&self.join, tls.as_ref(), agent, waiting).await;
+            let uplink = uplink.map_err(Failure::input)?;
+            agent::work(uplink, walkers, patience, scratch.path()).await
+        })?
+    }
+}
+
+fn minutes(text: &str) -> Result<f64, String> {
+    let minutes = text.parse().ok().filter(|minutes| (0.1..=1e6).contains(minutes));
+    minutes.ok_or_else(|| "expected 0.1 to 1e6".to_owned())
+}

@@ -1,0 +1,179 @@
+//! A campaign on several hosts, as far as one host can show it: agents are processes of their own and speak TCP.
+//!
+//! `CALMWALK_KILLS=200 cargo test --test hosts kills` for the long version.
+
+mod common;
+
+use std::fs;
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use common::campaign::{Outcome, Small, outcome};
+use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
+use common::{Running, kills, program, random};
+use tempfile::TempDir;
+use wire::place::Place;
+
+/// A campaign with its orchestrator's directory, and one for each other host.
+struct Hosts {
+    home: TempDir,
+    others: Vec<TempDir>,
+    port: u16,
+}
+
+impl Hosts {
+    /// The orchestrator has a walker of its own.
+    fn new(small: &Small, others: usize) -> Self {
+        let home = tempfile::tempdir().unwrap();
+        let path = Small { walkers: 1, ..small.clone() }.write(home.path());
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, text.replace("[run]\n", "[run]\nagent_silence_limit = 0.5\n")).unwrap();
+        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        Self { home, others: (0..others).map(|_| tempfile::tempdir().unwrap()).collect(), port }
+    }
+
+    fn endpoint(&self) -> String {
+        format!("tcp/127.0.0.1:{}", self.port)
+    }
+
+    fn lead(&self) -> Running {
+        let mut command = program(self.home.path());
+        command.args(["run", "campaign.toml", "--directory", ".", "--listen", &self.endpoint()]);
+        started(command, &self.home.path().join("said"))
+    }
+
+    fn agent(&self, host: usize) -> Running {
+        let directory = self.others[host].path();
+        let mut command = program(directory);
+        command.env("TMPDIR", directory).args(["agent", "--join", &self.endpoint(), "--walkers", "1"]);
+        started(command, &directory.join("said"))
+    }
+
+    fn said(&self, host: usize) -> String {
+        fs::read_to_string(self.others[host].path().join("said")).unwrap_or_default()
+    }
+
+    /// Everybody is gone and has left nothing behind.
+    fn are_empty(&self) {
+        nothing_is_left(self.home.path());
+        for host in &self.others {
+            wait_until("every process is gone", || processes_in(host.path()).is_empty());
+            let left: Vec<PathBuf> =
+                fs::read_dir(host.path()).unwrap().map(|entry| entry.unwrap().path()).collect();
+            assert_eq!(left, [host.path().join("said")]);
+            let here =
+                |place: &Place| place.campaign_directory().is_some_and(|of| of.starts_with(host.path()));
+            assert!(!Place::all().unwrap().iter().any(here));
+        }
+    }
+}
+
+fn started(mut command: std::process::Command, said: &Path) -> Running {
+    let said = fs::File::options().create(true).append(true).open(said).unwrap();
+    Running(command.stdout(Stdio::null()).stderr(said).spawn().expect("the program starts"))
+}
+
+/// What the campaign comes to in one process.
+fn undisturbed(small: &Small) -> Outcome {
+    let directory = tempfile::tempdir().unwrap();
+    small.write(directory.path());
+    let mut command = program(directory.path());
+    command.args(["run", "campaign.toml", "--directory", ".", "--in-process"]);
+    let ended = command.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap();
+    assert_eq!(ended.code(), Some(0));
+    outcome(directory.path())
+}
+
+#[test]
+fn a_campaign_on_three_hosts_comes_to_the_same() {
+    let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
+    let hosts = Hosts::new(&small, 2);
+    // An agent may be there before its orchestrator.
+    let mut first = hosts.agent(0);
+    wait_until("the agent waits", || hosts.said(0).contains("waiting for the orchestrator"));
+    let mut orchestrator = hosts.lead();
+    let mut second = hosts.agent(1);
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
+    assert_eq!((first.0.wait().unwrap().code(), second.0.wait().unwrap().code()), (Some(0), Some(0)));
+    for host in 0..2 {
+        assert!(hosts.said(host).contains("joined: 1 walkers, mixture version 0"), "{}", hosts.said(host));
+    }
+    assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
+    hosts.are_empty();
+}
+
+#[test]
+fn agents_leave_in_order_and_a_campaign_stops_in_order() {
+    let small = Small::default();
+    let hosts = Hosts::new(&small, 2);
+    let mut orchestrator = hosts.lead();
+    let mut agents = [hosts.agent(0), hosts.agent(1)];
+    let at_work = |host: usize| !carrying_out(hosts.others[host].path(), "walker").is_empty();
+    wait_until("walkers are at work", || at_work(0) && at_work(1));
+    signal(agents[0].0.id(), "TERM");
+    assert_eq!(agents[0].0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
+    signal(orchestrator.0.id(), "TERM");
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(130));
+    assert_eq!(agents[1].0.wait().unwrap().code(), Some(130), "{}", hosts.said(1));
+    hosts.are_empty();
+    let (mut orchestrator, mut agent) = (hosts.lead(), hosts.agent(0));
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
+    assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
+    assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
+    hosts.are_empty();
+}
+
+/// Kills the orchestrator, an agent, or a walker of an agent; whoever is no more is started again.
+#[test]
+fn kills_on_every_host_change_nothing() {
+    let small = Small::default();
+    let expected = undisturbed(&small);
+    let mut done = 0;
+    while done < kills() {
+        let hosts = Hosts::new(&small, 2);
+        let mut orchestrator = hosts.lead();
+        let mut agents = [hosts.agent(0), hosts.agent(1)];
+        let ended = loop {
+            std::thread::sleep(Duration::from_millis(random(done) % 1500));
+            match orchestrator.0.try_wait().unwrap() {
+                Some(ended) if ended.code().is_some() => break ended,
+                Some(_) => orchestrator = hosts.lead(),
+                None => {}
+            }
+            for (host, agent) in agents.iter_mut().enumerate() {
+                if let Some(ended) = agent.0.try_wait().unwrap()
+                    && ended.code() != Some(0)
+                {
+                    assert_eq!(ended.code(), None, "{}", hosts.said(host));
+                    *agent = hosts.agent(host);
+                }
+            }
+            if done == kills() {
+                let ended = orchestrator.0.wait().unwrap();
+                break ended;
+            }
+            let choice = random(9000 + done);
+            let host = (choice / 4) as usize % 2;
+            match choice % 4 {
+                0 => signal(orchestrator.0.id(), "KILL"),
+                1 | 2 => signal(agents[host].0.id(), "KILL"),
+                _ => {
+                    let walkers = carrying_out(hosts.others[host].path(), "walker");
+                    walkers.into_iter().for_each(|pid| signal(pid, "KILL"));
+                }
+            }
+            done += 1;
+            std::thread::sleep(Duration::from_millis(5));
+        };
+        assert_eq!(ended.code(), Some(0), "after {done} kills");
+        // One that came late to a campaign that was over waits for the next run of it.
+        for (host, agent) in agents.iter_mut().enumerate() {
+            signal(agent.0.id(), "TERM");
+            let ended = agent.0.wait().unwrap();
+            assert!(matches!(ended.code(), Some(0 | 130) | None), "{ended}: {}", hosts.said(host));
+        }
+        assert_eq!(outcome(hosts.home.path()), expected, "after {done} kills");
+    }
+}

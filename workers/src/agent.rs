@@ -1,0 +1,256 @@
+//! The agent of a host: deals the turns of a campaign that is led from another host to the walkers here.
+
+mod pool;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use futures_util::StreamExt;
+use futures_util::future::BoxFuture;
+use futures_util::stream::FuturesUnordered;
+use tokio::sync::mpsc;
+use tokio::time::{MissedTickBehavior, interval, timeout};
+use wire::WalkId;
+use wire::messages::Progress;
+use wire::net::{Joined, Parted, Slot, Told, Uplink};
+use wire::transport::{Incoming, Work};
+
+use self::pool::Pool;
+
+/// Between two questions whether the orchestrator wants its agents to stop.
+const LOOK: Duration = Duration::from_secs(2);
+/// Between two pieces of news about a walk.
+const NEWS: Duration = Duration::from_secs(1);
+/// What walkers delivered last may take so long on its way when the agent is asked to stop.
+const LAST_WORDS: Duration = Duration::from_secs(20);
+
+/// How an agent's work ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ended {
+    /// The campaign has no more work.
+    Done,
+    /// It was asked to stop, or every walker is gone.
+    Stopped,
+}
+
+/// Deals turns.
+pub struct Agent {
+    /// The line to the orchestrator.
+    pub uplink: Arc<Uplink>,
+    /// The place that it has been given there.
+    pub joined: Joined,
+    /// What comes from the walkers of this host.
+    pub incoming: mpsc::Receiver<Incoming>,
+    /// Set from outside: walkers are sent home with their turns where they stand.
+    pub stopping: Arc<AtomicBool>,
+    /// An orchestrator that has been silent for so long will not come back.
+    pub patience: Duration,
+}
+
+/// What an exchange about a slot came to.
+type Exchanged = (Slot, Told, Result<Option<Work>, Parted>);
+
+/// What an agent has to say and to ask.
+struct Desk {
+    uplink: Arc<Uplink>,
+    joined: Arc<Joined>,
+    pool: Pool,
+    asking: FuturesUnordered<BoxFuture<'static, Exchanged>>,
+    /// Those of them that deliver something.
+    telling: usize,
+    /// Whether the orchestrator wants its agents to stop.
+    question: Option<BoxFuture<'static, Result<Option<bool>, Parted>>>,
+    /// A new place, when this one has been lost …
+    joining: Option<BoxFuture<'static, Result<Joined, Parted>>>,
+    /// … which is taken when all that was asked from the old one has been answered.
+    next_place: Option<Joined>,
+    /// When the orchestrator was last heard.
+    heard: Instant,
+    /// When there was last news of a walk.
+    news: BTreeMap<WalkId, Instant>,
+}
+
+impl Agent {
+    /// Works until there is no more work or it is asked to stop. `stop` is called when the orchestrator asks for it.
+    ///
+    /// # Errors
+    /// The orchestrator is silent, or it and this program do not understand each other.
+    pub async fn run(mut self, mut stop: impl FnMut()) -> Result<Ended, Parted> {
+        let slots = self.joined.slots();
+        let mut desk = Desk::new(self.uplink, self.joined);
+        desk.begin(slots);
+        let mut look = interval(LOOK);
+        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                message = self.incoming.recv() => match message {
+                    Some(message) => desk.take_in(message),
+                    None => break,
+                },
+                Some(exchanged) = desk.asking.next() => desk.exchanged(exchanged)?,
+                joined = answered(&mut desk.joining) => desk.has_joined(joined?),
+                told = answered(&mut desk.question) => if desk.is_to_stop(told)? { stop() },
+                _ = look.tick() => desk.look(self.patience)?,
+            }
+            if self.stopping.load(Ordering::Relaxed) {
+                desk.pool.send_home();
+                if desk.pool.is_idle() {
+                    break;
+                }
+            } else if desk.pool.is_over() {
+                // Of a campaign that is over, or of one that is being stopped.
+                let stopped = matches!(desk.joined.is_stopping().await, Ok(Some(true)));
+                desk.pool.send_home();
+                desk.joined.leave().await;
+                return Ok(if stopped { Ended::Stopped } else { Ended::Done });
+            }
+        }
+        // Not for ever: a line that is down must not keep a batch job beyond its time.
+        let _ = timeout(LAST_WORDS, desk.last_words()).await;
+        desk.joined.leave().await;
+        Ok(Ended::Stopped)
+    }
+}
+
+/// The answer to a question, if one was asked.
+async fn answered<T>(question: &mut Option<BoxFuture<'static, T>>) -> T {
+    match question {
+        Some(asked) => {
+            let answer = asked.await;
+            *question = None;
+            answer
+        }
+        None => std::future::pending().await,
+    }
+}
+
+impl Desk {
+    fn new(uplink: Arc<Uplink>, joined: Joined) -> Self {
+        Self {
+            uplink,
+            joined: Arc::new(joined),
+            pool: Pool::default(),
+            asking: FuturesUnordered::new(),
+            telling: 0,
+            question: None,
+            joining: None,
+            next_place: None,
+            heard: Instant::now(),
+            news: BTreeMap::new(),
+        }
+    }
+
+    fn begin(&mut self, slots: Vec<Slot>) {
+        for (slot, told) in self.pool.begin(slots) {
+            self.exchange(slot, told);
+        }
+    }
+
+    /// Begins to deliver what came of a slot's turn, and to ask for the next.
+    fn exchange(&mut self, mut slot: Slot, told: Told) {
+        self.telling += usize::from(!matches!(told, Told::Nothing));
+        let joined = Arc::clone(&self.joined);
+        self.asking.push(Box::pin(async move {
+            let result = slot.exchange(&joined, &told).await;
+            (slot, told, result)
+        }));
+    }
+
+    fn take_in(&mut self, message: Incoming) {
+        let next = match message {
+            Incoming::Progress(walk, progress) => {
+                self.news(walk, progress);
+                None
+            }
+            Incoming::Free { walker, report, reply } => self.pool.free(walker, report, reply),
+            Incoming::Gone { walker, fault } => self.pool.gone(walker, fault),
+        };
+        if let Some((slot, told)) = next {
+            self.exchange(slot, told);
+        }
+    }
+
+    fn exchanged(&mut self, (slot, told, result): Exchanged) -> Result<(), Parted> {
+        self.heard = Instant::now();
+        self.telling -= usize::from(!matches!(told, Told::Nothing));
+        match result {
+            Ok(Some(work)) => self.pool.turn(slot, work),
+            Ok(None) => self.pool.sent_home(),
+            Err(Parted::Stranger(_)) => {
+                self.pool.keep(told);
+                self.join_anew();
+            }
+            Err(parted) => return Err(parted),
+        }
+        self.take_next_place();
+        Ok(())
+    }
+
+    /// This agent was taken for dead, or the orchestrator was started again: what it has to tell it tells in a new place.
+    fn join_anew(&mut self) {
+        if self.joining.is_none() && self.next_place.is_none() {
+            let uplink = Arc::clone(&self.uplink);
+            self.joining = Some(Box::pin(async move { uplink.join().await }));
+        }
+    }
+
+    fn has_joined(&mut self, joined: Joined) {
+        self.next_place = Some(joined);
+        self.take_next_place();
+    }
+
+    fn take_next_place(&mut self) {
+        if !self.asking.is_empty() {
+            return;
+        }
+        if let Some(joined) = self.next_place.take() {
+            let slots = joined.slots();
+            self.joined = Arc::new(joined);
+            self.begin(slots);
+        }
+    }
+
+    /// Asks whether to stop, unless the orchestrator has been silent for so long that it is of no use.
+    fn look(&mut self, patience: Duration) -> Result<(), Parted> {
+        if self.heard.elapsed() > patience {
+            return Err(Parted::Silence { minutes: patience.as_secs_f64() / 60.0 });
+        }
+        let joined = Arc::clone(&self.joined);
+        self.question.get_or_insert_with(|| Box::pin(async move { joined.is_stopping().await }));
+        Ok(())
+    }
+
+    fn is_to_stop(&mut self, told: Result<Option<bool>, Parted>) -> Result<bool, Parted> {
+        match told {
+            Ok(None) => return Ok(false),
+            Err(Parted::Stranger(_)) => self.join_anew(),
+            Err(parted) => return Err(parted),
+            Ok(Some(_)) => {}
+        }
+        self.heard = Instant::now();
+        Ok(matches!(told, Ok(Some(true))))
+    }
+
+    /// Where a walk stands, once a second.
+    fn news(&mut self, walk: WalkId, progress: Progress) {
+        let now = Instant::now();
+        if self.news.get(&walk).is_some_and(|last| now.duration_since(*last) < NEWS) {
+            return;
+        }
+        if let Some(slot) = self.pool.slot_of(walk) {
+            self.news.insert(walk, now);
+            tokio::spawn(slot.progress(Arc::clone(&self.joined), walk, progress));
+        }
+    }
+
+    /// Waits until everything that is to be told has been taken. From a place that is lost it is not told: as far as the
+    /// orchestrator knows nobody has those turns in hand, and they begin again where they began.
+    async fn last_words(&mut self) {
+        while self.telling > 0 {
+            let Some((_, told, _)) = self.asking.next().await else { return };
+            self.telling -= usize::from(!matches!(told, Told::Nothing));
+        }
+    }
+}
