@@ -96,16 +96,34 @@ fn reports_that_nobody_asked_for_change_nothing() {
     unasked(&mut selector, report.clone());
     turn(&mut selector);
     unasked(&mut selector, report);
-    // Twice in one round, and from a walker that was given up.
+    // Twice in one round.
     let mut selector = begin(&settings(Mode::Reproducible), 2);
     let [first, second] =
         [(); 2].map(|()| turn(&mut selector)).map(|a| common::report(&a, Outcome::Turn, at(10)));
     assert!(selector.report(first.clone()).unwrap().is_none());
     unasked(&mut selector, first);
-    selector.lost(second.walk);
-    unasked(&mut selector, second.clone());
-    turn(&mut selector);
-    decided(&mut selector, second);
+    decided(&mut selector, second.clone());
+    unasked(&mut selector, second);
+}
+
+#[test]
+fn a_late_report_of_a_walker_that_was_taken_for_lost_counts_once() {
+    for mode in [Mode::Live, Mode::Reproducible] {
+        let mut selector = begin(&settings(mode), 1);
+        let assignment = turn(&mut selector);
+        let report = common::report(&assignment, Outcome::Turn, at(10));
+        selector.lost(assignment.walk);
+        let commit = decided(&mut selector, report.clone());
+        assert_eq!(commit.walks[0].turn, assignment.turn + 1);
+        assert!(selector.report(report.clone()).unwrap().is_none());
+        assert_eq!(turn(&mut selector).turn, assignment.turn + 1);
+        assert!(selector.report(report).unwrap().is_none());
+        // What comes after the end of a walk comes too late.
+        selector.lost(assignment.walk);
+        let last = turn(&mut selector);
+        decided(&mut selector, ended(&last, 30, End::Steps));
+        assert!(selector.report(ended(&last, 30, End::Steps)).unwrap().is_none());
+    }
 }
 
 #[test]
