@@ -9,8 +9,10 @@ use calm::Mixture;
 use serde_json::json;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
+use tokio::time::{MissedTickBehavior, interval};
 use wire::net::{self, AgentEvent, Hub, NetError, Welcome};
 use wire::transport::Incoming;
+use workers::labeller::SIGN_OF_LIFE;
 
 use super::Run;
 use crate::outcome::Failure;
@@ -86,11 +88,34 @@ impl Agents {
 /// without.
 async fn keep_records(store: &Store, mut events: mpsc::UnboundedReceiver<AgentEvent>) {
     let mut records = BTreeMap::new();
-    while let Some(event) = events.recv().await {
-        if let Err(error) = keep_record(store, &mut records, event).await {
-            say(format_args!("cannot write down what happened to an agent: {error}"));
+    let mut look = interval(SIGN_OF_LIFE);
+    look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        let written = tokio::select! {
+            event = events.recv() => match event {
+                Some(event) => keep_record(store, &mut records, event).await,
+                None => return,
+            },
+            _ = look.tick() => signs_of_life(store, &mut records).await,
+        };
+        if let Err(error) = written {
+            say(format_args!("cannot write down how agents are: {error}"));
         }
     }
+}
+
+async fn signs_of_life(
+    store: &Store,
+    records: &mut BTreeMap<String, ProcessRecord>,
+) -> Result<(), StoreError> {
+    let living = records.values_mut().filter(|record| record.state == "running");
+    let living: Vec<_> = living
+        .map(|record| {
+            record.last_seen = unix_milliseconds();
+            record.clone()
+        })
+        .collect();
+    store.upsert_processes(&living).await
 }
 
 async fn keep_record(
@@ -121,6 +146,7 @@ async fn keep_record(
     (record.last_seen, record.state) = (now, state.to_owned());
     record.remark = format!("{} walkers", agent.walkers);
     if state == "left" {
+        records.remove(&agent.id);
         store.remove_process(&agent.id).await?;
     } else {
         store.upsert_process(record).await?;

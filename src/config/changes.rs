@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 14] = [
+pub(super) const CHANGEABLE: [&str; 15] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
