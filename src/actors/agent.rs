@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use calm::Mixture;
@@ -19,7 +19,7 @@ use wire::transport::Incoming;
 use workers::agent::{self, Agent};
 
 use super::crew::all_given_up;
-use super::{CHANNEL, stop_on_signals};
+use super::{CHANNEL, asked_to_stop};
 use crate::outcome::{Ended, Failure};
 use crate::output::say;
 use crate::setup::{self, AgentSetup, WalkerSetup};
@@ -35,12 +35,7 @@ pub async fn work(
     patience: Duration,
     directory: &Path,
 ) -> Result<Ended, Failure> {
-    let (stopping, stop) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
-    let asked = (Arc::clone(&stopping), Arc::clone(&stop));
-    stop_on_signals(move || {
-        asked.0.store(true, Ordering::Relaxed);
-        asked.1.notify_one();
-    })?;
+    let (stopping, stop) = asked_to_stop()?;
     let uplink = Arc::new(uplink);
     let joined = tokio::select! {
         joined = uplink.join() => joined.map_err(Failure::failed)?,

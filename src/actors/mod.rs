@@ -12,14 +12,14 @@ mod starts;
 use std::path::Path;
 use std::process;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 
 use orchestrator::reactor::{self, Reactor};
 use orchestrator::selector::Selector;
 use store::{ProcessRecord, Store};
 use tokio::signal::unix::{SignalKind, signal};
-use tokio::sync::mpsc;
+use tokio::sync::{Notify, mpsc};
 use wire::net::{Endpoint, Tls};
 use wire::transport::Incoming;
 
@@ -93,6 +93,17 @@ fn wanted_walkers(campaign: &Campaign) -> u32 {
 /// Processor cores that this process may use.
 pub fn cores() -> u32 {
     thread::available_parallelism().map_or(1, |cores| cores.get()) as u32
+}
+
+/// Whether somebody has asked this process to stop, and what wakes whoever waits for that.
+fn asked_to_stop() -> Result<(Arc<AtomicBool>, Arc<Notify>), Failure> {
+    let (stopping, stop) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
+    let asked = (Arc::clone(&stopping), Arc::clone(&stop));
+    stop_on_signals(move || {
+        asked.0.store(true, Ordering::Relaxed);
+        asked.1.notify_one();
+    })?;
+    Ok((stopping, stop))
 }
 
 /// Ctrl-C, SIGTERM and a closed terminal: the first calls `stop`, which stops in order, the second ends at once (which is safe too).

@@ -3,7 +3,6 @@
 //! Walkers end with this process; labellers go on without it, and the next run adopts them.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use orchestrator::launcher::Children;
@@ -19,7 +18,7 @@ use wire::place::Place;
 
 use super::agents::{self, Agents};
 use super::crew::{self, Crew};
-use super::{CHANNEL, ReactorTask, Run, start_reactor, starts, stop_on_signals, wanted_walkers};
+use super::{CHANNEL, ReactorTask, Run, asked_to_stop, start_reactor, starts, wanted_walkers};
 use crate::outcome::Failure;
 
 /// Labellers give their signs of life in the database, which may be busy for a while.
@@ -49,12 +48,7 @@ async fn work_in(place: &Place, run: Run<'_>, selector: Selector) -> Result<reac
     let shared = shared.map_err(Failure::failed)?;
     let server = Server::open(place, sizes, session(process)).map_err(Failure::failed)?;
 
-    let (stopping, stop) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
-    let asked = (Arc::clone(&stopping), Arc::clone(&stop));
-    stop_on_signals(move || {
-        asked.0.store(true, Ordering::Relaxed);
-        asked.1.notify_one();
-    })?;
+    let (stopping, stop) = asked_to_stop()?;
     let limits = Limits {
         silence: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
         restarts: campaign.config.run.restarts,
