@@ -1,30 +1,41 @@
 //! What it costs to have walkers and labellers in processes of their own: the aluminium campaign of `configs/`, lengthened,
-//! all in one process and in processes, in turn. Both make the same steps, to the last bit.
+//! all in one process and in processes. Both make the same steps, to the last bit.
+//!
+//! Both campaigns of a pair are under way together, and have the machine in turn: one is stopped while the other runs,
+//! for a fraction of a second. So both see the same weather, which from one minute to the next changes the speed of a
+//! virtual machine by more than what is to be measured.
 //!
 //! `cargo bench --bench processes`; a number behind `--` is how many pairs are run.
 
+use std::fs;
 use std::path::Path;
-use std::process::{Command, Stdio};
-use std::time::Instant;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
 
+use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
+use tempfile::TempDir;
 
-/// Pairs of runs, if not given.
+/// Pairs of campaigns, if not given.
 const PAIRS: usize = 5;
+/// For so long a campaign has the machine at a time.
+const TURN: Duration = Duration::from_millis(500);
+/// How often it is looked whether it has ended.
+const LOOK: Duration = Duration::from_millis(1);
 
 fn main() {
     let pairs = std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(PAIRS);
     println!("campaign steps a second (all in one process, in processes of their own), and their ratio");
     let mut ratios = Vec::new();
     for pair in 0..pairs {
+        let mut both = [UnderWay::new(&["--in-process"]), UnderWay::new(&[])];
         // Whichever goes first in one pair goes second in the next.
-        let (alone, apart) = if pair % 2 == 0 {
-            let alone = steps_a_second(&["--in-process"]);
-            (alone, steps_a_second(&[]))
-        } else {
-            let apart = steps_a_second(&[]);
-            (steps_a_second(&["--in-process"]), apart)
-        };
+        let mut turn = pair % 2;
+        while both.iter().any(|campaign| !campaign.ended) {
+            both[turn].advance();
+            turn = 1 - turn;
+        }
+        let [alone, apart] = both.map(|campaign| campaign.steps_a_second());
         println!("{alone:8.1} {apart:8.1}   {:.3}", apart / alone);
         ratios.push(apart / alone);
     }
@@ -32,21 +43,67 @@ fn main() {
     println!("median ratio {:.3}", ratios[ratios.len() / 2]);
 }
 
-/// Runs the whole campaign, start and end included.
-fn steps_a_second(options: &[&str]) -> f64 {
-    let directory = tempfile::tempdir().expect("a directory for temporary files");
-    let here = directory.path();
-    std::fs::write(here.join("campaign.toml"), text()).expect("a file that can be written");
-    let begun = Instant::now();
-    let arguments = ["run", "campaign.toml", "--directory", "."].iter().chain(options);
-    assert!(
-        calmwalk(here).args(arguments).stderr(Stdio::null()).output().expect("the program").status.success()
-    );
-    let seconds = begun.elapsed().as_secs_f64();
-    let status = calmwalk(here).args(["status", ".", "--json"]).output().expect("the program");
-    let status: Value = serde_json::from_slice(&status.stdout).expect("JSON");
-    let steps = status["walks"].as_array().expect("walks").iter().map(|walk| walk["step"].as_u64());
-    steps.map(|step| step.expect("a step") as f64).sum::<f64>() / seconds
+/// A whole campaign, start and end included.
+struct UnderWay {
+    directory: TempDir,
+    options: Vec<&'static str>,
+    run: Option<Child>,
+    /// For so long it had the machine.
+    time: Duration,
+    ended: bool,
+}
+
+impl UnderWay {
+    fn new(options: &[&'static str]) -> Self {
+        let directory = tempfile::tempdir().expect("a directory for temporary files");
+        fs::write(directory.path().join("campaign.toml"), text()).expect("a file that can be written");
+        Self { directory, options: options.to_vec(), run: None, time: Duration::ZERO, ended: false }
+    }
+
+    /// Gives it the machine for a turn.
+    fn advance(&mut self) {
+        let begun = Instant::now();
+        if self.run.is_none() {
+            self.run = Some(self.start());
+        } else {
+            self.signal(Signal::CONT);
+        }
+        let run = self.run.as_mut().expect("it was started above");
+        while !self.ended && begun.elapsed() < TURN {
+            std::thread::sleep(LOOK);
+            if let Some(status) = run.try_wait().expect("a child of this process") {
+                assert!(status.success());
+                self.ended = true;
+            }
+        }
+        self.time += begun.elapsed();
+        self.signal(Signal::STOP);
+    }
+
+    fn start(&self) -> Child {
+        let mut command = calmwalk(self.directory.path());
+        command.args(["run", "campaign.toml", "--directory", "."]).args(&self.options);
+        command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("the program")
+    }
+
+    /// Signals each of its processes: they are those that work in its directory.
+    fn signal(&self, signal: Signal) {
+        for entry in fs::read_dir("/proc").expect("/proc").flatten() {
+            let number = entry.file_name().to_str().and_then(|name| name.parse().ok());
+            let Some(pid) = number.and_then(Pid::from_raw) else { continue };
+            if fs::read_link(entry.path().join("cwd")).is_ok_and(|cwd| cwd == self.directory.path()) {
+                // One that is gone needs no signal.
+                let _ = kill_process(pid, signal);
+            }
+        }
+    }
+
+    fn steps_a_second(&self) -> f64 {
+        let status = calmwalk(self.directory.path()).args(["status", ".", "--json"]).output();
+        let status: Value = serde_json::from_slice(&status.expect("the program").stdout).expect("JSON");
+        let steps = status["walks"].as_array().expect("walks").iter().map(|walk| walk["step"].as_u64());
+        steps.map(|step| step.expect("a step") as f64).sum::<f64>() / self.time.as_secs_f64()
+    }
 }
 
 fn calmwalk(directory: &Path) -> Command {
@@ -58,7 +115,7 @@ fn calmwalk(directory: &Path) -> Command {
 /// The demo with longer walks, so that starting takes a small part of the time.
 fn text() -> String {
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
-    let text = std::fs::read_to_string(configs.join("aluminium.toml")).expect("a file of the project");
+    let text = fs::read_to_string(configs.join("aluminium.toml")).expect("a file of the project");
     let longer =
         text.replace("\nsteps = 2000 ", "\nsteps = 6000 ").replace("# per_seed = 3 ", "per_seed = 9 ");
     assert_ne!(longer, text, "the keys stand in the file as they are replaced here");
