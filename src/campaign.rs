@@ -2,10 +2,11 @@
 
 mod load;
 
+use std::collections::BTreeMap;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use atoms::Potential;
 use calm::Artifact;
 use calm::watch::ForgettingAlarm;
 use orchestrator::grader::Grader;
@@ -16,7 +17,9 @@ use store::Protocol;
 use wire::{CampaignId, ContentHash};
 use workers::settings::{GuardSettings, WalkSettings};
 
-use crate::config::{Config, ConfigError, LabelMethod, without_changeable};
+use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, without_changeable};
+use crate::labelling::{LabelFiles, REFERENCE_FILE};
+use crate::setup::MethodSetup;
 use load::Loader;
 
 /// Keys that name files: a campaign depends on what is in them, not on where they are.
@@ -75,10 +78,17 @@ impl Campaign {
         Ok(Self { config, path, text, model, artifact, seeds, training, protocol, file_hashes })
     }
 
-    /// The label source, one for each labeller.
-    pub fn reference_potential(&self) -> Result<Box<dyn Potential>, String> {
-        let LabelMethod::Reference(potential) = &self.config.label.method;
-        potential.load()
+    /// How labels are made.
+    pub fn method(&self) -> io::Result<MethodSetup> {
+        let LabelMethod::Reference(PotentialFile { kind, file }) = &self.config.label.method;
+        let (file, file_hash) = (std::path::absolute(file.get_ref())?, self.hash_of(REFERENCE_FILE));
+        Ok(MethodSetup::Reference { kind: *kind, file, file_hash })
+    }
+
+    /// Where the files are that labels are made with.
+    pub fn label_files(&self) -> io::Result<LabelFiles> {
+        let MethodSetup::Reference { file, .. } = self.method()?;
+        Ok(BTreeMap::from([(REFERENCE_FILE.to_owned(), file)]))
     }
 
     /// The hash of a file that the configuration names under this key.

@@ -7,6 +7,7 @@ mod cli;
 mod config;
 mod frames;
 mod interrupt;
+mod labelling;
 mod outcome;
 mod output;
 mod progress;

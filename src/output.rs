@@ -1,7 +1,7 @@
 //! What commands print: text and JSON on the standard output, tables with aligned columns, a bar for long work.
 
 use std::fmt::Display;
-use std::io::{self, BufWriter, ErrorKind, Write};
+use std::io::{self, BufWriter, ErrorKind, IsTerminal, Write};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -90,6 +90,16 @@ impl Bar {
             ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()),
         );
         Self { bar, begun: Instant::now() }
+    }
+
+    /// Whether there is a terminal to show it.
+    pub fn is_shown(&self) -> bool {
+        io::stderr().is_terminal()
+    }
+
+    /// Writes something else meanwhile.
+    pub fn suspend(&self, write: impl FnOnce()) {
+        self.bar.suspend(write);
     }
 
     /// Moves it.

@@ -4,15 +4,18 @@
 use std::io::{self, Read};
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use potentials::grace::GraceModel;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use store::Protocol;
 use wire::ipc::Door;
+use workers::labeller::ReferenceMethod;
 use workers::settings::WalkSettings;
 
 use crate::config::PotentialKind;
+use crate::labelling::Labelling;
 use crate::outcome::Failure;
 
 /// What a walker's process needs to know.
@@ -53,27 +56,63 @@ pub struct AgentSetup {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct LabellerSetup {
-    /// Its number among those of the campaign.
-    pub number: u32,
-    /// How often one of its number was started again in this run.
+    /// Its number among those of a run, which the next run adopts.
+    pub number: Option<u32>,
+    /// How often one in its place was started again.
     pub restarts: u32,
-    /// Directory of the campaign.
-    pub directory: PathBuf,
-    /// URL of its database without password, if that is on a server.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub store: Option<String>,
-    /// What the potential's file holds.
-    pub kind: PotentialKind,
-    /// The potential that gives the labels.
-    pub file: PathBuf,
-    /// BLAKE3 of that file.
-    pub file_hash: String,
+    /// What it is if `calmwalk label` started it.
+    pub slot: Option<SlotSetup>,
+    /// Directory of the campaign, or URL of its store.
+    pub location: PathBuf,
+    /// How labels are made.
+    pub method: MethodSetup,
     /// The protocol.
     pub protocol: Protocol,
     /// Attempts before a label counts as failed.
     pub attempts: u32,
     /// Largest force that is believed, eV/Å.
     pub largest_force: f64,
+    /// How long a job is leased.
+    pub lease: Duration,
+}
+
+/// What tells a slot of `calmwalk label` from a labeller of a run.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct SlotSetup {
+    /// The process with which it ends.
+    pub parent: u32,
+    /// Whether it leaves when the queue is empty and nobody runs the campaign, also if some walks are not over.
+    pub until_empty: bool,
+    /// How long a label in hand may take after a stop, s.
+    pub grace: f64,
+}
+
+/// How labels are made.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum MethodSetup {
+    /// By a potential that calmwalk evaluates.
+    Reference {
+        /// What the potential's file holds.
+        kind: PotentialKind,
+        /// The potential.
+        file: PathBuf,
+        /// BLAKE3 of that file.
+        file_hash: String,
+    },
+}
+
+impl MethodSetup {
+    /// The method, ready to label.
+    pub fn load(&self) -> Result<ReferenceMethod, Failure> {
+        match self {
+            Self::Reference { kind, file, file_hash } => {
+                unchanged(file, file_hash)?;
+                Ok(ReferenceMethod::new(kind.load(file).map_err(Failure::Input)?))
+            }
+        }
+    }
 }
 
 /// Reads the setup of this process.
@@ -90,10 +129,18 @@ pub fn bytes(setup: &impl Serialize) -> Vec<u8> {
     serde_json::to_vec(setup).expect("plain data becomes JSON")
 }
 
-/// What tells two setups of labellers apart, whatever their numbers: one that was started with another must be replaced.
 impl LabellerSetup {
+    /// That of a labeller without a number.
+    pub fn new(location: PathBuf, labelling: Labelling) -> Self {
+        let Labelling { method, protocol, attempts, largest_force, lease } = labelling;
+        let (number, restarts, slot) = (None, 0, None);
+        Self { number, restarts, slot, location, method, protocol, attempts, largest_force, lease }
+    }
+
+    /// What tells two setups of labellers apart, whatever their numbers: one that was started with another must be
+    /// replaced.
     pub fn hash(&self) -> String {
-        blake3::hash(&bytes(&Self { number: 0, restarts: 0, ..self.clone() })).to_string()
+        blake3::hash(&bytes(&Self { number: None, restarts: 0, ..self.clone() })).to_string()
     }
 }
 

@@ -19,7 +19,7 @@ use wire::transport::Incoming;
 use workers::agent::{self, Agent};
 
 use super::crew::all_given_up;
-use super::{CHANNEL, asked_to_stop};
+use super::{CHANNEL, STOPPING, asked_to_stop};
 use crate::outcome::{Ended, Failure};
 use crate::output::say;
 use crate::setup::{self, AgentSetup, WalkerSetup};
@@ -35,7 +35,7 @@ pub async fn work(
     patience: Duration,
     directory: &Path,
 ) -> Result<Ended, Failure> {
-    let (stopping, stop) = asked_to_stop()?;
+    let (stopping, stop) = asked_to_stop(STOPPING)?;
     let uplink = Arc::new(uplink);
     let joined = tokio::select! {
         joined = uplink.join() => joined.map_err(Failure::failed)?,

@@ -17,9 +17,9 @@ use crate::outcome::Failure;
 use crate::output::say;
 
 /// Between two looks whether labels are still to be made, once no more structures will come.
-const LAST_LABELS: Duration = Duration::from_millis(100);
+pub const LAST_LABELS: Duration = Duration::from_millis(100);
 /// A labeller that has lived for so long (ms) is of use: what it was started with is in order.
-const PROVEN: i64 = 10_000;
+pub const PROVEN: i64 = 10_000;
 
 /// Walkers and labellers at work.
 pub struct Crew<'a> {
@@ -128,6 +128,7 @@ impl<'a> Crew<'a> {
 
     /// Asks everybody to end in order.
     pub fn stop(&mut self) {
+        self.last_labels = None;
         self.stopping.store(true, Ordering::Relaxed);
         self.walkers.stop();
         self.labellers.children.stop();
@@ -140,9 +141,9 @@ impl<'a> Crew<'a> {
         }
     }
 
-    /// Whether nobody is left.
+    /// Whether nobody is left, and no label of others is waited for.
     pub fn is_gone(&self) -> bool {
-        self.gone == [true; 2]
+        self.gone == [true; 2] && self.last_labels.is_none()
     }
 
     /// Why the campaign cannot go on, if it cannot.

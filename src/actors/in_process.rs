@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
+use std::time::Duration;
 
 use orchestrator::reactor;
 use orchestrator::selector::Selector;
@@ -11,12 +12,13 @@ use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
 use wire::place::Place;
 use wire::transport::{InProcess, Incoming};
-use workers::labeller::{self, Closing, LabellerSettings, ReferenceMethod, SIGN_OF_LIFE, Timing};
+use workers::labeller::{self, Closing, LabellerSettings, SIGN_OF_LIFE, Stay, Timing};
 use workers::walk::WalkContext;
 use workers::walker;
 
+use super::crew::LAST_LABELS;
 use super::starts::no_labellers;
-use super::{CHANNEL, ReactorTask, Run, start_reactor, stop_on_signals, wanted_walkers};
+use super::{CHANNEL, ReactorTask, Run, STOPPING, start_reactor, stop_on_signals, wanted_walkers};
 use crate::campaign::Campaign;
 use crate::outcome::Failure;
 
@@ -49,6 +51,8 @@ struct Actors {
     walkers: Vec<JoinHandle<walker::Ended>>,
     labellers: JoinSet<Result<(), StoreError>>,
     reactor: ReactorTask,
+    /// Where labels of others are waited for, if nobody makes any here.
+    labels_of_others: Option<Store>,
     closing: Arc<Closing>,
     stopping: Arc<AtomicBool>,
 }
@@ -59,15 +63,16 @@ impl Actors {
         let stopping = Arc::new(AtomicBool::new(false));
         let closing = Arc::new(Closing::default());
         let asked = (Arc::clone(&stopping), Arc::clone(&closing));
-        stop_on_signals(move || {
+        stop_on_signals(STOPPING, move || {
             asked.0.store(true, Ordering::Relaxed);
-            asked.1.stopping.store(true, Ordering::Relaxed);
+            asked.1.stop();
         })?;
         let (to_reactor, incoming) = mpsc::channel(CHANNEL);
         let walkers = start_walkers(run.campaign, &to_reactor, &stopping)?;
         let labellers = start_labellers(run, &closing)?;
         let reactor = start_reactor(run, selector, incoming, &stopping);
-        Ok(Self { walkers, labellers, reactor, closing, stopping })
+        let labels_of_others = labellers.is_empty().then(|| run.store.clone());
+        Ok(Self { walkers, labellers, reactor, labels_of_others, closing, stopping })
     }
 
     /// Waits for all of them. A labeller that cannot go on stops the campaign: without labels its queue only grows.
@@ -82,10 +87,13 @@ impl Actors {
                 }
             }
         };
-        self.closing.no_more_jobs.store(true, Ordering::Relaxed);
+        self.closing.set_no_more_jobs(true);
         if ended.is_err() || failure.is_some() {
             self.stopping.store(true, Ordering::Relaxed);
-            self.closing.stopping.store(true, Ordering::Relaxed);
+            self.closing.stop();
+        }
+        if let Some(store) = self.labels_of_others.filter(|_| matches!(ended, Ok(reactor::Ended::Done))) {
+            wait_for_labels(&store, &self.closing).await?;
         }
         let panicked = self.walkers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
         while let Some(labeller) = self.labellers.join_next().await {
@@ -98,10 +106,22 @@ impl Actors {
         match failure {
             Some(failure) => Err(failure),
             // Every walk is over, but the labellers were asked to stop and may have left jobs.
-            None if self.closing.stopping.load(Ordering::Relaxed) => Ok(reactor::Ended::Stopped),
+            None if self.closing.is_stopping() => Ok(reactor::Ended::Stopped),
             None => Ok(ended),
         }
     }
+}
+
+/// Waits until no structure waits for a label, or somebody asks to stop.
+async fn wait_for_labels(store: &Store, closing: &Closing) -> Result<(), StoreError> {
+    while !closing.is_stopping() {
+        match store.unfinished_jobs().await {
+            Ok(0) => break,
+            Err(error) if !error.is_transient() => return Err(error),
+            _ => tokio::time::sleep(LAST_LABELS).await,
+        }
+    }
+    Ok(())
 }
 
 /// Why a labeller ended, if it could not go on.
@@ -134,18 +154,20 @@ fn start_labellers(run: Run<'_>, closing: &Arc<Closing>) -> Result<JoinSet<Resul
     let Run { campaign, store, process, .. } = run;
     let label = &campaign.config.label;
     let mut labellers = JoinSet::new();
-    for slot in 0..label.slots.get() {
-        let method = ReferenceMethod::new(campaign.reference_potential().map_err(Failure::Input)?);
+    for slot in 0..label.slots {
+        let method = campaign.method().map_err(Failure::failed)?.load()?;
         let settings = LabellerSettings {
             holder: format!("{}/{slot}", process.id),
             protocol: campaign.protocol.clone(),
             attempts: label.attempts.get(),
             largest_force: label.largest_force.get(),
-            timing: Timing::default(),
+            stay: Stay::UntilEmpty,
+            timing: Timing { lease: Duration::from_secs(label.lease.get().into()), ..Timing::default() },
         };
         let (store, closing) = (store.clone(), Arc::clone(closing));
-        labellers
-            .spawn(async move { labeller::run(store, method, settings, &closing, unix_milliseconds).await });
+        labellers.spawn(async move {
+            labeller::run(store, method, settings, &closing, unix_milliseconds, |_| ()).await
+        });
     }
     Ok(labellers)
 }

@@ -39,7 +39,7 @@ impl Labellers {
     ) -> Result<Option<ProcessRecord>, StoreError> {
         let pid = self.pids.remove(&number);
         let labellers = store.processes(Some(ProcessRecord::LABELLER)).await?;
-        let record = labellers.into_iter().rfind(|record| is_process(record, number, pid));
+        let record = labellers.into_iter().rfind(|record| is_process(record, pid));
         let now = unix_milliseconds();
         if let Some(record) = record.as_ref().filter(|_| ended.ending.is_own_fault()) {
             // A structure that kills labellers must not do so for ever.
@@ -55,7 +55,7 @@ impl Labellers {
         let signs = self.children.signs();
         let records = store.processes(Some(ProcessRecord::LABELLER)).await?;
         for (&number, &pid) in &self.pids {
-            let Some(record) = records.iter().rfind(|record| is_process(record, number, Some(pid))) else {
+            let Some(record) = records.iter().rfind(|record| is_process(record, Some(pid))) else {
                 continue;
             };
             if self.seen.insert(number, record.last_seen) == Some(record.last_seen) {
@@ -77,6 +77,7 @@ impl Labellers {
     }
 }
 
-fn is_process(record: &ProcessRecord, number: u32, pid: Option<u32>) -> bool {
-    record.number == Some(number) && Some(record.pid) == pid && record.is_local()
+/// Of several records with one process number the last is that of the process that had it last.
+fn is_process(record: &ProcessRecord, pid: Option<u32>) -> bool {
+    Some(record.pid) == pid && record.is_local()
 }

@@ -7,6 +7,7 @@ pub mod in_process;
 mod labellers;
 pub mod processes;
 mod records;
+pub mod slots;
 mod starts;
 
 use std::path::Path;
@@ -55,6 +56,9 @@ pub struct Listen {
     pub tls: Option<Tls>,
 }
 
+/// What is said when a campaign is asked to stop.
+const STOPPING: &str = "stopping: walks are checkpointed …";
+
 /// The reactor at work.
 type ReactorTask = tokio::task::JoinHandle<Result<reactor::Ended, reactor::ReactorError>>;
 
@@ -95,11 +99,11 @@ pub fn cores() -> u32 {
     thread::available_parallelism().map_or(1, |cores| cores.get()) as u32
 }
 
-/// Whether somebody has asked this process to stop, and what wakes whoever waits for that.
-fn asked_to_stop() -> Result<(Arc<AtomicBool>, Arc<Notify>), Failure> {
+/// Whether somebody has asked this process to stop, and what wakes whoever waits for that; `told` is said then.
+pub fn asked_to_stop(told: &'static str) -> Result<(Arc<AtomicBool>, Arc<Notify>), Failure> {
     let (stopping, stop) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
     let asked = (Arc::clone(&stopping), Arc::clone(&stop));
-    stop_on_signals(move || {
+    stop_on_signals(told, move || {
         asked.0.store(true, Ordering::Relaxed);
         asked.1.notify_one();
     })?;
@@ -107,7 +111,7 @@ fn asked_to_stop() -> Result<(Arc<AtomicBool>, Arc<Notify>), Failure> {
 }
 
 /// Ctrl-C, SIGTERM and a closed terminal: the first calls `stop`, which stops in order, the second ends at once (which is safe too).
-fn stop_on_signals(stop: impl Fn() + Send + 'static) -> Result<(), Failure> {
+fn stop_on_signals(told: &'static str, stop: impl Fn() + Send + 'static) -> Result<(), Failure> {
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
     let mut hangup = signal(SignalKind::hangup()).map_err(Failure::failed)?;
@@ -118,7 +122,7 @@ fn stop_on_signals(stop: impl Fn() + Send + 'static) -> Result<(), Failure> {
                 process::exit(130);
             }
             stop();
-            say("stopping: walks are checkpointed …");
+            say(told);
         }
     });
     Ok(())

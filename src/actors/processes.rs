@@ -18,11 +18,11 @@ use wire::place::Place;
 
 use super::agents::{self, Agents};
 use super::crew::{self, Crew};
-use super::{CHANNEL, ReactorTask, Run, asked_to_stop, start_reactor, starts, wanted_walkers};
+use super::{CHANNEL, ReactorTask, Run, STOPPING, asked_to_stop, start_reactor, starts, wanted_walkers};
 use crate::outcome::Failure;
 
 /// Labellers give their signs of life in the database, which may be busy for a while.
-const LABELLER_SILENCE: Duration = Duration::from_secs(60);
+pub const LABELLER_SILENCE: Duration = Duration::from_secs(60);
 
 /// Runs the campaign until it is done or stopped. To be awaited on the main thread: the walkers end with the thread that
 /// starts them.
@@ -48,7 +48,7 @@ async fn work_in(place: &Place, run: Run<'_>, selector: Selector) -> Result<reac
     let shared = shared.map_err(Failure::failed)?;
     let server = Server::open(place, sizes, session(process)).map_err(Failure::failed)?;
 
-    let (stopping, stop) = asked_to_stop()?;
+    let (stopping, stop) = asked_to_stop(STOPPING)?;
     let limits = Limits {
         silence: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
         restarts: campaign.config.run.restarts,

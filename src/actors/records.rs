@@ -59,11 +59,11 @@ impl<'a> Records<'a> {
         let record = self.walkers.remove(&number);
         // One that could not even be started has none.
         let record = record.unwrap_or_else(|| new_record(ProcessRecord::WALKER, number, 0));
-        let record = judged(record, ended);
         if ended.then != Standing::GoneHome {
-            self.walkers.insert(number, record.clone());
+            self.walkers.insert(number, judged(record.clone(), ended));
         }
-        self.write_down(&record, ended).await
+        tell(ProcessRecord::WALKER, number, ended);
+        write_down(self.store, record, ended).await
     }
 
     /// A labeller's process ended, and left this record if it had one.
@@ -74,7 +74,8 @@ impl<'a> Records<'a> {
         ended: &Ended,
     ) -> Result<(), StoreError> {
         let record = record.unwrap_or_else(|| new_record(ProcessRecord::LABELLER, number, 0));
-        self.write_down(&judged(record, ended), ended).await
+        tell(ProcessRecord::LABELLER, number, ended);
+        write_down(self.store, record, ended).await
     }
 
     /// Gives the signs of life of this process and of its walkers, and says which messages were dropped.
@@ -102,21 +103,25 @@ impl<'a> Records<'a> {
         }
         Ok(())
     }
+}
 
-    /// Writes down how a process ended.
-    async fn write_down(&self, record: &ProcessRecord, ended: &Ended) -> Result<(), StoreError> {
-        if ended.then == Standing::GoneHome {
-            return self.store.remove_process(&record.id).await;
-        }
-        let ProcessRecord { kind, number, .. } = record;
-        let shown = number.map_or_else(|| kind.clone(), |number| format!("{kind} {number}"));
-        say(format_args!("{shown}: {}; {}", ended.ending, ended.then));
-        self.store.upsert_process(record).await?;
-        let detail = json!({
-            "kind": kind, "number": number, "incarnation": ended.incarnation, "how": ended.ending.to_string(),
-            "then": ended.then.to_string(),
-        });
-        self.store.log_operation(unix_milliseconds(), "process_ended", &detail).await
+/// Writes down how a process ended that has this record.
+pub async fn write_down(store: &Store, record: ProcessRecord, ended: &Ended) -> Result<(), StoreError> {
+    if ended.then == Standing::GoneHome {
+        return store.remove_process(&record.id).await;
+    }
+    let record = judged(record, ended);
+    store.upsert_process(&record).await?;
+    let detail = json!({
+        "kind": record.kind, "number": record.number, "incarnation": ended.incarnation,
+        "how": ended.ending.to_string(), "then": ended.then.to_string(),
+    });
+    store.log_operation(unix_milliseconds(), "process_ended", &detail).await
+}
+
+fn tell(kind: &str, number: u32, ended: &Ended) {
+    if ended.then != Standing::GoneHome {
+        say(format_args!("{kind} {number}: {}; {}", ended.ending, ended.then));
     }
 }
 

@@ -2,16 +2,17 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use orchestrator::launcher::{Children, Launch, ask_to_end};
 use orchestrator::supervisor::Limits;
-use store::{ProcessRecord, Store};
+use store::{ProcessRecord, Store, StoreError};
 use wire::ipc::Handle;
 
 use super::Run;
 use super::labellers::Labellers;
 use crate::campaign::Campaign;
-use crate::config::LabelMethod;
+use crate::labelling::Labelling;
 use crate::outcome::Failure;
 use crate::setup::{self, LabellerSetup, WalkerSetup};
 
@@ -39,30 +40,27 @@ pub fn walker(
 /// The labellers: those that an earlier run left and that work as this one wants it, and new ones in the other places.
 pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failure> {
     let Run { campaign, store, directory, .. } = run;
-    let LabelMethod::Reference(potential) = &campaign.config.label.method;
-    let setup = LabellerSetup {
-        number: 0,
-        restarts: 0,
-        directory: absolute(directory)?,
-        store: campaign.config.run.store.clone(),
-        kind: potential.kind,
-        file: absolute(potential.file.get_ref())?,
-        file_hash: campaign.hash_of("label.method.reference.file"),
-        protocol: campaign.protocol.clone(),
-        attempts: campaign.config.label.attempts.get(),
-        largest_force: campaign.config.label.largest_force.get(),
+    let location = match &campaign.config.run.store {
+        Some(url) => PathBuf::from(url),
+        None => absolute(directory)?,
     };
-    let hash = setup.hash();
-    let slots = campaign.config.label.slots.get() as u32;
+    let label = &campaign.config.label;
+    let labelling = Labelling {
+        method: campaign.method().map_err(Failure::failed)?,
+        protocol: campaign.protocol.clone(),
+        attempts: label.attempts.get(),
+        largest_force: label.largest_force.get(),
+        lease: Duration::from_secs(label.lease.get().into()),
+    };
+    let setup = LabellerSetup::new(location, labelling);
+    let (hash, slots) = (setup.hash(), label.slots as u32);
     let mut labellers = Children::new(slots, limits, move |number, incarnation| {
-        let setup = LabellerSetup { number, restarts: incarnation.saturating_sub(1), ..setup.clone() };
+        let restarts = incarnation.saturating_sub(1);
+        let setup = LabellerSetup { number: Some(number), restarts, ..setup.clone() };
         Launch::this_program(["labeller"], setup::bytes(&setup)).for_own_session()
     });
     let mut adopted = BTreeMap::new();
-    for found in store.processes(Some(ProcessRecord::LABELLER)).await? {
-        if !found.is_local() || found.is_gone() {
-            continue;
-        }
+    for found in left_by_runs(store).await? {
         let wanted = found.number.filter(|_| found.setup.as_ref() == Some(&hash) && found.state == "running");
         match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.birth).is_ok()) {
             Some(number) => drop(adopted.insert(number, found.pid)),
@@ -75,12 +73,17 @@ pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failur
 
 /// Asks the labellers that an earlier run left to end: this run makes its labels itself.
 pub async fn no_labellers(store: &Store) -> Result<(), Failure> {
-    for found in store.processes(Some(ProcessRecord::LABELLER)).await? {
-        if found.is_local() && !found.is_gone() {
-            let _ = ask_to_end(found.pid, &found.birth);
-        }
+    for found in left_by_runs(store).await? {
+        let _ = ask_to_end(found.pid, &found.birth);
     }
     Ok(())
+}
+
+/// The labellers here that an earlier run started. Those of `calmwalk label` have no number, and are their own masters.
+async fn left_by_runs(store: &Store) -> Result<Vec<ProcessRecord>, StoreError> {
+    let mut labellers = store.processes(Some(ProcessRecord::LABELLER)).await?;
+    labellers.retain(|found| found.number.is_some() && found.is_local() && !found.is_gone());
+    Ok(labellers)
 }
 
 fn absolute(path: &Path) -> Result<PathBuf, Failure> {

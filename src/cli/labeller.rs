@@ -1,33 +1,36 @@
 //! `calmwalk labeller`
 
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::time::Duration;
 
 use orchestrator::launcher;
 use store::{Location, ProcessRecord, Store, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
-use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Timing, serve};
+use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Stay, Timing, serve};
 
 use super::{Ended, Failure, block_on};
-use crate::setup::{self, LabellerSetup, unchanged};
+use crate::output::say;
+use crate::setup::{self, LabellerSetup};
 
-/// A labeller's process; `calmwalk run` starts it
+/// A labeller's process; `calmwalk run` and `calmwalk label` start it
 ///
 /// It reads what to do from standard input. If the run that started it is killed it goes on until the queue is empty, or
-/// until the next run takes it over. SIGTERM ends it after the label in hand.
+/// until the next run takes it over; with `calmwalk label` it ends. SIGTERM ends it after the label in hand.
 #[derive(Debug, clap::Args)]
 pub struct Labeller {}
 
 impl Labeller {
     pub fn run(self) -> Result<Ended, Failure> {
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
-        launcher::own_session().map_err(Failure::failed)?;
         let setup: LabellerSetup = setup::read()?;
-        unchanged(&setup.file, &setup.file_hash)?;
-        let method = ReferenceMethod::new(setup.kind.load(&setup.file).map_err(Failure::Input)?);
+        match &setup.slot {
+            Some(slot) => launcher::end_with_parent(slot.parent).map_err(Failure::failed)?,
+            None => launcher::own_session().map_err(Failure::failed)?,
+        }
+        let method = setup.method.load()?;
         let closing = Arc::new(Closing::default());
         block_on(label(setup, method, &closing))??;
-        Ok(if closing.stopping.load(Ordering::Relaxed) { Ended::Interrupted } else { Ended::Done })
+        Ok(if closing.is_stopping() { Ended::Interrupted } else { Ended::Done })
     }
 }
 
@@ -36,28 +39,37 @@ async fn label(setup: LabellerSetup, method: ReferenceMethod, closing: &Arc<Clos
         (signal(SignalKind::terminate()).map_err(Failure::failed)?, Arc::clone(closing));
     tokio::spawn(async move {
         while terminate.recv().await.is_some() {
-            asked.stopping.store(true, Ordering::Relaxed);
+            asked.stop();
         }
     });
-    let store = match &setup.store {
-        Some(url) => Store::open(url.parse::<Location>()?).await?,
-        None => Store::open(&setup.directory).await?,
-    };
-    let record = ProcessRecord::new(
-        ProcessRecord::LABELLER,
-        Some(setup.number),
-        std::process::id(),
-        unix_milliseconds(),
-    );
-    let record = ProcessRecord { setup: Some(setup.hash()), restarts: setup.restarts, ..record };
+    let location: Location =
+        setup.location.to_str().map_or_else(|| Ok(Location::from(&setup.location)), str::parse)?;
+    let store = Store::open(location).await?;
+    let (pid, now) = (std::process::id(), unix_milliseconds());
+    let record = ProcessRecord::new(ProcessRecord::LABELLER, setup.number, pid, now);
+    // Nobody adopts a slot.
+    let hash = setup.slot.is_none().then(|| setup.hash());
+    let record = ProcessRecord { setup: hash, restarts: setup.restarts, ..record };
+    let slot = setup.slot.as_ref();
     let settings = LabellerSettings {
         holder: record.id.clone(),
         protocol: setup.protocol,
         attempts: setup.attempts,
         largest_force: setup.largest_force,
-        timing: Timing::default(),
+        stay: if slot.is_none_or(|slot| slot.until_empty) { Stay::UntilEmpty } else { Stay::UntilFinished },
+        timing: Timing {
+            lease: setup.lease,
+            grace: slot.map(|slot| Duration::from_secs_f64(slot.grace)),
+            ..Timing::default()
+        },
     };
-    serve(store.clone(), method, settings, record, closing, unix_milliseconds).await?;
+    let tells = slot.is_some();
+    let tell = |line: &str| {
+        if tells {
+            say(line);
+        }
+    };
+    serve(store.clone(), method, settings, record, closing, unix_milliseconds, tell).await?;
     store.close().await;
     Ok(())
 }

@@ -6,6 +6,7 @@ mod clean;
 mod export;
 mod import;
 mod init;
+mod label;
 mod labeller;
 mod md;
 mod queue;
@@ -39,6 +40,7 @@ enum Command {
     Validate(validate::Validate),
     Run(run::Run),
     Agent(agent::Agent),
+    Label(label::Label),
     Status(status::Status),
     Queue(queue::Queue),
     Export(export::Export),
@@ -60,6 +62,7 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Validate(command) => command.run(),
         Command::Run(command) => command.run(),
         Command::Agent(command) => command.run(),
+        Command::Label(command) => command.run(),
         Command::Status(command) => command.run(),
         Command::Queue(command) => command.run(),
         Command::Export(command) => command.run(),
@@ -91,5 +94,8 @@ impl CampaignLocation {
 fn block_on<T>(future: impl Future<Output = T>) -> Result<T, Failure> {
     let runtime =
         tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(Failure::failed)?;
-    Ok(runtime.block_on(future))
+    let done = runtime.block_on(future);
+    // A label that was given back goes on in its thread; nobody waits for it.
+    runtime.shutdown_background();
+    Ok(done)
 }

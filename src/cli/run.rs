@@ -86,6 +86,10 @@ async fn run(
     let store = lock.iter().fold(store, Store::led_by);
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
+    if campaign.config.label.slots == 0 {
+        let shown = shown(&location);
+        say(format_args!("label.slots = 0: labels come from calmwalk label --store {shown}"));
+    }
     let run = actors::Run { campaign, store: &store, process: &process, directory, listen };
     let work = async {
         if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
@@ -102,9 +106,8 @@ async fn run(
     let summary = summary::of(&store, campaign.protocol.hash).await?;
     let failed = store.status().await?.labels.failed;
     let (shown, file) = match &location {
-        Location::Directory(_) => (location.to_string(), format!("/{DATABASE}")),
-        // The shell has uses of its own for '?' and '&'.
-        Location::Server(url) => (format!("'{url}'"), String::new()),
+        Location::Directory(_) => (shown(&location), format!("/{DATABASE}")),
+        Location::Server(_) => (shown(&location), String::new()),
     };
     print(|out| {
         writeln!(out, "{summary}")?;
@@ -118,6 +121,15 @@ async fn run(
     })?;
     store.close().await;
     Ok(Ended::Done)
+}
+
+/// The location as an argument of a command.
+fn shown(location: &Location) -> String {
+    match location {
+        Location::Directory(_) => location.to_string(),
+        // The shell has uses of its own for '?' and '&'.
+        Location::Server(url) => format!("'{url}'"),
+    }
 }
 
 /// Waits until another process has the lock.
@@ -150,6 +162,9 @@ async fn open_store(campaign: &Campaign, location: &Location) -> Result<Store, F
             store
         }
     };
+    let files = serde_json::to_string(&campaign.label_files().map_err(Failure::failed)?);
+    store.set_label_files(&files.map_err(Failure::failed)?).await?;
+    // Labellers that wait for the campaign begin with its protocol.
     store.add_protocol(&campaign.protocol, now).await?;
     Ok(store)
 }

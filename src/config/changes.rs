@@ -5,13 +5,14 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 15] = [
+pub(super) const CHANGEABLE: [&str; 16] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
     "collect.declined_features_mb",
     "calm.forgetting_alarm",
     "label.slots",
+    "label.lease",
     "label.attempts",
     "label.largest_force",
     "label.queue_limit",

@@ -207,9 +207,12 @@ pub struct LabelSection {
     /// Name of the protocol, as exports and imports call it.
     #[serde(default = "defaults::protocol")]
     pub protocol: String,
-    /// Labels calculated side by side.
+    /// Labels calculated side by side by `run`; 0: all come from `calmwalk label`.
     #[serde(default = "defaults::slots")]
-    pub slots: NonZeroUsize,
+    pub slots: usize,
+    /// How long a job is leased to a labeller, s.
+    #[serde(default = "defaults::lease")]
+    pub lease: NonZeroU32,
     /// Attempts before a label counts as failed.
     #[serde(default = "defaults::attempts")]
     pub attempts: NonZeroU32,
@@ -387,8 +390,12 @@ mod defaults {
         "reference".to_owned()
     }
 
-    pub fn slots() -> NonZeroUsize {
-        NonZeroUsize::MIN
+    pub fn slots() -> usize {
+        1
+    }
+
+    pub fn lease() -> NonZeroU32 {
+        nonzero(600)
     }
 
     pub fn attempts() -> NonZeroU32 {

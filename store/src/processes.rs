@@ -9,6 +9,8 @@ use crate::error::Result;
 /// A process of this system may be silent for so long (ms) without having lost what it holds: the whole system slept,
 /// or its clock was put right. One that hangs for longer does not keep its jobs for ever.
 const SLEEP: i64 = 24 * 3600 * 1000;
+/// A process of another host that has been silent for so long (ms) cannot be counted on. Signs of life are seconds apart.
+const SILENCE: i64 = 60 * 1000;
 
 /// A process that works for the campaign.
 ///
@@ -39,6 +41,10 @@ pub struct ProcessRecord {
     pub setup: Option<String>,
     /// What is worth knowing besides: the last failure, messages that were dropped.
     pub remark: String,
+    /// How long it has been silent, ms by the clock of the database's server. None where the database serves one host; not
+    /// written.
+    #[serde(skip)]
+    pub silence: Option<i64>,
 }
 
 impl FromRow for ProcessRecord {
@@ -56,6 +62,7 @@ impl FromRow for ProcessRecord {
             restarts: row.get_or_default("restarts")?,
             setup: row.get_or_default("setup")?,
             remark: row.get_or_default("remark")?,
+            silence: row.get_or_default("silence")?,
         })
     }
 }
@@ -94,22 +101,32 @@ impl ProcessRecord {
     }
 
     /// Whether it runs no longer, as far as can be seen from here. One without a birth is taken for whatever process has
-    /// its number now.
+    /// its number now. Where several hosts share the database, a birth of another boot may be one of another host, and
+    /// only a day of silence says that it is gone.
     pub fn is_gone(&self) -> bool {
-        birth::is_of_another_boot(&self.birth)
-            || (self.is_local() && !birth::is_running(self.pid, &self.birth))
+        match (self.is_local(), self.silence) {
+            (true, _) => !birth::is_running(self.pid, &self.birth),
+            (false, Some(silence)) => silence >= SLEEP,
+            (false, None) => birth::is_of_another_boot(&self.birth),
+        }
+    }
+
+    /// Whether nobody here can see it, and its host has not been heard of for a minute.
+    pub fn is_silent(&self) -> bool {
+        !self.is_local() && self.silence.is_some_and(|silence| silence >= SILENCE)
     }
 
     /// Whether it may be at work on something that it leased for `seconds`, although that time is over: see
     /// [`crate::Store::lease`].
     pub(crate) fn may_be_at_work(&self, now: i64, seconds: u32) -> bool {
-        let silence = if self.is_local() { SLEEP } else { 1000 * i64::from(seconds) };
-        !self.is_gone() && now.saturating_sub(self.last_seen) < silence
+        let allowed = if self.is_local() { SLEEP } else { 1000 * i64::from(seconds) };
+        let silence = self.silence.unwrap_or_else(|| now.saturating_sub(self.last_seen));
+        !self.is_gone() && silence < allowed
     }
 
-    /// Whether it runs the campaign and is not gone.
+    /// Whether it runs the campaign, and is neither gone nor silent.
     pub fn is_leading(&self) -> bool {
-        self.kind == Self::ORCHESTRATOR && !self.is_gone()
+        self.kind == Self::ORCHESTRATOR && !self.is_gone() && !self.is_silent()
     }
 
     /// Whether it came after `other` to do the same here, and is not gone itself.
@@ -160,6 +177,18 @@ mod tests {
         assert!(!version_1(&renamed).is_local());
         let reused = ProcessRecord { birth: format!("{}0", record.birth), ..record };
         assert!(reused.is_gone());
+    }
+
+    #[test]
+    fn what_was_born_on_another_host_is_gone_after_a_day_of_silence() {
+        let record = ProcessRecord { birth: "another-boot/1/1".into(), ..own(ProcessRecord::ORCHESTRATOR) };
+        let silent_for = |silence| ProcessRecord { silence: Some(silence), ..record.clone() };
+        assert!(record.is_gone(), "where there is one host");
+        assert!(silent_for(SILENCE - 1).is_leading() && !silent_for(SILENCE - 1).is_silent());
+        assert!(silent_for(SILENCE).is_silent() && !silent_for(SILENCE).is_leading());
+        assert!(!silent_for(SLEEP - 1).is_gone() && silent_for(SLEEP).is_gone());
+        let here = ProcessRecord { silence: Some(SLEEP), ..own(ProcessRecord::ORCHESTRATOR) };
+        assert!(!here.is_gone() && !here.is_silent() && here.is_leading(), "it can be seen to run");
     }
 
     #[test]

@@ -86,6 +86,11 @@ impl Store {
         }
     }
 
+    /// Whether [`Self::wait_for_jobs`] is told of jobs.
+    pub fn tells_of_jobs(&self) -> bool {
+        matches!(self.database, Database::Postgres(_))
+    }
+
     /// Closes every connection. What was committed is safe without it.
     pub async fn close(&self) {
         self.database.close().await;

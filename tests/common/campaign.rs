@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::config;
-use store::{ComponentRecord, ExportFilter, Store};
+use store::{ComponentRecord, ExportFilter, Location, Store};
 
 /// Keys that tests vary.
 #[derive(Clone, Debug)]
@@ -96,15 +96,21 @@ pub struct Outcome {
 
 /// Reads the outcome of the campaign in `directory` and checks that nothing is lost or doubled in it.
 pub fn outcome(directory: &Path) -> Outcome {
+    outcome_at(&directory.display().to_string(), directory)
+}
+
+/// The same of a campaign wherever it is kept; `directory` is where something may be written.
+pub fn outcome_at(location: &str, directory: &Path) -> Outcome {
     let output = directory.join("dataset.extxyz");
-    let arguments = ["export", &directory.display().to_string(), "--control", "--output"];
+    let arguments = ["export", location, "--control", "--output"];
     super::succeed(
         directory,
         arguments.iter().map(|a| (*a).to_owned()).chain([output.display().to_string()]),
     );
+    let location: Location = if location == "." { directory.into() } else { location.parse().expect("one") };
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     runtime.block_on(async {
-        let store = Store::open_read_only(directory).await.expect("the campaign's database");
+        let store = Store::open_read_only(location).await.expect("the campaign's database");
         check_books(&store).await;
         let walks = store.load_walks().await.expect("walks").into_iter();
         Outcome {

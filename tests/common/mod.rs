@@ -3,6 +3,7 @@
 
 pub mod campaign;
 pub mod desk;
+pub mod place;
 pub mod processes;
 
 use std::path::{Path, PathBuf};

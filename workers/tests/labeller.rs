@@ -17,7 +17,7 @@ use store::{
     DATABASE, JobState, LabelRecord, ProcessRecord, Standing, Store, StoreError, this_host, unix_milliseconds,
 };
 use tokio::task::JoinHandle;
-use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Timing, run, serve};
+use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Stay, Timing, run, serve};
 
 /// A method that begins labels at once and ends them only while it is open.
 #[derive(Clone, Default)]
@@ -87,10 +87,12 @@ fn settings(holder: &str) -> LabellerSettings {
         protocol: protocol("dft"),
         attempts: 3,
         largest_force: 100.0,
+        stay: Stay::UntilEmpty,
         timing: Timing {
             lease: Duration::from_secs(1),
             idle: Duration::from_millis(5),
             sign_of_life: Duration::from_millis(20),
+            grace: None,
         },
     }
 }
@@ -122,7 +124,8 @@ impl Labeller {
         let store = Store::open(directory).await.unwrap();
         let (method, closing) = (gate.method(), Arc::new(Closing::default()));
         let (process, asked) = (living("l", ProcessRecord::LABELLER, Some(0)), Arc::clone(&closing));
-        let task = async move { serve(store, method, settings, process, &asked, unix_milliseconds).await };
+        let task =
+            async move { serve(store, method, settings, process, &asked, unix_milliseconds, |_| ()).await };
         Self { closing, task: tokio::spawn(task) }
     }
 
@@ -151,10 +154,12 @@ async fn a_lease_lasts_as_long_as_the_label_takes() {
     let store = create(directory.path()).await;
     let candidates = accept(&store, 1).await;
     let gate = Gate::default();
-    let closing = Closing { no_more_jobs: true.into(), ..Closing::default() };
+    let closing = Closing::default();
+    closing.set_no_more_jobs(true);
     let (method, own, mut settings) = (gate.method(), store.clone(), settings("a/0"));
     settings.timing.lease = Duration::from_secs(3);
-    let labeller = tokio::spawn(async move { run(own, method, settings, &closing, unix_milliseconds).await });
+    let labeller =
+        tokio::spawn(async move { run(own, method, settings, &closing, unix_milliseconds, |_| ()).await });
     gate.wait_for_labels(1).await;
     let begun = Instant::now();
     while begun.elapsed() < Duration::from_millis(4500) {
@@ -202,7 +207,7 @@ async fn a_label_is_not_lost_while_the_database_is_locked() {
     let mut other = other.connect().await.unwrap();
     sqlx::query("BEGIN IMMEDIATE").execute(&mut other).await.unwrap();
     gate.open.store(true, Ordering::Relaxed);
-    labeller.closing.stopping.store(true, Ordering::Relaxed);
+    labeller.closing.stop();
     tokio::time::sleep(Duration::from_secs(35)).await;
     assert!(!labeller.task.is_finished());
     assert_eq!(number(&store, JobState::Labelled).await, 0);
@@ -254,7 +259,7 @@ async fn a_stop_waits_for_the_label_in_hand_and_signs_of_life_go_on() {
     let gate = Gate::default();
     let labeller = Labeller::serving(directory.path(), &gate).await;
     gate.wait_for_labels(1).await;
-    labeller.closing.stopping.store(true, Ordering::Relaxed);
+    labeller.closing.stop();
     let own = async || store.processes(Some("labeller")).await.unwrap().remove(0);
     until("nobody can see that it stops", async || own().await.state == "stopping").await;
     let first = own().await.last_seen;
@@ -264,6 +269,45 @@ async fn a_stop_waits_for_the_label_in_hand_and_signs_of_life_go_on() {
     labeller.ended().await.unwrap();
     let numbers = (number(&store, JobState::Labelled).await, number(&store, JobState::Queued).await);
     assert_eq!((numbers, names(&store).await), ((1, 1), vec![]));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_label_that_takes_too_long_after_a_stop_is_given_back() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let candidates = accept(&store, 1).await;
+    let gate = Gate::default();
+    let mut settings = settings("l");
+    settings.timing.grace = Some(Duration::from_millis(300));
+    let labeller = Labeller::with(directory.path(), &gate, settings).await;
+    gate.wait_for_labels(1).await;
+    let begun = Instant::now();
+    labeller.closing.stop();
+    labeller.ended().await.unwrap();
+    assert!(begun.elapsed() >= Duration::from_millis(300));
+    assert_eq!((number(&store, JobState::Queued).await, names(&store).await), (1, vec![]));
+    let job = store.queue_show(&candidates[0]).await.unwrap();
+    assert_eq!((job.job.failures, job.attempts_made[0].outcome.as_deref()), (0, Some("released")));
+}
+
+/// Also without an orchestrator, until every walk is over.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_labeller_that_is_to_stay_waits_for_the_end_of_the_campaign() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let (gate, settings) = (Gate::opened(), LabellerSettings { stay: Stay::UntilFinished, ..settings("l") });
+    let labeller = Labeller::with(directory.path(), &gate, settings).await;
+    for walks in [vec![], vec![walk(0, 1)]] {
+        store.commit(&store::Commit { walks, ..store::Commit::default() }).await.unwrap();
+        accept_from(&store, 1 + gate.begun.load(Ordering::Relaxed) as u64, 2).await;
+        until("no label comes", async || number(&store, JobState::Queued).await == 0).await;
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        assert!(!labeller.task.is_finished());
+    }
+    let over = store::WalkRecord { state: "steps".into(), ..walk(0, 2) };
+    store.commit(&store::Commit { walks: vec![over], ..store::Commit::default() }).await.unwrap();
+    labeller.ended().await.unwrap();
+    assert_eq!((number(&store, JobState::Labelled).await, names(&store).await), (4, vec![]));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use store::{ProcessRecord, Status, unix_milliseconds};
+use store::{ProcessRecord, Status, this_host, unix_milliseconds};
 
 use super::SHOWN;
 use crate::output::Table;
@@ -65,12 +65,18 @@ fn line(process: &ProcessRecord, now: i64) -> Vec<String> {
     let number = process.number.map_or(String::new(), |number| format!(" {number}"));
     vec![
         format!("{}{number}", process.kind),
-        process.pid.to_string(),
+        pid(process),
         process.state.clone(),
         process.restarts.to_string(),
-        ago(now - process.last_seen),
+        ago(process.silence.unwrap_or(now - process.last_seen)),
         first_line(&process.remark),
     ]
+}
+
+/// Its number, which is of use on its host only.
+fn pid(process: &ProcessRecord) -> String {
+    let ProcessRecord { pid, host, .. } = process;
+    if host.is_empty() || *host == this_host() { pid.to_string() } else { format!("{pid}@{host}") }
 }
 
 /// What a process said may have many lines, and bytes that a terminal obeys.

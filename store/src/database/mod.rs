@@ -12,7 +12,7 @@ pub mod value;
 
 use sqlx::{Postgres, Sqlite};
 
-pub use query::query;
+pub use query::{Query, query};
 pub(crate) use row::from_columns;
 pub use row::{FromRow, Row};
 pub use rows::for_rows;
@@ -80,6 +80,11 @@ impl Database {
             Self::Sqlite(file) => Ok(Transaction::Sqlite(file.readers.begin().await?)),
             Self::Postgres(server) => server.begin_to_read().await,
         }
+    }
+
+    /// Whether leases go by the clock of a server.
+    pub fn has_a_clock(&self) -> bool {
+        matches!(self, Self::Postgres(server) if server.clock == Clock::Server)
     }
 
     pub async fn close(&self) {

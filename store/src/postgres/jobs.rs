@@ -60,13 +60,12 @@ impl Drop for Jobs {
     }
 }
 
-/// Never ends: a connection that breaks is made again. What came meanwhile is unknown, so whoever waits looks.
+/// Never ends: a connection that breaks is made again. What came before it listens is unknown, so whoever waits looks then.
 async fn listen(options: PgConnectOptions, channel: String, heard: watch::Sender<u64>) {
     loop {
         // Errors need no answer: without a listener a wait takes its longest time.
         let _ = hear(options.clone(), &channel, &heard).await;
         tokio::time::sleep(PAUSE).await;
-        heard.send_modify(|heard| *heard += 1);
     }
 }
 
@@ -78,6 +77,7 @@ async fn hear(
     let pool = PgPoolOptions::new().max_connections(1).connect_lazy_with(options);
     let mut listener = PgListener::connect_with(&pool).await?;
     listener.listen(channel).await?;
+    heard.send_modify(|heard| *heard += 1);
     while listener.try_recv().await?.is_some() {
         heard.send_modify(|heard| *heard += 1);
     }

@@ -1,23 +1,26 @@
 //! The processes of a campaign, and what comes back of those that are gone.
 
-use std::collections::HashMap;
-
 use serde_json::json;
 
 use super::logs::insert_operation;
 use super::queue::{InVain, end_in_vain};
 use crate::Store;
-use crate::database::{Transaction, query};
+use crate::database::{Query, Transaction, query};
 use crate::error::Result;
 use crate::processes::ProcessRecord;
 
-pub(super) const LEASED: &str = "SELECT number, holder FROM job WHERE state = 'leased'";
+pub(crate) const LEASED: &str = "SELECT number, holder FROM job WHERE state = 'leased'";
+
+const PROCESSES: &str = "SELECT * FROM process WHERE $1 IS NULL OR kind = $1 ORDER BY started, id";
+
+/// The same on a server, which knows how long each has been silent.
+const PROCESSES_WITH_SILENCE: &str = "SELECT process.*, server_clock() - heard AS silence FROM process
+    WHERE $1 IS NULL OR kind = $1 ORDER BY started, id";
 
 impl Store {
     /// The processes of a kind, or all, in the order in which they started.
     pub async fn processes(&self, kind: Option<&str>) -> Result<Vec<ProcessRecord>> {
-        let sql = "SELECT * FROM process WHERE $1 IS NULL OR kind = $1 ORDER BY started, id";
-        query(sql).bind(kind).fetch_all(&self.database).await
+        of_kind(kind, self.database.has_a_clock()).fetch_all(&self.database).await
     }
 
     /// See [`Self::upsert_processes`].
@@ -30,11 +33,12 @@ impl Store {
     /// for as long as it has one.
     pub async fn upsert_processes(&self, processes: &[ProcessRecord]) -> Result<()> {
         let mut transaction = self.database.begin().await?;
+        let known = all(&mut transaction).await?;
         for process in processes {
-            let sql = "SELECT * FROM process WHERE kind = $1 AND number IS NOT DISTINCT FROM $2 AND id <> $3";
-            let query = query(sql).bind(&process.kind).bind(process.number).bind(&process.id);
-            let others: Vec<ProcessRecord> = query.fetch_all(&mut transaction).await?;
-            for other in others.iter().filter(|other| other.is_gone()) {
+            let place = |record: &ProcessRecord| (record.kind.clone(), record.number);
+            let others =
+                known.iter().filter(|other| other.id != process.id && place(other) == place(process));
+            for other in others.filter(|other| other.is_gone()) {
                 remove(&mut transaction, &other.id).await?;
             }
             insert(&mut transaction, process).await?;
@@ -90,21 +94,13 @@ impl Store {
     }
 }
 
-pub(super) async fn all(transaction: &mut Transaction) -> Result<Vec<ProcessRecord>> {
-    query("SELECT * FROM process ORDER BY started, id").fetch_all(&mut *transaction).await
+/// Every process.
+pub(crate) async fn all(transaction: &mut Transaction) -> Result<Vec<ProcessRecord>> {
+    of_kind(None, transaction.has_a_clock()).fetch_all(transaction).await
 }
 
-/// Every process, last seen when the clock by which leases go says so.
-pub(super) async fn all_as_heard(transaction: &mut Transaction) -> Result<Vec<ProcessRecord>> {
-    let mut processes = all(transaction).await?;
-    if transaction.has_a_clock() {
-        let heard: Vec<(String, i64)> = query("SELECT id, heard FROM process").fetch_all(transaction).await?;
-        let heard: HashMap<_, _> = heard.into_iter().collect();
-        for process in &mut processes {
-            process.last_seen = heard.get(&process.id).copied().unwrap_or(process.last_seen);
-        }
-    }
-    Ok(processes)
+fn of_kind(kind: Option<&str>, has_a_clock: bool) -> Query {
+    query(if has_a_clock { PROCESSES_WITH_SILENCE } else { PROCESSES }).bind(kind)
 }
 
 async fn insert(transaction: &mut Transaction, process: &ProcessRecord) -> Result<()> {

@@ -85,6 +85,30 @@ impl Store {
         transaction.commit().await
     }
 
+    /// Where the leader of the campaign has the files that its labels are made with, as it last said; JSON.
+    pub async fn label_files(&self) -> Result<Option<String>> {
+        let files = query("SELECT value FROM campaign WHERE key = 'label_files'");
+        files.fetch_optional(&self.database).await
+    }
+
+    /// Says where they are now.
+    pub async fn set_label_files(&self, files: &str) -> Result<()> {
+        if self.label_files().await?.as_deref() == Some(files) {
+            return Ok(());
+        }
+        let mut transaction = self.database.begin_to_lead().await?;
+        set_campaign_value(&mut transaction, "label_files", files).await?;
+        transaction.commit().await
+    }
+
+    /// The protocol of new label jobs, if there is one.
+    pub async fn protocol_in_force(&self) -> Result<Option<Protocol>> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let Some(number) = in_force(&mut transaction).await? else { return Ok(None) };
+        let row = query("SELECT hash, name, settings FROM protocol WHERE number = $1").bind(number);
+        protocol(row.fetch_one(&mut transaction).await?).map(Some)
+    }
+
     /// Adds seed structures; those with the index of one that is there replace it.
     pub async fn add_seed_structures(&self, seeds: &[SeedStructure]) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;
@@ -140,14 +164,14 @@ impl Store {
     pub async fn protocols(&self) -> Result<Vec<Protocol>> {
         let sql = "SELECT hash, name, settings FROM protocol ORDER BY number";
         let rows: Vec<(Vec<u8>, String, String)> = query(sql).fetch_all(&self.database).await?;
-        rows.into_iter()
-            .map(|(hash, name, settings)| {
-                let settings = serde_json::from_str(&settings);
-                let settings = settings.map_err(|error| StoreError::damaged("a protocol", error))?;
-                Ok(Protocol { hash: decode_hash(&hash)?, name, settings })
-            })
-            .collect()
+        rows.into_iter().map(protocol).collect()
     }
+}
+
+fn protocol((hash, name, settings): (Vec<u8>, String, String)) -> Result<Protocol> {
+    let settings = serde_json::from_str(&settings);
+    let settings = settings.map_err(|error| StoreError::damaged("a protocol", error))?;
+    Ok(Protocol { hash: decode_hash(&hash)?, name, settings })
 }
 
 async fn set_campaign_value(transaction: &mut Transaction, key: &str, value: &str) -> Result<()> {

@@ -42,7 +42,7 @@ const LOST_TOO_OFTEN: &str = "lost_too_often";
 
 /// How an attempt ended that brought nothing.
 #[derive(Clone, Copy)]
-pub(super) enum InVain<'a> {
+pub(crate) enum InVain<'a> {
     /// It failed: the job is given up after `limit` of these.
     Failed { class: &'a str, log: &'a str, limit: u32 },
     /// Nobody works on it any longer: `released`, `lost` or `expired`.
@@ -185,6 +185,13 @@ impl Store {
         Ok(jobs.len())
     }
 
+    /// Whether every walk is over. None has begun in a campaign that is just being made.
+    pub async fn all_walks_are_over(&self) -> Result<bool> {
+        let sql = "SELECT EXISTS (SELECT 1 FROM walk)
+                   AND NOT EXISTS (SELECT 1 FROM walk WHERE state IN ('waiting', 'running'))";
+        query(sql).fetch_one(&self.database).await
+    }
+
     /// Number of jobs that are queued or leased.
     pub async fn unfinished_jobs(&self) -> Result<u64> {
         query(UNFINISHED).fetch_one(&self.database).await
@@ -203,7 +210,7 @@ async fn end_expired(transaction: &mut Transaction, now: i64, seconds: u32) -> R
     if expired.is_empty() {
         return Ok(());
     }
-    let processes = processes::all_as_heard(transaction).await?;
+    let processes = processes::all(transaction).await?;
     let holds_on = |process: &&ProcessRecord| process.may_be_at_work(now, seconds);
     let at_work: Vec<_> = processes.iter().filter(holds_on).collect();
     for (job, holder) in expired {
@@ -228,7 +235,7 @@ pub(super) async fn end_attempt(
 }
 
 /// Ends the attempt that is under way without a result: the job waits for another, or is given up. Returns which.
-pub(super) async fn end_in_vain(
+pub(crate) async fn end_in_vain(
     transaction: &mut Transaction,
     job: i64,
     how: InVain<'_>,

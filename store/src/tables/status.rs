@@ -1,5 +1,6 @@
 //! The state of a campaign, from indexes.
 
+use super::processes;
 use crate::Store;
 use crate::database::query;
 use crate::error::Result;
@@ -17,8 +18,9 @@ const WALKS: &str =
     FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure ORDER BY walk";
 
 impl Store {
-    /// Everything at one instant. Processes are in order of kind and number. A process that is gone has the state `gone`, whatever was said of it before, unless
-    /// it was `given up`, or is `pausing` and an orchestrator lives.
+    /// Everything at one instant. Processes are in order of kind and number. A process that is gone has the
+    /// state `gone`, whatever was said of it before, unless it was `given up`, or is `pausing` and an orchestrator lives. One
+    /// of another host that has said nothing for a minute is `silent`.
     pub async fn status(&self) -> Result<Status> {
         let mut transaction = self.database.begin_to_read().await?;
         let fates: Vec<(String, String, u64)> = query(FATES).fetch_all(&mut transaction).await?;
@@ -30,8 +32,7 @@ impl Store {
         let last: Option<(u64, u64)> = query(sql).fetch_optional(&mut transaction).await?;
         let (mixture_version, round) = last.unwrap_or_default();
         let imported = query("SELECT count(*) FROM import").fetch_one(&mut transaction).await?;
-        let processes = query("SELECT * FROM process ORDER BY started, id");
-        let processes: Vec<ProcessRecord> = processes.fetch_all(&mut transaction).await?;
+        let processes = processes::all(&mut transaction).await?;
         transaction.commit().await?;
         let labels = labels(&states);
         let under_way = |walk: &WalkStatus| matches!(walk.state.as_str(), "waiting" | "running");
@@ -87,11 +88,13 @@ fn seen_from_here(mut processes: Vec<ProcessRecord>) -> Vec<ProcessRecord> {
     let rank = |kind: &str| ranks.iter().position(|k| *k == kind).unwrap_or(ranks.len());
     processes.sort_by_key(|process| (rank(&process.kind), process.number));
     let led = processes.iter().any(ProcessRecord::is_leading);
-    for process in processes.iter_mut().filter(|process| process.is_gone()) {
+    for process in &mut processes {
         let state = process.state.as_str();
         let stays = state.starts_with("given up") || (led && state.starts_with("pausing"));
-        if !stays {
+        if process.is_gone() && !stays {
             process.state = "gone".to_owned();
+        } else if process.is_silent() && matches!(state, "running" | "stopping") {
+            process.state = "silent".to_owned();
         }
     }
     processes

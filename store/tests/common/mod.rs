@@ -149,8 +149,13 @@ pub fn walk(walk: u32, turn: u64) -> WalkRecord {
 
 /// Commits `number` accepted candidates of walk 0 and returns their names.
 pub async fn accept(store: &Store, number: u64) -> Vec<String> {
+    accept_from(store, 1, number).await
+}
+
+/// The same from a step on.
+pub async fn accept_from(store: &Store, first: u64, number: u64) -> Vec<String> {
     let mut names = Vec::new();
-    for step in 1..=number {
+    for step in first..first + number {
         let record = candidate(0, step, Origin::Biased, Fate::Accepted);
         names.push(name_of(&record));
         store.commit(&commit_of(vec![record])).await.unwrap();

@@ -1,6 +1,5 @@
 //! What has to be written, however busy or full the database is.
 
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use store::StoreError;
@@ -32,9 +31,7 @@ async fn insist_for<T, F: Future<Output = Result<T, StoreError>>>(
             Err(error) if error.is_transient() => error,
             done => return done,
         };
-        if closing.stopping.load(Ordering::Relaxed)
-            && asked_to_stop.get_or_insert_with(Instant::now).elapsed() >= last_tries
-        {
+        if closing.is_stopping() && asked_to_stop.get_or_insert_with(Instant::now).elapsed() >= last_tries {
             return Err(error);
         }
         tokio::time::sleep(pause).await;
@@ -78,7 +75,7 @@ mod tests {
         let full = insist_for(SHORT, last_tries, &closing, || {
             tries += 1;
             if tries == 20 {
-                closing.stopping.store(true, Ordering::Relaxed);
+                closing.stop();
                 asked = Some(Instant::now());
             }
             ready(Err::<(), _>(StoreError::DiskFull))

@@ -2,27 +2,35 @@
 //!
 //! [`run`] is one of the tasks of a process, [`serve`] a process of its own, which outlives its orchestrator.
 
+mod closing;
 mod insist;
 mod judge;
 mod presence;
 pub mod reference;
+mod told;
 
 use std::panic;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::pin::pin;
+use std::time::{Duration, Instant};
 
 use store::records::{Label, Lease, Protocol};
 use store::{Store, StoreError};
 use tokio::task::{JoinError, spawn_blocking};
 
+use closing::Wanted;
 use insist::insist;
-pub use presence::serve;
+use told::Became;
+
+pub use closing::Closing;
+pub use presence::{Stay, serve};
 pub use reference::{LabelFailure, ReferenceMethod};
 
 /// Between two signs of life in the store, of every process that gives them there.
 pub const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
-/// The longest time between two looks at the queue.
+/// The longest time between two looks at the queue …
 const LONGEST_IDLE: Duration = Duration::from_secs(1);
+/// … and where the database tells of new jobs: only leases that ran out are not told of.
+const TOLD_IDLE: Duration = Duration::from_secs(5);
 /// Which part of the time without work passes until the next look, and so how late work may be found.
 const IDLE_PART: u32 = 8;
 
@@ -37,6 +45,8 @@ pub struct LabellerSettings {
     pub attempts: u32,
     /// Largest force that is believed, eV/Å.
     pub largest_force: f64,
+    /// For how long it is of use, if it is a process of its own, while nobody leads the campaign.
+    pub stay: Stay,
     /// How often it does what has to be done again and again.
     pub timing: Timing,
 }
@@ -53,11 +63,19 @@ pub struct Timing {
     pub idle: Duration,
     /// Between two signs of life of a labeller that is a process.
     pub sign_of_life: Duration,
+    /// How long the label in hand may go on when the labeller is asked to stop, before it is given back; none for as long
+    /// as it takes.
+    pub grace: Option<Duration>,
 }
 
 impl Default for Timing {
     fn default() -> Self {
-        Self { lease: Duration::from_secs(600), idle: Duration::from_millis(50), sign_of_life: SIGN_OF_LIFE }
+        Self {
+            lease: Duration::from_secs(600),
+            idle: Duration::from_millis(50),
+            sign_of_life: SIGN_OF_LIFE,
+            grace: None,
+        }
     }
 }
 
@@ -65,15 +83,6 @@ impl Timing {
     fn lease_seconds(&self) -> u32 {
         u32::try_from(self.lease.as_secs()).unwrap_or(u32::MAX).max(1)
     }
-}
-
-/// When a labeller may go home.
-#[derive(Debug, Default)]
-pub struct Closing {
-    /// No more jobs will be queued: go home once there are none.
-    pub no_more_jobs: AtomicBool,
-    /// Go home after the label in hand.
-    pub stopping: AtomicBool,
 }
 
 /// What a look at the queue finds.
@@ -84,7 +93,7 @@ enum Found {
     TheEnd,
 }
 
-/// Labels until there is nothing more to do. `now` is asked for ms since 1970.
+/// Labels until there is nothing more to do. `now` is asked for ms since 1970; `tell` gets a line for each job.
 ///
 /// A database that is busy or full is no reason to end: the queue is looked at again later, and a label that was made is
 /// brought again and again, after `closing` asks to stop for a minute more.
@@ -97,28 +106,34 @@ pub async fn run(
     settings: LabellerSettings,
     closing: &Closing,
     now: impl Fn() -> i64,
+    tell: impl Fn(&str),
 ) -> Result<(), StoreError> {
     let mut idle = Duration::ZERO;
-    while !closing.stopping.load(Ordering::Relaxed) {
-        let last_look = closing.no_more_jobs.load(Ordering::Relaxed);
-        let lease = match look(&store, &settings, last_look, now()).await {
+    loop {
+        let wanted = closing.wanted();
+        if wanted.stop {
+            return Ok(());
+        }
+        let lease = match look(&store, &settings, wanted.no_more_jobs, now()).await {
             Ok(Found::Job(lease)) => lease,
-            Ok(Found::TheEnd) => break,
+            Ok(Found::TheEnd) => return Ok(()),
             Err(error) if !error.is_transient() => return Err(error),
-            Ok(Found::Nothing) | Err(_) => {
-                let wait = (idle / IDLE_PART).min(LONGEST_IDLE).max(settings.timing.idle);
-                nap(wait, settings.timing.idle, closing, last_look).await;
-                idle += wait;
+            looked => {
+                idle += wait(&store, idle, settings.timing.idle, looked.is_ok(), closing, wanted).await;
                 continue;
             }
         };
         idle = Duration::ZERO;
-        let made;
-        (method, made) = make(&store, method, &lease, &settings.timing, &now).await?;
+        let begun = Instant::now();
+        let Some((used, made)) = make(&store, method, &lease, &settings.timing, closing, &now).await? else {
+            tell(&format!("{} is given back: there is no time to finish it", lease.candidate));
+            return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
+        };
+        method = used;
         let judged = made.and_then(|label| judge::judge(label, &lease, settings.largest_force));
-        insist(closing, || deliver(&store, &lease, &judged, &settings, now())).await?;
+        let became = insist(closing, || deliver(&store, &lease, &judged, &settings, now())).await?;
+        tell(&told::line(&lease, &judged, &became, begun.elapsed().as_secs_f64()));
     }
-    Ok(())
 }
 
 async fn look(
@@ -135,37 +150,48 @@ async fn look(
     Ok(lease.map_or(Found::Nothing, |lease| Found::Job(Box::new(lease))))
 }
 
-/// Waits in steps of `step`, so that it ends at once when there may be a reason to go home.
-async fn nap(wait: Duration, step: Duration, closing: &Closing, last_look: bool) {
-    let mut left = wait;
-    while !left.is_zero()
-        && !closing.stopping.load(Ordering::Relaxed)
-        && closing.no_more_jobs.load(Ordering::Relaxed) == last_look
-    {
-        tokio::time::sleep(left.min(step)).await;
-        left = left.saturating_sub(step);
+/// Waits until there may be work after `idle` without any, or until something else is `wanted`. Returns how long, at most.
+async fn wait(
+    store: &Store,
+    idle: Duration,
+    least: Duration,
+    answers: bool,
+    closing: &Closing,
+    wanted: Wanted,
+) -> Duration {
+    let wait = match answers && store.tells_of_jobs() {
+        true => TOLD_IDLE,
+        false => (idle / IDLE_PART).min(LONGEST_IDLE).max(least),
+    };
+    tokio::select! {
+        () = store.wait_for_jobs(wait) => {}
+        () = closing.other_than(wanted) => {}
     }
+    wait
 }
 
 /// Makes a label on a thread of its own, and renews the lease meanwhile. A label whose lease was lost is made to its
-/// end: if another is first, it becomes a check.
+/// end: if another is first, it becomes a check. `None` if there was no time for that.
 async fn make(
     store: &Store,
     mut method: ReferenceMethod,
     lease: &Lease,
     timing: &Timing,
+    closing: &Closing,
     now: impl Fn() -> i64,
-) -> Result<(ReferenceMethod, Result<Label, LabelFailure>), StoreError> {
+) -> Result<Option<(ReferenceMethod, Result<Label, LabelFailure>)>, StoreError> {
     let structure = lease.structure.clone();
     let mut making = spawn_blocking(move || {
         let made = method.label(&structure);
         (method, made)
     });
     let mut held = true;
+    let mut too_late = pin!(end_of_grace(timing.grace, closing));
     loop {
         let seconds = timing.lease_seconds();
         tokio::select! {
-            made = &mut making => return made.or_else(crashed),
+            made = &mut making => return made.or_else(crashed).map(Some),
+            () = &mut too_late => return Ok(None),
             () = tokio::time::sleep(Duration::from_secs(seconds.into()) / 3), if held => {
                 held = match store.renew(lease, now(), seconds).await {
                     // There is time for another try.
@@ -174,6 +200,16 @@ async fn make(
                 };
             }
         }
+    }
+}
+
+async fn end_of_grace(grace: Option<Duration>, closing: &Closing) {
+    match grace {
+        Some(grace) => {
+            closing.stopped().await;
+            tokio::time::sleep(grace).await;
+        }
+        None => std::future::pending().await,
     }
 }
 
@@ -188,11 +224,12 @@ async fn deliver(
     judged: &Result<Label, LabelFailure>,
     settings: &LabellerSettings,
     now: i64,
-) -> Result<(), StoreError> {
+) -> Result<Became, StoreError> {
     match judged {
-        Ok(label) => store.complete(lease, label, now).await.map(|_| ()),
+        Ok(label) => store.complete(lease, label, now).await.map(Became::Completed),
         Err(failure) => {
-            store.fail(lease, failure.class(), &failure.to_string(), settings.attempts, now).await.map(|_| ())
+            let (class, log) = (failure.class(), failure.to_string());
+            store.fail(lease, class, &log, settings.attempts, now).await.map(Became::Failed)
         }
     }
 }

@@ -1,0 +1,134 @@
+//! `calmwalk label`
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use store::{Location, Store, StoreError};
+use tokio::sync::Notify;
+
+use super::{Ended, Failure, block_on};
+use crate::actors::asked_to_stop;
+use crate::actors::slots::{self, Slots};
+use crate::labelling::Labelling;
+use crate::output::say;
+
+/// Between two looks whether the campaign is there.
+const PAUSE: Duration = Duration::from_secs(2);
+
+/// Label what a campaign collects, anywhere that reaches its store
+///
+/// Method, protocol and limits are those of the campaign's [label] section. Labels as many structures side by side as there
+/// are slots, each in a process of its own. Waits for work while the campaign is run or may be run again, and ends when it
+/// is finished (exit code 0), or on Ctrl-C or SIGTERM (130): labels in hand are finished then, or given back if they take
+/// longer than --grace.
+#[derive(Debug, clap::Args)]
+pub struct Label {
+    /// Directory of the campaign (on its host), or the postgres:// URL of its store
+    #[arg(long, value_name = "LOCATION")]
+    store: PathBuf,
+    /// Labels to make side by side
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    slots: u32,
+    /// The method that the campaign must have, to be sure [default: whatever its configuration says]
+    #[arg(long, value_name = "NAME")]
+    method: Option<String>,
+    /// A file that the method needs and that is not where the campaign's leader has it; known by its content. May be given
+    /// several times
+    #[arg(long = "file", value_name = "PATH")]
+    files: Vec<PathBuf>,
+    /// End when no label is waited for and nobody runs the campaign
+    #[arg(long)]
+    until_empty: bool,
+    /// After a stop, labels in hand have so long to be finished, s: less than a batch system leaves between SIGTERM and SIGKILL
+    #[arg(long, value_name = "SECONDS", default_value_t = 20.0, value_parser = seconds)]
+    grace: f64,
+    /// Wait so long for a campaign that has not begun yet, or whose store cannot be reached yet, min
+    #[arg(long, value_name = "MINUTES", default_value_t = 0.0, value_parser = seconds)]
+    wait: f64,
+}
+
+impl Label {
+    pub fn run(self) -> Result<Ended, Failure> {
+        block_on(self.label())?
+    }
+
+    async fn label(self) -> Result<Ended, Failure> {
+        let (stopping, stop) = asked_to_stop("stopping: labels in hand are finished or given back …")?;
+        let location: Location =
+            self.store.to_str().map_or_else(|| Ok(Location::from(&self.store)), str::parse)?;
+        let Some((store, labelling)) = self.begin(&location, &stopping, &stop).await? else {
+            return Ok(Ended::Interrupted);
+        };
+        let slots = Slots {
+            number: self.slots,
+            location: match location {
+                Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
+                // With its password, if it has one.
+                Location::Server(_) => self.store,
+            },
+            labelling,
+            until_empty: self.until_empty,
+            grace: Duration::from_secs_f64(self.grace),
+        };
+        let ended = slots::work(&store, slots, &stopping, &stop).await;
+        store.close().await;
+        ended
+    }
+
+    /// Opens the store, as soon as there is a campaign in it; `None` if somebody asked to stop first.
+    async fn begin(
+        &self,
+        location: &Location,
+        stopping: &Arc<AtomicBool>,
+        stop: &Notify,
+    ) -> Result<Option<(Store, Labelling)>, Failure> {
+        let (begun, mut told) = (Instant::now(), false);
+        while !stopping.load(Ordering::Relaxed) {
+            let error = match self.open(location).await {
+                Ok(opened) => return Ok(Some(opened)),
+                Err(Early::NotYet(error)) if begun.elapsed().as_secs_f64() < 60.0 * self.wait => error,
+                Err(Early::NotYet(error)) => return Err(error.into()),
+                Err(Early::Never(failure)) => return Err(failure),
+            };
+            if !std::mem::replace(&mut told, true) {
+                say(format_args!("waiting for the campaign: {error}"));
+            }
+            tokio::select! { () = tokio::time::sleep(PAUSE) => {}, () = stop.notified() => {} }
+        }
+        Ok(None)
+    }
+
+    async fn open(&self, location: &Location) -> Result<(Store, Labelling), Early> {
+        let store = Store::open(location).await?;
+        let Some(protocol) = store.protocol_in_force().await? else {
+            let lacks = "label protocol yet";
+            return Err(Early::NotYet(StoreError::Missing { location: location.to_string(), lacks }));
+        };
+        match Labelling::of(&store, protocol, self.method.as_deref(), &self.files).await {
+            Ok(labelling) => Ok((store, labelling)),
+            Err(failure) => Err(Early::Never(failure)),
+        }
+    }
+}
+
+/// Why there is nothing to label yet.
+enum Early {
+    NotYet(StoreError),
+    Never(Failure),
+}
+
+impl From<StoreError> for Early {
+    fn from(error: StoreError) -> Self {
+        match error {
+            StoreError::Missing { .. } | StoreError::Unreachable(_) => Self::NotYet(error),
+            error => Self::Never(error.into()),
+        }
+    }
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|number| (0.0..=1e6).contains(number));
+    number.ok_or_else(|| "expected 0 to 1e6".to_owned())
+}

@@ -1,0 +1,189 @@
+//! Where a test keeps a campaign that others label: its directory; in the test targets `postgres…` a schema of a server.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use atoms::{Cell, Structure};
+use serde_json::Value;
+use store::{
+    AtomGrades, CandidateRecord, Commit, Decision, Fate, JobDetails, Location, Store, unix_milliseconds,
+};
+use tempfile::TempDir;
+use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
+
+use super::campaign::Small;
+use super::{Running, calmwalk, program, succeed};
+
+/// A directory with `campaign.toml`, and the URL of the store if that is on a server.
+pub struct Place {
+    directory: TempDir,
+    url: Option<String>,
+}
+
+impl Place {
+    /// With this configuration; `changes` are replaced in its text.
+    pub fn new(small: &Small, changes: &[(&str, &str)]) -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let path = small.write(directory.path());
+        let mut text = fs::read_to_string(&path).unwrap();
+        for (from, to) in changes {
+            assert!(text.contains(from), "no {from}");
+            text = text.replacen(from, to, 1);
+        }
+        let url = env!("CARGO_CRATE_NAME").starts_with("postgres").then(new_schema);
+        if let Some(url) = &url {
+            text = text.replacen("[run]\n", &format!("[run]\nstore = \"{url}\"\n"), 1);
+        }
+        fs::write(path, text).unwrap();
+        Self { directory, url }
+    }
+
+    pub fn path(&self) -> &Path {
+        self.directory.path()
+    }
+
+    /// As an argument of commands that run in its directory.
+    pub fn argument(&self) -> &str {
+        self.url.as_deref().unwrap_or(".")
+    }
+
+    /// As `Store::open` takes it.
+    pub fn location(&self) -> Location {
+        self.url.as_ref().map_or_else(|| self.path().into(), |url| url.parse().unwrap())
+    }
+
+    /// Starts a command whose standard error goes to the file `said`.
+    pub fn start(&self, arguments: &[&str]) -> Running {
+        self.spawn(program(self.path()), arguments)
+    }
+
+    /// The same with a command that runs the program somehow.
+    pub fn spawn(&self, mut command: Command, arguments: &[&str]) -> Running {
+        let said = fs::File::options().create(true).append(true).open(self.path().join("said")).unwrap();
+        Running(command.args(arguments).stdout(Stdio::null()).stderr(said).spawn().expect("it starts"))
+    }
+
+    /// `calmwalk run`
+    pub fn run(&self) -> Running {
+        self.start(&["run", "campaign.toml", "--directory", "."])
+    }
+
+    /// `calmwalk label` with these arguments besides.
+    pub fn label(&self, arguments: &[&str]) -> Running {
+        self.start(&[&["label", "--store", self.argument()], arguments].concat())
+    }
+
+    /// What commands have said so far.
+    pub fn said(&self) -> String {
+        fs::read_to_string(self.path().join("said")).unwrap_or_default()
+    }
+
+    /// `calmwalk status`; null while there is no campaign.
+    pub fn status(&self) -> Value {
+        let output = calmwalk(self.path(), ["status", self.argument(), "--json"]);
+        serde_json::from_slice(&output.stdout).unwrap_or_default()
+    }
+
+    /// Number of jobs in a state.
+    pub fn jobs(&self, state: &str) -> u64 {
+        self.status()["labels"][state].as_u64().unwrap_or_default()
+    }
+
+    /// The bytes of an export.
+    pub fn export(&self) -> Vec<u8> {
+        succeed(self.path(), ["export", self.argument(), "--control", "--output", "exported.extxyz"]);
+        fs::read(self.path().join("exported.extxyz")).unwrap()
+    }
+
+    /// A job with its attempts.
+    pub fn job(&self, candidate: &str) -> JobDetails {
+        on_store(self.location(), async |store| store.queue_show(candidate).await.unwrap())
+    }
+
+    /// Queues a structure whose label takes a second or more. Returns the name of its candidate.
+    pub fn queue_large(&self) -> String {
+        let candidate = large();
+        let name = candidate.id.to_string();
+        let grades = AtomGrades { gamma: candidate.gamma.clone(), gamma_nbr: candidate.gamma_nbr.clone() };
+        let record = CandidateRecord {
+            block: CandidateBlock::encode(&candidate),
+            fate: Fate::Accepted,
+            seed_structure: 0,
+            selector: grades.clone(),
+            original: grades,
+            keep_features: false,
+            priority: 10,
+        };
+        let decision = Decision {
+            round: 0,
+            kind: "accepted",
+            walk: Some(candidate.id.walk),
+            candidate: Some(candidate.id),
+            mixture_version: 0,
+            detail: Value::Null,
+        };
+        let commit = Commit { decisions: vec![decision], candidates: vec![record], ..Commit::default() };
+        on_store(self.location(), async |store| store.commit(&commit).await.unwrap());
+        name
+    }
+}
+
+/// Does something with the store.
+pub fn on_store<T>(location: Location, act: impl AsyncFnOnce(&Store) -> T) -> T {
+    tokio::runtime::Runtime::new().unwrap().block_on(async {
+        let store = Store::open(location).await.unwrap();
+        let done = act(&store).await;
+        store.close().await;
+        done
+    })
+}
+
+/// Aluminium, fcc, of so many atoms that its label takes a while.
+fn large() -> Candidate {
+    const CELLS: usize = 28;
+    let (a, basis) = (4.05, [[0.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]]);
+    let corners = (0..CELLS.pow(3)).map(|k| [k / CELLS / CELLS, k / CELLS % CELLS, k % CELLS]);
+    let atoms = corners.flat_map(|corner| {
+        basis.map(|shift| std::array::from_fn(|axis| a * (corner[axis] as f64 + shift[axis])))
+    });
+    let positions: Vec<[f64; 3]> = atoms.collect();
+    let (n, edge) = (positions.len(), a * CELLS as f64);
+    let structure = Structure {
+        species: vec!["Al".parse().unwrap(); n],
+        positions,
+        cell: Cell::orthorhombic(edge, edge, edge),
+        periodic: [true; 3],
+    };
+    let id = CandidateId {
+        campaign: wire::CampaignId([1; 16]),
+        walk: WalkId(0),
+        segment: 0,
+        step: 1,
+        content: ContentHash::of(&structure),
+    };
+    Candidate {
+        id,
+        origin: Origin::Biased,
+        mixture_version: 0,
+        temperature: 300.0,
+        relative_volume: 1.0,
+        energy: 0.0,
+        virial: [[0.0; 3]; 3],
+        forces: vec![[0.0; 3]; n],
+        gamma: vec![2.0; n],
+        gamma_nbr: vec![2.0; n],
+        features: Vec::new(),
+        structure,
+    }
+}
+
+/// The URL of a schema of its own; the server of the tests is thrown away with it.
+fn new_schema() -> String {
+    static NUMBER: AtomicU64 = AtomicU64::new(0);
+    let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+    let server = std::env::var("CALMWALK_POSTGRES")
+        .expect("CALMWALK_POSTGRES must be the URL of a PostgreSQL server; '.ci/postgres start' makes one");
+    format!("{server}?schema=whole_{}_{}_{number}", std::process::id(), unix_milliseconds())
+}

@@ -1,0 +1,269 @@
+//! `calmwalk label`: labellers that nobody's run starts. The same tests on PostgreSQL are in `postgres_label.rs`.
+
+mod common;
+
+use std::fs;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use common::campaign::{Outcome, Small, outcome, outcome_at};
+use common::place::Place;
+use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
+use common::{Running, calmwalk, config, program, refuse, succeed};
+use store::{JobState, Standing};
+
+/// `run` starts no labellers of its own.
+const NO_SLOTS: (&str, &str) = ("[label]", "[label]\nslots = 0");
+
+fn ended(running: &mut Running) -> Option<i32> {
+    running.0.wait().expect("a child").code()
+}
+
+/// The same campaign, all in one process.
+fn expected(small: &Small) -> Outcome {
+    let directory = tempfile::tempdir().unwrap();
+    small.write(directory.path());
+    succeed(directory.path(), ["run", "campaign.toml", "--directory", ".", "--in-process"]);
+    outcome(directory.path())
+}
+
+/// A campaign that is over, and in whose queue is one structure that takes its time. Returns its name as well.
+fn with_large_structure(changes: &[(&str, &str)]) -> (Place, String) {
+    let place = Place::new(&Small { steps: 60, ..Small::default() }, changes);
+    assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
+    let name = place.queue_large();
+    (place, name)
+}
+
+fn wait_for_lease(place: &Place) {
+    wait_until("the structure is leased", || place.jobs("leased") == 1);
+}
+
+#[test]
+fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
+    let small = Small::default();
+    let place = Place::new(&small, &[NO_SLOTS]);
+    // It may be there before the campaign.
+    let mut label = place.label(&["--slots", "2", "--method", "reference", "--wait", "2"]);
+    wait_until("it waits", || place.said().contains("waiting for the campaign: there is no campaign in"));
+    let mut run = place.run();
+    wait_until("both slots show in status", || {
+        let status = place.status();
+        let processes = status["processes"].as_array().cloned().unwrap_or_default();
+        let slots =
+            processes.iter().filter(|process| process["kind"] == "labeller" && process["state"] == "running");
+        slots.count() == 2
+    });
+    assert_eq!(ended(&mut run), Some(0), "{}", place.said());
+    assert_eq!(ended(&mut label), Some(0), "{}", place.said());
+    let said = place.said();
+    assert!(said.contains("label.slots = 0: labels come from calmwalk label --store "), "{said}");
+    let labels = place.jobs("labelled") as usize;
+    assert!(labels > 0 && said.matches(": labelled ").count() == labels, "{labels} in {said}");
+    assert_eq!(outcome_at(place.argument(), place.path()), expected(&small));
+    assert_eq!(place.status()["processes"], serde_json::json!([]));
+    nothing_is_left(place.path());
+}
+
+#[test]
+fn everything_in_one_process_waits_for_labels_of_others() {
+    let small = Small { steps: 60, ..Small::default() };
+    let place = Place::new(&small, &[NO_SLOTS]);
+    let mut run = place.start(&["run", "campaign.toml", "--directory", ".", "--in-process"]);
+    wait_until("walks are over", || {
+        let status = place.status();
+        let walks = status["walks"].as_array().cloned().unwrap_or_default();
+        let under_way = |walk: &&serde_json::Value| walk["state"] == "running" || walk["state"] == "waiting";
+        place.jobs("queued") > 0 && !walks.iter().any(|walk| under_way(&walk))
+    });
+    assert!(run.0.try_wait().unwrap().is_none(), "{}", place.said());
+    assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
+    assert_eq!(ended(&mut run), Some(0), "{}", place.said());
+    assert_eq!(outcome_at(place.argument(), place.path()), expected(&small));
+}
+
+#[test]
+fn what_it_is_killed_over_is_labelled_by_the_next() {
+    let (place, name) = with_large_structure(&[]);
+    let mut label = place.label(&["--until-empty"]);
+    wait_for_lease(&place);
+    label.0.kill().unwrap();
+    label.0.wait().unwrap();
+    wait_until("its slot ends with it", || processes_in(place.path()).is_empty());
+    assert_ne!(place.job(&name).job.state, JobState::Labelled);
+    assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
+    let job = place.job(&name);
+    let outcomes: Vec<_> = job.attempts_made.iter().map(|attempt| attempt.outcome.as_deref()).collect();
+    assert_eq!((job.job.state, job.job.failures), (JobState::Labelled, 0));
+    assert_eq!(outcomes, [Some("lost"), Some("labelled")]);
+}
+
+#[test]
+fn a_slot_that_is_killed_is_replaced_and_the_others_go_on() {
+    let (place, name) = with_large_structure(&[]);
+    let mut label = place.label(&["--slots", "2", "--until-empty"]);
+    wait_for_lease(&place);
+    let holder = place.job(&name).job.holder.unwrap();
+    let pid: u32 = holder.rsplit('-').nth(1).unwrap().parse().unwrap();
+    let slots = carrying_out(place.path(), "labeller");
+    assert!(slots.len() == 2 && slots.contains(&pid), "{slots:?} {holder}");
+    signal(pid, "KILL");
+    assert_eq!(ended(&mut label), Some(0), "{}", place.said());
+    assert!(place.said().contains("killed by signal 9 (SIGKILL); pausing"), "{}", place.said());
+    assert_eq!(place.job(&name).job.state, JobState::Labelled);
+    assert_eq!(place.status()["processes"], serde_json::json!([]));
+}
+
+#[test]
+fn a_stop_finishes_the_label_in_hand_or_gives_it_back() {
+    let (place, name) = with_large_structure(&[]);
+    let mut label = place.label(&["--grace", "0"]);
+    wait_for_lease(&place);
+    signal(label.0.id(), "TERM");
+    assert_eq!(ended(&mut label), Some(130), "{}", place.said());
+    assert_eq!(place.job(&name).job.state, JobState::Queued);
+    assert_eq!(place.job(&name).attempts_made[0].outcome.as_deref(), Some("released"));
+    assert!(place.said().contains("is given back"), "{}", place.said());
+    let mut label = place.label(&["--grace", "100"]);
+    wait_for_lease(&place);
+    signal(label.0.id(), "INT");
+    assert_eq!(ended(&mut label), Some(130), "{}", place.said());
+    assert_eq!(place.job(&name).job.state, JobState::Labelled);
+    wait_until("nobody is left", || processes_in(place.path()).is_empty());
+    assert_eq!(place.status()["processes"], serde_json::json!([]));
+}
+
+#[test]
+fn wrong_files_methods_and_stores_are_refused() {
+    let label = config("data/Al_mm.eam.fs");
+    let place = Place::new(
+        &Small { steps: 60, ..Small::default() },
+        &[(&label.display().to_string(), "label.eam.fs"), NO_SLOTS],
+    );
+    let here = place.path();
+    let content = fs::read_to_string(&label).unwrap();
+    fs::write(here.join("label.eam.fs"), &content).unwrap();
+    let mut run = place.run();
+    wait_until("there is a structure", || place.jobs("queued") > 0);
+    fs::write(here.join("other.eam.fs"), format!("another comment{content}")).unwrap();
+    fs::rename(here.join("label.eam.fs"), here.join("moved.eam.fs")).unwrap();
+    let command = |arguments: &[&str]| {
+        let all = [&["label", "--until-empty", "--store", place.argument()], arguments].concat();
+        all.into_iter().map(str::to_owned).collect::<Vec<_>>()
+    };
+    let message = refuse(here, command(&[]));
+    let hash = blake3::hash(content.as_bytes()).to_string();
+    for words in ["label.method.reference.file: ", &hash, "label.eam.fs cannot be read here", "--file"] {
+        assert!(message.contains(words), "{message}");
+    }
+    let message = refuse(here, command(&["--file", "other.eam.fs"]));
+    assert!(message.contains("label.eam.fs cannot be read here"), "{message}");
+    let message = refuse(here, command(&["--file", "moved.eam.fs", "--file", "other.eam.fs"]));
+    assert!(
+        message.contains("--file ") && message.contains("other.eam.fs: its content (BLAKE3 "),
+        "{message}"
+    );
+    let message = refuse(here, command(&["--file", "missing"]));
+    assert!(message.contains("--file missing: cannot be read"), "{message}");
+    fs::copy(here.join("other.eam.fs"), here.join("label.eam.fs")).unwrap();
+    let message = refuse(here, command(&[]));
+    assert!(message.contains("label.eam.fs here has another content (BLAKE3 "), "{message}");
+    let message = refuse(here, command(&["--method", "vasp"]));
+    assert!(
+        message.contains("--method vasp, but the labels of this campaign are made by the method 'reference'")
+    );
+
+    let empty = tempfile::tempdir().unwrap();
+    let nowhere = match place.argument() {
+        "." => empty.path().display().to_string(),
+        url => format!("{url}_other"),
+    };
+    let message = refuse(here, ["label", "--store", &nowhere]);
+    assert!(message.contains("there is no campaign in"), "{message}");
+
+    let mut labelling = place.label(&["--until-empty", "--file", "moved.eam.fs"]);
+    assert_eq!(ended(&mut run), Some(0), "{}", place.said());
+    assert_eq!(ended(&mut labelling), Some(0), "{}", place.said());
+}
+
+/// The program on another host, as far as one can show it: with process numbers of its own, and another boot.
+/// `None` where this is not permitted.
+fn elsewhere(place: &Place) -> Option<Command> {
+    let boot = place.path().join("boot_id");
+    fs::write(&boot, "11111111-2222-3333-4444-555555555555\n").unwrap();
+    let flags = ["--user", "--map-root-user", "--pid", "--fork", "--kill-child", "--mount-proc"];
+    // A boot of its own only where hosts share the database: SQLite takes what ran before a boot for gone.
+    let other_boot = match place.argument() {
+        "." => "true".to_owned(),
+        _ => format!("mount --bind {} /proc/sys/kernel/random/boot_id", boot.display()),
+    };
+    let permitted = Command::new("unshare").args(flags).args(["sh", "-c", &other_boot]).output();
+    if !permitted.is_ok_and(|output| output.status.success()) {
+        assert!(std::env::var_os("CI").is_none(), "unshare(1) must be permitted in CI");
+        eprintln!("not tested: unshare(1) is not permitted here");
+        return None;
+    }
+    let mut command = Command::new("unshare");
+    let script = format!("{other_boot} && exec {} \"$@\"", program(place.path()).get_program().display());
+    command.current_dir(place.path()).args(flags).args(["sh", "-c", &script, "sh"]);
+    Some(command)
+}
+
+/// A labeller elsewhere is stopped in mid-label for longer than its lease, and goes on when another has made the label.
+#[test]
+fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
+    let (place, name) = with_large_structure(&[("[label]", "[label]\nlease = 2")]);
+    let Some(command) = elsewhere(&place) else { return };
+    let arguments = ["label", "--until-empty", "--store", place.argument()];
+    let mut late = place.spawn(command, &arguments);
+    wait_for_lease(&place);
+    let slot = carrying_out(place.path(), "labeller");
+    assert_eq!(slot.len(), 1);
+    signal(slot[0], "STOP");
+    let begun = Instant::now();
+    let first = place.job(&name).job;
+    assert_eq!(
+        (first.state, first.attempts),
+        (JobState::Leased, 1),
+        "it was stopped too late: {}",
+        place.said()
+    );
+    assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
+    assert!(begun.elapsed() > Duration::from_secs(1), "not before the lease was over");
+    let exported = place.export();
+    signal(slot[0], "CONT");
+    assert_eq!(ended(&mut late), Some(0), "{}", place.said());
+    assert!(place.said().contains("had its label already; this one is kept as a check"), "{}", place.said());
+    let job = place.job(&name);
+    let outcomes: Vec<_> = job.attempts_made.iter().map(|attempt| attempt.outcome.as_deref()).collect();
+    assert_eq!(outcomes, [Some("check"), Some("labelled")]);
+    let standings: Vec<_> = job.energies.iter().map(|(standing, _)| *standing).collect();
+    assert_eq!((job.job.state, standings), (JobState::Labelled, vec![Standing::Label, Standing::Check]));
+    assert_eq!(place.export(), exported);
+}
+
+/// What this host cannot see it does not take for gone: neither `run` nor another labeller takes the job away.
+#[test]
+fn a_labeller_elsewhere_keeps_its_job_when_a_run_starts() {
+    let (place, name) = with_large_structure(&[("[label]", "[label]\nlease = 60")]);
+    let Some(command) = elsewhere(&place) else { return };
+    let arguments = ["label", "--until-empty", "--store", place.argument()];
+    let mut label = place.spawn(command, &arguments);
+    wait_for_lease(&place);
+    let slot = carrying_out(place.path(), "labeller")[0];
+    signal(slot, "STOP");
+    let mut run = place.run();
+    wait_until("it runs", || {
+        let output = calmwalk(place.path(), ["status", place.argument()]);
+        String::from_utf8_lossy(&output.stdout).contains("\nstate       running")
+    });
+    // Longer than it takes until what is gone is found.
+    std::thread::sleep(Duration::from_secs(6));
+    assert_eq!(place.job(&name).job.attempts, 1, "{}", place.said());
+    assert!(run.0.try_wait().unwrap().is_none(), "{}", place.said());
+    signal(slot, "CONT");
+    assert_eq!(ended(&mut label), Some(0), "{}", place.said());
+    assert_eq!(ended(&mut run), Some(0), "{}", place.said());
+    let job = place.job(&name);
+    assert_eq!((job.job.state, job.job.attempts, job.energies.len()), (JobState::Labelled, 1, 1));
+}
