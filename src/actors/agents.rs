@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use calm::Mixture;
 use serde_json::json;
-use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
+use store::{ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval};
 use wire::net::{self, AgentEvent, Hub, NetError, Welcome};
@@ -39,7 +39,8 @@ impl Handle {
 impl Agents {
     /// Listens where this run is to.
     pub async fn open(run: Run<'_>, session: u64, mixture: &Arc<Mixture>) -> Result<Self, Failure> {
-        let (store, mixture) = (run.store.clone(), Arc::clone(mixture));
+        // What is to be written down waits here while the database is away.
+        let (store, mixture) = (run.store.clone().patient(SERVER_AWAY), Arc::clone(mixture));
         let Some(listen) = run.listen else { return Ok(Self { hub: None, store, mixture }) };
         let config = &run.campaign.config;
         let model = std::path::absolute(config.potential.model.get_ref()).map_err(Failure::failed)?;

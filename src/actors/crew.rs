@@ -11,6 +11,7 @@ use tokio::time::{Interval, MissedTickBehavior, interval};
 use wire::ipc::Handle;
 use workers::labeller::SIGN_OF_LIFE;
 
+use super::answers::Answers;
 use super::labellers::Labellers;
 use super::records::Records;
 use crate::outcome::Failure;
@@ -18,8 +19,8 @@ use crate::output::say;
 
 /// Between two looks whether labels are still to be made, once no more structures will come.
 pub const LAST_LABELS: Duration = Duration::from_millis(100);
-/// A labeller that has lived for so long (ms) is of use: what it was started with is in order.
-pub const PROVEN: i64 = 10_000;
+/// A labeller that has lived for so long is of use: what it was started with is in order.
+pub const PROVEN: Duration = Duration::from_secs(10);
 
 /// Walkers and labellers at work.
 pub struct Crew<'a> {
@@ -35,8 +36,8 @@ pub struct Crew<'a> {
     /// Tells the reactor to send walkers home.
     stopping: Arc<AtomicBool>,
     failure: Option<String>,
-    /// Whether the database could not be written to at the last try.
-    deaf: bool,
+    /// Whether the database does.
+    answers: Answers,
 }
 
 /// What there is to react to.
@@ -75,7 +76,7 @@ impl<'a> Crew<'a> {
             gone: [false; 2],
             stopping,
             failure: None,
-            deaf: false,
+            answers: Answers::default(),
         }
     }
 
@@ -110,18 +111,17 @@ impl<'a> Crew<'a> {
         let done = match event {
             Event::Walker(event) => self.walker(event).await,
             Event::Labeller(event) => self.labeller(event).await,
-            Event::Look => self.look().await,
+            Event::Look => {
+                let looked = self.look().await;
+                self.answers.tried(&looked);
+                looked
+            }
             Event::LastLabels => self.look_for_labels().await,
         };
         match done {
-            Ok(()) => self.deaf = false,
-            Err(error) if error.is_transient() => {
-                if !std::mem::replace(&mut self.deaf, true) {
-                    say(format_args!("signs of life wait: {error}"));
-                }
-                // They cannot be seen to be alive now.
-                self.labellers.all_are_heard();
-            }
+            Ok(()) => {}
+            // They cannot be seen to be alive now.
+            Err(error) if error.is_transient() => self.labellers.all_are_heard(),
             Err(error) => self.fail(error.to_string()),
         }
     }

@@ -16,6 +16,7 @@ use workers::labeller::{self, Closing, LabellerSettings, SIGN_OF_LIFE, Stay, Tim
 use workers::walk::WalkContext;
 use workers::walker;
 
+use super::answers::Answers;
 use super::crew::LAST_LABELS;
 use super::starts::no_labellers;
 use super::{CHANNEL, ReactorTask, Run, STOPPING, start_reactor, stop_on_signals, wanted_walkers};
@@ -38,11 +39,12 @@ pub async fn work(run: Run<'_>, selector: Selector) -> Result<reactor::Ended, Fa
 
 /// Keeps the sign of life in `status` fresh.
 async fn say_alive(store: Store, mut process: ProcessRecord) {
+    let mut answers = Answers::default();
     loop {
         tokio::time::sleep(SIGN_OF_LIFE).await;
         process.last_seen = unix_milliseconds();
         // A busy database can do without this one.
-        let _ = store.upsert_process(&process).await;
+        answers.tried(&store.upsert_process(&process).await);
     }
 }
 

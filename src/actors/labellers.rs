@@ -1,6 +1,7 @@
 //! The labellers of a campaign: processes that outlive their orchestrator and speak to it through the database only.
 
 use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
 
 use orchestrator::launcher::Children;
 use orchestrator::supervisor::Ended;
@@ -12,8 +13,9 @@ pub struct Labellers {
     pub children: Children,
     /// The process of each number: others of that number may still be making their last label.
     pids: BTreeMap<u32, u32>,
-    /// When each last gave a sign of life, ms since 1970.
-    seen: BTreeMap<u32, i64>,
+    /// The last sign of life of each, and since when it gives them. Its clock may be put right, so it says nothing but that
+    /// there is another.
+    seen: BTreeMap<u32, (i64, Instant)>,
     /// Attempts before a label counts as failed.
     attempts: u32,
 }
@@ -50,18 +52,21 @@ impl Labellers {
         Ok(record)
     }
 
-    /// Takes in their signs of life. Those that are older than `proven` (ms) have shown that they are of use.
-    pub async fn look(&mut self, store: &Store, proven: i64) -> Result<(), StoreError> {
+    /// Takes in their signs of life. Those that have given them for longer than `proven` have shown that they are of use.
+    pub async fn look(&mut self, store: &Store, proven: Duration) -> Result<(), StoreError> {
         let signs = self.children.signs();
         let records = store.processes(Some(ProcessRecord::LABELLER)).await?;
         for (&number, &pid) in &self.pids {
             let Some(record) = records.iter().rfind(|record| is_process(record, Some(pid))) else {
                 continue;
             };
-            if self.seen.insert(number, record.last_seen) == Some(record.last_seen) {
+            let before = self.seen.get(&number).copied();
+            if before.is_some_and(|(last, _)| last == record.last_seen) {
                 continue;
             }
-            if record.last_seen - record.started > proven {
+            let since = before.map_or_else(Instant::now, |(_, since)| since);
+            self.seen.insert(number, (record.last_seen, since));
+            if since.elapsed() > proven {
                 signs.useful(number);
             } else {
                 signs.heard(number);

@@ -2,6 +2,7 @@
 
 pub mod agent;
 mod agents;
+mod answers;
 mod crew;
 pub mod in_process;
 mod labellers;
@@ -18,7 +19,7 @@ use std::thread;
 
 use orchestrator::reactor::{self, Reactor};
 use orchestrator::selector::Selector;
-use store::{ProcessRecord, Store};
+use store::{ProcessRecord, SERVER_AWAY, Store};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{Notify, mpsc};
 use wire::net::{Endpoint, Tls};
@@ -74,7 +75,7 @@ fn start_reactor(
     let mut display = Display::new(walk_steps, selector.standing(walk_steps));
     let reactor = Reactor {
         selector,
-        store: run.store.clone(),
+        store: run.store.clone().patient(SERVER_AWAY),
         incoming,
         stopping: Arc::clone(stopping),
         queue_limit: u64::from(config.label.queue_limit.get()),

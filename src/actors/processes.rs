@@ -2,6 +2,7 @@
 //!
 //! Walkers end with this process; labellers go on without it, and the next run adopts them.
 
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -12,6 +13,7 @@ use orchestrator::supervisor::Limits;
 use store::ProcessRecord;
 use tokio::sync::{Notify, mpsc};
 use tokio::task::{JoinError, JoinHandle};
+use tokio::time::{Sleep, sleep};
 use wire::ipc::{Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
 use wire::place::Place;
@@ -21,6 +23,8 @@ use super::crew::{self, Crew};
 use super::{CHANNEL, ReactorTask, Run, STOPPING, asked_to_stop, start_reactor, starts, wanted_walkers};
 use crate::outcome::Failure;
 
+/// What is on its way to the database when everybody is gone may take so long.
+const LAST_WORDS: Duration = Duration::from_secs(60);
 /// Labellers give their signs of life in the database, which may be busy for a while.
 pub const LABELLER_SILENCE: Duration = Duration::from_secs(60);
 
@@ -101,8 +105,13 @@ async fn lead(
     stop: &Notify,
 ) -> Result<reactor::Ended, Failure> {
     let (mut decided, mut closed, mut asked) = (None, None, false);
+    let mut last_words = None;
     while decided.is_none() || closed.is_none() || !crew.is_gone() {
+        if asked && decided.is_none() && crew.is_gone() {
+            last_words.get_or_insert_with(|| Box::pin(sleep(LAST_WORDS)));
+        }
         let happened = tokio::select! {
+            () = over(&mut last_words) => return Err(unheard()),
             event = crew.event() => Happened::InCrew(event),
             () = stop.notified() => Happened::Asked,
             ended = &mut reactor, if decided.is_none() => Happened::Decided(plain(ended)),
@@ -137,6 +146,21 @@ async fn lead(
         // Every walk may be over, but the labellers were asked to stop and may have left jobs.
         _ => Ok(reactor::Ended::Stopped),
     }
+}
+
+/// The end of a time, if it has begun.
+async fn over(time: &mut Option<Pin<Box<Sleep>>>) {
+    match time {
+        Some(time) => time.await,
+        None => std::future::pending().await,
+    }
+}
+
+fn unheard() -> Failure {
+    Failure::Failed(format!(
+        "asked to stop, but the database has not answered for {} s: walks are where they were checkpointed last; the same command goes on with the campaign",
+        LAST_WORDS.as_secs()
+    ))
 }
 
 /// A task's own result; a crash is one too.

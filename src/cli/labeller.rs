@@ -6,7 +6,7 @@ use std::time::Duration;
 use orchestrator::launcher;
 use store::{Location, ProcessRecord, Store, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
-use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Stay, Timing, serve};
+use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Stay, Timing, insist, serve};
 
 use super::{Ended, Failure, block_on};
 use crate::output::say;
@@ -44,7 +44,7 @@ async fn label(setup: LabellerSetup, method: ReferenceMethod, closing: &Arc<Clos
     });
     let location: Location =
         setup.location.to_str().map_or_else(|| Ok(Location::from(&setup.location)), str::parse)?;
-    let store = Store::open(location).await?;
+    let store = insist(closing, || Store::open(&location)).await?;
     let (pid, now) = (std::process::id(), unix_milliseconds());
     let record = ProcessRecord::new(ProcessRecord::LABELLER, setup.number, pid, now);
     // Nobody adopts a slot.

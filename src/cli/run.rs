@@ -8,7 +8,9 @@ use std::sync::Arc;
 use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
 use serde_json::json;
-use store::{CampaignLock, DATABASE, Location, ProcessRecord, Store, StoreError, unix_milliseconds};
+use store::{
+    CampaignLock, DATABASE, Location, ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds,
+};
 use wire::net::{Endpoint, Tls};
 
 use super::{Ended, Failure, block_on};
@@ -98,7 +100,14 @@ async fn run(
         ended = work => ended?,
         error = lost(lock.as_ref()) => return Err(error.into()),
     };
-    leave(&store, &process, ended).await?;
+    // Hours of work do not end as a failure because a server is away in the last second.
+    let store = store.patient(SERVER_AWAY);
+    loop {
+        match leave(&store, &process, ended).await {
+            Err(StoreError::Unreachable(_)) => {}
+            left => break left?,
+        }
+    }
     if !store.status().await?.finished {
         store.close().await;
         return Ok(Ended::Interrupted);

@@ -38,6 +38,11 @@ pub(crate) fn is_local(birth: &str) -> Option<bool> {
     Some(then == boot() && place.is_none_or(|place| place == namespace().to_string()))
 }
 
+/// How late somebody was born, of those of one boot; whatever the clock on the wall said.
+pub(crate) fn order(birth: &str) -> Option<u64> {
+    Birth::parse(birth)?.ticks.parse().ok()
+}
+
 /// What a birth is made of.
 struct Birth<'a> {
     boot: &'a str,

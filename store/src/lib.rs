@@ -36,7 +36,7 @@ pub use processes::{ProcessRecord, this_host};
 pub use records::*;
 pub use sqlite::DATABASE;
 pub use status::{Candidates, Declined, Labels, Status, WalkStatus};
-pub use store::Store;
+pub use store::{SERVER_AWAY, Store};
 
 /// The time now, ms since 1970.
 pub fn unix_milliseconds() -> i64 {

@@ -132,7 +132,8 @@ impl ProcessRecord {
     /// Whether it came after `other` to do the same here, and is not gone itself.
     pub fn replaces(&self, other: &Self) -> bool {
         let place = |process: &Self| (process.kind.clone(), process.number, process.is_local());
-        let is_later = (self.started, &self.id) > (other.started, &other.id);
+        let age = |process: &Self| (birth::order(&process.birth), process.started, process.id.clone());
+        let is_later = age(self) > age(other);
         self.number.is_some() && self.is_local() && place(self) == place(other) && is_later && !self.is_gone()
     }
 
@@ -196,6 +197,11 @@ mod tests {
         let first = own(ProcessRecord::LABELLER);
         let second = ProcessRecord { id: "later".into(), started: 11, ..first.clone() };
         assert!(second.replaces(&first) && !first.replaces(&second) && !first.replaces(&first));
+        // The clock was put back in between.
+        let (place, ticks) = first.birth.rsplit_once('/').unwrap();
+        let earlier = format!("{place}/{}", ticks.parse::<u64>().unwrap() - 1);
+        let earlier = ProcessRecord { birth: earlier, started: 3_600_000, ..first.clone() };
+        assert!(!earlier.replaces(&first));
         let gone = ProcessRecord { pid: u32::MAX, ..second.clone() };
         assert!(!gone.replaces(&first), "the first one is needed again");
         assert!(!elsewhere(&second).replaces(&first) && !second.replaces(&elsewhere(&first)));

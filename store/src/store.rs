@@ -1,5 +1,7 @@
 //! Beginning a campaign, and opening one.
 
+use std::time::Duration;
+
 use crate::database::{Clock, Database};
 use crate::error::Result;
 use crate::location::Location;
@@ -8,6 +10,10 @@ use crate::postgres::Server;
 use crate::records::{Campaign, SeedStructure};
 use crate::sqlite::DatabaseFile;
 use crate::tables::protocols;
+
+/// How long a server that is away is waited for by those who run a campaign, and by every commit. Whoever waits has nothing
+/// else to do; a campaign that failed goes on from here just as well, but somebody has to start it.
+pub const SERVER_AWAY: Duration = Duration::from_secs(3600);
 
 /// The database of one campaign. Clones share its connections.
 #[derive(Clone, Debug)]
@@ -68,6 +74,15 @@ impl Store {
         self
     }
 
+    /// The same store, which waits for a server that is away for so long, and not some seconds, before it says so. What
+    /// breaks in the middle of a transaction fails at once in any case, but for [`Self::commit`].
+    pub fn patient(mut self, patience: Duration) -> Self {
+        if let Database::Postgres(server) = &mut self.database {
+            server.patience = patience;
+        }
+        self
+    }
+
     /// The same store, whose leases go by the times that callers give also on a server: to tell it what time it is.
     #[doc(hidden)]
     pub fn by_the_callers_clock(mut self) -> Self {
@@ -79,7 +94,7 @@ impl Store {
 
     /// Waits until there may be new label jobs, or for `longest`. A server tells when there are; that may be lost like
     /// any message, so the queue is to be looked at in any case. In a file nobody tells.
-    pub async fn wait_for_jobs(&self, longest: std::time::Duration) {
+    pub async fn wait_for_jobs(&self, longest: Duration) {
         match &self.database {
             Database::Sqlite(_) => tokio::time::sleep(longest).await,
             Database::Postgres(server) => server.wait_for_jobs(longest).await,

@@ -1,7 +1,7 @@
 //! A query for either database.
 
 use std::borrow::Cow;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use sqlx::{AssertSqlSafe, Executor, Postgres, Sqlite};
 
@@ -9,10 +9,7 @@ use super::row::{FromRow, Row};
 use super::value::Value;
 use super::{Database, Target, Transaction, missing_row};
 use crate::error::{Result, StoreError};
-use crate::postgres::{PATIENCE, Server};
-
-/// Between two tries to read from a server that is away.
-const PAUSE: Duration = Duration::from_millis(100);
+use crate::postgres::{PAUSE, Server};
 
 /// SQL with its values.
 #[derive(Clone)]
@@ -93,7 +90,7 @@ impl Query {
                 Err(error) => Err(error),
             };
             match read {
-                Err(StoreError::Unreachable(_)) if begun.elapsed() < PATIENCE => {
+                Err(StoreError::Unreachable(_)) if begun.elapsed() < server.patience => {
                     tokio::time::sleep(PAUSE).await
                 }
                 read => return read,

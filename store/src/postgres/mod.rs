@@ -5,12 +5,13 @@ pub mod leadership;
 
 use std::fmt;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use sqlx::migrate::Migrator;
 use sqlx::pool::PoolConnection;
 use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, Postgres};
 use sqlx::{AssertSqlSafe, Executor};
+use tokio::time::sleep;
 use wire::CampaignId;
 
 use self::jobs::Jobs;
@@ -24,8 +25,10 @@ const SCHEMA: i64 = 1;
 const CONNECTIONS: u32 = 5;
 /// Connections that nobody needs are closed after this time: a server has few.
 const IDLE: Duration = Duration::from_secs(60);
-/// How long a server may be away before what needs it fails, for a moment.
-pub const PATIENCE: Duration = Duration::from_secs(10);
+/// How long a server may be away before what needs it fails, and how long a connection is waited for.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// Between two tries to reach a server that is away.
+pub const PAUSE: Duration = Duration::from_millis(100);
 
 static MIGRATIONS: Migrator = sqlx::migrate!("migrations/postgres");
 
@@ -39,6 +42,8 @@ pub struct Server {
     pub clock: Clock,
     /// That of the lock which its user holds, if it does.
     pub generation: Option<i64>,
+    /// How long a server that is away is waited for.
+    pub patience: Duration,
     jobs: Arc<Jobs>,
 }
 
@@ -78,7 +83,15 @@ impl Server {
             .idle_timeout(IDLE)
             .connect_lazy_with(options.clone());
         let jobs = Arc::new(Jobs::new(options, &url.schema));
-        Self { pool, shown: url.as_str().into(), writes, clock: Clock::Server, generation: None, jobs }
+        Self {
+            pool,
+            shown: url.as_str().into(),
+            writes,
+            clock: Clock::Server,
+            generation: None,
+            patience: PATIENCE,
+            jobs,
+        }
     }
 
     /// Id of the campaign, if there is one.
@@ -103,9 +116,15 @@ impl Server {
         self.begin_with("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY").await
     }
 
+    /// Nothing has happened before a transaction begins: it may be tried again.
     async fn begin_with(&self, statement: &'static str) -> Result<Transaction> {
-        let transaction = self.pool.begin_with(statement).await.map_err(unreachable)?;
-        Ok(Transaction::Postgres(transaction, self.clock))
+        let begun = Instant::now();
+        loop {
+            match self.pool.begin_with(statement).await.map_err(unreachable) {
+                Err(StoreError::Unreachable(_)) if begun.elapsed() < self.patience => sleep(PAUSE).await,
+                begun => return Ok(Transaction::Postgres(begun?, self.clock)),
+            }
+        }
     }
 
     /// A transaction that holds the leader's row, which must be that of its own lock, if it has one.

@@ -17,10 +17,8 @@ use crate::database::{Transaction, for_rows, query};
 use crate::encoding::{encode_structure, integer};
 use crate::error::{Result, StoreError};
 use crate::records::Commit;
+use crate::store::SERVER_AWAY;
 
-/// How long a commit is tried while the server is away. Whoever waits for it has nothing else to do; a campaign that
-/// failed goes on from here just as well, but somebody has to start it.
-const SERVER_AWAY: Duration = Duration::from_secs(3600);
 const PAUSE: Duration = Duration::from_secs(1);
 
 const INSERT_DECISIONS: &str = "INSERT INTO decision ({columns}) SELECT * FROM {rows}";

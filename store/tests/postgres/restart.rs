@@ -22,7 +22,7 @@ const LABELLERS: usize = 3;
 
 fn restart() {
     let command = std::env::var("CALMWALK_POSTGRES_RESTART")
-        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../.ci/postgres restart").into());
+        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../.ci/postgres crash").into());
     assert!(Command::new("sh").args(["-c", &command]).status().unwrap().success(), "{command}");
 }
 

@@ -12,7 +12,10 @@ const PAUSE: Duration = Duration::from_secs(1);
 const LAST_TRIES: Duration = Duration::from_secs(60);
 
 /// Calls `write` until it succeeds, fails for good, or has been of no use for a minute after `closing` asked to stop.
-pub(super) async fn insist<T, F: Future<Output = Result<T, StoreError>>>(
+///
+/// # Errors
+/// The last one of `write`.
+pub async fn insist<T, F: Future<Output = Result<T, StoreError>>>(
     closing: &Closing,
     write: impl FnMut() -> F,
 ) -> Result<T, StoreError> {

@@ -18,10 +18,10 @@ use store::{Store, StoreError};
 use tokio::task::{JoinError, spawn_blocking};
 
 use closing::Wanted;
-use insist::insist;
 use told::Became;
 
 pub use closing::Closing;
+pub use insist::insist;
 pub use presence::{Stay, serve};
 pub use reference::{LabelFailure, ReferenceMethod};
 
