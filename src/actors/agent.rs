@@ -16,7 +16,7 @@ use wire::mixture::SharedMixture;
 use wire::net::{Joined, Parted, Uplink};
 use wire::place::Place;
 use wire::transport::Incoming;
-use workers::agent::{self, Agent};
+use workers::agent::{self, Agent, News};
 
 use super::crew::all_given_up;
 use super::{CHANNEL, STOPPING, asked_to_stop};
@@ -51,9 +51,15 @@ pub async fn work(
     let mixture = joined.newest().await;
     let (flag, asked) = (Arc::clone(&stopping), Arc::clone(&stop));
     let deal = |incoming| {
-        tokio::spawn(Agent { uplink, joined, incoming, stopping, patience }.run(move || {
-            flag.store(true, Ordering::Relaxed);
-            asked.notify_one();
+        tokio::spawn(Agent { uplink, joined, incoming, stopping, patience }.run(move |news| match news {
+            News::Stop => {
+                flag.store(true, Ordering::Relaxed);
+                asked.notify_one();
+            }
+            News::Silent { untold, idle } => say(format_args!(
+                "the orchestrator does not answer: {untold} reports are kept for it, {idle} of {walkers} walkers wait"
+            )),
+            News::Back => say("the orchestrator answers again"),
         }))
     };
     let ended = work_in(&place, &setup, walkers, &mixture, deal, &stop).await;

@@ -23,6 +23,8 @@ use self::pool::Pool;
 const LOOK: Duration = Duration::from_secs(2);
 /// Between two pieces of news about a walk.
 const NEWS: Duration = Duration::from_secs(1);
+/// An orchestrator that is there answers sooner.
+const SILENT: Duration = Duration::from_secs(5);
 /// What walkers delivered last may take so long on its way when the agent is asked to stop.
 const LAST_WORDS: Duration = Duration::from_secs(20);
 
@@ -33,6 +35,22 @@ pub enum Ended {
     Done,
     /// It was asked to stop, or every walker is gone.
     Stopped,
+}
+
+/// What an agent tells those who watch it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum News {
+    /// The orchestrator wants its agents to stop.
+    Stop,
+    /// It does not answer.
+    Silent {
+        /// Reports that are kept for it.
+        untold: usize,
+        /// Walkers that have nothing to do.
+        idle: usize,
+    },
+    /// It answers again.
+    Back,
 }
 
 /// Deals turns.
@@ -68,16 +86,18 @@ struct Desk {
     next_place: Option<Joined>,
     /// When the orchestrator was last heard.
     heard: Instant,
+    /// What was told of its silence.
+    silence: Option<News>,
     /// When there was last news of a walk.
     news: BTreeMap<WalkId, Instant>,
 }
 
 impl Agent {
-    /// Works until there is no more work or it is asked to stop. `stop` is called when the orchestrator asks for it.
+    /// Works until there is no more work or it is asked to stop.
     ///
     /// # Errors
     /// The orchestrator is silent, or it and this program do not understand each other.
-    pub async fn run(mut self, mut stop: impl FnMut()) -> Result<Ended, Parted> {
+    pub async fn run(mut self, mut watch: impl FnMut(News)) -> Result<Ended, Parted> {
         let slots = self.joined.slots();
         let mut desk = Desk::new(self.uplink, self.joined);
         desk.begin(slots);
@@ -91,8 +111,8 @@ impl Agent {
                 },
                 Some(exchanged) = desk.asking.next() => desk.exchanged(exchanged)?,
                 joined = answered(&mut desk.joining) => desk.has_joined(joined?),
-                told = answered(&mut desk.question) => if desk.is_to_stop(told)? { stop() },
-                _ = look.tick() => desk.look(self.patience)?,
+                told = answered(&mut desk.question) => if desk.is_to_stop(told)? { watch(News::Stop) },
+                _ = look.tick() => desk.look(self.patience)?.into_iter().for_each(&mut watch),
             }
             if self.stopping.load(Ordering::Relaxed) {
                 desk.pool.send_home();
@@ -138,6 +158,7 @@ impl Desk {
             joining: None,
             next_place: None,
             heard: Instant::now(),
+            silence: None,
             news: BTreeMap::new(),
         }
     }
@@ -212,14 +233,19 @@ impl Desk {
         }
     }
 
-    /// Asks whether to stop, unless the orchestrator has been silent for so long that it is of no use.
-    fn look(&mut self, patience: Duration) -> Result<(), Parted> {
-        if self.heard.elapsed() > patience {
+    /// Asks whether to stop, unless the orchestrator has been silent for so long that it is of no use. Returns what is new
+    /// of its silence.
+    fn look(&mut self, patience: Duration) -> Result<Option<News>, Parted> {
+        let silence = self.heard.elapsed();
+        if silence > patience {
             return Err(Parted::Silence { minutes: patience.as_secs_f64() / 60.0 });
         }
         let joined = Arc::clone(&self.joined);
         self.question.get_or_insert_with(|| Box::pin(async move { joined.is_stopping().await }));
-        Ok(())
+        let untold = self.telling + self.pool.untold();
+        let now = (silence > SILENT).then(|| News::Silent { untold, idle: self.pool.idle() });
+        let before = std::mem::replace(&mut self.silence, now);
+        Ok(if now.is_none() { before.map(|_| News::Back) } else { now.filter(|_| now != before) })
     }
 
     fn is_to_stop(&mut self, told: Result<Option<bool>, Parted>) -> Result<bool, Parted> {

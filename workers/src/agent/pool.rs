@@ -100,6 +100,16 @@ impl<S> Pool<S> {
         }
     }
 
+    /// Reports that nobody takes for the time being.
+    pub(super) fn untold(&self) -> usize {
+        self.untold.len()
+    }
+
+    /// Walkers that wait for a turn.
+    pub(super) fn idle(&self) -> usize {
+        self.waiting.len()
+    }
+
     /// Whether no walker has a turn in hand.
     pub(super) fn is_idle(&self) -> bool {
         self.in_hand.is_empty()

@@ -114,6 +114,16 @@ impl Uplink {
     /// # Errors
     /// A place is refused.
     pub async fn join(self: &Arc<Self>) -> Result<Joined, Parted> {
+        loop {
+            match self.try_to_join().await {
+                // Another orchestrator has taken its place in the meantime.
+                Err(Parted::Stranger(_)) => {}
+                joined => return joined,
+            }
+        }
+    }
+
+    async fn try_to_join(self: &Arc<Self>) -> Result<Joined, Parted> {
         let answer = self.insist(&Request::Join(self.agent.clone())).await?;
         let Reply::Joined(place) = read(&answer)? else { return Err(unexpected("join")) };
         let joined = Joined {
