@@ -4,92 +4,22 @@
 
 mod common;
 
-use std::fs;
-use std::net::TcpListener;
-use std::path::{Path, PathBuf};
-use std::process::Stdio;
 use std::time::Duration;
 
-use common::campaign::{Outcome, Small, outcome};
-use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
-use common::{Running, kills, program, random};
-use tempfile::TempDir;
-use wire::place::Place;
+use common::campaign::{Small, outcome};
+use common::hosts::{Hosts, undisturbed};
+use common::processes::{carrying_out, signal, wait_until};
+use common::{kills, random};
 
-/// A campaign with its orchestrator's directory, and one for each other host.
-struct Hosts {
-    home: TempDir,
-    others: Vec<TempDir>,
-    port: u16,
-}
-
-impl Hosts {
-    /// The orchestrator has a walker of its own.
-    fn new(small: &Small, others: usize) -> Self {
-        let home = tempfile::tempdir().unwrap();
-        let path = Small { walkers: 1, ..small.clone() }.write(home.path());
-        let text = fs::read_to_string(&path).unwrap();
-        fs::write(&path, text.replace("[run]\n", "[run]\nagent_silence_limit = 0.5\n")).unwrap();
-        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-        Self { home, others: (0..others).map(|_| tempfile::tempdir().unwrap()).collect(), port }
-    }
-
-    fn endpoint(&self) -> String {
-        format!("tcp/127.0.0.1:{}", self.port)
-    }
-
-    fn lead(&self) -> Running {
-        let mut command = program(self.home.path());
-        command.args(["run", "campaign.toml", "--directory", ".", "--listen", &self.endpoint()]);
-        started(command, &self.home.path().join("said"))
-    }
-
-    fn agent(&self, host: usize) -> Running {
-        let directory = self.others[host].path();
-        let mut command = program(directory);
-        command.env("TMPDIR", directory).args(["agent", "--join", &self.endpoint(), "--walkers", "1"]);
-        started(command, &directory.join("said"))
-    }
-
-    fn said(&self, host: usize) -> String {
-        fs::read_to_string(self.others[host].path().join("said")).unwrap_or_default()
-    }
-
-    /// Everybody is gone and has left nothing behind.
-    fn are_empty(&self) {
-        nothing_is_left(self.home.path());
-        for host in &self.others {
-            wait_until("every process is gone", || processes_in(host.path()).is_empty());
-            let left: Vec<PathBuf> =
-                fs::read_dir(host.path()).unwrap().map(|entry| entry.unwrap().path()).collect();
-            assert_eq!(left, [host.path().join("said")]);
-            let here =
-                |place: &Place| place.campaign_directory().is_some_and(|of| of.starts_with(host.path()));
-            assert!(!Place::all().unwrap().iter().any(here));
-        }
-    }
-}
-
-fn started(mut command: std::process::Command, said: &Path) -> Running {
-    let said = fs::File::options().create(true).append(true).open(said).unwrap();
-    Running(command.stdout(Stdio::null()).stderr(said).spawn().expect("the program starts"))
-}
-
-/// What the campaign comes to in one process.
-fn undisturbed(small: &Small) -> Outcome {
-    let directory = tempfile::tempdir().unwrap();
-    small.write(directory.path());
-    let mut command = program(directory.path());
-    command.args(["run", "campaign.toml", "--directory", ".", "--in-process"]);
-    let ended = command.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap();
-    assert_eq!(ended.code(), Some(0));
-    outcome(directory.path())
+/// A silent agent is soon taken for dead.
+fn hosts(small: &Small, others: usize) -> Hosts {
+    Hosts::new(small, others, "agent_silence_limit = 0.5")
 }
 
 #[test]
 fn a_campaign_on_three_hosts_comes_to_the_same() {
     let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
-    let hosts = Hosts::new(&small, 2);
+    let hosts = hosts(&small, 2);
     // An agent may be there before its orchestrator.
     let mut first = hosts.agent(0);
     wait_until("the agent waits", || hosts.said(0).contains("waiting for the orchestrator"));
@@ -107,7 +37,7 @@ fn a_campaign_on_three_hosts_comes_to_the_same() {
 #[test]
 fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     let small = Small::default();
-    let hosts = Hosts::new(&small, 2);
+    let hosts = hosts(&small, 2);
     let mut orchestrator = hosts.lead();
     let mut agents = [hosts.agent(0), hosts.agent(1)];
     let at_work = |host: usize| !carrying_out(hosts.others[host].path(), "walker").is_empty();
@@ -132,7 +62,7 @@ fn kills_on_every_host_change_nothing() {
     let expected = undisturbed(&small);
     let mut done = 0;
     while done < kills() {
-        let hosts = Hosts::new(&small, 2);
+        let hosts = hosts(&small, 2);
         let mut orchestrator = hosts.lead();
         let mut agents = [hosts.agent(0), hosts.agent(1)];
         let ended = loop {

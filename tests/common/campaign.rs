@@ -13,20 +13,21 @@ pub struct Small {
     pub walkers: usize,
     pub walks_per_round: usize,
     pub steps: u64,
+    pub per_seed: u32,
     pub seeds: &'static [&'static str],
 }
 
 impl Default for Small {
     fn default() -> Self {
         let seeds = &["fcc-100", "vacancy"];
-        Self { mode: "reproducible", walkers: 2, walks_per_round: 2, steps: 240, seeds }
+        Self { mode: "reproducible", walkers: 2, walks_per_round: 2, steps: 240, per_seed: 4, seeds }
     }
 }
 
 impl Small {
     /// The configuration as text.
     pub fn text(&self) -> String {
-        let Self { mode, walkers, walks_per_round, steps, .. } = self;
+        let Self { mode, walkers, walks_per_round, steps, per_seed, .. } = self;
         let file = |path: &str| config(path).display().to_string();
         format!(
             r#"
@@ -51,7 +52,7 @@ when = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1 }}
 until = {{ rule = "atom_count", threshold = 1.0, fraction = 0.1, target = 1.25 }}
 gap = 30
 declined_gap = 5
-per_seed = 4
+per_seed = {per_seed}
 [guard]
 zbl = {{ inner = 1.6, outer = 2.4 }}
 [label]
@@ -92,6 +93,37 @@ pub struct Outcome {
     pub components: Vec<ComponentRecord>,
     pub walks: Vec<(u32, String, u64, Option<Vec<u8>>)>,
     pub dataset: Vec<u8>,
+}
+
+/// How far a campaign has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd)]
+pub struct Counters {
+    /// Candidates and control frames that reached the selector.
+    pub sent: u64,
+    /// Of them, in the data set.
+    pub accepted: u64,
+    /// Labels made.
+    pub labels: u64,
+}
+
+impl Counters {
+    /// As `status` has them; nothing before there is a campaign.
+    pub fn of(location: &str, directory: &Path) -> Self {
+        let output = super::calmwalk(directory, ["status", location, "--json"]);
+        let status = serde_json::from_slice::<serde_json::Value>(&output.stdout).unwrap_or_default();
+        let count = |path| status.pointer(path).and_then(serde_json::Value::as_u64).unwrap_or(0);
+        let control = count("/candidates/control");
+        Self {
+            sent: count("/candidates/seen") + control,
+            accepted: count("/candidates/accepted") + control,
+            labels: count("/labels/labelled"),
+        }
+    }
+
+    /// Whether none of them is below what it was.
+    pub fn is_no_less_than(&self, before: &Self) -> bool {
+        self.sent >= before.sent && self.accepted >= before.accepted && self.labels >= before.labels
+    }
 }
 
 /// Reads the outcome of the campaign in `directory` and checks that nothing is lost or doubled in it.

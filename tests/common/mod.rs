@@ -2,7 +2,9 @@
 #![allow(dead_code)] // Each test program uses a part.
 
 pub mod campaign;
+pub mod clock;
 pub mod desk;
+pub mod hosts;
 pub mod place;
 pub mod processes;
 
@@ -39,6 +41,14 @@ pub fn demo(name: &str) -> String {
 pub fn program(directory: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_calmwalk"));
     command.current_dir(directory);
+    command
+}
+
+/// The same, started by another program with its arguments, if there is one.
+pub fn through(starter: &[String], directory: &Path) -> Command {
+    let Some((first, rest)) = starter.split_first() else { return program(directory) };
+    let mut command = Command::new(first);
+    command.args(rest).arg(env!("CARGO_BIN_EXE_calmwalk")).current_dir(directory);
     command
 }
 

@@ -1,0 +1,53 @@
+//! Clocks that are wrong: libfaketime, from the package of that name.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// A clock that is set by hand.
+pub struct Clock {
+    file: PathBuf,
+}
+
+impl Clock {
+    pub fn new(directory: &Path, offset: &str) -> Self {
+        let clock = Self { file: directory.join("clock") };
+        clock.set(offset);
+        clock
+    }
+
+    /// As `+1h`.
+    pub fn set(&self, offset: &str) {
+        // At once, as a reader sees it.
+        let new = self.file.with_extension("new");
+        fs::write(&new, format!("{offset}\n")).unwrap();
+        fs::rename(new, &self.file).unwrap();
+    }
+
+    /// A program that starts others by this clock. Time that passes is measured as ever.
+    pub fn starter(&self) -> Vec<String> {
+        let library = "/usr/$LIB/faketime/libfaketimeMT.so.1";
+        let variables = [
+            format!("LD_PRELOAD={library}"),
+            format!("FAKETIME_TIMESTAMP_FILE={}", self.file.display()),
+            "FAKETIME_NO_CACHE=1".into(),
+            "FAKETIME_DONT_FAKE_MONOTONIC=1".into(),
+            "DONT_FAKE_MONOTONIC=1".into(),
+        ];
+        ["env".to_owned()].into_iter().chain(variables).collect()
+    }
+}
+
+/// The library leaves these of processes that are killed.
+impl Drop for Clock {
+    fn drop(&mut self) {
+        for entry in fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            let Some((_, pid)) = name.rsplit_once('_').filter(|(of, _)| of.contains("faketime_")) else {
+                continue;
+            };
+            if !Path::new("/proc").join(pid).exists() {
+                let _ = fs::remove_file(entry.path());
+            }
+        }
+    }
+}

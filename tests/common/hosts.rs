@@ -1,0 +1,103 @@
+//! A campaign on several hosts: its orchestrator, and agents.
+
+use std::fs;
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use tempfile::TempDir;
+use wire::place::Place;
+
+use super::campaign::{Outcome, Small, outcome};
+use super::processes::{nothing_is_left, processes_in, wait_until};
+use super::{Running, program, through};
+
+/// A campaign with its orchestrator's directory, and one for each other host.
+pub struct Hosts {
+    pub home: TempDir,
+    pub others: Vec<TempDir>,
+    /// Where the orchestrator listens, and where agents find it.
+    pub endpoints: [String; 2],
+    /// Whether agents may join at all.
+    pub listens: bool,
+    /// More options of `run`, and of `agent`.
+    pub options: [Vec<String>; 2],
+    /// What the orchestrator is started with, and what agents are: a program that starts them, with its arguments.
+    pub through: [Vec<String>; 2],
+}
+
+impl Hosts {
+    /// The orchestrator has a walker of its own, and `keys` in the section `[run]`.
+    pub fn new(small: &Small, others: usize, keys: &str) -> Self {
+        let home = tempfile::tempdir().unwrap();
+        let path = Small { walkers: 1, ..small.clone() }.write(home.path());
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, text.replace("[run]\n", &format!("[run]\n{keys}\n"))).unwrap();
+        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let endpoint = format!("tcp/127.0.0.1:{port}");
+        let others = (0..others).map(|_| tempfile::tempdir().unwrap()).collect();
+        let endpoints = [endpoint.clone(), endpoint];
+        let (options, through) = Default::default();
+        Self { home, others, endpoints, listens: true, options, through }
+    }
+
+    pub fn lead(&self) -> Running {
+        let home = self.home.path();
+        let mut command = through(&self.through[0], home);
+        command.args(["run", "campaign.toml", "--directory", "."]);
+        if self.listens {
+            command.args(["--listen", &self.endpoints[0]]);
+        }
+        started(command.args(&self.options[0]), &home.join("said"))
+    }
+
+    /// Each has one walker.
+    pub fn agent(&self, host: usize) -> Running {
+        let directory = self.others[host].path();
+        let mut command = through(&self.through[1], directory);
+        command.env("TMPDIR", directory);
+        command.args(["agent", "--join", &self.endpoints[1], "--walkers", "1"]).args(&self.options[1]);
+        started(&mut command, &directory.join("said"))
+    }
+
+    /// What the agent of a host has said.
+    pub fn said(&self, host: usize) -> String {
+        fs::read_to_string(self.others[host].path().join("said")).unwrap_or_default()
+    }
+
+    /// What the orchestrator has said.
+    pub fn head_said(&self) -> String {
+        fs::read_to_string(self.home.path().join("said")).unwrap_or_default()
+    }
+
+    /// Everybody is gone and has left nothing behind.
+    pub fn are_empty(&self) {
+        nothing_is_left(self.home.path());
+        for host in &self.others {
+            wait_until("every process is gone", || processes_in(host.path()).is_empty());
+            let left: Vec<PathBuf> =
+                fs::read_dir(host.path()).unwrap().map(|entry| entry.unwrap().path()).collect();
+            assert_eq!(left, [host.path().join("said")]);
+            let here =
+                |place: &Place| place.campaign_directory().is_some_and(|of| of.starts_with(host.path()));
+            assert!(!Place::all().unwrap().iter().any(here));
+        }
+    }
+}
+
+/// Starts a program that writes what it says to the end of a file.
+pub fn started(command: &mut Command, said: &Path) -> Running {
+    let said = fs::File::options().create(true).append(true).open(said).unwrap();
+    Running(command.stdout(Stdio::null()).stderr(said).spawn().expect("the program starts"))
+}
+
+/// What the campaign comes to in one process.
+pub fn undisturbed(small: &Small) -> Outcome {
+    let directory = tempfile::tempdir().unwrap();
+    small.write(directory.path());
+    let mut command = program(directory.path());
+    command.args(["run", "campaign.toml", "--directory", ".", "--in-process"]);
+    let ended = command.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap();
+    assert_eq!(ended.code(), Some(0));
+    outcome(directory.path())
+}

@@ -1,0 +1,83 @@
+//! Two hosts with a cable between them: each is a namespace of the network, held by a process that sleeps.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use crate::common::Running;
+use crate::common::processes::wait_until;
+use crate::must;
+
+/// The address of the first host.
+pub const HEAD: &str = "10.77.0.1";
+/// That of the second.
+pub const NODE: &str = "10.77.0.2";
+
+/// Two hosts and the cable between them, which all go when this goes.
+pub struct Cable {
+    head: Running,
+    node: Running,
+}
+
+impl Cable {
+    pub fn new() -> Self {
+        let [head, node] = [namespace(), namespace()];
+        let (here, there) = (head.0.id(), node.0.id());
+        // Made inside, so that names matter to nobody else.
+        must(&format!(
+            "nsenter --net=/proc/{here}/ns/net ip link add cable type veth peer name cable netns {there}"
+        ));
+        let cable = Self { head, node };
+        for (host, address) in [(&cable.head, HEAD), (&cable.node, NODE)] {
+            inside(host, &format!("ip address add {address}/24 dev cable"));
+            inside(host, "ip link set lo up");
+            inside(host, "ip link set cable up");
+        }
+        cable
+    }
+
+    /// What programs of the first host are started with, and those of the second.
+    pub fn through(&self) -> [Vec<String>; 2] {
+        [&self.head, &self.node].map(|host| vec!["nsenter".to_owned(), net(host)])
+    }
+
+    pub fn cut(&self) {
+        inside(&self.node, "ip link set cable down");
+    }
+
+    pub fn mend(&self) {
+        inside(&self.node, "ip link set cable up");
+    }
+
+    /// Drops what comes in at the second host and what leaves it, each where the condition of nftables holds; `None` drops
+    /// nothing.
+    pub fn drop_where(&self, comes_in: Option<&str>, leaves: Option<&str>) {
+        inside(&self.node, "nft flush ruleset");
+        inside(&self.node, "nft add table ip faults");
+        for (hook, condition) in [("input", comes_in), ("output", leaves)] {
+            let Some(condition) = condition else { continue };
+            let chain = format!("{{ type filter hook {hook} priority 0; }}");
+            inside(&self.node, &format!("nft 'add chain ip faults {hook} {chain}'"));
+            inside(&self.node, &format!("nft 'add rule ip faults {hook} {condition} drop'"));
+        }
+    }
+}
+
+fn namespace() -> Running {
+    let sleeping = Command::new("unshare").args(["--net", "sleep", "3600"]).spawn();
+    let holder = Running(sleeping.expect("unshare, of util-linux"));
+    let own = fs::read_link("/proc/self/ns/net").expect("/proc");
+    let path = format!("/proc/{}/ns/net", holder.0.id());
+    wait_until("there is a namespace (as root)", || {
+        fs::read_link(Path::new(&path)).is_ok_and(|other| other != own)
+    });
+    holder
+}
+
+fn net(host: &Running) -> String {
+    format!("--net=/proc/{}/ns/net", host.0.id())
+}
+
+fn inside(host: &Running, command: &str) {
+    must(&format!("nsenter {} {command}", net(host)));
+}

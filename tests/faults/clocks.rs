@@ -1,0 +1,131 @@
+//! Clocks that are wrong by an hour, or jump by as much (NTP, a hand): nothing depends on them. libfaketime makes them wrong.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+use std::thread::sleep;
+use std::time::Duration;
+
+use serde_json::Value;
+
+use crate::common::campaign::{Counters, Small, outcome};
+use crate::common::clock::Clock;
+use crate::common::hosts::{Hosts, started, undisturbed};
+use crate::common::processes::{carrying_out, nothing_is_left, signal, wait_until};
+use crate::common::{calmwalk, random, through};
+
+#[test]
+fn the_clocks_of_these_tests_are_wrong() {
+    let directory = tempfile::tempdir().unwrap();
+    let clock = Clock::new(directory.path(), "-1h");
+    let seconds = |starter: &[String]| {
+        let mut command = Command::new(starter.first().map_or("env", String::as_str));
+        let output =
+            command.args(starter.get(1..).unwrap_or_default()).args(["date", "+%s"]).output().unwrap();
+        String::from_utf8(output.stdout).unwrap().trim().parse::<i64>().unwrap()
+    };
+    let late = |offset: &str| {
+        clock.set(offset);
+        seconds(&clock.starter()) - seconds(&[])
+    };
+    for (offset, expected) in [("-1h", -3600), ("+1h", 3600), ("+0", 0)] {
+        assert!((late(offset) - expected).abs() < 60, "the package libfaketime is needed");
+    }
+}
+
+/// All processes of a host jump together. `disturb` is called after each jump.
+fn jumping(small: &Small, disturb: impl Fn(&Path, u64)) -> tempfile::TempDir {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    small.write(here);
+    let clock = Clock::new(here, "+0");
+    let mut command = through(&clock.starter(), here);
+    let said = here.join("said");
+    let mut run = started(command.args(["run", "campaign.toml", "--directory", "."]), &said);
+    wait_until("the campaign advances", || Counters::of(".", here).labels > 0);
+    let mut before = Counters::of(".", here);
+    for jump in 0.. {
+        clock.set(["+1h", "-1h", "+0", "-1h", "+1h"][jump as usize % 5]);
+        disturb(here, jump);
+        sleep(Duration::from_millis(200 + random(jump) % 1000));
+        let after = Counters::of(".", here);
+        assert!(after.is_no_less_than(&before), "{before:?} {after:?}");
+        before = after;
+        if let Some(ended) = run.0.try_wait().unwrap() {
+            assert_eq!(ended.code(), Some(0), "{}", fs::read_to_string(&said).unwrap());
+            break;
+        }
+    }
+    assert_eq!(outcome(here), undisturbed(small));
+    nothing_is_left(here);
+    directory
+}
+
+#[test]
+fn a_clock_that_jumps_changes_nothing_and_nobody_is_taken_for_dead() {
+    let small = Small { steps: 1600, per_seed: 16, ..Small::default() };
+    let directory = jumping(&small, |here, _| {
+        let status = calmwalk(here, ["status", ".", "--json"]);
+        let status: Value = serde_json::from_slice(&status.stdout).unwrap();
+        for process in status["processes"].as_array().unwrap() {
+            assert!(process["state"] == "running" || process["state"] == "stopping", "{process}");
+            assert_eq!(process["restarts"], 0, "{process}");
+        }
+    });
+    let said = fs::read_to_string(directory.path().join("said")).unwrap();
+    assert!(!said.contains("silent") && !said.contains("restart"), "{said}");
+}
+
+/// What a labeller held that is killed comes back, whatever its clock said.
+#[test]
+fn labellers_that_are_killed_while_the_clock_jumps_lose_and_double_nothing() {
+    let small = Small { steps: 1600, per_seed: 16, ..Small::default() };
+    jumping(&small, |here, jump| {
+        let labellers = carrying_out(here, "labeller");
+        if jump % 2 == 0 && !labellers.is_empty() {
+            signal(labellers[0], "KILL");
+        }
+    });
+}
+
+/// One agent an hour ahead, one behind, and both jump.
+#[test]
+fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
+    let small = Small {
+        steps: 1600,
+        per_seed: 12,
+        walks_per_round: 3,
+        seeds: &["fcc-100", "vacancy", "fcc-097"],
+        ..Small::default()
+    };
+    let mut hosts = Hosts::new(&small, 2, "agent_silence_limit = 5.0");
+    let clocks = tempfile::tempdir().unwrap();
+    let mut orchestrator = hosts.lead();
+    let mut agents = Vec::new();
+    let mut set = Vec::new();
+    for (host, offset) in ["+1h", "-1h"].into_iter().enumerate() {
+        let directory = clocks.path().join(offset);
+        fs::create_dir(&directory).unwrap();
+        let clock = Clock::new(&directory, offset);
+        hosts.through[1] = clock.starter();
+        agents.push(hosts.agent(host));
+        set.push(clock);
+    }
+    for host in 0..2 {
+        wait_until("it has joined", || hosts.said(host).contains("joined: 1 walkers"));
+    }
+    for jump in 0.. {
+        set[jump % 2].set(["-1h", "+1h", "+0"][jump % 3]);
+        sleep(Duration::from_millis(300));
+        if orchestrator.0.try_wait().unwrap().is_some() {
+            break;
+        }
+    }
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
+    for (host, agent) in agents.iter_mut().enumerate() {
+        assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(host));
+    }
+    assert!(!hosts.head_said().contains("gives no sign of life"), "{}", hosts.head_said());
+    assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
+    hosts.are_empty();
+}

@@ -1,0 +1,126 @@
+//! The disk of a campaign is full, or the host's shared memory.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+use tempfile::TempDir;
+
+use crate::common::campaign::{Counters, Small, outcome};
+use crate::common::hosts::{started, undisturbed};
+use crate::common::processes::{carrying_out, nothing_is_left, processes_in, wait_until};
+use crate::common::{Running, program, random, through};
+use crate::must;
+
+const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
+
+fn small() -> Small {
+    Small { steps: 1600, per_seed: 12, ..Small::default() }
+}
+
+/// A small disk.
+struct Disk {
+    at: PathBuf,
+    /// Where it is mounted, and what is said there is kept beside it.
+    home: TempDir,
+}
+
+impl Disk {
+    fn new(megabytes: u32) -> Self {
+        let home = tempfile::tempdir().unwrap();
+        let at = home.path().join("disk");
+        fs::create_dir(&at).unwrap();
+        must(&format!("mount -t tmpfs -o size={megabytes}m tmpfs {}", at.display()));
+        Self { at, home }
+    }
+
+    /// Takes all the space that is left.
+    fn fill(&self) {
+        let filler = self.at.join("filler");
+        let to = format!("of={}", filler.display());
+        let written = Command::new("dd").args(["if=/dev/zero", "bs=64k", &to]).output().unwrap();
+        assert!(!written.status.success(), "the disk is too large");
+    }
+
+    fn make_space(&self) {
+        fs::remove_file(self.at.join("filler")).unwrap();
+    }
+
+    fn run(&self) -> Running {
+        let mut command = program(&self.at);
+        started(command.args(RUN), &self.home.path().join("said"))
+    }
+
+    /// What was said since the last time.
+    fn said(&self) -> String {
+        let path = self.home.path().join("said");
+        let said = fs::read_to_string(&path).unwrap();
+        fs::write(path, "").unwrap();
+        said
+    }
+}
+
+impl Drop for Disk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").args(["--lazy".as_ref(), self.at.as_os_str()]).status();
+    }
+}
+
+/// It ends with a clear message, and goes on when there is space. Labellers wait for it with what they have made.
+#[test]
+fn a_full_disk_ends_a_run_and_loses_nothing() {
+    let disk = Disk::new(256);
+    small().write(&disk.at);
+    let mut before = Counters::of(".", &disk.at);
+    for full in 0..2 {
+        let mut run = disk.run();
+        wait_until("the campaign advances", || Counters::of(".", &disk.at).sent > before.sent);
+        std::thread::sleep(Duration::from_millis(random(full) % 700));
+        before = Counters::of(".", &disk.at);
+        disk.fill();
+        assert_eq!(run.0.wait().unwrap().code(), Some(1));
+        let said = disk.said();
+        let words = "the disk is full: nothing was written, and what was committed before is safe; make space and start again";
+        assert!(said.contains(words), "{said}");
+        // Nor does one begin.
+        assert_eq!(disk.run().0.wait().unwrap().code(), Some(1));
+        let said = disk.said();
+        assert!(said.contains("the disk is full"), "{said}");
+        disk.make_space();
+        let after = Counters::of(".", &disk.at);
+        assert!(after.is_no_less_than(&before), "{before:?} {after:?}");
+    }
+    assert_eq!(disk.run().0.wait().unwrap().code(), Some(0), "{}", disk.said());
+    assert_eq!(outcome(&disk.at), undisturbed(&small()));
+    nothing_is_left(&disk.at);
+}
+
+/// What a campaign needs of it is reserved when it begins.
+#[test]
+fn shared_memory_that_others_fill_does_no_harm() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    small().write(here);
+    let sleeping = Command::new("unshare").args(["--mount", "sleep", "3600"]).spawn();
+    let host = Running(sleeping.expect("unshare, of util-linux"));
+    let namespace = format!("/proc/{}/ns/mnt", host.0.id());
+    let own = fs::read_link("/proc/self/ns/mnt").unwrap();
+    wait_until("there is a namespace (as root)", || {
+        fs::read_link(Path::new(&namespace)).is_ok_and(|other| other != own)
+    });
+    let inside = format!("nsenter --mount={namespace}");
+    must(&format!("{inside} mount -t tmpfs -o size=64m tmpfs /dev/shm"));
+    let starter = ["nsenter".into(), format!("--mount={namespace}"), format!("--wd={}", here.display())];
+    let said = here.join("said");
+    let mut run = started(through(&starter, here).args(RUN), &said);
+    wait_until("walkers are at work", || Counters::of(".", here).sent > 0);
+    must(&format!("{inside} sh -c '! dd if=/dev/zero of=/dev/shm/filler bs=64k'"));
+    // Those that are started now find it full.
+    let walker = carrying_out(here, "walker")[0];
+    crate::common::processes::signal(walker, "KILL");
+    assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", fs::read_to_string(&said).unwrap());
+    wait_until("every process is gone", || processes_in(here).is_empty());
+    must(&format!("{inside} sh -c 'rm /dev/shm/filler && ! ls /dev/shm | grep ^cw-'"));
+    assert_eq!(outcome(here), undisturbed(&small()));
+}

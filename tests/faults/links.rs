@@ -1,0 +1,182 @@
+//! The link between an orchestrator and an agent breaks, as programs on two hosts see it. The agent has one walker and may be
+//! one turn ahead, so its walker goes on for a turn or two without the link, and then waits.
+
+use std::path::Path;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use crate::cable::{Cable, HEAD, NODE};
+use crate::common::Running;
+use crate::common::campaign::{Counters, Outcome, Small, outcome};
+use crate::common::hosts::{Hosts, undisturbed};
+use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::must;
+
+/// Three walks side by side: one for the orchestrator's own walker, two for the agent.
+fn small() -> Small {
+    Small {
+        walks_per_round: 3,
+        seeds: &["fcc-100", "vacancy", "fcc-097"],
+        steps: 1600,
+        per_seed: 8,
+        ..Small::default()
+    }
+}
+
+/// A campaign on two hosts, with certificates.
+struct Linked {
+    hosts: Hosts,
+    cable: Cable,
+    orchestrator: Running,
+    agent: Running,
+}
+
+impl Linked {
+    /// Both are at work. An agent is taken for dead after `silence_limit`, and gives up after `patience` (min).
+    fn new(silence_limit: f64, patience: f64) -> Self {
+        let linked = Self::with_cable(Cable::new(), silence_limit, patience);
+        linked.are_at_work();
+        linked
+    }
+
+    fn with_cable(cable: Cable, silence_limit: f64, patience: f64) -> Self {
+        let mut hosts = Hosts::new(&small(), 1, &format!("agent_silence_limit = {silence_limit}"));
+        hosts.through = cable.through();
+        hosts.endpoints = ["0.0.0.0", HEAD].map(|address| format!("tcp/{address}:7447"));
+        let certificates = hosts.home.path().join("certificates");
+        certify(&certificates);
+        let tls = |name: &str| ["--tls".to_owned(), certificates.join(name).display().to_string()];
+        let [ahead, limit] = ["--ahead=1".to_owned(), format!("--patience={patience}")];
+        hosts.options = [tls(HEAD).into(), tls(NODE).into_iter().chain([ahead, limit]).collect()];
+        let (orchestrator, agent) = (hosts.lead(), hosts.agent(0));
+        Self { hosts, cable, orchestrator, agent }
+    }
+
+    fn are_at_work(&self) {
+        let works = |path: &Path| !carrying_out(path, "walker").is_empty();
+        wait_until("both hosts are at work", || {
+            works(self.hosts.home.path())
+                && works(self.hosts.others[0].path())
+                && self.counters().accepted > 0
+        });
+    }
+
+    fn counters(&self) -> Counters {
+        Counters::of(".", self.hosts.home.path())
+    }
+
+    fn agent_says(&self, words: &str) -> bool {
+        self.hosts.said(0).contains(words)
+    }
+
+    fn head_says(&self, words: &str) -> bool {
+        self.hosts.head_said().contains(words)
+    }
+
+    /// The agent's walker has nothing to do any more.
+    fn walker_waits(&self) {
+        let said = "reports are kept for it, 1 of 1 walkers wait";
+        wait_until("the agent's walker waits", || self.agent_says(said));
+    }
+
+    /// Waits for the end, at which the counters are at least these; returns the exit code of the agent.
+    fn ends_as(mut self, expected: &Outcome, before: Counters) -> (Option<i32>, Hosts) {
+        let ended = self.orchestrator.0.wait().unwrap();
+        assert_eq!(ended.code(), Some(0), "{}", self.hosts.head_said());
+        let agent = self.agent.0.wait().unwrap();
+        let after = self.counters();
+        assert!(after.is_no_less_than(&before), "{before:?} {after:?}");
+        assert_eq!(&outcome(self.hosts.home.path()), expected, "{}", self.hosts.said(0));
+        self.hosts.are_empty();
+        (agent.code(), self.hosts)
+    }
+}
+
+fn certify(directory: &Path) {
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/configs/certificates.sh");
+    must(&format!("sh {script} {} {HEAD} {NODE}", directory.display()));
+}
+
+/// Nobody is taken for dead: what the walker finds meanwhile is delivered, and it goes on.
+#[test]
+fn cut_for_five_seconds() {
+    let linked = Linked::new(60.0, 60.0);
+    let before = linked.counters();
+    linked.cable.cut();
+    sleep(Duration::from_secs(5));
+    linked.cable.mend();
+    let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
+    assert_eq!(agent, Some(0), "{}", hosts.said(0));
+    assert!(!hosts.head_said().contains("others get its walks"), "{}", hosts.head_said());
+}
+
+/// Longer than the limit: the orchestrator's own walker gets the walks. The host that comes back joins anew; of what it
+/// brings nothing counts that somebody else has in hand or has done.
+#[test]
+fn cut_for_a_minute() {
+    let linked = Linked::new(15.0, 60.0);
+    let before = linked.counters();
+    linked.cable.cut();
+    let begun = Instant::now();
+    linked.walker_waits();
+    wait_until("the walks are handed on", || linked.head_says("others get its walks"));
+    let handed_on = linked.counters();
+    wait_until("they go on elsewhere", || linked.counters().sent > handed_on.sent);
+    // So that there is something left to do for the host that comes back.
+    let walker = carrying_out(linked.hosts.home.path(), "walker")[0];
+    signal(walker, "STOP");
+    sleep(Duration::from_secs(60).saturating_sub(begun.elapsed()));
+    linked.cable.mend();
+    wait_until("the agent is back", || linked.agent_says("the orchestrator answers again"));
+    wait_until("it joins anew", || linked.hosts.head_said().matches("): joined").count() == 2);
+    signal(walker, "CONT");
+    let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
+    assert_eq!(agent, Some(0), "{}", hosts.said(0));
+}
+
+/// The campaign ends without the host, and the agent gives up.
+#[test]
+fn cut_for_good() {
+    let linked = Linked::new(2.0, 0.3);
+    let before = linked.counters();
+    linked.cable.cut();
+    linked.walker_waits();
+    let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
+    assert_eq!(agent, Some(1), "{}", hosts.said(0));
+    let last_words = "calmwalk: the orchestrator has not answered for 0.3 min";
+    assert!(hosts.said(0).contains(last_words), "{}", hosts.said(0));
+    assert!(hosts.head_said().contains("others get its walks"), "{}", hosts.head_said());
+}
+
+/// What one side says is lost, then what the other says: each time both notice, and go on where they were.
+#[test]
+fn one_way() {
+    let linked = Linked::new(300.0, 60.0);
+    let before = linked.counters();
+    let all = "ip protocol tcp";
+    for (comes_in, leaves) in [(Some(all), None), (None, Some(all))] {
+        let said = |words| linked.hosts.said(0).matches(words).count();
+        let back = said("the orchestrator answers again");
+        let waits = said("1 of 1 walkers wait");
+        linked.cable.drop_where(comes_in, leaves);
+        wait_until("the walker waits", || said("1 of 1 walkers wait") > waits);
+        linked.cable.drop_where(None, None);
+        wait_until("the orchestrator is heard again", || said("the orchestrator answers again") > back);
+    }
+    let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
+    assert_eq!(agent, Some(0), "{}", hosts.said(0));
+    assert!(!hosts.head_said().contains("others get its walks"), "{}", hosts.head_said());
+}
+
+/// One packet in five is lost, in both directions and from the first on: the walkers wait more, that is all.
+#[test]
+fn a_fifth_is_lost() {
+    let cable = Cable::new();
+    let some = Some("numgen random mod 100 < 20");
+    cable.drop_where(some, some);
+    let linked = Linked::with_cable(cable, 300.0, 60.0);
+    linked.are_at_work();
+    let before = linked.counters();
+    let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
+    assert_eq!(agent, Some(0), "{}", hosts.said(0));
+}

@@ -1,0 +1,24 @@
+//! What goes wrong on real machines: links between hosts, full disks, wrong clocks, labellers that sleep.
+//!
+//! `cargo test --test faults`, as root, where namespaces may be made (a container needs the capabilities `SYS_ADMIN` and
+//! `NET_ADMIN`), with iproute2, nftables, libfaketime, openssl and util-linux. A test fails that lacks what it needs.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod cable;
+mod clocks;
+mod disk;
+mod links;
+
+use std::process::Command;
+
+/// Runs a command of the system, which must succeed.
+fn must(command: &str) {
+    let output = Command::new("sh").args(["-c", command]).output().expect("a shell");
+    assert!(
+        output.status.success(),
+        "{command}: {}\nThis test needs root, namespaces, and the packages that tests/faults/main.rs names.",
+        String::from_utf8_lossy(&output.stderr)
+    );
+}

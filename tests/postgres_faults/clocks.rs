@@ -1,0 +1,87 @@
+//! Labellers on other hosts whose clocks are wrong by an hour, or jump: leases go by the server's clock.
+
+use std::fs;
+use std::thread::sleep;
+use std::time::Duration;
+
+use crate::common::Running;
+use crate::common::campaign::{Small, outcome_at};
+use crate::common::clock::Clock;
+use crate::common::hosts::undisturbed;
+use crate::common::place::Place;
+use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::common::{random, through};
+
+/// `calmwalk label` with this clock on another host, as far as one can show it: with process numbers of its own, and
+/// another boot.
+fn label(place: &Place, clock: &Clock) -> Running {
+    let boot = place.path().join("boot_id");
+    fs::write(&boot, "11111111-2222-3333-4444-555555555555\n").unwrap();
+    let elsewhere = ["unshare", "--pid", "--mount", "--fork", "--kill-child", "--mount-proc", "sh", "-c"];
+    let script = format!("mount --bind {} /proc/sys/kernel/random/boot_id && exec \"$@\"", boot.display());
+    let starter = elsewhere.map(str::to_owned).into_iter().chain([script, "sh".into()]);
+    let starter: Vec<_> = starter.chain(clock.starter()).collect();
+    place.spawn(through(&starter, place.path()), &["label", "--store", place.argument()])
+}
+
+fn clocks(place: &Place) -> [Clock; 2] {
+    ["+1h", "-1h"].map(|offset| {
+        let directory = place.path().join(offset);
+        fs::create_dir(&directory).unwrap();
+        Clock::new(&directory, offset)
+    })
+}
+
+/// Every label is made by one of two whose clocks are never the same, nor that of the server.
+#[test]
+fn labellers_with_wrong_clocks_label_everything_once() {
+    let small = Small { steps: 1600, per_seed: 12, ..Small::default() };
+    let place = Place::new(&small, &[("[label]", "[label]\nslots = 0\nlease = 2")]);
+    let mut run = place.run();
+    wait_until("there is a campaign", || place.jobs("queued") > 0);
+    let clocks = clocks(&place);
+    let mut labelling: Vec<_> = clocks.iter().map(|clock| label(&place, clock)).collect();
+    for jump in 0.. {
+        if run.0.try_wait().unwrap().is_some() {
+            break;
+        }
+        sleep(Duration::from_millis(200 + random(jump) % 800));
+        clocks[jump as usize % 2].set(["+1h", "+0", "-1h"][jump as usize % 3]);
+    }
+    assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    for label in &mut labelling {
+        assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    }
+    assert_eq!(
+        place.said().matches(": labelled ").count() as u64,
+        place.jobs("labelled"),
+        "{}",
+        place.said()
+    );
+    assert_eq!(outcome_at(place.argument(), place.path()), undisturbed(&small));
+}
+
+/// One an hour behind has a structure in hand, and does not get on for some seconds; one an hour ahead looks for work.
+#[test]
+fn a_lease_lasts_however_late_others_think_it_is() {
+    let small = Small { steps: 60, ..Small::default() };
+    let place = Place::new(&small, &[("[label]", "[label]\nlease = 60")]);
+    assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
+    let name = place.queue_large();
+    let [ahead, behind] = clocks(&place);
+    let mut first = label(&place, &behind);
+    wait_until("the structure is leased", || place.jobs("leased") == 1);
+    let slot = carrying_out(place.path(), "labeller")[0];
+    signal(slot, "STOP");
+    assert_eq!(place.jobs("leased"), 1, "it was stopped too late: {}", place.said());
+    let mut second = label(&place, &ahead);
+    wait_until("another looks", || carrying_out(place.path(), "labeller").len() == 2);
+    // Some looks at the queue.
+    sleep(Duration::from_secs(8));
+    signal(slot, "CONT");
+    for label in [&mut first, &mut second] {
+        assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    }
+    let job = place.job(&name);
+    assert_eq!((job.job.attempts, job.energies.len()), (1, 1), "{}", place.said());
+}

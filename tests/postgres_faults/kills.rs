@@ -1,0 +1,117 @@
+//! Orchestrator, agents, walkers and labellers are killed at random instants.
+
+use std::thread::sleep;
+use std::time::Duration;
+
+use crate::common::campaign::{Outcome, Small};
+use crate::common::hosts::undisturbed;
+use crate::common::processes::{carrying_out, signal};
+use crate::common::{Running, kills, random};
+use crate::server::Campaign;
+
+/// A campaign with two agents, in which everybody is killed sooner or later and started again.
+struct Killed {
+    campaign: Campaign,
+    orchestrator: Running,
+    agents: [Running; 2],
+}
+
+impl Killed {
+    fn new(small: &Small, name: &str) -> Self {
+        let campaign = Campaign::new(small, name, 2);
+        let orchestrator = campaign.hosts.lead();
+        let agents = [campaign.hosts.agent(0), campaign.hosts.agent(1)];
+        Self { campaign, orchestrator, agents }
+    }
+
+    /// Kills one process, or the orchestrator in its place if there is none of that kind.
+    fn kill(&self, choice: u64) {
+        let which = |mut pids: Vec<u32>| match pids.len() {
+            0 => self.orchestrator.0.id(),
+            n => pids.swap_remove((choice / 8) as usize % n),
+        };
+        let host = (choice / 64) as usize % 2;
+        let home = self.campaign.home();
+        signal(
+            match choice % 8 {
+                0 | 1 => self.orchestrator.0.id(),
+                2 | 3 => self.agents[host].0.id(),
+                4 => which(carrying_out(self.campaign.hosts.others[host].path(), "walker")),
+                5 => which(carrying_out(home, "walker")),
+                _ => which(carrying_out(home, "labeller")),
+            },
+            "KILL",
+        );
+    }
+
+    /// Starts whoever was killed; whether the campaign is over.
+    fn start_again(&mut self) -> bool {
+        match self.orchestrator.0.try_wait().unwrap().map(|ended| ended.code()) {
+            Some(Some(code)) => {
+                assert_eq!(code, 0, "{}", self.campaign.hosts.head_said());
+                return true;
+            }
+            Some(None) => self.orchestrator = self.campaign.hosts.lead(),
+            None => {}
+        }
+        for (host, agent) in self.agents.iter_mut().enumerate() {
+            if let Some(ended) = agent.0.try_wait().unwrap()
+                && ended.code() != Some(0)
+            {
+                assert_eq!(ended.code(), None, "{}", self.campaign.hosts.said(host));
+                *agent = self.campaign.hosts.agent(host);
+            }
+        }
+        false
+    }
+
+    /// Waits until the campaign is over and its agents have left.
+    fn end(mut self) -> Outcome {
+        while !self.start_again() {
+            sleep(Duration::from_millis(20));
+        }
+        // One that came late to a campaign that was over waits for the next run of it.
+        for (host, agent) in self.agents.iter_mut().enumerate() {
+            signal(agent.0.id(), "TERM");
+            let ended = agent.0.wait().unwrap();
+            assert!(
+                matches!(ended.code(), Some(0 | 130) | None),
+                "{ended}: {}",
+                self.campaign.hosts.said(host)
+            );
+        }
+        self.campaign.outcome()
+    }
+}
+
+/// So many kills, some in each campaign; hands each outcome to `check`.
+fn killed(small: &Small, name: &str, check: impl Fn(&Outcome)) {
+    let mut done = 0;
+    while done < kills() {
+        let mut killed = Killed::new(small, name);
+        while done < kills() {
+            sleep(Duration::from_millis(random(done) % 1500));
+            if killed.start_again() {
+                break;
+            }
+            killed.kill(random(9000 + done));
+            done += 1;
+            // Of a process that was killed there may be a moment's delay until it is seen to be so.
+            sleep(Duration::from_millis(5));
+        }
+        check(&killed.end());
+    }
+}
+
+#[test]
+fn kills_change_nothing_in_a_reproducible_campaign() {
+    let small = Small::default();
+    let expected = undisturbed(&small);
+    killed(&small, "kills", |outcome| assert_eq!(outcome, &expected));
+}
+
+/// What is decided depends on who is first; [`Campaign::outcome`] checks the books.
+#[test]
+fn kills_lose_and_double_nothing_in_a_live_campaign() {
+    killed(&Small { mode: "live", ..Small::default() }, "live", |_| ());
+}

@@ -1,0 +1,90 @@
+//! The server is restarted, or away for longer.
+
+use std::thread::sleep;
+use std::time::Duration;
+
+use crate::common::campaign::Small;
+use crate::common::hosts::undisturbed;
+use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::common::random;
+use crate::server::{Campaign, control};
+
+/// Some 20 s of work for two walkers.
+fn long() -> Small {
+    Small { steps: 1600, per_seed: 24, ..Small::default() }
+}
+
+/// In order and after crashes, while walkers and labellers are at work here and on another host.
+#[test]
+fn restarts_change_nothing() {
+    let small = long();
+    let expected = undisturbed(&small);
+    let campaign = Campaign::new(&small, "restarts", 1);
+    let (mut orchestrator, mut agent) = (campaign.hosts.lead(), campaign.hosts.agent(0));
+    let mut before = campaign.counters();
+    for restart in 0..6 {
+        wait_until("the campaign advances", || {
+            let now = campaign.counters();
+            now.sent > before.sent && now.labels > before.labels
+        });
+        before = campaign.counters();
+        sleep(Duration::from_millis(random(restart) % 500));
+        control(if restart % 3 == 0 { "restart" } else { "crash" });
+        assert!(orchestrator.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.head_said());
+        let after = campaign.counters();
+        assert!(after.is_no_less_than(&before), "{before:?} {after:?}");
+    }
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.head_said());
+    assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.said(0));
+    assert_eq!(campaign.outcome(), expected);
+}
+
+/// The same with everything in one process.
+#[test]
+fn restarts_change_nothing_in_one_process() {
+    let small = long();
+    let expected = undisturbed(&small);
+    let mut campaign = Campaign::new(&small, "one", 0);
+    campaign.hosts.listens = false;
+    campaign.hosts.options[0] = vec!["--in-process".into()];
+    let mut orchestrator = campaign.hosts.lead();
+    for restart in 0..3 {
+        let before = campaign.counters();
+        wait_until("the campaign advances", || campaign.counters().sent > before.sent);
+        sleep(Duration::from_millis(random(50 + restart) % 500));
+        control("crash");
+    }
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.head_said());
+    assert_eq!(campaign.outcome(), expected);
+}
+
+/// Longer than anybody may be silent. A labeller that dies meanwhile is replaced by one that waits, too.
+#[test]
+fn a_server_that_is_away_for_a_minute_is_waited_for() {
+    let small = long();
+    let expected = undisturbed(&small);
+    let campaign = Campaign::new(&small, "away", 1);
+    let (mut orchestrator, mut agent) = (campaign.hosts.lead(), campaign.hosts.agent(0));
+    wait_until("labels are made", || campaign.counters().labels > 0);
+    let before = campaign.counters();
+    control("halt");
+    let said = |words: &str| campaign.hosts.head_said().contains(words);
+    wait_until("it says why it waits", || {
+        said("waiting for the database: the database server does not answer")
+    });
+    let labeller = carrying_out(campaign.home(), "labeller")[0];
+    signal(labeller, "KILL");
+    wait_until("another is there", || {
+        carrying_out(campaign.home(), "labeller").first().is_some_and(|other| *other != labeller)
+    });
+    sleep(Duration::from_secs(60));
+    assert!(orchestrator.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.head_said());
+    assert!(agent.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.said(0));
+    control("resume");
+    wait_until("it says that it goes on", || said("the database answers again"));
+    let after = campaign.counters();
+    assert!(after.is_no_less_than(&before), "{before:?} {after:?}");
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.head_said());
+    assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.said(0));
+    assert_eq!(campaign.outcome(), expected);
+}

@@ -1,0 +1,54 @@
+//! The server, and campaigns on it.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use crate::common::campaign::{Counters, Outcome, Small, outcome_at};
+use crate::common::hosts::Hosts;
+use crate::common::processes::nothing_is_left;
+
+/// Does something to the server: `restart` in order, or after a `crash`; `halt` and `resume` it.
+pub fn control(action: &str) {
+    let command = std::env::var("CALMWALK_POSTGRES_CONTROL")
+        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/.ci/postgres").into());
+    let done = Command::new("sh").args(["-c", &format!("{command} {action}")]).status().unwrap();
+    assert!(done.success(), "{command} {action}");
+}
+
+/// URL of a schema that no other test uses.
+pub fn location(name: &str) -> String {
+    let server = std::env::var("CALMWALK_POSTGRES")
+        .expect("CALMWALK_POSTGRES must be the URL of a PostgreSQL server; '.ci/postgres start' makes one");
+    format!("{server}?schema=faults_{name}_{}_{}", std::process::id(), store::unix_milliseconds())
+}
+
+/// A campaign there, with `others` hosts besides the orchestrator's.
+pub struct Campaign {
+    pub hosts: Hosts,
+    pub location: String,
+}
+
+impl Campaign {
+    pub fn new(small: &Small, name: &str, others: usize) -> Self {
+        let location = location(name);
+        let keys = format!("store = \"{location}\"\nagent_silence_limit = 0.5");
+        Self { hosts: Hosts::new(small, others, &keys), location }
+    }
+
+    pub fn home(&self) -> &Path {
+        self.hosts.home.path()
+    }
+
+    pub fn counters(&self) -> Counters {
+        Counters::of(&self.location, self.home())
+    }
+
+    /// Checks that nothing is lost or doubled, and nobody left.
+    pub fn outcome(&self) -> Outcome {
+        let outcome = outcome_at(&self.location, self.home());
+        fs::remove_file(self.home().join("dataset.extxyz")).expect("the exported data set");
+        nothing_is_left(self.home());
+        outcome
+    }
+}
