@@ -11,7 +11,7 @@ use crate::server::{Campaign, control};
 
 /// Some 20 s of work for two walkers.
 fn long() -> Small {
-    Small { steps: 1600, per_seed: 24, ..Small::default() }
+    Small { steps: 1600, per_seed: 16, ..Small::default() }
 }
 
 /// In order and after crashes, while walkers and labellers are at work here and on another host.
@@ -22,7 +22,7 @@ fn restarts_change_nothing() {
     let campaign = Campaign::new(&small, "restarts", 1);
     let (mut orchestrator, mut agent) = (campaign.hosts.lead(), campaign.hosts.agent(0));
     let mut before = campaign.counters();
-    for restart in 0..6 {
+    for restart in 0..4 {
         wait_until("the campaign advances", || {
             let now = campaign.counters();
             now.sent > before.sent && now.labels > before.labels
@@ -48,7 +48,7 @@ fn restarts_change_nothing_in_one_process() {
     campaign.hosts.listens = false;
     campaign.hosts.options[0] = vec!["--in-process".into()];
     let mut orchestrator = campaign.hosts.lead();
-    for restart in 0..3 {
+    for restart in 0..2 {
         let before = campaign.counters();
         wait_until("the campaign advances", || campaign.counters().sent > before.sent);
         sleep(Duration::from_millis(random(50 + restart) % 500));
