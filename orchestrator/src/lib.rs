@@ -5,10 +5,11 @@
 //! store, and only then answers.
 //!
 //! The processes of a campaign are kept alive in the same way: the [`supervisor`] decides, the [`launcher`] starts and
-//! watches.
+//! watches. Where a batch system starts processes, [`slurm`] tells it which.
 
 pub mod grader;
 pub mod launcher;
 pub mod reactor;
 pub mod selector;
+pub mod slurm;
 pub mod supervisor;

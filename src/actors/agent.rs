@@ -13,7 +13,7 @@ use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinHandle;
 use wire::ipc::{self, IpcError, Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
-use wire::net::{Joined, Parted, Uplink};
+use wire::net::{self, Address, Joined, NetError, Parted, Tls, Uplink};
 use wire::place::Place;
 use wire::transport::Incoming;
 use workers::agent::{self, Agent, News};
@@ -30,16 +30,25 @@ pub const SCRATCH: &str = "calmwalk-agent-";
 /// Works for a campaign until it is over or this process is asked to stop. What is needed in the meantime lies in
 /// `directory`. To be awaited on the main thread: the walkers end with the thread that starts them.
 pub async fn work(
-    uplink: Uplink,
-    walkers: u32,
+    address: &Address,
+    tls: Option<&Tls>,
+    agent: net::Agent,
     patience: Duration,
     directory: &Path,
 ) -> Result<Ended, Failure> {
     let (stopping, stop) = asked_to_stop(STOPPING)?;
-    let uplink = Arc::new(uplink);
-    let joined = tokio::select! {
-        joined = uplink.join() => joined.map_err(Failure::failed)?,
+    let walkers = agent.walkers;
+    let (uplink, joined) = tokio::select! {
+        joined = join(address, tls, agent) => joined?,
         () = stop.notified() => return Ok(Ended::Interrupted),
+        () = address.over() => {
+            say("the campaign is over");
+            return Ok(Ended::Done);
+        }
+        () = tokio::time::sleep(patience) => {
+            let minutes = patience.as_secs_f64() / 60.0;
+            return Err(Failure::Failed(format!("no orchestrator has answered at {address} for {minutes:.1} min")));
+        }
     };
     let setup: AgentSetup = serde_json::from_slice(&joined.setup).map_err(|error| {
         Failure::Failed(format!("the orchestrator's setup: {error}: run the same program everywhere"))
@@ -67,6 +76,19 @@ pub async fn work(
     let ended = ended?;
     removed?;
     Ok(ended)
+}
+
+/// Waits until there is an orchestrator, and a place with it.
+async fn join(
+    address: &Address,
+    tls: Option<&Tls>,
+    agent: net::Agent,
+) -> Result<(Arc<Uplink>, Joined), Failure> {
+    let waiting = |why: &NetError| say(format_args!("waiting for the orchestrator: {why}"));
+    let uplink = Uplink::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
+    let uplink = Arc::new(uplink);
+    let joined = uplink.join().await.map_err(Failure::failed)?;
+    Ok((uplink, joined))
 }
 
 /// Removes what agents left that were killed on this host.

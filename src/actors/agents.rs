@@ -60,7 +60,8 @@ impl Agents {
             NetError::Ended { .. } => Failure::failed(error),
             error => Failure::input(error),
         })?;
-        say(format_args!("agents may join at {}", listen.endpoint));
+        listen.announce(hub.endpoint())?;
+        say(format_args!("agents may join at {}", hub.endpoint()));
         Ok(Self { hub: Some(hub), store, mixture })
     }
 

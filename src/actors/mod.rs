@@ -11,24 +11,28 @@ mod records;
 pub mod slots;
 mod starts;
 
-use std::path::Path;
+use std::fs;
+use std::io::{ErrorKind, Write};
+use std::path::{Path, PathBuf};
 use std::process;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
+use std::time::{Duration, Instant};
 
 use orchestrator::reactor::{self, Reactor};
 use orchestrator::selector::Selector;
 use store::{ProcessRecord, SERVER_AWAY, Store};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{Notify, mpsc};
-use wire::net::{Endpoint, Tls};
+use wire::net::{Announcement, Endpoint, Tls};
 use wire::transport::Incoming;
 
 use crate::campaign::Campaign;
-use crate::outcome::Failure;
+use crate::outcome::{Ended, Failure};
 use crate::output::say;
 use crate::progress::Display;
+use crate::whole_file::{WholeFile, cannot_write};
 
 /// Reports under way between walkers and reactor.
 const CHANNEL: usize = 64;
@@ -55,6 +59,46 @@ pub struct Listen {
     pub endpoint: Endpoint,
     /// Needed for everything but loopback.
     pub tls: Option<Tls>,
+    /// The file in which agents find it.
+    pub announce: Option<PathBuf>,
+    /// By which name others reach this host.
+    pub host: String,
+}
+
+impl Listen {
+    /// Writes down where agents find this run.
+    fn announce(&self, endpoint: &Endpoint) -> Result<(), Failure> {
+        let Some(path) = &self.announce else { return Ok(()) };
+        let endpoint = endpoint.of_host(&self.host).map_err(Failure::input)?;
+        write_down(path, &Announcement::At(endpoint))
+    }
+
+    /// What an earlier run wrote down does not hold any more.
+    pub fn begins(&self) -> Result<(), Failure> {
+        self.announce.as_deref().map_or(Ok(()), remove)
+    }
+
+    /// Writes down that there is no more work, or that nobody is there for the time being.
+    pub fn has_ended(&self, ended: Ended) -> Result<(), Failure> {
+        match (self.announce.as_deref(), ended) {
+            (None, _) => Ok(()),
+            (Some(path), Ended::Done) => write_down(path, &Announcement::Over),
+            (Some(path), Ended::Interrupted) => remove(path),
+        }
+    }
+}
+
+fn remove(path: &Path) -> Result<(), Failure> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != ErrorKind::NotFound => Err(cannot_write(path, error)),
+        _ => Ok(()),
+    }
+}
+
+fn write_down(path: &Path, announcement: &Announcement) -> Result<(), Failure> {
+    let mut file = WholeFile::create(path)?;
+    write!(file, "{announcement}").map_err(|error| cannot_write(path, error))?;
+    file.finish()
 }
 
 /// What is said when a campaign is asked to stop.
@@ -111,15 +155,27 @@ pub fn asked_to_stop(told: &'static str) -> Result<(Arc<AtomicBool>, Arc<Notify>
     Ok((stopping, stop))
 }
 
-/// Ctrl-C, SIGTERM and a closed terminal: the first calls `stop`, which stops in order, the second ends at once (which is safe too).
+/// A batch system tells every process of a job to end, and the job's script hands on what it is told: that is one request.
+const AT_ONCE: Duration = Duration::from_secs(5);
+
+/// Ctrl-C, SIGTERM and a closed terminal: the first calls `stop`, which stops in order, the second ends at once (which is
+/// safe too), but for a SIGTERM that comes together with the first.
 fn stop_on_signals(told: &'static str, stop: impl Fn() + Send + 'static) -> Result<(), Failure> {
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
     let mut hangup = signal(SignalKind::hangup()).map_err(Failure::failed)?;
     tokio::spawn(async move {
-        for first in [true, false] {
-            tokio::select! { _ = interrupt.recv() => (), _ = terminate.recv() => (), _ = hangup.recv() => () };
-            if !first {
+        let mut asked: Option<Instant> = None;
+        loop {
+            let again = tokio::select! {
+                _ = interrupt.recv() => false,
+                _ = hangup.recv() => false,
+                _ = terminate.recv() => asked.is_some_and(|asked| asked.elapsed() < AT_ONCE),
+            };
+            if again {
+                continue;
+            }
+            if asked.replace(Instant::now()).is_some() {
                 process::exit(130);
             }
             stop();

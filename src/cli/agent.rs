@@ -4,11 +4,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use store::ProcessRecord;
-use wire::net::{self, Endpoint, NetError, Tls, Uplink};
+use wire::net::{self, Address, Tls};
 
 use super::{Ended, Failure, block_on};
 use crate::actors::{agent, cores};
-use crate::output::say;
 
 /// Let this host take part in a campaign that `calmwalk run --listen` leads on another
 ///
@@ -18,9 +17,10 @@ use crate::output::say;
 /// before the end of a job is enough.
 #[derive(Debug, clap::Args)]
 pub struct Agent {
-    /// Where the orchestrator listens, as tcp/head:7447
+    /// Where the orchestrator listens, as tcp/head:7447; or @FILE, where FILE is that of its --announce and is looked at
+    /// again whenever it does not answer
     #[arg(long, value_name = "ENDPOINT")]
-    join: Endpoint,
+    join: Address,
     /// Walkers to start here [default: one a core]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
     walkers: Option<u32>,
@@ -28,7 +28,7 @@ pub struct Agent {
     /// use where a campaign has more walks than walkers
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=4096))]
     ahead: u32,
-    /// Give up when the orchestrator has been silent for so long, min
+    /// Give up when there was no orchestrator, or no answer of it, for so long, min
     #[arg(long, value_name = "MINUTES", default_value_t = 60.0, value_parser = minutes)]
     patience: f64,
     /// Directory with authority.pem, certificate.pem and key.pem: needed for everything but loopback
@@ -57,12 +57,7 @@ impl Agent {
             walkers,
             ahead: self.ahead,
         };
-        block_on(async {
-            let waiting = |why: &NetError| say(format_args!("waiting for the orchestrator: {why}"));
-            let uplink = Uplink::open(&self.join, tls.as_ref(), agent, waiting).await;
-            let uplink = uplink.map_err(Failure::input)?;
-            agent::work(uplink, walkers, patience, scratch.path()).await
-        })?
+        block_on(agent::work(&self.join, tls.as_ref(), agent, patience, scratch.path()))?
     }
 }
 

@@ -8,6 +8,7 @@ mod import;
 mod init;
 mod label;
 mod labeller;
+mod launch;
 mod md;
 mod queue;
 mod run;
@@ -41,6 +42,7 @@ enum Command {
     Run(run::Run),
     Agent(agent::Agent),
     Label(label::Label),
+    Launch(launch::Launch),
     Status(status::Status),
     Queue(queue::Queue),
     Export(export::Export),
@@ -63,6 +65,7 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Run(command) => command.run(),
         Command::Agent(command) => command.run(),
         Command::Label(command) => command.run(),
+        Command::Launch(command) => command.run(),
         Command::Status(command) => command.run(),
         Command::Queue(command) => command.run(),
         Command::Export(command) => command.run(),

@@ -4,6 +4,7 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
@@ -19,6 +20,9 @@ use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
 use crate::output::{print, say};
 use crate::summary;
+
+/// Between two tries to take a lock that another process has.
+const NEXT_TRY: Duration = Duration::from_secs(1);
 
 /// Run a campaign to its end, or go on with one that was interrupted
 ///
@@ -41,6 +45,16 @@ pub struct Run {
     /// Directory with authority.pem, certificate.pem and key.pem: needed for everything but loopback
     #[arg(long, value_name = "DIR", requires = "listen")]
     tls: Option<PathBuf>,
+    /// Write into this file where agents find this process (calmwalk agent --join @FILE), and in the end that there is no
+    /// more work
+    #[arg(long, value_name = "FILE", requires = "listen")]
+    announce: Option<PathBuf>,
+    /// Name by which other hosts know this one, to be announced [default: its host name]
+    #[arg(long, value_name = "NAME", requires = "announce")]
+    host: Option<String>,
+    /// Wait so long for another process that runs this campaign, which may be about to end, min
+    #[arg(long, value_name = "MINUTES", default_value_t = 0.0, value_parser = minutes)]
+    patience: f64,
 }
 
 impl Run {
@@ -56,12 +70,21 @@ impl Run {
             }
             _ => StoreError::Directory { directory: directory.clone(), source },
         })?;
-        store::check_directory(&directory)?;
-        let _lock = CampaignLock::acquire(&directory, "calmwalk run")?;
-        let tls = self.tls.as_deref().map(Tls::in_directory);
-        let listen = self.listen.map(|endpoint| actors::Listen { endpoint, tls });
-        let ended = block_on(run(&campaign, &directory, self.in_process, listen.as_ref()))?
-            .map_err(|failure| failure.in_campaign(&directory))?;
+        let listen = self.listen.map(|endpoint| actors::Listen {
+            endpoint,
+            tls: self.tls.as_deref().map(Tls::in_directory),
+            announce: self.announce,
+            host: self.host.unwrap_or_else(store::this_host),
+        });
+        let patience = Duration::from_secs_f64(60.0 * self.patience);
+        let ended = block_on(async {
+            let location = campaign.config.location(&directory)?;
+            let _lock = lock_directory(&directory, &location, patience).await?;
+            listen.iter().try_for_each(actors::Listen::begins)?;
+            run(&campaign, &directory, &location, self.in_process, listen.as_ref(), patience).await
+        })?
+        .map_err(|failure| failure.in_campaign(&directory))?;
+        listen.iter().try_for_each(|listen| listen.has_ended(ended))?;
         if ended == Ended::Interrupted {
             say("stopped in order; the same command goes on with the campaign");
         }
@@ -72,24 +95,24 @@ impl Run {
 async fn run(
     campaign: &Campaign,
     directory: &Path,
+    location: &Location,
     in_process: bool,
     listen: Option<&actors::Listen>,
+    patience: Duration,
 ) -> Result<Ended, Failure> {
-    let location = match &campaign.config.run.store {
-        Some(url) => url.parse()?,
-        None => Location::from(directory),
-    };
     // On a server the directory's lock is not enough: the campaign may be run from another host.
-    let lock = match &location {
-        Location::Server(_) => Some(CampaignLock::acquire_at(&location, "calmwalk run").await?),
+    let lock = match location {
+        Location::Server(_) => Some(
+            patiently(patience, async || CampaignLock::acquire_at(location, "calmwalk run").await).await?,
+        ),
         Location::Directory(_) => None,
     };
-    let store = open_store(campaign, &location).await?;
+    let store = open_store(campaign, location).await?;
     let store = lock.iter().fold(store, Store::led_by);
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
     if campaign.config.label.slots == 0 {
-        let shown = shown(&location);
+        let shown = shown(location);
         say(format_args!("label.slots = 0: labels come from calmwalk label --store {shown}"));
     }
     let run = actors::Run { campaign, store: &store, process: &process, directory, listen };
@@ -114,9 +137,9 @@ async fn run(
     }
     let summary = summary::of(&store, campaign.protocol.hash).await?;
     let failed = store.status().await?.labels.failed;
-    let (shown, file) = match &location {
-        Location::Directory(_) => (shown(&location), format!("/{DATABASE}")),
-        Location::Server(_) => (shown(&location), String::new()),
+    let (shown, file) = match location {
+        Location::Directory(_) => (shown(location), format!("/{DATABASE}")),
+        Location::Server(_) => (shown(location), String::new()),
     };
     print(|out| {
         writeln!(out, "{summary}")?;
@@ -138,6 +161,46 @@ fn shown(location: &Location) -> String {
         Location::Directory(_) => location.to_string(),
         // The shell has uses of its own for '?' and '&'.
         Location::Server(url) => format!("'{url}'"),
+    }
+}
+
+/// Takes the directory's lock. A campaign that is on a server may have its directory on a network file system, some of
+/// which lock nothing: the server's lock is what counts there.
+async fn lock_directory(
+    directory: &Path,
+    location: &Location,
+    patience: Duration,
+) -> Result<Option<CampaignLock>, StoreError> {
+    let acquire = async || CampaignLock::acquire(directory, "calmwalk run");
+    match location {
+        Location::Directory(_) => {
+            store::check_directory(directory)?;
+            patiently(patience, acquire).await.map(Some)
+        }
+        Location::Server(_) => match patiently(patience, acquire).await {
+            Err(StoreError::File { .. }) => Ok(None),
+            acquired => acquired.map(Some),
+        },
+    }
+}
+
+/// Tries to take a lock until it is free, or for so long.
+async fn patiently(
+    patience: Duration,
+    mut acquire: impl AsyncFnMut() -> Result<CampaignLock, StoreError>,
+) -> Result<CampaignLock, StoreError> {
+    let begun = Instant::now();
+    let mut waiting = false;
+    loop {
+        match acquire().await {
+            Err(error @ StoreError::Locked { .. }) if begun.elapsed() < patience => {
+                if !std::mem::replace(&mut waiting, true) {
+                    say(format_args!("waiting: {error}"));
+                }
+                tokio::time::sleep(NEXT_TRY).await;
+            }
+            acquired => return acquired,
+        }
     }
 }
 
@@ -252,4 +315,9 @@ async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector
         store.commit(&begun).await?;
     }
     Ok(selector)
+}
+
+fn minutes(text: &str) -> Result<f64, String> {
+    let minutes = text.parse().ok().filter(|minutes| (0.0..=1e6).contains(minutes));
+    minutes.ok_or_else(|| "expected 0 to 1e6".to_owned())
 }

@@ -1,12 +1,14 @@
 //! `calmwalk status`
 
+mod jobs;
 mod processes;
 
 use std::io::{self, Write};
 
 use serde_json::Value;
-use store::{Candidates, Labels, Status as Standing, Store, WalkStatus};
+use store::{Candidates, Labels, Location, Status as Standing, Store, WalkStatus};
 
+use self::jobs::Jobs;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::output::{Table, decimals, print, print_json};
 
@@ -30,22 +32,28 @@ pub struct Status {
 
 impl Status {
     pub fn run(self) -> Result<Ended, Failure> {
-        let (campaign, standing, training) = block_on(self.read())??;
+        let location = self.location.get()?;
+        let (campaign, standing, training) = block_on(self.read(&location))??;
+        let jobs = block_on(Jobs::of(&location))?;
         if self.json {
             let mut json = serde_json::to_value(&standing).map_err(Failure::failed)?;
             json["campaign"] = campaign.id.to_string().into();
             json["mode"] = campaign.mode.clone().into();
             json["training_frames"] = training;
+            jobs.add_to(&mut json);
             print_json(&json)?;
         } else {
-            print(|out| write_status(out, &campaign, &standing, &training, self.all))?;
+            print(|out| {
+                write_status(out, &campaign, &standing, &training, self.all)?;
+                jobs.write(out, self.all)
+            })?;
         }
         Ok(Ended::Done)
     }
 
     /// Campaign, standing, and the grades of the training frames under the newest mixture (null if not watched).
-    async fn read(&self) -> Result<(store::Campaign, Standing, Value), Failure> {
-        let store = Store::open_read_only(&self.location.get()?).await?;
+    async fn read(&self, location: &Location) -> Result<(store::Campaign, Standing, Value), Failure> {
+        let store = Store::open_read_only(location).await?;
         let values = store.values().await?;
         let watched = values.iter().find(|(name, _)| name == "training_frames");
         let watched = watched.and_then(|(_, text)| serde_json::from_str(text).ok()).unwrap_or_default();

@@ -14,6 +14,7 @@ use calm::rules::{Combination, Fraction, Positive};
 use calm::{CollectionRule, UpdateSettings};
 use orchestrator::selector::{Mode, UpdateProtocol};
 use serde::{Deserialize, Serialize};
+use store::{Location, StoreError};
 use toml::Spanned;
 use workers::settings::ThermostatKind;
 
@@ -267,6 +268,14 @@ impl Config {
             expected,
         })?;
         Ok((config, text))
+    }
+
+    /// Where the campaign is kept, if `directory` is its directory.
+    pub fn location(&self, directory: &Path) -> Result<Location, StoreError> {
+        match &self.run.store {
+            Some(url) => url.parse(),
+            None => Ok(Location::from(directory)),
+        }
     }
 
     /// Every path in it.

@@ -3,6 +3,7 @@
 mod pool;
 
 use std::collections::BTreeMap;
+use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -99,6 +100,8 @@ impl Agent {
     /// The orchestrator is silent, or it and this program do not understand each other.
     pub async fn run(mut self, mut watch: impl FnMut(News)) -> Result<Ended, Parted> {
         let slots = self.joined.slots();
+        let uplink = Arc::clone(&self.uplink);
+        let mut over = pin!(uplink.address().over());
         let mut desk = Desk::new(self.uplink, self.joined);
         desk.begin(slots);
         let mut look = interval(LOOK);
@@ -113,6 +116,11 @@ impl Agent {
                 joined = answered(&mut desk.joining) => desk.has_joined(joined?),
                 told = answered(&mut desk.question) => if desk.is_to_stop(told)? { watch(News::Stop) },
                 _ = look.tick() => desk.look(self.patience)?.into_iter().for_each(&mut watch),
+                // Of this agent the orchestrator knew nothing any more, or it would have waited.
+                () = &mut over => {
+                    desk.pool.send_home();
+                    return Ok(Ended::Done);
+                }
             }
             if self.stopping.load(Ordering::Relaxed) {
                 desk.pool.send_home();

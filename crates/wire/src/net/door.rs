@@ -1,7 +1,8 @@
 //! Endpoints, and the zenoh sessions that listen on them or connect to them.
 
 use std::fmt;
-use std::net::IpAddr;
+use std::io;
+use std::net::{IpAddr, TcpListener};
 use std::path::PathBuf;
 use std::str::FromStr;
 
@@ -10,7 +11,7 @@ use zenoh::{Config, Session, Wait};
 
 use super::NetError;
 
-/// Where an orchestrator listens, or an agent connects to: `tcp/HOST:PORT`.
+/// Where an orchestrator listens, or an agent connects to: `tcp/HOST:PORT`. Listening at port 0 takes one that is free.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Endpoint {
     host: String,
@@ -48,10 +49,33 @@ impl Tls {
 impl Endpoint {
     /// Whether nobody on another host can reach it.
     pub fn is_loopback(&self) -> bool {
-        match self.host.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>() {
+        match self.plain_host().parse::<IpAddr>() {
             Ok(address) => address.is_loopback(),
             Err(_) => self.host == "localhost",
         }
+    }
+
+    /// This endpoint, with a port that is free now in the place of port 0.
+    ///
+    /// # Errors
+    /// The host is none of this machine's.
+    pub(super) fn with_a_port(&self) -> io::Result<Self> {
+        let port = match self.port {
+            0 => TcpListener::bind((self.plain_host(), 0))?.local_addr()?.port(),
+            port => port,
+        };
+        Ok(Self { host: self.host.clone(), port })
+    }
+
+    /// As others reach it: where it is every address of this host, that is by the host's name.
+    pub fn of_host(&self, name: &str) -> Result<Self, EndpointError> {
+        let everywhere = self.plain_host().parse::<IpAddr>().is_ok_and(|address| address.is_unspecified());
+        if everywhere { format!("tcp/{name}:{}", self.port).parse() } else { Ok(self.clone()) }
+    }
+
+    /// Without the brackets of IPv6.
+    fn plain_host(&self) -> &str {
+        self.host.trim_start_matches('[').trim_end_matches(']')
     }
 
     /// As zenoh spells it.
@@ -169,6 +193,17 @@ mod tests {
         ] {
             assert!(text.parse::<Endpoint>().is_err(), "{text}");
         }
+    }
+
+    #[test]
+    fn others_are_told_a_name_and_a_port() {
+        let endpoint = |text: &str| text.parse::<Endpoint>().unwrap();
+        assert_eq!(endpoint("tcp/0.0.0.0:7").of_host("node7").unwrap(), endpoint("tcp/node7:7"));
+        assert_eq!(endpoint("tcp/[::]:7").of_host("node7").unwrap(), endpoint("tcp/node7:7"));
+        assert_eq!(endpoint("tcp/127.0.0.1:7").of_host("node7").unwrap(), endpoint("tcp/127.0.0.1:7"));
+        assert!(endpoint("tcp/0.0.0.0:7").of_host("node 7").is_err());
+        assert_ne!(endpoint("tcp/127.0.0.1:0").with_a_port().unwrap().port, 0);
+        assert_eq!(endpoint("tcp/head:7").with_a_port().unwrap(), endpoint("tcp/head:7"));
     }
 
     #[test]

@@ -46,6 +46,7 @@ pub enum AgentEvent {
 
 /// The orchestrator's end of the transport. Agents can connect as soon as it is open and are heard when it runs.
 pub struct Hub {
+    endpoint: Endpoint,
     session: Session,
     questions: Queryable<FifoChannelHandler<Query>>,
     signs: Subscriber<FifoChannelHandler<Sample>>,
@@ -84,8 +85,9 @@ impl Hub {
         patience: Duration,
         welcome: Welcome,
     ) -> Result<Self, NetError> {
-        let (number, failed) = (session, |why| NetError::open(endpoint, why));
-        let session = door::open(Side::Orchestrator, endpoint, tls).await?;
+        let endpoint = endpoint.with_a_port().map_err(|why| NetError::open(endpoint, why))?;
+        let (number, failed) = (session, |why| NetError::open(&endpoint, why));
+        let session = door::open(Side::Orchestrator, &endpoint, tls).await?;
         let channel = zenoh::handlers::FifoChannel::new(QUESTIONS);
         let questions = session.declare_queryable(ORCHESTRATOR).complete(true).with(channel);
         let questions = questions.await.map_err(failed)?;
@@ -93,7 +95,13 @@ impl Hub {
         let signs = session.liveliness().declare_subscriber(format!("{AGENTS}/*")).with(channel);
         let signs = signs.await.map_err(failed)?;
         let (sender, orders) = mpsc::unbounded_channel();
-        Ok(Self { session, questions, signs, orders, handle: Handle(sender), number, patience, welcome })
+        let handle = Handle(sender);
+        Ok(Self { endpoint, session, questions, signs, orders, handle, number, patience, welcome })
+    }
+
+    /// Where it listens.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.endpoint
     }
 
     /// For whoever ends it.

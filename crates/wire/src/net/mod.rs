@@ -13,6 +13,7 @@
 //!   joins anew.
 //! - **Explicit endpoints, no scouting.** Off loopback nothing listens or connects without TLS with certificates on both sides.
 
+mod address;
 mod changes;
 mod desk;
 mod door;
@@ -27,6 +28,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
+pub use address::{Address, Announcement};
 pub use changes::ChangesError;
 pub use door::{Endpoint, EndpointError, Tls};
 pub use hub::{AgentEvent, Handle, Hub};
@@ -63,6 +65,27 @@ pub enum NetError {
         path: PathBuf,
         /// Why not.
         source: std::io::Error,
+    },
+    /// No orchestrator has said where it is.
+    #[error("no orchestrator has written yet where it is: there is no file {}", path.display())]
+    Nobody {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The orchestrator has written that there is no more work.
+    #[error("the campaign is over")]
+    Over,
+    /// A file that does not say where the orchestrator is.
+    #[error(
+        "{} does not say where the orchestrator is: expected tcp/HOST:PORT, found {found:?}; \
+         calmwalk run --announce writes such a file",
+        path.display()
+    )]
+    Announcement {
+        /// The file.
+        path: PathBuf,
+        /// How it begins.
+        found: String,
     },
     /// zenoh cannot listen or connect.
     #[error("cannot open {endpoint}: {why}")]

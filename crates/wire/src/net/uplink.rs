@@ -1,7 +1,7 @@
 //! An agent's end: one session with the orchestrator, in which everything is asked until it is answered.
 
 use std::collections::VecDeque;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex as Lock, PoisonError};
 use std::time::Duration;
 
 use calm::Mixture;
@@ -13,6 +13,7 @@ use zenoh::query::ConsolidationMode;
 use zerocopy::IntoBytes;
 
 use super::NetError;
+use super::address::{Address, Announcement};
 use super::changes::{Arriving, ChangesError};
 use super::door::{self, Endpoint, Side, Tls};
 use super::message::{AGENTS, Agent, ORCHESTRATOR, Reply, Request};
@@ -26,13 +27,25 @@ const ASK_EVERY: Duration = Duration::from_secs(5);
 const PAUSE: Duration = Duration::from_millis(300);
 /// Between two tries to connect for the first time.
 const NEXT_TRY: Duration = Duration::from_secs(1);
+/// Between two looks whether the orchestrator is somewhere else.
+const LOOK: Duration = Duration::from_secs(1);
 /// Versions of the mixture that are kept.
 const VERSIONS: usize = 4;
 
 /// An agent's line to the orchestrator.
 pub struct Uplink {
-    session: Session,
+    address: Address,
+    tls: Option<Tls>,
     agent: Agent,
+    line: Lock<Arc<Line>>,
+    /// Held by who looks for the orchestrator, with the moment of the last look.
+    looked: Mutex<Option<Instant>>,
+}
+
+/// A connection to the orchestrator in one place.
+struct Line {
+    endpoint: Endpoint,
+    session: Session,
     /// The sign of life.
     _token: LivelinessToken,
 }
@@ -81,32 +94,81 @@ impl From<ChangesError> for Parted {
     }
 }
 
+impl Line {
+    /// Connects to where the orchestrator is said to be.
+    async fn find(address: &Address, tls: Option<&Tls>, agent: &Agent) -> Result<Self, NetError> {
+        match address.look()? {
+            Announcement::At(endpoint) => Self::open(endpoint, tls, agent).await,
+            Announcement::Over => Err(NetError::Over),
+        }
+    }
+
+    async fn open(endpoint: Endpoint, tls: Option<&Tls>, agent: &Agent) -> Result<Self, NetError> {
+        let session = door::open(Side::Agent, &endpoint, tls).await?;
+        let token = session.liveliness().declare_token(format!("{AGENTS}/{}", agent.id));
+        let _token = token.await.map_err(|why| NetError::open(&endpoint, why))?;
+        Ok(Self { endpoint, session, _token })
+    }
+
+    /// Asks once; `None` if there was no answer in time, or no line.
+    async fn ask(&self, payload: Vec<u8>) -> Option<Vec<u8>> {
+        let query = self.session.get(ORCHESTRATOR).payload(payload).timeout(ASK_EVERY);
+        let replies = query.consolidation(ConsolidationMode::None).await.ok()?;
+        let reply = replies.recv_async().await.ok()?;
+        Some(reply.result().ok()?.payload().to_bytes().into_owned())
+    }
+}
+
 impl Uplink {
-    /// Waits until an orchestrator listens at the endpoint, and makes itself known there.
+    /// Waits until an orchestrator listens at the address, and makes itself known there.
     ///
     /// `waiting` is told why the first try did not succeed.
     ///
     /// # Errors
-    /// An endpoint off loopback without certificates, files that cannot be read.
+    /// An endpoint off loopback without certificates, files that cannot be read or that say something else.
     pub async fn open(
-        endpoint: &Endpoint,
+        address: &Address,
         tls: Option<&Tls>,
         agent: Agent,
         waiting: impl FnOnce(&NetError),
     ) -> Result<Self, NetError> {
         let mut waiting = Some(waiting);
-        let session = loop {
-            match door::open(Side::Agent, endpoint, tls).await {
-                Err(error @ NetError::Open { .. }) => {
+        let line = loop {
+            match Line::find(address, tls, &agent).await {
+                Err(error @ (NetError::Open { .. } | NetError::Nobody { .. } | NetError::Over)) => {
                     waiting.take().into_iter().for_each(|waiting| waiting(&error));
                     sleep(NEXT_TRY).await;
                 }
-                opened => break opened?,
+                found => break found?,
             }
         };
-        let token = session.liveliness().declare_token(format!("{AGENTS}/{}", agent.id));
-        let _token = token.await.map_err(|why| NetError::open(endpoint, why))?;
-        Ok(Self { session, agent, _token })
+        let (address, tls) = (address.clone(), tls.cloned());
+        Ok(Self { address, tls, agent, line: Lock::new(Arc::new(line)), looked: Mutex::default() })
+    }
+
+    /// Where it looks for the orchestrator.
+    pub fn address(&self) -> &Address {
+        &self.address
+    }
+
+    fn line(&self) -> Arc<Line> {
+        Arc::clone(&self.line.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Goes to where the orchestrator is said to be, if that is not where the line leads.
+    async fn follow(&self, line: &Arc<Line>) {
+        // One of many who have no answer looks for all of them.
+        let Ok(mut looked) = self.looked.try_lock() else { return };
+        if looked.is_some_and(|looked| looked.elapsed() < LOOK) || !Arc::ptr_eq(line, &self.line()) {
+            return;
+        }
+        if let Ok(Announcement::At(endpoint)) = self.address.look()
+            && endpoint != line.endpoint
+            && let Ok(found) = Line::open(endpoint, self.tls.as_ref(), &self.agent).await
+        {
+            *self.line.lock().unwrap_or_else(PoisonError::into_inner) = Arc::new(found);
+        }
+        *looked = Some(Instant::now());
     }
 
     /// Asks for a place until it is given one.
@@ -139,11 +201,12 @@ impl Uplink {
 
     /// Asks once; `None` if there was no answer in time, or no line.
     pub(super) async fn ask(&self, control: &[u8], candidate: Option<&[u8]>) -> Option<Vec<u8>> {
-        let payload = frame::beside(control, candidate).as_bytes().to_vec();
-        let query = self.session.get(ORCHESTRATOR).payload(payload).timeout(ASK_EVERY);
-        let replies = query.consolidation(ConsolidationMode::None).await.ok()?;
-        let reply = replies.recv_async().await.ok()?;
-        Some(reply.result().ok()?.payload().to_bytes().into_owned())
+        let line = self.line();
+        let answer = line.ask(frame::beside(control, candidate).as_bytes().to_vec()).await;
+        if answer.is_none() {
+            self.follow(&line).await;
+        }
+        answer
     }
 
     /// Asks until there is an answer.

@@ -129,7 +129,7 @@ pub fn agent(id: &str, walkers: u32) -> Agent {
 
 /// An agent that has been given a place.
 pub async fn join(port: u16, agent: Agent) -> (Arc<Uplink>, Arc<Joined>) {
-    let uplink = Arc::new(Uplink::open(&endpoint(port), None, agent, |_| {}).await.unwrap());
+    let uplink = Arc::new(Uplink::open(&endpoint(port).into(), None, agent, |_| {}).await.unwrap());
     let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
     (uplink, Arc::new(joined))
 }

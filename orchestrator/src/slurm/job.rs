@@ -1,0 +1,211 @@
+//! Jobs: their names, and what `squeue` says about them.
+
+use std::fmt;
+
+/// What a job of a campaign does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Role {
+    /// Leads the campaign.
+    Orchestrator,
+    /// Walkers on one node; which agent, from 0.
+    Agent(u32),
+    /// Makes labels; which labeller job, from 0.
+    Labeller(u32),
+}
+
+/// The names of the jobs of one campaign.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct JobNames {
+    prefix: String,
+}
+
+/// Where a job stands, as far as it matters to what is to be submitted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Phase {
+    /// It waits.
+    Pending,
+    /// It has a node. States that are not known count as this one: nothing is submitted beside them.
+    Running,
+    /// It ends; it may be requeued then.
+    Completing,
+    /// It has ended and will not come back.
+    Over,
+}
+
+/// A job, as `squeue` shows it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Job {
+    /// Its number.
+    pub id: u64,
+    /// What it does.
+    pub role: Role,
+    /// Its state in Slurm's words, as `RUNNING`.
+    pub state: String,
+    /// Where it runs or ran; empty for one that waits.
+    pub nodes: String,
+    /// When it began, or will as far as is known: local time as 2026-11-21T20:15:00, or `N/A`.
+    pub start: String,
+    /// How long it may go on: days-hours:minutes:seconds, or what else Slurm says.
+    pub time_left: String,
+    /// Walkers of an agent, if Slurm has kept what was written down at its submission.
+    pub walkers: Option<u32>,
+    /// Why it waits or how it ended, in Slurm's words; `None` where there is no reason.
+    pub reason: Option<String>,
+}
+
+/// Before the number of walkers in the comment of an agent's job.
+const WALKERS: &str = "walkers=";
+
+impl Role {
+    /// `orchestrator`, `agent-3`, `labeller-0`.
+    pub fn name(self) -> String {
+        match self {
+            Self::Orchestrator => "orchestrator".to_owned(),
+            Self::Agent(number) => format!("agent-{number}"),
+            Self::Labeller(number) => format!("labeller-{number}"),
+        }
+    }
+
+    fn of(name: &str) -> Option<Self> {
+        let number = |text: &str| text.parse().ok();
+        match name.split_once('-') {
+            None => (name == "orchestrator").then_some(Self::Orchestrator),
+            Some(("agent", text)) => Some(Self::Agent(number(text)?)),
+            Some(("labeller", text)) => Some(Self::Labeller(number(text)?)),
+            Some(_) => None,
+        }
+    }
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Orchestrator => f.write_str("orchestrator"),
+            Self::Agent(number) => write!(f, "agent {number}"),
+            Self::Labeller(number) => write!(f, "labeller {number}"),
+        }
+    }
+}
+
+impl JobNames {
+    /// Of the campaign with this identifier, of letters and digits.
+    pub fn new(campaign: &str) -> Self {
+        Self { prefix: format!("calmwalk-{campaign}-") }
+    }
+
+    /// The name of the job that does this.
+    pub fn of(&self, role: Role) -> String {
+        format!("{}{}", self.prefix, role.name())
+    }
+
+    /// What the job of this name does, if it is one of the campaign.
+    pub fn role(&self, name: &str) -> Option<Role> {
+        Role::of(name.strip_prefix(&self.prefix)?)
+    }
+}
+
+impl Job {
+    /// What `squeue` is to write about each job, one on a line.
+    pub(super) const FORMAT: &str = "%i|%T|%j|%N|%S|%L|%k|%r";
+
+    /// A line of `squeue`; `Ok(None)` if it is about a job of something else.
+    ///
+    /// # Errors
+    /// A job of the campaign about which something else is said than what was asked for.
+    pub(super) fn parse(line: &str, names: &JobNames) -> Result<Option<Self>, ()> {
+        let fields: Vec<_> = line.splitn(8, '|').collect();
+        let Some(role) = fields.get(2).and_then(|name| names.role(name)) else { return Ok(None) };
+        let [id, state, _, nodes, start, time_left, comment, reason] = fields[..] else { return Err(()) };
+        Ok(Some(Self {
+            id: id.parse().map_err(drop)?,
+            role,
+            state: state.to_owned(),
+            nodes: nodes.to_owned(),
+            start: start.to_owned(),
+            time_left: time_left.to_owned(),
+            walkers: comment.strip_prefix(WALKERS).and_then(|number| number.parse().ok()),
+            reason: (reason != "None").then(|| reason.to_owned()),
+        }))
+    }
+
+    /// Where it stands.
+    pub fn phase(&self) -> Phase {
+        match self.state.as_str() {
+            "PENDING" | "REQUEUED" | "REQUEUE_FED" | "REQUEUE_HOLD" | "RESV_DEL_HOLD" | "SPECIAL_EXIT" => {
+                Phase::Pending
+            }
+            "COMPLETING" => Phase::Completing,
+            "BOOT_FAIL" | "CANCELLED" | "COMPLETED" | "DEADLINE" | "FAILED" | "LAUNCH_FAILED"
+            | "NODE_FAIL" | "OUT_OF_MEMORY" | "PREEMPTED" | "RECONFIG_FAIL" | "REVOKED" | "TIMEOUT" => {
+                Phase::Over
+            }
+            _ => Phase::Running,
+        }
+    }
+}
+
+/// What is written into the comment of an agent's job.
+pub(super) fn comment(walkers: u32) -> String {
+    format!("{WALKERS}{walkers}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_belong_to_one_campaign() {
+        let names = JobNames::new("1a2b");
+        for role in [Role::Orchestrator, Role::Agent(0), Role::Agent(4000), Role::Labeller(7)] {
+            assert_eq!(names.role(&names.of(role)), Some(role));
+            assert_eq!(JobNames::new("1a2").role(&names.of(role)), None);
+            assert_eq!(JobNames::new("1a2b3").role(&names.of(role)), None);
+        }
+        for name in ["", "calmwalk-1a2b-", "calmwalk-1a2b-agent", "calmwalk-1a2b-agent-x", "agent-1"] {
+            assert_eq!(names.role(name), None, "{name}");
+        }
+        assert_eq!(names.of(Role::Agent(3)), "calmwalk-1a2b-agent-3");
+    }
+
+    #[test]
+    fn lines_of_squeue_are_read() {
+        let names = JobNames::new("1a");
+        let line = "12|RUNNING|calmwalk-1a-agent-3|node7|2026-11-21T20:15:00|1-02:00:00|walkers=16|None";
+        let job = Job::parse(line, &names).unwrap().unwrap();
+        assert_eq!((job.id, job.role, job.phase()), (12, Role::Agent(3), Phase::Running));
+        assert_eq!((job.walkers, job.reason), (Some(16), None));
+        let line = "13|PENDING|calmwalk-1a-orchestrator||N/A|2:00|(null)|launch failed | requeued held";
+        let job = Job::parse(line, &names).unwrap().unwrap();
+        assert_eq!((job.role, job.phase(), job.walkers), (Role::Orchestrator, Phase::Pending, None));
+        assert_eq!(job.reason.as_deref(), Some("launch failed | requeued held"));
+    }
+
+    #[test]
+    fn other_jobs_are_passed_over_and_half_lines_are_not() {
+        let names = JobNames::new("1a");
+        for line in ["", "12|RUNNING|relax|node7|N/A|1:00|(null)|None", "12_[1-3]|PENDING|a|b"] {
+            assert_eq!(Job::parse(line, &names), Ok(None), "{line}");
+        }
+        for line in ["12|RUNNING|calmwalk-1a-agent-3|node7", "x|RUNNING|calmwalk-1a-agent-3|n|N/A|1:00||None"]
+        {
+            assert_eq!(Job::parse(line, &names), Err(()), "{line}");
+        }
+    }
+
+    #[test]
+    fn a_state_that_nobody_knows_is_that_of_a_living_job() {
+        let job = |state: &str| Job {
+            id: 1,
+            role: Role::Orchestrator,
+            state: state.into(),
+            nodes: String::new(),
+            start: String::new(),
+            time_left: String::new(),
+            walkers: None,
+            reason: None,
+        };
+        let phase = |state| job(state).phase();
+        assert_eq!([phase("CONFIGURING"), phase("SUSPENDED"), phase("DREAMING")], [Phase::Running; 3]);
+        assert_eq!([phase("FAILED"), phase("NODE_FAIL"), phase("COMPLETED")], [Phase::Over; 3]);
+    }
+}

@@ -1,0 +1,143 @@
+//! The scripts of a campaign's jobs: templates with what belongs to the campaign put in.
+
+use std::fs;
+use std::io::Write;
+use std::path::Path;
+
+use crate::outcome::Failure;
+use crate::whole_file::{WholeFile, cannot_write};
+
+/// The templates, as they stand in `configs/slurm`.
+const TEMPLATES: [(&str, &str); 4] = [
+    (ORCHESTRATOR, include_str!("../../../configs/slurm/orchestrator.sbatch")),
+    (AGENT, include_str!("../../../configs/slurm/agent.sbatch")),
+    (LABELLER, include_str!("../../../configs/slurm/labeller.sbatch")),
+    (COMMON, include_str!("../../../configs/slurm/job.sh")),
+];
+pub const ORCHESTRATOR: &str = "orchestrator.sbatch";
+pub const AGENT: &str = "agent.sbatch";
+pub const LABELLER: &str = "labeller.sbatch";
+/// What the others source.
+pub const COMMON: &str = "job.sh";
+
+/// Names and values that are put into a template.
+pub type Values<'a> = [(&'a str, String)];
+
+/// The template of this name: the site's, if it has its own, or that of this program.
+pub fn template(site: Option<&Path>, name: &str) -> Result<String, Failure> {
+    match site {
+        Some(directory) => {
+            let path = directory.join(name);
+            let failed = |error| {
+                Failure::Input(format!(
+                    "cannot read {}: {error}; --template names a copy of configs/slurm with its four files",
+                    path.display()
+                ))
+            };
+            fs::read_to_string(&path).map_err(failed)
+        }
+        None => {
+            let found = TEMPLATES.iter().find(|(of, _)| *of == name);
+            Ok(found.map(|(_, text)| (*text).to_owned()).unwrap_or_default())
+        }
+    }
+}
+
+/// The template with each `{name}` replaced by its value. `${name}` is the shell's and stays.
+///
+/// # Errors
+/// A name that has no value.
+pub fn fill(name: &str, template: &str, values: &Values<'_>) -> Result<String, Failure> {
+    let mut text = String::with_capacity(template.len());
+    let mut rest = template;
+    while let Some(begin) = rest.find('{') {
+        let (before, from) = rest.split_at(begin);
+        text += before;
+        let word = placeholder(from).filter(|_| !before.ends_with('$'));
+        let Some(word) = word else {
+            text.push('{');
+            rest = &from[1..];
+            continue;
+        };
+        let Some((_, value)) = values.iter().find(|(name, _)| *name == word) else {
+            let line = 1 + template[..template.len() - from.len()].matches('\n').count();
+            let known: Vec<_> = values.iter().map(|(name, _)| format!("{{{name}}}")).collect();
+            return Err(Failure::Input(format!(
+                "{name}:{line}: {{{word}}} means nothing here; known are {}",
+                known.join(", ")
+            )));
+        };
+        text += value;
+        rest = &from[word.len() + 2..];
+    }
+    Ok(text + rest)
+}
+
+/// The name in `{name}`, if the text begins with one.
+fn placeholder(text: &str) -> Option<&str> {
+    let (word, _) = text.strip_prefix('{')?.split_once('}')?;
+    let plain = !word.is_empty() && word.chars().all(|c| c.is_ascii_lowercase() || c == '_');
+    plain.then_some(word)
+}
+
+/// A script as a whole or, where it cannot be written, not at all: a job may read it now.
+pub fn write(path: &Path, text: &str) -> Result<(), Failure> {
+    let mut file = WholeFile::create(path)?;
+    file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
+    file.finish()
+}
+
+/// A word as the shell reads it.
+pub fn quoted(word: &str) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_=./:,@%+".contains(c);
+    if !word.is_empty() && word.chars().all(plain) {
+        word.to_owned()
+    } else {
+        format!("'{}'", word.replace('\'', "'\\''"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::process::Command;
+
+    use super::*;
+
+    fn filled(template: &str) -> Result<String, Failure> {
+        fill("agent.sbatch", template, &[("cpus", "4".into()), ("command", "calmwalk agent".into())])
+    }
+
+    #[test]
+    fn what_is_the_shells_stays() {
+        for text in ["${cpus} $x {a,b} { work; } {} {Cpus}", "work() {\n}\n", "a {", "x{", "${a:-0}{", ""] {
+            assert_eq!(filled(text).unwrap(), text);
+        }
+        assert_eq!(filled("-c {cpus}\n{command}{cpus}").unwrap(), "-c 4\ncalmwalk agent4");
+    }
+
+    #[test]
+    fn what_means_nothing_is_refused_with_its_line() {
+        let Err(Failure::Input(message)) = filled("{cpus}\n\nx {cpu} {command}") else { panic!() };
+        assert_eq!(message, "agent.sbatch:3: {cpu} means nothing here; known are {cpus}, {command}");
+    }
+
+    #[test]
+    fn templates_are_bash_once_they_are_filled() {
+        for (name, template) in TEMPLATES {
+            let values = ["cpus", "command", "stop", "job"].map(|name| (name, format!("/a/{name}")));
+            let text = fill(name, template, &values).unwrap();
+            let checked = Command::new("bash").args(["-n", "-c", &text]).output().unwrap();
+            assert!(checked.status.success(), "{name}: {}", String::from_utf8_lossy(&checked.stderr));
+        }
+    }
+
+    #[test]
+    fn words_reach_a_command_as_they_are() {
+        for word in ["", "a b", "it's", "$HOME", "`x`", "a\\b", "x\ny", "postgres://u@h/d?schema=s&x=1"] {
+            let text = format!("printf %s {}", quoted(word));
+            let output = Command::new("bash").args(["-c", &text]).output().unwrap();
+            assert_eq!(String::from_utf8(output.stdout).unwrap(), word);
+        }
+        assert_eq!(quoted("/a/b-c.toml"), "/a/b-c.toml");
+    }
+}

@@ -1,0 +1,192 @@
+//! The jobs of a campaign in `calmwalk status`, as the batch system gives them.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+use std::time::Duration;
+
+use orchestrator::slurm::{Job, Phase, Role, Slurm, SlurmError};
+use serde_json::{Value, json};
+use store::Location;
+use tokio::time::timeout;
+
+use super::SHOWN;
+use crate::cli::launch::{FOLDER, job_names};
+use crate::output::Table;
+
+/// Whoever looks at a campaign does not wait for a batch system for longer than this.
+const PATIENCE: Duration = Duration::from_secs(4);
+
+/// What is known of jobs.
+#[derive(Debug)]
+pub enum Jobs {
+    /// There is no batch system, or it has no job of this campaign.
+    None,
+    /// These, with the exit codes of those that ended.
+    Known(Vec<(Job, Option<String>)>),
+    /// It does not say.
+    Unknown(String),
+}
+
+impl Jobs {
+    /// Asks the batch system about the campaign that is kept here.
+    pub async fn of(location: &Location) -> Self {
+        let location = match location {
+            // Nothing was ever launched from a directory without scripts.
+            Location::Directory(directory) if !directory.join(FOLDER).is_dir() => return Self::None,
+            Location::Directory(directory) => {
+                Location::Directory(directory.canonicalize().unwrap_or_else(|_| directory.clone()))
+            }
+            Location::Server(url) => Location::Server(url.clone()),
+        };
+        match timeout(PATIENCE, ask(&location)).await {
+            Ok(Ok(jobs)) if jobs.is_empty() => Self::None,
+            Ok(Ok(jobs)) => Self::Known(jobs),
+            Ok(Err(error)) if error.is_missing() => Self::None,
+            Ok(Err(error)) => Self::Unknown(error.to_string()),
+            Err(_) => Self::Unknown(format!("no answer within {} s", PATIENCE.as_secs())),
+        }
+    }
+
+    /// Adds them to the state of a campaign.
+    pub fn add_to(&self, json: &mut Value) {
+        match self {
+            Self::None => {}
+            Self::Known(jobs) => json["jobs"] = jobs.iter().map(|(job, code)| as_json(job, code)).collect(),
+            Self::Unknown(why) => json["jobs_unknown"] = why.as_str().into(),
+        }
+    }
+
+    /// A line for each; where there are many, those first that do not simply run.
+    pub fn write(&self, out: &mut dyn Write, all: bool) -> io::Result<()> {
+        let jobs = match self {
+            Self::None => return Ok(()),
+            Self::Unknown(why) => return writeln!(out, "\njobs        Slurm does not say: {why}"),
+            Self::Known(jobs) => jobs,
+        };
+        let runs = |job: &Job| job.role != Role::Orchestrator && job.phase() == Phase::Running;
+        let mut shown: Vec<_> = jobs.iter().collect();
+        if !all && shown.len() > SHOWN {
+            shown.sort_by_key(|(job, _)| (runs(job), job.role));
+            shown.truncate(SHOWN);
+            shown.sort_by_key(|(job, _)| (job.role, job.id));
+        }
+        let mut table = Table::new(&["job", ">id", "state", "node", "since", ">time left", "remark"]);
+        for (job, code) in &shown {
+            table.push(line(job, code.as_deref()));
+        }
+        writeln!(out)?;
+        table.write(out)?;
+        if shown.len() < jobs.len() {
+            writeln!(out, "… and {} more jobs: --all shows them", jobs.len() - shown.len())?;
+        }
+        Ok(())
+    }
+}
+
+/// Jobs that live, and of each kind the last that has ended if none does.
+async fn ask(location: &Location) -> Result<Vec<(Job, Option<String>)>, SlurmError> {
+    let slurm = Slurm::with_patience(PATIENCE);
+    let mut jobs = slurm.jobs(&job_names(location)).await?;
+    let mut last: BTreeMap<Role, (bool, u64)> = BTreeMap::new();
+    for job in &jobs {
+        let found = (job.phase() != Phase::Over, job.id);
+        let last = last.entry(job.role).or_insert(found);
+        *last = found.max(*last);
+    }
+    jobs.retain(|job| job.phase() != Phase::Over || last.get(&job.role) == Some(&(false, job.id)));
+    jobs.sort_by_key(|job| (job.role, job.id));
+    let mut known = Vec::new();
+    for job in jobs {
+        let failed = job.phase() == Phase::Over && job.state != "COMPLETED";
+        // It may be forgotten by now.
+        let code = if failed { slurm.exit_code(job.id).await.ok().flatten() } else { None };
+        known.push((job, code));
+    }
+    Ok(known)
+}
+
+fn line(job: &Job, code: Option<&str>) -> Vec<String> {
+    let begun = job.phase() != Phase::Pending;
+    let reason = job.reason.clone().unwrap_or_default();
+    let remark = match (job.phase(), code) {
+        (Phase::Pending, _) if job.start != "N/A" => format!("{reason}; expected to begin {}", job.start),
+        (_, Some(code)) if reason.is_empty() => format!("exit code {code}"),
+        (_, Some(code)) => format!("exit code {code}, {reason}"),
+        _ => reason,
+    };
+    vec![
+        job.role.to_string(),
+        job.id.to_string(),
+        job.state.to_lowercase(),
+        job.nodes.clone(),
+        if begun { job.start.clone() } else { String::new() },
+        if job.phase() == Phase::Over { String::new() } else { job.time_left.clone() },
+        remark,
+    ]
+}
+
+fn as_json(job: &Job, code: &Option<String>) -> Value {
+    let Job { id, role, state, nodes, start, time_left, walkers, reason } = job;
+    let (kind, number) = match role {
+        Role::Orchestrator => ("orchestrator", None),
+        Role::Agent(number) => ("agent", Some(number)),
+        Role::Labeller(number) => ("labeller", Some(number)),
+    };
+    json!({
+        "kind": kind, "number": number, "id": id, "state": state, "node": nodes, "start": start,
+        "time_left": time_left, "walkers": walkers, "reason": reason, "exit_code": code,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn job(id: u64, role: Role, state: &str) -> Job {
+        Job {
+            id,
+            role,
+            state: state.into(),
+            nodes: "node7".into(),
+            start: "2026-11-21T20:15:00".into(),
+            time_left: "1:00:00".into(),
+            walkers: None,
+            reason: None,
+        }
+    }
+
+    #[test]
+    fn jobs_are_shown_as_the_batch_system_gives_them() {
+        let mut waiting = job(13, Role::Agent(0), "PENDING");
+        (waiting.nodes, waiting.start) = (String::new(), "N/A".into());
+        waiting.reason = Some("Resources".into());
+        let failed = job(9, Role::Agent(1), "FAILED");
+        let jobs = Jobs::Known(vec![
+            (job(12, Role::Orchestrator, "RUNNING"), None),
+            (waiting, None),
+            (failed, Some("1:0".into())),
+        ]);
+        let mut text = Vec::new();
+        jobs.write(&mut text, false).unwrap();
+        let expected = [
+            "job           id  state    node   since                time left  remark",
+            "orchestrator  12  running  node7  2026-11-21T20:15:00    1:00:00",
+            "agent 0       13  pending                                1:00:00  Resources",
+            "agent 1        9  failed   node7  2026-11-21T20:15:00             exit code 1:0",
+        ];
+        assert_eq!(String::from_utf8(text).unwrap().trim().lines().collect::<Vec<_>>(), expected);
+        let mut value = json!({});
+        jobs.add_to(&mut value);
+        assert_eq!(value["jobs"][2]["exit_code"], "1:0");
+        assert_eq!((&value["jobs"][1]["kind"], &value["jobs"][1]["number"]), (&json!("agent"), &json!(0)));
+    }
+
+    #[test]
+    fn nothing_is_said_of_what_was_never_launched() {
+        let mut value = json!({});
+        Jobs::None.add_to(&mut value);
+        let mut text = Vec::new();
+        Jobs::None.write(&mut text, false).unwrap();
+        assert_eq!((value, text.len()), (json!({}), 0));
+    }
+}

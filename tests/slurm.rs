@@ -1,0 +1,396 @@
+//! Campaigns on a real Slurm of one node: `SLURM_CONF=$(.ci/slurm start) cargo test --test slurm`.
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use common::campaign::{Outcome, Small, outcome};
+use common::processes::{carrying_out, nothing_is_left, wait_until};
+use common::{Running, calmwalk, program, stderr, succeed};
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// One campaign at a time: they share the node, and one test kills slurmctld.
+static NODE: Mutex<()> = Mutex::new(());
+
+/// A campaign that is launched on Slurm.
+struct OnSlurm {
+    home: TempDir,
+    options: Vec<String>,
+    _node: MutexGuard<'static, ()>,
+}
+
+/// What Slurm knows of a job.
+#[derive(Clone, Debug)]
+struct Job {
+    id: String,
+    state: String,
+}
+
+/// A campaign that lasts long enough to be disturbed.
+fn long() -> Small {
+    Small {
+        walkers: 1,
+        walks_per_round: 3,
+        steps: 600,
+        seeds: &["fcc-100", "vacancy", "fcc-097"],
+        ..Small::default()
+    }
+}
+
+/// What the campaign comes to in one process.
+fn undisturbed(small: &Small) -> Outcome {
+    let directory = tempfile::tempdir().unwrap();
+    small.write(directory.path());
+    succeed(directory.path(), ["run", "campaign.toml", "--directory", ".", "--in-process"]);
+    outcome(directory.path())
+}
+
+fn slurm(arguments: &[&str]) -> String {
+    let output = Command::new(arguments[0]).args(&arguments[1..]).output().expect("Slurm's commands");
+    assert!(output.status.success(), "{arguments:?}: {}", stderr(&output));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// `.ci/slurm`, which started what is tested on.
+fn ci(order: &str) {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join(".ci/slurm");
+    assert!(Command::new(script).arg(order).status().unwrap().success(), "{order}");
+}
+
+fn this_node() -> String {
+    slurm(&["sinfo", "--noheader", "--format=%N"]).trim().to_owned()
+}
+
+impl OnSlurm {
+    fn new(small: &Small, agents: u32) -> Self {
+        assert!(std::env::var_os("SLURM_CONF").is_some(), "SLURM_CONF=$(.ci/slurm start) is needed");
+        let _node = NODE.lock().unwrap_or_else(PoisonError::into_inner);
+        let home = tempfile::tempdir().unwrap();
+        let path = small.write(home.path());
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, text.replace("[run]\n", "[run]\nagent_silence_limit = 2\n")).unwrap();
+        let options = vec![format!("--agents={agents}"), "--".into(), format!("--nodelist={}", this_node())];
+        Self { home, options, _node }
+    }
+
+    fn directory(&self) -> &Path {
+        self.home.path()
+    }
+
+    fn launch(&self) -> Command {
+        let mut command = program(self.directory());
+        command.args(["launch", "campaign.toml", "--on", "slurm", "--directory", "."]);
+        command
+    }
+
+    /// Launches, and returns what it says.
+    fn launched(&self) -> String {
+        said(self.launch().args(&self.options).output().unwrap())
+    }
+
+    fn stop(&self) -> String {
+        said(self.launch().arg("--stop").output().unwrap())
+    }
+
+    /// Every job of this campaign that Slurm has not forgotten, by what it does.
+    fn jobs(&self) -> BTreeMap<String, Vec<Job>> {
+        let here = self.directory().canonicalize().unwrap();
+        let text = slurm(&["squeue", "--noheader", "--states=all", "--format=%i|%T|%j|%Z"]);
+        let mut jobs: BTreeMap<String, Vec<Job>> = BTreeMap::new();
+        for line in text.lines() {
+            let fields: Vec<_> = line.split('|').collect();
+            if Path::new(fields[3]) == here {
+                let role = fields[2].splitn(3, '-').nth(2).unwrap().to_owned();
+                let job = Job { id: fields[0].to_owned(), state: fields[1].to_owned() };
+                jobs.entry(role).or_default().push(job);
+            }
+        }
+        jobs
+    }
+
+    /// The only job that does this.
+    fn job(&self, role: &str) -> Job {
+        let jobs = self.jobs();
+        let [job] = &jobs[role][..] else { panic!("{role}: {jobs:?}") };
+        job.clone()
+    }
+
+    fn logs(&self) -> String {
+        let logs = fs::read_dir(self.directory().join("slurm")).unwrap().map(|entry| entry.unwrap().path());
+        let logs = logs.filter(|path| path.extension().is_some_and(|ending| ending == "log"));
+        logs.map(|path| format!("==> {}\n{}", path.display(), fs::read_to_string(&path).unwrap())).collect()
+    }
+
+    fn log(&self, role: &str) -> String {
+        fs::read_to_string(self.directory().join(format!("slurm/{role}.log"))).unwrap_or_default()
+    }
+
+    /// Waits until orchestrator and agents are at work.
+    fn at_work(&self, agents: usize) {
+        let walkers = || carrying_out(self.directory(), "walker").len();
+        let joined = || carrying_out(self.directory(), "agent").len();
+        wait_until("everybody is at work", || walkers() > agents && joined() == agents);
+    }
+
+    /// Waits until no job is left, and checks that none has failed.
+    fn finished(&self) {
+        let begun = Instant::now();
+        let over = |state: &str| ["COMPLETED", "CANCELLED", "FAILED", "TIMEOUT"].contains(&state);
+        while !self.jobs().values().flatten().all(|job| over(&job.state)) {
+            assert!(begun.elapsed() < Duration::from_secs(240), "{:?}\n{}", self.jobs(), self.logs());
+            std::thread::sleep(Duration::from_millis(200));
+        }
+        let last = self.jobs()["orchestrator"].last().unwrap().clone();
+        assert_eq!(last.state, "COMPLETED", "{}", self.logs());
+        assert_eq!(fs::read_to_string(self.directory().join("endpoint")).unwrap(), "over\n");
+        nothing_is_left(self.directory());
+    }
+
+    fn comes_to(&self, expected: &Outcome) {
+        self.finished();
+        assert!(outcome(self.directory()) == *expected, "{}", self.logs());
+    }
+
+    fn status(&self) -> Value {
+        serde_json::from_str(&succeed(self.directory(), ["status", ".", "--json"])).unwrap()
+    }
+}
+
+impl Drop for OnSlurm {
+    fn drop(&mut self) {
+        for job in self.jobs().values().flatten() {
+            slurm(&["scancel", "--quiet", &job.id]);
+        }
+    }
+}
+
+fn said(output: Output) -> String {
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn restarts(id: &str) -> u32 {
+    let text = slurm(&["scontrol", "--oneliner", "show", "job", id]);
+    text.split_whitespace().find_map(|word| word.strip_prefix("Restarts=")?.parse().ok()).unwrap()
+}
+
+#[test]
+fn a_campaign_comes_to_the_same_however_often_it_is_launched() {
+    let small = long();
+    let campaign = OnSlurm::new(&small, 2);
+    assert_eq!(campaign.launched().matches("submitted").count(), 3);
+    assert_eq!(campaign.launched().matches("is there").count(), 3);
+    campaign.at_work(2);
+    let twice = [(); 2].map(|()| {
+        let mut launch = campaign.launch();
+        Running(launch.args(&campaign.options).stdout(Stdio::null()).spawn().unwrap())
+    });
+    for mut launch in twice {
+        assert_eq!(launch.0.wait().unwrap().code(), Some(0));
+    }
+    let status = campaign.status();
+    let jobs: Vec<_> = status["jobs"].as_array().unwrap().iter().map(|job| job["state"].clone()).collect();
+    assert_eq!(jobs, ["RUNNING"; 3], "{status}");
+    assert_eq!(status["jobs"][1]["walkers"], 1);
+    campaign.comes_to(&undisturbed(&small));
+    for role in ["orchestrator", "agent-0", "agent-1"] {
+        let job = campaign.job(role);
+        assert_eq!((job.state.as_str(), restarts(&job.id)), ("COMPLETED", 0), "{}", campaign.logs());
+    }
+    // Once more, though it is over: everybody sees that and leaves.
+    assert_eq!(campaign.launched().matches("submitted").count(), 3);
+    campaign.finished();
+}
+
+#[test]
+fn two_who_launch_at_the_same_moment_submit_each_job_once() {
+    let campaign = OnSlurm::new(&long(), 3);
+    let launches = [(); 4].map(|()| {
+        let mut launch = campaign.launch();
+        Running(launch.args(&campaign.options).stdout(Stdio::null()).spawn().unwrap())
+    });
+    for mut launch in launches {
+        assert_eq!(launch.0.wait().unwrap().code(), Some(0));
+    }
+    let jobs = campaign.jobs();
+    let roles: Vec<_> = jobs.keys().map(String::as_str).collect();
+    assert_eq!(roles, ["agent-0", "agent-1", "agent-2", "orchestrator"]);
+    assert!(jobs.values().all(|jobs| jobs.len() == 1), "{jobs:?}");
+    // Even where nothing locks, Slurm holds back the second of a name.
+    let name = slurm(&["squeue", "--noheader", "--format=%j", "--jobs", &jobs["agent-0"][0].id]);
+    let script = campaign.directory().join("slurm/agent.sbatch");
+    let second = slurm(&[
+        "sbatch",
+        "--parsable",
+        &format!("--job-name={}", name.trim()),
+        "--dependency=singleton",
+        &format!("--chdir={}", campaign.directory().display()),
+        "--output=/dev/null",
+        script.to_str().unwrap(),
+    ]);
+    campaign.at_work(3);
+    let states: Vec<_> = campaign.jobs()["agent-0"].iter().map(|job| job.state.clone()).collect();
+    assert!(states.contains(&"PENDING".to_owned()) && states.contains(&"RUNNING".to_owned()), "{states:?}");
+    // The next launch takes it away, and an agent that is not asked for any more.
+    let fewer = [&["--agents=2".to_owned()], &campaign.options[1..]].concat();
+    let text = said(campaign.launch().args(fewer).output().unwrap());
+    assert!(text.contains(&format!("job {} (PENDING) is cancelled", second.trim())), "{text}");
+    assert_eq!(text.matches("is cancelled").count(), 2, "{text}");
+    campaign.finished();
+}
+
+#[test]
+fn at_the_notice_a_campaign_leaves_and_goes_on_when_it_is_requeued() {
+    let small = long();
+    let campaign = OnSlurm::new(&small, 2);
+    campaign.launched();
+    campaign.at_work(2);
+    let agent = campaign.job("agent-0").id;
+    slurm(&["scancel", "--batch", "--signal=TERM", &agent]);
+    wait_until("the agent is requeued", || restarts(&agent) == 1);
+    let orchestrator = campaign.job("orchestrator").id;
+    slurm(&["scancel", "--batch", "--signal=TERM", &orchestrator]);
+    wait_until("the orchestrator is requeued", || restarts(&orchestrator) == 1);
+    campaign.comes_to(&undisturbed(&small));
+    assert!(campaign.log("orchestrator").contains("exit code 130"), "{}", campaign.logs());
+    assert!(campaign.jobs().values().flatten().all(|job| job.state == "COMPLETED"), "{:?}", campaign.jobs());
+}
+
+/// A whole minute is the least time that Slurm gives.
+#[test]
+fn before_its_time_is_over_a_job_is_told_and_requeued() {
+    let seeds = &["fcc-100", "vacancy", "fcc-097"];
+    let small = Small { walkers: 1, walks_per_round: 3, steps: 6000, seeds, ..Small::default() };
+    let mut campaign = OnSlurm::new(&small, 1);
+    let site = campaign.directory().join("site");
+    fs::create_dir(&site).unwrap();
+    for name in ["orchestrator.sbatch", "agent.sbatch", "labeller.sbatch", "job.sh"] {
+        let text = fs::read_to_string(common::config(&format!("slurm/{name}"))).unwrap();
+        fs::write(site.join(name), text.replace("TERM@120", "TERM@45")).unwrap();
+    }
+    campaign.options.splice(1..1, ["--time=1".into(), format!("--template={}", site.display())]);
+    campaign.launched();
+    let orchestrator = campaign.job("orchestrator").id;
+    wait_until("the notice has come", || restarts(&orchestrator) == 1);
+    campaign.comes_to(&undisturbed(&small));
+    assert!(campaign.jobs().values().flatten().all(|job| job.state == "COMPLETED"), "{:?}", campaign.jobs());
+}
+
+#[test]
+fn an_agent_that_is_cancelled_is_missed_by_nobody_and_launched_again() {
+    let small = long();
+    let campaign = OnSlurm::new(&small, 2);
+    campaign.launched();
+    campaign.at_work(2);
+    let agent = campaign.job("agent-1").id;
+    slurm(&["scancel", &agent]);
+    wait_until("it is gone", || campaign.job("agent-1").state == "CANCELLED");
+    assert_eq!(restarts(&agent), 0, "{}", campaign.log("agent-1"));
+    let again = campaign.launched();
+    assert_eq!((again.matches("submitted").count(), again.matches("is there").count()), (1, 2), "{again}");
+    assert!(again.contains("agent 1: job"), "{again}");
+    campaign.comes_to(&undisturbed(&small));
+}
+
+#[test]
+fn a_campaign_survives_the_loss_of_slurmctld() {
+    let small = long();
+    let campaign = OnSlurm::new(&small, 2);
+    campaign.launched();
+    campaign.at_work(2);
+    ci("kill");
+    let asked = Instant::now();
+    let text = succeed(campaign.directory(), ["status", "."]);
+    assert!(text.contains("Slurm does not say"), "{text}");
+    assert!(asked.elapsed() < Duration::from_secs(20));
+    assert!(campaign.status()["jobs_unknown"].is_string());
+    std::thread::sleep(Duration::from_secs(2));
+    ci("revive");
+    campaign.comes_to(&undisturbed(&small));
+}
+
+#[test]
+fn a_campaign_is_stopped_in_order_and_launched_again() {
+    let small = long();
+    let campaign = OnSlurm::new(&small, 2);
+    campaign.launched();
+    campaign.at_work(2);
+    let text = campaign.stop();
+    assert!(text.contains("3 jobs cancelled"), "{text}");
+    wait_until("no job is left", || campaign.jobs().values().flatten().all(|job| job.state == "CANCELLED"));
+    nothing_is_left(campaign.directory());
+    assert!(campaign.log("orchestrator").contains("stopped in order"), "{}", campaign.logs());
+    assert_eq!(campaign.status()["finished"], false);
+    assert_eq!(campaign.status()["processes"].as_array().unwrap().len(), 0);
+    assert_eq!(campaign.launched().matches("submitted").count(), 3);
+    campaign.comes_to(&undisturbed(&small));
+}
+
+#[test]
+fn with_certificates_agents_reach_the_orchestrator_by_the_name_of_its_node() {
+    let small = long();
+    let mut campaign = OnSlurm::new(&small, 2);
+    let (certificates, node) = (campaign.directory().join("certificates"), this_node());
+    let made = Command::new("sh")
+        .arg(common::config("certificates.sh"))
+        .arg(&certificates)
+        .args([&format!("orchestrator={node},elsewhere.example"), "agent"])
+        .output()
+        .unwrap();
+    assert!(made.status.success(), "{}", stderr(&made));
+    // No --nodelist is needed.
+    campaign.options = vec!["--agents=2".into(), format!("--tls={}", certificates.display())];
+    campaign.launched();
+    campaign.at_work(2);
+    let endpoint = fs::read_to_string(campaign.directory().join("endpoint")).unwrap();
+    assert!(endpoint.starts_with(&format!("tcp/{node}:")), "{endpoint}");
+    campaign.comes_to(&undisturbed(&small));
+}
+
+#[test]
+fn what_cannot_go_on_is_not_requeued() {
+    let campaign = OnSlurm::new(&long(), 1);
+    // It is there when the campaign is launched, and not any more when its job begins.
+    let seeds = campaign.directory().join("seeds.extxyz");
+    let mut launch = campaign.launch();
+    launch.args(&campaign.options[..1]).args(["--", "--begin=now+4"]).arg(&campaign.options[2]);
+    said(launch.output().unwrap());
+    fs::remove_file(seeds).unwrap();
+    wait_until("the jobs have ended", || {
+        let jobs = campaign.jobs();
+        jobs["orchestrator"][0].state == "FAILED" && jobs["agent-0"][0].state == "CANCELLED"
+    });
+    let log = campaign.log("orchestrator");
+    assert!(log.contains("exit code 2") && log.contains("seeds.extxyz"), "{log}");
+    assert_eq!(restarts(&campaign.job("orchestrator").id), 0);
+    nothing_is_left(campaign.directory());
+}
+
+#[test]
+fn a_dry_run_shows_everything_and_does_nothing() {
+    let campaign = OnSlurm::new(&long(), 2);
+    let text = said(campaign.launch().arg("--dry-run").args(&campaign.options).output().unwrap());
+    for expected in ["#SBATCH --signal=B:TERM@120", "agent.sbatch", "--join @", "--dependency=singleton"] {
+        assert!(text.contains(expected), "{expected}: {text}");
+    }
+    assert_eq!(text.matches("\nsbatch ").count(), 3, "{text}");
+    assert!(campaign.jobs().is_empty());
+    let written = |path: &PathBuf| path.exists();
+    assert!(
+        !written(&campaign.directory().join("slurm")) && !written(&campaign.directory().join("endpoint"))
+    );
+    // Without certificates agents have to be where the orchestrator is.
+    let refused = campaign.launch().arg("--agents=2").output().unwrap();
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(stderr(&refused).contains("--nodelist"), "{}", stderr(&refused));
+    assert_eq!(
+        calmwalk(campaign.directory(), ["launch", "campaign.toml", "--on", "pbs"]).status.code(),
+        Some(2)
+    );
+}
