@@ -51,6 +51,11 @@ fn undisturbed(small: &Small) -> Outcome {
     outcome(directory.path())
 }
 
+/// One that goes on for half a minute and more.
+fn lasting() -> Small {
+    Small { steps: 4000, per_seed: 20, ..long() }
+}
+
 fn slurm(arguments: &[&str]) -> String {
     let output = Command::new(arguments[0]).args(&arguments[1..]).output().expect("Slurm's commands");
     assert!(output.status.success(), "{arguments:?}: {}", stderr(&output));
@@ -265,14 +270,13 @@ fn at_the_notice_a_campaign_leaves_and_goes_on_when_it_is_requeued() {
 /// A whole minute is the least time that Slurm gives.
 #[test]
 fn before_its_time_is_over_a_job_is_told_and_requeued() {
-    let seeds = &["fcc-100", "vacancy", "fcc-097"];
-    let small = Small { walkers: 1, walks_per_round: 3, steps: 6000, seeds, ..Small::default() };
+    let small = lasting();
     let mut campaign = OnSlurm::new(&small, 1);
     let site = campaign.directory().join("site");
     fs::create_dir(&site).unwrap();
     for name in ["orchestrator.sbatch", "agent.sbatch", "labeller.sbatch", "job.sh"] {
         let text = fs::read_to_string(common::config(&format!("slurm/{name}"))).unwrap();
-        fs::write(site.join(name), text.replace("TERM@120", "TERM@45")).unwrap();
+        fs::write(site.join(name), text.replace("TERM@120", "TERM@59")).unwrap();
     }
     campaign.options.splice(1..1, ["--time=1".into(), format!("--template={}", site.display())]);
     campaign.launched();
@@ -300,17 +304,19 @@ fn an_agent_that_is_cancelled_is_missed_by_nobody_and_launched_again() {
 
 #[test]
 fn a_campaign_survives_the_loss_of_slurmctld() {
-    let small = long();
+    let small = lasting();
     let campaign = OnSlurm::new(&small, 2);
     campaign.launched();
     campaign.at_work(2);
+    // So long Slurm may take to write down what it knows of jobs.
+    std::thread::sleep(Duration::from_secs(6));
     ci("kill");
     let asked = Instant::now();
     let text = succeed(campaign.directory(), ["status", "."]);
     assert!(text.contains("Slurm does not say"), "{text}");
     assert!(asked.elapsed() < Duration::from_secs(20));
     assert!(campaign.status()["jobs_unknown"].is_string());
-    std::thread::sleep(Duration::from_secs(2));
+    assert_eq!(carrying_out(campaign.directory(), "agent").len(), 2, "they go on");
     ci("revive");
     campaign.comes_to(&undisturbed(&small));
 }

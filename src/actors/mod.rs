@@ -141,7 +141,10 @@ fn wanted_walkers(campaign: &Campaign) -> u32 {
 
 /// Processor cores that this process may use.
 pub fn cores() -> u32 {
-    thread::available_parallelism().map_or(1, |cores| cores.get()) as u32
+    let there = thread::available_parallelism().map_or(1, |cores| cores.get()) as u32;
+    // Not every batch system keeps a job to the processors that it was given.
+    let given = std::env::var("SLURM_CPUS_PER_TASK").ok().and_then(|text| text.parse().ok());
+    given.map_or(there, |given: u32| given.clamp(1, there))
 }
 
 /// Whether somebody has asked this process to stop, and what wakes whoever waits for that; `told` is said then.

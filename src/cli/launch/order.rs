@@ -38,8 +38,11 @@ impl Order {
         let commands = Commands::new(launch, campaign, directory)?;
         let job = quoted(&text(&folder.join(COMMON))?);
         let config = &campaign.config;
-        // "One a core" cannot be known here.
-        let walkers = if config.run.walkers == 0 { 2 } else { config.run.walkers };
+        // "One a core" is as many as the job is given.
+        let leading = match config.run.walkers {
+            0 => 2,
+            walkers => walkers + config.label.slots.get(),
+        };
         let values = |cpus: usize, command: String| {
             [
                 ("cpus", cpus.to_string()),
@@ -52,7 +55,7 @@ impl Order {
         let script = |name: &'static str, values: &Values<'_>| {
             template(site, name).and_then(|template| fill(name, &template, values)).map(|text| (name, text))
         };
-        let leading = values(walkers + config.label.slots.get(), commands.orchestrator(wanted)?);
+        let leading = values(leading, commands.orchestrator(wanted)?);
         let mut scripts = vec![script(ORCHESTRATOR, &leading)?];
         if wanted.agents > 0 {
             scripts.push(script(AGENT, &values(launch.walkers as usize, commands.agent()?))?);

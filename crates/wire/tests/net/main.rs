@@ -4,4 +4,5 @@ mod breaks;
 mod exchange;
 mod head;
 mod link;
+mod moves;
 mod security;

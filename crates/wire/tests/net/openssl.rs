@@ -20,11 +20,11 @@ fn make(directory: &Path, names: &[&str]) {
 #[tokio::test(flavor = "multi_thread")]
 async fn hosts_with_certificates_of_the_script_speak_to_each_other() {
     let directory = tempfile::tempdir().unwrap();
-    make(directory.path(), &["localhost"]);
+    make(directory.path(), &["head=node.example,localhost,10.0.0.8"]);
     // Another host later.
     make(directory.path(), &["10.0.0.7"]);
     let tls = |name: &str| Tls::in_directory(&directory.path().join(name));
-    let head = Head::open(Wanted { tls: Some(tls("localhost")), ..Wanted::default() }).await;
+    let head = Head::open(Wanted { tls: Some(tls("head")), ..Wanted::default() }).await;
     let endpoint = format!("tcp/localhost:{}", head.port).parse().unwrap();
     let other = tls("10.0.0.7");
     let uplink = Uplink::open(&endpoint, Some(&other), agent("a", 1), |_| {});

@@ -1,0 +1,54 @@
+//! The orchestrator comes back somewhere else.
+
+use std::fs;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::timeout;
+use wire::net::{Address, Announcement, NetError, Parted, Told, Uplink};
+
+use crate::head::{Head, LIMIT, Wanted, agent, endpoint, report, work};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("endpoint");
+    let write = |announcement: Announcement| fs::write(&path, announcement.to_string()).unwrap();
+    let address = Address::In(path.clone());
+    // Before it has been anywhere the agent waits.
+    let (why, whys) = std::sync::mpsc::channel();
+    let opening = {
+        let address = address.clone();
+        let waiting = move |error: &NetError| why.send(error.to_string()).unwrap();
+        tokio::spawn(async move { Uplink::open(&address, None, agent("a", 1), waiting).await.unwrap() })
+    };
+    let mut head = Head::open(Wanted::default()).await;
+    let told = tokio::task::spawn_blocking(move || whys.recv_timeout(LIMIT).unwrap()).await.unwrap();
+    assert!(told.contains("has written yet where it is"), "{told}");
+    write(Announcement::At(endpoint(head.port)));
+    let uplink = Arc::new(timeout(LIMIT, opening).await.expect("in time").unwrap());
+    let joined = Arc::new(timeout(LIMIT, uplink.join()).await.expect("in time").unwrap());
+
+    let mut slot = joined.slots().remove(0);
+    let mixture = Wanted::default().mixture;
+    let line = Arc::clone(&joined);
+    let turn = tokio::spawn(async move { (slot.exchange(&line, &Told::Nothing).await, slot) });
+    head.offer().await.reply.send(Some(work(4, 1, &mixture))).unwrap();
+    let (given, mut slot) = turn.await.unwrap();
+    let told = Told::Report(report(&given.unwrap().unwrap().assignment));
+    let before = head.kill().await;
+    let line = Arc::clone(&joined);
+    let telling = tokio::spawn(async move { slot.exchange(&line, &told).await.map(drop) });
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    let head = Head::open(Wanted { session: 2, ..Wanted::default() }).await;
+    assert_ne!(head.port, before);
+    write(Announcement::At(endpoint(head.port)));
+    let refused = timeout(LIMIT, telling).await.expect("in time").unwrap();
+    assert!(matches!(refused, Err(Parted::Stranger(_))), "{refused:?}");
+    let joined = timeout(LIMIT, uplink.join()).await.expect("in time").unwrap();
+    assert!(timeout(Duration::from_millis(300), address.over()).await.is_err());
+    write(Announcement::Over);
+    timeout(LIMIT, address.over()).await.expect("in time");
+    joined.leave().await;
+    head.close().await;
+}
