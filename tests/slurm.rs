@@ -332,8 +332,11 @@ fn a_campaign_is_stopped_in_order_and_launched_again() {
     wait_until("no job is left", || campaign.jobs().values().flatten().all(|job| job.state == "CANCELLED"));
     nothing_is_left(campaign.directory());
     assert!(campaign.log("orchestrator").contains("stopped in order"), "{}", campaign.logs());
-    assert_eq!(campaign.status()["finished"], false);
-    assert_eq!(campaign.status()["processes"].as_array().unwrap().len(), 0);
+    let status = campaign.status();
+    assert_eq!(status["finished"], false);
+    // A walker that was only just starting may have died of the signal, which is written down.
+    let processes = status["processes"].as_array().unwrap();
+    assert!(processes.iter().all(|process| process["state"] != "running"), "{status}");
     assert_eq!(campaign.launched().matches("submitted").count(), 3);
     campaign.comes_to(&undisturbed(&small));
 }

@@ -6,14 +6,13 @@ mod answers;
 mod crew;
 pub mod in_process;
 mod labellers;
+mod listen;
 pub mod processes;
 mod records;
 pub mod slots;
 mod starts;
 
-use std::fs;
-use std::io::{ErrorKind, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -25,14 +24,14 @@ use orchestrator::selector::Selector;
 use store::{ProcessRecord, SERVER_AWAY, Store};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{Notify, mpsc};
-use wire::net::{Announcement, Endpoint, Tls};
 use wire::transport::Incoming;
 
+pub use listen::Listen;
+
 use crate::campaign::Campaign;
-use crate::outcome::{Ended, Failure};
+use crate::outcome::Failure;
 use crate::output::say;
 use crate::progress::Display;
-use crate::whole_file::{WholeFile, cannot_write};
 
 /// Reports under way between walkers and reactor.
 const CHANNEL: usize = 64;
@@ -50,55 +49,6 @@ pub struct Run<'a> {
     pub directory: &'a Path,
     /// Where agents of other hosts may join.
     pub listen: Option<&'a Listen>,
-}
-
-/// Where agents of other hosts may join.
-#[derive(Clone, Debug)]
-pub struct Listen {
-    /// The address.
-    pub endpoint: Endpoint,
-    /// Needed for everything but loopback.
-    pub tls: Option<Tls>,
-    /// The file in which agents find it.
-    pub announce: Option<PathBuf>,
-    /// By which name others reach this host.
-    pub host: String,
-}
-
-impl Listen {
-    /// Writes down where agents find this run.
-    fn announce(&self, endpoint: &Endpoint) -> Result<(), Failure> {
-        let Some(path) = &self.announce else { return Ok(()) };
-        let endpoint = endpoint.of_host(&self.host).map_err(Failure::input)?;
-        write_down(path, &Announcement::At(endpoint))
-    }
-
-    /// What an earlier run wrote down does not hold any more.
-    pub fn begins(&self) -> Result<(), Failure> {
-        self.announce.as_deref().map_or(Ok(()), remove)
-    }
-
-    /// Writes down that there is no more work, or that nobody is there for the time being.
-    pub fn has_ended(&self, ended: Ended) -> Result<(), Failure> {
-        match (self.announce.as_deref(), ended) {
-            (None, _) => Ok(()),
-            (Some(path), Ended::Done) => write_down(path, &Announcement::Over),
-            (Some(path), Ended::Interrupted) => remove(path),
-        }
-    }
-}
-
-fn remove(path: &Path) -> Result<(), Failure> {
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != ErrorKind::NotFound => Err(cannot_write(path, error)),
-        _ => Ok(()),
-    }
-}
-
-fn write_down(path: &Path, announcement: &Announcement) -> Result<(), Failure> {
-    let mut file = WholeFile::create(path)?;
-    write!(file, "{announcement}").map_err(|error| cannot_write(path, error))?;
-    file.finish()
 }
 
 /// What is said when a campaign is asked to stop.

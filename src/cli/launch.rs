@@ -105,6 +105,9 @@ impl Launch {
                 store::check_directory(directory)?;
             }
             let (names, wanted) = (job_names(&location), self.wanted(&location));
+            if wanted.labellers == 0 && campaign.config.label.slots == 0 {
+                say("label.slots = 0 and no job for labellers: labels have to come from calmwalk label");
+            }
             let order = Order::new(&self, &campaign, &directory, wanted)?;
             block_on(self.launch(&slurm, &names, &order, wanted))??;
         }

@@ -1,17 +1,17 @@
 //! `calmwalk run`
 
+mod lock;
+
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
 use serde_json::json;
-use store::{
-    CampaignLock, DATABASE, Location, ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds,
-};
+use store::{DATABASE, Location, ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds};
 use wire::net::{Endpoint, Tls};
 
 use super::{Ended, Failure, block_on};
@@ -20,9 +20,6 @@ use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
 use crate::output::{print, say};
 use crate::summary;
-
-/// Between two tries to take a lock that another process has.
-const NEXT_TRY: Duration = Duration::from_secs(1);
 
 /// Run a campaign to its end, or go on with one that was interrupted
 ///
@@ -79,7 +76,7 @@ impl Run {
         let patience = Duration::from_secs_f64(60.0 * self.patience);
         let ended = block_on(async {
             let location = campaign.config.location(&directory)?;
-            let _lock = lock_directory(&directory, &location, patience).await?;
+            let _lock = lock::directory(&directory, &location, patience).await?;
             listen.iter().try_for_each(actors::Listen::begins)?;
             run(&campaign, &directory, &location, self.in_process, listen.as_ref(), patience).await
         })?
@@ -100,13 +97,7 @@ async fn run(
     listen: Option<&actors::Listen>,
     patience: Duration,
 ) -> Result<Ended, Failure> {
-    // On a server the directory's lock is not enough: the campaign may be run from another host.
-    let lock = match location {
-        Location::Server(_) => Some(
-            patiently(patience, async || CampaignLock::acquire_at(location, "calmwalk run").await).await?,
-        ),
-        Location::Directory(_) => None,
-    };
+    let lock = lock::server(location, patience).await?;
     let store = open_store(campaign, location).await?;
     let store = lock.iter().fold(store, Store::led_by);
     let process = register(&store).await?;
@@ -121,7 +112,7 @@ async fn run(
     };
     let ended = tokio::select! {
         ended = work => ended?,
-        error = lost(lock.as_ref()) => return Err(error.into()),
+        error = lock::lost(lock.as_ref()) => return Err(error.into()),
     };
     // Hours of work do not end as a failure because a server is away in the last second.
     let store = store.patient(SERVER_AWAY);
@@ -161,54 +152,6 @@ fn shown(location: &Location) -> String {
         Location::Directory(_) => location.to_string(),
         // The shell has uses of its own for '?' and '&'.
         Location::Server(url) => format!("'{url}'"),
-    }
-}
-
-/// Takes the directory's lock. A campaign that is on a server may have its directory on a network file system, some of
-/// which lock nothing: the server's lock is what counts there.
-async fn lock_directory(
-    directory: &Path,
-    location: &Location,
-    patience: Duration,
-) -> Result<Option<CampaignLock>, StoreError> {
-    let acquire = async || CampaignLock::acquire(directory, "calmwalk run");
-    match location {
-        Location::Directory(_) => {
-            store::check_directory(directory)?;
-            patiently(patience, acquire).await.map(Some)
-        }
-        Location::Server(_) => match patiently(patience, acquire).await {
-            Err(StoreError::File { .. }) => Ok(None),
-            acquired => acquired.map(Some),
-        },
-    }
-}
-
-/// Tries to take a lock until it is free, or for so long.
-async fn patiently(
-    patience: Duration,
-    mut acquire: impl AsyncFnMut() -> Result<CampaignLock, StoreError>,
-) -> Result<CampaignLock, StoreError> {
-    let begun = Instant::now();
-    let mut waiting = false;
-    loop {
-        match acquire().await {
-            Err(error @ StoreError::Locked { .. }) if begun.elapsed() < patience => {
-                if !std::mem::replace(&mut waiting, true) {
-                    say(format_args!("waiting: {error}"));
-                }
-                tokio::time::sleep(NEXT_TRY).await;
-            }
-            acquired => return acquired,
-        }
-    }
-}
-
-/// Waits until another process has the lock.
-async fn lost(lock: Option<&CampaignLock>) -> StoreError {
-    match lock {
-        Some(lock) => lock.lost().await,
-        None => std::future::pending().await,
     }
 }
 

@@ -41,7 +41,7 @@ impl Order {
         // "One a core" is as many as the job is given.
         let leading = match config.run.walkers {
             0 => 2,
-            walkers => walkers + config.label.slots.get(),
+            walkers => walkers + config.label.slots,
         };
         let values = |cpus: usize, command: String| {
             [
