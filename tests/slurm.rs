@@ -10,6 +10,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use common::campaign::{Outcome, Small, outcome};
+use common::hosts::undisturbed;
 use common::processes::{carrying_out, nothing_is_left, wait_until};
 use common::{Running, calmwalk, program, stderr, succeed};
 use serde_json::Value;
@@ -41,14 +42,6 @@ fn long() -> Small {
         seeds: &["fcc-100", "vacancy", "fcc-097"],
         ..Small::default()
     }
-}
-
-/// What the campaign comes to in one process.
-fn undisturbed(small: &Small) -> Outcome {
-    let directory = tempfile::tempdir().unwrap();
-    small.write(directory.path());
-    succeed(directory.path(), ["run", "campaign.toml", "--directory", ".", "--in-process"]);
-    outcome(directory.path())
 }
 
 /// One that goes on for half a minute and more.
