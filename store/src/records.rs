@@ -99,7 +99,8 @@ pub struct StoredCandidate {
 pub struct Decision {
     /// Round (reproducible mode) or 0.
     pub round: u64,
-    /// `accepted`, `declined`, `control`, `segment` (a return to a checkpoint), `ended`, `begun`.
+    /// `accepted`, `declined`, `control`, `segment` (a return to a checkpoint), `ended`, `begun`, `resumed`, `imported`,
+    /// `configuration`.
     pub kind: &'static str,
     /// The walk, if it is about one.
     pub walk: Option<WalkId>,
@@ -152,6 +153,17 @@ pub struct ComponentRecord {
     pub slot: u32,
     /// Encoded component.
     pub bytes: Vec<u8>,
+}
+
+/// The mixture after a decision.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NewestMixture {
+    /// Number of the decision, 0 before the first.
+    pub decision: i64,
+    /// Version of the mixture after it.
+    pub version: u64,
+    /// The components that ever changed (since the mixture last began anew), by element and slot.
+    pub components: Vec<ComponentRecord>,
 }
 
 /// How a walk stands, as the store keeps it.

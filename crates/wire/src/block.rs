@@ -120,20 +120,34 @@ impl CandidateBlock {
             .expect("its owner gives the bytes that were checked")
     }
 
-    /// The same block without its features, for a store that keeps those apart.
-    pub fn without_features(&self) -> Self {
+    /// The same block with other features ([n × D]), such as those that it had before they were kept apart.
+    ///
+    /// # Errors
+    /// [`BlockError::Field`] if they are not as many for each atom.
+    pub fn with_features(&self, features: &[f64]) -> Result<Self, BlockError> {
         let header = self.view().header;
-        let counts = Counts { features: 0, ..self.counts };
-        let length = length(counts.atoms as u64, 0);
+        let atoms = self.counts.atoms;
+        if !features.len().is_multiple_of(atoms) {
+            let value = format!("{} numbers for {atoms} atoms", features.len());
+            return Err(BlockError::Field { field: "features", value });
+        }
+        let counts = Counts { atoms, features: features.len() / atoms };
+        let length = length(atoms as u64, counts.features as u64);
         let mut words = vec![0_u64; length as usize / 8];
         let bytes = words.as_mut_bytes();
-        // The features are what stands last.
-        bytes.copy_from_slice(&self.as_bytes()[..bytes.len()]);
-        bytes[..HEADER].copy_from_slice(
-            Header { length, atoms: counts.atoms as u64, features: 0, ..header.clone() }.as_bytes(),
-        );
+        // They stand last.
+        let (before, place) = bytes.split_at_mut(bytes.len() - size_of_val(features));
+        before.copy_from_slice(&self.as_bytes()[..before.len()]);
+        place.copy_from_slice(features.as_bytes());
+        let header = Header { length, features: counts.features as u64, ..header.clone() };
+        bytes[..HEADER].copy_from_slice(header.as_bytes());
         seal(bytes);
-        Self { owner: Arc::new(Words(words)), counts }
+        Ok(Self { owner: Arc::new(Words(words)), counts })
+    }
+
+    /// The same block without its features, for a store that keeps those apart.
+    pub fn without_features(&self) -> Self {
+        self.with_features(&[]).expect("none for each atom")
     }
 }
 

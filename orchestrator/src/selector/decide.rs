@@ -13,7 +13,8 @@ use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate};
 use wire::messages::{Decline, End, Outcome, Verdict};
 use wire::{CandidateBlock, ContentHash, WalkId};
 
-use super::{Examined, ExaminedReport, Selector, SelectorError, UpdateProtocol};
+use super::judge::Judge;
+use super::{Examined, ExaminedReport, SelectorError, UpdateProtocol};
 
 /// Priority of the label jobs of biased candidates; control frames come after them.
 const BIASED_PRIORITY: i32 = 10;
@@ -62,8 +63,9 @@ fn gamma(mixture: &Mixture, elements: &[usize], features: &[f64]) -> Result<Vec<
     Ok(grades.gamma)
 }
 
-impl Selector {
-    pub(super) fn decide(&mut self, reports: Vec<ExaminedReport>) -> Result<Commit, SelectorError> {
+impl Judge {
+    /// Decides on the reports of a round, in order.
+    pub fn decide(&mut self, reports: Vec<ExaminedReport>) -> Result<Commit, SelectorError> {
         let mut commit = Commit::default();
         let mut touched = BTreeSet::new();
         for report in reports {
@@ -113,7 +115,8 @@ impl Selector {
         }
     }
 
-    fn decide_candidate(
+    /// Decides on a candidate of a biased walk, and ends the walk if that was its last.
+    pub fn decide_candidate(
         &mut self,
         id: WalkId,
         examined: Examined,
@@ -122,6 +125,7 @@ impl Selector {
         let graded = examined.under(&self.mixture)?;
         let view = graded.block.view();
         let candidate = view.id();
+        self.staleness.add(self.mixture.version().saturating_sub(view.mixture_version()));
         let mut detail = json!({
             "walker": grade_summary(view.gamma, view.mixture_version()),
             "selector": grade_summary(&graded.selector.gamma, self.mixture.version()),
@@ -149,7 +153,7 @@ impl Selector {
     }
 
     /// A wanted frame of a control walk: labelled like a candidate, but no mixture learns from it.
-    fn keep_control_frame(
+    pub fn keep_control_frame(
         &mut self,
         id: WalkId,
         examined: Examined,
@@ -266,10 +270,15 @@ impl Selector {
     }
 
     fn end_walk(&mut self, id: WalkId, end: &End, commit: &mut Commit) {
+        self.end_walk_as(id, end.name(), reason_of(end), commit);
+    }
+
+    /// Ends a walk, which has that state from now on, for a reason in words.
+    pub fn end_walk_as(&mut self, id: WalkId, end: &str, reason: String, commit: &mut Commit) {
         let walk = self.walk_mut(id);
-        walk.end(end);
+        (walk.record.state, walk.record.reason) = (end.to_owned(), reason);
         let detail = json!({
-            "end": end.name(), "reason": walk.record.reason, "step": walk.record.progress.step,
+            "end": end, "reason": walk.record.reason, "step": walk.record.progress.step,
             "accepted": walk.record.accepted,
         });
         let restart = walk.is_biased() && self.settings.update == UpdateProtocol::Restarted;
@@ -305,14 +314,29 @@ impl Selector {
         let ended: Vec<_> =
             self.walks.iter().filter(|(_, walk)| walk.needs_control()).map(|(id, _)| *id).collect();
         for id in ended {
-            let (control_id, turn_steps) = (self.next_walk_id(), self.settings.turn_steps);
-            let control = self.walk_mut(id).control(control_id, turn_steps);
-            let detail = json!({ "control_of": id, "wanted": control.memory.wanted });
-            commit.decisions.push(self.decision("begun", control_id, detail));
-            self.walks.insert(control_id, control);
+            let control_id = self.next_walk_id();
+            commit.decisions.push(self.begin_control(control_id, id));
             touched.extend([id, control_id]);
         }
         touched
+    }
+
+    /// Begins the control of the biased walk `of`, which must be there.
+    pub fn begin_control(&mut self, id: WalkId, of: WalkId) -> Decision {
+        let turn_steps = self.settings.turn_steps;
+        let control = self.walk_mut(of).control(id, turn_steps);
+        let detail = json!({ "control_of": of, "wanted": control.memory.wanted });
+        self.walks.insert(id, control);
+        self.decision("begun", id, detail)
+    }
+}
+
+/// Why a walk ended, in words, where its name does not say it all.
+fn reason_of(end: &End) -> String {
+    match end {
+        End::Steps | End::Collected | End::Budget => String::new(),
+        End::Trapped { guard } => format!("refused by the {guard} guard again and again"),
+        End::BlewUp { reason } | End::BadStart { reason } => reason.clone(),
     }
 }
 

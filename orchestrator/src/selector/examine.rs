@@ -38,7 +38,8 @@ impl Examiner {
         report.map_candidate(|block| self.examine_block(block, mixture))
     }
 
-    fn examine_block(
+    /// The same of a candidate alone.
+    pub fn examine_block(
         &self,
         block: CandidateBlock,
         mixture: &Arc<Mixture>,

@@ -1,31 +1,46 @@
 //! The selector: owns the one mixture, decides on every candidate, and hands out the turns of walks.
 //!
+//! It has two halves. The judge decides what becomes of candidates and walks, one after the other, and knows
+//! nothing of turns. The other half hands out turns and gathers what comes of them, in rounds if the campaign is to be
+//! reproducible. What is replayed goes through the same judge.
+//!
 //! It is driven by three calls. [`Selector::next_turn`] gives the next turn for a free walker, [`Selector::report`] takes
 //! what came of a turn and returns what must be committed, and no turn is given out again before the caller has
 //! committed it. All state that matters goes through a [`Commit`], so [`Selector::restore`] continues from the store
 //! as if nothing had happened.
 
+mod begin;
 mod decide;
 mod examine;
+mod judge;
+mod replay;
+mod rules;
+mod staleness;
 mod turns;
 mod walk;
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use atoms::Structure;
 use calm::watch::ForgettingAlarm;
-use calm::{ChangedComponent, Component, Mixture, MixtureError};
+use calm::{Mixture, MixtureError};
 use serde::{Deserialize, Serialize};
-use store::records::{Commit, ComponentRecord, Decision, WalkRecord};
+use store::records::{Commit, ComponentRecord, WalkRecord};
 use wire::messages::{End, Outcome, Report};
 use wire::{CampaignId, CandidateId, ContentHash, WalkId};
 
 use crate::grader::{Grader, GraderError};
 pub use decide::TrainingFrames;
 pub use examine::{Examined, ExaminedReport, Examiner};
+use judge::Judge;
+pub use replay::{Replay, ReplayError, Replayed};
+pub use staleness::Staleness;
 pub use turns::Next;
 use walk::Walk;
+
+/// The value under which the histogram of ages ([`Staleness`], JSON) is committed.
+pub const STALENESS: &str = "staleness";
 
 /// Whether the same campaign gives the same bytes each time, or walks never wait for each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -155,24 +170,11 @@ pub enum SelectorError {
 
 /// The pure core. See the [module](self).
 pub struct Selector {
-    settings: Settings,
     campaign: CampaignId,
     seeds: Vec<SeedStructure>,
-    /// Shortest distance of each seed structure that a candidate must keep, Å.
-    least_distances: Vec<f64>,
-    examiner: Examiner,
-    mixture: Arc<Mixture>,
-    training: Option<TrainingFrames>,
-    walks: BTreeMap<WalkId, Walk>,
-    known: HashSet<ContentHash>,
-    /// Rounds begun; always 0 in live mode.
-    round: u64,
+    judge: Judge,
     /// Walks of the round in hand, with the reports that have come in.
     in_round: BTreeMap<WalkId, Option<ExaminedReport>>,
-    accepted: u32,
-    declined_feature_bytes: u64,
-    /// Imported structures among the known ones: now, and when the log last spoke of them.
-    imported: (u64, u64),
 }
 
 impl Selector {
@@ -187,38 +189,13 @@ impl Selector {
         training: Option<TrainingFrames>,
         snapshot: Snapshot,
     ) -> Result<Self, SelectorError> {
-        let least_distances = least_distances(&settings, &seeds, &grader)?;
-        let value = |name: &str| -> Result<u64, SelectorError> {
-            let stored = snapshot.values.iter().find(|(key, _)| key == name);
-            let Some((_, text)) = stored else { return Ok(0) };
-            text.parse().map_err(|_| SelectorError::Snapshot(format!("{name} is '{text}', not a number")))
-        };
-        let (round, version) = (value("round")?, value("mixture_version")?);
-        let (declined_feature_bytes, imported) = (value("declined_feature_bytes")?, value("imported")?);
-        let mixture = Arc::new(restored_mixture(&original, version, &snapshot.components)?);
-        let walks = restored_walks(snapshot.walks, seeds.len())?;
-        let accepted = walks.values().filter(|walk| walk.is_biased()).map(|walk| walk.record.accepted).sum();
-        Ok(Self {
-            settings,
-            campaign,
-            seeds,
-            least_distances,
-            examiner: Examiner { grader: Arc::new(grader), original },
-            mixture,
-            training,
-            walks,
-            known: snapshot.known.into_iter().collect(),
-            round,
-            in_round: BTreeMap::new(),
-            accepted,
-            declined_feature_bytes,
-            imported: (snapshot.imported, imported),
-        })
+        let judge = Judge::restore(settings, &seeds, grader, original, training, snapshot)?;
+        Ok(Self { campaign, seeds, judge, in_round: BTreeMap::new() })
     }
 
     /// The mixture of the turns that [`Selector::next_turn`] gives out.
     pub fn mixture(&self) -> &Arc<Mixture> {
-        &self.mixture
+        &self.judge.mixture
     }
 
     /// Every walk for those who watch: its seed structure's name, and its step (`last` once it has ended).
@@ -229,7 +206,14 @@ impl Selector {
             let step = if walk.has_ended() { last } else { walk.record.progress.step };
             (walk.record.walk, format!("{name}{control}"), step)
         };
-        self.walks.values().map(standing).collect()
+        self.judge.walks.values().map(standing).collect()
+    }
+
+    /// Makes a walk for every seed structure that has none: at the start of a campaign, or when seed structures were
+    /// added to it. Walks that had ended by a budget which has grown since go on. The commit is empty if there was
+    /// nothing to do.
+    pub fn begin_walks(&mut self) -> Commit {
+        self.judge.begin(&self.seeds)
     }
 
     /// Takes what came of a turn. What it returns must be committed before a turn that is asked for afterwards is given to
@@ -237,13 +221,13 @@ impl Selector {
     /// A report of a turn that is over changes nothing. One of the present turn counts also if nobody has it in hand as
     /// far as is known here: it comes from a walker that was taken for lost, or from before a restart.
     pub fn report(&mut self, report: Report) -> Result<Option<Commit>, SelectorError> {
-        let examined = self.examiner.examine(report, &self.mixture);
+        let examined = self.judge.examiner.examine(report, &self.judge.mixture);
         self.examined(examined)
     }
 
     /// Ends a walk whose turn, which a walker had in hand, cannot be worked on; as a report of that would.
     pub fn give_up(&mut self, id: WalkId, reason: String) -> Result<Option<Commit>, SelectorError> {
-        let Some(walk) = self.walks.get(&id) else { return Ok(None) };
+        let Some(walk) = self.judge.walks.get(&id) else { return Ok(None) };
         let WalkRecord { turn, checkpoint, progress, .. } = walk.record.clone();
         let (checkpoint, outcome) = (checkpoint.unwrap_or_default(), Outcome::Ended(End::BlewUp { reason }));
         self.report(Report { walk: id, turn, outcome, checkpoint, progress })
@@ -251,25 +235,26 @@ impl Selector {
 
     /// What a report's candidate needs to be examined elsewhere, for [`Selector::examined`].
     pub fn examiner(&self) -> &Examiner {
-        &self.examiner
+        &self.judge.examiner
     }
 
     /// [`Selector::report`] of a report whose candidate has been examined already. What comes of it is the same, whenever
     /// that was.
     pub fn examined(&mut self, report: ExaminedReport) -> Result<Option<Commit>, SelectorError> {
         let (id, turn) = (report.walk, report.turn);
-        let in_round = match self.settings.mode {
+        let mode = self.judge.settings.mode;
+        let in_round = match mode {
             Mode::Live => true,
             Mode::Reproducible => self.in_round.get(&id).is_some_and(Option::is_none),
         };
         let present = |walk: &&mut Walk| in_round && walk.record.turn == turn && !walk.has_ended();
-        let Some(walk) = self.walks.get_mut(&id).filter(present) else { return Ok(None) };
+        let Some(walk) = self.judge.walks.get_mut(&id).filter(present) else { return Ok(None) };
         walk.out = false;
         if matches!(report.outcome, Outcome::Paused) {
             walk.pause(report);
             return Ok(Some(Commit { walks: vec![walk.to_record()], ..Commit::default() }));
         }
-        let reports = match self.settings.mode {
+        let reports = match mode {
             Mode::Live => vec![report],
             Mode::Reproducible => {
                 self.in_round.insert(id, Some(report));
@@ -279,75 +264,6 @@ impl Selector {
                 std::mem::take(&mut self.in_round).into_values().flatten().collect()
             }
         };
-        self.decide(reports).map(Some)
+        self.judge.decide(reports).map(Some)
     }
-
-    /// A walk that is known to be there: none is ever taken out of the table.
-    fn walk_mut(&mut self, id: WalkId) -> &mut Walk {
-        self.walks.get_mut(&id).expect("walks stay in the table")
-    }
-
-    /// Seals a commit: what holds after it.
-    fn seal(&self, commit: &mut Commit) {
-        let values = [
-            ("round", self.round),
-            ("mixture_version", self.mixture.version()),
-            ("declined_feature_bytes", self.declined_feature_bytes),
-            ("imported", self.imported.0),
-        ];
-        commit.values.extend(values.map(|(name, value)| (name.to_owned(), value.to_string())));
-    }
-
-    fn decision(&self, kind: &'static str, walk: WalkId, detail: serde_json::Value) -> Decision {
-        let (round, mixture_version) = (self.round, self.mixture.version());
-        Decision { round, kind, walk: Some(walk), candidate: None, mixture_version, detail }
-    }
-}
-
-/// max(least, fraction × shortest distance) of each seed structure, Å (paper: max(1.2 Å, 0.75 d_nn⁰)).
-fn least_distances(
-    settings: &Settings,
-    seeds: &[SeedStructure],
-    grader: &Grader,
-) -> Result<Vec<f64>, SelectorError> {
-    let (least, fraction) = settings.least_distance;
-    let of = |seed: &SeedStructure| match grader.bonds(&seed.structure) {
-        Ok(bonds) if bonds.shortest.is_finite() => Ok(least.max(fraction * bonds.shortest)),
-        Ok(_) => Ok(least),
-        Err(source) => Err(SelectorError::SeedStructure { name: seed.name.clone(), source }),
-    };
-    seeds.iter().map(of).collect()
-}
-
-/// The stored walks, which are numbered from 0 and start from known seed structures.
-fn restored_walks(records: Vec<WalkRecord>, seeds: usize) -> Result<BTreeMap<WalkId, Walk>, SelectorError> {
-    let restored = records.into_iter().enumerate().map(|(number, record)| {
-        let (id, seed) = (record.walk, record.seed_structure);
-        if id.0 as usize != number {
-            return Err(SelectorError::Snapshot(format!("walk {id} stands where walk {number} should")));
-        }
-        if seed as usize >= seeds {
-            let problem = format!("walk {id} starts from seed structure {seed}, but there are {seeds}");
-            return Err(SelectorError::Snapshot(problem));
-        }
-        Ok((id, Walk::restore(record)?))
-    });
-    restored.collect()
-}
-
-fn restored_mixture(
-    original: &Mixture,
-    version: u64,
-    components: &[ComponentRecord],
-) -> Result<Mixture, SelectorError> {
-    let changed = components.iter().map(|record| {
-        let component = Component::from_bytes(&record.bytes).map_err(|error| {
-            let place = format!("component {} of element {}", record.slot, record.element);
-            SelectorError::Snapshot(format!("{place}: {error}"))
-        })?;
-        let (element, slot) = (record.element as usize, record.slot as usize);
-        Ok(ChangedComponent { element, slot, component: Arc::new(component) })
-    });
-    let changed = changed.collect::<Result<Vec<_>, SelectorError>>()?;
-    Ok(original.with_changes(&changed)?.at_version(version))
 }

@@ -112,13 +112,4 @@ impl Walk {
     pub fn ended_by_budget(&self) -> bool {
         self.is_biased() && [End::Collected, End::Budget].iter().any(|end| self.record.state == end.name())
     }
-
-    pub fn end(&mut self, end: &End) {
-        self.record.state = end.name().to_owned();
-        self.record.reason = match end {
-            End::Steps | End::Collected | End::Budget => String::new(),
-            End::Trapped { guard } => format!("refused by the {guard} guard again and again"),
-            End::BlewUp { reason } | End::BadStart { reason } => reason.clone(),
-        };
-    }
 }

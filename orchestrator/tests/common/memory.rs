@@ -11,6 +11,7 @@ pub struct MemoryStore {
     pub decisions: Vec<Decision>,
     pub candidates: BTreeSet<String>,
     pub known: Vec<ContentHash>,
+    pub imported: Vec<ContentHash>,
     pub components: BTreeMap<(u32, u32), Vec<u8>>,
     pub walks: BTreeMap<WalkId, WalkRecord>,
     pub values: BTreeMap<String, String>,
@@ -43,12 +44,12 @@ impl MemoryStore {
     pub fn snapshot(&self) -> Snapshot {
         let components = self.components.iter();
         Snapshot {
-            imported: 0,
+            imported: self.imported.len() as u64,
             walks: self.walks.values().cloned().collect(),
             components: components
                 .map(|(&(element, slot), bytes)| ComponentRecord { element, slot, bytes: bytes.clone() })
                 .collect(),
-            known: self.known.clone(),
+            known: [self.known.as_slice(), &self.imported].concat(),
             values: self.values.clone().into_iter().collect(),
         }
     }

@@ -109,6 +109,21 @@ impl Store {
         protocol(row.fetch_one(&mut transaction).await?).map(Some)
     }
 
+    /// Where the leader of the campaign has the files that grades depend on, as it last said: a JSON object of paths.
+    pub async fn set_grade_files(&self, files: &serde_json::Value) -> Result<()> {
+        let mut transaction = self.database.begin_to_lead().await?;
+        set_campaign_value(&mut transaction, "grade_files", &files.to_string()).await?;
+        transaction.commit().await
+    }
+
+    /// See [`Self::set_grade_files`]; null in campaigns of earlier versions.
+    pub async fn grade_files(&self) -> Result<serde_json::Value> {
+        let files = query("SELECT value FROM campaign WHERE key = 'grade_files'");
+        let files: Option<String> = files.fetch_optional(&self.database).await?;
+        let files = files.map(|files| serde_json::from_str(&files)).transpose();
+        Ok(files.map_err(|error| StoreError::damaged("the campaign's files", error))?.unwrap_or_default())
+    }
+
     /// Adds seed structures; those with the index of one that is there replace it.
     pub async fn add_seed_structures(&self, seeds: &[SeedStructure]) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;

@@ -4,11 +4,16 @@ use wire::messages::{Decline, Progress};
 use wire::{CandidateBlock, ContentHash, Origin, WalkId};
 
 use crate::Store;
-use crate::database::{from_columns, query};
+use crate::database::{Target, from_columns, query};
 use crate::encoding::decode_hash;
 use crate::error::{Result, StoreError};
 use crate::numbers::decode_numbers;
-use crate::records::{AtomGrades, ComponentRecord, Fate, StoredCandidate, WalkRecord};
+use crate::records::{AtomGrades, ComponentRecord, Fate, NewestMixture, StoredCandidate, WalkRecord};
+
+const CANDIDATES: &str = "SELECT candidate.decision, seed_structure, fate, reason, block, features,
+        selector_grades, original_grades
+    FROM candidate CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
+    WHERE candidate.decision > $1 AND (origin = 'biased' OR $2 = 1) ORDER BY candidate.decision LIMIT $3";
 
 struct WalkRow {
     walk: u32,
@@ -83,9 +88,7 @@ impl Store {
 
     /// Every component that ever changed (since the mixture last began anew), by element and slot.
     pub async fn load_components(&self) -> Result<Vec<ComponentRecord>> {
-        let sql = "SELECT element, slot, bytes FROM component ORDER BY element, slot";
-        let rows: Vec<(u32, u32, Vec<u8>)> = query(sql).fetch_all(&self.database).await?;
-        Ok(rows.into_iter().map(|(element, slot, bytes)| ComponentRecord { element, slot, bytes }).collect())
+        components(&self.database).await
     }
 
     /// The selector's values, by name.
@@ -98,11 +101,37 @@ impl Store {
     pub async fn known_hashes(&self) -> Result<Vec<ContentHash>> {
         let sql =
             "SELECT content FROM candidate WHERE origin = 'biased' AND fate = 'accepted' ORDER BY decision";
-        let mut hashes: Vec<Vec<u8>> = query(sql).fetch_all(&self.database).await?;
+        let hashes: Vec<Vec<u8>> = query(sql).fetch_all(&self.database).await?;
+        let mut hashes: Vec<_> = hashes.iter().map(|hash| decode_hash(hash)).collect::<Result<_>>()?;
+        hashes.extend(self.imported_hashes().await?);
+        Ok(hashes)
+    }
+
+    /// Hashes of imported structures, in the order in which they came.
+    pub async fn imported_hashes(&self) -> Result<Vec<ContentHash>> {
         let sql = "SELECT hash FROM import JOIN structure ON structure.number = import.structure
                    ORDER BY import.number";
-        hashes.extend(query(sql).fetch_all(&self.database).await?);
+        let hashes: Vec<Vec<u8>> = query(sql).fetch_all(&self.database).await?;
         hashes.iter().map(|hash| decode_hash(hash)).collect()
+    }
+
+    /// How far the decisions have come, and the mixture at that instant.
+    pub async fn newest_mixture(&self) -> Result<NewestMixture> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let sql = "SELECT sequence, mixture_version FROM decision ORDER BY sequence DESC LIMIT 1";
+        let last: Option<(i64, u64)> = query(sql).fetch_optional(&mut transaction).await?;
+        let (decision, version) = last.unwrap_or_default();
+        let components = components(&mut transaction).await?;
+        transaction.commit().await?;
+        Ok(NewestMixture { decision, version, components })
+    }
+
+    /// At most `limit` candidates behind decision number `after`, in decision order and whole; those of control walks only
+    /// if `control` says so.
+    pub async fn candidates(&self, after: i64, control: bool, limit: u32) -> Result<Vec<StoredCandidate>> {
+        let query = query(CANDIDATES).bind(after).bind(control).bind(limit);
+        let rows: Vec<CandidateRow> = query.fetch_all(&self.database).await?;
+        rows.into_iter().map(CandidateRow::into_candidate).collect()
     }
 
     /// The candidate of that name, `None` if there is none.
@@ -120,6 +149,12 @@ impl Store {
         let sql = "SELECT decision, id FROM candidate WHERE decision > $1 ORDER BY decision LIMIT $2";
         query(sql).bind(after).bind(limit).fetch_all(&self.database).await
     }
+}
+
+async fn components(from: impl Into<Target<'_>>) -> Result<Vec<ComponentRecord>> {
+    let sql = "SELECT element, slot, bytes FROM component ORDER BY element, slot";
+    let rows: Vec<(u32, u32, Vec<u8>)> = query(sql).fetch_all(from).await?;
+    Ok(rows.into_iter().map(|(element, slot, bytes)| ComponentRecord { element, slot, bytes }).collect())
 }
 
 impl WalkRow {

@@ -1,0 +1,278 @@
+//! The recorded stream of candidates and ends of walks once more before the judge, by the same rules or by others.
+//!
+//! What walkers said is taken from the log: which structures they offered and when, where they went back to a checkpoint,
+//! how their walks ended. What the judge said is decided anew. By the same rules every decision must come out the same.
+
+use std::collections::HashSet;
+use std::sync::Arc;
+
+use calm::Mixture;
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+use serde_json::{Map, Value};
+use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, LoggedDecision};
+use wire::messages::End;
+use wire::{ContentHash, WalkId};
+
+use super::judge::{Judge, restored_mixture};
+use super::rules::CONFIGURATION;
+use super::{Examined, Examiner, SeedStructure, SelectorError, Settings, Snapshot, TrainingFrames};
+use crate::grader::Grader;
+
+/// Why a log cannot be replayed.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// The judge gave up.
+    #[error("decision {sequence}: {source}")]
+    Selector {
+        /// Number of the decision.
+        sequence: i64,
+        /// Why.
+        source: SelectorError,
+    },
+    /// A log that no selector wrote.
+    #[error("decision {sequence} ({kind}): {problem}: the database is damaged; restore it from a copy")]
+    Damaged {
+        /// Number of the decision.
+        sequence: i64,
+        /// Its kind.
+        kind: String,
+        /// What is wrong.
+        problem: String,
+    },
+    /// The settings do not go with the campaign.
+    #[error(transparent)]
+    Settings(SelectorError),
+}
+
+/// What comes of a place of the log now.
+#[derive(Debug)]
+pub struct Replayed {
+    /// The decision.
+    pub decision: Decision,
+    /// The candidate that it is about, if it is about one.
+    pub candidate: Option<CandidateRecord>,
+}
+
+/// A campaign that is replayed.
+pub struct Replay {
+    judge: Judge,
+    seeds: Vec<SeedStructure>,
+    /// Imported structures in the order in which they came.
+    imported: Vec<ContentHash>,
+    /// Keys of the configuration that are not those of the campaign.
+    set: HashSet<String>,
+    /// The end of a walk that came with the last candidate.
+    ended: Option<Decision>,
+    cut_short: u64,
+}
+
+impl Replay {
+    /// A campaign before its first decision: `settings` are those of its begin, but for the keys in `set`, which the log
+    /// cannot change.
+    pub fn new(
+        settings: Settings,
+        set: HashSet<String>,
+        seeds: Vec<SeedStructure>,
+        grader: Grader,
+        original: Arc<Mixture>,
+        training: Option<TrainingFrames>,
+        imported: Vec<ContentHash>,
+    ) -> Result<Self, ReplayError> {
+        let judge = Judge::restore(settings, &seeds, grader, original, training, Snapshot::default());
+        let judge = judge.map_err(ReplayError::Settings)?;
+        Ok(Self { judge, seeds, imported, set, ended: None, cut_short: 0 })
+    }
+
+    /// Whether everything is as it was: then control walks and their frames are replayed too. They decide nothing, and
+    /// other rules would give others.
+    pub fn is_exact(&self) -> bool {
+        self.set.is_empty()
+    }
+
+    /// To examine candidates ahead of [`Self::follow`].
+    pub fn examiner(&self) -> &Examiner {
+        &self.judge.examiner
+    }
+
+    /// The mixture in force.
+    pub fn mixture(&self) -> &Arc<Mixture> {
+        &self.judge.mixture
+    }
+
+    /// Walks that a budget or their seed structure's limit ended, and that these rules would have let go on.
+    pub fn cut_short(&self) -> u64 {
+        self.cut_short
+    }
+
+    /// Whether by these rules it would come to a decision about a candidate at all.
+    pub fn comes_to(&self, recorded: &LoggedDecision) -> Result<bool, ReplayError> {
+        Ok(self.walk_under_way(recorded)?.is_some())
+    }
+
+    /// Goes on by one decision of the log, which have to come in order; a decision about a candidate comes with it. Nothing
+    /// comes of it if by these rules it would not have come to it: the walk was over.
+    pub fn follow(
+        &mut self,
+        recorded: &LoggedDecision,
+        candidate: Option<Examined>,
+    ) -> Result<Option<Replayed>, ReplayError> {
+        self.judge.round = recorded.round;
+        let ended = self.ended.take();
+        let decision = match recorded.kind.as_str() {
+            "accepted" | "declined" | "control" => return self.candidate(recorded, candidate),
+            "imported" => Some(self.import(recorded)?),
+            CONFIGURATION => Some(self.change_rules(recorded)?),
+            "begun" => self.begin(recorded)?,
+            "resumed" => self.resume(recorded)?,
+            "segment" => self.segment(recorded)?,
+            "ended" => match ended {
+                Some(ended) if ended.walk.map(|walk| walk.0) == recorded.walk => Some(ended),
+                _ => self.end(recorded)?,
+            },
+            _ => return Err(damaged(recorded, "a kind that this version does not know")),
+        };
+        Ok(decision.map(|decision| Replayed { decision, candidate: None }))
+    }
+
+    fn candidate(
+        &mut self,
+        recorded: &LoggedDecision,
+        candidate: Option<Examined>,
+    ) -> Result<Option<Replayed>, ReplayError> {
+        let Some(id) = self.walk_under_way(recorded)? else { return Ok(None) };
+        let examined = candidate.ok_or_else(|| damaged(recorded, "its candidate is missing"))?;
+        let step = examined.block.view().id().step;
+        let walk = self.judge.walk_mut(id);
+        walk.record.progress.step = step;
+        let (mut commit, biased) = (Commit::default(), walk.is_biased());
+        let decided = match biased {
+            true => self.judge.decide_candidate(id, examined, &mut commit),
+            false => self.judge.keep_control_frame(id, examined, &mut commit),
+        };
+        decided.map_err(|source| ReplayError::Selector { sequence: recorded.sequence, source })?;
+        let mut decisions = commit.decisions.into_iter();
+        let decision = decisions.next();
+        self.ended = decisions.next();
+        let candidate = commit.candidates.pop();
+        Ok(decision.map(|decision| Replayed { decision, candidate }))
+    }
+
+    fn import(&mut self, recorded: &LoggedDecision) -> Result<Decision, ReplayError> {
+        #[derive(Deserialize)]
+        struct Detail {
+            structures: usize,
+        }
+        let Detail { structures } = read(recorded)?;
+        let known = self.imported.get(..structures);
+        let known = known.ok_or_else(|| {
+            damaged(recorded, &format!("{structures} imported structures, but {} are there", self.imported.len()))
+        })?;
+        self.judge.known.extend(known);
+        Ok(self.judge.of_campaign("imported", recorded.detail.clone()))
+    }
+
+    /// Takes the rules that the campaign went on by, but for those that are set.
+    fn change_rules(&mut self, recorded: &LoggedDecision) -> Result<Decision, ReplayError> {
+        let mut rules = self.judge.settings.changeable().to_map();
+        for (key, value) in read::<Map<String, Value>>(recorded)? {
+            if !self.set.contains(&key) {
+                rules.insert(key, value);
+            }
+        }
+        let rules = serde_json::from_value(Value::Object(rules));
+        self.judge.settings.change(&rules.map_err(|error| damaged(recorded, &error.to_string()))?);
+        Ok(self.judge.of_campaign(CONFIGURATION, recorded.detail.clone()))
+    }
+
+    fn begin(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
+        #[derive(Deserialize)]
+        #[serde(untagged)]
+        enum Detail {
+            Biased { seed_structure: String },
+            Control { control_of: WalkId },
+        }
+        // Control walks are left out where rules are others, but the numbers stay those of the log.
+        let id = if self.is_exact() { self.judge.next_walk_id() } else { walk(recorded)? };
+        match read(recorded)? {
+            Detail::Biased { seed_structure: name } => {
+                let seed = self.seeds.iter().position(|seed| seed.name == name);
+                let seed =
+                    seed.ok_or_else(|| damaged(recorded, &format!("there is no seed structure '{name}'")))?;
+                Ok(Some(self.judge.begin_walk(id, seed, &name)))
+            }
+            Detail::Control { control_of } if self.is_exact() => {
+                let is_there = self.judge.walks.contains_key(&control_of);
+                Ok(is_there.then(|| self.judge.begin_control(id, control_of)))
+            }
+            Detail::Control { .. } => Ok(None),
+        }
+    }
+
+    /// A walk that has ended for good by these rules stays ended.
+    fn resume(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
+        let id = walk(recorded)?;
+        let goes_on = self.judge.walks.contains_key(&id) && self.judge.may_go_on(id);
+        Ok(goes_on.then(|| self.judge.resume(id)))
+    }
+
+    /// A return to a checkpoint is what the walker said.
+    fn segment(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
+        let id = self.walk_under_way(recorded)?;
+        Ok(id.map(|id| self.judge.decision("segment", id, recorded.detail.clone())))
+    }
+
+    fn end(&mut self, recorded: &LoggedDecision) -> Result<Option<Decision>, ReplayError> {
+        #[derive(Deserialize)]
+        struct Detail {
+            end: String,
+            reason: String,
+            step: u64,
+        }
+        let Some(id) = self.walk_under_way(recorded)? else { return Ok(None) };
+        let Detail { end, reason, step } = read(recorded)?;
+        let collected = end == End::Collected.name();
+        if collected && self.is_exact() {
+            // That would have been the judge's own word.
+            return Ok(None);
+        }
+        let budget = end == End::Budget.name() && !self.judge.is_used_up();
+        self.cut_short += u64::from(collected || budget);
+        self.judge.walk_mut(id).record.progress.step = step;
+        let mut commit = Commit::default();
+        self.judge.end_walk_as(id, &end, reason, &mut commit);
+        Ok(commit.decisions.pop())
+    }
+
+    /// The walk of a decision, if it is there and not over.
+    fn walk_under_way(&self, recorded: &LoggedDecision) -> Result<Option<WalkId>, ReplayError> {
+        let id = walk(recorded)?;
+        Ok(self.judge.walks.get(&id).filter(|walk| !walk.has_ended()).map(|_| id))
+    }
+
+    /// The first place (element index, slot) at which the mixture is not, byte for byte, what the store has of it.
+    pub fn other_component(
+        &self,
+        version: u64,
+        stored: &[ComponentRecord],
+    ) -> Result<Option<(usize, usize)>, ReplayError> {
+        let stored = restored_mixture(&self.judge.examiner.original, version, stored);
+        let stored = stored.map_err(ReplayError::Settings)?;
+        let mut places = self.judge.mixture.iter().zip(stored.iter());
+        let other = places.find(|((.., now), (.., stored))| now.to_bytes() != stored.to_bytes());
+        Ok(other.map(|((element, slot, _), _)| (element, slot)))
+    }
+}
+
+fn damaged(recorded: &LoggedDecision, problem: &str) -> ReplayError {
+    let LoggedDecision { sequence, kind, .. } = recorded;
+    ReplayError::Damaged { sequence: *sequence, kind: kind.clone(), problem: problem.to_owned() }
+}
+
+fn walk(recorded: &LoggedDecision) -> Result<WalkId, ReplayError> {
+    recorded.walk.map(WalkId).ok_or_else(|| damaged(recorded, "it is about no walk"))
+}
+
+fn read<T: DeserializeOwned>(recorded: &LoggedDecision) -> Result<T, ReplayError> {
+    T::deserialize(&recorded.detail).map_err(|error| damaged(recorded, &error.to_string()))
+}

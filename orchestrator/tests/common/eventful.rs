@@ -1,0 +1,202 @@
+//! Campaigns of scripted walks to which things happen.
+
+use std::sync::Arc;
+
+use orchestrator::selector::{Mode, Next, Selector, Settings, Snapshot, UpdateProtocol};
+use proptest::collection::vec;
+use proptest::prelude::*;
+use store::records::Commit;
+use wire::messages::Outcome;
+use wire::transport::Work;
+
+use super::memory::MemoryStore;
+use super::scripted::{Event, Script, advance};
+use super::{restore, settings};
+
+/// What happens next while a campaign runs.
+#[derive(Clone, Copy, Debug)]
+pub enum Act {
+    /// A free walker asks for a turn.
+    Ask,
+    /// One of the walkers at work (the index picks) delivers its report.
+    Deliver(prop::sample::Index),
+    /// One of them is interrupted after so many steps.
+    Interrupt(prop::sample::Index, u64),
+    /// One of them is lost.
+    Lose(prop::sample::Index),
+    /// All processes die, and the campaign is started again.
+    Crash,
+}
+
+pub fn acts() -> impl Strategy<Value = Vec<Act>> {
+    let index = any::<prop::sample::Index>;
+    vec(
+        prop_oneof![
+            8 => Just(Act::Ask),
+            6 => index().prop_map(Act::Deliver),
+            3 => (index(), 0..12_u64).prop_map(|(index, steps)| Act::Interrupt(index, steps)),
+            1 => index().prop_map(Act::Lose),
+            1 => Just(Act::Crash),
+        ],
+        0..150,
+    )
+}
+
+fn event() -> impl Strategy<Value = Event> {
+    // Few numbers and directions, so that duplicates and structures that are covered meanwhile are common.
+    let structure = (0..12_u64, 0..3_usize, 1.0..9.0, prop::bool::weighted(0.1)).prop_map(
+        |(number, direction, far, close)| {
+            let mut z = [0.0; 3];
+            z[direction] = far;
+            Event::Structure { number, z, close }
+        },
+    );
+    prop_oneof![
+        12 => Just(Event::Nothing),
+        8 => structure,
+        2 => Just(Event::Return),
+        1 => Just(Event::BlowUp),
+    ]
+}
+
+pub fn scripts() -> impl Strategy<Value = Vec<Script>> {
+    vec(vec(event(), 5..60), 1..6)
+}
+
+pub fn any_settings() -> impl Strategy<Value = Settings> {
+    let update =
+        prop::sample::select(vec![UpdateProtocol::Carried, UpdateProtocol::Restarted, UpdateProtocol::Never]);
+    (1..5_usize, update, 1..6_u32, prop::option::of(1..12_u32), any::<bool>(), 0..300_u64).prop_map(
+        |(walks, update, per_seed, total, control, declined_feature_bytes)| Settings {
+            walks_per_round: if update == UpdateProtocol::Restarted { 1 } else { walks },
+            update,
+            per_seed,
+            total,
+            control,
+            declined_feature_bytes,
+            ..settings(Mode::Reproducible)
+        },
+    )
+}
+
+/// A campaign on its way: the selector, its store, and walkers with turns in hand.
+pub struct Campaign<'a> {
+    settings: &'a Settings,
+    scripts: &'a [Script],
+    walkers: usize,
+    pub selector: Selector,
+    pub store: MemoryStore,
+    at_work: Vec<Work>,
+    /// All commits but those that only keep where an interrupted walk stands.
+    pub commits: Vec<Commit>,
+}
+
+impl<'a> Campaign<'a> {
+    pub fn begin(settings: &'a Settings, scripts: &'a [Script], walkers: usize) -> Self {
+        let selector = restore(settings, scripts.len(), Snapshot::default());
+        let (store, at_work, commits) = (MemoryStore::default(), Vec::new(), Vec::new());
+        let mut campaign = Self { settings, scripts, walkers, selector, store, at_work, commits };
+        let commit = campaign.selector.begin_walks();
+        campaign.commit(commit);
+        campaign
+    }
+
+    fn commit(&mut self, commit: Commit) {
+        self.store.commit(&commit);
+        let only_keeps = commit.decisions.is_empty() && commit.values.is_empty();
+        if !only_keeps {
+            self.commits.push(commit);
+        }
+    }
+
+    /// Gives a turn to a free walker, if there are both.
+    fn ask(&mut self) -> bool {
+        if self.at_work.len() == self.walkers {
+            return false;
+        }
+        match self.selector.next_turn() {
+            Next::Turn(assignment) => {
+                let mixture = Arc::clone(self.selector.mixture());
+                self.at_work.push(Work { assignment: *assignment, mixture });
+                true
+            }
+            Next::Wait => {
+                assert!(!self.at_work.is_empty(), "nothing to wait for");
+                false
+            }
+            Next::Done => {
+                assert!(self.selector.is_done() && self.at_work.is_empty());
+                false
+            }
+        }
+    }
+
+    fn take(&mut self, index: prop::sample::Index) -> Option<Work> {
+        (!self.at_work.is_empty()).then(|| self.at_work.remove(index.index(self.at_work.len())))
+    }
+
+    fn deliver(&mut self, work: &Work, pause_after: Option<u64>) {
+        let seed = self.store.walks[&work.assignment.walk].seed_structure as usize;
+        let report = advance(&self.scripts[seed], &work.assignment, &work.mixture, pause_after);
+        let paused = report.outcome == Outcome::Paused;
+        let commit = self.selector.report(report).unwrap();
+        assert!(!paused || commit.is_some(), "an interrupted walk is kept at once");
+        if let Some(commit) = commit {
+            self.commit(commit);
+        }
+    }
+
+    fn crash(&mut self) {
+        self.at_work.clear();
+        self.selector = restore(self.settings, self.scripts.len(), self.store.snapshot());
+        assert!(self.selector.begin_walks().walks.is_empty());
+    }
+
+    /// Everybody dies, and the campaign goes on by other settings.
+    pub fn go_on(&mut self, settings: &'a Settings) {
+        self.at_work.clear();
+        self.settings = settings;
+        self.selector = restore(self.settings, self.scripts.len(), self.store.snapshot());
+        let commit = self.selector.begin_walks();
+        self.commit(commit);
+    }
+
+    pub fn act(&mut self, act: Act) {
+        let index = match act {
+            Act::Ask => {
+                self.ask();
+                return;
+            }
+            Act::Crash => return self.crash(),
+            Act::Deliver(index) | Act::Interrupt(index, _) | Act::Lose(index) => index,
+        };
+        let Some(work) = self.take(index) else { return };
+        match act {
+            Act::Lose(_) => self.selector.lost(work.assignment.walk),
+            Act::Interrupt(_, steps) => self.deliver(&work, Some(steps)),
+            _ => self.deliver(&work, None),
+        }
+    }
+
+    /// Goes on without incidents until all walks are over; with `crash_often`, every commit is followed by a crash.
+    pub fn finish(mut self, crash_often: bool) -> Self {
+        for _ in 0..10_000 {
+            if self.selector.is_done() {
+                return self;
+            }
+            while self.ask() {}
+            let (work, commits) = (self.at_work.remove(0), self.commits.len());
+            self.deliver(&work, None);
+            if crash_often && self.commits.len() > commits {
+                self.crash();
+            }
+        }
+        panic!("the campaign does not end");
+    }
+
+    /// Everything that must be the same, as text: numbers are written so that other bits are other text.
+    pub fn content(&self) -> Vec<String> {
+        let rest = format!("{:?} {:?} {:?}", self.store.walks, self.store.components, self.store.values);
+        self.commits.iter().map(|commit| format!("{commit:?}")).chain([rest]).collect()
+    }
+}

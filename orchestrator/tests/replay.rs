@@ -1,0 +1,165 @@
+//! What a campaign decided is decided again from its log, exactly; and other rules decide otherwise.
+
+mod common;
+
+use std::collections::{BTreeMap, HashSet};
+
+use common::eventful::{Campaign, acts, any_settings, scripts};
+use common::scripted::Script;
+use common::{SHORTEST, grader, kinds, mixture, positive, seed, structure};
+use calm::CollectionRule;
+use orchestrator::selector::{Mode, Replay, Replayed, Settings, UpdateProtocol};
+use proptest::prelude::*;
+use proptest::strategy::ValueTree;
+use proptest::test_runner::TestRunner;
+use store::records::{CandidateRecord, ComponentRecord, Fate, LoggedDecision};
+use wire::ContentHash;
+
+/// The decisions of a campaign as a store gives them back, each with its candidate.
+fn log<'a>(campaign: &'a Campaign<'_>) -> Vec<(LoggedDecision, Option<&'a CandidateRecord>)> {
+    let candidates = campaign.commits.iter().flat_map(|commit| &commit.candidates);
+    let candidates: BTreeMap<_, _> = candidates.map(|c| (c.block.view().id().to_string(), c)).collect();
+    let logged = |(decision, sequence): (&store::records::Decision, i64)| {
+        let candidate = decision.candidate.map(|id| id.to_string());
+        let record = candidate.as_ref().map(|id| candidates[id]);
+        let decision = LoggedDecision {
+            sequence,
+            round: decision.round,
+            kind: decision.kind.to_owned(),
+            walk: decision.walk.map(|walk| walk.0),
+            candidate,
+            mixture_version: decision.mixture_version,
+            detail: serde_json::from_str(&decision.detail.to_string()).unwrap(),
+        };
+        (decision, record)
+    };
+    campaign.store.decisions.iter().zip(1..).map(logged).collect()
+}
+
+fn open(campaign: &Campaign<'_>, settings: &Settings, seeds: usize, set: &[&str]) -> Replay {
+    let set: HashSet<String> = set.iter().map(|key| (*key).to_owned()).collect();
+    let seeds = (0..seeds).map(seed).collect();
+    let imported = campaign.store.imported.clone();
+    Replay::new(settings.clone(), set, seeds, grader(), mixture(), None, imported).unwrap()
+}
+
+/// What comes of each place of the log.
+fn follow(replay: &mut Replay, log: &[(LoggedDecision, Option<&CandidateRecord>)]) -> Vec<Option<Replayed>> {
+    let next = |(decision, candidate): &(LoggedDecision, Option<&CandidateRecord>)| {
+        let examine = |record: &&CandidateRecord| {
+            replay.examiner().examine_block(record.block.clone(), replay.mixture()).unwrap()
+        };
+        let examined = candidate.as_ref().map(examine);
+        replay.follow(decision, examined).unwrap()
+    };
+    log.iter().map(next).collect()
+}
+
+/// Replays a campaign by its own rules and checks that everything is as it was.
+fn check_exact(campaign: &Campaign<'_>, settings: &Settings, seeds: usize) {
+    let log = log(campaign);
+    let mut replay = open(campaign, settings, seeds, &[]);
+    let replayed = follow(&mut replay, &log);
+    for ((recorded, candidate), now) in log.iter().zip(replayed) {
+        let now = now.unwrap_or_else(|| panic!("nothing comes of {recorded:?}"));
+        let Replayed { decision, candidate: graded } = now;
+        let found = (decision.kind, decision.walk.map(|walk| walk.0), decision.mixture_version, decision.round);
+        assert_eq!(found, (recorded.kind.as_str(), recorded.walk, recorded.mixture_version, recorded.round));
+        assert_eq!(decision.candidate.map(|id| id.to_string()), recorded.candidate);
+        assert_eq!(decision.detail.to_string(), recorded.detail.to_string(), "{recorded:?}");
+        let (before, now) = (candidate.map(|c| (&c.selector, &c.original, c.fate)), graded.as_ref());
+        assert_eq!(before, now.map(|c| (&c.selector, &c.original, c.fate)));
+    }
+    let components = campaign.store.components.iter();
+    let components: Vec<_> = components
+        .map(|(&(element, slot), bytes)| ComponentRecord { element, slot, bytes: bytes.clone() })
+        .collect();
+    let version = campaign.selector.mixture().version();
+    assert_eq!((replay.mixture().version(), replay.other_component(version, &components).unwrap()), (version, None));
+    assert_eq!(replay.cut_short(), 0);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(200))]
+
+    #[test]
+    fn every_decision_comes_out_as_it_was(
+        settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize, acts in acts(),
+    ) {
+        let mode = if live { Mode::Live } else { Mode::Reproducible };
+        let settings = Settings { mode, ..settings };
+        let mut campaign = Campaign::begin(&settings, &scripts, walkers);
+        acts.into_iter().for_each(|act| campaign.act(act));
+        check_exact(&campaign.finish(false), &settings, scripts.len());
+    }
+
+    /// The rules are changed twice, and structures that walks will meet are imported.
+    #[test]
+    fn also_where_rules_changed_and_structures_were_imported(
+        settings in any_settings(), live in any::<bool>(), scripts in scripts(), walkers in 1..7_usize,
+        parts in prop::array::uniform3(acts()), limits in prop::array::uniform2((1..6_u32, prop::option::of(1..12_u32))),
+        imports in prop::collection::vec(0..12_u64, 0..6),
+    ) {
+        let mode = if live { Mode::Live } else { Mode::Reproducible };
+        let settings = Settings { mode, ..settings };
+        let [second, third] =
+            limits.map(|(per_seed, total)| Settings { per_seed, total, ..settings.clone() });
+        let [first, middle, last] = parts;
+        let mut campaign = Campaign::begin(&settings, &scripts, walkers);
+        first.into_iter().for_each(|act| campaign.act(act));
+        let hash = |number| ContentHash::of(&structure(number, SHORTEST));
+        campaign.store.imported = imports.into_iter().map(hash).collect();
+        campaign.go_on(&second);
+        middle.into_iter().for_each(|act| campaign.act(act));
+        campaign.go_on(&third);
+        last.into_iter().for_each(|act| campaign.act(act));
+        check_exact(&campaign.finish(false), &settings, scripts.len());
+    }
+
+    /// Where nothing is learned, a threshold alone decides what is new among what was offered.
+    #[test]
+    fn a_stricter_rule_accepts_what_lies_above_it(
+        settings in any_settings(), scripts in scripts(), threshold in 1.5..9.0,
+    ) {
+        let settings = Settings { update: UpdateProtocol::Never, per_seed: 100, total: None, ..settings };
+        let campaign = Campaign::begin(&settings, &scripts, 1).finish(false);
+        let log = log(&campaign);
+        let collection = CollectionRule::MaximumGrade { threshold: positive(threshold) };
+        let strict = Settings { collection, ..settings.clone() };
+        let replayed = follow(&mut open(&campaign, &strict, scripts.len(), &["collect.when"]), &log);
+        for ((recorded, candidate), now) in log.iter().zip(replayed) {
+            let (Some(candidate), true) = (candidate, recorded.kind != "control") else { continue };
+            let above = candidate.selector.gamma.iter().any(|gamma| *gamma > threshold);
+            let was_accepted = candidate.fate == Fate::Accepted;
+            let now = now.unwrap().candidate.unwrap();
+            prop_assert_eq!(&now.selector, &candidate.selector);
+            // What is not in the data set any more can be no duplicate: so some that were declined are taken now.
+            if was_accepted {
+                prop_assert_eq!(now.fate == Fate::Accepted, above);
+            } else if now.fate == Fate::Accepted {
+                prop_assert!(above);
+            }
+        }
+    }
+}
+
+/// The campaigns above are worth the name: rules change in the middle of them, and imports are met.
+#[test]
+fn the_campaigns_reach_what_they_are_for() {
+    let mut runner = TestRunner::deterministic();
+    let mut seen = HashSet::new();
+    for _ in 0..60 {
+        let settings = any_settings().new_tree(&mut runner).unwrap().current();
+        let scripts: Vec<Script> = scripts().new_tree(&mut runner).unwrap().current();
+        let more = Settings { per_seed: settings.per_seed + 3, total: None, ..settings.clone() };
+        let mut campaign = Campaign::begin(&settings, &scripts, 2).finish(false);
+        campaign.store.imported = (0..12).map(|n| ContentHash::of(&structure(n, SHORTEST))).collect();
+        campaign.go_on(&more);
+        let campaign = campaign.finish(false);
+        check_exact(&campaign, &settings, scripts.len());
+        seen.extend(campaign.commits.iter().flat_map(kinds));
+    }
+    for kind in ["configuration", "imported", "resumed", "declined duplicate", "declined guard", "segment"] {
+        assert!(seen.contains(kind), "{seen:?}");
+    }
+}
