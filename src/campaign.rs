@@ -91,6 +91,19 @@ impl Campaign {
         Ok(BTreeMap::from([(REFERENCE_FILE.to_owned(), file)]))
     }
 
+    /// Where the files are that grades depend on, by the keys of the configuration.
+    pub fn grade_files(&self) -> Value {
+        let calm = &self.config.calm;
+        let files = [
+            ("potential.model", Some(&self.config.potential.model)),
+            ("calm.artifact", calm.artifact.as_ref()),
+            ("calm.training_frames", calm.training_frames.as_ref()),
+        ];
+        let absolute = |path: &PathBuf| std::path::absolute(path).unwrap_or_else(|_| path.clone());
+        let files = files.into_iter().filter_map(|(key, file)| Some((key, absolute(file?.get_ref()))));
+        files.map(|(key, path)| (key.to_owned(), json!(path.to_string_lossy()))).collect()
+    }
+
     /// The hash of a file that the configuration names under this key.
     pub fn hash_of(&self, key: &str) -> String {
         let hashes = self.file_hashes.iter().find(|(name, _)| name == key);
@@ -156,9 +169,7 @@ impl Campaign {
 
     /// What the orchestrator needs of the model.
     pub fn grader(&self) -> Grader {
-        let n = self.model.elements().len();
-        let cutoffs = (0..n * n).map(|k| self.model.pair_cutoff(k / n, k % n)).collect();
-        Grader::new(self.model.elements().to_vec(), cutoffs)
+        grader(&self.model)
     }
 
     /// What walks need of the configuration.
@@ -193,26 +204,51 @@ impl Campaign {
 
     /// What the selector needs of the configuration.
     pub fn selector_settings(&self) -> selector::Settings {
-        let Config { campaign, calm, collect, guard, run, .. } = &self.config;
-        selector::Settings {
-            mode: campaign.mode,
-            walks_per_round: run.walks_per_round.get(),
-            turn_steps: run.turn_steps.get(),
-            update: calm.update,
-            search: self.config.update_settings(),
-            forgetting_alarm: ForgettingAlarm { share_above_one: calm.forgetting_alarm },
-            collection: collect.when,
-            per_seed: collect.per_seed.get(),
-            total: collect.total.map(|total| total.get()),
-            control: campaign.control,
-            least_distance: (guard.least_distance.get(), guard.least_distance_fraction.get()),
-            declined_feature_bytes: collect.declined_features_mb * 1_000_000,
-        }
+        selector_settings(&self.config)
+    }
+}
+
+/// What grades depend on: the model, its mixture at the start, and the training frames if they are watched. `name` stands
+/// for the configuration in what is said about its files.
+pub fn load_for_grades(
+    config: &Config,
+    name: &Path,
+) -> Result<(Arc<GraceModel>, Artifact, Option<TrainingFrames>), ConfigError> {
+    let loader = Loader { path: name, text: "", config };
+    let model = loader.model()?;
+    let artifact = loader.artifact(&model)?;
+    let training = loader.training_frames(&model, &artifact.mixture)?;
+    Ok((model, artifact, training))
+}
+
+/// What of a model the grades need.
+pub fn grader(model: &GraceModel) -> Grader {
+    let n = model.elements().len();
+    let cutoffs = (0..n * n).map(|k| model.pair_cutoff(k / n, k % n)).collect();
+    Grader::new(model.elements().to_vec(), cutoffs)
+}
+
+/// What the selector needs of a configuration.
+pub fn selector_settings(config: &Config) -> selector::Settings {
+    let Config { campaign, calm, collect, guard, run, .. } = config;
+    selector::Settings {
+        mode: campaign.mode,
+        walks_per_round: run.walks_per_round.get(),
+        turn_steps: run.turn_steps.get(),
+        update: calm.update,
+        search: config.update_settings(),
+        forgetting_alarm: ForgettingAlarm { share_above_one: calm.forgetting_alarm },
+        collection: collect.when,
+        per_seed: collect.per_seed.get(),
+        total: collect.total.map(|total| total.get()),
+        control: campaign.control,
+        least_distance: (guard.least_distance.get(), guard.least_distance_fraction.get()),
+        declined_feature_bytes: collect.declined_features_mb * 1_000_000,
     }
 }
 
 /// The instruction sets that the numerical libraries choose among: another choice gives other last bits.
-fn instructions() -> String {
+pub fn instructions() -> String {
     let mut names = vec![std::env::consts::ARCH];
     #[cfg(target_arch = "x86_64")]
     {

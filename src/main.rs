@@ -11,6 +11,7 @@ mod labelling;
 mod outcome;
 mod output;
 mod progress;
+mod replay;
 mod setup;
 mod summary;
 mod whole_file;

@@ -11,6 +11,7 @@ mod labeller;
 mod launch;
 mod md;
 mod queue;
+mod replay;
 mod run;
 mod status;
 mod validate;
@@ -46,6 +47,7 @@ enum Command {
     Status(status::Status),
     Queue(queue::Queue),
     Export(export::Export),
+    Replay(replay::Replay),
     #[command(subcommand)]
     Calm(calm::Calm),
     Import(import::Import),
@@ -69,6 +71,7 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Status(command) => command.run(),
         Command::Queue(command) => command.run(),
         Command::Export(command) => command.run(),
+        Command::Replay(command) => command.run(),
         Command::Calm(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Md(command) => command.run(),

@@ -177,6 +177,7 @@ async fn open_store(campaign: &Campaign, location: &Location) -> Result<Store, F
             store
         }
     };
+    store.set_grade_files(&campaign.grade_files()).await?;
     let files = serde_json::to_string(&campaign.label_files().map_err(Failure::failed)?);
     store.set_label_files(&files.map_err(Failure::failed)?).await?;
     // Labellers that wait for the campaign begin with its protocol.

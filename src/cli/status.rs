@@ -2,13 +2,14 @@
 
 mod jobs;
 mod processes;
+mod values;
 
 use std::io::{self, Write};
 
-use serde_json::Value;
 use store::{Candidates, Labels, Location, Status as Standing, Store, WalkStatus};
 
 use self::jobs::Jobs;
+use self::values::Values;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::output::{Table, decimals, print, print_json};
 
@@ -33,31 +34,28 @@ pub struct Status {
 impl Status {
     pub fn run(self) -> Result<Ended, Failure> {
         let location = self.location.get()?;
-        let (campaign, standing, training) = block_on(self.read(&location))??;
+        let (campaign, standing, values) = block_on(self.read(&location))??;
         let jobs = block_on(Jobs::of(&location))?;
         if self.json {
             let mut json = serde_json::to_value(&standing).map_err(Failure::failed)?;
             json["campaign"] = campaign.id.to_string().into();
             json["mode"] = campaign.mode.clone().into();
-            json["training_frames"] = training;
+            json["training_frames"] = values.training_frames();
+            json["staleness"] = values.staleness();
             jobs.add_to(&mut json);
             print_json(&json)?;
         } else {
             print(|out| {
-                write_status(out, &campaign, &standing, &training, self.all)?;
+                write_status(out, &campaign, &standing, &values, self.all)?;
                 jobs.write(out, self.all)
             })?;
         }
         Ok(Ended::Done)
     }
 
-    /// Campaign, standing, and the grades of the training frames under the newest mixture (null if not watched).
-    async fn read(&self, location: &Location) -> Result<(store::Campaign, Standing, Value), Failure> {
+    async fn read(&self, location: &Location) -> Result<(store::Campaign, Standing, Values), Failure> {
         let store = Store::open_read_only(location).await?;
-        let values = store.values().await?;
-        let watched = values.iter().find(|(name, _)| name == "training_frames");
-        let watched = watched.and_then(|(_, text)| serde_json::from_str(text).ok()).unwrap_or_default();
-        let read = (store.campaign().await?, store.status().await?, watched);
+        let read = (store.campaign().await?, store.status().await?, Values(store.values().await?));
         store.close().await;
         Ok(read)
     }
@@ -67,7 +65,7 @@ fn write_status(
     out: &mut dyn Write,
     campaign: &store::Campaign,
     status: &Standing,
-    training: &Value,
+    values: &Values,
     all: bool,
 ) -> io::Result<()> {
     let walks = &status.walks;
@@ -81,24 +79,11 @@ fn write_status(
         status.round
     )?;
     writeln!(out, "mixture     version {}", status.mixture_version)?;
-    write_training(out, training)?;
+    values.write(out, &campaign.mode)?;
     write_candidates(out, &status.candidates)?;
     write_labels(out, &status.labels, status.imported)?;
     write_walks(out, walks, all)?;
     processes::write(out, &status.processes, all)
-}
-
-fn write_training(out: &mut dyn Write, training: &Value) -> io::Result<()> {
-    let number = |key: &str| training[key].as_f64();
-    if let (Some(median), Some(share)) = (number("median"), number("share_above_one")) {
-        let alarm = if training["alarm"] == true { "; ALARM: the mixture forgets them" } else { "" };
-        let share = 100.0 * share;
-        writeln!(
-            out,
-            "            training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}"
-        )?;
-    }
-    Ok(())
 }
 
 fn write_candidates(out: &mut dyn Write, candidates: &Candidates) -> io::Result<()> {

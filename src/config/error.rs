@@ -59,10 +59,7 @@ impl ConfigError {
         let (line, column) = error.span().map_or((1, 1), |span| line_and_column(text, span.start));
         let at = format!("{}:{line}:{column}", path.display());
         let shown = text.lines().nth(line - 1).unwrap_or_default().trim();
-        let mut message = in_plain_words(&error.message().trim().replace('\n', "; "));
-        if let Some(suggestion) = suggestion(&message) {
-            message += &format!("; did you mean `{suggestion}`?");
-        }
+        let mut message = in_plain_words(error);
         // What the whole file lacks has no line of its own.
         let of_whole = (line, column) == (1, 1) && message.starts_with("missing");
         if !(shown.is_empty() || of_whole) {
@@ -82,8 +79,17 @@ pub fn read_text(path: &Path) -> Result<String, ConfigError> {
     })
 }
 
+/// What is wrong with TOML, with a suggestion for an unknown key.
+pub fn in_plain_words(error: &toml::de::Error) -> String {
+    let message = translated(&error.message().trim().replace('\n', "; "));
+    match suggestion(&message) {
+        Some(suggestion) => format!("{message}; did you mean `{suggestion}`?"),
+        None => message,
+    }
+}
+
 /// The words of the parser, which are those of Rust, in the words of those who write configurations.
-fn in_plain_words(message: &str) -> String {
+fn translated(message: &str) -> String {
     let words = [
         ("unknown field", "unknown key"),
         ("missing field", "missing key"),

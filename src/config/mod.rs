@@ -19,7 +19,7 @@ use toml::Spanned;
 use workers::settings::ThermostatKind;
 
 pub use changes::{Change, compare, without_changeable};
-pub use error::{ConfigError, place, place_of_offset};
+pub use error::{ConfigError, in_plain_words, place, place_of_offset};
 pub use files::{PotentialFile, PotentialKind};
 
 /// A whole campaign.
@@ -261,7 +261,7 @@ impl Config {
         let mut config: Self =
             toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
         config.resolve_paths(path.parent().unwrap_or(Path::new("")));
-        check::check(&config).map_err(|(key, found, expected)| ConfigError::Value {
+        config.check().map_err(|(key, found, expected)| ConfigError::Value {
             at: place(path, &text, key),
             key: key.to_owned(),
             found,
@@ -276,6 +276,11 @@ impl Config {
             Some(url) => url.parse(),
             None => Ok(Location::from(directory)),
         }
+    }
+
+    /// Checks it as a whole; the first thing that is wrong.
+    pub fn check(&self) -> Result<(), check::Wrong> {
+        check::check(self)
     }
 
     /// Every path in it.

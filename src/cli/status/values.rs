@@ -1,0 +1,91 @@
+//! What the selector keeps about its mixture for those who watch.
+
+use std::io::{self, Write};
+
+use orchestrator::selector::{STALENESS, Staleness};
+use serde_json::{Value, json};
+
+/// The values of past commits, by name.
+pub struct Values(pub Vec<(String, String)>);
+
+impl Values {
+    /// The grades of the training frames under the newest mixture; null if they are not watched.
+    pub fn training_frames(&self) -> Value {
+        self.read("training_frames").unwrap_or_default()
+    }
+
+    /// By how many versions the mixture was newer at decisions than what walkers had seen; null before the first.
+    pub fn staleness(&self) -> Value {
+        let Some(staleness) = self.read::<Staleness>(STALENESS) else { return Value::Null };
+        let mut json = json!(staleness);
+        json["decisions"] = json!(staleness.decisions());
+        json["share_of_newest"] = json!(staleness.share_of_newest());
+        json["median"] = json!(staleness.quantile(0.5));
+        json["quantile_90"] = json!(staleness.quantile(0.9));
+        json
+    }
+
+    fn read<T: serde::de::DeserializeOwned>(&self, name: &str) -> Option<T> {
+        let (_, text) = self.0.iter().find(|(key, _)| key == name)?;
+        serde_json::from_str(text).ok()
+    }
+
+    /// Writes the lines that stand below the version of the mixture.
+    pub fn write(&self, out: &mut dyn Write, mode: &str) -> io::Result<()> {
+        let training = self.training_frames();
+        let number = |key: &str| training[key].as_f64();
+        if let (Some(median), Some(share)) = (number("median"), number("share_above_one")) {
+            let alarm = if training["alarm"] == true { "; ALARM: the mixture forgets them" } else { "" };
+            let share = 100.0 * share;
+            writeln!(
+                out,
+                "            training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}"
+            )?;
+        }
+        // Where walks follow one another each sees the newest, by construction.
+        let staleness = self.read::<Staleness>(STALENESS);
+        match staleness.filter(|staleness| mode == "live" || staleness.largest() > 0) {
+            Some(staleness) => writeln!(
+                out,
+                "            walkers had seen the newest at {:.1} % of decisions; versions behind: median {}, 90 % {}, \
+                 largest {}",
+                100.0 * staleness.share_of_newest(),
+                staleness.quantile(0.5),
+                staleness.quantile(0.9),
+                staleness.largest()
+            ),
+            None => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn text(values: &Values, mode: &str) -> String {
+        let mut out = Vec::new();
+        values.write(&mut out, mode).unwrap();
+        String::from_utf8(out).unwrap()
+    }
+
+    #[test]
+    fn the_age_of_what_walkers_saw_is_shown_where_it_says_something() {
+        let mut staleness = Staleness::default();
+        [0, 0, 0].iter().for_each(|age| staleness.add(*age));
+        let of = |staleness: &Staleness| Values(vec![(STALENESS.into(), json!(staleness).to_string())]);
+        assert_eq!(text(&of(&staleness), "reproducible"), "");
+        assert!(text(&of(&staleness), "live").contains("at 100.0 % of decisions"));
+        [1, 2, 7].iter().for_each(|age| staleness.add(*age));
+        let shown = text(&of(&staleness), "reproducible");
+        assert!(shown.contains("50.0 % of decisions; versions behind: median 0, 90 % 7, largest 7"), "{shown}");
+        let json = of(&staleness).staleness();
+        let expected = json!({
+            "counts": { "0": 3, "1": 1, "2": 1, "7": 1 }, "largest": 7, "decisions": 6, "share_of_newest": 0.5,
+            "median": 0, "quantile_90": 7,
+        });
+        assert_eq!(json, expected);
+        let none = Values(Vec::new());
+        assert_eq!((text(&none, "live").as_str(), none.staleness()), ("", Value::Null));
+    }
+}

@@ -1,0 +1,254 @@
+//! What a replay came to, beside what was recorded.
+
+use std::collections::BTreeMap;
+
+use orchestrator::selector::{Replay, ReplayError, Replayed};
+use serde::Serialize;
+use serde_json::{Value, json};
+use store::{AtomGrades, LoggedDecision, NewestMixture, StoredCandidate};
+
+use super::Setting;
+
+/// What a replay came to.
+#[derive(Clone, Debug, Serialize)]
+pub struct Report {
+    /// Id of the campaign.
+    pub campaign: String,
+    /// The keys that were set, with their values.
+    pub set: BTreeMap<String, String>,
+    /// Decisions that the campaign has.
+    pub recorded: i64,
+    /// Those that were replayed.
+    pub replayed: i64,
+    /// Candidates of biased walks among them, as they were decided.
+    pub before: Tally,
+    /// The same now.
+    pub now: Tally,
+    /// Accepted before, and not now.
+    pub no_longer_accepted: Vec<Change>,
+    /// Accepted now, and not before.
+    pub newly_accepted: Vec<Change>,
+    /// Walks that ended for what was collected and that would go on now; what they would find is not known.
+    pub walks_cut_short: u64,
+    /// Where the replay had to stop, if it had.
+    pub stopped: Option<Stop>,
+    /// By the same rules: the first thing that is not as it was recorded.
+    pub difference: Option<Difference>,
+    /// By the same rules, to the end: the mixture at the end is the stored one, byte for byte.
+    pub same_mixture: Option<bool>,
+    /// Seconds that it took.
+    pub seconds: f64,
+    /// This processor may give other last digits than that on which the campaign began.
+    pub other_processor: bool,
+}
+
+/// Numbers of candidates by what became of them.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Tally {
+    /// All of them.
+    pub candidates: u64,
+    /// Accepted.
+    pub accepted: u64,
+    /// Declined, by reason; `walk over` if their walk would have ended before.
+    pub declined: BTreeMap<String, u64>,
+    /// Version of the mixture at the end.
+    pub mixture_version: u64,
+}
+
+/// A candidate with another fate than before.
+#[derive(Clone, Debug, Serialize)]
+pub struct Change {
+    /// Number of the decision.
+    pub decision: i64,
+    /// Name of the candidate.
+    pub candidate: String,
+    /// Its walk.
+    pub walk: u32,
+    /// Its step.
+    pub step: u64,
+    /// γ_max under the selector's mixture, before and now.
+    pub gamma_max: (Option<f64>, Option<f64>),
+    /// Why it was declined, before or now.
+    pub reason: String,
+}
+
+/// Where a replay stops: the features of that candidate were not kept.
+#[derive(Clone, Debug, Serialize)]
+pub struct Stop {
+    /// Number of the decision.
+    pub decision: i64,
+    /// Name of the candidate.
+    pub candidate: String,
+    /// Its walk.
+    pub walk: u32,
+    /// Its step.
+    pub step: u64,
+}
+
+/// Something that is not as it was recorded.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Difference {
+    /// Number of the decision.
+    pub decision: i64,
+    /// Which of its values, of a JSON value by its path.
+    pub what: String,
+    /// The value in the log.
+    pub recorded: Value,
+    /// The value now.
+    pub now: Value,
+}
+
+/// A place of the log.
+pub struct Recorded<'a> {
+    /// The decision.
+    pub decision: &'a LoggedDecision,
+    /// The candidate that it is about.
+    pub candidate: Option<&'a StoredCandidate>,
+}
+
+impl Report {
+    /// One of nothing yet.
+    pub fn new(campaign: &store::Campaign, settings: &[Setting], other_processor: bool, recorded: i64) -> Self {
+        let set = settings.iter().map(|setting| (setting.key.clone(), setting.value.to_string()));
+        Self {
+            campaign: campaign.id.to_string(),
+            set: set.collect(),
+            recorded,
+            replayed: 0,
+            before: Tally::default(),
+            now: Tally::default(),
+            no_longer_accepted: Vec::new(),
+            newly_accepted: Vec::new(),
+            walks_cut_short: 0,
+            stopped: None,
+            difference: None,
+            same_mixture: None,
+            seconds: 0.0,
+            other_processor,
+        }
+    }
+
+    /// Takes in a place of the log and what came of it now.
+    pub fn take(&mut self, recorded: Recorded<'_>, now: Option<Replayed>, exact: bool) {
+        let decision = recorded.decision;
+        self.replayed = decision.sequence;
+        self.before.mixture_version = decision.mixture_version;
+        if exact {
+            self.difference = difference(&recorded, now.as_ref());
+        }
+        if !matches!(decision.kind.as_str(), "accepted" | "declined") {
+            return;
+        }
+        let now = now.map(|now| now.decision);
+        let now_reason = match &now {
+            Some(now) => reason(now.kind, &now.detail),
+            None => Some("walk over".to_owned()),
+        };
+        let before_reason = reason(&decision.kind, &decision.detail);
+        self.before.count(before_reason.as_deref());
+        self.now.count(now_reason.as_deref());
+        let gamma_max = |detail: &Value| detail["selector"]["gamma_max"].as_f64();
+        let change = |reason| Change {
+            decision: decision.sequence,
+            candidate: decision.candidate.clone().unwrap_or_default(),
+            walk: decision.walk.unwrap_or_default(),
+            step: recorded.candidate.map_or_else(|| step(decision), |stored| stored.block.view().id().step),
+            gamma_max: (gamma_max(&decision.detail), now.as_ref().and_then(|now| gamma_max(&now.detail))),
+            reason,
+        };
+        match (before_reason, now_reason) {
+            (None, Some(reason)) => self.no_longer_accepted.push(change(reason)),
+            (Some(reason), None) => self.newly_accepted.push(change(reason)),
+            _ => {}
+        }
+    }
+
+    /// The replay cannot go on with this decision.
+    pub fn stop(&mut self, decision: &LoggedDecision) {
+        self.stopped = Some(Stop {
+            decision: decision.sequence,
+            candidate: decision.candidate.clone().unwrap_or_default(),
+            walk: decision.walk.unwrap_or_default(),
+            step: step(decision),
+        });
+    }
+
+    /// Takes in how it ended.
+    pub fn close(&mut self, replay: &Replay, end: &NewestMixture) -> Result<(), ReplayError> {
+        self.now.mixture_version = replay.mixture().version();
+        self.walks_cut_short = replay.cut_short();
+        if !replay.is_exact() || self.stopped.is_some() || self.difference.is_some() {
+            return Ok(());
+        }
+        let other = replay.other_component(end.version, &end.components)?;
+        self.same_mixture = Some(other.is_none());
+        self.difference = other.map(|(element, slot)| Difference {
+            decision: end.decision,
+            what: format!("the mixture after it, component {slot} of element {element}"),
+            recorded: json!("the bytes in the database"),
+            now: json!("other bytes"),
+        });
+        Ok(())
+    }
+}
+
+impl Tally {
+    fn count(&mut self, reason: Option<&str>) {
+        self.candidates += 1;
+        match reason {
+            None => self.accepted += 1,
+            Some(reason) => *self.declined.entry(reason.to_owned()).or_default() += 1,
+        }
+    }
+}
+
+/// Why a candidate was declined; none if it was accepted.
+fn reason(kind: &str, detail: &Value) -> Option<String> {
+    (kind == "declined").then(|| detail["reason"].as_str().unwrap_or_default().to_owned())
+}
+
+/// The step in the name of a decision's candidate, `campaign-walk.segment.step-content`.
+fn step(decision: &LoggedDecision) -> u64 {
+    let place = decision.candidate.as_ref().and_then(|name| name.split('-').nth(1));
+    place.and_then(|place| place.rsplit('.').next()).and_then(|step| step.parse().ok()).unwrap_or_default()
+}
+
+/// The first thing in which a decision is not the recorded one.
+fn difference(recorded: &Recorded<'_>, now: Option<&Replayed>) -> Option<Difference> {
+    let before = recorded.decision;
+    let as_json = |kind: &str, walk: Option<u32>, candidate: Option<String>, version: u64, detail: &Value| {
+        json!({
+            "kind": kind, "walk": walk, "candidate": candidate, "mixture_version": version, "detail": detail,
+        })
+    };
+    let LoggedDecision { kind, walk, candidate, mixture_version, detail, .. } = before;
+    let old = as_json(kind, *walk, candidate.clone(), *mixture_version, detail);
+    let new = now.map_or(Value::Null, |Replayed { decision: now, .. }| {
+        let (walk, candidate) = (now.walk.map(|walk| walk.0), now.candidate.map(|id| id.to_string()));
+        as_json(now.kind, walk, candidate, now.mixture_version, &now.detail)
+    });
+    let grades = recorded.candidate.zip(now.and_then(|now| now.candidate.as_ref()));
+    let place = first_difference("decision", &old, &new).or_else(|| {
+        let (before, now) = grades?;
+        let pairs = [("selector", &before.selector, &now.selector), ("original", &before.original, &now.original)];
+        let (name, before, now) = pairs.into_iter().find(|(_, before, now)| before != now)?;
+        Some((format!("grades of the atoms ({name})"), json!(all(before)), json!(all(now))))
+    });
+    let (what, recorded, now) = place?;
+    Some(Difference { decision: before.sequence, what, recorded, now })
+}
+
+fn all(grades: &AtomGrades) -> Vec<f64> {
+    [grades.gamma.as_slice(), &grades.gamma_nbr].concat()
+}
+
+/// The first path at which two JSON values are not the same text.
+fn first_difference(path: &str, before: &Value, now: &Value) -> Option<(String, Value, Value)> {
+    if let (Value::Object(old), Value::Object(new)) = (before, now) {
+        let keys = old.keys().chain(new.keys().filter(|key| !old.contains_key(*key)));
+        let null = Value::Null;
+        let mut keys = keys.map(|key| (key, old.get(key).unwrap_or(&null), new.get(key).unwrap_or(&null)));
+        return keys.find_map(|(key, old, new)| first_difference(&format!("{path}.{key}"), old, new));
+    }
+    (before.to_string() != now.to_string()).then(|| (path.to_owned(), before.clone(), now.clone()))
+}
