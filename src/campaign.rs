@@ -240,7 +240,7 @@ pub fn selector_settings(config: &Config) -> selector::Settings {
         forgetting_alarm: ForgettingAlarm { share_above_one: calm.forgetting_alarm },
         collection: collect.when,
         per_seed: collect.per_seed.get(),
-        total: collect.total.map(|total| total.get()),
+        total: config.most_structures(),
         control: campaign.control,
         least_distance: (guard.least_distance.get(), guard.least_distance_fraction.get()),
         declined_feature_bytes: collect.declined_features_mb * 1_000_000,

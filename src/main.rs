@@ -2,6 +2,7 @@
 //! gradient of the CALM extrapolation grade, a selector decides what is new, and what is new is labelled.
 
 mod actors;
+mod budget;
 mod campaign;
 mod cli;
 mod config;

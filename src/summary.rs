@@ -7,6 +7,8 @@ use calm::watch::GradeDistribution;
 use store::{ExportFilter, ExportSource, Status, Store, StoreError};
 use wire::{ContentHash, Origin};
 
+use crate::budget;
+
 /// Rows read from the store at a time.
 const PAGE: u32 = 256;
 
@@ -70,16 +72,17 @@ impl fmt::Display for Summary {
             ends.chunk_by(|a, b| a == b).map(|run| format!("{} {}", run.len(), run[0])).collect();
         writeln!(f, "                 ended: {}", ends.join(", ").replace('_', " "))?;
         let declined = &candidates.declined;
-        let all = declined.covered + declined.duplicate + declined.guard + declined.budget;
+        let all = declined.covered + declined.duplicate + declined.guard + declined.budget + declined.backlog;
         writeln!(
             f,
-            "candidates       {} seen, {} accepted, {all} declined (covered {}, duplicate {}, guard {}, budget {})",
+            "candidates       {} seen, {} accepted, {all} declined (covered {}, duplicate {}, guard {}, budget {}, backlog {})",
             candidates.seen,
             candidates.accepted,
             declined.covered,
             declined.duplicate,
             declined.guard,
-            declined.budget
+            declined.budget,
+            declined.backlog
         )?;
         writeln!(f, "                 {} refused by walkers' own guards", candidates.refused_by_walkers)?;
         writeln!(
@@ -87,6 +90,9 @@ impl fmt::Display for Summary {
             "labels           {} biased and {} control structures labelled, {} failed, {} dropped",
             self.biased.structures, self.control.structures, labels.failed, labels.dropped
         )?;
+        if let Some(budget) = budget::shown(&self.status.budget) {
+            writeln!(f, "budget           {budget}")?;
+        }
         writeln!(f, "mixture          version {mixture_version}")?;
         if let Some(training) = &self.training {
             let (share, median) = (100.0 * training.share_above_one, training.median);

@@ -24,6 +24,11 @@ fn finished(small: &Small, changes: &[(&str, &str)]) -> TempDir {
     directory
 }
 
+/// Walks from alike structures that advance together: what one finds is no news from the others.
+fn many() -> Small {
+    Small { walks_per_round: 4, seeds: &["fcc-100", "fcc-097", "fcc-103", "vacancy"], ..Small::default() }
+}
+
 fn change(path: &Path, changes: &[(&str, &str)]) {
     let mut text = fs::read_to_string(path).unwrap();
     for (from, to) in changes {
@@ -49,6 +54,7 @@ fn check_exact(directory: &Path) -> Value {
     assert_eq!(status["candidates"]["accepted"], accepted);
     assert_eq!(status["candidates"]["seen"], report["now"]["candidates"]);
     assert_eq!(status["mixture_version"], report["now"]["mixture_version"]);
+    assert_eq!(status["staleness"]["decisions"], report["now"]["candidates"]);
     assert!(accepted > 0);
     report
 }
@@ -59,7 +65,8 @@ fn execute(directory: &Path, statements: &[&str]) {
         let options = SqliteConnectOptions::new().filename(directory.join("here/campaign.sqlite"));
         let mut connection = options.foreign_keys(false).connect().await.unwrap();
         for statement in statements {
-            let done = sqlx::query(sqlx::AssertSqlSafe((*statement).to_owned())).execute(&mut connection).await;
+            let done =
+                sqlx::query(sqlx::AssertSqlSafe((*statement).to_owned())).execute(&mut connection).await;
             assert!(done.unwrap().rows_affected() > 0, "{statement}");
         }
         connection.close().await.unwrap();
@@ -75,7 +82,7 @@ fn export(directory: &Path) -> PathBuf {
 
 #[test]
 fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise() {
-    let directory = finished(&Small::default(), &[]);
+    let directory = finished(&many(), &[]);
     let here = directory.path();
     let database = fs::read(here.join("here/campaign.sqlite")).unwrap();
     let report = check_exact(here);
@@ -91,14 +98,14 @@ fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise(
     let lost = strict["no_longer_accepted"].as_array().unwrap();
     let won = strict["newly_accepted"].as_array().unwrap();
     assert_eq!(accepted(&strict, "before") - lost.len() as u64 + won.len() as u64, accepted(&strict, "now"));
-    assert!(lost.iter().all(|change| change["reason"] == "covered"), "{lost:?}");
+    assert!(lost.iter().any(|change| change["reason"] == "covered"), "{lost:?}");
     assert!(lost.iter().all(|change| change["step"].as_u64() > Some(20)), "{lost:?}");
     // A value can be set as a whole or inside.
     let inside = replayed(here, &["collect.when.threshold=1.2"]);
     assert_eq!((&inside["now"], &inside["set"]["collect.when.threshold"]), (&strict["now"], &"1.2".into()));
 
     let one = replayed(here, &["collect.per_seed=1"]);
-    assert_eq!(accepted(&one, "now"), 2, "{one}");
+    assert_eq!(accepted(&one, "now"), 4, "{one}");
     let over = one["no_longer_accepted"].as_array().unwrap();
     assert!(over.iter().all(|change| change["reason"] == "walk over"), "{over:?}");
     let other = replayed(here, &["calm.update=never", "collect.per_seed=100"]);
@@ -147,7 +154,7 @@ fn a_mixture_that_begins_anew_comes_out_as_it_was() {
 
 #[test]
 fn it_says_from_where_on_features_are_missing() {
-    let directory = finished(&Small::default(), &[("per_seed = 4", "per_seed = 4\ndeclined_features_mb = 0")]);
+    let directory = finished(&many(), &[("per_seed = 4", "per_seed = 4\ndeclined_features_mb = 0")]);
     let here = directory.path();
     let report = replayed(here, &[]);
     let stopped = &report["stopped"];
@@ -189,7 +196,10 @@ fn files_are_found_where_they_are_and_must_be_the_same() {
     check_exact(here);
     fs::rename(here.join("model.npz"), here.join("moved.npz")).unwrap();
     let message = refuse(here, ["replay", "here"]);
-    assert!(message.contains("potential.model: cannot read ") && message.contains("--model FILE"), "{message}");
+    assert!(
+        message.contains("potential.model: cannot read ") && message.contains("--model FILE"),
+        "{message}"
+    );
     succeed(here, ["replay", "here", "--model", "moved.npz"]);
     let artifact = config("data/al_eam_1l/gmm_artifacts.npz");
     let message = refuse(here, ["replay", "here", "--model", artifact.to_str().unwrap()]);
@@ -227,8 +237,9 @@ fn what_was_changed_behind_its_back_is_found() {
             &["numbers"],
         ),
         (
-            format!("UPDATE candidate_data SET selector_grades = original_grades || x'' WHERE decision = {first} + 1
-                     OR decision = (SELECT max(decision) FROM candidate WHERE fate = 'accepted' AND origin = 'biased')"),
+            "UPDATE candidate_data SET selector_grades = original_grades WHERE decision =
+                (SELECT max(decision) FROM candidate WHERE fate = 'accepted' AND origin = 'biased')"
+                .to_owned(),
             &["grades of the atoms (selector)"],
         ),
         ("UPDATE component SET bytes = zeroblob(length(bytes)) WHERE slot = (SELECT min(slot) FROM component)".to_owned(),

@@ -71,7 +71,7 @@ pub struct Reactor {
     pub incoming: mpsc::Receiver<Incoming>,
     /// Set from outside, by Ctrl-C say: walkers are sent home with their walks where they stand.
     pub stopping: Arc<AtomicBool>,
-    /// Walkers wait while more label jobs than this are unfinished.
+    /// Walkers wait while more label jobs than this are unfinished, unless the selector raises its threshold first.
     pub queue_limit: u64,
 }
 
@@ -206,7 +206,10 @@ impl Shell {
                 Arrival::Gone { walker, fault } => self.gone(walker, fault)?,
             };
             if let Some(commit) = commit {
-                self.unfinished.iter_mut().for_each(|(most, _)| *most += accepted(&commit));
+                if let Some((most, _)) = &mut self.unfinished {
+                    *most += accepted(&commit);
+                    self.selector.set_unfinished_jobs(*most);
+                }
                 group::append(self.decided.get_or_insert_default(), commit);
             }
         }
@@ -284,16 +287,18 @@ impl Shell {
     /// Whether the label queue is full, or may be when what is decided has come to it: then it is looked at again after
     /// the commit. It is not counted each time, since for a while it grows by what is decided here and nothing else.
     async fn is_queue_full(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<bool, ReactorError> {
-        if self.unfinished.is_some_and(|(most, at)| most <= self.queue_limit && at.elapsed() < QUEUE_LOOK) {
+        let limit = self.selector.most_unfinished(self.queue_limit);
+        if self.unfinished.is_some_and(|(most, at)| most <= limit && at.elapsed() < QUEUE_LOOK) {
             return Ok(false);
         }
         let unfinished = self.store.unfinished_jobs().await?;
-        if unfinished > self.queue_limit {
+        if unfinished > limit {
             watch(Notice::QueueFull(unfinished));
         }
         let most = unfinished + self.decided.as_ref().map_or(0, accepted);
         self.unfinished = Some((most, Instant::now()));
-        Ok(most > self.queue_limit)
+        self.selector.set_unfinished_jobs(most);
+        Ok(most > limit)
     }
 
     fn send_home(&mut self) {

@@ -358,6 +358,23 @@ fn forgetting_is_recorded_and_raises_an_alarm() {
     assert!(!alarms[0] && alarms[7], "{alarms:?}");
 }
 
+/// What is new, but not so new as it has to be while many structures wait for labels, is told apart.
+#[test]
+fn a_raised_threshold_declines_what_lies_below_it() {
+    let mut selector = begin(&live(), 1);
+    selector.raise_above(100);
+    selector.set_unfinished_jobs(150);
+    let commit = next_candidate(&mut selector, 5, 1, [0.0, 1.8, 0.0]);
+    assert_eq!(kinds(&commit), ["declined backlog"]);
+    let detail = &commit.decisions[0].detail;
+    assert_eq!((&detail["raised_by"], &detail["threshold"]), (&1.25.into(), &1.875.into()));
+    assert_eq!(kinds(&next_candidate(&mut selector, 6, 2, KNOWN)), ["declined covered"]);
+    assert_eq!(kinds(&next_candidate(&mut selector, 7, 3, NEW)), ["accepted"]);
+    selector.set_unfinished_jobs(100);
+    assert_eq!(turn(&mut selector).raised, 1.0);
+    assert_eq!((selector.most_unfinished(100), begin(&live(), 1).most_unfinished(100)), (200, 100));
+}
+
 /// The update's rule reaches the search, not only the collection's.
 #[test]
 fn the_update_target_is_the_one_of_the_settings() {

@@ -213,6 +213,54 @@ async fn walkers_wait_while_the_label_queue_is_full() {
     threads.into_iter().for_each(|thread| thread.join().unwrap());
 }
 
+/// With a raised threshold the queue may grow to twice the limit, and no further.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long() {
+    const LIMIT: u64 = 2;
+    let folder = tempfile::tempdir().unwrap();
+    let store = open(folder.path()).await;
+    let stopping = Arc::new(AtomicBool::new(false));
+    let (mut reactor, to_reactor) = reactor(&store, &stopping).await;
+    reactor.selector.raise_above(LIMIT);
+    let reactor = Reactor { queue_limit: LIMIT, ..reactor };
+    let (full, mut seen_full) = mpsc::unbounded_channel();
+    let running = tokio::spawn(end_of(reactor, move |notice| {
+        if let Notice::QueueFull(unfinished) = notice {
+            full.send(unfinished).unwrap();
+        }
+    }));
+    // Walkers by hand: what each turn says of the threshold is seen.
+    let raised = Arc::new(std::sync::Mutex::new(Vec::new()));
+    let (seen, mut transport) = (Arc::clone(&raised), InProcess::new(0, to_reactor, Arc::clone(&stopping)));
+    let walker = thread::spawn(move || {
+        let mut report = None;
+        while let Some(work) = transport.exchange(report.take()) {
+            seen.lock().unwrap().push(work.assignment.raised);
+            report = Some(work_on(&work, &transport).map_candidate(|block| block.view().to_candidate()));
+        }
+    });
+    let mut times = 0;
+    while let Some(unfinished) = seen_full.recv().await {
+        assert!((2 * LIMIT + 1..=2 * LIMIT + 4).contains(&unfinished), "{unfinished}");
+        for job in store.queue_list(Some(JobState::Queued), 10, 0).await.unwrap() {
+            store.drop_job(&job.candidate, 0).await.unwrap();
+        }
+        times += 1;
+    }
+    assert_eq!(running.await.unwrap(), Ended::Done);
+    walker.join().unwrap();
+    let raised = raised.lock().unwrap();
+    assert!(times > 0 && raised.contains(&1.0), "{raised:?}");
+    assert!(
+        raised.iter().any(|factor| *factor > 1.0) && raised.iter().all(|factor| *factor <= 2.0),
+        "{raised:?}"
+    );
+    let decisions = store.decisions(1..=i64::MAX).await.unwrap();
+    let factors: Vec<_> =
+        decisions.iter().filter_map(|decision| decision.detail["raised_by"].as_f64()).collect();
+    assert!(!factors.is_empty() && factors.iter().all(|factor| (1.0..=2.0).contains(factor)), "{factors:?}");
+}
+
 /// A campaign whose only walker waits can be stopped, also while somebody reports progress without a pause.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_waiting_walker_is_sent_home_when_the_campaign_is_stopped() {

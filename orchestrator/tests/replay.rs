@@ -4,10 +4,10 @@ mod common;
 
 use std::collections::{BTreeMap, HashSet};
 
+use calm::CollectionRule;
 use common::eventful::{Campaign, acts, any_settings, scripts};
 use common::scripted::Script;
 use common::{SHORTEST, grader, kinds, mixture, positive, seed, structure};
-use calm::CollectionRule;
 use orchestrator::selector::{Mode, Replay, Replayed, Settings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
@@ -63,7 +63,8 @@ fn check_exact(campaign: &Campaign<'_>, settings: &Settings, seeds: usize) {
     for ((recorded, candidate), now) in log.iter().zip(replayed) {
         let now = now.unwrap_or_else(|| panic!("nothing comes of {recorded:?}"));
         let Replayed { decision, candidate: graded } = now;
-        let found = (decision.kind, decision.walk.map(|walk| walk.0), decision.mixture_version, decision.round);
+        let found =
+            (decision.kind, decision.walk.map(|walk| walk.0), decision.mixture_version, decision.round);
         assert_eq!(found, (recorded.kind.as_str(), recorded.walk, recorded.mixture_version, recorded.round));
         assert_eq!(decision.candidate.map(|id| id.to_string()), recorded.candidate);
         assert_eq!(decision.detail.to_string(), recorded.detail.to_string(), "{recorded:?}");
@@ -75,7 +76,10 @@ fn check_exact(campaign: &Campaign<'_>, settings: &Settings, seeds: usize) {
         .map(|(&(element, slot), bytes)| ComponentRecord { element, slot, bytes: bytes.clone() })
         .collect();
     let version = campaign.selector.mixture().version();
-    assert_eq!((replay.mixture().version(), replay.other_component(version, &components).unwrap()), (version, None));
+    assert_eq!(
+        (replay.mixture().version(), replay.other_component(version, &components).unwrap()),
+        (version, None)
+    );
     assert_eq!(replay.cut_short(), 0);
 }
 
@@ -150,16 +154,31 @@ fn the_campaigns_reach_what_they_are_for() {
     let mut seen = HashSet::new();
     for _ in 0..60 {
         let settings = any_settings().new_tree(&mut runner).unwrap().current();
+        let settings = Settings { mode: Mode::Live, update: UpdateProtocol::Carried, ..settings };
         let scripts: Vec<Script> = scripts().new_tree(&mut runner).unwrap().current();
         let more = Settings { per_seed: settings.per_seed + 3, total: None, ..settings.clone() };
-        let mut campaign = Campaign::begin(&settings, &scripts, 2).finish(false);
+        let mut campaign = Campaign::begin(&settings, &scripts, 2);
+        for act in acts().new_tree(&mut runner).unwrap().current() {
+            campaign.act(act);
+        }
+        let mut campaign = campaign.finish(false);
         campaign.store.imported = (0..12).map(|n| ContentHash::of(&structure(n, SHORTEST))).collect();
         campaign.go_on(&more);
         let campaign = campaign.finish(false);
         check_exact(&campaign, &settings, scripts.len());
         seen.extend(campaign.commits.iter().flat_map(kinds));
     }
-    for kind in ["configuration", "imported", "resumed", "declined duplicate", "declined guard", "segment"] {
-        assert!(seen.contains(kind), "{seen:?}");
+    for kind in [
+        "configuration",
+        "imported",
+        "resumed",
+        "segment",
+        "declined backlog",
+        "declined budget",
+        "declined covered",
+        "declined duplicate",
+        "declined guard",
+    ] {
+        assert!(seen.contains(kind), "no {kind} in {seen:?}");
     }
 }

@@ -19,7 +19,9 @@ use workers::walker;
 use super::answers::Answers;
 use super::crew::LAST_LABELS;
 use super::starts::no_labellers;
-use super::{CHANNEL, ReactorTask, Run, STOPPING, start_reactor, stop_on_signals, wanted_walkers};
+use super::{
+    CHANNEL, ReactorTask, Run, STOPPING, start_reactor, stop_on_signals, stop_when_over, wanted_walkers,
+};
 use crate::campaign::Campaign;
 use crate::outcome::Failure;
 
@@ -65,10 +67,12 @@ impl Actors {
         let stopping = Arc::new(AtomicBool::new(false));
         let closing = Arc::new(Closing::default());
         let asked = (Arc::clone(&stopping), Arc::clone(&closing));
-        stop_on_signals(STOPPING, move || {
+        let stop = move || {
             asked.0.store(true, Ordering::Relaxed);
             asked.1.stop();
-        })?;
+        };
+        stop_when_over(run.over, stop.clone());
+        stop_on_signals(STOPPING, stop)?;
         let (to_reactor, incoming) = mpsc::channel(CHANNEL);
         let walkers = start_walkers(run.campaign, &to_reactor, &stopping)?;
         let labellers = start_labellers(run, &closing)?;
@@ -117,8 +121,8 @@ impl Actors {
 /// Waits until no structure waits for a label, or somebody asks to stop.
 async fn wait_for_labels(store: &Store, closing: &Closing) -> Result<(), StoreError> {
     while !closing.is_stopping() {
-        match store.unfinished_jobs().await {
-            Ok(0) => break,
+        match store.awaits_labels(unix_milliseconds()).await {
+            Ok(false) => break,
             Err(error) if !error.is_transient() => return Err(error),
             _ => tokio::time::sleep(LAST_LABELS).await,
         }

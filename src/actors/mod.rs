@@ -3,6 +3,7 @@
 pub mod agent;
 mod agents;
 mod answers;
+pub mod budget;
 mod crew;
 pub mod in_process;
 mod labellers;
@@ -29,6 +30,7 @@ use wire::transport::Incoming;
 pub use listen::Listen;
 
 use crate::campaign::Campaign;
+use crate::config::QueueFull;
 use crate::outcome::Failure;
 use crate::output::say;
 use crate::progress::Display;
@@ -49,6 +51,8 @@ pub struct Run<'a> {
     pub directory: &'a Path,
     /// Where agents of other hosts may join.
     pub listen: Option<&'a Listen>,
+    /// Told when a limit of time is reached.
+    pub over: &'a Arc<Notify>,
 }
 
 /// What is said when a campaign is asked to stop.
@@ -60,19 +64,23 @@ type ReactorTask = tokio::task::JoinHandle<Result<reactor::Ended, reactor::React
 /// Starts the reactor, with a display of what it does.
 fn start_reactor(
     run: Run<'_>,
-    selector: Selector,
+    mut selector: Selector,
     incoming: mpsc::Receiver<Incoming>,
     stopping: &Arc<AtomicBool>,
 ) -> ReactorTask {
     let config = &run.campaign.config;
     let walk_steps = config.walk.equilibration + config.walk.steps.get();
     let mut display = Display::new(walk_steps, selector.standing(walk_steps));
+    let queue_limit = u64::from(config.label.queue_limit.get());
+    if config.label.queue_full == QueueFull::Raise {
+        selector.raise_above(queue_limit);
+    }
     let reactor = Reactor {
         selector,
         store: run.store.clone().patient(SERVER_AWAY),
         incoming,
         stopping: Arc::clone(stopping),
-        queue_limit: u64::from(config.label.queue_limit.get()),
+        queue_limit,
     };
     tokio::spawn(async move {
         let ended = reactor.run(|notice| display.notice(&notice)).await;
@@ -106,6 +114,15 @@ pub fn asked_to_stop(told: &'static str) -> Result<(Arc<AtomicBool>, Arc<Notify>
         asked.1.notify_one();
     })?;
     Ok((stopping, stop))
+}
+
+/// Stops in order, as on a signal, when a limit of time is reached.
+fn stop_when_over(over: &Arc<Notify>, stop: impl FnOnce() + Send + 'static) {
+    let over = Arc::clone(over);
+    tokio::spawn(async move {
+        over.notified().await;
+        stop();
+    });
 }
 
 /// A batch system tells every process of a job to end, and the job's script hands on what it is told: that is one request.

@@ -4,6 +4,7 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use orchestrator::launcher::Children;
@@ -20,7 +21,9 @@ use wire::place::Place;
 
 use super::agents::{self, Agents};
 use super::crew::{self, Crew};
-use super::{CHANNEL, ReactorTask, Run, STOPPING, asked_to_stop, start_reactor, starts, wanted_walkers};
+use super::{
+    CHANNEL, ReactorTask, Run, STOPPING, asked_to_stop, start_reactor, starts, stop_when_over, wanted_walkers,
+};
 use crate::outcome::Failure;
 
 /// What is on its way to the database when everybody is gone may take so long.
@@ -53,6 +56,11 @@ async fn work_in(place: &Place, run: Run<'_>, selector: Selector) -> Result<reac
     let server = Server::open(place, sizes, session(process)).map_err(Failure::failed)?;
 
     let (stopping, stop) = asked_to_stop(STOPPING)?;
+    let asked = (Arc::clone(&stopping), Arc::clone(&stop));
+    stop_when_over(run.over, move || {
+        asked.0.store(true, Ordering::Relaxed);
+        asked.1.notify_one();
+    });
     let limits = Limits {
         silence: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
         restarts: campaign.config.run.restarts,

@@ -65,8 +65,14 @@ fn write_report(out: &mut dyn Write, report: &Report) -> io::Result<()> {
         writeln!(out, "            {key} = {value}")?;
     }
     if let Some(Stop { decision, candidate, walk, step }) = &report.stopped {
-        writeln!(out, "            no further: the features of candidate {candidate} (decision {decision}, walk {walk},")?;
-        writeln!(out, "            step {step}) were not kept; collect.declined_features_mb says how many are")?;
+        writeln!(
+            out,
+            "            no further: the features of candidate {candidate} (decision {decision}, walk {walk},"
+        )?;
+        writeln!(
+            out,
+            "            step {step}) were not kept; collect.declined_features_mb says how many are"
+        )?;
     }
     if report.set.is_empty() {
         return write_sameness(out, report);
@@ -75,9 +81,15 @@ fn write_report(out: &mut dyn Write, report: &Report) -> io::Result<()> {
     write_tally(out, "now", now)?;
     if report.walks_cut_short > 0 {
         let walks = report.walks_cut_short;
-        writeln!(out, "            {walks} walks that ended with what they had collected would go on: to where is not known")?;
+        writeln!(
+            out,
+            "            {walks} walks that ended with what they had collected would go on: to where is not known"
+        )?;
     }
-    writeln!(out, "            only structures that walkers offered are known, and they walked under the rules before")?;
+    writeln!(
+        out,
+        "            only structures that walkers offered are known, and they walked under the rules before"
+    )?;
     write_changes(out, "accepted before, and not now", &report.no_longer_accepted)?;
     write_changes(out, "accepted now, and not before", &report.newly_accepted)
 }
@@ -85,14 +97,23 @@ fn write_report(out: &mut dyn Write, report: &Report) -> io::Result<()> {
 fn write_sameness(out: &mut dyn Write, report: &Report) -> io::Result<()> {
     if report.difference.is_some() {
         if report.other_processor {
-            writeln!(out, "            the campaign began on another kind of processor, which has other last digits")?;
+            writeln!(
+                out,
+                "            the campaign began on another kind of processor, which has other last digits"
+            )?;
         }
         return Ok(());
     }
     let Tally { candidates, accepted, mixture_version, .. } = report.now;
-    writeln!(out, "            every one as it was recorded, to the last digit: {accepted} of {candidates} accepted")?;
+    writeln!(
+        out,
+        "            every one as it was recorded, to the last digit: {accepted} of {candidates} accepted"
+    )?;
     if report.same_mixture == Some(true) {
-        writeln!(out, "            and the mixture, version {mixture_version}, is the stored one, byte for byte")?;
+        writeln!(
+            out,
+            "            and the mixture, version {mixture_version}, is the stored one, byte for byte"
+        )?;
     }
     Ok(())
 }

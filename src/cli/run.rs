@@ -12,10 +12,11 @@ use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
 use serde_json::json;
 use store::{DATABASE, Location, ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds};
+use tokio::sync::Notify;
 use wire::net::{Endpoint, Tls};
 
 use super::{Ended, Failure, block_on};
-use crate::actors::{self, in_process, processes};
+use crate::actors::{self, budget, in_process, processes};
 use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
 use crate::output::{print, say};
@@ -106,12 +107,19 @@ async fn run(
         let shown = shown(location);
         say(format_args!("label.slots = 0: labels come from calmwalk label --store {shown}"));
     }
-    let run = actors::Run { campaign, store: &store, process: &process, directory, listen };
+    let over = Arc::new(Notify::new());
+    let run = actors::Run { campaign, store: &store, process: &process, directory, listen, over: &over };
+    let used_up = budget::time_used_up(&store).await?;
     let work = async {
+        if used_up.is_some() {
+            // Nothing may be begun.
+            return Ok(reactor::Ended::Stopped);
+        }
         if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
     };
     let ended = tokio::select! {
         ended = work => ended?,
+        error = budget::keep(&store, &over) => return Err(error.into()),
         error = lock::lost(lock.as_ref()) => return Err(error.into()),
     };
     // Hours of work do not end as a failure because a server is away in the last second.
@@ -177,6 +185,7 @@ async fn open_store(campaign: &Campaign, location: &Location) -> Result<Store, F
             store
         }
     };
+    store.set_budget(&campaign.config.budget()).await?;
     store.set_grade_files(&campaign.grade_files()).await?;
     let files = serde_json::to_string(&campaign.label_files().map_err(Failure::failed)?);
     store.set_label_files(&files.map_err(Failure::failed)?).await?;

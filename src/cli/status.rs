@@ -11,6 +11,7 @@ use store::{Candidates, Labels, Location, Status as Standing, Store, WalkStatus}
 use self::jobs::Jobs;
 use self::values::Values;
 use super::{CampaignLocation, Ended, Failure, block_on};
+use crate::budget;
 use crate::output::{Table, decimals, print, print_json};
 
 /// Walks, and processes, shown unless all are asked for.
@@ -82,6 +83,9 @@ fn write_status(
     values.write(out, &campaign.mode)?;
     write_candidates(out, &status.candidates)?;
     write_labels(out, &status.labels, status.imported)?;
+    if let Some(budget) = budget::shown(&status.budget) {
+        writeln!(out, "budget      {budget}")?;
+    }
     write_walks(out, walks, all)?;
     processes::write(out, &status.processes, all)
 }
@@ -93,6 +97,7 @@ fn write_candidates(out: &mut dyn Write, candidates: &Candidates) -> io::Result<
         ("duplicate", declined.duplicate),
         ("guard", declined.guard),
         ("budget", declined.budget),
+        ("backlog", declined.backlog),
     ];
     let all: u64 = reasons.iter().map(|(_, count)| count).sum();
     let reasons = reasons.map(|(reason, count)| format!("{count} {reason}")).join(", ");

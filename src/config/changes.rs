@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 16] = [
+pub(super) const CHANGEABLE: [&str; 20] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -16,6 +16,10 @@ pub(super) const CHANGEABLE: [&str; 16] = [
     "label.attempts",
     "label.largest_force",
     "label.queue_limit",
+    "label.queue_full",
+    "budget.labels",
+    "budget.core_hours",
+    "budget.wall_hours",
     "run.walkers",
     "run.silence_limit",
     "run.agent_silence_limit",
@@ -210,6 +214,11 @@ fn excerpt(hash: &str) -> &str {
     hash.get(..12).unwrap_or(hash)
 }
 
+/// Whether some of its keys may change.
+fn is_section(key: &str) -> bool {
+    CHANGEABLE.iter().any(|changeable| changeable.strip_prefix(key).is_some_and(|rest| rest.starts_with('.')))
+}
+
 /// (key, before, after) of every leaf that differs.
 pub(super) fn differences(
     key: &str,
@@ -224,6 +233,9 @@ pub(super) fn differences(
             let of = |map: &serde_json::Map<String, Value>| map.get(name).cloned().unwrap_or(Value::Null);
             differences(&key, &of(old), &of(new), changes);
         }
+    } else if before.is_null() && is_section(key) {
+        // A section that an earlier version did not know.
+        differences(key, &json!({}), after, changes);
     } else if before != after {
         changes.push((key.to_owned(), before.clone(), after.clone()));
     }

@@ -4,7 +4,7 @@ use orchestrator::selector::{Mode, UpdateProtocol};
 use store::ServerUrl;
 use workers::settings::ThermostatKind;
 
-use super::Config;
+use super::{Config, QueueFull};
 
 /// Signs of life are seconds apart.
 const LEAST_SILENCE: f64 = 5.0;
@@ -21,6 +21,8 @@ pub fn check(config: &Config) -> Result<(), Wrong> {
     check_thermostat(config)?;
     check_guard(config)?;
     check_store(config)?;
+    check_queue(config)?;
+    check_budget(config)?;
     if config.seeds.files.is_empty() {
         return wrong("seeds.files", "an empty list", "at least one file with seed structures");
     }
@@ -77,6 +79,28 @@ fn check_store(config: &Config) -> Result<(), Wrong> {
         Ok(_) => Ok(()),
         Err(error) => wrong("run.store", error, "the URL of a PostgreSQL database"),
     }
+}
+
+/// Fewer labels than one structure takes are no campaign.
+fn check_budget(config: &Config) -> Result<(), Wrong> {
+    let least = config.labels_of_each();
+    match config.budget.labels {
+        Some(labels) if labels.get() < least => {
+            let expected = format!("at least {least}: a structure and its control frame");
+            wrong("budget.labels", labels, expected)
+        }
+        _ => Ok(()),
+    }
+}
+
+/// How long the queue is depends on how fast labels are made, which is not the same twice.
+fn check_queue(config: &Config) -> Result<(), Wrong> {
+    if config.label.queue_full == QueueFull::Raise && config.campaign.mode == Mode::Reproducible {
+        let expected = "\"wait\", or mode = \"live\": what is collected would depend on how fast labels are made, and a \
+                        reproducible campaign must not";
+        return wrong("label.queue_full", "\"raise\"", expected);
+    }
+    Ok(())
 }
 
 fn check_mixture(config: &Config) -> Result<(), Wrong> {

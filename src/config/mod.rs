@@ -44,6 +44,9 @@ pub struct Config {
     pub guard: GuardSection,
     /// How collected structures are labelled.
     pub label: LabelSection,
+    /// What the campaign may use up.
+    #[serde(default)]
+    pub budget: BudgetSection,
     /// Processes and rounds.
     #[serde(default)]
     pub run: RunSection,
@@ -220,9 +223,23 @@ pub struct LabelSection {
     /// Largest force that is believed, eV/Å.
     #[serde(default = "defaults::largest_force")]
     pub largest_force: Positive,
-    /// Walkers wait while more jobs than this are unfinished.
+    /// Walkers wait while more jobs than this are unfinished, or the threshold is raised.
     #[serde(default = "defaults::queue_limit")]
     pub queue_limit: NonZeroU32,
+    /// Which of the two.
+    #[serde(default)]
+    pub queue_full: QueueFull,
+}
+
+/// What happens while the label queue is longer than it should be.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum QueueFull {
+    /// Walkers wait.
+    #[default]
+    Wait,
+    /// The threshold of the collection rule is raised; walkers wait at twice the limit.
+    Raise,
 }
 
 /// How labels are made.
@@ -231,6 +248,18 @@ pub struct LabelSection {
 pub enum LabelMethod {
     /// Any potential that calmwalk evaluates.
     Reference(PotentialFile),
+}
+
+/// `[budget]`
+#[derive(Clone, Debug, Default, Deserialize, Serialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BudgetSection {
+    /// Most labels that are made.
+    pub labels: Option<NonZeroU32>,
+    /// Most hours of label attempts.
+    pub core_hours: Option<Positive>,
+    /// Most hours for which it is under way.
+    pub wall_hours: Option<Positive>,
 }
 
 /// `[run]`
@@ -300,6 +329,34 @@ impl Config {
         let mut config = self.clone();
         config.paths().for_each(PathBuf::clear);
         config
+    }
+
+    /// Label jobs of each structure that is collected: its own, and that of its control frame.
+    pub fn labels_of_each(&self) -> u32 {
+        1 + u32::from(self.campaign.control)
+    }
+
+    /// Most structures that may be collected, each with all its labels.
+    pub fn most_structures(&self) -> Option<u32> {
+        Some(self.limit_of_structures()?.0)
+    }
+
+    /// The same with the key that says so.
+    fn limit_of_structures(&self) -> Option<(u32, &'static str)> {
+        let by_labels = self.budget.labels.map(|labels| labels.get() / self.labels_of_each());
+        let total = self.collect.total.map(|total| (total.get(), "collect.total"));
+        by_labels.map(|labels| (labels, "budget.labels")).into_iter().chain(total).min()
+    }
+
+    /// The limits that the store holds labellers to.
+    pub fn budget(&self) -> store::Budget {
+        let BudgetSection { labels, core_hours, wall_hours } = self.budget.clone();
+        store::Budget {
+            labels: labels.map(|labels| labels.get().into()),
+            core_hours: core_hours.map(Positive::get),
+            wall_hours: wall_hours.map(Positive::get),
+            structures_by: self.limit_of_structures().map(|(_, key)| key.to_owned()),
+        }
     }
 
     /// What the update search needs.

@@ -48,7 +48,7 @@ async fn open(store: &Store, config: &Config, settings: &[Setting]) -> Result<Re
     let (model, artifact, training) = campaign::load_for_grades(config, Path::new("(the campaign)"))?;
     let seeds = store.seed_structures().await?.into_iter();
     let seeds = seeds.map(|seed| SeedStructure { name: seed.name, structure: seed.structure }).collect();
-    let set = settings.iter().map(|setting| setting.of_key().to_owned()).collect();
+    let set = settings.iter().map(|setting| setting.rule().to_owned()).collect();
     let replay = Replay::new(
         campaign::selector_settings(config),
         set,

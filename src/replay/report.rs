@@ -108,7 +108,12 @@ pub struct Recorded<'a> {
 
 impl Report {
     /// One of nothing yet.
-    pub fn new(campaign: &store::Campaign, settings: &[Setting], other_processor: bool, recorded: i64) -> Self {
+    pub fn new(
+        campaign: &store::Campaign,
+        settings: &[Setting],
+        other_processor: bool,
+        recorded: i64,
+    ) -> Self {
         let set = settings.iter().map(|setting| (setting.key.clone(), setting.value.to_string()));
         Self {
             campaign: campaign.id.to_string(),
@@ -230,7 +235,8 @@ fn difference(recorded: &Recorded<'_>, now: Option<&Replayed>) -> Option<Differe
     let grades = recorded.candidate.zip(now.and_then(|now| now.candidate.as_ref()));
     let place = first_difference("decision", &old, &new).or_else(|| {
         let (before, now) = grades?;
-        let pairs = [("selector", &before.selector, &now.selector), ("original", &before.original, &now.original)];
+        let pairs =
+            [("selector", &before.selector, &now.selector), ("original", &before.original, &now.original)];
         let (name, before, now) = pairs.into_iter().find(|(_, before, now)| before != now)?;
         Some((format!("grades of the atoms ({name})"), json!(all(before)), json!(all(now))))
     });

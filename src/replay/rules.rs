@@ -8,7 +8,8 @@ use crate::config::{Config, in_plain_words};
 use crate::outcome::Failure;
 
 /// Keys that act on what the selector decides. What they do to walks has been done: those are as they were recorded.
-const KEYS: [&str; 10] = [
+const KEYS: [&str; 11] = [
+    "budget.labels",
     "calm.combination",
     "calm.forgetting_alarm",
     "calm.ladder",
@@ -53,6 +54,14 @@ impl Setting {
     }
 }
 
+impl Setting {
+    /// The key by which the log speaks of it.
+    pub fn rule(&self) -> &'static str {
+        // One limit of structures, whoever sets it.
+        if self.of_key() == "budget.labels" { "collect.total" } else { self.of_key() }
+    }
+}
+
 fn known(key: &str) -> Option<&'static str> {
     let is_in = |known: &&str| key == *known || key.strip_prefix(known).is_some_and(|k| k.starts_with('.'));
     KEYS.into_iter().find(is_in)
@@ -66,8 +75,7 @@ fn parse(value: &str) -> Result<Value, String> {
     if is_word {
         return Ok(Value::String(value.to_owned()));
     }
-    let mut table: Table =
-        format!("value = {value}").parse().map_err(|error| in_plain_words(&error))?;
+    let mut table: Table = format!("value = {value}").parse().map_err(|error| in_plain_words(&error))?;
     table.remove("value").ok_or_else(|| "expected a value".to_owned())
 }
 
@@ -79,8 +87,7 @@ pub fn configuration(stored: &str, settings: &[Setting]) -> Result<Config, Failu
         ))
     };
     let mut table: Table = stored.parse().map_err(|error| unreadable(in_plain_words(&error)))?;
-    let mut config: Config =
-        toml::from_str(stored).map_err(|error| unreadable(in_plain_words(&error)))?;
+    let mut config: Config = toml::from_str(stored).map_err(|error| unreadable(in_plain_words(&error)))?;
     for Setting { key, value } in settings {
         let wrong = |error: String| Failure::Input(format!("--set {key}={value}: {error}"));
         put(&mut table, key, value.clone()).map_err(wrong)?;
@@ -119,12 +126,15 @@ mod tests {
     #[test]
     fn keys_of_the_selector_are_taken_and_no_others() {
         let words = setting("calm.combination=additive").unwrap();
-        assert_eq!((words.value, words.of_key()), (Value::from("additive"), "calm.combination"));
+        assert_eq!((&words.value, words.of_key()), (&Value::from("additive"), "calm.combination"));
         let inside = setting("collect.when.threshold = 1.75").unwrap();
         assert_eq!((inside.value.as_float(), inside.of_key()), (Some(1.75), "collect.when"));
         assert_eq!(setting("calm.ladder=[0.5,1]").unwrap().value.as_array().unwrap().len(), 2);
         for (text, words) in [
-            ("walk.tau=0.2", "walk.tau cannot be replayed: expected a key that acts on the selector alone, calm.c"),
+            (
+                "walk.tau=0.2",
+                "walk.tau cannot be replayed: expected a key that acts on the selector alone, budget.l",
+            ),
             ("collect.whenever=1", "collect.whenever cannot be replayed"),
             ("collect.total", "expected KEY=VALUE"),
             ("collect.total=", "collect.total = : "),
@@ -146,11 +156,14 @@ mod tests {
         let rule = with(&["collect.when={ rule = \"maximum_grade\" }", "collect.when.threshold=2.5"]);
         assert!(rule.unwrap().collect.when.is_met(&[2.6]));
         for (texts, words) in [
-            (&["collect.per_seed=0"][..], "--set collect.per_seed=0: invalid value: integer `0`, expected a whole"),
+            (
+                &["collect.per_seed=0"][..],
+                "--set collect.per_seed=0: invalid value: integer `0`, expected a whole",
+            ),
             (&["collect.when.threshold=-1.0"], "expected a finite number above 0"),
             (&["collect.when.treshold=1.0"], "unknown key `treshold`"),
             (&["calm.combination=conves"], "did you mean `convex`?"),
-            (&["collect.per_seed.x=1"], "per_seed is no table"),
+            (&["collect.per_seed.x=1"], "invalid type: map, expected a whole number"),
         ] {
             let Err(Failure::Input(error)) = with(texts) else { panic!("{texts:?} are taken") };
             assert!(error.contains(words), "{error}");

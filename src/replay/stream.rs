@@ -61,7 +61,9 @@ pub async fn follow(
 }
 
 fn damaged(decision: i64, problem: &str) -> Failure {
-    Failure::Failed(format!("decision {decision}: {problem}: the database is damaged; restore it from a copy"))
+    Failure::Failed(format!(
+        "decision {decision}: {problem}: the database is damaged; restore it from a copy"
+    ))
 }
 
 /// A candidate as it was stored, without its arrays, and examined; not, if its features were not kept.
@@ -113,7 +115,8 @@ fn examine(
             scope.spawn(move || part.into_iter().map(one).collect::<Result<Vec<_>, _>>())
         };
         let threads: Vec<_> = parts.into_iter().map(examine).collect();
-        let joined = threads.into_iter().map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
+        let joined =
+            threads.into_iter().map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
         joined.collect::<Result<Vec<_>, Failure>>()
     });
     Ok(examined?.into_iter().flatten().collect())
@@ -125,6 +128,9 @@ fn examine_one(
     mixture: &Arc<Mixture>,
 ) -> Result<Ready, Failure> {
     let Some(features) = stored.features.take() else { return Ok(Ready { stored, examined: None }) };
-    let block = stored.block.with_features(&features).map_err(|error| damaged(stored.decision, &error.to_string()))?;
+    let block = stored
+        .block
+        .with_features(&features)
+        .map_err(|error| damaged(stored.decision, &error.to_string()))?;
     Ok(Ready { examined: Some(examiner.examine_block(block, mixture)), stored })
 }

@@ -5,6 +5,7 @@
 //! may be killed at any time. No function reads a clock: `now` is ms since 1970, see [`unix_milliseconds`].
 
 mod birth;
+mod budget;
 mod database;
 mod encoding;
 mod error;
@@ -25,6 +26,7 @@ mod tables;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 pub use birth::process_birth;
+pub use budget::{Budget, BudgetStatus, BudgetUse};
 pub use error::{Result, StoreError};
 pub use export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
 pub use filesystem::{check_directory, network_file_system};

@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use crate::budget::BudgetStatus;
 use crate::database::from_columns;
 use crate::processes::ProcessRecord;
 
@@ -22,7 +23,9 @@ pub struct Status {
     pub walks: Vec<WalkStatus>,
     /// Processes that said that they work for the campaign.
     pub processes: Vec<ProcessRecord>,
-    /// Every walk is over, and no label job is queued or leased.
+    /// Limits, what was used of them, and which of them ended the campaign.
+    pub budget: BudgetStatus,
+    /// Every walk is over, or stopped by a limit of time, and no label is under way or will be begun.
     pub finished: bool,
 }
 
@@ -52,6 +55,8 @@ pub struct Declined {
     pub guard: u64,
     /// As many as there may be.
     pub budget: u64,
+    /// New, but not so new as it had to be while so many waited for labels.
+    pub backlog: u64,
 }
 
 /// Numbers of label jobs by state.

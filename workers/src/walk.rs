@@ -9,7 +9,7 @@ mod state;
 use std::sync::Arc;
 
 use atoms::PotentialError;
-use calm::{GradeError, Mixture};
+use calm::{CollectionRule, GradeError, Mixture};
 use md::{Dynamics, DynamicsError, Stream};
 use potentials::grace::GraceModel;
 use potentials::{Zbl, ZblRangeError};
@@ -83,6 +83,8 @@ struct Walk<'a> {
     assignment: &'a Assignment,
     model: &'a GraceModel,
     mixture_version: u64,
+    /// When a structure is a candidate in this turn.
+    collection: CollectionRule,
     dynamics: Dynamics,
     potential: BiasedPotential,
     state: WalkState,
@@ -109,7 +111,9 @@ impl<'a> Walk<'a> {
             }
         };
         potential.state = state.bias;
-        let mut walk = Self { settings, assignment, model, mixture_version, dynamics, potential, state };
+        let collection = settings.collection.raised(assignment.raised);
+        let mut walk =
+            Self { settings, assignment, model, mixture_version, collection, dynamics, potential, state };
         walk.take_verdict();
         Ok(walk)
     }
@@ -193,7 +197,7 @@ impl<'a> Walk<'a> {
         }
         let gamma = &self.potential.grades()?.gamma;
         self.state.gamma_max = calm::grade::maximum(gamma);
-        let collects = step >= self.state.next_offer && self.settings.collection.is_met(gamma);
+        let collects = step >= self.state.next_offer && self.collection.is_met(gamma);
         match (collects, too_close) {
             (false, _) => Ok(None),
             (true, true) => self.refuse(),

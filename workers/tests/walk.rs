@@ -69,6 +69,7 @@ fn assignment(structure: Structure, until: u64) -> Assignment {
         verdict: None,
         until,
         wanted: Vec::new(),
+        raised: 1.0,
     }
 }
 

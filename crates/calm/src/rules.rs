@@ -209,6 +209,21 @@ impl UpdateSettings {
 }
 
 impl CollectionRule {
+    /// The grade above which a structure, or an atom of it, counts.
+    pub fn threshold(&self) -> f64 {
+        match *self {
+            Self::MaximumGrade { threshold } | Self::AtomCount { threshold, .. } => threshold.0,
+        }
+    }
+
+    /// The same rule with its threshold times `factor`, which is finite and above 0.
+    pub fn raised(mut self, factor: f64) -> Self {
+        match &mut self {
+            Self::MaximumGrade { threshold } | Self::AtomCount { threshold, .. } => threshold.0 *= factor,
+        }
+        self
+    }
+
     /// Whether a structure with these grades, `[atoms]`, is to be collected.
     pub fn is_met(&self, gamma: &[f64]) -> bool {
         match *self {

@@ -190,6 +190,7 @@ fn assignment(turn: u64) -> Assignment {
         verdict: None,
         until: 1000,
         wanted: Vec::new(),
+        raised: 1.0,
     }
 }
 

@@ -19,7 +19,7 @@ use crate::ids::{CandidateId, Origin, WalkId};
 use crate::messages::{Assignment, End, Outcome, Progress, Report};
 
 const MAGIC: [u8; 4] = *b"CALM";
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 const PREFIX: usize = MAGIC.len() + 1 + 4;
 
 /// Why bytes are not a control message.
@@ -69,6 +69,14 @@ pub(crate) enum ControlError {
         wanted: Vec<u64>,
         /// What they should be.
         expected: &'static str,
+    },
+    /// A threshold that is lowered, or none.
+    #[error("walk {walk} is to multiply its threshold by {found}: expected a finite number, 1 or more")]
+    Raised {
+        /// The walk.
+        walk: WalkId,
+        /// The factor.
+        found: f64,
     },
     /// A report without the candidate that it names, or with another.
     #[error("a report of walk {walk} names candidate {}, the block beside it is {}", name(.named), name(.beside))]
@@ -165,6 +173,9 @@ pub(crate) fn checked_assignment(assignment: Assignment) -> Result<Assignment, C
     }
     if !wanted.is_sorted_by(|a, b| a < b) {
         return wrong("ascending steps");
+    }
+    if !(assignment.raised.is_finite() && assignment.raised >= 1.0) {
+        return Err(ControlError::Raised { walk, found: assignment.raised });
     }
     Ok(assignment)
 }

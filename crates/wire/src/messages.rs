@@ -32,6 +32,8 @@ pub struct Assignment {
     pub until: u64,
     /// A control walk: the steps whose frames are wanted, ascending. Otherwise empty.
     pub wanted: Vec<u64>,
+    /// Factor on the threshold of the collection rule: 1, or more while many structures wait for labels.
+    pub raised: f64,
 }
 
 /// The answer to a candidate.
@@ -56,19 +58,22 @@ pub enum Decline {
     Guard,
     /// The seed structure or the campaign has as many as it may have.
     Budget,
+    /// So many structures wait for labels that the threshold was raised, above it.
+    Backlog,
 }
 
 impl Decline {
     /// Every reason, in the order of summaries.
-    pub const ALL: [Self; 4] = [Self::Covered, Self::Duplicate, Self::Guard, Self::Budget];
+    pub const ALL: [Self; 5] = [Self::Covered, Self::Duplicate, Self::Guard, Self::Budget, Self::Backlog];
 
-    /// `"covered"`, `"duplicate"`, `"guard"`, `"budget"`.
+    /// `"covered"`, `"duplicate"`, `"guard"`, `"budget"`, `"backlog"`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Covered => "covered",
             Self::Duplicate => "duplicate",
             Self::Guard => "guard",
             Self::Budget => "budget",
+            Self::Backlog => "backlog",
         }
     }
 }

@@ -131,6 +131,10 @@ impl Judge {
             "selector": grade_summary(&graded.selector.gamma, self.mixture.version()),
             "original": grade_summary(&graded.original.gamma, 0),
         });
+        if self.raised > 1.0 {
+            detail["raised_by"] = json!(self.raised);
+            detail["threshold"] = json!(self.settings.collection.raised(self.raised).threshold());
+        }
         let (fate, verdict) = match self.reason_to_decline(id, candidate.content, &graded) {
             Some(reason) => {
                 detail["reason"] = json!(reason.name());
@@ -202,7 +206,7 @@ impl Judge {
         });
     }
 
-    /// The first reason, if any, in the order: guard, duplicate, budget, covered.
+    /// The first reason, if any, in the order: guard, duplicate, budget, covered, backlog.
     fn reason_to_decline(&self, id: WalkId, content: ContentHash, graded: &Examined) -> Option<Decline> {
         let walk = &self.walks[&id].record;
         if graded.bonds.shortest < self.least_distances[walk.seed_structure as usize] {
@@ -213,6 +217,8 @@ impl Judge {
             Some(Decline::Budget)
         } else if !self.settings.collection.is_met(&graded.selector.gamma) {
             Some(Decline::Covered)
+        } else if !self.settings.collection.raised(self.raised).is_met(&graded.selector.gamma) {
+            Some(Decline::Backlog)
         } else {
             None
         }

@@ -9,9 +9,12 @@ use serde_json::json;
 use store::records::{Commit, ComponentRecord, Decision, WalkRecord};
 use wire::{ContentHash, WalkId};
 
+use super::backlog::Backlog;
 use super::rules::{ChangeableRules, RULES};
 use super::walk::Walk;
-use super::{Examiner, STALENESS, SeedStructure, SelectorError, Settings, Snapshot, Staleness, TrainingFrames};
+use super::{
+    Examiner, STALENESS, SeedStructure, SelectorError, Settings, Snapshot, Staleness, TrainingFrames,
+};
 use crate::grader::Grader;
 
 /// Decides what becomes of candidates and walks.
@@ -33,6 +36,9 @@ pub(super) struct Judge {
     pub imported: (u64, u64),
     /// The changeable rules, when the log last spoke of them.
     pub rules: Option<ChangeableRules>,
+    pub backlog: Option<Backlog>,
+    /// Factor on the threshold of the collection rule.
+    pub raised: f64,
 }
 
 impl Judge {
@@ -71,6 +77,8 @@ impl Judge {
             staleness,
             imported: (snapshot.imported, imported),
             rules: restored(RULES, &snapshot.values)?,
+            backlog: None,
+            raised: 1.0,
         })
     }
 

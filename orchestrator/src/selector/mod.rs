@@ -9,6 +9,7 @@
 //! committed it. All state that matters goes through a [`Commit`], so [`Selector::restore`] continues from the store
 //! as if nothing had happened.
 
+mod backlog;
 mod begin;
 mod decide;
 mod examine;
@@ -31,6 +32,7 @@ use wire::messages::{End, Outcome, Report};
 use wire::{CampaignId, CandidateId, ContentHash, WalkId};
 
 use crate::grader::{Grader, GraderError};
+use backlog::Backlog;
 pub use decide::TrainingFrames;
 pub use examine::{Examined, ExaminedReport, Examiner};
 use judge::Judge;
@@ -214,6 +216,23 @@ impl Selector {
     /// nothing to do.
     pub fn begin_walks(&mut self) -> Commit {
         self.judge.begin(&self.seeds)
+    }
+
+    /// From now on the threshold of the collection rule is raised while more than `limit` label jobs are unfinished
+    /// (see [`Self::set_unfinished_jobs`]). Live mode only: the length of the queue depends on what happens when.
+    pub fn raise_above(&mut self, limit: u64) {
+        self.judge.backlog = Some(Backlog::above(limit));
+    }
+
+    /// Says how many label jobs are unfinished, for decisions and turns from now on.
+    pub fn set_unfinished_jobs(&mut self, unfinished: u64) {
+        self.judge.raised = self.judge.backlog.map_or(1.0, |backlog| backlog.factor(unfinished));
+    }
+
+    /// Walkers have to wait while more label jobs than this are unfinished, where they are to wait above `limit` unless the
+    /// threshold is raised first.
+    pub fn most_unfinished(&self, limit: u64) -> u64 {
+        self.judge.backlog.map_or(limit, Backlog::bound)
     }
 
     /// Takes what came of a turn. What it returns must be committed before a turn that is asked for afterwards is given to

@@ -143,6 +143,7 @@ impl Replay {
         let Some(id) = self.walk_under_way(recorded)? else { return Ok(None) };
         let examined = candidate.ok_or_else(|| damaged(recorded, "its candidate is missing"))?;
         let step = examined.block.view().id().step;
+        self.judge.raised = recorded.detail["raised_by"].as_f64().unwrap_or(1.0);
         let walk = self.judge.walk_mut(id);
         walk.record.progress.step = step;
         let (mut commit, biased) = (Commit::default(), walk.is_biased());
@@ -166,7 +167,10 @@ impl Replay {
         let Detail { structures } = read(recorded)?;
         let known = self.imported.get(..structures);
         let known = known.ok_or_else(|| {
-            damaged(recorded, &format!("{structures} imported structures, but {} are there", self.imported.len()))
+            damaged(
+                recorded,
+                &format!("{structures} imported structures, but {} are there", self.imported.len()),
+            )
         })?;
         self.judge.known.extend(known);
         Ok(self.judge.of_campaign("imported", recorded.detail.clone()))

@@ -18,7 +18,7 @@ pub struct ChangeableRules {
     /// See [`Settings::per_seed`].
     #[serde(rename = "collect.per_seed")]
     pub per_seed: u32,
-    /// See [`Settings::total`].
+    /// See [`Settings::total`]: the least of what the keys say that limit it.
     #[serde(rename = "collect.total")]
     pub total: Option<u32>,
     /// See [`ForgettingAlarm`].

@@ -53,7 +53,8 @@ impl Selector {
         for biased in [true, false] {
             let unfinished =
                 self.judge.walks.values().filter(|walk| !walk.has_ended() && walk.is_biased() == biased);
-            let taken = unfinished.take(self.judge.settings.walks_per_round).map(|walk| (walk.record.walk, None));
+            let taken =
+                unfinished.take(self.judge.settings.walks_per_round).map(|walk| (walk.record.walk, None));
             self.in_round.extend(taken);
         }
         if !self.in_round.is_empty() {
@@ -76,6 +77,7 @@ impl Selector {
             verdict: walk.memory.verdict.clone(),
             until: walk.memory.until,
             wanted: walk.memory.wanted.clone(),
+            raised: self.judge.raised,
         }
     }
 }

@@ -13,6 +13,17 @@ use super::memory::MemoryStore;
 use super::scripted::{Event, Script, advance};
 use super::{restore, settings};
 
+/// Label jobs above which a live campaign raises its threshold.
+const QUEUE_LIMIT: u64 = 5;
+
+fn open(settings: &Settings, seeds: usize, snapshot: Snapshot) -> Selector {
+    let mut selector = restore(settings, seeds, snapshot);
+    if settings.mode == Mode::Live {
+        selector.raise_above(QUEUE_LIMIT);
+    }
+    selector
+}
+
 /// What happens next while a campaign runs.
 #[derive(Clone, Copy, Debug)]
 pub enum Act {
@@ -24,6 +35,8 @@ pub enum Act {
     Interrupt(prop::sample::Index, u64),
     /// One of them is lost.
     Lose(prop::sample::Index),
+    /// So many structures wait for labels.
+    Queue(u64),
     /// All processes die, and the campaign is started again.
     Crash,
 }
@@ -36,6 +49,7 @@ pub fn acts() -> impl Strategy<Value = Vec<Act>> {
             6 => index().prop_map(Act::Deliver),
             3 => (index(), 0..12_u64).prop_map(|(index, steps)| Act::Interrupt(index, steps)),
             1 => index().prop_map(Act::Lose),
+            2 => (0..2 * QUEUE_LIMIT + 3).prop_map(Act::Queue),
             1 => Just(Act::Crash),
         ],
         0..150,
@@ -93,7 +107,7 @@ pub struct Campaign<'a> {
 
 impl<'a> Campaign<'a> {
     pub fn begin(settings: &'a Settings, scripts: &'a [Script], walkers: usize) -> Self {
-        let selector = restore(settings, scripts.len(), Snapshot::default());
+        let selector = open(settings, scripts.len(), Snapshot::default());
         let (store, at_work, commits) = (MemoryStore::default(), Vec::new(), Vec::new());
         let mut campaign = Self { settings, scripts, walkers, selector, store, at_work, commits };
         let commit = campaign.selector.begin_walks();
@@ -148,7 +162,7 @@ impl<'a> Campaign<'a> {
 
     fn crash(&mut self) {
         self.at_work.clear();
-        self.selector = restore(self.settings, self.scripts.len(), self.store.snapshot());
+        self.selector = open(self.settings, self.scripts.len(), self.store.snapshot());
         assert!(self.selector.begin_walks().walks.is_empty());
     }
 
@@ -156,7 +170,7 @@ impl<'a> Campaign<'a> {
     pub fn go_on(&mut self, settings: &'a Settings) {
         self.at_work.clear();
         self.settings = settings;
-        self.selector = restore(self.settings, self.scripts.len(), self.store.snapshot());
+        self.selector = open(self.settings, self.scripts.len(), self.store.snapshot());
         let commit = self.selector.begin_walks();
         self.commit(commit);
     }
@@ -167,6 +181,7 @@ impl<'a> Campaign<'a> {
                 self.ask();
                 return;
             }
+            Act::Queue(unfinished) => return self.selector.set_unfinished_jobs(unfinished),
             Act::Crash => return self.crash(),
             Act::Deliver(index) | Act::Interrupt(index, _) | Act::Lose(index) => index,
         };

@@ -16,7 +16,10 @@ pub fn state(status: &Status) -> String {
     let living = |kind| number(kind, |state| state != "gone" && !is_given_up(state));
     let given_up = number(ProcessRecord::WALKER, is_given_up);
     match (status.finished, living(ProcessRecord::ORCHESTRATOR), living(ProcessRecord::LABELLER)) {
-        (true, ..) => "finished".to_owned(),
+        (true, ..) => match &status.budget.used_up {
+            Some(key) => format!("finished, since {key} is used up; raised, it lets calmwalk run go on"),
+            None => "finished".to_owned(),
+        },
         (false, 0, 0) => "not running; the same calmwalk run goes on with it".to_owned(),
         (false, 0, labellers) => {
             let who =

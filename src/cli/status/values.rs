@@ -78,7 +78,10 @@ mod tests {
         assert!(text(&of(&staleness), "live").contains("at 100.0 % of decisions"));
         [1, 2, 7].iter().for_each(|age| staleness.add(*age));
         let shown = text(&of(&staleness), "reproducible");
-        assert!(shown.contains("50.0 % of decisions; versions behind: median 0, 90 % 7, largest 7"), "{shown}");
+        assert!(
+            shown.contains("50.0 % of decisions; versions behind: median 0, 90 % 7, largest 7"),
+            "{shown}"
+        );
         let json = of(&staleness).staleness();
         let expected = json!({
             "counts": { "0": 3, "1": 1, "2": 1, "7": 1 }, "largest": 7, "decisions": 6, "share_of_newest": 0.5,

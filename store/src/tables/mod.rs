@@ -1,5 +1,6 @@
 //! What the functions of [`crate::Store`] do with its tables, a file a matter.
 
+mod budget;
 pub mod by_hand;
 mod commit;
 pub mod export;

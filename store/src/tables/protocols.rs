@@ -189,7 +189,7 @@ fn protocol((hash, name, settings): (Vec<u8>, String, String)) -> Result<Protoco
     Ok(Protocol { hash: decode_hash(&hash)?, name, settings })
 }
 
-async fn set_campaign_value(transaction: &mut Transaction, key: &str, value: &str) -> Result<()> {
+pub(super) async fn set_campaign_value(transaction: &mut Transaction, key: &str, value: &str) -> Result<()> {
     let sql = "INSERT INTO campaign (key, value) VALUES ($1, $2)
                ON CONFLICT (key) DO UPDATE SET value = excluded.value";
     query(sql).bind(key).bind(value).execute(&mut *transaction).await?;

@@ -8,7 +8,7 @@
 use atoms::Structure;
 use wire::ContentHash;
 
-use super::{processes, protocols};
+use super::{budget, processes, protocols};
 use crate::Store;
 use crate::database::{Transaction, from_columns, query};
 use crate::encoding::decode_structure;
@@ -61,7 +61,8 @@ pub(super) struct JobRow {
 from_columns!(JobRow { structure, protocol, state, attempts, failures });
 
 impl Store {
-    /// The next job of that protocol for `holder` (`process` or `process/part`), for `seconds` from `now` on.
+    /// The next job of that protocol for `holder` (`process` or `process/part`), for `seconds` from `now` on. None if the
+    /// campaign's budget ([`Store::set_budget`]) is used up.
     ///
     /// Leases that ran out end first, and their jobs go back into the queue, which does not count as failed attempts. But
     /// a clock on the wall is no proof: after the sleep of a computer every lease has run out, and whoever is first
@@ -79,6 +80,10 @@ impl Store {
         let protocol_number = protocols::number(&mut transaction, protocol).await?;
         let now = transaction.time(now).await?;
         end_expired(&mut transaction, now, seconds).await?;
+        if budget::allows_no_attempt(&mut transaction, now).await? {
+            transaction.commit().await?;
+            return Ok(None);
+        }
         let next = query(NEXT).bind(protocol_number).unless_locked();
         let next: Option<(i64, u32, i64, i64)> = next.fetch_optional(&mut transaction).await?;
         let Some((job, attempts, structure, decision)) = next else {

@@ -1,11 +1,15 @@
 //! The state of a campaign, from indexes.
 
-use super::processes;
+use super::{budget, processes};
 use crate::Store;
+use crate::budget::{Budget, BudgetStatus};
 use crate::database::query;
 use crate::error::Result;
 use crate::processes::ProcessRecord;
 use crate::status::{Candidates, Labels, Status, WalkStatus};
+use crate::unix_milliseconds;
+
+const END_BY_BUDGET: &str = "budget";
 
 pub(crate) const FATES: &str =
     "SELECT origin, coalesce(reason, fate), count(*) FROM candidate GROUP BY origin, fate, reason";
@@ -21,11 +25,12 @@ impl Store {
     /// Everything at one instant. Processes are in order of kind and number. A process that is gone has the
     /// state `gone`, whatever was said of it before, unless it was `given up`, or is `pausing` and an orchestrator lives. One
     /// of another host that has said nothing for a minute is `silent`.
+    /// A walk that a limit of time has stopped has the state `budget`.
     pub async fn status(&self) -> Result<Status> {
         let mut transaction = self.database.begin_to_read().await?;
         let fates: Vec<(String, String, u64)> = query(FATES).fetch_all(&mut transaction).await?;
         let states: Vec<(String, u64)> = query(STATES).fetch_all(&mut transaction).await?;
-        let walks: Vec<WalkStatus> = query(WALKS).fetch_all(&mut transaction).await?;
+        let mut walks: Vec<WalkStatus> = query(WALKS).fetch_all(&mut transaction).await?;
         let refused = query("SELECT CAST(coalesce(sum(refused), 0) AS BIGINT) FROM walk");
         let refused: u64 = refused.fetch_one(&mut transaction).await?;
         let sql = "SELECT mixture_version, round FROM decision ORDER BY sequence DESC LIMIT 1";
@@ -33,20 +38,44 @@ impl Store {
         let (mixture_version, round) = last.unwrap_or_default();
         let imported = query("SELECT count(*) FROM import").fetch_one(&mut transaction).await?;
         let processes = processes::all(&mut transaction).await?;
+        let (limits, used) = budget::read(&mut transaction, unix_milliseconds()).await?;
         transaction.commit().await?;
         let labels = labels(&states);
+        let time_used_up = limits.time_used_up(&used);
+        name_budget(&mut walks, time_used_up, &limits);
         let under_way = |walk: &WalkStatus| matches!(walk.state.as_str(), "waiting" | "running");
+        let no_more_labels = labels.leased == 0 && (labels.queued == 0 || limits.allows_no_attempt(&used));
         Ok(Status {
             candidates: candidates(&fates, refused),
             imported,
             mixture_version,
             round,
-            finished: !walks.is_empty() && !walks.iter().any(under_way) && labels.queued + labels.leased == 0,
+            finished: !walks.is_empty() && !walks.iter().any(under_way) && no_more_labels,
+            budget: BudgetStatus { used_up: used_up(time_used_up, &walks), limits, used },
             labels,
             walks,
             processes: seen_from_here(processes),
         })
     }
+}
+
+/// Says of walks which budget has ended them. Those that are under way are stopped while a limit of time is reached.
+fn name_budget(walks: &mut [WalkStatus], time: Option<&'static str>, limits: &Budget) {
+    let structures = limits.structures_by.as_deref().unwrap_or("collect.total");
+    for walk in walks {
+        if walk.state == END_BY_BUDGET {
+            structures.clone_into(&mut walk.reason);
+        }
+        if let (Some(key), "waiting" | "running") = (time, walk.state.as_str()) {
+            (walk.state, walk.reason) = (END_BY_BUDGET.to_owned(), key.to_owned());
+        }
+    }
+}
+
+/// The limit that ended walks: of time, or what the walks say.
+fn used_up(time: Option<&'static str>, walks: &[WalkStatus]) -> Option<String> {
+    let ended = || walks.iter().rfind(|walk| walk.state == END_BY_BUDGET).map(|walk| walk.reason.clone());
+    time.map(str::to_owned).or_else(ended)
 }
 
 fn candidates(fates: &[(String, String, u64)], refused_by_walkers: u64) -> Candidates {
@@ -64,6 +93,7 @@ fn candidates(fates: &[(String, String, u64)], refused_by_walkers: u64) -> Candi
             "duplicate" => declined.duplicate += count,
             "guard" => declined.guard += count,
             "budget" => declined.budget += count,
+            "backlog" => declined.backlog += count,
             _ => {}
         }
     }

@@ -142,7 +142,7 @@ async fn look(
     last_look: bool,
     now: i64,
 ) -> Result<Found, StoreError> {
-    if store.unfinished_jobs().await? == 0 {
+    if !store.awaits_labels(now).await? {
         return Ok(if last_look { Found::TheEnd } else { Found::Nothing });
     }
     let (protocol, seconds) = (settings.protocol.hash, settings.timing.lease_seconds());

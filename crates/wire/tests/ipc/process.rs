@@ -101,6 +101,7 @@ pub fn assignment(walk: u32, turn: u64, (atoms, features): (usize, usize)) -> As
         verdict: None,
         until: features as u64,
         wanted: Vec::new(),
+        raised: 1.0,
     }
 }
 

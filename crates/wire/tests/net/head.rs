@@ -166,6 +166,7 @@ pub fn work(walk: u32, turn: u64, mixture: &Arc<Mixture>) -> Work {
         verdict: None,
         until: turn * 1000,
         wanted: Vec::new(),
+        raised: 1.0,
     };
     Work { assignment, mixture: Arc::clone(mixture) }
 }

@@ -51,10 +51,15 @@ fn progress() -> impl Strategy<Value = Progress> {
 
 pub fn assignment() -> impl Strategy<Value = Assignment> {
     let ids = (any::<[u8; 16]>(), any::<u32>(), any::<u32>(), any::<u64>(), any::<u64>());
-    let rest = (option::of(vec(any::<u8>(), 0..300)), option::of(verdict()), btree_set(any::<u64>(), 0..6));
+    let rest = (
+        option::of(vec(any::<u8>(), 0..300)),
+        option::of(verdict()),
+        btree_set(any::<u64>(), 0..6),
+        1.0..9.0,
+    );
     (ids, origin(), usable_structure(), rest).prop_map(|(ids, origin, seed_structure, rest)| {
         let (campaign, walk, random_walk, turn, until) = ids;
-        let (checkpoint, verdict, wanted) = rest;
+        let (checkpoint, verdict, wanted, raised) = rest;
         let (campaign, walk, random_walk) = (CampaignId(campaign), WalkId(walk), WalkId(random_walk));
         let wanted = if origin == Origin::Control { wanted.into_iter().collect() } else { Vec::new() };
         Assignment {
@@ -68,6 +73,7 @@ pub fn assignment() -> impl Strategy<Value = Assignment> {
             verdict,
             until,
             wanted,
+            raised,
         }
     })
 }

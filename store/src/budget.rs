@@ -1,0 +1,91 @@
+//! What a campaign may use up, and what it has.
+
+use serde::{Deserialize, Serialize};
+
+/// Limits; none where there is none.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Budget {
+    /// Labels that are made.
+    pub labels: Option<u64>,
+    /// Hours of label attempts, each on one core.
+    pub core_hours: Option<f64>,
+    /// Hours for which the campaign is under way.
+    pub wall_hours: Option<f64>,
+    /// The key of the configuration that limits the number of structures; the selector sees to that.
+    pub structures_by: Option<String>,
+}
+
+/// What was used.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct BudgetUse {
+    /// Labels that were made, also such as came too late and were kept beside another.
+    pub labels: u64,
+    /// Attempts that are under way.
+    pub under_way: u64,
+    /// Hours of label attempts, those that are under way so far.
+    pub core_hours: f64,
+    /// Hours for which the campaign was under way, summed over its runs.
+    pub wall_hours: f64,
+}
+
+/// Both, for those who watch.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct BudgetStatus {
+    /// The limits.
+    pub limits: Budget,
+    /// What was used of them.
+    pub used: BudgetUse,
+    /// The key of the configuration that ended the campaign.
+    pub used_up: Option<String>,
+}
+
+impl Budget {
+    /// Whether labellers are free to begin what is queued.
+    pub fn is_none(&self) -> bool {
+        self.labels.is_none() && self.core_hours.is_none() && self.wall_hours.is_none()
+    }
+
+    /// The key of the limit of time that was reached: walks stop where they stand.
+    pub fn time_used_up(&self, used: &BudgetUse) -> Option<&'static str> {
+        let limits = [
+            ("budget.wall_hours", self.wall_hours, used.wall_hours),
+            ("budget.core_hours", self.core_hours, used.core_hours),
+        ];
+        let reached = |(_, limit, used): &(&str, Option<f64>, f64)| limit.is_some_and(|limit| *used >= limit);
+        limits.into_iter().find(reached).map(|(key, ..)| key)
+    }
+
+    /// Whether no further attempt may begin: one that is under way may still bring the last label.
+    pub fn allows_no_attempt(&self, used: &BudgetUse) -> bool {
+        let labels = used.labels + used.under_way;
+        self.time_used_up(used).is_some() || self.labels.is_some_and(|limit| labels >= limit)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_limit_is_reached_when_as_much_was_used() {
+        let used = BudgetUse { labels: 3, under_way: 2, core_hours: 1.5, wall_hours: 0.25 };
+        let none = Budget::default();
+        assert!(none.is_none() && none.time_used_up(&used).is_none() && !none.allows_no_attempt(&used));
+        for (labels, allows) in [(6, true), (5, false), (4, false)] {
+            let budget = Budget { labels: Some(labels), ..Budget::default() };
+            assert_eq!((budget.allows_no_attempt(&used), budget.time_used_up(&used)), (!allows, None));
+        }
+        for (core_hours, wall_hours, key) in [
+            (1.5, 1.0, Some("budget.core_hours")),
+            (1.6, 0.25, Some("budget.wall_hours")),
+            (1.0, 0.2, Some("budget.wall_hours")),
+            (1.6, 0.3, None),
+        ] {
+            let budget =
+                Budget { core_hours: Some(core_hours), wall_hours: Some(wall_hours), ..Budget::default() };
+            assert_eq!(budget.time_used_up(&used), key);
+            assert_eq!(budget.allows_no_attempt(&used), key.is_some());
+        }
+    }
+}

@@ -1,0 +1,93 @@
+//! Budgets: what was used up is found from what is there, and no further label is begun where there is nothing left.
+
+use super::protocols::set_campaign_value;
+use crate::Store;
+use crate::budget::{Budget, BudgetUse};
+use crate::database::{Transaction, query};
+use crate::error::{Result, StoreError};
+
+const MILLISECONDS_PER_HOUR: f64 = 3.6e6;
+
+/// Labels made, attempts under way, and milliseconds of all attempts.
+const ATTEMPTS: &str = "SELECT CAST(coalesce(sum(CASE WHEN outcome IN ('labelled', 'check') THEN 1 ELSE 0 END), 0) AS BIGINT),
+        CAST(coalesce(sum(CASE WHEN outcome IS NULL THEN 1 ELSE 0 END), 0) AS BIGINT),
+        CAST(coalesce(sum(CASE WHEN coalesce(ended, $1) > started THEN coalesce(ended, $1) - started ELSE 0 END), 0) AS BIGINT)
+    FROM attempt";
+
+impl Store {
+    /// From now on these limits hold, for every labeller.
+    pub async fn set_budget(&self, budget: &Budget) -> Result<()> {
+        let text = serde_json::to_string(budget).expect("plain data becomes JSON");
+        let mut transaction = self.database.begin_to_lead().await?;
+        set_campaign_value(&mut transaction, "budget", &text).await?;
+        transaction.commit().await
+    }
+
+    /// The limits, and what was used of them until `now`.
+    pub async fn budget(&self, now: i64) -> Result<(Budget, BudgetUse)> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let read = read(&mut transaction, now).await?;
+        transaction.commit().await?;
+        Ok(read)
+    }
+
+    /// The campaign was under way for so long again.
+    pub async fn add_time_under_way(&self, milliseconds: u64) -> Result<()> {
+        let mut transaction = self.database.begin_to_lead().await?;
+        let before = time_under_way(&mut transaction).await?;
+        let now = before.saturating_add(milliseconds).to_string();
+        set_campaign_value(&mut transaction, "time_under_way", &now).await?;
+        transaction.commit().await
+    }
+
+    /// Whether a label is being made, or waits to be and may be.
+    pub async fn awaits_labels(&self, now: i64) -> Result<bool> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let some = |state: &'static str| {
+            query("SELECT count(*) FROM (SELECT 1 FROM job WHERE state = $1 LIMIT 1) AS one").bind(state)
+        };
+        let leased: u64 = some("leased").fetch_one(&mut transaction).await?;
+        let queued: u64 = some("queued").fetch_one(&mut transaction).await?;
+        let awaits = leased > 0 || (queued > 0 && !allows_no_attempt(&mut transaction, now).await?);
+        transaction.commit().await?;
+        Ok(awaits)
+    }
+}
+
+/// Limits and use. Where there is a server, its clock counts.
+pub(super) async fn read(transaction: &mut Transaction, now: i64) -> Result<(Budget, BudgetUse)> {
+    let limits = limits(transaction).await?;
+    let now = transaction.time(now).await?;
+    let attempts: (u64, u64, u64) = query(ATTEMPTS).bind(now).fetch_one(&mut *transaction).await?;
+    let (labels, under_way, milliseconds) = attempts;
+    let used = BudgetUse {
+        labels,
+        under_way,
+        core_hours: milliseconds as f64 / MILLISECONDS_PER_HOUR,
+        wall_hours: time_under_way(transaction).await? as f64 / MILLISECONDS_PER_HOUR,
+    };
+    Ok((limits, used))
+}
+
+/// Whether no further attempt may begin. Attempts are counted only where there is a limit.
+pub(super) async fn allows_no_attempt(transaction: &mut Transaction, now: i64) -> Result<bool> {
+    if limits(transaction).await?.is_none() {
+        return Ok(false);
+    }
+    let (limits, used) = read(transaction, now).await?;
+    Ok(limits.allows_no_attempt(&used))
+}
+
+async fn limits(transaction: &mut Transaction) -> Result<Budget> {
+    let limits = query("SELECT value FROM campaign WHERE key = 'budget'");
+    let limits: Option<String> = limits.fetch_optional(&mut *transaction).await?;
+    let limits = limits.map(|text| serde_json::from_str(&text)).transpose();
+    Ok(limits.map_err(|error| StoreError::damaged("the budget", error))?.unwrap_or_default())
+}
+
+async fn time_under_way(transaction: &mut Transaction) -> Result<u64> {
+    let time = query("SELECT value FROM campaign WHERE key = 'time_under_way'");
+    let time: Option<String> = time.fetch_optional(&mut *transaction).await?;
+    let time = time.map(|text| text.parse()).transpose();
+    Ok(time.map_err(|error| StoreError::damaged("the time under way", error))?.unwrap_or_default())
+}

@@ -1,0 +1,183 @@
+//! Budgets end a campaign in order, and a larger one lets it go on; what a long label queue does.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::process::Stdio;
+
+use common::campaign::{Outcome, Small, outcome};
+use common::desk::Desk;
+use common::processes::{carrying_out, signal, wait_until};
+use common::{Running, program, succeed};
+use serde_json::Value;
+use tempfile::TempDir;
+
+const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
+
+fn write(small: &Small, more: &str) -> TempDir {
+    let directory = tempfile::tempdir().unwrap();
+    let path = small.write(directory.path());
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(path, text + more).unwrap();
+    directory
+}
+
+fn change(directory: &Path, from: &str, to: &str) {
+    let path = directory.join("campaign.toml");
+    let text = fs::read_to_string(&path).unwrap();
+    assert!(text.contains(from), "no {from}");
+    fs::write(path, text.replacen(from, to, 1)).unwrap();
+}
+
+fn status(directory: &Path) -> Value {
+    serde_json::from_str(&succeed(directory, ["status", "here", "--json"])).unwrap()
+}
+
+/// States of the biased walks.
+fn walks(status: &Value) -> Vec<(String, String)> {
+    let biased = status["walks"].as_array().unwrap().iter().filter(|walk| walk["origin"] == "biased");
+    let text = |value: &Value| value.as_str().unwrap().to_owned();
+    biased.map(|walk| (text(&walk["state"]), text(&walk["reason"]))).collect()
+}
+
+/// A campaign without budgets.
+fn undisturbed(small: &Small) -> Outcome {
+    let directory = write(small, "");
+    succeed(directory.path(), RUN);
+    outcome(&directory.path().join("here"))
+}
+
+fn decisions(directory: &Path) -> Vec<String> {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let text = runtime.block_on(async {
+        let store = store::Store::open_read_only(&directory.join("here")).await.unwrap();
+        store.decision_log_text().await.unwrap()
+    });
+    text.lines().map(str::to_owned).collect()
+}
+
+#[test]
+fn as_many_structures_are_collected_as_there_may_be_labels_for() {
+    // With its control frame a structure takes two.
+    let small = Small { walks_per_round: 1, ..Small::default() };
+    let directory = write(&small, "[budget]\nlabels = 5\n");
+    let here = directory.path();
+    let summary = succeed(here, RUN);
+    assert!(
+        summary.contains("budget           labels 4 of 5; walks were ended by budget.labels"),
+        "{summary}"
+    );
+    let ended = status(here);
+    assert_eq!((&ended["candidates"]["accepted"], &ended["labels"]["labelled"]), (&2.into(), &4.into()));
+    assert_eq!((&ended["finished"], &ended["budget"]["used_up"]), (&true.into(), &"budget.labels".into()));
+    let by_budget = ("budget".to_owned(), "budget.labels".to_owned());
+    assert!(walks(&ended).contains(&by_budget), "{ended}");
+    let shown = succeed(here, ["status", "here"]);
+    assert!(shown.contains("state       finished, since budget.labels is used up"), "{shown}");
+    // The same for another number of walkers.
+    let other = write(&Small { walkers: 1, ..small.clone() }, "[budget]\nlabels = 5\n");
+    succeed(other.path(), RUN);
+    assert_eq!(decisions(here), decisions(other.path()));
+
+    change(here, "labels = 5", "labels = 6");
+    succeed(here, RUN);
+    let more = status(here);
+    assert_eq!((&more["candidates"]["accepted"], &more["labels"]["labelled"]), (&3.into(), &6.into()));
+    change(here, "labels = 6", "");
+    succeed(here, RUN);
+    assert!(!walks(&status(here)).contains(&by_budget));
+    outcome(&here.join("here"));
+    succeed(here, ["replay", "here"]);
+}
+
+#[test]
+fn a_limit_of_time_stops_walks_where_they_stand() {
+    let small = Small { steps: 900, ..Small::default() };
+    let expected = undisturbed(&small);
+    let directory = write(&small, "[budget]\nwall_hours = 1e-6\n");
+    let here = directory.path();
+    let summary = succeed(here, RUN);
+    assert!(summary.contains("walks were ended by budget.wall_hours"), "{summary}");
+    let stopped = status(here);
+    assert_eq!(
+        (&stopped["finished"], &stopped["budget"]["used_up"]),
+        (&true.into(), &"budget.wall_hours".into())
+    );
+    assert!(
+        walks(&stopped)
+            .iter()
+            .all(|(state, reason)| (state.as_str(), reason.as_str()) == ("budget", "budget.wall_hours"))
+    );
+    assert!(stopped["budget"]["used"]["wall_hours"].as_f64() > Some(1e-6));
+    let so_far = decisions(here);
+    let all: Vec<_> = expected.decisions.lines().map(str::to_owned).collect();
+    assert!(
+        so_far.len() < all.len() && so_far == all[..so_far.len()],
+        "the first decisions of the undisturbed campaign"
+    );
+    // Nothing is begun as long as nothing is left.
+    succeed(here, RUN);
+    assert_eq!(decisions(here), so_far);
+    change(here, "wall_hours = 1e-6", "wall_hours = 10.0");
+    succeed(here, RUN);
+    assert_eq!(outcome(&here.join("here")), expected);
+}
+
+#[test]
+fn labels_beyond_the_core_hours_are_not_begun() {
+    for in_process in [false, true] {
+        let directory = write(&Small { mode: "live", ..Small::default() }, "[budget]\ncore_hours = 1e-9\n");
+        let here = directory.path();
+        let run: Vec<_> = RUN.into_iter().chain(in_process.then_some("--in-process")).collect();
+        let summary = succeed(here, &run);
+        assert!(summary.contains("walks were ended by budget.core_hours"), "{summary}");
+        let stopped = status(here);
+        assert_eq!((&stopped["finished"], &stopped["labels"]["leased"]), (&true.into(), &0.into()));
+        // One, or two if the first took no whole millisecond.
+        assert!((1..=2).contains(&stopped["labels"]["labelled"].as_u64().unwrap()), "{stopped}");
+        change(here, "core_hours = 1e-9", "core_hours = 10");
+        succeed(here, &run);
+        outcome(&here.join("here"));
+        let done = status(here);
+        assert_eq!((&done["budget"]["used_up"], &done["labels"]["queued"]), (&Value::Null, &0.into()));
+    }
+}
+
+#[test]
+fn a_long_queue_raises_the_threshold_and_the_log_can_be_replayed() {
+    let directory = write(&Small { mode: "live", steps: 2000, ..Small::default() }, "");
+    let here = directory.path();
+    change(here, "[run]", "queue_limit = 4\nqueue_full = \"raise\"\n[run]");
+    let run = program(here).args(RUN).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let mut run = Running(run);
+    // While nobody makes labels the queue only grows.
+    wait_until("a labeller is at work", || !carrying_out(here, "labeller").is_empty());
+    let labellers = carrying_out(here, "labeller");
+    labellers.iter().for_each(|pid| signal(*pid, "STOP"));
+    let raised = || decisions(here).into_iter().filter(|line| line.contains("\"raised_by\"")).count();
+    wait_until("the threshold is raised", || here.join("here/campaign.sqlite").exists() && raised() > 0);
+    labellers.iter().for_each(|pid| signal(*pid, "CONT"));
+    assert!(run.0.wait().unwrap().success());
+    outcome(&here.join("here"));
+    let report: Value = serde_json::from_str(&succeed(here, ["replay", "here", "--json"])).unwrap();
+    assert_eq!((&report["difference"], &report["same_mixture"]), (&Value::Null, &true.into()), "{report}");
+}
+
+#[test]
+fn wrong_budgets_and_queues_are_refused() {
+    let desk = Desk::new();
+    desk.refused_with(
+        "# labels = 1000",
+        "labels = 1",
+        &["budget.labels is 1; expected at least 2: a structure and its control"],
+    );
+    desk.refused_with("# labels = 1000", "labels = 0", &["expected a whole number above 0"]);
+    desk.refused_with("# wall_hours = 24.0", "wall_hours = -1.0", &["expected a finite number above 0"]);
+    desk.refused_with("# core_hours = 100.0", "core_hour = 100.0", &["did you mean `core_hours`?"]);
+    desk.refused_with(
+        "# queue_full = \"wait\"",
+        "queue_full = \"raise\"",
+        &["label.queue_full is \"raise\"; expected \"wait\", or mode = \"live\"", "how fast labels are made"],
+    );
+}
