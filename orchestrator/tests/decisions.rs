@@ -197,18 +197,20 @@ fn walks_that_ended_by_a_budget_go_on_when_it_grows() {
     let mut selector = common::restore(&limited, 2, Snapshot::default());
     let mut walks = std::collections::BTreeMap::new();
     let mut keep = |commit: &Commit| walks.extend(commit.walks.iter().map(|walk| (walk.walk, walk.clone())));
-    keep(&selector.begin_walks());
+    let begun = selector.begin_walks();
+    keep(&begun);
     let commit = next_candidate(&mut selector, 5, 1, NEW);
     assert_eq!(kinds(&commit), ["accepted", "ended", "ended", "begun"]);
     keep(&commit);
-    let stored = Snapshot { walks: walks.values().cloned().collect(), ..Snapshot::default() };
+    let walks = walks.values().cloned().collect();
+    let stored = Snapshot { walks, values: begun.values, ..Snapshot::default() };
     // With the same budget nothing goes on but the control walk.
     let mut same = common::restore(&limited, 2, stored.clone());
     assert!(same.begin_walks().decisions.is_empty());
     assert_eq!(turn(&mut same).walk, wire::WalkId(2));
     // With a larger one both walks do, from where they stood, and only what is new gets another control.
     let mut larger = common::restore(&Settings { total: Some(2), ..limited }, 2, stored);
-    assert_eq!(kinds(&larger.begin_walks()), ["resumed", "resumed"]);
+    assert_eq!(kinds(&larger.begin_walks()), ["configuration", "resumed", "resumed"]);
     let assignment = turn(&mut larger);
     assert_eq!((assignment.turn, assignment.verdict.clone()), (1, Some(Verdict::Accepted)));
     let report = offer(&larger, &assignment, 9, structure(2, SHORTEST), NEW);

@@ -28,7 +28,7 @@ pub enum ReplayError {
         /// Number of the decision.
         sequence: i64,
         /// Why.
-        source: SelectorError,
+        source: Box<SelectorError>,
     },
     /// A log that no selector wrote.
     #[error("decision {sequence} ({kind}): {problem}: the database is damaged; restore it from a copy")]
@@ -42,7 +42,7 @@ pub enum ReplayError {
     },
     /// The settings do not go with the campaign.
     #[error(transparent)]
-    Settings(SelectorError),
+    Settings(Box<SelectorError>),
 }
 
 /// What comes of a place of the log now.
@@ -80,7 +80,7 @@ impl Replay {
         imported: Vec<ContentHash>,
     ) -> Result<Self, ReplayError> {
         let judge = Judge::restore(settings, &seeds, grader, original, training, Snapshot::default());
-        let judge = judge.map_err(ReplayError::Settings)?;
+        let judge = judge.map_err(|source| ReplayError::Settings(Box::new(source)))?;
         Ok(Self { judge, seeds, imported, set, ended: None, cut_short: 0 })
     }
 
@@ -151,7 +151,10 @@ impl Replay {
             true => self.judge.decide_candidate(id, examined, &mut commit),
             false => self.judge.keep_control_frame(id, examined, &mut commit),
         };
-        decided.map_err(|source| ReplayError::Selector { sequence: recorded.sequence, source })?;
+        decided.map_err(|source| ReplayError::Selector {
+            sequence: recorded.sequence,
+            source: Box::new(source),
+        })?;
         let mut decisions = commit.decisions.into_iter();
         let decision = decisions.next();
         self.ended = decisions.next();
@@ -261,7 +264,7 @@ impl Replay {
         stored: &[ComponentRecord],
     ) -> Result<Option<(usize, usize)>, ReplayError> {
         let stored = restored_mixture(&self.judge.examiner.original, version, stored);
-        let stored = stored.map_err(ReplayError::Settings)?;
+        let stored = stored.map_err(|source| ReplayError::Settings(Box::new(source)))?;
         let mut places = self.judge.mixture.iter().zip(stored.iter());
         let other = places.find(|((.., now), (.., stored))| now.to_bytes() != stored.to_bytes());
         Ok(other.map(|((element, slot, _), _)| (element, slot)))
