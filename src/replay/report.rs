@@ -256,5 +256,6 @@ fn first_difference(path: &str, before: &Value, now: &Value) -> Option<(String, 
         let mut keys = keys.map(|key| (key, old.get(key).unwrap_or(&null), new.get(key).unwrap_or(&null)));
         return keys.find_map(|(key, old, new)| first_difference(&format!("{path}.{key}"), old, new));
     }
-    (before.to_string() != now.to_string()).then(|| (path.to_owned(), before.clone(), now.clone()))
+    let [old, new] = [before, now].map(Value::to_string);
+    (old != new).then(|| (path.to_owned(), before.clone(), now.clone()))
 }
