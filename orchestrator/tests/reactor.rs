@@ -249,7 +249,7 @@ async fn walkers_go_on_with_a_raised_threshold_until_the_queue_is_twice_as_long(
     }
     assert_eq!(running.await.unwrap(), Ended::Done);
     walker.join().unwrap();
-    let raised = raised.lock().unwrap();
+    let raised = raised.lock().unwrap().clone();
     assert!(times > 0 && raised.contains(&1.0), "{raised:?}");
     assert!(
         raised.iter().any(|factor| *factor > 1.0) && raised.iter().all(|factor| *factor <= 2.0),
