@@ -15,6 +15,9 @@ use crate::setup::MethodSetup;
 /// The key of the configuration that names the file of a reference potential.
 pub const REFERENCE_FILE: &str = "label.method.reference.file";
 
+/// Under which name the leader says in the store where those files are.
+pub const LABEL_FILES: &str = "label_files";
+
 /// Where the files are that labels are made with: the key of the configuration and the path.
 pub type LabelFiles = BTreeMap<String, PathBuf>;
 
@@ -93,7 +96,7 @@ impl Labelling {
                  or name the campaign that you mean"
             )));
         }
-        let places = store.label_files().await?.unwrap_or_default();
+        let places = store.note(LABEL_FILES).await?.unwrap_or_default();
         let places: LabelFiles = serde_json::from_str(&places).unwrap_or_default();
         let files = Files { hashes: &hashes, places: &places, given: &given_files(given)? };
         let method = match label.method {

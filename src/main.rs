@@ -6,6 +6,7 @@ mod budget;
 mod campaign;
 mod cli;
 mod config;
+mod forecast;
 mod frames;
 mod interrupt;
 mod labelling;

@@ -1,4 +1,4 @@
-//! `calmwalk label`: labellers that nobody's run starts. The same tests on PostgreSQL are in `postgres_label.rs`.
+//! `calmwalk label`: labellers that nobody's run starts. The same tests on PostgreSQL are in `postgres_whole.rs`.
 
 mod common;
 

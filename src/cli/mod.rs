@@ -14,14 +14,15 @@ mod queue;
 mod replay;
 mod run;
 mod status;
+mod store;
 mod validate;
 mod walker;
 
 use std::future::Future;
 use std::path::PathBuf;
 
+use ::store::Location;
 use clap::{Parser, Subcommand};
-use store::Location;
 
 use crate::outcome::{Ended, Failure};
 
@@ -51,6 +52,7 @@ enum Command {
     #[command(subcommand)]
     Calm(calm::Calm),
     Import(import::Import),
+    Store(store::StoreCommand),
     Md(md::Md),
     Clean(clean::Clean),
     #[command(hide = true)]
@@ -74,6 +76,7 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Replay(command) => command.run(),
         Command::Calm(command) => command.run(),
         Command::Import(command) => command.run(),
+        Command::Store(command) => command.run(),
         Command::Md(command) => command.run(),
         Command::Clean(command) => command.run(),
         Command::Walker(command) => command.run(),

@@ -19,6 +19,8 @@ use super::{Ended, Failure, block_on};
 use crate::actors::{self, budget, in_process, processes};
 use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
+use crate::forecast::{self, Forecast, megabytes};
+use crate::labelling::LABEL_FILES;
 use crate::output::{print, say};
 use crate::summary;
 
@@ -101,6 +103,9 @@ async fn run(
     let lock = lock::server(location, patience).await?;
     let store = open_store(campaign, location).await?;
     let store = lock.iter().fold(store, Store::led_by);
+    if let Location::Directory(directory) = &location {
+        warn_of_the_disk(campaign, directory, &store).await?;
+    }
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
     if campaign.config.label.slots == 0 {
@@ -181,17 +186,41 @@ async fn open_store(campaign: &Campaign, location: &Location) -> Result<Store, F
         }
         opened => {
             let store = opened?;
-            go_on(campaign, &resolved, &store, now).await?;
+            go_on(campaign, &resolved, &store, location, now).await?;
             store
         }
     };
     store.set_budget(&campaign.config.budget()).await?;
     store.set_grade_files(&campaign.grade_files()).await?;
-    let files = serde_json::to_string(&campaign.label_files().map_err(Failure::failed)?);
-    store.set_label_files(&files.map_err(Failure::failed)?).await?;
+    leave_notes(campaign, &store).await?;
     // Labellers that wait for the campaign begin with its protocol.
     store.add_protocol(&campaign.protocol, now).await?;
     Ok(store)
+}
+
+/// Says in the store what others do not know: where files are, and how much disk is needed.
+async fn leave_notes(campaign: &Campaign, store: &Store) -> Result<(), Failure> {
+    let text = |note: serde_json::Result<String>| note.map_err(Failure::failed);
+    let files = campaign.label_files().map_err(Failure::failed)?;
+    store.leave_note(LABEL_FILES, &text(serde_json::to_string(&files))?).await?;
+    store.leave_note(forecast::NOTE, &text(serde_json::to_string(&Forecast::of(campaign)))?).await?;
+    Ok(())
+}
+
+/// A campaign that will not have room on its disk is better stopped now.
+async fn warn_of_the_disk(campaign: &Campaign, directory: &Path, store: &Store) -> Result<(), Failure> {
+    let forecast = Forecast::of(campaign);
+    let needed = (forecast.bytes() + forecast::LOG).saturating_sub(store.size().await?);
+    let free = store::free_space(directory)?;
+    if free < needed {
+        say(format_args!(
+            "WARNING: the campaign will take {} more on the disk of {}, where {} are free (forecast: {forecast})",
+            megabytes(needed),
+            directory.display(),
+            megabytes(free)
+        ));
+    }
+    Ok(())
 }
 
 /// Checks that the campaign in the store is this one, and applies what may have changed.
@@ -199,8 +228,13 @@ async fn go_on(
     campaign: &Campaign,
     resolved: &serde_json::Value,
     store: &Store,
+    location: &Location,
     now: i64,
 ) -> Result<(), Failure> {
+    let elsewhere = match location {
+        Location::Directory(_) => "with --directory",
+        Location::Server(_) => "in another schema, which ?schema=… in run.store names",
+    };
     let in_force = store.campaign().await?.configuration_in_force;
     let before = serde_json::from_str(&in_force).map_err(|error| {
         Failure::Failed(format!(
@@ -209,7 +243,7 @@ async fn go_on(
     })?;
     let changes = compare(&before, resolved).map_err(|refused| {
         let at = place(&campaign.path, &campaign.text, refused.key());
-        Failure::Input(format!("{at}: {refused}"))
+        Failure::Input(format!("{at}: {refused}, or start another campaign {elsewhere}"))
     })?;
     if changes.is_empty() {
         return Ok(());

@@ -12,6 +12,7 @@ use self::jobs::Jobs;
 use self::values::Values;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::budget;
+use crate::forecast::{self, Forecast, megabytes};
 use crate::output::{Table, decimals, print, print_json};
 
 /// Walks, and processes, shown unless all are asked for.
@@ -35,7 +36,7 @@ pub struct Status {
 impl Status {
     pub fn run(self) -> Result<Ended, Failure> {
         let location = self.location.get()?;
-        let (campaign, standing, values) = block_on(self.read(&location))??;
+        let (campaign, standing, values, disk) = block_on(self.read(&location))??;
         let jobs = block_on(Jobs::of(&location))?;
         if self.json {
             let mut json = serde_json::to_value(&standing).map_err(Failure::failed)?;
@@ -43,20 +44,24 @@ impl Status {
             json["mode"] = campaign.mode.clone().into();
             json["training_frames"] = values.training_frames();
             json["staleness"] = values.staleness();
+            json["disk"] = serde_json::to_value(&disk).map_err(Failure::failed)?;
             jobs.add_to(&mut json);
             print_json(&json)?;
         } else {
             print(|out| {
-                write_status(out, &campaign, &standing, &values, self.all)?;
+                write_status(out, &campaign, &standing, &values, &disk, self.all)?;
                 jobs.write(out, self.all)
             })?;
         }
         Ok(Ended::Done)
     }
 
-    async fn read(&self, location: &Location) -> Result<(store::Campaign, Standing, Values), Failure> {
+    async fn read(&self, location: &Location) -> Result<(store::Campaign, Standing, Values, Disk), Failure> {
         let store = Store::open_read_only(location).await?;
-        let read = (store.campaign().await?, store.status().await?, Values(store.values().await?));
+        let forecast = store.note(forecast::NOTE).await?;
+        let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
+        let disk = Disk { bytes: store.size().await?, forecast };
+        let read = (store.campaign().await?, store.status().await?, Values(store.values().await?), disk);
         store.close().await;
         Ok(read)
     }
@@ -67,6 +72,7 @@ fn write_status(
     campaign: &store::Campaign,
     status: &Standing,
     values: &Values,
+    disk: &Disk,
     all: bool,
 ) -> io::Result<()> {
     let walks = &status.walks;
@@ -86,8 +92,26 @@ fn write_status(
     if let Some(budget) = budget::shown(&status.budget) {
         writeln!(out, "budget      {budget}")?;
     }
+    write_disk(out, disk)?;
     write_walks(out, walks, all)?;
     processes::write(out, &status.processes, all)
+}
+
+/// What the store takes.
+#[derive(Debug, serde::Serialize)]
+struct Disk {
+    /// Now.
+    bytes: u64,
+    /// At the end, as the leader of the campaign last reckoned.
+    forecast: Option<Forecast>,
+}
+
+fn write_disk(out: &mut dyn Write, disk: &Disk) -> io::Result<()> {
+    let now = megabytes(disk.bytes);
+    match &disk.forecast {
+        Some(forecast) => writeln!(out, "disk        {now} now; {forecast}"),
+        None => writeln!(out, "disk        {now} now"),
+    }
 }
 
 fn write_candidates(out: &mut dyn Write, candidates: &Candidates) -> io::Result<()> {

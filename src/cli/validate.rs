@@ -7,6 +7,7 @@ use calm::Artifact;
 
 use super::{Ended, Failure};
 use crate::campaign::Campaign;
+use crate::forecast::Forecast;
 use crate::output::print;
 
 /// Check a configuration and every file that it names
@@ -42,5 +43,6 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()
         )?;
     }
     writeln!(out, "  seed structures  {}, of {least} to {most} atoms", seeds.len())?;
-    writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)
+    writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)?;
+    writeln!(out, "  disk             {}", Forecast::of(campaign))
 }

@@ -54,8 +54,7 @@ pub enum Change {
 pub enum Refused {
     /// A key that cannot change.
     #[error(
-        "{key} is {}, but this campaign began with {}: {}. Put the old value back, or start another campaign \
-         with --directory",
+        "{key} is {}, but this campaign began with {}: {}. Put the old value back",
         shown(after),
         shown(before),
         reason(key)
@@ -71,7 +70,7 @@ pub enum Refused {
     /// A file with other content.
     #[error(
         "{key}: the file has another content (BLAKE3 {after}) than when this campaign began ({before}): {OTHER_PHYSICS}. \
-         Put the old file back, or start another campaign with --directory"
+         Put the old file back"
     )]
     File {
         /// Dotted key of the configuration that names the file.
@@ -84,8 +83,7 @@ pub enum Refused {
     /// A seed structure that is gone or changed.
     #[error(
         "seeds.files: seed structure {number} is {after}, but this campaign has {before} there: seed structures can be \
-         added behind those that it has, but not changed, moved or taken away. Put it back, or start another campaign \
-         with --directory"
+         added behind those that it has, but not changed, moved or taken away. Put it back"
     )]
     SeedStructure {
         /// Its number, from 0.

@@ -31,6 +31,27 @@ pub enum StoreError {
         /// The database.
         path: PathBuf,
     },
+    /// A backup must not overwrite anything.
+    #[error("{path} exists already: a backup is a new directory; name another one, or remove it", path = path.display())]
+    BackupExists {
+        /// Where the backup was to be.
+        path: PathBuf,
+    },
+    /// Too little space to write the database anew.
+    #[error(
+        "{directory} has {} MB free, and writing the database anew takes {} MB there: make space, or let SQLITE_TMPDIR name a directory on another disk",
+        found / 1_000_000,
+        needed.div_ceil(1_000_000),
+        directory = directory.display()
+    )]
+    NoRoom {
+        /// The directory on the disk.
+        directory: PathBuf,
+        /// Bytes that are free.
+        found: u64,
+        /// Bytes that are needed.
+        needed: u64,
+    },
     /// Another campaign there already.
     #[error(
         "campaign {wanted} cannot begin in {location}, which holds campaign {found}: a schema holds one campaign; name another one with ?schema=… in the URL"

@@ -25,6 +25,13 @@ pub fn check_directory(directory: &Path) -> Result<()> {
     }
 }
 
+/// Bytes that this user may still write into `directory`.
+pub fn free_space(directory: &Path) -> Result<u64> {
+    let disk = rustix::fs::statvfs(directory)
+        .map_err(|error| StoreError::Directory { directory: directory.into(), source: error.into() })?;
+    Ok(disk.f_bavail.saturating_mul(disk.f_frsize))
+}
+
 #[cfg(target_os = "linux")]
 fn network_file_system_of(directory: &Path) -> rustix::io::Result<Option<String>> {
     // The type of the field differs between processors; the numbers have 32 bits.

@@ -4,8 +4,11 @@
 //! it. Every writing function is one transaction that is on the disk when the function returns, so any process
 //! may be killed at any time. No function reads a clock: `now` is ms since 1970, see [`unix_milliseconds`].
 
+mod backup;
 mod birth;
 mod budget;
+mod check;
+mod compact;
 mod database;
 mod encoding;
 mod error;
@@ -27,9 +30,10 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 pub use birth::process_birth;
 pub use budget::{Budget, BudgetStatus, BudgetUse};
+pub use check::Finding;
 pub use error::{Result, StoreError};
 pub use export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
-pub use filesystem::{check_directory, network_file_system};
+pub use filesystem::{check_directory, free_space, network_file_system};
 pub use jobs::{Attempt, Completed, Failed, Imported, Job, JobDetails, LabelRecord, LabelSource, Standing};
 pub use location::{Location, ServerUrl};
 pub use lock::{CampaignLock, LOCK};

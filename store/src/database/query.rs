@@ -59,17 +59,21 @@ impl Query {
     }
 
     pub async fn fetch_all<T: FromRow>(self, target: impl Into<Target<'_>>) -> Result<Vec<T>> {
-        let rows = match target.into() {
-            Target::Database(Database::Sqlite(file)) => self.fetch_sqlite(&file.readers).await?,
-            Target::Database(Database::Postgres(server)) => self.read_from(server).await?,
+        self.rows(target).await?.iter().map(T::from_row).collect()
+    }
+
+    /// What it finds, as it is.
+    pub async fn rows(self, target: impl Into<Target<'_>>) -> Result<Vec<Row>> {
+        match target.into() {
+            Target::Database(Database::Sqlite(file)) => self.fetch_sqlite(&file.readers).await,
+            Target::Database(Database::Postgres(server)) => self.read_from(server).await,
             Target::Transaction(Transaction::Sqlite(transaction)) => {
-                self.fetch_sqlite(&mut **transaction).await?
+                self.fetch_sqlite(&mut **transaction).await
             }
             Target::Transaction(Transaction::Postgres(transaction, _)) => {
-                self.fetch_postgres(&mut **transaction).await?
+                self.fetch_postgres(&mut **transaction).await
             }
-        };
-        rows.iter().map(T::from_row).collect()
+        }
     }
 
     /// The first row, if there is one: queries that are asked for one find no more.

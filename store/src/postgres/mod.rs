@@ -159,6 +159,27 @@ impl Server {
         }
     }
 
+    /// Bytes of the tables with their indexes and long columns.
+    pub async fn size(&self) -> Result<u64> {
+        let sql =
+            "SELECT CAST(coalesce(sum(pg_total_relation_size(pg_class.oid)), 0) AS BIGINT) FROM pg_class
+                   JOIN pg_namespace ON pg_namespace.oid = relnamespace
+                   WHERE nspname = current_schema() AND relkind = 'r'";
+        query(sql).fetch_one(&Database::Postgres(self.clone())).await
+    }
+
+    /// Writes every table of the campaign anew.
+    pub async fn compact(&self) -> Result<()> {
+        let mut connection = self.connection().await?;
+        let sql = "SELECT tablename::TEXT FROM pg_tables WHERE schemaname = current_schema() ORDER BY 1";
+        let tables: Vec<String> = sqlx::query_scalar(sql).fetch_all(&mut *connection).await?;
+        for table in tables {
+            let vacuum = AssertSqlSafe(format!("VACUUM (FULL, ANALYZE) \"{table}\""));
+            connection.execute(vacuum).await?;
+        }
+        Ok(())
+    }
+
     pub async fn wait_for_jobs(&self, longest: Duration) {
         self.jobs.wait(longest).await;
     }

@@ -21,6 +21,10 @@ impl InPlace {
         Ok(Self { path: path.into(), identity })
     }
 
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
     pub fn check(&self) -> Result<()> {
         match identity(&self.path) {
             Ok(found) if found == self.identity => Ok(()),

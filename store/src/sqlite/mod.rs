@@ -1,10 +1,12 @@
 //! The database in one SQLite file: making it and opening it.
 
 mod in_place;
+mod room;
 
 use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
+use std::pin::pin;
 use std::time::{Duration, Instant};
 
 use sqlx::migrate::Migrator;
@@ -34,6 +36,8 @@ const READERS: u32 = 4;
 const MIGRATION_TRIES: u32 = 50;
 /// Between two tries to open a database.
 const OPENING_PAUSE: Duration = Duration::from_millis(20);
+/// Between two looks at how far a copy is.
+const LOOK: Duration = Duration::from_millis(200);
 /// Bytes of a page of a new database. A candidate with features is some 100 kB, and every page has its price; with
 /// larger ones short rows would cost too much.
 const PAGE: u32 = 1 << 14;
@@ -131,10 +135,49 @@ impl DatabaseFile {
 
     /// Moves the write-ahead log into the database: it bears the database's name and would be lost under another.
     /// Closing does the same, but says nothing when the disk is full.
-    async fn empty_log(&self) -> Result<()> {
-        let checkpoint = sqlx::query_as("PRAGMA wal_checkpoint(TRUNCATE)").fetch_one(&self.readers);
+    pub async fn empty_log(&self) -> Result<()> {
+        let writer = self.writer.as_ref().ok_or(StoreError::ReadOnly)?;
+        let checkpoint = sqlx::query_as("PRAGMA wal_checkpoint(TRUNCATE)").fetch_one(writer);
         let (busy, _, _): (bool, i64, i64) = checkpoint.await?;
         if busy { Err(StoreError::Busy) } else { Ok(()) }
+    }
+
+    /// Copies the database as it is at one instant into another directory, which has none. `tell` hears how many bytes of how
+    /// many, about, are written. The copy is not yet known to be on the disk.
+    pub async fn copy_into(&self, directory: &Path, mut tell: impl FnMut(u64, u64)) -> Result<()> {
+        let (unfinished, path) = (directory.join(UNFINISHED), directory.join(DATABASE));
+        let failed = |source| StoreError::File { path: path.clone(), source };
+        let all = self.size()?;
+        let copy = sqlx::query("VACUUM INTO $1").bind(unfinished.to_string_lossy().into_owned());
+        let mut copying = pin!(copy.execute(&self.readers));
+        loop {
+            tokio::select! {
+                copied = &mut copying => break copied.map(drop)?,
+                () = tokio::time::sleep(LOOK) => {
+                    tell(fs::metadata(&unfinished).map_or(0, |file| file.len()).min(all), all);
+                }
+            }
+        }
+        fs::rename(&unfinished, &path).map_err(failed)
+    }
+
+    /// Bytes of the database and its log.
+    pub fn size(&self) -> Result<u64> {
+        let path = self.file.path();
+        let log = path.with_file_name(format!("{DATABASE}-wal"));
+        let size = |path: &Path| fs::metadata(path).map(|file| file.len());
+        let database = size(path).map_err(|source| StoreError::File { path: path.into(), source })?;
+        Ok(database + size(&log).unwrap_or(0))
+    }
+
+    /// Writes the database anew without gaps, which takes room for two more of it: in the directory for temporary files,
+    /// and in the log.
+    pub async fn compact(&self) -> Result<()> {
+        let writer = self.writer.as_ref().ok_or(StoreError::ReadOnly)?;
+        self.file.check()?;
+        room::check(self.file.path(), self.size()?)?;
+        sqlx::query("VACUUM").execute(writer).await?;
+        self.empty_log().await
     }
 
     /// A transaction that has the right to write from its first statement on: one that asked for it later could be

@@ -201,7 +201,7 @@ impl LabelRow {
 }
 
 /// A label from its columns.
-pub(super) fn decode_label(energy: f64, forces: &[u8], stress: Option<&[u8]>) -> Result<Label> {
+pub(crate) fn decode_label(energy: f64, forces: &[u8], stress: Option<&[u8]>) -> Result<Label> {
     let damaged = || StoreError::damaged("a label", "its forces or stress have a wrong length");
     Ok(Label {
         energy,

@@ -91,7 +91,7 @@ fn write_line(text: &mut String, row: &Row) {
     );
 }
 
-pub(super) async fn insert_operation(
+pub(crate) async fn insert_operation(
     transaction: &mut Transaction,
     now: i64,
     kind: &str,

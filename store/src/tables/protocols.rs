@@ -85,19 +85,19 @@ impl Store {
         transaction.commit().await
     }
 
-    /// Where the leader of the campaign has the files that its labels are made with, as it last said; JSON.
-    pub async fn label_files(&self) -> Result<Option<String>> {
-        let files = query("SELECT value FROM campaign WHERE key = 'label_files'");
-        files.fetch_optional(&self.database).await
+    /// What the leader of the campaign last left for others under that name.
+    pub async fn note(&self, name: &str) -> Result<Option<String>> {
+        let note = query("SELECT value FROM campaign WHERE key = $1").bind(format!("note/{name}"));
+        note.fetch_optional(&self.database).await
     }
 
-    /// Says where they are now.
-    pub async fn set_label_files(&self, files: &str) -> Result<()> {
-        if self.label_files().await?.as_deref() == Some(files) {
+    /// Leaves something for others.
+    pub async fn leave_note(&self, name: &str, note: &str) -> Result<()> {
+        if self.note(name).await?.as_deref() == Some(note) {
             return Ok(());
         }
         let mut transaction = self.database.begin_to_lead().await?;
-        set_campaign_value(&mut transaction, "label_files", files).await?;
+        set_campaign_value(&mut transaction, &format!("note/{name}"), note).await?;
         transaction.commit().await
     }
 

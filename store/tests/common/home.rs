@@ -3,6 +3,7 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use sqlx::postgres::PgConnectOptions;
+use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions, Executor};
 use store::{Location, Store};
 use tempfile::TempDir;
@@ -40,6 +41,19 @@ impl Home {
                 url.parse().unwrap()
             }
             None => self.directory.path().into(),
+        }
+    }
+
+    /// Does something to the tables behind the back of the program.
+    pub async fn execute(&self, sql: &'static str) {
+        if let Some(schema) = &self.schema {
+            let options: PgConnectOptions = server().parse().unwrap();
+            let options = options.options([("search_path", schema.as_str())]);
+            options.connect().await.unwrap().execute(sql).await.unwrap();
+        } else {
+            let path = self.directory.path().join(store::DATABASE);
+            let options = SqliteConnectOptions::new().filename(path).foreign_keys(false);
+            options.connect().await.unwrap().execute(sql).await.unwrap();
         }
     }
 

@@ -6,8 +6,12 @@
     reason = "files that are tests by themselves, on SQLite, each bring what is common"
 )]
 
+#[path = "../backup.rs"]
+mod backup;
 #[path = "../campaign.rs"]
 mod campaign;
+#[path = "../check.rs"]
+mod check;
 #[path = "../common/mod.rs"]
 mod common;
 mod leading;

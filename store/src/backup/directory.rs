@@ -1,0 +1,65 @@
+//! A directory that gets its name when it is complete.
+
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{CWD, RenameFlags, renameat_with};
+
+use crate::error::{Result, StoreError};
+use crate::filesystem::check_directory;
+
+/// A directory beside the one that it is to be, under another name. Dropped before it is published, it is removed.
+pub(super) struct Unfinished {
+    path: PathBuf,
+}
+
+impl Unfinished {
+    /// Makes it. What a killed process left under that name is removed.
+    pub fn beside(target: &Path) -> Result<Self> {
+        if target.symlink_metadata().is_ok() {
+            return Err(StoreError::BackupExists { path: target.into() });
+        }
+        let failed = |source| StoreError::Directory { directory: target.into(), source };
+        let name = target.file_name().ok_or_else(|| failed(io::ErrorKind::InvalidFilename.into()))?;
+        let parent = parent(target);
+        check_directory(parent)?;
+        let path = parent.join(format!(".{}.unfinished-backup", name.to_string_lossy()));
+        match fs::remove_dir_all(&path) {
+            Err(source) if source.kind() != io::ErrorKind::NotFound => return Err(failed(source)),
+            _ => {}
+        }
+        fs::create_dir(&path).map_err(failed)?;
+        Ok(Self { path })
+    }
+
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Gives it its name, if nobody else has taken that meanwhile.
+    pub fn publish(self, target: &Path) -> Result<()> {
+        let failed = |source: io::Error| StoreError::File { path: target.into(), source };
+        for entry in fs::read_dir(&self.path).map_err(failed)? {
+            File::open(entry.map_err(failed)?.path()).and_then(|file| file.sync_all()).map_err(failed)?;
+        }
+        File::open(&self.path).and_then(|directory| directory.sync_all()).map_err(failed)?;
+        let renamed = renameat_with(CWD, &self.path, CWD, target, RenameFlags::NOREPLACE);
+        renamed.map_err(|error| match error {
+            rustix::io::Errno::EXIST => StoreError::BackupExists { path: target.into() },
+            error => failed(error.into()),
+        })?;
+        File::open(parent(target)).and_then(|directory| directory.sync_all()).map_err(failed)
+    }
+}
+
+impl Drop for Unfinished {
+    fn drop(&mut self) {
+        // Under its own name no more, once it is published.
+        let _ = fs::remove_dir_all(&self.path);
+    }
+}
+
+fn parent(path: &Path) -> &Path {
+    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}

@@ -1,0 +1,158 @@
+//! From the tables of a server into those of a file, in one transaction that sees everything at one instant.
+
+use std::path::Path;
+
+use sqlx::{AssertSqlSafe, Executor, Postgres};
+
+use crate::database::{Database, Row, Transaction, Value, for_rows, query};
+use crate::error::{Result, StoreError};
+use crate::postgres::Server;
+use crate::sqlite::DatabaseFile;
+
+/// Rows that are on their way at a time: a row of a large structure has megabytes.
+const PAGE: usize = 64;
+/// Pages in a transaction of the copy.
+const PAGES: usize = 32;
+
+/// The types of columns: whole numbers, numbers, text, bytes.
+#[derive(Clone, Copy)]
+enum Kind {
+    I,
+    R,
+    T,
+    B,
+}
+use Kind::{B, I, R, T};
+
+struct Table {
+    name: &'static str,
+    columns: &'static [&'static str],
+    kinds: &'static [Kind],
+    insert: &'static str,
+    fetch: &'static str,
+}
+
+/// One of the tables, with the types of its columns.
+macro_rules! table {
+    ($name:literal { $($column:ident: $kind:ident),* $(,)? }) => {
+        Table {
+            name: $name,
+            columns: &[$(stringify!($column)),*],
+            kinds: &[$($kind),*],
+            insert: concat!("INSERT INTO ", $name, " ({columns}) SELECT * FROM {rows}"),
+            fetch: concat!("FETCH 64 FROM copy_of_", $name),
+        }
+    };
+}
+
+/// Every table but those of the leader and of processes, each after those that it refers to.
+const TABLES: [Table; 14] = [
+    table!("campaign" { key: T, value: T }),
+    table!("value" { name: T, value: T }),
+    table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B }),
+    table!("seed_structure" { seed: I, name: T, source: T, structure: I }),
+    table!("protocol" { number: I, hash: B, name: T, settings: T }),
+    table!("decision" {
+        sequence: I, round: I, kind: T, walk: I, candidate: T, mixture_version: I, detail: T,
+    }),
+    table!("candidate" {
+        decision: I, id: T, content: B, structure: I, walk: I, segment: I, step: I, seed_structure: I, origin: T,
+        fate: T, reason: T, mixture_version: I, atoms: I, formula: T, temperature: R, relative_volume: R, energy: R,
+        walker_gamma: R, walker_gamma_nbr: R, walker_above: I, selector_gamma: R, selector_gamma_nbr: R,
+        selector_above: I, original_gamma: R, original_gamma_nbr: R, original_above: I,
+    }),
+    table!("candidate_data" { decision: I, block: B, features: B, selector_grades: B, original_grades: B }),
+    table!("component" { element: I, slot: I, bytes: B }),
+    table!("walk" {
+        walk: I, origin: T, partner: I, seed_structure: I, state: T, reason: T, turn: I, accepted: I, step: I,
+        segment: I, tau: R, temperature: R, relative_volume: R, gamma_max: R, refused: I, returns: I,
+        selector_state: T, checkpoint: B,
+    }),
+    table!("job" {
+        number: I, structure: I, protocol: I, decision: I, state: T, priority: I, holder: T, expires: I, attempts: I,
+        failures: I,
+    }),
+    table!("attempt" {
+        job: I, attempt: I, holder: T, calculation: T, started: I, ended: I, outcome: T, class: T, log: T,
+    }),
+    table!("label" {
+        number: I, structure: I, protocol: I, standing: T, energy: R, forces: B, stress: B, job: I, attempt: I,
+        file: T, frame: I, correction: T, received: I,
+    }),
+    table!("import" { number: I, structure: I, file: T, frame: I }),
+];
+const OPERATIONS: Table = table!("operation" { number: I, time: I, kind: T, detail: T });
+
+/// Makes the copy in a directory.
+pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut(u64, u64)) -> Result<()> {
+    let mut from = server.begin_to_read().await?;
+    let tables = || TABLES.iter().chain([&OPERATIONS]);
+    let mut all = 0;
+    for table in tables() {
+        all += count(&mut from, table).await?;
+    }
+    let mut copied = 0;
+    let fill = async |into: &Database| {
+        for table in tables() {
+            copy_table(&mut from, into, table, |rows| {
+                copied += rows;
+                tell(copied, all);
+            })
+            .await?;
+        }
+        Ok(())
+    };
+    DatabaseFile::create(directory, fill).await?.close().await;
+    Ok(())
+}
+
+async fn count(from: &mut Transaction, table: &Table) -> Result<u64> {
+    let sql = format!("SELECT count(*) FROM {}", table.name);
+    let count: i64 = sqlx::query_scalar(AssertSqlSafe(sql)).fetch_one(&mut **postgres(from)?).await?;
+    Ok(count.unsigned_abs())
+}
+
+async fn copy_table(
+    from: &mut Transaction,
+    into: &Database,
+    table: &Table,
+    mut told: impl FnMut(u64),
+) -> Result<()> {
+    let Table { name, columns, .. } = table;
+    let cursor =
+        format!("DECLARE copy_of_{name} NO SCROLL CURSOR FOR SELECT {} FROM {name}", columns.join(", "));
+    postgres(from)?.execute(AssertSqlSafe(cursor)).await?;
+    loop {
+        let mut transaction = into.begin().await?;
+        for _ in 0..PAGES {
+            let page = query(table.fetch).rows(&mut *from).await?;
+            let (rows, end) = (page.len(), page.len() < PAGE);
+            let page = page.iter().map(|row| values(row, table.kinds)).collect::<Result<_>>()?;
+            for_rows(&mut transaction, table.insert, table.columns, page).await?;
+            told(rows as u64);
+            if end {
+                return transaction.commit().await;
+            }
+        }
+        transaction.commit().await?;
+    }
+}
+
+fn postgres(transaction: &mut Transaction) -> Result<&mut sqlx::Transaction<'static, Postgres>> {
+    match transaction {
+        Transaction::Postgres(transaction, _) => Ok(transaction),
+        Transaction::Sqlite(_) => Err(StoreError::Inconsistent("not a transaction of a server".into())),
+    }
+}
+
+fn values(row: &Row, kinds: &[Kind]) -> Result<Vec<Value>> {
+    let value = |(place, kind): (usize, &Kind)| {
+        Ok(match kind {
+            I => Value::Integer(row.get(place)?),
+            R => Value::Real(row.get(place)?),
+            T => Value::Text(row.get(place)?),
+            B => Value::Bytes(row.get(place)?),
+        })
+    };
+    kinds.iter().enumerate().map(value).collect()
+}

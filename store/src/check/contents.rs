@@ -1,0 +1,198 @@
+//! What stands in the long columns: structures, candidates, labels, texts of JSON.
+
+use wire::{CandidateBlock, ContentHash};
+
+use super::Finding;
+use crate::database::{FromRow, Transaction, from_columns, query};
+use crate::encoding::decode_structure;
+use crate::error::Result;
+use crate::numbers::decode_numbers;
+use crate::tables::labels::decode_label;
+
+/// Rows read at a time: a row of a large structure has megabytes.
+const PAGE: u32 = 16;
+/// Findings of a kind that are told one by one.
+const TOLD: usize = 5;
+
+const STRUCTURES: &str =
+    "SELECT number AS place, hash, data FROM structure WHERE number > $1 ORDER BY number LIMIT $2";
+
+const CANDIDATES: &str =
+    "SELECT candidate_data.decision AS place, id, content, block, features, selector_grades,
+        original_grades
+    FROM candidate_data JOIN candidate ON candidate.decision = candidate_data.decision
+    WHERE candidate_data.decision > $1 ORDER BY candidate_data.decision LIMIT $2";
+
+const LABELS: &str = "SELECT label.number AS place, atoms, energy, forces, stress
+    FROM label JOIN structure ON structure.number = label.structure
+    WHERE label.number > $1 ORDER BY label.number LIMIT $2";
+
+const DECISIONS: &str =
+    "SELECT sequence AS place, detail AS text FROM decision WHERE sequence > $1 ORDER BY sequence LIMIT $2";
+
+const PROTOCOLS: &str =
+    "SELECT number AS place, settings AS text FROM protocol WHERE number > $1 ORDER BY number LIMIT $2";
+
+const ROWS: &str = "SELECT (SELECT count(*) FROM structure) + (SELECT count(*) FROM candidate_data)
+    + (SELECT count(*) FROM label) + (SELECT count(*) FROM decision) + (SELECT count(*) FROM protocol)";
+
+struct Structure {
+    place: i64,
+    hash: Vec<u8>,
+    data: Vec<u8>,
+}
+
+struct Candidate {
+    place: i64,
+    id: String,
+    content: Vec<u8>,
+    block: Vec<u8>,
+    features: Option<Vec<u8>>,
+    selector_grades: Option<Vec<u8>>,
+    original_grades: Option<Vec<u8>>,
+}
+
+struct Label {
+    place: i64,
+    atoms: u64,
+    energy: f64,
+    forces: Vec<u8>,
+    stress: Option<Vec<u8>>,
+}
+
+struct Text {
+    place: i64,
+    text: String,
+}
+
+from_columns!(Structure { place, hash, data });
+from_columns!(Candidate { place, id, content, block, features, selector_grades, original_grades });
+from_columns!(Label { place, atoms, energy, forces, stress });
+from_columns!(Text { place, text });
+
+/// A row that can be looked into.
+trait Content: FromRow {
+    /// Where it stands in the order of the query.
+    fn place(&self) -> i64;
+    /// What is wrong with it.
+    fn fault(&self) -> Option<String>;
+}
+
+/// Looks into rows, and remembers what is wrong.
+pub(super) struct Contents<'a> {
+    transaction: &'a mut Transaction,
+    tell: &'a mut dyn FnMut(u64, u64),
+    read: u64,
+    all: u64,
+    findings: Vec<Finding>,
+}
+
+impl<'a> Contents<'a> {
+    pub async fn check(
+        transaction: &'a mut Transaction,
+        tell: &'a mut dyn FnMut(u64, u64),
+    ) -> Result<Vec<Finding>> {
+        let all = query(ROWS).fetch_one(&mut *transaction).await?;
+        let mut contents = Self { transaction, tell, read: 0, all, findings: Vec::new() };
+        contents.table::<Structure>("structure", STRUCTURES).await?;
+        contents.table::<Candidate>("candidate", CANDIDATES).await?;
+        contents.table::<Label>("label", LABELS).await?;
+        contents.table::<Text>("decision", DECISIONS).await?;
+        contents.table::<Text>("protocol", PROTOCOLS).await?;
+        Ok(contents.findings)
+    }
+
+    async fn table<C: Content>(&mut self, what: &str, sql: &'static str) -> Result<()> {
+        let (mut after, mut faults) = (0, Vec::new());
+        loop {
+            let page: Vec<C> = query(sql).bind(after).bind(PAGE).fetch_all(&mut *self.transaction).await?;
+            let Some(last) = page.last() else { break };
+            after = last.place();
+            self.read += page.len() as u64;
+            (self.tell)(self.read, self.all);
+            let of_page =
+                page.iter().filter_map(|row| Some(format!("{what} {}: {}", row.place(), row.fault()?)));
+            faults.extend(of_page);
+        }
+        let then = "its content is damaged; restore the campaign from a backup";
+        if faults.len() > TOLD {
+            let more = format!("{} more rows of the same table are like the following", faults.len() - TOLD);
+            self.findings.push(Finding { what: more, then });
+        }
+        self.findings.extend(faults.into_iter().take(TOLD).map(|what| Finding { what, then }));
+        Ok(())
+    }
+}
+
+impl Content for Structure {
+    fn place(&self) -> i64 {
+        self.place
+    }
+
+    fn fault(&self) -> Option<String> {
+        decode_structure(&self.data, &self.hash).err().map(|_| "it does not have its hash".to_owned())
+    }
+}
+
+impl Content for Candidate {
+    fn place(&self) -> i64 {
+        self.place
+    }
+
+    fn fault(&self) -> Option<String> {
+        let block = match CandidateBlock::from_bytes(&self.block) {
+            Ok(block) => block,
+            Err(error) => return Some(error.to_string()),
+        };
+        let view = block.view();
+        if view.id().to_string() != self.id || view.id().content.0 != *self.content {
+            return Some(format!("its block is that of {}", view.id()));
+        }
+        if ContentHash::of(&view.structure()) != view.id().content {
+            return Some("its structure does not have its hash".to_owned());
+        }
+        let n = view.numbers.len();
+        let numbers =
+            |what: &str, bytes: &Option<Vec<u8>>, fits: fn(usize, usize) -> bool| match decode_numbers(
+                bytes.as_deref()?,
+            ) {
+                Ok(numbers) if fits(numbers.len(), n) => None,
+                Ok(numbers) => Some(format!("{} {what} for {n} atoms", numbers.len())),
+                Err(error) => Some(format!("its {what}: {error}")),
+            };
+        let grades = |count, atoms| count == 2 * atoms;
+        numbers("features", &self.features, |count, atoms| atoms > 0 && count % atoms == 0)
+            .or_else(|| numbers("grades of the selector", &self.selector_grades, grades))
+            .or_else(|| numbers("original grades", &self.original_grades, grades))
+    }
+}
+
+impl Content for Label {
+    fn place(&self) -> i64 {
+        self.place
+    }
+
+    fn fault(&self) -> Option<String> {
+        let label = match decode_label(self.energy, &self.forces, self.stress.as_deref()) {
+            Ok(label) => label,
+            Err(error) => return Some(error.to_string()),
+        };
+        let stress = label.stress.iter().flatten();
+        let finite = label.forces.iter().chain(stress).flatten().all(|x| x.is_finite());
+        if label.forces.len() as u64 != self.atoms {
+            return Some(format!("{} forces for {} atoms", label.forces.len(), self.atoms));
+        }
+        (!finite || !label.energy.is_finite()).then(|| "it has numbers that are not finite".to_owned())
+    }
+}
+
+impl Content for Text {
+    fn place(&self) -> i64 {
+        self.place
+    }
+
+    fn fault(&self) -> Option<String> {
+        let parsed: serde_json::Result<serde_json::Value> = serde_json::from_str(&self.text);
+        parsed.err().map(|error| format!("its text is no JSON ({error})"))
+    }
+}

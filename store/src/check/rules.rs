@@ -1,0 +1,124 @@
+//! What holds between rows.
+
+use super::Finding;
+use crate::database::{Transaction, query};
+use crate::error::Result;
+use crate::processes::ProcessRecord;
+use crate::tables::processes::{LEASED, all};
+
+/// A query that counts what must not be, with an example.
+pub(super) struct Rule {
+    pub finds: &'static str,
+    pub what: &'static str,
+    pub then: &'static str,
+}
+
+const LOST: &str = "something was lost or changed by hand; restore the campaign from a backup";
+const QUEUE: &str =
+    "the label queue was changed by hand; calmwalk queue shows the jobs, and a backup has them whole";
+
+pub(super) const RULES: [Rule; 14] = [
+    Rule {
+        finds: "SELECT count(*), CAST(min(sequence) AS TEXT) FROM decision WHERE sequence > 1
+                AND NOT EXISTS (SELECT 1 FROM decision AS before WHERE before.sequence = decision.sequence - 1)",
+        what: "gaps in the decision log, before the decision",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(sequence) AS TEXT) FROM decision WHERE sequence < 1",
+        what: "decisions with numbers below 1",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), min(candidate) FROM decision WHERE candidate IS NOT NULL
+                AND NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.decision = decision.sequence)",
+        what: "decisions about candidates that are not there",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), min(id) FROM candidate JOIN decision ON sequence = decision
+                WHERE candidate.id IS DISTINCT FROM decision.candidate OR kind <>
+                CASE origin WHEN 'control' THEN 'control' ELSE fate END",
+        what: "candidates whose decision says something else",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), min(id) FROM candidate
+                WHERE NOT EXISTS (SELECT 1 FROM decision WHERE sequence = candidate.decision)",
+        what: "candidates without a decision",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), min(id) FROM candidate
+                WHERE NOT EXISTS (SELECT 1 FROM candidate_data WHERE candidate_data.decision = candidate.decision)",
+        what: "candidates without their structure and grades",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), min(id) FROM candidate JOIN structure ON structure.number = candidate.structure
+                WHERE content <> hash",
+        what: "candidates that lead to another structure than their own",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), min(id) FROM candidate WHERE structure IS NOT NULL
+                AND EXISTS (SELECT 1 FROM campaign WHERE key = 'protocol')
+                AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure)",
+        what: "accepted candidates without a label job",
+        then: "they will not be labelled; the next calmwalk run queues them",
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(walk.walk) AS TEXT) FROM walk WHERE accepted <>
+                (SELECT count(*) FROM candidate WHERE candidate.walk = walk.walk AND fate = 'accepted')",
+        what: "walks that count other accepted structures than there are",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), min(id) FROM candidate
+                WHERE NOT EXISTS (SELECT 1 FROM walk WHERE walk.walk = candidate.walk)",
+        what: "candidates of walks that are not there",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(label.number) AS TEXT) FROM label
+                LEFT JOIN job ON job.number = label.job
+                LEFT JOIN attempt ON attempt.job = label.job AND attempt.attempt = label.attempt
+                WHERE label.job IS NOT NULL AND (job.number IS NULL OR attempt.attempt IS NULL
+                OR job.structure <> label.structure OR job.protocol <> label.protocol)",
+        what: "labels that do not belong to their job",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(job.number) AS TEXT) FROM job WHERE (state = 'labelled') <> EXISTS (
+                SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
+                AND standing = 'label') AND state <> 'dropped'",
+        what: "jobs that are labelled without a label, or have one and are not",
+        then: QUEUE,
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job
+                WHERE attempts <> (SELECT coalesce(max(attempt), 0) FROM attempt WHERE attempt.job = job.number)
+                OR attempts <> (SELECT count(*) FROM attempt WHERE attempt.job = job.number)",
+        what: "jobs that count other attempts than there are",
+        then: QUEUE,
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(attempt.job) AS TEXT) FROM attempt JOIN job ON job.number = attempt.job
+                WHERE outcome IS NULL AND NOT (state = 'leased' AND attempt = attempts)",
+        what: "attempts that seem to be under way although nobody has the job",
+        then: QUEUE,
+    },
+];
+
+/// Leases of processes that do not exist any more.
+pub(super) async fn leases(transaction: &mut Transaction) -> Result<Vec<Finding>> {
+    let leased: Vec<(i64, String)> = query(LEASED).fetch_all(&mut *transaction).await?;
+    let mut living = all(transaction).await?;
+    living.retain(|process: &ProcessRecord| !process.is_gone());
+    let is_lost = |holder: &str| !living.iter().any(|process| process.is_holder(holder));
+    let lost: Vec<_> = leased.iter().filter(|(_, holder)| is_lost(holder)).collect();
+    let Some((job, holder)) = lost.first() else { return Ok(Vec::new()) };
+    let what =
+        format!("{} jobs are leased to processes that are gone (such as {job} to {holder})", lost.len());
+    Ok(vec![Finding { what, then: "the next calmwalk run, or calmwalk label, takes them back" }])
+}

@@ -1,0 +1,118 @@
+//! What `Store::check` finds, each in a campaign that is damaged in one way.
+
+#[path = "common/mod.rs"]
+mod common;
+
+use common::*;
+use store::{Commit, Decision, Fate, Finding, Store};
+use wire::Origin;
+use wire::messages::Decline;
+
+/// Two walks with a structure each, one of them labelled, a declined candidate and a decision about none.
+pub async fn whole(home: &Home) -> Store {
+    let store = home.create().await;
+    let records = vec![
+        candidate(0, 1, Origin::Biased, Fate::Accepted),
+        candidate(0, 2, Origin::Biased, Fate::Declined(Decline::Covered)),
+        candidate(1, 1, Origin::Control, Fate::Accepted),
+    ];
+    let mut commit = Commit { walks: vec![walk(0, 1), walk(1, 1)], ..commit_of(records) };
+    let ended = Decision { kind: "ended", candidate: None, ..commit.decisions[0].clone() };
+    commit.decisions.extend([ended.clone(), ended]);
+    store.commit(&commit).await.unwrap();
+    let lease = store.lease(protocol("dft").hash, "l", 0, 600).await.unwrap().unwrap();
+    store.complete(&lease, &label(-1.0), 1).await.unwrap();
+    store
+}
+
+async fn check(store: &Store) -> Vec<Finding> {
+    let mut rows = (0, 0);
+    let findings = store.check(|read, all| rows = (read, all)).await.unwrap();
+    assert!(rows.0 > 0 && (rows.0 == rows.1 || !findings.is_empty()), "{rows:?}");
+    findings
+}
+
+#[tokio::test]
+async fn nothing_is_found_in_a_whole_campaign() {
+    let home = Home::new();
+    assert_eq!(check(&whole(&home).await).await, []);
+    assert_eq!(check(&home.open_read_only().await).await, []);
+}
+
+#[tokio::test]
+async fn each_damage_is_found_and_told_in_words() {
+    for (damage, words) in [
+        (
+            "DELETE FROM decision WHERE sequence = 4",
+            "1 gaps in the decision log, before the decision (such as 5)",
+        ),
+        (
+            "UPDATE decision SET candidate = 'x' WHERE sequence = 1",
+            "1 candidates whose decision says something else",
+        ),
+        (
+            "UPDATE decision SET candidate = 'x' WHERE sequence = 5",
+            "1 decisions about candidates that are not there",
+        ),
+        (
+            "UPDATE decision SET kind = 'declined' WHERE sequence = 3",
+            "1 candidates whose decision says something else",
+        ),
+        ("DELETE FROM candidate_data WHERE decision = 2", "1 candidates without their structure and grades"),
+        ("UPDATE walk SET accepted = 7 WHERE walk = 0", "1 walks that count other accepted structures"),
+        ("DELETE FROM walk WHERE walk = 1", "1 candidates of walks that are not there"),
+        ("DELETE FROM job WHERE state = 'queued'", "1 accepted candidates without a label job"),
+        (
+            "UPDATE job SET state = 'queued'",
+            "1 jobs that are labelled without a label, or have one and are not",
+        ),
+        ("DELETE FROM label", "1 jobs that are labelled without a label, or have one and are not"),
+        ("DELETE FROM attempt", "1 labels that do not belong to their job"),
+        (
+            "UPDATE job SET attempts = 5 WHERE state = 'queued'",
+            "1 jobs that count other attempts than there are",
+        ),
+        (
+            "UPDATE attempt SET ended = NULL, outcome = NULL",
+            "1 attempts that seem to be under way although nobody has the job",
+        ),
+        (
+            "UPDATE structure SET data = substr(data, 1, 80) WHERE number = 2",
+            "structure 2: it does not have its hash",
+        ),
+        ("UPDATE candidate_data SET block = substr(block, 1, 300) WHERE decision = 1", "candidate 1: "),
+        (
+            "UPDATE candidate_data SET block = (SELECT block FROM candidate_data WHERE decision = 2) WHERE decision = 3",
+            "candidate 3: its block is that of 9f9f9f9f-0.0.2-",
+        ),
+        (
+            "UPDATE candidate_data SET features = substr(features, 1, 20) WHERE decision = 2",
+            "candidate 2: its features: ",
+        ),
+        ("UPDATE label SET forces = substr(forces, 1, 24)", "label 1: 1 forces for 2 atoms"),
+        ("UPDATE decision SET detail = '{' WHERE sequence = 5", "decision 5: its text is no JSON"),
+    ] {
+        let home = Home::new();
+        let store = whole(&home).await;
+        home.execute(damage).await;
+        let findings: Vec<_> = check(&store).await.iter().map(Finding::to_string).collect();
+        assert!(findings.iter().any(|finding| finding.starts_with(words)), "{damage}: {findings:#?}");
+        assert!(
+            findings.iter().all(|finding| finding.rsplit_once(": ").is_some_and(|(_, then)| then.len() > 20))
+        );
+    }
+}
+
+#[tokio::test]
+async fn leases_of_nobody_are_found() {
+    let home = Home::new();
+    let store = whole(&home).await;
+    store.lease(protocol("dft").hash, "nobody", 0, 600).await.unwrap().unwrap();
+    let found = check(&store).await;
+    assert_eq!(found.len(), 1, "{found:?}");
+    assert!(
+        found[0].to_string().contains("1 jobs are leased to processes that are gone (such as 2 to nobody)")
+    );
+    store.release_leases_of_gone_processes(1).await.unwrap();
+    assert_eq!(check(&store).await, []);
+}

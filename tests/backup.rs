@@ -1,0 +1,156 @@
+//! `calmwalk store`: copies of a campaign that is run, whole or not there. The same tests on PostgreSQL are in
+//! `postgres_whole.rs`.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
+
+use common::campaign::{Small, outcome, outcome_at};
+use common::place::{Place, on_store};
+use common::processes::{processes_in, wait_until};
+use common::{calmwalk, kills, random, refuse, stderr, succeed};
+use serde_json::Value;
+use store::Location;
+
+fn ended(running: &mut common::Running) -> Option<i32> {
+    running.0.wait().expect("a child").code()
+}
+
+/// What is in a directory but hidden names.
+fn visible(directory: &Path) -> Vec<String> {
+    let names =
+        fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    names.filter(|name| !name.starts_with('.')).collect()
+}
+
+/// A copy that is made in mid-campaign comes to the same end as the campaign itself.
+#[test]
+fn a_copy_of_a_running_campaign_can_be_run_on() {
+    let small = Small { steps: 900, ..Small::default() };
+    let place = Place::new(&small, &[]);
+    let elsewhere = tempfile::tempdir().unwrap();
+    let copy = elsewhere.path().join("copy").display().to_string();
+    let mut run = place.run();
+    wait_until("it advances", || {
+        place.status()["mixture_version"].as_u64().is_some_and(|version| version > 0)
+    });
+    let said = succeed(place.path(), ["store", "backup", place.argument(), &copy]);
+    assert!(said.contains("the campaign is copied to "), "{said}");
+    assert_eq!(visible(elsewhere.path()), ["copy"]);
+    let message = refuse(place.path(), ["store", "backup", place.argument(), &copy]);
+    assert!(message.contains("exists already: a backup is a new directory"), "{message}");
+    let message = refuse(place.path(), ["store", "compact", place.argument()]);
+    assert!(message.contains("is being run by process"), "{message}");
+    let said = succeed(place.path(), ["store", "check", &copy]);
+    assert!(said.contains("nothing found: "), "{said}");
+    let status: Value = serde_json::from_str(&succeed(place.path(), ["status", &copy, "--json"])).unwrap();
+    assert_eq!((&status["processes"], &status["finished"]), (&serde_json::json!([]), &false.into()));
+    assert_eq!(ended(&mut run), Some(0), "{}", place.said());
+
+    let text = fs::read_to_string(place.path().join("campaign.toml")).unwrap();
+    let lines = text.lines().filter(|line| !line.starts_with("store = "));
+    fs::write(place.path().join("campaign.toml"), lines.collect::<Vec<_>>().join("\n")).unwrap();
+    succeed(place.path(), ["run", "campaign.toml", "--directory", &copy]);
+    assert_eq!(outcome(Path::new(&copy)), outcome_at(place.argument(), place.path()));
+}
+
+#[test]
+fn a_killed_backup_leaves_nothing_that_looks_like_one() {
+    let small = Small { steps: 60, ..Small::default() };
+    let place = Place::new(&small, &[]);
+    assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
+    // Enough for a copy to take its time.
+    on_store(place.location(), async |store| {
+        for slot in 100..140 {
+            let bytes = (0..1_000_000u64).map(|n| random(n + slot) as u8).collect();
+            let component = store::ComponentRecord { element: 0, slot: slot as u32, bytes };
+            let commit = store::Commit { components: vec![component], ..store::Commit::default() };
+            store.commit(&commit).await.unwrap();
+        }
+    });
+    let exported = place.export();
+    let elsewhere = tempfile::tempdir().unwrap();
+    let target = elsewhere.path().join("copy");
+    let copy = target.display().to_string();
+    let (mut unfinished, mut whole) = (0, 0);
+    for kill in 0..kills() {
+        let mut backup = place.start(&["store", "backup", place.argument(), &copy]);
+        std::thread::sleep(Duration::from_millis(random(kill) % 500));
+        backup.0.kill().unwrap();
+        backup.0.wait().unwrap();
+        if target.exists() {
+            assert_eq!(visible(elsewhere.path()), ["copy"]);
+            on_store(Location::from(&target), async |store| {
+                assert_eq!(store.load_components().await.unwrap().last().unwrap().bytes.len(), 1_000_000);
+            });
+            fs::remove_dir_all(&target).unwrap();
+            whole += 1;
+        } else {
+            unfinished += fs::read_dir(elsewhere.path()).unwrap().count();
+            assert_eq!(visible(elsewhere.path()), [""; 0]);
+        }
+    }
+    assert!(unfinished > 0, "none of {} was killed at work, {whole} were whole", kills());
+    succeed(place.path(), ["store", "backup", place.argument(), &copy]);
+    assert_eq!(fs::read_dir(elsewhere.path()).unwrap().count(), 1, "what was left is removed");
+    succeed(place.path(), ["export", &copy, "--control", "--output", "copy.extxyz"]);
+    assert_eq!(fs::read(place.path().join("copy.extxyz")).unwrap(), exported);
+}
+
+#[test]
+fn check_and_compact_tell_what_they_find() {
+    let small = Small { steps: 60, ..Small::default() };
+    let place = Place::new(&small, &[]);
+    assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
+    let said = succeed(place.path(), ["store", "check", place.argument()]);
+    assert!(said.starts_with("nothing found: "), "{said}");
+    let said = succeed(place.path(), ["store", "compact", place.argument()]);
+    assert!(said.contains(" MB before, ") && said.contains(" MB after"), "{said}");
+    let output = calmwalk(place.path(), ["store", "compact", place.argument(), "--drop-declined-features"]);
+    assert!(stderr(&output).contains("a replay with other rules ends at the first of them"));
+    succeed(place.path(), ["store", "check", place.argument()]);
+    wait_until("nobody is left", || processes_in(place.path()).is_empty());
+    on_store(place.location(), async |store| {
+        let bytes = b"no component".to_vec();
+        let component = store::ComponentRecord { element: 0, slot: 7, bytes };
+        let commit = store::Commit { components: vec![component], ..store::Commit::default() };
+        store.commit(&commit).await.unwrap();
+    });
+    let output = calmwalk(place.path(), ["store", "check", place.argument()]);
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(
+        said.contains("component 7 of element 0 cannot be read (") && said.contains("restore the campaign"),
+        "{said}"
+    );
+    assert!(stderr(&output).contains("1 findings in "), "{}", stderr(&output));
+    let status = place.status();
+    let (bytes, forecast) = (status["disk"]["bytes"].as_u64(), &status["disk"]["forecast"]);
+    assert!(bytes.unwrap() > 100_000 && forecast["structures"].as_u64().unwrap() > 0, "{status}");
+}
+
+/// Where a file of SQLite is damaged, its own check says so.
+#[test]
+fn a_damaged_file_is_found() {
+    let small = Small { steps: 60, ..Small::default() };
+    let place = Place::new(&small, &[]);
+    if place.argument() != "." {
+        // A server looks after its files itself.
+        return;
+    }
+    assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
+    let path = place.path().join("campaign.sqlite");
+    let whole = fs::read(&path).unwrap();
+    const PAGE: usize = 1 << 14;
+    for page in [whole.len() / PAGE / 2, whole.len() / PAGE - 1] {
+        let mut damaged = whole.clone();
+        damaged[page * PAGE..(page + 1) * PAGE].fill(0x5a);
+        fs::write(&path, damaged).unwrap();
+        let output = calmwalk(place.path(), ["store", "check", "."]);
+        let said = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "page {page}: {said}");
+        assert!(said.contains("restore the campaign from a backup"), "{said}");
+    }
+}
