@@ -77,7 +77,7 @@ fn words(bytes: &[u8]) -> Vec<u64> {
 
 /// Plain data as a control message.
 fn sealed(content: &[u8]) -> Vec<u8> {
-    [b"CALM\x01".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat()
+    [b"CALM\x02".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat()
 }
 
 /// A request with a control message and what is behind it.
@@ -118,7 +118,7 @@ async fn what_is_no_message_is_dropped_and_counted() {
         framed(&bytes, b"")
     };
     stranger.refused(&desk, &changed(0, b'B'), "not a control message").await;
-    stranger.refused(&desk, &changed(4, 2), "a control message of version 2").await;
+    stranger.refused(&desk, &changed(4, 1), "a control message of version 1").await;
     stranger.refused(&desk, &changed(12, 0x55), "a damaged control message").await;
     let trailing = sealed(&[stranger.letter((7, 2), QUESTION).as_slice(), &[0]].concat());
     stranger.refused(&desk, &framed(&trailing, b""), "1 bytes behind the end").await;

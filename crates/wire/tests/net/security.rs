@@ -43,7 +43,7 @@ async fn foreign_messages_are_dropped_and_spoken_of() {
         String::from_utf8_lossy(&reply.result().unwrap().payload().to_bytes()).into_owned()
     };
     let other_version = [&9_u64.to_le_bytes()[..], b"CALM\x09\0\0\0\0\0\0\0\0\0\0\0"].concat();
-    let damaged = [&9_u64.to_le_bytes()[..], b"CALM\x01\0\0\0\x01\0\0\0\0\0\0\0"].concat();
+    let damaged = [&9_u64.to_le_bytes()[..], b"CALM\x02\0\0\0\x01\0\0\0\0\0\0\0"].concat();
     let cases = [
         (Vec::new(), "a request of 0 bytes"),
         (vec![1, 2, 3], "its length alone has 8"),

@@ -36,7 +36,7 @@ fn content(message: &[u8]) -> &[u8] {
 
 /// What a sender would send of any content, right or wrong.
 fn sealed(content: &[u8]) -> Vec<u8> {
-    let control = [b"CALM\x01".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
+    let control = [b"CALM\x02".as_slice(), &crc32fast::hash(content).to_le_bytes(), content].concat();
     frame::words(&control, None).as_bytes().to_vec()
 }
 
@@ -173,6 +173,10 @@ proptest! {
             let control = Assignment { origin: Origin::Control, wanted, ..assignment.clone() };
             prop_assert!(refused(&control).ends_with("expected ascending steps"));
         }
+        for raised in [0.5, f64::NAN, f64::INFINITY] {
+            let message = refused(&Assignment { raised, ..assignment.clone() });
+            prop_assert!(message.ends_with("expected a finite number, 1 or more"), "{}", message);
+        }
     }
 }
 
@@ -188,7 +192,7 @@ fn what_is_wrong_is_said() {
         }
     };
     assert_eq!(changed(8), ControlError::Magic(*b"BALM"));
-    assert_eq!(changed(12), ControlError::Version(0));
+    assert_eq!(changed(12), ControlError::Version(3));
     assert!(matches!(changed(13), ControlError::Checksum { .. }));
     assert!(matches!(changed(CONTENT), ControlError::Checksum { .. }));
     let short = |control: &[u8]| super::answer(frame::words(control, None).as_bytes());
