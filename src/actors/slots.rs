@@ -126,7 +126,7 @@ impl Crew<'_> {
     /// Takes in the slots' signs of life, and says what the queue does.
     async fn look(&mut self) -> Result<(), StoreError> {
         self.labellers.look(self.store, PROVEN).await?;
-        let jobs = self.store.unfinished_jobs().await?;
+        let jobs = self.store.awaits_labels(unix_milliseconds()).await?;
         let leaders = self.store.processes(Some(ProcessRecord::ORCHESTRATOR)).await?;
         self.display.queue(jobs, leaders.iter().any(ProcessRecord::is_leading));
         Ok(())
@@ -168,10 +168,10 @@ impl Display {
         self.line(&format!("slot {slot}: {line}"));
     }
 
-    fn queue(&mut self, jobs: u64, led: bool) {
+    fn queue(&mut self, jobs: bool, led: bool) {
         let queue = match (jobs, led) {
-            (0, true) => "the queue is empty: waiting for structures",
-            (0, false) => "the queue is empty, and nobody runs the campaign",
+            (false, true) => "the queue is empty: waiting for structures",
+            (false, false) => "the queue is empty, and nobody runs the campaign",
             _ => "",
         };
         if queue != self.queue && !queue.is_empty() {

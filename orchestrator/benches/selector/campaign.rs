@@ -1,6 +1,5 @@
 //! A campaign in live mode whose walkers offer what was recorded, as fast as it is taken.
 
-use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -9,7 +8,7 @@ use calm::watch::ForgettingAlarm;
 use calm::{CollectionRule, Combination, UpdateRule, UpdateSettings};
 use orchestrator::reactor::{Notice, Reactor};
 use orchestrator::selector::{Mode, SeedStructure, Selector, Settings, Snapshot, UpdateProtocol};
-use store::{Campaign, Fate, Protocol, Store};
+use store::{Campaign, Fate, Location, Protocol, Store};
 use tokio::sync::{mpsc, oneshot};
 use wire::messages::{Assignment, End, Outcome, Report};
 use wire::transport::Incoming;
@@ -47,16 +46,20 @@ pub fn settings(threshold: f64) -> Settings {
 
 /// A selector at the start of the campaign, one seed structure a walk.
 pub fn selector(model: &Model, walks: usize, settings: &Settings) -> Selector {
-    let seeds =
-        (0..walks).map(|k| SeedStructure { name: format!("fcc-{k}"), structure: crystal() }).collect();
+    let seeds = seeds(walks);
     let (grader, original) = (model.grader.clone(), Arc::clone(&model.original));
     let training = Some(model.training.clone());
     Selector::restore(settings.clone(), CAMPAIGN, seeds, grader, original, training, Snapshot::default())
         .unwrap()
 }
 
+/// Where walks start.
+pub fn seeds(walks: usize) -> Vec<SeedStructure> {
+    (0..walks).map(|k| SeedStructure { name: format!("fcc-{k}"), structure: crystal() }).collect()
+}
+
 /// The campaign's database, with a label protocol, so that every accept queues a job.
-pub async fn create_store(directory: &Path, walks: usize) -> Store {
+pub async fn create_store(location: Location, walks: usize) -> Store {
     let campaign = Campaign {
         id: CAMPAIGN,
         program_version: "bench".into(),
@@ -72,7 +75,7 @@ pub async fn create_store(directory: &Path, walks: usize) -> Store {
         structure: crystal(),
     };
     let seeds: Vec<_> = (0..walks as u32).map(seed).collect();
-    let store = Store::create(directory, &campaign, &seeds, 0).await.unwrap();
+    let store = Store::create(location, &campaign, &seeds, 0).await.unwrap();
     let hash = ContentHash([7; 32]);
     let protocol = Protocol { hash, name: "reference".into(), settings: serde_json::json!({}) };
     store.add_protocol(&protocol, 0).await.unwrap();
@@ -109,10 +112,10 @@ pub async fn run(
     model: &Model,
     settings: &Settings,
     recording: &[Vec<CandidateBlock>],
-    directory: &Path,
+    location: Location,
 ) -> Run {
     let walks = recording.len();
-    let store = create_store(directory, walks).await;
+    let store = create_store(location, walks).await;
     let mut selector = selector(model, walks, settings);
     store.commit(&selector.begin_walks()).await.unwrap();
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);

@@ -1,14 +1,17 @@
-//! Recorded candidates through reactor, selector and SQLite as fast as they go, and where the time goes.
+//! Recorded candidates through reactor, selector and database as fast as they go, and where the time goes.
 //!
-//! `cargo bench -p orchestrator --bench selector`; the figures are in `docs/benchmarks.md`.
+//! `cargo bench -p orchestrator --bench selector`; with a PostgreSQL server too if `CALMWALK_POSTGRES` is its URL, see
+//! `.ci/postgres`. The figures are in `docs/benchmarks.md`.
 
 mod campaign;
+mod database;
 mod random;
 mod recording;
 mod stages;
 
 use std::time::Duration;
 
+use database::Database;
 use orchestrator::selector::Settings;
 use recording::{Model, Plan};
 use stages::{Stages, plain_inserts};
@@ -42,23 +45,34 @@ fn main() {
     runtime.block_on(measure(&model, &model.record(plan), campaign::settings(ALL)));
 }
 
-/// One setting: the whole way, then each stage alone.
+/// One setting, with every database.
 async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], settings: Settings) {
-    let folder = || tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
-    let (whole, apart, plain) = (folder(), folder(), folder());
-    let run = campaign::run(model, &settings, recording, whole.path()).await;
+    for database in Database::all() {
+        measure_with(database, model, recording, &settings).await;
+    }
+}
+
+/// The whole way, then each stage alone.
+async fn measure_with(
+    database: Database,
+    model: &Model,
+    recording: &[Vec<CandidateBlock>],
+    settings: &Settings,
+) {
+    let room = database.room().await;
+    let run = campaign::run(model, settings, recording, room.location).await;
     let n = run.candidates;
     let group = n.div_ceil(run.commits.max(1));
-    let stages = Stages::measure(model, &settings, recording, group, apart.path()).await;
-    let stored = std::fs::metadata(whole.path().join(store::DATABASE)).unwrap().len() as usize;
-    let bytes = stored / n + campaign::CHECKPOINT;
-    let plain = plain_inserts(n, bytes, group, plain.path()).await;
+    let apart = database.room().await;
+    let stages = Stages::measure(model, settings, recording, group, apart.location).await;
 
     let rate = |count: usize, time: Duration| count as f64 / time.as_secs_f64();
     let (dimension, share) = (model.original.dimension(), 100.0 * run.accepted as f64 / n as f64);
     println!(
-        "  {n} candidates, 108 atoms, {dimension} features; {} accepted ({share:.1} %), {} covered",
-        run.accepted, run.covered
+        "  {}: {n} candidates, 108 atoms, {dimension} features; {} accepted ({share:.1} %), {} covered",
+        database.name(),
+        run.accepted,
+        run.covered
     );
     println!(
         "  {:.0} candidates/s, {:.0} durable accepts/s",
@@ -72,7 +86,12 @@ async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], settings: Set
         1e3 * run.processor.as_secs_f64() / n as f64,
         run.commits
     );
-    println!("  {:.0}/s plain inserts of {bytes} bytes in the same groups", rate(n, plain));
+    if database == Database::Sqlite {
+        let stored = std::fs::metadata(room.directory.path().join(store::DATABASE)).unwrap().len() as usize;
+        let bytes = stored / n + campaign::CHECKPOINT;
+        let plain = plain_inserts(n, bytes, group, apart.directory.path()).await;
+        println!("  {:.0}/s plain inserts of {bytes} bytes in the same groups", rate(n, plain));
+    }
     println!("  {:<32} {:>13} {:>10}", "alone, on one thread", "µs/candidate", "of the sum");
     let sum = stages.check + stages.decide + stages.commit;
     let parts = stages.bonds + stages.grades + stages.search + stages.watch;
@@ -84,7 +103,7 @@ async fn measure(model: &Model, recording: &[Vec<CandidateBlock>], settings: Set
         ("  search for α, inverses", stages.search),
         ("  watch over training frames", stages.watch),
         ("  rest", stages.decide.saturating_sub(parts)),
-        ("commit: copies, SQLite, flush", stages.commit),
+        ("commit: copies, database, flush", stages.commit),
     ] {
         let (each, of_sum) =
             (1e6 * time.as_secs_f64() / n as f64, 100.0 * time.as_secs_f64() / sum.as_secs_f64());

@@ -10,7 +10,7 @@ use orchestrator::reactor::group;
 use orchestrator::selector::{Next, Settings};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection};
-use store::Commit;
+use store::{Commit, Location};
 use wire::CandidateBlock;
 
 use crate::campaign::{checked, create_store, report, selector};
@@ -43,11 +43,11 @@ impl Stages {
         settings: &Settings,
         recording: &[Vec<CandidateBlock>],
         group: usize,
-        directory: &Path,
+        location: Location,
     ) -> Self {
         let mut stages = Self::default();
         let commits = stages.decide(model, settings, recording);
-        stages.commit(commits, recording.len(), group, directory).await;
+        stages.commit(commits, recording.len(), group, location).await;
         stages
     }
 
@@ -105,8 +105,8 @@ impl Stages {
         }
     }
 
-    async fn commit(&mut self, commits: Vec<Commit>, walks: usize, size: usize, directory: &Path) {
-        let store = create_store(directory, walks).await;
+    async fn commit(&mut self, commits: Vec<Commit>, walks: usize, size: usize, location: Location) {
+        let store = create_store(location, walks).await;
         let mut commits = commits.into_iter().peekable();
         while commits.peek().is_some() {
             let mut whole = Commit::default();

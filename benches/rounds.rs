@@ -1,0 +1,187 @@
+//! What it costs walks to wait for each other: the walks of the aluminium campaign of `configs/`, each on a walker of its
+//! own, in live mode and in rounds. Real dynamics and real decisions, one after the other on this machine; what they
+//! would take side by side is told by a clock that goes by the processor time of each turn.
+//!
+//! `cargo bench --bench rounds`; a number behind `--` is the steps of a turn. The figures are in `docs/benchmarks.md`.
+
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use calm::watch::ForgettingAlarm;
+use calm::{Artifact, UpdateSettings};
+use orchestrator::grader::Grader;
+use orchestrator::selector::{Mode, Next, SeedStructure, Selector, Settings, Snapshot, UpdateProtocol};
+use potentials::grace::GraceModel;
+use rustix::time::{ClockId, clock_gettime};
+use wire::messages::{Outcome, Report};
+use wire::{CampaignId, CandidateBlock};
+use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
+use workers::walk::{WalkContext, advance};
+
+/// Steps of a turn, if not given: as in `configs/`.
+const TURN_STEPS: u64 = 250;
+
+fn main() {
+    let turn_steps = std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(TURN_STEPS);
+    println!("turns of {turn_steps} steps");
+    println!("{:<16} {:>10} {:>10} {:>12} {:>14}", "", "candidates", "accepted", "seconds", "walkers busy");
+    let [live, rounds] = [Mode::Live, Mode::Reproducible].map(|mode| Campaign::run(mode, turn_steps));
+    let rate = |campaign: &Campaign| f64::from(campaign.candidates) / campaign.time.as_secs_f64();
+    println!("candidates an hour, live over rounds: {:.2}", rate(&live) / rate(&rounds));
+}
+
+/// What a campaign came to.
+#[derive(Default)]
+struct Campaign {
+    candidates: u32,
+    accepted: u32,
+    /// By the clock of walkers side by side.
+    time: Duration,
+    /// Of all walkers together.
+    work: Duration,
+}
+
+/// A turn under way: when it ends, in which order turns that end at the same time were begun, what comes of it.
+struct Turn(Duration, u64, Report);
+
+impl Campaign {
+    fn run(mode: Mode, turn_steps: u64) -> Self {
+        let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
+        let context = WalkContext { model: Arc::clone(&model), settings: Arc::new(walk_settings()) };
+        let mut selector = selector(mode, turn_steps, &model);
+        selector.begin_walks();
+        let (mut campaign, mut turns, mut begun) = (Self::default(), BinaryHeap::new(), 0);
+        loop {
+            // As many walkers as walks: whoever has a turn begins it now.
+            while let Next::Turn(assignment) = selector.next_turn() {
+                let used = processor_time();
+                let report = advance(&context, &assignment, Arc::clone(selector.mixture()), || false, |_| {});
+                let taken = processor_time() - used;
+                campaign.work += taken;
+                begun += 1;
+                let report = report.map_candidate(|candidate| CandidateBlock::encode(&candidate));
+                turns.push(Reverse(Turn(campaign.time + taken, begun, report)));
+            }
+            let Some(Reverse(Turn(ended, _, report))) = turns.pop() else { break };
+            campaign.time = ended;
+            campaign.candidates += u32::from(matches!(report.outcome, Outcome::Candidate(_)));
+            let commit = selector.report(report).unwrap().unwrap_or_default();
+            let accepted = commit.decisions.iter().filter(|decision| decision.kind == "accepted");
+            campaign.accepted += accepted.count() as u32;
+        }
+        let busy = campaign.work.as_secs_f64() / (seeds().len() as f64 * campaign.time.as_secs_f64());
+        println!(
+            "{:<16} {:>10} {:>10} {:>12.1} {:>12.0} %",
+            mode.name(),
+            campaign.candidates,
+            campaign.accepted,
+            campaign.time.as_secs_f64(),
+            100.0 * busy
+        );
+        campaign
+    }
+}
+
+/// Processor time of this thread: what else is at work on the machine does not count.
+fn processor_time() -> Duration {
+    Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap()
+}
+
+fn selector(mode: Mode, turn_steps: u64, model: &GraceModel) -> Selector {
+    let rule = "rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nleast = 3\n";
+    let settings = Settings {
+        mode,
+        walks_per_round: seeds().len(),
+        turn_steps,
+        update: UpdateProtocol::Carried,
+        search: UpdateSettings {
+            combination: calm::Combination::Convex,
+            ladder: None,
+            stop: toml::from_str(&format!("{rule}target = 1.25")).unwrap(),
+        },
+        forgetting_alarm: ForgettingAlarm::default(),
+        collection: toml::from_str(rule).unwrap(),
+        per_seed: u32::MAX,
+        total: None,
+        control: false,
+        least_distance: (1.2, 0.75),
+        declined_feature_bytes: 0,
+    };
+    let n = model.elements().len();
+    let cutoffs = (0..n * n).map(|k| model.pair_cutoff(k / n, k % n)).collect();
+    let grader = Grader::new(model.elements().to_vec(), cutoffs);
+    let original = Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture);
+    let (campaign, snapshot) = (CampaignId([1; 16]), Snapshot::default());
+    Selector::restore(settings, campaign, seeds(), grader, original, None, snapshot).unwrap()
+}
+
+fn walk_settings() -> WalkSettings {
+    WalkSettings {
+        rng_seed: 1,
+        temperature: 600.0,
+        thermostat: ThermostatKind::Langevin { friction: 0.01 },
+        time_step: None,
+        equilibration: 500,
+        steps: 2000,
+        tau: 0.15,
+        average_steps: 10,
+        volume_ramp: Some((1.0, 1.4)),
+        skin: 0.5,
+        collection: toml::from_str("rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nleast = 3")
+            .unwrap(),
+        gap: 200,
+        declined_gap: 20,
+        zbl: Some((1.6, 2.4)),
+        guard: GuardSettings {
+            least_distance: 1.2,
+            least_distance_fraction: 0.75,
+            highest_temperature: 20_000.0,
+            refusals_in_a_row: 10,
+            most_returns: 3,
+            tau_factor: 0.5,
+            checkpoint_interval: 100,
+        },
+    }
+}
+
+fn seeds() -> Vec<SeedStructure> {
+    let frames = atoms::read_extxyz(&data("aluminium_seeds.extxyz")).unwrap();
+    let seed = |(number, frame): (usize, atoms::extxyz::Frame)| SeedStructure {
+        name: number.to_string(),
+        structure: frame.structure,
+    };
+    frames.into_iter().enumerate().map(seed).collect()
+}
+
+fn data(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/data").join(path)
+}
+
+impl Turn {
+    fn order(&self) -> (Duration, u64) {
+        (self.0, self.1)
+    }
+}
+
+impl PartialEq for Turn {
+    fn eq(&self, other: &Self) -> bool {
+        self.order() == other.order()
+    }
+}
+
+impl Eq for Turn {}
+
+impl PartialOrd for Turn {
+    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl Ord for Turn {
+    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
+        self.order().cmp(&other.order())
+    }
+}

@@ -1,0 +1,54 @@
+//! The databases that candidates go into.
+
+use sqlx::postgres::PgConnectOptions;
+use sqlx::{AssertSqlSafe, ConnectOptions, Executor};
+use store::Location;
+use tempfile::TempDir;
+
+/// Which one.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Database {
+    Sqlite,
+    /// The server whose URL is `CALMWALK_POSTGRES`.
+    Postgres,
+}
+
+/// Room for a campaign, which goes when this is dropped, or the next is made on the server.
+pub struct Room {
+    pub location: Location,
+    pub directory: TempDir,
+}
+
+impl Database {
+    pub fn all() -> Vec<Self> {
+        if server().is_some() { vec![Self::Sqlite, Self::Postgres] } else { vec![Self::Sqlite] }
+    }
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Sqlite => "SQLite",
+            Self::Postgres => "PostgreSQL",
+        }
+    }
+
+    pub async fn room(self) -> Room {
+        let directory = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+        let location = match self {
+            Self::Sqlite => directory.path().into(),
+            Self::Postgres => empty_schema().await,
+        };
+        Room { location, directory }
+    }
+}
+
+fn server() -> Option<String> {
+    std::env::var("CALMWALK_POSTGRES").ok()
+}
+
+async fn empty_schema() -> Location {
+    let server = server().expect("asked for only with a server");
+    let options: PgConnectOptions = server.parse().unwrap();
+    let sql = AssertSqlSafe("DROP SCHEMA IF EXISTS bench CASCADE");
+    options.connect().await.unwrap().execute(sql).await.unwrap();
+    format!("{server}?schema=bench").parse().unwrap()
+}
