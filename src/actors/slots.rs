@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use orchestrator::launcher::{Children, Event, Launch};
 use orchestrator::supervisor::{Limits, Standing};
-use store::{ProcessRecord, Store, StoreError};
+use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::Notify;
 use tokio::time::{MissedTickBehavior, interval};
 use workers::labeller::SIGN_OF_LIFE;

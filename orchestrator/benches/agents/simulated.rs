@@ -81,9 +81,8 @@ impl Host {
         };
         let uplink = Uplink::open(&endpoint(plan), None, agent, |why| eprintln!("waiting: {why}")).await;
         let joined = Arc::new(uplink.unwrap()).join().await.unwrap();
-        let shared =
-            SharedMixture::create(&directory.join(number.to_string()), &joined.newest().await, walkers)
-                .unwrap();
+        let newest = joined.newest().await;
+        let shared = SharedMixture::create(&directory.join(number.to_string()), &newest, walkers).unwrap();
         Self { joined, shared: Mutex::new((shared, Vec::new())) }
     }
 

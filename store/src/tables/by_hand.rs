@@ -13,10 +13,13 @@ use crate::records::JobState;
 /// Candidates shown when a name fits none or several.
 const SHOWN: usize = 5;
 
+/// A page is found in the index, and only its jobs are looked at.
 pub(crate) const LIST: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
-    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
+    FROM (SELECT number AS place FROM job WHERE state = $1
+          ORDER BY priority DESC, decision LIMIT $2 OFFSET $3) AS page
+    CROSS JOIN job ON job.number = place CROSS JOIN candidate ON candidate.decision = job.decision
     CROSS JOIN protocol ON protocol.number = job.protocol
-    WHERE state = $1 ORDER BY job.priority DESC, job.decision LIMIT $2 OFFSET $3";
+    ORDER BY job.priority DESC, job.decision";
 
 const LIST_ALL: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
     FROM job CROSS JOIN candidate ON candidate.decision = job.decision
