@@ -104,11 +104,10 @@ fn a_limit_of_time_stops_walks_where_they_stand() {
         (&stopped["finished"], &stopped["budget"]["used_up"]),
         (&true.into(), &"budget.wall_hours".into())
     );
-    assert!(
-        walks(&stopped)
-            .iter()
-            .all(|(state, reason)| (state.as_str(), reason.as_str()) == ("budget", "budget.wall_hours"))
-    );
+    // The clock is looked at now and then: some walks may have come to their end before.
+    let walks = walks(&stopped);
+    assert!(walks.iter().all(|(state, _)| !["waiting", "running"].contains(&state.as_str())), "{walks:?}");
+    assert!(walks.contains(&("budget".into(), "budget.wall_hours".into())), "{walks:?}");
     assert!(stopped["budget"]["used"]["wall_hours"].as_f64() > Some(1e-6));
     let so_far = decisions(here);
     let all: Vec<_> = expected.decisions.lines().map(str::to_owned).collect();
