@@ -7,10 +7,10 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use common::campaign::{Outcome, Small, outcome, outcome_at};
-use common::place::Place;
+use common::place::{Place, on_store};
 use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
 use common::{Running, calmwalk, config, program, refuse, succeed};
-use store::{JobState, Standing};
+use store::{JobState, Standing, Store};
 
 /// `run` starts no labellers of its own.
 const NO_SLOTS: (&str, &str) = ("[label]", "[label]\nslots = 0");
@@ -35,8 +35,10 @@ fn with_large_structure(changes: &[(&str, &str)]) -> (Place, String) {
     (place, name)
 }
 
+/// Asks the store itself: to start the program for it may take longer than the label.
 fn wait_for_lease(place: &Place) {
-    wait_until("the structure is leased", || place.jobs("leased") == 1);
+    let leased = async |store: &Store| store.queue_list(Some(JobState::Leased), 1, 0).await.unwrap().len();
+    wait_until("the structure is leased", || on_store(place.location(), leased) == 1);
 }
 
 #[test]
