@@ -60,13 +60,15 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
 fn kills_on_every_host_change_nothing() {
     let small = Small::default();
     let expected = undisturbed(&small);
-    let mut done = 0;
+    let (mut done, mut campaigns) = (0, 0);
     while done < kills() {
+        campaigns += 1;
         let hosts = hosts(&small, 2);
         let mut orchestrator = hosts.lead();
         let mut agents = [hosts.agent(0), hosts.agent(1)];
         let ended = loop {
-            std::thread::sleep(Duration::from_millis(random(done) % 1500));
+            // Another instant in each campaign: one that is over before it must not be tried again for ever.
+            std::thread::sleep(Duration::from_millis(random(done + 10_000 * campaigns) % 1500));
             match orchestrator.0.try_wait().unwrap() {
                 Some(ended) if ended.code().is_some() => break ended,
                 Some(_) => orchestrator = hosts.lead(),

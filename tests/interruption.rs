@@ -57,7 +57,9 @@ fn disturbed(small: &Small, options: &[&str], kills: u64) {
             Small { walkers: 1 + (random(done) % 2) as usize, ..small.clone() }.write(directory.path());
             let mut running = start(directory.path(), options);
             let ended = loop {
-                let instant = takes.mul_f64((random(1000 + done) % 1000) as f64 / 1500.0);
+                // Another in each campaign: one that is over before it must not be tried again for ever.
+                let instant =
+                    takes.mul_f64((random(1000 + done + 10_000 * campaigns) % 1000) as f64 / 1500.0);
                 std::thread::sleep(instant);
                 let ended = running.0.try_wait().unwrap();
                 if ended.is_some() || done == kills {

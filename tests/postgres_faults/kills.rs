@@ -86,11 +86,13 @@ impl Killed {
 
 /// So many kills, some in each campaign; hands each outcome to `check`.
 fn killed(small: &Small, name: &str, check: impl Fn(&Outcome)) {
-    let mut done = 0;
+    let (mut done, mut campaigns) = (0, 0);
     while done < kills() {
+        campaigns += 1;
         let mut killed = Killed::new(small, name);
         while done < kills() {
-            sleep(Duration::from_millis(random(done) % 1500));
+            // Another instant in each campaign: one that is over before it must not be tried again for ever.
+            sleep(Duration::from_millis(random(done + 10_000 * campaigns) % 1500));
             if killed.start_again() {
                 break;
             }
