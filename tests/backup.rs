@@ -28,7 +28,8 @@ fn visible(directory: &Path) -> Vec<String> {
 /// A copy that is made in mid-campaign comes to the same end as the campaign itself.
 #[test]
 fn a_copy_of_a_running_campaign_can_be_run_on() {
-    let small = Small { steps: 900, ..Small::default() };
+    // Seconds of work, so that it is under way while it is copied.
+    let small = Small { steps: 3000, per_seed: 1000, ..Small::default() };
     let place = Place::new(&small, &[]);
     let elsewhere = tempfile::tempdir().unwrap();
     let copy = elsewhere.path().join("copy").display().to_string();
