@@ -266,8 +266,9 @@ fn at_the_notice_a_campaign_leaves_and_goes_on_when_it_is_requeued() {
     campaign.nobody_failed();
 }
 
-/// A whole minute is the least time that Slurm gives.
+/// A whole minute is the least time that Slurm gives. By hand: `cargo test --test slurm -- --ignored`.
 #[test]
+#[ignore = "on a fast machine the campaign is over before Slurm looks at its minute"]
 fn before_its_time_is_over_a_job_is_told_and_requeued() {
     let small = lasting();
     let mut campaign = OnSlurm::new(&small, 1);
