@@ -6,20 +6,34 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 /// Every package, where it lives, and the packages that it may depend on.
-const HOUSE: [(&str, &str, &[&str]); 10] = [
+const HOUSE: [(&str, &str, &[&str]); 12] = [
     ("atoms", "crates/atoms", &[]),
     ("npz", "crates/npz", &[]),
     ("calm", "crates/calm", &["npz"]),
     ("potentials", "crates/potentials", &["atoms", "npz"]),
     ("md", "crates/md", &["atoms"]),
+    ("dft", "crates/dft", &["atoms"]),
+    ("analysis", "crates/analysis", &[]),
     ("wire", "crates/wire", &["atoms", "calm"]),
     ("store", "store", &["atoms", "wire"]),
-    ("workers", "workers", &["atoms", "calm", "potentials", "md", "wire", "store"]),
+    ("workers", "workers", &["atoms", "calm", "potentials", "md", "dft", "wire", "store"]),
     ("orchestrator", "orchestrator", &["atoms", "calm", "wire", "store"]),
     (
         "calmwalk",
         "",
-        &["atoms", "npz", "calm", "potentials", "md", "wire", "store", "workers", "orchestrator"],
+        &[
+            "atoms",
+            "npz",
+            "calm",
+            "potentials",
+            "md",
+            "dft",
+            "analysis",
+            "wire",
+            "store",
+            "workers",
+            "orchestrator",
+        ],
     ),
 ];
 
@@ -117,6 +131,7 @@ fn nobody_reaches_what_is_not_theirs() {
         ("md", &["calm", "potentials", "wire", "store"][..]),
         ("calm", &["atoms"]),
         ("potentials", &["calm", "md"]),
+        ("dft", &["calm", "potentials", "md", "wire", "store"]),
         ("store", &["potentials", "md", "workers", "orchestrator"]),
         ("orchestrator", &["potentials", "md", "workers"]),
         ("workers", &["orchestrator"]),

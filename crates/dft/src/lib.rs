@@ -1,0 +1,13 @@
+//! What calmwalk knows of the programs that make labels: their inputs, how to tell that a calculation is good, and
+//! where its numbers stand. Files and numbers only; who runs the programs, and where, is not known here.
+//!
+//! Units: eV, Å, eV/Å, eV/Å³ (tension positive), μ_B. What a program writes in others is converted by its module.
+
+mod code;
+mod failure;
+pub mod mesh;
+mod remedy;
+
+pub use code::{Calculated, Code, Exit, Input, SetupError, Size};
+pub use failure::{Failure, FailureClass};
+pub use remedy::{Remedy, remedies};
