@@ -7,7 +7,9 @@ mod code;
 mod failure;
 pub mod mesh;
 mod remedy;
+mod settings;
 
 pub use code::{Calculated, Code, Exit, Input, SetupError, Size};
 pub use failure::{Failure, FailureClass};
 pub use remedy::{Remedy, remedies};
+pub use settings::Settings;

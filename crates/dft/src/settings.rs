@@ -1,0 +1,32 @@
+//! The programs that can be chosen, each with its settings.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Code, SetupError};
+
+/// Which program makes labels, and how: `[label.method.<name>]` of a campaign.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Settings {}
+
+impl Settings {
+    /// The program's name, as a configuration writes it.
+    pub fn name(&self) -> &'static str {
+        match *self {}
+    }
+
+    /// Every path among the settings, to be resolved from the directory of the configuration.
+    pub fn paths(&mut self) -> Vec<&mut PathBuf> {
+        match *self {}
+    }
+
+    /// Finds the program, its version and its pseudopotentials.
+    ///
+    /// # Errors
+    /// What is missing or impossible, before anything is run.
+    pub fn prepare(&self) -> Result<Box<dyn Code>, SetupError> {
+        match *self {}
+    }
+}
