@@ -6,7 +6,7 @@ use std::path::Path;
 use atoms::cell::{Matrix3, Vec3};
 use atoms::{Species, Structure};
 
-use crate::{Failure, Remedy};
+use crate::{Failure, FailureClass, Remedy};
 
 /// A program that makes labels, with its settings. It is made by its module's `Settings`, which finds the program and
 /// its pseudopotentials.
@@ -66,6 +66,19 @@ pub enum Exit {
     OutOfMemory,
     /// The machine it ran on was lost.
     LostNode,
+}
+
+impl Exit {
+    /// The failure that this end means where the program's files tell nothing better.
+    pub fn failure(self) -> Failure {
+        match self {
+            Self::Code(code) => FailureClass::Crashed.because(format!("ended with exit code {code}")),
+            Self::Signal(signal) => FailureClass::Crashed.because(format!("ended by signal {signal}")),
+            Self::TimeLimit => FailureClass::TimeLimit.because("ended because its time was over"),
+            Self::OutOfMemory => FailureClass::OutOfMemory.because("ended because it used too much memory"),
+            Self::LostNode => FailureClass::LostNode.because("the machine that it ran on was lost"),
+        }
+    }
 }
 
 /// The numbers of a calculation.

@@ -4,9 +4,12 @@
 //! Units: eV, Å, eV/Å, eV/Å³ (tension positive), μ_B. What a program writes in others is converted by its module.
 
 mod code;
+pub mod command;
 mod failure;
+mod find;
 pub mod mesh;
 mod remedy;
+mod same;
 mod settings;
 
 pub use code::{Calculated, Code, Exit, Input, SetupError, Size};

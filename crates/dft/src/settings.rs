@@ -4,22 +4,29 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Code, SetupError};
+use crate::{Code, SetupError, command};
 
 /// Which program makes labels, and how: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Settings {}
+pub enum Settings {
+    /// A program of the user's.
+    Command(command::Settings),
+}
 
 impl Settings {
     /// The program's name, as a configuration writes it.
     pub fn name(&self) -> &'static str {
-        match *self {}
+        match self {
+            Self::Command(_) => "command",
+        }
     }
 
     /// Every path among the settings, to be resolved from the directory of the configuration.
     pub fn paths(&mut self) -> Vec<&mut PathBuf> {
-        match *self {}
+        match self {
+            Self::Command(settings) => settings.files.iter_mut().collect(),
+        }
     }
 
     /// Finds the program, its version and its pseudopotentials.
@@ -27,6 +34,8 @@ impl Settings {
     /// # Errors
     /// What is missing or impossible, before anything is run.
     pub fn prepare(&self) -> Result<Box<dyn Code>, SetupError> {
-        match *self {}
+        Ok(match self {
+            Self::Command(settings) => Box::new(settings.prepare()?),
+        })
     }
 }

@@ -1,0 +1,70 @@
+//! The label that a command left.
+
+use std::path::Path;
+
+use atoms::Structure;
+use atoms::extxyz::{Frame, Reader};
+
+use crate::same::same_structure;
+use crate::{Calculated, Failure, FailureClass};
+
+/// What the digits allow that ASE writes.
+const TOLERANCE: f64 = 1e-6;
+
+/// The numbers of the file, if it is whole and of this structure.
+pub(super) fn label(structure: &Structure, path: &Path) -> Result<Calculated, Failure> {
+    let frame = whole_frame(path).map_err(|fault| {
+        let name = path.file_name().unwrap_or_default().display();
+        FailureClass::Crashed.because(format!("the command ended with 0, but {name} {fault}"))
+    })?;
+    same_structure(structure, &frame.structure, TOLERANCE)?;
+    numbers(frame).map_err(|message| FailureClass::Implausible.because(message))
+}
+
+/// The one frame of a file; or what is wrong with it.
+fn whole_frame(path: &Path) -> Result<Frame, String> {
+    let text = std::fs::read(path).map_err(|error| format!("cannot be read: {error}"))?;
+    // A number that was cut off would be taken for another.
+    if text.last() != Some(&b'\n') {
+        return Err("does not end with a line break: it is not whole".to_owned());
+    }
+    let mut frames = Reader::new(text.as_slice());
+    let frame = frames.next().ok_or("is empty")?.map_err(|error| error.to_string())?;
+    match frames.next() {
+        None => Ok(frame),
+        Some(_) => Err("has more than one frame".to_owned()),
+    }
+}
+
+fn numbers(mut frame: Frame) -> Result<Calculated, String> {
+    // Names with this prefix would go before the plain ones.
+    frame.info.retain(|key, _| !key.starts_with("REF_"));
+    frame.arrays.retain(|key, _| !key.starts_with("REF_"));
+    let labels = frame.labels().map_err(|error| error.to_string())?;
+    let energy = labels.energy.ok_or("the label has no energy")?;
+    let forces = labels.forces.ok_or("the label has no forces")?;
+    let free = match frame.info.get("free_energy") {
+        None => None,
+        Some(value) => {
+            Some(value.number().filter(|x| x.is_finite()).ok_or("free_energy is no finite number")?)
+        }
+    };
+    let magnetic_moments = match frame.arrays.get("magmoms") {
+        None => None,
+        Some(column) => {
+            let moments = column.reals().filter(|_| column.width == 1);
+            let finite = moments.filter(|moments| moments.iter().all(|moment| moment.is_finite()));
+            Some(finite.ok_or("magmoms are not a finite number for each atom")?)
+        }
+    };
+    let extended = frame.structure.periodic != [false; 3];
+    Ok(Calculated {
+        energy: free.unwrap_or(energy),
+        energy_without_smearing: free.map(|_| energy),
+        forces,
+        stress: labels.stress.filter(|_| extended),
+        magnetisation: magnetic_moments.as_ref().map(|moments: &Vec<f64>| moments.iter().sum()),
+        magnetic_moments,
+        electronic_steps: None,
+    })
+}
