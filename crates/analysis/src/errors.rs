@@ -1,0 +1,194 @@
+//! How a grade foretells the force error of atoms.
+
+use crate::quantiles::quantile;
+use crate::ranks::{roc_auc, spearman};
+use crate::{Bins, Thinned};
+
+/// Gathers grades with the force errors of labelled atoms, and the grades of atoms whose label failed: those have an
+/// error too, which nobody knows. Counts are exact; ranks and quantiles come from the atoms that there is room for, a
+/// sample if there were more.
+#[derive(Clone, Debug)]
+pub struct ForceErrors {
+    bins: Bins,
+    threshold: f64,
+    pairs: Thinned<(f64, f64)>,
+    counts: Vec<Counts>,
+    left_out: u64,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Counts {
+    labelled: u64,
+    above: u64,
+    unlabelled: u64,
+}
+
+/// The force errors of the atoms whose grades are in one bin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ErrorBin {
+    /// Grades above this; `None` from the lowest on.
+    pub above: Option<f64>,
+    /// Up to this; `None` without an end.
+    pub up_to: Option<f64>,
+    /// Labelled atoms.
+    pub atoms: u64,
+    /// Of all labelled atoms, so many are here.
+    pub share: f64,
+    /// Atoms of structures whose label failed.
+    pub unlabelled: u64,
+    /// Median force error, eV/Å; `None` in an empty bin, as are those that follow.
+    pub median: Option<f64>,
+    /// 90 % are smaller, eV/Å.
+    pub p90: Option<f64>,
+    /// 99 % are smaller, eV/Å.
+    pub p99: Option<f64>,
+    /// Share of the labelled atoms with an error above the threshold.
+    pub large: Option<f64>,
+    /// That share if every unlabelled atom were below, and if every one were above: whatever they are, it is between.
+    pub large_between: Option<(f64, f64)>,
+}
+
+impl ForceErrors {
+    /// Sorts grades into `bins`; errors above `threshold`, eV/Å, are large. Keeps `room` atoms at most, 24 bytes each.
+    pub fn new(bins: Bins, threshold: f64, room: usize) -> Self {
+        let counts = vec![Counts::default(); bins.number()];
+        Self { bins, threshold, pairs: Thinned::new(room), counts, left_out: 0 }
+    }
+
+    /// A labelled atom: its grade, and |F_model − F_label|, eV/Å. What is not finite is counted and left out.
+    pub fn push(&mut self, grade: f64, error: f64) {
+        if !(grade.is_finite() && error.is_finite()) {
+            self.left_out += 1;
+            return;
+        }
+        let counts = &mut self.counts[self.bins.place(grade)];
+        counts.labelled += 1;
+        counts.above += u64::from(error > self.threshold);
+        self.pairs.push((grade, error));
+    }
+
+    /// An atom of a structure whose label failed.
+    pub fn push_unlabelled(&mut self, grade: f64) {
+        if grade.is_finite() {
+            self.counts[self.bins.place(grade)].unlabelled += 1;
+        } else {
+            self.left_out += 1;
+        }
+    }
+
+    /// Labelled atoms.
+    pub fn atoms(&self) -> u64 {
+        self.pairs.seen()
+    }
+
+    /// Of them, those that ranks and quantiles come from.
+    pub fn sampled(&self) -> usize {
+        self.pairs.kept().len()
+    }
+
+    /// Atoms without a finite grade or error.
+    pub fn left_out(&self) -> u64 {
+        self.left_out
+    }
+
+    /// Spearman's ρ of grade and error.
+    pub fn spearman(&self) -> Option<f64> {
+        let (grades, errors) = self.rows();
+        spearman(&grades, &errors)
+    }
+
+    /// Area under the receiver operating characteristic of the grade as a test for large errors.
+    pub fn roc_auc(&self) -> Option<f64> {
+        let (grades, errors) = self.rows();
+        roc_auc(&grades, &errors, self.threshold)
+    }
+
+    /// The force errors by bin of the grade, also of those in which there is none.
+    pub fn bins(&self) -> Vec<ErrorBin> {
+        let mut errors = vec![Vec::new(); self.bins.number()];
+        for (grade, error) in self.pairs.kept() {
+            errors[self.bins.place(*grade)].push(*error);
+        }
+        errors.iter_mut().for_each(|errors| errors.sort_by(f64::total_cmp));
+        (0..self.bins.number()).map(|place| self.bin(place, &errors[place])).collect()
+    }
+
+    fn bin(&self, place: usize, errors: &[f64]) -> ErrorBin {
+        let Counts { labelled, above: large, unlabelled } = self.counts[place];
+        let (above, up_to) = self.bins.edges(place);
+        let part = |part: u64, of: u64| (of > 0).then(|| part as f64 / of as f64);
+        let all = labelled + unlabelled;
+        ErrorBin {
+            above,
+            up_to,
+            atoms: labelled,
+            share: part(labelled, self.atoms()).unwrap_or(0.0),
+            unlabelled,
+            median: quantile(errors, 0.5),
+            p90: quantile(errors, 0.9),
+            p99: quantile(errors, 0.99),
+            large: part(large, labelled),
+            large_between: part(large, all).zip(part(large + unlabelled, all)),
+        }
+    }
+
+    fn rows(&self) -> (Vec<f64>, Vec<f64>) {
+        self.pairs.kept().copied().unzip()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn a_table_by_hand() {
+        let mut errors = ForceErrors::new(Bins::of_grades(), 1.0, 1000);
+        for (grade, error) in [(0.2, 0.1), (0.5, 0.3), (0.4, 0.2), (3.0, 1.0), (4.0, 2.0), (f64::NAN, 1.0)] {
+            errors.push(grade, error);
+        }
+        [3.5, 4.5, 9.0].into_iter().for_each(|grade| errors.push_unlabelled(grade));
+        let bins = errors.bins();
+        assert_eq!((errors.atoms(), errors.left_out(), bins.len()), (5, 1, 7));
+        assert_eq!((bins[0].atoms, bins[0].median, bins[0].large), (3, Some(0.2), Some(0.0)));
+        assert_eq!((bins[0].share, bins[0].large_between), (0.6, Some((0.0, 0.0))));
+        // One error of 1 is not above 1; two atoms failed, so between ¼ and ¾ of four are.
+        let far = bins[5];
+        assert_eq!((far.above, far.up_to, far.atoms, far.unlabelled), (Some(2.0), Some(5.0), 2, 2));
+        assert_eq!((far.median, far.large, far.large_between), (Some(1.5), Some(0.5), Some((0.25, 0.75))));
+        // Nothing is known where every label failed, and that is not the same as where there was nothing.
+        assert_eq!((bins[6].median, bins[6].large, bins[6].large_between), (None, None, Some((0.0, 1.0))));
+        assert_eq!((bins[1].atoms, bins[1].large_between), (0, None));
+        // Grades 0.2 0.5 0.4 3 4 against 0.1 0.3 0.2 1 2: the same order.
+        assert!((errors.spearman().unwrap() - 1.0).abs() < 1e-14);
+        assert_eq!(errors.roc_auc(), Some(1.0));
+    }
+
+    proptest! {
+        #[test]
+        fn nothing_is_lost_and_a_sample_is_near(seed in 0_u64..1000) {
+            let number = |k: u64| ((k * 2_654_435_761 + seed) % 1_000_003) as f64 / 1_000_003.0;
+            let (mut all, mut some) = (
+                ForceErrors::new(Bins::of_grades(), 1.0, 100_000),
+                ForceErrors::new(Bins::of_grades(), 1.0, 2_000),
+            );
+            for k in 0..6_000 {
+                let grade = 3.0 * number(k);
+                let error = grade * number(7 * k + 1);
+                all.push(grade, error);
+                some.push(grade, error);
+            }
+            prop_assert!(all.sampled() == 6_000 && some.sampled() <= 2_000);
+            let counts = |errors: &ForceErrors| -> Vec<_> {
+                errors.bins().iter().map(|bin| (bin.atoms, bin.large)).collect()
+            };
+            prop_assert_eq!(counts(&all), counts(&some));
+            prop_assert_eq!(all.bins().iter().map(|bin| bin.atoms).sum::<u64>(), 6_000);
+            // A correlation of n pairs has an error of about 1 / √n, here 1/31 at most.
+            let (exact, sampled) = (all.spearman().unwrap(), some.spearman().unwrap());
+            prop_assert!((exact - sampled).abs() < 0.16, "{} {}", exact, sampled);
+        }
+    }
+}
