@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::thread;
 
 use atoms::{Cell, Evaluation, Matrix3, NeighbourList, Structure, cell, read_extxyz};
+use calm::rules::Positive;
 use calm::{Artifact, CollectionRule, Mixture};
 use orchestrator::grader::Grader;
 use orchestrator::selector::TrainingFrames;
@@ -85,6 +86,17 @@ impl Model {
             walks[number % plan.walks].push(block);
         }
         walks
+    }
+
+    /// A candidate that the original mixture covers: the crystal with small displacements.
+    #[allow(dead_code, reason = "only the bench of agents needs it")]
+    pub fn at_rest(&self, number: u64) -> Candidate {
+        let mut structure = crystal();
+        displace(&mut structure, LIKENESS, &mut Random::new(number));
+        let any = CollectionRule::MaximumGrade { threshold: Positive::try_from(f64::MIN_POSITIVE).unwrap() };
+        let plan = Plan { walks: 1, kinds: 1, of_kind: 1, collection: any, least_distance: 1.0 };
+        let candidate = self.candidate(plan, number, structure, &mut Evaluator::new(&self.grace));
+        candidate.expect("any structure is collected")
     }
 
     /// The candidates of one kind. One that the original mixture covers, or whose atoms come too close, is drawn again.

@@ -1,0 +1,81 @@
+//! A thousand simulated walkers on 32 simulated agents against one orchestrator: its reactor, its database and its end of
+//! the lines between hosts are what campaigns have; agents connect over TCP and keep their mixture in shared memory as
+//! theirs do. Walkers do no dynamics: after a while they offer a candidate that was recorded, 2 % of them new.
+//!
+//! `cargo bench -p orchestrator --bench agents`; behind `--` candidates a second that walkers offer (0: as many as they
+//! can) and seconds. With a PostgreSQL server if `CALMWALK_POSTGRES` is its URL, see `.ci/postgres`; else SQLite. The
+//! figures are in `docs/benchmarks.md`.
+#![allow(dead_code, reason = "the other benches use the rest of what they share")]
+
+#[path = "../selector/campaign.rs"]
+mod campaign;
+#[path = "../selector/database.rs"]
+mod database;
+mod head;
+#[path = "../selector/random.rs"]
+mod random;
+#[path = "../selector/recording.rs"]
+mod recording;
+mod simulated;
+
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+const AGENTS: usize = 32;
+const WALKERS: usize = 1024;
+const RATE: f64 = 400.0;
+const SECONDS: f64 = 60.0;
+/// Periods in which figures are shown, one beside the other: what grows is seen.
+const PERIODS: usize = 4;
+
+/// What is to be simulated.
+#[derive(Clone, Copy)]
+struct Plan {
+    port: u16,
+    /// Candidates a second that all walkers together offer; 0 for as many as they can.
+    rate: f64,
+    duration: Duration,
+    /// From when on it counts, s: by then agents have joined and walkers have their first turns.
+    begun: f64,
+}
+
+const START: f64 = 10.0;
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let numbers: Vec<f64> = arguments.iter().filter_map(|text| text.parse().ok()).collect();
+    let rate = numbers.first().copied().unwrap_or(RATE);
+    let duration = Duration::from_secs_f64(numbers.get(1).copied().unwrap_or(SECONDS));
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
+    match numbers.get(2..4) {
+        Some(&[port, begun]) => {
+            runtime.block_on(simulated::agents(Plan { port: port as u16, rate, duration, begun }))
+        }
+        _ => runtime.block_on(head::lead(Plan { port: free_port(), rate, duration, begun: now() + START })),
+    }
+}
+
+fn free_port() -> u16 {
+    std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+}
+
+fn endpoint(plan: Plan) -> wire::net::Endpoint {
+    format!("tcp/127.0.0.1:{}", plan.port).parse().unwrap()
+}
+
+/// In which of the periods a time is.
+fn period(time: f64, plan: Plan) -> Option<usize> {
+    let period = PERIODS as f64 * (time - plan.begun) / plan.duration.as_secs_f64();
+    (0.0..PERIODS as f64).contains(&period).then_some(period as usize)
+}
+
+/// The clock of this host, s: both processes have the same.
+fn now() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs_f64()
+}
+
+/// A quantile of numbers, which it sorts; NaN of none.
+fn quantile(numbers: &mut [f64], share: f64) -> f64 {
+    numbers.sort_by(f64::total_cmp);
+    let last = numbers.len().saturating_sub(1);
+    numbers.get((share * last as f64).round() as usize).copied().unwrap_or(f64::NAN)
+}

@@ -1,0 +1,162 @@
+//! Agents and their walkers, in one process.
+
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use calm::{Grades, Mixture};
+use serde::{Deserialize, Serialize};
+use tokio::time::{Instant, sleep};
+use wire::messages::Assignment;
+use wire::mixture::SharedMixture;
+use wire::net::{Address, Agent, Joined, Slot, Told, Uplink};
+use wire::{Candidate, CandidateBlock, CandidateId, ContentHash};
+
+use crate::random::Random;
+use crate::recording::{Model, progress};
+use crate::{AGENTS, PERIODS, Plan, WALKERS, campaign, endpoint, now, period};
+
+/// Recorded candidates.
+const RECORDED: usize = 16;
+/// One of so many candidates is new to the mixture …
+const NEW: u64 = 50;
+/// … with an atom of this grade.
+const GRADE: f64 = 2.0;
+
+/// What the agents have seen.
+#[derive(Default, Deserialize, Serialize)]
+pub struct Seen {
+    /// How long walkers waited from an offer to the next turn, of each period, s.
+    pub waits: [Vec<f64>; PERIODS],
+    /// Of each agent the versions of the mixture, and when they were in its shared memory, s.
+    pub versions: Vec<Vec<(u64, f64)>>,
+}
+
+/// A host.
+struct Host {
+    joined: Joined,
+    shared: Mutex<(SharedMixture, Vec<(u64, f64)>)>,
+}
+
+pub async fn agents(plan: Plan) {
+    let model = Arc::new(Model::load());
+    let recorded: Arc<Vec<_>> = Arc::new((0..RECORDED as u64).map(|number| model.at_rest(number)).collect());
+    let directory = tempfile::tempdir_in("/dev/shm").unwrap();
+    let (mut hosts, mut walkers) = (Vec::new(), Vec::new());
+    for number in 0..AGENTS {
+        let host = Arc::new(Host::join(number, plan, directory.path()).await);
+        for slot in host.joined.slots() {
+            let random = Random::new(walkers.len() as u64);
+            let (recorded, host) = (Arc::clone(&recorded), Arc::clone(&host));
+            let walker = Walker { recorded, host, random, grades: Grades::default() };
+            walkers.push(tokio::spawn(walker.work(slot, plan)));
+        }
+        hosts.push(host);
+    }
+    let mut seen = Seen::default();
+    for walker in walkers {
+        for (offered, waited) in walker.await.unwrap() {
+            if let Some(period) = period(offered, plan) {
+                seen.waits[period].push(waited);
+            }
+        }
+    }
+    for host in hosts {
+        host.joined.leave().await;
+        seen.versions.push(std::mem::take(&mut host.shared.lock().unwrap().1));
+    }
+    println!("{}", serde_json::to_string(&seen).unwrap());
+}
+
+impl Host {
+    async fn join(number: usize, plan: Plan, directory: &Path) -> Self {
+        let walkers = (WALKERS / AGENTS) as u32;
+        let agent = Agent {
+            id: format!("{:032x}", Random::new(number as u64).next()),
+            host: "simulated".into(),
+            pid: std::process::id(),
+            program_version: "bench".into(),
+            walkers,
+            ahead: 0,
+        };
+        let address = Address::At(endpoint(plan));
+        let uplink = Uplink::open(&address, None, agent, |why| eprintln!("waiting: {why}")).await;
+        let joined = Arc::new(uplink.unwrap()).join().await.unwrap();
+        let newest = joined.newest().await;
+        let shared = SharedMixture::create(&directory.join(number.to_string()), &newest, walkers).unwrap();
+        Self { joined, shared: Mutex::new((shared, Vec::new())) }
+    }
+
+    /// What an agent does with the mixture of a turn before a walker gets it.
+    fn publish(&self, mixture: &Arc<Mixture>) {
+        let (shared, versions) = &mut *self.shared.lock().unwrap();
+        shared.publish(mixture).unwrap();
+        if versions.last().is_none_or(|(last, _)| *last < mixture.version()) {
+            versions.push((mixture.version(), now()));
+        }
+    }
+}
+
+/// A walker that does no dynamics.
+struct Walker {
+    recorded: Arc<Vec<Candidate>>,
+    host: Arc<Host>,
+    random: Random,
+    grades: Grades,
+}
+
+impl Walker {
+    /// Offers until it is sent home. When it offered, and how long it waited, s.
+    async fn work(mut self, mut slot: Slot, plan: Plan) -> Vec<(f64, f64)> {
+        let (mut told, mut waits) = (Told::Nothing, Vec::new());
+        loop {
+            let (offered, begun) = (now(), Instant::now());
+            let work = slot.exchange(&self.host.joined, &told).await.unwrap();
+            waits.push((offered, begun.elapsed().as_secs_f64()));
+            let Some(work) = work else { return waits };
+            self.host.publish(&work.mixture);
+            let walk = if plan.rate > 0.0 { WALKERS as f64 / plan.rate } else { 0.0 };
+            sleep(Duration::from_secs_f64(walk * (0.5 + self.random.uniform()))).await;
+            let candidate = self.candidate(&work.assignment, &work.mixture);
+            told = Told::Report(campaign::report(&work.assignment, Some(CandidateBlock::encode(&candidate))));
+        }
+    }
+
+    /// One that was recorded, moved a little as a whole, so that it is no duplicate.
+    fn candidate(&mut self, assignment: &Assignment, mixture: &Mixture) -> Candidate {
+        let (walk, turn) = (u64::from(assignment.walk.0), assignment.turn);
+        let mut candidate = self.recorded[(walk + turn) as usize % RECORDED].clone();
+        let shift = 1e-9 * (walk + WALKERS as u64 * turn) as f64;
+        candidate.structure.positions.iter_mut().for_each(|position| position[0] += shift);
+        let step = progress(turn).step;
+        let content = ContentHash::of(&candidate.structure);
+        candidate.id = CandidateId { walk: assignment.walk, step, content, ..candidate.id };
+        candidate.mixture_version = mixture.version();
+        if (walk + turn).is_multiple_of(NEW) {
+            self.make_new(&mut candidate, mixture);
+        }
+        candidate
+    }
+
+    /// Moves the features of the first atom in a random direction until it has the grade of something new.
+    fn make_new(&mut self, candidate: &mut Candidate, mixture: &Mixture) {
+        let dimension = mixture.dimension();
+        let before = candidate.features[..dimension].to_vec();
+        let direction: Vec<f64> = (0..dimension).map(|_| self.random.normal()).collect();
+        let mut moved = |scale: f64| {
+            let moved: Vec<f64> = before.iter().zip(&direction).map(|(z, d)| z + scale * d).collect();
+            self.grades.evaluate(mixture, &[0], &moved, None).unwrap();
+            (moved, self.grades.gamma[0])
+        };
+        // γ grows with the distance: double it until it is enough, then halve the interval.
+        let (mut low, mut high) = (0.0, 1e-6);
+        while moved(high).1 < GRADE {
+            (low, high) = (high, 2.0 * high);
+        }
+        for _ in 0..10 {
+            let middle = 0.5 * (low + high);
+            if moved(middle).1 < GRADE { low = middle } else { high = middle }
+        }
+        candidate.features[..dimension].copy_from_slice(&moved(high).0);
+    }
+}
