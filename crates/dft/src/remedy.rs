@@ -25,6 +25,17 @@ pub enum Remedy {
 }
 
 impl Remedy {
+    /// All of them.
+    pub const ALL: [Self; 7] = [
+        Self::MoreSteps,
+        Self::SlowerMixing,
+        Self::OtherAlgorithm,
+        Self::OtherMoments,
+        Self::MoreMemory,
+        Self::MoreTime,
+        Self::OtherNode,
+    ];
+
     /// Short name, as the store keeps it.
     pub fn name(self) -> &'static str {
         match self {

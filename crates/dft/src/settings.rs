@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Code, SetupError, command};
+use crate::{Code, SetupError, command, gpaw};
 
 /// Which program makes labels, and how: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -12,6 +12,8 @@ use crate::{Code, SetupError, command};
 pub enum Settings {
     /// A program of the user's.
     Command(command::Settings),
+    /// GPAW.
+    Gpaw(gpaw::Settings),
 }
 
 impl Settings {
@@ -19,6 +21,7 @@ impl Settings {
     pub fn name(&self) -> &'static str {
         match self {
             Self::Command(_) => "command",
+            Self::Gpaw(_) => "gpaw",
         }
     }
 
@@ -26,6 +29,7 @@ impl Settings {
     pub fn paths(&mut self) -> Vec<&mut PathBuf> {
         match self {
             Self::Command(settings) => settings.files.iter_mut().collect(),
+            Self::Gpaw(settings) => settings.pseudopotentials.iter_mut().collect(),
         }
     }
 
@@ -36,6 +40,7 @@ impl Settings {
     pub fn prepare(&self) -> Result<Box<dyn Code>, SetupError> {
         Ok(match self {
             Self::Command(settings) => Box::new(settings.prepare()?),
+            Self::Gpaw(settings) => Box::new(settings.prepare()?),
         })
     }
 }

@@ -1,0 +1,91 @@
+//! What the script is told.
+
+use std::collections::BTreeSet;
+
+use atoms::Species;
+use atoms::cell::{Matrix3, Vec3};
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use super::{Gpaw, SCRIPT, Settings};
+use crate::lattice::Enclosed;
+use crate::moments;
+use crate::{Failure, FailureClass, Input, Remedy, Smearing};
+
+/// Name of the script in the directory of a calculation.
+pub(super) const SCRIPT_FILE: &str = "job.py";
+
+/// `input.json`
+#[derive(Serialize)]
+struct Task<'a> {
+    species: &'a [Species],
+    positions: &'a [Vec3],
+    cell: &'a Matrix3,
+    moments: Option<Vec<f64>>,
+    cutoff: f64,
+    /// Keyword arguments of `GPAW`.
+    parameters: Value,
+}
+
+pub(super) fn write(gpaw: &Gpaw, enclosed: &Enclosed, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
+    let (settings, structure) = (&gpaw.settings, &enclosed.structure);
+    for species in BTreeSet::from_iter(structure.species.iter().copied()) {
+        gpaw.setup(species).map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+    }
+    let task = Task {
+        species: &structure.species,
+        positions: &structure.positions,
+        cell: &structure.cell.0,
+        moments: settings.spin.then(|| moments::initial(structure, &settings.moments, remedies)),
+        cutoff: settings.cutoff,
+        parameters: parameters(
+            settings,
+            enclosed.mesh(settings.k_spacing),
+            gpaw.electrons(structure),
+            remedies,
+        ),
+    };
+    let task = serde_json::to_vec_pretty(&task)
+        .map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+    Ok(Input {
+        files: [(SCRIPT_FILE.to_owned(), SCRIPT.into()), ("input.json".to_owned(), task)].into(),
+        command: settings.command.iter().cloned().chain([SCRIPT_FILE.to_owned()]).collect(),
+        environment: gpaw.environment.clone(),
+    })
+}
+
+fn parameters(settings: &Settings, mesh: [u32; 3], electrons: f64, remedies: &BTreeSet<Remedy>) -> Value {
+    let mut parameters = json!({
+        "xc": "PBE",
+        "setups": settings.variants,
+        "kpts": { "size": mesh, "gamma": true },
+        "symmetry": { "point_group": false },
+        "spinpol": settings.spin,
+        "occupations": occupations(settings.smearing, settings.smearing_width),
+        // GPAW counts the energy per valence electron.
+        "convergence": {
+            "energy": settings.energy_tolerance / electrons.max(1.0),
+            "forces": settings.force_tolerance,
+        },
+        "maxiter": settings.steps,
+    });
+    if remedies.contains(&Remedy::MoreSteps) {
+        parameters["maxiter"] = json!(settings.steps.saturating_mul(3));
+    }
+    if remedies.contains(&Remedy::SlowerMixing) {
+        parameters["mixer"] = json!({ "beta": 0.02, "nmaxold": 8, "weight": 100.0 });
+    }
+    if remedies.contains(&Remedy::OtherAlgorithm) {
+        parameters["eigensolver"] = json!({ "name": "cg" });
+    }
+    parameters
+}
+
+fn occupations(smearing: Smearing, width: f64) -> Value {
+    match smearing {
+        // Of order 0, Methfessel and Paxton's function is the Gaussian.
+        Smearing::Gaussian => json!({ "name": "methfessel-paxton", "order": 0, "width": width }),
+        Smearing::MethfesselPaxton => json!({ "name": "methfessel-paxton", "order": 1, "width": width }),
+        Smearing::FermiDirac => json!({ "name": "fermi-dirac", "width": width }),
+    }
+}

@@ -1,0 +1,91 @@
+"""A plane-wave single point with GPAW: input.json in, result.json out.
+
+result.json appears whole, as the last thing that is done, or not at all; what the program says goes to stdout. Without
+input.json, who GPAW is and where it looks for setups goes to stdout.
+"""
+
+import json
+import math
+import os
+
+import ase
+import gpaw
+from ase import Atoms
+from gpaw import GPAW, PW, KohnShamConvergenceError
+from gpaw.mpi import world
+from gpaw.utilities import AtomsTooClose
+
+
+def main():
+    try:
+        with open("input.json") as file:
+            task = json.load(file)
+    except FileNotFoundError:
+        paths = [str(path) for path in gpaw.setup_paths]
+        return say({"gpaw": gpaw.__version__, "ase": ase.__version__, "setup_paths": paths})
+
+    calculator = GPAW(mode=PW(task["cutoff"]), **task["parameters"])
+    atoms = Atoms(task["species"], positions=task["positions"], cell=task["cell"], pbc=True, calculator=calculator)
+    atoms.set_initial_magnetic_moments(task["moments"])
+    try:
+        result = calculate(atoms, spin=task["moments"] is not None)
+    except KohnShamConvergenceError as error:
+        steps = getattr(calculator.scf, "niter", None)
+        result = failure("not_converged", f"{error} ({steps} electronic steps)")
+    except AtomsTooClose as error:
+        result = failure("bad_input", str(error))
+    except MemoryError as error:
+        result = failure("out_of_memory", str(error))
+    leave(result)
+
+
+def calculate(atoms, spin):
+    calculator = atoms.calc
+    # The forces are derivatives of the free energy.
+    result = {"energy": calculator.get_potential_energy(atoms, force_consistent=True)}
+    if not calculator.scf.converged:
+        return failure("not_converged", "GPAW gives an energy, but does not say that it converged")
+    result["energy_without_smearing"] = calculator.get_potential_energy(atoms, force_consistent=False)
+    result["forces"] = calculator.get_forces(atoms).tolist()
+    result["stress"] = calculator.get_stress(atoms).tolist()
+    result["moments"] = calculator.get_magnetic_moments(atoms).tolist() if spin else None
+    result["magnetisation"] = calculator.get_magnetic_moment(atoms) if spin else None
+    result["steps"] = calculator.get_number_of_iterations()
+    calculated = calculator.get_atoms()
+    result["species"] = calculated.get_chemical_symbols()
+    result["positions"] = calculated.positions.tolist()
+    result["cell"] = calculated.cell[:].tolist()
+    if not all(map(math.isfinite, numbers(result))):
+        return failure("implausible", "a number of the result is not finite")
+    return {"converged": result}
+
+
+def numbers(result):
+    if isinstance(result, dict):
+        result = list(result.values())
+    if isinstance(result, list):
+        for part in result:
+            yield from numbers(part)
+    elif isinstance(result, float):
+        yield result
+
+
+def failure(kind, message):
+    return {"failure": {"class": kind, "message": message}}
+
+
+def say(result):
+    if world.rank == 0:
+        print(json.dumps(result), flush=True)
+
+
+def leave(result):
+    if world.rank == 0:
+        with open("result.json.part", "w") as file:
+            json.dump(result, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace("result.json.part", "result.json")
+
+
+main()

@@ -1,0 +1,234 @@
+//! GPAW with plane waves and PAW setups, run by a script of ours ([`SCRIPT`]).
+//!
+//! Spin-polarised PBE, no symmetry but time reversal. The energy is the free energy. Directions of a structure that do
+//! not repeat get vacuum, and no stress is given then.
+//!
+//! Remedies:
+//! - more steps: three times as many;
+//! - slower mixing: Pulay mixing with β 0.02 instead of 0.05, 8 old densities instead of 5, and twice the weight of long
+//!   waves;
+//! - another algorithm: conjugate gradients instead of Davidson's;
+//! - other moments: half of them to start from.
+
+mod input;
+mod result;
+mod setups;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use atoms::{Species, Structure};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::lattice::Enclosed;
+use crate::moments::Moments;
+use crate::setting::{at_least, positive};
+use crate::{Calculated, Code, Exit, Failure, Input, Remedy, SetupError, Size, Smearing, judge, program};
+use setups::Setup;
+
+/// The script that GPAW is run by.
+pub const SCRIPT: &str = include_str!("job.py");
+
+/// Counts changes of what is written here that change a label's value.
+const RECIPE: u32 = 1;
+
+/// `[label.method.gpaw]`
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Settings {
+    /// A Python that has GPAW, and what it is started by: `["mpirun", "-np", "4", "gpaw", "python"]`.
+    pub command: Vec<String>,
+    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    pub environment: BTreeMap<String, String>,
+    /// Directory of the setups; where GPAW itself looks if there is none.
+    pub pseudopotentials: Option<PathBuf>,
+    /// Setup of an element where it is not the one without a name: `{ Ni = "10" }`.
+    pub variants: BTreeMap<Species, String>,
+    /// Kinetic energy of the fastest plane wave, eV.
+    pub cutoff: f64,
+    /// Largest distance of k-points, Å⁻¹, 2π included; the mesh is Γ-centred.
+    pub k_spacing: f64,
+    /// Occupation of states near the Fermi level.
+    pub smearing: Smearing,
+    /// Its width, eV.
+    pub smearing_width: f64,
+    /// Whether the two spins have their own densities.
+    pub spin: bool,
+    /// Initial magnetic moment by element, μ_B; 1 for all others.
+    pub moments: Moments,
+    /// Largest change of the energy in the last three electronic steps, eV.
+    pub energy_tolerance: f64,
+    /// Largest change of a force in the last electronic step, eV/Å.
+    pub force_tolerance: f64,
+    /// Most electronic steps.
+    pub steps: u32,
+    /// Space between images in directions that do not repeat, Å.
+    pub vacuum: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            command: vec!["/usr/bin/python3".into()],
+            environment: BTreeMap::new(),
+            pseudopotentials: None,
+            variants: BTreeMap::new(),
+            cutoff: 500.0,
+            k_spacing: 0.125,
+            smearing: Smearing::Gaussian,
+            smearing_width: 0.1,
+            spin: true,
+            moments: Moments::new(),
+            energy_tolerance: 1e-6,
+            force_tolerance: 1e-3,
+            steps: 200,
+            vacuum: 10.0,
+        }
+    }
+}
+
+impl Settings {
+    /// Asks GPAW for its version and finds the setups.
+    ///
+    /// # Errors
+    /// A program that does not answer, a setting with an impossible value.
+    pub fn prepare(&self) -> Result<Gpaw, SetupError> {
+        positive("cutoff", self.cutoff)?;
+        positive("k_spacing", self.k_spacing)?;
+        positive("smearing_width", self.smearing_width)?;
+        positive("energy_tolerance", self.energy_tolerance)?;
+        positive("force_tolerance", self.force_tolerance)?;
+        positive("vacuum", self.vacuum)?;
+        at_least("steps", self.steps, 1)?;
+        let environment = self.environment();
+        let who = Who::ask(&self.command, &environment)?;
+        let setups = setups::find(&who.setup_paths, &self.variants)?;
+        Ok(Gpaw { settings: self.clone(), environment, who, setups })
+    }
+
+    fn environment(&self) -> BTreeMap<String, String> {
+        let mut environment = program::environment(&self.environment);
+        if let Some(directory) = &self.pseudopotentials {
+            environment.insert("GPAW_SETUP_PATH".into(), directory.to_string_lossy().into_owned());
+        }
+        environment
+    }
+}
+
+/// What GPAW says of itself.
+#[derive(Clone, Debug, Deserialize)]
+struct Who {
+    gpaw: String,
+    ase: String,
+    setup_paths: Vec<PathBuf>,
+}
+
+impl Who {
+    fn ask(command: &[String], environment: &BTreeMap<String, String>) -> Result<Self, SetupError> {
+        let wrong = |reason: String| SetupError::Program { program: command.join(" "), reason };
+        let directory = program::scratch().map_err(|error| wrong(error.to_string()))?;
+        std::fs::write(directory.path().join(input::SCRIPT_FILE), SCRIPT)
+            .map_err(|error| wrong(error.to_string()))?;
+        let said = program::ask(command, &[input::SCRIPT_FILE], environment, directory.path())?;
+        said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
+            wrong(format!("is no Python with GPAW: it does not say its version but {:?}", said.trim()))
+        })
+    }
+}
+
+/// GPAW, ready to be used.
+#[derive(Clone, Debug)]
+pub struct Gpaw {
+    settings: Settings,
+    environment: BTreeMap<String, String>,
+    who: Who,
+    setups: BTreeMap<Species, Setup>,
+}
+
+impl Gpaw {
+    fn setup(&self, species: Species) -> Result<&Setup, SetupError> {
+        self.setups
+            .get(&species)
+            .ok_or_else(|| setups::missing(species, &self.who.setup_paths, &self.settings.variants))
+    }
+
+    /// Valence electrons of a structure; elements without a setup have none.
+    fn electrons(&self, structure: &Structure) -> f64 {
+        structure
+            .species
+            .iter()
+            .filter_map(|species| self.setups.get(species))
+            .map(|setup| setup.valence)
+            .sum()
+    }
+}
+
+impl Code for Gpaw {
+    fn identity(&self) -> Value {
+        let hashes: BTreeMap<&str, &str> =
+            self.setups.iter().map(|(species, setup)| (species.symbol(), setup.hash.as_str())).collect();
+        // Destructured, so that a new setting is not forgotten here.
+        let Settings {
+            command: _,
+            environment: _,
+            pseudopotentials: _,
+            variants: _,
+            cutoff,
+            k_spacing,
+            smearing,
+            smearing_width,
+            spin,
+            moments,
+            energy_tolerance,
+            force_tolerance,
+            steps: _,
+            vacuum,
+        } = &self.settings;
+        json!({
+            "code": "gpaw", "version": self.who.gpaw, "ase": self.who.ase, "recipe": RECIPE, "functional": "PBE",
+            "cutoff": cutoff, "k_spacing": k_spacing, "smearing": smearing, "smearing_width": smearing_width,
+            "spin": spin, "moments": moments, "energy_tolerance": energy_tolerance,
+            "force_tolerance": force_tolerance, "vacuum": vacuum, "pseudopotentials": hashes,
+        })
+    }
+
+    fn supports(&self, species: &BTreeSet<Species>) -> Result<(), SetupError> {
+        for species in species {
+            let valence = self.setup(*species)?.valence;
+            let moment = self.settings.moments.get(species).copied().unwrap_or_default();
+            if self.settings.spin && moment.abs() > valence {
+                return Err(SetupError::Setting {
+                    key: "moments",
+                    found: format!("{species} = {moment}"),
+                    expected: format!("at most its {valence} valence electrons"),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
+        input::write(self, &Enclosed::new(structure, self.settings.vacuum)?, remedies)
+    }
+
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
+        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
+        match result::read(&enclosed.structure, directory)? {
+            Some(calculated) => Ok(enclosed.seen_from_outside(calculated)),
+            None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+        }
+    }
+
+    fn size(&self, structure: &Structure) -> Size {
+        let mesh = Enclosed::new(structure, self.settings.vacuum)
+            .map_or([1; 3], |e| e.mesh(self.settings.k_spacing));
+        Size {
+            atoms: structure.len(),
+            electrons: self.electrons(structure),
+            k_points: mesh.iter().map(|n| *n as usize).product(),
+        }
+    }
+}

@@ -1,0 +1,140 @@
+//! PAW setups, found as GPAW finds them: `Si.PBE` or `Si.PBE.gz` in the first of the directories that has one.
+
+use std::collections::BTreeMap;
+use std::io::{ErrorKind, Read};
+use std::path::{Path, PathBuf};
+
+use atoms::Species;
+use flate2::read::GzDecoder;
+
+use crate::SetupError;
+
+/// What is known of a setup.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Setup {
+    /// BLAKE3 of its text.
+    pub hash: String,
+    /// Electrons that it treats.
+    pub valence: f64,
+}
+
+/// All setups that are there.
+pub(super) fn find(
+    directories: &[PathBuf],
+    variants: &BTreeMap<Species, String>,
+) -> Result<BTreeMap<Species, Setup>, SetupError> {
+    let mut setups = BTreeMap::new();
+    for species in (1..=118).filter_map(|number| Species::from_atomic_number(number).ok()) {
+        let name = name(species, variants);
+        // GPAW takes the last by name of a directory's candidates.
+        let candidates = |directory: &PathBuf| [directory.join(format!("{name}.gz")), directory.join(&name)];
+        let Some(path) = directories.iter().flat_map(candidates).find(|path| path.is_file()) else {
+            if variants.contains_key(&species) {
+                return Err(missing(species, directories, variants));
+            }
+            continue;
+        };
+        let setup = read(species, &path).map_err(|reason| SetupError::Pseudopotential {
+            species,
+            reason: format!("{}: {reason}", path.display()),
+        })?;
+        setups.insert(species, setup);
+    }
+    Ok(setups)
+}
+
+/// The error for an element that has none.
+pub(super) fn missing(
+    species: Species,
+    directories: &[PathBuf],
+    variants: &BTreeMap<Species, String>,
+) -> SetupError {
+    let looked: Vec<String> = directories.iter().map(|path| path.display().to_string()).collect();
+    let reason = format!(
+        "no setup {} (or .gz) in {}: install GPAW's setups, or name their directory in `pseudopotentials`",
+        name(species, variants),
+        looked.join(", ")
+    );
+    SetupError::Pseudopotential { species, reason }
+}
+
+/// `Si.PBE`, or with a variant `Ni.10.PBE`.
+fn name(species: Species, variants: &BTreeMap<Species, String>) -> String {
+    match variants.get(&species) {
+        Some(variant) => format!("{species}.{variant}.PBE"),
+        None => format!("{species}.PBE"),
+    }
+}
+
+fn read(species: Species, path: &Path) -> Result<Setup, String> {
+    let bytes = std::fs::read(path).map_err(|error| error.to_string())?;
+    let text = match path.extension().is_some_and(|extension| extension == "gz") {
+        true => unpacked(&bytes).map_err(|error| format!("cannot be unpacked: {error}"))?,
+        false => bytes,
+    };
+    let head = String::from_utf8_lossy(&text[..text.len().min(4096)]);
+    let valence = valence(&head, species).ok_or_else(|| {
+        format!("is no PAW setup of {species}: its head has no <atom symbol=\"{species}\" … valence=\"…\"/>")
+    })?;
+    Ok(Setup { hash: blake3::hash(&text).to_hex().to_string(), valence })
+}
+
+fn unpacked(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
+    // Setups have some 100 kB; a file that grows without end is none.
+    const MOST: u64 = 64 << 20;
+    let mut text = Vec::new();
+    match GzDecoder::new(bytes).take(MOST).read_to_end(&mut text)? as u64 {
+        MOST => Err(std::io::Error::new(ErrorKind::InvalidData, "more than 64 MB")),
+        _ => Ok(text),
+    }
+}
+
+/// Valence electrons that the `<atom>` element of a setup states, if it is of this species.
+fn valence(head: &str, species: Species) -> Option<f64> {
+    let atom = head.split("<atom ").nth(1)?.split("/>").next()?;
+    let attribute = |key: &str| atom.split(&format!("{key}=\"")).nth(1)?.split('"').next();
+    let valence: f64 = attribute("valence")?.parse().ok()?;
+    (attribute("symbol")? == species.symbol() && valence.is_finite() && valence >= 0.0).then_some(valence)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HEAD: &str = "<?xml version=\"1.0\"?>\n<paw_setup version=\"0.6\">\n  \
+                        <atom symbol=\"Si\" Z=\"14\" core=\"10.0\" valence=\"4\"/>\n";
+
+    fn species(symbol: &str) -> Species {
+        symbol.parse().unwrap()
+    }
+
+    #[test]
+    fn a_setup_is_found_where_gpaw_finds_it_and_must_be_of_its_element() {
+        let directories = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+        let paths = directories.each_ref().map(|directory| directory.path().to_owned());
+        std::fs::write(paths[1].join("Si.PBE"), HEAD).unwrap();
+        let none = BTreeMap::new();
+        let setups = find(&paths, &none).unwrap();
+        assert_eq!(setups.keys().copied().collect::<Vec<_>>(), [species("Si")]);
+        assert_eq!(setups[&species("Si")].valence, 4.0);
+
+        std::fs::write(paths[0].join("Si.PBE"), HEAD.replace("valence=\"4\"", "valence=\"12\"")).unwrap();
+        let first = find(&paths, &none).unwrap();
+        assert_eq!(first[&species("Si")].valence, 12.0);
+        assert_ne!(first[&species("Si")].hash, setups[&species("Si")].hash);
+
+        std::fs::write(paths[0].join("Al.PBE"), HEAD).unwrap();
+        let error = find(&paths, &none).unwrap_err().to_string();
+        assert!(error.contains("is no PAW setup of Al"), "{error}");
+    }
+
+    #[test]
+    fn a_missing_variant_names_element_and_directories() {
+        let directory = tempfile::tempdir().unwrap();
+        let paths = [directory.path().to_owned()];
+        let error =
+            find(&paths, &BTreeMap::from([(species("Ni"), "10".to_owned())])).unwrap_err().to_string();
+        assert!(error.starts_with("pseudopotential of Ni: no setup Ni.10.PBE (or .gz) in "), "{error}");
+        assert!(error.contains(&paths[0].display().to_string()), "{error}");
+    }
+}

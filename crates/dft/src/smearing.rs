@@ -1,0 +1,16 @@
+//! Partial occupation of electronic states.
+
+use serde::{Deserialize, Serialize};
+
+/// How states near the Fermi level are occupied.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Smearing {
+    /// f = ½ erfc((ε − μ) / width).
+    #[default]
+    Gaussian,
+    /// f = 1 / (exp((ε − μ) / width) + 1); the width is k_B T.
+    FermiDirac,
+    /// Methfessel and Paxton, Phys. Rev. B 40, 3616 (1989), first order.
+    MethfesselPaxton,
+}

@@ -1,0 +1,51 @@
+//! GPAW. Real-space grids for densities make an egg-box of some 1e-4 eV/Å.
+
+use dft::gpaw::Settings;
+use dft::{Code, FailureClass};
+
+use crate::run::{climb, label};
+use crate::{checks, structures};
+
+fn settings() -> Settings {
+    Settings { cutoff: 250.0, k_spacing: 1.2, spin: false, ..Settings::default() }
+}
+
+#[test]
+fn the_stress_of_silicon_is_a_derivative_of_the_energy() {
+    // That the plane waves change with the cell adds some 3e-4 eV/Å³ at this cutoff and mesh.
+    let code = Settings { cutoff: 400.0, k_spacing: 0.8, ..settings() }.prepare().unwrap();
+    let structure = structures::silicon();
+    let calculated = label(&code, &structure);
+    assert!(calculated.magnetic_moments.is_none());
+    checks::stress(&code, &structure, &calculated, 5e-4);
+}
+
+#[test]
+fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
+    let code = Settings { k_spacing: 0.9, ..settings() }.prepare().unwrap();
+    let structure = structures::aluminium();
+    let calculated = label(&code, &structure);
+    let extrapolated = calculated.energy_without_smearing.unwrap();
+    assert!((1e-3..0.1).contains(&(extrapolated - calculated.energy)), "{calculated:?}");
+    checks::forces(&code, &structure, &calculated, 2e-3);
+}
+
+#[test]
+fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
+    let code = Settings { spin: true, cutoff: 400.0, vacuum: 5.0, ..settings() }.prepare().unwrap();
+    let structure = structures::oxygen();
+    let calculated = label(&code, &structure);
+    checks::magnet(&calculated, 2.0, 0.01);
+    assert_eq!(calculated.stress, None);
+    checks::forces(&code, &structure, &calculated, 2e-2);
+}
+
+#[test]
+fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
+    let few = Settings { steps: 12, ..settings() }.prepare().unwrap();
+    let (calculated, failures) = climb(&few, &structures::silicon());
+    assert_eq!(failures, [FailureClass::NotConverged]);
+    let enough = settings().prepare().unwrap();
+    assert_eq!(few.identity(), enough.identity());
+    assert!((calculated.energy - label(&enough, &structures::silicon()).energy).abs() < 1e-5);
+}

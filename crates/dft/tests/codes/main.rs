@@ -1,0 +1,10 @@
+//! Labels of real programs, checked against themselves: forces and stress are derivatives of the energy, a magnet has
+//! its moment, and a limit on electronic steps that is too low is judged so and climbed over.
+//!
+//! Needs Debian's packages gpaw, gpaw-data, abinit, abinit-data, cp2k and cp2k-data, and fails without them:
+//! `cargo test -p dft --test codes`.
+
+mod checks;
+mod gpaw;
+mod run;
+mod structures;
