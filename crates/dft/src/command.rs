@@ -19,7 +19,7 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use crate::{Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, SetupError, Size, find};
+use crate::{Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, SetupError, Size, find, judge};
 
 const STRUCTURE: &str = "structure.extxyz";
 const LABEL: &str = "label.extxyz";
@@ -111,7 +111,7 @@ impl Code for Command {
             Exit::Code(3) => Err(FailureClass::NotConverged.because("the command says so (exit code 3)")),
             Exit::Code(4) => Err(FailureClass::OutOfMemory.because("the command says so (exit code 4)")),
             Exit::Code(5) => Err(FailureClass::BadInput.because("the command says so (exit code 5)")),
-            _ => Err(exit.failure()),
+            _ => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
         }
     }
 

@@ -18,6 +18,7 @@ mod same;
 mod setting;
 mod settings;
 mod smearing;
+pub mod vasp;
 
 pub use code::{Calculated, Code, Exit, Input, SetupError, Size};
 pub use failure::{Failure, FailureClass};

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Code, SetupError, command, gpaw};
+use crate::{Code, SetupError, command, gpaw, vasp};
 
 /// Which program makes labels, and how: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -14,6 +14,8 @@ pub enum Settings {
     Command(command::Settings),
     /// GPAW.
     Gpaw(gpaw::Settings),
+    /// VASP.
+    Vasp(vasp::Settings),
 }
 
 impl Settings {
@@ -22,6 +24,7 @@ impl Settings {
         match self {
             Self::Command(_) => "command",
             Self::Gpaw(_) => "gpaw",
+            Self::Vasp(_) => "vasp",
         }
     }
 
@@ -30,6 +33,7 @@ impl Settings {
         match self {
             Self::Command(settings) => settings.files.iter_mut().collect(),
             Self::Gpaw(settings) => settings.pseudopotentials.iter_mut().collect(),
+            Self::Vasp(settings) => vec![&mut settings.pseudopotentials],
         }
     }
 
@@ -41,6 +45,7 @@ impl Settings {
         Ok(match self {
             Self::Command(settings) => Box::new(settings.prepare()?),
             Self::Gpaw(settings) => Box::new(settings.prepare()?),
+            Self::Vasp(settings) => Box::new(settings.prepare()?),
         })
     }
 }

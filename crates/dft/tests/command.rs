@@ -93,9 +93,12 @@ fn the_exit_code_tells_the_class() {
     let (home, place) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let code = settings(home.path(), INFO, 0).prepare().unwrap();
     run(&code, &oxide(), &[], place.path()).unwrap();
-    for (exit, class) in
-        [(Exit::Signal(9), Crashed), (Exit::TimeLimit, TimeLimit), (Exit::LostNode, LostNode)]
-    {
+    for (exit, class) in [
+        (Exit::Signal(9), OutOfMemory),
+        (Exit::Signal(11), Crashed),
+        (Exit::TimeLimit, TimeLimit),
+        (Exit::LostNode, LostNode),
+    ] {
         assert_eq!(code.read(&oxide(), place.path(), exit).unwrap_err().class, class);
     }
 }

@@ -1,0 +1,256 @@
+//! VASP with the user's own POTCAR files.
+//!
+//! Spin-polarised PBE with PAW potentials; the defaults are the protocol of calmwalk's paper. The energy is the free
+//! energy. Numbers are read from `vasprun.xml` or, where that is cut off, from an `OUTCAR` that is whole; moments from
+//! `OUTCAR`. Atoms of an element stand together in VASP's files, and come back in the structure's order. Directions of a
+//! structure that do not repeat get vacuum, and no stress is given then.
+//!
+//! Remedies:
+//! - more steps: three times as many;
+//! - slower mixing: almost linear (`BMIX` 0.0001) with a tenth of the new density;
+//! - another algorithm: conjugate gradients for all bands at once (`ALGO = All`), which mix nothing;
+//! - other moments: half of them to start from;
+//! - more memory: all processors share each k-point (`KPAR = 1`).
+
+mod incar;
+mod numbers;
+mod outcar;
+mod output;
+mod potcar;
+#[cfg(test)]
+mod real;
+mod result;
+mod vasprun;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use atoms::poscar::write_poscar;
+use atoms::{Species, Structure};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::lattice::Enclosed;
+use crate::moments::{self, Moments};
+use crate::setting::{at_least, positive};
+use crate::{
+    Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, SetupError, Size, Smearing, find, program,
+};
+use potcar::Potcar;
+
+/// Counts changes of what is written here that change a label's value.
+const RECIPE: u32 = 1;
+
+/// `[label.method.vasp]`
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Settings {
+    /// VASP, and what it is started by: `["mpirun", "-np", "16", "vasp_std"]`.
+    pub command: Vec<String>,
+    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    pub environment: BTreeMap<String, String>,
+    /// Version of VASP, `"5.4.4"`: it cannot be asked, and each output is compared with this. Needed.
+    pub version: String,
+    /// Directory of the POTCAR files: `Al_pv/POTCAR`, `POTCAR.Al_pv` or `Al_pv`. Needed.
+    pub pseudopotentials: PathBuf,
+    /// The potential of each element that may occur: `{ Al = "Al", Fe = "Fe_pv" }`. Needed.
+    pub variants: BTreeMap<Species, String>,
+    /// Kinetic energy of the fastest plane wave, eV (`ENCUT`).
+    pub cutoff: f64,
+    /// Largest distance of k-points, Å⁻¹, 2π included; the mesh is Γ-centred.
+    pub k_spacing: f64,
+    /// Occupation of states near the Fermi level (`ISMEAR`).
+    pub smearing: Smearing,
+    /// Its width, eV (`SIGMA`).
+    pub smearing_width: f64,
+    /// Whether the two spins have their own densities (`ISPIN`).
+    pub spin: bool,
+    /// Initial magnetic moment by element, μ_B; 1 for all others (`MAGMOM`).
+    pub moments: Moments,
+    /// Largest change of the energy in the last electronic step, eV (`EDIFF`).
+    pub energy_tolerance: f64,
+    /// Most electronic steps (`NELM`).
+    pub steps: u32,
+    /// Space between images in directions that do not repeat, Å.
+    pub vacuum: f64,
+    /// Groups of processors that share the k-points (`KPAR`).
+    pub k_groups: u32,
+    /// Processors that share a band (`NCORE`).
+    pub cores_per_band: u32,
+    /// Further tags of INCAR, part of the protocol: `{ LASPH = ".TRUE." }`.
+    pub tags: BTreeMap<String, String>,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            command: vec!["vasp_std".into()],
+            environment: BTreeMap::new(),
+            version: String::new(),
+            pseudopotentials: PathBuf::new(),
+            variants: BTreeMap::new(),
+            cutoff: 500.0,
+            k_spacing: 0.125,
+            smearing: Smearing::Gaussian,
+            smearing_width: 0.1,
+            spin: true,
+            moments: Moments::new(),
+            energy_tolerance: 1e-6,
+            steps: 100,
+            vacuum: 10.0,
+            k_groups: 1,
+            cores_per_band: 1,
+            tags: BTreeMap::new(),
+        }
+    }
+}
+
+impl Settings {
+    /// Finds the program and reads the POTCAR files.
+    ///
+    /// # Errors
+    /// No such program, no such POTCAR or another than its name says, a setting with an impossible value.
+    pub fn prepare(&self) -> Result<Vasp, SetupError> {
+        positive("cutoff", self.cutoff)?;
+        positive("k_spacing", self.k_spacing)?;
+        positive("smearing_width", self.smearing_width)?;
+        positive("energy_tolerance", self.energy_tolerance)?;
+        positive("vacuum", self.vacuum)?;
+        at_least("steps", self.steps, 1)?;
+        at_least("k_groups", self.k_groups, 1)?;
+        at_least("cores_per_band", self.cores_per_band, 1)?;
+        let needed = |key, missing: bool, expected: &str| match missing {
+            true => {
+                Err(SetupError::Setting { key, found: "nothing".to_owned(), expected: expected.to_owned() })
+            }
+            false => Ok(()),
+        };
+        needed("version", self.version.is_empty(), "the version of your VASP, such as \"5.4.4\"")?;
+        needed(
+            "pseudopotentials",
+            self.pseudopotentials.as_os_str().is_empty(),
+            "the directory of your POTCAR files",
+        )?;
+        needed(
+            "variants",
+            self.variants.is_empty(),
+            "the potential of each element, such as { Al = \"Al\" }",
+        )?;
+        needed(
+            "command",
+            self.command.is_empty(),
+            "VASP, such as [\"mpirun\", \"-np\", \"16\", \"vasp_std\"]",
+        )?;
+        incar::check(self)?;
+        find::program(&self.command[0])?;
+        let potcars = self.variants.iter().map(|(species, variant)| {
+            Ok((*species, Potcar::find(&self.pseudopotentials, *species, variant)?))
+        });
+        Ok(Vasp { potcars: potcars.collect::<Result<_, _>>()?, settings: self.clone() })
+    }
+}
+
+/// VASP, ready to be used.
+#[derive(Clone, Debug)]
+pub struct Vasp {
+    settings: Settings,
+    potcars: BTreeMap<Species, Potcar>,
+}
+
+impl Vasp {
+    fn potcar(&self, species: Species) -> Result<&Potcar, SetupError> {
+        self.potcars.get(&species).ok_or_else(|| {
+            let reason = format!("none is chosen; name one in `variants`, such as {species} = \"{species}\"");
+            SetupError::Pseudopotential { species, reason }
+        })
+    }
+}
+
+impl Code for Vasp {
+    fn identity(&self) -> Value {
+        let potcar = |(species, potcar): (&Species, &Potcar)| {
+            (species.symbol(), json!({ "title": potcar.title, "hash": potcar.hash }))
+        };
+        let pseudopotentials: BTreeMap<&str, Value> = self.potcars.iter().map(potcar).collect();
+        // Destructured, so that a new setting is not forgotten here.
+        let Settings {
+            command: _,
+            environment: _,
+            version,
+            pseudopotentials: _,
+            variants: _,
+            cutoff,
+            k_spacing,
+            smearing,
+            smearing_width,
+            spin,
+            moments,
+            energy_tolerance,
+            steps: _,
+            vacuum,
+            k_groups: _,
+            cores_per_band: _,
+            tags,
+        } = &self.settings;
+        json!({
+            "code": "vasp", "version": version, "recipe": RECIPE, "functional": "PBE", "precision": "Accurate",
+            "cutoff": cutoff, "k_spacing": k_spacing, "smearing": smearing, "smearing_width": smearing_width,
+            "spin": spin, "moments": moments, "energy_tolerance": energy_tolerance, "vacuum": vacuum, "tags": tags,
+            "pseudopotentials": pseudopotentials,
+        })
+    }
+
+    fn supports(&self, species: &BTreeSet<Species>) -> Result<(), SetupError> {
+        species.iter().try_for_each(|species| self.potcar(*species).map(drop))
+    }
+
+    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
+        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
+        let (poscar, order) = poscar(&enclosed.structure)?;
+        let mut potcar = Vec::new();
+        for species in order.chunk_by(|a, b| structure.species[*a] == structure.species[*b]) {
+            let part = self.potcar(structure.species[species[0]]);
+            potcar.extend(&part.map_err(|error| FailureClass::BadInput.because(error.to_string()))?.content);
+        }
+        let moments = moments::initial(structure, &self.settings.moments, remedies);
+        let moments: Vec<f64> = order.iter().map(|atom| moments[*atom]).collect();
+        let k_spacing = self.settings.k_spacing;
+        let files = [
+            ("POSCAR", poscar),
+            ("POTCAR", potcar),
+            ("INCAR", incar::incar(&self.settings, &moments, remedies).into_bytes()),
+            ("KPOINTS", incar::kpoints(enclosed.mesh(k_spacing), k_spacing).into_bytes()),
+        ];
+        Ok(Input {
+            files: files.map(|(name, content)| (name.to_owned(), content)).into(),
+            command: self.settings.command.clone(),
+            environment: program::environment(&self.settings.environment),
+        })
+    }
+
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
+        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
+        let (_, order) = poscar(&enclosed.structure)?;
+        let calculated = result::read(&enclosed.structure, &order, &self.settings.version, directory, exit)?;
+        Ok(enclosed.seen_from_outside(calculated))
+    }
+
+    fn size(&self, structure: &Structure) -> Size {
+        let valence = |species| self.potcars.get(species).map_or(0.0, |potcar| potcar.valence);
+        let mesh =
+            Enclosed::new(structure, self.settings.vacuum).map(|cell| cell.mesh(self.settings.k_spacing));
+        Size {
+            atoms: structure.len(),
+            electrons: structure.species.iter().map(valence).sum(),
+            k_points: mesh.map_or(1, |mesh| mesh.iter().map(|n| *n as usize).product()),
+        }
+    }
+}
+
+/// POSCAR and the order of its atoms.
+fn poscar(structure: &Structure) -> Result<(Vec<u8>, Vec<usize>), Failure> {
+    let mut text = Vec::new();
+    let order = write_poscar(&mut text, structure, &structure.formula())
+        .map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+    Ok((text, order))
+}

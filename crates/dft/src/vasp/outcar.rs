@@ -1,0 +1,214 @@
+//! `OUTCAR`: what stands only there, and all that matters where `vasprun.xml` is cut off.
+
+use std::io::BufRead;
+
+use atoms::cell::{Matrix3, Vec3};
+use atoms::{Cell, Species, Structure};
+
+use super::numbers::numbers;
+use super::output::{self, Output};
+
+/// Positions have five decimals.
+const RESOLUTION: f64 = 1e-4;
+
+/// What a file tells, of the last step if the atoms moved; whole or not.
+#[derive(Debug, Default)]
+pub(super) struct Outcar {
+    version: Option<String>,
+    /// Elements, in the order of POTCAR.
+    elements: Vec<Option<Species>>,
+    /// The same and more, where the file says less of them.
+    listed: Vec<Option<Species>>,
+    /// Atoms of each.
+    counts: Vec<usize>,
+    most_steps: Option<u32>,
+    ionic_steps: u32,
+    steps: u32,
+    /// Whether the last electronic step was small enough.
+    converged: bool,
+    energy: Option<f64>,
+    energy_without_smearing: Option<f64>,
+    cell: Vec<Vec3>,
+    /// Position, Å, and force, eV/Å, of each atom.
+    atoms: Vec<[f64; 6]>,
+    /// xx, yy, zz, xy, yz, zx, kB, positive for compression.
+    stress: Option<[f64; 6]>,
+    /// Magnetic moment of each atom, in the order of POSCAR, μ_B.
+    pub moments: Vec<f64>,
+    /// Magnetic moment of the cell, μ_B.
+    pub magnetisation: Option<f64>,
+    complete: bool,
+}
+
+/// The table that the lines which follow belong to.
+#[derive(Clone, Copy, PartialEq)]
+enum Table {
+    None,
+    Cell,
+    Atoms { begun: bool },
+    Moments { begun: bool },
+}
+
+impl Outcar {
+    /// Reads whatever is there; what cannot be read is not there.
+    pub fn read(mut input: impl BufRead) -> Self {
+        let mut outcar = Self::default();
+        let (mut table, mut bytes) = (Table::None, Vec::new());
+        loop {
+            bytes.clear();
+            match input.read_until(b'\n', &mut bytes) {
+                // A line that was cut off may end within a number.
+                Ok(_) if bytes.last() == Some(&b'\n') => {}
+                _ => return outcar,
+            }
+            let line = String::from_utf8_lossy(&bytes);
+            table = match table {
+                Table::None => outcar.line(&line),
+                table => outcar.row(&line, table),
+            };
+        }
+    }
+
+    /// A line of no table; returns the table that begins after it.
+    fn line(&mut self, line: &str) -> Table {
+        let after = |mark: &str| line.split_once(mark).map(|(_, rest)| rest.trim_start());
+        if self.version.is_none()
+            && let Some(rest) = after("vasp.")
+        {
+            self.version = rest.split_whitespace().next().map(str::to_owned);
+        } else if let Some(title) = after("TITEL  =") {
+            self.elements.push(element(title));
+        } else if let Some(title) = after("POTCAR:") {
+            self.listed.push(element(title));
+        } else if let Some(rest) = after("ions per type =") {
+            self.counts = rest.split_whitespace().map_while(|word| word.parse().ok()).collect();
+        } else if self.most_steps.is_none()
+            && let Some(rest) = after("NELM   =")
+        {
+            self.most_steps = rest.split(';').next().and_then(|word| word.trim().parse().ok());
+        } else if let Some(rest) = after("- Iteration") {
+            self.step(rest);
+        } else if line.contains("aborting loop because EDIFF is reached") {
+            self.converged = true;
+        } else if let Some(rest) = after("free  energy   TOTEN  =") {
+            self.energy = rest.trim_end().strip_suffix("eV").and_then(number);
+        } else if line.contains("energy  without entropy=") {
+            self.energy_without_smearing = after("energy(sigma->0) =").and_then(number);
+        } else if let Some(rest) = line.trim_start().strip_prefix("in kB") {
+            self.stress = numbers(rest, 5).and_then(|stress| stress.try_into().ok());
+        } else if let Some(rest) =
+            after("number of electron").and_then(|rest| rest.split_once("magnetization"))
+        {
+            self.magnetisation = number(rest.1);
+        } else if line.contains("direct lattice vectors") {
+            self.cell.clear();
+            return Table::Cell;
+        } else if line.contains("POSITION") && line.contains("TOTAL-FORCE") {
+            self.atoms.clear();
+            return Table::Atoms { begun: false };
+        } else if line.trim() == "magnetization (x)" {
+            self.moments.clear();
+            return Table::Moments { begun: false };
+        } else if line.contains("General timing and accounting informations") {
+            self.complete = true;
+        }
+        Table::None
+    }
+
+    /// `   1(  13)  -----`: an electronic step begins.
+    fn step(&mut self, numbers: &str) {
+        let ionic =
+            numbers.split('(').next().and_then(|word| word.trim().parse().ok()).unwrap_or(self.ionic_steps);
+        if ionic != self.ionic_steps {
+            (self.ionic_steps, self.steps) = (ionic, 0);
+        }
+        self.steps += 1;
+        self.converged = false;
+    }
+
+    /// A line in a table; returns the table that the next one belongs to.
+    fn row(&mut self, line: &str, table: Table) -> Table {
+        let ruled = line.trim_start().starts_with("-----");
+        match table {
+            Table::Cell => match numbers(line, 9).as_deref() {
+                Some(&[x, y, z, ..]) => {
+                    self.cell.push([x, y, z]);
+                    if self.cell.len() < 3 { table } else { Table::None }
+                }
+                _ => Table::None,
+            },
+            Table::Atoms { begun: false } if ruled => Table::Atoms { begun: true },
+            Table::Moments { begun: false } if ruled => Table::Moments { begun: true },
+            Table::Atoms { begun: false } | Table::Moments { begun: false } => table,
+            Table::Atoms { .. } => match numbers(line, 6).and_then(|row| row.try_into().ok()) {
+                Some(row) => {
+                    self.atoms.push(row);
+                    table
+                }
+                None => Table::None,
+            },
+            Table::Moments { .. } => match numbers(line, 3).as_deref() {
+                Some(&[_, .., total]) => {
+                    self.moments.push(total);
+                    table
+                }
+                _ => Table::None,
+            },
+            Table::None => Table::None,
+        }
+    }
+
+    /// The whole of a calculation that converged.
+    ///
+    /// # Errors
+    /// What is missing, for people.
+    pub fn output(self) -> Result<Output, String> {
+        if !self.complete {
+            return Err("ends before its timings".to_owned());
+        }
+        let species = self.species()?;
+        let most_steps = self.most_steps.ok_or("has no NELM")?;
+        let energy = self.energy.ok_or("has no energy")?;
+        let cell = Matrix3::try_from(self.cell).map_err(|_| "has no cell")?;
+        let positions = self.atoms.iter().map(|[x, y, z, ..]| [*x, *y, *z]).collect();
+        let kilobar = self.stress.map(|[xx, yy, zz, xy, yz, zx]| [[xx, xy, zx], [xy, yy, yz], [zx, yz, zz]]);
+        Ok(Output {
+            version: self.version.unwrap_or_default(),
+            structure: Structure { species, positions, cell: Cell(cell), periodic: [true; 3] },
+            resolution: RESOLUTION,
+            ionic_steps: self.ionic_steps,
+            most_steps,
+            // The program stops there whether it has converged or not.
+            steps: if self.converged { self.steps } else { self.steps.max(most_steps) },
+            energy,
+            energy_without_smearing: self.energy_without_smearing.ok_or("has no energy without smearing")?,
+            forces: self.atoms.iter().map(|[_, _, _, x, y, z]| [*x, *y, *z]).collect(),
+            stress: kilobar.map(|kilobar| output::stress(&kilobar)),
+        })
+    }
+
+    /// The element of each atom.
+    fn species(&self) -> Result<Vec<Species>, String> {
+        let elements = if self.elements.is_empty() { &self.listed } else { &self.elements };
+        if elements.len() < self.counts.len() {
+            let (elements, counts) = (elements.len(), self.counts.len());
+            return Err(format!("has {elements} titles of POTCAR for {counts} numbers of ions"));
+        }
+        let mut species = Vec::new();
+        for (element, count) in elements.iter().zip(&self.counts) {
+            let element = element.ok_or("has a title of POTCAR without an element")?;
+            // More than there are atoms is wrong in any case, and may be far too many.
+            species.extend(std::iter::repeat_n(element, (*count).min(self.atoms.len() + 1)));
+        }
+        Ok(species)
+    }
+}
+
+/// The element of a title: `PAW_PBE Fe_pv 06Sep2000`.
+fn element(title: &str) -> Option<Species> {
+    output::element(title.split_whitespace().nth(1)?.split(['_', '.']).next()?)
+}
+
+fn number(text: &str) -> Option<f64> {
+    numbers(text, 8)?.first().copied()
+}

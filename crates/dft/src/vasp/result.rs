@@ -1,0 +1,146 @@
+//! Judging what a calculation left.
+
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
+
+use atoms::Structure;
+
+use super::outcar::Outcar;
+use super::output::Output;
+use super::vasprun;
+use crate::same::same_structure;
+use crate::{Calculated, Exit, Failure, FailureClass, judge};
+
+/// Reads the calculation of `structure`, whose atoms stand in the files in the order `order`, by VASP of this version.
+pub(super) fn read(
+    structure: &Structure,
+    order: &[usize],
+    version: &str,
+    directory: &Path,
+    exit: Exit,
+) -> Result<Calculated, Failure> {
+    let outcar = match File::open(directory.join("OUTCAR")) {
+        Ok(file) => Outcar::read(BufReader::new(file)),
+        Err(_) => Outcar::default(),
+    };
+    let magnetism = (outcar.moments.clone(), outcar.magnetisation);
+    let xml = File::open(directory.join("vasprun.xml")).map_err(|error| error.to_string());
+    let output = match xml.and_then(|file| vasprun::read(BufReader::new(file))) {
+        Ok(output) => output,
+        Err(xml) => outcar.output().map_err(|outcar| without_output(exit, directory, &xml, &outcar))?,
+    };
+    let in_file_order = Structure {
+        species: order.iter().map(|atom| structure.species[*atom]).collect(),
+        positions: order.iter().map(|atom| structure.positions[*atom]).collect(),
+        ..*structure
+    };
+    check(&output, &in_file_order, version)?;
+    let calculated = Calculated {
+        energy: output.energy,
+        energy_without_smearing: Some(output.energy_without_smearing),
+        forces: back(&output.forces, order),
+        stress: output.stress,
+        magnetic_moments: Some(magnetism.0).filter(|m| m.len() == order.len()).map(|m| back(&m, order)),
+        magnetisation: magnetism.1,
+        electronic_steps: Some(output.steps),
+    };
+    judge::numbers(&calculated, structure.len())?;
+    Ok(calculated)
+}
+
+/// Whether it is the calculation that was asked for, and converged.
+fn check(output: &Output, asked: &Structure, version: &str) -> Result<(), Failure> {
+    if !is_version(&output.version, version) {
+        let found = &output.version;
+        let message =
+            format!("calculated by VASP {found}, but `version` says {version}: correct one of them");
+        return Err(FailureClass::BadInput.because(message));
+    }
+    if output.steps >= output.most_steps {
+        let message = format!("the electrons did not converge in {} steps", output.steps);
+        return Err(FailureClass::NotConverged.because(message));
+    }
+    if output.ionic_steps != 1 {
+        let message = format!("found {} ionic steps, expected one", output.ionic_steps);
+        return Err(FailureClass::Implausible.because(message));
+    }
+    if output.forces.len() != asked.len() {
+        let message = format!("found {} forces, expected {}", output.forces.len(), asked.len());
+        return Err(FailureClass::Implausible.because(message));
+    }
+    same_structure(asked, &output.structure, output.resolution)
+}
+
+/// Whether `5.4.4.18Apr17` is 5.4.4, and 5.4.40 is not.
+fn is_version(found: &str, expected: &str) -> bool {
+    found.strip_prefix(expected).is_some_and(|rest| !rest.starts_with(|c: char| c.is_alphanumeric()))
+}
+
+/// Values in the order of the structure from values in that of the files. Each atom stands in `order` once.
+fn back<T: Copy + Default>(values: &[T], order: &[usize]) -> Vec<T> {
+    let mut sorted = vec![T::default(); values.len()];
+    for (value, atom) in values.iter().zip(order) {
+        sorted[*atom] = *value;
+    }
+    sorted
+}
+
+/// What VASP says before it gives up, and what that means. Where its way to the ground state broke down, another may not.
+const LAST_WORDS: [(&str, FailureClass); 9] = [
+    ("BRMIX: very serious problems", FailureClass::NotConverged),
+    ("EDDDAV: Call to ZHEGV failed", FailureClass::NotConverged),
+    ("Error EDDDAV", FailureClass::NotConverged),
+    ("Error EDDRMM", FailureClass::NotConverged),
+    ("ZPOTRF", FailureClass::NotConverged),
+    ("FEXCF: supplied", FailureClass::BadInput),
+    ("FEXCP: supplied", FailureClass::BadInput),
+    ("internal error in subroutine SGRCON", FailureClass::BadInput),
+    ("NELECT < 0", FailureClass::BadInput),
+];
+
+/// Why there is no whole output.
+fn without_output(exit: Exit, directory: &Path, xml: &str, outcar: &str) -> Failure {
+    let from_outside = matches!(exit, Exit::TimeLimit | Exit::OutOfMemory | Exit::LostNode);
+    let said = if from_outside { String::new() } else { end_of(&directory.join("stdout")) };
+    if let Some((words, class)) = LAST_WORDS.iter().find(|(words, _)| said.contains(words)) {
+        return class.because(format!("VASP gave up: {words}"));
+    }
+    let failure = judge::without_result(exit, directory, &["stdout", "stderr"]);
+    failure.class.because(format!("{}; vasprun.xml {xml}; OUTCAR {outcar}", failure.message))
+}
+
+/// The last part of a file; empty if there is none.
+fn end_of(path: &Path) -> String {
+    const BYTES: u64 = 65_536;
+    let read = || -> std::io::Result<Vec<u8>> {
+        let mut file = File::open(path)?;
+        let length = file.metadata()?.len();
+        file.seek(SeekFrom::Start(length.saturating_sub(BYTES)))?;
+        let mut end = Vec::new();
+        file.take(BYTES).read_to_end(&mut end)?;
+        Ok(end)
+    };
+    String::from_utf8_lossy(&read().unwrap_or_default()).into_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn versions_are_compared_by_whole_numbers() {
+        assert!(is_version("5.4.4.18Apr17-6-g9f103f2a35", "5.4.4"));
+        assert!(is_version("6.3.0", "6.3"));
+        for (found, expected) in [("5.4.40", "5.4.4"), ("6.3.0", "6.3.1"), ("", "6.3.0"), ("5.4.4b", "5.4.4")]
+        {
+            assert!(!is_version(found, expected), "{found} {expected}");
+        }
+    }
+
+    #[test]
+    fn values_go_back_to_their_atoms() {
+        assert_eq!(back(&['a', 'c', 'b'], &[0, 2, 1]), ['a', 'b', 'c']);
+        assert_eq!(back(&[10, 12, 11, 13], &[2, 0, 3, 1]), [12, 13, 10, 11]);
+    }
+}
