@@ -11,7 +11,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use store::Protocol;
 use wire::ipc::Door;
-use workers::labeller::ReferenceMethod;
+use workers::labeller::Method;
 use workers::settings::WalkSettings;
 
 use crate::config::PotentialKind;
@@ -105,11 +105,11 @@ pub enum MethodSetup {
 
 impl MethodSetup {
     /// The method, ready to label.
-    pub fn load(&self) -> Result<ReferenceMethod, Failure> {
+    pub fn load(&self) -> Result<Method, Failure> {
         match self {
             Self::Reference { kind, file, file_hash } => {
                 unchanged(file, file_hash)?;
-                Ok(ReferenceMethod::new(kind.load(file).map_err(Failure::Input)?))
+                Ok(Method::reference(kind.load(file).map_err(Failure::Input)?))
             }
         }
     }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use atoms::extxyz::{Frame, Labels};
 use atoms::{FileError, Structure};
-use store::records::{Label, Protocol};
+use store::records::{Label, LabelDetails, Protocol};
 use store::{CampaignLock, Imported, Store, unix_milliseconds};
 use wire::ContentHash;
 
@@ -91,7 +91,9 @@ fn label(frame: &Frame) -> Result<Label, String> {
         .labels()
         .map_err(|error| format!("{} is {}, expected {}", error.key, error.found, error.expected))?
     {
-        Labels { energy: Some(energy), forces: Some(forces), stress } => Ok(Label { energy, forces, stress }),
+        Labels { energy: Some(energy), forces: Some(forces), stress } => {
+            Ok(Label { energy, forces, stress, details: LabelDetails::default() })
+        }
         Labels { energy, .. } => {
             let missing = if energy.is_none() { "energy" } else { "forces" };
             Err(format!("the frame has no {missing}: expected {missing} or REF_{missing}"))

@@ -6,7 +6,7 @@ use std::time::Duration;
 use orchestrator::launcher;
 use store::{Location, ProcessRecord, Store, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
-use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Stay, Timing, insist, serve};
+use workers::labeller::{Closing, LabellerSettings, Method, Stay, Timing, insist, serve};
 
 use super::{Ended, Failure, block_on};
 use crate::output::say;
@@ -34,7 +34,7 @@ impl Labeller {
     }
 }
 
-async fn label(setup: LabellerSetup, method: ReferenceMethod, closing: &Arc<Closing>) -> Result<(), Failure> {
+async fn label(setup: LabellerSetup, method: Method, closing: &Arc<Closing>) -> Result<(), Failure> {
     let (mut terminate, asked) =
         (signal(SignalKind::terminate()).map_err(Failure::failed)?, Arc::clone(closing));
     tokio::spawn(async move {

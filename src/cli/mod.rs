@@ -6,6 +6,7 @@ mod clean;
 mod export;
 mod import;
 mod init;
+mod keep;
 mod label;
 mod labeller;
 mod launch;
@@ -59,6 +60,8 @@ enum Command {
     Walker(walker::Walker),
     #[command(hide = true)]
     Labeller(labeller::Labeller),
+    #[command(hide = true)]
+    Keep(keep::Keep),
 }
 
 /// Carries out a command.
@@ -81,6 +84,7 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Clean(command) => command.run(),
         Command::Walker(command) => command.run(),
         Command::Labeller(command) => command.run(),
+        Command::Keep(command) => command.run(),
     }
 }
 

@@ -215,7 +215,18 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
 }
 
 fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
-    let Attempt { attempt: number, holder, calculation, started, ended, outcome, class, log } = attempt;
+    let Attempt {
+        attempt: number,
+        holder,
+        calculation,
+        started,
+        ended,
+        outcome,
+        class,
+        log,
+        made,
+        core_seconds,
+    } = attempt;
     let outcome = outcome.as_deref().unwrap_or("under way");
     let lasted = ended.map(|ended| (ended - started) as f64 / 1000.0);
     let lasted = lasted.map_or(String::new(), |seconds| format!(" after {seconds:.1} s"));
@@ -224,6 +235,14 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
     if let Some(calculation) = calculation {
         writeln!(out, "       calculation {calculation}")?;
     }
+    if let (Some(seconds), Some(cores)) = (core_seconds, made.cores) {
+        writeln!(out, "       took {seconds:.1} core-seconds on {cores} cores")?;
+    }
+    if let Some(remedies) = &made.remedies {
+        writeln!(out, "       changed after failures: {}", remedies.replace(',', ", "))?;
+    }
+    let difference = made.difference.as_deref().unwrap_or_default();
+    difference.lines().try_for_each(|line| writeln!(out, "       {line}"))?;
     let log = log.as_deref().unwrap_or_default();
     log.lines().try_for_each(|line| writeln!(out, "       | {line}"))
 }

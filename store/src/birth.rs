@@ -15,7 +15,7 @@ pub fn process_birth(pid: u32) -> Option<String> {
 
 /// Whether the process `pid` that began at `birth`, which [`is_local`], runs. Without a birth any process with that
 /// number is taken for it.
-pub(crate) fn is_running(pid: u32, birth: &str) -> bool {
+pub fn is_running(pid: u32, birth: &str) -> bool {
     match stat(pid) {
         Some(stat) => {
             !stat.ended && Birth::parse(birth).is_none_or(|birth| birth.ticks == stat.ticks.to_string())
@@ -33,7 +33,7 @@ pub(crate) fn is_of_another_boot(birth: &str) -> bool {
 
 /// Whether who was born then has its number from where this process has its own, so that the number means something
 /// here. `None` without a birth.
-pub(crate) fn is_local(birth: &str) -> Option<bool> {
+pub fn is_local(birth: &str) -> Option<bool> {
     let Birth { boot: then, namespace: place, .. } = Birth::parse(birth)?;
     Some(then == boot() && place.is_none_or(|place| place == namespace().to_string()))
 }

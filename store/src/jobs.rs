@@ -2,7 +2,8 @@
 
 use serde::Serialize;
 
-use crate::database::from_columns;
+use crate::database::{FromRow, Row};
+use crate::error::Result;
 use crate::records::{JobState, Label};
 
 /// What became of a result that was brought.
@@ -23,6 +24,44 @@ pub enum Failed {
     GivenUp,
     /// The lease was lost before: what became of the job was decided without this attempt.
     LeaseLost,
+}
+
+/// What has become of a job whose lease was lost.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Whereabouts {
+    /// The lease still lasts.
+    Held,
+    /// Somebody else has leased it.
+    LeasedAgain {
+        /// The calculation that they wait for, if they have started or found one.
+        calculation: Option<String>,
+    },
+    /// It waits for somebody.
+    Queued,
+    /// It has its label, was given up or dropped: nobody waits for a result.
+    Over,
+}
+
+/// A calculation of an attempt, as far as the store knows it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PastCalculation {
+    /// What finds it again.
+    pub calculation: Option<String>,
+    /// It was a failure.
+    pub failed: bool,
+    /// Somebody may still read what it gives.
+    pub wanted: bool,
+}
+
+/// The packed directory of a calculation.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Archive {
+    /// Number of the attempt.
+    pub attempt: u32,
+    /// A tar file, compressed with zstd.
+    pub bytes: Vec<u8>,
+    /// Files that are not in it, with their sizes, a line each.
+    pub left_out: String,
 }
 
 /// How many of the frames of an import became what.
@@ -63,10 +102,12 @@ pub struct Job {
     pub formula: String,
     /// Largest γ under the original mixture.
     pub original_gamma: Option<f64>,
+    /// Somebody has put it into the queue by hand: guards let it pass.
+    pub overruled: bool,
 }
 
 /// An attempt at a job.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Attempt {
     /// Its number, from 1.
     pub attempt: u32,
@@ -82,11 +123,55 @@ pub struct Attempt {
     pub outcome: Option<String>,
     /// Class of a failure; `lost_too_often` with the loss after which the job was given up.
     pub class: Option<String>,
-    /// Log of a failure.
+    /// Why it failed, and the end of what its program said.
     pub log: Option<String>,
+    /// What its calculation was, if it was one of another program.
+    #[serde(flatten)]
+    pub made: CalculationRecord,
+    /// Core-seconds of its calculation, if that has ended. Without them the attempt counts with its own time.
+    pub core_seconds: Option<f64>,
 }
 
-from_columns!(Attempt { attempt, holder, calculation, started, ended, outcome, class, log });
+/// What a calculation is, as far as it is known before it starts.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct CalculationRecord {
+    /// Cores that it has.
+    pub cores: Option<u32>,
+    /// What was changed because of earlier failures: names separated by commas.
+    pub remedies: Option<String>,
+    /// What that changed in its input: lines with `-` and `+`.
+    pub difference: Option<String>,
+    /// Atoms.
+    pub atoms: Option<u32>,
+    /// Electrons that the program treats.
+    pub electrons: Option<f64>,
+    /// Points of its k-point mesh.
+    pub k_points: Option<u32>,
+}
+
+impl FromRow for Attempt {
+    fn from_row(row: &Row) -> Result<Self> {
+        Ok(Self {
+            attempt: row.get("attempt")?,
+            holder: row.get("holder")?,
+            calculation: row.get("calculation")?,
+            started: row.get("started")?,
+            ended: row.get("ended")?,
+            outcome: row.get("outcome")?,
+            class: row.get("class")?,
+            log: row.get("log")?,
+            made: CalculationRecord {
+                cores: row.get_or_default("cores")?,
+                remedies: row.get_or_default("remedies")?,
+                difference: row.get_or_default("difference")?,
+                atoms: row.get_or_default("atoms")?,
+                electrons: row.get_or_default("electrons")?,
+                k_points: row.get_or_default("k_points")?,
+            },
+            core_seconds: row.get_or_default("core_seconds")?,
+        })
+    }
+}
 
 /// A job with its attempts.
 #[derive(Clone, Debug, PartialEq, Serialize)]

@@ -28,13 +28,16 @@ mod tables;
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-pub use birth::process_birth;
+pub use birth::{is_local, is_running, process_birth};
 pub use budget::{Budget, BudgetStatus, BudgetUse};
 pub use check::Finding;
 pub use error::{Result, StoreError};
 pub use export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
 pub use filesystem::{check_directory, free_space, network_file_system};
-pub use jobs::{Attempt, Completed, Failed, Imported, Job, JobDetails, LabelRecord, LabelSource, Standing};
+pub use jobs::{
+    Archive, Attempt, CalculationRecord, Completed, Failed, Imported, Job, JobDetails, LabelRecord,
+    LabelSource, PastCalculation, Standing, Whereabouts,
+};
 pub use location::{Location, ServerUrl};
 pub use lock::{CampaignLock, LOCK};
 pub use numbers::NumbersError;

@@ -219,6 +219,26 @@ pub struct Label {
     pub forces: Vec<Vec3>,
     /// Stress, eV/Å³, tension positive; none for a cluster or where the source gives none.
     pub stress: Option<Matrix3>,
+    /// What else the calculation says.
+    pub details: LabelDetails,
+}
+
+/// What is known of a label besides its numbers.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct LabelDetails {
+    /// The energy extrapolated to no smearing, eV.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub energy_without_smearing: Option<f64>,
+    /// Magnetic moment of each atom, [n], μ_B.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub magnetic_moments: Option<Vec<f64>>,
+    /// Magnetic moment of the cell, μ_B.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub magnetisation: Option<f64>,
+    /// Electronic steps that it took.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub electronic_steps: Option<u32>,
 }
 
 /// The settings that make labels comparable, and their hash.
@@ -243,9 +263,14 @@ pub struct Lease {
     pub holder: String,
     /// The protocol by which to label.
     pub protocol: ContentHash,
-    /// What the last attempt said of its own calculation ([`crate::Store::record_calculation`]), if it ended
-    /// without a result: look there before starting another.
-    pub earlier_calculation: Option<String>,
+    /// What the last attempts said of their own calculations ([`crate::Store::record_calculation`]), newest first, as far
+    /// back as they ended without a result: look there before starting another.
+    pub earlier_calculations: Vec<String>,
+    /// Classes of the attempts that failed since the job was last put into the queue by hand, and of those that were lost
+    /// with a class, oldest first.
+    pub failures: Vec<String>,
+    /// Somebody has put the job into the queue by hand: guards let it pass.
+    pub overruled: bool,
     /// The structure to label.
     pub structure: Structure,
     /// Its candidate's name.

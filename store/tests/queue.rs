@@ -7,8 +7,8 @@ use std::collections::BTreeSet;
 
 use common::*;
 use store::{
-    Completed, ExportFilter, ExportPlace, ExportSource, Failed, Fate, Imported, JobState, LabelSource, Lease,
-    Standing, Store, StoreError,
+    CalculationRecord, Completed, ExportFilter, ExportPlace, ExportSource, Failed, Fate, Imported, JobState,
+    LabelSource, Lease, Standing, Store, StoreError,
 };
 use wire::{ContentHash, Origin};
 
@@ -31,7 +31,7 @@ async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
     let first = lease(&store, "host-1/a", 0).await.unwrap();
     assert_eq!((first.candidate.as_str(), first.attempt), (names[2].as_str(), 1));
     assert_eq!(ContentHash::of(&first.structure), ContentHash::of(&structure(3e-6)));
-    store.record_calculation(&first, "slurm 17").await.unwrap();
+    store.record_calculation(&first, "slurm 17", &CalculationRecord::default()).await.unwrap();
     assert_eq!(lease(&store, "host-1/b", 0).await.unwrap().candidate, names[0]);
     assert_eq!(lease(&store, "host-2", 0).await.unwrap().candidate, names[1]);
     assert!(lease(&store, "host-2", 9_999).await.is_none());
@@ -44,7 +44,7 @@ async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
     assert_eq!(state(&store, &names[2]).await, JobState::Leased);
     let again = lease(&store, "c", 65_000).await.unwrap();
     assert_eq!((again.candidate.as_str(), again.attempt), (names[2].as_str(), 2));
-    assert_eq!(again.earlier_calculation.as_deref(), Some("slurm 17"));
+    assert_eq!(again.earlier_calculations, ["slurm 17"]);
     assert!(!store.renew(&first, 65_000, 60).await.unwrap());
     // That time ran out says nothing about the job.
     let details = store.queue_show(&names[0]).await.unwrap();
@@ -112,7 +112,8 @@ async fn failures_count_and_releases_do_not() {
     assert_eq!(first.attempt, 5);
     assert_eq!(store.fail(&first, "not converged", "SCF", LIMIT, 3).await.unwrap(), Failed::Requeued);
     let second = lease(&store, "h", 3).await.unwrap();
-    assert_eq!(second.earlier_calculation, None, "that one ended");
+    assert!(second.earlier_calculations.is_empty(), "that one ended");
+    assert_eq!(second.failures, ["not converged"]);
     assert_eq!(store.fail(&second, "not converged", "SCF", LIMIT, 4).await.unwrap(), Failed::GivenUp);
     let details = store.queue_show(&names[0]).await.unwrap();
     assert_eq!((details.job.state, details.job.failures), (JobState::Failed, 2));

@@ -17,7 +17,7 @@ use store::{
     DATABASE, JobState, LabelRecord, ProcessRecord, Standing, Store, StoreError, this_host, unix_milliseconds,
 };
 use tokio::task::JoinHandle;
-use workers::labeller::{Closing, LabellerSettings, ReferenceMethod, Stay, Timing, run, serve};
+use workers::labeller::{Closing, LabellerSettings, Method, Stay, Timing, run, serve};
 
 /// A method that begins labels at once and ends them only while it is open.
 #[derive(Clone, Default)]
@@ -33,8 +33,8 @@ impl Gate {
         gate
     }
 
-    fn method(&self) -> ReferenceMethod {
-        ReferenceMethod::new(Box::new(self.clone()))
+    fn method(&self) -> Method {
+        Method::reference(Box::new(self.clone()))
     }
 
     async fn wait_for_labels(&self, begun: usize) {

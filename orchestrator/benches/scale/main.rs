@@ -153,7 +153,7 @@ async fn look_at_the_queue(location: Location, decisions: usize) {
         drop(store.lease(protocol, "bench", store::unix_milliseconds(), 600).await.unwrap().unwrap())
     })
     .await;
-    let label = Label { energy: -7.0, forces: vec![[0.0; 3]; 2], stress: None };
+    let label = Label { energy: -7.0, forces: vec![[0.0; 3]; 2], stress: None, details: Default::default() };
     looks("lease a job and complete it", async || {
         let lease = store.lease(protocol, "bench", store::unix_milliseconds(), 600).await.unwrap().unwrap();
         store.complete(&lease, &label, store::unix_milliseconds()).await.unwrap();

@@ -8,9 +8,8 @@ use crate::database::{Database, Row, Transaction, Value, for_rows, query};
 use crate::error::{Result, StoreError};
 use crate::postgres::Server;
 use crate::sqlite::DatabaseFile;
+use crate::tables::budget::sum_up;
 
-/// Rows that are on their way at a time: a row of a large structure has megabytes.
-const PAGE: usize = 64;
 /// Pages in a transaction of the copy.
 const PAGES: usize = 32;
 
@@ -29,24 +28,29 @@ struct Table {
     columns: &'static [&'static str],
     kinds: &'static [Kind],
     insert: &'static str,
+    /// Rows that are on their way at a time: a row of a large structure has megabytes.
+    page: usize,
     fetch: &'static str,
 }
 
 /// One of the tables, with the types of its columns.
 macro_rules! table {
-    ($name:literal { $($column:ident: $kind:ident),* $(,)? }) => {
+    ($name:literal { $($columns:tt)* }) => { table!($name 64 { $($columns)* }) };
+    ($name:literal $page:literal { $($column:ident: $kind:ident),* $(,)? }) => {
         Table {
             name: $name,
             columns: &[$(stringify!($column)),*],
             kinds: &[$($kind),*],
-            insert: concat!("INSERT INTO ", $name, " ({columns}) SELECT * FROM {rows}"),
-            fetch: concat!("FETCH 64 FROM copy_of_", $name),
+            insert: concat!("INSERT OR REPLACE INTO ", $name, " ({columns}) SELECT * FROM {rows}"),
+            page: $page,
+            fetch: concat!("FETCH ", $page, " FROM copy_of_", $name),
         }
     };
 }
 
-/// Every table but those of the leader and of processes, each after those that it refers to.
-const TABLES: [Table; 14] = [
+/// Every table but those of the leader and of processes, each after those that it refers to. Some rows of the campaign's
+/// are there from the beginning.
+const TABLES: [Table; 15] = [
     table!("campaign" { key: T, value: T }),
     table!("value" { name: T, value: T }),
     table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B }),
@@ -70,16 +74,18 @@ const TABLES: [Table; 14] = [
     }),
     table!("job" {
         number: I, structure: I, protocol: I, decision: I, state: T, priority: I, holder: T, expires: I, attempts: I,
-        failures: I,
+        failures: I, overruled: I,
     }),
     table!("attempt" {
-        job: I, attempt: I, holder: T, calculation: T, started: I, ended: I, outcome: T, class: T, log: T,
+        job: I, attempt: I, holder: T, calculation: T, started: I, ended: I, outcome: T, class: T, log: T, cores: I,
+        core_seconds: R, remedies: T, difference: T, atoms: I, electrons: R, k_points: I,
     }),
     table!("label" {
         number: I, structure: I, protocol: I, standing: T, energy: R, forces: B, stress: B, job: I, attempt: I,
-        file: T, frame: I, correction: T, received: I,
+        file: T, frame: I, correction: T, received: I, details: T,
     }),
     table!("import" { number: I, structure: I, file: T, frame: I }),
+    table!("archive" 1 { job: I, attempt: I, bytes: B, left_out: T }),
 ];
 const OPERATIONS: Table = table!("operation" { number: I, time: I, kind: T, detail: T });
 
@@ -100,13 +106,16 @@ pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut
             })
             .await?;
         }
-        Ok(())
+        sum_up(into).await
     };
     DatabaseFile::create(directory, fill).await?.close().await;
     Ok(())
 }
 
 async fn count(from: &mut Transaction, table: &Table) -> Result<u64> {
+    if !exists(from, table).await? {
+        return Ok(0);
+    }
     let sql = format!("SELECT count(*) FROM {}", table.name);
     let count: i64 = sqlx::query_scalar(AssertSqlSafe(sql)).fetch_one(&mut **postgres(from)?).await?;
     Ok(count.unsigned_abs())
@@ -118,16 +127,18 @@ async fn copy_table(
     table: &Table,
     mut told: impl FnMut(u64),
 ) -> Result<()> {
-    let Table { name, columns, .. } = table;
-    let cursor =
-        format!("DECLARE copy_of_{name} NO SCROLL CURSOR FOR SELECT {} FROM {name}", columns.join(", "));
+    let name = table.name;
+    if !exists(from, table).await? {
+        return Ok(());
+    }
+    let cursor = format!("DECLARE copy_of_{name} NO SCROLL CURSOR FOR SELECT * FROM {name}");
     postgres(from)?.execute(AssertSqlSafe(cursor)).await?;
     loop {
         let mut transaction = into.begin().await?;
         for _ in 0..PAGES {
             let page = query(table.fetch).rows(&mut *from).await?;
-            let (rows, end) = (page.len(), page.len() < PAGE);
-            let page = page.iter().map(|row| values(row, table.kinds)).collect::<Result<_>>()?;
+            let (rows, end) = (page.len(), page.len() < table.page);
+            let page = page.iter().map(|row| values(row, table)).collect::<Result<_>>()?;
             for_rows(&mut transaction, table.insert, table.columns, page).await?;
             told(rows as u64);
             if end {
@@ -145,14 +156,20 @@ fn postgres(transaction: &mut Transaction) -> Result<&mut sqlx::Transaction<'sta
     }
 }
 
-fn values(row: &Row, kinds: &[Kind]) -> Result<Vec<Value>> {
-    let value = |(place, kind): (usize, &Kind)| {
+/// What tables of an earlier version do not have is NULL.
+fn values(row: &Row, table: &Table) -> Result<Vec<Value>> {
+    let value = |(name, kind): (&&str, &Kind)| {
         Ok(match kind {
-            I => Value::Integer(row.get(place)?),
-            R => Value::Real(row.get(place)?),
-            T => Value::Text(row.get(place)?),
-            B => Value::Bytes(row.get(place)?),
+            I => Value::Integer(row.get_or_default(name)?),
+            R => Value::Real(row.get_or_default(name)?),
+            T => Value::Text(row.get_or_default(name)?),
+            B => Value::Bytes(row.get_or_default(name)?),
         })
     };
-    kinds.iter().enumerate().map(value).collect()
+    table.columns.iter().zip(table.kinds).map(value).collect()
+}
+
+/// Whether the server has a table, which earlier versions may lack.
+async fn exists(from: &mut Transaction, table: &Table) -> Result<bool> {
+    query("SELECT to_regclass($1) IS NOT NULL").bind(table.name).fetch_one(from).await
 }

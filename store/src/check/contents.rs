@@ -23,7 +23,7 @@ const CANDIDATES: &str =
     FROM candidate_data JOIN candidate ON candidate.decision = candidate_data.decision
     WHERE candidate_data.decision > $1 ORDER BY candidate_data.decision LIMIT $2";
 
-const LABELS: &str = "SELECT label.number AS place, atoms, energy, forces, stress
+const LABELS: &str = "SELECT label.number AS place, atoms, label.*
     FROM label JOIN structure ON structure.number = label.structure
     WHERE label.number > $1 ORDER BY label.number LIMIT $2";
 
@@ -58,6 +58,7 @@ struct Label {
     energy: f64,
     forces: Vec<u8>,
     stress: Option<Vec<u8>>,
+    details: Option<String>,
 }
 
 struct Text {
@@ -67,7 +68,7 @@ struct Text {
 
 from_columns!(Structure { place, hash, data });
 from_columns!(Candidate { place, id, content, block, features, selector_grades, original_grades });
-from_columns!(Label { place, atoms, energy, forces, stress });
+from_columns!(Label { place, atoms, energy, forces, stress, details });
 from_columns!(Text { place, text });
 
 /// A row that can be looked into.
@@ -173,14 +174,19 @@ impl Content for Label {
     }
 
     fn fault(&self) -> Option<String> {
-        let label = match decode_label(self.energy, &self.forces, self.stress.as_deref()) {
-            Ok(label) => label,
-            Err(error) => return Some(error.to_string()),
-        };
+        let label =
+            match decode_label(self.energy, &self.forces, self.stress.as_deref(), self.details.as_deref()) {
+                Ok(label) => label,
+                Err(error) => return Some(error.to_string()),
+            };
         let stress = label.stress.iter().flatten();
         let finite = label.forces.iter().chain(stress).flatten().all(|x| x.is_finite());
         if label.forces.len() as u64 != self.atoms {
             return Some(format!("{} forces for {} atoms", label.forces.len(), self.atoms));
+        }
+        let moments = label.details.magnetic_moments.as_ref().map_or(label.forces.len(), Vec::len);
+        if moments as u64 != self.atoms {
+            return Some(format!("{moments} magnetic moments for {} atoms", self.atoms));
         }
         (!finite || !label.energy.is_finite()).then(|| "it has numbers that are not finite".to_owned())
     }

@@ -60,6 +60,7 @@ async fn ours(
         }
     }
     findings.extend(rules::leases(transaction).await?);
+    findings.extend(rules::sums(transaction).await?);
     findings.extend(Contents::check(transaction, tell).await?);
     Ok(())
 }

@@ -4,6 +4,7 @@ use super::Finding;
 use crate::database::{Transaction, query};
 use crate::error::Result;
 use crate::processes::ProcessRecord;
+use crate::tables::budget::SUMS;
 use crate::tables::processes::{LEASED, all};
 
 /// A query that counts what must not be, with an example.
@@ -121,4 +122,20 @@ pub(super) async fn leases(transaction: &mut Transaction) -> Result<Vec<Finding>
     let what =
         format!("{} jobs are leased to processes that are gone (such as {job} to {holder})", lost.len());
     Ok(vec![Finding { what, then: "the next calmwalk run, or calmwalk label, takes them back" }])
+}
+
+/// The sums by which budgets are held. Tables of an earlier version have none.
+pub(super) async fn sums(transaction: &mut Transaction) -> Result<Vec<Finding>> {
+    let mut findings = Vec::new();
+    for (name, sum) in SUMS {
+        let kept = query("SELECT value FROM campaign WHERE key = $1").bind(name);
+        let kept: Option<String> = kept.fetch_optional(&mut *transaction).await?;
+        let Some(kept) = kept else { continue };
+        let found: String = query(sum).fetch_one(&mut *transaction).await?;
+        if kept != found {
+            let what = format!("the sum of {name} over all attempts is {found}, and {kept} is kept");
+            findings.push(Finding { what, then: QUEUE });
+        }
+    }
+    Ok(findings)
 }

@@ -3,16 +3,46 @@
 use super::protocols::set_campaign_value;
 use crate::Store;
 use crate::budget::{Budget, BudgetUse};
-use crate::database::{Transaction, query};
+use crate::database::{Database, Transaction, query};
 use crate::error::{Result, StoreError};
 
 const MILLISECONDS_PER_HOUR: f64 = 3.6e6;
 
-/// Labels made, attempts under way, and milliseconds of all attempts.
+/// The sums that the database keeps of attempts that ended (`migrations`): labels made, and milliseconds of cores.
+const KEPT: &str = "SELECT CAST((SELECT value FROM campaign WHERE key = 'labels_made') AS BIGINT),
+        CAST((SELECT value FROM campaign WHERE key = 'core_milliseconds') AS BIGINT)";
+
+/// Attempts under way, and milliseconds of their cores so far.
+pub(crate) const UNDER_WAY: &str = "SELECT count(*),
+        CAST(coalesce(sum(CASE WHEN $1 > started THEN ($1 - started) * coalesce(cores, 1) ELSE 0 END), 0) AS BIGINT)
+    FROM attempt WHERE outcome IS NULL";
+
+/// All of it in tables of an earlier version, which are only looked at.
 const ATTEMPTS: &str = "SELECT CAST(coalesce(sum(CASE WHEN outcome IN ('labelled', 'check') THEN 1 ELSE 0 END), 0) AS BIGINT),
         CAST(coalesce(sum(CASE WHEN outcome IS NULL THEN 1 ELSE 0 END), 0) AS BIGINT),
         CAST(coalesce(sum(CASE WHEN coalesce(ended, $1) > started THEN coalesce(ended, $1) - started ELSE 0 END), 0) AS BIGINT)
     FROM attempt";
+
+/// What the kept sums have to be, by their names.
+pub(crate) const SUMS: [(&str, &str); 2] = [
+    ("labels_made", "SELECT CAST(count(*) AS TEXT) FROM attempt WHERE outcome IN ('labelled', 'check')"),
+    (
+        "core_milliseconds",
+        "SELECT CAST(coalesce(sum(coalesce(CAST(round(1000 * core_seconds) AS BIGINT),
+            CASE WHEN ended > started THEN (ended - started) * coalesce(cores, 1) ELSE 0 END)), 0) AS TEXT)
+        FROM attempt WHERE outcome IS NOT NULL",
+    ),
+];
+
+/// Writes the sums anew, where attempts were copied.
+pub(crate) async fn sum_up(database: &Database) -> Result<()> {
+    let mut transaction = database.begin().await?;
+    for (name, sum) in SUMS {
+        let sum: String = query(sum).fetch_one(&mut transaction).await?;
+        set_campaign_value(&mut transaction, name, &sum).await?;
+    }
+    transaction.commit().await
+}
 
 impl Store {
     /// From now on these limits hold, for every labeller.
@@ -58,8 +88,7 @@ impl Store {
 pub(super) async fn read(transaction: &mut Transaction, now: i64) -> Result<(Budget, BudgetUse)> {
     let limits = limits(transaction).await?;
     let now = transaction.time(now).await?;
-    let attempts: (u64, u64, u64) = query(ATTEMPTS).bind(now).fetch_one(&mut *transaction).await?;
-    let (labels, under_way, milliseconds) = attempts;
+    let (labels, under_way, milliseconds) = attempts(transaction, now).await?;
     let used = BudgetUse {
         labels,
         under_way,
@@ -67,6 +96,16 @@ pub(super) async fn read(transaction: &mut Transaction, now: i64) -> Result<(Bud
         wall_hours: time_under_way(transaction).await? as f64 / MILLISECONDS_PER_HOUR,
     };
     Ok((limits, used))
+}
+
+/// Labels made, attempts under way, and milliseconds of the cores of all attempts until `now`.
+async fn attempts(transaction: &mut Transaction, now: i64) -> Result<(u64, u64, u64)> {
+    let kept: (Option<u64>, Option<u64>) = query(KEPT).fetch_one(&mut *transaction).await?;
+    let (Some(labels), Some(ended)) = kept else {
+        return query(ATTEMPTS).bind(now).fetch_one(&mut *transaction).await;
+    };
+    let (under_way, so_far): (u64, u64) = query(UNDER_WAY).bind(now).fetch_one(&mut *transaction).await?;
+    Ok((labels, under_way, ended + so_far))
 }
 
 /// Whether no further attempt may begin. Attempts are counted only where there is a limit.

@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use super::logs::insert_operation;
 use super::queue::end_attempt;
 use crate::Store;
-use crate::database::{Transaction, from_columns, query};
+use crate::database::{self, FromRow, Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::jobs::{Attempt, Job, JobDetails, Standing};
 use crate::records::JobState;
@@ -50,23 +50,29 @@ struct Row {
     atoms: u32,
     formula: String,
     original_gamma: Option<f64>,
+    overruled: bool,
 }
 
-from_columns!(Row {
-    number,
-    structure,
-    id,
-    name,
-    state,
-    priority,
-    holder,
-    expires,
-    attempts,
-    failures,
-    atoms,
-    formula,
-    original_gamma
-});
+impl FromRow for Row {
+    fn from_row(row: &database::Row) -> Result<Self> {
+        Ok(Self {
+            number: row.get("number")?,
+            structure: row.get("structure")?,
+            id: row.get("id")?,
+            name: row.get("name")?,
+            state: row.get("state")?,
+            priority: row.get("priority")?,
+            holder: row.get("holder")?,
+            expires: row.get("expires")?,
+            attempts: row.get("attempts")?,
+            failures: row.get("failures")?,
+            atoms: row.get("atoms")?,
+            formula: row.get("formula")?,
+            original_gamma: row.get("original_gamma")?,
+            overruled: row.get_or_default::<Option<i64>>("overruled")?.is_some(),
+        })
+    }
+}
 
 impl Store {
     /// The jobs in a state, in the order in which they would be leased; or all, in the order in which they came.
@@ -108,12 +114,12 @@ impl Store {
         change.log("drop", json!({}), now).await
     }
 
-    /// Puts a failed or dropped candidate back into the queue, with all its attempts before it; a dropped one that
-    /// has its label by now is done. Returns its full name.
+    /// Puts a failed or dropped candidate back into the queue, with all its attempts before it, past any guard; a dropped
+    /// one that has its label by now is done. Returns its full name.
     pub async fn retry_job(&self, id: &str, now: i64) -> Result<String> {
         let allowed = [JobState::Failed, JobState::Dropped];
         let mut change = self.change("retry", id, &allowed, "failed and dropped").await?;
-        let sql = "UPDATE job SET failures = 0, state = CASE WHEN EXISTS (
+        let sql = "UPDATE job SET failures = 0, overruled = 1, state = CASE WHEN EXISTS (
                        SELECT 1 FROM label WHERE label.structure = job.structure
                        AND label.protocol = job.protocol AND standing = 'label'
                    ) THEN 'labelled' ELSE 'queued' END WHERE number = $1";
@@ -218,6 +224,7 @@ impl Row {
             atoms: self.atoms,
             formula: self.formula,
             original_gamma: self.original_gamma,
+            overruled: self.overruled,
         })
     }
 }

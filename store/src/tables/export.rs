@@ -5,14 +5,14 @@ use wire::{CandidateBlock, ContentHash};
 use super::labels::decode_label;
 use super::restore::{grades, origin};
 use crate::Store;
-use crate::database::{FromRow, Row, from_columns, query};
+use crate::database::{FromRow, Row, query};
 use crate::encoding::decode_structure;
 use crate::error::{Result, StoreError};
 use crate::export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
 
 pub(crate) const CANDIDATES: &str = "SELECT candidate.decision, id, candidate.seed_structure,
         coalesce(seed_structure.name, '') AS seed_name, origin, decision.mixture_version AS version_after,
-        block, original_grades, hash, data, label.energy, forces, stress
+        block, original_grades, hash, data, label.*
     FROM candidate
     CROSS JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND standing = 'label'
     CROSS JOIN structure ON structure.number = candidate.structure
@@ -26,7 +26,7 @@ pub(crate) const CANDIDATES: &str = "SELECT candidate.decision, id, candidate.se
 
 /// Imported structures that are not rows of candidates already.
 pub(crate) const IMPORTS: &str =
-    "SELECT import.number, import.file, import.frame, hash, data, energy, forces, stress
+    "SELECT import.number AS place, import.file AS from_file, import.frame AS from_frame, hash, data, label.*
     FROM import
     CROSS JOIN label ON label.structure = import.structure AND label.protocol = $1 AND standing = 'label'
     CROSS JOIN structure ON structure.number = import.structure
@@ -71,7 +71,7 @@ struct ImportRow {
 
 impl FromRow for ImportRow {
     fn from_row(row: &Row) -> Result<Self> {
-        let (number, file, frame) = (row.get("number")?, row.get("file")?, row.get("frame")?);
+        let (number, file, frame) = (row.get("place")?, row.get("from_file")?, row.get("from_frame")?);
         Ok(Self { number, file, frame, labelled: Labelled::from_row(row)? })
     }
 }
@@ -82,9 +82,21 @@ struct Labelled {
     energy: f64,
     forces: Vec<u8>,
     stress: Option<Vec<u8>>,
+    details: Option<String>,
 }
 
-from_columns!(Labelled { hash, data, energy, forces, stress });
+impl FromRow for Labelled {
+    fn from_row(row: &Row) -> Result<Self> {
+        Ok(Self {
+            hash: row.get("hash")?,
+            data: row.get("data")?,
+            energy: row.get("energy")?,
+            forces: row.get("forces")?,
+            stress: row.get("stress")?,
+            details: row.get_or_default("details")?,
+        })
+    }
+}
 
 impl Store {
     /// At most `limit` labelled structures behind `after` (`None`: from the first on): candidates in decision order, then
@@ -158,11 +170,12 @@ impl Labelled {
         protocol_name: &str,
         protocol: ContentHash,
     ) -> Result<ExportRow> {
+        let (stress, details) = (self.stress.as_deref(), self.details.as_deref());
         Ok(ExportRow {
             place,
             source,
             structure: decode_structure(&self.data, &self.hash)?,
-            label: decode_label(self.energy, &self.forces, self.stress.as_deref())?,
+            label: decode_label(self.energy, &self.forces, stress, details)?,
             protocol_name: protocol_name.to_owned(),
             protocol,
         })

@@ -6,11 +6,11 @@ use wire::ContentHash;
 use super::protocols;
 use super::queue::{end_attempt, job_row};
 use crate::Store;
-use crate::database::{Transaction, from_columns, query};
+use crate::database::{FromRow, Row, Transaction, query};
 use crate::encoding::{decode_matrix, decode_vectors, encode_vectors, integer};
 use crate::error::{Result, StoreError};
 use crate::jobs::{Completed, LabelRecord, LabelSource, Standing};
-use crate::records::{Label, Lease};
+use crate::records::{Label, LabelDetails, Lease};
 
 pub(crate) const CURRENT: &str =
     "SELECT EXISTS (SELECT 1 FROM label WHERE structure = $1 AND protocol = $2 AND standing = 'label')";
@@ -27,9 +27,26 @@ pub(super) struct LabelRow {
     frame: Option<u64>,
     correction: Option<String>,
     received: i64,
+    details: Option<String>,
 }
 
-from_columns!(LabelRow { standing, energy, forces, stress, job, attempt, file, frame, correction, received });
+impl FromRow for LabelRow {
+    fn from_row(row: &Row) -> Result<Self> {
+        Ok(Self {
+            standing: row.get("standing")?,
+            energy: row.get("energy")?,
+            forces: row.get("forces")?,
+            stress: row.get("stress")?,
+            job: row.get("job")?,
+            attempt: row.get("attempt")?,
+            file: row.get("file")?,
+            frame: row.get("frame")?,
+            correction: row.get("correction")?,
+            received: row.get("received")?,
+            details: row.get_or_default("details")?,
+        })
+    }
+}
 
 impl Store {
     /// Brings the result of a leased job. The first valid one for structure and protocol is the label, whether or not
@@ -125,6 +142,13 @@ pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: 
     if label.forces.iter().chain(stress).flatten().any(|x| !x.is_finite()) {
         return invalid("forces or stress have entries that are not finite".into());
     }
+    // JSON knows no others, and they would come back as none.
+    let LabelDetails { energy_without_smearing, magnetic_moments, magnetisation, .. } = &label.details;
+    let details =
+        energy_without_smearing.iter().chain(magnetisation).chain(magnetic_moments.iter().flatten());
+    if details.into_iter().any(|x| !x.is_finite()) {
+        return invalid("moments or energies in its details are not finite".into());
+    }
     Ok(())
 }
 
@@ -149,7 +173,8 @@ pub(super) async fn add(
     }
     let sql =
         "INSERT INTO label (structure, protocol, standing, energy, forces, stress, job, attempt, file, frame,
-                                  correction, received) VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12)";
+                                  correction, received, details)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)";
     query(sql)
         .bind(structure)
         .bind(protocol)
@@ -163,6 +188,7 @@ pub(super) async fn add(
         .bind(frame)
         .bind(correction)
         .bind(now)
+        .bind(encode_details(&label.details))
         .execute(&mut *transaction)
         .await?;
     Ok(standing)
@@ -195,17 +221,31 @@ impl LabelRow {
             (None, None, None, None, Some(reason)) => LabelSource::Correction { reason },
             _ => return Err(unknown()),
         };
-        let label = decode_label(self.energy, &self.forces, self.stress.as_deref())?;
+        let label = decode_label(self.energy, &self.forces, self.stress.as_deref(), self.details.as_deref())?;
         Ok(LabelRecord { standing, label, source, received: self.received })
     }
 }
 
 /// A label from its columns.
-pub(crate) fn decode_label(energy: f64, forces: &[u8], stress: Option<&[u8]>) -> Result<Label> {
+pub(crate) fn decode_label(
+    energy: f64,
+    forces: &[u8],
+    stress: Option<&[u8]>,
+    details: Option<&str>,
+) -> Result<Label> {
     let damaged = || StoreError::damaged("a label", "its forces or stress have a wrong length");
+    let details = details.map(serde_json::from_str).transpose();
     Ok(Label {
         energy,
         forces: decode_vectors(forces).ok_or_else(damaged)?,
         stress: stress.map(|bytes| decode_matrix(bytes).ok_or_else(damaged)).transpose()?,
+        details: details
+            .map_err(|error| StoreError::damaged("the details of a label", error))?
+            .unwrap_or_default(),
     })
+}
+
+fn encode_details(details: &LabelDetails) -> Option<String> {
+    let is_empty = *details == LabelDetails::default();
+    (!is_empty).then(|| serde_json::to_string(details).expect("plain data becomes JSON"))
 }

@@ -1,6 +1,7 @@
 //! What the functions of [`crate::Store`] do with its tables, a file a matter.
 
-mod budget;
+mod archives;
+pub mod budget;
 pub mod by_hand;
 mod commit;
 pub mod export;

@@ -13,12 +13,12 @@ use crate::Store;
 use crate::database::{Transaction, from_columns, query};
 use crate::encoding::decode_structure;
 use crate::error::{Result, StoreError};
-use crate::jobs::Failed;
+use crate::jobs::{CalculationRecord, Failed, Whereabouts};
 use crate::processes::ProcessRecord;
 use crate::records::{JobState, Lease};
 
 /// The next job by priority, then in decision order.
-pub(crate) const NEXT: &str = "SELECT number, attempts, structure, decision FROM job
+pub(crate) const NEXT: &str = "SELECT number, structure, decision, attempts, failures, overruled FROM job
     WHERE state = 'queued' AND protocol = $1 ORDER BY priority DESC, decision LIMIT 1";
 
 pub(crate) const EXPIRED: &str = "SELECT number, holder FROM job WHERE state = 'leased' AND expires <= $1";
@@ -48,6 +48,18 @@ pub(crate) enum InVain<'a> {
     /// Nobody works on it any longer: `released`, `lost` or `expired`.
     Lost(&'static str),
 }
+
+/// A job that may be leased.
+struct NextJob {
+    number: i64,
+    structure: i64,
+    decision: i64,
+    attempts: u32,
+    failures: u32,
+    overruled: Option<i64>,
+}
+
+from_columns!(NextJob { number, structure, decision, attempts, failures, overruled });
 
 /// A job as the ends of its leases need it.
 pub(super) struct JobRow {
@@ -85,12 +97,12 @@ impl Store {
             return Ok(None);
         }
         let next = query(NEXT).bind(protocol_number).unless_locked();
-        let next: Option<(i64, u32, i64, i64)> = next.fetch_optional(&mut transaction).await?;
-        let Some((job, attempts, structure, decision)) = next else {
+        let next: Option<NextJob> = next.fetch_optional(&mut transaction).await?;
+        let Some(next) = next else {
             transaction.commit().await?;
             return Ok(None);
         };
-        let attempt = attempts + 1;
+        let (job, attempt) = (next.number, next.attempts + 1);
         let sql =
             "UPDATE job SET state = 'leased', holder = $1, expires = $2, attempts = $3 WHERE number = $4";
         let lease = query(sql).bind(holder).bind(end_of_lease(now, seconds)).bind(attempt).bind(job);
@@ -103,9 +115,11 @@ impl Store {
             attempt,
             holder: holder.to_owned(),
             protocol,
-            earlier_calculation: earlier_calculation(&mut transaction, job, attempt).await?,
-            structure: structure_of(&mut transaction, structure).await?,
-            candidate: candidate_of(&mut transaction, decision).await?,
+            earlier_calculations: earlier_calculations(&mut transaction, job, attempt).await?,
+            failures: classes_of_failures(&mut transaction, job, next.failures).await?,
+            overruled: next.overruled.is_some(),
+            structure: structure_of(&mut transaction, next.structure).await?,
+            candidate: candidate_of(&mut transaction, next.decision).await?,
         };
         transaction.commit().await?;
         Ok(Some(lease))
@@ -123,14 +137,71 @@ impl Store {
         Ok(renewed)
     }
 
-    /// Stores what finds a calculation again (process group, number in a batch system) before it is started. Whoever
-    /// leases the job next gets it as [`Lease::earlier_calculation`].
-    pub async fn record_calculation(&self, lease: &Lease, calculation: &str) -> Result<()> {
+    /// Stores what finds a calculation again (process, number in a batch system), and what it is, before it is started.
+    /// Whoever leases the job next gets it among [`Lease::earlier_calculations`]. One that an earlier attempt had
+    /// started is this one's from now on: its core-seconds count here.
+    pub async fn record_calculation(
+        &self,
+        lease: &Lease,
+        calculation: &str,
+        made: &CalculationRecord,
+    ) -> Result<()> {
         let mut transaction = self.database.begin().await?;
-        let sql = "UPDATE attempt SET calculation = $1 WHERE job = $2 AND attempt = $3";
-        let query = query(sql).bind(calculation).bind(lease.job).bind(lease.attempt);
-        query.execute(&mut transaction).await?;
+        let sql =
+            "UPDATE attempt SET calculation = $1, cores = $2, remedies = $3, difference = $4, atoms = $5,
+                   electrons = $6, k_points = $7 WHERE job = $8 AND attempt = $9";
+        let record = query(sql).bind(calculation).bind(made.cores).bind(made.remedies.as_deref());
+        let record = record.bind(made.difference.as_deref()).bind(made.atoms);
+        let record = record.bind(made.electrons).bind(made.k_points).bind(lease.job).bind(lease.attempt);
+        record.execute(&mut transaction).await?;
+        let sql = "UPDATE attempt SET core_seconds = 0 WHERE job = $1 AND attempt < $2 AND calculation = $3";
+        let before = query(sql).bind(lease.job).bind(lease.attempt).bind(calculation);
+        before.execute(&mut transaction).await?;
         transaction.commit().await
+    }
+
+    /// A calculation has ended: the core-seconds that it took, and the end of what it said.
+    pub async fn account(&self, lease: &Lease, core_seconds: f64, log: &str) -> Result<()> {
+        let mut transaction = self.database.begin().await?;
+        let sql = "UPDATE attempt SET core_seconds = $1, log = $2 WHERE job = $3 AND attempt = $4";
+        let account = query(sql).bind(core_seconds).bind(log).bind(lease.job).bind(lease.attempt);
+        account.execute(&mut transaction).await?;
+        transaction.commit().await
+    }
+
+    /// What has become of the job of a lease that was lost.
+    pub async fn whereabouts(&self, lease: &Lease) -> Result<Whereabouts> {
+        let sql = "SELECT state, attempts, calculation FROM job
+                   LEFT JOIN attempt ON attempt.job = job.number AND attempt.attempt = attempts
+                   WHERE job.number = $1";
+        let row: Option<(String, u32, Option<String>)> =
+            query(sql).bind(lease.job).fetch_optional(&self.database).await?;
+        let unknown = || StoreError::UnknownJob { id: lease.candidate.clone(), near: Vec::new() };
+        let (state, attempts, calculation) = row.ok_or_else(unknown)?;
+        Ok(match state.as_str() {
+            "leased" if attempts == lease.attempt => Whereabouts::Held,
+            "leased" => Whereabouts::LeasedAgain { calculation },
+            "queued" => Whereabouts::Queued,
+            _ => Whereabouts::Over,
+        })
+    }
+
+    /// An attempt was lost through no fault of the job, and it is known why: the job waits for another.
+    pub async fn lose(&self, lease: &Lease, class: &str, log: &str, now: i64) -> Result<Failed> {
+        let mut transaction = self.database.begin().await?;
+        let now = transaction.time(now).await?;
+        let job = job_row(&mut transaction, lease.job).await?;
+        let held = job.state == "leased" && job.attempts == lease.attempt;
+        explain(&mut transaction, lease.job, lease.attempt, class, log).await?;
+        let lost = match held {
+            false => Failed::LeaseLost,
+            true => match end_in_vain(&mut transaction, lease.job, InVain::Lost("lost"), now).await? {
+                JobState::Failed => Failed::GivenUp,
+                _ => Failed::Requeued,
+            },
+        };
+        transaction.commit().await?;
+        Ok(lost)
     }
 
     /// An attempt failed: the job waits for another, or is given up after `attempt_limit` failed ones. Class and
@@ -167,7 +238,8 @@ impl Store {
     }
 
     /// Takes back every lease of `process` and of its parts, which crashed with them in hand: each counts as a failed
-    /// attempt of that class, and a job that has `attempt_limit` of them is given up. Returns their number.
+    /// attempt of that class, and a job that has `attempt_limit` of them is given up. But one whose calculation is a process
+    /// of its own is only lost: that goes on. Returns their number.
     pub async fn fail_leases_of(
         &self,
         process: &str,
@@ -184,6 +256,12 @@ impl Store {
         let now = transaction.time(now).await?;
         let jobs: Vec<i64> = query(HELD).bind(holder).locked().fetch_all(&mut transaction).await?;
         for job in &jobs {
+            let how = match how {
+                InVain::Failed { .. } if has_calculation(&mut transaction, *job).await? => {
+                    InVain::Lost("lost")
+                }
+                how => how,
+            };
             end_in_vain(&mut transaction, *job, how, now).await?;
         }
         transaction.commit().await?;
@@ -201,6 +279,13 @@ impl Store {
     pub async fn unfinished_jobs(&self) -> Result<u64> {
         query(UNFINISHED).fetch_one(&self.database).await
     }
+}
+
+/// Whether the attempt that is under way has started a calculation.
+async fn has_calculation(transaction: &mut Transaction, job: i64) -> Result<bool> {
+    let sql = "SELECT count(*) FROM attempt WHERE job = $1 AND outcome IS NULL AND calculation IS NOT NULL";
+    let found: u64 = query(sql).bind(job).fetch_one(&mut *transaction).await?;
+    Ok(found > 0)
 }
 
 fn end_of_lease(now: i64, seconds: u32) -> i64 {
@@ -292,16 +377,28 @@ pub(super) async fn job_row(transaction: &mut Transaction, job: i64) -> Result<J
     row.ok_or_else(|| StoreError::UnknownJob { id: job.to_string(), near: Vec::new() })
 }
 
-async fn earlier_calculation(
-    transaction: &mut Transaction,
-    job: i64,
-    attempt: u32,
-) -> Result<Option<String>> {
-    let sql = "SELECT calculation FROM attempt WHERE job = $1 AND attempt = $2
-               AND outcome IN ('expired', 'lost', 'released')";
-    let calculation = query(sql).bind(job).bind(attempt - 1);
-    let calculation: Option<Option<String>> = calculation.fetch_optional(&mut *transaction).await?;
-    Ok(calculation.flatten())
+async fn earlier_calculations(transaction: &mut Transaction, job: i64, attempt: u32) -> Result<Vec<String>> {
+    let sql = "SELECT calculation FROM attempt WHERE job = $1 AND attempt < $2 AND calculation IS NOT NULL
+               AND attempt > (SELECT coalesce(max(attempt), 0) FROM attempt WHERE job = $1
+                              AND outcome NOT IN ('expired', 'lost', 'released'))
+               ORDER BY attempt DESC";
+    query(sql).bind(job).bind(attempt).fetch_all(&mut *transaction).await
+}
+
+/// Of the last `failures` attempts that failed, and of what was lost with a class since, oldest first.
+async fn classes_of_failures(transaction: &mut Transaction, job: i64, failures: u32) -> Result<Vec<String>> {
+    let sql = "SELECT class, outcome FROM attempt WHERE job = $1 AND class IS NOT NULL
+               AND outcome IN ('failed', 'lost') ORDER BY attempt DESC";
+    let all: Vec<(String, String)> = query(sql).bind(job).fetch_all(&mut *transaction).await?;
+    let mut left = failures;
+    let counted = all.into_iter().take_while(|(_, outcome)| {
+        let counts = left > 0;
+        left -= u32::from(counts && outcome == "failed");
+        counts
+    });
+    let mut classes: Vec<String> = counted.map(|(class, _)| class).collect();
+    classes.reverse();
+    Ok(classes)
 }
 
 async fn structure_of(transaction: &mut Transaction, number: i64) -> Result<Structure> {

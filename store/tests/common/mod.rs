@@ -66,6 +66,7 @@ pub fn label(energy: f64) -> Label {
         energy,
         forces: vec![[0.5 * energy, -0.1, 0.0]; ATOMS],
         stress: Some([[energy, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]),
+        details: Default::default(),
     }
 }
 

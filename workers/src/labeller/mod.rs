@@ -3,27 +3,45 @@
 //! [`run`] is one of the tasks of a process, [`serve`] a process of its own, which outlives its orchestrator.
 
 mod closing;
+mod code;
+mod difference;
+mod here;
 mod insist;
 mod judge;
+mod keeper;
+mod log;
+mod method;
+mod once;
+mod pack;
+mod prepare;
 mod presence;
-pub mod reference;
+mod reference;
+mod running;
+mod scratch;
+mod session;
 mod told;
 
-use std::panic;
 use std::pin::pin;
 use std::time::{Duration, Instant};
 
-use store::records::{Label, Lease, Protocol};
-use store::{Store, StoreError};
-use tokio::task::{JoinError, spawn_blocking};
+use dft::{Calculated, Failure, FailureClass};
+use store::records::{Label, LabelDetails, Lease, Protocol};
+use store::{Store, StoreError, Whereabouts};
 
 use closing::Wanted;
+use judge::judge;
+use method::Made;
 use told::Became;
 
 pub use closing::Closing;
+pub use code::CodeMethod;
 pub use insist::insist;
+pub use keeper::{KeeperCommand, keep};
+pub use method::Method;
+pub use once::{Once, label_once};
 pub use presence::{Stay, serve};
-pub use reference::{LabelFailure, ReferenceMethod};
+pub use reference::ReferenceMethod;
+pub use running::{Keep, Running};
 
 /// Between two signs of life in the store, of every process that gives them there.
 pub const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
@@ -63,8 +81,8 @@ pub struct Timing {
     pub idle: Duration,
     /// Between two signs of life of a labeller that is a process.
     pub sign_of_life: Duration,
-    /// How long the label in hand may go on when the labeller is asked to stop, before it is given back; none for as long
-    /// as it takes.
+    /// How long the label in hand may go on when the labeller is asked to stop, before it is given back and its calculation
+    /// ended; none for as long as it takes.
     pub grace: Option<Duration>,
 }
 
@@ -102,7 +120,7 @@ enum Found {
 /// Whatever else the database says; the label in hand is lost then, and its job comes back.
 pub async fn run(
     store: Store,
-    mut method: ReferenceMethod,
+    method: Method,
     settings: LabellerSettings,
     closing: &Closing,
     now: impl Fn() -> i64,
@@ -125,14 +143,41 @@ pub async fn run(
         };
         idle = Duration::ZERO;
         let begun = Instant::now();
-        let Some((used, made)) = make(&store, method, &lease, &settings.timing, closing, &now).await? else {
-            tell(&format!("{} is given back: there is no time to finish it", lease.candidate));
-            return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
-        };
-        method = used;
-        let judged = made.and_then(|label| judge::judge(label, &lease, settings.largest_force));
-        let became = insist(closing, || deliver(&store, &lease, &judged, &settings, now())).await?;
+        let Made { result, ended } =
+            match make(&store, &method, &lease, &settings.timing, closing, &now).await? {
+                Work::Done(made) => made,
+                Work::NotWanted => {
+                    method.stop().await?;
+                    tell(&format!(
+                        "{} is given up here: it has its label, or is wanted no more",
+                        lease.candidate
+                    ));
+                    continue;
+                }
+                Work::LetGo => {
+                    method.let_go();
+                    tell(&format!("{} is finished by somebody else here", lease.candidate));
+                    continue;
+                }
+                Work::TooLate => {
+                    method.stop().await?;
+                    tell(&format!("{} is given back: there is no time to finish it", lease.candidate));
+                    return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
+                }
+            };
+        let judged = result.and_then(|made| judge(made, &lease.structure, settings.largest_force));
+        let log = ended.as_ref().map_or("", |ended| &ended.log);
+        if let Some(ended) = &ended {
+            insist(closing, || store.account(&lease, ended.core_seconds, log)).await?;
+        }
+        // What no remedy helps against is not tried again.
+        let no_remedy = judged.as_ref().is_err_and(|failure| method.has_no_remedy(&lease, failure));
+        let attempts = if no_remedy { 1 } else { settings.attempts };
+        let became = insist(closing, || deliver(&store, &lease, &judged, log, attempts, now())).await?;
         tell(&told::line(&lease, &judged, &became, begun.elapsed().as_secs_f64()));
+        if let Some(ended) = ended {
+            method.put_away(&store, &lease, closing, ended, judged.is_err()).await?;
+        }
     }
 }
 
@@ -170,35 +215,53 @@ async fn wait(
     wait
 }
 
-/// Makes a label on a thread of its own, and renews the lease meanwhile. A label whose lease was lost is made to its
-/// end: if another is first, it becomes a check. `None` if there was no time for that.
+/// What came of a lease.
+enum Work {
+    Done(Made),
+    /// Nobody waits for the result any more.
+    NotWanted,
+    /// Somebody else waits for this very calculation.
+    LetGo,
+    /// There was no time to end it.
+    TooLate,
+}
+
+/// Works on a job, and renews the lease meanwhile. A label whose lease was lost is made to its end: if another is first, it
+/// becomes a check. But a calculation of its own is ended when nobody waits for it, and left alone when somebody else does.
 async fn make(
     store: &Store,
-    mut method: ReferenceMethod,
+    method: &Method,
     lease: &Lease,
     timing: &Timing,
     closing: &Closing,
     now: impl Fn() -> i64,
-) -> Result<Option<(ReferenceMethod, Result<Label, LabelFailure>)>, StoreError> {
-    let structure = lease.structure.clone();
-    let mut making = spawn_blocking(move || {
-        let made = method.label(&structure);
-        (method, made)
-    });
-    let mut held = true;
+) -> Result<Work, StoreError> {
+    let mut making = pin!(method.make(store, lease, closing));
     let mut too_late = pin!(end_of_grace(timing.grace, closing));
+    let seconds = timing.lease_seconds();
+    let mut held = true;
     loop {
-        let seconds = timing.lease_seconds();
         tokio::select! {
-            made = &mut making => return made.or_else(crashed).map(Some),
-            () = &mut too_late => return Ok(None),
-            () = tokio::time::sleep(Duration::from_secs(seconds.into()) / 3), if held => {
-                held = match store.renew(lease, now(), seconds).await {
-                    // There is time for another try.
-                    Err(error) if error.is_transient() => true,
-                    renewed => renewed?,
-                };
+            made = &mut making => return made.map(Work::Done),
+            () = &mut too_late => return Ok(Work::TooLate),
+            () = tokio::time::sleep(Duration::from_secs(seconds.into()) / 3) => {}
+        }
+        if held {
+            held = match store.renew(lease, now(), seconds).await {
+                // There is time for another try.
+                Err(error) if error.is_transient() => true,
+                renewed => renewed?,
+            };
+        }
+        let Some(own) = method.calculation().filter(|_| !held) else { continue };
+        match store.whereabouts(lease).await {
+            Ok(Whereabouts::Over) => return Ok(Work::NotWanted),
+            Ok(Whereabouts::LeasedAgain { calculation: Some(other) }) if other == own => {
+                return Ok(Work::LetGo);
             }
+            Ok(_) => {}
+            Err(error) if error.is_transient() => {}
+            Err(error) => return Err(error),
         }
     }
 }
@@ -213,23 +276,39 @@ async fn end_of_grace(grace: Option<Duration>, closing: &Closing) {
     }
 }
 
-/// A method that panics takes its labeller with it.
-fn crashed<T>(crash: JoinError) -> Result<T, StoreError> {
-    panic::resume_unwind(crash.into_panic())
-}
-
 async fn deliver(
     store: &Store,
     lease: &Lease,
-    judged: &Result<Label, LabelFailure>,
-    settings: &LabellerSettings,
+    judged: &Result<Calculated, Failure>,
+    log: &str,
+    attempts: u32,
     now: i64,
 ) -> Result<Became, StoreError> {
-    match judged {
-        Ok(label) => store.complete(lease, label, now).await.map(Became::Completed),
-        Err(failure) => {
-            let (class, log) = (failure.class(), failure.to_string());
-            store.fail(lease, class, &log, settings.attempts, now).await.map(Became::Failed)
-        }
+    let failure = match judged {
+        Ok(made) => return store.complete(lease, &label(made), now).await.map(Became::Completed),
+        Err(failure) => failure,
+    };
+    let (class, text) = (failure.class.name(), format!("{failure}\n{log}"));
+    let text = text.trim_end();
+    let failed = match failure.class {
+        // That was no fault of the job.
+        FailureClass::LostNode => store.lose(lease, class, text, now).await,
+        _ => store.fail(lease, class, text, attempts, now).await,
+    };
+    failed.map(Became::Failed)
+}
+
+/// A result as the store keeps it.
+fn label(made: &Calculated) -> Label {
+    Label {
+        energy: made.energy,
+        forces: made.forces.clone(),
+        stress: made.stress,
+        details: LabelDetails {
+            energy_without_smearing: made.energy_without_smearing,
+            magnetic_moments: made.magnetic_moments.clone(),
+            magnetisation: made.magnetisation,
+            electronic_steps: made.electronic_steps,
+        },
     }
 }

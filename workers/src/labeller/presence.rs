@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use store::{ProcessRecord, Store, StoreError};
 
-use super::{Closing, LabellerSettings, ReferenceMethod, insist, run};
+use super::{Closing, LabellerSettings, Method, insist, run};
 
 /// For how long a labeller is of use when nobody leads the campaign.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,7 +26,7 @@ pub enum Stay {
 /// where that is still possible.
 pub async fn serve(
     store: Store,
-    method: ReferenceMethod,
+    method: Method,
     settings: LabellerSettings,
     process: ProcessRecord,
     closing: &Closing,

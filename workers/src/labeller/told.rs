@@ -1,9 +1,8 @@
 //! What came of a leased job, as a line for people.
 
-use store::records::{Label, Lease};
+use dft::{Calculated, Failure};
+use store::records::Lease;
 use store::{Completed, Failed};
-
-use super::LabelFailure;
 
 /// What became of the job when the result was brought.
 pub(super) enum Became {
@@ -14,7 +13,7 @@ pub(super) enum Became {
 /// The line. One for a label begins with `labelled`.
 pub(super) fn line(
     lease: &Lease,
-    judged: &Result<Label, LabelFailure>,
+    judged: &Result<Calculated, Failure>,
     became: &Became,
     seconds: f64,
 ) -> String {

@@ -1,0 +1,48 @@
+//! The directories of calculations, packed.
+
+use crate::Store;
+use crate::database::{from_columns, query};
+use crate::error::Result;
+use crate::jobs::{Archive, PastCalculation};
+
+impl Store {
+    /// Keeps the packed directory of an attempt's calculation, in the place of an earlier one. `left_out` names the files
+    /// that are not in it.
+    pub async fn keep_archive(&self, job: i64, attempt: u32, bytes: &[u8], left_out: &str) -> Result<()> {
+        let mut transaction = self.database.begin().await?;
+        let sql = "INSERT INTO archive (job, attempt, bytes, left_out) VALUES ($1, $2, $3, $4)
+                   ON CONFLICT (job, attempt) DO UPDATE SET bytes = excluded.bytes, left_out = excluded.left_out";
+        let keep = query(sql).bind(job).bind(attempt).bind(bytes).bind(left_out);
+        keep.execute(&mut transaction).await?;
+        transaction.commit().await
+    }
+
+    /// The packed directories of a job's calculations, by attempt.
+    pub async fn archives(&self, job: i64) -> Result<Vec<Archive>> {
+        let sql = "SELECT attempt, bytes, left_out FROM archive WHERE job = $1 ORDER BY attempt";
+        query(sql).bind(job).fetch_all(&self.database).await
+    }
+
+    /// What has become of an attempt and its calculation; none if there was no such attempt.
+    pub async fn past_calculation(&self, job: i64, attempt: u32) -> Result<Option<PastCalculation>> {
+        let sql = "SELECT calculation, CASE WHEN outcome = 'failed' THEN 1 ELSE 0 END AS failed,
+                       CASE WHEN state IN ('queued', 'leased')
+                       AND (outcome IS NULL OR outcome IN ('expired', 'lost', 'released')) THEN 1 ELSE 0 END AS wanted
+                   FROM attempt JOIN job ON job.number = attempt.job WHERE job = $1 AND attempt = $2";
+        let row: Option<Row> = query(sql).bind(job).bind(attempt).fetch_optional(&self.database).await?;
+        Ok(row.map(|Row { calculation, failed, wanted }| PastCalculation {
+            calculation,
+            failed: failed != 0,
+            wanted: wanted != 0,
+        }))
+    }
+}
+
+struct Row {
+    calculation: Option<String>,
+    failed: i64,
+    wanted: i64,
+}
+
+from_columns!(Row { calculation, failed, wanted });
+from_columns!(Archive { attempt, bytes, left_out });

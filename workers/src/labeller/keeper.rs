@@ -1,0 +1,274 @@
+//! The process that keeps a calculation: it starts the program, sees to its limits, and leaves behind how it ended. It
+//! outlives the labeller that started it, so what a killed labeller had begun is finished all the same.
+//!
+//! It is this program again, with an [`Order`] on its standard input. Until that has come nothing is started: whoever starts
+//! a keeper writes down which process it is before. The program itself is started by a second process of the same kind,
+//! which ties itself to the keeper and then becomes the program.
+
+use std::fs::{self, File};
+use std::io::{self, BufRead, Write};
+use std::os::fd::AsFd;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use dft::Exit;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::process::{
+    Pid, PidfdFlags, Signal, getppid, pidfd_open, set_parent_process_death_signal, setsid,
+};
+use serde::{Deserialize, Serialize};
+
+use super::session;
+
+/// Where the program works, in the directory of a calculation.
+pub(super) const WORK: &str = "work";
+/// What the keeper leaves there when the calculation has ended.
+const END: &str = "end.json";
+/// Between two looks at the memory in use.
+const LOOK: Duration = Duration::from_millis(500);
+/// The variable by which everything that a calculation starts can be known: its directory.
+pub(super) const MARK: &str = "CALMWALK_CALCULATION";
+/// What the second process leaves there if it could not become the program.
+const NOT_STARTED: &str = "not-started";
+
+/// What this program is to be, one line of JSON.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) enum Order {
+    /// The keeper of a calculation.
+    Keep(Calculation),
+    /// Its program.
+    Become { keeper: u32, directory: PathBuf, command: Vec<String> },
+}
+
+/// What is to be calculated, and within which limits.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct Calculation {
+    pub directory: PathBuf,
+    pub command: Vec<String>,
+    pub environment: Vec<(String, String)>,
+    /// Seconds.
+    pub time_limit: f64,
+    /// Bytes that all its processes together may have in memory.
+    pub memory_limit: Option<u64>,
+    /// How a keeper is started.
+    pub keeper: KeeperCommand,
+}
+
+/// The program, with its arguments, that calls [`keep`].
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct KeeperCommand {
+    /// A path.
+    pub program: PathBuf,
+    /// What it is started with.
+    pub arguments: Vec<String>,
+}
+
+impl Default for KeeperCommand {
+    /// `calmwalk keep`, of this very program, also when its file was replaced meanwhile.
+    fn default() -> Self {
+        Self { program: "/proc/self/exe".into(), arguments: vec!["keep".to_owned()] }
+    }
+}
+
+impl KeeperCommand {
+    pub(super) fn command(&self) -> Command {
+        let mut command = Command::new(&self.program);
+        command.args(&self.arguments);
+        command
+    }
+}
+
+/// How a calculation ended.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct End {
+    pub how: How,
+    /// The program, as the command calls it.
+    pub program: PathBuf,
+    /// From the program's start to its end, s.
+    pub seconds: f64,
+    /// Most bytes that its processes were seen to have in memory together; 0 where nobody looked.
+    pub memory: u64,
+}
+
+/// See [`End`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) enum How {
+    /// By itself, or at a limit.
+    Ended(#[serde(with = "ExitOnFile")] Exit),
+    /// There is no such program, or it cannot be executed: the system's number of the error.
+    NotStarted(i32),
+}
+
+/// [`Exit`] as it is written down.
+#[derive(Serialize, Deserialize)]
+#[serde(remote = "Exit")]
+enum ExitOnFile {
+    Code(i32),
+    Signal(i32),
+    TimeLimit,
+    OutOfMemory,
+    LostNode,
+}
+
+impl End {
+    /// What a keeper left in the directory, if the calculation has ended.
+    pub fn read(directory: &Path) -> Option<Self> {
+        serde_json::from_slice(&fs::read(directory.join(END)).ok()?).ok()
+    }
+
+    /// It appears as a whole, and only when everything else is over.
+    pub fn write(&self, directory: &Path) -> io::Result<()> {
+        let unfinished = directory.join(format!("{END}.new"));
+        fs::write(&unfinished, serde_json::to_vec(self)?)?;
+        fs::rename(unfinished, directory.join(END))
+    }
+}
+
+/// Does what standard input says: keeps a calculation, or becomes its program. To be called on the main thread of a
+/// process that does nothing else.
+///
+/// # Errors
+/// What the system refused. Without an order, since whoever started this process is gone, nothing is done.
+pub fn keep() -> io::Result<()> {
+    let mut line = String::new();
+    io::stdin().lock().read_line(&mut line)?;
+    // An order that was cut off was not given.
+    match line.ends_with('\n').then(|| serde_json::from_str(&line)) {
+        None => Ok(()),
+        Some(Err(error)) => Err(error.into()),
+        Some(Ok(Order::Keep(calculation))) => calculation.keep(),
+        Some(Ok(Order::Become { keeper, directory, command })) => {
+            Err(become_program(keeper, &directory, &command))
+        }
+    }
+}
+
+/// Returns only if that fails.
+fn become_program(keeper: u32, directory: &Path, command: &[String]) -> io::Error {
+    if let Err(error) = set_parent_process_death_signal(Some(Signal::KILL)) {
+        return error.into();
+    }
+    // It may have died before.
+    if getppid().map(|pid| pid.as_raw_nonzero().get().unsigned_abs()) != Some(keeper) {
+        return io::Error::other("the keeper of this calculation is gone");
+    }
+    let [program, arguments @ ..] = command else { return io::ErrorKind::InvalidInput.into() };
+    let error = Command::new(program).args(arguments).stdin(Stdio::null()).exec();
+    let number = error.raw_os_error().unwrap_or_default();
+    match fs::write(directory.join(NOT_STARTED), number.to_string()) {
+        Ok(()) => error,
+        Err(error) => error,
+    }
+}
+
+impl Calculation {
+    /// Starts the program, waits for it, and ends it at a limit.
+    fn keep(self) -> io::Result<()> {
+        // Neither Ctrl-C nor the end of the labeller's group reaches this process or its program.
+        setsid()?;
+        let kills = out_of_memory_kills();
+        let begun = Instant::now();
+        let mut program = self.start()?;
+        let (limit, memory) = self.wait(&program, begun)?;
+        session::end_others()?;
+        let status = program.wait()?;
+        let how = match (self.not_started(), limit) {
+            (Some(number), _) => How::NotStarted(number),
+            (None, Some(limit)) => How::Ended(limit),
+            (None, None) if !status.success() && out_of_memory_kills() > kills => {
+                How::Ended(Exit::OutOfMemory)
+            }
+            (None, None) => How::Ended(exit(status)),
+        };
+        let program = self.command.first().map(PathBuf::from).unwrap_or_default();
+        End { how, program, seconds: begun.elapsed().as_secs_f64(), memory }.write(&self.directory)
+    }
+
+    fn start(&self) -> io::Result<Child> {
+        let work = self.directory.join(WORK);
+        let mut child = self
+            .keeper
+            .command()
+            .current_dir(&work)
+            .envs(self.environment.iter().map(|(name, value)| (name, value)))
+            .env(MARK, &self.directory)
+            .stdin(Stdio::piped())
+            .stdout(File::create(work.join("stdout"))?)
+            .stderr(File::create(work.join("stderr"))?)
+            .process_group(0)
+            .spawn()?;
+        let (keeper, directory) = (std::process::id(), self.directory.clone());
+        let order = Order::Become { keeper, directory, command: self.command.clone() };
+        match child.stdin.take() {
+            Some(stdin) => give(stdin, &order).map(|()| child),
+            None => Err(io::ErrorKind::BrokenPipe.into()),
+        }
+    }
+
+    /// Waits until the program has ended, or must end: then the limit. The second is how much memory was seen in use.
+    fn wait(&self, program: &Child, begun: Instant) -> io::Result<(Option<Exit>, u64)> {
+        let pid = i32::try_from(program.id()).ok().and_then(Pid::from_raw);
+        let end = pidfd_open(pid.ok_or(io::ErrorKind::InvalidInput)?, PidfdFlags::empty())?;
+        let limit = Duration::try_from_secs_f64(self.time_limit).unwrap_or(Duration::MAX);
+        let mut most = 0;
+        loop {
+            let left = limit.saturating_sub(begun.elapsed());
+            if left.is_zero() {
+                return Ok((Some(Exit::TimeLimit), most));
+            }
+            if has_ended(&end, if self.memory_limit.is_some() { left.min(LOOK) } else { left })? {
+                return Ok((None, most));
+            }
+            if let Some(limit) = self.memory_limit {
+                most = most.max(session::memory());
+                if most > limit {
+                    return Ok((Some(Exit::OutOfMemory), most));
+                }
+            }
+        }
+    }
+
+    fn not_started(&self) -> Option<i32> {
+        fs::read_to_string(self.directory.join(NOT_STARTED)).ok()?.parse().ok()
+    }
+}
+
+/// Gives an order to a process that waits for one.
+pub(super) fn give(mut stdin: impl Write, order: &Order) -> io::Result<()> {
+    let mut line = serde_json::to_vec(order)?;
+    line.push(b'\n');
+    stdin.write_all(&line)
+}
+
+/// Waits for the end of a process, for so long.
+fn has_ended(process: &impl AsFd, patience: Duration) -> io::Result<bool> {
+    // A day more or less: who waits looks at the clock again.
+    let patience = patience.min(Duration::from_secs(86_400));
+    let patience = Timespec::try_from(patience).map_err(io::Error::other)?;
+    match poll(&mut [PollFd::new(process, PollFlags::IN)], Some(&patience)) {
+        Ok(ready) => Ok(ready > 0),
+        Err(rustix::io::Errno::INTR) => Ok(false),
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn exit(status: ExitStatus) -> Exit {
+    match status.code() {
+        Some(code) => Exit::Code(code),
+        None => Exit::Signal(status.signal().unwrap_or_default()),
+    }
+}
+
+/// How many processes the system has killed in this control group because it had no memory left; 0 where it does not tell.
+fn out_of_memory_kills() -> u64 {
+    let count = || {
+        let groups = fs::read_to_string("/proc/self/cgroup").ok()?;
+        let group = groups.lines().find_map(|line| line.strip_prefix("0::/"))?;
+        let events =
+            fs::read_to_string(Path::new("/sys/fs/cgroup").join(group).join("memory.events")).ok()?;
+        events.lines().find_map(|line| line.strip_prefix("oom_kill "))?.parse().ok()
+    };
+    count().unwrap_or_default()
+}

@@ -1,0 +1,124 @@
+//! What makes labels.
+
+use std::panic;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use atoms::{Potential, Structure};
+use dft::{Calculated, Code, Failure};
+use store::records::Lease;
+use store::{Store, StoreError};
+use tokio::task::spawn_blocking;
+
+use super::code::{CodeMethod, Ended, classes};
+use super::{Closing, KeeperCommand, ReferenceMethod, Running};
+
+/// A way to make labels.
+pub enum Method {
+    /// A potential, in this process.
+    Reference(Arc<Mutex<ReferenceMethod>>),
+    /// Another program, in processes of its own that outlive this one.
+    Code(CodeMethod),
+}
+
+/// A result that is not judged yet.
+pub(super) struct Made {
+    pub result: Result<Calculated, Failure>,
+    /// The calculation behind it, if it was a process of its own.
+    pub ended: Option<Ended>,
+}
+
+impl Method {
+    /// Labels by a potential.
+    pub fn reference(potential: Box<dyn Potential>) -> Self {
+        Self::Reference(Arc::new(Mutex::new(ReferenceMethod::new(potential))))
+    }
+
+    /// Labels by another program.
+    pub fn code(code: Box<dyn Code>, running: Running) -> Self {
+        Self::kept_by(KeeperCommand::default(), code, running)
+    }
+
+    /// The same with keepers ([`super::keep`]) that are started so.
+    pub fn kept_by(keeper: KeeperCommand, code: Box<dyn Code>, running: Running) -> Self {
+        Self::Code(CodeMethod::new(keeper, code, running))
+    }
+
+    /// Ends the calculation in hand, if there is one, and removes its directory.
+    ///
+    /// # Errors
+    /// [`StoreError::File`] if that is impossible.
+    pub async fn stop(&self) -> Result<(), StoreError> {
+        match self {
+            Self::Reference(_) => Ok(()),
+            Self::Code(method) => method.abandon().await,
+        }
+    }
+
+    /// Leaves the calculation in hand to whoever waits for it as well.
+    pub(super) fn let_go(&self) {
+        if let Self::Code(method) = self {
+            method.let_go();
+        }
+    }
+
+    /// The result of a job is where it belongs, and what was needed for it is put away.
+    pub(super) async fn put_away(
+        &self,
+        store: &Store,
+        lease: &Lease,
+        closing: &Closing,
+        ended: Ended,
+        failed: bool,
+    ) -> Result<(), StoreError> {
+        match self {
+            Self::Reference(_) => Ok(()),
+            Self::Code(method) => method.put_away(store, lease, closing, ended, failed).await,
+        }
+    }
+
+    /// Makes the result for a job. A potential takes a thread of its own.
+    pub(super) async fn make(
+        &self,
+        store: &Store,
+        lease: &Lease,
+        closing: &Closing,
+    ) -> Result<Made, StoreError> {
+        match self {
+            Self::Reference(method) => {
+                let result = evaluate(Arc::clone(method), lease.structure.clone()).await;
+                Ok(Made { result, ended: None })
+            }
+            Self::Code(method) => method.make(store, lease, closing).await,
+        }
+    }
+
+    /// What is said of the calculation in hand in the store, if there is one.
+    pub(super) fn calculation(&self) -> Option<String> {
+        match self {
+            Self::Reference(_) => None,
+            Self::Code(method) => method.calculation(),
+        }
+    }
+
+    /// Classes of failures after which nothing is left to try.
+    pub(super) fn has_no_remedy(&self, lease: &Lease, failure: &Failure) -> bool {
+        match self {
+            // Every attempt would be like the one before.
+            Self::Reference(_) => false,
+            Self::Code(_) => {
+                let failures = classes(lease).into_iter().chain([failure.class]);
+                dft::remedies(&failures.collect::<Vec<_>>()).is_none()
+            }
+        }
+    }
+}
+
+/// A method that panics takes its labeller with it.
+pub(super) async fn evaluate(
+    method: Arc<Mutex<ReferenceMethod>>,
+    structure: Structure,
+) -> Result<Calculated, Failure> {
+    // One that panicked has taken everybody with it who could see it.
+    let label = move || method.lock().unwrap_or_else(PoisonError::into_inner).label(&structure);
+    spawn_blocking(label).await.unwrap_or_else(|crash| panic::resume_unwind(crash.into_panic()))
+}

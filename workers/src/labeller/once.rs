@@ -1,0 +1,46 @@
+//! A single label, without a campaign.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use atoms::Structure;
+use dft::{Calculated, Failure};
+use store::StoreError;
+
+use super::judge::judge;
+use super::method::{Method, evaluate};
+
+/// What came of a single calculation.
+#[derive(Clone, Debug)]
+pub struct Once {
+    /// Its numbers, judged as those of a campaign are.
+    pub result: Result<Calculated, Failure>,
+    /// The end of what the program said; empty for a potential.
+    pub log: String,
+    /// Cores times the time that it took, s.
+    pub core_seconds: f64,
+}
+
+/// Labels one structure in a directory below `Running::scratch`, which is removed afterwards.
+///
+/// Dropped before it is ready, the calculation goes on until it ends by itself or by its time limit: who stops waiting has
+/// to call [`Method::stop`].
+///
+/// # Errors
+/// Where no calculation can be started here at all.
+pub async fn label_once(
+    method: &Method,
+    structure: &Structure,
+    largest_force: f64,
+) -> Result<Once, StoreError> {
+    let begun = Instant::now();
+    let mut once = match method {
+        Method::Reference(method) => {
+            let result = evaluate(Arc::clone(method), structure.clone()).await;
+            Once { result, log: String::new(), core_seconds: begun.elapsed().as_secs_f64() }
+        }
+        Method::Code(method) => method.once(structure).await?,
+    };
+    once.result = once.result.and_then(|made| judge(made, structure, largest_force));
+    Ok(once)
+}

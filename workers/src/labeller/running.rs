@@ -1,0 +1,59 @@
+//! How and where calculations run.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+/// How the calculations of another program run. Nothing of it changes what comes out.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Running {
+    /// Cores that a calculation has: it finds their number in its environment, as `CALMWALK_CORES`. Core-hours are counted
+    /// by it.
+    pub cores: u32,
+    /// Longest time of a calculation, s.
+    pub time_limit: f64,
+    /// Most memory of all processes of a calculation together, GB (10⁹ bytes); none for no limit.
+    pub memory: Option<f64>,
+    /// Where directories of calculations are made, on a disk of this host; none for the one for temporary files.
+    pub scratch: Option<PathBuf>,
+    /// What becomes of the directory when a calculation has ended.
+    pub keep: Keep,
+}
+
+/// Which directories of calculations are packed into the store; all others are removed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Keep {
+    /// None.
+    Nothing,
+    /// Those of calculations that failed.
+    #[default]
+    Failed,
+    /// All.
+    All,
+}
+
+impl Keep {
+    /// Whether the directory of a calculation is kept that has `failed`, or has not.
+    pub(super) fn keeps(self, failed: bool) -> bool {
+        match self {
+            Self::Nothing => false,
+            Self::Failed => failed,
+            Self::All => true,
+        }
+    }
+}
+
+impl Default for Running {
+    fn default() -> Self {
+        Self { cores: 1, time_limit: 86_400.0, memory: None, scratch: None, keep: Keep::default() }
+    }
+}
+
+impl Running {
+    /// Where directories of calculations are made.
+    pub fn scratch(&self) -> PathBuf {
+        self.scratch.clone().unwrap_or_else(std::env::temp_dir)
+    }
+}
