@@ -3,6 +3,7 @@
 //!
 //! Units: eV, Å, eV/Å, eV/Å³ (tension positive), μ_B. What a program writes in others is converted by its module.
 
+pub mod ase;
 mod code;
 pub mod command;
 mod failure;
@@ -15,6 +16,7 @@ mod moments;
 mod program;
 mod remedy;
 mod same;
+mod script_result;
 mod setting;
 mod settings;
 mod smearing;

@@ -4,12 +4,14 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Code, SetupError, command, gpaw, vasp};
+use crate::{Code, SetupError, ase, command, gpaw, vasp};
 
 /// Which program makes labels, and how: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Settings {
+    /// A calculator of ASE's.
+    Ase(ase::Settings),
     /// A program of the user's.
     Command(command::Settings),
     /// GPAW.
@@ -22,6 +24,7 @@ impl Settings {
     /// The program's name, as a configuration writes it.
     pub fn name(&self) -> &'static str {
         match self {
+            Self::Ase(_) => "ase",
             Self::Command(_) => "command",
             Self::Gpaw(_) => "gpaw",
             Self::Vasp(_) => "vasp",
@@ -31,6 +34,7 @@ impl Settings {
     /// Every path among the settings, to be resolved from the directory of the configuration.
     pub fn paths(&mut self) -> Vec<&mut PathBuf> {
         match self {
+            Self::Ase(settings) => vec![&mut settings.calculator],
             Self::Command(settings) => settings.files.iter_mut().collect(),
             Self::Gpaw(settings) => settings.pseudopotentials.iter_mut().collect(),
             Self::Vasp(settings) => vec![&mut settings.pseudopotentials],
@@ -43,6 +47,7 @@ impl Settings {
     /// What is missing or impossible, before anything is run.
     pub fn prepare(&self) -> Result<Box<dyn Code>, SetupError> {
         Ok(match self {
+            Self::Ase(settings) => Box::new(settings.prepare()?),
             Self::Command(settings) => Box::new(settings.prepare()?),
             Self::Gpaw(settings) => Box::new(settings.prepare()?),
             Self::Vasp(settings) => Box::new(settings.prepare()?),

@@ -11,7 +11,6 @@
 //! - other moments: half of them to start from.
 
 mod input;
-mod result;
 mod setups;
 #[cfg(test)]
 mod tests;
@@ -26,7 +25,9 @@ use serde_json::{Value, json};
 use crate::lattice::Enclosed;
 use crate::moments::Moments;
 use crate::setting::{at_least, positive};
-use crate::{Calculated, Code, Exit, Failure, Input, Remedy, SetupError, Size, Smearing, judge, program};
+use crate::{
+    Calculated, Code, Exit, Failure, Input, Remedy, SetupError, Size, Smearing, judge, program, script_result,
+};
 use setups::Setup;
 
 /// The script that GPAW is run by.
@@ -216,7 +217,7 @@ impl Code for Gpaw {
 
     fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
         let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        match result::read(&enclosed.structure, directory)? {
+        match script_result::read(&enclosed.structure, directory)? {
             Some(calculated) => Ok(enclosed.seen_from_outside(calculated)),
             None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
         }

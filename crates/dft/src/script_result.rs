@@ -1,4 +1,4 @@
-//! What the script leaves: `result.json`, whole or not at all.
+//! What our Python scripts leave: `result.json`, whole or not at all.
 
 use std::path::Path;
 
@@ -27,13 +27,13 @@ struct Converged {
     positions: Vec<Vec3>,
     cell: Matrix3,
     energy: f64,
-    energy_without_smearing: f64,
+    energy_without_smearing: Option<f64>,
     forces: Vec<Vec3>,
     /// xx, yy, zz, yz, xz, xy
-    stress: [f64; 6],
+    stress: Option<[f64; 6]>,
     moments: Option<Vec<f64>>,
     magnetisation: Option<f64>,
-    steps: u32,
+    steps: Option<u32>,
 }
 
 #[derive(Deserialize)]
@@ -43,7 +43,7 @@ struct Told {
 }
 
 /// The calculation of `structure` that was run in `directory`; `None` if there is no whole result.
-pub(super) fn read(structure: &Structure, directory: &Path) -> Result<Option<Calculated>, Failure> {
+pub(crate) fn read(structure: &Structure, directory: &Path) -> Result<Option<Calculated>, Failure> {
     match std::fs::read(directory.join("result.json")) {
         Ok(bytes) => parse(structure, &bytes),
         Err(_) => Ok(None),
@@ -72,15 +72,15 @@ fn parse(structure: &Structure, bytes: &[u8]) -> Result<Option<Calculated>, Fail
     } = *result;
     let found = Structure { species, positions, cell: Cell(cell), periodic: structure.periodic };
     same_structure(structure, &found, DIGITS)?;
-    let [xx, yy, zz, yz, xz, xy] = stress;
+    let matrix = |[xx, yy, zz, yz, xz, xy]: [f64; 6]| [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
     let calculated = Calculated {
         energy,
-        energy_without_smearing: Some(energy_without_smearing),
+        energy_without_smearing,
         forces,
-        stress: Some([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
+        stress: stress.map(matrix),
         magnetic_moments: moments,
         magnetisation,
-        electronic_steps: Some(steps),
+        electronic_steps: steps,
     };
     judge::numbers(&calculated, structure.len())?;
     Ok(Some(calculated))

@@ -1,0 +1,160 @@
+//! Any calculator of the Atomic Simulation Environment, in the user's Python, run by a script of ours ([`SCRIPT`]).
+//!
+//! The script finds `input.json` and the user's `calculator.py` in its directory and leaves `result.json`, whole or not at
+//! all. `input.json` has `species`, `positions` and `cell` (Å), `periodic`, `moments` (μ_B, or null) and the names of the
+//! `remedies`. `result.json` is either `{"converged": {…}}` with `species`, `positions`, `cell`, `energy` (eV, the one whose
+//! derivative the forces are), `energy_without_smearing`, `forces` (eV/Å), `stress` (eV/Å³, xx yy zz yz xz xy), `moments`,
+//! `magnetisation` (μ_B) and `steps`, null where there is none; or `{"failure": {"class": …, "message": …}}`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use atoms::{Species, Structure};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::moments::{self, Moments};
+use crate::{
+    Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, SetupError, Size, judge, program,
+    script_result,
+};
+
+/// The script that a calculator is run by.
+pub const SCRIPT: &str = include_str!("ase/job.py");
+
+const SCRIPT_FILE: &str = "job.py";
+const CALCULATOR_FILE: &str = "calculator.py";
+
+/// Counts changes of the script that change a label's value.
+const RECIPE: u32 = 1;
+
+/// `[label.method.ase]`
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Settings {
+    /// A Python that has ASE, and what it is started by: `["mpirun", "-np", "4", "gpaw", "python"]`.
+    pub command: Vec<String>,
+    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    pub environment: BTreeMap<String, String>,
+    /// A Python file that defines `calculator()`, which returns an ASE calculator; if it has a parameter, that is the set
+    /// of names of the remedies. It may define a text `version` of what the labels depend on beside this file, and
+    /// `converged(calculator)`. It is read once, at the start, and stands alone in each calculation's directory. Needed.
+    pub calculator: PathBuf,
+    /// Initial magnetic moment by element, μ_B, 1 for all others; if there are none, no atom gets one.
+    pub moments: Moments,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            command: vec!["python3".into()],
+            environment: BTreeMap::new(),
+            calculator: PathBuf::new(),
+            moments: Moments::new(),
+        }
+    }
+}
+
+impl Settings {
+    /// Reads the calculator's file and asks for the versions.
+    ///
+    /// # Errors
+    /// No such file, a program that is no Python with ASE, a file that Python cannot load.
+    pub fn prepare(&self) -> Result<Ase, SetupError> {
+        let calculator = std::fs::read(&self.calculator).map_err(|error| SetupError::Setting {
+            key: "calculator",
+            found: self.calculator.display().to_string(),
+            expected: format!("a Python file that defines calculator(), but: {error}"),
+        })?;
+        let environment = program::environment(&self.environment);
+        let who = Who::ask(&self.command, &environment, &calculator)?;
+        Ok(Ase { settings: self.clone(), environment, calculator, who })
+    }
+}
+
+/// What the script says of ASE and of the calculator's file.
+#[derive(Clone, Debug, Deserialize)]
+struct Who {
+    ase: String,
+    version: String,
+}
+
+impl Who {
+    fn ask(
+        command: &[String],
+        environment: &BTreeMap<String, String>,
+        calculator: &[u8],
+    ) -> Result<Self, SetupError> {
+        let wrong = |reason: String| SetupError::Program { program: command.join(" "), reason };
+        let directory = program::scratch().map_err(|error| wrong(error.to_string()))?;
+        for (name, content) in [(SCRIPT_FILE, SCRIPT.as_bytes()), (CALCULATOR_FILE, calculator)] {
+            std::fs::write(directory.path().join(name), content).map_err(|error| wrong(error.to_string()))?;
+        }
+        let said = program::ask(command, &[SCRIPT_FILE], environment, directory.path())?;
+        said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
+            wrong(format!("is no Python with ASE: it does not say its version but {:?}", said.trim()))
+        })
+    }
+}
+
+/// A calculator, ready to be used.
+#[derive(Clone, Debug)]
+pub struct Ase {
+    settings: Settings,
+    environment: BTreeMap<String, String>,
+    calculator: Vec<u8>,
+    who: Who,
+}
+
+impl Code for Ase {
+    fn identity(&self) -> Value {
+        // Destructured, so that a new setting is not forgotten here.
+        let Settings { command: _, environment: _, calculator: _, moments } = &self.settings;
+        json!({
+            "code": "ase", "ase": self.who.ase, "recipe": RECIPE, "version": self.who.version,
+            "calculator": blake3::hash(&self.calculator).to_hex().to_string(), "moments": moments,
+        })
+    }
+
+    fn supports(&self, _: &BTreeSet<Species>) -> Result<(), SetupError> {
+        // Only the calculator knows, and only when it calculates.
+        Ok(())
+    }
+
+    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
+        structure.validate().map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+        let table = &self.settings.moments;
+        let task = json!({
+            "species": structure.species,
+            "positions": structure.positions,
+            "cell": structure.cell.0,
+            "periodic": structure.periodic,
+            "moments": (!table.is_empty()).then(|| moments::initial(structure, table, remedies)),
+            "remedies": remedies.iter().map(|remedy| remedy.name()).collect::<Vec<_>>(),
+        });
+        let files = [
+            (SCRIPT_FILE, SCRIPT.into()),
+            (CALCULATOR_FILE, self.calculator.clone()),
+            ("input.json", task.to_string().into_bytes()),
+        ];
+        Ok(Input {
+            files: files.map(|(name, content)| (name.to_owned(), content)).into(),
+            command: self.settings.command.iter().cloned().chain([SCRIPT_FILE.to_owned()]).collect(),
+            environment: self.environment.clone(),
+        })
+    }
+
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
+        match script_result::read(structure, directory)? {
+            Some(calculated) => Ok(calculated),
+            None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+        }
+    }
+
+    fn size(&self, structure: &Structure) -> Size {
+        Size { atoms: structure.len(), electrons: 0.0, k_points: 1 }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,82 @@
+//! Without Python: what is written, and what is made of a result. With it: `tests/ase.rs`.
+
+use atoms::Cell;
+
+use super::*;
+
+fn copper() -> Structure {
+    Structure {
+        species: ["Cu", "O"].map(|symbol| symbol.parse().unwrap()).to_vec(),
+        positions: vec![[0.1, 0.2, 0.3], [1.0 / 3.0, 2.0, 9.0]],
+        cell: Cell([[4.0, 0.0, 0.0], [0.5, 4.0, 0.0], [0.0; 3]]),
+        periodic: [true, true, false],
+    }
+}
+
+fn ase(moments: Moments) -> Ase {
+    let who = Who { ase: "3.22.1".into(), version: "mine".into() };
+    let settings = Settings { moments, ..Settings::default() };
+    Ase { environment: BTreeMap::new(), settings, calculator: b"def calculator(): ...".to_vec(), who }
+}
+
+fn task(code: &Ase, remedies: &[Remedy]) -> Value {
+    let input = code.input(&copper(), &BTreeSet::from_iter(remedies.iter().copied())).unwrap();
+    assert_eq!(input.command, ["python3", "job.py"]);
+    assert_eq!(input.files["calculator.py"], b"def calculator(): ...");
+    serde_json::from_slice(&input.files["input.json"]).unwrap()
+}
+
+#[test]
+fn the_task_is_the_structure_with_its_moments_and_remedies() {
+    let plain = json!({
+        "species": ["Cu", "O"],
+        "positions": [[0.1, 0.2, 0.3], [1.0 / 3.0, 2.0, 9.0]],
+        "cell": [[4.0, 0.0, 0.0], [0.5, 4.0, 0.0], [0.0, 0.0, 0.0]],
+        "periodic": [true, true, false],
+        "moments": null,
+        "remedies": [],
+    });
+    assert_eq!(task(&ase(Moments::new()), &[]), plain);
+    let changed =
+        task(&ase([("Cu".parse().unwrap(), 3.0)].into()), &[Remedy::SlowerMixing, Remedy::OtherMoments]);
+    assert_eq!(changed["moments"], json!([1.5, 0.5]));
+    assert_eq!(changed["remedies"], json!(["slower_mixing", "other_moments"]));
+}
+
+/// What is read of this result; its structure is [`copper`] in any case.
+fn read(mut converged: Value) -> Result<Calculated, Failure> {
+    let structure = task(&ase(Moments::new()), &[]);
+    for key in ["species", "positions", "cell"] {
+        converged[key] = structure[key].clone();
+    }
+    let directory = tempfile::tempdir().unwrap();
+    let text = json!({ "converged": converged }).to_string();
+    std::fs::write(directory.path().join("result.json"), text).unwrap();
+    ase(Moments::new()).read(&copper(), directory.path(), Exit::Code(0))
+}
+
+#[test]
+fn a_calculator_need_not_give_more_than_energy_and_forces() {
+    let forces = [[0.1, -0.2, 0.3], [-0.1, 0.2, -0.3]];
+    let least = json!({
+        "energy": -1.5, "energy_without_smearing": null, "forces": forces, "stress": null, "moments": null,
+        "magnetisation": null, "steps": null,
+    });
+    let expected = Calculated { energy: -1.5, forces: forces.to_vec(), ..Calculated::default() };
+    assert_eq!(read(least.clone()), Ok(expected));
+    for (key, value) in
+        [("energy", json!(null)), ("forces", json!([[0.1, -0.2, 0.3]])), ("stress", json!([1.0]))]
+    {
+        let mut wrong = least.clone();
+        wrong[key] = value;
+        assert!(read(wrong).is_err(), "{key}");
+    }
+}
+
+#[test]
+fn a_setting_that_does_not_exist_is_refused() {
+    let text = r#"{ "calculator": "a.py", "calculators": "b.py" }"#;
+    assert!(serde_json::from_str::<Settings>(text).is_err());
+    let missing = Settings { calculator: "/no/such/file.py".into(), ..Settings::default() };
+    assert!(matches!(missing.prepare(), Err(SetupError::Setting { key: "calculator", .. })));
+}
