@@ -3,6 +3,7 @@
 //!
 //! Units: eV, Å, eV/Å, eV/Å³ (tension positive), μ_B. What a program writes in others is converted by its module.
 
+pub mod abinit;
 pub mod ase;
 mod code;
 pub mod command;
@@ -13,6 +14,7 @@ mod judge;
 mod lattice;
 pub mod mesh;
 mod moments;
+mod paw;
 mod program;
 mod remedy;
 mod same;

@@ -4,12 +4,14 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Code, SetupError, ase, command, gpaw, vasp};
+use crate::{Code, SetupError, abinit, ase, command, gpaw, vasp};
 
 /// Which program makes labels, and how: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Settings {
+    /// ABINIT.
+    Abinit(abinit::Settings),
     /// A calculator of ASE's.
     Ase(ase::Settings),
     /// A program of the user's.
@@ -24,6 +26,7 @@ impl Settings {
     /// The program's name, as a configuration writes it.
     pub fn name(&self) -> &'static str {
         match self {
+            Self::Abinit(_) => "abinit",
             Self::Ase(_) => "ase",
             Self::Command(_) => "command",
             Self::Gpaw(_) => "gpaw",
@@ -34,6 +37,7 @@ impl Settings {
     /// Every path among the settings, to be resolved from the directory of the configuration.
     pub fn paths(&mut self) -> Vec<&mut PathBuf> {
         match self {
+            Self::Abinit(settings) => vec![&mut settings.pseudopotentials],
             Self::Ase(settings) => vec![&mut settings.calculator],
             Self::Command(settings) => settings.files.iter_mut().collect(),
             Self::Gpaw(settings) => settings.pseudopotentials.iter_mut().collect(),
@@ -47,6 +51,7 @@ impl Settings {
     /// What is missing or impossible, before anything is run.
     pub fn prepare(&self) -> Result<Box<dyn Code>, SetupError> {
         Ok(match self {
+            Self::Abinit(settings) => Box::new(settings.prepare()?),
             Self::Ase(settings) => Box::new(settings.prepare()?),
             Self::Command(settings) => Box::new(settings.prepare()?),
             Self::Gpaw(settings) => Box::new(settings.prepare()?),

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use atoms::Species;
 use flate2::read::GzDecoder;
 
-use crate::SetupError;
+use crate::{SetupError, paw};
 
 /// What is known of a setup.
 #[derive(Clone, Debug, PartialEq)]
@@ -72,10 +72,7 @@ fn read(species: Species, path: &Path) -> Result<Setup, String> {
         true => unpacked(&bytes).map_err(|error| format!("cannot be unpacked: {error}"))?,
         false => bytes,
     };
-    let head = String::from_utf8_lossy(&text[..text.len().min(4096)]);
-    let valence = valence(&head, species).ok_or_else(|| {
-        format!("is no PAW setup of {species}: its head has no <atom symbol=\"{species}\" … valence=\"…\"/>")
-    })?;
+    let valence = paw::valence(&text, species)?;
     Ok(Setup { hash: blake3::hash(&text).to_hex().to_string(), valence })
 }
 
@@ -89,20 +86,13 @@ fn unpacked(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
     }
 }
 
-/// Valence electrons that the `<atom>` element of a setup states, if it is of this species.
-fn valence(head: &str, species: Species) -> Option<f64> {
-    let atom = head.split("<atom ").nth(1)?.split("/>").next()?;
-    let attribute = |key: &str| atom.split(&format!("{key}=\"")).nth(1)?.split('"').next();
-    let valence: f64 = attribute("valence")?.parse().ok()?;
-    (attribute("symbol")? == species.symbol() && valence.is_finite() && valence >= 0.0).then_some(valence)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     const HEAD: &str = "<?xml version=\"1.0\"?>\n<paw_setup version=\"0.6\">\n  \
-                        <atom symbol=\"Si\" Z=\"14\" core=\"10.0\" valence=\"4\"/>\n";
+                        <atom symbol=\"Si\" Z=\"14\" core=\"10.0\" valence=\"4\"/>\n  \
+                        <xc_functional type=\"GGA\" name=\"PBE\"/>\n";
 
     fn species(symbol: &str) -> Species {
         symbol.parse().unwrap()

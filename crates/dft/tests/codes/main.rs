@@ -4,6 +4,7 @@
 //! Needs Debian's packages gpaw, gpaw-data, abinit, abinit-data, cp2k and cp2k-data, and fails without them:
 //! `cargo test -p dft --test codes`.
 
+mod abinit;
 mod checks;
 mod gpaw;
 mod run;

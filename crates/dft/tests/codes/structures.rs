@@ -27,6 +27,13 @@ pub fn oxygen() -> Structure {
     Structure { periodic: [false; 3], ..molecule }
 }
 
+/// The primitive cell of bcc iron, a little strained.
+pub fn iron() -> Structure {
+    let half = 2.83 / 2.0;
+    let cell = [[-half, half, half], [half, -half, half + 0.03], [half, half + 0.02, -half]];
+    structure("Fe", cell, &[[0.0; 3]])
+}
+
 /// Cell and positions times 1 + `strain`.
 pub fn strained(of: &Structure, strain: &Matrix3) -> Structure {
     let mut deformation = *strain;

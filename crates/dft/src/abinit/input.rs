@@ -1,0 +1,119 @@
+//! `run.abi`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write;
+
+use atoms::{Species, Vec3};
+
+use super::pseudopotentials::Pseudopotential;
+use super::{Abinit, Settings};
+use crate::lattice::Enclosed;
+use crate::{Failure, FailureClass, Input, Remedy, Smearing, moments};
+
+/// Name of the input; ABINIT calls its output after it.
+const NAME: &str = "run.abi";
+
+pub(super) fn write(
+    abinit: &Abinit,
+    enclosed: &Enclosed,
+    remedies: &BTreeSet<Remedy>,
+) -> Result<Input, Failure> {
+    let bad = |error: crate::SetupError| FailureClass::BadInput.because(error.to_string());
+    let species = BTreeSet::from_iter(enclosed.structure.species.iter().copied());
+    let pseudopotentials = abinit.of_one_kind(&species).map_err(bad)?;
+    let mut text = fixed(&abinit.settings);
+    electrons(&mut text, &abinit.settings, enclosed, &pseudopotentials, remedies);
+    steps(&mut text, &abinit.settings, pseudopotentials.values().any(|p| p.paw), remedies);
+    structure(&mut text, enclosed, &pseudopotentials);
+    text += &format!("pp_dirpath \"{}\"\n", abinit.settings.pseudopotentials.display());
+    let files: Vec<_> = pseudopotentials.values().map(|p| p.file.as_str()).collect();
+    text += &format!("pseudos \"{}\"\n", files.join(", "));
+    Ok(Input {
+        files: [(NAME.to_owned(), text.into_bytes())].into(),
+        command: abinit.settings.command.iter().cloned().chain([NAME.to_owned()]).collect(),
+        environment: abinit.environment.clone(),
+    })
+}
+
+/// What no structure changes: PBE, forces and stress, no symmetry but time reversal, no files beside the output.
+fn fixed(settings: &Settings) -> String {
+    let occupation = match settings.smearing {
+        Smearing::FermiDirac => 3,
+        Smearing::MethfesselPaxton => 6,
+        Smearing::Gaussian => 7,
+    };
+    format!(
+        "ixc 11\necut {:?} eV\noccopt {occupation}\ntsmear {:?} eV\ntoldfe {:?} eV\nnsym 1\nkptopt 2\nchkprim 0\n\
+         chksymbreak 0\noptforces 1\noptstress 1\nprtwf 0\nprtden 0\nprteig 0\nprtebands 0\nprtgsr 0\n",
+        settings.cutoff, settings.smearing_width, settings.energy_tolerance
+    )
+}
+
+fn electrons(
+    text: &mut String,
+    settings: &Settings,
+    enclosed: &Enclosed,
+    pseudopotentials: &BTreeMap<Species, &Pseudopotential>,
+    remedies: &BTreeSet<Remedy>,
+) {
+    let structure = &enclosed.structure;
+    // Without spin, no moments: bands are counted with those of the first attempt, so that all have as many.
+    let counted =
+        if settings.spin { moments::initial(structure, &settings.moments, &BTreeSet::new()) } else { vec![] };
+    let moment: f64 = counted.iter().map(|moment| moment.abs()).sum();
+    let electrons: f64 =
+        structure.species.iter().filter_map(|s| pseudopotentials.get(s)).map(|p| p.valence).sum();
+    // A fifth more than are full, and some for small cells: the highest must be empty.
+    let bands = (0.6 * (electrons + moment)).ceil() as u64 + 4;
+    *text += &format!("nband {bands}\n");
+    if pseudopotentials.values().any(|p| p.paw) {
+        *text += &format!("pawecutdg {:?} eV\n", settings.fine_cutoff.unwrap_or(2.0 * settings.cutoff));
+    }
+    if settings.spin {
+        *text += "nsppol 2\nspinat\n";
+        for moment in moments::initial(structure, &settings.moments, remedies) {
+            *text += &format!("  0 0 {moment:?}\n");
+        }
+    }
+    let [x, y, z] = enclosed.mesh(settings.k_spacing);
+    *text += &format!("ngkpt {x} {y} {z}\nnshiftk 1\nshiftk 0 0 0\n");
+}
+
+fn steps(text: &mut String, settings: &Settings, paw: bool, remedies: &BTreeSet<Remedy>) {
+    let factor = if remedies.contains(&Remedy::MoreSteps) { 3 } else { 1 };
+    *text += &format!("nstep {}\n", settings.steps.saturating_mul(factor));
+    if remedies.contains(&Remedy::SlowerMixing) {
+        *text += "diemix 0.25\nnpulayit 15\n";
+    }
+    if remedies.contains(&Remedy::OtherAlgorithm) {
+        // 7 mixes potentials, 17 densities: each is the default of the other kind of pseudopotential.
+        *text += &format!("iscf {}\nnline 8\nnnsclo 2\n", if paw { 7 } else { 17 });
+    }
+}
+
+fn structure(text: &mut String, enclosed: &Enclosed, pseudopotentials: &BTreeMap<Species, &Pseudopotential>) {
+    let structure = &enclosed.structure;
+    let numbers: Vec<_> =
+        pseudopotentials.keys().map(|species| species.atomic_number().to_string()).collect();
+    *text +=
+        &format!("natom {}\nntypat {}\nznucl {}\ntypat\n", structure.len(), numbers.len(), numbers.join(" "));
+    // ABINIT cuts long lines off.
+    for atoms in structure.species.chunks(20) {
+        for species in atoms {
+            let kind = pseudopotentials.keys().position(|other| other == species).unwrap_or_default() + 1;
+            *text += &format!(" {kind}");
+        }
+        *text += "\n";
+    }
+    *text += "acell 1 1 1 Angstrom\nrprim\n";
+    structure.cell.0.iter().for_each(|row| vector(text, *row));
+    *text += "xcart\n";
+    structure.positions.iter().for_each(|position| vector(text, *position));
+    *text += "  Angstrom\n";
+}
+
+/// With all digits.
+fn vector(text: &mut String, [x, y, z]: Vec3) {
+    // Writing to a string cannot fail.
+    let _ = writeln!(text, "  {x:?} {y:?} {z:?}");
+}

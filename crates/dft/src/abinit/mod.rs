@@ -1,0 +1,225 @@
+//! ABINIT with plane waves and norm-conserving pseudopotentials (psp8) or PAW setups (xml).
+//!
+//! Spin-polarised PBE, no symmetry but time reversal. The energy is the free energy; with PAW it is that of the
+//! double-counting expression, as in ABINIT's own summary. Directions of a structure that do not repeat get vacuum, and
+//! no stress is given then.
+//!
+//! Remedies:
+//! - more steps: three times as many;
+//! - slower mixing: a quarter of the residual is mixed in at first (0.7 otherwise), and 15 old steps count instead of 7;
+//! - another algorithm: densities are mixed instead of potentials (with PAW the other way round), and wave functions are
+//!   brought nearer to convergence in each step;
+//! - other moments: half of them to start from.
+
+mod input;
+mod output;
+mod pseudopotentials;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use atoms::{Species, Structure};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::lattice::Enclosed;
+use crate::moments::Moments;
+use crate::setting::{at_least, positive};
+use crate::{Calculated, Code, Exit, Failure, Input, Remedy, SetupError, Size, Smearing, judge, program};
+use pseudopotentials::Pseudopotential;
+
+/// eV (CODATA 2018).
+const HARTREE: f64 = 27.211_386_245_988;
+
+/// Counts changes of what is written here that change a label's value.
+const RECIPE: u32 = 1;
+
+/// ABINIT keeps names of files in this many characters.
+const LONGEST_PATH: usize = 240;
+
+/// `[label.method.abinit]`
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Settings {
+    /// ABINIT, and what it is started by: `["mpirun", "-np", "4", "abinit"]`.
+    pub command: Vec<String>,
+    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    pub environment: BTreeMap<String, String>,
+    /// Directory of the pseudopotentials, `Si.psp8` or `Si.xml`.
+    pub pseudopotentials: PathBuf,
+    /// File of an element where it has another name: `{ Zn = "Zn-sp.psp8" }`.
+    pub variants: BTreeMap<Species, String>,
+    /// Kinetic energy of the fastest plane wave, eV.
+    pub cutoff: f64,
+    /// That of the fine grid of PAW, eV; twice `cutoff` if there is none.
+    pub fine_cutoff: Option<f64>,
+    /// Largest distance of k-points, Å⁻¹, 2π included; the mesh is Γ-centred.
+    pub k_spacing: f64,
+    /// Occupation of states near the Fermi level.
+    pub smearing: Smearing,
+    /// Its width, eV.
+    pub smearing_width: f64,
+    /// Whether the two spins have their own densities.
+    pub spin: bool,
+    /// Initial magnetic moment by element, μ_B; 1 for all others.
+    pub moments: Moments,
+    /// Largest change of the energy in an electronic step, twice in a row, eV.
+    pub energy_tolerance: f64,
+    /// Most electronic steps.
+    pub steps: u32,
+    /// Space between images in directions that do not repeat, Å.
+    pub vacuum: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            command: vec!["abinit".into()],
+            environment: BTreeMap::new(),
+            pseudopotentials: "/usr/share/abinit/psp/Pseudodojo_nc_sr_04_pbe_standard_psp8".into(),
+            variants: BTreeMap::new(),
+            cutoff: 1000.0,
+            fine_cutoff: None,
+            k_spacing: 0.125,
+            smearing: Smearing::Gaussian,
+            smearing_width: 0.1,
+            spin: true,
+            moments: Moments::new(),
+            energy_tolerance: 1e-6,
+            steps: 200,
+            vacuum: 10.0,
+        }
+    }
+}
+
+impl Settings {
+    /// Asks ABINIT for its version and finds the pseudopotentials.
+    ///
+    /// # Errors
+    /// A program that does not answer, a setting with an impossible value, a file that is not what its name says.
+    pub fn prepare(&self) -> Result<Abinit, SetupError> {
+        positive("cutoff", self.cutoff)?;
+        at_least("fine_cutoff", self.fine_cutoff.unwrap_or(self.cutoff), self.cutoff)?;
+        positive("k_spacing", self.k_spacing)?;
+        positive("smearing_width", self.smearing_width)?;
+        positive("energy_tolerance", self.energy_tolerance)?;
+        positive("vacuum", self.vacuum)?;
+        at_least("steps", self.steps, 1)?;
+        let path = self.pseudopotentials.to_string_lossy();
+        if path.contains('"') || path.len() > LONGEST_PATH {
+            return Err(SetupError::Setting {
+                key: "pseudopotentials",
+                found: path.into_owned(),
+                expected: format!("a path of at most {LONGEST_PATH} bytes, without quotation marks"),
+            });
+        }
+        let environment = program::environment(&self.environment);
+        let version = version(&self.command, &environment)?;
+        let pseudopotentials = pseudopotentials::find(&self.pseudopotentials, &self.variants)?;
+        Ok(Abinit { settings: self.clone(), environment, version, pseudopotentials })
+    }
+}
+
+/// `9.6.2`
+fn version(command: &[String], environment: &BTreeMap<String, String>) -> Result<String, SetupError> {
+    let wrong = |reason: String| SetupError::Program { program: command.join(" "), reason };
+    let directory = program::scratch().map_err(|error| wrong(error.to_string()))?;
+    let said = program::ask(command, &["--version"], environment, directory.path())?;
+    // Each process of a parallel run may say it.
+    let version =
+        said.split_whitespace().next().filter(|word| word.starts_with(|c: char| c.is_ascii_digit()));
+    version
+        .map(str::to_owned)
+        .ok_or_else(|| wrong(format!("is not ABINIT: it says {:?} of its version", said.trim())))
+}
+
+/// ABINIT, ready to be used.
+#[derive(Clone, Debug)]
+pub struct Abinit {
+    settings: Settings,
+    environment: BTreeMap<String, String>,
+    version: String,
+    pseudopotentials: BTreeMap<Species, Pseudopotential>,
+}
+
+impl Abinit {
+    /// The pseudopotentials of these elements, which ABINIT wants to be all norm-conserving or all PAW.
+    fn of_one_kind(
+        &self,
+        species: &BTreeSet<Species>,
+    ) -> Result<BTreeMap<Species, &Pseudopotential>, SetupError> {
+        let Settings { pseudopotentials: directory, variants, .. } = &self.settings;
+        let mut chosen: BTreeMap<Species, &Pseudopotential> = BTreeMap::new();
+        for species in species {
+            let one = self.pseudopotentials.get(species);
+            let one = one.ok_or_else(|| pseudopotentials::missing(*species, directory, variants))?;
+            if let Some((other, before)) = chosen.iter().find(|(_, before)| before.paw != one.paw) {
+                let (file, before) = (&one.file, &before.file);
+                let reason =
+                    format!("{file} cannot go with {before} of {other}: one is PAW, the other is not");
+                return Err(SetupError::Pseudopotential { species: *species, reason });
+            }
+            chosen.insert(*species, one);
+        }
+        Ok(chosen)
+    }
+}
+
+impl Code for Abinit {
+    fn identity(&self) -> Value {
+        let hashes: BTreeMap<&str, &str> =
+            self.pseudopotentials.iter().map(|(species, p)| (species.symbol(), p.hash.as_str())).collect();
+        // Destructured, so that a new setting is not forgotten here.
+        let Settings {
+            command: _,
+            environment: _,
+            pseudopotentials: _,
+            variants: _,
+            cutoff,
+            fine_cutoff,
+            k_spacing,
+            smearing,
+            smearing_width,
+            spin,
+            moments,
+            energy_tolerance,
+            steps: _,
+            vacuum,
+        } = &self.settings;
+        json!({
+            "code": "abinit", "version": self.version, "recipe": RECIPE, "functional": "PBE", "cutoff": cutoff,
+            "fine_cutoff": fine_cutoff, "k_spacing": k_spacing, "smearing": smearing,
+            "smearing_width": smearing_width, "spin": spin, "moments": moments, "energy_tolerance": energy_tolerance,
+            "vacuum": vacuum, "pseudopotentials": hashes,
+        })
+    }
+
+    fn supports(&self, species: &BTreeSet<Species>) -> Result<(), SetupError> {
+        self.of_one_kind(species).map(|_| ())
+    }
+
+    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
+        input::write(self, &Enclosed::new(structure, self.settings.vacuum)?, remedies)
+    }
+
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
+        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
+        match output::read(&enclosed.structure, directory, &self.version, self.settings.smearing)? {
+            Some(calculated) => Ok(enclosed.seen_from_outside(calculated)),
+            None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+        }
+    }
+
+    fn size(&self, structure: &Structure) -> Size {
+        let mesh = Enclosed::new(structure, self.settings.vacuum)
+            .map_or([1; 3], |e| e.mesh(self.settings.k_spacing));
+        let valence = structure.species.iter().filter_map(|species| self.pseudopotentials.get(species));
+        Size {
+            atoms: structure.len(),
+            electrons: valence.map(|p| p.valence).sum(),
+            k_points: mesh.iter().map(|n| *n as usize).product(),
+        }
+    }
+}

@@ -1,0 +1,131 @@
+//! Pseudopotentials of ABINIT: `Si.psp8` (norm-conserving) or `Si.xml` (PAW) in one directory.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use atoms::Species;
+
+use crate::{SetupError, paw};
+
+/// What is known of a pseudopotential.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Pseudopotential {
+    /// Its file in the directory.
+    pub file: String,
+    /// BLAKE3 of the file.
+    pub hash: String,
+    /// Electrons that it treats.
+    pub valence: f64,
+    /// Whether it is a PAW setup.
+    pub paw: bool,
+}
+
+/// All that are in the directory.
+pub(super) fn find(
+    directory: &Path,
+    variants: &BTreeMap<Species, String>,
+) -> Result<BTreeMap<Species, Pseudopotential>, SetupError> {
+    let mut found = BTreeMap::new();
+    for species in (1..=118).filter_map(|number| Species::from_atomic_number(number).ok()) {
+        let names = match variants.get(&species) {
+            Some(name) => vec![name.clone()],
+            None => vec![format!("{species}.psp8"), format!("{species}.xml")],
+        };
+        let Some(file) = names.into_iter().find(|name| directory.join(name).is_file()) else {
+            if variants.contains_key(&species) {
+                return Err(missing(species, directory, variants));
+            }
+            continue;
+        };
+        found.insert(species, read(species, directory, file)?);
+    }
+    Ok(found)
+}
+
+/// The error for an element that has none.
+pub(super) fn missing(
+    species: Species,
+    directory: &Path,
+    variants: &BTreeMap<Species, String>,
+) -> SetupError {
+    let sought =
+        variants.get(&species).cloned().unwrap_or_else(|| format!("{species}.psp8 or {species}.xml"));
+    let reason = format!(
+        "no {sought} in {}: get one for PBE, and name its directory in `pseudopotentials` and, if it is called \
+         otherwise, its file in `variants`",
+        directory.display()
+    );
+    SetupError::Pseudopotential { species, reason }
+}
+
+fn read(species: Species, directory: &Path, file: String) -> Result<Pseudopotential, SetupError> {
+    let path = directory.join(&file);
+    let wrong = |reason: String| SetupError::Pseudopotential {
+        species,
+        reason: format!("{}: {reason}", path.display()),
+    };
+    let bytes = std::fs::read(&path).map_err(|error| wrong(error.to_string()))?;
+    let paw = path.extension().is_some_and(|extension| extension == "xml");
+    let valence = match paw {
+        true => paw::valence(&bytes, species),
+        false => valence(&bytes, species),
+    };
+    let hash = blake3::hash(&bytes).to_hex().to_string();
+    Ok(Pseudopotential { file, hash, valence: valence.map_err(wrong)?, paw })
+}
+
+/// Valence electrons of a `psp8` file: Z and the valence begin its second line, format and functional the third.
+fn valence(file: &[u8], species: Species) -> Result<f64, String> {
+    // 11 is ABINIT's own PBE, the other that of libxc.
+    const PBE: [&str; 2] = ["11", "-101130"];
+    let head = String::from_utf8_lossy(&file[..file.len().min(4096)]);
+    let mut lines = head.lines().skip(1).map(str::split_whitespace);
+    let mut word = || Some((lines.next()?, lines.next()?));
+    let (mut second, mut third) = word().ok_or("has no head")?;
+    let mut number = || second.next().and_then(|word| word.parse::<f64>().ok());
+    let (charge, valence) = (number(), number());
+    if third.next() != Some("8") || charge != Some(f64::from(species.atomic_number())) {
+        return Err(format!("is no psp8 file of {species}"));
+    }
+    match (third.next(), valence) {
+        (Some(functional), Some(valence)) if PBE.contains(&functional) && valence >= 0.0 => Ok(valence),
+        (functional, _) => {
+            Err(format!("is of the functional {}, not of PBE (11)", functional.unwrap_or("?")))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SILICON: &str = "Si    ONCVPSP-3.2.3.1\n14.0000      4.0000      170510    zatom,zion,pspd\n\
+                           8      11   2     4   600     0    pspcod,pspxc\n";
+
+    #[test]
+    fn the_head_says_what_a_file_is() {
+        let silicon = "Si".parse().unwrap();
+        assert_eq!(valence(SILICON.as_bytes(), silicon), Ok(4.0));
+        assert_eq!(valence(SILICON.as_bytes(), "Al".parse().unwrap()), Err("is no psp8 file of Al".into()));
+        let lda = SILICON.replace("   11   2", "   -1012   2").replace("      11   2", "      -1012   2");
+        assert_eq!(
+            valence(lda.as_bytes(), silicon),
+            Err("is of the functional -1012, not of PBE (11)".into())
+        );
+        for end in 0..SILICON.find(" 11").unwrap() + 2 {
+            assert!(valence(&SILICON.as_bytes()[..end], silicon).is_err(), "cut at {end}");
+        }
+    }
+
+    #[test]
+    fn a_missing_one_names_element_and_directory() {
+        let directory = tempfile::tempdir().unwrap();
+        std::fs::write(directory.path().join("Si.psp8"), SILICON).unwrap();
+        let found = find(directory.path(), &BTreeMap::new()).unwrap();
+        assert_eq!(found.len(), 1);
+        let variants = BTreeMap::from([("Zn".parse().unwrap(), "Zn-sp.psp8".to_owned())]);
+        let error = find(directory.path(), &variants).unwrap_err().to_string();
+        let expected = format!("pseudopotential of Zn: no Zn-sp.psp8 in {}", directory.path().display());
+        assert!(error.starts_with(&expected), "{error}");
+    }
+}
