@@ -158,7 +158,12 @@ impl Outcar {
         }
     }
 
-    /// The whole of a calculation that converged.
+    /// Whether it is whole, and does not say that the electrons converged.
+    pub fn denies_convergence(&self) -> bool {
+        self.complete && !self.converged
+    }
+
+    /// The whole of a calculation that came to its end, converged or not.
     ///
     /// # Errors
     /// What is missing, for people.

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use atoms::Species;
 
+use super::output;
 use crate::SetupError;
 
 /// What the title begins with: the PBE sets for the projector augmented-wave method.
@@ -54,8 +55,8 @@ impl Potcar {
         if words.first() != Some(&SET) || words.get(1) != Some(&variant) {
             return Err(format!("its TITEL is '{title}', expected '{SET} {variant} …'"));
         }
-        let element = after(&text, "VRHFIN").and_then(|rest| rest.split(':').next()).map(str::trim);
-        if element != Some(species.symbol()) {
+        let element = after(&text, "VRHFIN").and_then(|rest| rest.split(|c: char| !c.is_alphabetic()).next());
+        if element.and_then(output::element) != Some(species) {
             let found = element.unwrap_or("missing");
             return Err(format!("its element (VRHFIN) is {found}, expected {species}"));
         }

@@ -25,6 +25,7 @@ pub(super) fn read(
         Err(_) => Outcar::default(),
     };
     let magnetism = (outcar.moments.clone(), outcar.magnetisation);
+    let denied = outcar.denies_convergence();
     let xml = File::open(directory.join("vasprun.xml")).map_err(|error| error.to_string());
     let output = match xml.and_then(|file| vasprun::read(BufReader::new(file))) {
         Ok(output) => output,
@@ -36,6 +37,9 @@ pub(super) fn read(
         ..*structure
     };
     check(&output, &in_file_order, version)?;
+    if denied {
+        return Err(FailureClass::NotConverged.because("OUTCAR does not say that EDIFF was reached"));
+    }
     let calculated = Calculated {
         energy: output.energy,
         energy_without_smearing: Some(output.energy_without_smearing),

@@ -89,6 +89,16 @@ fn changes_in_vasprun_are_seen() {
 }
 
 #[test]
+fn outcar_is_asked_whether_it_converged() {
+    // As if something had stopped the electronic steps before there were too many.
+    let outcar = text("OUTCAR").replace("because EDIFF is reached", "EDIFF was not reached");
+    let files = [("vasprun.xml", text("vasprun.xml")), ("OUTCAR", outcar)];
+    let failure =
+        read(&files.each_ref().map(|(name, text)| (*name, text.as_bytes())), Exit::Code(0)).unwrap_err();
+    assert_eq!(failure.class, FailureClass::NotConverged);
+}
+
+#[test]
 fn changes_in_outcar_are_seen() {
     let changed = |from: &str, to: &str| changed("OUTCAR", from, to);
     use FailureClass::*;
