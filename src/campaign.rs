@@ -2,8 +2,6 @@
 
 mod load;
 
-use std::collections::BTreeMap;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -17,8 +15,8 @@ use store::Protocol;
 use wire::{CampaignId, ContentHash};
 use workers::settings::{GuardSettings, WalkSettings};
 
-use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, without_changeable};
-use crate::labelling::{LabelFiles, REFERENCE_FILE};
+use crate::config::{Config, ConfigError, LabelMethod, without_changeable};
+use crate::outcome::Failure;
 use crate::setup::MethodSetup;
 use load::Loader;
 
@@ -65,8 +63,8 @@ impl Campaign {
         let artifact = loader.artifact(&model)?;
         let seeds = loader.seeds(&model)?;
         let training = loader.training_frames(&model, &artifact.mixture)?;
-        let (protocol, label_hash) = loader.protocol(&seeds)?;
-        let mut file_hashes = vec![loader.hash("potential.model", &config.potential.model)?, label_hash];
+        let (protocol, mut file_hashes) = loader.protocol(&seeds)?;
+        file_hashes.insert(0, loader.hash("potential.model", &config.potential.model)?);
         let others = [
             ("calm.artifact", &config.calm.artifact),
             ("calm.training_frames", &config.calm.training_frames),
@@ -79,16 +77,8 @@ impl Campaign {
     }
 
     /// How labels are made.
-    pub fn method(&self) -> io::Result<MethodSetup> {
-        let LabelMethod::Reference(PotentialFile { kind, file }) = &self.config.label.method;
-        let (file, file_hash) = (std::path::absolute(file.get_ref())?, self.hash_of(REFERENCE_FILE));
-        Ok(MethodSetup::Reference { kind: *kind, file, file_hash })
-    }
-
-    /// Where the files are that labels are made with.
-    pub fn label_files(&self) -> io::Result<LabelFiles> {
-        let MethodSetup::Reference { file, .. } = self.method()?;
-        Ok(BTreeMap::from([(REFERENCE_FILE.to_owned(), file)]))
+    pub fn method(&self) -> Result<MethodSetup, Failure> {
+        MethodSetup::of(&self.config.label)
     }
 
     /// Where the files are that grades depend on, by the keys of the configuration.
@@ -129,6 +119,11 @@ impl Campaign {
         }
         let hashes = self.file_hashes.iter().map(|(key, hash)| (key.clone(), json!(hash)));
         value["files"] = Value::Object(hashes.collect());
+        value["label"]["protocol"] = json!(self.config.label.protocol_name());
+        if let LabelMethod::Code(settings) = &self.config.label.method {
+            // What makes a label what it is; how its program is called may change.
+            value["label"]["method"] = json!({ settings.name(): self.protocol.settings });
+        }
         // Where a campaign is kept is no part of what it is.
         value["run"].as_object_mut().map(|run| run.remove("store"));
         if self.config.campaign.mode == Mode::Reproducible {

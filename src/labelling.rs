@@ -1,25 +1,24 @@
 //! How the labels of a campaign are made, as its store says: for labellers that have no configuration at hand.
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use dft::Code;
 use serde::Deserialize;
+use serde_json::{Value, json};
 use store::{Protocol, Store};
+use wire::ContentHash;
 
-use crate::config::PotentialKind;
+use crate::config::{LabelMethod, LabelSection, PotentialFile, PotentialKind, changed_keys};
 use crate::outcome::Failure;
 use crate::setup::MethodSetup;
 
 /// The key of the configuration that names the file of a reference potential.
 pub const REFERENCE_FILE: &str = "label.method.reference.file";
 
-/// Under which name the leader says in the store where those files are.
-pub const LABEL_FILES: &str = "label_files";
-
-/// Where the files are that labels are made with: the key of the configuration and the path.
-pub type LabelFiles = BTreeMap<String, PathBuf>;
+/// Under which name the leader says in the store how it makes labels: a [`MethodSetup`] with paths of its host.
+pub const LABEL_METHOD: &str = "label_method";
 
 /// What a labeller needs to know of the campaign.
 #[derive(Clone, Debug)]
@@ -36,17 +35,25 @@ pub struct Labelling {
     pub lease: Duration,
 }
 
+/// What the user says of the host on which labels are made.
+#[derive(Debug, Default)]
+pub struct Here<'a> {
+    /// The method that the campaign must have.
+    pub method: Option<&'a str>,
+    /// Files that are not where the leader has them.
+    pub files: &'a [PathBuf],
+    /// How its program is called here: another command, other paths, the same protocol.
+    pub label: Option<LabelSection>,
+}
+
 /// Of the configuration in force, what concerns labels.
 #[derive(Deserialize)]
 struct InForce {
-    label: LabelSection,
-    /// BLAKE3 of every file by the key that names it.
-    files: BTreeMap<String, String>,
+    label: Limits,
 }
 
 #[derive(Deserialize)]
-struct LabelSection {
-    method: Method,
+struct Limits {
     attempts: u32,
     largest_force: f64,
     /// Campaigns of earlier versions have none.
@@ -54,119 +61,187 @@ struct LabelSection {
     lease: u32,
 }
 
-#[derive(Deserialize)]
-#[serde(rename_all = "snake_case")]
-enum Method {
-    Reference { kind: PotentialKind },
-}
-
 fn ten_minutes() -> u32 {
     600
 }
 
-impl Method {
-    /// As the configuration calls it.
-    fn name(&self) -> &'static str {
-        match self {
-            Self::Reference { .. } => "reference",
-        }
-    }
+/// The protocol with these settings: its hash is theirs.
+pub fn protocol(name: &str, settings: Value) -> Protocol {
+    let hash = ContentHash(*blake3::hash(settings.to_string().as_bytes()).as_bytes());
+    Protocol { hash, name: name.to_owned(), settings }
+}
+
+/// Settings of the protocol of a program's labels.
+pub fn identity(method: &str, code: &dyn Code) -> Value {
+    json!({ "method": method, "settings": code.identity() })
+}
+
+/// The same of a reference potential.
+pub fn reference_identity(kind: PotentialKind, file_hash: &str) -> Value {
+    json!({ "method": "reference", "kind": kind, "file_hash": file_hash })
 }
 
 impl Labelling {
-    /// Reads it, and finds the files that the method needs: among `given`, or where the leader of the campaign has them.
-    /// `protocol` is the one in force, `wanted` the name of the method that the user expects.
-    pub async fn of(
-        store: &Store,
-        protocol: Protocol,
-        wanted: Option<&str>,
-        given: &[PathBuf],
-    ) -> Result<Self, Failure> {
+    /// Reads it, and finds what the method needs here. `protocol` is the one in force.
+    pub async fn of(store: &Store, protocol: Protocol, here: Here<'_>) -> Result<Self, Failure> {
         let text = store.campaign().await?.configuration_in_force;
-        let InForce { label, files: hashes } = serde_json::from_str(&text).map_err(|error| {
-            Failure::Failed(format!(
-                "the configuration in force cannot be read ({error}): the campaign may be one of another version of \
-                 this program, or its database is damaged; calmwalk store check tells"
-            ))
+        let InForce { label: Limits { attempts, largest_force, lease } } =
+            serde_json::from_str(&text).map_err(unreadable)?;
+        let noted = store.note(LABEL_METHOD).await?.ok_or_else(|| {
+            Failure::Failed(
+                "the store does not say how labels are made: the campaign was last run by an earlier version of this \
+                 program; run it once with this one"
+                    .to_owned(),
+            )
         })?;
-        let found = label.method.name();
-        if let Some(wanted) = wanted.filter(|wanted| *wanted != found) {
+        let noted: MethodSetup = serde_json::from_str(&noted).map_err(unreadable)?;
+        let found = noted.name();
+        if let Some(wanted) = here.method.filter(|wanted| *wanted != found) {
             return Err(Failure::Input(format!(
                 "--method {wanted}, but the labels of this campaign are made by the method '{found}': leave --method out, \
                  or name the campaign that you mean"
             )));
         }
-        let places = store.note(LABEL_FILES).await?.unwrap_or_default();
-        let places: LabelFiles = serde_json::from_str(&places).unwrap_or_default();
-        let files = Files { hashes: &hashes, places: &places, given: &given_files(given)? };
-        let method = match label.method {
-            Method::Reference { kind } => {
-                let (file, file_hash) = files.find(REFERENCE_FILE)?;
-                MethodSetup::Reference { kind, file, file_hash }
-            }
-        };
-        files.all_given_are_needed(&[REFERENCE_FILE])?;
-        let LabelSection { attempts, largest_force, lease, .. } = label;
+        let method = noted.for_this_host(&protocol, here)?;
         let lease = Duration::from_secs(lease.into());
         Ok(Self { method, protocol, attempts, largest_force, lease })
     }
 }
 
-/// The files that the user names, each with its BLAKE3.
-fn given_files(given: &[PathBuf]) -> Result<Vec<(PathBuf, String)>, Failure> {
-    let read = |path: &PathBuf| match hash(path) {
-        Ok(hash) => Ok((std::path::absolute(path).map_err(Failure::failed)?, hash)),
-        Err(error) => Err(Failure::Input(format!("--file {}: cannot be read ({error})", path.display()))),
+fn unreadable(error: serde_json::Error) -> Failure {
+    Failure::Failed(format!(
+        "what the store says of labels cannot be read ({error}): the campaign may be one of another version of this \
+         program, or its database is damaged; calmwalk store check tells"
+    ))
+}
+
+impl MethodSetup {
+    /// The method of a configuration, with absolute paths.
+    pub fn of(label: &LabelSection) -> Result<Self, Failure> {
+        let absolute = |path: &Path| std::path::absolute(path).map_err(Failure::failed);
+        match &label.method {
+            LabelMethod::Reference(PotentialFile { kind, file }) => {
+                let file = file.get_ref();
+                let file_hash = hash(file)
+                    .map_err(|error| Failure::Input(format!("cannot read {}: {error}", file.display())))?;
+                Ok(Self::Reference { kind: *kind, file: absolute(file)?, file_hash })
+            }
+            LabelMethod::Code(settings) => {
+                let mut settings = Box::new(settings.clone());
+                for path in settings.paths() {
+                    *path = absolute(path)?;
+                }
+                Ok(Self::Code { settings, running: label.running() })
+            }
+        }
+    }
+
+    /// Settings of the protocol of its labels. A program must be there.
+    pub fn identity(&self) -> Result<Value, Failure> {
+        match self {
+            Self::Reference { kind, file_hash, .. } => Ok(reference_identity(*kind, file_hash)),
+            Self::Code { settings, .. } => {
+                let code = settings.prepare().map_err(Failure::input)?;
+                Ok(identity(settings.name(), &*code))
+            }
+        }
+    }
+
+    /// As the configuration calls it.
+    fn name(&self) -> &'static str {
+        match self {
+            Self::Reference { .. } => "reference",
+            Self::Code { settings, .. } => settings.name(),
+        }
+    }
+
+    /// The same with what is on this host, if it makes labels of that protocol.
+    fn for_this_host(self, protocol: &Protocol, here: Here<'_>) -> Result<Self, Failure> {
+        let given = here.label.as_ref().map(Self::of).transpose()?;
+        match (self, given) {
+            (Self::Reference { kind, file, .. }, None) => {
+                let (file, file_hash) = find(&file, protocol, here.files)?;
+                Ok(Self::Reference { kind, file, file_hash })
+            }
+            (noted @ Self::Code { .. }, given) => {
+                let (name, method) = (noted.name(), given.unwrap_or(noted));
+                if let Some(file) = here.files.first() {
+                    return Err(Failure::Input(format!(
+                        "--file {}: where files of the method '{name}' are on this host is said in a --config",
+                        file.display()
+                    )));
+                }
+                if method.name() != name {
+                    return Err(another_method(method.name(), name));
+                }
+                method.agrees(protocol)?;
+                Ok(method)
+            }
+            (Self::Reference { .. }, Some(given)) => Err(another_method(given.name(), "reference")),
+        }
+    }
+
+    /// Whether it makes labels of the protocol.
+    fn agrees(&self, protocol: &Protocol) -> Result<(), Failure> {
+        let here = self.identity().map_err(|failure| {
+            Failure::Input(format!(
+                "labels cannot be made here: {failure}; if what is missing is elsewhere on this host, say so in a --config"
+            ))
+        })?;
+        match changed_keys(&protocol.settings, &here).first() {
+            None => Ok(()),
+            Some((key, before, after)) => Err(Failure::Input(format!(
+                "labels made here would be of another protocol than '{}' of the campaign: {key} is {after} here, {before} \
+                 there",
+                protocol.name
+            ))),
+        }
+    }
+}
+
+fn another_method(found: &str, expected: &str) -> Failure {
+    Failure::Input(match (found, expected) {
+        ("reference", "reference") => {
+            "--config: the file of a reference potential is named with --file".to_owned()
+        }
+        _ => format!(
+            "--config has the label method '{found}', but the labels of this campaign are made by '{expected}'"
+        ),
+    })
+}
+
+/// The file with which labels of that protocol are made, and its BLAKE3: one of those given, or where the leader has it.
+fn find(noted: &Path, protocol: &Protocol, given: &[PathBuf]) -> Result<(PathBuf, String), Failure> {
+    let expected = protocol.settings["file_hash"].as_str().unwrap_or_default();
+    let mut found = None;
+    for path in given {
+        let hash = hash(path).map_err(|error| {
+            Failure::Input(format!("--file {}: cannot be read ({error})", path.display()))
+        })?;
+        if hash != expected {
+            // A file that nobody needs is most likely a wrong one.
+            return Err(Failure::Input(format!(
+                "--file {}: its content (BLAKE3 {hash}) is not that of the file with which the labels of this campaign \
+                 are made",
+                path.display()
+            )));
+        }
+        found = Some((std::path::absolute(path).map_err(Failure::failed)?, hash));
+    }
+    if let Some(found) = found {
+        return Ok(found);
+    }
+    let why = match hash(noted) {
+        Ok(hash) if hash == expected => return Ok((noted.to_owned(), hash)),
+        Ok(hash) => format!("{} here has another content (BLAKE3 {hash})", noted.display()),
+        Err(error) => format!("{} cannot be read here ({error})", noted.display()),
     };
-    given.iter().map(read).collect()
+    Err(Failure::Input(format!(
+        "{REFERENCE_FILE}: labels of this campaign are made with the file of BLAKE3 {expected}, but {why}; copy it to this \
+         host and name it with --file"
+    )))
 }
 
 fn hash(path: &Path) -> std::io::Result<String> {
     Ok(blake3::hash(&fs::read(path)?).to_string())
-}
-
-/// Where files may be, and what must be in them.
-struct Files<'a> {
-    hashes: &'a BTreeMap<String, String>,
-    places: &'a LabelFiles,
-    given: &'a [(PathBuf, String)],
-}
-
-impl Files<'_> {
-    /// The file of this key here, and its BLAKE3.
-    fn find(&self, key: &str) -> Result<(PathBuf, String), Failure> {
-        let expected = self.hashes.get(key).ok_or_else(|| {
-            Failure::Failed(format!(
-                "damaged database: the configuration in force has no hash of {key}; restore it from a copy"
-            ))
-        })?;
-        if let Some((path, _)) = self.given.iter().find(|(_, hash)| hash == expected) {
-            return Ok((path.clone(), expected.clone()));
-        }
-        let why = match self.places.get(key).map(|path| (path, hash(path))) {
-            Some((path, Ok(found))) if found == *expected => return Ok((path.clone(), found)),
-            Some((path, Ok(found))) => {
-                format!("{} here has another content (BLAKE3 {found})", path.display())
-            }
-            Some((path, Err(error))) => format!("{} cannot be read here ({error})", path.display()),
-            None => "the store does not say where it is".to_owned(),
-        };
-        Err(Failure::Input(format!(
-            "{key}: labels of this campaign are made with the file of BLAKE3 {expected}, but {why}; copy it to this host \
-             and name it with --file"
-        )))
-    }
-
-    /// A file that nobody needs is most likely a wrong one.
-    fn all_given_are_needed(&self, keys: &[&str]) -> Result<(), Failure> {
-        let expected: Vec<_> = keys.iter().filter_map(|key| self.hashes.get(*key)).collect();
-        match self.given.iter().find(|(_, hash)| !expected.contains(&hash)) {
-            None => Ok(()),
-            Some((path, hash)) => Err(Failure::Input(format!(
-                "--file {}: its content (BLAKE3 {hash}) is not that of a file with which the labels of this campaign are \
-                 made",
-                path.display()
-            ))),
-        }
-    }
 }

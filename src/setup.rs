@@ -11,7 +11,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use store::Protocol;
 use wire::ipc::Door;
-use workers::labeller::Method;
+use workers::labeller::{Method, Running};
 use workers::settings::WalkSettings;
 
 use crate::config::PotentialKind;
@@ -101,6 +101,13 @@ pub enum MethodSetup {
         /// BLAKE3 of that file.
         file_hash: String,
     },
+    /// By a program.
+    Code {
+        /// Which one, and by which protocol.
+        settings: Box<dft::Settings>,
+        /// How its calculations run.
+        running: Running,
+    },
 }
 
 impl MethodSetup {
@@ -110,6 +117,9 @@ impl MethodSetup {
             Self::Reference { kind, file, file_hash } => {
                 unchanged(file, file_hash)?;
                 Ok(Method::reference(kind.load(file).map_err(Failure::Input)?))
+            }
+            Self::Code { settings, running } => {
+                Ok(Method::code(settings.prepare().map_err(Failure::input)?, running.clone()))
             }
         }
     }

@@ -158,13 +158,10 @@ fn wrong_files_methods_and_stores_are_refused() {
     for words in ["label.method.reference.file: ", &hash, "label.eam.fs cannot be read here", "--file"] {
         assert!(message.contains(words), "{message}");
     }
-    let message = refuse(here, command(&["--file", "other.eam.fs"]));
-    assert!(message.contains("label.eam.fs cannot be read here"), "{message}");
-    let message = refuse(here, command(&["--file", "moved.eam.fs", "--file", "other.eam.fs"]));
-    assert!(
-        message.contains("--file ") && message.contains("other.eam.fs: its content (BLAKE3 "),
-        "{message}"
-    );
+    for given in [&["--file", "other.eam.fs"][..], &["--file", "moved.eam.fs", "--file", "other.eam.fs"]] {
+        let message = refuse(here, command(given));
+        assert!(message.contains("--file other.eam.fs: its content (BLAKE3 "), "{message}");
+    }
     let message = refuse(here, command(&["--file", "missing"]));
     assert!(message.contains("--file missing: cannot be read"), "{message}");
     fs::copy(here.join("other.eam.fs"), here.join("label.eam.fs")).unwrap();

@@ -46,7 +46,7 @@ pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failur
     };
     let label = &campaign.config.label;
     let labelling = Labelling {
-        method: campaign.method().map_err(Failure::failed)?,
+        method: campaign.method()?,
         protocol: campaign.protocol.clone(),
         attempts: label.attempts.get(),
         largest_force: label.largest_force.get(),

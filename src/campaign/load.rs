@@ -7,13 +7,13 @@ use atoms::{NeighbourList, Structure, extxyz, read_structures, shortest_distance
 use calm::{Artifact, ArtifactError, Mixture};
 use orchestrator::selector::{SeedStructure, TrainingFrames};
 use potentials::grace::{Grace, GraceModel};
-use serde_json::json;
+use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
-use wire::ContentHash;
 
 use super::NamedSeed;
-use crate::config::{Config, ConfigError, LabelMethod, place, place_of_offset};
+use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, place, place_of_offset};
+use crate::labelling::{self, REFERENCE_FILE};
 
 /// Atoms of training frames whose grades are watched, at most: enough for the share above 1 to a percent.
 const WATCHED_ATOMS: usize = 4000;
@@ -149,11 +149,21 @@ impl Loader<'_> {
         TrainingFrames::new(elements, features, original).map(Some).map_err(|error| wrong(error.to_string()))
     }
 
-    /// How labels are made, and the hash of the file by which they are made.
-    pub fn protocol(&self, seeds: &[NamedSeed]) -> Result<(Protocol, (String, String)), ConfigError> {
-        const KEY: &str = "label.method.reference.file";
-        let LabelMethod::Reference(reference) = &self.config.label.method;
-        let wrong = |message: String| self.wrong(KEY, &reference.file, message);
+    /// How labels are made, and the hashes of files by which they are made.
+    pub fn protocol(&self, seeds: &[NamedSeed]) -> Result<(Protocol, Vec<(String, String)>), ConfigError> {
+        let (settings, hashes) = match &self.config.label.method {
+            LabelMethod::Reference(reference) => self.reference(reference, seeds)?,
+            LabelMethod::Code(settings) => (self.code(settings, seeds)?, Vec::new()),
+        };
+        Ok((labelling::protocol(self.config.label.protocol_name(), settings), hashes))
+    }
+
+    fn reference(
+        &self,
+        reference: &PotentialFile,
+        seeds: &[NamedSeed],
+    ) -> Result<(Value, Vec<(String, String)>), ConfigError> {
+        let wrong = |message: String| self.wrong(REFERENCE_FILE, &reference.file, message);
         let potential = reference.load().map_err(wrong)?;
         for named in seeds {
             if let Some(species) =
@@ -168,10 +178,23 @@ impl Loader<'_> {
                 )));
             }
         }
-        let file_hash = self.hash(KEY, &reference.file)?;
-        let settings = json!({ "method": "reference", "kind": reference.kind, "file_hash": file_hash.1 });
-        let hash = ContentHash(*blake3::hash(settings.to_string().as_bytes()).as_bytes());
-        Ok((Protocol { hash, name: self.config.label.protocol.clone(), settings }, file_hash))
+        let hash = self.hash(REFERENCE_FILE, &reference.file)?;
+        Ok((labelling::reference_identity(reference.kind, &hash.1), vec![hash]))
+    }
+
+    /// Settings of a program's protocol; the program must be there, with what it needs for every seed structure.
+    fn code(&self, settings: &dft::Settings, seeds: &[NamedSeed]) -> Result<Value, ConfigError> {
+        let key = format!("label.method.{}", settings.name());
+        let at = || place(self.path, self.text, &key);
+        let wrong = |message: String| ConfigError::File { at: at(), key: key.clone(), message };
+        let code = settings.prepare().map_err(|error| wrong(error.to_string()))?;
+        for named in seeds {
+            let species = named.seed.structure.species.iter().copied().collect();
+            let supported = code.supports(&species);
+            let of_seed = |error| format!("{error} (seed structure '{}', {})", named.seed.name, named.source);
+            supported.map_err(|error| wrong(of_seed(error)))?;
+        }
+        Ok(labelling::identity(settings.name(), &*code))
     }
 
     /// A key and the hash of the file that it names.

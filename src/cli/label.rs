@@ -1,5 +1,7 @@
 //! `calmwalk label`
 
+mod once;
+
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,7 +13,8 @@ use tokio::sync::Notify;
 use super::{Ended, Failure, block_on};
 use crate::actors::asked_to_stop;
 use crate::actors::slots::{self, Slots};
-use crate::labelling::Labelling;
+use crate::config::Config;
+use crate::labelling::{Here, Labelling};
 use crate::output::say;
 
 /// Between two looks whether the campaign is there.
@@ -26,14 +29,28 @@ const PAUSE: Duration = Duration::from_secs(2);
 #[derive(Debug, clap::Args)]
 pub struct Label {
     /// Directory of the campaign (on its host), or the postgres:// URL of its store
-    #[arg(long, value_name = "LOCATION")]
-    store: PathBuf,
+    #[arg(long, value_name = "LOCATION", required_unless_present = "once")]
+    store: Option<PathBuf>,
+    /// Instead: label every structure of a file (extended XYZ or POSCAR) by the [label] section of --config, print the results
+    /// and end. No campaign is needed, and none changes
+    #[arg(long, value_name = "STRUCTURES", requires = "config", conflicts_with = "store")]
+    once: Option<PathBuf>,
+    /// With --once: where the labelled structures go, extended XYZ
+    #[arg(long, value_name = "FILE", requires = "once")]
+    output: Option<PathBuf>,
+    /// With --once: print JSON
+    #[arg(long, requires = "once")]
+    json: bool,
     /// Labels to make side by side
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
     slots: u32,
     /// The method that the campaign must have, to be sure [default: whatever its configuration says]
     #[arg(long, value_name = "NAME")]
     method: Option<String>,
+    /// A configuration whose [label] section says how the method's program is called on this host, and where its files are;
+    /// its protocol must be the campaign's [default: as on the host of `calmwalk run`]
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
     /// A file that the method needs and that is not where the campaign's leader has it; known by its content. May be given
     /// several times
     #[arg(long = "file", value_name = "PATH")]
@@ -56,9 +73,13 @@ impl Label {
 
     async fn label(self) -> Result<Ended, Failure> {
         let (stopping, stop) = asked_to_stop("stopping: labels in hand are finished or given back …")?;
-        let location: Location =
-            self.store.to_str().map_or_else(|| Ok(Location::from(&self.store)), str::parse)?;
-        let Some((store, labelling)) = self.begin(&location, &stopping, &stop).await? else {
+        if let (Some(structures), Some(config)) = (&self.once, &self.config) {
+            let (output, json) = (self.output.as_deref(), self.json);
+            return once::label(once::Task { structures, config, output, json }, &stop).await;
+        }
+        let store = self.store.clone().unwrap_or_default();
+        let location: Location = store.to_str().map_or_else(|| Ok(Location::from(&store)), str::parse)?;
+        let Some((opened, labelling)) = self.begin(&location, &stopping, &stop).await? else {
             return Ok(Ended::Interrupted);
         };
         let slots = Slots {
@@ -66,14 +87,14 @@ impl Label {
             location: match location {
                 Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
                 // With its password, if it has one.
-                Location::Server(_) => self.store,
+                Location::Server(_) => store,
             },
             labelling,
             until_empty: self.until_empty,
             grace: Duration::from_secs_f64(self.grace),
         };
-        let ended = slots::work(&store, slots, &stopping, &stop).await;
-        store.close().await;
+        let ended = slots::work(&opened, slots, &stopping, &stop).await;
+        opened.close().await;
         ended
     }
 
@@ -106,7 +127,10 @@ impl Label {
             let lacks = "label protocol yet";
             return Err(Early::NotYet(StoreError::Missing { location: location.to_string(), lacks }));
         };
-        match Labelling::of(&store, protocol, self.method.as_deref(), &self.files).await {
+        let label = self.config.as_deref().map(Config::load_label).transpose();
+        let label = label.map_err(|error| Early::Never(error.into()))?;
+        let here = Here { method: self.method.as_deref(), files: &self.files, label };
+        match Labelling::of(&store, protocol, here).await {
             Ok(labelling) => Ok((store, labelling)),
             Err(failure) => Err(Early::Never(failure)),
         }

@@ -20,7 +20,7 @@ use crate::actors::{self, budget, in_process, processes};
 use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
 use crate::forecast::{self, Forecast, megabytes};
-use crate::labelling::LABEL_FILES;
+use crate::labelling::LABEL_METHOD;
 use crate::output::{print, say};
 use crate::summary;
 
@@ -201,8 +201,8 @@ async fn open_store(campaign: &Campaign, location: &Location) -> Result<Store, F
 /// Says in the store what others do not know: where files are, and how much disk is needed.
 async fn leave_notes(campaign: &Campaign, store: &Store) -> Result<(), Failure> {
     let text = |note: serde_json::Result<String>| note.map_err(Failure::failed);
-    let files = campaign.label_files().map_err(Failure::failed)?;
-    store.leave_note(LABEL_FILES, &text(serde_json::to_string(&files))?).await?;
+    let method = campaign.method()?;
+    store.leave_note(LABEL_METHOD, &text(serde_json::to_string(&method))?).await?;
     store.leave_note(forecast::NOTE, &text(serde_json::to_string(&Forecast::of(campaign)))?).await?;
     Ok(())
 }

@@ -146,9 +146,8 @@ impl fmt::Display for Change {
 
 /// What differs between the configuration a campaign has and the one it is continued with.
 pub fn compare(before: &Value, after: &Value) -> Result<Vec<Change>, Refused> {
-    let mut changes = Vec::new();
-    differences("", before, after, &mut changes);
-    changes.into_iter().map(|(key, before, after)| judge(key, before, after)).collect()
+    let changes = changed_keys(before, after).into_iter();
+    changes.map(|(key, before, after)| judge(key, before, after)).collect()
 }
 
 fn judge(key: String, before: Value, after: Value) -> Result<Change, Refused> {
@@ -215,6 +214,13 @@ fn excerpt(hash: &str) -> &str {
 /// Whether some of its keys may change.
 fn is_section(key: &str) -> bool {
     CHANGEABLE.iter().any(|changeable| changeable.strip_prefix(key).is_some_and(|rest| rest.starts_with('.')))
+}
+
+/// (key, before, after) of every leaf that differs in two JSON values.
+pub fn changed_keys(before: &Value, after: &Value) -> Vec<(String, Value, Value)> {
+    let mut changes = Vec::new();
+    differences("", before, after, &mut changes);
+    changes
 }
 
 /// (key, before, after) of every leaf that differs.

@@ -6,6 +6,7 @@ mod check;
 mod documented;
 mod error;
 mod files;
+mod method;
 
 use std::num::{NonZeroU32, NonZeroU64, NonZeroUsize};
 use std::path::{Path, PathBuf};
@@ -16,11 +17,13 @@ use orchestrator::selector::{Mode, UpdateProtocol};
 use serde::{Deserialize, Serialize};
 use store::{Location, StoreError};
 use toml::Spanned;
+use workers::labeller::Running;
 use workers::settings::ThermostatKind;
 
-pub use changes::{Change, compare, without_changeable};
+pub use changes::{Change, changed_keys, compare, without_changeable};
 pub use error::{ConfigError, in_plain_words, place, place_of_offset};
 pub use files::{PotentialFile, PotentialKind};
+pub use method::LabelMethod;
 
 /// A whole campaign.
 #[derive(Clone, Debug, Deserialize, Serialize)]
@@ -208,9 +211,9 @@ pub struct ZblSection {
 pub struct LabelSection {
     /// The method.
     pub method: LabelMethod,
-    /// Name of the protocol, as exports and imports call it.
-    #[serde(default = "defaults::protocol")]
-    pub protocol: String,
+    /// Name of the protocol, as exports and imports call it; left out, that of the method.
+    #[serde(default)]
+    pub protocol: Option<String>,
     /// Labels calculated side by side by `run`; 0: all come from `calmwalk label`.
     #[serde(default = "defaults::slots")]
     pub slots: usize,
@@ -240,14 +243,6 @@ pub enum QueueFull {
     Wait,
     /// The threshold of the collection rule is raised; walkers wait at twice the limit.
     Raise,
-}
-
-/// How labels are made.
-#[derive(Clone, Debug, Deserialize, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum LabelMethod {
-    /// Any potential that calmwalk evaluates.
-    Reference(PotentialFile),
 }
 
 /// `[budget]`
@@ -299,6 +294,20 @@ impl Config {
         Ok((config, text))
     }
 
+    /// Reads the `[label]` section alone, of a configuration that needs no other.
+    pub fn load_label(path: &Path) -> Result<LabelSection, ConfigError> {
+        #[derive(Deserialize)]
+        struct Labels {
+            label: LabelSection,
+        }
+        let text = error::read_text(path)?;
+        let Labels { mut label } =
+            toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
+        let directory = path.parent().unwrap_or(Path::new(""));
+        label.method.paths().into_iter().for_each(|path| *path = directory.join(&*path));
+        Ok(label)
+    }
+
     /// Where the campaign is kept, if `directory` is its directory.
     pub fn location(&self, directory: &Path) -> Result<Location, StoreError> {
         match &self.run.store {
@@ -314,10 +323,9 @@ impl Config {
 
     /// Every path in it.
     fn paths(&mut self) -> impl Iterator<Item = &mut PathBuf> {
-        let LabelMethod::Reference(reference) = &mut self.label.method;
-        let required = [&mut self.potential.model, &mut reference.file];
         let optional = self.calm.artifact.iter_mut().chain(&mut self.calm.training_frames);
-        required.into_iter().chain(optional).chain(&mut self.seeds.files).map(Spanned::get_mut)
+        let others = [&mut self.potential.model].into_iter().chain(optional).chain(&mut self.seeds.files);
+        others.map(Spanned::get_mut).chain(self.label.method.paths())
     }
 
     fn resolve_paths(&mut self, directory: &Path) {
@@ -363,6 +371,18 @@ impl Config {
     pub fn update_settings(&self) -> UpdateSettings {
         let (combination, ladder) = (self.calm.combination, self.calm.ladder.clone());
         UpdateSettings { combination, ladder, stop: self.collect.until }
+    }
+}
+
+impl LabelSection {
+    /// Name of the protocol.
+    pub fn protocol_name(&self) -> &str {
+        self.protocol.as_deref().unwrap_or(self.method.name())
+    }
+
+    /// How the calculations of a program run.
+    pub fn running(&self) -> Running {
+        Running::default()
     }
 }
 
@@ -455,10 +475,6 @@ mod defaults {
 
     pub fn declined_features() -> u64 {
         1000
-    }
-
-    pub fn protocol() -> String {
-        "reference".to_owned()
     }
 
     pub fn slots() -> usize {

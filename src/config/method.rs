@@ -1,0 +1,93 @@
+//! `label.method`: how labels are made.
+
+use std::fmt;
+use std::path::PathBuf;
+
+use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDeserializer};
+use serde::{Deserialize, Deserializer, Serialize};
+use toml::Spanned;
+
+use super::PotentialFile;
+
+/// How labels are made: a table with one key, the name of the method.
+#[derive(Clone, Debug, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LabelMethod {
+    /// Any potential that calmwalk evaluates.
+    Reference(PotentialFile),
+    /// A program.
+    #[serde(untagged)]
+    Code(dft::Settings),
+}
+
+impl LabelMethod {
+    /// Its key.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Reference(_) => "reference",
+            Self::Code(settings) => settings.name(),
+        }
+    }
+
+    /// Every path in it.
+    pub(super) fn paths(&mut self) -> Vec<&mut PathBuf> {
+        match self {
+            Self::Reference(reference) => vec![Spanned::get_mut(&mut reference.file)],
+            Self::Code(settings) => settings.paths().into_iter().collect(),
+        }
+    }
+}
+
+/// Written out, so that what is wrong inside a method is told with its place and not as "no method fits".
+impl<'de> Deserialize<'de> for LabelMethod {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_map(Methods)
+    }
+}
+
+struct Methods;
+
+impl<'de> Visitor<'de> for Methods {
+    type Value = LabelMethod;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a table with one label method, as { reference = { … } }")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<LabelMethod, A::Error> {
+        let name: String = map.next_key()?.ok_or_else(|| A::Error::custom("found no label method"))?;
+        if name != "reference" {
+            let settings = MapAccessDeserializer::new(Again { name: Some(name), map });
+            return dft::Settings::deserialize(settings).map(LabelMethod::Code);
+        }
+        let reference = map.next_value()?;
+        match map.next_key::<String>()? {
+            None => Ok(LabelMethod::Reference(reference)),
+            Some(second) => Err(A::Error::custom(format!("found a second label method, `{second}`"))),
+        }
+    }
+}
+
+/// A map whose first key was read already.
+struct Again<A> {
+    name: Option<String>,
+    map: A,
+}
+
+impl<'de, A: MapAccess<'de>> MapAccess<'de> for Again<A> {
+    type Error = A::Error;
+
+    fn next_key_seed<K: serde::de::DeserializeSeed<'de>>(
+        &mut self,
+        seed: K,
+    ) -> Result<Option<K::Value>, A::Error> {
+        match self.name.take() {
+            Some(name) => seed.deserialize(name.into_deserializer()).map(Some),
+            None => self.map.next_key_seed(seed),
+        }
+    }
+
+    fn next_value_seed<V: serde::de::DeserializeSeed<'de>>(&mut self, seed: V) -> Result<V::Value, A::Error> {
+        self.map.next_value_seed(seed)
+    }
+}
