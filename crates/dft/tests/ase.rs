@@ -28,7 +28,7 @@ fn prepared(calculator: &str) -> Ase {
 }
 
 /// Writes the input, runs the script, reads what it left.
-fn run(code: &Ase, structure: &Structure, remedies: &[Remedy]) -> Result<Calculated, Failure> {
+fn run(code: &dyn Code, structure: &Structure, remedies: &[Remedy]) -> Result<Calculated, Failure> {
     let place = TempDir::new().unwrap();
     let input = code.input(structure, &remedies.iter().copied().collect::<BTreeSet<_>>())?;
     for (name, content) in &input.files {
@@ -92,6 +92,32 @@ fn emt_gives_the_numbers_that_ase_gives() {
     assert_eq!(found.forces, forces);
     assert_eq!(found.stress, Some([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]));
     assert!(forces.iter().flatten().any(|force| force.abs() > 0.5));
+}
+
+/// As docs/dft-codes.md has it.
+const LABEL: &str = "from ase.io import read, write\nfrom ase.calculators.emt import EMT\natoms = read('structure.extxyz')\n\
+                     atoms.calc = EMT()\natoms.get_forces(), atoms.get_stress()\nwrite('label.extxyz', atoms)\n";
+
+#[test]
+fn a_command_that_uses_ase_gives_the_same_but_for_the_digits_of_its_file() {
+    let place = TempDir::new().unwrap();
+    let path = place.path().join("label.py");
+    std::fs::write(&path, LABEL).unwrap();
+    let settings = dft::command::Settings {
+        command: vec![python(), "label.py".to_owned()],
+        files: vec![path],
+        version: "EMT".to_owned(),
+    };
+    let found = run(&settings.prepare().unwrap(), &alloy(), &[]).unwrap();
+    let expected = run(&prepared(EMT), &alloy(), &[]).unwrap();
+    let numbers = |label: &Calculated| {
+        let energies = [label.energy, label.energy_without_smearing.unwrap()];
+        [energies.as_slice(), &label.forces.concat(), &label.stress.unwrap().concat()].concat()
+    };
+    let (found, expected) = (numbers(&found), numbers(&expected));
+    assert_eq!(found.len(), expected.len());
+    let close = found.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-6);
+    assert!(close, "{found:?}\n{expected:?}");
 }
 
 /// ∂E/∂x by central differences, where `change` adds to x.
