@@ -22,7 +22,8 @@ const BAR: &str = "{spinner} {pos} structures";
 /// gives the same bytes. Beside the label each has candidate_id, seed_structure, walk, segment, step, origin,
 /// mixture_version (after the decision), mixture_version_seen (by the walker), protocol, protocol_hash and
 /// relative_volume (V/V₀), and the columns gamma and gamma_nbr under the ORIGINAL mixture. Imported structures have
-/// source_file and source_frame (from 0) instead.
+/// source_file and source_frame (from 0) instead. Where the calculation gives them there are energy_without_smearing (eV),
+/// the cell's magnetic moment magmom and the column magmoms (μ_B).
 #[derive(Debug, clap::Args)]
 pub struct Export {
     #[command(flatten)]
@@ -175,7 +176,19 @@ fn frame(row: ExportRow, keys: Keys) -> Frame {
     let label = row.label;
     let labels = Labels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
     frame.set_labels(&labels, keys);
+    let scalars = |values| Column { width: 1, entries: Entries::Real(values) };
+    let details = label.details;
+    if let Some(moments) = details.magnetic_moments {
+        frame.arrays.insert("magmoms".to_owned(), scalars(moments));
+    }
     let mut info = |key: &str, value: Value| frame.info.insert(key.to_owned(), value);
+    for (key, number) in
+        [("energy_without_smearing", details.energy_without_smearing), ("magmom", details.magnetisation)]
+    {
+        if let Some(number) = number {
+            info(key, number.into());
+        }
+    }
     info("protocol", row.protocol_name.into());
     info("protocol_hash", row.protocol.to_string().chars().take(16).collect::<String>().into());
     match row.source {
@@ -198,7 +211,6 @@ fn frame(row: ExportRow, keys: Keys) -> Frame {
             info("mixture_version", whole(mixture_version_after));
             info("mixture_version_seen", whole(view.mixture_version()));
             info("relative_volume", view.relative_volume().into());
-            let scalars = |values| Column { width: 1, entries: Entries::Real(values) };
             frame.arrays.insert("gamma".to_owned(), scalars(original.gamma));
             frame.arrays.insert("gamma_nbr".to_owned(), scalars(original.gamma_nbr));
         }

@@ -1,6 +1,9 @@
 //! `calmwalk queue`
 
+mod files;
+
 use std::io::{self, Write};
+use std::path::PathBuf;
 
 use store::{Attempt, Job, JobDetails, JobState, Location, Store, unix_milliseconds};
 
@@ -31,6 +34,14 @@ enum Action {
     Show {
         /// Candidate
         id: String,
+    },
+    /// Write the packed directories of its calculations, as label.keep has them kept
+    Files {
+        /// Candidate
+        id: String,
+        /// Directory to write into, a file CANDIDATE-ATTEMPT.tar.zst each; made if it does not exist
+        #[arg(long, value_name = "DIR", default_value = ".")]
+        into: PathBuf,
     },
     /// Take structures out of the queue and out of exports
     Drop {
@@ -84,6 +95,10 @@ impl Queue {
                 let details = block_on(read_details(location, id))??;
                 if self.json { print_json(&details)? } else { print(|out| write_details(out, &details))? }
             }
+            Action::Files { id, into } => {
+                let written = block_on(files::write(location, id, into))??;
+                if self.json { print_json(&written)? } else { print(|out| write_files(out, &written))? }
+            }
             action => self.change(location, action)?,
         }
         Ok(Ended::Done)
@@ -117,7 +132,7 @@ async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>) ->
     let ids = match action {
         Action::Drop { ids } | Action::Retry { ids } => ids.as_slice(),
         Action::Show { id } | Action::Prioritise { id, .. } => std::slice::from_ref(id),
-        Action::List(_) => &[],
+        Action::List(_) | Action::Files { .. } => &[],
     };
     for id in ids {
         let now = unix_milliseconds();
@@ -125,7 +140,7 @@ async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>) ->
             Action::Drop { .. } => store.drop_job(id, now).await?,
             Action::Retry { .. } => store.retry_job(id, now).await?,
             Action::Prioritise { priority, .. } => store.prioritise_job(id, *priority, now).await?,
-            Action::List(_) | Action::Show { .. } => id.clone(),
+            Action::List(_) | Action::Show { .. } | Action::Files { .. } => id.clone(),
         };
         changed.push(store.queue_show(&candidate).await?.job);
     }
@@ -212,6 +227,17 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
         details.job.attempts, details.job.failures
     )?;
     details.attempts_made.iter().try_for_each(|attempt| write_attempt(out, attempt))
+}
+
+fn write_files(out: &mut dyn Write, written: &[(PathBuf, String)]) -> io::Result<()> {
+    if written.is_empty() {
+        writeln!(out, "no directory of a calculation is kept (label.keep says which are)")?;
+    }
+    for (path, left_out) in written {
+        writeln!(out, "{}", path.display())?;
+        left_out.lines().try_for_each(|line| writeln!(out, "  without {line}: too large"))?;
+    }
+    Ok(())
 }
 
 fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {

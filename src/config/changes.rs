@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 20] = [
+pub(super) const CHANGEABLE: [&str; 25] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -15,6 +15,11 @@ pub(super) const CHANGEABLE: [&str; 20] = [
     "label.lease",
     "label.attempts",
     "label.largest_force",
+    "label.cores",
+    "label.time_limit",
+    "label.memory",
+    "label.scratch",
+    "label.keep",
     "label.queue_limit",
     "label.queue_full",
     "budget.labels",

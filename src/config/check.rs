@@ -23,6 +23,7 @@ pub fn check(config: &Config) -> Result<(), Wrong> {
     check_store(config)?;
     check_queue(config)?;
     check_budget(config)?;
+    check_scratch(config)?;
     if config.seeds.files.is_empty() {
         return wrong("seeds.files", "an empty list", "at least one file with seed structures");
     }
@@ -53,6 +54,9 @@ fn check_limits(config: &Config) -> Result<(), Wrong> {
         ("guard.checkpoint_interval", guard.checkpoint_interval.get() as f64, most_steps),
         ("label.slots", label.slots as f64, 1024.0),
         ("label.lease", f64::from(label.lease.get()), 86_400.0),
+        ("label.cores", f64::from(label.cores.get()), 4096.0),
+        ("label.time_limit", label.time_limit.get(), 1e8),
+        ("label.memory", label.memory.map_or(0.0, |memory| memory.get()), 1e6),
         ("run.walkers", run.walkers as f64, 1024.0),
         ("run.silence_limit", run.silence_limit.get(), 1e6),
         ("run.agent_silence_limit", run.agent_silence_limit.get(), 1e6),
@@ -101,6 +105,16 @@ fn check_queue(config: &Config) -> Result<(), Wrong> {
         return wrong("label.queue_full", "\"raise\"", expected);
     }
     Ok(())
+}
+
+/// Labellers may be on other hosts, where the directory of the configuration is not.
+fn check_scratch(config: &Config) -> Result<(), Wrong> {
+    match &config.label.scratch {
+        Some(scratch) if !scratch.is_absolute() => {
+            wrong("label.scratch", scratch.display(), "an absolute path, such as \"/scratch\"")
+        }
+        _ => Ok(()),
+    }
 }
 
 fn check_mixture(config: &Config) -> Result<(), Wrong> {

@@ -17,7 +17,7 @@ use orchestrator::selector::{Mode, UpdateProtocol};
 use serde::{Deserialize, Serialize};
 use store::{Location, StoreError};
 use toml::Spanned;
-use workers::labeller::Running;
+use workers::labeller::{Keep, Running};
 use workers::settings::ThermostatKind;
 
 pub use changes::{Change, changed_keys, compare, without_changeable};
@@ -226,6 +226,19 @@ pub struct LabelSection {
     /// Largest force that is believed, eV/Å.
     #[serde(default = "defaults::largest_force")]
     pub largest_force: Positive,
+    /// Cores of a calculation by another program.
+    #[serde(default = "defaults::cores")]
+    pub cores: NonZeroU32,
+    /// Longest time of a calculation, s.
+    #[serde(default = "defaults::time_limit")]
+    pub time_limit: Positive,
+    /// Most memory of a calculation, GB.
+    pub memory: Option<Positive>,
+    /// Where calculations have their directories, if not where temporary files are.
+    pub scratch: Option<PathBuf>,
+    /// Which of these directories are kept in the store.
+    #[serde(default)]
+    pub keep: Keep,
     /// Walkers wait while more jobs than this are unfinished, or the threshold is raised.
     #[serde(default = "defaults::queue_limit")]
     pub queue_limit: NonZeroU32,
@@ -382,7 +395,13 @@ impl LabelSection {
 
     /// How the calculations of a program run.
     pub fn running(&self) -> Running {
-        Running::default()
+        Running {
+            cores: self.cores.get(),
+            time_limit: self.time_limit.get(),
+            memory: self.memory.map(Positive::get),
+            scratch: self.scratch.clone(),
+            keep: self.keep,
+        }
     }
 }
 
@@ -487,6 +506,14 @@ mod defaults {
 
     pub fn attempts() -> NonZeroU32 {
         nonzero(3)
+    }
+
+    pub fn cores() -> NonZeroU32 {
+        nonzero(1)
+    }
+
+    pub fn time_limit() -> Positive {
+        positive(86_400.0)
     }
 
     pub fn largest_force() -> Positive {

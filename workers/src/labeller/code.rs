@@ -1,5 +1,6 @@
 //! Labels by another program: calculations that outlive the labeller that began them.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -133,11 +134,15 @@ impl CodeMethod {
     /// The newest of these calculations that goes on here, or has ended and can be read. What is left of the others here
     /// is removed.
     async fn find(&self, earlier: &[String]) -> Result<Option<Kept>, StoreError> {
-        let known: Vec<Kept> = earlier.iter().filter_map(|text| serde_json::from_str(text).ok()).collect();
+        // One that was taken over is named by each attempt that waited for it.
+        let mut named = BTreeSet::new();
+        let once = earlier.iter().filter(|text| named.insert(*text));
+        let known: Vec<Kept> = once.filter_map(|text| serde_json::from_str(text).ok()).collect();
         let mut found = None;
         for kept in known {
             match kept.look() {
                 Found::Elsewhere => {}
+                Found::Ended(End { how: How::NotStarted(_), .. }) => clear(kept).await?,
                 Found::Ended(_) | Found::Running if found.is_none() => found = Some(kept),
                 _ => clear(kept).await?,
             }
@@ -175,7 +180,11 @@ impl CodeMethod {
         let (code, work) = (Arc::clone(&self.code), kept.directory.join(WORK));
         let directory = work.clone();
         let exit = match end.how {
-            How::NotStarted(number) => return Err(file(&end.program, io::Error::from_raw_os_error(number))),
+            How::NotStarted(number) => {
+                clear(kept).await?;
+                self.reap();
+                return Err(file(&end.program, io::Error::from_raw_os_error(number)));
+            }
             How::Ended(exit) => exit,
         };
         let result = blocking(move || read(&*code, &structure, &directory, exit)).await;

@@ -17,7 +17,7 @@ pub enum Method {
     /// A potential, in this process.
     Reference(Arc<Mutex<ReferenceMethod>>),
     /// Another program, in processes of its own that outlive this one.
-    Code(CodeMethod),
+    Code(Box<CodeMethod>),
 }
 
 /// A result that is not judged yet.
@@ -40,7 +40,7 @@ impl Method {
 
     /// The same with keepers ([`super::keep`]) that are started so.
     pub fn kept_by(keeper: KeeperCommand, code: Box<dyn Code>, running: Running) -> Self {
-        Self::Code(CodeMethod::new(keeper, code, running))
+        Self::Code(Box::new(CodeMethod::new(keeper, code, running)))
     }
 
     /// Ends the calculation in hand, if there is one, and removes its directory.

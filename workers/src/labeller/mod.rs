@@ -145,7 +145,7 @@ pub async fn run(
         let begun = Instant::now();
         let Made { result, ended } =
             match make(&store, &method, &lease, &settings.timing, closing, &now).await? {
-                Work::Done(made) => made,
+                Work::Done(made) => *made,
                 Work::NotWanted => {
                     method.stop().await?;
                     tell(&format!(
@@ -217,7 +217,7 @@ async fn wait(
 
 /// What came of a lease.
 enum Work {
-    Done(Made),
+    Done(Box<Made>),
     /// Nobody waits for the result any more.
     NotWanted,
     /// Somebody else waits for this very calculation.
@@ -242,7 +242,7 @@ async fn make(
     let mut held = true;
     loop {
         tokio::select! {
-            made = &mut making => return made.map(Work::Done),
+            made = &mut making => return made.map(|made| Work::Done(Box::new(made))),
             () = &mut too_late => return Ok(Work::TooLate),
             () = tokio::time::sleep(Duration::from_secs(seconds.into()) / 3) => {}
         }
