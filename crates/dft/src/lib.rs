@@ -7,6 +7,7 @@ pub mod abinit;
 pub mod ase;
 mod code;
 pub mod command;
+pub mod cp2k;
 mod failure;
 mod find;
 pub mod gpaw;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Code, SetupError, abinit, ase, command, gpaw, vasp};
+use crate::{Code, SetupError, abinit, ase, command, cp2k, gpaw, vasp};
 
 /// Which program makes labels, and how: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -16,6 +16,8 @@ pub enum Settings {
     Ase(ase::Settings),
     /// A program of the user's.
     Command(command::Settings),
+    /// CP2K.
+    Cp2k(cp2k::Settings),
     /// GPAW.
     Gpaw(gpaw::Settings),
     /// VASP.
@@ -29,6 +31,7 @@ impl Settings {
             Self::Abinit(_) => "abinit",
             Self::Ase(_) => "ase",
             Self::Command(_) => "command",
+            Self::Cp2k(_) => "cp2k",
             Self::Gpaw(_) => "gpaw",
             Self::Vasp(_) => "vasp",
         }
@@ -40,6 +43,7 @@ impl Settings {
             Self::Abinit(settings) => vec![&mut settings.pseudopotentials],
             Self::Ase(settings) => vec![&mut settings.calculator],
             Self::Command(settings) => settings.files.iter_mut().collect(),
+            Self::Cp2k(settings) => vec![&mut settings.pseudopotentials],
             Self::Gpaw(settings) => settings.pseudopotentials.iter_mut().collect(),
             Self::Vasp(settings) => vec![&mut settings.pseudopotentials],
         }
@@ -54,6 +58,7 @@ impl Settings {
             Self::Abinit(settings) => Box::new(settings.prepare()?),
             Self::Ase(settings) => Box::new(settings.prepare()?),
             Self::Command(settings) => Box::new(settings.prepare()?),
+            Self::Cp2k(settings) => Box::new(settings.prepare()?),
             Self::Gpaw(settings) => Box::new(settings.prepare()?),
             Self::Vasp(settings) => Box::new(settings.prepare()?),
         })

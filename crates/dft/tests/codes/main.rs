@@ -6,6 +6,7 @@
 
 mod abinit;
 mod checks;
+mod cp2k;
 mod gpaw;
 mod run;
 mod structures;

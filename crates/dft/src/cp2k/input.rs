@@ -1,0 +1,138 @@
+//! `run.inp`.
+
+use std::collections::BTreeSet;
+use std::fmt::Write;
+
+use atoms::Structure;
+
+use super::{Cp2k, OUTPUT, Settings, data};
+use crate::lattice::Enclosed;
+use crate::{Failure, FailureClass, Input, Remedy, moments};
+
+/// Name of the input.
+const NAME: &str = "run.inp";
+
+pub(super) fn write(cp2k: &Cp2k, enclosed: &Enclosed, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
+    let species = BTreeSet::from_iter(enclosed.structure.species.iter().copied());
+    for species in &species {
+        cp2k.kind(*species).map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+    }
+    let spins = Spins::new(cp2k, &enclosed.structure, remedies);
+    let text = format!(
+        "&GLOBAL\n  PROJECT run\n  RUN_TYPE ENERGY_FORCE\n  PRINT_LEVEL MEDIUM\n&END GLOBAL\n&FORCE_EVAL\n  METHOD \
+         QUICKSTEP\n  STRESS_TENSOR ANALYTICAL\n  &PRINT\n    &FORCES\n    &END FORCES\n    &STRESS_TENSOR\n    &END \
+         STRESS_TENSOR\n  &END PRINT\n  &DFT\n{}{}{}  &END DFT\n  &SUBSYS\n{}  &END SUBSYS\n&END FORCE_EVAL\n",
+        method(&cp2k.settings, &spins),
+        k_points(enclosed.mesh(cp2k.settings.k_spacing)),
+        steps(&cp2k.settings, &spins, remedies),
+        structure(cp2k, &enclosed.structure, remedies),
+    );
+    let arguments = ["-i", NAME, "-o", OUTPUT].map(str::to_owned);
+    Ok(Input {
+        files: [(NAME.to_owned(), text.into_bytes())].into(),
+        command: cp2k.settings.command.iter().cloned().chain(arguments).collect(),
+        environment: cp2k.environment.clone(),
+    })
+}
+
+/// What CP2K is told of the number of electrons and orbitals.
+struct Spins {
+    /// 2 S + 1 to start from; smearing lets the moment go where it wants.
+    multiplicity: u64,
+    /// Empty orbitals of each spin.
+    empty: [u64; 2],
+}
+
+impl Spins {
+    fn new(cp2k: &Cp2k, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Self {
+        let electrons = cp2k.electrons(structure).round() as u64;
+        let initial = |remedies| moments::initial(structure, &cp2k.settings.moments, remedies);
+        let sum =
+            |moments: Vec<f64>| if cp2k.settings.spin { moments.iter().sum::<f64>().abs() } else { 0.0 };
+        let parity = electrons % 2;
+        // The nearest that as many electrons can have.
+        let unpaired = 2 * ((sum(initial(remedies)) - parity as f64) / 2.0).round().max(0.0) as u64 + parity;
+        let unpaired = if cp2k.settings.spin { unpaired.min(electrons) } else { 0 };
+        // As many orbitals with every remedy.
+        let orbitals = (0.6 * (electrons as f64 + sum(initial(&BTreeSet::new())))).ceil() as u64 + 4;
+        let occupied = [electrons.div_ceil(2) + unpaired / 2, (electrons / 2).saturating_sub(unpaired / 2)];
+        Self { multiplicity: unpaired + 1, empty: occupied.map(|n| orbitals.saturating_sub(n).max(1)) }
+    }
+}
+
+fn method(settings: &Settings, spins: &Spins) -> String {
+    let directory = settings.pseudopotentials.display();
+    let spin = match settings.spin {
+        true => format!("    UKS T\n    MULTIPLICITY {}\n", spins.multiplicity),
+        false => String::new(),
+    };
+    format!(
+        "    BASIS_SET_FILE_NAME {directory}/{}\n    POTENTIAL_FILE_NAME {directory}/{}\n{spin}    &QS\n      EPS_DEFAULT \
+         1.0E-12\n    &END QS\n    &MGRID\n      CUTOFF [eV] {:?}\n      REL_CUTOFF [eV] {:?}\n    &END MGRID\n    &XC\n      \
+         &XC_FUNCTIONAL PBE\n      &END XC_FUNCTIONAL\n    &END XC\n    &PRINT\n      &MULLIKEN\n      &END MULLIKEN\n    \
+         &END PRINT\n",
+        data::BASES,
+        data::POTENTIALS,
+        settings.cutoff,
+        settings.relative_cutoff
+    )
+}
+
+/// Γ alone needs no section. MacDonald's shift brings meshes of even size to Γ.
+fn k_points(mesh: [u32; 3]) -> String {
+    if mesh == [1; 3] {
+        return String::new();
+    }
+    let [x, y, z] = mesh;
+    let [a, b, c] = mesh.map(|n| if n % 2 == 0 { 0.5 / f64::from(n) } else { 0.0 });
+    format!(
+        "    &KPOINTS\n      SCHEME MACDONALD {x} {y} {z} {a:?} {b:?} {c:?}\n      SYMMETRY OFF\n    &END KPOINTS\n"
+    )
+}
+
+fn steps(settings: &Settings, spins: &Spins, remedies: &BTreeSet<Remedy>) -> String {
+    let has = |remedy| remedies.contains(&remedy);
+    let steps = settings.steps.saturating_mul(if has(Remedy::MoreSteps) { 3 } else { 1 });
+    let (alpha, history) = if has(Remedy::SlowerMixing) { (0.1, 16) } else { (0.4, 8) };
+    let mixing = match has(Remedy::OtherAlgorithm) {
+        false => format!("METHOD BROYDEN_MIXING\n        ALPHA {alpha:?}\n        NBROYDEN {history}"),
+        true => format!("METHOD PULAY_MIXING\n        ALPHA {alpha:?}\n        NPULAY {history}"),
+    };
+    let [up, down] = spins.empty;
+    let empty = if settings.spin { format!("{up} {down}") } else { up.to_string() };
+    let temperature = settings.smearing_width / atoms::units::BOLTZMANN;
+    format!(
+        "    &SCF\n      SCF_GUESS ATOMIC\n      EPS_SCF {:?}\n      MAX_SCF {steps}\n      ADDED_MOS {empty}\n      \
+         &SMEAR\n        METHOD FERMI_DIRAC\n        ELECTRONIC_TEMPERATURE [K] {temperature:?}\n      &END SMEAR\n      \
+         &MIXING\n        {mixing}\n      &END MIXING\n    &END SCF\n",
+        settings.density_tolerance
+    )
+}
+
+fn structure(cp2k: &Cp2k, structure: &Structure, remedies: &BTreeSet<Remedy>) -> String {
+    let mut text = "    &CELL\n".to_owned();
+    // Writing to a string cannot fail.
+    for (name, [x, y, z]) in ["A", "B", "C"].iter().zip(structure.cell.0) {
+        let _ = writeln!(text, "      {name} {x:?} {y:?} {z:?}");
+    }
+    text += "    &END CELL\n    &COORD\n";
+    for (species, [x, y, z]) in structure.species.iter().zip(&structure.positions) {
+        let _ = writeln!(text, "      {species} {x:?} {y:?} {z:?}");
+    }
+    text += "    &END COORD\n";
+    let initial = moments::initial(structure, &cp2k.settings.moments, remedies);
+    let moments = std::collections::BTreeMap::from_iter(structure.species.iter().zip(initial));
+    for (species, moment) in moments {
+        let potential = cp2k.kind(*species).map_or("", |kind| kind.potential.as_str());
+        let _ = writeln!(
+            text,
+            "    &KIND {species}\n      BASIS_SET {}\n      POTENTIAL {potential}",
+            cp2k.settings.basis
+        );
+        if cp2k.settings.spin {
+            let _ = writeln!(text, "      MAGNETIZATION {moment:?}");
+        }
+        text += "    &END KIND\n";
+    }
+    text
+}

@@ -1,0 +1,150 @@
+//! Without CP2K: what is written, and what is made of outputs that CP2K left (`tests/data/cp2k`).
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::FailureClass;
+
+const INPUT: &str = include_str!("../../tests/data/cp2k/run.inp");
+const OUTPUT: &str = include_str!("../../tests/data/cp2k/run.out");
+/// Of the same input with two electronic steps.
+const SHORT: &str = include_str!("../../tests/data/cp2k/short.out");
+
+/// What the outputs are of.
+fn silicon() -> Structure {
+    let cell = atoms::Cell([[0.0, 2.75, 2.7], [2.72, 0.05, 2.75], [2.68, 2.72, -0.04]]);
+    let positions = vec![[0.0; 3], [1.43, 1.33, 1.3]];
+    Structure { species: vec!["Si".parse().unwrap(); 2], positions, cell, periodic: [true; 3] }
+}
+
+fn cp2k(settings: Settings) -> Cp2k {
+    let kind = Kind { potential: "GTH-PBE".into(), valence: 4.0, hash: "abc".into() };
+    let environment = program::environment(&settings.environment);
+    let kinds = BTreeMap::from([("Si".parse().unwrap(), kind)]);
+    Cp2k { settings, environment, version: "2023.1".into(), kinds }
+}
+
+/// The settings of `INPUT`.
+fn settings() -> Settings {
+    Settings {
+        basis: "SZV-MOLOPT-SR-GTH".into(),
+        cutoff: 1500.0,
+        relative_cutoff: 300.0,
+        density_tolerance: 1e-6,
+        k_spacing: 10.0,
+        ..Settings::default()
+    }
+}
+
+fn input(settings: Settings, remedies: &[Remedy]) -> String {
+    let remedies = BTreeSet::from_iter(remedies.iter().copied());
+    let input = cp2k(settings.clone()).input(&silicon(), &remedies).unwrap();
+    assert_eq!(input, cp2k(settings).input(&silicon(), &remedies).unwrap());
+    assert_eq!(input.command, ["cp2k", "-i", "run.inp", "-o", "run.out"]);
+    String::from_utf8(input.files["run.inp"].clone()).unwrap()
+}
+
+fn parse(structure: &Structure, output: &str) -> Result<Option<Calculated>, Failure> {
+    output::parse(structure, output, "2023.1")
+}
+
+#[test]
+fn the_input_is_the_one_that_the_output_is_of() {
+    assert_eq!(input(settings(), &[]), INPUT);
+}
+
+#[test]
+fn remedies_change_nothing_that_the_accuracy_depends_on() {
+    let changed = input(settings(), &Remedy::ALL);
+    let restored = changed
+        .replace("MAX_SCF 600", "MAX_SCF 200")
+        .replace("PULAY_MIXING", "BROYDEN_MIXING")
+        .replace("ALPHA 0.1", "ALPHA 0.4")
+        .replace("NPULAY 16", "NBROYDEN 8")
+        .replace("MAGNETIZATION 0.5", "MAGNETIZATION 1.0");
+    assert_ne!(changed, INPUT);
+    assert_eq!(restored, INPUT);
+}
+
+#[test]
+fn meshes_hold_the_point_gamma() {
+    let mesh = |spacing| {
+        let text = input(Settings { k_spacing: spacing, ..settings() }, &[]);
+        text.lines().find(|line| line.contains("SCHEME")).map(|line| line.trim().to_owned())
+    };
+    assert_eq!(mesh(10.0), None);
+    assert_eq!(mesh(1.2).as_deref(), Some("SCHEME MACDONALD 2 2 2 0.25 0.25 0.25"));
+    assert_eq!(mesh(0.8).as_deref(), Some("SCHEME MACDONALD 3 3 3 0.0 0.0 0.0"));
+}
+
+#[test]
+fn what_changes_a_value_is_in_the_identity_and_nothing_else() {
+    let identity = |settings: Settings| cp2k(settings).identity();
+    let plain = identity(settings());
+    assert_eq!(identity(Settings { steps: 7, command: vec!["mpirun".into()], ..settings() }), plain);
+    assert_ne!(identity(Settings { relative_cutoff: 400.0, ..settings() }), plain);
+    let error = Settings { cutoff: 600.0, ..settings() }.prepare().unwrap_err().to_string();
+    assert_eq!(error, "cutoff: found 600, expected at least 1000");
+}
+
+#[test]
+fn an_output_is_a_label() {
+    let label = parse(&silicon(), OUTPUT).unwrap().unwrap();
+    let total = OUTPUT.split("Total energy:").nth(1).unwrap().split_whitespace().next().unwrap();
+    let total: f64 = total.parse().unwrap();
+    assert!((label.energy / HARTREE - total).abs() < 1e-9, "{label:?}");
+    assert!(label.energy_without_smearing.unwrap() > label.energy);
+    assert_eq!(label.forces.len(), 2);
+    // CP2K's trace, GPa, is that of a pressure.
+    let trace = OUTPUT.split("1/3 Trace").nth(1).unwrap().split_whitespace().next().unwrap();
+    let stress = label.stress.unwrap();
+    let pressure = -(stress[0][0] + stress[1][1] + stress[2][2]) / 3.0 * atoms::units::GPA_PER_EV_A3;
+    assert!((pressure - trace.parse::<f64>().unwrap()).abs() < 1e-6, "{pressure} {trace}");
+    assert_eq!(label.magnetic_moments.unwrap().len(), 2);
+    assert!(OUTPUT.contains(&format!("SCF run converged in {:5} steps", label.electronic_steps.unwrap())));
+}
+
+#[test]
+fn an_output_that_is_not_converged_is_no_label() {
+    let failure = parse(&silicon(), SHORT).unwrap_err();
+    assert_eq!(failure.class, FailureClass::NotConverged);
+    assert_eq!(failure.message, "not in 2 electronic steps");
+}
+
+#[test]
+fn an_output_of_something_else_is_implausible() {
+    let class = |structure: &Structure, output: &str| parse(structure, output).unwrap_err().class;
+    let mut moved = silicon();
+    moved.positions[1][0] += 1e-4;
+    assert_eq!(class(&moved, OUTPUT), FailureClass::Implausible);
+    let mut stretched = silicon();
+    stretched.cell.0[0][1] += 4e-4;
+    assert_eq!(class(&stretched, OUTPUT), FailureClass::Implausible);
+    let mut other = silicon();
+    other.species[0] = "Fe".parse().unwrap();
+    assert_eq!(class(&other, OUTPUT), FailureClass::Implausible);
+    assert_eq!(
+        class(&silicon(), &OUTPUT.replace("version 2023.1", "version 2024.1")),
+        FailureClass::Implausible
+    );
+}
+
+#[test]
+fn an_abort_is_told() {
+    let boxed = " *   ___    *\n *  /   \\   *\n * [ABORT]   *\n *  \\___/   found an unknown keyword NDIGITS   *\n *  O/| *\n * /| |   *\n ***************\n";
+    let failure = parse(&silicon(), boxed).unwrap_err();
+    assert_eq!(failure.class, FailureClass::Crashed);
+    assert_eq!(failure.message, "CP2K says: found an unknown keyword NDIGITS");
+}
+
+proptest! {
+    #[test]
+    fn an_output_that_is_cut_off_is_never_a_label(end in 0..OUTPUT.len(), from_the_end in 1..800_usize) {
+        for mut end in [end, OUTPUT.len() - from_the_end] {
+            while !OUTPUT.is_char_boundary(end) {
+                end -= 1;
+            }
+            prop_assert!(!matches!(parse(&silicon(), &OUTPUT[..end]), Ok(Some(_))), "cut at {end}");
+        }
+    }
+}

@@ -1,0 +1,49 @@
+//! CP2K. Coarse grids and the smallest basis, with which it stays itself.
+
+use dft::cp2k::Settings;
+use dft::{Code, FailureClass};
+
+use crate::run::{climb, label};
+use crate::{checks, structures};
+
+fn settings() -> Settings {
+    Settings {
+        basis: "SZV-MOLOPT-SR-GTH".into(),
+        cutoff: 3000.0,
+        relative_cutoff: 500.0,
+        density_tolerance: 1e-6,
+        vacuum: 4.0,
+        k_spacing: 10.0,
+        ..Settings::default()
+    }
+}
+
+#[test]
+fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
+    let code = settings().prepare().unwrap();
+    let structure = structures::oxygen();
+    let calculated = label(&code, &structure);
+    checks::magnet(&calculated, 2.0, 0.01);
+    assert_eq!(calculated.stress, None);
+    checks::forces(&code, &structure, &calculated, 2e-2);
+}
+
+#[test]
+fn the_stress_of_silicon_is_a_derivative_of_its_energy() {
+    // At Γ alone: what is checked is sign, unit and order.
+    let code =
+        Settings { spin: false, cutoff: 2000.0, relative_cutoff: 400.0, ..settings() }.prepare().unwrap();
+    let structure = structures::silicon();
+    let calculated = label(&code, &structure);
+    checks::stress(&code, &structure, &calculated, 2e-3);
+}
+
+#[test]
+fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
+    let few = Settings { steps: 6, ..settings() }.prepare().unwrap();
+    let (calculated, failures) = climb(&few, &structures::oxygen());
+    assert_eq!(failures, [FailureClass::NotConverged]);
+    let enough = settings().prepare().unwrap();
+    assert_eq!(few.identity(), enough.identity());
+    assert!((calculated.energy - label(&enough, &structures::oxygen()).energy).abs() < 1e-4);
+}
