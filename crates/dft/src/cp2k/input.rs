@@ -96,7 +96,8 @@ fn steps(settings: &Settings, spins: &Spins, remedies: &BTreeSet<Remedy>) -> Str
     let (alpha, history) = if has(Remedy::SlowerMixing) { (0.1, 16) } else { (0.4, 8) };
     let mixing = match has(Remedy::OtherAlgorithm) {
         false => format!("METHOD BROYDEN_MIXING\n        ALPHA {alpha:?}\n        NBROYDEN {history}"),
-        true => format!("METHOD PULAY_MIXING\n        ALPHA {alpha:?}\n        NPULAY {history}"),
+        // With a longer history, the residuals become linearly dependent, which CP2K does not survive.
+        true => format!("METHOD PULAY_MIXING\n        ALPHA {alpha:?}\n        NPULAY 4"),
     };
     let [up, down] = spins.empty;
     let empty = if settings.spin { format!("{up} {down}") } else { up.to_string() };

@@ -7,7 +7,7 @@
 //! Remedies:
 //! - more steps: three times as many;
 //! - slower mixing: a tenth of the new density is mixed in (0.4 otherwise), and 16 old ones count instead of 8;
-//! - another algorithm: Pulay's mixing instead of Broyden's;
+//! - another algorithm: Pulay's mixing of 4 old densities instead of Broyden's;
 //! - other moments: half of them to start from.
 
 mod data;

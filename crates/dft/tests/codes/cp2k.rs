@@ -1,9 +1,9 @@
 //! CP2K. Coarse grids and the smallest basis, with which it stays itself.
 
 use dft::cp2k::Settings;
-use dft::{Code, FailureClass};
+use dft::{Code, FailureClass, Remedy};
 
-use crate::run::{climb, label};
+use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
 
 fn settings() -> Settings {
@@ -35,15 +35,19 @@ fn the_stress_of_silicon_is_a_derivative_of_its_energy() {
         Settings { spin: false, cutoff: 2000.0, relative_cutoff: 400.0, ..settings() }.prepare().unwrap();
     let structure = structures::silicon();
     let calculated = label(&code, &structure);
-    checks::stress(&code, &structure, &calculated, 2e-3);
+    checks::stress(&code, &structure, &calculated, 1e-4);
 }
 
 #[test]
 fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
-    let few = Settings { steps: 6, ..settings() }.prepare().unwrap();
+    let few = Settings { steps: 12, ..settings() }.prepare().unwrap();
     let (calculated, failures) = climb(&few, &structures::oxygen());
     assert_eq!(failures, [FailureClass::NotConverged]);
     let enough = settings().prepare().unwrap();
     assert_eq!(few.identity(), enough.identity());
-    assert!((calculated.energy - label(&enough, &structures::oxygen()).energy).abs() < 1e-4);
+    // Whatever the remedies, the energy is the same.
+    let every = attempt(&enough, &structures::oxygen(), &Remedy::ALL.into()).unwrap();
+    for other in [label(&enough, &structures::oxygen()), every] {
+        assert!((calculated.energy - other.energy).abs() < 1e-4, "{calculated:?} {other:?}");
+    }
 }
