@@ -166,7 +166,14 @@ fn the_foundation_expansion_runs_once_its_files_are_there() {
 
 #[test]
 fn every_file_of_configs_is_run_by_a_test() {
-    let run = ["aluminium.toml", "foundation-expansion.toml", "md-aluminium.toml", "silicon.toml"];
+    // silicon-dft.toml with ABINIT: cargo test --test dft
+    let run = [
+        "aluminium.toml",
+        "foundation-expansion.toml",
+        "md-aluminium.toml",
+        "silicon-dft.toml",
+        "silicon.toml",
+    ];
     let entries =
         fs::read_dir(config("")).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
     let mut files: Vec<_> = entries.filter(|name| name.ends_with(".toml")).collect();
