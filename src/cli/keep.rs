@@ -1,5 +1,6 @@
 //! `calmwalk keep`
 
+use orchestrator::launcher;
 use workers::labeller::keep;
 
 use super::{Ended, Failure};
@@ -12,6 +13,7 @@ pub struct Keep {}
 
 impl Keep {
     pub fn run(self) -> Result<Ended, Failure> {
+        launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
         keep().map_err(Failure::failed)?;
         Ok(Ended::Done)
     }

@@ -7,8 +7,8 @@ use std::collections::BTreeSet;
 
 use common::*;
 use store::{
-    CalculationRecord, Completed, ExportFilter, ExportPlace, ExportSource, Failed, Fate, Imported, JobState,
-    LabelSource, Lease, Standing, Store, StoreError,
+    Archive, CalculationRecord, Completed, ExportFilter, ExportPlace, ExportSource, Failed, Fate, Imported,
+    JobState, Label, LabelDetails, LabelSource, Lease, Standing, Store, StoreError, Whereabouts,
 };
 use wire::{ContentHash, Origin};
 
@@ -365,4 +365,88 @@ async fn two_connections_never_lease_the_same_job() {
     }
     assert_eq!((all, distinct.len()), (60, 60));
     assert_eq!(store.status().await.unwrap().labels.labelled, 60);
+}
+
+/// A calculation that was taken over counts once, with the attempt that brought its result.
+#[tokio::test]
+async fn what_calculations_take_is_kept_and_counted_once() {
+    let home = Home::new();
+    let store = home.create().await.by_the_callers_clock();
+    let names = accept(&store, 2).await;
+    let made = CalculationRecord {
+        cores: Some(4),
+        remedies: Some("slower_mixing".into()),
+        difference: Some("INCAR: + AMIX = 0.1".into()),
+        atoms: Some(2),
+        electrons: Some(8.0),
+        k_points: Some(27),
+    };
+    let core_seconds =
+        async |now| (store.budget(now).await.unwrap().1.core_hours * 3600.0 * 1000.0).round() / 1000.0;
+    let first = lease(&store, "a", 0).await.unwrap();
+    store.record_calculation(&first, "here", &made).await.unwrap();
+    assert_eq!(core_seconds(3000).await, 12.0, "under way, on four cores");
+    assert_eq!(store.release_all("a", 3000).await.unwrap(), 1);
+    assert_eq!(core_seconds(3000).await, 12.0, "nobody knows more");
+    let second = lease(&store, "b", 3000).await.unwrap();
+    assert_eq!((second.earlier_calculations.as_slice(), second.attempt), (&["here".to_owned()][..], 2));
+    store.record_calculation(&second, "here", &made).await.unwrap();
+    assert_eq!(core_seconds(3000).await, 0.0);
+    store.account(&second, 17.25, "the end").await.unwrap();
+    let details = LabelDetails {
+        energy_without_smearing: Some(-3.25),
+        magnetic_moments: Some(vec![1.5, -1.5]),
+        magnetisation: Some(0.0),
+        electronic_steps: Some(12),
+    };
+    let label = Label { details, ..label(-3.0) };
+    store.complete(&second, &label, 5000).await.unwrap();
+    assert_eq!(core_seconds(5000).await, 17.25);
+    let shown = store.queue_show(&names[0]).await.unwrap();
+    assert_eq!(shown.attempts_made[1].made, made);
+    assert_eq!(shown.attempts_made[1].log.as_deref(), Some("the end"));
+    let hash = ContentHash::of(&second.structure);
+    assert_eq!(store.label_history(hash, protocol("dft").hash).await.unwrap()[0].label, label);
+
+    // Another time of a calculation that has ended changes the sum by the difference.
+    store.account(&second, 18.0, "the end").await.unwrap();
+    let third = lease(&store, "c", 6000).await.unwrap();
+    store.record_calculation(&third, "there", &made).await.unwrap();
+    store.account(&third, 1.5, "").await.unwrap();
+    assert_eq!(store.lose(&third, "lost_node", "gone", 9000).await.unwrap(), Failed::Requeued);
+    assert_eq!(core_seconds(9000).await, 19.5);
+    let fourth = lease(&store, "c", 9000).await.unwrap();
+    assert_eq!((fourth.failures.as_slice(), fourth.overruled), (&["lost_node".to_owned()][..], false));
+    let found = store.check(|_, _| ()).await.unwrap();
+    assert!(found.iter().all(|finding| !finding.what.contains("sum of")), "{found:?}");
+    assert_eq!(store.whereabouts(&third).await.unwrap(), Whereabouts::LeasedAgain { calculation: None });
+    assert_eq!(store.whereabouts(&fourth).await.unwrap(), Whereabouts::Held);
+    assert_eq!(store.whereabouts(&second).await.unwrap(), Whereabouts::Over);
+}
+
+#[tokio::test]
+async fn directories_of_calculations_are_kept_with_their_attempts() {
+    let home = Home::new();
+    let store = home.create().await;
+    accept(&store, 1).await;
+    let lease = lease(&store, "a", 0).await.unwrap();
+    store.record_calculation(&lease, "here", &CalculationRecord::default()).await.unwrap();
+    let past = async || store.past_calculation(lease.job, 1).await.unwrap().unwrap();
+    assert_eq!((past().await.wanted, past().await.calculation.as_deref()), (true, Some("here")));
+    for bytes in [&b"first"[..], b"second"] {
+        store.keep_archive(lease.job, lease.attempt, bytes, "work/large (5 bytes)\n").await.unwrap();
+    }
+    store.fail(&lease, "crashed", "", 1, 5).await.unwrap();
+    assert_eq!((past().await.wanted, past().await.failed), (false, true));
+    let archive =
+        Archive { attempt: 1, bytes: b"second".to_vec(), left_out: "work/large (5 bytes)\n".into() };
+    assert_eq!(store.archives(lease.job).await.unwrap(), [archive.clone()]);
+    assert_eq!(store.past_calculation(lease.job, 2).await.unwrap(), None);
+    // It goes with a copy, and so does what was used up.
+    let elsewhere = tempfile::tempdir().unwrap();
+    let target = elsewhere.path().join("copy");
+    store.backup(&target, 7, |_, _| ()).await.unwrap();
+    let copy = Store::open(&target).await.unwrap();
+    assert_eq!(copy.archives(lease.job).await.unwrap(), [archive]);
+    assert_eq!(copy.budget(9).await.unwrap(), store.budget(9).await.unwrap());
 }

@@ -120,7 +120,7 @@ impl CodeMethod {
     }
 
     /// Where calculations of this campaign are; what killed ones have left there is tidied up first.
-    async fn home(&self, store: &Store, closing: &Closing) -> Result<&Path, StoreError> {
+    pub(super) async fn home(&self, store: &Store, closing: &Closing) -> Result<&Path, StoreError> {
         let make = async || {
             let campaign = insist(closing, || store.campaign()).await?.id;
             let home = self.running.scratch().join(format!("calmwalk-{campaign}"));

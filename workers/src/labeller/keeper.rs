@@ -75,7 +75,8 @@ impl Default for KeeperCommand {
 impl KeeperCommand {
     pub(super) fn command(&self) -> Command {
         let mut command = Command::new(&self.program);
-        command.args(&self.arguments);
+        // People look for that name in lists of processes.
+        command.arg0(std::env::args_os().next().unwrap_or_else(|| "calmwalk".into())).args(&self.arguments);
         command
     }
 }

@@ -54,6 +54,14 @@ impl Method {
         }
     }
 
+    /// Makes room for calculations, and clears away what killed labellers have left.
+    pub(super) async fn begin(&self, store: &Store, closing: &Closing) -> Result<(), StoreError> {
+        match self {
+            Self::Reference(_) => Ok(()),
+            Self::Code(method) => method.home(store, closing).await.map(drop),
+        }
+    }
+
     /// Leaves the calculation in hand to whoever waits for it as well.
     pub(super) fn let_go(&self) {
         if let Self::Code(method) = self {

@@ -127,6 +127,7 @@ pub async fn run(
     tell: impl Fn(&str),
 ) -> Result<(), StoreError> {
     let mut idle = Duration::ZERO;
+    method.begin(&store, closing).await?;
     loop {
         let wanted = closing.wanted();
         if wanted.stop {

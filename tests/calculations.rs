@@ -1,0 +1,156 @@
+//! Labels by another program in a real campaign, while everybody who works on them is killed.
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use common::campaign::{Small, outcome_at};
+use common::place::{Place, on_store};
+use common::processes::{carrying_out, processes_in, signal, wait_until};
+use store::{ExportFilter, Store};
+
+/// Leaves no label before half a second is over, and starts what never ends by itself.
+const SCRIPT: &str = r#"
+sleep 1000 &
+setsid sleep 1000 &
+sleep 0.5
+awk '
+    NR == 1 { print; next }
+    NR == 2 { sub(/Properties=[^ ]*/, "Properties=species:S:1:pos:R:3:forces:R:3"); print $0 " energy=-1.5"; next }
+    { print $0, 0.25, 0, 0 }
+' structure.extxyz > unfinished
+mv unfinished label.extxyz
+"#;
+
+/// Programs may be killed so often: each time counts as a failure of a job, which has two rungs.
+const PROGRAMS: usize = 2;
+const KILLS: usize = 24;
+
+/// Who is killed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Victim {
+    Label,
+    Labeller,
+    Keeper,
+    Program,
+    Child,
+}
+use Victim::{Child, Keeper, Label, Labeller, Program};
+
+/// The same numbers in each run.
+struct Random(u64);
+
+impl Random {
+    fn below(&mut self, limit: usize) -> usize {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 33) as usize % limit
+    }
+}
+
+/// A campaign whose labels are made by [`SCRIPT`], below `scratch`.
+fn place(scratch: &Path) -> Place {
+    let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
+    let keys = format!(
+        "[label]\nslots = 0\nattempts = 20\nscratch = {:?}\nmethod = {command} # ",
+        scratch.display().to_string()
+    );
+    let small = Small { walkers: 1, steps: 120, ..Small::default() };
+    let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
+    fs::write(place.path().join("label.sh"), SCRIPT).unwrap();
+    place
+}
+
+/// Process numbers of what calculations below `scratch` have started, with the command.
+fn calculating(scratch: &Path) -> Vec<(u32, String)> {
+    let mark = format!("CALMWALK_CALCULATION={}/", scratch.display());
+    let numbers = fs::read_dir("/proc").unwrap().flatten();
+    let numbers = numbers.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+    let marked = |pid: u32| {
+        let environment = fs::read(format!("/proc/{pid}/environ")).ok()?;
+        let command = fs::read_to_string(format!("/proc/{pid}/cmdline")).ok()?.replace('\0', " ");
+        String::from_utf8_lossy(&environment).contains(&mark).then_some((pid, command))
+    };
+    numbers.filter_map(marked).collect()
+}
+
+fn directories(scratch: &Path) -> Vec<PathBuf> {
+    let campaigns = fs::read_dir(scratch).unwrap().map(|entry| entry.unwrap().path());
+    campaigns
+        .flat_map(|campaign| fs::read_dir(campaign).unwrap())
+        .map(|entry| entry.unwrap().path())
+        .collect()
+}
+
+/// Those who can be killed now.
+fn victims(place: &Place, scratch: &Path, who: Victim) -> Vec<u32> {
+    let started = |what: &str| {
+        let all = calculating(scratch).into_iter();
+        all.filter(|(_, command)| command.starts_with(what)).map(|(pid, _)| pid).collect()
+    };
+    match who {
+        Label => carrying_out(place.path(), "label"),
+        Labeller => carrying_out(place.path(), "labeller"),
+        Keeper => carrying_out(place.path(), "keep"),
+        Program => started("sh label.sh"),
+        Child => started("sleep 1000"),
+    }
+}
+
+/// Each label once, and no other result beside it.
+async fn are_single(store: &Store) -> usize {
+    let protocol = store.protocols().await.unwrap()[0].hash;
+    let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+    let rows = store.labelled(&filter, None, u32::MAX).await.unwrap();
+    for row in &rows {
+        let structure = wire::ContentHash::of(&row.structure);
+        assert_eq!(store.label_history(structure, protocol).await.unwrap().len(), 1);
+        assert_eq!((row.label.energy, row.label.forces[0]), (-1.5, [0.25, 0.0, 0.0]));
+    }
+    assert_eq!(store.check(|_, _| ()).await.unwrap(), []);
+    rows.len()
+}
+
+#[test]
+fn each_label_comes_once_whoever_is_killed() {
+    let scratch = tempfile::tempdir().unwrap();
+    let (scratch, mut random) = (scratch.path().canonicalize().unwrap(), Random(11));
+    let place = place(&scratch);
+    let mut run = place.run();
+    let slots = ["--slots", "2", "--wait", "2"];
+    let mut label = place.label(&slots);
+    let (mut killed, begun) = (BTreeMap::<Victim, usize>::new(), Instant::now());
+    while run.0.try_wait().unwrap().is_none() {
+        assert!(begun.elapsed() < Duration::from_secs(240), "{}", place.said());
+        std::thread::sleep(Duration::from_millis(50 + random.below(200) as u64));
+        if label.0.try_wait().unwrap().is_some() {
+            label = place.label(&slots);
+        }
+        let who = [Label, Labeller, Keeper, Program, Child][random.below(5)];
+        let found = victims(&place, &scratch, who);
+        let enough = killed.values().sum::<usize>() >= KILLS
+            || (who == Program && killed.get(&Program).is_some_and(|times| *times >= PROGRAMS));
+        if !found.is_empty() && !enough {
+            signal(found[random.below(found.len())], "KILL");
+            *killed.entry(who).or_default() += 1;
+        }
+    }
+    assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    assert!(killed.len() == 5, "{killed:?} {}", place.said());
+    // The last labellers leave by themselves.
+    label.0.wait().unwrap();
+    outcome_at(place.argument(), place.path());
+    assert!(on_store(place.location(), are_single) > 2);
+    wait_until("nobody is left", || processes_in(place.path()).is_empty());
+
+    // What a killed one has only just made is cleared away by those who come later.
+    for directory in directories(&scratch) {
+        let touched = Command::new("touch").args(["-d", "2 minutes ago"]).arg(directory).status();
+        assert!(touched.unwrap().success());
+    }
+    assert_eq!(place.label(&["--until-empty"]).0.wait().unwrap().code(), Some(0), "{}", place.said());
+    assert_eq!((calculating(&scratch), directories(&scratch)), (vec![], vec![]), "{killed:?}");
+}
