@@ -392,9 +392,9 @@ async fn classes_of_failures(transaction: &mut Transaction, job: i64, failures: 
     let all: Vec<(String, String)> = query(sql).bind(job).fetch_all(&mut *transaction).await?;
     let mut left = failures;
     let counted = all.into_iter().take_while(|(_, outcome)| {
-        let counts = left > 0;
-        left -= u32::from(counts && outcome == "failed");
-        counts
+        let is_earlier = outcome == "failed" && left == 0;
+        left = left.saturating_sub(u32::from(outcome == "failed"));
+        !is_earlier
     });
     let mut classes: Vec<String> = counted.map(|(class, _)| class).collect();
     classes.reverse();
