@@ -18,6 +18,7 @@ mod jobs;
 mod location;
 mod lock;
 mod numbers;
+mod outcomes;
 mod postgres;
 mod processes;
 pub mod records;
@@ -41,6 +42,7 @@ pub use jobs::{
 pub use location::{Location, ServerUrl};
 pub use lock::{CampaignLock, LOCK};
 pub use numbers::NumbersError;
+pub use outcomes::{FailureCount, Finished, LabelCost, NearLabel, Range, Unlabelled, Waiting, Work};
 pub use processes::{ProcessRecord, this_host};
 pub use records::*;
 pub use sqlite::DATABASE;

@@ -6,7 +6,7 @@ use wire::CampaignId;
 use super::*;
 use crate::Store;
 use crate::records::{Campaign, Commit, ComponentRecord};
-use crate::tables::{by_hand, export, labels, queue, status};
+use crate::tables::{by_hand, export, labels, outcomes, queue, status};
 
 /// The store in a directory, and its file.
 async fn store(directory: &Path) -> (Store, DatabaseFile) {
@@ -44,6 +44,8 @@ async fn what_is_asked_often_goes_through_indexes() {
         export::CANDIDATES,
         export::IMPORTS,
         labels::CURRENT,
+        outcomes::AT_WORK,
+        outcomes::FINISHED,
     ] {
         let plan = plan(&file, sql).await.replace("SCAN CONSTANT ROW", "");
         assert!(!plan.contains("SCAN") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");

@@ -8,6 +8,8 @@ pub mod export;
 mod imports;
 pub mod labels;
 pub mod logs;
+mod near;
+pub mod outcomes;
 pub mod processes;
 pub mod protocols;
 pub mod queue;

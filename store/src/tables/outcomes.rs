@@ -1,0 +1,187 @@
+//! What became of label jobs: what the cost model, `status` and the table of force errors read.
+
+use wire::ContentHash;
+
+use super::protocols;
+use super::restore::{grades, origin};
+use crate::Store;
+use crate::database::{FromRow, Row, query};
+use crate::error::Result;
+use crate::outcomes::{FailureCount, Finished, LabelCost, Range, Unlabelled, Waiting, Work};
+
+/// The newest first: what labels cost may change with the machine.
+pub(crate) const COSTS: &str =
+    "SELECT attempt.*, candidate.seed_structure, candidate.formula, candidate.atoms AS size
+    FROM label CROSS JOIN attempt ON attempt.job = label.job AND attempt.attempt = label.attempt
+    CROSS JOIN job ON job.number = label.job CROSS JOIN candidate ON candidate.decision = job.decision
+    WHERE label.protocol = $1 ORDER BY label.number DESC LIMIT $2";
+
+pub(crate) const WAITING: &str = "SELECT seed_structure, formula, atoms, count(*)
+    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
+    WHERE job.state IN ('queued', 'leased') AND job.protocol = $1 GROUP BY seed_structure, formula, atoms";
+
+pub(crate) const AT_WORK: &str =
+    "SELECT attempt.* FROM job CROSS JOIN attempt ON attempt.job = job.number AND attempt.attempt = job.attempts
+    WHERE job.state = 'leased'";
+
+pub(crate) const CLASSES: &str = "SELECT class,
+        count(DISTINCT CASE WHEN state = 'labelled' THEN job.number END),
+        count(DISTINCT CASE WHEN state = 'failed' THEN job.number END),
+        count(DISTINCT CASE WHEN state IN ('queued', 'leased') THEN job.number END)
+    FROM attempt CROSS JOIN job ON job.number = attempt.job
+    WHERE class IS NOT NULL AND job.protocol = $1 GROUP BY class ORDER BY class";
+
+pub(crate) const UNLABELLED: &str = "SELECT coalesce(name, '') AS seed_name, formula,
+        CAST(sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) AS BIGINT) AS failed,
+        CAST(sum(CASE WHEN state = 'labelled' THEN 1 ELSE 0 END) AS BIGINT) AS labelled,
+        min(CASE WHEN state = 'failed' THEN original_gamma END) AS gamma_low,
+        max(CASE WHEN state = 'failed' THEN original_gamma END) AS gamma_high,
+        min(CASE WHEN state = 'failed' THEN relative_volume END) AS volume_low,
+        max(CASE WHEN state = 'failed' THEN relative_volume END) AS volume_high,
+        min(CASE WHEN state = 'labelled' THEN original_gamma END) AS labelled_gamma_low,
+        max(CASE WHEN state = 'labelled' THEN original_gamma END) AS labelled_gamma_high,
+        min(CASE WHEN state = 'labelled' THEN relative_volume END) AS labelled_volume_low,
+        max(CASE WHEN state = 'labelled' THEN relative_volume END) AS labelled_volume_high
+    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
+    LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
+    WHERE job.state IN ('failed', 'labelled') AND job.protocol = $1
+    GROUP BY candidate.seed_structure, name, formula
+    HAVING sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) > 0
+    ORDER BY candidate.seed_structure, formula";
+
+pub(crate) const FINISHED: &str =
+    "SELECT candidate.decision AS decision, id, state, origin, coalesce(name, '') AS seed_name, formula,
+        original_gamma, original_gamma_nbr, relative_volume,
+        CASE WHEN state = 'failed' THEN original_grades END AS unlabelled,
+        CASE WHEN state = 'failed' THEN (SELECT class FROM attempt WHERE attempt.job = job.number
+                                         AND attempt.attempt = job.attempts) END AS class
+    FROM candidate CROSS JOIN job ON job.structure = candidate.structure AND job.protocol = $2
+    CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
+    LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
+    WHERE candidate.decision > $1 AND job.state IN ('labelled', 'failed')
+    ORDER BY candidate.decision LIMIT $3";
+
+/// A label takes some time, whatever the clock says.
+const LEAST_MILLISECONDS: i64 = 1;
+
+impl Store {
+    /// What the newest labels took that were made by this protocol, `limit` at most.
+    pub async fn label_costs(&self, protocol: ContentHash, limit: u32) -> Result<Vec<LabelCost>> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let costs = query(COSTS).bind(protocol).bind(limit).fetch_all(&mut transaction).await?;
+        transaction.commit().await?;
+        Ok(costs)
+    }
+
+    /// The jobs of this protocol that have no label yet and may get one, by their sizes.
+    pub async fn waiting_jobs(&self, protocol: ContentHash) -> Result<Vec<Waiting>> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let rows: Vec<(u32, String, u32, u64)> =
+            query(WAITING).bind(protocol).fetch_all(&mut transaction).await?;
+        transaction.commit().await?;
+        let waiting =
+            |(seed_structure, formula, atoms, jobs)| Waiting { seed_structure, formula, atoms, jobs };
+        Ok(rows.into_iter().map(waiting).collect())
+    }
+
+    /// What attempts have used, and how many cores are at work now.
+    pub async fn label_work(&self) -> Result<Work> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let milliseconds = query("SELECT value FROM campaign WHERE key = 'core_milliseconds'");
+        let milliseconds: Option<String> = milliseconds.fetch_optional(&mut transaction).await?;
+        let mut cores = 0;
+        for row in query(AT_WORK).rows(&mut transaction).await? {
+            cores += row.get_or_default::<Option<u64>>("cores")?.unwrap_or(1);
+        }
+        transaction.commit().await?;
+        let milliseconds = milliseconds.and_then(|text| text.parse::<f64>().ok());
+        Ok(Work { core_seconds: milliseconds.map(|milliseconds| milliseconds / 1000.0), cores })
+    }
+
+    /// The failures that attempts of this protocol met, by class.
+    pub async fn failures(&self, protocol: ContentHash) -> Result<Vec<FailureCount>> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let rows: Vec<(String, u64, u64, u64)> =
+            query(CLASSES).bind(protocol).fetch_all(&mut transaction).await?;
+        transaction.commit().await?;
+        let count =
+            |(class, labelled, given_up, unfinished)| FailureCount { class, labelled, given_up, unfinished };
+        Ok(rows.into_iter().map(count).collect())
+    }
+
+    /// What is unlabelled because labels of this protocol finally failed, by seed structure and formula.
+    pub async fn unlabelled(&self, protocol: ContentHash) -> Result<Vec<Unlabelled>> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let rows = query(UNLABELLED).bind(protocol).fetch_all(&mut transaction).await?;
+        transaction.commit().await?;
+        Ok(rows)
+    }
+
+    /// At most `limit` candidates whose jobs of this protocol have come to their ends, labelled or failed, behind the decision
+    /// `after` (0: from the first on). An empty page is the end.
+    pub async fn finished(&self, protocol: ContentHash, after: i64, limit: u32) -> Result<Vec<Finished>> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let page = query(FINISHED).bind(after).bind(protocol).bind(limit);
+        let page = page.fetch_all(&mut transaction).await?;
+        transaction.commit().await?;
+        Ok(page)
+    }
+}
+
+impl FromRow for LabelCost {
+    fn from_row(row: &Row) -> Result<Self> {
+        let (started, ended): (i64, Option<i64>) = (row.get("started")?, row.get("ended")?);
+        let cores = row.get_or_default::<Option<u32>>("cores")?.unwrap_or(1);
+        let milliseconds = ended.unwrap_or(started).saturating_sub(started).max(LEAST_MILLISECONDS);
+        let by_the_clock = milliseconds as f64 / 1000.0 * f64::from(cores);
+        Ok(Self {
+            seed_structure: row.get("seed_structure")?,
+            formula: row.get("formula")?,
+            atoms: row.get("size")?,
+            electrons: row.get_or_default("electrons")?,
+            k_points: row.get_or_default("k_points")?,
+            core_seconds: row.get_or_default::<Option<f64>>("core_seconds")?.unwrap_or(by_the_clock),
+        })
+    }
+}
+
+impl FromRow for Unlabelled {
+    fn from_row(row: &Row) -> Result<Self> {
+        let range = |low, high| -> Result<Range> { Ok(Range { low: row.get(low)?, high: row.get(high)? }) };
+        Ok(Self {
+            seed_structure: row.get("seed_name")?,
+            formula: row.get("formula")?,
+            failed: row.get("failed")?,
+            labelled: row.get("labelled")?,
+            gamma: range("gamma_low", "gamma_high")?,
+            gamma_labelled: range("labelled_gamma_low", "labelled_gamma_high")?,
+            relative_volume: range("volume_low", "volume_high")?,
+            relative_volume_labelled: range("labelled_volume_low", "labelled_volume_high")?,
+        })
+    }
+}
+
+impl FromRow for Finished {
+    fn from_row(row: &Row) -> Result<Self> {
+        let labelled = row.get::<String>("state")? == "labelled";
+        let unlabelled: Option<Vec<u8>> = row.get("unlabelled")?;
+        Ok(Self {
+            decision: row.get("decision")?,
+            candidate: row.get("id")?,
+            labelled,
+            origin: origin(&row.get::<String>("origin")?)?,
+            seed_structure: row.get("seed_name")?,
+            formula: row.get("formula")?,
+            gamma: row.get("original_gamma")?,
+            gamma_nbr: row.get("original_gamma_nbr")?,
+            relative_volume: row.get("relative_volume")?,
+            class: row.get("class")?,
+            unlabelled: if labelled { None } else { Some(grades(unlabelled.as_deref())?) },
+        })
+    }
+}

@@ -1,0 +1,112 @@
+//! What became of label jobs, as the cost model, `status` and the table of force errors read it.
+
+#[path = "common/mod.rs"]
+mod common;
+
+use common::*;
+use store::{FailureCount, Fate, Lease, Range, Store, Waiting, Work};
+use wire::{Candidate, CandidateBlock, ContentHash, Origin};
+
+async fn lease(store: &Store, now: i64) -> Lease {
+    store.lease(protocol("dft").hash, "a", now, 1000).await.unwrap().unwrap()
+}
+
+/// Accepts a structure with this largest γ under the original mixture, and V/V₀.
+async fn accept_with(store: &Store, step: u64, gamma: f64, relative_volume: f64) -> String {
+    let mut record = candidate(0, step, Origin::Biased, Fate::Accepted);
+    let candidate = Candidate { relative_volume, ..record.block.view().to_candidate() };
+    record.block = CandidateBlock::encode(&candidate);
+    record.original.gamma[0] = gamma;
+    store.commit(&commit_of(vec![record.clone()])).await.unwrap();
+    name_of(&record)
+}
+
+/// Three labels, of which the second takes two attempts; two that fail for good, and one that waits.
+async fn filled(home: &Home) -> (Store, Vec<String>) {
+    let store = home.create().await.by_the_callers_clock();
+    let mut names = Vec::new();
+    for (step, gamma, volume) in
+        [(1, 1.5, 1.0), (2, 1.6, 1.1), (3, 1.7, 1.2), (4, 4.0, 1.4), (5, 3.0, 1.35), (6, 2.0, 1.3)]
+    {
+        names.push(accept_with(&store, step, gamma, volume).await);
+    }
+    let first = lease(&store, 0).await;
+    store.complete(&first, &label(-1.0), 2_000).await.unwrap();
+    let second = lease(&store, 2_000).await;
+    store.fail(&second, "not_converged", "60 steps", 2, 7_000).await.unwrap();
+    let second = lease(&store, 7_000).await;
+    store.complete(&second, &label(-2.0), 11_000).await.unwrap();
+    let third = lease(&store, 11_000).await;
+    store.complete(&third, &label(-3.0), 19_000).await.unwrap();
+    for class in ["crashed", "not_converged"] {
+        let failing = lease(&store, 20_000).await;
+        store.fail(&failing, class, "", 1, 21_000).await.unwrap();
+    }
+    (store, names)
+}
+
+#[tokio::test]
+async fn costs_are_those_of_the_attempts_that_brought_labels() {
+    let home = Home::new();
+    let (store, _) = filled(&home).await;
+    let costs = store.label_costs(protocol("dft").hash, 10).await.unwrap();
+    let seconds: Vec<_> = costs.iter().map(|cost| cost.core_seconds).collect();
+    assert_eq!(seconds, [8.0, 4.0, 2.0], "newest first");
+    assert_eq!((costs[0].atoms, costs[0].formula.as_str(), costs[0].seed_structure), (2, "Si2", 0));
+    assert_eq!(store.label_costs(protocol("dft").hash, 1).await.unwrap(), costs[..1]);
+    let waiting = store.waiting_jobs(protocol("dft").hash).await.unwrap();
+    assert_eq!(waiting, [Waiting { seed_structure: 0, formula: "Si2".into(), atoms: 2, jobs: 1 }]);
+    assert_eq!(store.label_work().await.unwrap().cores, 0);
+    lease(&store, 30_000).await;
+    assert_eq!(store.label_work().await.unwrap(), Work { cores: 1, ..store.label_work().await.unwrap() });
+}
+
+#[tokio::test]
+async fn failures_are_counted_by_class_and_by_what_became_of_the_job() {
+    let home = Home::new();
+    let (store, _) = filled(&home).await;
+    let found = store.failures(protocol("dft").hash).await.unwrap();
+    let count = |class: &str, labelled, given_up| FailureCount {
+        class: class.into(),
+        labelled,
+        given_up,
+        unfinished: 0,
+    };
+    assert_eq!(found, [count("crashed", 0, 1), count("not_converged", 1, 1)]);
+}
+
+#[tokio::test]
+async fn what_failed_is_a_part_of_the_collected_space() {
+    let home = Home::new();
+    let (store, names) = filled(&home).await;
+    let unlabelled = store.unlabelled(protocol("dft").hash).await.unwrap();
+    let [only] = unlabelled.as_slice() else { panic!("{unlabelled:?}") };
+    assert_eq!((only.seed_structure.as_str(), only.formula.as_str()), ("diamond", "Si2"));
+    assert_eq!((only.failed, only.labelled), (2, 3));
+    let range = |low, high| Range { low: Some(low), high: Some(high) };
+    assert_eq!((only.gamma, only.gamma_labelled), (range(3.0, 4.0), range(1.5, 1.7)));
+    assert_eq!((only.relative_volume, only.relative_volume_labelled), (range(1.35, 1.4), range(1.0, 1.2)));
+
+    // Page by page, whatever its length.
+    let (mut after, mut jobs) = (0, Vec::new());
+    loop {
+        let page = store.finished(protocol("dft").hash, after, 2).await.unwrap();
+        let Some(last) = page.last() else { break };
+        after = last.decision;
+        jobs.extend(page);
+    }
+    let seen: Vec<_> = jobs.iter().map(|job| (job.candidate.as_str(), job.labelled, job.gamma)).collect();
+    let expected = [1.5, 1.6, 1.7, 4.0, 3.0];
+    assert_eq!(seen.len(), 5, "{seen:?}");
+    for (k, (name, labelled, gamma)) in seen.into_iter().enumerate() {
+        assert_eq!((name, labelled, gamma), (names[k].as_str(), k < 3, Some(expected[k])));
+    }
+    assert_eq!((jobs[0].class.as_deref(), jobs[3].class.as_deref()), (None, Some("crashed")));
+    assert!(jobs[1].unlabelled.is_none());
+    assert_eq!(jobs[3].unlabelled.as_ref().unwrap().gamma, [4.0, 0.8]);
+    // Of a protocol without jobs nothing is told.
+    store.add_protocol(&protocol("other"), 0).await.unwrap();
+    assert!(store.finished(protocol("other").hash, 0, 9).await.unwrap().is_empty());
+    assert!(store.unlabelled(protocol("other").hash).await.unwrap().is_empty());
+    assert!(store.unlabelled(ContentHash([9; 32])).await.is_err());
+}
