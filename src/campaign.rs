@@ -81,6 +81,20 @@ impl Campaign {
         MethodSetup::of(&self.config.label)
     }
 
+    /// What the label of each seed structure depends on in its cost. A program must be there.
+    pub fn label_sizes(&self) -> Result<Vec<dft::Size>, Failure> {
+        let structures = self.seeds.iter().map(|seed| &seed.seed.structure);
+        Ok(match &self.config.label.method {
+            LabelMethod::Reference(_) => structures
+                .map(|structure| dft::Size { atoms: structure.len(), electrons: 0.0, k_points: 1 })
+                .collect(),
+            LabelMethod::Code(settings) => {
+                let code = settings.prepare().map_err(|error| Failure::Input(error.to_string()))?;
+                structures.map(|structure| code.size(structure)).collect()
+            }
+        })
+    }
+
     /// Where the files are that grades depend on, by the keys of the configuration.
     pub fn grade_files(&self) -> Value {
         let calm = &self.config.calm;

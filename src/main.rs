@@ -2,6 +2,7 @@
 //! gradient of the CALM extrapolation grade, a selector decides what is new, and what is new is labelled.
 
 mod actors;
+mod bill;
 mod budget;
 mod campaign;
 mod cli;
@@ -10,12 +11,14 @@ mod forecast;
 mod frames;
 mod interrupt;
 mod labelling;
+mod learned;
 mod outcome;
 mod output;
 mod progress;
 mod replay;
 mod setup;
 mod summary;
+mod unlabelled;
 mod whole_file;
 
 use std::process::ExitCode;

@@ -2,35 +2,25 @@
 
 use std::fmt;
 
-use atoms::cell::{norm, sub};
 use calm::watch::GradeDistribution;
-use store::{ExportFilter, ExportSource, Status, Store, StoreError};
-use wire::{ContentHash, Origin};
+use store::{Status, Store, StoreError, Unlabelled};
+use wire::ContentHash;
 
 use crate::budget;
+use crate::learned::{self, Grades, Learned};
+use crate::output::decimals;
+use crate::unlabelled;
 
-/// Rows read from the store at a time.
-const PAGE: u32 = 256;
-
-/// Grades and force errors of labelled atoms, of one origin.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct ForceErrors {
-    /// Labelled structures.
-    pub structures: usize,
-    /// |F_model − F_label| of every atom, eV/Å.
-    pub errors: Vec<f64>,
-    /// γ under the original mixture.
-    pub gamma: Vec<f64>,
-    /// γ_nbr under the original mixture.
-    pub gamma_nbr: Vec<f64>,
-}
+/// Seed structures with failed labels that are shown.
+const SHOWN: usize = 8;
 
 /// A finished campaign.
 #[derive(Clone, Debug)]
 pub struct Summary {
     status: Status,
-    biased: ForceErrors,
-    control: ForceErrors,
+    learned: Learned,
+    /// Where labels finally failed.
+    unlabelled: Vec<Unlabelled>,
     /// Grades of the training frames under the newest mixture, if they are watched.
     training: Option<GradeDistribution>,
 }
@@ -38,27 +28,12 @@ pub struct Summary {
 /// Gathers the summary of a campaign, with the labels of one protocol.
 pub async fn of(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
     let status = store.status().await?;
-    let (mut biased, mut control) = (ForceErrors::default(), ForceErrors::default());
-    let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
-    let mut after = None;
-    loop {
-        let page = store.labelled(&filter, after, PAGE).await?;
-        let Some(last) = page.last() else { break };
-        after = Some(last.place);
-        for row in &page {
-            let ExportSource::Candidate { origin, block, original, .. } = &row.source else { continue };
-            let into = if *origin == Origin::Biased { &mut biased } else { &mut control };
-            let pairs = block.view().forces.iter().zip(&row.label.forces);
-            into.structures += 1;
-            into.errors.extend(pairs.map(|(model, label)| norm(sub(*model, *label))));
-            into.gamma.extend(&original.gamma);
-            into.gamma_nbr.extend(&original.gamma_nbr);
-        }
-    }
+    let learned = learned::of(store, protocol).await?;
+    let unlabelled = store.unlabelled(protocol).await?;
     let values = store.values().await?;
     let watched = values.iter().find(|(name, _)| name == "training_frames");
     let watched: Option<GradeDistribution> = watched.and_then(|(_, text)| serde_json::from_str(text).ok());
-    Ok(Summary { status, biased, control, training: watched })
+    Ok(Summary { status, learned, unlabelled, training: watched })
 }
 
 impl fmt::Display for Summary {
@@ -88,8 +63,9 @@ impl fmt::Display for Summary {
         writeln!(
             f,
             "labels           {} biased and {} control structures labelled, {} failed, {} dropped",
-            self.biased.structures, self.control.structures, labels.failed, labels.dropped
+            self.learned.biased.structures, self.learned.control.structures, labels.failed, labels.dropped
         )?;
+        write!(f, "{}", unlabelled::shown(&self.unlabelled, 17, SHOWN))?;
         if let Some(budget) = budget::shown(&self.status.budget) {
             writeln!(f, "budget           {budget}")?;
         }
@@ -102,70 +78,31 @@ impl fmt::Display for Summary {
             )?;
         }
         writeln!(f, "force error of the potential against the grade of the original mixture:")?;
-        writeln!(f, "           atoms   mean error   γ > 1   γ_nbr > 1   ρ(γ, error)   ρ(γ_nbr, error)")?;
-        writeln!(f, "  biased   {}", self.biased)?;
-        writeln!(f, "  control  {}", self.control)
-    }
-}
-
-impl fmt::Display for ForceErrors {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let n = self.errors.len();
-        if n == 0 {
-            return write!(f, "no labelled structures");
-        }
-        let share = |grades: &[f64]| 100.0 * grades.iter().filter(|x| **x > 1.0).count() as f64 / n as f64;
-        write!(
+        writeln!(
             f,
-            "{n:>5}   {:.3} eV/Å   {:>4.0} %      {:>4.0} %   {:>11.2}   {:>15.2}",
-            self.errors.iter().sum::<f64>() / n as f64,
-            share(&self.gamma),
-            share(&self.gamma_nbr),
-            spearman(&self.gamma, &self.errors),
-            spearman(&self.gamma_nbr, &self.errors)
-        )
+            "           atoms   mean error   γ > 1   γ_nbr > 1   ρ(γ, error)   ρ(γ_nbr, error)   ROC-AUC(γ)   ROC-AUC(γ_nbr)"
+        )?;
+        writeln!(f, "  biased   {}", line(&self.learned.biased))?;
+        writeln!(f, "  control  {}", line(&self.learned.control))
     }
 }
 
-/// Spearman's ρ: Pearson's correlation of the ranks, equal values sharing their mean rank. NaN below two values or
-/// without any spread.
-pub fn spearman(a: &[f64], b: &[f64]) -> f64 {
-    let (a, b) = (ranks(a), ranks(b));
-    let mean = |x: &[f64]| x.iter().sum::<f64>() / x.len() as f64;
-    let (mean_a, mean_b) = (mean(&a), mean(&b));
-    let (mut covariance, mut variance_a, mut variance_b) = (0.0, 0.0, 0.0);
-    for (x, y) in a.iter().zip(&b) {
-        covariance += (x - mean_a) * (y - mean_b);
-        variance_a += (x - mean_a).powi(2);
-        variance_b += (y - mean_b).powi(2);
+/// A line of numbers.
+fn line(grades: &Grades) -> String {
+    let Grades { gamma, gamma_nbr, .. } = grades;
+    if gamma.atoms() == 0 {
+        return "no labelled structures".to_owned();
     }
-    covariance / (variance_a * variance_b).sqrt()
-}
-
-fn ranks(values: &[f64]) -> Vec<f64> {
-    let mut order: Vec<_> = (0..values.len()).collect();
-    order.sort_by(|i, j| values[*i].total_cmp(&values[*j]));
-    let mut ranks = vec![0.0; values.len()];
-    let mut first = 0;
-    for run in order.chunk_by(|i, j| values[*i] == values[*j]) {
-        let rank = first as f64 + 0.5 * (run.len() - 1) as f64;
-        run.iter().for_each(|i| ranks[*i] = rank);
-        first += run.len();
-    }
-    ranks
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn spearman_is_that_of_the_ranks() {
-        assert!((spearman(&[1.0, 2.0, 3.0], &[1.0, 10.0, 1000.0]) - 1.0).abs() < 1e-15);
-        assert!((spearman(&[1.0, 2.0, 3.0], &[3.0, 2.0, -1.0]) + 1.0).abs() < 1e-15);
-        // scipy.stats.spearmanr([1, 2, 2, 4, 5], [2, 1, 3, 3, 5]) = 0.763157894736842
-        let tied = spearman(&[1.0, 2.0, 2.0, 4.0, 5.0], &[2.0, 1.0, 3.0, 3.0, 5.0]);
-        assert!((tied - 0.763_157_894_736_842).abs() < 1e-14, "{tied}");
-        assert!(spearman(&[1.0], &[1.0]).is_nan());
-    }
+    let percent = |share: Option<f64>| decimals(share.map(|share| 100.0 * share), 0);
+    format!(
+        "{:>5}   {} eV/Å   {:>4} %      {:>4} %   {:>11}   {:>15}   {:>10}   {:>14}",
+        gamma.atoms(),
+        decimals(gamma.mean(), 3),
+        percent(gamma.share_above(1.0)),
+        percent(gamma_nbr.share_above(1.0)),
+        decimals(gamma.spearman(), 2),
+        decimals(gamma_nbr.spearman(), 2),
+        decimals(gamma.roc_auc(), 2),
+        decimals(gamma_nbr.roc_auc(), 2),
+    )
 }

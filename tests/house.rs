@@ -16,7 +16,7 @@ const HOUSE: [(&str, &str, &[&str]); 12] = [
     ("analysis", "crates/analysis", &[]),
     ("wire", "crates/wire", &["atoms", "calm"]),
     ("store", "store", &["atoms", "wire"]),
-    ("workers", "workers", &["atoms", "calm", "potentials", "md", "dft", "wire", "store"]),
+    ("workers", "workers", &["atoms", "calm", "potentials", "md", "dft", "analysis", "wire", "store"]),
     ("orchestrator", "orchestrator", &["atoms", "calm", "wire", "store"]),
     (
         "calmwalk",

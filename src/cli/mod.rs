@@ -3,6 +3,7 @@
 mod agent;
 mod calm;
 mod clean;
+mod errors;
 mod export;
 mod import;
 mod init;
@@ -11,6 +12,7 @@ mod label;
 mod labeller;
 mod launch;
 mod md;
+mod plan;
 mod queue;
 mod replay;
 mod run;
@@ -42,11 +44,13 @@ pub struct Arguments {
 enum Command {
     Init(init::Init),
     Validate(validate::Validate),
+    Plan(plan::Plan),
     Run(run::Run),
     Agent(agent::Agent),
     Label(label::Label),
     Launch(launch::Launch),
     Status(status::Status),
+    Errors(errors::Errors),
     Queue(queue::Queue),
     Export(export::Export),
     Replay(replay::Replay),
@@ -69,11 +73,13 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
     match arguments.command {
         Command::Init(command) => command.run(),
         Command::Validate(command) => command.run(),
+        Command::Plan(command) => command.run(),
         Command::Run(command) => command.run(),
         Command::Agent(command) => command.run(),
         Command::Label(command) => command.run(),
         Command::Launch(command) => command.run(),
         Command::Status(command) => command.run(),
+        Command::Errors(command) => command.run(),
         Command::Queue(command) => command.run(),
         Command::Export(command) => command.run(),
         Command::Replay(command) => command.run(),

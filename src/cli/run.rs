@@ -14,6 +14,7 @@ use serde_json::json;
 use store::{DATABASE, Location, ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds};
 use tokio::sync::Notify;
 use wire::net::{Endpoint, Tls};
+use workers::labeller::GUARD;
 
 use super::{Ended, Failure, block_on};
 use crate::actors::{self, budget, in_process, processes};
@@ -203,6 +204,7 @@ async fn leave_notes(campaign: &Campaign, store: &Store) -> Result<(), Failure> 
     let text = |note: serde_json::Result<String>| note.map_err(Failure::failed);
     let method = campaign.method()?;
     store.leave_note(LABEL_METHOD, &text(serde_json::to_string(&method))?).await?;
+    store.leave_note(GUARD, &text(serde_json::to_string(&campaign.config.label.guard))?).await?;
     store.leave_note(forecast::NOTE, &text(serde_json::to_string(&Forecast::of(campaign)))?).await?;
     Ok(())
 }

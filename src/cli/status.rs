@@ -1,6 +1,7 @@
 //! `calmwalk status`
 
 mod jobs;
+mod labels;
 mod processes;
 mod values;
 
@@ -9,6 +10,7 @@ use std::io::{self, Write};
 use store::{Candidates, Labels, Location, Status as Standing, Store, WalkStatus};
 
 use self::jobs::Jobs;
+use self::labels::LabelsSoFar;
 use self::values::Values;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::budget;
@@ -36,7 +38,7 @@ pub struct Status {
 impl Status {
     pub fn run(self) -> Result<Ended, Failure> {
         let location = self.location.get()?;
-        let (campaign, standing, values, disk) = block_on(self.read(&location))??;
+        let Read { campaign, standing, values, disk, labels } = block_on(self.read(&location))??;
         let jobs = block_on(Jobs::of(&location))?;
         if self.json {
             let mut json = serde_json::to_value(&standing).map_err(Failure::failed)?;
@@ -45,26 +47,41 @@ impl Status {
             json["training_frames"] = values.training_frames();
             json["staleness"] = values.staleness();
             json["disk"] = serde_json::to_value(&disk).map_err(Failure::failed)?;
+            labels.add_to(&mut json, standing.budget.used.core_hours);
             jobs.add_to(&mut json);
             print_json(&json)?;
         } else {
             print(|out| {
-                write_status(out, &campaign, &standing, &values, &disk, self.all)?;
+                write_status(out, &campaign, &standing, &values, &labels, &disk, self.all)?;
                 jobs.write(out, self.all)
             })?;
         }
         Ok(Ended::Done)
     }
 
-    async fn read(&self, location: &Location) -> Result<(store::Campaign, Standing, Values, Disk), Failure> {
+    async fn read(&self, location: &Location) -> Result<Read, Failure> {
         let store = Store::open_read_only(location).await?;
         let forecast = store.note(forecast::NOTE).await?;
         let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
-        let disk = Disk { bytes: store.size().await?, forecast };
-        let read = (store.campaign().await?, store.status().await?, Values(store.values().await?), disk);
+        let read = Read {
+            campaign: store.campaign().await?,
+            standing: store.status().await?,
+            values: Values(store.values().await?),
+            disk: Disk { bytes: store.size().await?, forecast },
+            labels: LabelsSoFar::of(&store).await?,
+        };
         store.close().await;
         Ok(read)
     }
+}
+
+/// What the store says.
+struct Read {
+    campaign: store::Campaign,
+    standing: Standing,
+    values: Values,
+    disk: Disk,
+    labels: LabelsSoFar,
 }
 
 fn write_status(
@@ -72,6 +89,7 @@ fn write_status(
     campaign: &store::Campaign,
     status: &Standing,
     values: &Values,
+    labels: &LabelsSoFar,
     disk: &Disk,
     all: bool,
 ) -> io::Result<()> {
@@ -89,6 +107,7 @@ fn write_status(
     values.write(out, &campaign.mode)?;
     write_candidates(out, &status.candidates)?;
     write_labels(out, &status.labels, status.imported)?;
+    labels.write(out, status.budget.used.core_hours, all)?;
     if let Some(budget) = budget::shown(&status.budget) {
         writeln!(out, "budget      {budget}")?;
     }

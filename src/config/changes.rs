@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 25] = [
+pub(super) const CHANGEABLE: [&str; 34] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -22,6 +22,15 @@ pub(super) const CHANGEABLE: [&str; 25] = [
     "label.keep",
     "label.queue_limit",
     "label.queue_full",
+    "label.guard.shortest_bond",
+    "label.guard.least_height",
+    "label.guard.largest_edge_ratio",
+    "label.guard.least_angle",
+    "label.guard.least_volume",
+    "label.guard.largest_volume",
+    "label.guard.most_atoms",
+    "label.guard.near_duplicate",
+    "label.guard.largest_cost",
     "budget.labels",
     "budget.core_hours",
     "budget.wall_hours",
@@ -32,6 +41,8 @@ pub(super) const CHANGEABLE: [&str; 25] = [
     "run.store",
     "guard.highest_temperature",
 ];
+
+const BONDS: &str = "label.guard.shortest_bond";
 
 /// Something that is not as the campaign has it, and that holds from now on.
 #[derive(Clone, Debug, PartialEq)]
@@ -167,7 +178,9 @@ fn judge(key: String, before: Value, after: Value) -> Result<Change, Refused> {
             _ => Refused::Key { key, before, after },
         });
     }
-    if CHANGEABLE.contains(&key.as_str()) {
+    // The pairs of elements are keys as well.
+    let whole = if key.starts_with(BONDS) { BONDS } else { &key };
+    if CHANGEABLE.contains(&whole) {
         Ok(Change::Key { key, before, after })
     } else {
         Err(Refused::Key { key, before, after })

@@ -24,6 +24,9 @@ pub fn check(config: &Config) -> Result<(), Wrong> {
     check_queue(config)?;
     check_budget(config)?;
     check_scratch(config)?;
+    if let Some((key, found, expected)) = config.label.guard.fault() {
+        return wrong(key, found, expected);
+    }
     if config.seeds.files.is_empty() {
         return wrong("seeds.files", "an empty list", "at least one file with seed structures");
     }

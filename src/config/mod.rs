@@ -17,7 +17,7 @@ use orchestrator::selector::{Mode, UpdateProtocol};
 use serde::{Deserialize, Serialize};
 use store::{Location, StoreError};
 use toml::Spanned;
-use workers::labeller::{Keep, Running};
+use workers::labeller::{Keep, LabelGuard, Running};
 use workers::settings::ThermostatKind;
 
 pub use changes::{Change, changed_keys, compare, without_changeable};
@@ -245,6 +245,9 @@ pub struct LabelSection {
     /// Which of the two.
     #[serde(default)]
     pub queue_full: QueueFull,
+    /// What a structure must be before anything is spent on its label.
+    #[serde(default)]
+    pub guard: LabelGuard,
 }
 
 /// What happens while the label queue is longer than it should be.

@@ -13,6 +13,7 @@ pub struct ForceErrors {
     threshold: f64,
     pairs: Thinned<(f64, f64)>,
     counts: Vec<Counts>,
+    sum: f64,
     left_out: u64,
 }
 
@@ -52,7 +53,7 @@ impl ForceErrors {
     /// Sorts grades into `bins`; errors above `threshold`, eV/Å, are large. Keeps `room` atoms at most, 24 bytes each.
     pub fn new(bins: Bins, threshold: f64, room: usize) -> Self {
         let counts = vec![Counts::default(); bins.number()];
-        Self { bins, threshold, pairs: Thinned::new(room), counts, left_out: 0 }
+        Self { bins, threshold, pairs: Thinned::new(room), counts, sum: 0.0, left_out: 0 }
     }
 
     /// A labelled atom: its grade, and |F_model − F_label|, eV/Å. What is not finite is counted and left out.
@@ -64,6 +65,7 @@ impl ForceErrors {
         let counts = &mut self.counts[self.bins.place(grade)];
         counts.labelled += 1;
         counts.above += u64::from(error > self.threshold);
+        self.sum += error;
         self.pairs.push((grade, error));
     }
 
@@ -89,6 +91,18 @@ impl ForceErrors {
     /// Atoms without a finite grade or error.
     pub fn left_out(&self) -> u64 {
         self.left_out
+    }
+
+    /// Mean force error, eV/Å.
+    pub fn mean(&self) -> Option<f64> {
+        (self.atoms() > 0).then(|| self.sum / self.atoms() as f64)
+    }
+
+    /// Share of the labelled atoms in the bins that begin at `edge` or above it.
+    pub fn share_above(&self, edge: f64) -> Option<f64> {
+        let is_above = |place: &usize| self.bins.edges(*place).0.is_some_and(|above| above >= edge);
+        let above = (0..self.bins.number()).filter(is_above).map(|place| self.counts[place].labelled);
+        (self.atoms() > 0).then(|| above.sum::<u64>() as f64 / self.atoms() as f64)
     }
 
     /// Spearman's ρ of grade and error.
@@ -161,6 +175,7 @@ mod tests {
         // Nothing is known where every label failed, and that is not the same as where there was nothing.
         assert_eq!((bins[6].median, bins[6].large, bins[6].large_between), (None, None, Some((0.0, 1.0))));
         assert_eq!((bins[1].atoms, bins[1].large_between), (0, None));
+        assert_eq!((errors.mean(), errors.share_above(1.0)), (Some(3.6 / 5.0), Some(0.4)));
         // Grades 0.2 0.5 0.4 3 4 against 0.1 0.3 0.2 1 2: the same order.
         assert!((errors.spearman().unwrap() - 1.0).abs() < 1e-14);
         assert_eq!(errors.roc_auc(), Some(1.0));

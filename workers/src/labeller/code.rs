@@ -8,7 +8,7 @@ use std::process::Child;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use atoms::Structure;
-use dft::{Code, Failure, FailureClass};
+use dft::{Code, Failure, FailureClass, Size};
 use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::sync::OnceCell;
@@ -48,6 +48,10 @@ pub(super) struct Ended {
 impl CodeMethod {
     pub(super) fn new(keeper: KeeperCommand, code: Box<dyn Code>, running: Running) -> Self {
         Self { code: code.into(), running, keeper, home: OnceCell::new(), in_hand: Mutex::default() }
+    }
+
+    pub(super) fn size(&self, structure: &Structure) -> Size {
+        self.code.size(structure)
     }
 
     /// Finds the calculation that an earlier attempt began here, or starts one, and waits for its end.

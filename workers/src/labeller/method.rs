@@ -4,7 +4,7 @@ use std::panic;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use atoms::{Potential, Structure};
-use dft::{Calculated, Code, Failure};
+use dft::{Calculated, Code, Failure, Size};
 use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::task::spawn_blocking;
@@ -97,6 +97,14 @@ impl Method {
                 Ok(Made { result, ended: None })
             }
             Self::Code(method) => method.make(store, lease, closing).await,
+        }
+    }
+
+    /// What the cost of a label depends on.
+    pub(super) fn size(&self, structure: &Structure) -> Size {
+        match self {
+            Self::Reference(_) => Size { atoms: structure.len(), electrons: 0.0, k_points: 1 },
+            Self::Code(method) => method.size(structure),
         }
     }
 

@@ -5,6 +5,7 @@
 mod closing;
 mod code;
 mod difference;
+mod guard;
 mod here;
 mod insist;
 mod judge;
@@ -35,6 +36,7 @@ use told::Became;
 
 pub use closing::Closing;
 pub use code::CodeMethod;
+pub use guard::{GUARD, LabelGuard, Pair};
 pub use insist::insist;
 pub use keeper::{KeeperCommand, keep};
 pub use method::Method;
@@ -144,6 +146,13 @@ pub async fn run(
         };
         idle = Duration::ZERO;
         let begun = Instant::now();
+        let size = method.size(&lease.structure);
+        if let Some(reason) = insist(closing, || guard::refusal(&store, &lease, size)).await? {
+            // Whatever was tried before, another attempt would be refused as well.
+            insist(closing, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
+            tell(&format!("{} is refused: {reason}", lease.candidate));
+            continue;
+        }
         let Made { result, ended } =
             match make(&store, &method, &lease, &settings.timing, closing, &now).await? {
                 Work::Done(made) => *made,

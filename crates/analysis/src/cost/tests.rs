@@ -106,6 +106,50 @@ fn without_all_electrons_atoms_count() {
     assert_eq!(model.predict_all([(unknown, 3)]), None);
 }
 
+/// (atoms, electrons, k-points, core-seconds) of labels that ABINIT 9.6 made of rattled and stretched silicon, one after
+/// the other: 8 Ha, a Γ-centred mesh of 0.55 Å⁻¹ before symmetry.
+const ABINIT: [(u32, u32, u32, f64); 24] = [
+    (2, 8, 64, 1.8),
+    (4, 16, 18, 1.99),
+    (8, 32, 27, 12.29),
+    (2, 8, 64, 2.31),
+    (16, 64, 4, 14.16),
+    (4, 16, 18, 1.86),
+    (8, 32, 27, 10.88),
+    (2, 8, 64, 1.38),
+    (4, 16, 27, 2.4),
+    (8, 32, 8, 4.86),
+    (4, 16, 18, 2.37),
+    (2, 8, 64, 1.65),
+    (8, 32, 27, 12.81),
+    (16, 64, 18, 46.42),
+    (2, 8, 64, 1.45),
+    (4, 16, 27, 2.32),
+    (8, 32, 27, 11.35),
+    (2, 8, 64, 2.08),
+    (4, 16, 27, 2.19),
+    (8, 32, 27, 10.35),
+    (2, 8, 64, 1.53),
+    (16, 64, 4, 12.14),
+    (4, 16, 18, 1.8),
+    (8, 32, 27, 9.73),
+];
+
+#[test]
+fn the_last_third_of_real_labels_is_within_a_factor_of_two() {
+    let label = |&(atoms, electrons, k_points, core_seconds): &(u32, u32, u32, f64)| Measured {
+        size: Size { atoms: atoms.into(), electrons: Some(electrons.into()), k_points: k_points.into() },
+        core_seconds,
+    };
+    let labels: Vec<_> = ABINIT.iter().map(label).collect();
+    let found = ratio(&labels);
+    assert!((0.5..2.0).contains(&found), "{found}");
+    // The other way round the first third is what is foretold.
+    let reversed: Vec<_> = labels.into_iter().rev().collect();
+    let found = ratio(&reversed);
+    assert!((0.5..2.0).contains(&found), "{found}");
+}
+
 /// A label that hung on a sick node, one that was read from a file in no time.
 #[test]
 fn outliers_do_not_lead() {

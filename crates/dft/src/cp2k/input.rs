@@ -93,12 +93,11 @@ fn k_points(mesh: [u32; 3]) -> String {
 fn steps(settings: &Settings, spins: &Spins, remedies: &BTreeSet<Remedy>) -> String {
     let has = |remedy| remedies.contains(&remedy);
     let steps = settings.steps.saturating_mul(if has(Remedy::MoreSteps) { 3 } else { 1 });
-    // Broyden's method stagnates with less than 0.2. Pulay's wants more, and a short history: the residuals of a longer one
-    // become linearly dependent, which CP2K does not survive.
-    let mixing = match (has(Remedy::OtherAlgorithm), has(Remedy::SlowerMixing)) {
-        (false, false) => "METHOD BROYDEN_MIXING\n        ALPHA 0.4\n        NBROYDEN 8",
-        (false, true) => "METHOD BROYDEN_MIXING\n        ALPHA 0.2\n        NBROYDEN 8",
-        (true, _) => "METHOD PULAY_MIXING\n        ALPHA 0.4\n        NPULAY 4",
+    let (alpha, history) = if has(Remedy::SlowerMixing) { (0.1, 16) } else { (0.4, 8) };
+    let mixing = match has(Remedy::OtherAlgorithm) {
+        false => format!("METHOD BROYDEN_MIXING\n        ALPHA {alpha:?}\n        NBROYDEN {history}"),
+        // With a longer history, the residuals become linearly dependent, which CP2K does not survive.
+        true => format!("METHOD PULAY_MIXING\n        ALPHA {alpha:?}\n        NPULAY 4"),
     };
     let [up, down] = spins.empty;
     let empty = if settings.spin { format!("{up} {down}") } else { up.to_string() };

@@ -1,0 +1,153 @@
+//! What labels teach: `calmwalk errors`, and what `status` and the summary say of labels that failed.
+
+mod common;
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+use atoms::cell::{norm, sub};
+use common::campaign::Small;
+use common::succeed;
+use serde_json::Value as Json;
+use store::{ExportFilter, ExportRow, ExportSource, Store};
+
+fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
+    serde_json::from_str(&succeed(here, arguments.into_iter().chain(["--json"]))).unwrap()
+}
+
+/// Every labelled structure of a campaign.
+fn labelled(directory: &Path) -> Vec<ExportRow> {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    runtime.block_on(async {
+        let store = Store::open_read_only(directory).await.unwrap();
+        let protocol = store.protocol_in_force().await.unwrap().unwrap().hash;
+        let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+        store.labelled(&filter, None, u32::MAX).await.unwrap()
+    })
+}
+
+fn largest_force(row: &ExportRow) -> f64 {
+    row.label.forces.iter().map(|force| norm(*force)).fold(0.0, f64::max)
+}
+
+fn content(row: &ExportRow) -> String {
+    let ExportSource::Candidate { block, .. } = &row.source else { panic!("an import") };
+    block.view().id().content.to_string()
+}
+
+/// (γ, force error) of every atom.
+fn pairs(rows: &[&ExportRow]) -> Vec<(f64, f64)> {
+    let mut pairs = Vec::new();
+    for row in rows {
+        let ExportSource::Candidate { block, original, .. } = &row.source else { panic!("an import") };
+        let forces = block.view().forces.iter().zip(&row.label.forces);
+        pairs.extend(original.gamma.iter().copied().zip(forces.map(|(a, b)| norm(sub(*a, *b)))));
+    }
+    pairs
+}
+
+/// By counting: ρ of the ranks, where a rank is the number of smaller values and half of that of equal ones.
+fn spearman(pairs: &[(f64, f64)]) -> f64 {
+    let rank = |value: f64, of: &dyn Fn(&(f64, f64)) -> f64| {
+        let smaller = pairs.iter().filter(|pair| of(pair) < value).count() as f64;
+        smaller + 0.5 * pairs.iter().filter(|pair| of(pair) == value).count() as f64
+    };
+    let ranks: Vec<_> = pairs.iter().map(|p| (rank(p.0, &|p| p.0), rank(p.1, &|p| p.1))).collect();
+    let middle = 0.5 * pairs.len() as f64;
+    let sum =
+        |f: &dyn Fn(f64, f64) -> f64| -> f64 { ranks.iter().map(|(a, b)| f(a - middle, b - middle)).sum() };
+    sum(&|a, b| a * b) / (sum(&|a, _| a * a) * sum(&|_, b| b * b)).sqrt()
+}
+
+fn atoms_in(bin: &Json, pairs: &[(f64, f64)]) -> usize {
+    let above = bin["above"].as_f64().unwrap_or(f64::NEG_INFINITY);
+    let up_to = bin["up_to"].as_f64().unwrap_or(f64::INFINITY);
+    pairs.iter().filter(|(gamma, _)| *gamma > above && *gamma <= up_to).count()
+}
+
+#[test]
+fn failed_labels_are_censored_and_the_others_are_measured() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let config = Small::default().write(here);
+    succeed(here, ["run", "campaign.toml", "--directory", "whole"]);
+    let rows = labelled(&here.join("whole"));
+    let mut forces: Vec<_> = rows.iter().map(largest_force).collect();
+    forces.sort_by(f64::total_cmp);
+    // The same campaign, in which a third of the labels is not believed.
+    let limit = forces[forces.len() * 2 / 3];
+    let text = fs::read_to_string(&config).unwrap();
+    let text = text.replace("[label]", &format!("[label]\nlargest_force = {limit}\nattempts = 1"));
+    fs::write(here.join("strict.toml"), text).unwrap();
+    let summary = succeed(here, ["run", "strict.toml", "--directory", "strict"]);
+    let (kept, lost): (Vec<_>, Vec<_>) = rows.iter().partition(|row| largest_force(row) <= limit);
+    assert!(lost.len() > 1 && kept.len() > 1, "{forces:?}");
+
+    let errors = json(here, ["errors", "strict"]);
+    let (measured, unknown) = (pairs(&kept), pairs(&lost));
+    let all = &errors["all"];
+    assert_eq!(
+        (all["structures"].as_u64(), all["atoms"].as_u64()),
+        (Some(kept.len() as u64), Some(measured.len() as u64))
+    );
+    let found = all["gamma"]["spearman"].as_f64().unwrap();
+    assert!((found - spearman(&measured)).abs() < 1e-9, "{found}");
+    let bins = all["gamma"]["bins"].as_array().unwrap();
+    assert_eq!(bins.len(), 7);
+    for bin in bins {
+        assert_eq!(bin["atoms"], atoms_in(bin, &measured), "{bin}");
+        assert_eq!(bin["atoms_without_label"], atoms_in(bin, &unknown), "{bin}");
+    }
+    let of_bin = |key: &str, key_in: &str| -> usize {
+        let bins = errors[key].as_array().unwrap();
+        bins.iter().map(|bin| bin[key_in].as_array().map_or(0, Vec::len)).sum()
+    };
+    assert_eq!(of_bin("completion_by_gamma", "failed"), lost.len());
+    assert_eq!(of_bin("completion_by_relative_volume", "failed"), lost.len());
+    let text = succeed(here, ["errors", "strict"]);
+    assert!(text.contains("ROC-AUC(γ_nbr)") && text.contains("censored"), "{text}");
+
+    // A walk and its control begin with the same structure, which has one job.
+    let lost: BTreeSet<_> = lost.iter().map(|row| content(row)).collect();
+    let kept: BTreeSet<_> = kept.iter().map(|row| content(row)).collect();
+    let status = json(here, ["status", "strict"]);
+    assert_eq!(status["labels"]["failed"], lost.len());
+    assert_eq!(status["failures"][0]["class"], "implausible");
+    assert_eq!(status["failures"][0]["given_up"], lost.len());
+    let unlabelled = status["unlabelled"].as_array().unwrap();
+    let failed: u64 = unlabelled.iter().map(|part| part["failed"].as_u64().unwrap()).sum();
+    assert_eq!(failed as usize, lost.len());
+    assert_eq!(status["cost"]["queue"]["measured"], kept.len());
+    for text in [&summary, &succeed(here, ["status", "strict"])] {
+        assert!(text.contains(&format!("the labels of {} structures failed", lost.len())), "{text}");
+    }
+    assert!(!succeed(here, ["status", "whole"]).contains("unlabelled"));
+    // Another protocol than there is.
+    let wrong = common::refuse(here, ["errors", "whole", "--protocol", "nothing"]);
+    assert!(wrong.contains("no protocol 'nothing'; it has 'reference'"), "{wrong}");
+}
+
+#[test]
+fn labels_that_wait_have_a_price_as_soon_as_one_was_made() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let config = Small::default().write(here);
+    let text = fs::read_to_string(&config).unwrap();
+    fs::write(&config, text.replace("[label]", "[label]\nslots = 0")).unwrap();
+    let _run = common::Running(common::program(here).args(["run", "campaign.toml"]).spawn().unwrap());
+    let queued = || json(here, ["status", "campaign"])["labels"]["queued"].as_u64().unwrap_or(0);
+    common::processes::wait_until("all is collected", || {
+        here.join("campaign/campaign.sqlite").exists() && queued() >= 4
+    });
+    let before = json(here, ["status", "campaign"]);
+    assert_eq!(before["cost"]["queue"]["remaining"], Json::Null, "{before}");
+    assert!(succeed(here, ["status", "campaign"]).contains("unknown before a first one"));
+    // Labels from elsewhere.
+    let mut labeller = common::Running(
+        common::program(here).args(["label", "--store", "campaign", "--until-empty"]).spawn().unwrap(),
+    );
+    assert!(labeller.0.wait().unwrap().success());
+    let after = json(here, ["status", "campaign"]);
+    assert!(after["cost"]["queue"]["measured"].as_u64().unwrap() > 0, "{after}");
+}

@@ -1,0 +1,111 @@
+//! What is refused before anything is spent on it, and the bill before a campaign begins.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+
+use common::campaign::Small;
+use common::{refuse, succeed};
+use serde_json::Value as Json;
+
+fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
+    serde_json::from_str(&succeed(here, arguments.into_iter().chain(["--json"]))).unwrap()
+}
+
+/// A small campaign with these keys in `[label]`.
+fn write(here: &Path, keys: &str) {
+    let config = Small { seeds: &["fcc-100"], per_seed: 2, ..Small::default() }.write(here);
+    let text = fs::read_to_string(&config).unwrap();
+    fs::write(&config, text.replace("[label]", &format!("[label]\n{keys}"))).unwrap();
+}
+
+fn names(jobs: &Json, state: &str) -> Vec<String> {
+    let jobs = jobs.as_array().unwrap().iter().filter(|job| job["state"] == state);
+    jobs.map(|job| job["candidate"].as_str().unwrap().to_owned()).collect()
+}
+
+#[test]
+fn what_a_guard_refuses_is_labelled_when_somebody_says_so() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(here, r#"guard = { shortest_bond = { "Al-Al" = 3.5 } }"#);
+    let summary = succeed(here, ["run", "campaign.toml"]);
+    let refused = names(&json(here, ["queue", "campaign", "list"]), "failed");
+    assert!(refused.len() > 1 && summary.contains("structures failed"), "{summary}");
+    let details = json(here, ["queue", "campaign", "show", &refused[0]]);
+    let attempt = &details["attempts_made"][0];
+    assert_eq!(attempt["class"], "refused");
+    let log = attempt["log"].as_str().unwrap();
+    assert!(log.contains("Å apart, where label.guard.shortest_bond of Al-Al is 3.5"), "{log}");
+    let status = json(here, ["status", "campaign"]);
+    assert_eq!(status["failures"][0]["class"], "refused");
+    assert_eq!(status["failures"][0]["given_up"], refused.len());
+
+    // Overruled, one is labelled by the same labellers; the others stay refused.
+    succeed(here, ["queue", "campaign", "retry", &refused[0]]);
+    succeed(here, ["run", "campaign.toml"]);
+    let jobs = json(here, ["queue", "campaign", "list"]);
+    assert_eq!(names(&jobs, "labelled"), refused[..1]);
+    assert_eq!(names(&jobs, "failed").len(), refused.len() - 1);
+}
+
+#[test]
+fn near_duplicates_of_labelled_structures_are_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    // Everything from one seed structure is as near as that.
+    write(here, "guard = { near_duplicate = 1.0 }");
+    succeed(here, ["run", "campaign.toml"]);
+    let jobs = json(here, ["queue", "campaign", "list"]);
+    let (labelled, refused) = (names(&jobs, "labelled"), names(&jobs, "failed"));
+    assert!(!labelled.is_empty() && !refused.is_empty(), "{jobs}");
+    let details = json(here, ["queue", "campaign", "show", &refused[0]]);
+    let log = details["attempts_made"][0]["log"].as_str().unwrap();
+    assert!(labelled.iter().any(|name| log.contains(name.as_str())), "{log}");
+}
+
+#[test]
+fn impossible_guards_are_wrong_input() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    for (guard, said) in [
+        ("{ least_angle = 120.0 }", "label.guard.least_angle"),
+        (r#"{ shortest_bond = { "Xx-Al" = 1.0 } }"#, "'Xx-Al' is not a pair of elements"),
+        ("{ smallest_volume = 1.0 }", "smallest_volume"),
+    ] {
+        write(here, &format!("guard = {guard}"));
+        let error = refuse(here, ["validate", "campaign.toml"]);
+        assert!(error.contains(said), "{error}");
+    }
+}
+
+#[test]
+fn a_campaign_has_a_bill_before_it_begins() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    Small::default().write(here);
+    // Two seed structures, four structures each, and a control frame of each of those.
+    let plan = json(here, ["plan", "campaign.toml"]);
+    assert_eq!((&plan["labels"], &plan["core_hours"]), (&16.into(), &Json::Null));
+    assert!(succeed(here, ["plan", "campaign.toml"]).contains("cost is unknown"));
+    let priced = json(here, ["plan", "campaign.toml", "--core-seconds", "3600"]);
+    let hours = |plan: &Json| plan["core_hours"]["expected"].as_f64().unwrap();
+    let first = priced["seed_structures"][0]["core_hours_each"]["expected"].as_f64().unwrap();
+    // An hour, and what labels take on average above the middle.
+    assert!((0.9..1.2).contains(&first), "{priced}");
+    // The second cell has 47 atoms and not 32: (47/32)² times as much, before anything is known of the exponent.
+    let expected = 8.0 * first * (1.0 + (47.0_f64 / 32.0).powi(2));
+    assert!((hours(&priced) / expected - 1.0).abs() < 1e-9, "{priced}");
+    // A key that limits structures limits the bill.
+    let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
+    fs::write(here.join("less.toml"), text.replace("per_seed = 4", "per_seed = 4\ntotal = 2")).unwrap();
+    let less = json(here, ["plan", "less.toml", "--core-seconds", "3600"]);
+    assert_eq!((&less["labels"], &less["limited_by"]), (&4.into(), &"collect.total".into()));
+    assert!((hours(&less) / hours(&priced) - 0.25).abs() < 1e-9);
+
+    assert!(refuse(here, ["plan", "campaign.toml", "--like", "less"]).contains("less"));
+    succeed(here, ["run", "less.toml"]);
+    let like = json(here, ["plan", "campaign.toml", "--like", "less"]);
+    assert!(hours(&like) > 0.0 && hours(&like) < 1.0, "{like}");
+}

@@ -1,0 +1,213 @@
+//! What a structure must be before anything is spent on its label.
+
+mod bonds;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+
+use analysis::{CostModel, Measured, Size};
+use atoms::Structure;
+use atoms::cell::{dot, norm};
+use serde::{Deserialize, Serialize};
+use store::records::Lease;
+use store::{Store, StoreError};
+
+pub use bonds::Pair;
+
+/// Under which name the leader of a campaign leaves its guard in the store, as JSON: it holds for every labeller, from the
+/// next label on.
+pub const GUARD: &str = "label_guard";
+
+/// Class of an attempt that a guard has refused.
+pub(super) const REFUSED: &str = "refused";
+
+/// Structures that are compared with by their features: those nearest in energy.
+const COMPARED: u32 = 32;
+/// Labels that a cost is learned from.
+const LEARNED_FROM: u32 = 1_000;
+
+/// `[label.guard]`: what is left out does not count. Directions that are not periodic have no shape.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LabelGuard {
+    /// Shortest bond of pairs of elements, Å.
+    pub shortest_bond: BTreeMap<Pair, f64>,
+    /// Least distance of opposite faces of the cell, Å.
+    pub least_height: Option<f64>,
+    /// Longest edge of the cell by its shortest, at most.
+    pub largest_edge_ratio: Option<f64>,
+    /// Angles between edges of the cell are at least this and at most 180° less this, degrees.
+    pub least_angle: Option<f64>,
+    /// Volume an atom at least, Å³.
+    pub least_volume: Option<f64>,
+    /// Volume an atom at most, Å³.
+    pub largest_volume: Option<f64>,
+    /// Atoms at most.
+    pub most_atoms: Option<u32>,
+    /// A structure is refused whose features differ by less than this part of their norm, for each of its atoms, from
+    /// those of one that has its label.
+    pub near_duplicate: Option<f64>,
+    /// Core-seconds that a label is expected to take, at most.
+    pub largest_cost: Option<f64>,
+}
+
+impl LabelGuard {
+    /// A key with a value that no guard can have, what it is, and what was expected.
+    pub fn fault(&self) -> Option<(&'static str, String, &'static str)> {
+        let positive = |x: &f64| x.is_finite() && *x > 0.0;
+        if let Some((pair, bond)) = self.shortest_bond.iter().find(|(_, bond)| !positive(bond)) {
+            return Some(("label.guard.shortest_bond", format!("{pair} = {bond}"), "a length above 0, Å"));
+        }
+        let numbers = [
+            ("label.guard.least_height", self.least_height, f64::MAX),
+            ("label.guard.largest_edge_ratio", self.largest_edge_ratio, f64::MAX),
+            ("label.guard.least_angle", self.least_angle, 90.0),
+            ("label.guard.least_volume", self.least_volume, f64::MAX),
+            ("label.guard.largest_volume", self.largest_volume, f64::MAX),
+            ("label.guard.near_duplicate", self.near_duplicate, 1.0),
+            ("label.guard.largest_cost", self.largest_cost, f64::MAX),
+        ];
+        let wrong = |(key, value, most): (&'static str, Option<f64>, f64)| {
+            let value = value.filter(|value| !positive(value) || *value > most)?;
+            let expected = match most {
+                90.0 => "an angle above 0 and at most 90°",
+                1.0 => "a number above 0 and at most 1",
+                _ => "a number above 0",
+            };
+            Some((key, value.to_string(), expected))
+        };
+        numbers.into_iter().find_map(wrong)
+    }
+
+    /// Why a structure is refused for what it is; `None` if it may be labelled.
+    pub fn refuses(&self, structure: &Structure) -> Option<String> {
+        let atoms = structure.len();
+        if let Some(most) = self.most_atoms.filter(|most| atoms > *most as usize) {
+            return Some(format!("{atoms} atoms, where label.guard.most_atoms is {most}"));
+        }
+        self.refuses_shape(structure)
+            .or_else(|| self.refuses_volume(structure))
+            .or_else(|| bonds::too_short(structure, &self.shortest_bond))
+    }
+
+    fn refuses_shape(&self, structure: &Structure) -> Option<String> {
+        let cell = structure.cell.completed(structure.periodic);
+        let directions: Vec<_> = (0..3).filter(|k| structure.periodic[*k]).collect();
+        let heights = cell.heights();
+        let height = directions.iter().map(|k| heights[*k]).reduce(f64::min)?;
+        if let Some(least) = self.least_height.filter(|least| height < *least) {
+            return Some(format!(
+                "opposite faces of its cell are {height:.3} Å apart, where label.guard.least_height is {least}"
+            ));
+        }
+        let edges = || directions.iter().map(|k| norm(cell.0[*k]));
+        let ratio = edges().reduce(f64::max)? / edges().reduce(f64::min)?;
+        if let Some(largest) = self.largest_edge_ratio.filter(|largest| ratio > *largest) {
+            return Some(format!(
+                "its cell is {ratio:.2} times as long as wide, where label.guard.largest_edge_ratio is {largest}"
+            ));
+        }
+        let least = self.least_angle?;
+        let pairs =
+            directions.iter().flat_map(|i| directions.iter().filter(move |k| i < *k).map(move |k| (*i, *k)));
+        let angle = |(i, k): (usize, usize)| {
+            let (a, b) = (cell.0[i], cell.0[k]);
+            (dot(a, b) / (norm(a) * norm(b))).clamp(-1.0, 1.0).acos().to_degrees()
+        };
+        let sharp = pairs.map(angle).find(|angle| angle.min(180.0 - angle) < least)?;
+        Some(format!("its cell has an angle of {sharp:.1}°, where label.guard.least_angle is {least}"))
+    }
+
+    /// Where there is a volume: in all three directions.
+    fn refuses_volume(&self, structure: &Structure) -> Option<String> {
+        if structure.periodic != [true; 3] {
+            return None;
+        }
+        let volume = structure.cell.volume() / structure.len() as f64;
+        let too =
+            |key: &str, limit: f64| format!("{volume:.3} Å³ an atom, where label.guard.{key} is {limit}");
+        let small = self.least_volume.filter(|least| volume < *least);
+        let large = self.largest_volume.filter(|largest| volume > *largest);
+        small.map(|limit| too("least_volume", limit)).or(large.map(|limit| too("largest_volume", limit)))
+    }
+}
+
+/// Why a leased job is not worth its label by the campaign's guard; `None` if it is, or if somebody has overruled it.
+pub(super) async fn refusal(
+    store: &Store,
+    lease: &Lease,
+    size: dft::Size,
+) -> Result<Option<String>, StoreError> {
+    if lease.overruled {
+        return Ok(None);
+    }
+    let Some(text) = store.note(GUARD).await? else { return Ok(None) };
+    let guard: LabelGuard = serde_json::from_str(&text).map_err(damaged)?;
+    if let Some(reason) = guard.refuses(&lease.structure) {
+        return Ok(Some(reason));
+    }
+    if let Some(reason) = too_costly(store, lease, size, &guard).await? {
+        return Ok(Some(reason));
+    }
+    let Some(bound) = guard.near_duplicate else { return Ok(None) };
+    let near = store.labelled_near(lease, COMPARED).await?;
+    let Some((own, others)) = near else { return Ok(None) };
+    let like = others.iter().find(|other| is_near(&own, &other.features, lease.structure.len(), bound));
+    Ok(like.map(|other| {
+        format!(
+            "its features differ by less than {bound} of their norm from those of {}, which has its label \
+             (label.guard.near_duplicate)",
+            other.candidate
+        )
+    }))
+}
+
+fn damaged(error: serde_json::Error) -> StoreError {
+    StoreError::Damaged { what: "the guard of labels".into(), reason: error.to_string() }
+}
+
+async fn too_costly(
+    store: &Store,
+    lease: &Lease,
+    size: dft::Size,
+    guard: &LabelGuard,
+) -> Result<Option<String>, StoreError> {
+    let Some(largest) = guard.largest_cost else { return Ok(None) };
+    let costs = store.label_costs(lease.protocol, LEARNED_FROM).await?;
+    let measured: Vec<_> = costs
+        .iter()
+        .map(|cost| Measured {
+            size: Size {
+                atoms: cost.atoms.into(),
+                electrons: cost.electrons.filter(|electrons| *electrons > 0.0),
+                k_points: cost.k_points.unwrap_or(1).into(),
+            },
+            core_seconds: cost.core_seconds,
+        })
+        .collect();
+    let electrons = Some(size.electrons).filter(|electrons| *electrons > 0.0);
+    let size = Size { atoms: size.atoms as f64, electrons, k_points: size.k_points as f64 };
+    // Before a first label nothing is known, and nothing refused.
+    let expected = CostModel::fit(&measured, None).and_then(|model| model.predict(&size));
+    let too_much = expected.map(|expected| expected.core_seconds).filter(|seconds| *seconds > largest);
+    Ok(too_much.map(|seconds| {
+        format!(
+            "a label of it is expected to take {seconds:.0} core-seconds, as {} others did, where label.guard.largest_cost \
+             is {largest}",
+            measured.len()
+        )
+    }))
+}
+
+/// Whether |z − z'| < bound |z| for each atom; features [n × D], of the same atoms in the same order.
+fn is_near(own: &[f64], other: &[f64], atoms: usize, bound: f64) -> bool {
+    if own.is_empty() || own.len() != other.len() || !own.len().is_multiple_of(atoms) {
+        return false;
+    }
+    let dimension = own.len() / atoms;
+    own.chunks_exact(dimension).zip(other.chunks_exact(dimension)).all(|(a, b)| {
+        let distance: f64 = a.iter().zip(b).map(|(x, y)| (x - y).powi(2)).sum();
+        distance < bound * bound * a.iter().map(|x| x * x).sum::<f64>()
+    })
+}

@@ -1,0 +1,104 @@
+//! Each guard by itself, on both sides of its limit.
+
+use atoms::Cell;
+use atoms::cell::Matrix3;
+
+use super::*;
+
+/// An atom of Si and one of O, 2 Å apart.
+fn structure(cell: Matrix3) -> Structure {
+    let species = ["Si", "O"].map(|symbol| symbol.parse().unwrap());
+    Structure {
+        species: species.to_vec(),
+        positions: vec![[0.1, 0.0, 0.0], [2.1, 0.0, 0.0]],
+        cell: Cell(cell),
+        periodic: [true; 3],
+    }
+}
+
+fn box_of(a: f64, b: f64, c: f64) -> Structure {
+    structure(Cell::orthorhombic(a, b, c).0)
+}
+
+fn guard(text: &str) -> LabelGuard {
+    serde_json::from_str(text).unwrap()
+}
+
+fn refused(guard_text: &str, structure: &Structure) -> bool {
+    guard(guard_text).refuses(structure).is_some()
+}
+
+#[test]
+fn what_is_left_out_refuses_nothing() {
+    assert_eq!(LabelGuard::default().refuses(&box_of(0.5, 100.0, 3.0)), None);
+    assert_eq!(guard("{}"), LabelGuard::default());
+    assert_eq!(LabelGuard::default().fault(), None);
+}
+
+#[test]
+fn bonds_are_those_of_their_pair_and_through_the_boundary() {
+    let apart = box_of(9.0, 9.0, 9.0);
+    assert!(refused(r#"{ "shortest_bond": { "O-Si": 2.01 } }"#, &apart));
+    assert!(refused(r#"{ "shortest_bond": { "Si-O": 2.01 } }"#, &apart));
+    assert!(!refused(r#"{ "shortest_bond": { "Si-O": 1.99, "Si-Si": 8.0, "O-O": 8.9 } }"#, &apart));
+    // 1.5 Å through the boundary, and an atom from its own image.
+    assert!(refused(r#"{ "shortest_bond": { "Si-O": 1.6 } }"#, &box_of(3.5, 9.0, 9.0)));
+    assert!(refused(r#"{ "shortest_bond": { "O-O": 3.6 } }"#, &box_of(3.5, 9.0, 9.0)));
+    let reason = guard(r#"{ "shortest_bond": { "Si-O": 2.5 } }"#).refuses(&apart).unwrap();
+    assert!(reason.contains("2.000 Å") && reason.contains("O-Si is 2.5"), "{reason}");
+    assert!(serde_json::from_str::<LabelGuard>(r#"{ "shortest_bond": { "Si": 2.0 } }"#).is_err());
+}
+
+#[test]
+fn cells_have_a_shape() {
+    let long = box_of(4.0, 5.0, 12.0);
+    assert!(refused(r#"{ "least_height": 4.1 }"#, &long) && !refused(r#"{ "least_height": 3.9 }"#, &long));
+    assert!(refused(r#"{ "largest_edge_ratio": 2.9 }"#, &long));
+    assert!(!refused(r#"{ "largest_edge_ratio": 3.1 }"#, &long));
+    // 45°, and 135° are the same.
+    for x in [5.0, -5.0] {
+        let sheared = structure([[6.0, 0.0, 0.0], [x, 5.0, 0.0], [0.0, 0.0, 6.0]]);
+        assert!(refused(r#"{ "least_angle": 46 }"#, &sheared), "{x}");
+        assert!(!refused(r#"{ "least_angle": 44 }"#, &sheared), "{x}");
+        assert!(refused(r#"{ "least_height": 4.3 }"#, &sheared), "6 sin 45° = 4.24 Å");
+    }
+    // What is not periodic has no shape.
+    let slab = Structure { periodic: [true, true, false], ..long };
+    assert!(!refused(r#"{ "largest_edge_ratio": 2.9, "least_volume": 1e6 }"#, &slab));
+}
+
+#[test]
+fn volumes_and_numbers_of_atoms_have_limits() {
+    // 60 Å³ for two atoms.
+    let structure = box_of(3.0, 4.0, 5.0);
+    for (text, expected) in [
+        (r#"{ "least_volume": 30.1 }"#, true),
+        (r#"{ "least_volume": 29.9 }"#, false),
+        (r#"{ "largest_volume": 29.9 }"#, true),
+        (r#"{ "largest_volume": 30.1 }"#, false),
+        (r#"{ "most_atoms": 1 }"#, true),
+        (r#"{ "most_atoms": 2 }"#, false),
+    ] {
+        assert_eq!(refused(text, &structure), expected, "{text}");
+    }
+}
+
+#[test]
+fn impossible_limits_are_faults() {
+    for (text, key) in [
+        (r#"{ "shortest_bond": { "Si-O": -1.0 } }"#, "label.guard.shortest_bond"),
+        (r#"{ "least_angle": 91 }"#, "label.guard.least_angle"),
+        (r#"{ "near_duplicate": 1.5 }"#, "label.guard.near_duplicate"),
+        (r#"{ "largest_cost": 0 }"#, "label.guard.largest_cost"),
+    ] {
+        assert_eq!(guard(text).fault().unwrap().0, key);
+    }
+}
+
+#[test]
+fn features_are_near_if_those_of_each_atom_are() {
+    let own = [1.0, 0.0, 0.0, 2.0];
+    assert!(is_near(&own, &[1.0, 0.09, 0.0, 2.1], 2, 0.1));
+    assert!(!is_near(&own, &[1.0, 0.11, 0.0, 2.0], 2, 0.1), "one atom is enough");
+    assert!(!is_near(&own, &[1.0, 0.0], 2, 0.1) && !is_near(&[], &[], 2, 0.1));
+}
