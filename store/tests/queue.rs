@@ -440,7 +440,7 @@ async fn directories_of_calculations_are_kept_with_their_attempts() {
     assert_eq!((past().await.wanted, past().await.failed), (false, true));
     let archive =
         Archive { attempt: 1, bytes: b"second".to_vec(), left_out: "work/large (5 bytes)\n".into() };
-    assert_eq!(store.archives(lease.job).await.unwrap(), [archive.clone()]);
+    assert_eq!(store.archives(lease.job).await.unwrap(), std::slice::from_ref(&archive));
     assert_eq!(store.past_calculation(lease.job, 2).await.unwrap(), None);
     // It goes with a copy, and so does what was used up.
     let elsewhere = tempfile::tempdir().unwrap();

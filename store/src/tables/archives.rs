@@ -25,9 +25,11 @@ impl Store {
 
     /// What has become of an attempt and its calculation; none if there was no such attempt.
     pub async fn past_calculation(&self, job: i64, attempt: u32) -> Result<Option<PastCalculation>> {
-        let sql = "SELECT calculation, CASE WHEN outcome = 'failed' THEN 1 ELSE 0 END AS failed,
-                       CASE WHEN state IN ('queued', 'leased')
-                       AND (outcome IS NULL OR outcome IN ('expired', 'lost', 'released')) THEN 1 ELSE 0 END AS wanted
+        let sql = "SELECT calculation,
+                   CAST(CASE WHEN outcome = 'failed' THEN 1 ELSE 0 END AS BIGINT) AS failed,
+                   CAST(CASE WHEN state IN ('queued', 'leased')
+                       AND (outcome IS NULL OR outcome IN ('expired', 'lost', 'released')) THEN 1 ELSE 0 END AS BIGINT)
+                       AS wanted
                    FROM attempt JOIN job ON job.number = attempt.job WHERE job = $1 AND attempt = $2";
         let row: Option<Row> = query(sql).bind(job).bind(attempt).fetch_optional(&self.database).await?;
         Ok(row.map(|Row { calculation, failed, wanted }| PastCalculation {
