@@ -106,7 +106,10 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     assert_eq!(of_bin("completion_by_gamma", "failed"), lost.len());
     assert_eq!(of_bin("completion_by_relative_volume", "failed"), lost.len());
     let text = succeed(here, ["errors", "strict"]);
-    assert!(text.contains("ROC-AUC(γ_nbr)") && text.contains("censored"), "{text}");
+    assert!(
+        text.contains("ROC-AUC(γ_nbr)") && text.contains("above 1 eV/Å (%)") && text.contains("censored"),
+        "{text}"
+    );
 
     // A walk and its control begin with the same structure, which has one job.
     let lost: BTreeSet<_> = lost.iter().map(|row| content(row)).collect();

@@ -116,7 +116,7 @@ fn write_correlations(out: &mut dyn Write, learned: &Learned) -> io::Result<()> 
 }
 
 fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<()> {
-    let large = format!(">> {LARGE} eV/Å (%)");
+    let large = format!(">above {LARGE} eV/Å (%)");
     let mut table = Table::new(&[
         name,
         ">atoms",
