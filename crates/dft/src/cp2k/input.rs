@@ -93,12 +93,11 @@ fn k_points(mesh: [u32; 3]) -> String {
 fn steps(settings: &Settings, spins: &Spins, remedies: &BTreeSet<Remedy>) -> String {
     let has = |remedy| remedies.contains(&remedy);
     let steps = settings.steps.saturating_mul(if has(Remedy::MoreSteps) { 3 } else { 1 });
-    let (alpha, history) = if has(Remedy::SlowerMixing) { (0.1, 16) } else { (0.4, 8) };
-    let mixing = match has(Remedy::OtherAlgorithm) {
-        false => format!("METHOD BROYDEN_MIXING\n        ALPHA {alpha:?}\n        NBROYDEN {history}"),
-        // With a longer history, the residuals become linearly dependent, which CP2K does not survive.
-        true => format!("METHOD PULAY_MIXING\n        ALPHA {alpha:?}\n        NPULAY 4"),
-    };
+    // Broyden's method stagnates with less than 0.2. It stays Broyden's: Pulay's oscillates or ends by a bad condition
+    // number even where nothing is difficult, and Kerker's looks converged to CP2K long before it is.
+    let careful = has(Remedy::SlowerMixing) || has(Remedy::OtherAlgorithm);
+    let (alpha, memory) = (if careful { 0.2 } else { 0.4 }, if has(Remedy::OtherAlgorithm) { 4 } else { 8 });
+    let mixing = format!("METHOD BROYDEN_MIXING\n        ALPHA {alpha:?}\n        NBROYDEN {memory}");
     let [up, down] = spins.empty;
     let empty = if settings.spin { format!("{up} {down}") } else { up.to_string() };
     let temperature = settings.smearing_width / atoms::units::BOLTZMANN;

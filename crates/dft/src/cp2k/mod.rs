@@ -6,8 +6,8 @@
 //!
 //! Remedies:
 //! - more steps: three times as many;
-//! - slower mixing: a tenth of the new density is mixed in (0.4 otherwise), and 16 old ones count instead of 8;
-//! - another algorithm: Pulay's mixing of 4 old densities instead of Broyden's;
+//! - slower mixing: a fifth of the new density is mixed in instead of two;
+//! - another algorithm: Broyden's mixing forgets all but 4 old densities, instead of 8, which leads elsewhere;
 //! - other moments: half of them to start from.
 
 mod data;
