@@ -110,3 +110,34 @@ async fn what_failed_is_a_part_of_the_collected_space() {
     assert!(store.unlabelled(protocol("other").hash).await.unwrap().is_empty());
     assert!(store.unlabelled(ContentHash([9; 32])).await.is_err());
 }
+
+#[tokio::test]
+async fn structures_that_may_be_the_same_are_those_nearest_in_energy_that_have_labels() {
+    let home = Home::new();
+    let store = home.create().await.by_the_callers_clock();
+    let mut names = Vec::new();
+    for (step, energy) in [(1, -8.0), (2, -7.0), (3, -8.4), (4, -9.0)] {
+        let mut record = candidate(0, step, Origin::Biased, Fate::Accepted);
+        let candidate = Candidate { energy, ..record.block.view().to_candidate() };
+        record.block = CandidateBlock::encode(&candidate);
+        store.commit(&commit_of(vec![record.clone()])).await.unwrap();
+        names.push(name_of(&record));
+    }
+    let first = lease(&store, 0).await;
+    let (own, others) = store.labelled_near(&first, 9).await.unwrap().unwrap();
+    assert_eq!((own.len(), others.len()), (3 * ATOMS, 0), "nothing has its label");
+    store.complete(&first, &label(-1.0), 1).await.unwrap();
+    for _ in 0..2 {
+        store.complete(&lease(&store, 2).await, &label(-1.0), 3).await.unwrap();
+    }
+    let last = lease(&store, 4).await;
+    let near = |others: Vec<store::NearLabel>| -> Vec<_> {
+        others.into_iter().map(|other| other.candidate).collect()
+    };
+    let (_, others) = store.labelled_near(&last, 2).await.unwrap().unwrap();
+    let mut found = near(others);
+    found.sort();
+    let mut expected = [names[0].clone(), names[2].clone()];
+    expected.sort();
+    assert_eq!(found, expected, "-8.4 and -8.0 are nearest to -9.0");
+}

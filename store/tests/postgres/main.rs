@@ -16,6 +16,8 @@ mod check;
 mod common;
 mod leading;
 mod leases;
+#[path = "../outcomes.rs"]
+mod outcomes;
 #[path = "../processes.rs"]
 mod processes;
 #[path = "../queue.rs"]
