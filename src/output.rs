@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
+use store::Location;
 
 use crate::outcome::Failure;
 
@@ -26,6 +27,18 @@ pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(),
 /// Writes a line to the standard error. That nobody reads it, or that it cannot be kept, stops no work.
 pub fn say(line: impl Display) {
     let _ = writeln!(io::stderr().lock(), "{line}");
+}
+
+/// Says that what goes to the store may be read by others, if its URL allows that.
+pub fn say_if_unprotected(location: &Location) {
+    if let Location::Server(url) = location
+        && url.is_unprotected()
+    {
+        say(format_args!(
+            "WARNING: what goes to and from {url} is not encrypted (sslmode=disable): whoever is on the network can read and \
+             change it"
+        ));
+    }
 }
 
 /// Writes JSON to the standard output.

@@ -15,7 +15,7 @@ use crate::actors::asked_to_stop;
 use crate::actors::slots::{self, Slots};
 use crate::config::Config;
 use crate::labelling::{Here, Labelling};
-use crate::output::say;
+use crate::output::{say, say_if_unprotected};
 
 /// Between two looks whether the campaign is there.
 const PAUSE: Duration = Duration::from_secs(2);
@@ -79,6 +79,7 @@ impl Label {
         }
         let store = self.store.clone().unwrap_or_default();
         let location: Location = store.to_str().map_or_else(|| Ok(Location::from(&store)), str::parse)?;
+        say_if_unprotected(&location);
         let Some((opened, labelling)) = self.begin(&location, &stopping, &stop).await? else {
             return Ok(Ended::Interrupted);
         };

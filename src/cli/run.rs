@@ -22,7 +22,7 @@ use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
 use crate::forecast::{self, Forecast, megabytes};
 use crate::labelling::LABEL_METHOD;
-use crate::output::{print, say};
+use crate::output::{print, say, say_if_unprotected};
 use crate::summary;
 
 /// Run a campaign to its end, or go on with one that was interrupted
@@ -80,6 +80,7 @@ impl Run {
         let patience = Duration::from_secs_f64(60.0 * self.patience);
         let ended = block_on(async {
             let location = campaign.config.location(&directory)?;
+            say_if_unprotected(&location);
             let _lock = lock::directory(&directory, &location, patience).await?;
             listen.iter().try_for_each(actors::Listen::begins)?;
             run(&campaign, &directory, &location, self.in_process, listen.as_ref(), patience).await

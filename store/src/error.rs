@@ -181,6 +181,11 @@ pub enum StoreError {
         "the database server does not answer ({0}): it may be restarting; see that it runs and can be reached, and try again"
     )]
     Unreachable(sqlx::Error),
+    /// The server is there, but what it says about itself or what it is told about us is not believed.
+    #[error(
+        "no protected connection to the database server ({0}): with sslmode=verify-full its certificate must have the name by which the URL calls it, and sslrootcert=FILE the authority that signed it; where the server asks for one, sslcert=FILE and sslkey=FILE are our own"
+    )]
+    Protection(sqlx::Error),
     /// Content that this program cannot have written.
     #[error("damaged database: {what}: {reason}; restore it from a copy")]
     Damaged {
@@ -271,6 +276,9 @@ impl From<sqlx::Error> for StoreError {
                 }
             }
             sqlx::Error::PoolTimedOut => Self::Busy,
+            // TLS calls what it does not believe invalid data; nothing else does.
+            sqlx::Error::Io(source) if source.kind() == io::ErrorKind::InvalidData => Self::Protection(error),
+            sqlx::Error::Tls(_) => Self::Protection(error),
             // SQLite has no connections that break.
             sqlx::Error::Io(_) => Self::Unreachable(error),
             sqlx::Error::ColumnDecode { .. } | sqlx::Error::Decode(_) => Self::damaged("a row", error),

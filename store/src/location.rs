@@ -1,5 +1,7 @@
 //! Where a campaign is kept: a directory of this host, or a server.
 
+mod protection;
+
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -30,6 +32,7 @@ pub struct ServerUrl {
     pub(crate) schema: String,
     shown: String,
     has_password: bool,
+    is_unprotected: bool,
 }
 
 impl ServerUrl {
@@ -72,12 +75,16 @@ impl FromStr for ServerUrl {
             );
             return Err(StoreError::Url { url: shown, reason });
         }
+        protection::check_parameters(&plain)
+            .map_err(|reason| StoreError::Url { url: shown.clone(), reason })?;
         // What its parser says may show a part of what it was given.
         let options: PgConnectOptions = plain.parse().map_err(|_| StoreError::Url {
             url: shown.clone(),
             reason: "it should look like postgres://user@host:5432/database?schema=name".into(),
         })?;
-        Ok(Self { options: Box::new(options), schema, shown, has_password })
+        let (options, is_unprotected) =
+            protection::settle(options).map_err(|reason| StoreError::Url { url: shown.clone(), reason })?;
+        Ok(Self { options: Box::new(options), schema, shown, has_password, is_unprotected })
     }
 }
 
@@ -181,9 +188,9 @@ mod tests {
     #[test]
     fn a_password_is_used_and_never_shown() {
         for url in [
-            "postgres://anna:s3cret@host:5433/lab?schema=alloy",
-            "postgres://anna:s3c@ret@host:5433/lab?schema=alloy",
-            "postgresql://anna@host:5433/lab?password=s3cret&schema=alloy",
+            "postgres://anna:s3cret@host:5433/lab?schema=alloy&sslmode=require",
+            "postgres://anna:s3c@ret@host:5433/lab?schema=alloy&sslmode=verify-full",
+            "postgresql://anna@host:5433/lab?password=s3cret&schema=alloy&sslmode=disable",
         ] {
             let location: Location = url.parse().unwrap();
             let Location::Server(server) = &location else { panic!("{location}") };
@@ -216,6 +223,22 @@ mod tests {
         }
         let location: Location = "campaigns/alloy".parse().unwrap();
         assert!(matches!(location, Location::Directory(directory) if directory.ends_with("alloy")));
+    }
+
+    #[test]
+    fn a_place_is_the_same_however_it_is_written() {
+        let place = |url: &str| url.parse::<ServerUrl>().unwrap().place();
+        let expected = place("postgres://anna@localhost/lab?schema=alloy");
+        for same in [
+            "postgresql://localhost:5432/lab?schema=alloy",
+            "postgres://bert:s3cret@LOCALHOST/lab?application_name=x&schema=alloy",
+            "postgres:///?dbname=lab&host=localhost&schema=alloy",
+        ] {
+            assert_eq!(place(same), expected, "{same}");
+        }
+        for other in ["localhost/lab", "localhost:5433/lab?schema=alloy", "localhost/lap?schema=alloy"] {
+            assert_ne!(place(&format!("postgres://{other}")), expected, "{other}");
+        }
     }
 
     #[test]

@@ -20,6 +20,7 @@ mod leases;
 mod outcomes;
 #[path = "../processes.rs"]
 mod processes;
+mod protection;
 #[path = "../queue.rs"]
 mod queue;
 #[path = "../queue_model.rs"]

@@ -1,0 +1,130 @@
+//! What goes to a server must not be read or changed on its way: TLS, or not a step outside this host. Words as in libpq, but
+//! no way by which a connection is protected only if it happens to be.
+
+use std::fs::File;
+use std::net::IpAddr;
+
+use sqlx::postgres::{PgConnectOptions, PgSslMode};
+
+/// The parameter of a URL, and its variable in the environment, that say how a connection is protected.
+const MODE: &str = "sslmode";
+const ROOT: (&str, &str) = ("sslrootcert", "PGSSLROOTCERT");
+const MODES: &str = "disable, require and verify-full";
+
+/// Refuses what does not mean here what it means to libpq, and files that cannot be read: whoever connects would take that
+/// for a server that is away.
+pub fn check_parameters(url: &str) -> Result<(), String> {
+    let parameters = url.split_once('?').unwrap_or_default().1;
+    let (mut mode, mut has_root) = (std::env::var("PGSSLMODE").ok(), std::env::var_os(ROOT.1).is_some());
+    for (key, value) in form_urlencoded::parse(parameters.as_bytes()) {
+        match &*key {
+            MODE => mode = Some(value.into_owned()),
+            "sslrootcert" | "sslcert" | "sslkey" => {
+                has_root |= key == ROOT.0;
+                File::open(&*value).map_err(|error| format!("cannot read its {key} '{value}' ({error})"))?;
+            }
+            "ssl-mode" | "ssl-root-cert" | "ssl-ca" | "ssl-cert" | "ssl-key" => {
+                return Err(format!(
+                    "'{key}' is written as libpq does: {MODE}, sslrootcert, sslcert, sslkey"
+                ));
+            }
+            _ => {}
+        }
+    }
+    match mode.as_deref() {
+        Some("require") if has_root => Err(format!(
+            "{MODE}=require does not look at the server's certificate, so sslrootcert would be without use: say \
+             {MODE}=verify-full"
+        )),
+        Some("verify-ca") => Err(format!(
+            "{MODE}=verify-ca would believe any server with a certificate of a public authority: say {MODE}=verify-full"
+        )),
+        None | Some("disable" | "allow" | "prefer" | "require" | "verify-full") => Ok(()),
+        Some(mode) => Err(format!("{MODE}={mode} is not known: there are {MODES}")),
+    }
+}
+
+/// The options, and whether a connection leaves this host without protection because its user says so; an error if it would by
+/// default.
+pub fn settle(options: PgConnectOptions) -> Result<(PgConnectOptions, bool), String> {
+    let by_default = matches!(options.get_ssl_mode(), PgSslMode::Allow | PgSslMode::Prefer);
+    match (is_local(&options), by_default) {
+        // Within a host it would cost time and protect nothing.
+        (true, true) => Ok((options.ssl_mode(PgSslMode::Disable), false)),
+        (true, false) => Ok((options, false)),
+        (false, false) => {
+            let unprotected = matches!(options.get_ssl_mode(), PgSslMode::Disable);
+            Ok((options, unprotected))
+        }
+        (false, true) => Err(format!(
+            "the server '{}' is another host, and what goes there must be protected: add {MODE}=verify-full, and \
+             sslrootcert=FILE with the authority that signed the server's certificate unless that is a public one \
+             ({MODE}=require encrypts without knowing to whom; {MODE}=disable is for a network that nobody else is on)",
+            options.get_host()
+        )),
+    }
+}
+
+/// A Unix socket, or this host by an address that no other one has.
+fn is_local(options: &PgConnectOptions) -> bool {
+    let host = options.get_host().trim_matches(['[', ']']);
+    options.get_socket().is_some()
+        || host.starts_with('/')
+        || host.eq_ignore_ascii_case("localhost")
+        || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::{Location, StoreError};
+
+    fn unprotected(url: &str) -> Result<bool, String> {
+        match url.parse::<Location>() {
+            Ok(Location::Server(server)) => Ok(server.is_unprotected()),
+            Ok(Location::Directory(directory)) => panic!("{}", directory.display()),
+            Err(StoreError::Url { reason, .. }) => Err(reason),
+            Err(error) => panic!("{error}"),
+        }
+    }
+
+    #[test]
+    fn off_this_host_nothing_goes_unprotected_by_default() {
+        for local in ["localhost", "127.0.0.1", "127.8.0.1:5433", "[::1]:5433", "%2Frun%2Fpostgresql"] {
+            assert_eq!(unprotected(&format!("postgres://anna@{local}/lab")), Ok(false), "{local}");
+        }
+        assert_eq!(unprotected("postgres:///lab?host=/run/postgresql"), Ok(false));
+        for remote in ["head", "192.168.1.7", "[fe80::1]:5433", "localhost.example.org"] {
+            let url = format!("postgres://anna@{remote}/lab?schema=x");
+            for (mode, expected) in [("require", false), ("verify-full", false), ("disable", true)] {
+                assert_eq!(unprotected(&format!("{url}&sslmode={mode}")), Ok(expected), "{remote} {mode}");
+            }
+            for mode in ["", "&sslmode=prefer", "&sslmode=allow"] {
+                let message = unprotected(&format!("{url}{mode}")).unwrap_err();
+                assert!(message.contains("sslmode=verify-full"), "{message}");
+            }
+        }
+        // The last word counts.
+        assert!(unprotected("postgres://anna@localhost/lab?host=head").is_err());
+    }
+
+    #[test]
+    fn what_means_something_else_than_it_says_is_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let root = directory.path().join("an authority.pem");
+        std::fs::write(&root, "certificate").unwrap();
+        let root = root.to_str().unwrap().replace(' ', "%20");
+        let url = |parameters: &str| unprotected(&format!("postgres://anna@head/lab?{parameters}"));
+        assert_eq!(url(&format!("sslmode=verify-full&sslrootcert={root}")), Ok(false));
+        for (parameters, expected) in [
+            (format!("sslmode=require&sslrootcert={root}"), "say sslmode=verify-full"),
+            (format!("sslmode=verify-ca&sslrootcert={root}"), "any server with a certificate"),
+            (format!("sslmode=verify-full&sslrootcert={root}.old"), "an authority.pem.old' (No such file"),
+            ("sslmode=verify-full&sslkey=/nowhere/key.pem".into(), "its sslkey '/nowhere/key.pem'"),
+            ("sslmode=verify_full".into(), "not known"),
+            ("ssl-mode=disable".into(), "as libpq does"),
+        ] {
+            let message = url(&parameters).unwrap_err();
+            assert!(message.contains(expected), "{message}");
+        }
+    }
+}

@@ -1,0 +1,90 @@
+//! TLS to the server that `.ci/postgres` makes, whose certificate, and that of a user who needs one, are of its own authority.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use sqlx::Executor;
+use store::{CampaignLock, Location, Store, StoreError};
+
+use super::common::*;
+use super::leading::connect;
+
+/// The directory with `authority.pem`, `server` and `anna`.
+async fn certificates(home: &Home) -> PathBuf {
+    let mut connection = connect(home).await;
+    let file: String = sqlx::query_scalar("SHOW ssl_ca_file").fetch_one(&mut connection).await.unwrap();
+    Path::new(&file).parent().unwrap().to_owned()
+}
+
+/// The location as `user` by an encrypted connection, to the host by that name.
+fn at(home: &Home, user: &str, host: &str, parameters: &str) -> Location {
+    let address = server().split_once('@').unwrap().1.replace("127.0.0.1", host);
+    let schema = home.schema();
+    let url = format!("postgres://{user}@{address}?schema={schema}&application_name={schema}&{parameters}");
+    url.parse().unwrap()
+}
+
+/// Number of the connections of a test by which its store and its lock are used, and of those that are encrypted.
+async fn connections(home: &Home) -> (i64, i64) {
+    let sql = "SELECT count(*), count(*) FILTER (WHERE ssl) FROM pg_stat_activity NATURAL JOIN pg_stat_ssl
+               WHERE application_name = $1";
+    sqlx::query_as(sql).bind(home.schema()).fetch_one(&mut connect(home).await).await.unwrap()
+}
+
+#[tokio::test]
+async fn a_server_that_is_known_is_spoken_to_in_secret() {
+    let home = Home::new();
+    let root = certificates(&home).await.join("authority.pem");
+    let location =
+        at(&home, "calmwalk", "localhost", &format!("sslmode=verify-full&sslrootcert={}", root.display()));
+    let lock = CampaignLock::acquire_at(&location, "protected").await.unwrap();
+    let store = Store::create(&location, &campaign(), &[], 0).await.unwrap().led_by(&lock);
+    store.status().await.unwrap();
+    let (all, encrypted) = connections(&home).await;
+    assert!(all >= 2, "the lock has one, and the store");
+    assert_eq!(all, encrypted);
+}
+
+#[tokio::test]
+async fn a_server_that_is_not_known_is_not_spoken_to() {
+    let home = Home::new();
+    let own = certificates(&home).await;
+    let others = tempfile::tempdir().unwrap();
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/certificates.sh");
+    let made = Command::new(script).arg(others.path()).arg("server").output().unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let wrong = format!("sslmode=verify-full&sslrootcert={}/authority.pem", others.path().display());
+    let right = format!("sslmode=verify-full&sslrootcert={}/authority.pem", own.display());
+    for (host, parameters, expected) in [
+        ("localhost", wrong.as_str(), "BadSignature"),
+        // Public authorities alone.
+        ("localhost", "sslmode=verify-full", "UnknownIssuer"),
+        // Another name than that of its certificate.
+        ("127.0.0.1", right.as_str(), "not valid for name"),
+    ] {
+        let error = Store::open(at(&home, "calmwalk", host, parameters)).await.unwrap_err();
+        let message = error.to_string();
+        assert!(matches!(error, StoreError::Protection(_)) && !error.is_transient(), "{error:?}");
+        assert!(message.contains(expected) && message.contains("sslrootcert"), "{message}");
+    }
+}
+
+#[tokio::test]
+async fn a_user_may_be_known_by_a_certificate() {
+    let home = Home::new();
+    let certificates = certificates(&home).await;
+    let make = "DO $$ BEGIN CREATE ROLE anna LOGIN SUPERUSER; EXCEPTION WHEN duplicate_object THEN END $$";
+    connect(&home).await.execute(make).await.unwrap();
+    let (root, anna) = (certificates.join("authority.pem"), certificates.join("anna"));
+    let known = format!("sslmode=verify-full&sslrootcert={}", root.display());
+    let refused = Store::open(at(&home, "anna", "localhost", &known)).await.unwrap_err();
+    assert!(refused.to_string().contains("certificate"), "{refused}");
+    let anna = anna.display();
+    let own = format!("sslcert={anna}/certificate.pem&sslkey={anna}/key.pem");
+    let location = at(&home, "anna", "localhost", &format!("{known}&{own}"));
+    let store = Store::create(&location, &campaign(), &[], 0).await.unwrap();
+    assert!(connections(&home).await.1 >= 1);
+    store.close().await;
+    let leave = "REASSIGN OWNED BY anna TO CURRENT_USER; DROP ROLE anna";
+    connect(&home).await.execute(leave).await.unwrap();
+}
