@@ -2,5 +2,6 @@
 //! conversation has come. No port, no clock.
 
 pub(crate) mod conversation;
+pub(crate) mod dropped;
 pub(crate) mod frame;
 pub(crate) mod message;

@@ -11,9 +11,9 @@ use super::config::{IN_PLACE, IN_PLACE_IN_ALL, Request};
 use super::lent::Lent;
 use super::lines::Lines;
 use crate::block::{BlockError, CandidateBlock};
-use crate::control::{ControlError, EncodedReport, seal, unseal};
-use crate::exchange::conversation::{Conversations, Next, Stranger};
-use crate::exchange::frame::FrameError;
+use crate::control::{EncodedReport, seal, unseal};
+use crate::exchange::conversation::{Conversations, Next};
+use crate::exchange::dropped::Dropped;
 use crate::exchange::message::{Answer, Caller, Decision, Letter, Words, complete};
 use crate::ids::WalkId;
 use crate::messages::Progress;
@@ -31,19 +31,6 @@ pub(super) struct Desk {
     /// Candidates that may still be read in place.
     in_place: Vec<(Caller, Weak<Lent>)>,
     mixtures: SharedMixture,
-}
-
-/// Why a message is dropped.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum Dropped {
-    #[error(transparent)]
-    Frame(#[from] FrameError),
-    #[error(transparent)]
-    Control(#[from] ControlError),
-    #[error(transparent)]
-    Stranger(#[from] Stranger),
-    #[error(transparent)]
-    Block(#[from] BlockError),
 }
 
 impl Desk {

@@ -4,9 +4,9 @@
 use serde::Serialize;
 use zerocopy::IntoBytes;
 
-use super::desk::Dropped;
 use crate::block::{Candidate, CandidateBlock};
 use crate::control::{seal, unseal};
+use crate::exchange::dropped::Dropped;
 use crate::exchange::frame;
 use crate::exchange::message::{Answer, Letter, Words, complete};
 

@@ -20,10 +20,11 @@ use super::files::Files;
 use super::hub::AgentEvent;
 use super::message::{Agent, ORCHESTRATOR, Place, Reply, Request};
 use super::roster::{Member, Roster};
-use crate::block::{BlockError, CandidateBlock};
-use crate::control::{ControlError, EncodedReport, seal, unseal};
+use crate::block::CandidateBlock;
+use crate::control::{EncodedReport, seal, unseal};
 use crate::exchange::conversation::{Conversations, Next, Stranger};
-use crate::exchange::frame::{self, FrameError};
+use crate::exchange::dropped::Dropped;
+use crate::exchange::frame;
 use crate::exchange::message::{Answer, Caller, Decision, Letter, Words, complete};
 use crate::ids::WalkId;
 use crate::messages::Progress;
@@ -64,27 +65,6 @@ struct Line {
     mixture: Option<Arc<Mixture>>,
     /// Gives up waiting for the reactor.
     deciding: Option<AbortHandle>,
-}
-
-/// Why a message is dropped.
-#[derive(Debug, thiserror::Error)]
-enum Dropped {
-    #[error(transparent)]
-    Frame(#[from] FrameError),
-    #[error(transparent)]
-    Control(#[from] ControlError),
-    #[error(transparent)]
-    Stranger(#[from] Stranger),
-    #[error(transparent)]
-    Block(#[from] BlockError),
-    #[error("there is no version {0} of the mixture any more")]
-    Version(u64),
-    #[error("no file with the hash {0} belongs to this campaign")]
-    File(String),
-    #[error("cannot read a file that walkers need: {0}")]
-    Read(#[from] std::io::Error),
-    #[error("no numbers are left for so many walkers")]
-    Numbers,
 }
 
 impl Desk {
