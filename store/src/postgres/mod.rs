@@ -4,14 +4,15 @@ mod jobs;
 pub mod leadership;
 
 use std::fmt;
+use std::io::{self, ErrorKind};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sqlx::migrate::Migrator;
 use sqlx::pool::PoolConnection;
 use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, Postgres};
-use sqlx::{AssertSqlSafe, Executor};
-use tokio::time::sleep;
+use sqlx::{AssertSqlSafe, ConnectOptions, Connection, Executor};
+use tokio::time::{sleep, timeout};
 use wire::CampaignId;
 
 use self::jobs::Jobs;
@@ -27,6 +28,8 @@ const CONNECTIONS: u32 = 5;
 const IDLE: Duration = Duration::from_secs(60);
 /// How long a server may be away before what needs it fails, and how long a connection is waited for.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// How long a server is asked why there is no connection.
+const ANSWER: Duration = Duration::from_secs(3);
 /// Between two tries to reach a server that is away.
 pub const PAUSE: Duration = Duration::from_millis(100);
 
@@ -102,7 +105,22 @@ impl Server {
 
     /// A connection to read with, or to begin with.
     pub async fn connection(&self) -> Result<PoolConnection<Postgres>> {
-        self.pool.acquire().await.map_err(unreachable)
+        self.told(self.pool.acquire().await).await
+    }
+
+    /// What came of waiting for a connection. The pool tries on where a server refuses one or has none left, and in the end says
+    /// only that its time is over: the server itself is asked why.
+    async fn told<T>(&self, waited: sqlx::Result<T>) -> Result<T> {
+        let Err(sqlx::Error::PoolTimedOut) = waited else { return Ok(waited?) };
+        let timed_out = |why: &str| sqlx::Error::Io(io::Error::new(ErrorKind::TimedOut, why));
+        let connect = async { self.pool.connect_options().connect().await?.close().await };
+        Err(match timeout(ANSWER, connect).await {
+            Ok(Ok(())) => StoreError::Unreachable(timed_out(
+                "it takes new connections, but all of this process waited for it: for its disk, or for what somebody has locked",
+            )),
+            Ok(Err(error)) => error.into(),
+            Err(_) => StoreError::Unreachable(timed_out("no answer")),
+        })
     }
 
     pub async fn begin(&self) -> Result<Transaction> {
@@ -120,7 +138,7 @@ impl Server {
     async fn begin_with(&self, statement: &'static str) -> Result<Transaction> {
         let begun = Instant::now();
         loop {
-            match self.pool.begin_with(statement).await.map_err(unreachable) {
+            match self.told(self.pool.begin_with(statement).await).await {
                 Err(StoreError::Unreachable(_)) if begun.elapsed() < self.patience => sleep(PAUSE).await,
                 begun => return Ok(Transaction::Postgres(begun?, self.clock)),
             }
@@ -208,14 +226,6 @@ fn options(url: &ServerUrl) -> PgConnectOptions {
             ("tcp_keepalives_count", "3"),
         ])
         .options([("search_path", url.schema.as_str()), ("synchronous_commit", "on")])
-}
-
-/// What a server says that cannot be asked.
-fn unreachable(error: sqlx::Error) -> StoreError {
-    match error {
-        sqlx::Error::PoolTimedOut => StoreError::Unreachable(error),
-        error => error.into(),
-    }
 }
 
 /// Makes the schema and the tables in it, where they are not there yet.

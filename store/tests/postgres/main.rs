@@ -14,6 +14,7 @@ mod campaign;
 mod check;
 #[path = "../common/mod.rs"]
 mod common;
+mod connections;
 mod leading;
 mod leases;
 #[path = "../outcomes.rs"]

@@ -1,0 +1,57 @@
+//! What is said when there is no connection to be had.
+
+use std::time::Duration;
+
+use sqlx::postgres::PgConnectOptions;
+use sqlx::{AssertSqlSafe, ConnectOptions, Connection, Executor};
+use store::{Commit, Location, Store};
+
+use super::common::*;
+use super::leading::connect;
+
+/// A server that refuses new connections, though it is there.
+#[tokio::test]
+async fn a_server_without_a_connection_left_is_waited_for_and_says_so() {
+    let home = Home::new();
+    let store = home.create().await;
+    store.close().await;
+    let role = format!("one_{}", home.schema());
+    let mut connection = connect(&home).await;
+    let make = format!(
+        "CREATE ROLE {role} LOGIN CONNECTION LIMIT 1; GRANT USAGE ON SCHEMA {0} TO {role};
+         GRANT SELECT ON ALL TABLES IN SCHEMA {0} TO {role}",
+        home.schema()
+    );
+    connection.execute(AssertSqlSafe(make)).await.unwrap();
+    let options: PgConnectOptions = server().parse().unwrap();
+    let first = options.username(&role).connect().await.unwrap();
+    let address = server().split_once('@').unwrap().1.to_owned();
+    let location: Location = format!("postgres://{role}@{address}?schema={}", home.schema()).parse().unwrap();
+    let error = Store::open_read_only(&location).await.unwrap_err();
+    assert!(error.is_transient() && error.to_string().contains("too many connections"), "{error}");
+    first.close().await.unwrap();
+    let leave = format!("DROP OWNED BY {role}; DROP ROLE {role}");
+    connection.execute(AssertSqlSafe(leave)).await.unwrap();
+}
+
+/// Somebody holds what all connections of a process wait for.
+#[tokio::test]
+async fn who_waits_for_a_lock_is_not_told_that_the_server_is_away() {
+    let home = Home::new();
+    let store = home.create().await;
+    let mut other = connect(&home).await;
+    other.execute("BEGIN; UPDATE leader SET holder = 'somebody'").await.unwrap();
+    let commits = (0..5).map(|_| {
+        let store = store.clone();
+        tokio::spawn(async move { store.commit(&Commit::default()).await })
+    });
+    let commits: Vec<_> = commits.collect();
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    let error = store.add_time_under_way(1).await.unwrap_err();
+    assert!(error.is_transient() && error.to_string().contains("locked"), "{error}");
+    other.execute("ROLLBACK").await.unwrap();
+    for commit in commits {
+        commit.await.unwrap().unwrap();
+    }
+    store.add_time_under_way(1).await.unwrap();
+}
