@@ -4,10 +4,12 @@
 
 mod common;
 
+use std::fs;
 use std::time::Duration;
 
 use common::campaign::{Small, outcome};
 use common::hosts::{Hosts, undisturbed};
+use common::line::SlowLine;
 use common::processes::{carrying_out, signal, wait_until};
 use common::{kills, random};
 
@@ -52,6 +54,49 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
     assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
+    hosts.are_empty();
+}
+
+/// 200 ms each way, so an agent with a turn ahead works through it as ever.
+#[test]
+fn a_slow_line_changes_nothing() {
+    let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
+    let mut hosts = Hosts::new(&small, 1, "agent_silence_limit = 30.0");
+    let line = SlowLine::to(hosts.endpoints[0].trim_start_matches("tcp/"), Duration::from_millis(200));
+    hosts.endpoints[1] = format!("tcp/{}", line.here);
+    hosts.options[1] = vec!["--ahead=1".into()];
+    let mut agent = hosts.agent(0);
+    let mut orchestrator = hosts.lead();
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
+    assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
+    assert!(!hosts.head_said().contains("gives no sign of life"), "{}", hosts.head_said());
+    assert!(hosts.said(0).contains("joined: 1 walkers"), "{}", hosts.said(0));
+    assert!(line.carried() > 1_000_000, "candidates came over the line: {} bytes", line.carried());
+    assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
+    hosts.are_empty();
+}
+
+#[test]
+fn what_a_killed_agent_leaves_is_removed_by_the_next() {
+    let hosts = hosts(&Small::default(), 1);
+    let directories = || {
+        let entries = fs::read_dir(hosts.others[0].path()).unwrap().map(|entry| entry.unwrap().path());
+        entries.filter(|path| path.is_dir()).collect::<Vec<_>>()
+    };
+    let waits = || hosts.said(0).matches("waiting for the orchestrator").count();
+    let mut killed = hosts.agent(0);
+    wait_until("the first waits", || waits() == 1);
+    signal(killed.0.id(), "KILL");
+    killed.0.wait().unwrap();
+    let left = directories();
+    assert_eq!(left.len(), 1);
+    let (mut second, third) = (hosts.agent(0), hosts.agent(0));
+    wait_until("two others wait", || waits() == 3);
+    assert!(directories().len() == 2 && !directories().contains(&left[0]), "{:?}", directories());
+    for agent in [&second, &third] {
+        signal(agent.0.id(), "TERM");
+    }
+    assert_eq!(second.0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
     hosts.are_empty();
 }
 

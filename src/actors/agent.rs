@@ -24,9 +24,6 @@ use crate::outcome::{Ended, Failure};
 use crate::output::say;
 use crate::setup::{self, AgentSetup, WalkerSetup};
 
-/// Names of directories in which agents keep what they need begin with this.
-pub const SCRATCH: &str = "calmwalk-agent-";
-
 /// Works for a campaign until it is over or this process is asked to stop. What is needed in the meantime lies in
 /// `directory`. To be awaited on the main thread: the walkers end with the thread that starts them.
 pub async fn work(
@@ -38,8 +35,8 @@ pub async fn work(
 ) -> Result<Ended, Failure> {
     let (stopping, stop) = asked_to_stop(STOPPING)?;
     let walkers = agent.walkers;
-    let (uplink, joined) = tokio::select! {
-        joined = join(address, tls, agent) => joined?,
+    let (uplink, joined, setup) = tokio::select! {
+        joined = join(address, tls, agent, directory) => joined?,
         () = stop.notified() => return Ok(Ended::Interrupted),
         () = address.over() => {
             say("the campaign is over");
@@ -50,12 +47,7 @@ pub async fn work(
             return Err(Failure::Failed(format!("no orchestrator has answered at {address} for {minutes:.1} min")));
         }
     };
-    let setup: AgentSetup = serde_json::from_slice(&joined.setup).map_err(|error| {
-        Failure::Failed(format!("the orchestrator's setup: {error}: run the same program everywhere"))
-    })?;
-    let setup = AgentSetup { model: model(&joined, &setup, directory).await?, ..setup };
     say(format_args!("joined: {walkers} walkers, mixture version {}", joined.newest().await.version()));
-    clean();
     let place = Place::of(directory).map_err(Failure::failed)?;
     let mixture = joined.newest().await;
     let (flag, asked) = (Arc::clone(&stopping), Arc::clone(&stop));
@@ -78,43 +70,45 @@ pub async fn work(
     Ok(ended)
 }
 
-/// Waits until there is an orchestrator, and a place with it.
+/// Waits until there is an orchestrator, a place with it, and what its walkers need.
 async fn join(
     address: &Address,
     tls: Option<&Tls>,
     agent: net::Agent,
-) -> Result<(Arc<Uplink>, Joined), Failure> {
+    directory: &Path,
+) -> Result<(Arc<Uplink>, Joined, AgentSetup), Failure> {
     let waiting = |why: &NetError| say(format_args!("waiting for the orchestrator: {why}"));
     let uplink = Uplink::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
     let uplink = Arc::new(uplink);
-    let joined = uplink.join().await.map_err(Failure::failed)?;
-    Ok((uplink, joined))
-}
-
-/// Removes what agents left that were killed on this host.
-fn clean() {
-    for place in Place::all().unwrap_or_default() {
-        let Some(directory) = place.campaign_directory() else { continue };
-        let name = directory.file_name().unwrap_or_default().to_string_lossy();
-        // Those of the living are in use and stay.
-        if name.starts_with(SCRATCH) && place.remove().is_ok() {
-            let _ = fs::remove_dir_all(directory);
+    loop {
+        let joined = uplink.join().await.map_err(Failure::failed)?;
+        let setup: AgentSetup = serde_json::from_slice(&joined.setup).map_err(|error| {
+            Failure::Failed(format!("the orchestrator's setup: {error}: run the same program everywhere"))
+        })?;
+        match model(&joined, &setup, directory).await? {
+            Some(model) => return Ok((uplink, joined, AgentSetup { model, ..setup })),
+            None => say("the orchestrator was started again meanwhile: joining anew"),
         }
     }
 }
 
-/// The model's file: the orchestrator's own where this host sees it, else a copy.
-async fn model(joined: &Joined, setup: &AgentSetup, directory: &Path) -> Result<PathBuf, Failure> {
+/// The model's file: the orchestrator's own where this host sees it, else a copy; `None` if the place was lost before it was
+/// here.
+async fn model(joined: &Joined, setup: &AgentSetup, directory: &Path) -> Result<Option<PathBuf>, Failure> {
     let hash = &setup.model_hash;
     if setup::unchanged(&setup.model, hash).is_ok() {
-        return Ok(setup.model.clone());
+        return Ok(Some(setup.model.clone()));
     }
+    say("this host does not see the orchestrator's model: fetching the model …");
     let path = directory.join("kokkos.npz");
-    let bytes = joined.file(hash).await.map_err(Failure::failed)?;
+    let bytes = match joined.file(hash).await {
+        Err(Parted::Stranger(_)) => return Ok(None),
+        bytes => bytes.map_err(Failure::failed)?,
+    };
     fs::write(&path, bytes)
         .map_err(|error| Failure::Failed(format!("cannot write {}: {error}", path.display())))?;
     setup::unchanged(&path, hash).map_err(Failure::failed)?;
-    Ok(path)
+    Ok(Some(path))
 }
 
 /// The walkers of this host, and the task that deals turns to them.

@@ -10,6 +10,7 @@ mod labellers;
 mod listen;
 pub mod processes;
 mod records;
+pub mod scratch;
 pub mod slots;
 mod starts;
 

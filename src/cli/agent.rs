@@ -7,6 +7,7 @@ use store::ProcessRecord;
 use wire::net::{self, Address, Tls};
 
 use super::{Ended, Failure, block_on};
+use crate::actors::scratch::{self, Scratch};
 use crate::actors::{agent, cores};
 
 /// Let this host take part in a campaign that `calmwalk run --listen` leads on another
@@ -41,8 +42,8 @@ impl Agent {
         let walkers = self.walkers.unwrap_or_else(cores);
         let patience = Duration::from_secs_f64(60.0 * self.patience);
         let tls = self.tls.as_deref().map(Tls::in_directory);
-        let scratch = tempfile::Builder::new().prefix(agent::SCRATCH).tempdir();
-        let scratch = scratch.map_err(|error| {
+        scratch::clean();
+        let scratch = Scratch::new().map_err(|error| {
             Failure::Failed(format!("cannot make a directory in {}: {error}", std::env::temp_dir().display()))
         })?;
         let process =

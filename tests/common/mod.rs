@@ -5,6 +5,7 @@ pub mod campaign;
 pub mod clock;
 pub mod desk;
 pub mod hosts;
+pub mod line;
 pub mod place;
 pub mod processes;
 

@@ -10,6 +10,7 @@ mod cable;
 mod clocks;
 mod disk;
 mod links;
+mod model;
 
 use std::process::Command;
 

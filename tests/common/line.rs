@@ -1,0 +1,60 @@
+//! A line between hosts on which everything takes longer.
+
+use std::io::{Read, Write};
+use std::net::{Shutdown, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc;
+use std::thread::{self, sleep};
+use std::time::{Duration, Instant};
+
+/// Where it begins, as `127.0.0.1:port`, and how many bytes have come through.
+pub struct SlowLine {
+    pub here: String,
+    carried: Arc<AtomicUsize>,
+}
+
+impl SlowLine {
+    /// Listens for connections to `there`; what goes over them, either way, arrives by so much later.
+    pub fn to(there: &str, delay: Duration) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let (here, carried) = (listener.local_addr().unwrap().to_string(), Arc::new(AtomicUsize::new(0)));
+        let (there, count) = (there.to_owned(), Arc::clone(&carried));
+        thread::spawn(move || {
+            for near in listener.incoming().flatten() {
+                // If nobody is there yet, whoever calls tries again.
+                let Ok(far) = TcpStream::connect(&there) else { continue };
+                carry(near.try_clone().unwrap(), far.try_clone().unwrap(), delay, Arc::clone(&count));
+                carry(far, near, delay, Arc::clone(&count));
+            }
+        });
+        Self { here, carried }
+    }
+
+    pub fn carried(&self) -> usize {
+        self.carried.load(Ordering::Relaxed)
+    }
+}
+
+fn carry(mut from: TcpStream, mut to: TcpStream, delay: Duration, count: Arc<AtomicUsize>) {
+    let (sender, receiver) = mpsc::channel::<(Instant, Vec<u8>)>();
+    thread::spawn(move || {
+        let mut buffer = vec![0; 1 << 16];
+        while let Ok(read @ 1..) = from.read(&mut buffer) {
+            if sender.send((Instant::now() + delay, buffer[..read].to_vec())).is_err() {
+                return;
+            }
+        }
+    });
+    thread::spawn(move || {
+        for (due, bytes) in receiver {
+            sleep(due.saturating_duration_since(Instant::now()));
+            if to.write_all(&bytes).is_err() {
+                break;
+            }
+            count.fetch_add(bytes.len(), Ordering::Relaxed);
+        }
+        // It may be closed already.
+        let _ = to.shutdown(Shutdown::Both);
+    });
+}

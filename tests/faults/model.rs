@@ -1,0 +1,50 @@
+//! An agent on a host that does not see the orchestrator's model fetches it, and the orchestrator is killed meanwhile.
+
+use std::fs;
+use std::time::Duration;
+
+use crate::common::campaign::{Small, outcome};
+use crate::common::config;
+use crate::common::hosts::{Hosts, undisturbed};
+use crate::common::line::SlowLine;
+use crate::common::processes::{carrying_out, signal, wait_until};
+
+/// Long enough to kill somebody while a question is on its way.
+const DELAY: Duration = Duration::from_secs(1);
+
+#[test]
+fn an_orchestrator_is_killed_while_its_model_is_fetched() {
+    let small = Small { steps: 1600, per_seed: 16, ..Small::default() };
+    let mut hosts = Hosts::new(&small, 1, "agent_silence_limit = 30.0");
+    // The agent has another file system where the model is.
+    let models = hosts.home.path().join("models");
+    fs::create_dir(&models).unwrap();
+    let (path, model) = (hosts.home.path().join("campaign.toml"), config("data/al_eam_1l/kokkos.npz"));
+    let text = fs::read_to_string(&path).unwrap();
+    assert!(text.contains(model.to_str().unwrap()));
+    fs::copy(&model, models.join("kokkos.npz")).unwrap();
+    fs::write(&path, text.replace(model.to_str().unwrap(), "models/kokkos.npz")).unwrap();
+    let elsewhere = ["unshare", "--mount", "sh", "-c", "mount -t tmpfs none \"$0\" && exec \"$@\""];
+    hosts.through[1] =
+        elsewhere.map(str::to_owned).into_iter().chain([models.display().to_string()]).collect();
+    let line = SlowLine::to(hosts.endpoints[0].trim_start_matches("tcp/"), DELAY);
+    hosts.endpoints[1] = format!("tcp/{}", line.here);
+
+    let (mut orchestrator, mut agent) = (hosts.lead(), hosts.agent(0));
+    wait_until("the agent asks for the model", || hosts.said(0).contains("fetching the model"));
+    signal(orchestrator.0.id(), "KILL");
+    orchestrator.0.wait().unwrap();
+    let mut orchestrator = hosts.lead();
+    // So that there is something left to do for the host that comes back.
+    let walkers = || carrying_out(hosts.home.path(), "walker");
+    wait_until("its own walker is at work", || !walkers().is_empty());
+    let walker = walkers()[0];
+    signal(walker, "STOP");
+    wait_until("the agent has joined it", || hosts.said(0).contains("joined: 1 walkers"));
+    signal(walker, "CONT");
+    assert!(hosts.said(0).contains("joining anew"), "{}", hosts.said(0));
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
+    assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
+    assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
+    hosts.are_empty();
+}
