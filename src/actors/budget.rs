@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use store::{Store, StoreError, unix_milliseconds};
+use store::{Budget, Store, StoreError, unix_milliseconds};
 use tokio::sync::Notify;
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
@@ -19,14 +19,15 @@ pub async fn time_used_up(store: &Store) -> Result<Option<&'static str>, StoreEr
 
 /// Counts the time until it is dropped, and says so to `over` when a limit is reached: once, as somebody who asks to stop.
 /// A database that is busy is told later.
-pub async fn keep(store: &Store, over: &Notify) -> StoreError {
+pub async fn keep(store: &Store, limits: &Budget, over: &Notify) -> StoreError {
+    let limited = limits.wall_hours.is_some() || limits.core_hours.is_some();
     let mut look = interval(LOOK);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let (mut counted, mut is_over) = (Instant::now(), false);
     loop {
         look.tick().await;
         let now = Instant::now();
-        match count(store, now - counted).await {
+        match count(store, now - counted, limited).await {
             Ok(used_up) => {
                 counted = now;
                 if let Some(key) = used_up.filter(|_| !is_over) {
@@ -41,7 +42,8 @@ pub async fn keep(store: &Store, over: &Notify) -> StoreError {
     }
 }
 
-async fn count(store: &Store, time: Duration) -> Result<Option<&'static str>, StoreError> {
+/// Adds the time, and looks whether a limit is reached if there is one.
+async fn count(store: &Store, time: Duration, limited: bool) -> Result<Option<&'static str>, StoreError> {
     store.add_time_under_way(time.as_millis() as u64).await?;
-    time_used_up(store).await
+    if limited { time_used_up(store).await } else { Ok(None) }
 }

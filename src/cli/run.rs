@@ -116,7 +116,7 @@ async fn run(
     }
     let over = Arc::new(Notify::new());
     let run = actors::Run { campaign, store: &store, process: &process, directory, listen, over: &over };
-    let used_up = budget::time_used_up(&store).await?;
+    let (limits, used_up) = (campaign.config.budget(), budget::time_used_up(&store).await?);
     let work = async {
         if used_up.is_some() {
             // Nothing may be begun.
@@ -126,7 +126,7 @@ async fn run(
     };
     let ended = tokio::select! {
         ended = work => ended?,
-        error = budget::keep(&store, &over) => return Err(error.into()),
+        error = budget::keep(&store, &limits, &over) => return Err(error.into()),
         error = lock::lost(lock.as_ref()) => return Err(error.into()),
     };
     // Hours of work do not end as a failure because a server is away in the last second.
