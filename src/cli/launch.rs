@@ -86,7 +86,11 @@ pub const FOLDER: &str = "slurm";
 
 /// How the jobs of a campaign are called: after the place where it is kept, which is there before it begins.
 pub fn job_names(location: &Location) -> JobNames {
-    JobNames::new(&blake3::hash(location.to_string().as_bytes()).to_hex()[..12])
+    let place = match location {
+        Location::Directory(directory) => directory.display().to_string(),
+        Location::Server(url) => url.place(),
+    };
+    JobNames::new(&blake3::hash(place.as_bytes()).to_hex()[..12])
 }
 
 impl Launch {

@@ -45,6 +45,22 @@ impl ServerUrl {
     pub fn has_password(&self) -> bool {
         self.has_password
     }
+
+    /// What tells its campaign from others: server, port, database and schema, however the URL says them, and whoever connects.
+    pub fn place(&self) -> String {
+        let options = &self.options;
+        let host = match options.get_socket() {
+            Some(directory) => directory.display().to_string(),
+            None => options.get_host().to_ascii_lowercase(),
+        };
+        let database = options.get_database().unwrap_or(options.get_username());
+        format!("{host}:{}/{database}?schema={}", options.get_port(), self.schema)
+    }
+
+    /// Whether what is said to the server crosses a network that others may read and change, since the URL says so.
+    pub fn is_unprotected(&self) -> bool {
+        self.is_unprotected
+    }
 }
 
 impl Location {
