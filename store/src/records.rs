@@ -55,6 +55,16 @@ pub enum Fate {
     Declined(Decline),
 }
 
+impl Fate {
+    /// `accepted`, or why not.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Accepted => "accepted",
+            Self::Declined(reason) => reason.name(),
+        }
+    }
+}
+
 /// A candidate with what the selector found. The walker's own grades are in the block.
 #[derive(Clone, Debug)]
 pub struct CandidateRecord {

@@ -66,6 +66,14 @@ async fn each_damage_is_found_and_told_in_words() {
             "UPDATE job SET state = 'queued'",
             "1 jobs that are labelled without a label, or have one and are not",
         ),
+        (
+            "UPDATE candidate_count SET number = 7 WHERE fate = 'covered'",
+            "1 kinds of candidates are counted wrongly (such as biased covered)",
+        ),
+        (
+            "DELETE FROM candidate_count",
+            "3 kinds of candidates are counted wrongly (such as biased accepted)",
+        ),
         ("DELETE FROM label", "1 jobs that are labelled without a label, or have one and are not"),
         ("DELETE FROM attempt", "1 labels that do not belong to their job"),
         (

@@ -23,6 +23,12 @@ async fn version(directory: &Path) -> i64 {
     sqlx::query_scalar("PRAGMA user_version").fetch_one(&mut connection).await.unwrap()
 }
 
+/// Candidates, as they were counted.
+async fn counts(directory: &Path) -> i64 {
+    let mut connection = connect(&directory.join(DATABASE)).await;
+    sqlx::query_scalar("SELECT sum(number) FROM candidate_count").fetch_one(&mut connection).await.unwrap()
+}
+
 /// A campaign as version 1 leaves it when it is killed: one job is leased. Returns its decision log.
 async fn version_1(directory: &Path) -> String {
     let now = tempfile::tempdir().unwrap();
@@ -85,6 +91,7 @@ async fn a_campaign_of_version_1_is_looked_at_as_it_is() {
     let before = fs::read(directory.path().join(DATABASE)).unwrap();
     let store = Store::open_read_only(directory.path()).await.unwrap();
     let status = store.status().await.unwrap();
+    assert_eq!(status.candidates.accepted, 2);
     assert_eq!((status.labels.leased, status.processes), (1, vec![old_process()]));
     assert_eq!(store.processes(Some("orchestrator")).await.unwrap(), [old_process()]);
     assert_eq!(store.decision_log_text().await.unwrap(), log);
@@ -97,8 +104,9 @@ async fn a_campaign_of_version_1_goes_on() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let store = Store::open(directory.path()).await.unwrap();
-    assert_eq!(version(directory.path()).await, 3);
+    assert_eq!(version(directory.path()).await, 4);
     assert_eq!(store.decision_log_text().await.unwrap(), log);
+    assert_eq!((store.status().await.unwrap().candidates.accepted, counts(directory.path()).await), (2, 2));
     assert_eq!(store.processes(None).await.unwrap(), [old_process()]);
     // Its number is in use again, but the lock says that it cannot be the same process.
     assert!(!old_process().is_gone());

@@ -50,7 +50,7 @@ macro_rules! table {
 
 /// Every table but those of the leader and of processes, each after those that it refers to. Some rows of the campaign's
 /// are there from the beginning.
-const TABLES: [Table; 15] = [
+const TABLES: [Table; 16] = [
     table!("campaign" { key: T, value: T }),
     table!("value" { name: T, value: T }),
     table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B }),
@@ -65,6 +65,7 @@ const TABLES: [Table; 15] = [
         walker_gamma: R, walker_gamma_nbr: R, walker_above: I, selector_gamma: R, selector_gamma_nbr: R,
         selector_above: I, original_gamma: R, original_gamma_nbr: R, original_above: I,
     }),
+    table!("candidate_count" { origin: T, fate: T, number: I }),
     table!("candidate_data" { decision: I, block: B, features: B, selector_grades: B, original_grades: B }),
     table!("component" { element: I, slot: I, bytes: B }),
     table!("walk" {

@@ -59,6 +59,7 @@ async fn ours(
             findings.push(Finding { what, then: rule.then });
         }
     }
+    findings.extend(rules::counts(transaction).await?);
     findings.extend(rules::leases(transaction).await?);
     findings.extend(rules::sums(transaction).await?);
     findings.extend(Contents::check(transaction, tell).await?);

@@ -111,6 +111,24 @@ pub(super) const RULES: [Rule; 14] = [
     },
 ];
 
+/// What is counted of candidates, against what is there.
+const COUNTS: &str = "SELECT count(*), min(coalesce(found.origin, kept.origin) || ' ' || coalesce(found.fate, kept.fate))
+    FROM (SELECT origin, coalesce(reason, fate) AS fate, count(*) AS number FROM candidate GROUP BY 1, 2) AS found
+    FULL JOIN candidate_count AS kept ON kept.origin = found.origin AND kept.fate = found.fate
+    WHERE found.number IS DISTINCT FROM kept.number";
+
+/// Counts that are kept and are not those of the rows.
+pub(super) async fn counts(transaction: &mut Transaction) -> Result<Vec<Finding>> {
+    if !transaction.has_table("candidate_count").await? {
+        return Ok(Vec::new());
+    }
+    let (count, example): (u64, Option<String>) = query(COUNTS).fetch_one(&mut *transaction).await?;
+    let what = || {
+        format!("{count} kinds of candidates are counted wrongly (such as {})", example.unwrap_or_default())
+    };
+    Ok((count > 0).then(|| Finding { what: what(), then: LOST }).into_iter().collect())
+}
+
 /// Leases of processes that do not exist any more.
 pub(super) async fn leases(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let leased: Vec<(i64, String)> = query(LEASED).fetch_all(&mut *transaction).await?;

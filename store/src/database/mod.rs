@@ -115,6 +115,18 @@ impl Transaction {
     pub fn has_a_clock(&self) -> bool {
         matches!(self, Self::Postgres(_, Clock::Server))
     }
+
+    /// Whether there is a table of this name: those of an earlier version lack some.
+    pub async fn has_table(&mut self, name: &str) -> Result<bool> {
+        let sql = match self {
+            Self::Sqlite(_) => "SELECT count(*) FROM sqlite_schema WHERE type = 'table' AND name = $1",
+            Self::Postgres(..) => {
+                "SELECT count(*) FROM pg_tables WHERE schemaname = current_schema() AND tablename = $1"
+            }
+        };
+        let found: u64 = query(sql).bind(name).fetch_one(self).await?;
+        Ok(found > 0)
+    }
 }
 
 /// Where a query may be sent.

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use atoms::Structure;
 use wire::ContentHash;
 
-use self::rows::{CANDIDATE, CANDIDATE_DATA, DECISION, JOB, Rows, STRUCTURE, WALK};
+use self::rows::{CANDIDATE, CANDIDATE_COUNT, CANDIDATE_DATA, DECISION, JOB, Rows, STRUCTURE, WALK};
 use super::protocols;
 use crate::Store;
 use crate::database::{Transaction, for_rows, query};
@@ -46,6 +46,9 @@ const UPSERT_COMPONENTS: &str = "INSERT INTO component ({columns}) SELECT * FROM
 
 const UPSERT_WALKS: &str = "INSERT INTO walk ({columns}) SELECT * FROM {rows} WHERE TRUE
     ON CONFLICT (walk) DO UPDATE SET {excluded}";
+
+const COUNT_CANDIDATES: &str = "INSERT INTO candidate_count ({columns}) SELECT * FROM {rows} WHERE TRUE
+    ON CONFLICT (origin, fate) DO UPDATE SET number = candidate_count.number + excluded.number";
 
 const UPSERT_VALUES: &str = "INSERT INTO value ({columns}) SELECT * FROM {rows} WHERE TRUE
     ON CONFLICT (name) DO UPDATE SET value = excluded.value";
@@ -101,6 +104,7 @@ async fn write(transaction: &mut Transaction, commit: &Commit, rows: Rows, last:
     if written < commit.candidates.len() as u64 {
         return Err(duplicate(transaction, commit, last).await?);
     }
+    for_rows(transaction, COUNT_CANDIDATES, &CANDIDATE_COUNT, rows.candidate_counts).await?;
     for_rows(transaction, INSERT_CANDIDATE_DATA, &CANDIDATE_DATA, rows.candidate_data).await?;
     for_rows(transaction, INSERT_JOBS, &JOB, rows.jobs).await?;
     if commit.restart_mixture {

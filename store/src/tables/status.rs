@@ -11,7 +11,10 @@ use crate::unix_milliseconds;
 
 const END_BY_BUDGET: &str = "budget";
 
-pub(crate) const FATES: &str =
+const FATES: &str = "SELECT origin, fate, number FROM candidate_count";
+
+/// The same where nobody has kept count: in tables of an earlier version.
+pub(crate) const COUNTED_FATES: &str =
     "SELECT origin, coalesce(reason, fate), count(*) FROM candidate GROUP BY origin, fate, reason";
 
 pub(crate) const STATES: &str = "SELECT state, count(*) FROM job GROUP BY state";
@@ -28,7 +31,9 @@ impl Store {
     /// A walk that a limit of time has stopped has the state `budget`.
     pub async fn status(&self) -> Result<Status> {
         let mut transaction = self.database.begin_to_read().await?;
-        let fates: Vec<(String, String, u64)> = query(FATES).fetch_all(&mut transaction).await?;
+        let are_counted = transaction.has_table("candidate_count").await?;
+        let fates = query(if are_counted { FATES } else { COUNTED_FATES });
+        let fates: Vec<(String, String, u64)> = fates.fetch_all(&mut transaction).await?;
         let states: Vec<(String, u64)> = query(STATES).fetch_all(&mut transaction).await?;
         let mut walks: Vec<WalkStatus> = query(WALKS).fetch_all(&mut transaction).await?;
         let refused = query("SELECT CAST(coalesce(sum(refused), 0) AS BIGINT) FROM walk");

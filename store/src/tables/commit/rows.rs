@@ -1,6 +1,6 @@
 //! A commit as the rows that it writes.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use wire::CandidateView;
 
@@ -43,6 +43,7 @@ pub(super) const CANDIDATE: [&str; 25] = [
     "original_gamma_nbr",
     "original_above",
 ];
+pub(super) const CANDIDATE_COUNT: [&str; 3] = ["origin", "fate", "number"];
 pub(super) const CANDIDATE_DATA: [&str; 5] =
     ["decision", "block", "features", "selector_grades", "original_grades"];
 pub(super) const JOB: [&str; 4] = ["hash", "protocol", "decision", "priority"];
@@ -72,6 +73,8 @@ pub(super) struct Rows {
     pub decisions: Vec<Row>,
     pub structures: Vec<Row>,
     pub candidates: Vec<Row>,
+    /// How many there are of each kind.
+    pub candidate_counts: Vec<Row>,
     pub candidate_data: Vec<Row>,
     /// For every accepted candidate.
     pub jobs: Vec<Row>,
@@ -86,6 +89,7 @@ impl Rows {
             decisions: commit.decisions.iter().zip(1..).map(decision).collect::<Result<_>>()?,
             structures: Vec::new(),
             candidates: Vec::new(),
+            candidate_counts: candidate_counts(commit),
             candidate_data: Vec::new(),
             jobs: Vec::new(),
             components: newest(&commit.components, |component| (component.element, component.slot))
@@ -168,6 +172,17 @@ impl Rows {
             shift(&mut row[2]);
         }
     }
+}
+
+fn candidate_counts(commit: &Commit) -> Vec<Row> {
+    let mut counts = BTreeMap::<_, i64>::new();
+    for record in &commit.candidates {
+        *counts.entry((record.block.view().origin().name(), record.fate.name())).or_default() += 1;
+    }
+    counts
+        .into_iter()
+        .map(|((origin, fate), number)| vec![origin.into(), fate.into(), number.into()])
+        .collect()
 }
 
 /// Candidates with the place of the decision about each, from 1.
