@@ -5,7 +5,6 @@ mod common;
 
 use std::fs;
 use std::io::{Cursor, Read, Write};
-use std::path::Path;
 
 use common::desk::{Desk, changed, line};
 use common::{calmwalk, config, refuse, stderr, succeed};
@@ -208,21 +207,6 @@ fn a_mixture_without_statistics_can_be_scored_with_but_not_updated() {
     assert!(valid.contains("it can be scored with but not updated"), "{valid}");
     let summary = succeed(desk.path(), ["run", "c.toml"]);
     assert!(summary.contains("mixture          version 0"), "{summary}");
-}
-
-#[test]
-fn models_of_more_layers_are_told_to_be_unsupported() {
-    let Ok(peers) = std::env::var("CALMWALK_PEER_DATA") else {
-        eprintln!("skipped: CALMWALK_PEER_DATA is not set");
-        return;
-    };
-    let desk = Desk::new();
-    let model = Path::new(&peers).join("grace/grace2l_tiny/kokkos.npz").display().to_string();
-    desk.refused_with(
-        &path(MODEL),
-        &model,
-        &["potential.model: ", &model, "two-layer models are not supported"],
-    );
 }
 
 #[test]

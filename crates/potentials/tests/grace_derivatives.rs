@@ -4,15 +4,22 @@ mod common;
 #[path = "common/golden.rs"]
 mod golden;
 
+use std::path::Path;
 use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
 use common::{assert_close, check_forces, check_virial, position_gradient, strain_gradient};
-use golden::{committed, peer};
-use potentials::grace::{Architecture, Grace, GraceError, GraceModel, PullBack, RadialPath};
+use golden::committed;
+use potentials::grace::{Architecture, Grace, GraceModel, PullBack, RadialPath};
 
 fn model(name: &str, path: RadialPath) -> Arc<GraceModel> {
-    Arc::new(GraceModel::load_with(&committed(name).join("kokkos.npz"), path).unwrap())
+    let file = match name {
+        "two_layers" | "three_layers" => {
+            Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/data/{name}.npz"))
+        }
+        _ => committed(name).join("kokkos.npz"),
+    };
+    Arc::new(GraceModel::load_with(&file, path).unwrap())
 }
 
 /// Numbers in [−½, ½), the same in every run.
@@ -37,12 +44,24 @@ fn small(symbol: &str, spacing: f64, periodic: [bool; 3]) -> Structure {
     }
 }
 
+/// Two elements, and neighbours that have neighbours out of the atom's own sight.
+fn alloy(periodic: [bool; 3]) -> Structure {
+    let mut structure = small("W", 3.7, periodic);
+    structure.species[1] = "Mo".parse().unwrap();
+    structure.species[2] = "Mo".parse().unwrap();
+    structure
+}
+
 fn structures() -> Vec<(&'static str, Structure)> {
     vec![
         ("al_eam_1l", small("Al", 4.1, [true; 3])),
         ("al_eam_1l", small("Al", 4.1, [true, true, false])),
         ("si_sw_1l", small("Si", 4.3, [true, false, false])),
         ("si_sw_1l", small("Si", 4.3, [false; 3])),
+        ("two_layers", alloy([true; 3])),
+        ("two_layers", alloy([true, false, true])),
+        ("three_layers", alloy([true; 3])),
+        ("three_layers", alloy([false; 3])),
     ]
 }
 
@@ -111,8 +130,13 @@ fn an_atom_without_neighbours_has_a_finite_feature_and_no_gradient() {
 #[test]
 fn equal_structures_give_equal_bits() {
     let golden = golden::golden(&committed("al_eam_1l"));
-    let structure = &golden[2].structure;
-    let model = model("al_eam_1l", RadialPath::Table);
+    check_bits(model("al_eam_1l", RadialPath::Table), &golden[2].structure, &golden[3].structure);
+    for name in ["two_layers", "three_layers"] {
+        check_bits(model(name, RadialPath::Table), &alloy([true; 3]), &small("Mo", 6.0, [false; 3]));
+    }
+}
+
+fn check_bits(model: Arc<GraceModel>, structure: &Structure, other: &Structure) {
     let run = |grace: &mut Grace, skin: f64| {
         let mut neighbours = NeighbourList::new(grace.cutoff(), skin);
         neighbours.update(structure).unwrap();
@@ -124,7 +148,7 @@ fn equal_structures_give_equal_bits() {
     };
     let mut used = Grace::new(model.clone());
     let first = run(&mut used, 0.0);
-    features(&mut used, &golden[3].structure); // another number of atoms in between
+    features(&mut used, other); // another number of atoms in between
     for skin in [0.0, 0.3, 1.1] {
         assert_eq!(run(&mut used, skin), first);
         assert_eq!(run(&mut Grace::new(model.clone()), skin), first);
@@ -167,11 +191,58 @@ fn a_model_describes_itself() {
 }
 
 #[test]
-fn deeper_models_are_refused() {
-    for (name, reason) in [("grace2l_tiny", "two-layer"), ("grace3l_tiny", "three-layer")] {
-        let Some(model) = peer(name) else { return };
-        let error = GraceModel::load(&model.join("kokkos.npz")).unwrap_err();
-        assert!(matches!(&error, GraceError::Unsupported { .. }));
-        assert!(error.to_string().contains(&format!("{reason} models are not supported yet")), "{error}");
+fn deeper_models_describe_themselves() {
+    for (name, architecture, basis, features) in
+        [("two_layers", Architecture::TwoLayer, 128, 9), ("three_layers", Architecture::ThreeLayer, 24, 10)]
+    {
+        let model = model(name, RadialPath::Exact);
+        let description = model.description();
+        assert_eq!(description.architecture, architecture);
+        assert_eq!((description.basis_dimension, description.feature_dimension), (basis, features));
+        assert_eq!((model.cutoff(), model.pair_cutoff(0, 1)), (4.5, 4.5));
+    }
+}
+
+/// Atom 0 hears of atom 2 only through atom 1, and of atom 3 through both, which takes three layers.
+#[test]
+fn messages_carry_as_far_as_there_are_layers() {
+    let chain = |end: f64| Structure {
+        species: ["Mo", "W", "W", "Mo"].map(|symbol| symbol.parse().unwrap()).to_vec(),
+        positions: vec![[0.0; 3], [3.1, 0.4, 0.0], [6.2, 0.0, 0.3], [end, 0.2, 0.9]],
+        cell: Cell::orthorhombic(1.0, 1.0, 1.0),
+        periodic: [false; 3],
+    };
+    for (name, heard) in [("two_layers", [false, true]), ("three_layers", [true, true])] {
+        let mut grace = Grace::new(model(name, RadialPath::Exact));
+        let [near, far] = [9.1, 9.3].map(|end| common::evaluate(&mut grace, &chain(end)).atomic_energies);
+        for (atom, heard) in heard.into_iter().enumerate() {
+            assert_eq!(near[atom] != far[atom], heard, "{name}: atom {atom}");
+        }
+    }
+}
+
+/// The energy of an atom is the same in any orientation, mirrored, and in any order of atoms.
+#[test]
+fn deeper_models_do_not_change_under_rotation_and_permutation() {
+    let structure = alloy([false; 3]);
+    let turned = |x: &[f64; 3]| {
+        let (c, s) = (0.6, 0.8);
+        let y = [c * x[0] - s * x[1], s * x[0] + c * x[1], x[2]];
+        [-y[0], -(s * y[1] + c * y[2]), -(c * y[1] - s * y[2])]
+    };
+    let order = [2, 0, 3, 1];
+    let moved = Structure {
+        species: order.map(|i| structure.species[i]).to_vec(),
+        positions: order.map(|i| turned(&structure.positions[i])).to_vec(),
+        ..structure.clone()
+    };
+    for name in ["two_layers", "three_layers"] {
+        let mut grace = Grace::new(model(name, RadialPath::Exact));
+        let here = common::evaluate(&mut grace, &structure);
+        let there = common::evaluate(&mut grace, &moved);
+        let energies = order.map(|i| here.atomic_energies[i]);
+        assert_close("energy", &there.atomic_energies, &energies, 1e-11);
+        let forces = order.map(|i| turned(&here.forces[i]));
+        assert_close("force", there.forces.as_flattened(), forces.as_flattened(), 1e-9);
     }
 }

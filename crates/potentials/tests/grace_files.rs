@@ -72,7 +72,6 @@ fn wrong_arrays_are_named_with_what_was_expected() {
         (vec![("mlp_rad_b0", array::<f64>(&[64], &[0.0; 64]))], "may change its energy: mlp_rad_b0"),
         (vec![("uq_schema_version", array::<i64>(&[1], &[3]))], "'uq_schema_version' is 3, expected 6"),
         (vec![("uq_feature_dim", array::<i64>(&[1], &[128]))], "array 'uq_feature_dim' is 128, expected 130"),
-        (vec![("spb_names", array::<i64>(&[1], &[0]))], "two-layer models are not supported yet"),
     ] {
         let error = changed(&changes).unwrap_err().to_string();
         assert!(error.contains(message), "{error}\nis not\n{message}");

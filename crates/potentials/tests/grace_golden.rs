@@ -139,3 +139,24 @@ fn four_elements_at_the_size_of_the_paper() {
         check(&model);
     }
 }
+
+#[test]
+fn two_layers() {
+    if let Some(model) = peer("grace2l_tiny") {
+        check(&model);
+    }
+}
+
+#[test]
+fn two_layers_at_the_size_of_use() {
+    if let Some(model) = peer("grace2l_small") {
+        check(&model);
+    }
+}
+
+#[test]
+fn three_layers() {
+    if let Some(model) = peer("grace3l_tiny") {
+        check(&model);
+    }
+}

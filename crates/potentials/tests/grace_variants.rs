@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, NeighbourList, Structure};
 use common::{check_forces, check_virial};
-use model_file::{array, changed, floats, strings};
+use model_file::{BYTES, array, changed, changed_of, deep, floats, strings};
 use potentials::grace::{Grace, GraceModel, PullBack};
 
 type Changes<'a> = Vec<(&'a str, Option<Vec<u8>>)>;
@@ -25,10 +25,13 @@ fn structure() -> Structure {
 }
 
 fn forward(model: GraceModel) -> Grace {
+    let mut structure = structure();
+    let element = model.elements()[0];
+    structure.species.fill(element);
     let mut grace = Grace::new(Arc::new(model));
     let mut neighbours = NeighbourList::new(grace.model().cutoff(), 0.0);
-    neighbours.update(&structure()).unwrap();
-    grace.forward(&structure(), &neighbours).unwrap();
+    neighbours.update(&structure).unwrap();
+    grace.forward(&structure, &neighbours).unwrap();
     grace
 }
 
@@ -171,24 +174,34 @@ fn a_readout_with_tanh_has_the_right_derivatives() {
 /// Features without normalisation or densities: p = B R, so that those of the committed model are p / ‖B‖.
 #[test]
 fn features_of_the_older_schemas_follow_their_definition() {
+    check_older_schemas(&BYTES, 128, 2);
+    check_older_schemas(&deep("two_layers.npz"), 6, 3);
+    check_older_schemas(&deep("three_layers.npz"), 6, 4);
+}
+
+/// `d` projected features and `norms` of the basis and its blocks in a model of the newest schema.
+fn check_older_schemas(model: &[u8], d: usize, norms: usize) {
     let flags = |version: i64, asinh: i64| {
-        changed(&[
-            ("uq_schema_version", array(&[1], &[version])),
-            ("uq_rp_normalize", None),
-            ("uq_rp_add_density_channel", None),
-            ("uq_rp_density_scale", None),
-            ("uq_feature_dim", array(&[1], &[128_i64])),
-            ("uq_feature_transform", array(&[1], &[asinh])),
-        ])
+        changed_of(
+            model,
+            &[
+                ("uq_schema_version", array(&[1], &[version])),
+                ("uq_rp_normalize", None),
+                ("uq_rp_add_density_channel", None),
+                ("uq_rp_density_scale", None),
+                ("uq_feature_dim", array(&[1], &[d as i64])),
+                ("uq_feature_transform", array(&[1], &[asinh])),
+            ],
+        )
         .unwrap()
     };
     let (newest, mut linear, mut asinh) =
-        (forward(changed(&[]).unwrap()), forward(flags(3, 0)), forward(flags(4, 1)));
+        (forward(changed_of(model, &[]).unwrap()), forward(flags(3, 0)), forward(flags(4, 1)));
     for ((z, p), t) in
-        newest.features().chunks(130).zip(linear.features().chunks(128)).zip(asinh.features().chunks(128))
+        newest.features().chunks(d + norms).zip(linear.features().chunks(d)).zip(asinh.features().chunks(d))
     {
-        let norm = z[128].exp() - 1e-12;
-        for k in 0..128 {
+        let norm = z[d].exp() - 1e-12;
+        for k in 0..d {
             assert!((p[k] - z[k] * norm).abs() < 1e-12 * norm.max(1.0));
             assert!((t[k] - p[k].asinh()).abs() < 1e-14);
         }

@@ -1,12 +1,13 @@
-//! The sum over bonds: from neighbours to the atomic density A, and from its cotangents back to forces.
+//! The sum over bonds in the first layer: from neighbours to the atomic density A, and from its cotangents back
+//! to forces.
 //!
 //! A_a,lm,n = Σ_j R_nl(r) Y_lm(v) ζ_n(μ_j), with d = r_j − r_a, r = √(d·d + 10⁻¹⁰) and v = d / r.
 
 use atoms::{NeighbourList, Structure, Vec3};
 
+use super::layer::Layer;
 use super::matrix::{LANES, Lanes, ZERO, add_product, add_scaled, product};
-use super::model::GraceModel;
-use super::radial::RadialWork;
+use super::radial_network::RadialWork;
 
 /// Keeps r differentiable at d = 0, Å².
 const SQUARE_FLOOR: f64 = 1e-10;
@@ -28,21 +29,21 @@ pub(super) struct Bond {
 /// the reverse sweep.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Bonds {
-    offsets: Vec<usize>,
-    bonds: Vec<Bond>,
+    pub offsets: Vec<usize>,
+    pub bonds: Vec<Bond>,
     /// First block of eight bonds of each atom.
-    block_offsets: Vec<usize>,
-    /// R_nl ζ_n, \[block\]\[l\]\[channel\]\[bond\]
-    values: Vec<Lanes>,
-    /// dR_nl/dr ζ_n
-    derivatives: Vec<Lanes>,
+    pub block_offsets: Vec<usize>,
+    /// R_nl ζ_n, \[block\]\[l\]\[channel\]\[bond\]; in later layers R_nl, \[block\]\[bond\]\[l\]\[channel\].
+    pub values: Vec<Lanes>,
+    /// The same of dR_nl/dr.
+    pub derivatives: Vec<Lanes>,
 }
 
 impl Bonds {
     /// Collects the bonds that are shorter than the cutoff of their pair.
     pub fn update(
         &mut self,
-        model: &GraceModel,
+        layer: &Layer,
         structure: &Structure,
         neighbours: &NeighbourList,
         elements: &[usize],
@@ -58,7 +59,7 @@ impl Bonds {
                 let element = elements[neighbour.atom as usize];
                 let d = neighbour.displacement(structure, i);
                 let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + SQUARE_FLOOR).sqrt();
-                if r < model.radial.cutoff(model.radial.pair(*centre, element)) {
+                if r < layer.radial.cutoff(layer.radial.pair(*centre, element)) {
                     self.bonds.push(Bond { neighbour: neighbour.atom, element: element as u32, d, r });
                 }
             }
@@ -66,7 +67,7 @@ impl Bonds {
             self.offsets.push(self.bonds.len());
             self.block_offsets.push(blocks);
         }
-        let lanes = LANES * model.radial.output_lanes();
+        let lanes = LANES * layer.radial.output_lanes();
         self.values.resize(blocks * lanes, ZERO);
         self.derivatives.resize(blocks * lanes, ZERO);
     }
@@ -76,19 +77,19 @@ impl Bonds {
 #[derive(Clone, Debug, Default)]
 pub(super) struct BondWork {
     /// Y_lm, \[lm\]\[bond\]
-    harmonics: Vec<Lanes>,
+    pub harmonics: Vec<Lanes>,
     /// ∂Y_lm/∂v
-    gradients: Vec<[Lanes; 3]>,
+    pub gradients: Vec<[Lanes; 3]>,
     /// R_nl ζ_n, \[bond\]\[l\]\[channel\]
     values: Vec<Lanes>,
     /// dR_nl/dr ζ_n
     derivatives: Vec<Lanes>,
-    radial: RadialWork,
+    pub radial: RadialWork,
 }
 
 impl BondWork {
-    pub fn new(model: &GraceModel) -> Self {
-        let (functions, lanes) = (model.harmonics.len(), LANES * model.radial.output_lanes());
+    pub fn new(layer: &Layer) -> Self {
+        let (functions, lanes) = (layer.harmonics.len(), LANES * layer.radial.output_lanes());
         Self {
             harmonics: vec![ZERO; functions],
             gradients: vec![[ZERO; 3]; functions],
@@ -100,21 +101,29 @@ impl BondWork {
 
     /// R_nl(r) ζ_n and derivatives of up to eight bonds, zero where there are fewer.
     #[inline(always)]
-    fn radial(&mut self, model: &GraceModel, centre: usize, bonds: &[Bond], r: &Lanes) {
-        let (lanes, mut pairs) = (model.radial.output_lanes(), [0; LANES]);
-        for (pair, bond) in pairs.iter_mut().zip(bonds) {
-            *pair = model.radial.pair(centre, bond.element as usize);
-        }
+    fn radial(&mut self, layer: &Layer, centre: usize, bonds: &[Bond], r: &Lanes) {
+        let (lanes, pairs) = (layer.radial.output_lanes(), pairs(layer, centre, bonds));
         let (values, derivatives) = (&mut self.values[..], &mut self.derivatives[..]);
-        model.radial.evaluate(bonds.len(), &pairs, r, &mut self.radial, values, derivatives);
+        layer.radial.evaluate(bonds.len(), &pairs, r, &mut self.radial, values, derivatives);
         for (b, bond) in bonds.iter().enumerate() {
-            let (row, embedding) = (b * lanes..(b + 1) * lanes, &model.embedding[bond.element as usize][..]);
+            let (row, embedding) =
+                (b * lanes..(b + 1) * lanes, &layer.message.constants[bond.element as usize][..]);
             multiply_channels(&mut values[row.clone()], embedding);
             multiply_channels(&mut derivatives[row], embedding);
         }
         values[bonds.len() * lanes..].fill(ZERO);
         derivatives[bonds.len() * lanes..].fill(ZERO);
     }
+}
+
+/// Index of the pair of elements of up to eight bonds.
+#[inline(always)]
+pub(super) fn pairs(layer: &Layer, centre: usize, bonds: &[Bond]) -> [usize; LANES] {
+    let mut pairs = [0; LANES];
+    for (pair, bond) in pairs.iter_mut().zip(bonds) {
+        *pair = layer.radial.pair(centre, bond.element as usize);
+    }
+    pairs
 }
 
 #[inline(always)]
@@ -141,7 +150,7 @@ fn transpose(rows: &[Lanes], columns: &mut [Lanes]) {
 
 /// v and r of up to eight bonds; v is zero where there are fewer.
 #[inline(always)]
-fn directions(bonds: &[Bond]) -> ([Lanes; 3], Lanes) {
+pub(super) fn directions(bonds: &[Bond]) -> ([Lanes; 3], Lanes) {
     let (mut v, mut r) = ([ZERO; 3], [1.0; LANES]);
     for (b, bond) in bonds.iter().enumerate() {
         r[b] = bond.r;
@@ -163,20 +172,20 @@ impl Bonds {
     pub fn accumulate(
         &mut self,
         i: usize,
-        model: &GraceModel,
+        layer: &Layer,
         centre: usize,
         density: &mut [Lanes],
         work: &mut BondWork,
     ) {
-        let (lanes, first) = (model.radial.output_lanes(), self.block_offsets[i]);
+        let (lanes, first) = (layer.radial.output_lanes(), self.block_offsets[i]);
         for (k, bonds) in self.bonds[self.offsets[i]..self.offsets[i + 1]].chunks(LANES).enumerate() {
             let (v, r) = directions(bonds);
-            model.harmonics.evaluate::<false>(&v, &mut work.harmonics, &mut work.gradients);
-            work.radial(model, centre, bonds, &r);
+            layer.harmonics.evaluate::<false>(&v, &mut work.harmonics, &mut work.gradients);
+            work.radial(layer, centre, bonds, &r);
             let block = (first + k) * LANES * lanes..(first + k + 1) * LANES * lanes;
             transpose(&work.values, &mut self.values[block.clone()]);
             transpose(&work.derivatives, &mut self.derivatives[block]);
-            add_eight(model, density, work);
+            add_eight(layer, density, work);
         }
     }
 
@@ -189,27 +198,23 @@ impl Bonds {
     pub fn reverse<const N: usize>(
         &self,
         i: usize,
-        model: &GraceModel,
+        layer: &Layer,
         cotangents: [&[Lanes]; N],
         work: &mut BondWork,
         mut sink: impl FnMut(&Bond, [Vec3; N]),
     ) {
-        let (lanes, first) = (model.radial.output_lanes(), self.block_offsets[i]);
+        let (lanes, first) = (layer.radial.output_lanes(), self.block_offsets[i]);
         for (k, bonds) in self.bonds[self.offsets[i]..self.offsets[i + 1]].chunks(LANES).enumerate() {
             let (v, r) = directions(bonds);
-            model.harmonics.evaluate::<true>(&v, &mut work.harmonics, &mut work.gradients);
+            layer.harmonics.evaluate::<true>(&v, &mut work.harmonics, &mut work.gradients);
             let block = (first + k) * LANES * lanes..(first + k + 1) * LANES * lanes;
             let radial = (&self.values[block.clone()], &self.derivatives[block]);
             let mut gradients = [[ZERO; 3]; N];
             for (gradient, cotangent) in gradients.iter_mut().zip(cotangents) {
-                *gradient = gradient_of_eight(model, &v, &r, cotangent, radial, work);
+                *gradient = gradient_of_eight(layer, &v, &r, cotangent, radial, work);
             }
             for (b, bond) in bonds.iter().enumerate() {
-                let mut of_bond = [[0.0; 3]; N];
-                for (of_bond, gradient) in of_bond.iter_mut().zip(&gradients) {
-                    *of_bond = [gradient[0][b], gradient[1][b], gradient[2][b]];
-                }
-                sink(bond, of_bond);
+                sink(bond, gradients.map(|gradient| gradient.map(|axis| axis[b])));
             }
         }
     }
@@ -217,10 +222,10 @@ impl Bonds {
 
 /// A_lm,n += Σ_b Y_lm(v_b) R_nl(r_b) ζ_n over eight bonds.
 #[inline(always)]
-fn add_eight(model: &GraceModel, density: &mut [Lanes], work: &BondWork) {
-    let (width, lanes) = (model.density.width, model.radial.output_lanes());
+fn add_eight(layer: &Layer, density: &mut [Lanes], work: &BondWork) {
+    let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
     let mut rows = density.chunks_exact_mut(width).zip(&work.harmonics);
-    for l in 0..=model.harmonics.lmax() {
+    for l in 0..=layer.harmonics.lmax() {
         for (row, y) in rows.by_ref().take(2 * l + 1) {
             for (c, sum) in row.iter_mut().enumerate() {
                 let mut density = *sum;
@@ -235,14 +240,14 @@ fn add_eight(model: &GraceModel, density: &mut [Lanes], work: &BondWork) {
 
 #[inline(always)]
 fn gradient_of_eight(
-    model: &GraceModel,
+    layer: &Layer,
     v: &[Lanes; 3],
     r: &Lanes,
     cotangent: &[Lanes],
     (values, derivatives): (&[Lanes], &[Lanes]),
     work: &BondWork,
 ) -> [Lanes; 3] {
-    let (width, channels) = (model.density.width, model.density.channels);
+    let (width, channels) = (layer.density.width, layer.density.channels);
     let (mut along, mut across) = (ZERO, [ZERO; 3]);
     let mut functions = cotangent.chunks_exact(width).zip(work.harmonics.iter().zip(&work.gradients));
     let orders = values.chunks_exact(width * LANES).zip(derivatives.chunks_exact(width * LANES));
@@ -260,6 +265,12 @@ fn gradient_of_eight(
             }
         }
     }
+    bond_gradient(v, r, &along, &across)
+}
+
+/// g v + (G − (G·v) v)/r of eight bonds, from g and G.
+#[inline(always)]
+pub(super) fn bond_gradient(v: &[Lanes; 3], r: &Lanes, along: &Lanes, across: &[Lanes; 3]) -> [Lanes; 3] {
     let mut result = [ZERO; 3];
     for b in 0..LANES {
         let radial = across[0][b] * v[0][b] + across[1][b] * v[1][b] + across[2][b] * v[2][b];

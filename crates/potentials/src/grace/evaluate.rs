@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use atoms::{Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
 
-use super::bonds::{BondWork, Bonds};
+use super::layer_work::{BasisCotangents, LayerWork};
 use super::matrix::{Lanes, ZERO};
 use super::model::GraceModel;
 use super::projection::ProjectionWork;
@@ -37,12 +37,10 @@ pub struct Grace {
     model: Arc<GraceModel>,
     instructions: pulp::Arch,
     elements: Vec<usize>,
-    bonds: Bonds,
-    /// [n, tape]
-    tapes: Vec<Lanes>,
+    layers: Vec<LayerWork>,
     /// B, [n, lanes of the basis]
     bases: Vec<Lanes>,
-    /// ∂E/∂y, [n, lanes of the densities]
+    /// ∂E/∂(W B) of each layer, [n, lanes of the densities]
     density_cotangents: Vec<Lanes>,
     atomic_energies: Vec<f64>,
     features: Vec<f64>,
@@ -50,11 +48,6 @@ pub struct Grace {
     projection: ProjectionWork,
     /// Cotangent of B from the features, [n, lanes of the basis]
     basis_cotangents: Vec<Lanes>,
-    /// Cotangent of one atom's B from the energy.
-    energy_basis_cotangent: Vec<Lanes>,
-    /// Cotangent tapes of one atom, for the energy and for the features.
-    cotangent_tapes: [Vec<Lanes>; 2],
-    bond_work: BondWork,
 }
 
 impl Grace {
@@ -63,8 +56,7 @@ impl Grace {
         Self {
             instructions: pulp::Arch::new(),
             elements: Vec::new(),
-            bonds: Bonds::default(),
-            tapes: Vec::new(),
+            layers: model.layers.iter().map(LayerWork::new).collect(),
             bases: Vec::new(),
             density_cotangents: Vec::new(),
             atomic_energies: Vec::new(),
@@ -72,9 +64,6 @@ impl Grace {
             readout: ReadoutWork::default(),
             projection: ProjectionWork::default(),
             basis_cotangents: Vec::new(),
-            energy_basis_cotangent: Vec::new(),
-            cotangent_tapes: std::array::from_fn(|_| vec![ZERO; model.tape_lanes]),
-            bond_work: BondWork::new(&model),
             model,
         }
     }
@@ -110,31 +99,38 @@ impl Grace {
             return Err(PotentialError::Cutoff { list: neighbours.cutoff(), needed });
         }
         self.model.write_element_indices(&structure.species, &mut self.elements)?;
-        self.bonds.update(&self.model, structure, neighbours, &self.elements);
+        for (work, layer) in self.layers.iter_mut().zip(&self.model.layers) {
+            work.bonds.update(layer, structure, neighbours, &self.elements);
+        }
         Ok(())
     }
 
+    /// Layer after layer, all atoms of one before the next, which needs the messages of neighbours.
     #[inline(always)]
-    fn forward_atoms(&mut self) {
-        let (model, n) = (&*self.model, self.elements.len());
-        let (tape_lanes, basis_lanes) = (model.tape_lanes, model.basis.lanes());
-        let density_lanes = model.readout.density_lanes();
-        self.tapes.resize(n * tape_lanes, ZERO);
-        self.bases.resize(n * basis_lanes, ZERO);
-        self.density_cotangents.resize(n * density_lanes, ZERO);
-        for (i, element) in self.elements.iter().enumerate() {
-            let tape = &mut self.tapes[i * tape_lanes..(i + 1) * tape_lanes];
-            tape.fill(ZERO);
-            let density = &mut tape[..model.density.end()];
-            self.bonds.accumulate(i, model, *element, density, &mut self.bond_work);
-            for operation in &model.operations {
-                operation.forward(tape);
+    fn forward_layers(&mut self) {
+        let model = &*self.model;
+        let basis_lanes = model.basis_lanes();
+        self.bases.resize(self.elements.len() * basis_lanes, ZERO);
+        for (k, layer) in model.layers.iter().enumerate() {
+            let (before, work) = self.layers.split_at_mut(k);
+            if let (Some(before), Some(layer_before)) = (before.last(), k.checked_sub(1)) {
+                work[0].take_messages(layer, &self.elements, before, &model.layers[layer_before]);
             }
-            let basis = &mut self.bases[i * basis_lanes..(i + 1) * basis_lanes];
-            model.basis.forward(tape, basis);
-            let cotangent = &mut self.density_cotangents[i * density_lanes..(i + 1) * density_lanes];
-            let energy = model.readout.evaluate(*element, basis, cotangent, &mut self.readout);
-            self.atomic_energies.push(energy);
+            let place = (model.basis_start(k), basis_lanes);
+            work[0].forward(layer, &self.elements, &mut self.bases, place);
+        }
+    }
+
+    #[inline(always)]
+    fn forward_energies(&mut self) {
+        let model = &*self.model;
+        let density_lanes = model.readout.density_lanes();
+        self.density_cotangents.resize(self.elements.len() * density_lanes, ZERO);
+        let bases = self.bases.chunks_exact(model.basis_lanes());
+        let cotangents = self.density_cotangents.chunks_exact_mut(density_lanes);
+        for ((element, basis), cotangent) in self.elements.iter().zip(bases).zip(cotangents) {
+            let (readout, work) = (&model.readout, &mut self.readout);
+            self.atomic_energies.push(readout.evaluate(*element, basis, &model.basis_ends, cotangent, work));
         }
     }
 
@@ -196,39 +192,21 @@ impl Grace {
         }
     }
 
-    /// Atom by atom back along the tape, then along the bonds; `N` is 2 with a cotangent of the features.
+    /// The layers backwards, all atoms of one before the next, which needs the cotangents of its messages from all
+    /// neighbours; `N` is 2 with a cotangent of the features.
     #[inline(always)]
-    fn backward_atoms<const N: usize>(&mut self, energy: &mut Evaluation, pull_back: &mut PullBack) {
+    fn backward_layers<const N: usize>(&mut self, energy: &mut Evaluation, pull_back: &mut PullBack) {
         let model = &*self.model;
-        let (tape_lanes, basis_lanes) = (model.tape_lanes, model.basis.lanes());
-        let density_lanes = model.readout.density_lanes();
-        self.energy_basis_cotangent.resize(basis_lanes, ZERO);
-        for (i, element) in self.elements.iter().enumerate() {
-            let tape = &self.tapes[i * tape_lanes..(i + 1) * tape_lanes];
-            let densities = &self.density_cotangents[i * density_lanes..(i + 1) * density_lanes];
-            self.energy_basis_cotangent.fill(ZERO);
-            model.readout.basis_cotangent(*element, densities, &mut self.energy_basis_cotangent);
-            for (k, cotangent) in self.cotangent_tapes.iter_mut().enumerate().take(N) {
-                let basis = match k {
-                    0 => &self.energy_basis_cotangent[..],
-                    _ => &self.basis_cotangents[i * basis_lanes..(i + 1) * basis_lanes],
-                };
-                cotangent.fill(ZERO);
-                model.basis.backward(basis, cotangent);
-                for operation in model.operations.iter().rev() {
-                    operation.backward(tape, cotangent);
-                }
-            }
-            let densities: [&[Lanes]; N] =
-                std::array::from_fn(|k| &self.cotangent_tapes[k][..model.density.end()]);
-            let work = &mut self.bond_work;
-            self.bonds.reverse(i, model, densities, work, |bond, gradients| {
-                let j = bond.neighbour as usize;
-                add_bond(&mut energy.forces, &mut energy.virial, j, i, bond.d, gradients[0]);
-                if N == 2 {
-                    add_bond(&mut pull_back.gradient, &mut pull_back.virial, i, j, bond.d, gradients[N - 1]);
-                }
-            });
+        for k in (0..model.layers.len()).rev() {
+            let (work, after) = self.layers.split_at_mut(k + 1);
+            let cotangents = BasisCotangents {
+                model,
+                layer: k,
+                densities: &self.density_cotangents,
+                from_features: &self.basis_cotangents,
+            };
+            let returned = after.first().map(|after| (&model.layers[k + 1].message, after));
+            work[k].backward::<N>(&self.elements, &cotangents, returned, energy, pull_back);
         }
     }
 }
@@ -244,7 +222,8 @@ impl pulp::WithSimd for Forward<'_> {
 
     #[inline(always)]
     fn with_simd<S: pulp::Simd>(self, _: S) {
-        self.grace.forward_atoms();
+        self.grace.forward_layers();
+        self.grace.forward_energies();
         if self.features {
             self.grace.forward_features();
         }
@@ -267,21 +246,9 @@ impl pulp::WithSimd for Backward<'_> {
         match self.feature_cotangent {
             Some(cotangent) if self.grace.model.projection.is_some() => {
                 self.grace.backward_features(cotangent);
-                self.grace.backward_atoms::<2>(self.energy, self.pull_back);
+                self.grace.backward_layers::<2>(self.energy, self.pull_back);
             }
-            _ => self.grace.backward_atoms::<1>(self.energy, self.pull_back),
-        }
-    }
-}
-
-/// With g = ∂/∂d: `gradient` loses g at `less` and gains it at `more`; `virial` gains g ⊗ d.
-#[inline(always)]
-fn add_bond(gradient: &mut [Vec3], virial: &mut Matrix3, less: usize, more: usize, d: Vec3, g: Vec3) {
-    for a in 0..3 {
-        gradient[less][a] -= g[a];
-        gradient[more][a] += g[a];
-        for b in 0..3 {
-            virial[a][b] += g[a] * d[b];
+            _ => self.grace.backward_layers::<1>(self.energy, self.pull_back),
         }
     }
 }

@@ -1,52 +1,66 @@
-//! Builds the tape of an atom from the index lists of a model file.
+//! Builds the tape of an atom in one layer from the index lists of a model file.
 
 use std::collections::BTreeMap;
 
 use npz::Archive;
 
 use super::error::{GraceError, mismatch, unsupported};
-use super::matrix::{LANES, Matrix, lanes_for};
-use super::readout::with_transpose;
-use super::tape::{Gather, Linear, LinearPart, Operation, Product, ProductOutput, Tensor, Term};
+use super::matrix::lanes_for;
+use super::product::{Combination, Product, ProductOutput, Term};
+use super::tape::{Gather, Linear, LinearPart, Operation, Tensor};
+use super::weights::Weights;
 
 /// A longer tape than this is taken for damage (64 MiB an atom).
 const LONGEST_TAPE: usize = 1 << 20;
 
 /// A graph under construction.
 pub(super) struct Graph<'a> {
-    archive: &'a Archive,
+    pub(super) archive: &'a Archive,
     /// Tensors that a reduction may name.
     named: Vec<(String, Tensor)>,
     end: usize,
-    operations: Vec<Operation>,
-    basis: Gather,
+    pub(super) operations: Vec<Operation>,
+    pub(super) basis: Gather,
     /// Components and channels of each source of the basis.
-    sources: Vec<(usize, usize)>,
+    pub(super) sources: Vec<(usize, usize)>,
+    pub(super) source_names: Vec<String>,
     /// Number of trained weights so far.
     pub weights: usize,
 }
 
 impl<'a> Graph<'a> {
-    /// A graph that holds the atomic density A alone.
-    pub fn new(archive: &'a Archive, components: usize, channels: usize) -> Self {
-        let density = Tensor { start: 0, components, channels, width: lanes_for(channels) };
-        Self {
+    /// A graph that holds the sum over neighbours alone; errors call it `name`.
+    pub fn new(
+        archive: &'a Archive,
+        name: &str,
+        components: usize,
+        channels: usize,
+    ) -> Result<Self, GraceError> {
+        let mut graph = Self {
             archive,
-            named: vec![("A".to_owned(), density)],
-            end: density.end(),
+            named: Vec::new(),
+            end: 0,
             operations: Vec::new(),
             basis: Gather::default(),
             sources: Vec::new(),
+            source_names: Vec::new(),
             weights: 0,
-        }
+        };
+        graph.push(name, components, channels)?;
+        Ok(graph)
     }
 
-    /// A
+    /// The sum over neighbours.
     pub fn density(&self) -> Tensor {
         self.named[0].1
     }
 
-    fn push(&mut self, name: &str, components: usize, channels: usize) -> Result<Tensor, GraceError> {
+    pub(super) fn push(
+        &mut self,
+        name: &str,
+        components: usize,
+        channels: usize,
+    ) -> Result<Tensor, GraceError> {
         let tensor = Tensor { start: self.end, components, channels, width: lanes_for(channels) };
         if components.saturating_mul(tensor.width) > LONGEST_TAPE - self.end {
             return Err(unsupported(
@@ -82,6 +96,7 @@ impl<'a> Graph<'a> {
             tiles.iter().enumerate().for_each(|(w, tile)| add(false, *tile, left.row(w), w));
             weights.scaled(archive.scalar(&key("norm_left"))?)
         } else {
+            archive.ignore(&key("w_tile_left"));
             (0..left.components).for_each(|w| add(false, 0, left.row(w), w));
             if left.channels != channels {
                 let found = format!("{channels} but its left input keeps {} channels", left.channels);
@@ -101,10 +116,10 @@ impl<'a> Graph<'a> {
         let part = |((is_right, tile, factor), rows): ((bool, usize, u64), Vec<(u32, u32)>)| {
             let weights = if is_right { &right_weights } else { &left_weights };
             let factor = f64::from_bits(factor);
-            let (weights, transposed) =
-                with_transpose(weights.inputs, channels, |n, k| factor * weights.at(k, n, tile));
+            let weights =
+                Weights::new(1, weights.inputs, channels, |_, n, k| factor * weights.at(k, n, tile));
             let (from, to) = rows.into_iter().unzip();
-            LinearPart { weights, transposed, from, to }
+            LinearPart { weights, from, to }
         };
         let parts = rows.into_iter().map(part).collect();
         self.operations.push(Operation::Linear(Linear { start: out.start, parts }));
@@ -138,14 +153,27 @@ impl<'a> Graph<'a> {
                 ),
             ));
         }
+        let out = self.coupled(name, &format!("prod_{name}"), "cg_coeff", [left, right])?;
+        archive.expect_count(&key("n_output_funcs"), out.components)?;
+        archive.expect_count(&key("n_cg_terms"), archive.integers(&key("left_ind"))?.data.len())?;
+        ["lmax", "Lmax"].iter().for_each(|suffix| archive.ignore(&key(suffix)));
+        Ok(out)
+    }
+
+    /// The tensor `name` from factors of equally many channels, by the lists whose names begin with `prefix`.
+    pub(super) fn coupled(
+        &mut self,
+        name: &str,
+        prefix: &str,
+        coefficients: &str,
+        [left, right]: [Tensor; 2],
+    ) -> Result<Tensor, GraceError> {
+        let (archive, key) = (self.archive, |suffix: &str| format!("{prefix}_{suffix}"));
         let lefts = archive.indices(&key("left_ind"), left.components)?;
         let rights = archive.exactly_indices(&key("right_ind"), lefts.len(), right.components)?;
         let sums = archive.exactly_indices(&key("m_sum_ind"), lefts.len(), LONGEST_TAPE)?;
-        let coefficients = archive.floats(&key("cg_coeff"), &[lefts.len()])?;
+        let coefficients = archive.floats(&key(coefficients), &[lefts.len()])?;
         let components = sums.iter().max().map_or(0, |last| last + 1);
-        archive.expect_count(&key("n_output_funcs"), components)?;
-        archive.expect_count(&key("n_cg_terms"), lefts.len())?;
-        ["lmax", "Lmax"].iter().for_each(|suffix| archive.ignore(&key(suffix)));
 
         let out = self.push(name, components, left.channels)?;
         let mut outputs: Vec<ProductOutput> =
@@ -158,86 +186,45 @@ impl<'a> Graph<'a> {
         Ok(out)
     }
 
-    /// The invariant reduction `prefix`: gathers the basis B of its sources and returns the weights W
-    /// with transpose (for each element of the central atom, if they differ) of y_k = Σ_b W_kb B_b.
-    pub fn invariants(
+    /// Rows of `tensor` combined by a list of (row of the result, row of the tensor, factor).
+    pub fn combination(
         &mut self,
-        prefix: &str,
-        names: &[String],
-        n_elements: usize,
-    ) -> Result<Vec<(Matrix, Matrix)>, GraceError> {
-        let archive = self.archive;
-        let n_out = archive.count(&format!("{prefix}_n_out"), 1, 4096)?;
-        let by_element = archive.count(&format!("{prefix}_is_central_atom_type_dependent"), 0, 1)? == 1;
-        let types_key = format!("{prefix}_number_of_atom_types");
-        if by_element {
-            archive.expect_count(&types_key, n_elements)?;
-        } else {
-            archive.ignore(&types_key);
+        name: &str,
+        tensor: Tensor,
+        components: usize,
+        terms: &[(usize, usize, f64)],
+    ) -> Result<Tensor, GraceError> {
+        let out = self.push(name, components, tensor.channels)?;
+        let mut outputs: Vec<(usize, Vec<(u32, f64)>)> =
+            (0..components).map(|f| (out.row(f), Vec::new())).collect();
+        for (to, from, factor) in terms {
+            outputs[*to].1.push((tensor.row(*from) as u32, *factor));
         }
-        let n_types = if by_element { n_elements } else { 1 };
-        // Weights of each place of the padded basis, [place][type][k]; none for padding.
-        let mut places: Vec<Vec<f64>> = Vec::new();
-        for name in names {
-            let key = |suffix: &str| format!("{prefix}_{suffix}_{name}");
-            let weights_key = format!("{prefix}_reduce_{name}_W");
-            let source = self.named(name)?;
-            let collect = archive.indices(&key("collect_ind"), source.components)?;
-            let (shape, weights) = if by_element {
-                archive.tensor::<4>(&weights_key)?
-            } else {
-                let ([k, n, tiles], weights) = archive.tensor::<3>(&weights_key)?;
-                ([1, k, n, tiles], weights)
-            };
-            if shape[..3] != [n_types, n_out, source.channels] {
-                let expected = format!("[{n_types}, {n_out}, {}, …]", source.channels);
-                return Err(mismatch(archive, &weights_key, format!("of shape {shape:?}"), expected));
-            }
-            let tiles = archive.exactly_indices(&key("w_l_tile"), collect.len(), shape[3])?;
-            let norm = archive.scalar(&format!("{prefix}_reduce_{name}_norm"))?;
-            archive.expect_count(&key("n_in"), source.channels)?;
-            archive.expect_count(&key("w_shape"), shape[3])?;
-            archive.ignore(&key("total_sum_ind"));
-            self.weights += weights.len();
-            for (component, tile) in collect.iter().zip(&tiles) {
-                self.basis.rows.push((source.row(*component), source.width));
-                for n in 0..source.width * LANES {
-                    let weight = |tk: usize| norm * weights[(tk * shape[2] + n) * shape[3] + tile];
-                    let filled = if n < source.channels { n_types * n_out } else { 0 };
-                    places.push((0..filled).map(weight).collect());
-                }
-            }
-            self.sources.push((collect.len(), source.channels));
-        }
-        let element = |element: usize| {
-            with_transpose(places.len(), n_out, |place, k| {
-                places[place].get(element * n_out + k).copied().unwrap_or(0.0)
-            })
-        };
-        Ok((0..n_types).map(element).collect())
+        let combination = Combination { start: out.start, width: out.width, outputs };
+        self.operations.push(Operation::Combination(combination));
+        Ok(out)
     }
 
-    fn named(&self, name: &str) -> Result<Tensor, GraceError> {
+    /// Gives a tensor a name that reductions may use.
+    pub fn name(&mut self, name: &str, tensor: Tensor) {
+        self.named.push((name.to_owned(), tensor));
+    }
+
+    pub(super) fn named(&self, name: &str) -> Result<Tensor, GraceError> {
         let found = self.named.iter().find(|(known, _)| known == name);
         found.map(|(_, tensor)| *tensor).ok_or_else(|| {
             unsupported(self.archive, format!("the energy takes '{name}', which the graph does not make"))
         })
     }
 
-    /// Components and channels of each source of the basis, in the file's order.
-    pub fn basis_sources(&self) -> &[(usize, usize)] {
-        &self.sources
-    }
-
-    /// D_basis
-    pub fn basis_dimension(&self) -> usize {
-        self.sources.iter().map(|(components, channels)| components * channels).sum()
-    }
-
-    /// Length of the tape, the operations without results that nobody needs, and the basis.
-    pub fn finish(mut self) -> (usize, Vec<Operation>, Gather) {
+    /// Length of the tape, the operations without results that neither the basis nor `message` needs, and
+    /// the basis.
+    pub fn finish(mut self, message: Option<Tensor>) -> (usize, Vec<Operation>, Gather) {
         let mut needed = vec![false; self.end];
         self.basis.rows.iter().for_each(|(row, _)| needed[*row] = true);
+        if let Some(message) = message {
+            (0..message.components).for_each(|q| needed[message.row(q)] = true);
+        }
         self.operations.iter_mut().rev().for_each(|operation| operation.keep(&mut needed));
         (self.end, self.operations, self.basis)
     }

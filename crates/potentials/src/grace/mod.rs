@@ -21,19 +21,36 @@
 //! # }
 //! ```
 
+mod assembly;
 mod bonds;
+mod copies;
+mod equivariant_graph;
+mod equivariant_norm;
 mod error;
 mod evaluate;
+mod globals;
 mod graph;
 mod harmonics;
+mod invariant_norm;
+mod layer;
+mod layer_work;
 mod matrix;
+mod messages;
 mod model;
+mod networks;
 mod one_layer;
+mod product;
 mod projection;
 mod radial;
+mod radial_network;
 mod radial_table;
 mod readout;
+mod reduction;
+mod symmetry;
 mod tape;
+mod three_layers;
+mod two_layers;
+mod weights;
 
 pub use error::GraceError;
 pub use evaluate::{Grace, PullBack};

@@ -5,14 +5,13 @@ use std::path::Path;
 use atoms::{PotentialError, Species};
 use npz::Archive;
 
-use super::error::{GraceError, unsupported};
-use super::harmonics::Harmonics;
-use super::matrix::Lanes;
-use super::one_layer;
+use super::error::GraceError;
+use super::layer::Layer;
 use super::projection::Projection;
-use super::radial::{RadialFunctions, RadialPath};
+use super::radial::RadialPath;
 use super::readout::Readout;
-use super::tape::{Gather, Operation, Tensor};
+use super::symmetry::require_invariance;
+use super::{one_layer, three_layers, two_layers};
 
 /// How many message-passing layers a model has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -23,6 +22,17 @@ pub enum Architecture {
     TwoLayer,
     /// GRACE-3L
     ThreeLayer,
+}
+
+impl Architecture {
+    /// In words.
+    pub(super) fn number_of_layers(self) -> &'static str {
+        match self {
+            Self::OneLayer => "one",
+            Self::TwoLayer => "two",
+            Self::ThreeLayer => "three",
+        }
+    }
 }
 
 impl std::fmt::Display for Architecture {
@@ -42,7 +52,7 @@ pub struct GraceDescription {
     pub architecture: Architecture,
     /// Symbols, in the order of element indices.
     pub elements: Vec<Species>,
-    /// The largest cutoff, Å.
+    /// The largest cutoff, Å; messages carry further, as many times as there are layers.
     pub cutoff: f64,
     /// Whether pairs of elements have cutoffs of their own.
     pub pair_cutoffs: bool,
@@ -50,9 +60,9 @@ pub struct GraceDescription {
     pub lmax: usize,
     /// Chebyshev polynomials.
     pub radial_basis_size: usize,
-    /// Radial channels.
+    /// Radial channels of the first layer.
     pub channels: usize,
-    /// The tensors the energy is made of: A, AA, AAA, AAAA.
+    /// The tensors the energy is made of, layer after layer: A, AA, AAA, AAAA.
     pub basis_functions: Vec<String>,
     /// D_basis, the number of invariants.
     pub basis_dimension: usize,
@@ -69,16 +79,9 @@ pub struct GraceDescription {
 #[derive(Clone, Debug)]
 pub struct GraceModel {
     pub(super) elements: Vec<Species>,
-    pub(super) radial: RadialFunctions,
-    pub(super) harmonics: Harmonics,
-    /// Per element of the neighbour: embedding times the inverse mean number of neighbours,
-    /// [element, channel].
-    pub(super) embedding: Vec<Vec<Lanes>>,
-    /// Length of an atom's tape; the atomic density A stands at its beginning.
-    pub(super) tape_lanes: usize,
-    pub(super) density: Tensor,
-    pub(super) operations: Vec<Operation>,
-    pub(super) basis: Gather,
+    pub(super) layers: Vec<Layer>,
+    /// One lane past each layer's part of the basis B, which stand behind one another.
+    pub(super) basis_ends: Vec<usize>,
     pub(super) readout: Readout,
     pub(super) projection: Option<Projection>,
     pub(super) description: GraceDescription,
@@ -101,10 +104,8 @@ impl GraceModel {
         let archive = Archive::open(path)?;
         match detect(&archive) {
             Architecture::OneLayer => one_layer::read(&archive, radial),
-            Architecture::TwoLayer => Err(unsupported(&archive, "two-layer models are not supported yet")),
-            Architecture::ThreeLayer => {
-                Err(unsupported(&archive, "three-layer models are not supported yet"))
-            }
+            Architecture::TwoLayer => require_invariance(&archive, two_layers::read(&archive, radial)?),
+            Architecture::ThreeLayer => require_invariance(&archive, three_layers::read(&archive, radial)?),
         }
     }
 
@@ -115,7 +116,7 @@ impl GraceModel {
 
     /// The largest cutoff, Å.
     pub fn cutoff(&self) -> f64 {
-        self.radial.largest_cutoff()
+        self.layers.iter().map(|layer| layer.radial.largest_cutoff()).fold(0.0, f64::max)
     }
 
     /// The cutoff of a pair by element indices (centre, neighbour), Å.
@@ -127,7 +128,21 @@ impl GraceModel {
             centre < self.elements.len() && neighbour < self.elements.len(),
             "element index out of range"
         );
-        self.radial.cutoff(self.radial.pair(centre, neighbour))
+        let cutoffs =
+            self.layers.iter().map(|layer| layer.radial.cutoff(layer.radial.pair(centre, neighbour)));
+        cutoffs.fold(0.0, f64::max)
+    }
+
+    /// First lane of a layer's part of the basis.
+    #[inline(always)]
+    pub(super) fn basis_start(&self, layer: usize) -> usize {
+        layer.checked_sub(1).map_or(0, |before| self.basis_ends[before])
+    }
+
+    /// Lanes of the basis of one atom.
+    #[inline(always)]
+    pub(super) fn basis_lanes(&self) -> usize {
+        self.basis_start(self.layers.len())
     }
 
     /// D, the dimension of z; 0 for a model without feature arrays.

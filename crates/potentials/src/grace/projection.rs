@@ -1,7 +1,9 @@
 //! The CALM feature z: the invariant basis, normalised, projected, with its norms.
 
+use std::ops::Range;
+
 use super::matrix::{LANES, Lanes, Matrix, ZERO, add_product, horizontal_sum};
-use super::readout::with_transpose;
+use super::weights::with_transpose;
 
 /// ε_0 of the paper (Methods, "Latent features and uncertainty models").
 const NORM_FLOOR: f64 = 1e-12;
@@ -25,6 +27,8 @@ pub struct Projection {
     pub density_scale: f32,
     /// Whether T is asinh (identity otherwise).
     pub asinh: bool,
+    /// The lanes of the basis of each layer, in the order of their norms in z.
+    pub(super) blocks: Vec<Range<usize>>,
     pub(super) maps: ProjectionMaps,
 }
 
@@ -51,7 +55,7 @@ impl ProjectionMaps {
 pub(super) struct ProjectionWork {
     /// B̂ R before T, [n, lanes of d].
     projected: Vec<Lanes>,
-    /// ‖B‖, [n].
+    /// ‖B‖, ‖B_1‖, …, [n, 1 + blocks].
     norms: Vec<f64>,
     basis_offsets: Vec<u32>,
     projected_offsets: Vec<u32>,
@@ -60,8 +64,12 @@ pub(super) struct ProjectionWork {
 impl Projection {
     /// D, the dimension of z.
     pub fn feature_dimension(&self) -> usize {
-        // One norm of the whole basis and one of the only block.
-        self.dimension + if self.density_channels { 2 } else { 0 }
+        self.dimension + if self.density_channels { self.n_norms() } else { 0 }
+    }
+
+    /// That of the whole basis and that of each block.
+    fn n_norms(&self) -> usize {
+        1 + self.blocks.len()
     }
 
     /// Everything that distinguishes this map from another, as bytes: two models with equal bytes give
@@ -90,6 +98,7 @@ impl Projection {
         work.projected_offsets.clear();
         for (i, basis) in basis.chunks_exact(basis_lanes).enumerate() {
             work.norms.push(norm(basis));
+            work.norms.extend(self.blocks.iter().map(|block| norm(&basis[block.clone()])));
             work.basis_offsets.push((i * basis_lanes) as u32);
             work.projected_offsets.push((i * lanes) as u32);
         }
@@ -103,16 +112,19 @@ impl Projection {
         );
         features.clear();
         features.resize(n * width, 0.0);
-        for ((z, projected), norm) in
-            features.chunks_exact_mut(width).zip(work.projected.chunks_exact_mut(lanes)).zip(&work.norms)
+        let norms = work.norms.chunks_exact(self.n_norms());
+        for ((z, projected), norms) in
+            features.chunks_exact_mut(width).zip(work.projected.chunks_exact_mut(lanes)).zip(norms)
         {
-            let scale = if self.normalize { 1.0 / (norm + NORM_FLOOR) } else { 1.0 };
+            let scale = if self.normalize { 1.0 / (norms[0] + NORM_FLOOR) } else { 1.0 };
             let projected = &mut projected.as_flattened_mut()[..self.dimension];
             for (z, p) in z.iter_mut().zip(projected) {
                 *p *= scale;
                 *z = if self.asinh { p.asinh() } else { *p };
             }
-            z[self.dimension..].fill(f64::from(self.density_scale) * (norm + NORM_FLOOR).ln());
+            for (z, norm) in z[self.dimension..].iter_mut().zip(norms) {
+                *z = f64::from(self.density_scale) * (norm + NORM_FLOOR).ln();
+            }
         }
     }
 
@@ -142,26 +154,34 @@ impl Projection {
             basis_cotangent,
             &work.basis_offsets,
         );
-        for (i, (basis, out)) in
-            basis.chunks_exact(basis_lanes).zip(basis_cotangent.chunks_exact_mut(basis_lanes)).enumerate()
+        let norms = work.norms.chunks_exact(self.n_norms());
+        let cotangents = feature_cotangent.chunks_exact(width).zip(norms);
+        for ((basis, out), (cotangent, norms)) in
+            basis.chunks_exact(basis_lanes).zip(basis_cotangent.chunks_exact_mut(basis_lanes)).zip(cotangents)
         {
-            let densities: f64 = feature_cotangent[i * width + self.dimension..(i + 1) * width].iter().sum();
-            self.through_norm(work.norms[i], f64::from(self.density_scale) * densities, basis, out);
+            self.through_norms(norms, &cotangent[self.dimension..], basis, out);
         }
     }
 
-    /// From the cotangent of B̂ (in `out`) and that of log(‖B‖ + ε_0) to that of B:
-    /// B̄ = B̂̄/(N + ε_0) + \[L̄/(N + ε_0) − (B̂̄ · B)/(N + ε_0)²\] B/N.
+    /// From the cotangent of B̂ (in `out`) and those of log(‖B‖ + ε_0) and log(‖B_1‖ + ε_0), … to that of B:
+    /// B̄ = B̂̄/(N + ε_0) + \[L̄/(N + ε_0) − (B̂̄ · B)/(N + ε_0)²\] B/N, and in block k L̄_k/(N_k + ε_0) B/N_k.
     #[inline(always)]
-    fn through_norm(&self, norm: f64, log_cotangent: f64, basis: &[Lanes], out: &mut [Lanes]) {
-        let inverse = 1.0 / (norm + NORM_FLOOR);
-        let (mut scale, mut along) = (1.0, log_cotangent * inverse);
+    fn through_norms(&self, norms: &[f64], log_cotangents: &[f64], basis: &[Lanes], out: &mut [Lanes]) {
+        let log_cotangent = |k: usize| {
+            log_cotangents.get(k).map_or(0.0, |c| f64::from(self.density_scale) * c) / (norms[k] + NORM_FLOOR)
+        };
+        let inverse = 1.0 / (norms[0] + NORM_FLOOR);
+        let (mut scale, mut along) = (1.0, log_cotangent(0));
         if self.normalize {
             along -= dot(out, basis) * inverse * inverse;
             scale = inverse;
         }
-        for (out, b) in out.as_flattened_mut().iter_mut().zip(basis.as_flattened()) {
-            *out = scale * *out + along * (b / norm);
+        for (k, block) in self.blocks.iter().enumerate() {
+            let factor = along / norms[0] + log_cotangent(k + 1) / norms[k + 1];
+            let (out, basis) = (&mut out[block.clone()], &basis[block.clone()]);
+            for (out, b) in out.as_flattened_mut().iter_mut().zip(basis.as_flattened()) {
+                *out = scale * *out + factor * b;
+            }
         }
     }
 
@@ -185,11 +205,13 @@ fn dot(a: &[Lanes], b: &[Lanes]) -> f64 {
     horizontal_sum(&sum)
 }
 
-/// The row of R for each place of the padded basis: sources one after another, the file channel-major
-/// (row n · components + c), the evaluation \[component\]\[padded channel\].
-pub(super) fn rows_of_projection(sources: &[(usize, usize)]) -> Vec<Option<usize>> {
+/// Components and channels of the sources of one layer's basis.
+pub(super) type Sources = [(usize, usize)];
+
+/// The row of R for each place of the padded basis of one layer, whose first row is `first`: sources one after
+/// another, the file channel-major (row n · components + c), the evaluation \[component\]\[padded channel\].
+pub(super) fn rows_of_projection(mut first: usize, sources: &Sources) -> Vec<Option<usize>> {
     let mut rows = Vec::new();
-    let mut first = 0;
     for (components, channels) in sources {
         let padded = channels.next_multiple_of(LANES);
         for c in 0..*components {

@@ -1,7 +1,7 @@
 //! Radial functions as splines of degree seven.
 
 use super::matrix::{LANES, Lanes, ZERO, add_scaled, scaled};
-use super::radial::{RadialNetwork, RadialWork};
+use super::radial_network::{RadialNetwork, RadialWork};
 
 /// Intervals to begin with, and the most that are tried.
 const INTERVALS: std::ops::RangeInclusive<usize> = 256..=16384;
@@ -44,28 +44,28 @@ pub struct RadialTable {
 
 impl RadialTable {
     /// Halves the spacing until the errors are small enough.
-    pub(super) fn new(network: &RadialNetwork, cutoff: f64) -> Self {
-        let mut table = Self::with_intervals(network, cutoff, *INTERVALS.start());
+    pub(super) fn new(network: &RadialNetwork, cutoff: f64, pair: usize) -> Self {
+        let mut table = Self::with_intervals(network, cutoff, pair, *INTERVALS.start());
         while table.is_coarse() && table.intervals < *INTERVALS.end() {
-            table = Self::with_intervals(network, cutoff, 2 * table.intervals);
+            table = Self::with_intervals(network, cutoff, pair, 2 * table.intervals);
         }
         table
     }
 
     /// The network is a smooth function beyond both ends too, so the samples simply go on there.
-    fn with_intervals(network: &RadialNetwork, cutoff: f64, intervals: usize) -> Self {
+    fn with_intervals(network: &RadialNetwork, cutoff: f64, pair: usize, intervals: usize) -> Self {
         let mut work = RadialWork::default();
         let (lanes, spacing) = (network.output_lanes(), cutoff / intervals as f64);
         let mut samples = Vec::new();
         for k in 0..=intervals + 2 * MARGIN {
             let r = (k as f64 - MARGIN as f64) * spacing;
-            samples.extend_from_slice(&network.evaluate(r, cutoff, &mut work)[0]);
+            samples.extend_from_slice(&network.evaluate(r, cutoff, pair, &mut work)[0]);
         }
         to_coefficients(&mut samples, lanes);
         let coefficients = samples[(MARGIN - 3) * lanes..(MARGIN + intervals + 4) * lanes].to_vec();
         let knots_per_length = intervals as f64 / cutoff;
         let mut table = Self { cutoff, intervals, knots_per_length, errors: [0.0; 2], lanes, coefficients };
-        table.errors = table.measure(network);
+        table.errors = table.measure(network, pair);
         table
     }
 
@@ -75,7 +75,7 @@ impl RadialTable {
 
     /// The largest error of values and of derivatives between knots, relative to the largest of each. They
     /// are largest near the middle and near the quarters of an interval.
-    fn measure(&self, network: &RadialNetwork) -> [f64; 2] {
+    fn measure(&self, network: &RadialNetwork, pair: usize) -> [f64; 2] {
         let mut work = RadialWork::default();
         let mut found = [vec![ZERO; self.lanes], vec![ZERO; self.lanes]];
         let (mut errors, mut largest) = ([0.0_f64; 2], [f64::MIN_POSITIVE; 2]);
@@ -84,7 +84,7 @@ impl RadialTable {
             let r = ((k / 2) as f64 + within) * self.cutoff / self.intervals as f64;
             let [values, derivatives] = &mut found;
             self.evaluate_one(r, values, derivatives);
-            let exact = network.evaluate(r, self.cutoff, &mut work);
+            let exact = network.evaluate(r, self.cutoff, pair, &mut work);
             for (order, found) in found.iter().enumerate() {
                 for (found, exact) in found.as_flattened().iter().zip(exact[order].as_flattened()) {
                     errors[order] = errors[order].max((found - exact).abs());
@@ -98,6 +98,11 @@ impl RadialTable {
     /// The cutoff it was made for, Å.
     pub fn cutoff(&self) -> f64 {
         self.cutoff
+    }
+
+    /// What it takes in memory.
+    pub(super) fn bytes(&self) -> usize {
+        size_of_val(&self.coefficients[..])
     }
 
     /// Number of intervals between r = 0 and the cutoff.

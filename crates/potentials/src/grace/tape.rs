@@ -4,7 +4,10 @@
 //! reads rows that stand before its result. Cotangents stand on a second tape of the same layout, which
 //! the operations walk backwards.
 
-use super::matrix::{Lanes, Matrix, ZERO, add_product, add_scaled, scaled};
+use super::equivariant_norm::EquivariantNorm;
+use super::matrix::{Lanes, add_scaled};
+use super::product::{Combination, Product};
+use super::weights::Weights;
 
 /// Where a tensor stands on the tape.
 #[derive(Clone, Copy, Debug)]
@@ -38,23 +41,32 @@ pub(super) enum Operation {
     Linear(Linear),
     /// Components coupled, channel by channel.
     Product(Product),
+    /// Components summed with factors.
+    Combination(Combination),
+    /// Components divided by their norm.
+    EquivariantNorm(EquivariantNorm),
 }
 
 impl Operation {
+    /// `element` is that of the atom.
     #[inline(always)]
-    pub fn forward(&self, tape: &mut [Lanes]) {
+    pub fn forward(&self, element: usize, tape: &mut [Lanes]) {
         match self {
-            Self::Linear(linear) => linear.forward(tape),
+            Self::Linear(linear) => linear.forward(element, tape),
             Self::Product(product) => product.forward(tape),
+            Self::Combination(combination) => combination.forward(tape),
+            Self::EquivariantNorm(norm) => norm.forward(tape),
         }
     }
 
     /// Adds to the cotangents of what it read.
     #[inline(always)]
-    pub fn backward(&self, tape: &[Lanes], cotangent: &mut [Lanes]) {
+    pub fn backward(&self, element: usize, tape: &[Lanes], cotangent: &mut [Lanes]) {
         match self {
-            Self::Linear(linear) => linear.backward(cotangent),
+            Self::Linear(linear) => linear.backward(element, cotangent),
             Self::Product(product) => product.backward(tape, cotangent),
+            Self::Combination(combination) => combination.backward(cotangent),
+            Self::EquivariantNorm(norm) => norm.backward(tape, cotangent),
         }
     }
 
@@ -64,6 +76,8 @@ impl Operation {
         match self {
             Self::Linear(linear) => linear.keep(needed),
             Self::Product(product) => product.keep(needed),
+            Self::Combination(combination) => combination.keep(needed),
+            Self::EquivariantNorm(norm) => norm.keep(needed),
         }
     }
 }
@@ -81,9 +95,7 @@ pub(super) struct Linear {
 #[derive(Clone, Debug)]
 pub(super) struct LinearPart {
     /// [n_in × n_out]
-    pub weights: Matrix,
-    /// [n_out × n_in]
-    pub transposed: Matrix,
+    pub weights: Weights,
     /// Where each row is read, lanes from the beginning of the tape.
     pub from: Vec<u32>,
     /// Where each is added, lanes from the beginning of the result.
@@ -92,18 +104,18 @@ pub(super) struct LinearPart {
 
 impl Linear {
     #[inline(always)]
-    fn forward(&self, tape: &mut [Lanes]) {
+    fn forward(&self, element: usize, tape: &mut [Lanes]) {
         let (before, out) = tape.split_at_mut(self.start);
         for part in &self.parts {
-            part.weights.multiply_add(before, &part.from, out, &part.to);
+            part.weights.forward(element).multiply_add(before, &part.from, out, &part.to);
         }
     }
 
     #[inline(always)]
-    fn backward(&self, cotangent: &mut [Lanes]) {
+    fn backward(&self, element: usize, cotangent: &mut [Lanes]) {
         let (before, out) = cotangent.split_at_mut(self.start);
         for part in &self.parts {
-            part.transposed.multiply_add(out, &part.to, before, &part.from);
+            part.weights.transposed(element).multiply_add(out, &part.to, before, &part.from);
         }
     }
 
@@ -116,77 +128,6 @@ impl Linear {
             (part.from, part.to) = kept.into_iter().unzip();
         }
         self.parts.retain(|part| !part.from.is_empty());
-    }
-}
-
-/// out_n,f = Σ_c C_c left_n,l(c) right_n,r(c), the sum over the terms c of f.
-#[derive(Clone, Debug)]
-pub(super) struct Product {
-    /// First lane of the result.
-    pub start: usize,
-    /// Lanes of a component, the same for result and factors.
-    pub width: usize,
-    /// Each component of the result that is needed.
-    pub outputs: Vec<ProductOutput>,
-}
-
-/// One component of a product.
-#[derive(Clone, Debug)]
-pub(super) struct ProductOutput {
-    /// First lane on the tape.
-    pub row: usize,
-    /// What it sums.
-    pub terms: Vec<Term>,
-}
-
-/// One coupling.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Term {
-    /// First lane of the left factor on the tape.
-    pub left: u32,
-    /// First lane of the right factor on the tape.
-    pub right: u32,
-    /// Clebsch–Gordan coefficient.
-    pub coefficient: f64,
-}
-
-impl Product {
-    #[inline(always)]
-    fn forward(&self, tape: &mut [Lanes]) {
-        let (before, out) = tape.split_at_mut(self.start);
-        for output in &self.outputs {
-            for (c, out) in out[output.row - self.start..][..self.width].iter_mut().enumerate() {
-                let mut sum = ZERO;
-                for term in &output.terms {
-                    let left = scaled(term.coefficient, &before[term.left as usize + c]);
-                    add_product(&mut sum, &left, &before[term.right as usize + c]);
-                }
-                *out = sum;
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn backward(&self, tape: &[Lanes], cotangent: &mut [Lanes]) {
-        let (before, out) = cotangent.split_at_mut(self.start);
-        for output in &self.outputs {
-            for (c, out) in out[output.row - self.start..][..self.width].iter().enumerate() {
-                for term in &output.terms {
-                    let (left, right) = (term.left as usize + c, term.right as usize + c);
-                    let cotangent = scaled(term.coefficient, out);
-                    add_product(&mut before[left], &cotangent, &tape[right]);
-                    add_product(&mut before[right], &cotangent, &tape[left]);
-                }
-            }
-        }
-    }
-
-    fn keep(&mut self, needed: &mut [bool]) {
-        self.outputs.retain(|output| needed[output.row]);
-        for term in self.outputs.iter().flat_map(|output| &output.terms) {
-            needed[term.left as usize] = true;
-            needed[term.right as usize] = true;
-        }
     }
 }
 

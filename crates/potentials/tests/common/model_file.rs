@@ -23,33 +23,69 @@ pub fn load(bytes: &[u8]) -> Result<GraceModel, GraceError> {
     GraceModel::load_with(file.path(), RadialPath::Exact)
 }
 
-fn entry(name: &str) -> Vec<u8> {
+/// A model of several layers that is there for tests.
+pub fn deep(name: &str) -> Vec<u8> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name);
+    std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// The names of all arrays.
+pub fn names(model: &[u8]) -> Vec<String> {
+    NpzArchive::new(Cursor::new(model)).unwrap().array_names().map(str::to_owned).collect()
+}
+
+fn entry(source: &mut NpzArchive<Cursor<&[u8]>>, name: &str) -> Vec<u8> {
     let mut bytes = Vec::new();
-    let mut source = NpzArchive::new(Cursor::new(&BYTES[..])).unwrap();
     source.zip_archive().by_name(&file_name_from_array_name(name)).unwrap().read_to_end(&mut bytes).unwrap();
     bytes
 }
 
 /// Shape and data of one array.
 pub fn floats(name: &str) -> (Vec<u64>, Vec<f64>) {
-    let bytes = entry(name);
+    floats_of(&BYTES, name)
+}
+
+/// The same of another model.
+pub fn floats_of(model: &[u8], name: &str) -> (Vec<u64>, Vec<f64>) {
+    let bytes = entry(&mut NpzArchive::new(Cursor::new(model)).unwrap(), name);
     let file = NpyFile::new(&bytes[..]).unwrap();
     (file.shape().to_vec(), file.into_vec().unwrap())
 }
 
-/// Reads the model with some arrays replaced or added; `None` takes one away.
-pub fn changed(changes: &[(&str, Option<Vec<u8>>)]) -> Result<GraceModel, GraceError> {
-    let source = NpzArchive::new(Cursor::new(&BYTES[..])).unwrap();
-    let mut names: Vec<String> = source.array_names().map(str::to_owned).collect();
+/// Shape and data of one array of indices.
+pub fn integers_of(model: &[u8], name: &str) -> (Vec<u64>, Vec<i32>) {
+    let bytes = entry(&mut NpzArchive::new(Cursor::new(model)).unwrap(), name);
+    let file = NpyFile::new(&bytes[..]).unwrap();
+    (file.shape().to_vec(), file.into_vec().unwrap())
+}
+
+/// Number of items of one array.
+pub fn length(model: &[u8], name: &str) -> usize {
+    let bytes = entry(&mut NpzArchive::new(Cursor::new(model)).unwrap(), name);
+    NpyFile::new(&bytes[..]).unwrap().shape().iter().product::<u64>() as usize
+}
+
+/// Arrays to replace or add; `None` takes one away.
+pub type Change<'a> = (&'a str, Option<Vec<u8>>);
+
+/// Reads the aluminium model with changes.
+pub fn changed(changes: &[Change]) -> Result<GraceModel, GraceError> {
+    changed_of(&BYTES, changes)
+}
+
+/// Reads another model with changes.
+pub fn changed_of(model: &[u8], changes: &[Change]) -> Result<GraceModel, GraceError> {
+    let mut names = names(model);
     names.extend(changes.iter().map(|(name, _)| (*name).to_owned()));
     names.sort();
     names.dedup();
+    let mut source = NpzArchive::new(Cursor::new(model)).unwrap();
     let mut out = NpzWriter::new(Cursor::new(Vec::new()));
     for name in names {
         let bytes = match changes.iter().find(|(changed, _)| *changed == name) {
             Some((_, None)) => continue,
             Some((_, Some(bytes))) => bytes.clone(),
-            None => entry(&name),
+            None => entry(&mut source, &name),
         };
         out.zip_writer().start_file(file_name_from_array_name(&name), Default::default()).unwrap();
         out.zip_writer().write_all(&bytes).unwrap();

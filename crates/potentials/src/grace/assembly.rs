@@ -1,0 +1,138 @@
+//! Puts a model together from its layers.
+
+use std::ops::Range;
+
+use atoms::Species;
+use npz::Archive;
+
+use super::error::{GraceError, mismatch};
+use super::globals::refuse_left_over;
+use super::layer::{Layer, LayerDraft};
+use super::matrix::LANES;
+use super::model::{Architecture, GraceDescription, GraceModel};
+use super::networks::readout;
+use super::projection::{Projection, ProjectionMaps, rows_of_projection};
+
+/// What a reader found out about a file.
+pub(super) struct Draft<'a> {
+    pub archive: &'a Archive,
+    pub architecture: Architecture,
+    pub elements: Vec<Species>,
+    pub layers: Vec<LayerDraft<'a>>,
+    /// The layers in the order of their blocks of the basis B in the file.
+    pub block_order: Vec<usize>,
+    /// Number of densities y.
+    pub n_densities: usize,
+    /// Number of trained weights outside the graphs.
+    pub weights: usize,
+}
+
+impl Draft<'_> {
+    /// Reads what follows the layers, and refuses the file if any array is left over.
+    pub fn finish(mut self) -> Result<GraceModel, GraceError> {
+        let archive = self.archive;
+        let blocks = self.layers.iter().map(|layer| layer.block.clone()).collect();
+        let readout = readout(archive, blocks, self.n_densities, self.elements.len(), &mut self.weights)?;
+        let sources: Vec<_> = self.layers.iter().map(|layer| layer.graph.sources.clone()).collect();
+        let projection = projection(archive, &sources, &self.block_order)?;
+        refuse_left_over(archive, self.architecture.number_of_layers())?;
+        let description = self.describe(basis_dimension(&sources), projection.as_ref())?;
+        let messages: Vec<_> = self.layers.iter().skip(1).map(|layer| layer.message.from).collect();
+        let messages = messages.into_iter().chain([None]);
+        let layers: Vec<Layer> =
+            self.layers.into_iter().zip(messages).map(|(layer, message)| layer.finish(message)).collect();
+        let mut end = 0;
+        let ends = layers.iter().map(|layer| {
+            end += layer.basis.lanes();
+            end
+        });
+        let basis_ends = ends.collect();
+        Ok(GraceModel { elements: self.elements, layers, basis_ends, readout, projection, description })
+    }
+
+    fn describe(
+        &self,
+        basis_dimension: usize,
+        projection: Option<&Projection>,
+    ) -> Result<GraceDescription, GraceError> {
+        let radial = self.layers.iter().map(|layer| &layer.radial);
+        let first = &self.layers[0];
+        Ok(GraceDescription {
+            architecture: self.architecture,
+            elements: self.elements.clone(),
+            cutoff: radial.clone().map(|radial| radial.largest_cutoff()).fold(0.0, f64::max),
+            pair_cutoffs: self.archive.count("has_bond_specific_cutoff", 0, 1)? == 1,
+            lmax: first.lmax,
+            radial_basis_size: first.radial.basis_size(),
+            channels: first.graph.density().channels,
+            basis_functions: self.layers.iter().flat_map(|layer| layer.graph.source_names.clone()).collect(),
+            basis_dimension,
+            feature_dimension: projection.map_or(0, Projection::feature_dimension),
+            weights: self.weights + self.layers.iter().map(|layer| layer.graph.weights).sum::<usize>(),
+            radial_tables: radial
+                .flat_map(|radial| radial.tables())
+                .map(|table| (table.intervals(), table.errors()))
+                .collect(),
+        })
+    }
+}
+
+/// D_basis
+fn basis_dimension(sources: &[Vec<(usize, usize)>]) -> usize {
+    sources.iter().flatten().map(|(components, channels)| components * channels).sum()
+}
+
+/// The row of the projection matrix for each place of the padded basis, in which the layers follow one
+/// another, and the lanes of the blocks in the file's order.
+fn places(sources: &[Vec<(usize, usize)>], block_order: &[usize]) -> (Vec<Option<usize>>, Vec<Range<usize>>) {
+    let (mut firsts, mut first) = (vec![0; sources.len()], 0);
+    for layer in block_order {
+        firsts[*layer] = first;
+        first += basis_dimension(&sources[*layer..=*layer]);
+    }
+    let (mut rows, mut of_layers) = (Vec::new(), Vec::new());
+    for (first, sources) in firsts.into_iter().zip(sources) {
+        let start = rows.len() / LANES;
+        rows.extend(rows_of_projection(first, sources));
+        of_layers.push(start..rows.len() / LANES);
+    }
+    (rows, block_order.iter().map(|layer| of_layers[*layer].clone()).collect())
+}
+
+/// The feature map, if the file holds one. `sources` are those of each layer's basis, `block_order` the layers in the
+/// order of their blocks in the file.
+fn projection(
+    archive: &Archive,
+    sources: &[Vec<(usize, usize)>],
+    block_order: &[usize],
+) -> Result<Option<Projection>, GraceError> {
+    if !archive.contains("uq_schema_version") {
+        return Ok(None);
+    }
+    let version = archive.count("uq_schema_version", 0, usize::MAX)?;
+    let dimension = archive.count("uq_rp_dim", 1, 1 << 16)?;
+    let matrix = archive.singles("uq_rp_matrix")?.finite()?.shaped(&[basis_dimension(sources), dimension])?;
+    let normalize = archive.flag_or("uq_rp_normalize", false)?;
+    let density_channels = archive.flag_or("uq_rp_add_density_channel", false)?;
+    let asinh = archive.flag_or("uq_feature_transform", false)?;
+    let expected = match (normalize || density_channels, asinh) {
+        (true, _) => 6,
+        (false, true) => 4,
+        (false, false) => 3,
+    };
+    if version != expected {
+        return Err(mismatch(
+            archive,
+            "uq_schema_version",
+            version.to_string(),
+            format!("{expected}, which its flags mean"),
+        ));
+    }
+    let (rows, blocks) = places(sources, block_order);
+    let maps = ProjectionMaps::new(&matrix, dimension, &rows);
+    let density_scale = archive.scalar_or("uq_rp_density_scale", 1.0)? as f32;
+    let projection =
+        Projection { matrix, dimension, normalize, density_channels, density_scale, asinh, blocks, maps };
+    archive.expect_count("uq_feature_dim", projection.feature_dimension())?;
+    Ok(Some(projection))
+}

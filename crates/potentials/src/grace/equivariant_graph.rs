@@ -1,0 +1,101 @@
+//! The steps of a graph that only models of three layers have.
+
+use super::equivariant_norm::EquivariantNorm;
+use super::error::{GraceError, mismatch};
+use super::graph::Graph;
+use super::matrix::to_lanes;
+use super::tape::{Linear, LinearPart, Operation, Tensor};
+use super::weights::Weights;
+
+impl Graph<'_> {
+    /// The product of left and right whose channels have been mixed with weights U and V, which are those of the
+    /// group of each component.
+    pub fn mixed_product(&mut self, name: &str, left: Tensor, right: Tensor) -> Result<Tensor, GraceError> {
+        let archive = self.archive;
+        let key = |suffix: &str| format!("{name}_{suffix}");
+        let left = self.mixed(name, left, ["U", "norm_u", "left"])?;
+        let right = self.mixed(name, right, ["V", "norm_v", "right"])?;
+        let out = self.coupled(name, name, "cg", [left, right])?;
+        archive.expect_count(&key("nfunc"), out.components)?;
+        for suffix in ["out_l", "out_parity"] {
+            let labels = archive.integers(&key(suffix))?.data.len();
+            if labels != out.components {
+                let expected = format!("a list of {}", out.components);
+                return Err(mismatch(archive, &key(suffix), format!("a list of {labels}"), expected));
+            }
+        }
+        Ok(out)
+    }
+
+    /// Σ_n W_g(w),k,n x_n,w
+    fn mixed(
+        &mut self,
+        name: &str,
+        tensor: Tensor,
+        [matrix, norm, side]: [&str; 3],
+    ) -> Result<Tensor, GraceError> {
+        let (archive, key) = (self.archive, |suffix: &str| format!("{name}_{suffix}"));
+        let rank = archive.count(&key("rank"), 1, 4096)?;
+        let n_groups = archive.count(&key(&format!("n_groups_{side}")), 1, 1 << 16)?;
+        archive.expect_count(&key(&format!("n_{side}")), tensor.channels)?;
+        let weights = archive.floats(&key(matrix), &[n_groups, rank, tensor.channels])?;
+        let groups = archive.exactly_indices(&key(&format!("group_{side}")), tensor.components, n_groups)?;
+        let norm = archive.scalar(&key(norm))?;
+        self.weights += weights.len();
+        let out = self.push(&format!("{name} {side}"), tensor.components, rank)?;
+        let mut parts = Vec::new();
+        for group in 0..n_groups {
+            let rows: Vec<usize> = (0..groups.len()).filter(|w| groups[*w] == group).collect();
+            let (from, to) = rows.iter().map(|w| (tensor.row(*w) as u32, (w * out.width) as u32)).unzip();
+            let element = |_, n, k| norm * weights[(group * rank + k) * tensor.channels + n];
+            parts.push(LinearPart { weights: Weights::new(1, tensor.channels, rank, element), from, to });
+        }
+        parts.retain(|part| !part.from.is_empty());
+        self.operations.push(Operation::Linear(Linear { start: out.start, parts }));
+        Ok(out)
+    }
+
+    /// The norm `name` of a tensor.
+    pub fn equivariant_norm(&mut self, name: &str, from: Tensor) -> Result<Tensor, GraceError> {
+        let (archive, key) = (self.archive, |suffix: &str| format!("{name}_{suffix}"));
+        let ([groups, channels], weights) = archive.tensor::<2>(&key("affine_weight"))?;
+        if channels != from.channels {
+            let found = format!("{channels} columns wide");
+            return Err(mismatch(
+                archive,
+                &key("affine_weight"),
+                found,
+                format!("{} channels", from.channels),
+            ));
+        }
+        let expand = archive.exactly_indices(&key("expand_index"), from.components, groups)?;
+        let invariant = archive.floats(&key("l0_mask"), &[from.components])?;
+        if invariant.iter().any(|x| *x != 0.0 && *x != 1.0) {
+            return Err(mismatch(archive, &key("l0_mask"), format!("{invariant:?}"), "zeros and ones"));
+        }
+        let centring = f64::from(u8::from(archive.count(&key("center_l0"), 0, 1)? == 1));
+        let floor = archive.scalar(&key("eps"))?;
+        if !(1e-30..=1.0).contains(&floor) {
+            return Err(mismatch(archive, &key("eps"), floor.to_string(), "a number from 1e-30 to 1"));
+        }
+        let degree_weights = archive.floats(&key("degree_weights"), &[from.components])?;
+        if let Some(negative) = degree_weights.iter().find(|d| **d < 0.0) {
+            let found = format!("partly {negative}");
+            return Err(mismatch(archive, &key("degree_weights"), found, "numbers not below zero"));
+        }
+        self.weights += weights.len();
+        let to = self.push(name, from.components, channels)?;
+        self.operations.push(Operation::EquivariantNorm(EquivariantNorm {
+            from,
+            to,
+            centred: invariant.iter().map(|x| x * centring).collect(),
+            degree_weights,
+            affine: expand
+                .iter()
+                .flat_map(|g| to_lanes(&weights[g * channels..(g + 1) * channels]))
+                .collect(),
+            floor,
+        }));
+        Ok(to)
+    }
+}

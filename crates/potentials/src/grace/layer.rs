@@ -1,0 +1,75 @@
+//! One round of message passing: what an atom sums over its neighbours, and what it makes of it.
+
+use super::graph::Graph;
+use super::harmonics::Harmonics;
+use super::matrix::Lanes;
+use super::radial::RadialFunctions;
+use super::readout::Block;
+use super::tape::{Gather, Operation, Tensor};
+
+/// The weights of one layer: T_q,lm,n = Σ_j R_nl(r) Y_lm(v) m_q,n(j), the messages m of the neighbours being
+/// the results of the layer before, and the operations on T. In the first layer a message is just a
+/// factor for each channel.
+#[derive(Clone, Debug)]
+pub(super) struct Layer {
+    pub radial: RadialFunctions,
+    pub harmonics: Harmonics,
+    pub message: Message,
+    /// T, \[q\]\[lm\]\[channel\], at the beginning of the tape.
+    pub density: Tensor,
+    /// Length of an atom's tape.
+    pub tape_lanes: usize,
+    pub operations: Vec<Operation>,
+    /// The rows of the tape that this layer gives to the basis B.
+    pub basis: Gather,
+}
+
+/// What an atom tells its neighbours: m_q,n = x_q,n + c_q,n with the tensor x of the layer before, zero beyond its
+/// components, and constants c of the atom's element.
+#[derive(Clone, Debug)]
+pub(super) struct Message {
+    /// x on the tape of the layer before; none in the first layer.
+    pub from: Option<Tensor>,
+    /// Number of components q.
+    pub components: usize,
+    /// c, [element][q][channel]
+    pub constants: Vec<Vec<Lanes>>,
+}
+
+impl Message {
+    /// Components that depend on the atom's surroundings.
+    pub fn passed(&self) -> usize {
+        self.from.map_or(0, |tensor| tensor.components)
+    }
+
+    /// Lanes of one atom's message.
+    pub fn lanes(&self) -> usize {
+        self.constants.first().map_or(0, Vec::len)
+    }
+}
+
+/// A layer whose graph is complete.
+pub(super) struct LayerDraft<'a> {
+    pub graph: Graph<'a>,
+    pub radial: RadialFunctions,
+    pub lmax: usize,
+    pub message: Message,
+    pub block: Block,
+}
+
+impl LayerDraft<'_> {
+    /// `message` is what the next layer takes from this one.
+    pub fn finish(self, message: Option<Tensor>) -> Layer {
+        let density = self.graph.density();
+        let (tape_lanes, operations, basis) = self.graph.finish(message);
+        Layer {
+            radial: self.radial,
+            harmonics: Harmonics::new(self.lmax),
+            message: self.message,
+            density,
+            tape_lanes,
+            operations,
+            basis,
+        }
+    }
+}

@@ -1,0 +1,164 @@
+//! Reductions: several tensors summed into one with weights, which may be those of the central atom's element.
+
+use std::collections::BTreeMap;
+
+use super::error::{GraceError, mismatch};
+use super::graph::Graph;
+use super::matrix::LANES;
+use super::tape::{Linear, LinearPart, Operation, Tensor};
+use super::weights::Weights;
+
+/// What a reduction takes from one tensor.
+struct Source {
+    name: String,
+    tensor: Tensor,
+    /// Its components,
+    collect: Vec<usize>,
+    /// which weights each has,
+    tiles: Vec<usize>,
+    /// and to which component of the result it is added.
+    sums: Vec<usize>,
+    /// Number of different weights.
+    n_tiles: usize,
+    /// Weights times their norms, [type, k, n, tile].
+    weights: Vec<f64>,
+}
+
+/// The sizes of a reduction and its sources.
+struct Reduction {
+    n_types: usize,
+    n_out: usize,
+    sources: Vec<Source>,
+}
+
+impl Reduction {
+    /// W_kn of the given tile for the central atom's element `t`.
+    fn weight(&self, source: &Source, tile: usize, [t, n, k]: [usize; 3]) -> f64 {
+        source.weights[((t * self.n_out + k) * source.tensor.channels + n) * source.n_tiles + tile]
+    }
+}
+
+impl Graph<'_> {
+    /// The invariant reduction `prefix`: gathers the basis B of its sources and returns the weights W of
+    /// y_k = Σ_b W_kb B_b.
+    pub fn invariants(&mut self, prefix: &str, n_elements: usize) -> Result<Weights, GraceError> {
+        let key = format!("{prefix}_only_invar");
+        if self.archive.contains(&key) {
+            self.archive.expect_count(&key, 1)?;
+            self.archive.expect_count(&format!("{prefix}_n_funcs"), 1)?;
+        }
+        let reduction = self.reduction(prefix, n_elements, 1)?;
+        // Source, tile and channel of each place of the padded basis; none for padding.
+        let mut places: Vec<Option<(&Source, usize, usize)>> = Vec::new();
+        for source in &reduction.sources {
+            for (component, tile) in source.collect.iter().zip(&source.tiles) {
+                self.basis.rows.push((source.tensor.row(*component), source.tensor.width));
+                let channels = source.tensor.channels;
+                places.extend(
+                    (0..source.tensor.width * LANES).map(|n| (n < channels).then_some((source, *tile, n))),
+                );
+            }
+            self.sources.push((source.collect.len(), source.tensor.channels));
+            self.source_names.push(source.name.clone());
+        }
+        if places.is_empty() {
+            let key = format!("{prefix}_instruction_names");
+            return Err(mismatch(self.archive, &key, "a list of tensors without invariants", "invariants"));
+        }
+        Ok(Weights::new(reduction.n_types, places.len(), reduction.n_out, |t, place, k| {
+            places[place].map_or(0.0, |(source, tile, n)| reduction.weight(source, tile, [t, n, k]))
+        }))
+    }
+
+    /// The reduction `prefix` to a tensor of that name:
+    /// out_k,f = Σ over sources and c with sum(c) = f of Σ_n W_kn x_n,collect(c).
+    pub fn reduce(&mut self, prefix: &str, n_elements: usize) -> Result<Tensor, GraceError> {
+        let archive = self.archive;
+        let components = archive.count(&format!("{prefix}_n_funcs"), 1, 1 << 16)?;
+        if archive.count(&format!("{prefix}_only_invar"), 0, 1)? == 1 {
+            archive.expect_count(&format!("{prefix}_n_funcs"), 1)?;
+        }
+        let reduction = self.reduction(prefix, n_elements, components)?;
+        let out = self.push(prefix, components, reduction.n_out)?;
+        let mut parts = Vec::new();
+        for source in &reduction.sources {
+            let mut rows: BTreeMap<usize, (Vec<u32>, Vec<u32>)> = BTreeMap::new();
+            for ((component, tile), sum) in source.collect.iter().zip(&source.tiles).zip(&source.sums) {
+                let (from, to) = rows.entry(*tile).or_default();
+                from.push(source.tensor.row(*component) as u32);
+                to.push((sum * out.width) as u32);
+            }
+            for (tile, (from, to)) in rows {
+                let (channels, n_out) = (source.tensor.channels, reduction.n_out);
+                let element = |t, n, k| reduction.weight(source, tile, [t, n, k]);
+                let weights = Weights::new(reduction.n_types, channels, n_out, element);
+                parts.push(LinearPart { weights, from, to });
+            }
+        }
+        self.operations.push(Operation::Linear(Linear { start: out.start, parts }));
+        Ok(out)
+    }
+
+    fn reduction(
+        &mut self,
+        prefix: &str,
+        n_elements: usize,
+        components: usize,
+    ) -> Result<Reduction, GraceError> {
+        let archive = self.archive;
+        let n_out = archive.count(&format!("{prefix}_n_out"), 1, 4096)?;
+        let by_element = archive.count(&format!("{prefix}_is_central_atom_type_dependent"), 0, 1)? == 1;
+        let types_key = format!("{prefix}_number_of_atom_types");
+        if by_element {
+            archive.expect_count(&types_key, n_elements)?;
+        } else {
+            archive.ignore(&types_key);
+        }
+        let n_types = if by_element { n_elements } else { 1 };
+        let norm = archive.scalar_or(&format!("{prefix}_norm_map"), 1.0)?;
+        let names_key = format!("{prefix}_instruction_names");
+        let names = archive.strings(&names_key)?;
+        if names.is_empty() || (1..names.len()).any(|k| names[..k].contains(&names[k])) {
+            return Err(mismatch(archive, &names_key, format!("{names:?}"), "tensors, each once"));
+        }
+        let mut sources = Vec::new();
+        for name in &names {
+            let shape = [n_types, n_out, usize::from(by_element)];
+            sources.push(self.source(prefix, name, shape, components, norm)?);
+        }
+        Ok(Reduction { n_types, n_out, sources })
+    }
+
+    fn source(
+        &mut self,
+        prefix: &str,
+        name: &str,
+        [n_types, n_out, by_element]: [usize; 3],
+        components: usize,
+        norm: f64,
+    ) -> Result<Source, GraceError> {
+        let archive = self.archive;
+        let key = |suffix: &str| format!("{prefix}_{suffix}_{name}");
+        let weights_key = format!("{prefix}_reduce_{name}_W");
+        let tensor = self.named(name)?;
+        let collect = archive.indices(&key("collect_ind"), tensor.components)?;
+        let (shape, mut weights) = if by_element == 1 {
+            archive.tensor::<4>(&weights_key)?
+        } else {
+            let ([k, n, tiles], weights) = archive.tensor::<3>(&weights_key)?;
+            ([1, k, n, tiles], weights)
+        };
+        if shape[..3] != [n_types, n_out, tensor.channels] {
+            let expected = format!("[{n_types}, {n_out}, {}, …]", tensor.channels);
+            return Err(mismatch(archive, &weights_key, format!("of shape {shape:?}"), expected));
+        }
+        let tiles = archive.exactly_indices(&key("w_l_tile"), collect.len(), shape[3])?;
+        let sums = archive.exactly_indices(&key("total_sum_ind"), collect.len(), components)?;
+        archive.expect_count(&key("n_in"), tensor.channels)?;
+        archive.expect_count(&key("w_shape"), shape[3])?;
+        self.weights += weights.len();
+        let norm = norm * archive.scalar(&format!("{prefix}_reduce_{name}_norm"))?;
+        weights.iter_mut().for_each(|w| *w *= norm);
+        Ok(Source { name: name.to_owned(), tensor, collect, tiles, sums, n_tiles: shape[3], weights })
+    }
+}

@@ -1,0 +1,67 @@
+//! A check of models whose files do not say how their parts are connected.
+//!
+//! Where a product takes another factor than the maker of the model meant, components of different orders meet, and
+//! energies change when a structure is turned.
+
+use std::sync::Arc;
+
+use atoms::{Cell, NeighbourList, Structure, Vec3};
+use npz::Archive;
+
+use super::error::{GraceError, unsupported};
+use super::evaluate::Grace;
+use super::model::GraceModel;
+
+/// The largest change, relative to the largest energy without shifts: far beyond rounding, even of weights that were
+/// single-precision numbers once.
+const TOLERANCE: f64 = 1e-3;
+
+/// Atoms of a cluster, as parts of the cutoff.
+const SITES: [Vec3; 6] = [
+    [0.0, 0.0, 0.0],
+    [0.42, 0.05, 0.1],
+    [-0.1, 0.45, 0.2],
+    [0.15, -0.3, 0.4],
+    [-0.35, -0.2, -0.25],
+    [0.3, -0.45, -0.2],
+];
+
+/// Refuses a model for which the energies of atoms change when a cluster is turned or mirrored.
+pub(super) fn require_invariance(archive: &Archive, model: GraceModel) -> Result<GraceModel, GraceError> {
+    let model = Arc::new(model);
+    let mut grace = Grace::new(Arc::clone(&model));
+    let here = energies(&mut grace, |x| x);
+    let largest = here.iter().fold(f64::MIN_POSITIVE, |most, energy| most.max(energy.abs()));
+    let turned =
+        |[x, y, z]: Vec3| [0.36 * x - 0.8 * y - 0.48 * z, 0.48 * x + 0.6 * y - 0.64 * z, 0.8 * x + 0.6 * z];
+    let mirrored = |x: Vec3| turned(x).map(|x| -x);
+    for there in [energies(&mut grace, turned), energies(&mut grace, mirrored)] {
+        let change = here.iter().zip(&there).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        if change.is_nan() || change > TOLERANCE * largest {
+            let reason = format!(
+                "energies change by {change:.1e} eV when a cluster is turned: the parts of this model are not \
+                 connected as in the models that are known"
+            );
+            return Err(unsupported(archive, reason));
+        }
+    }
+    drop(grace);
+    Ok(Arc::unwrap_or_clone(model))
+}
+
+/// Energies of the atoms without the shifts of their elements, eV.
+fn energies(grace: &mut Grace, place: impl Fn(Vec3) -> Vec3) -> Vec<f64> {
+    let model = Arc::clone(grace.model());
+    let elements = (0..SITES.len()).map(|atom| atom % model.elements().len());
+    let structure = Structure {
+        species: elements.clone().map(|element| model.elements()[element]).collect(),
+        positions: SITES.map(|site| place(site).map(|x| model.cutoff() * x)).to_vec(),
+        cell: Cell::orthorhombic(1.0, 1.0, 1.0),
+        periodic: [false; 3],
+    };
+    let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
+    neighbours.update(&structure).expect("a few atoms some Å apart");
+    grace.forward(&structure, &neighbours).expect("a list as long as the cutoff, and elements of the model");
+    let shifts = elements.map(|element| model.readout.shifts[element]);
+    grace.atomic_energies().iter().zip(shifts).map(|(energy, shift)| energy - shift).collect()
+}

@@ -1,0 +1,47 @@
+//! Matrices with their transposes, one for each element of the central atom where these differ.
+
+use super::matrix::Matrix;
+
+/// Weights W_kn of a linear map and of its reverse.
+#[derive(Clone, Debug)]
+pub(super) struct Weights(Vec<(Matrix, Matrix)>);
+
+impl Weights {
+    /// From `element(type, input, output)` for `n_types` elements of the central atom, or for one type that
+    /// stands for all.
+    pub fn new(
+        n_types: usize,
+        inputs: usize,
+        outputs: usize,
+        element: impl Fn(usize, usize, usize) -> f64,
+    ) -> Self {
+        Self((0..n_types).map(|t| with_transpose(inputs, outputs, |i, o| element(t, i, o))).collect())
+    }
+
+    /// [inputs × outputs]
+    #[inline(always)]
+    pub fn forward(&self, element: usize) -> &Matrix {
+        &self.of(element).0
+    }
+
+    /// [outputs × inputs]
+    #[inline(always)]
+    pub fn transposed(&self, element: usize) -> &Matrix {
+        &self.of(element).1
+    }
+
+    #[inline(always)]
+    fn of(&self, element: usize) -> &(Matrix, Matrix) {
+        &self.0[if self.0.len() == 1 { 0 } else { element }]
+    }
+}
+
+/// A matrix and its transpose.
+pub(super) fn with_transpose(
+    inputs: usize,
+    outputs: usize,
+    element: impl Fn(usize, usize) -> f64,
+) -> (Matrix, Matrix) {
+    let transposed = Matrix::from_fn(outputs, inputs, |i, o| element(o, i));
+    (Matrix::from_fn(inputs, outputs, element), transposed)
+}
