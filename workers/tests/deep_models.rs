@@ -1,0 +1,104 @@
+//! The bias on models whose atoms send messages: the grade's gradient, and a walk that does not know the difference.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use atoms::{Cell, Evaluation, NeighbourList, Potential, Structure, Vec3, cell};
+use calm::{Component, Mixture};
+use potentials::grace::{Grace, GraceModel};
+use workers::bias::BiasedPotential;
+
+fn model(name: &str) -> Arc<GraceModel> {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../crates/potentials/tests/data").join(name);
+    Arc::new(GraceModel::load(&file).unwrap())
+}
+
+fn alloy() -> Structure {
+    Structure {
+        species: ["Mo", "W", "W", "Mo"].map(|symbol| symbol.parse().unwrap()).to_vec(),
+        positions: vec![[0.1, 0.0, -0.1], [0.2, 1.8, 1.7], [1.9, -0.1, 2.0], [1.8, 2.0, 0.1]],
+        cell: Cell([[3.8, 0.1, 0.0], [-0.2, 3.9, 0.1], [0.3, 0.0, 3.7]]),
+        periodic: [true; 3],
+    }
+}
+
+/// One component for each element, about the features of `structure` with its atoms shifted.
+fn mixture(model: &Arc<GraceModel>, structure: &Structure) -> Arc<Mixture> {
+    let mut moved = structure.clone();
+    moved.positions.iter_mut().enumerate().for_each(|(k, r)| r[k % 3] += 0.3);
+    let mut grace = Grace::new(Arc::clone(model));
+    let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
+    neighbours.update(&moved).unwrap();
+    grace.forward(&moved, &neighbours).unwrap();
+    let d = model.feature_dimension();
+    let component = |centre: &[f64], scale: f64| {
+        let inverse = (0..d * d).map(|k| f64::from(u8::from(k / d == k % d)) * scale * (1 + k % d) as f64);
+        Arc::new(Component::new(centre.to_vec(), inverse.collect(), 1.5, None).unwrap())
+    };
+    let features = grace.features();
+    let elements = vec![vec![component(&features[..d], 2.0)], vec![component(&features[d..2 * d], 0.7)]];
+    Arc::new(Mixture::new(0, elements).unwrap())
+}
+
+/// Σγ and the biased forces and virial.
+fn evaluate(potential: &mut BiasedPotential, structure: &Structure) -> (f64, Evaluation) {
+    let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
+    neighbours.update(structure).unwrap();
+    let mut out = Evaluation::default();
+    potential.evaluate(structure, &neighbours, &mut out).unwrap();
+    (potential.grades().unwrap().gamma.iter().sum(), out)
+}
+
+/// f′(0) from f(±h) and f(±2h).
+fn difference(h: f64, mut f: impl FnMut(f64) -> f64) -> f64 {
+    (8.0 * (f(h) - f(-h)) - (f(2.0 * h) - f(-2.0 * h))) / (12.0 * h)
+}
+
+fn check(name: &str) {
+    let (model, structure) = (model(name), alloy());
+    let mixture = mixture(&model, &structure);
+    let mut potential =
+        BiasedPotential::new(Arc::clone(&model), mixture, None, 1, &structure.species).unwrap();
+    potential.tau = 0.3;
+    evaluate(&mut potential, &structure); // the bias is silent at first
+    let (_, biased) = evaluate(&mut potential, &structure);
+    let physical = potential.physical().clone();
+
+    let mut sum_of_grades = |structure: &Structure| evaluate(&mut potential, structure).0;
+    let mut gradient: Vec<Vec3> = Vec::new();
+    for atom in 0..structure.len() {
+        gradient.push(std::array::from_fn(|axis| {
+            difference(1e-3, |shift| {
+                let mut moved = structure.clone();
+                moved.positions[atom][axis] += shift;
+                sum_of_grades(&moved)
+            })
+        }));
+    }
+    let norm = |vectors: &[Vec3]| vectors.iter().map(|v| cell::norm(*v)).sum::<f64>();
+    let scale = 0.3 * norm(&physical.forces) / norm(&gradient);
+    let largest = biased.forces.iter().flatten().fold(0.0, |m: f64, f| m.max(f.abs()));
+    for atom in 0..structure.len() {
+        let expected = cell::add(physical.forces[atom], cell::scale(gradient[atom], scale));
+        let error = cell::norm(cell::sub(biased.forces[atom], expected));
+        assert!(error <= 1e-7 * largest, "{name}: atom {atom}: {error:e} of {largest}");
+    }
+
+    let strain = difference(1e-4, |strain| {
+        let mut moved = structure.clone();
+        moved.positions.iter_mut().chain(&mut moved.cell.0).for_each(|x| x[1] += strain * x[0]);
+        sum_of_grades(&moved)
+    });
+    let found = (biased.virial[0][1] - physical.virial[0][1]) / scale;
+    assert!((found - strain).abs() <= 1e-7 * strain.abs(), "{name}: {found} is not {strain}");
+}
+
+#[test]
+fn the_bias_on_two_layers_is_the_gradient_of_the_grade() {
+    check("two_layers.npz");
+}
+
+#[test]
+fn the_bias_on_three_layers_is_the_gradient_of_the_grade() {
+    check("three_layers.npz");
+}
