@@ -67,6 +67,12 @@ fn a_slow_line_changes_nothing() {
     hosts.options[1] = vec!["--ahead=1".into()];
     let mut agent = hosts.agent(0);
     let mut orchestrator = hosts.lead();
+    // On an idle machine the orchestrator's own walker would be through before the agent has joined.
+    let own = || carrying_out(hosts.home.path(), "walker");
+    wait_until("there is a walker", || !own().is_empty());
+    own().into_iter().for_each(|pid| signal(pid, "STOP"));
+    wait_until("the agent has joined", || hosts.said(0).contains("joined: 1 walkers"));
+    own().into_iter().for_each(|pid| signal(pid, "CONT"));
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
     assert!(!hosts.head_said().contains("gives no sign of life"), "{}", hosts.head_said());

@@ -90,7 +90,11 @@ fn every_wrong_key_is_named_with_its_line() {
             "kind = \"eam\"",
             "expected one of `grace`, `eam_alloy`, `eam_fs`, `stillinger_weber`",
         ),
-        ("method = { reference", "method = { dft", "unknown value `dft`, expected `reference`"),
+        (
+            "method = { reference",
+            "method = { dft",
+            "unknown value `dft`, expected one of `reference`, `abinit`, ",
+        ),
     ] {
         let message = desk.refused(changed(from, to));
         let line = line(from);

@@ -45,6 +45,9 @@ impl<'de> Deserialize<'de> for LabelMethod {
     }
 }
 
+/// Every method.
+const METHODS: &[&str] = &["reference", "abinit", "ase", "command", "cp2k", "gpaw", "vasp"];
+
 struct Methods;
 
 impl<'de> Visitor<'de> for Methods {
@@ -56,6 +59,9 @@ impl<'de> Visitor<'de> for Methods {
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<LabelMethod, A::Error> {
         let name: String = map.next_key()?.ok_or_else(|| A::Error::custom("found no label method"))?;
+        if !METHODS.contains(&name.as_str()) {
+            return Err(A::Error::unknown_variant(&name, METHODS));
+        }
         if name != "reference" {
             let settings = MapAccessDeserializer::new(Again { name: Some(name), map });
             return dft::Settings::deserialize(settings).map(LabelMethod::Code);

@@ -36,10 +36,10 @@ async fn other_files_and_versions_are_refused_with_what_was_found() {
     newer[63] = 7;
     fs::write(&path, &newer).unwrap();
     let message = Store::open(directory.path()).await.unwrap_err().to_string();
-    assert!(message.contains("version 7") && message.contains("reads version 2"), "{message}");
+    assert!(message.contains("version 7") && message.contains("reads version 4"), "{message}");
     assert!(matches!(
         Store::open_read_only(directory.path()).await,
-        Err(StoreError::Version { found: 7, reads: 2, .. })
+        Err(StoreError::Version { found: 7, reads: 4, .. })
     ));
     let mut foreign = whole.clone();
     foreign[68..72].copy_from_slice(&[0, 0, 0, 9]);
