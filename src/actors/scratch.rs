@@ -46,8 +46,8 @@ pub fn clean() {
     for place in Place::all().unwrap_or_default() {
         let Some(directory) = place.campaign_directory() else { continue };
         // Those of the living are in use and stay.
-        if is_scratch(&directory) && place.remove().is_ok() {
-            remove_if_free(&directory);
+        if is_scratch(directory) && place.remove().is_ok() {
+            remove_if_free(directory);
         }
     }
     for entry in fs::read_dir(std::env::temp_dir()).into_iter().flatten().flatten() {

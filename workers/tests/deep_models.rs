@@ -78,8 +78,8 @@ fn check(name: &str) {
     let norm = |vectors: &[Vec3]| vectors.iter().map(|v| cell::norm(*v)).sum::<f64>();
     let scale = 0.3 * norm(&physical.forces) / norm(&gradient);
     let largest = biased.forces.iter().flatten().fold(0.0, |m: f64, f| m.max(f.abs()));
-    for atom in 0..structure.len() {
-        let expected = cell::add(physical.forces[atom], cell::scale(gradient[atom], scale));
+    for (atom, gradient) in gradient.iter().enumerate() {
+        let expected = cell::add(physical.forces[atom], cell::scale(*gradient, scale));
         let error = cell::norm(cell::sub(biased.forces[atom], expected));
         assert!(error <= 1e-7 * largest, "{name}: atom {atom}: {error:e} of {largest}");
     }
