@@ -20,7 +20,7 @@ use crate::{
 };
 
 /// The script that a calculator is run by.
-pub const SCRIPT: &str = include_str!("ase/job.py");
+pub const SCRIPT: &str = concat!(include_str!("script.py"), include_str!("ase/job.py"));
 
 const SCRIPT_FILE: &str = "job.py";
 const CALCULATOR_FILE: &str = "calculator.py";
@@ -85,14 +85,11 @@ impl Who {
         environment: &BTreeMap<String, String>,
         calculator: &[u8],
     ) -> Result<Self, SetupError> {
-        let wrong = |reason: String| SetupError::Program { program: command.join(" "), reason };
-        let directory = program::scratch().map_err(|error| wrong(error.to_string()))?;
-        for (name, content) in [(SCRIPT_FILE, SCRIPT.as_bytes()), (CALCULATOR_FILE, calculator)] {
-            std::fs::write(directory.path().join(name), content).map_err(|error| wrong(error.to_string()))?;
-        }
-        let said = program::ask(command, &[SCRIPT_FILE], environment, directory.path())?;
+        let files = [(SCRIPT_FILE, SCRIPT.as_bytes()), (CALCULATOR_FILE, calculator)];
+        let said = program::ask(command, &[SCRIPT_FILE], environment, &files)?;
         said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
-            wrong(format!("is no Python with ASE: it does not say its version but {:?}", said.trim()))
+            let reason = format!("is no Python with ASE: it does not say its version but {:?}", said.trim());
+            program::another(command, reason)
         })
     }
 }

@@ -3,7 +3,7 @@
 use atoms::cell::{self, scale};
 use atoms::{NeighbourList, Structure, shortest_distance};
 
-use crate::{Calculated, Failure, FailureClass, mesh};
+use crate::{Calculated, Failure, FailureClass, Size, mesh};
 
 /// No nuclei that a campaign could want are as near as this, Å; some codes calculate them without a word.
 const NEAREST: f64 = 0.4;
@@ -73,6 +73,13 @@ impl Enclosed {
         let stress = calculated.stress.filter(|_| self.repeats == [true; 3]);
         Calculated { stress, ..calculated }
     }
+}
+
+/// What the cost of a structure depends on, with this vacuum, this k-spacing and so many valence electrons.
+pub(crate) fn size(structure: &Structure, vacuum: f64, k_spacing: f64, electrons: f64) -> Size {
+    // A structure that cannot be calculated is refused when its input is written.
+    let mesh = Enclosed::new(structure, vacuum).map_or([1; 3], |enclosed| enclosed.mesh(k_spacing));
+    Size { atoms: structure.len(), electrons, k_points: mesh.iter().map(|n| *n as usize).product() }
 }
 
 #[cfg(test)]

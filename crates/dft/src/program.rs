@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::io::Read;
-use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -11,7 +10,7 @@ use crate::SetupError;
 /// Programs that say who they are do so at once; a cold file system may need its time.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// What `command` with further arguments prints, run in `directory`.
+/// What `command` with further arguments prints, run in a directory of its own with these files (name and content).
 ///
 /// # Errors
 /// [`SetupError::Program`] if it cannot be started, fails, or does not end.
@@ -19,7 +18,7 @@ pub(crate) fn ask(
     command: &[String],
     arguments: &[&str],
     environment: &BTreeMap<String, String>,
-    directory: &Path,
+    files: &[(&str, &[u8])],
 ) -> Result<String, SetupError> {
     let words = command.iter().map(String::as_str).chain(arguments.iter().copied());
     let shown = words.collect::<Vec<_>>().join(" ");
@@ -29,11 +28,12 @@ pub(crate) fn ask(
             "no command; name the program, as in command = [\"mpirun\", \"-np\", \"4\", \"abinit\"]".into(),
         ));
     };
+    let directory = prepared(files).map_err(|error| wrong(error.to_string()))?;
     let mut child = Command::new(program)
         .args(first)
         .args(arguments)
         .envs(environment)
-        .current_dir(directory)
+        .current_dir(directory.path())
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -82,6 +82,15 @@ pub(crate) fn environment(settings: &BTreeMap<String, String>) -> BTreeMap<Strin
 }
 
 /// A directory for the time of a question.
-pub(crate) fn scratch() -> std::io::Result<tempfile::TempDir> {
-    tempfile::Builder::new().prefix("calmwalk-").tempdir()
+fn prepared(files: &[(&str, &[u8])]) -> std::io::Result<tempfile::TempDir> {
+    let directory = tempfile::Builder::new().prefix("calmwalk-").tempdir()?;
+    for (name, content) in files {
+        std::fs::write(directory.path().join(name), content)?;
+    }
+    Ok(directory)
+}
+
+/// The error of a program that answers as another would.
+pub(crate) fn another(command: &[String], reason: String) -> SetupError {
+    SetupError::Program { program: command.join(" "), reason }
 }

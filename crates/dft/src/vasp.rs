@@ -30,7 +30,7 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::Enclosed;
+use crate::lattice::{self, Enclosed};
 use crate::moments::{self, Moments};
 use crate::setting::{at_least, positive};
 use crate::{
@@ -236,14 +236,9 @@ impl Code for Vasp {
     }
 
     fn size(&self, structure: &Structure) -> Size {
-        let valence = |species| self.potcars.get(species).map_or(0.0, |potcar| potcar.valence);
-        let mesh =
-            Enclosed::new(structure, self.settings.vacuum).map(|cell| cell.mesh(self.settings.k_spacing));
-        Size {
-            atoms: structure.len(),
-            electrons: structure.species.iter().map(valence).sum(),
-            k_points: mesh.map_or(1, |mesh| mesh.iter().map(|n| *n as usize).product()),
-        }
+        let Settings { vacuum, k_spacing, .. } = self.settings;
+        let potcars = structure.species.iter().filter_map(|species| self.potcars.get(species));
+        lattice::size(structure, vacuum, k_spacing, potcars.map(|potcar| potcar.valence).sum())
     }
 }
 

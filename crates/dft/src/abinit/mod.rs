@@ -24,7 +24,7 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::Enclosed;
+use crate::lattice::{self, Enclosed};
 use crate::moments::Moments;
 use crate::setting::{at_least, positive};
 use crate::{Calculated, Code, Exit, Failure, Input, Remedy, SetupError, Size, Smearing, judge, program};
@@ -124,15 +124,13 @@ impl Settings {
 
 /// `9.6.2`
 fn version(command: &[String], environment: &BTreeMap<String, String>) -> Result<String, SetupError> {
-    let wrong = |reason: String| SetupError::Program { program: command.join(" "), reason };
-    let directory = program::scratch().map_err(|error| wrong(error.to_string()))?;
-    let said = program::ask(command, &["--version"], environment, directory.path())?;
+    let said = program::ask(command, &["--version"], environment, &[])?;
     // Each process of a parallel run may say it.
     let version =
         said.split_whitespace().next().filter(|word| word.starts_with(|c: char| c.is_ascii_digit()));
-    version
-        .map(str::to_owned)
-        .ok_or_else(|| wrong(format!("is not ABINIT: it says {:?} of its version", said.trim())))
+    version.map(str::to_owned).ok_or_else(|| {
+        program::another(command, format!("is not ABINIT: it says {:?} of its version", said.trim()))
+    })
 }
 
 /// ABINIT, ready to be used.
@@ -213,13 +211,8 @@ impl Code for Abinit {
     }
 
     fn size(&self, structure: &Structure) -> Size {
-        let mesh = Enclosed::new(structure, self.settings.vacuum)
-            .map_or([1; 3], |e| e.mesh(self.settings.k_spacing));
+        let Settings { vacuum, k_spacing, .. } = self.settings;
         let valence = structure.species.iter().filter_map(|species| self.pseudopotentials.get(species));
-        Size {
-            atoms: structure.len(),
-            electrons: valence.map(|p| p.valence).sum(),
-            k_points: mesh.iter().map(|n| *n as usize).product(),
-        }
+        lattice::size(structure, vacuum, k_spacing, valence.map(|p| p.valence).sum())
     }
 }

@@ -1,14 +1,10 @@
-"""A single point with an ASE calculator: input.json and calculator.py in, result.json out.
-
-result.json appears whole, as the last thing that is done, or not at all; what the calculator says goes to stdout. Without
-input.json, the versions of ASE and of calculator.py go to stdout.
-"""
+# A single point with an ASE calculator: input.json and calculator.py in, result.json out.
+#
+# result.json appears whole, as the last thing that is done, or not at all; what the calculator says goes to stdout. Without
+# input.json, the versions of ASE and of calculator.py go to stdout.
 
 import importlib.util
 import inspect
-import json
-import math
-import os
 import sys
 import traceback
 
@@ -108,34 +104,6 @@ def kind(error):
     if names & {"CalculatorSetupError", "InputError", "AtomsTooClose"}:
         return "bad_input"
     return "crashed"
-
-
-def numbers(result):
-    if isinstance(result, dict):
-        result = list(result.values())
-    if isinstance(result, list):
-        for part in result:
-            yield from numbers(part)
-    elif isinstance(result, float):
-        yield result
-
-
-def failure(kind, message):
-    return {"failure": {"class": kind, "message": message}}
-
-
-def say(result):
-    if world.rank == 0:
-        print(json.dumps(result), flush=True)
-
-
-def leave(result):
-    if world.rank == 0:
-        with open("result.json.part", "w") as file:
-            json.dump(result, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace("result.json.part", "result.json")
 
 
 main()

@@ -23,7 +23,7 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::Enclosed;
+use crate::lattice::{self, Enclosed};
 use crate::moments::Moments;
 use crate::setting::{at_least, positive};
 use crate::{Calculated, Code, Exit, Failure, Input, Remedy, SetupError, Size, judge, program};
@@ -122,11 +122,11 @@ impl Settings {
 
 /// `2023.1`
 fn version(command: &[String], environment: &BTreeMap<String, String>) -> Result<String, SetupError> {
-    let wrong = |reason: String| SetupError::Program { program: command.join(" "), reason };
-    let directory = program::scratch().map_err(|error| wrong(error.to_string()))?;
-    let said = program::ask(command, &["--version"], environment, directory.path())?;
+    let said = program::ask(command, &["--version"], environment, &[])?;
     let version = said.split("CP2K version ").nth(1).and_then(|rest| rest.split_whitespace().next());
-    version.map(str::to_owned).ok_or_else(|| wrong("is not CP2K: it does not say its version".into()))
+    version
+        .map(str::to_owned)
+        .ok_or_else(|| program::another(command, "is not CP2K: it does not say its version".into()))
 }
 
 /// CP2K, ready to be used.
@@ -195,12 +195,7 @@ impl Code for Cp2k {
     }
 
     fn size(&self, structure: &Structure) -> Size {
-        let mesh = Enclosed::new(structure, self.settings.vacuum)
-            .map_or([1; 3], |e| e.mesh(self.settings.k_spacing));
-        Size {
-            atoms: structure.len(),
-            electrons: self.electrons(structure),
-            k_points: mesh.iter().map(|n| *n as usize).product(),
-        }
+        let Settings { vacuum, k_spacing, .. } = self.settings;
+        lattice::size(structure, vacuum, k_spacing, self.electrons(structure))
     }
 }

@@ -1,12 +1,7 @@
-"""A plane-wave single point with GPAW: input.json in, result.json out.
-
-result.json appears whole, as the last thing that is done, or not at all; what the program says goes to stdout. Without
-input.json, who GPAW is and where it looks for setups goes to stdout.
-"""
-
-import json
-import math
-import os
+# A plane-wave single point with GPAW: input.json in, result.json out.
+#
+# result.json appears whole, as the last thing that is done, or not at all; what the program says goes to stdout. Without
+# input.json, who GPAW is and where it looks for setups goes to stdout.
 
 import ase
 import gpaw
@@ -58,34 +53,6 @@ def calculate(atoms, spin):
     if not all(map(math.isfinite, numbers(result))):
         return failure("implausible", "a number of the result is not finite")
     return {"converged": result}
-
-
-def numbers(result):
-    if isinstance(result, dict):
-        result = list(result.values())
-    if isinstance(result, list):
-        for part in result:
-            yield from numbers(part)
-    elif isinstance(result, float):
-        yield result
-
-
-def failure(kind, message):
-    return {"failure": {"class": kind, "message": message}}
-
-
-def say(result):
-    if world.rank == 0:
-        print(json.dumps(result), flush=True)
-
-
-def leave(result):
-    if world.rank == 0:
-        with open("result.json.part", "w") as file:
-            json.dump(result, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace("result.json.part", "result.json")
 
 
 main()

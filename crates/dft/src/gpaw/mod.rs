@@ -22,7 +22,7 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::Enclosed;
+use crate::lattice::{self, Enclosed};
 use crate::moments::Moments;
 use crate::setting::{at_least, positive};
 use crate::{
@@ -31,7 +31,7 @@ use crate::{
 use setups::Setup;
 
 /// The script that GPAW is run by.
-pub const SCRIPT: &str = include_str!("job.py");
+pub const SCRIPT: &str = concat!(include_str!("../script.py"), include_str!("job.py"));
 
 /// Counts changes of what is written here that change a label's value.
 const RECIPE: u32 = 1;
@@ -129,13 +129,11 @@ struct Who {
 
 impl Who {
     fn ask(command: &[String], environment: &BTreeMap<String, String>) -> Result<Self, SetupError> {
-        let wrong = |reason: String| SetupError::Program { program: command.join(" "), reason };
-        let directory = program::scratch().map_err(|error| wrong(error.to_string()))?;
-        std::fs::write(directory.path().join(input::SCRIPT_FILE), SCRIPT)
-            .map_err(|error| wrong(error.to_string()))?;
-        let said = program::ask(command, &[input::SCRIPT_FILE], environment, directory.path())?;
+        let files = [(input::SCRIPT_FILE, SCRIPT.as_bytes())];
+        let said = program::ask(command, &[input::SCRIPT_FILE], environment, &files)?;
         said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
-            wrong(format!("is no Python with GPAW: it does not say its version but {:?}", said.trim()))
+            let reason = format!("is no Python with GPAW: it does not say its version but {:?}", said.trim());
+            program::another(command, reason)
         })
     }
 }
@@ -224,12 +222,7 @@ impl Code for Gpaw {
     }
 
     fn size(&self, structure: &Structure) -> Size {
-        let mesh = Enclosed::new(structure, self.settings.vacuum)
-            .map_or([1; 3], |e| e.mesh(self.settings.k_spacing));
-        Size {
-            atoms: structure.len(),
-            electrons: self.electrons(structure),
-            k_points: mesh.iter().map(|n| *n as usize).product(),
-        }
+        let Settings { vacuum, k_spacing, .. } = self.settings;
+        lattice::size(structure, vacuum, k_spacing, self.electrons(structure))
     }
 }
