@@ -45,9 +45,6 @@ impl<'de> Deserialize<'de> for LabelMethod {
     }
 }
 
-/// Every method.
-const METHODS: &[&str] = &["reference", "abinit", "ase", "command", "cp2k", "gpaw", "vasp"];
-
 struct Methods;
 
 impl<'de> Visitor<'de> for Methods {
@@ -59,8 +56,10 @@ impl<'de> Visitor<'de> for Methods {
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<LabelMethod, A::Error> {
         let name: String = map.next_key()?.ok_or_else(|| A::Error::custom("found no label method"))?;
-        if !METHODS.contains(&name.as_str()) {
-            return Err(A::Error::unknown_variant(&name, METHODS));
+        if name != "reference" && !dft::Settings::NAMES.contains(&name.as_str()) {
+            let names = dft::Settings::NAMES.join("`, `");
+            let message = format!("unknown value `{name}`, expected one of `reference`, `{names}`");
+            return Err(A::Error::custom(message));
         }
         if name != "reference" {
             let settings = MapAccessDeserializer::new(Again { name: Some(name), map });

@@ -25,6 +25,9 @@ pub enum Settings {
 }
 
 impl Settings {
+    /// Name of each.
+    pub const NAMES: [&str; 6] = ["abinit", "ase", "command", "cp2k", "gpaw", "vasp"];
+
     /// The program's name, as a configuration writes it.
     pub fn name(&self) -> &'static str {
         match self {
