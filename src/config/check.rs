@@ -4,7 +4,7 @@ use orchestrator::selector::{Mode, UpdateProtocol};
 use store::ServerUrl;
 use workers::settings::ThermostatKind;
 
-use super::{Config, QueueFull};
+use super::{Config, LabelSection, QueueFull};
 
 /// Signs of life are seconds apart.
 const LEAST_SILENCE: f64 = 5.0;
@@ -23,10 +23,7 @@ pub fn check(config: &Config) -> Result<(), Wrong> {
     check_store(config)?;
     check_queue(config)?;
     check_budget(config)?;
-    check_scratch(config)?;
-    if let Some((key, found, expected)) = config.label.guard.fault() {
-        return wrong(key, found, expected);
-    }
+    check_label(&config.label)?;
     if config.seeds.files.is_empty() {
         return wrong("seeds.files", "an empty list", "at least one file with seed structures");
     }
@@ -39,7 +36,7 @@ fn wrong(key: &'static str, found: impl ToString, expected: impl ToString) -> Re
 
 /// Larger values than these are slips of the pen, and some would exhaust the machine.
 fn check_limits(config: &Config) -> Result<(), Wrong> {
-    let Config { walk, collect, guard, label, run, .. } = config;
+    let Config { walk, collect, guard, run, .. } = config;
     let ramp = walk.volume_ramp.map_or(0.0, |ramp| ramp.from.get().max(ramp.to.get()));
     let most_steps = 1e12;
     let limits = [
@@ -55,11 +52,6 @@ fn check_limits(config: &Config) -> Result<(), Wrong> {
         ("collect.declined_gap", collect.declined_gap.get() as f64, most_steps),
         ("collect.declined_features_mb", collect.declined_features_mb as f64, 1e9),
         ("guard.checkpoint_interval", guard.checkpoint_interval.get() as f64, most_steps),
-        ("label.slots", label.slots as f64, 1024.0),
-        ("label.lease", f64::from(label.lease.get()), 86_400.0),
-        ("label.cores", f64::from(label.cores.get()), 4096.0),
-        ("label.time_limit", label.time_limit.get(), 1e8),
-        ("label.memory", label.memory.map_or(0.0, |memory| memory.get()), 1e6),
         ("run.walkers", run.walkers as f64, 1024.0),
         ("run.silence_limit", run.silence_limit.get(), 1e6),
         ("run.agent_silence_limit", run.agent_silence_limit.get(), 1e6),
@@ -69,10 +61,7 @@ fn check_limits(config: &Config) -> Result<(), Wrong> {
     if silence < LEAST_SILENCE {
         return wrong("run.silence_limit", silence, format!("at least {LEAST_SILENCE} s"));
     }
-    match limits.into_iter().find(|(_, found, limit)| found > limit) {
-        Some((key, found, limit)) => wrong(key, found, format!("at most {limit}")),
-        None => Ok(()),
-    }
+    at_most(&limits)
 }
 
 /// The text of a configuration is kept in the database, where no password belongs.
@@ -110,13 +99,32 @@ fn check_queue(config: &Config) -> Result<(), Wrong> {
     Ok(())
 }
 
-/// Labellers may be on other hosts, where the directory of the configuration is not.
-fn check_scratch(config: &Config) -> Result<(), Wrong> {
-    match &config.label.scratch {
+/// What can be said of labels without the rest.
+pub fn check_label(label: &LabelSection) -> Result<(), Wrong> {
+    at_most(&[
+        ("label.slots", label.slots as f64, 1024.0),
+        ("label.lease", f64::from(label.lease.get()), 86_400.0),
+        ("label.cores", f64::from(label.cores.get()), 4096.0),
+        ("label.time_limit", label.time_limit.get(), 1e8),
+        ("label.memory", label.memory.map_or(0.0, |memory| memory.get()), 1e6),
+    ])?;
+    if let Some((key, found, expected)) = label.guard.fault() {
+        return wrong(key, found, expected);
+    }
+    match &label.scratch {
+        // Labellers may be on other hosts, where the directory of the configuration is not.
         Some(scratch) if !scratch.is_absolute() => {
             wrong("label.scratch", scratch.display(), "an absolute path, such as \"/scratch\"")
         }
         _ => Ok(()),
+    }
+}
+
+/// Keys with what was found and the largest that makes sense.
+fn at_most(limits: &[(&'static str, f64, f64)]) -> Result<(), Wrong> {
+    match limits.iter().find(|(_, found, limit)| found > limit) {
+        Some((key, found, limit)) => wrong(key, found, format!("at most {limit}")),
+        None => Ok(()),
     }
 }
 

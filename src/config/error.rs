@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use super::check::Wrong;
+
 /// Why a configuration cannot be used: exit code 2.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
@@ -54,6 +56,11 @@ pub enum ConfigError {
 }
 
 impl ConfigError {
+    /// A wrong value in the configuration of that text.
+    pub(super) fn value(path: &Path, text: &str, (key, found, expected): Wrong) -> Self {
+        Self::Value { at: place(path, text, key), key: key.to_owned(), found, expected }
+    }
+
     /// The place of a TOML error in plain words, with a suggestion for an unknown key.
     pub(crate) fn parse(path: &Path, text: &str, error: &toml::de::Error) -> Self {
         let (line, column) = error.span().map_or((1, 1), |span| line_and_column(text, span.start));

@@ -301,12 +301,7 @@ impl Config {
         let mut config: Self =
             toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
         config.resolve_paths(path.parent().unwrap_or(Path::new("")));
-        config.check().map_err(|(key, found, expected)| ConfigError::Value {
-            at: place(path, &text, key),
-            key: key.to_owned(),
-            found,
-            expected,
-        })?;
+        config.check().map_err(|wrong| ConfigError::value(path, &text, wrong))?;
         Ok((config, text))
     }
 
@@ -321,6 +316,7 @@ impl Config {
             toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
         let directory = path.parent().unwrap_or(Path::new(""));
         label.method.paths().into_iter().for_each(|path| *path = directory.join(&*path));
+        check::check_label(&label).map_err(|wrong| ConfigError::value(path, &text, wrong))?;
         Ok(label)
     }
 
