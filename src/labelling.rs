@@ -174,28 +174,29 @@ impl MethodSetup {
                 if method.name() != name {
                     return Err(another_method(method.name(), name));
                 }
-                method.agrees(protocol)?;
+                let identity = method.identity().map_err(|failure| {
+                    Failure::Input(format!(
+                        "labels cannot be made here: {failure}; if what is missing is elsewhere on this host, say so in a \
+                         --config"
+                    ))
+                })?;
+                agrees(&identity, protocol)?;
                 Ok(method)
             }
             (Self::Reference { .. }, Some(given)) => Err(another_method(given.name(), "reference")),
         }
     }
+}
 
-    /// Whether it makes labels of the protocol.
-    fn agrees(&self, protocol: &Protocol) -> Result<(), Failure> {
-        let here = self.identity().map_err(|failure| {
-            Failure::Input(format!(
-                "labels cannot be made here: {failure}; if what is missing is elsewhere on this host, say so in a --config"
-            ))
-        })?;
-        match changed_keys(&protocol.settings, &here).first() {
-            None => Ok(()),
-            Some((key, before, after)) => Err(Failure::Input(format!(
-                "labels made here would be of another protocol than '{}' of the campaign: {key} is {after} here, {before} \
-                 there",
-                protocol.name
-            ))),
-        }
+/// Whether labels of that identity are labels of the protocol.
+pub fn agrees(identity: &Value, protocol: &Protocol) -> Result<(), Failure> {
+    match changed_keys(&protocol.settings, identity).first() {
+        None => Ok(()),
+        Some((key, before, after)) => Err(Failure::Input(format!(
+            "labels made here would be of another protocol than '{}' of the campaign: {key} is {after} here, {before} \
+             there",
+            protocol.name
+        ))),
     }
 }
 

@@ -15,7 +15,7 @@ use workers::labeller::{Method, Running};
 use workers::settings::WalkSettings;
 
 use crate::config::PotentialKind;
-use crate::labelling::Labelling;
+use crate::labelling::{self, Labelling};
 use crate::outcome::Failure;
 
 /// What a walker's process needs to know.
@@ -111,15 +111,17 @@ pub enum MethodSetup {
 }
 
 impl MethodSetup {
-    /// The method, ready to label.
-    pub fn load(&self) -> Result<Method, Failure> {
+    /// The method, ready to label by that protocol: a file or a program may have been replaced meanwhile.
+    pub fn load(&self, protocol: &Protocol) -> Result<Method, Failure> {
         match self {
             Self::Reference { kind, file, file_hash } => {
                 unchanged(file, file_hash)?;
                 Ok(Method::reference(kind.load(file).map_err(Failure::Input)?))
             }
             Self::Code { settings, running } => {
-                Ok(Method::code(settings.prepare().map_err(Failure::input)?, running.clone()))
+                let code = settings.prepare().map_err(Failure::input)?;
+                labelling::agrees(&labelling::identity(settings.name(), &*code), protocol)?;
+                Ok(Method::code(code, running.clone()))
             }
         }
     }
@@ -174,4 +176,31 @@ pub fn unchanged(path: &std::path::Path, expected: &str) -> Result<(), Failure> 
         "{}: the file has another content (BLAKE3 {found}) than when this run began ({expected}); put the old file back",
         path.display()
     )))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn a_program_that_was_replaced_makes_no_labels_of_the_protocol() {
+        let directory = tempfile::tempdir().unwrap();
+        let script = directory.path().join("label.sh");
+        fs::write(&script, "exit 0").unwrap();
+        let settings = serde_json::json!({ "command": {
+            "command": ["sh", "label.sh"], "files": [script], "version": "1"
+        } });
+        let settings = Box::new(serde_json::from_value(settings).unwrap());
+        let method = MethodSetup::Code { settings, running: Running::default() };
+        let protocol = labelling::protocol("script", method.identity().unwrap());
+        assert!(method.load(&protocol).is_ok());
+        fs::write(&script, "exit 1").unwrap();
+        let message = method.load(&protocol).map(drop).unwrap_err().to_string();
+        assert!(
+            message.contains("of another protocol than 'script'") && message.contains("label.sh"),
+            "{message}"
+        );
+    }
 }

@@ -161,7 +161,7 @@ fn start_labellers(run: Run<'_>, closing: &Arc<Closing>) -> Result<JoinSet<Resul
     let label = &campaign.config.label;
     let mut labellers = JoinSet::new();
     for slot in 0..label.slots {
-        let method = campaign.method()?.load()?;
+        let method = campaign.method()?.load(&campaign.protocol)?;
         let settings = LabellerSettings {
             holder: format!("{}/{slot}", process.id),
             protocol: campaign.protocol.clone(),

@@ -27,7 +27,7 @@ impl Labeller {
             Some(slot) => launcher::end_with_parent(slot.parent).map_err(Failure::failed)?,
             None => launcher::own_session().map_err(Failure::failed)?,
         }
-        let method = setup.method.load()?;
+        let method = setup.method.load(&setup.protocol)?;
         let closing = Arc::new(Closing::default());
         block_on(label(setup, method, &closing))??;
         Ok(if closing.is_stopping() { Ended::Interrupted } else { Ended::Done })

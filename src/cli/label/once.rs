@@ -61,7 +61,7 @@ pub async fn label(task: Task<'_>, stop: &Notify) -> Result<Ended, Failure> {
     let frames = read_structures(task.structures).map_err(Failure::input)?;
     let setup = MethodSetup::of(&section)?;
     let protocol = labelling::protocol(section.protocol_name(), setup.identity()?);
-    let method = setup.load()?;
+    let method = setup.load(&protocol)?;
     let mut output = task.output.map(WholeFile::create).transpose()?;
     for frame in frames {
         let place = format!("{}:{}", task.structures.display(), frame.line);
