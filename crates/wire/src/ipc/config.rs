@@ -36,8 +36,12 @@ pub(super) const IN_PLACE_IN_ALL: usize = 256;
 const ACTIVE_REQUESTS: usize = IN_PLACE + 4;
 /// Requests that a walker has memory for. More of them, or larger ones, make iceoryx2 add a segment.
 const REQUEST_BUFFERS: usize = ACTIVE_REQUESTS + 2;
-/// Answers to one walker that the server has memory for.
-const ANSWER_BUFFERS: usize = 3;
+/// Channels that iceoryx2 has for the answers to one walker, each with a place for one. What nobody has read when its
+/// channel is closed stays there until the channel is used again.
+const CHANNELS: usize = 2 * ACTIVE_REQUESTS + 1;
+/// Answers to one walker that the server has memory for: those in all channels, and one that is being written. More of
+/// them must not be needed: iceoryx2 0.10 adds a segment with more places than it has counters for, and panics.
+const ANSWER_BUFFERS: usize = CHANNELS + 1;
 /// Bytes of a message beside what it was expected to have: iceoryx2's header, the frame.
 const MESSAGE_MARGIN: usize = 4096;
 /// Bytes that iceoryx2 uses for the connection with one walker (measured: 270 kB), and for everything else (100 kB).
@@ -223,4 +227,34 @@ fn server_bell_of(session: u64) -> String {
 
 fn walker_bell_of(Caller { session, walker, incarnation }: Caller) -> String {
     format!("{session:016x}/walker/{walker}/{incarnation}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A walker that has its answer another way leaves those to its questions where they are.
+    #[test]
+    fn answers_that_nobody_reads_leave_room_for_others() {
+        let directory = tempfile::tempdir().unwrap();
+        let sizes = Sizes { walkers: 1, message_bytes: 64 };
+        let node = node(directory.path(), "unread").unwrap();
+        let server = server_port(&create_requests(&node, &sizes, 1).unwrap(), &sizes).unwrap();
+        let client = client_port(&open_requests(&node, 1).unwrap(), sizes.message_bytes).unwrap();
+        let ask = |number: u64| {
+            let pending = client.loan_slice_uninit(1).unwrap().write_from_slice(&[number]).send().unwrap();
+            let request = server.receive().unwrap().unwrap();
+            request.loan_slice_uninit(1).unwrap().write_from_slice(&[number]).send().unwrap();
+            pending
+        };
+        for number in 0..20 * CHANNELS as u64 {
+            drop(ask(number));
+        }
+        // A channel is free again when it has been looked at: each loses one answer at most.
+        let heard = (0..2 * CHANNELS as u64).filter(|number| {
+            let pending = ask(*number);
+            pending.receive().unwrap().is_some_and(|answer| answer.payload() == [*number])
+        });
+        assert!(heard.count() >= CHANNELS);
+    }
 }

@@ -52,6 +52,16 @@ pub struct IpcWalker {
     _node: Node<Service>,
 }
 
+/// A message that may be answered.
+struct Asked(Pending);
+
+impl Drop for Asked {
+    fn drop(&mut self) {
+        // What nobody reads would keep its place, which a later answer needs (see `config::ANSWER_BUFFERS`).
+        while let Ok(Some(_)) = self.0.receive() {}
+    }
+}
+
 impl IpcWalker {
     /// Connects to the orchestrator. Setting `stopping` asks the walker to stop.
     ///
@@ -135,13 +145,13 @@ impl IpcWalker {
         Ok(())
     }
 
-    fn offer(&self, report: Option<&Report<Candidate>>) -> Result<Option<Pending>, IpcError> {
+    fn offer(&self, report: Option<&Report<Candidate>>) -> Result<Option<Asked>, IpcError> {
         let (offer, candidate) = Words::offer(self.sequence, report);
         self.send(offer, candidate)
     }
 
     /// Sends a message and wakes the server; `None` if it could not be delivered.
-    fn send(&self, words: Words<'_>, candidate: Option<&Candidate>) -> Result<Option<Pending>, IpcError> {
+    fn send(&self, words: Words<'_>, candidate: Option<&Candidate>) -> Result<Option<Asked>, IpcError> {
         let begin = Instant::now();
         let control = seal(&Letter { caller: self.caller, words });
         let length = frame::length(control.len(), candidate);
@@ -161,12 +171,12 @@ impl IpcWalker {
         }
         // A bell that cannot be rung because its buffer is full rings already.
         let _ = self.server_bell.notify();
-        Ok(Some(pending))
+        Ok(Some(Asked(pending)))
     }
 
     /// What has been answered to the present offer.
-    fn answer(&self, pending: Option<&Pending>) -> Result<Option<Decision<'static>>, IpcError> {
-        let Some(pending) = pending else { return Ok(None) };
+    fn answer(&self, asked: Option<&Asked>) -> Result<Option<Decision<'static>>, IpcError> {
+        let Some(Asked(pending)) = asked else { return Ok(None) };
         let received = pending.receive().map_err(|e| IpcError::new("receive an answer", e))?;
         let Some(received) = received else { return Ok(None) };
         let unreadable = |why: &dyn Display| IpcError::new("read an answer", why);
