@@ -14,7 +14,7 @@ const DELAY: Duration = Duration::from_secs(1);
 
 #[test]
 fn an_orchestrator_is_killed_while_its_model_is_fetched() {
-    let small = Small { steps: 1600, per_seed: 16, ..Small::default() };
+    let small = Small::default();
     let mut hosts = Hosts::new(&small, 1, "agent_silence_limit = 30.0");
     // The agent has another file system where the model is.
     let models = hosts.home.path().join("models");
@@ -30,16 +30,21 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     let line = SlowLine::to(hosts.endpoints[0].trim_start_matches("tcp/"), DELAY);
     hosts.endpoints[1] = format!("tcp/{}", line.here);
 
-    let (mut orchestrator, mut agent) = (hosts.lead(), hosts.agent(0));
+    // So that there is something left to do for the host that comes, and comes back.
+    let held = || {
+        let walkers = || carrying_out(hosts.home.path(), "walker");
+        wait_until("the orchestrator's own walker is at work", || !walkers().is_empty());
+        signal(walkers()[0], "STOP");
+        walkers()[0]
+    };
+    let mut orchestrator = hosts.lead();
+    held();
+    let mut agent = hosts.agent(0);
     wait_until("the agent asks for the model", || hosts.said(0).contains("fetching the model"));
     signal(orchestrator.0.id(), "KILL");
     orchestrator.0.wait().unwrap();
     let mut orchestrator = hosts.lead();
-    // So that there is something left to do for the host that comes back.
-    let walkers = || carrying_out(hosts.home.path(), "walker");
-    wait_until("its own walker is at work", || !walkers().is_empty());
-    let walker = walkers()[0];
-    signal(walker, "STOP");
+    let walker = held();
     wait_until("the agent has joined it", || hosts.said(0).contains("joined: 1 walkers"));
     signal(walker, "CONT");
     assert!(hosts.said(0).contains("joining anew"), "{}", hosts.said(0));
