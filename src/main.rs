@@ -17,6 +17,7 @@ mod output;
 mod progress;
 mod replay;
 mod setup;
+mod story;
 mod summary;
 mod unlabelled;
 mod whole_file;

@@ -4,6 +4,7 @@ mod agent;
 mod calm;
 mod clean;
 mod errors;
+mod explain;
 mod export;
 mod import;
 mod init;
@@ -52,6 +53,7 @@ enum Command {
     Status(status::Status),
     Errors(errors::Errors),
     Queue(queue::Queue),
+    Explain(explain::Explain),
     Export(export::Export),
     Replay(replay::Replay),
     #[command(subcommand)]
@@ -81,6 +83,7 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Status(command) => command.run(),
         Command::Errors(command) => command.run(),
         Command::Queue(command) => command.run(),
+        Command::Explain(command) => command.run(),
         Command::Export(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Calm(command) => command.run(),

@@ -7,6 +7,7 @@ use sqlx::postgres::PgDatabaseError;
 use wire::{BlockError, ContentHash};
 
 use crate::JobState;
+use crate::history::Named;
 use crate::numbers::NumbersError;
 
 /// What the functions of this crate return.
@@ -216,6 +217,25 @@ pub enum StoreError {
         /// Some of the candidates that it could be.
         matches: Vec<String>,
     },
+    /// No such candidate.
+    #[error("no candidate is called '{id}'; {}", candidates(range.as_ref()))]
+    UnknownCandidate {
+        /// What was asked for.
+        id: String,
+        /// The first and the last candidate.
+        range: Option<(Named, Named)>,
+    },
+    /// No such imported structure.
+    #[error(
+        "no imported structure is called '{id}'; {}",
+        if *imported == 0 { "the campaign has none".into() } else { format!("they are import-1 to import-{imported}") }
+    )]
+    UnknownImport {
+        /// What was asked for.
+        id: String,
+        /// Number of the last one.
+        imported: u64,
+    },
     /// The job is not in a state where that makes sense.
     #[error("cannot {action} {candidate}: its label job is {state}, and only {allowed} jobs can be {past}", past = past(action))]
     WrongState {
@@ -254,7 +274,8 @@ impl StoreError {
         matches!(self, Self::DiskFull | Self::Busy | Self::Unreachable(_))
     }
 
-    pub(crate) fn damaged(what: impl ToString, reason: impl ToString) -> Self {
+    /// The database holds what it cannot hold.
+    pub fn damaged(what: impl ToString, reason: impl ToString) -> Self {
         Self::Damaged { what: what.to_string(), reason: reason.to_string() }
     }
 }
@@ -331,6 +352,15 @@ fn list(names: &[String]) -> String {
 
 fn neighbours(names: &[String]) -> String {
     if names.is_empty() { "the queue is empty".into() } else { format!("near it are {}", list(names)) }
+}
+
+fn candidates(range: Option<&(Named, Named)>) -> String {
+    let Some((first, last)) = range else { return "the campaign has none yet".into() };
+    format!(
+        "give the number of the decision about it, {} to {} (some of these are about walks), or the beginning of its name, as \
+         {} (the first) or {} (the last)",
+        first.decision, last.decision, first.candidate, last.candidate
+    )
 }
 
 fn past(action: &str) -> &'static str {

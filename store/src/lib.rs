@@ -14,6 +14,7 @@ mod encoding;
 mod error;
 mod export;
 mod filesystem;
+mod history;
 mod jobs;
 mod location;
 mod lock;
@@ -35,6 +36,7 @@ pub use check::Finding;
 pub use error::{Result, StoreError};
 pub use export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
 pub use filesystem::{check_directory, free_space, network_file_system};
+pub use history::{Covered, ImportedStructure, LaterCovered, Named, SameStructure, StructureLabel};
 pub use jobs::{
     Archive, Attempt, CalculationRecord, Completed, Failed, Imported, Job, JobDetails, LabelRecord,
     LabelSource, PastCalculation, Standing, Whereabouts,

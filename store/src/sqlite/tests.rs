@@ -6,7 +6,7 @@ use wire::CampaignId;
 use super::*;
 use crate::Store;
 use crate::records::{Campaign, Commit, ComponentRecord};
-use crate::tables::{by_hand, export, labels, outcomes, queue, status};
+use crate::tables::{by_hand, export, history, labels, outcomes, queue, status};
 
 /// The store in a directory, and its file.
 async fn store(directory: &Path) -> (Store, DatabaseFile) {
@@ -43,6 +43,16 @@ async fn what_is_asked_often_goes_through_indexes() {
         by_hand::FIND,
         export::CANDIDATES,
         export::IMPORTS,
+        history::NUMBERED,
+        history::BEGINNING,
+        history::FIRST,
+        history::LAST,
+        history::SAME_STRUCTURE,
+        history::JOBS,
+        history::LABELS,
+        history::AT_STEP,
+        history::BEFORE,
+        history::AFTER,
         labels::CURRENT,
         outcomes::AT_WORK,
         outcomes::FINISHED,

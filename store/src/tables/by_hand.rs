@@ -88,6 +88,10 @@ impl Store {
     /// A job by the name of its candidate or the beginning of it; the campaign's part of the name may be left out.
     pub async fn queue_show(&self, id: &str) -> Result<JobDetails> {
         let (job, _) = self.find(id).await?;
+        self.job_details(job).await
+    }
+
+    pub(super) async fn job_details(&self, job: i64) -> Result<JobDetails> {
         let row: Row = query(SHOW).bind(job).fetch_one(&self.database).await?;
         let attempts = query("SELECT * FROM attempt WHERE job = $1 ORDER BY attempt").bind(job);
         let attempts: Vec<Attempt> = attempts.fetch_all(&self.database).await?;

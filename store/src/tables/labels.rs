@@ -212,7 +212,7 @@ pub(super) async fn finish_job(
 }
 
 impl LabelRow {
-    fn into_record(self) -> Result<LabelRecord> {
+    pub(super) fn into_record(self) -> Result<LabelRecord> {
         let unknown = || StoreError::damaged("a label", "unknown standing or source");
         let standing = Standing::named(&self.standing).ok_or_else(unknown)?;
         let source = match (self.job, self.attempt, self.file, self.frame, self.correction) {

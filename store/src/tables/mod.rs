@@ -5,6 +5,7 @@ pub mod budget;
 pub mod by_hand;
 mod commit;
 pub mod export;
+pub mod history;
 mod imports;
 pub mod labels;
 pub mod logs;

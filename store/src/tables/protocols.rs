@@ -23,6 +23,14 @@ struct SeedRow {
 
 from_columns!(SeedRow { seed, name, source, hash, data });
 
+impl SeedRow {
+    fn into_seed_structure(self) -> Result<SeedStructure> {
+        let Self { seed, name, source, hash, data } = self;
+        let structure = decode_structure(&data, &hash)?;
+        Ok(SeedStructure { index: seed, name, source, structure })
+    }
+}
+
 /// What a database begins with.
 pub(crate) async fn write_campaign(
     database: &Database,
@@ -138,12 +146,15 @@ impl Store {
         let sql = "SELECT seed, name, source, hash, data FROM seed_structure
                    JOIN structure ON structure.number = seed_structure.structure ORDER BY seed";
         let rows: Vec<SeedRow> = query(sql).fetch_all(&self.database).await?;
-        rows.into_iter()
-            .map(|SeedRow { seed, name, source, hash, data }| {
-                let structure = decode_structure(&data, &hash)?;
-                Ok(SeedStructure { index: seed, name, source, structure })
-            })
-            .collect()
+        rows.into_iter().map(SeedRow::into_seed_structure).collect()
+    }
+
+    /// The seed structure of that index.
+    pub async fn seed_structure(&self, index: u32) -> Result<Option<SeedStructure>> {
+        let sql = "SELECT seed, name, source, hash, data FROM seed_structure
+                   JOIN structure ON structure.number = seed_structure.structure WHERE seed = $1";
+        let row: Option<SeedRow> = query(sql).bind(index).fetch_optional(&self.database).await?;
+        row.map(SeedRow::into_seed_structure).transpose()
     }
 
     /// Makes `protocol` the one of new label jobs. Accepted candidates that have no job at all (there was no protocol

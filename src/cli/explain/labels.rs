@@ -1,0 +1,102 @@
+//! The label queue in words: what happened to each job, and what its label says.
+
+use std::io::{self, Write};
+
+use store::{Attempt, Job, unix_milliseconds};
+
+use super::line;
+use crate::story::{ForceError, LabelJob, Story, StoryLabel};
+
+/// Lines of a log that are shown, the last ones.
+const LOG: usize = 10;
+
+pub fn write(out: &mut dyn Write, story: &Story) -> io::Result<()> {
+    if story.jobs.is_empty() && story.labels.is_empty() {
+        return line(out, "label", "no label job: only what is accepted gets one");
+    }
+    story.jobs.iter().try_for_each(|job| write_job(out, job))?;
+    story.labels.iter().try_for_each(|label| write_label(out, label, story.structure.atoms))
+}
+
+fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
+    let Job { job: number, protocol, state, priority, attempts, holder, expires, overruled, .. } =
+        &job.details.job;
+    line(
+        out,
+        "label job",
+        &format!(
+            "{number} by protocol '{protocol}': {state}, priority {priority}, {attempts} attempts, {:.1} core-seconds",
+            job.core_seconds
+        ),
+    )?;
+    if let (Some(holder), Some(expires)) = (holder, expires) {
+        let left = (expires - unix_milliseconds()) / 1000;
+        line(out, "", &format!("held by {holder}, for {left} s more"))?;
+    }
+    if *overruled {
+        line(out, "", "put into the queue by hand: the labellers' guard lets it pass")?;
+    }
+    for done in &job.by_hand {
+        let to = done.priority.map_or(String::new(), |priority| format!(", to {priority}"));
+        line(out, "", &format!("by hand: {}{to}, {} ago", done.action, since(done.time)))?;
+    }
+    job.details.attempts_made.iter().try_for_each(|attempt| write_attempt(out, attempt))
+}
+
+fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
+    let Attempt { attempt: number, holder, started, ended, outcome, class, log, made, core_seconds, .. } =
+        attempt;
+    let outcome = outcome.as_deref().unwrap_or("under way");
+    let class = class.as_ref().map_or(String::new(), |class| format!(" ({class})"));
+    let lasted = match ended {
+        Some(ended) => format!("after {:.1} s", (ended - started) as f64 / 1000.0),
+        None => format!("for {}", since(*started)),
+    };
+    let cost = core_seconds.map_or(String::new(), |seconds| {
+        format!(", {seconds:.1} core-seconds on {} cores", made.cores.unwrap_or(1))
+    });
+    line(out, "", &format!("attempt {number}: {outcome}{class} {lasted}, by {holder}{cost}"))?;
+    if let Some(remedies) = &made.remedies {
+        line(out, "", &format!("  changed after failures: {}", remedies.replace(',', ", ")))?;
+    }
+    let difference = made.difference.as_deref().unwrap_or_default();
+    difference.lines().try_for_each(|changed| line(out, "", &format!("  {changed}")))?;
+    let log: Vec<_> = log.as_deref().unwrap_or_default().lines().collect();
+    let tail = &log[log.len().saturating_sub(LOG)..];
+    tail.iter().try_for_each(|text| line(out, "", &format!("  | {text}")))
+}
+
+fn write_label(out: &mut dyn Write, label: &StoryLabel, atoms: usize) -> io::Result<()> {
+    let StoryLabel { protocol, protocol_hash, standing, source, energy, energy_per_atom, .. } = label;
+    let standing = format!("{standing:?}").to_lowercase();
+    line(
+        out,
+        &standing,
+        &format!(
+            "energy {energy:.6} eV ({energy_per_atom:.6} eV/atom), largest force {:.4} eV/Å",
+            label.largest_force
+        ),
+    )?;
+    line(out, "", &format!("protocol '{protocol}' ({}), from {source}", &protocol_hash[..16]))?;
+    let Some(ForceError { energy_per_atom, mean, largest, atom, .. }) = &label.model else { return Ok(()) };
+    line(
+        out,
+        "potential",
+        &format!(
+            "|F_model − F_label|: mean {mean:.4} eV/Å over {atoms} atoms, largest {largest:.4} eV/Å (atom {atom}); \
+             E_model − E_label {:.1} meV/atom",
+            1000.0 * energy_per_atom
+        ),
+    )
+}
+
+/// How long ago it was.
+fn since(time: i64) -> String {
+    let seconds = (unix_milliseconds() - time).max(0) / 1000;
+    match seconds {
+        0..120 => format!("{seconds} s"),
+        120..7200 => format!("{} min", seconds / 60),
+        7200..172_800 => format!("{} h", seconds / 3600),
+        _ => format!("{} d", seconds / 86_400),
+    }
+}

@@ -1,0 +1,146 @@
+//! The label jobs of a structure, what became of each attempt, and how far the potential is from the labels.
+
+use atoms::Vec3;
+use atoms::cell::{norm, sub};
+use serde::Serialize;
+use store::{
+    JobDetails, LabelDetails, LabelRecord, LabelSource, Operation, Standing, Store, StoreError,
+    StructureLabel,
+};
+use wire::{CandidateView, ContentHash};
+
+/// A label job with everything that happened to it.
+#[derive(Clone, Debug, Serialize)]
+pub struct LabelJob {
+    /// The job with its attempts.
+    #[serde(flatten)]
+    pub details: JobDetails,
+    /// Core-seconds of all its attempts, as far as they are known.
+    pub core_seconds: f64,
+    /// What people did to it: `drop`, `retry`, `prioritise`.
+    pub by_hand: Vec<ByHand>,
+}
+
+/// What somebody did to a job.
+#[derive(Clone, Debug, Serialize)]
+pub struct ByHand {
+    /// ms since 1970.
+    pub time: i64,
+    /// `drop`, `retry` or `prioritise`.
+    pub action: String,
+    /// The priority that it was given.
+    pub priority: Option<i64>,
+}
+
+/// A label, a check or a superseded label.
+#[derive(Clone, Debug, Serialize)]
+pub struct StoryLabel {
+    /// Name of the protocol.
+    pub protocol: String,
+    /// Its hash.
+    pub protocol_hash: String,
+    /// What it is now.
+    pub standing: Standing,
+    /// Where it came from, in words.
+    pub source: String,
+    /// When it came, ms since 1970.
+    pub received: i64,
+    /// Energy, eV.
+    pub energy: f64,
+    /// Energy an atom, eV.
+    pub energy_per_atom: f64,
+    /// Largest force, eV/Å.
+    pub largest_force: f64,
+    /// Pressure −tr(stress)/3, eV/Å³; none without a stress.
+    pub pressure: Option<f64>,
+    /// What else the calculation says.
+    pub details: LabelDetails,
+    /// How far the potential is from it; none of imported structures, whose model forces are not kept.
+    pub model: Option<ForceError>,
+}
+
+/// The potential beside a label.
+#[derive(Clone, Debug, Serialize)]
+pub struct ForceError {
+    /// E_model − E_label an atom, eV.
+    pub energy_per_atom: f64,
+    /// Mean of |F_model − F_label| over the atoms, eV/Å.
+    pub mean: f64,
+    /// The largest, eV/Å.
+    pub largest: f64,
+    /// The atom that has it.
+    pub atom: usize,
+    /// |F_model − F_label| of each atom, eV/Å.
+    pub atoms: Vec<f64>,
+}
+
+pub(super) async fn jobs(store: &Store, content: ContentHash) -> Result<Vec<LabelJob>, StoreError> {
+    let mut jobs = Vec::new();
+    for details in store.jobs_of(content).await? {
+        let core_seconds = details.attempts_made.iter().filter_map(|attempt| attempt.core_seconds).sum();
+        let by_hand = store.done_by_hand(details.job.job).await?;
+        jobs.push(LabelJob { core_seconds, by_hand: by_hand.into_iter().map(ByHand::of).collect(), details });
+    }
+    Ok(jobs)
+}
+
+/// `model`: the candidate, with the potential's energy and forces.
+pub(super) async fn labels(
+    store: &Store,
+    content: ContentHash,
+    model: Option<&CandidateView<'_>>,
+) -> Result<Vec<StoryLabel>, StoreError> {
+    let labels = store.labels_of(content).await?;
+    Ok(labels.into_iter().map(|label| StoryLabel::of(label, model)).collect())
+}
+
+impl ByHand {
+    fn of(operation: Operation) -> Self {
+        let priority = operation.detail["priority"].as_i64();
+        Self { time: operation.time, action: operation.kind, priority }
+    }
+}
+
+impl StoryLabel {
+    fn of(label: StructureLabel, model: Option<&CandidateView<'_>>) -> Self {
+        let StructureLabel { protocol, record } = label;
+        let LabelRecord { standing, label, source, received } = record;
+        let atoms = label.forces.len().max(1) as f64;
+        Self {
+            protocol: protocol.name,
+            protocol_hash: protocol.hash.to_string(),
+            standing,
+            source: in_words(&source),
+            received,
+            energy: label.energy,
+            energy_per_atom: label.energy / atoms,
+            largest_force: label.forces.iter().map(|force| norm(*force)).fold(0.0, f64::max),
+            pressure: label.stress.map(|stress| -(stress[0][0] + stress[1][1] + stress[2][2]) / 3.0),
+            model: model.map(|view| ForceError::of(view, label.energy, &label.forces)),
+            details: label.details,
+        }
+    }
+}
+
+fn in_words(source: &LabelSource) -> String {
+    match source {
+        LabelSource::Attempt { job, attempt } => format!("attempt {attempt} of job {job}"),
+        LabelSource::Import { file, frame } => format!("{file}, frame {frame}"),
+        LabelSource::Correction { reason } => format!("correction: {reason}"),
+    }
+}
+
+impl ForceError {
+    fn of(view: &CandidateView<'_>, energy: f64, forces: &[Vec3]) -> Self {
+        let pairs = view.forces.iter().zip(forces);
+        let atoms: Vec<f64> = pairs.map(|(model, label)| norm(sub(*model, *label))).collect();
+        let (atom, largest) =
+            atoms.iter().copied().enumerate().fold((0, 0.0), |worst, error| match error.1 > worst.1 {
+                true => error,
+                false => worst,
+            });
+        let n = atoms.len().max(1) as f64;
+        let energy_per_atom = (view.energy() - energy) / n;
+        Self { energy_per_atom, mean: atoms.iter().sum::<f64>() / n, largest, atom, atoms }
+    }
+}
