@@ -15,8 +15,8 @@ pub struct LabelJob {
     /// The job with its attempts.
     #[serde(flatten)]
     pub details: JobDetails,
-    /// Core-seconds of all its attempts, as far as they are known.
-    pub core_seconds: f64,
+    /// Core-seconds of all its attempts, as far as they are known; none if of none.
+    pub core_seconds: Option<f64>,
     /// What people did to it: `drop`, `retry`, `prioritise`.
     pub by_hand: Vec<ByHand>,
 }
@@ -77,7 +77,8 @@ pub struct ForceError {
 pub(super) async fn jobs(store: &Store, content: ContentHash) -> Result<Vec<LabelJob>, StoreError> {
     let mut jobs = Vec::new();
     for details in store.jobs_of(content).await? {
-        let core_seconds = details.attempts_made.iter().filter_map(|attempt| attempt.core_seconds).sum();
+        let known = details.attempts_made.iter().filter_map(|attempt| attempt.core_seconds);
+        let core_seconds = known.reduce(|sum, seconds| sum + seconds);
         let by_hand = store.done_by_hand(details.job.job).await?;
         jobs.push(LabelJob { core_seconds, by_hand: by_hand.into_iter().map(ByHand::of).collect(), details });
     }

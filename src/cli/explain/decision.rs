@@ -140,7 +140,7 @@ fn write_coverage(out: &mut dyn Write, decision: &Decided, coverage: &Coverage) 
     line(
         out,
         "covered",
-        &format!("{count} later candidates, whose walkers had not seen this update, were declined{looked}:"),
+        &format!("later candidates declined whose walkers had not seen this update: {count}{looked}"),
     )?;
     for covered in coverage.later.iter().take(SHOWN) {
         let by = match covered.decided - covered.seen {

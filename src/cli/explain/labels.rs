@@ -21,12 +21,12 @@ pub fn write(out: &mut dyn Write, story: &Story) -> io::Result<()> {
 fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
     let Job { job: number, protocol, state, priority, attempts, holder, expires, overruled, .. } =
         &job.details.job;
+    let cost = job.core_seconds.map_or(String::new(), |seconds| format!(", {seconds:.1} core-seconds"));
     line(
         out,
         "label job",
         &format!(
-            "{number} by protocol '{protocol}': {state}, priority {priority}, {attempts} attempts, {:.1} core-seconds",
-            job.core_seconds
+            "{number} by protocol '{protocol}': {state}, priority {priority}, attempts {attempts}{cost}"
         ),
     )?;
     if let (Some(holder), Some(expires)) = (holder, expires) {
