@@ -6,6 +6,7 @@ mod bill;
 mod budget;
 mod campaign;
 mod cli;
+mod condition;
 mod config;
 mod forecast;
 mod frames;

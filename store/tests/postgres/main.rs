@@ -15,6 +15,8 @@ mod check;
 #[path = "../common/mod.rs"]
 mod common;
 mod connections;
+#[path = "../history.rs"]
+mod history;
 mod leading;
 mod leases;
 #[path = "../outcomes.rs"]

@@ -24,6 +24,8 @@ pub enum Keys {
     /// As [`Keys::Ase`] with the same energy also as `free_energy`: gracemaker reads through ASE and
     /// prefers the free energy. If one frame of a file lacks the stress, it uses no stress of that file.
     Grace,
+    /// `energy`, `force`, `virial` (eV, 9 numbers; −volume × stress): what `gap_fit` of QUIP reads by default.
+    Gap,
 }
 
 /// A label that cannot be used.
@@ -46,7 +48,7 @@ impl Frame {
     /// If it has any of `REF_energy`, `REF_free_energy`, `REF_forces`, `REF_stress` and `REF_virial`,
     /// only these count (the plain ones may then be a model's); otherwise the same names without
     /// `REF_`. `energy` goes before `free_energy`, as in ASE, and `stress` before `virial` (eV), with
-    /// stress = −virial / volume. Of a stress that is not symmetric the upper triangle counts, as in ASE.
+    /// stress = −virial / volume, and `forces` before `force`, which QUIP writes. Of a stress that is not symmetric the upper triangle counts, as in ASE.
     pub fn labels(&self) -> Result<Labels, LabelError> {
         let reference = QUANTITIES.map(|quantity| format!("REF_{quantity}"));
         let given = |key: &String| self.info.contains_key(key) || self.arrays.contains_key(key);
@@ -59,7 +61,11 @@ impl Frame {
             None => self.label(prefix, "virial", Self::stress_from_virial)?,
             stress => stress,
         };
-        Ok(Labels { energy, forces: self.forces(&format!("{prefix}forces"))?, stress })
+        let forces = match self.forces(&format!("{prefix}forces"))? {
+            None => self.forces(&format!("{prefix}force"))?,
+            forces => forces,
+        };
+        Ok(Labels { energy, forces, stress })
     }
 
     /// Replaces all labels of the frame, whatever their names.
@@ -78,9 +84,14 @@ impl Frame {
             }
         }
         if let Some(forces) = &labels.forces {
-            self.arrays.insert(format!("{prefix}forces"), Column::vectors(forces));
+            let key = if keys == Keys::Gap { "force".to_owned() } else { format!("{prefix}forces") };
+            self.arrays.insert(key, Column::vectors(forces));
         }
-        if let Some(stress) = labels.stress {
+        if let (Some(stress), Keys::Gap) = (labels.stress, keys) {
+            let volume = self.structure.cell.volume();
+            let virial = stress.concat().into_iter().map(|s| -s * volume);
+            self.info.insert("virial".to_owned(), virial.collect::<Vec<_>>().into());
+        } else if let Some(stress) = labels.stress {
             let value = if keys == Keys::Mace { stress.concat().into() } else { stress.into() };
             self.info.insert(format!("{prefix}stress"), value);
         }
@@ -140,4 +151,4 @@ impl Frame {
     }
 }
 
-const QUANTITIES: [&str; 5] = ["energy", "free_energy", "forces", "stress", "virial"];
+const QUANTITIES: [&str; 6] = ["energy", "free_energy", "forces", "force", "stress", "virial"];

@@ -213,6 +213,7 @@ fn labels_replace_those_of_any_name() {
     for (keys, names) in [
         (Keys::Grace, &["energy", "free_energy", "stress"][..]),
         (Keys::Mace, &["REF_energy", "REF_stress"]),
+        (Keys::Gap, &["energy", "virial"]),
         (Keys::Ase, &["energy", "stress"]),
     ] {
         frame.set_labels(&labels, keys);

@@ -1,0 +1,97 @@
+//! A labelled structure as a frame, with where it came from, and as a condition sees it.
+
+use atoms::cell::norm;
+use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, Value};
+use store::{ExportRow, ExportSource};
+
+use crate::condition::Facts;
+
+/// What a condition is put to.
+pub fn facts(row: &ExportRow) -> Facts<'_> {
+    let largest = |grades: &[f64]| grades.iter().copied().reduce(f64::max);
+    let forces = row.label.forces.iter().map(|force| norm(*force));
+    let of_label = Facts {
+        energy: row.label.energy,
+        max_force: forces.fold(0.0, f64::max),
+        species: &row.structure.species,
+        kind: "imported",
+        ..Facts::default()
+    };
+    let ExportSource::Candidate {
+        block, original, origin, seed_structure_name, mixture_version_after, ..
+    } = &row.source
+    else {
+        return of_label;
+    };
+    let view = block.view();
+    Facts {
+        gamma: largest(&original.gamma),
+        gamma_nbr: largest(&original.gamma_nbr),
+        volume: Some(view.relative_volume()),
+        temperature: Some(view.temperature()),
+        walk: Some(view.id().walk.0),
+        step: Some(view.id().step),
+        mixture_version: Some(*mixture_version_after),
+        kind: origin.name(),
+        seed: Some(seed_structure_name),
+        ..of_label
+    }
+}
+
+/// The frame of a structure of a campaign.
+pub fn frame(row: ExportRow, keys: Keys, campaign: &str) -> Frame {
+    let mut frame = Frame::from(row.structure);
+    let label = row.label;
+    let labels = Labels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
+    frame.set_labels(&labels, keys);
+    let scalars = |values| Column { width: 1, entries: Entries::Real(values) };
+    let details = label.details;
+    if let Some(moments) = details.magnetic_moments {
+        frame.arrays.insert("magmoms".to_owned(), scalars(moments));
+    }
+    let mut info = |key: &str, value: Value| frame.info.insert(key.to_owned(), value);
+    for (key, number) in
+        [("energy_without_smearing", details.energy_without_smearing), ("magmom", details.magnetisation)]
+    {
+        if let Some(number) = number {
+            info(key, number.into());
+        }
+    }
+    info("campaign", campaign.into());
+    info("protocol", row.protocol_name.into());
+    info("protocol_hash", row.protocol.to_string().chars().take(16).collect::<String>().into());
+    match row.source {
+        ExportSource::Candidate {
+            id,
+            seed_structure_name,
+            origin,
+            mixture_version_after,
+            block,
+            original,
+            ..
+        } => {
+            let view = block.view();
+            info("candidate_id", id.into());
+            info("seed_structure", seed_structure_name.into());
+            info("walk", i64::from(view.id().walk.0).into());
+            info("segment", i64::from(view.id().segment).into());
+            info("step", whole(view.id().step));
+            info("origin", origin.name().into());
+            info("mixture_version", whole(mixture_version_after));
+            info("mixture_version_seen", whole(view.mixture_version()));
+            info("relative_volume", view.relative_volume().into());
+            frame.arrays.insert("gamma".to_owned(), scalars(original.gamma));
+            frame.arrays.insert("gamma_nbr".to_owned(), scalars(original.gamma_nbr));
+        }
+        ExportSource::Import { file, frame } => {
+            info("origin", "imported".into());
+            info("source_file", file.into());
+            info("source_frame", whole(frame));
+        }
+    }
+    frame
+}
+
+fn whole(number: u64) -> Value {
+    Value::Int(i64::try_from(number).unwrap_or(i64::MAX))
+}

@@ -1,0 +1,201 @@
+//! Conditions on labelled structures, as `gamma > 2 and element = Mo`: a small language, described in docs/export.md.
+
+mod parse;
+#[cfg(test)]
+mod tests;
+
+use std::fmt;
+use std::str::FromStr;
+
+use atoms::Species;
+
+pub use parse::ConditionError;
+
+/// What is known of a structure that a condition is put to. What is not there meets no comparison.
+#[derive(Clone, Debug, Default)]
+pub struct Facts<'a> {
+    /// Largest γ under the original mixture.
+    pub gamma: Option<f64>,
+    /// Largest γ_nbr under the original mixture.
+    pub gamma_nbr: Option<f64>,
+    /// V/V₀.
+    pub volume: Option<f64>,
+    /// Kinetic temperature, K.
+    pub temperature: Option<f64>,
+    /// Walk.
+    pub walk: Option<u32>,
+    /// Step, equilibration included.
+    pub step: Option<u64>,
+    /// Version of the mixture after the decision.
+    pub mixture_version: Option<u64>,
+    /// Energy of the label, eV.
+    pub energy: f64,
+    /// Largest force of the label, eV/Å.
+    pub max_force: f64,
+    /// The elements of its atoms, an entry an atom.
+    pub species: &'a [Species],
+    /// `biased`, `control` or `imported`.
+    pub kind: &'a str,
+    /// Name of the seed structure.
+    pub seed: Option<&'a str>,
+}
+
+/// A condition.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Condition {
+    /// A number beside another.
+    Number(Number, Comparison, f64),
+    /// A text that is, or is not, another.
+    Text(Text, bool, String),
+    /// Not that.
+    Not(Box<Condition>),
+    /// Both.
+    And(Box<Condition>, Box<Condition>),
+    /// One or both.
+    Or(Box<Condition>, Box<Condition>),
+}
+
+/// How numbers are compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Comparison {
+    /// `=`
+    Equal,
+    /// `!=`
+    Different,
+    /// `<`
+    Below,
+    /// `<=`
+    AtMost,
+    /// `>`
+    Above,
+    /// `>=`
+    AtLeast,
+}
+
+macro_rules! names {
+    ($(#[$doc:meta])* $type:ident { $($variant:ident $name:literal),* }) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        #[allow(missing_docs)]
+        pub enum $type { $($variant),* }
+
+        impl $type {
+            /// Each with its name.
+            pub const ALL: &[(Self, &str)] = &[$((Self::$variant, $name)),*];
+
+            fn name(self) -> &'static str {
+                match self { $(Self::$variant => $name),* }
+            }
+        }
+    };
+}
+
+names! {
+    /// What is a number.
+    Number {
+        Gamma "gamma", GammaNbr "gamma_nbr", Volume "volume", Temperature "temperature", Walk "walk", Step "step",
+        MixtureVersion "mixture_version", Atoms "atoms", Energy "energy", EnergyPerAtom "energy_per_atom",
+        MaxForce "max_force"
+    }
+}
+
+names! {
+    /// What is a text.
+    Text { Element "element", Kind "kind", Seed "seed" }
+}
+
+impl Condition {
+    /// Whether a structure meets it.
+    pub fn is_met(&self, facts: &Facts<'_>) -> bool {
+        match self {
+            Self::Number(column, comparison, value) => {
+                facts.number(*column).is_some_and(|number| comparison.holds(number, *value))
+            }
+            Self::Text(column, wanted, value) => {
+                facts.is_text(*column, value).is_some_and(|found| found == *wanted)
+            }
+            Self::Not(condition) => !condition.is_met(facts),
+            Self::And(left, right) => left.is_met(facts) && right.is_met(facts),
+            Self::Or(left, right) => left.is_met(facts) || right.is_met(facts),
+        }
+    }
+}
+
+impl Comparison {
+    fn holds(self, a: f64, b: f64) -> bool {
+        match self {
+            Self::Equal => a == b,
+            Self::Different => a != b,
+            Self::Below => a < b,
+            Self::AtMost => a <= b,
+            Self::Above => a > b,
+            Self::AtLeast => a >= b,
+        }
+    }
+
+    fn sign(self) -> &'static str {
+        match self {
+            Self::Equal => "=",
+            Self::Different => "!=",
+            Self::Below => "<",
+            Self::AtMost => "<=",
+            Self::Above => ">",
+            Self::AtLeast => ">=",
+        }
+    }
+}
+
+impl Facts<'_> {
+    fn number(&self, column: Number) -> Option<f64> {
+        let atoms = self.species.len() as f64;
+        match column {
+            Number::Gamma => self.gamma,
+            Number::GammaNbr => self.gamma_nbr,
+            Number::Volume => self.volume,
+            Number::Temperature => self.temperature,
+            Number::Walk => self.walk.map(f64::from),
+            Number::Step => self.step.map(|step| step as f64),
+            Number::MixtureVersion => self.mixture_version.map(|version| version as f64),
+            Number::Atoms => Some(atoms),
+            Number::Energy => Some(self.energy),
+            Number::EnergyPerAtom => Some(self.energy / atoms),
+            Number::MaxForce => Some(self.max_force),
+        }
+    }
+
+    /// Whether the text is this one; of elements, whether one of the atoms is it.
+    fn is_text(&self, column: Text, value: &str) -> Option<bool> {
+        match column {
+            Text::Element => Some(self.species.iter().any(|species| species.symbol() == value)),
+            Text::Kind => Some(self.kind == value),
+            Text::Seed => self.seed.map(|seed| seed == value),
+        }
+    }
+}
+
+impl FromStr for Condition {
+    type Err = ConditionError;
+
+    fn from_str(text: &str) -> Result<Self, ConditionError> {
+        parse::parse(text)
+    }
+}
+
+/// As it can be read again.
+impl fmt::Display for Condition {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Number(column, comparison, value) => {
+                write!(f, "{} {} {value:?}", column.name(), comparison.sign())
+            }
+            Self::Text(column, wanted, value) => {
+                let quote = if value.contains('\'') { '"' } else { '\'' };
+                let sign = if *wanted { "=" } else { "!=" };
+                write!(f, "{} {sign} {quote}{value}{quote}", column.name())
+            }
+            Self::Not(condition) => write!(f, "not ({condition})"),
+            Self::And(left, right) => write!(f, "({left}) and ({right})"),
+            Self::Or(left, right) => write!(f, "({left}) or ({right})"),
+        }
+    }
+}

@@ -1,0 +1,192 @@
+//! `calmwalk export`: choosing structures, dividing them by seed structure, and the names of training codes.
+
+mod common;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use atoms::extxyz::Frame;
+use atoms::read_extxyz;
+use common::campaign::Small;
+use common::{deviation, refuse, stderr, succeed};
+use serde_json::Value;
+use tempfile::TempDir;
+
+fn campaign() -> TempDir {
+    let directory = tempfile::tempdir().unwrap();
+    let seeds = &["fcc-100", "fcc-097", "fcc-103", "vacancy", "slab-111"];
+    let path = Small { seeds, ..Small::default() }.write(directory.path());
+    succeed(directory.path(), ["run", path.to_str().unwrap(), "--directory", "here"]);
+    directory
+}
+
+fn export(here: &Path, options: &[&str]) -> Vec<Frame> {
+    succeed(here, ["export", "here", "--output", "out.extxyz"].iter().chain(options));
+    read_extxyz(&here.join("out.extxyz")).unwrap()
+}
+
+fn text<'a>(frame: &'a Frame, key: &str) -> &'a str {
+    frame.info[key].text().unwrap()
+}
+
+fn largest(frame: &Frame, key: &str) -> f64 {
+    frame.arrays[key].reals().unwrap().iter().copied().fold(0.0, f64::max)
+}
+
+#[test]
+fn conditions_choose_what_they_say() {
+    let directory = campaign();
+    let here = directory.path();
+    let all = export(here, &["--control"]);
+    let middle = largest(&all[all.len() / 2], "gamma");
+    let high = |frame: &Frame| largest(frame, "gamma") > middle;
+    let force = |frame: &Frame| {
+        let forces = frame.labels().unwrap().forces.unwrap();
+        forces.iter().map(|f| atoms::cell::norm(*f)).fold(0.0, f64::max)
+    };
+    type Choice<'a> = &'a dyn Fn(&Frame) -> bool;
+    let choices: [(String, Choice); 5] = [
+        (format!("gamma > {middle:?} and element = Al"), &high),
+        (format!("not gamma > {middle:?} or kind = control"), &|frame| {
+            !high(frame) || text(frame, "origin") == "control"
+        }),
+        ("seed = 'slab-111' or seed = vacancy".into(), &|frame| {
+            ["slab-111", "vacancy"].contains(&text(frame, "seed_structure"))
+        }),
+        ("max_force >= 1.5 and atoms < 40".into(), &|frame| {
+            force(frame) >= 1.5 && frame.structure.len() < 40
+        }),
+        ("volume <= 1.1 and step > 60".into(), &|frame| {
+            frame.info["relative_volume"].number() <= Some(1.1) && frame.info["step"].number() > Some(60.0)
+        }),
+    ];
+    for (condition, meets) in &choices {
+        let expected: Vec<_> =
+            all.iter().filter(|frame| meets(frame)).map(|frame| text(frame, "candidate_id")).collect();
+        assert!((1..all.len()).contains(&expected.len()), "{condition} tells nothing");
+        let found = export(here, &["--control", "--where", condition]);
+        assert_eq!(
+            found.iter().map(|frame| text(frame, "candidate_id")).collect::<Vec<_>>(),
+            expected,
+            "{condition}"
+        );
+    }
+    for (condition, problem) in [
+        ("gamma > 2 elment = Mo", "at character 11: found 'elment', expected 'and', 'or' or the end"),
+        ("gamma >", "at character 8: found the end, expected a number"),
+        ("element = Mo", "no labelled structure meets --where"),
+    ] {
+        let message = refuse(here, ["export", "here", "--output", "none.extxyz", "--where", condition]);
+        assert!(message.contains(problem), "{message}");
+        assert!(!here.join("none.extxyz").exists());
+    }
+}
+
+#[test]
+fn whole_seed_structures_go_to_one_part() {
+    let directory = campaign();
+    let here = directory.path();
+    let all = export(here, &["--control"]);
+    let split = |options: &[&str]| {
+        let arguments =
+            ["export", "here", "--control", "--output", "out.extxyz", "--split", "train=0.6,test=0.4"];
+        let printed = succeed(here, arguments.iter().chain(options));
+        ["train", "test"].map(|part| {
+            let path = here.join(format!("out-{part}.extxyz"));
+            let frames = read_extxyz(&path).unwrap();
+            let seeds: BTreeSet<_> =
+                frames.iter().map(|frame| text(frame, "seed_structure").to_owned()).collect();
+            let line = format!(
+                "{} structures in out-{part}.extxyz, found from {} of the",
+                frames.len(),
+                seeds.len()
+            );
+            assert!(printed.contains(&line), "{printed}");
+            (frames, seeds, fs::read(path).unwrap())
+        })
+    };
+    let [(train, train_seeds, bytes), (test, test_seeds, _)] = split(&[]);
+    assert!(train_seeds.is_disjoint(&test_seeds), "{train_seeds:?} {test_seeds:?}");
+    assert_eq!((train_seeds.len(), test_seeds.len()), (3, 2));
+    let mut both = train.clone();
+    both.extend(test);
+    let order: BTreeMap<_, _> =
+        all.iter().enumerate().map(|(k, frame)| (text(frame, "candidate_id"), k)).collect();
+    both.sort_by_key(|frame| order[text(frame, "candidate_id")]);
+    let ids = |frames: &[Frame]| {
+        frames.iter().map(|frame| text(frame, "candidate_id").to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(ids(&both), ids(&all), "every structure is in one part");
+    assert!(ids(&train).is_sorted_by_key(|id| order[id.as_str()]), "in the order of the decisions");
+    assert!(split(&[])[0].2 == bytes, "the same bytes each time");
+    let others: Vec<_> =
+        (1..9).map(|seed| split(&["--split-seed", &seed.to_string()])[0].1.clone()).collect();
+    assert!(others.iter().any(|other| *other != train_seeds), "another number deals otherwise");
+    // What is left out changes nothing for the others.
+    let [(_, high_seeds, _), _] = split(&["--where", "gamma > 1.5"]);
+    assert!(high_seeds.is_subset(&train_seeds));
+    let many = "a=0.2,b=0.2,c=0.2,d=0.2,e=0.1,f=0.1";
+    let message = refuse(here, ["export", "here", "--output", "out.extxyz", "--split", many]);
+    assert!(message.contains("6 parts and 5 seed structures"), "{message}");
+    let message = refuse(here, ["export", "here", "--output", "out.extxyz", "--split", "train=0.9,test=0.2"]);
+    assert!(message.contains("the shares add up to 1.1"), "{message}");
+}
+
+/// ASE finds the labels under the names of each training code, and where each frame came from.
+#[test]
+fn training_codes_find_their_names() {
+    let directory = campaign();
+    let here = directory.path();
+    let frames = export(here, &[]);
+    let status: Value = serde_json::from_str(&succeed(here, ["status", "here", "--json"])).unwrap();
+    for frame in &frames {
+        assert_eq!(text(frame, "campaign"), status["campaign"].as_str().unwrap());
+    }
+    for keys in ["mace", "grace", "gap"] {
+        let others = export(here, &["--keys", keys]);
+        for (frame, other) in frames.iter().zip(&others) {
+            let (labels, read) = (frame.labels().unwrap(), other.labels().unwrap());
+            assert_eq!((read.energy, &read.forces), (labels.energy, &labels.forces));
+            assert!(deviation(&read.stress.unwrap().concat(), &labels.stress.unwrap().concat()) < 1e-14);
+        }
+    }
+    let Some(python) = std::env::var_os("CALMWALK_PYTHON") else {
+        eprintln!("CALMWALK_PYTHON is not set: no comparison with ASE");
+        return;
+    };
+    let names = [
+        ("ase", "a.get_potential_energy(), a.get_forces(), a.get_stress(voigt=False)"),
+        ("grace", "a.get_potential_energy(force_consistent=True), a.get_forces(), a.get_stress(voigt=False)"),
+        ("mace", "a.info['REF_energy'], a.arrays['REF_forces'], a.info['REF_stress']"),
+        ("gap", "a.get_potential_energy(), a.arrays['force'], -a.info['virial'] / a.get_volume()"),
+    ];
+    for (keys, read) in names {
+        export(here, &["--keys", keys]);
+        let script = format!(
+            "import json, sys, ase.io, numpy as np\n\
+             f = lambda e, f, s: dict(energy=float(e), forces=np.ravel(f).tolist(), stress=np.ravel(s).tolist())\n\
+             print(json.dumps([dict(f({read}), gamma=a.arrays['gamma'].tolist(), campaign=a.info['campaign'],\n\
+                 walk=int(a.info['walk']), step=int(a.info['step'])) for a in ase.io.read(sys.argv[1], ':')]))"
+        );
+        let output =
+            Command::new(&python).args(["-c", &script, "out.extxyz"]).current_dir(here).output().unwrap();
+        assert!(output.status.success(), "{keys}: {}", stderr(&output));
+        let found: Vec<Value> = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(found.len(), frames.len());
+        for (found, frame) in found.iter().zip(&frames) {
+            let labels = frame.labels().unwrap();
+            let numbers = |key: &str| -> Vec<f64> { serde_json::from_value(found[key].clone()).unwrap() };
+            assert_eq!(found["energy"].as_f64(), labels.energy, "{keys}");
+            assert_eq!(numbers("forces"), labels.forces.unwrap().as_flattened());
+            assert!(deviation(&numbers("stress"), labels.stress.unwrap().as_flattened()) < 1e-12, "{keys}");
+            assert_eq!(numbers("gamma"), frame.arrays["gamma"].reals().unwrap());
+            assert_eq!(found["campaign"], text(frame, "campaign"));
+            assert_eq!(
+                (found["walk"].as_f64(), found["step"].as_f64()),
+                (frame.info["walk"].number(), frame.info["step"].number())
+            );
+        }
+    }
+}
