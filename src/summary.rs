@@ -29,7 +29,7 @@ pub struct Summary {
 pub async fn of(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
     let status = store.status().await?;
     let learned = learned::of(store, protocol).await?;
-    let unlabelled = store.unlabelled(protocol).await?;
+    let unlabelled = store.unlabelled(protocol, true).await?;
     let values = store.values().await?;
     let watched = values.iter().find(|(name, _)| name == "training_frames");
     let watched: Option<GradeDistribution> = watched.and_then(|(_, text)| serde_json::from_str(text).ok());

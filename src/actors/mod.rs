@@ -8,6 +8,7 @@ mod crew;
 pub mod in_process;
 mod labellers;
 mod listen;
+mod pace;
 pub mod processes;
 mod records;
 pub mod scratch;
@@ -16,18 +17,19 @@ mod starts;
 
 use std::path::Path;
 use std::process;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use orchestrator::reactor::{self, Reactor};
+use orchestrator::reactor::{self, Notice, Reactor};
 use orchestrator::selector::Selector;
-use store::{ProcessRecord, SERVER_AWAY, Store};
+use store::{ProcessRecord, SERVER_AWAY, Store, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{Notify, mpsc};
 use wire::transport::Incoming;
 
+use self::pace::Paces;
 pub use listen::Listen;
 
 use crate::campaign::Campaign;
@@ -83,8 +85,16 @@ fn start_reactor(
         stopping: Arc::clone(stopping),
         queue_limit,
     };
+    let (store, paces) = (run.store.clone(), Mutex::new(Paces::default()));
     tokio::spawn(async move {
-        let ended = reactor.run(|notice| display.notice(&notice)).await;
+        let watch = |notice: Notice<'_>| {
+            paces.lock().unwrap_or_else(PoisonError::into_inner).notice(&notice, unix_milliseconds());
+            display.notice(&notice);
+        };
+        let ended = tokio::select! {
+            ended = reactor.run(watch) => ended,
+            never = pace::keep(&store, &paces) => match never {},
+        };
         display.finish();
         ended
     })

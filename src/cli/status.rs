@@ -1,28 +1,34 @@
 //! `calmwalk status`
 
+mod end;
 mod jobs;
+mod json;
 mod labels;
+mod page;
 mod processes;
+#[cfg(test)]
+mod tests;
 mod values;
+mod walks;
 
 use std::io::{self, Write};
 
-use store::{Candidates, Labels, Location, Status as Standing, Store, WalkStatus};
+use serde_json::Value;
+use store::{Candidates, Location, Status as Standing, Store};
 
+use self::end::End;
 use self::jobs::Jobs;
 use self::labels::LabelsSoFar;
+use self::page::Page;
 use self::values::Values;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::budget;
 use crate::forecast::{self, Forecast, megabytes};
-use crate::output::{Table, decimals, print, print_json};
-
-/// Walks, and processes, shown unless all are asked for.
-const SHOWN: usize = 20;
+use crate::output::{decimals, print, print_json};
 
 /// Show how a campaign stands
 ///
-/// Works while it runs and after it ended, and changes nothing.
+/// Works while it runs and after it ended, also on a copy, and changes nothing. docs/status.md says what the JSON means.
 #[derive(Debug, clap::Args)]
 pub struct Status {
     #[command(flatten)]
@@ -30,90 +36,87 @@ pub struct Status {
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Show every walk and process, not only 20 of them (JSON always has all)
+    /// Show every walk and process, not only some of them (JSON always has all)
     #[arg(long)]
     all: bool,
+    /// Show so many walks, or all: first those that advance, the newest structures before the others
+    #[arg(long, value_name = "NUMBER", value_parser = page::number)]
+    walks: Option<usize>,
 }
 
 impl Status {
     pub fn run(self) -> Result<Ended, Failure> {
         let location = self.location.get()?;
-        let Read { campaign, standing, values, disk, labels } = block_on(self.read(&location))??;
+        let snapshot = block_on(Snapshot::at(&location))??;
         let jobs = block_on(Jobs::of(&location))?;
         if self.json {
-            let mut json = serde_json::to_value(&standing).map_err(Failure::failed)?;
-            json["campaign"] = campaign.id.to_string().into();
-            json["mode"] = campaign.mode.clone().into();
-            json["training_frames"] = values.training_frames();
-            json["staleness"] = values.staleness();
-            json["disk"] = serde_json::to_value(&disk).map_err(Failure::failed)?;
-            labels.add_to(&mut json, standing.budget.used.core_hours);
-            jobs.add_to(&mut json);
-            print_json(&json)?;
+            print_json(&json::of(&snapshot, &jobs).map_err(Failure::failed)?)?;
         } else {
+            let page = Page::new(self.all, self.walks, !matches!(jobs, Jobs::None));
             print(|out| {
-                write_status(out, &campaign, &standing, &values, &labels, &disk, self.all)?;
-                jobs.write(out, self.all)
+                snapshot.write(out, &page)?;
+                jobs.write(out, &page)
             })?;
         }
         Ok(Ended::Done)
     }
-
-    async fn read(&self, location: &Location) -> Result<Read, Failure> {
-        let store = Store::open_read_only(location).await?;
-        let forecast = store.note(forecast::NOTE).await?;
-        let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
-        let read = Read {
-            campaign: store.campaign().await?,
-            standing: store.status().await?,
-            values: Values(store.values().await?),
-            disk: Disk { bytes: store.size().await?, forecast },
-            labels: LabelsSoFar::of(&store).await?,
-        };
-        store.close().await;
-        Ok(read)
-    }
 }
 
-/// What the store says.
-struct Read {
+/// What the store says, at one instant or almost.
+#[derive(Debug)]
+pub struct Snapshot {
     campaign: store::Campaign,
     standing: Standing,
     values: Values,
     disk: Disk,
     labels: LabelsSoFar,
+    end: End,
 }
 
-fn write_status(
-    out: &mut dyn Write,
-    campaign: &store::Campaign,
-    status: &Standing,
-    values: &Values,
-    labels: &LabelsSoFar,
-    disk: &Disk,
-    all: bool,
-) -> io::Result<()> {
-    let walks = &status.walks;
-    let under_way = walks.iter().filter(|walk| is_under_way(walk)).count();
-    writeln!(out, "campaign    {}, {} mode", campaign.id, campaign.mode)?;
-    writeln!(out, "state       {}", processes::state(status))?;
-    writeln!(
-        out,
-        "walks       {under_way} under way, {} ended; round {}",
-        walks.len() - under_way,
-        status.round
-    )?;
-    writeln!(out, "mixture     version {}", status.mixture_version)?;
-    values.write(out, &campaign.mode)?;
-    write_candidates(out, &status.candidates)?;
-    write_labels(out, &status.labels, status.imported)?;
-    labels.write(out, status.budget.used.core_hours, all)?;
-    if let Some(budget) = budget::shown(&status.budget) {
-        writeln!(out, "budget      {budget}")?;
+impl Snapshot {
+    async fn at(location: &Location) -> Result<Self, Failure> {
+        let store = Store::open_read_only(location).await?;
+        let snapshot = Self::of(&store).await?;
+        store.close().await;
+        Ok(snapshot)
     }
-    write_disk(out, disk)?;
-    write_walks(out, walks, all)?;
-    processes::write(out, &status.processes, all)
+
+    /// Reads it.
+    pub async fn of(store: &Store) -> Result<Self, Failure> {
+        let forecast = store.note(forecast::NOTE).await?;
+        let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
+        let (campaign, standing) = (store.campaign().await?, store.status().await?);
+        let labels = LabelsSoFar::of(store, &standing).await?;
+        let configuration: Value = serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default();
+        Ok(Self {
+            end: End::of(&standing, &configuration, labels.bill()),
+            values: Values(store.values().await?),
+            disk: Disk { bytes: store.size().await?, forecast },
+            campaign,
+            standing,
+            labels,
+        })
+    }
+
+    fn write(&self, out: &mut dyn Write, page: &Page) -> io::Result<()> {
+        let Self { campaign, standing, values, disk, labels, end } = self;
+        page.titled(out, "campaign", &format!("{}, {} mode", campaign.id, campaign.mode))?;
+        page.titled(out, "state", &processes::state(standing))?;
+        page.titled(out, "walks", &walks_in_words(standing))?;
+        page.titled(out, "mixture", &format!("version {}", standing.mixture_version))?;
+        values.write(out, page, &campaign.mode)?;
+        write_candidates(out, page, &standing.candidates)?;
+        labels.write(out, page, standing)?;
+        if let Some(budget) = budget::shown(&standing.budget) {
+            page.titled(out, "budget", &budget)?;
+        }
+        page.titled(out, "disk", &disk.in_words())?;
+        if let Some(end) = end.shown() {
+            page.titled(out, "end", &end)?;
+        }
+        walks::write(out, &standing.walks, page)?;
+        processes::write(out, &standing.processes, page)
+    }
 }
 
 /// What the store takes.
@@ -125,15 +128,25 @@ struct Disk {
     forecast: Option<Forecast>,
 }
 
-fn write_disk(out: &mut dyn Write, disk: &Disk) -> io::Result<()> {
-    let now = megabytes(disk.bytes);
-    match &disk.forecast {
-        Some(forecast) => writeln!(out, "disk        {now} now; {forecast}"),
-        None => writeln!(out, "disk        {now} now"),
+impl Disk {
+    fn in_words(&self) -> String {
+        let now = megabytes(self.bytes);
+        match &self.forecast {
+            Some(forecast) => format!("{now} now; {forecast}"),
+            None => format!("{now} now"),
+        }
     }
 }
 
-fn write_candidates(out: &mut dyn Write, candidates: &Candidates) -> io::Result<()> {
+fn walks_in_words(status: &Standing) -> String {
+    let under_way = status.walks.iter().filter(|walk| walks::is_under_way(walk)).count();
+    let ended = status.walks.len() - under_way;
+    let pace = status.steps_per_second.filter(|_| under_way > 0);
+    let pace = pace.map_or(String::new(), |pace| format!("; {} steps/s", decimals(Some(pace), 1)));
+    format!("{under_way} under way, {ended} ended; round {}{pace}", status.round)
+}
+
+fn write_candidates(out: &mut dyn Write, page: &Page, candidates: &Candidates) -> io::Result<()> {
     let Candidates { seen, accepted, declined, control, refused_by_walkers } = candidates;
     let reasons = [
         ("covered", declined.covered),
@@ -144,76 +157,10 @@ fn write_candidates(out: &mut dyn Write, candidates: &Candidates) -> io::Result<
     ];
     let all: u64 = reasons.iter().map(|(_, count)| count).sum();
     let reasons = reasons.map(|(reason, count)| format!("{count} {reason}")).join(", ");
-    writeln!(out, "candidates  {seen} seen, {accepted} accepted, {all} declined ({reasons})")?;
-    writeln!(out, "            {control} control frames; {refused_by_walkers} refused by walkers' guards")
-}
-
-fn write_labels(out: &mut dyn Write, labels: &Labels, imported: u64) -> io::Result<()> {
-    let Labels { queued, leased, labelled, failed, dropped } = labels;
-    writeln!(
+    page.titled(out, "candidates", &format!("{seen} seen, {accepted} accepted, {all} declined ({reasons})"))?;
+    page.titled(
         out,
-        "labels      {queued} queued, {leased} leased, {labelled} labelled, {failed} failed, {dropped} dropped; \
-         {imported} structures imported"
+        "",
+        &format!("{control} control frames; {refused_by_walkers} refused by walkers' guards"),
     )
-}
-
-fn is_under_way(walk: &WalkStatus) -> bool {
-    matches!(walk.state.as_str(), "waiting" | "running")
-}
-
-/// Those under way first, then those that began last; in order of their numbers.
-fn shown(walks: &[WalkStatus], all: bool) -> Vec<&WalkStatus> {
-    let mut shown: Vec<_> = walks.iter().collect();
-    if !all && shown.len() > SHOWN {
-        shown.sort_by_key(|walk| (!is_under_way(walk), std::cmp::Reverse(walk.walk)));
-        shown.truncate(SHOWN);
-        shown.sort_by_key(|walk| walk.walk);
-    }
-    shown
-}
-
-fn write_walks(out: &mut dyn Write, walks: &[WalkStatus], all: bool) -> io::Result<()> {
-    if walks.is_empty() {
-        return Ok(());
-    }
-    let shown = shown(walks, all);
-    let mut table = Table::new(&[
-        ">walk",
-        "seed structure",
-        "origin",
-        "state",
-        ">step",
-        ">segment",
-        ">τ",
-        ">T (K)",
-        ">V/V₀",
-        ">γ_max",
-        ">accepted",
-        ">refused",
-        ">returns",
-    ]);
-    for walk in &shown {
-        table.push(vec![
-            walk.walk.to_string(),
-            walk.seed_structure.clone(),
-            walk.origin.clone(),
-            walk.state.replace('_', " "),
-            walk.step.to_string(),
-            walk.segment.to_string(),
-            decimals(walk.tau, 3),
-            decimals(walk.temperature, 0),
-            decimals(walk.relative_volume, 3),
-            // Walks without bias are not graded.
-            decimals(walk.gamma_max.filter(|gamma| *gamma > 0.0), 2),
-            walk.accepted.to_string(),
-            walk.refused.to_string(),
-            walk.returns.to_string(),
-        ]);
-    }
-    writeln!(out)?;
-    table.write(out)?;
-    if shown.len() < walks.len() {
-        writeln!(out, "… and {} more walks: --all shows them", walks.len() - shown.len())?;
-    }
-    Ok(())
 }

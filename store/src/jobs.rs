@@ -2,9 +2,22 @@
 
 use serde::Serialize;
 
-use crate::database::{FromRow, Row};
+use crate::database::{FromRow, Row, from_columns};
 use crate::error::Result;
 use crate::records::{JobState, Label};
+
+/// The label attempt under way that began first.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct OldestLease {
+    /// Number of its job.
+    pub job: i64,
+    /// Who makes it.
+    pub holder: String,
+    /// When it began, ms since 1970.
+    pub started: i64,
+}
+
+from_columns!(OldestLease { job, holder, started });
 
 /// What became of a result that was brought.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -20,6 +20,7 @@ mod location;
 mod lock;
 mod numbers;
 mod outcomes;
+mod pace;
 mod postgres;
 mod processes;
 pub mod records;
@@ -39,12 +40,13 @@ pub use filesystem::{check_directory, free_space, network_file_system};
 pub use history::{Covered, ImportedStructure, LaterCovered, Named, SameStructure, StructureLabel};
 pub use jobs::{
     Archive, Attempt, CalculationRecord, Completed, Failed, Imported, Job, JobDetails, LabelRecord,
-    LabelSource, PastCalculation, Standing, Whereabouts,
+    LabelSource, OldestLease, PastCalculation, Standing, Whereabouts,
 };
 pub use location::{Location, ServerUrl};
 pub use lock::{CampaignLock, LOCK};
 pub use numbers::NumbersError;
 pub use outcomes::{FailureCount, Finished, LabelCost, NearLabel, Range, Unlabelled, Waiting, Work};
+pub use pace::Pace;
 pub use processes::{ProcessRecord, this_host};
 pub use records::*;
 pub use sqlite::DATABASE;

@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use crate::budget::BudgetStatus;
 use crate::database::from_columns;
+use crate::jobs::OldestLease;
 use crate::processes::ProcessRecord;
 
 /// Everything that `status` shows.
@@ -13,12 +14,18 @@ pub struct Status {
     pub candidates: Candidates,
     /// The label queue.
     pub labels: Labels,
+    /// The label attempt under way that began first.
+    pub oldest_lease: Option<OldestLease>,
+    /// Labels made within the last hour.
+    pub labels_last_hour: u64,
     /// Structures that came with their labels.
     pub imported: u64,
     /// Version of the mixture.
     pub mixture_version: u64,
     /// Round (reproducible mode) or 0.
     pub round: u64,
+    /// Steps that all walks together make a second; none if that was not heard of within the last minute.
+    pub steps_per_second: Option<f64>,
     /// Every walk, in order.
     pub walks: Vec<WalkStatus>,
     /// Processes that said that they work for the campaign.
@@ -75,7 +82,7 @@ pub struct Labels {
 }
 
 /// Where a walk stands.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct WalkStatus {
     /// Its number.
     pub walk: u32,
@@ -88,7 +95,7 @@ pub struct WalkStatus {
     /// Why it ended, in words.
     pub reason: String,
     /// Step.
-    pub step: i64,
+    pub step: u64,
     /// Segment.
     pub segment: u32,
     /// τ.
@@ -99,6 +106,8 @@ pub struct WalkStatus {
     pub relative_volume: Option<f64>,
     /// Largest γ of the last graded step.
     pub gamma_max: Option<f64>,
+    /// Steps per second, with the time between its turns; none if it was not heard of within the last minute.
+    pub steps_per_second: Option<f64>,
     /// Structures accepted.
     pub accepted: u32,
     /// Refusals by the walker's guard.
@@ -119,6 +128,7 @@ from_columns!(WalkStatus {
     temperature,
     relative_volume,
     gamma_max,
+    steps_per_second,
     accepted,
     refused,
     returns

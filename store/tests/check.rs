@@ -74,6 +74,10 @@ async fn each_damage_is_found_and_told_in_words() {
             "DELETE FROM candidate_count",
             "3 kinds of candidates are counted wrongly (such as biased accepted)",
         ),
+        (
+            "UPDATE job_count SET number = 7 WHERE state = 'queued'",
+            "1 kinds of label jobs are counted wrongly (such as queued)",
+        ),
         ("DELETE FROM label", "1 jobs that are labelled without a label, or have one and are not"),
         ("DELETE FROM attempt", "1 labels that do not belong to their job"),
         (

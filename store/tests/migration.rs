@@ -29,6 +29,13 @@ async fn counts(directory: &Path) -> i64 {
     sqlx::query_scalar("SELECT sum(number) FROM candidate_count").fetch_one(&mut connection).await.unwrap()
 }
 
+/// Label jobs by state, as they were counted.
+async fn job_counts(directory: &Path) -> Vec<(String, i64)> {
+    let mut connection = connect(&directory.join(DATABASE)).await;
+    let sql = "SELECT state, sum(number) FROM job_count GROUP BY state ORDER BY state";
+    sqlx::query_as(sql).fetch_all(&mut connection).await.unwrap()
+}
+
 /// A campaign as version 1 leaves it when it is killed: one job is leased. Returns its decision log.
 async fn version_1(directory: &Path) -> String {
     let now = tempfile::tempdir().unwrap();
@@ -104,9 +111,10 @@ async fn a_campaign_of_version_1_goes_on() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let store = Store::open(directory.path()).await.unwrap();
-    assert_eq!(version(directory.path()).await, 4);
+    assert_eq!(version(directory.path()).await, 5);
     assert_eq!(store.decision_log_text().await.unwrap(), log);
     assert_eq!((store.status().await.unwrap().candidates.accepted, counts(directory.path()).await), (2, 2));
+    assert_eq!(job_counts(directory.path()).await, [("leased".into(), 1), ("queued".into(), 1)]);
     assert_eq!(store.processes(None).await.unwrap(), [old_process()]);
     // Its number is in use again, but the lock says that it cannot be the same process.
     assert!(!old_process().is_gone());
@@ -114,6 +122,9 @@ async fn a_campaign_of_version_1_goes_on() {
     assert_eq!(store.processes(None).await.unwrap(), []);
     let queued = store.queue_list(Some(JobState::Queued), 9, 0).await.unwrap();
     assert_eq!((queued.len(), queued[0].failures), (2, 0));
+    assert_eq!(job_counts(directory.path()).await, [("leased".into(), 0), ("queued".into(), 2)]);
+    let found = store.check(|_, _| {}).await.unwrap();
+    assert!(!found.iter().any(|finding| finding.what.contains("counted")), "{found:?}");
     store.close().await;
     Store::open(directory.path()).await.unwrap();
 }

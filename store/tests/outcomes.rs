@@ -4,7 +4,7 @@
 mod common;
 
 use common::*;
-use store::{FailureCount, Fate, Lease, Range, Store, Waiting, Work};
+use store::{FailureCount, Fate, Lease, Range, Store, Unlabelled, Waiting, Work};
 use wire::{Candidate, CandidateBlock, ContentHash, Origin};
 
 async fn lease(store: &Store, now: i64) -> Lease {
@@ -79,7 +79,14 @@ async fn failures_are_counted_by_class_and_by_what_became_of_the_job() {
 async fn what_failed_is_a_part_of_the_collected_space() {
     let home = Home::new();
     let (store, names) = filled(&home).await;
-    let unlabelled = store.unlabelled(protocol("dft").hash).await.unwrap();
+    let unlabelled = store.unlabelled(protocol("dft").hash, true).await.unwrap();
+    let without = |part: &Unlabelled| Unlabelled {
+        gamma_labelled: Range::default(),
+        relative_volume_labelled: Range::default(),
+        ..part.clone()
+    };
+    let expected: Vec<_> = unlabelled.iter().map(without).collect();
+    assert_eq!(store.unlabelled(protocol("dft").hash, false).await.unwrap(), expected);
     let [only] = unlabelled.as_slice() else { panic!("{unlabelled:?}") };
     assert_eq!((only.seed_structure.as_str(), only.formula.as_str()), ("diamond", "Si2"));
     assert_eq!((only.failed, only.labelled), (2, 3));
@@ -107,8 +114,8 @@ async fn what_failed_is_a_part_of_the_collected_space() {
     // Of a protocol without jobs nothing is told.
     store.add_protocol(&protocol("other"), 0).await.unwrap();
     assert!(store.finished(protocol("other").hash, 0, 9).await.unwrap().is_empty());
-    assert!(store.unlabelled(protocol("other").hash).await.unwrap().is_empty());
-    assert!(store.unlabelled(ContentHash([9; 32])).await.is_err());
+    assert!(store.unlabelled(protocol("other").hash, true).await.unwrap().is_empty());
+    assert!(store.unlabelled(ContentHash([9; 32]), true).await.is_err());
 }
 
 #[tokio::test]

@@ -239,7 +239,12 @@ impl Run {
         let labelled = self.model.0.values().filter(|job| job.state == JobState::Labelled);
         let energies: Vec<f64> = labelled.map(|job| -f64::from(job.results[0])).collect();
         assert_eq!(exported.iter().map(|row| row.label.energy).collect::<Vec<_>>(), energies);
-        assert_eq!(self.store.status().await.unwrap().labels.leased as usize, open.len());
+        let labels = self.store.status().await.unwrap().labels;
+        let found = [labels.queued, labels.leased, labels.labelled, labels.failed, labels.dropped];
+        let states =
+            [JobState::Queued, JobState::Leased, JobState::Labelled, JobState::Failed, JobState::Dropped];
+        let number = |state| self.model.0.values().filter(|job| job.state == state).count() as u64;
+        assert_eq!((found, labels.leased as usize), (states.map(number), open.len()));
     }
 }
 

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use store::Location;
 use tokio::time::timeout;
 
-use super::SHOWN;
+use super::page::Page;
 use crate::cli::launch::{FOLDER, job_names};
 use crate::output::Table;
 
@@ -57,7 +57,7 @@ impl Jobs {
     }
 
     /// A line for each; where there are many, those first that do not simply run.
-    pub fn write(&self, out: &mut dyn Write, all: bool) -> io::Result<()> {
+    pub fn write(&self, out: &mut dyn Write, page: &Page) -> io::Result<()> {
         let jobs = match self {
             Self::None => return Ok(()),
             Self::Unknown(why) => return writeln!(out, "\njobs        Slurm does not say: {why}"),
@@ -65,21 +65,16 @@ impl Jobs {
         };
         let runs = |job: &Job| job.role != Role::Orchestrator && job.phase() == Phase::Running;
         let mut shown: Vec<_> = jobs.iter().collect();
-        if !all && shown.len() > SHOWN {
+        if shown.len() > page.others {
             shown.sort_by_key(|(job, _)| (runs(job), job.role));
-            shown.truncate(SHOWN);
+            shown.truncate(page.others);
             shown.sort_by_key(|(job, _)| (job.role, job.id));
         }
         let mut table = Table::new(&["job", ">id", "state", "node", "since", ">time left", "remark"]);
         for (job, code) in &shown {
             table.push(line(job, code.as_deref()));
         }
-        writeln!(out)?;
-        table.write(out)?;
-        if shown.len() < jobs.len() {
-            writeln!(out, "… and {} more jobs: --all shows them", jobs.len() - shown.len())?;
-        }
-        Ok(())
+        page.table(out, &table, shown.len(), jobs.len(), "jobs")
     }
 }
 
@@ -142,6 +137,8 @@ fn as_json(job: &Job, code: &Option<String>) -> Value {
 mod tests {
     use super::*;
 
+    const PAGE: Page = Page { walks: 8, others: 8, few: 8, width: 120 };
+
     fn job(id: u64, role: Role, state: &str) -> Job {
         Job {
             id,
@@ -167,7 +164,7 @@ mod tests {
             (failed, Some("1:0".into())),
         ]);
         let mut text = Vec::new();
-        jobs.write(&mut text, false).unwrap();
+        jobs.write(&mut text, &PAGE).unwrap();
         let expected = [
             "job           id  state    node   since                time left  remark",
             "orchestrator  12  running  node7  2026-11-21T20:15:00    1:00:00",
@@ -186,7 +183,7 @@ mod tests {
         let mut value = json!({});
         Jobs::None.add_to(&mut value);
         let mut text = Vec::new();
-        Jobs::None.write(&mut text, false).unwrap();
+        Jobs::None.write(&mut text, &PAGE).unwrap();
         assert_eq!((value, text.len()), (json!({}), 0));
     }
 }

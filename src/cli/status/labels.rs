@@ -3,81 +3,113 @@
 use std::io::{self, Write};
 
 use serde_json::{Value, json};
-use store::{FailureCount, Store, StoreError, Unlabelled};
+use store::{FailureCount, Labels, Status, Store, StoreError, Unlabelled};
 
+use super::page::{Page, cut};
+use super::processes::since;
 use crate::bill::{self, Bill, digits};
 use crate::unlabelled;
 
-/// Lines for seed structures with failed labels, unless all are asked for.
-const SHOWN: usize = 8;
+/// Labelled structures that are looked through for ranges of grades and volumes, at most.
+const LOOKED_THROUGH: u64 = 20_000;
 
 /// What is known of the labels of the protocol in force.
 #[derive(Clone, Debug, Default)]
 pub struct LabelsSoFar {
-    bill: Bill,
-    failures: Vec<FailureCount>,
-    unlabelled: Vec<Unlabelled>,
+    pub(super) bill: Bill,
+    pub(super) failures: Vec<FailureCount>,
+    pub(super) unlabelled: Vec<Unlabelled>,
 }
 
 impl LabelsSoFar {
     /// Reads it; nothing without a protocol.
-    pub async fn of(store: &Store) -> Result<Self, StoreError> {
+    pub async fn of(store: &Store, status: &Status) -> Result<Self, StoreError> {
         let Some(protocol) = store.protocol_in_force().await? else { return Ok(Self::default()) };
         let failures = store.failures(protocol.hash).await?;
-        let unlabelled = match failures.iter().any(|class| class.given_up > 0) {
-            true => store.unlabelled(protocol.hash).await?,
-            false => Vec::new(),
+        let unlabelled = match (status.labels.failed, status.labels.labelled) {
+            (0, _) => Vec::new(),
+            (_, labelled) => store.unlabelled(protocol.hash, labelled <= LOOKED_THROUGH).await?,
         };
         Ok(Self { bill: bill::of(store, protocol.hash).await?, failures, unlabelled })
     }
 
-    /// Adds it to the state of a campaign; `used` are the core-hours so far.
-    pub fn add_to(&self, json: &mut Value, used: f64) {
-        json["cost"] = json!({ "core_hours": used, "queue": self.bill });
+    /// What labels have cost and will.
+    pub fn bill(&self) -> &Bill {
+        &self.bill
+    }
+
+    /// Adds it to the state of a campaign.
+    pub fn add_to(&self, json: &mut Value, status: &Status) {
+        json["labels_per_hour"] = json!(per_hour(status));
+        json["cost"] = json!({ "core_hours": status.budget.used.core_hours, "queue": self.bill });
         json["failures"] = json!(self.failures);
         json["unlabelled"] = json!(self.unlabelled);
     }
 
-    /// Cost, failures and what is unlabelled because of them.
-    pub fn write(&self, out: &mut dyn Write, used: f64, all: bool) -> io::Result<()> {
-        let Bill { unfinished, remaining, hours_left, cores, measured, overhead } = &self.bill;
-        let used = digits(used);
-        match remaining {
-            None if *unfinished == 0 => writeln!(out, "cost        {used} core-hours so far")?,
-            None => writeln!(
-                out,
-                "cost        {used} core-hours so far; that of {unfinished} labels to come is unknown before a first one"
-            )?,
-            Some(hours) => {
-                writeln!(
-                    out,
-                    "cost        {used} core-hours so far; {unfinished} labels to come: about {hours}"
-                )?;
-                write!(out, "            as {measured} labels so far")?;
-                if *overhead > 1.005 {
-                    write!(out, ", attempts in vain add {:.0} %", 100.0 * (overhead - 1.0))?;
-                }
-                match hours_left {
-                    Some(hours) => {
-                        writeln!(out, "; done in {} h on the {cores} cores at work", digits(*hours))?
-                    }
-                    None => writeln!(out, "; nobody is at work on them")?,
-                }
-            }
+    /// The queue, what it costs, failures and what is unlabelled because of them.
+    pub fn write(&self, out: &mut dyn Write, page: &Page, status: &Status) -> io::Result<()> {
+        page.titled(out, "labels", &queue(status))?;
+        page.titled(out, "", &made(status))?;
+        page.titled(out, "cost", &self.cost(status.budget.used.core_hours))?;
+        for (k, failure) in self.failures.iter().take(page.few).enumerate() {
+            page.titled(out, if k == 0 { "failures" } else { "" }, &in_words(failure))?;
         }
-        self.write_failures(out, all)
+        if self.failures.len() > page.few {
+            page.titled(out, "", &format!("… and {} more classes", self.failures.len() - page.few))?;
+        }
+        unlabelled::shown(&self.unlabelled, 12, page.few)
+            .lines()
+            .try_for_each(|line| writeln!(out, "{}", cut(line, page.width)))
     }
 
-    fn write_failures(&self, out: &mut dyn Write, all: bool) -> io::Result<()> {
-        for (k, FailureCount { class, labelled, given_up, unfinished }) in self.failures.iter().enumerate() {
-            let (title, class) = (if k == 0 { "failures" } else { "" }, class.replace('_', " "));
-            let jobs = labelled + given_up + unfinished;
-            writeln!(
-                out,
-                "{title:<12}{class} in {jobs}: {labelled} labelled all the same, {given_up} given up, {unfinished} not done"
-            )?;
-        }
-        let shown = if all { usize::MAX } else { SHOWN };
-        out.write_all(unlabelled::shown(&self.unlabelled, 12, shown).as_bytes())
+    fn cost(&self, used: f64) -> String {
+        let Bill { unfinished, remaining, hours_left, cores, measured, overhead } = &self.bill;
+        let used = format!("{} core-hours so far", digits(used));
+        let Some(remaining) = remaining else {
+            return match unfinished {
+                0 => used,
+                _ => format!("{used}; that of {unfinished} labels to come is unknown before a first one"),
+            };
+        };
+        let in_vain = match *overhead > 1.005 {
+            true => format!(", attempts in vain add {:.0} %", 100.0 * (overhead - 1.0)),
+            false => String::new(),
+        };
+        let done = match hours_left {
+            Some(hours) => format!("done in {} h on the {cores} cores at work", digits(*hours)),
+            None => "nobody is at work on them".to_owned(),
+        };
+        format!(
+            "{used}; {unfinished} labels to come: about {remaining} as {measured} labels so far{in_vain}; {done}"
+        )
     }
+}
+
+fn queue(status: &Status) -> String {
+    let Labels { queued, leased, labelled, failed, dropped } = &status.labels;
+    let oldest = status.oldest_lease.as_ref();
+    let oldest = oldest.map_or(String::new(), |lease| format!(" (the oldest for {})", since(lease.started)));
+    let imported = status.imported;
+    format!(
+        "{queued} queued, {leased} leased{oldest}, {labelled} labelled, {failed} failed, {dropped} dropped; \
+         {imported} structures imported"
+    )
+}
+
+fn made(status: &Status) -> String {
+    let average =
+        per_hour(status).map_or(String::new(), |average| format!("; {} an hour on average", digits(average)));
+    format!("{} made in the last hour{average}", status.labels_last_hour)
+}
+
+/// Labels that were made by the time for which the campaign was under way.
+fn per_hour(status: &Status) -> Option<f64> {
+    let used = &status.budget.used;
+    (used.wall_hours > 0.0).then(|| used.labels as f64 / used.wall_hours)
+}
+
+fn in_words(failure: &FailureCount) -> String {
+    let FailureCount { class, labelled, given_up, unfinished } = failure;
+    let (class, jobs) = (class.replace('_', " "), labelled + given_up + unfinished);
+    format!("{class} in {jobs}: {labelled} labelled all the same, {given_up} given up, {unfinished} not done")
 }

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use store::{ProcessRecord, Status, this_host, unix_milliseconds};
 
-use super::SHOWN;
+use super::page::Page;
 use crate::output::Table;
 
 /// What the campaign does, in words.
@@ -39,29 +39,24 @@ fn is_given_up(state: &str) -> bool {
 }
 
 /// A line for each process; where there are many, those first that do not simply run.
-pub fn write(out: &mut dyn Write, processes: &[ProcessRecord], all: bool) -> io::Result<()> {
+pub fn write(out: &mut dyn Write, processes: &[ProcessRecord], page: &Page) -> io::Result<()> {
     if processes.is_empty() {
         return Ok(());
     }
     let now = unix_milliseconds();
     let mut shown: Vec<_> = processes.iter().enumerate().collect();
-    if !all && shown.len() > SHOWN {
+    if shown.len() > page.others {
         shown.sort_by_key(|(_, process)| {
             process.kind != ProcessRecord::ORCHESTRATOR && process.state == "running"
         });
-        shown.truncate(SHOWN);
+        shown.truncate(page.others);
         shown.sort_by_key(|(place, _)| *place);
     }
     let mut table = Table::new(&["process", ">pid", "state", ">restarts", ">last seen", "remark"]);
     for (_, process) in &shown {
         table.push(line(process, now));
     }
-    writeln!(out)?;
-    table.write(out)?;
-    if shown.len() < processes.len() {
-        writeln!(out, "… and {} more processes: --all shows them", processes.len() - shown.len())?;
-    }
-    Ok(())
+    page.table(out, &table, shown.len(), processes.len(), "processes")
 }
 
 fn line(process: &ProcessRecord, now: i64) -> Vec<String> {
@@ -91,12 +86,21 @@ fn first_line(text: &str) -> String {
 
 /// A time that has passed, given in ms.
 fn ago(milliseconds: i64) -> String {
+    format!("{} ago", lasting(milliseconds))
+}
+
+/// The time since then, ms since 1970.
+pub fn since(time: i64) -> String {
+    lasting(unix_milliseconds() - time)
+}
+
+fn lasting(milliseconds: i64) -> String {
     let seconds = milliseconds.max(0) / 1000;
     match (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60, seconds % 60) {
-        (0, 0, 0, s) => format!("{s} s ago"),
-        (0, 0, m, s) => format!("{m} min {s} s ago"),
-        (0, h, m, _) => format!("{h} h {m} min ago"),
-        (d, h, ..) => format!("{d} d {h} h ago"),
+        (0, 0, 0, s) => format!("{s} s"),
+        (0, 0, m, s) => format!("{m} min {s} s"),
+        (0, h, m, _) => format!("{h} h {m} min"),
+        (d, h, ..) => format!("{d} d {h} h"),
     }
 }
 
@@ -117,7 +121,8 @@ mod tests {
 
     fn text(processes: &[ProcessRecord], all: bool) -> String {
         let mut out = Vec::new();
-        write(&mut out, processes, all).unwrap();
+        let most = if all { usize::MAX } else { 20 };
+        write(&mut out, processes, &Page { walks: most, others: most, few: 8, width: 120 }).unwrap();
         String::from_utf8(out).unwrap()
     }
 

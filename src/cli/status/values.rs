@@ -5,7 +5,10 @@ use std::io::{self, Write};
 use orchestrator::selector::{STALENESS, Staleness};
 use serde_json::{Value, json};
 
+use super::page::Page;
+
 /// The values of past commits, by name.
+#[derive(Debug)]
 pub struct Values(pub Vec<(String, String)>);
 
 impl Values {
@@ -31,28 +34,32 @@ impl Values {
     }
 
     /// Writes the lines that stand below the version of the mixture.
-    pub fn write(&self, out: &mut dyn Write, mode: &str) -> io::Result<()> {
+    pub fn write(&self, out: &mut dyn Write, page: &Page, mode: &str) -> io::Result<()> {
         let training = self.training_frames();
         let number = |key: &str| training[key].as_f64();
         if let (Some(median), Some(share)) = (number("median"), number("share_above_one")) {
             let alarm = if training["alarm"] == true { "; ALARM: the mixture forgets them" } else { "" };
             let share = 100.0 * share;
-            writeln!(
+            page.titled(
                 out,
-                "            training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}"
+                "",
+                &format!("training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}"),
             )?;
         }
         // Where walks follow one another each sees the newest, by construction.
         let staleness = self.read::<Staleness>(STALENESS);
         match staleness.filter(|staleness| mode == "live" || staleness.largest() > 0) {
-            Some(staleness) => writeln!(
+            Some(staleness) => page.titled(
                 out,
-                "            walkers had seen the newest at {:.1} % of decisions; versions behind: median {}, 90 % {}, \
-                 largest {}",
-                100.0 * staleness.share_of_newest(),
-                staleness.quantile(0.5),
-                staleness.quantile(0.9),
-                staleness.largest()
+                "",
+                &format!(
+                    "walkers had seen the newest at {:.1} % of decisions; versions behind: median {}, 90 % {}, \
+                     largest {}",
+                    100.0 * staleness.share_of_newest(),
+                    staleness.quantile(0.5),
+                    staleness.quantile(0.9),
+                    staleness.largest()
+                ),
             ),
             None => Ok(()),
         }
@@ -65,7 +72,8 @@ mod tests {
 
     fn text(values: &Values, mode: &str) -> String {
         let mut out = Vec::new();
-        values.write(&mut out, mode).unwrap();
+        let page = Page { walks: 8, others: 8, few: 8, width: 120 };
+        values.write(&mut out, &page, mode).unwrap();
         String::from_utf8(out).unwrap()
     }
 

@@ -48,7 +48,8 @@ macro_rules! table {
     };
 }
 
-/// Every table but those of the leader and of processes, each after those that it refers to. Some rows of the campaign's
+/// Every table but those of the leader, of processes and their pace, and of the numbers of jobs, which are counted again as
+/// jobs come in; each after those that it refers to. Some rows of the campaign's
 /// are there from the beginning.
 const TABLES: [Table; 16] = [
     table!("campaign" { key: T, value: T }),

@@ -60,6 +60,7 @@ async fn ours(
         }
     }
     findings.extend(rules::counts(transaction).await?);
+    findings.extend(rules::job_counts(transaction).await?);
     findings.extend(rules::leases(transaction).await?);
     findings.extend(rules::sums(transaction).await?);
     findings.extend(Contents::check(transaction, tell).await?);

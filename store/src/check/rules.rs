@@ -5,6 +5,7 @@ use crate::database::{Transaction, query};
 use crate::error::Result;
 use crate::processes::ProcessRecord;
 use crate::tables::budget::SUMS;
+use crate::tables::job_counts;
 use crate::tables::processes::{LEASED, all};
 
 /// A query that counts what must not be, with an example.
@@ -127,6 +128,19 @@ pub(super) async fn counts(transaction: &mut Transaction) -> Result<Vec<Finding>
         format!("{count} kinds of candidates are counted wrongly (such as {})", example.unwrap_or_default())
     };
     Ok((count > 0).then(|| Finding { what: what(), then: LOST }).into_iter().collect())
+}
+
+/// The same of label jobs.
+pub(super) async fn job_counts(transaction: &mut Transaction) -> Result<Vec<Finding>> {
+    if !job_counts::are_kept(transaction).await? {
+        return Ok(Vec::new());
+    }
+    let (count, example): (u64, Option<String>) =
+        query(job_counts::WRONG).fetch_one(&mut *transaction).await?;
+    let what = || {
+        format!("{count} kinds of label jobs are counted wrongly (such as {})", example.unwrap_or_default())
+    };
+    Ok((count > 0).then(|| Finding { what: what(), then: QUEUE }).into_iter().collect())
 }
 
 /// Leases of processes that do not exist any more.

@@ -21,7 +21,7 @@ use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
 
 /// The newest of the migrations.
-const SCHEMA: i64 = 4;
+const SCHEMA: i64 = 5;
 /// Connections of a process, at most: one that writes and some that read.
 const CONNECTIONS: u32 = 5;
 /// Connections that nobody needs are closed after this time: a server has few.

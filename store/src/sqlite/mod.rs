@@ -28,7 +28,7 @@ const UNFINISHED: &str = "campaign.sqlite.new";
 /// `PRAGMA application_id` of a campaign: "CALM".
 const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` that the newest migration leaves behind.
-const SCHEMA: i64 = 4;
+const SCHEMA: i64 = 5;
 /// How long another connection may hold the database.
 const PATIENCE: Duration = Duration::from_secs(30);
 const READERS: u32 = 4;

@@ -6,7 +6,7 @@ use wire::CampaignId;
 use super::*;
 use crate::Store;
 use crate::records::{Campaign, Commit, ComponentRecord};
-use crate::tables::{by_hand, export, history, labels, outcomes, queue, status};
+use crate::tables::{by_hand, export, history, job_counts, labels, outcomes, queue, status};
 
 /// The store in a directory, and its file.
 async fn store(directory: &Path) -> (Store, DatabaseFile) {
@@ -54,6 +54,7 @@ async fn what_is_asked_often_goes_through_indexes() {
         history::BEFORE,
         history::AFTER,
         labels::CURRENT,
+        job_counts::MADE_SINCE,
         outcomes::AT_WORK,
         outcomes::FINISHED,
     ] {
@@ -62,7 +63,7 @@ async fn what_is_asked_often_goes_through_indexes() {
     }
     let page = plan(&file, by_hand::LIST).await;
     assert!(page.contains("USING COVERING INDEX job_order (state=?)"), "{page}");
-    for sql in [status::COUNTED_FATES, status::STATES] {
+    for sql in [status::COUNTED_FATES, job_counts::COUNTED_STATES] {
         let plan = plan(&file, sql).await;
         assert!(plan.contains("COVERING INDEX") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");
     }

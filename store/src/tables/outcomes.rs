@@ -2,12 +2,12 @@
 
 use wire::ContentHash;
 
-use super::protocols;
 use super::restore::{grades, origin};
+use super::{job_counts, protocols};
 use crate::Store;
 use crate::database::{FromRow, Row, query};
 use crate::error::Result;
-use crate::outcomes::{FailureCount, Finished, LabelCost, Range, Unlabelled, Waiting, Work};
+use crate::outcomes::{FailureCount, Finished, LabelCost, Range, Unlabelled, Work};
 
 /// The newest first: what labels cost may change with the machine.
 pub(crate) const COSTS: &str =
@@ -15,10 +15,6 @@ pub(crate) const COSTS: &str =
     FROM label CROSS JOIN attempt ON attempt.job = label.job AND attempt.attempt = label.attempt
     CROSS JOIN job ON job.number = label.job CROSS JOIN candidate ON candidate.decision = job.decision
     WHERE label.protocol = $1 ORDER BY label.number DESC LIMIT $2";
-
-pub(crate) const WAITING: &str = "SELECT seed_structure, formula, atoms, count(*)
-    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
-    WHERE job.state IN ('queued', 'leased') AND job.protocol = $1 GROUP BY seed_structure, formula, atoms";
 
 pub(crate) const AT_WORK: &str =
     "SELECT attempt.* FROM job CROSS JOIN attempt ON attempt.job = job.number AND attempt.attempt = job.attempts
@@ -49,6 +45,20 @@ pub(crate) const UNLABELLED: &str = "SELECT coalesce(name, '') AS seed_name, for
     HAVING sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) > 0
     ORDER BY candidate.seed_structure, formula";
 
+/// The same without ranges of what is labelled.
+const FAILED: &str = "SELECT coalesce(name, '') AS seed_name, candidate.formula AS formula, count(*) AS failed,
+        (SELECT CAST(coalesce(sum(job_count.number), 0) AS BIGINT) FROM job_count
+         WHERE job_count.protocol = $1 AND job_count.state = 'labelled'
+         AND job_count.seed_structure = candidate.seed_structure AND job_count.formula = candidate.formula) AS labelled,
+        min(original_gamma) AS gamma_low, max(original_gamma) AS gamma_high,
+        min(relative_volume) AS volume_low, max(relative_volume) AS volume_high,
+        CAST(NULL AS DOUBLE PRECISION) AS labelled_gamma_low, CAST(NULL AS DOUBLE PRECISION) AS labelled_gamma_high,
+        CAST(NULL AS DOUBLE PRECISION) AS labelled_volume_low, CAST(NULL AS DOUBLE PRECISION) AS labelled_volume_high
+    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
+    LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
+    WHERE job.state = 'failed' AND job.protocol = $1
+    GROUP BY candidate.seed_structure, name, candidate.formula ORDER BY candidate.seed_structure, candidate.formula";
+
 pub(crate) const FINISHED: &str =
     "SELECT candidate.decision AS decision, id, state, origin, coalesce(name, '') AS seed_name, formula,
         original_gamma, original_gamma_nbr, relative_volume,
@@ -72,18 +82,6 @@ impl Store {
         let costs = query(COSTS).bind(protocol).bind(limit).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         Ok(costs)
-    }
-
-    /// The jobs of this protocol that have no label yet and may get one, by their sizes.
-    pub async fn waiting_jobs(&self, protocol: ContentHash) -> Result<Vec<Waiting>> {
-        let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
-        let rows: Vec<(u32, String, u32, u64)> =
-            query(WAITING).bind(protocol).fetch_all(&mut transaction).await?;
-        transaction.commit().await?;
-        let waiting =
-            |(seed_structure, formula, atoms, jobs)| Waiting { seed_structure, formula, atoms, jobs };
-        Ok(rows.into_iter().map(waiting).collect())
     }
 
     /// What attempts have used, and how many cores are at work now.
@@ -112,11 +110,14 @@ impl Store {
         Ok(rows.into_iter().map(count).collect())
     }
 
-    /// What is unlabelled because labels of this protocol finally failed, by seed structure and formula.
-    pub async fn unlabelled(&self, protocol: ContentHash) -> Result<Vec<Unlabelled>> {
+    /// What is unlabelled because labels of this protocol finally failed, by seed structure and formula. Without `ranges` of
+    /// those that have their labels no more rows are read than failed.
+    pub async fn unlabelled(&self, protocol: ContentHash, ranges: bool) -> Result<Vec<Unlabelled>> {
         let mut transaction = self.database.begin_to_read().await?;
         let protocol = protocols::number(&mut transaction, protocol).await?;
-        let rows = query(UNLABELLED).bind(protocol).fetch_all(&mut transaction).await?;
+        let ranges = ranges || !job_counts::are_kept(&mut transaction).await?;
+        let sql = if ranges { UNLABELLED } else { FAILED };
+        let rows = query(sql).bind(protocol).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         Ok(rows)
     }

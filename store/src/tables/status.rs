@@ -1,10 +1,11 @@
 //! The state of a campaign, from indexes.
 
-use super::{budget, processes};
+use super::{budget, job_counts, pace, processes};
 use crate::Store;
 use crate::budget::{Budget, BudgetStatus};
 use crate::database::query;
 use crate::error::Result;
+use crate::pace::Pace;
 use crate::processes::ProcessRecord;
 use crate::status::{Candidates, Labels, Status, WalkStatus};
 use crate::unix_milliseconds;
@@ -17,11 +18,10 @@ const FATES: &str = "SELECT origin, fate, number FROM candidate_count";
 pub(crate) const COUNTED_FATES: &str =
     "SELECT origin, coalesce(reason, fate), count(*) FROM candidate GROUP BY origin, fate, reason";
 
-pub(crate) const STATES: &str = "SELECT state, count(*) FROM job GROUP BY state";
-
 const WALKS: &str =
     "SELECT walk, coalesce(name, '') AS seed_structure, origin, state, reason, step, segment, tau,
-        temperature, relative_volume, gamma_max, accepted, refused, returns
+        temperature, relative_volume, gamma_max, CAST(NULL AS DOUBLE PRECISION) AS steps_per_second, accepted, refused,
+        returns
     FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure ORDER BY walk";
 
 impl Store {
@@ -30,11 +30,14 @@ impl Store {
     /// of another host that has said nothing for a minute is `silent`.
     /// A walk that a limit of time has stopped has the state `budget`.
     pub async fn status(&self) -> Result<Status> {
+        let now = unix_milliseconds();
         let mut transaction = self.database.begin_to_read().await?;
         let are_counted = transaction.has_table("candidate_count").await?;
         let fates = query(if are_counted { FATES } else { COUNTED_FATES });
         let fates: Vec<(String, String, u64)> = fates.fetch_all(&mut transaction).await?;
-        let states: Vec<(String, u64)> = query(STATES).fetch_all(&mut transaction).await?;
+        let states = job_counts::states(&mut transaction).await?;
+        let oldest_lease = job_counts::oldest_lease(&mut transaction).await?;
+        let labels_last_hour = job_counts::made_in_the_last_hour(&mut transaction, now).await?;
         let mut walks: Vec<WalkStatus> = query(WALKS).fetch_all(&mut transaction).await?;
         let refused = query("SELECT CAST(coalesce(sum(refused), 0) AS BIGINT) FROM walk");
         let refused: u64 = refused.fetch_one(&mut transaction).await?;
@@ -43,7 +46,9 @@ impl Store {
         let (mixture_version, round) = last.unwrap_or_default();
         let imported = query("SELECT count(*) FROM import").fetch_one(&mut transaction).await?;
         let processes = processes::all(&mut transaction).await?;
-        let (limits, used) = budget::read(&mut transaction, unix_milliseconds()).await?;
+        let (limits, used) = budget::read(&mut transaction, now).await?;
+        advance(&mut walks, &pace::fresh(&mut transaction, now).await?);
+        let steps_per_second = pace::of_all(&mut transaction, now).await?;
         transaction.commit().await?;
         let labels = labels(&states);
         let time_used_up = limits.time_used_up(&used);
@@ -58,9 +63,26 @@ impl Store {
             finished: !walks.is_empty() && !walks.iter().any(under_way) && no_more_labels,
             budget: BudgetStatus { used_up: used_up(time_used_up, &walks), limits, used },
             labels,
+            oldest_lease,
+            labels_last_hour,
+            steps_per_second,
             walks,
             processes: seen_from_here(processes),
         })
+    }
+}
+
+/// Says of walks under way how fast they are, and where they are between their checkpoints.
+fn advance(walks: &mut [WalkStatus], paces: &[Pace]) {
+    for walk in walks.iter_mut().filter(|walk| matches!(walk.state.as_str(), "waiting" | "running")) {
+        let Ok(found) = paces.binary_search_by_key(&walk.walk, |pace| pace.walk) else { continue };
+        let pace = &paces[found];
+        walk.steps_per_second = pace.steps_per_second;
+        if (pace.segment, pace.step) > (walk.segment, walk.step) {
+            (walk.segment, walk.step, walk.tau) = (pace.segment, pace.step, pace.tau);
+            (walk.temperature, walk.relative_volume) = (pace.temperature, pace.relative_volume);
+            walk.gamma_max = pace.gamma_max;
+        }
     }
 }
 

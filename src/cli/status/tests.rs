@@ -1,0 +1,192 @@
+//! Whether everything has room on a screen, and whether docs/status.md says what is so.
+
+use std::collections::BTreeSet;
+
+use orchestrator::slurm::{Job, Role};
+use serde_json::json;
+use store::{
+    Budget, BudgetStatus, BudgetUse, Declined, FailureCount, Labels, OldestLease, ProcessRecord, Range,
+    Unlabelled, WalkStatus, unix_milliseconds,
+};
+use wire::CampaignId;
+
+use super::*;
+use crate::bill::{Bill, CoreHours};
+
+/// A campaign in which there is something of everything, and much of what there may be much of.
+fn large() -> Snapshot {
+    let staleness = json!({ "counts": { "0": 900_000, "3": 100_000 }, "largest": 3 });
+    let training = json!({
+        "atoms": 20_000, "median": 0.51, "percentile_95": 1.2, "maximum": 7.0, "share_above_one": 0.25, "alarm": true,
+    });
+    let values = [(orchestrator::selector::STALENESS, staleness), ("training_frames", training)];
+    let hours = CoreHours { expected: 123_456.0, low: 98_765.0, high: 234_567.0 };
+    let bill = Bill {
+        unfinished: 12_345,
+        measured: 5000,
+        overhead: 1.25,
+        remaining: Some(hours),
+        cores: 4096,
+        hours_left: Some(30.1),
+    };
+    let failure =
+        |class: &str| FailureCount { class: class.into(), labelled: 1000, given_up: 2000, unfinished: 300 };
+    let range = |low, high| Range { low: Some(low), high: Some(high) };
+    let unlabelled = Unlabelled {
+        seed_structure: "bcc-100".into(),
+        formula: "Mo54".into(),
+        failed: 12,
+        labelled: 1234,
+        gamma: range(1.0, 9.5),
+        gamma_labelled: range(1.0, 12.5),
+        relative_volume: range(0.8, 1.2),
+        relative_volume_labelled: range(0.8, 1.2),
+    };
+    Snapshot {
+        campaign: store::Campaign {
+            id: CampaignId([7; 16]),
+            program_version: String::new(),
+            mode: "reproducible".into(),
+            configuration: String::new(),
+            resolved_configuration: String::new(),
+            configuration_in_force: String::new(),
+        },
+        standing: standing(),
+        values: Values(values.map(|(name, value)| (name.to_owned(), value.to_string())).into()),
+        disk: Disk {
+            bytes: 123_456_789_012,
+            forecast: Some(Forecast { structures: 9 << 33, rest: 1 << 32, declined: 1 << 30 }),
+        },
+        labels: LabelsSoFar {
+            bill,
+            failures: ["not_converged", "out_of_memory", "implausible"].map(failure).into(),
+            unlabelled: vec![unlabelled],
+        },
+        end: End {
+            walks_hours: Some(12.0),
+            labels_hours: Some(30.1),
+            budget_hours: Some(100.0),
+            time: Some(unix_milliseconds() + 108_360_000),
+        },
+    }
+}
+
+fn standing() -> Standing {
+    let walk = |number: u32| WalkStatus {
+        walk: number,
+        seed_structure: format!("a-long-name-of-a-seed-structure-{number}"),
+        origin: if number.is_multiple_of(2) { "biased" } else { "control" }.into(),
+        state: if number < 4 { "running" } else { "collected" }.into(),
+        step: 10_000_000,
+        tau: Some(0.3),
+        temperature: Some(12_345.0),
+        relative_volume: Some(1.234),
+        gamma_max: Some(123.45),
+        steps_per_second: Some(1234.5),
+        accepted: 300,
+        ..WalkStatus::default()
+    };
+    let process = |number: u32| ProcessRecord {
+        remark: "exit code 2: something that takes a whole sentence and some more to say".into(),
+        ..ProcessRecord::new(ProcessRecord::WALKER, Some(number), 4_000_000, 0)
+    };
+    let declined =
+        Declined { covered: 900_000, duplicate: 10_000, guard: 1_000, budget: 100, backlog: 10_000 };
+    Standing {
+        candidates: Candidates {
+            seen: 1_000_000,
+            accepted: 80_000,
+            declined,
+            control: 80_000,
+            refused_by_walkers: 123_456,
+        },
+        labels: Labels { queued: 12_345, leased: 1024, labelled: 140_000, failed: 2000, dropped: 12 },
+        oldest_lease: Some(OldestLease { job: 17, holder: "node7-17-0/3".into(), started: 0 }),
+        labels_last_hour: 512,
+        imported: 10_000,
+        mixture_version: 80_000,
+        round: 1_000_000,
+        steps_per_second: Some(123_456.7),
+        walks: (0..1000).map(walk).collect(),
+        processes: (0..1000).map(process).collect(),
+        budget: BudgetStatus {
+            limits: Budget {
+                labels: Some(200_000),
+                core_hours: Some(1e6),
+                wall_hours: Some(1000.0),
+                structures_by: Some("budget.labels".into()),
+            },
+            used: BudgetUse { labels: 140_000, under_way: 1024, core_hours: 654_321.0, wall_hours: 900.0 },
+            used_up: Some("budget.labels".into()),
+        },
+        finished: false,
+    }
+}
+
+fn job() -> (Job, Option<String>) {
+    let job = Job {
+        id: 1_234_567,
+        role: Role::Agent(3),
+        state: "PENDING".into(),
+        nodes: "node7".into(),
+        start: "2026-11-21T20:15:00".into(),
+        time_left: "1:00:00".into(),
+        walkers: Some(4),
+        reason: Some("Resources".into()),
+    };
+    (job, Some("1:0".into()))
+}
+
+#[test]
+fn a_large_campaign_has_room_on_a_screen() {
+    for (jobs, lines) in [(Jobs::None, 40), (Jobs::Known(vec![job(); 100]), 45)] {
+        let page = Page { width: 80, ..Page::of_all().screen() };
+        let mut text = Vec::new();
+        large().write(&mut text, &jobs, page, None).unwrap();
+        let text = String::from_utf8(text).unwrap();
+        let widest = text.lines().map(|line| line.chars().count()).max();
+        assert!(text.lines().count() <= lines && widest <= Some(80), "{text}");
+        for words in ["the oldest for", "512 made in the last hour", "123456.7 steps/s", "expected in 30 h"] {
+            assert!(text.contains(words), "{words}: {text}");
+        }
+    }
+}
+
+#[test]
+fn all_walks_are_shown_to_who_asks_for_them() {
+    let mut text = Vec::new();
+    large().write(&mut text, &Jobs::None, Page::of_all().screen(), Some(usize::MAX)).unwrap();
+    let text = String::from_utf8(text).unwrap();
+    assert!(text.contains("a-long-name-of-a-seed-structure-999") && !text.contains("more walks"));
+    assert!(text.contains("more processes"));
+}
+
+/// Names of everything in it that is no object and no list, as docs/status.md writes them.
+fn keys(value: &Value, name: &str, keys: &mut BTreeSet<String>) {
+    match value {
+        Value::Object(object) => {
+            for (key, value) in object {
+                let key = if key.parse::<u64>().is_ok() { "*" } else { key };
+                let name = if name.is_empty() { key.to_owned() } else { format!("{name}.{key}") };
+                self::keys(value, &name, keys);
+            }
+        }
+        Value::Array(list) => list.iter().for_each(|value| self::keys(value, &format!("{name}[]"), keys)),
+        _ => drop(keys.insert(name.to_owned())),
+    }
+}
+
+#[test]
+fn every_key_is_documented_and_every_documented_key_is_there() {
+    let mut found = BTreeSet::new();
+    for jobs in [Jobs::Known(vec![job()]), Jobs::Unknown("no answer".into())] {
+        let json = json::of(&large(), &jobs).unwrap();
+        assert_eq!(json["version"], json::VERSION);
+        keys(&json, "", &mut found);
+    }
+    let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/status.md")).unwrap();
+    let rows = text.lines().filter_map(|line| line.strip_prefix("| `")?.split_once("` | "));
+    let documented: BTreeSet<_> = rows.map(|(key, _)| key.to_owned()).collect();
+    assert_eq!(found, documented);
+    assert!(text.contains(&format!("of this description: {}", json::VERSION)));
+}

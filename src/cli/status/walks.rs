@@ -1,0 +1,101 @@
+//! The walks of a campaign in `calmwalk status`.
+
+use std::cmp::Reverse;
+use std::io::{self, Write};
+
+use store::WalkStatus;
+
+use super::page::{Page, cut};
+use crate::output::{Table, decimals};
+
+/// Columns of the name of a seed structure, unless everything is shown.
+const NAME: usize = 14;
+
+/// Whether it has more steps to make.
+pub fn is_under_way(walk: &WalkStatus) -> bool {
+    matches!(walk.state.as_str(), "waiting" | "running")
+}
+
+/// Those that advance first, the newest structures before the others; then those that began last. In order of their
+/// numbers.
+fn shown(walks: &[WalkStatus], most: usize) -> Vec<&WalkStatus> {
+    let mut shown: Vec<_> = walks.iter().collect();
+    if shown.len() > most {
+        let gamma = |walk: &WalkStatus| (1e6 * walk.gamma_max.unwrap_or_default().clamp(0.0, 1e9)) as u64;
+        shown.sort_by_cached_key(|walk| match is_under_way(walk) {
+            true => (0, walk.steps_per_second.is_none(), Reverse(gamma(walk)), Reverse(walk.walk)),
+            false => (1, true, Reverse(0), Reverse(walk.walk)),
+        });
+        shown.truncate(most);
+        shown.sort_by_key(|walk| walk.walk);
+    }
+    shown
+}
+
+/// A line for each.
+pub fn write(out: &mut dyn Write, walks: &[WalkStatus], page: &Page) -> io::Result<()> {
+    let shown = shown(walks, page.walks);
+    if shown.is_empty() {
+        return Ok(());
+    }
+    let mut table = Table::new(&[
+        ">walk",
+        "seed structure",
+        "state",
+        ">step",
+        ">steps/s",
+        ">T (K)",
+        ">V/V₀",
+        ">γ_max",
+        ">taken",
+    ]);
+    for walk in &shown {
+        table.push(line(walk, page));
+    }
+    page.table(out, &table, shown.len(), walks.len(), "walks")
+}
+
+fn line(walk: &WalkStatus, page: &Page) -> Vec<String> {
+    let control = if walk.origin == "control" { "c: " } else { "" };
+    let name = format!("{control}{}", walk.seed_structure);
+    let name = if page.walks == usize::MAX { name } else { cut(&name, NAME) };
+    let state = walk.state.replace('_', " ");
+    vec![
+        walk.walk.to_string(),
+        name,
+        state,
+        walk.step.to_string(),
+        decimals(walk.steps_per_second, 1),
+        decimals(walk.temperature, 0),
+        decimals(walk.relative_volume, 3),
+        // Walks without bias are not graded.
+        decimals(walk.gamma_max.filter(|gamma| *gamma > 0.0), 2),
+        walk.accepted.to_string(),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn walk(number: u32, state: &str, gamma: f64, pace: Option<f64>) -> WalkStatus {
+        WalkStatus {
+            walk: number,
+            state: state.into(),
+            gamma_max: Some(gamma),
+            steps_per_second: pace,
+            ..WalkStatus::default()
+        }
+    }
+
+    #[test]
+    fn of_many_walks_those_that_find_something_are_shown() {
+        let mut walks: Vec<_> = (0..50).map(|number| walk(number, "collected", 9.0, None)).collect();
+        walks[3] = walk(3, "running", 1.2, Some(10.0));
+        walks[4] = walk(4, "running", 2.5, Some(10.0));
+        walks[5] = walk(5, "waiting", 3.5, None);
+        let numbers = |most| shown(&walks, most).iter().map(|walk| walk.walk).collect::<Vec<_>>();
+        assert_eq!((numbers(1), numbers(2), numbers(3)), (vec![4], vec![3, 4], vec![3, 4, 5]));
+        assert_eq!((numbers(5), numbers(usize::MAX).len()), (vec![3, 4, 5, 48, 49], 50));
+    }
+}

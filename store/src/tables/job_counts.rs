@@ -1,0 +1,74 @@
+//! How many label jobs there are, from counts that the database keeps (`migrations`), and how many labels were made.
+
+use super::protocols;
+use crate::Store;
+use crate::database::{Transaction, query};
+use crate::error::Result;
+use crate::jobs::OldestLease;
+use crate::outcomes::Waiting;
+use wire::ContentHash;
+
+const HOUR: i64 = 3_600_000;
+
+const STATES: &str = "SELECT state, CAST(sum(number) AS BIGINT) FROM job_count GROUP BY state";
+
+/// The same in tables of an earlier version.
+pub(crate) const COUNTED_STATES: &str = "SELECT state, count(*) FROM job GROUP BY state";
+
+const WAITING: &str = "SELECT seed_structure, formula, atoms, CAST(sum(number) AS BIGINT) FROM job_count
+    WHERE state IN ('queued', 'leased') AND protocol = $1 GROUP BY seed_structure, formula, atoms
+    HAVING sum(number) > 0";
+
+/// The same in tables of an earlier version.
+const COUNTED_WAITING: &str = "SELECT seed_structure, formula, atoms, count(*)
+    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
+    WHERE job.state IN ('queued', 'leased') AND job.protocol = $1 GROUP BY seed_structure, formula, atoms";
+
+pub(crate) const OLDEST_LEASE: &str = "SELECT job, holder, started FROM attempt WHERE outcome IS NULL
+    ORDER BY started, job LIMIT 1";
+
+pub(crate) const MADE_SINCE: &str = "SELECT count(*) FROM label WHERE job IS NOT NULL AND received > $1";
+
+/// What is kept, against what is there.
+pub(crate) const WRONG: &str = "SELECT count(*), min(coalesce(found.state, kept.state))
+    FROM (SELECT protocol, state, seed_structure, formula, atoms, count(*) AS number
+          FROM job JOIN candidate ON candidate.decision = job.decision GROUP BY 1, 2, 3, 4, 5) AS found
+    FULL JOIN job_count AS kept ON kept.protocol = found.protocol AND kept.state = found.state
+        AND kept.seed_structure = found.seed_structure AND kept.formula = found.formula AND kept.atoms = found.atoms
+    WHERE coalesce(found.number, 0) <> coalesce(kept.number, 0)";
+
+pub(crate) async fn are_kept(transaction: &mut Transaction) -> Result<bool> {
+    transaction.has_table("job_count").await
+}
+
+/// Numbers of jobs by state.
+pub(super) async fn states(transaction: &mut Transaction) -> Result<Vec<(String, u64)>> {
+    let sql = if are_kept(transaction).await? { STATES } else { COUNTED_STATES };
+    query(sql).fetch_all(transaction).await
+}
+
+/// The attempt under way that began first.
+pub(super) async fn oldest_lease(transaction: &mut Transaction) -> Result<Option<OldestLease>> {
+    query(OLDEST_LEASE).fetch_optional(transaction).await
+}
+
+/// Labels that were made within an hour before `now`.
+pub(super) async fn made_in_the_last_hour(transaction: &mut Transaction, now: i64) -> Result<u64> {
+    let now = transaction.time(now).await?;
+    query(MADE_SINCE).bind(now - HOUR).fetch_one(transaction).await
+}
+
+impl Store {
+    /// The jobs of this protocol that have no label yet and may get one, by their sizes.
+    pub async fn waiting_jobs(&self, protocol: ContentHash) -> Result<Vec<Waiting>> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let sql = if are_kept(&mut transaction).await? { WAITING } else { COUNTED_WAITING };
+        let rows: Vec<(u32, String, u32, u64)> =
+            query(sql).bind(protocol).fetch_all(&mut transaction).await?;
+        transaction.commit().await?;
+        let waiting =
+            |(seed_structure, formula, atoms, jobs)| Waiting { seed_structure, formula, atoms, jobs };
+        Ok(rows.into_iter().map(waiting).collect())
+    }
+}
