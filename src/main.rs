@@ -13,6 +13,7 @@ mod frames;
 mod interrupt;
 mod labelling;
 mod learned;
+mod notify;
 mod outcome;
 mod output;
 mod progress;

@@ -8,6 +8,7 @@ mod crew;
 pub mod in_process;
 mod labellers;
 mod listen;
+pub mod notify;
 mod pace;
 pub mod processes;
 mod records;

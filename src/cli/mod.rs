@@ -17,7 +17,7 @@ mod plan;
 mod queue;
 mod replay;
 mod run;
-mod status;
+pub mod status;
 mod store;
 mod validate;
 mod walker;

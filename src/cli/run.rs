@@ -17,6 +17,7 @@ use wire::net::{Endpoint, Tls};
 use workers::labeller::GUARD;
 
 use super::{Ended, Failure, block_on};
+use crate::actors::notify::{self, Notifier};
 use crate::actors::{self, budget, in_process, processes};
 use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
@@ -124,11 +125,15 @@ async fn run(
         }
         if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
     };
-    let ended = tokio::select! {
-        ended = work => ended?,
-        error = budget::keep(&store, &limits, &over) => return Err(error.into()),
-        error = lock::lost(lock.as_ref()) => return Err(error.into()),
+    let mut notifier = Notifier::new(&campaign.config.notify, &store, location).await?;
+    let worked = tokio::select! {
+        ended = work => ended,
+        error = budget::keep(&store, &limits, &over) => Err(error.into()),
+        error = lock::lost(lock.as_ref()) => Err(error.into()),
+        never = notify::keep(&mut notifier) => match never {},
     };
+    notify::finish(notifier, worked.as_ref().err()).await;
+    let ended = worked?;
     // Hours of work do not end as a failure because a server is away in the last second.
     let store = store.patient(SERVER_AWAY);
     loop {

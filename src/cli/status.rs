@@ -52,11 +52,8 @@ impl Status {
         if self.json {
             print_json(&json::of(&snapshot, &jobs).map_err(Failure::failed)?)?;
         } else {
-            let page = Page::new(self.all, self.walks, !matches!(jobs, Jobs::None));
-            print(|out| {
-                snapshot.write(out, &page)?;
-                jobs.write(out, &page)
-            })?;
+            let page = if self.all { Page::of_all() } else { Page::of_all().screen() };
+            print(|out| snapshot.write(out, &jobs, page, self.walks))?;
         }
         Ok(Ended::Done)
     }
@@ -98,7 +95,23 @@ impl Snapshot {
         })
     }
 
-    fn write(&self, out: &mut dyn Write, page: &Page) -> io::Result<()> {
+    /// As docs/status.md has it, without jobs of a batch system.
+    pub fn to_json(&self) -> serde_json::Result<Value> {
+        json::of(self, &Jobs::None)
+    }
+
+    fn write(&self, out: &mut dyn Write, jobs: &Jobs, page: Page, walks: Option<usize>) -> io::Result<()> {
+        let mut head = Vec::new();
+        self.write_head(&mut head, &page)?;
+        out.write_all(&head)?;
+        let lines = head.iter().filter(|byte| **byte == b'\n').count();
+        let page = page.fitted(lines, if matches!(jobs, Jobs::Known(_)) { 3 } else { 2 }, walks);
+        walks::write(out, &self.standing.walks, &page)?;
+        processes::write(out, &self.standing.processes, &page)?;
+        jobs.write(out, &page)
+    }
+
+    fn write_head(&self, out: &mut dyn Write, page: &Page) -> io::Result<()> {
         let Self { campaign, standing, values, disk, labels, end } = self;
         page.titled(out, "campaign", &format!("{}, {} mode", campaign.id, campaign.mode))?;
         page.titled(out, "state", &processes::state(standing))?;
@@ -111,11 +124,10 @@ impl Snapshot {
             page.titled(out, "budget", &budget)?;
         }
         page.titled(out, "disk", &disk.in_words())?;
-        if let Some(end) = end.shown() {
-            page.titled(out, "end", &end)?;
+        match end.shown() {
+            Some(end) => page.titled(out, "end", &end),
+            None => Ok(()),
         }
-        walks::write(out, &standing.walks, page)?;
-        processes::write(out, &standing.processes, page)
     }
 }
 

@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 34] = [
+pub(super) const CHANGEABLE: [&str; 39] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -39,6 +39,11 @@ pub(super) const CHANGEABLE: [&str; 34] = [
     "run.agent_silence_limit",
     "run.restarts",
     "run.store",
+    "notify.command",
+    "notify.on",
+    "notify.stall",
+    "notify.failed_labels",
+    "notify.time_limit",
     "guard.highest_temperature",
 ];
 

@@ -4,7 +4,7 @@ use orchestrator::selector::{Mode, UpdateProtocol};
 use store::ServerUrl;
 use workers::settings::ThermostatKind;
 
-use super::{Config, LabelSection, QueueFull};
+use super::{Config, LabelSection, NotifySection, QueueFull};
 
 /// Signs of life are seconds apart.
 const LEAST_SILENCE: f64 = 5.0;
@@ -24,8 +24,16 @@ pub fn check(config: &Config) -> Result<(), Wrong> {
     check_queue(config)?;
     check_budget(config)?;
     check_label(&config.label)?;
+    check_notify(&config.notify)?;
     if config.seeds.files.is_empty() {
         return wrong("seeds.files", "an empty list", "at least one file with seed structures");
+    }
+    Ok(())
+}
+
+fn check_notify(notify: &NotifySection) -> Result<(), Wrong> {
+    if notify.command.as_ref().is_some_and(|command| command.first().is_none_or(String::is_empty)) {
+        return wrong("notify.command", "an empty command", "a program, and its arguments");
     }
     Ok(())
 }
@@ -52,6 +60,8 @@ fn check_limits(config: &Config) -> Result<(), Wrong> {
         ("collect.declined_gap", collect.declined_gap.get() as f64, most_steps),
         ("collect.declined_features_mb", collect.declined_features_mb as f64, 1e9),
         ("guard.checkpoint_interval", guard.checkpoint_interval.get() as f64, most_steps),
+        ("notify.stall", config.notify.stall.get(), 1e6),
+        ("notify.time_limit", config.notify.time_limit.get(), 86_400.0),
         ("run.walkers", run.walkers as f64, 1024.0),
         ("run.silence_limit", run.silence_limit.get(), 1e6),
         ("run.agent_silence_limit", run.agent_silence_limit.get(), 1e6),

@@ -7,6 +7,7 @@ mod documented;
 mod error;
 mod files;
 mod method;
+mod notify;
 
 use std::num::{NonZeroU32, NonZeroU64, NonZeroUsize};
 use std::path::{Path, PathBuf};
@@ -24,6 +25,7 @@ pub use changes::{Change, changed_keys, compare, without_changeable};
 pub use error::{ConfigError, in_plain_words, place, place_of_offset};
 pub use files::{PotentialFile, PotentialKind};
 pub use method::LabelMethod;
+pub use notify::{NotifyEvent, NotifySection};
 
 /// A whole campaign.
 #[derive(Clone, Debug, Deserialize, Serialize)]
@@ -53,6 +55,9 @@ pub struct Config {
     /// Processes and rounds.
     #[serde(default)]
     pub run: RunSection,
+    /// Who is told what happens.
+    #[serde(default)]
+    pub notify: NotifySection,
 }
 
 /// `[campaign]`
@@ -342,6 +347,7 @@ impl Config {
 
     fn resolve_paths(&mut self, directory: &Path) {
         self.paths().for_each(|path| *path = directory.join(&*path));
+        self.notify.resolve_paths(directory);
     }
 
     /// The same without any path: a campaign depends on what is in files, not on where they are.

@@ -1,0 +1,78 @@
+//! `[notify]`
+
+use std::num::NonZeroU32;
+use std::path::Path;
+
+use calm::rules::Positive;
+use serde::{Deserialize, Serialize};
+
+use super::defaults;
+
+/// A command of the user's that is run when something has happened to a campaign.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct NotifySection {
+    /// It and its arguments; left out, nobody is told.
+    pub command: Option<Vec<String>>,
+    /// On what it is run.
+    pub on: Vec<NotifyEvent>,
+    /// No candidate and no label for so long is a stall, min.
+    pub stall: Positive,
+    /// So many labels that finally failed, and so many again.
+    pub failed_labels: NonZeroU32,
+    /// It is killed after so long, s.
+    pub time_limit: Positive,
+}
+
+/// What may happen to a campaign.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NotifyEvent {
+    /// It is finished.
+    End,
+    /// `calmwalk run` cannot go on with it.
+    Failure,
+    /// Nothing is found and nothing labelled.
+    Stall,
+    /// A budget is used up.
+    Budget,
+    /// Labels failed.
+    FailedLabels,
+}
+
+impl NotifyEvent {
+    /// All of them.
+    pub const ALL: [Self; 5] = [Self::End, Self::Failure, Self::Stall, Self::Budget, Self::FailedLabels];
+
+    /// As the configuration has it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::End => "end",
+            Self::Failure => "failure",
+            Self::Stall => "stall",
+            Self::Budget => "budget",
+            Self::FailedLabels => "failed_labels",
+        }
+    }
+}
+
+impl NotifySection {
+    /// A command that is given as a path is one relative to the configuration.
+    pub(super) fn resolve_paths(&mut self, directory: &Path) {
+        if let Some(program) = self.command.iter_mut().flatten().next().filter(|name| name.contains('/')) {
+            *program = directory.join(&*program).to_string_lossy().into_owned();
+        }
+    }
+}
+
+impl Default for NotifySection {
+    fn default() -> Self {
+        Self {
+            command: None,
+            on: NotifyEvent::ALL.into(),
+            stall: defaults::positive(120.0),
+            failed_labels: defaults::nonzero(10),
+            time_limit: defaults::positive(60.0),
+        }
+    }
+}

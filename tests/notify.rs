@@ -1,0 +1,112 @@
+//! Whether the owner of a campaign is told what happens to it, once, and whether that can disturb it.
+
+mod common;
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::Stdio;
+
+use common::campaign::Small;
+use common::processes::wait_until;
+use common::{Running, program, succeed};
+use serde_json::Value;
+
+const RUN: [&str; 2] = ["run", "campaign.toml"];
+
+/// Writes `campaign.toml`, and a script with this last line that adds a line to `events` and leaves what it was told.
+fn write(here: &Path, small: &Small, notify: &str, change: (&str, &str), last: &str) {
+    let script = format!(
+        "#!/bin/sh\ncd '{}'\ncat > \"$CALMWALK_EVENT.json\"\necho \"$CALMWALK_EVENT $1 $CALMWALK_MESSAGE\" >> events\n{last}\n",
+        here.display()
+    );
+    fs::write(here.join("tell.sh"), script).unwrap();
+    fs::set_permissions(here.join("tell.sh"), fs::Permissions::from_mode(0o755)).unwrap();
+    let path = small.write(here);
+    let text = small.text().replace(change.0, change.1);
+    fs::write(path, format!("{text}\n[notify]\ncommand = [\"./tell.sh\", \"argument\"]\n{notify}\n"))
+        .unwrap();
+}
+
+fn events(here: &Path) -> Vec<String> {
+    let text = fs::read_to_string(here.join("events")).unwrap_or_default();
+    text.lines().map(|line| line.split_once(' ').unwrap().0.to_owned()).collect()
+}
+
+/// Lines of the operations log of these kinds.
+fn operations(here: &Path, kinds: &[&str]) -> Vec<(String, Value)> {
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
+    let lines = runtime.block_on(async {
+        let store = store::Store::open_read_only(here.join("campaign")).await.unwrap();
+        let lines = store.operations(0, 10_000).await.unwrap();
+        store.close().await;
+        lines
+    });
+    let of_kind = lines.into_iter().filter(|line| kinds.contains(&line.kind.as_str()));
+    of_kind.map(|line| (line.kind, line.detail)).collect()
+}
+
+#[test]
+fn the_end_is_told_once_with_the_state_of_the_campaign() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(here, &Small::default(), "", ("[label]", "[budget]\nlabels = 4\n[label]"), "exit 0");
+    succeed(here, RUN);
+    assert_eq!(events(here).iter().filter(|event| *event == "end").count(), 1, "{:?}", events(here));
+    assert!(events(here).contains(&"budget".into()));
+    let told: Value = serde_json::from_slice(&fs::read(here.join("end.json")).unwrap()).unwrap();
+    let status: Value = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();
+    for key in ["version", "campaign", "candidates", "labels", "finished"] {
+        assert_eq!(told["status"][key], status[key], "{key}");
+    }
+    assert_eq!((&told["event"], &told["location"]), (&"end".into(), &"campaign".into()));
+    let line = fs::read_to_string(here.join("events")).unwrap();
+    assert!(line.contains("end argument the campaign is finished: "), "{line}");
+    let log = operations(here, &["notified", "not_notified"]);
+    assert!(log.len() == 2 && log.iter().all(|(kind, _)| kind == "notified"), "{log:?}");
+    // The same command once more says nothing new.
+    succeed(here, RUN);
+    assert_eq!(events(here).len(), 2);
+}
+
+#[test]
+fn a_command_that_fails_or_hangs_is_a_line_in_the_log() {
+    for (last, words) in
+        [("echo no network >&2; exit 3", "no network"), ("sleep 1000", "not done after 0.5 s, and killed")]
+    {
+        let directory = tempfile::tempdir().unwrap();
+        let here = directory.path();
+        write(here, &Small::default(), "on = [\"end\"]\ntime_limit = 0.5", ("", ""), last);
+        succeed(here, RUN);
+        assert_eq!(events(here), ["end"]);
+        let log = operations(here, &["notified", "not_notified"]);
+        assert_eq!((log.len(), log[0].0.as_str()), (1, "not_notified"), "{log:?}");
+        assert!(log[0].1["how"].as_str().unwrap().contains(words), "{log:?}");
+    }
+}
+
+#[test]
+fn a_stall_is_told_once_also_over_restarts() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let small = Small { steps: 1_000_000, ..Small::default() };
+    let nothing_is_new = ("threshold = 1.0", "threshold = 1e6");
+    write(here, &small, "stall = 0.02", nothing_is_new, "exit 0");
+    for again in [false, true] {
+        let run = program(here).args(RUN).stderr(Stdio::null()).stdout(Stdio::null()).spawn();
+        let run = Running(run.unwrap());
+        if again {
+            // Several times as long as it takes to be told.
+            std::thread::sleep(std::time::Duration::from_secs(6));
+        } else {
+            wait_until("the stall is told", || !operations_if_any(here).is_empty());
+        }
+        drop(run);
+        wait_until("the walkers are gone", || common::processes::processes_in(here).is_empty());
+    }
+    assert_eq!(events(here), ["stall"]);
+}
+
+fn operations_if_any(here: &Path) -> Vec<(String, Value)> {
+    if here.join("events").exists() { operations(here, &["notified"]) } else { Vec::new() }
+}
