@@ -36,7 +36,7 @@ async fn other_files_and_versions_are_refused_with_what_was_found() {
     newer[63] = 7;
     fs::write(&path, &newer).unwrap();
     let message = Store::open(directory.path()).await.unwrap_err().to_string();
-    assert!(message.contains("version 7") && message.contains("reads version 4"), "{message}");
+    assert!(message.contains("version 7") && message.contains("reads version 5"), "{message}");
     assert!(matches!(
         Store::open_read_only(directory.path()).await,
         Err(StoreError::Version { found: 7, reads: 4, .. })
