@@ -6,8 +6,8 @@ use crate::output::Table;
 
 /// Columns of titles.
 const TITLE: usize = 12;
-/// Columns of a terminal, and of what is read by other programs.
-const WIDTHS: [usize; 2] = [80, 200];
+/// Columns of a terminal, and of what other programs read.
+const WIDTHS: [usize; 2] = [80, usize::MAX];
 /// Lines of a screen.
 const HEIGHT: usize = 40;
 /// Lines of a table besides its rows.
