@@ -111,5 +111,5 @@ fn per_hour(status: &Status) -> Option<f64> {
 fn in_words(failure: &FailureCount) -> String {
     let FailureCount { class, labelled, given_up, unfinished } = failure;
     let (class, jobs) = (class.replace('_', " "), labelled + given_up + unfinished);
-    format!("{class} in {jobs}: {labelled} labelled later, {given_up} given up, {unfinished} not done")
+    format!("{class} in {jobs}: {labelled} labelled later, {given_up} given up, {unfinished} open")
 }
