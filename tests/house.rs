@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 /// Every package, where it lives, and the packages that it may depend on.
-const HOUSE: [(&str, &str, &[&str]); 12] = [
+const HOUSE: [(&str, &str, &[&str]); 13] = [
     ("atoms", "crates/atoms", &[]),
     ("npz", "crates/npz", &[]),
     ("calm", "crates/calm", &["npz"]),
@@ -14,10 +14,15 @@ const HOUSE: [(&str, &str, &[&str]); 12] = [
     ("md", "crates/md", &["atoms"]),
     ("dft", "crates/dft", &["atoms"]),
     ("analysis", "crates/analysis", &[]),
+    ("slurm", "crates/slurm", &[]),
     ("wire", "crates/wire", &["atoms", "calm"]),
     ("store", "store", &["atoms", "wire"]),
-    ("workers", "workers", &["atoms", "calm", "potentials", "md", "dft", "analysis", "wire", "store"]),
-    ("orchestrator", "orchestrator", &["atoms", "calm", "wire", "store"]),
+    (
+        "workers",
+        "workers",
+        &["atoms", "calm", "potentials", "md", "dft", "analysis", "slurm", "wire", "store"],
+    ),
+    ("orchestrator", "orchestrator", &["atoms", "calm", "slurm", "wire", "store"]),
     (
         "calmwalk",
         "",

@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 39] = [
+pub(super) const CHANGEABLE: [&str; 41] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -20,6 +20,8 @@ pub(super) const CHANGEABLE: [&str; 39] = [
     "label.memory",
     "label.scratch",
     "label.keep",
+    "label.batch_system",
+    "label.batch_options",
     "label.queue_limit",
     "label.queue_full",
     "label.guard.shortest_bond",

@@ -121,13 +121,26 @@ pub fn check_label(label: &LabelSection) -> Result<(), Wrong> {
     if let Some((key, found, expected)) = label.guard.fault() {
         return wrong(key, found, expected);
     }
+    if let Some(option) = label.batch_options.iter().find(|option| !is_option(option)) {
+        let expected = "options of sbatch, each with its value in one piece: \"--partition=long\"";
+        return wrong("label.batch_options", format!("{option:?}"), expected);
+    }
     match &label.scratch {
+        None if label.batch_system.is_some() => {
+            let expected = "with label.batch_system, a directory that every node sees by the same name";
+            wrong("label.scratch", "left out", expected)
+        }
         // Labellers may be on other hosts, where the directory of the configuration is not.
         Some(scratch) if !scratch.is_absolute() => {
             wrong("label.scratch", scratch.display(), "an absolute path, such as \"/scratch\"")
         }
         _ => Ok(()),
     }
+}
+
+/// It becomes a line of a script.
+fn is_option(text: &str) -> bool {
+    text.starts_with('-') && !text.chars().any(char::is_control)
 }
 
 /// Keys with what was found and the largest that makes sense.

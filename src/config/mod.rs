@@ -18,7 +18,7 @@ use orchestrator::selector::{Mode, UpdateProtocol};
 use serde::{Deserialize, Serialize};
 use store::{Location, StoreError};
 use toml::Spanned;
-use workers::labeller::{Keep, LabelGuard, Running};
+use workers::labeller::{BatchSystem, Keep, LabelGuard, Running};
 use workers::settings::ThermostatKind;
 
 pub use changes::{Change, changed_keys, compare, without_changeable};
@@ -244,6 +244,11 @@ pub struct LabelSection {
     /// Which of these directories are kept in the store.
     #[serde(default)]
     pub keep: Keep,
+    /// The batch system that each calculation is a job of; left out, they run beside the labeller.
+    pub batch_system: Option<BatchSystem>,
+    /// Further options of its jobs.
+    #[serde(default)]
+    pub batch_options: Vec<String>,
     /// Walkers wait while more jobs than this are unfinished, or the threshold is raised.
     #[serde(default = "defaults::queue_limit")]
     pub queue_limit: NonZeroU32,
@@ -406,6 +411,8 @@ impl LabelSection {
             memory: self.memory.map(Positive::get),
             scratch: self.scratch.clone(),
             keep: self.keep,
+            batch_system: self.batch_system,
+            batch_options: self.batch_options.clone(),
         }
     }
 }

@@ -279,6 +279,8 @@ pub struct Lease {
     /// Classes of the attempts that failed since the job was last put into the queue by hand, and of those that were lost
     /// with a class, oldest first.
     pub failures: Vec<String>,
+    /// What the attempts that failed said of their own calculations, in the end.
+    pub failed_calculations: Vec<String>,
     /// Somebody has put the job into the queue by hand: guards let it pass.
     pub overruled: bool,
     /// The structure to label.

@@ -1,23 +1,18 @@
-//! Slurm's own commands, asked and told as child processes.
+//! The jobs of a campaign, as Slurm's own commands show and take them.
 
 use std::ffi::{OsStr, OsString};
-use std::io;
 use std::path::{Path, PathBuf};
-use std::process::Stdio;
 use std::time::Duration;
 
-use tokio::process::Command;
+use ::slurm::{Commands, SlurmError};
 
 use super::job::{Job, JobNames, Role, comment};
 use super::plan::Submission;
 
-/// Jobs in one call of `scancel`.
-const AT_ONCE: usize = 200;
-
 /// Slurm, as far as this host can reach it.
 #[derive(Clone, Debug)]
 pub struct Slurm {
-    patience: Duration,
+    commands: Commands,
 }
 
 /// Everything about a submission that is the same for all jobs of a kind.
@@ -37,70 +32,19 @@ pub struct Request<'a> {
     pub options: &'a [String],
 }
 
-/// Why Slurm did not do what it was asked for.
-#[derive(Debug, thiserror::Error)]
-pub enum SlurmError {
-    /// There is no such command.
-    #[error("cannot start {program}: {source}; Slurm's commands have to be on the PATH")]
-    Missing {
-        /// The command.
-        program: &'static str,
-        /// Why not.
-        source: io::Error,
-    },
-    /// It takes too long.
-    #[error("{program} has given no answer for {seconds} s: is slurmctld at work? ('scontrol ping' says so)")]
-    Silent {
-        /// The command.
-        program: &'static str,
-        /// How long.
-        seconds: u64,
-    },
-    /// It has failed.
-    #[error("{program} failed: {said}")]
-    Failed {
-        /// The command.
-        program: &'static str,
-        /// What it wrote.
-        said: String,
-    },
-    /// It says something else than what it was asked for.
-    #[error("{program} wrote {found:?}, and {expected} was expected")]
-    Unreadable {
-        /// The command.
-        program: &'static str,
-        /// What it wrote.
-        found: String,
-        /// What it should have written.
-        expected: &'static str,
-    },
-}
-
-impl SlurmError {
-    /// Whether there is no Slurm here at all.
-    pub fn is_missing(&self) -> bool {
-        matches!(self, Self::Missing { source, .. } if source.kind() == io::ErrorKind::NotFound)
-    }
-}
-
 impl Slurm {
     /// Who does not wait for an answer for longer than this.
     pub fn with_patience(patience: Duration) -> Self {
-        Self { patience }
+        Self { commands: Commands::with_patience(patience) }
     }
 
     /// The jobs of a campaign that this user has: all that wait or run, and those that have ended within the last minutes
     /// (`MinJobAge` in Slurm's configuration).
     pub async fn jobs(&self, names: &JobNames) -> Result<Vec<Job>, SlurmError> {
-        const SQUEUE: &str = "squeue";
-        let user = rustix::process::getuid().as_raw();
-        let arguments =
-            ["--noheader", "--states=all", "--array", &format!("--user={user}"), "--format", Job::FORMAT];
-        let text = self.ask(SQUEUE, arguments).await?;
+        let text = self.commands.queue(Job::FORMAT, &["--states=all"]).await?;
         let job = |line: &str| {
-            let expected = "what --format asks for";
-            let unreadable =
-                |()| SlurmError::Unreadable { program: SQUEUE, found: line.to_owned(), expected };
+            let (found, expected) = (line.to_owned(), "what --format asks for");
+            let unreadable = |()| SlurmError::Unreadable { program: "squeue", found, expected };
             Job::parse(line, names).map_err(unreadable).transpose()
         };
         text.lines().filter_map(job).collect()
@@ -108,9 +52,7 @@ impl Slurm {
 
     /// The exit code of a job that has ended as `code:signal`, while Slurm still knows it.
     pub async fn exit_code(&self, id: u64) -> Result<Option<String>, SlurmError> {
-        let text = self.ask("scontrol", ["--oneliner", "show", "job", &id.to_string()]).await?;
-        let code = text.split_whitespace().find_map(|word| word.strip_prefix("ExitCode="));
-        Ok(code.map(str::to_owned))
+        self.commands.exit_code(id).await
     }
 
     /// Submits a job and returns its number.
@@ -120,49 +62,13 @@ impl Slurm {
         submission: &Submission,
         request: &Request<'_>,
     ) -> Result<u64, SlurmError> {
-        const SBATCH: &str = "sbatch";
-        let text = self.ask(SBATCH, request.arguments(names, submission)).await?;
-        // With several clusters its name follows.
-        let id = text.trim().split(';').next().and_then(|id| id.parse().ok());
-        let expected = "the number of a job";
-        id.ok_or_else(|| SlurmError::Unreadable { program: SBATCH, found: text.trim().to_owned(), expected })
+        self.commands.submit(&request.arguments(names, submission)).await
     }
 
     /// Has jobs ended: each process of theirs gets SIGTERM, and SIGKILL after Slurm's `KillWait`. Those that have ended
     /// are no error.
     pub async fn cancel(&self, ids: &[u64]) -> Result<(), SlurmError> {
-        for ids in ids.chunks(AT_ONCE) {
-            let ids = ids.iter().map(u64::to_string);
-            self.ask("scancel", ["--quiet".to_owned()].into_iter().chain(ids)).await?;
-        }
-        Ok(())
-    }
-
-    /// What a command writes to its standard output.
-    async fn ask(
-        &self,
-        program: &'static str,
-        arguments: impl IntoIterator<Item = impl AsRef<OsStr>>,
-    ) -> Result<String, SlurmError> {
-        let mut command = Command::new(program);
-        command.args(arguments).stdin(Stdio::null()).kill_on_drop(true);
-        // Habits of the user that would show something else than is expected.
-        for (name, _) in std::env::vars_os() {
-            let text = name.to_string_lossy();
-            if text.starts_with("SQUEUE_") || text.starts_with("SCANCEL_") {
-                command.env_remove(&name);
-            }
-        }
-        command.env("SLURM_TIME_FORMAT", "standard");
-        let silent = |_| SlurmError::Silent { program, seconds: self.patience.as_secs() };
-        let output = tokio::time::timeout(self.patience, command.output()).await.map_err(silent)?;
-        let output = output.map_err(|source| SlurmError::Missing { program, source })?;
-        if !output.status.success() {
-            let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-            let said = if said.is_empty() { output.status.to_string() } else { said };
-            return Err(SlurmError::Failed { program, said });
-        }
-        Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+        self.commands.cancel(ids).await
     }
 }
 
@@ -176,7 +82,6 @@ impl Request<'_> {
             dependency.push(format!("after:{id}"));
         }
         let mut arguments: Vec<OsString> = self.options.iter().map(Into::into).collect();
-        arguments.push("--parsable".into());
         arguments.push(format!("--job-name={}", names.of(role)).into());
         arguments.push(format!("--dependency={}", dependency.join(",")).into());
         if let Role::Agent(_) = role {

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use ::slurm::Phase;
+
 /// What a job of a campaign does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
@@ -17,19 +19,6 @@ pub enum Role {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct JobNames {
     prefix: String,
-}
-
-/// Where a job stands, as far as it matters to what is to be submitted.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Phase {
-    /// It waits.
-    Pending,
-    /// It has a node. States that are not known count as this one: nothing is submitted beside them.
-    Running,
-    /// It ends; it may be requeued then.
-    Completing,
-    /// It has ended and will not come back.
-    Over,
 }
 
 /// A job, as `squeue` shows it.
@@ -130,17 +119,7 @@ impl Job {
 
     /// Where it stands.
     pub fn phase(&self) -> Phase {
-        match self.state.as_str() {
-            "PENDING" | "REQUEUED" | "REQUEUE_FED" | "REQUEUE_HOLD" | "RESV_DEL_HOLD" | "SPECIAL_EXIT" => {
-                Phase::Pending
-            }
-            "COMPLETING" => Phase::Completing,
-            "BOOT_FAIL" | "CANCELLED" | "COMPLETED" | "DEADLINE" | "FAILED" | "LAUNCH_FAILED"
-            | "NODE_FAIL" | "OUT_OF_MEMORY" | "PREEMPTED" | "RECONFIG_FAIL" | "REVOKED" | "TIMEOUT" => {
-                Phase::Over
-            }
-            _ => Phase::Running,
-        }
+        Phase::of(&self.state)
     }
 }
 
@@ -190,22 +169,5 @@ mod tests {
         {
             assert_eq!(Job::parse(line, &names), Err(()), "{line}");
         }
-    }
-
-    #[test]
-    fn a_state_that_nobody_knows_is_that_of_a_living_job() {
-        let job = |state: &str| Job {
-            id: 1,
-            role: Role::Orchestrator,
-            state: state.into(),
-            nodes: String::new(),
-            start: String::new(),
-            time_left: String::new(),
-            walkers: None,
-            reason: None,
-        };
-        let phase = |state| job(state).phase();
-        assert_eq!([phase("CONFIGURING"), phase("SUSPENDED"), phase("DREAMING")], [Phase::Running; 3]);
-        assert_eq!([phase("FAILED"), phase("NODE_FAIL"), phase("COMPLETED")], [Phase::Over; 3]);
     }
 }

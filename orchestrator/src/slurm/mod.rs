@@ -13,6 +13,7 @@ mod job;
 mod plan;
 mod stop;
 
-pub use commands::{Request, Slurm, SlurmError};
-pub use job::{Job, JobNames, Phase, Role};
+pub use ::slurm::{Phase, SlurmError};
+pub use commands::{Request, Slurm};
+pub use job::{Job, JobNames, Role};
 pub use plan::{Plan, Submission, Wanted, plan};

@@ -2,7 +2,9 @@
 
 use std::cmp::Reverse;
 
-use super::job::{Job, Phase, Role};
+use ::slurm::Phase;
+
+use super::job::{Job, Role};
 
 /// What is asked for, beside an orchestrator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

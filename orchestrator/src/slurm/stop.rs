@@ -2,10 +2,11 @@
 
 use std::time::{Duration, Instant};
 
+use ::slurm::{Phase, SlurmError};
 use tokio::time::sleep;
 
-use super::commands::{Slurm, SlurmError};
-use super::job::{Job, JobNames, Phase, Role};
+use super::commands::Slurm;
+use super::job::{Job, JobNames, Role};
 
 /// Between two looks at jobs that are ending.
 const LOOK: Duration = Duration::from_secs(1);

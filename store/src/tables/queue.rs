@@ -117,6 +117,7 @@ impl Store {
             protocol,
             earlier_calculations: earlier_calculations(&mut transaction, job, attempt).await?,
             failures: classes_of_failures(&mut transaction, job, next.failures).await?,
+            failed_calculations: failed_calculations(&mut transaction, job).await?,
             overruled: next.overruled.is_some(),
             structure: structure_of(&mut transaction, next.structure).await?,
             candidate: candidate_of(&mut transaction, next.decision).await?,
@@ -383,6 +384,14 @@ async fn earlier_calculations(transaction: &mut Transaction, job: i64, attempt: 
                               AND outcome NOT IN ('expired', 'lost', 'released'))
                ORDER BY attempt DESC";
     query(sql).bind(job).bind(attempt).fetch_all(&mut *transaction).await
+}
+
+/// Of those that failed, and of those that were lost and it is known why.
+async fn failed_calculations(transaction: &mut Transaction, job: i64) -> Result<Vec<String>> {
+    let sql =
+        "SELECT calculation FROM attempt WHERE job = $1 AND class IS NOT NULL AND calculation IS NOT NULL
+               AND outcome IN ('failed', 'lost') ORDER BY attempt";
+    query(sql).bind(job).fetch_all(&mut *transaction).await
 }
 
 /// Of the last `failures` attempts that failed, and of what was lost with a class since, oldest first.

@@ -14,11 +14,13 @@ use store::{Store, StoreError};
 use tokio::sync::OnceCell;
 use tokio::task::spawn_blocking;
 
-use super::here::{Found, Kept, Ready};
+use super::begun::{Begun, Found};
+use super::here;
 use super::keeper::{Calculation, End, How, WORK};
 use super::method::Made;
 use super::prepare::{Prepared, prepare, read, write};
-use super::{Closing, KeeperCommand, Once, Running, insist, log, scratch};
+use super::slurm::{self, Slurm};
+use super::{BatchSystem, Closing, KeeperCommand, Once, Running, insist, log, scratch};
 
 /// Another program, and how it is run.
 pub struct CodeMethod {
@@ -28,11 +30,12 @@ pub struct CodeMethod {
     /// Where the calculations of this campaign are.
     home: OnceCell<PathBuf>,
     in_hand: Mutex<Option<InHand>>,
+    slurm: Slurm,
 }
 
 /// A calculation that this labeller waits for.
 struct InHand {
-    kept: Kept,
+    begun: Begun,
     /// Its keeper, if this process started it, and so has to take note of its end.
     keeper: Option<Child>,
 }
@@ -42,12 +45,21 @@ pub(super) struct Ended {
     pub core_seconds: f64,
     /// The end of what the program said.
     pub log: String,
-    kept: Kept,
+    /// Where it ran, if a batch system had it run.
+    node: Option<String>,
+    begun: Begun,
+}
+
+/// A calculation that only waits for a word.
+enum Ready {
+    Here(here::Ready),
+    Slurm(slurm::Job),
 }
 
 impl CodeMethod {
     pub(super) fn new(keeper: KeeperCommand, code: Box<dyn Code>, running: Running) -> Self {
-        Self { code: code.into(), running, keeper, home: OnceCell::new(), in_hand: Mutex::default() }
+        let (home, in_hand, slurm) = (OnceCell::new(), Mutex::default(), Slurm::default());
+        Self { code: code.into(), running, keeper, home, in_hand, slurm }
     }
 
     pub(super) fn size(&self, structure: &Structure) -> Size {
@@ -68,28 +80,32 @@ impl CodeMethod {
             Ok(prepared) => prepared,
             Err(failure) => return Ok(Made { result: Err(failure), ended: None }),
         };
-        let record = async |kept: &Kept| {
-            let identity = identity(kept);
+        let record = async |begun: &Begun| {
+            let identity = begun.identity();
             insist(closing, || store.record_calculation(lease, &identity, &prepared.record)).await
         };
         let home = self.home(store, closing).await?;
-        let kept = match self.find(&lease.earlier_calculations).await? {
-            Some(kept) => {
-                self.take(kept.clone(), None);
-                record(&kept).await?;
-                kept
+        let begun = match self.find(&lease.earlier_calculations).await? {
+            Some((begun, found)) => {
+                self.take(begun.clone(), None);
+                record(&begun).await?;
+                if let (Begun::Slurm(job), Found::Ready) = (&begun, found) {
+                    self.slurm.submit(job).await?;
+                }
+                begun
             }
             None => {
                 let directory = home.join(scratch::name(lease.job, lease.attempt));
-                let ready = self.ready(&directory, &prepared)?;
-                record(&ready.kept).await?;
-                self.go(ready)?
+                let ready = self.ready(&directory, &prepared, &nodes(lease)).await?;
+                record(&ready.begun()).await?;
+                self.go(ready).await?
             }
         };
-        match kept.end().await {
-            Some(end) => self.read(lease.structure.clone(), kept, end).await,
-            None => self.broken_off(kept).await,
+        let made = self.outcome(lease.structure.clone(), begun).await?;
+        if let Some(failed) = failed_elsewhere(&made) {
+            record(&failed).await?;
         }
+        Ok(made)
     }
 
     /// A calculation that no campaign knows of.
@@ -100,11 +116,9 @@ impl CodeMethod {
             Err(failure) => return Ok(none(Err(failure))),
         };
         let name = format!("calmwalk-once-{}", scratch::name(std::process::id().into(), 1));
-        let kept = self.go(self.ready(&self.running.scratch().join(name), &prepared)?)?;
-        let made = match kept.end().await {
-            Some(end) => self.read(structure.clone(), kept, end).await,
-            None => self.broken_off(kept).await,
-        };
+        let directory = self.running.scratch().join(name);
+        let begun = self.go(self.ready(&directory, &prepared, &[]).await?).await?;
+        let made = self.outcome(structure.clone(), begun).await;
         self.abandon().await?;
         let Made { result, ended } = made?;
         Ok(match ended {
@@ -129,34 +143,40 @@ impl CodeMethod {
             let campaign = insist(closing, || store.campaign()).await?.id;
             let home = self.running.scratch().join(format!("calmwalk-{campaign}"));
             fs::create_dir_all(&home).map_err(|error| file(&home, error))?;
-            scratch::tidy(store, &home, self.running.keep, closing).await?;
+            scratch::tidy(store, &home, self.running.keep, &self.slurm, closing).await?;
             Ok(home)
         };
         self.home.get_or_try_init(make).await.map(PathBuf::as_path)
     }
 
-    /// The newest of these calculations that goes on here, or has ended and can be read. What is left of the others here
-    /// is removed.
-    async fn find(&self, earlier: &[String]) -> Result<Option<Kept>, StoreError> {
+    /// The newest of these calculations that goes on, or has ended and can be read. What is left of the others is removed.
+    async fn find(&self, earlier: &[String]) -> Result<Option<(Begun, Found)>, StoreError> {
         // One that was taken over is named by each attempt that waited for it.
         let mut named = BTreeSet::new();
-        let once = earlier.iter().filter(|text| named.insert(*text));
-        let known: Vec<Kept> = once.filter_map(|text| serde_json::from_str(text).ok()).collect();
+        let known = earlier.iter().filter_map(|text| Begun::parse(text));
+        let once: Vec<_> = known.filter(|begun| named.insert(begun.directory().to_owned())).collect();
         let mut found = None;
-        for kept in known {
-            match kept.look() {
+        for begun in once {
+            match begun.look(&self.slurm).await? {
                 Found::Elsewhere => {}
-                Found::Ended(End { how: How::NotStarted(_), .. }) => clear(kept).await?,
-                Found::Ended(_) | Found::Running if found.is_none() => found = Some(kept),
-                _ => clear(kept).await?,
+                Found::Ended(End { how: How::NotStarted(_), .. }) | Found::Gone => {
+                    begun.clear(&self.slurm).await?;
+                }
+                look if found.is_none() => found = Some((begun, look)),
+                _ => begun.clear(&self.slurm).await?,
             }
         }
         Ok(found)
     }
 
-    /// A directory with the input in it, and a keeper that waits.
-    fn ready(&self, directory: &Path, prepared: &Prepared) -> Result<Ready, StoreError> {
-        let Prepared { input, time_limit, memory_limit, .. } = prepared;
+    /// A directory with the input in it, and who waits for a word to begin.
+    async fn ready(
+        &self,
+        directory: &Path,
+        prepared: &Prepared,
+        failed_on: &[String],
+    ) -> Result<Ready, StoreError> {
+        let Prepared { input, time_limit, memory_limit, avoids_nodes, .. } = prepared;
         let mut environment: Vec<_> = input.environment.clone().into_iter().collect();
         environment.push(("CALMWALK_CORES".to_owned(), self.running.cores.to_string()));
         let calculation = Calculation {
@@ -167,50 +187,80 @@ impl CodeMethod {
             memory_limit: *memory_limit,
             keeper: self.keeper.clone(),
         };
-        let ready = write(directory, input).and_then(|()| Ready::start(calculation));
+        let written = write(directory, input);
+        let ready = match self.running.batch_system {
+            None => written.and_then(|()| here::Ready::start(calculation)).map(Ready::Here),
+            Some(BatchSystem::Slurm) => {
+                let (cores, options) = (self.running.cores, self.running.batch_options.as_slice());
+                let avoid = if *avoids_nodes { failed_on } else { &[] };
+                let wanted = slurm::Wanted { cores, options, avoid };
+                let job = self.slurm.job(directory).await?;
+                written.and_then(|()| slurm::write(calculation, &wanted)).map(|()| Ready::Slurm(job))
+            }
+        };
         ready.map_err(|error| file(directory, error))
     }
 
     /// Has the calculation begin.
-    fn go(&self, ready: Ready) -> Result<Kept, StoreError> {
-        let kept = ready.kept.clone();
-        let keeper = ready.go().map_err(|error| file(&kept.directory, error))?;
-        self.take(kept.clone(), Some(keeper));
-        Ok(kept)
+    async fn go(&self, ready: Ready) -> Result<Begun, StoreError> {
+        let begun = ready.begun();
+        match ready {
+            Ready::Here(ready) => {
+                let keeper = ready.go().map_err(|error| file(begun.directory(), error))?;
+                self.take(begun.clone(), Some(keeper));
+            }
+            Ready::Slurm(job) => {
+                self.take(begun.clone(), None);
+                self.slurm.submit(&job).await?;
+            }
+        }
+        Ok(begun)
+    }
+
+    /// Waits for the end of a calculation, and reads its numbers.
+    async fn outcome(&self, structure: Structure, begun: Begun) -> Result<Made, StoreError> {
+        match begun.end(&self.slurm).await? {
+            Some(end) => self.read(structure, begun, end).await,
+            None => self.broken_off(begun).await,
+        }
     }
 
     /// Judges a calculation that has ended, and reads its numbers.
-    async fn read(&self, structure: Structure, kept: Kept, end: End) -> Result<Made, StoreError> {
-        let (code, work) = (Arc::clone(&self.code), kept.directory.join(WORK));
+    async fn read(&self, structure: Structure, begun: Begun, end: End) -> Result<Made, StoreError> {
+        let (code, work) = (Arc::clone(&self.code), begun.directory().join(WORK));
         let directory = work.clone();
         let exit = match end.how {
             How::NotStarted(number) => {
-                clear(kept).await?;
+                begun.remove().await?;
                 self.reap();
                 return Err(file(&end.program, io::Error::from_raw_os_error(number)));
             }
             How::Ended(exit) => exit,
         };
-        let result = blocking(move || read(&*code, &structure, &directory, exit)).await;
+        let mut result = blocking(move || read(&*code, &structure, &directory, exit)).await;
+        if let (Err(failure), Some(remark)) = (&mut result, &end.remark) {
+            failure.message.clone_from(remark);
+        }
         let core_seconds = end.seconds * f64::from(self.running.cores);
-        Ok(Made { result, ended: Some(Ended { core_seconds, log: log::tail(&work), kept }) })
+        let log = log::tail(&work);
+        Ok(Made { result, ended: Some(Ended { core_seconds, log, node: end.node, begun }) })
     }
 
     /// Somebody killed the keeper, which says nothing about the job.
-    async fn broken_off(&self, kept: Kept) -> Result<Made, StoreError> {
-        clear(kept).await?;
+    async fn broken_off(&self, begun: Begun) -> Result<Made, StoreError> {
+        begun.clear(&self.slurm).await?;
         self.reap();
         let result = Err(FailureClass::LostNode.because("the process that kept the calculation was killed"));
         Ok(Made { result, ended: None })
     }
 
-    fn take(&self, kept: Kept, keeper: Option<Child>) {
-        *self.in_hand() = Some(InHand { kept, keeper });
+    fn take(&self, begun: Begun, keeper: Option<Child>) {
+        *self.in_hand() = Some(InHand { begun, keeper });
     }
 
     /// What is said of the calculation in hand in the store.
     pub(super) fn calculation(&self) -> Option<String> {
-        self.in_hand().as_ref().map(|in_hand| identity(&in_hand.kept))
+        self.in_hand().as_ref().map(|in_hand| in_hand.begun.identity())
     }
 
     /// It goes on without this labeller.
@@ -220,9 +270,9 @@ impl CodeMethod {
 
     /// Ends it, and removes what is left of it.
     pub(super) async fn abandon(&self) -> Result<(), StoreError> {
-        let kept = self.in_hand().as_ref().map(|in_hand| in_hand.kept.clone());
-        if let Some(kept) = kept {
-            clear(kept).await?;
+        let begun = self.in_hand().as_ref().map(|in_hand| in_hand.begun.clone());
+        if let Some(begun) = begun {
+            begun.clear(&self.slurm).await?;
             self.reap();
         }
         Ok(())
@@ -247,9 +297,9 @@ impl CodeMethod {
         failed: bool,
     ) -> Result<(), StoreError> {
         if self.running.keep.keeps(failed) {
-            scratch::pack(store, lease.job, lease.attempt, closing, &ended.kept.directory).await?;
+            scratch::pack(store, lease.job, lease.attempt, closing, ended.begun.directory()).await?;
         }
-        clear(ended.kept).await?;
+        ended.begun.remove().await?;
         self.reap();
         Ok(())
     }
@@ -264,14 +314,34 @@ pub(super) fn classes(lease: &Lease) -> Vec<FailureClass> {
     lease.failures.iter().filter_map(|name| FailureClass::named(name)).collect()
 }
 
-fn identity(kept: &Kept) -> String {
-    serde_json::to_string(kept).expect("plain data becomes JSON")
+/// Nodes on which a job failed, where another may help.
+fn nodes(lease: &Lease) -> Vec<String> {
+    let failed = lease.failed_calculations.iter().filter_map(|text| Begun::parse(text));
+    let nodes = failed.filter_map(|begun| match begun {
+        Begun::Slurm(job) => job.node,
+        Begun::Here(_) => None,
+    });
+    nodes.collect::<BTreeSet<_>>().into_iter().collect()
 }
 
-/// Ends what is left of a calculation, and removes its directory.
-async fn clear(kept: Kept) -> Result<(), StoreError> {
-    let directory = kept.directory.clone();
-    blocking(move || kept.clear()).await.map_err(|error| file(&directory, error))
+/// A calculation that failed and may do better on another node, with the node that it had.
+fn failed_elsewhere(made: &Made) -> Option<Begun> {
+    use FailureClass::{Crashed, LostNode, OutOfMemory};
+    let Made { result: Err(failure), ended: Some(Ended { begun: Begun::Slurm(job), node, .. }) } = made
+    else {
+        return None;
+    };
+    let may_help = matches!(failure.class, Crashed | LostNode | OutOfMemory) && node.is_some();
+    may_help.then(|| Begun::Slurm(slurm::Job { node: node.clone(), ..job.clone() }))
+}
+
+impl Ready {
+    fn begun(&self) -> Begun {
+        match self {
+            Self::Here(ready) => Begun::Here(ready.kept.clone()),
+            Self::Slurm(job) => Begun::Slurm(job.clone()),
+        }
+    }
 }
 
 /// What takes time, in a thread of its own. If it panics, so does who waits for it.

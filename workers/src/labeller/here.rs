@@ -9,6 +9,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use store::{is_local, is_running, process_birth, this_host};
 
+use super::begun::Found;
 use super::keeper::{self, Calculation, End, Order};
 use super::session;
 
@@ -25,18 +26,6 @@ pub(super) struct Kept {
     pub directory: PathBuf,
     pub pid: u32,
     pub birth: String,
-}
-
-/// What is found of one.
-#[derive(Debug, PartialEq)]
-pub(super) enum Found {
-    /// It has ended, and waits to be read.
-    Ended(End),
-    Running,
-    /// It was broken off.
-    Gone,
-    /// Nobody can know from here.
-    Elsewhere,
 }
 
 /// A keeper that waits for its order.
@@ -87,7 +76,7 @@ impl Kept {
             match self.look() {
                 Found::Ended(end) => return Some(end),
                 Found::Running => tokio::time::sleep(pause).await,
-                Found::Gone | Found::Elsewhere => return None,
+                Found::Ready | Found::Gone | Found::Elsewhere => return None,
             }
             pause = (pause * 5 / 4).min(LONGEST_PAUSE);
         }
@@ -103,6 +92,11 @@ impl Kept {
 /// The same for the directory of a calculation whose keeper is gone.
 pub(super) fn clear(directory: &Path) -> io::Result<()> {
     session::end_marked(directory)?;
+    remove(directory)
+}
+
+/// A directory that is gone already is no error.
+pub(super) fn remove(directory: &Path) -> io::Result<()> {
     match fs::remove_dir_all(directory) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
         _ => Ok(()),

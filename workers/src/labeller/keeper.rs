@@ -30,6 +30,8 @@ const END: &str = "end.json";
 const LOOK: Duration = Duration::from_millis(500);
 /// The variable by which everything that a calculation starts can be known: its directory.
 pub(super) const MARK: &str = "CALMWALK_CALCULATION";
+/// In this variable Slurm says on which node a job runs.
+const NODE: &str = "SLURMD_NODENAME";
 /// What the second process leaves there if it could not become the program.
 const NOT_STARTED: &str = "not-started";
 
@@ -91,6 +93,12 @@ pub(super) struct End {
     pub seconds: f64,
     /// Most bytes that its processes were seen to have in memory together; 0 where nobody looked.
     pub memory: u64,
+    /// Node of the batch system on which it ran.
+    #[serde(default)]
+    pub node: Option<String>,
+    /// What is known of it if no keeper left this, but another found it out.
+    #[serde(default)]
+    pub remark: Option<String>,
 }
 
 /// See [`End`].
@@ -184,7 +192,8 @@ impl Calculation {
             (None, None) => How::Ended(exit(status)),
         };
         let program = self.command.first().map(PathBuf::from).unwrap_or_default();
-        End { how, program, seconds: begun.elapsed().as_secs_f64(), memory }.write(&self.directory)
+        let (seconds, node) = (begun.elapsed().as_secs_f64(), std::env::var(NODE).ok());
+        End { how, program, seconds, memory, node, remark: None }.write(&self.directory)
     }
 
     fn start(&self) -> io::Result<Child> {

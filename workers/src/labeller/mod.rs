@@ -2,6 +2,7 @@
 //!
 //! [`run`] is one of the tasks of a process, [`serve`] a process of its own, which outlives its orchestrator.
 
+mod begun;
 mod closing;
 mod code;
 mod difference;
@@ -20,6 +21,7 @@ mod reference;
 mod running;
 mod scratch;
 mod session;
+mod slurm;
 mod told;
 
 use std::pin::pin;
@@ -30,6 +32,7 @@ use store::records::{Label, LabelDetails, Lease, Protocol};
 use store::{Store, StoreError, Whereabouts};
 
 use closing::Wanted;
+use code::Ended;
 use judge::judge;
 use method::Made;
 use told::Became;
@@ -43,7 +46,7 @@ pub use method::Method;
 pub use once::{Once, label_once};
 pub use presence::{Stay, serve};
 pub use reference::ReferenceMethod;
-pub use running::{Keep, Running};
+pub use running::{BatchSystem, Keep, Running};
 
 /// Between two signs of life in the store, of every process that gives them there.
 pub const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
@@ -153,42 +156,64 @@ pub async fn run(
             tell(&format!("{} is refused: {reason}", lease.candidate));
             continue;
         }
-        let Made { result, ended } =
-            match make(&store, &method, &lease, &settings.timing, closing, &now).await? {
-                Work::Done(made) => *made,
-                Work::NotWanted => {
-                    method.stop().await?;
-                    tell(&format!(
-                        "{} is given up here: it has its label, or is wanted no more",
-                        lease.candidate
-                    ));
-                    continue;
-                }
-                Work::LetGo => {
-                    method.let_go();
-                    tell(&format!("{} is finished by somebody else here", lease.candidate));
-                    continue;
-                }
-                Work::TooLate => {
-                    method.stop().await?;
-                    tell(&format!("{} is given back: there is no time to finish it", lease.candidate));
-                    return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
-                }
-            };
-        let judged = result.and_then(|made| judge(made, &lease.structure, settings.largest_force));
-        let log = ended.as_ref().map_or("", |ended| &ended.log);
-        if let Some(ended) = &ended {
-            insist(closing, || store.account(&lease, ended.core_seconds, log)).await?;
-        }
-        // What no remedy helps against is not tried again.
-        let no_remedy = judged.as_ref().is_err_and(|failure| method.has_no_remedy(&lease, failure));
-        let attempts = if no_remedy { 1 } else { settings.attempts };
-        let became = insist(closing, || deliver(&store, &lease, &judged, log, attempts, now())).await?;
+        let made = match make(&store, &method, &lease, &settings.timing, closing, &now).await? {
+            Work::Done(made) => *made,
+            Work::NotWanted => {
+                method.stop().await?;
+                tell(&format!(
+                    "{} is given up here: it has its label, or is wanted no more",
+                    lease.candidate
+                ));
+                continue;
+            }
+            Work::LetGo => {
+                method.let_go();
+                tell(&format!("{} is finished by somebody else here", lease.candidate));
+                continue;
+            }
+            Work::TooLate => {
+                method.stop().await?;
+                tell(&format!("{} is given back: there is no time to finish it", lease.candidate));
+                return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
+            }
+        };
+        let Brought { judged, became, ended } =
+            bring(&store, &method, &lease, &settings, made, closing, &now).await?;
         tell(&told::line(&lease, &judged, &became, begun.elapsed().as_secs_f64()));
         if let Some(ended) = ended {
             method.put_away(&store, &lease, closing, ended, judged.is_err()).await?;
         }
     }
+}
+
+/// A result that the store has.
+struct Brought {
+    judged: Result<Calculated, Failure>,
+    became: Became,
+    ended: Option<Ended>,
+}
+
+/// Judges what was made for a job, and brings it to the store with what it has cost.
+async fn bring(
+    store: &Store,
+    method: &Method,
+    lease: &Lease,
+    settings: &LabellerSettings,
+    made: Made,
+    closing: &Closing,
+    now: impl Fn() -> i64,
+) -> Result<Brought, StoreError> {
+    let Made { result, ended } = made;
+    let judged = result.and_then(|made| judge(made, &lease.structure, settings.largest_force));
+    let log = ended.as_ref().map_or("", |ended| &ended.log);
+    if let Some(ended) = &ended {
+        insist(closing, || store.account(lease, ended.core_seconds, log)).await?;
+    }
+    // What no remedy helps against is not tried again.
+    let no_remedy = judged.as_ref().is_err_and(|failure| method.has_no_remedy(lease, failure));
+    let attempts = if no_remedy { 1 } else { settings.attempts };
+    let became = insist(closing, || deliver(store, lease, &judged, log, attempts, now())).await?;
+    Ok(Brought { judged, became, ended })
 }
 
 async fn look(

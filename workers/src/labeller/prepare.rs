@@ -24,6 +24,8 @@ pub(super) struct Prepared {
     pub time_limit: f64,
     /// Bytes.
     pub memory_limit: Option<u64>,
+    /// Whether it is not to run where it failed.
+    pub avoids_nodes: bool,
 }
 
 /// Everything that is known before anything is started.
@@ -52,6 +54,7 @@ pub(super) fn prepare(
         time_limit: twice(Remedy::MoreTime) * running.time_limit,
         // The conversion saturates.
         memory_limit: memory.map(|bytes| bytes as u64),
+        avoids_nodes: remedies.contains(&Remedy::OtherNode),
     })
 }
 

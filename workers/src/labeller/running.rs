@@ -15,10 +15,25 @@ pub struct Running {
     pub time_limit: f64,
     /// Most memory of all processes of a calculation together, GB (10⁹ bytes); none for no limit.
     pub memory: Option<f64>,
-    /// Where directories of calculations are made, on a disk of this host; none for the one for temporary files.
+    /// Where directories of calculations are made, on a disk of this host; none for the one for temporary files. With a batch
+    /// system every node has to see it.
     pub scratch: Option<PathBuf>,
     /// What becomes of the directory when a calculation has ended.
     pub keep: Keep,
+    /// The batch system that each calculation is a job of; none for processes beside the labeller.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub batch_system: Option<BatchSystem>,
+    /// Further options of its jobs, as the batch system's own command takes them.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub batch_options: Vec<String>,
+}
+
+/// What runs calculations as jobs of their own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BatchSystem {
+    /// Slurm.
+    Slurm,
 }
 
 /// Which directories of calculations are packed into the store; all others are removed.
@@ -47,7 +62,15 @@ impl Keep {
 
 impl Default for Running {
     fn default() -> Self {
-        Self { cores: 1, time_limit: 86_400.0, memory: None, scratch: None, keep: Keep::default() }
+        Self {
+            cores: 1,
+            time_limit: 86_400.0,
+            memory: None,
+            scratch: None,
+            keep: Keep::default(),
+            batch_system: None,
+            batch_options: Vec::new(),
+        }
     }
 }
 

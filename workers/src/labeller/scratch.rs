@@ -6,9 +6,11 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use store::{Store, StoreError};
 
+use super::begun::{Begun, Found};
 use super::code::{blocking, file};
-use super::here::{self, Found, Kept};
+use super::here;
 use super::running::Keep;
+use super::slurm::Slurm;
 use super::{Closing, insist, pack};
 
 /// What was left behind is only cleared away when nobody can still be at it.
@@ -39,6 +41,7 @@ pub(super) async fn tidy(
     store: &Store,
     home: &Path,
     keep: Keep,
+    slurm: &Slurm,
     closing: &Closing,
 ) -> Result<(), StoreError> {
     let entries = fs::read_dir(home).map_err(|error| file(home, error))?;
@@ -47,9 +50,9 @@ pub(super) async fn tidy(
         let past = insist(closing, || store.past_calculation(job, attempt)).await?;
         // Of a copy of this campaign.
         let Some(past) = past.filter(|past| !past.wanted) else { continue };
-        let kept = past.calculation.as_deref().and_then(|text| serde_json::from_str(text).ok());
-        let is_over = match kept.filter(|kept: &Kept| kept.directory == directory) {
-            Some(kept) => !matches!(kept.look(), Found::Running),
+        let begun = past.calculation.as_deref().and_then(Begun::parse);
+        let is_over = match begun.filter(|begun| begun.directory() == directory) {
+            Some(begun) => !matches!(begun.look(slurm).await?, Found::Running),
             // Whoever made it was killed before anything began.
             None => true,
         };

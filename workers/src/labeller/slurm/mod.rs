@@ -1,0 +1,243 @@
+//! A calculation as a job of its own in the batch system Slurm.
+//!
+//! Its directory, which every node sees, has all that it needs: whoever finds it there, and that Slurm does not know its
+//! name, submits it (again). Of two jobs of one name the second waits for the end of the first (`singleton`), and only
+//! the one that makes the directory [`BEGUN`] calculates, so what was submitted twice, because an answer was lost, is calculated once.
+//!
+//! The end is what the keeper leaves, as everywhere. Slurm is asked seldom, only to find jobs that cannot leave one any more;
+//! as long as it does not answer nothing is concluded.
+
+mod script;
+mod shared;
+mod told;
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use ::slurm::{Commands, Phase, SlurmError};
+use serde::{Deserialize, Serialize};
+use store::StoreError;
+use tokio::sync::OnceCell;
+use tokio::time::sleep;
+
+use super::begun::Found;
+use super::code::file;
+use super::keeper::End;
+use told::Told;
+
+pub(super) use script::{Wanted, write};
+
+/// Made in the directory by the job that calculates.
+const BEGUN: &str = "begun";
+/// What the job is told to do.
+const SCRIPT: &str = "job.sh";
+/// What its keeper reads.
+const ORDER: &str = "order.json";
+/// What Slurm and the script say.
+const LOG: &str = "slurm.log";
+
+/// No answer is waited for for longer.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Between two looks at the directory of a calculation that has just begun …
+const SHORTEST_PAUSE: Duration = Duration::from_millis(50);
+/// … and of one that has lasted for a while.
+const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+/// Between two questions to Slurm.
+const LOOK: Duration = Duration::from_secs(20);
+/// What a node has written may be seen here so much later.
+const SETTLING: Duration = Duration::from_secs(2);
+/// Between two tries to submit …
+const PAUSE: Duration = Duration::from_secs(3);
+/// … of which so many may be refused, though Slurm answers.
+const TRIES: u32 = 3;
+/// How long a cancelled job may take to end, before its directory is left for later.
+const ENDING: Duration = Duration::from_secs(5);
+
+/// What finds a job again.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Job {
+    /// Elsewhere the name says nothing.
+    pub cluster: String,
+    pub directory: PathBuf,
+    /// That of no other calculation.
+    pub name: String,
+    /// Where it failed, if it may go better on another node.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub node: Option<String>,
+}
+
+/// Slurm, as jobs of calculations need it.
+pub(super) struct Slurm {
+    commands: Commands,
+    cluster: OnceCell<String>,
+}
+
+impl Default for Slurm {
+    fn default() -> Self {
+        Self { commands: Commands::with_patience(PATIENCE), cluster: OnceCell::new() }
+    }
+}
+
+impl Slurm {
+    /// The job of the calculation in this directory, below that of its campaign.
+    pub async fn job(&self, directory: &Path) -> Result<Job, StoreError> {
+        let last = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let campaign = directory.parent().map(last).filter(|name| name.starts_with("calmwalk-"));
+        let name = campaign.into_iter().chain([last(directory)]).collect::<Vec<_>>().join("-");
+        let cluster = self.cluster(directory).await?.to_owned();
+        Ok(Job { cluster, directory: directory.to_owned(), name, node: None })
+    }
+
+    /// Submits a job that Slurm does not know. An answer that was lost is looked for; where Slurm answers, and will not have
+    /// the job, that fails the labeller and not the calculation.
+    pub async fn submit(&self, job: &Job) -> Result<(), StoreError> {
+        let mut refused = 0;
+        loop {
+            let error = match self.commands.submit(&script::arguments(job)).await {
+                Ok(_) => return Ok(()),
+                Err(error) => error,
+            };
+            if !self.jobs(job).await?.is_empty() {
+                return Ok(());
+            }
+            refused += 1;
+            // There may be no node beside those that are avoided.
+            let again = script::avoid_none(&job.directory).map_err(|error| file(&job.directory, error))?;
+            if refused >= TRIES && !again {
+                return Err(cannot(job, format_args!("its job cannot be submitted: {error}")));
+            }
+            sleep(PAUSE).await;
+        }
+    }
+
+    pub async fn look(&self, job: &Job) -> Result<Found, StoreError> {
+        if let Some(end) = End::read(&job.directory) {
+            return Ok(Found::Ended(end));
+        }
+        if self.cluster(&job.directory).await? != job.cluster {
+            return Ok(Found::Elsewhere);
+        }
+        let jobs = self.jobs(job).await?;
+        let lives = jobs.iter().any(|told| told.phase() != Phase::Over);
+        match (lives, job.directory.is_dir()) {
+            (true, true) => Ok(Found::Running),
+            (true, false) => Err(cannot(
+                job,
+                format_args!(
+                    "job '{}' is at work there, and it cannot be seen from here: {SHARED}",
+                    job.name
+                ),
+            )),
+            (false, false) => Ok(Found::Gone),
+            (false, true) => self.over(job, &jobs).await,
+        }
+    }
+
+    /// What is left of a job that is over, or that Slurm does not know.
+    async fn over(&self, job: &Job, jobs: &[Told]) -> Result<Found, StoreError> {
+        settle(&job.directory).await;
+        if let Some(end) = End::read(&job.directory) {
+            return Ok(Found::Ended(end));
+        }
+        let begun = job.directory.join(BEGUN).is_dir();
+        let told = told::last(jobs);
+        match told {
+            None if !begun => return Ok(Found::Ready),
+            Some(told) if !begun && told.ran_to_its_end() => {
+                let message = format!("{told}, where that is not seen: {SHARED}");
+                return Err(cannot(job, message));
+            }
+            _ => {}
+        }
+        // Slurm forgets it before long.
+        let end = told::end(told);
+        end.write(&job.directory).map_err(|error| file(&job.directory, error))?;
+        Ok(Found::Ended(end))
+    }
+
+    /// Waits for the end, and submits the job should Slurm not know it; `None` if it was cleared away.
+    pub async fn end(&self, job: &Job) -> Result<Option<End>, StoreError> {
+        let (mut pause, mut asked) = (SHORTEST_PAUSE, Instant::now());
+        loop {
+            if let Some(end) = End::read(&job.directory) {
+                return Ok(Some(end));
+            }
+            if asked.elapsed() >= LOOK {
+                if !shared::lives(&self.commands, job).await {
+                    match self.look(job).await? {
+                        Found::Ended(end) => return Ok(Some(end)),
+                        Found::Ready => self.submit(job).await?,
+                        Found::Running => {}
+                        Found::Gone | Found::Elsewhere => return Ok(None),
+                    }
+                }
+                asked = Instant::now();
+            }
+            sleep(pause).await;
+            pause = (pause * 5 / 4).min(LONGEST_PAUSE);
+        }
+    }
+
+    /// Ends a job, and waits a little for that. Where Slurm does not answer that is an error: the job goes on then, and whoever
+    /// looks for it finds it.
+    pub async fn cancel(&self, job: &Job) -> Result<(), StoreError> {
+        let begun = Instant::now();
+        loop {
+            let jobs = self.ask(job).await.map_err(|error| cannot(job, error))?;
+            let living = jobs.iter().filter(|told| told.phase() != Phase::Over);
+            // What ends was told so before.
+            let ids: Vec<_> =
+                living.filter(|told| told.phase() != Phase::Completing).map(|told| told.id).collect();
+            self.commands.cancel(&ids).await.map_err(|error| cannot(job, error))?;
+            if jobs.iter().all(|told| told.phase() == Phase::Over) || begun.elapsed() > ENDING {
+                return Ok(());
+            }
+            sleep(SHORTEST_PAUSE * 4).await;
+        }
+    }
+
+    /// What Slurm says of the job, however long it takes to say something.
+    async fn jobs(&self, job: &Job) -> Result<Vec<Told>, StoreError> {
+        loop {
+            match self.ask(job).await {
+                Ok(jobs) => return Ok(jobs),
+                Err(error) if error.is_missing() => return Err(cannot(job, error)),
+                Err(_) => sleep(LOOK).await,
+            }
+        }
+    }
+
+    async fn ask(&self, job: &Job) -> Result<Vec<Told>, SlurmError> {
+        let name = format!("--name={}", job.name);
+        let text = self.commands.queue(Told::FORMAT, &["--states=all", &name]).await?;
+        text.lines().map(Told::parse).collect()
+    }
+
+    async fn cluster(&self, directory: &Path) -> Result<&str, StoreError> {
+        let ask = async || loop {
+            match self.commands.cluster().await {
+                Err(error) if error.is_missing() => {
+                    return Err(file(directory, io::Error::other(error.to_string())));
+                }
+                Err(_) => sleep(PAUSE).await,
+                Ok(cluster) => return Ok(cluster),
+            }
+        };
+        self.cluster.get_or_try_init(ask).await.map(String::as_str)
+    }
+}
+
+const SHARED: &str = "label.scratch has to be a directory that this host and every node see by the same name";
+
+fn cannot(job: &Job, why: impl ToString) -> StoreError {
+    file(&job.directory, io::Error::other(why.to_string()))
+}
+
+/// Lets what other hosts have written into a directory be seen: a network file system looks again where something was made.
+async fn settle(directory: &Path) {
+    sleep(SETTLING).await;
+    let new = directory.join("look");
+    let _ = fs::write(&new, "").and_then(|()| fs::remove_file(&new));
+}

@@ -1,0 +1,140 @@
+//! What a job is submitted with. All of it stands in its script, so that submitting it again needs nothing else.
+
+use std::ffi::OsString;
+use std::fmt::Write as _;
+use std::fs;
+use std::io;
+use std::path::Path;
+
+use super::super::KeeperCommand;
+use super::super::keeper::{self, Calculation, Order};
+use super::{BEGUN, Job, LOG, ORDER, SCRIPT};
+
+/// Slurm's limit comes so much after that of the keeper, which ends the calculation in order, s.
+const MARGIN: f64 = 60.0;
+/// Bytes of the M of `--mem`.
+const MEBIBYTE: u64 = 1 << 20;
+const EXCLUDE: &str = "#SBATCH --exclude=";
+
+/// What a job needs.
+pub(in super::super) struct Wanted<'a> {
+    pub cores: u32,
+    /// Options of the user.
+    pub options: &'a [String],
+    /// Nodes on which it failed.
+    pub avoid: &'a [String],
+}
+
+/// Writes all that the job of a calculation needs into its directory.
+pub(in super::super) fn write(calculation: Calculation, wanted: &Wanted<'_>) -> io::Result<()> {
+    let directory = calculation.directory.clone();
+    fs::write(directory.join(SCRIPT), script(&calculation, wanted)?)?;
+    keeper::give(fs::File::create(directory.join(ORDER))?, &Order::Keep(calculation))
+}
+
+fn script(calculation: &Calculation, wanted: &Wanted<'_>) -> io::Result<String> {
+    let minutes = ((calculation.time_limit + MARGIN) / 60.0).ceil();
+    let mut options =
+        vec!["--nodes=1".to_owned(), format!("--ntasks={}", wanted.cores), format!("--time={minutes:.0}")];
+    options.extend(calculation.memory_limit.map(|bytes| format!("--mem={}M", bytes.div_ceil(MEBIBYTE))));
+    options.extend(wanted.options.iter().cloned());
+    let mut script = "#!/bin/sh\n".to_owned();
+    for option in options {
+        let _ = writeln!(script, "#SBATCH {option}");
+    }
+    if !wanted.avoid.is_empty() {
+        let _ = writeln!(script, "{EXCLUDE}{}", wanted.avoid.join(","));
+    }
+    let (directory, keeper) = (quoted(&calculation.directory), keeper(&calculation.keeper)?);
+    let _ = writeln!(
+        script,
+        "# Once, however often it is submitted.\ncd -- {directory} && mkdir {BEGUN} || exit 0\n{keeper} < {ORDER}\n\
+         # The keeper must not be the process that Slurm has started.\nexit $?"
+    );
+    Ok(script)
+}
+
+/// The keeper's command as a node can call it.
+fn keeper(command: &KeeperCommand) -> io::Result<String> {
+    let program = match command.program.starts_with("/proc/self") {
+        true => fs::read_link(&command.program)?,
+        false => command.program.clone(),
+    };
+    let words = [quoted(&program)].into_iter().chain(command.arguments.iter().map(quoted));
+    Ok(words.collect::<Vec<_>>().join(" "))
+}
+
+/// A word for the shell.
+fn quoted(word: impl AsRef<Path>) -> String {
+    format!("'{}'", word.as_ref().display().to_string().replace('\'', r"'\''"))
+}
+
+/// Lets the job run anywhere. Returns whether there was a node that it avoided.
+pub(super) fn avoid_none(directory: &Path) -> io::Result<bool> {
+    let path = directory.join(SCRIPT);
+    let script = fs::read_to_string(&path)?;
+    let (avoiding, others): (Vec<_>, Vec<_>) =
+        script.split_inclusive('\n').partition(|line| line.starts_with(EXCLUDE));
+    if !avoiding.is_empty() {
+        fs::write(&path, others.concat())?;
+    }
+    Ok(!avoiding.is_empty())
+}
+
+/// What `sbatch` is called with: what makes this job the one that is looked for, whatever the user's options are.
+pub(super) fn arguments(job: &Job) -> Vec<OsString> {
+    let option = |name: &str, value: &Path| {
+        let mut option = OsString::from(name);
+        option.push(value);
+        option
+    };
+    // sbatch puts numbers of the job in the place of letters after '%'.
+    let log = job.directory.join(LOG).display().to_string().replace('%', "%%");
+    vec![
+        format!("--job-name={}", job.name).into(),
+        "--dependency=singleton".into(),
+        "--no-requeue".into(),
+        option("--chdir=", &job.directory),
+        option("--output=", log.as_ref()),
+        job.directory.join(SCRIPT).into(),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn calculation(directory: &Path) -> Calculation {
+        Calculation {
+            directory: directory.to_owned(),
+            command: vec!["abinit".to_owned()],
+            environment: Vec::new(),
+            time_limit: 3600.0,
+            memory_limit: Some(2_000_000_000),
+            keeper: KeeperCommand {
+                program: "/opt/it's/calmwalk".into(),
+                arguments: vec!["keep".to_owned()],
+            },
+        }
+    }
+
+    #[test]
+    fn a_script_has_everything_that_a_job_needs() {
+        let home = tempfile::tempdir().unwrap();
+        let options = ["--partition=long".to_owned()];
+        let avoid = ["n1".to_owned(), "n2".to_owned()];
+        write(calculation(home.path()), &Wanted { cores: 4, options: &options, avoid: &avoid }).unwrap();
+        let text = fs::read_to_string(home.path().join(SCRIPT)).unwrap();
+        let directives: Vec<_> = text.lines().filter_map(|line| line.strip_prefix("#SBATCH ")).collect();
+        let expected =
+            ["--nodes=1", "--ntasks=4", "--time=61", "--mem=1908M", "--partition=long", "--exclude=n1,n2"];
+        assert_eq!(directives, expected);
+        assert!(text.contains(r"'/opt/it'\''s/calmwalk' 'keep' < order.json"), "{text}");
+        let order = fs::read_to_string(home.path().join(ORDER)).unwrap();
+        assert!(order.starts_with("{\"Keep\"") && order.ends_with("}\n"), "{order}");
+        assert!(avoid_none(home.path()).unwrap());
+        let anywhere = fs::read_to_string(home.path().join(SCRIPT)).unwrap();
+        assert_eq!(anywhere, text.replace("#SBATCH --exclude=n1,n2\n", ""));
+        assert!(!avoid_none(home.path()).unwrap());
+    }
+}

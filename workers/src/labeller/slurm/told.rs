@@ -1,0 +1,163 @@
+//! What Slurm says of a job.
+
+use std::fmt;
+use std::path::PathBuf;
+
+use ::slurm::{Phase, SlurmError};
+use dft::Exit;
+
+use super::super::keeper::{End, How};
+
+/// A job, as `squeue` shows it.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Told {
+    pub id: u64,
+    /// In Slurm's words, as `RUNNING`.
+    state: String,
+    /// Where it runs or ran.
+    nodes: String,
+    /// For how long it has run.
+    seconds: f64,
+    /// Why it waits or how it ended.
+    reason: String,
+}
+
+impl Told {
+    /// What `squeue` is to write about a job.
+    pub const FORMAT: &str = "%i|%T|%N|%M|%r";
+
+    pub fn parse(line: &str) -> Result<Self, SlurmError> {
+        let unreadable = || SlurmError::Unreadable {
+            program: "squeue",
+            found: line.to_owned(),
+            expected: "what --format asks for",
+        };
+        let fields: Vec<_> = line.splitn(5, '|').collect();
+        let [id, state, nodes, time, reason] = fields[..] else { return Err(unreadable()) };
+        Ok(Self {
+            id: id.parse().map_err(|_| unreadable())?,
+            state: state.to_owned(),
+            nodes: nodes.to_owned(),
+            seconds: seconds(time),
+            reason: reason.to_owned(),
+        })
+    }
+
+    pub fn phase(&self) -> Phase {
+        Phase::of(&self.state)
+    }
+
+    /// Whether its script has ended, and was not ended.
+    pub fn ran_to_its_end(&self) -> bool {
+        matches!(self.state.as_str(), "COMPLETED" | "FAILED")
+    }
+
+    fn exit(&self) -> Exit {
+        match self.state.as_str() {
+            "TIMEOUT" | "DEADLINE" => Exit::TimeLimit,
+            "OUT_OF_MEMORY" => Exit::OutOfMemory,
+            _ => Exit::LostNode,
+        }
+    }
+
+    /// The node that may be to blame; those of jobs that somebody has ended are not.
+    fn node(&self) -> Option<String> {
+        let blamed = ["NODE_FAIL", "BOOT_FAIL", "LAUNCH_FAILED", "OUT_OF_MEMORY", "FAILED", "COMPLETED"];
+        let node = blamed.contains(&self.state.as_str()).then(|| self.nodes.clone());
+        node.filter(|node| !node.is_empty())
+    }
+}
+
+impl fmt::Display for Told {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "job {} is {}", self.id, self.state)?;
+        if !self.nodes.is_empty() {
+            write!(f, " on {}", self.nodes)?;
+        }
+        match self.reason.as_str() {
+            "" | "None" => Ok(()),
+            reason => write!(f, " ({reason})"),
+        }
+    }
+}
+
+/// The one that says most of several of one name: of those that were submitted twice one did nothing.
+pub(super) fn last(jobs: &[Told]) -> Option<&Told> {
+    let said_more = jobs.iter().find(|told| told.state != "COMPLETED");
+    said_more.or_else(|| jobs.first())
+}
+
+/// How the calculation of a job ended that is over, or that Slurm has forgotten, and whose keeper has left no end.
+pub(super) fn end(told: Option<&Told>) -> End {
+    let remark = match told {
+        Some(told) => format!("Slurm says: {told}; its keeper has left no end"),
+        None => "Slurm does not know its job any more, and its keeper has left no end".to_owned(),
+    };
+    End {
+        how: How::Ended(told.map_or(Exit::LostNode, Told::exit)),
+        program: PathBuf::new(),
+        seconds: told.map_or(0.0, |told| told.seconds),
+        memory: 0,
+        node: told.and_then(Told::node),
+        remark: Some(remark),
+    }
+}
+
+/// `1-02:03:04`, `2:03:04` or `3:04`; 0 for what is none of these.
+fn seconds(time: &str) -> f64 {
+    let (days, time) = time.split_once('-').unwrap_or(("0", time));
+    let parts = time.split(':').map(|part| part.parse::<f64>().ok());
+    let sum = parts.reduce(|sum, part| Some(60.0 * sum? + part?)).flatten();
+    let days: Option<f64> = days.parse().ok();
+    sum.zip(days).map_or(0.0, |(sum, days)| 86_400.0 * days + sum)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn told(state: &str) -> Told {
+        Told::parse(&format!("12|{state}|node7|1:01|None")).unwrap()
+    }
+
+    #[test]
+    fn lines_of_squeue_are_read() {
+        let job = Told::parse("12|RUNNING|node7|1-02:03:04|Node | failure").unwrap();
+        assert_eq!((job.id, job.phase(), job.seconds), (12, Phase::Running, 93_784.0));
+        assert_eq!(job.to_string(), "job 12 is RUNNING on node7 (Node | failure)");
+        assert!(Told::parse("12|RUNNING|node7").is_err() && Told::parse("x|RUNNING||0:00|None").is_err());
+        for (time, expected) in
+            [("0:00", 0.0), ("1:01", 61.0), ("2:03:04", 7384.0), ("INVALID", 0.0), ("", 0.0)]
+        {
+            assert_eq!(seconds(time), expected, "{time}");
+        }
+    }
+
+    #[test]
+    fn a_job_without_an_end_ends_as_slurm_says() {
+        use Exit::{LostNode, OutOfMemory, TimeLimit};
+        let expected = [
+            ("TIMEOUT", TimeLimit, None),
+            ("OUT_OF_MEMORY", OutOfMemory, Some("node7")),
+            ("NODE_FAIL", LostNode, Some("node7")),
+            ("FAILED", LostNode, Some("node7")),
+            ("CANCELLED", LostNode, None),
+            ("PREEMPTED", LostNode, None),
+        ];
+        for (state, exit, node) in expected {
+            let end = end(Some(&told(state)));
+            assert_eq!((end.how, end.node.as_deref()), (How::Ended(exit), node), "{state}");
+            assert_eq!(end.seconds, 61.0);
+            assert!(end.remark.unwrap().contains(state));
+        }
+        assert_eq!(end(None).how, How::Ended(LostNode));
+    }
+
+    #[test]
+    fn of_two_jobs_of_one_name_the_one_counts_that_did_something() {
+        let jobs = [told("COMPLETED"), told("TIMEOUT")];
+        assert_eq!(last(&jobs), Some(&jobs[1]));
+        assert_eq!(last(&jobs[..1]), Some(&jobs[0]));
+        assert_eq!(last(&[]), None);
+    }
+}
