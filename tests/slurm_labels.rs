@@ -175,7 +175,8 @@ fn a_labeller_that_is_killed_is_followed_by_one_that_finds_its_job() {
     wait_until("a job is at work", || jobs.begun().len() == 1);
     let name = jobs.jobs()[0][2].clone();
     jobs.kill(&mut label);
-    let label = jobs.place.label(&["--slots", "8"]);
+    // As many as there are structures: none of them ends before it may.
+    let label = jobs.place.label(&["--slots", "20"]);
     let waits = || {
         jobs.attempts()
             .iter()
