@@ -46,8 +46,8 @@ fn other_files_in_the_place_of_the_database_are_refused_unchanged() {
         bytes
     };
     for (content, words) in [
-        (patched(60, 7), "has a schema of version 7; this program reads version 4"),
-        (patched(60, 0), "has a schema of version 0; this program reads version 4"),
+        (patched(60, 7), "has a schema of version 7; this program reads version 5"),
+        (patched(60, 0), "has a schema of version 0; this program reads version 5"),
         (patched(68, 5), "is a database of another program (application id 0x5,"),
         (b"units metal\natom_style atomic\n".to_vec(), "is no SQLite database: it begins with 'units metal"),
         (Vec::new(), "is no SQLite database: it begins with ''"),
@@ -77,7 +77,7 @@ fn a_damaged_database_is_told_and_left_alone() {
         fs::write(&database, &content).unwrap();
         let message = assert_plain(&calmwalk(directory.path(), RUN), 1);
         assert!(message.contains("campaign in here: damaged database: "), "{message}");
-        assert!(message.contains("restore it from a copy"), "{message}");
+        assert!(message.contains("restore the campaign from a backup"), "{message}");
         assert_eq!(fs::read(&database).unwrap(), content);
     }
     fs::write(&database, &good).unwrap();

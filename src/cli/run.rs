@@ -246,7 +246,7 @@ async fn go_on(
     let in_force = store.campaign().await?.configuration_in_force;
     let before = serde_json::from_str(&in_force).map_err(|error| {
         Failure::Failed(format!(
-            "damaged database: the configuration in force: {error}; restore it from a copy"
+            "damaged database: the configuration in force: {error}; restore the campaign from a backup"
         ))
     })?;
     let changes = compare(&before, resolved).map_err(|refused| {

@@ -62,7 +62,7 @@ pub async fn follow(
 
 fn damaged(decision: i64, problem: &str) -> Failure {
     Failure::Failed(format!(
-        "decision {decision}: {problem}: the database is damaged; restore it from a copy"
+        "decision {decision}: {problem}: the database is damaged; restore the campaign from a backup"
     ))
 }
 

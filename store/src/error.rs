@@ -188,7 +188,7 @@ pub enum StoreError {
     )]
     Protection(sqlx::Error),
     /// Content that this program cannot have written.
-    #[error("damaged database: {what}: {reason}; restore it from a copy")]
+    #[error("damaged database: {what}: {reason}; restore the campaign from a backup")]
     Damaged {
         /// What was read.
         what: String,

@@ -3,7 +3,7 @@
 use wire::{ContentHash, WalkId};
 
 use super::labels::LabelRow;
-
+use super::status::walks;
 use crate::Store;
 use crate::database::{FromRow, Row, from_columns, query};
 use crate::encoding::{decode_hash, decode_structure};
@@ -62,11 +62,6 @@ pub(crate) const AFTER: &str = "SELECT sequence, id, reason, candidate.mixture_v
 
 const IMPORT: &str = "SELECT import.number, file, frame, hash, data FROM import
     JOIN structure ON structure.number = import.structure WHERE import.number = $1";
-
-const WALK: &str =
-    "SELECT walk, coalesce(name, '') AS seed_structure, origin, state, reason, step, segment, tau,
-        temperature, relative_volume, gamma_max, accepted, refused, returns
-    FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure WHERE walk = $1";
 
 /// What people do is in the log of operations, which does not grow with the candidates.
 const BY_HAND: &str = "SELECT number, time, kind, detail FROM operation
@@ -210,7 +205,8 @@ impl Store {
 
     /// Where a walk stands, and the biased walk that it matches, if it is a control.
     pub async fn walk(&self, walk: WalkId) -> Result<Option<(WalkStatus, Option<WalkId>)>> {
-        let status: Option<WalkStatus> = query(WALK).bind(walk.0).fetch_optional(&self.database).await?;
+        let status = query(walks!("WHERE walk = $1"));
+        let status: Option<WalkStatus> = status.bind(walk.0).fetch_optional(&self.database).await?;
         let Some(status) = status else { return Ok(None) };
         let partner = query("SELECT coalesce(partner, -1) FROM walk WHERE walk = $1").bind(walk.0);
         let partner: i64 = partner.fetch_one(&self.database).await?;

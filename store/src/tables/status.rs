@@ -18,11 +18,19 @@ const FATES: &str = "SELECT origin, fate, number FROM candidate_count";
 pub(crate) const COUNTED_FATES: &str =
     "SELECT origin, coalesce(reason, fate), count(*) FROM candidate GROUP BY origin, fate, reason";
 
-const WALKS: &str =
-    "SELECT walk, coalesce(name, '') AS seed_structure, origin, state, reason, step, segment, tau,
-        temperature, relative_volume, gamma_max, CAST(NULL AS DOUBLE PRECISION) AS steps_per_second, accepted, refused,
-        returns
-    FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure ORDER BY walk";
+/// The question for [`WalkStatus`], ended by which walks are meant.
+macro_rules! walks {
+    ($which:literal) => {
+        concat!(
+            "SELECT walk, coalesce(name, '') AS seed_structure, origin, state, reason, step, segment, tau,
+                temperature, relative_volume, gamma_max, CAST(NULL AS DOUBLE PRECISION) AS steps_per_second, accepted,
+                refused, returns
+            FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure ",
+            $which
+        )
+    };
+}
+pub(super) use walks;
 
 impl Store {
     /// Everything at one instant. Processes are in order of kind and number. A process that is gone has the
@@ -38,7 +46,7 @@ impl Store {
         let states = job_counts::states(&mut transaction).await?;
         let oldest_lease = job_counts::oldest_lease(&mut transaction).await?;
         let labels_last_hour = job_counts::made_in_the_last_hour(&mut transaction, now).await?;
-        let mut walks: Vec<WalkStatus> = query(WALKS).fetch_all(&mut transaction).await?;
+        let mut walks: Vec<WalkStatus> = query(walks!("ORDER BY walk")).fetch_all(&mut transaction).await?;
         let refused = query("SELECT CAST(coalesce(sum(refused), 0) AS BIGINT) FROM walk");
         let refused: u64 = refused.fetch_one(&mut transaction).await?;
         let sql = "SELECT mixture_version, round FROM decision ORDER BY sequence DESC LIMIT 1";
