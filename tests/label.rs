@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use common::campaign::{Outcome, Small, outcome, outcome_at};
 use common::place::{Place, on_store};
-use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
+use common::processes::{carrying_out, nothing_is_left, one_carrying_out, processes_in, signal, wait_until};
 use common::{Running, calmwalk, config, program, refuse, succeed};
 use store::{JobState, Standing, Store};
 
@@ -249,7 +249,7 @@ fn a_labeller_elsewhere_keeps_its_job_when_a_run_starts() {
     let arguments = ["label", "--until-empty", "--store", place.argument()];
     let mut label = place.spawn(command, &arguments);
     wait_for_lease(&place);
-    let slot = carrying_out(place.path(), "labeller")[0];
+    let slot = one_carrying_out(place.path(), "labeller");
     signal(slot, "STOP");
     let mut run = place.run();
     wait_until("it runs", || {

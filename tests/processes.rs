@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use common::campaign::{Outcome, Small, outcome};
-use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
+use common::processes::{carrying_out, nothing_is_left, one_carrying_out, processes_in, signal, wait_until};
 use common::{Running, calmwalk, config, program, refuse, succeed};
 use serde_json::Value;
 use store::Store;
@@ -111,7 +111,7 @@ fn wait_for_work(directory: &Path) {
 fn a_hung_walker_is_killed_and_replaced() {
     let mut hung = 0;
     let directory = disturbed("silence_limit = 5.0", |here| {
-        hung = carrying_out(here, "walker")[0];
+        hung = one_carrying_out(here, "walker");
         signal(hung, "STOP");
     });
     assert!(!processes_in(directory.path()).iter().any(|process| process.pid == hung));
@@ -123,7 +123,7 @@ fn a_hung_walker_is_killed_and_replaced() {
 
 #[test]
 fn a_walker_that_is_told_to_end_leaves_its_walk_to_another() {
-    let directory = disturbed("", |here| signal(carrying_out(here, "walker")[0], "TERM"));
+    let directory = disturbed("", |here| signal(one_carrying_out(here, "walker"), "TERM"));
     let endings = endings(directory.path());
     assert!(endings.iter().any(|ending| ending.contains("exit code 130")), "{endings:?}");
 }
@@ -131,7 +131,7 @@ fn a_walker_that_is_told_to_end_leaves_its_walk_to_another() {
 #[test]
 fn a_labeller_that_is_told_to_end_is_replaced() {
     disturbed("", |here| {
-        let labeller = carrying_out(here, "labeller")[0];
+        let labeller = one_carrying_out(here, "labeller");
         signal(labeller, "TERM");
         wait_until("another is there", || {
             carrying_out(here, "labeller").first().is_some_and(|other| *other != labeller)
@@ -150,7 +150,7 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
     wait_for_work(here);
     let model = fs::read(here.join("model.npz")).unwrap();
     fs::write(here.join("model.npz"), b"spoiled").unwrap();
-    signal(carrying_out(here, "walker")[0], "KILL");
+    signal(one_carrying_out(here, "walker"), "KILL");
     let given_up = |process: &Value| {
         let remark = process["remark"].as_str().unwrap_or_default();
         process["kind"] == "walker" && process["state"] == "given up" && remark.contains("another content")

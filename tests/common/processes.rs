@@ -34,6 +34,16 @@ pub fn carrying_out(directory: &Path, command: &str) -> Vec<u32> {
     processes_in(directory).into_iter().filter(|p| p.command == command).map(|p| p.pid).collect()
 }
 
+/// One that carries out `command`, as soon as there is one.
+pub fn one_carrying_out(directory: &Path, command: &str) -> u32 {
+    let mut found = None;
+    wait_until(&format!("a {command} is at work"), || {
+        found = carrying_out(directory, command).first().copied();
+        found.is_some()
+    });
+    found.expect("it was waited for")
+}
+
 /// Sends a signal; nothing happens to a process that is gone.
 pub fn signal(pid: u32, name: &str) {
     let sent = Command::new("kill").args([format!("-{name}"), pid.to_string()]).output();

@@ -9,7 +9,7 @@ use tempfile::TempDir;
 
 use crate::common::campaign::{Counters, Small, outcome};
 use crate::common::hosts::{started, undisturbed};
-use crate::common::processes::{carrying_out, nothing_is_left, processes_in, wait_until};
+use crate::common::processes::{nothing_is_left, one_carrying_out, processes_in, wait_until};
 use crate::common::{Running, program, random, through};
 use crate::must;
 
@@ -117,7 +117,7 @@ fn shared_memory_that_others_fill_does_no_harm() {
     wait_until("walkers are at work", || Counters::of(".", here).sent > 0);
     must(&format!("{inside} sh -c '! dd if=/dev/zero of=/dev/shm/filler bs=64k'"));
     // Those that are started now find it full.
-    let walker = carrying_out(here, "walker")[0];
+    let walker = one_carrying_out(here, "walker");
     crate::common::processes::signal(walker, "KILL");
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", fs::read_to_string(&said).unwrap());
     wait_until("every process is gone", || processes_in(here).is_empty());

@@ -9,7 +9,7 @@ use crate::cable::{Cable, HEAD, NODE};
 use crate::common::Running;
 use crate::common::campaign::{Counters, Outcome, Small, outcome};
 use crate::common::hosts::{Hosts, undisturbed};
-use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::common::processes::{carrying_out, one_carrying_out, signal, wait_until};
 use crate::must;
 
 /// Three walks side by side: one for the orchestrator's own walker, two for the agent.
@@ -123,7 +123,7 @@ fn cut_for_a_minute() {
     let handed_on = linked.counters();
     wait_until("they go on elsewhere", || linked.counters().sent > handed_on.sent);
     // So that there is something left to do for the host that comes back.
-    let walker = carrying_out(linked.hosts.home.path(), "walker")[0];
+    let walker = one_carrying_out(linked.hosts.home.path(), "walker");
     signal(walker, "STOP");
     sleep(Duration::from_secs(60).saturating_sub(begun.elapsed()));
     linked.cable.mend();

@@ -7,7 +7,7 @@ use crate::common::campaign::{Small, outcome};
 use crate::common::config;
 use crate::common::hosts::{Hosts, undisturbed};
 use crate::common::line::SlowLine;
-use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::common::processes::{carrying_out, one_carrying_out, signal, wait_until};
 
 /// Long enough to kill somebody while a question is on its way.
 const DELAY: Duration = Duration::from_secs(1);
@@ -32,10 +32,9 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
 
     // So that there is something left to do for the host that comes, and comes back.
     let held = || {
-        let walkers = || carrying_out(hosts.home.path(), "walker");
-        wait_until("the orchestrator's own walker is at work", || !walkers().is_empty());
-        signal(walkers()[0], "STOP");
-        walkers()[0]
+        let walker = one_carrying_out(hosts.home.path(), "walker");
+        signal(walker, "STOP");
+        walker
     };
     let mut orchestrator = hosts.lead();
     held();
@@ -43,6 +42,7 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     wait_until("the agent asks for the model", || hosts.said(0).contains("fetching the model"));
     signal(orchestrator.0.id(), "KILL");
     orchestrator.0.wait().unwrap();
+    wait_until("its walker is gone", || carrying_out(hosts.home.path(), "walker").is_empty());
     let mut orchestrator = hosts.lead();
     let walker = held();
     wait_until("the agent has joined it", || hosts.said(0).contains("joined: 1 walkers"));

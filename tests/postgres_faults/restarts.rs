@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use crate::common::campaign::Small;
 use crate::common::hosts::undisturbed;
-use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::common::processes::{carrying_out, one_carrying_out, signal, wait_until};
 use crate::common::random;
 use crate::server::{Campaign, control};
 
@@ -72,7 +72,7 @@ fn a_server_that_is_away_for_a_minute_is_waited_for() {
     wait_until("it says why it waits", || {
         said("waiting for the database: the database server does not answer")
     });
-    let labeller = carrying_out(campaign.home(), "labeller")[0];
+    let labeller = one_carrying_out(campaign.home(), "labeller");
     signal(labeller, "KILL");
     wait_until("another is there", || {
         carrying_out(campaign.home(), "labeller").first().is_some_and(|other| *other != labeller)
