@@ -1,0 +1,96 @@
+//! The directions in which rows of numbers differ most.
+
+use faer::{Mat, Side};
+
+/// Rows that differ by less than this from their mean, both squared, do not differ but by rounding.
+const ROUNDING: f64 = 1e-24;
+
+/// Mean and leading principal axes of rows of `dimension` numbers.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PrincipalAxes {
+    mean: Vec<f64>,
+    /// Unit vectors, the one with the largest variance first.
+    axes: Vec<Vec<f64>>,
+    /// Of the whole variance, the share along each.
+    pub shares: Vec<f64>,
+}
+
+impl PrincipalAxes {
+    /// The first `number` axes of rows that follow each other in `rows`: eigenvectors of their covariance. An axis points
+    /// to where its largest component is positive, so that the same rows give the same numbers. `None` of fewer than two
+    /// rows, of rows that do not differ, of numbers that are not finite, or if the eigenvalues do not converge.
+    pub fn of(rows: &[f64], dimension: usize, number: usize) -> Option<Self> {
+        let count = rows.len().checked_div(dimension)?;
+        if count < 2 || number > dimension || !rows.iter().all(|x| x.is_finite()) {
+            return None;
+        }
+        let mut mean = vec![0.0; dimension];
+        for row in rows.chunks_exact(dimension) {
+            mean.iter_mut().zip(row).for_each(|(mean, x)| *mean += x / count as f64);
+        }
+        let centred = Mat::from_fn(count, dimension, |row, k| rows[row * dimension + k] - mean[k]);
+        let covariance = centred.transpose() * &centred;
+        let eigen = covariance.self_adjoint_eigen(Side::Lower).ok()?;
+        let (values, vectors) = (eigen.S(), eigen.U());
+        let trace: f64 = (0..dimension).map(|k| values[k].max(0.0)).sum();
+        let size = count as f64 * mean.iter().map(|x| x * x).sum::<f64>();
+        if trace <= ROUNDING * size {
+            return None;
+        }
+        // Eigenvalues ascend.
+        let last = (0..number).map(|k| dimension - 1 - k);
+        let axes = last.clone().map(|column| turned((0..dimension).map(|k| vectors[(k, column)]).collect()));
+        let shares = last.clone().map(|column| values[column].max(0.0) / trace);
+        Some(Self { axes: axes.collect(), shares: shares.collect(), mean })
+    }
+
+    /// A row by its components along the axes, from the mean of all.
+    pub fn project(&self, row: &[f64]) -> Vec<f64> {
+        let along = |axis: &Vec<f64>| {
+            let parts = axis.iter().zip(row).zip(&self.mean);
+            parts.map(|((axis, x), mean)| axis * (x - mean)).sum()
+        };
+        self.axes.iter().map(along).collect()
+    }
+}
+
+fn turned(mut axis: Vec<f64>) -> Vec<f64> {
+    let largest =
+        axis.iter().copied().fold(0.0, |largest: f64, x| if x.abs() > largest.abs() { x } else { largest });
+    if largest < 0.0 {
+        axis.iter_mut().for_each(|x| *x = -*x);
+    }
+    axis
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_thin_cloud_lies_along_its_axis() {
+        // Mean (1, 2, 3); ±3 along (3, 4, 0) / 5 and ±1 along (−4, 3, 0) / 5: variances 9 : 1 : 0.
+        let (long, thin) = ([0.6, 0.8, 0.0], [-0.8, 0.6, 0.0]);
+        let mut rows = Vec::new();
+        for (a, b) in [(3.0, 0.0), (-3.0, 0.0), (0.0, 1.0), (0.0, -1.0)] {
+            (0..3).for_each(|k| rows.push([1.0, 2.0, 3.0][k] + a * long[k] + b * thin[k]));
+        }
+        let axes = PrincipalAxes::of(&rows, 3, 2).unwrap();
+        for (found, expected) in axes.shares.iter().zip([0.9, 0.1]) {
+            assert!((found - expected).abs() < 1e-12, "{:?}", axes.shares);
+        }
+        // The second axis points to where x grows.
+        let point = axes.project(&[1.0 + 0.6 - 0.8, 2.0 + 0.8 + 0.6, 7.0]);
+        assert!((point[0] - 1.0).abs() < 1e-12 && (point[1] + 1.0).abs() < 1e-12, "{point:?}");
+    }
+
+    #[test]
+    fn nothing_is_said_of_nothing() {
+        assert_eq!(PrincipalAxes::of(&[], 3, 2), None);
+        assert_eq!(PrincipalAxes::of(&[1.0, 2.0], 2, 2), None, "one row");
+        assert_eq!(PrincipalAxes::of(&[1.0, 2.0, 1.0, 2.0], 2, 2), None, "the same row twice");
+        assert_eq!(PrincipalAxes::of(&[7.1; 40], 2, 2), None, "they differ from their mean by rounding");
+        assert_eq!(PrincipalAxes::of(&[1.0, f64::NAN, 1.0, 2.0], 2, 2), None);
+        assert_eq!(PrincipalAxes::of(&[1.0], 0, 0), None);
+    }
+}

@@ -1,0 +1,137 @@
+//! An axis: from where to where, how, and what its values are.
+
+use crate::ticks::{self, Tick};
+
+/// How values are laid out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scale {
+    /// Evenly.
+    Linear,
+    /// By their logarithms.
+    Logarithmic,
+}
+
+/// One side of a panel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Axis {
+    /// What its values are, with their unit.
+    pub title: String,
+    /// How they are laid out.
+    pub scale: Scale,
+    /// Least.
+    pub low: f64,
+    /// Largest.
+    pub high: f64,
+    ticks: Vec<Tick>,
+    speaks: bool,
+}
+
+/// Ticks that have words, about.
+const TICKS: usize = 5;
+
+impl Axis {
+    /// An axis with even ticks. What is not a range of finite numbers, above zero if the scale is logarithmic, becomes one.
+    pub fn new(title: &str, scale: Scale, low: f64, high: f64) -> Self {
+        let (low, high) = range(scale, low, high);
+        let ticks = ticks::of(scale, low, high, TICKS);
+        Self { title: title.into(), scale, low, high, ticks, speaks: true }
+    }
+
+    /// An axis of things that have names and no order: the first is at ½, the next at 1½ and so on.
+    pub fn of_names(title: &str, names: &[String]) -> Self {
+        let tick = |(k, name): (usize, &String)| Tick { at: k as f64 + 0.5, words: name.clone() };
+        let ticks = names.iter().enumerate().map(tick).collect();
+        let high = names.len().max(1) as f64;
+        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, speaks: true }
+    }
+
+    /// An axis of bins, each as wide as the next, with words at these places: 1 is the end of the first bin.
+    pub fn of_bins(title: &str, bins: usize, words: impl IntoIterator<Item = (f64, String)>) -> Self {
+        let ticks = words.into_iter().map(|(at, words)| Tick { at, words }).collect();
+        let high = bins.max(1) as f64;
+        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, speaks: true }
+    }
+
+    /// The same with about so many ticks.
+    pub fn with_ticks(mut self, number: usize) -> Self {
+        self.ticks = ticks::of(self.scale, self.low, self.high, number);
+        self
+    }
+
+    /// The same with another title.
+    pub fn titled(mut self, title: &str) -> Self {
+        title.clone_into(&mut self.title);
+        self
+    }
+
+    /// The same without ticks.
+    pub fn bare(mut self) -> Self {
+        self.ticks.clear();
+        self
+    }
+
+    /// The same without words: another panel has the same axis.
+    pub fn silent(mut self) -> Self {
+        self.speaks = false;
+        self
+    }
+
+    /// Where a value is: 0 at the beginning, 1 at the end. What has no place is far before the beginning.
+    pub fn place(&self, value: f64) -> f64 {
+        let of = |x: f64| if self.scale == Scale::Linear { x } else { x.ln() };
+        let place = (of(value) - of(self.low)) / (of(self.high) - of(self.low));
+        if place.is_nan() { -FAR } else { place.clamp(-FAR, FAR) }
+    }
+
+    /// Its ticks.
+    pub(crate) fn ticks(&self) -> &[Tick] {
+        &self.ticks
+    }
+
+    /// Whether it has words.
+    pub(crate) fn speaks(&self) -> bool {
+        self.speaks
+    }
+}
+
+/// What is farther outside than so many lengths of the axis is there.
+const FAR: f64 = 10.0;
+
+fn range(scale: Scale, low: f64, high: f64) -> (f64, f64) {
+    let is_usable = |x: f64| x.is_finite() && (scale == Scale::Linear || x > 0.0);
+    match (is_usable(low), is_usable(high)) {
+        (true, true) if low < high => (low, high),
+        (true, true) if low == high && scale == Scale::Logarithmic => (low / 2.0, low * 2.0),
+        (true, true) if low == high => (low - 0.5, low + 0.5),
+        _ if scale == Scale::Logarithmic => (0.1, 10.0),
+        _ => (0.0, 1.0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_are_shares_of_the_axis() {
+        let axis = Axis::new("x", Scale::Linear, -1.0, 3.0);
+        assert_eq!([-1.0, 0.0, 3.0, 5.0].map(|x| axis.place(x)), [0.0, 0.25, 1.0, 1.5]);
+        let axis = Axis::new("x", Scale::Logarithmic, 0.01, 100.0);
+        assert!((axis.place(1.0) - 0.5).abs() < 1e-12 && (axis.place(0.1) - 0.25).abs() < 1e-12);
+        assert_eq!([0.0, -1.0, f64::NAN, f64::INFINITY].map(|x| axis.place(x)), [-FAR, -FAR, -FAR, FAR]);
+    }
+
+    #[test]
+    fn no_range_becomes_one() {
+        for (scale, low, high) in [
+            (Scale::Linear, f64::NAN, 1.0),
+            (Scale::Linear, 2.0, 2.0),
+            (Scale::Logarithmic, 0.0, 1.0),
+            (Scale::Logarithmic, 3.0, 3.0),
+            (Scale::Linear, 2.0, 1.0),
+        ] {
+            let axis = Axis::new("x", scale, low, high);
+            assert!(axis.low < axis.high && !axis.ticks().is_empty(), "{axis:?}");
+        }
+    }
+}

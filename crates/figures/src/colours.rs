@@ -1,0 +1,70 @@
+//! Colours that are told apart by everyone, and in what is printed without colour.
+
+/// Red, green and blue.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Colour(pub u8, pub u8, pub u8);
+
+/// Vermillion, blue and the others are those of Okabe and Ito (2008), which differ also in lightness.
+impl Colour {
+    /// Vermillion.
+    pub const VERMILLION: Self = Self(0xd5, 0x5e, 0x00);
+    /// Blue.
+    pub const BLUE: Self = Self(0x00, 0x72, 0xb2);
+    /// Bluish green.
+    pub const GREEN: Self = Self(0x00, 0x9e, 0x73);
+    /// Orange.
+    pub const ORANGE: Self = Self(0xe6, 0x9f, 0x00);
+    /// Sky blue.
+    pub const SKY: Self = Self(0x56, 0xb4, 0xe9);
+    /// Reddish purple.
+    pub const PURPLE: Self = Self(0xcc, 0x79, 0xa7);
+    /// Of words and axes.
+    pub const INK: Self = Self(0x22, 0x22, 0x22);
+    /// Of lines that only help the eye.
+    pub const GREY: Self = Self(0x80, 0x80, 0x80);
+    /// The sheet.
+    pub const WHITE: Self = Self(0xff, 0xff, 0xff);
+}
+
+/// A colour through which what is below is seen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Paint {
+    /// The colour.
+    pub colour: Colour,
+    /// From 0 (nothing) to 1 (nothing is seen through it).
+    pub opacity: f64,
+}
+
+/// A line.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Stroke {
+    /// Its colour.
+    pub paint: Paint,
+    /// Its width, points.
+    pub width: f64,
+    /// Lengths of dashes and gaps by turns, points; empty for a solid line.
+    pub dashes: &'static [f64],
+}
+
+impl From<Colour> for Paint {
+    fn from(colour: Colour) -> Self {
+        Self { colour, opacity: 1.0 }
+    }
+}
+
+impl Colour {
+    /// The same, seen through.
+    pub fn faint(self, opacity: f64) -> Paint {
+        Paint { colour: self, opacity }
+    }
+
+    /// A solid line.
+    pub fn line(self, width: f64) -> Stroke {
+        Stroke { paint: self.into(), width, dashes: &[] }
+    }
+
+    /// A dashed line.
+    pub fn dashed(self, width: f64) -> Stroke {
+        Stroke { paint: self.into(), width, dashes: &[3.0, 2.0] }
+    }
+}

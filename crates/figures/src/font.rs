@@ -1,0 +1,72 @@
+//! The font: widths of words for the layout, outlines for PNG.
+
+use std::sync::LazyLock;
+
+use ttf_parser::{Face, GlyphId, OutlineBuilder};
+
+/// The regular font, TrueType (fonts/README.md).
+pub const REGULAR: &[u8] = include_bytes!("../fonts/report-sans-regular.ttf");
+/// The bold one.
+pub const BOLD: &[u8] = include_bytes!("../fonts/report-sans-bold.ttf");
+
+/// Font families for SVG and HTML: those after the first have the same widths.
+pub const FAMILY: &str = "'Report Sans', 'Liberation Sans', Arial, Helvetica, sans-serif";
+
+static FACES: LazyLock<[Face<'static>; 2]> =
+    LazyLock::new(|| [REGULAR, BOLD].map(|bytes| Face::parse(bytes, 0).expect("a font of the program")));
+
+fn face(bold: bool) -> &'static Face<'static> {
+    &FACES[usize::from(bold)]
+}
+
+/// The glyph of a character; of one that the font does not have, the empty box that fonts have for it.
+fn glyph(face: &Face<'_>, character: char) -> GlyphId {
+    face.glyph_index(character).unwrap_or(GlyphId(0))
+}
+
+/// Width of a character in a font of height 1.
+pub fn advance(character: char, bold: bool) -> f64 {
+    let face = face(bold);
+    let advance = face.glyph_hor_advance(glyph(face, character)).unwrap_or_default();
+    f64::from(advance) / f64::from(face.units_per_em())
+}
+
+/// Draws the outline of a character in units of [`units`].
+pub fn outline(character: char, bold: bool, builder: &mut dyn OutlineBuilder) {
+    let face = face(bold);
+    // A space has none.
+    let _ = face.outline_glyph(glyph(face, character), builder);
+}
+
+/// Height of the font in the units of its outlines.
+pub fn units() -> f64 {
+    f64::from(face(false).units_per_em())
+}
+
+/// Whether the font has every character of `text`.
+#[cfg(test)]
+pub fn has_all(text: &str) -> bool {
+    let has = |c| face(false).glyph_index(c).is_some() && face(true).glyph_index(c).is_some();
+    text.chars().all(has)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn widths_are_those_of_arial() {
+        // Widths of the metrics that Helvetica, Arial and Liberation Sans share, in thousandths of the height.
+        for (character, bold, width) in
+            [('a', false, 556), ('i', false, 222), ('W', false, 944), (' ', false, 278), ('a', true, 556)]
+        {
+            let found = 1000.0 * advance(character, bold);
+            assert!((found - f64::from(width)).abs() < 0.5, "{character}: {found}");
+        }
+    }
+
+    #[test]
+    fn it_has_what_figures_say() {
+        assert!(has_all("γρτσΔÅ−–×≤≥₀²³·°±|≈½…αβ√ ABCxyz019%/()"));
+    }
+}

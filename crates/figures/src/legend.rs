@@ -1,0 +1,43 @@
+//! What marks and colours mean.
+
+use crate::{Anchor, Figure, Item, Marker, Paint, Rectangle, Stroke, Text, width};
+
+/// A sample of what is explained.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Key {
+    /// A filled box.
+    Area(Paint),
+    /// A line.
+    Line(Stroke),
+    /// A mark.
+    Dot(Marker, Paint),
+}
+
+/// Width of a sample, and the gap behind words, points.
+const SAMPLE: f64 = 14.0;
+const GAP: f64 = 12.0;
+
+/// Samples and their words in a row that ends at `right`; `base` is the line on which the words stand.
+pub fn legend(figure: &mut Figure, [right, base]: [f64; 2], keys: &[(Key, &str)]) {
+    let of = |words: &str| SAMPLE + 4.0 + Text::SIZE * width(words, false);
+    let whole =
+        keys.iter().map(|(_, words)| of(words)).sum::<f64>() + GAP * keys.len().saturating_sub(1) as f64;
+    let mut x = right - whole;
+    for (key, words) in keys {
+        draw(figure, *key, Rectangle { x, y: base - 6.0, width: SAMPLE, height: 6.5 });
+        figure.text([x + SAMPLE + 4.0, base], words, Anchor::Start);
+        x += of(words) + GAP;
+    }
+}
+
+fn draw(figure: &mut Figure, key: Key, place: Rectangle) {
+    let middle = place.y + 0.5 * place.height;
+    match key {
+        Key::Area(paint) => figure.rectangle(place, paint),
+        Key::Line(stroke) => figure.line(vec![[place.x, middle], [place.right(), middle]], stroke),
+        Key::Dot(marker, fill) => {
+            let centres = vec![[place.x + 0.5 * place.width, middle]];
+            figure.items.push(Item::Dots { centres, marker, radius: 2.2, fill, stroke: None, clip: None });
+        }
+    }
+}

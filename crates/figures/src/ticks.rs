@@ -1,0 +1,115 @@
+//! Where an axis has its ticks, and what stands there.
+
+use crate::Scale;
+
+/// A tick: where, among data, and what it says; a small one says nothing.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tick {
+    /// Value.
+    pub at: f64,
+    /// Words.
+    pub words: String,
+}
+
+/// Ticks of an axis from `low` to `high`, about `number` of them with words.
+pub fn of(scale: Scale, low: f64, high: f64, number: usize) -> Vec<Tick> {
+    match scale {
+        Scale::Linear => linear(low, high, number),
+        Scale::Logarithmic => logarithmic(low, high, number),
+    }
+}
+
+/// At multiples of 1, 2 or 5 times a power of ten.
+fn linear(low: f64, high: f64, number: usize) -> Vec<Tick> {
+    let step = step((high - low) / number.max(1) as f64);
+    let decimals = (-step.log10().floor()).max(0.0) as usize;
+    // A step as 2.5 would need one more; those of `step` do not.
+    let (first, last) = ((low / step - 1e-9).ceil() as i64, (high / step + 1e-9).floor() as i64);
+    let tick = |k: i64| {
+        let at = k as f64 * step;
+        Tick { at, words: minus(format!("{at:.decimals$}")) }
+    };
+    (first..=last).map(tick).collect()
+}
+
+/// The least of 1, 2, 5 times a power of ten that is not below `least`.
+fn step(least: f64) -> f64 {
+    let power = 10_f64.powf(least.log10().floor());
+    let of = |factor: f64| factor * power;
+    [1.0, 2.0, 5.0, 10.0]
+        .map(of)
+        .into_iter()
+        .find(|step| *step >= least * (1.0 - 1e-9))
+        .unwrap_or(10.0 * power)
+}
+
+/// At powers of ten, and between them small; over less than two decades also 2 and 5 have words, over less than one
+/// 3 and 7 as well.
+fn logarithmic(low: f64, high: f64, number: usize) -> Vec<Tick> {
+    let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);
+    let decades = (high / low).log10();
+    let every = (decades / number.max(1) as f64).ceil().max(1.0) as i32;
+    let mut ticks = Vec::new();
+    for power in first..=last {
+        for digit in 1..10 {
+            let at = f64::from(digit) * 10_f64.powi(power);
+            let is_inside = at >= low * (1.0 - 1e-9) && at <= high * (1.0 + 1e-9);
+            let speaks = match digit {
+                1 => power.rem_euclid(every) == 0,
+                2 | 5 => decades < 2.0,
+                3 | 7 => decades < 0.95,
+                _ => false,
+            };
+            if is_inside && (every == 1 || digit == 1) {
+                ticks.push(Tick {
+                    at,
+                    words: if speaks { power_of_ten(digit, power) } else { String::new() },
+                });
+            }
+        }
+    }
+    ticks
+}
+
+/// 0.001 to 1000 in full, others as a power.
+fn power_of_ten(digit: i32, power: i32) -> String {
+    match power {
+        -3..=-1 => format!("{:.*}", power.unsigned_abs() as usize, f64::from(digit) * 10_f64.powi(power)),
+        0..=3 => format!("{}", digit * 10_i32.pow(power.unsigned_abs())),
+        _ if digit == 1 => format!("10^{{{}}}", minus(power.to_string())),
+        _ => format!("{digit}·10^{{{}}}", minus(power.to_string())),
+    }
+}
+
+/// With the sign that is as wide as a digit.
+fn minus(number: String) -> String {
+    number.replace('-', "−")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn words(ticks: &[Tick]) -> Vec<&str> {
+        ticks.iter().map(|tick| tick.words.as_str()).filter(|words| !words.is_empty()).collect()
+    }
+
+    #[test]
+    fn steps_are_one_two_or_five() {
+        assert_eq!(words(&linear(0.0, 1.0, 5)), ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]);
+        assert_eq!(words(&linear(0.93, 1.42, 5)), ["1.0", "1.1", "1.2", "1.3", "1.4"]);
+        assert_eq!(words(&linear(-3.0, 12.0, 4)), ["0", "5", "10"]);
+        assert_eq!(words(&linear(-0.12, 0.1, 3)), ["−0.1", "0.0", "0.1"]);
+        assert_eq!(words(&linear(0.0, 23_000.0, 3)), ["0", "10000", "20000"]);
+    }
+
+    #[test]
+    fn decades_have_small_ticks_between_them() {
+        let ticks = logarithmic(0.01, 10.0, 6);
+        assert_eq!(words(&ticks), ["0.01", "0.1", "1", "10"]);
+        assert_eq!(ticks.len(), 28);
+        assert_eq!(words(&logarithmic(0.3, 3.0, 5)), ["0.5", "1", "2"]);
+        assert_eq!(words(&logarithmic(18.0, 75.0, 5)), ["20", "30", "50", "70"]);
+        assert_eq!(words(&logarithmic(1e-6, 1e6, 4)), ["10^{−6}", "0.001", "1", "1000", "10^{6}"]);
+    }
+}
