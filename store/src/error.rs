@@ -4,7 +4,7 @@ use std::io;
 use std::path::PathBuf;
 
 use sqlx::postgres::PgDatabaseError;
-use wire::{BlockError, ContentHash};
+use wire::{BlockError, WalkId};
 
 use crate::JobState;
 use crate::history::Named;
@@ -236,6 +236,25 @@ pub enum StoreError {
         /// Number of the last one.
         imported: u64,
     },
+    /// No such walk.
+    #[error(
+        "the campaign has no walk {walk}; {}",
+        if *walks == 0 { "none has begun yet".into() } else { format!("they are 0 to {}", walks - 1) }
+    )]
+    UnknownWalk {
+        /// What was asked for.
+        walk: WalkId,
+        /// Walks that have begun.
+        walks: u64,
+    },
+    /// It makes no more steps.
+    #[error("walk {walk} has ended ({state}): only those that have more steps to make can be paused")]
+    EndedWalk {
+        /// The walk.
+        walk: WalkId,
+        /// How it ended.
+        state: String,
+    },
     /// The job is not in a state where that makes sense.
     #[error("cannot {action} {candidate}: its label job is {state}, and only {allowed} jobs can be {past}", past = past(action))]
     WrongState {
@@ -259,9 +278,6 @@ pub enum StoreError {
     /// A label with impossible numbers.
     #[error("not a valid label: {0}")]
     InvalidLabel(String),
-    /// Nothing to supersede.
-    #[error("structure {0} has no label that could be superseded")]
-    NoLabel(ContentHash),
     /// Anything else that the database says.
     #[error("database: {0}")]
     Database(sqlx::Error),

@@ -115,8 +115,24 @@ pub struct Job {
     pub formula: String,
     /// Largest γ under the original mixture.
     pub original_gamma: Option<f64>,
+    /// Largest γ_nbr under the original mixture.
+    pub original_gamma_nbr: Option<f64>,
+    /// `biased` or `control`.
+    pub origin: String,
+    /// Name of the seed structure.
+    pub seed_structure: String,
+    /// The walk that found it.
+    pub walk: u32,
+    /// Step of the walk, equilibration included.
+    pub step: u64,
+    /// Kinetic temperature, K.
+    pub temperature: Option<f64>,
+    /// V/V₀.
+    pub relative_volume: Option<f64>,
     /// Somebody has put it into the queue by hand: guards let it pass.
     pub overruled: bool,
+    /// Why another label was asked for in the place of the one that there is, until it has come.
+    pub relabel: Option<String>,
 }
 
 /// An attempt at a job.
@@ -206,7 +222,7 @@ pub enum Standing {
     Label,
     /// A further result, for comparison.
     Check,
-    /// It was the label until it was corrected.
+    /// It was the label until another came that was asked for anew.
     Superseded,
 }
 
@@ -241,11 +257,6 @@ pub enum LabelSource {
         /// The frame in it, from 0.
         frame: u64,
     },
-    /// Somebody who corrected another label.
-    Correction {
-        /// Why.
-        reason: String,
-    },
 }
 
 /// A label with its history.
@@ -259,4 +270,15 @@ pub struct LabelRecord {
     pub source: LabelSource,
     /// When it came, ms since 1970.
     pub received: i64,
+    /// When and why another came in its place.
+    pub superseded: Option<Superseded>,
+}
+
+/// How a label was superseded.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Superseded {
+    /// When the label came that is in its place, ms since 1970.
+    pub time: i64,
+    /// Why another was asked for.
+    pub reason: String,
 }

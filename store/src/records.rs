@@ -303,13 +303,16 @@ pub enum JobState {
     Failed,
     /// Taken out by hand.
     Dropped,
+    /// A job of another protocol is in its place.
+    Superseded,
 }
 
 impl JobState {
     /// Every state, in the order of a job's life.
-    pub const ALL: [Self; 5] = [Self::Queued, Self::Leased, Self::Labelled, Self::Failed, Self::Dropped];
+    pub const ALL: [Self; 6] =
+        [Self::Queued, Self::Leased, Self::Labelled, Self::Failed, Self::Dropped, Self::Superseded];
 
-    /// `"queued"`, `"leased"`, `"labelled"`, `"failed"`, `"dropped"`.
+    /// `"queued"`, `"leased"`, `"labelled"`, `"failed"`, `"dropped"`, `"superseded"`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Queued => "queued",
@@ -317,6 +320,7 @@ impl JobState {
             Self::Labelled => "labelled",
             Self::Failed => "failed",
             Self::Dropped => "dropped",
+            Self::Superseded => "superseded",
         }
     }
 

@@ -79,6 +79,12 @@ pub struct Labels {
     pub failed: u64,
     /// Taken out by hand.
     pub dropped: u64,
+    /// Of those that wait or are in work: there is a label, which stays until the new one has come.
+    pub again: u64,
+    /// Labels that were to be made again and could not be: those that there are stay.
+    pub again_in_vain: u64,
+    /// Of them, those that were to be made by another protocol: their jobs count as failed.
+    pub failed_again: u64,
 }
 
 /// Where a walk stands.
@@ -94,6 +100,8 @@ pub struct WalkStatus {
     pub state: String,
     /// Why it ended, in words.
     pub reason: String,
+    /// Somebody has paused it: it gets no turn until it is resumed.
+    pub paused: bool,
     /// Step.
     pub step: u64,
     /// Segment.
@@ -116,12 +124,20 @@ pub struct WalkStatus {
     pub returns: u32,
 }
 
+impl WalkStatus {
+    /// Whether it has more steps to make.
+    pub fn is_under_way(&self) -> bool {
+        matches!(self.state.as_str(), "waiting" | "running")
+    }
+}
+
 from_columns!(WalkStatus {
     walk,
     seed_structure,
     origin,
     state,
     reason,
+    paused,
     step,
     segment,
     tau,

@@ -4,9 +4,11 @@
 mod common;
 
 use common::*;
-use store::{CandidateRecord, Commit, ComponentRecord, Fate, ProcessRecord, Store, StoreError};
-use wire::Origin;
+use store::{
+    CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
+};
 use wire::messages::Decline;
+use wire::{Origin, WalkId};
 
 #[tokio::test]
 async fn a_campaign_is_begun_once_and_opened_often() {
@@ -179,7 +181,10 @@ async fn status_counts_everything_once() {
         "control": 1, "refused_by_walkers": 4,
     });
     assert_eq!(status["candidates"], candidates);
-    let labels = serde_json::json!({ "queued": 2, "leased": 0, "labelled": 0, "failed": 0, "dropped": 0 });
+    let labels = serde_json::json!({
+        "queued": 2, "leased": 0, "labelled": 0, "failed": 0, "dropped": 0, "failed_again": 0, "again": 0,
+        "again_in_vain": 0,
+    });
     assert_eq!(status["labels"], labels);
     assert_eq!((&status["imported"], &status["round"]), (&1.into(), &1.into()));
     assert_eq!(status["walks"][1]["seed_structure"], "diamond");
@@ -203,4 +208,92 @@ async fn status_counts_everything_once() {
     let status = reader.status().await.unwrap();
     assert!(status.finished);
     assert_eq!(status.processes, [next]);
+}
+
+#[tokio::test]
+async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
+    let home = Home::new();
+    let store = home.create().await;
+    let pause = async |walks: &[u32], paused| {
+        let walks: Vec<_> = walks.iter().copied().map(WalkId).collect();
+        let changed = store.pause_walks(&walks, paused, 5).await?;
+        Ok::<_, StoreError>(changed.into_iter().map(|walk| walk.0).collect::<Vec<_>>())
+    };
+    let error = pause(&[0], true).await.unwrap_err();
+    assert_eq!(error.to_string(), "the campaign has no walk 0; none has begun yet");
+    let ended = WalkRecord { state: "blew_up".into(), ..walk(2, 1) };
+    store.commit(&Commit { walks: vec![walk(0, 1), walk(1, 1), ended], ..Commit::default() }).await.unwrap();
+    assert_eq!(pause(&[1, 0, 1], true).await.unwrap(), [1, 0]);
+    assert_eq!(pause(&[1], true).await.unwrap(), [0_u32; 0], "it is paused already");
+    assert_eq!(pause(&[0, 2], false).await.unwrap(), [0]);
+    // Nothing is changed where one of them cannot be.
+    let error = pause(&[0, 2], true).await.unwrap_err().to_string();
+    assert_eq!(error, "walk 2 has ended (blew up): only those that have more steps to make can be paused");
+    let error = pause(&[0, 3], true).await.unwrap_err().to_string();
+    assert_eq!(error, "the campaign has no walk 3; they are 0 to 2");
+
+    let reader = home.open_read_only().await;
+    assert_eq!(reader.paused_walks().await.unwrap(), [WalkId(1)].into());
+    let paused = |status: store::Status| status.walks.iter().map(|walk| walk.paused).collect::<Vec<_>>();
+    assert_eq!(paused(reader.status().await.unwrap()), [false, true, false]);
+    assert!(reader.walk(WalkId(1)).await.unwrap().unwrap().0.paused);
+    assert!(matches!(reader.pause_walks(&[WalkId(1)], false, 5).await, Err(StoreError::ReadOnly)));
+    let log = reader.operations(0, 100).await.unwrap();
+    let log = log.iter().filter(|line| line.time == 5).map(|line| format!("{} {}", line.kind, line.detail));
+    assert_eq!(log.collect::<Vec<_>>(), ["pause {\"walk\":1}", "pause {\"walk\":0}", "resume {\"walk\":0}"]);
+    // Its end is the end of its pause.
+    store
+        .commit(&Commit {
+            walks: vec![WalkRecord { state: "steps".into(), ..walk(1, 2) }],
+            ..Commit::default()
+        })
+        .await
+        .unwrap();
+    assert_eq!(paused(reader.status().await.unwrap()), [false; 3]);
+}
+
+#[tokio::test]
+async fn the_newest_decisions_come_in_short() {
+    let home = Home::new();
+    let store = home.create().await;
+    let records = vec![
+        candidate(0, 1, Origin::Biased, Fate::Accepted),
+        candidate(0, 2, Origin::Biased, Fate::Declined(Decline::Covered)),
+    ];
+    let mut commit = commit_of(records);
+    commit.decisions.push(Decision {
+        round: 1,
+        kind: "ended",
+        walk: Some(WalkId(0)),
+        candidate: None,
+        mixture_version: 2,
+        detail: serde_json::json!({ "end": "steps", "step": 7 }),
+    });
+    store.commit(&commit).await.unwrap();
+    let newest = store.newest_decisions(0, 10).await.unwrap();
+    let short: Vec<_> = newest.iter().map(|d| (d.sequence, d.kind.as_str(), d.mixture_version)).collect();
+    assert_eq!(short, [(3, "ended", 2), (2, "declined", 2), (1, "accepted", 1)]);
+    assert_eq!((&newest[0].detail["end"], &newest[0].candidate), (&"steps".into(), &None));
+    let declined = newest[1].candidate.as_ref().unwrap();
+    assert_eq!(
+        (declined.reason.as_deref(), declined.step, declined.origin),
+        (Some("covered"), 2, Origin::Biased)
+    );
+    assert_eq!((declined.seed_structure.as_str(), declined.formula.as_str()), ("diamond", "Si2"));
+    assert_eq!((declined.selector_gamma, declined.original_gamma), (Some(1.3), Some(1.3 + 0.1)));
+    assert!(newest[1].detail.is_null() && newest[2].candidate.as_ref().unwrap().reason.is_none());
+    let numbers =
+        |decisions: Vec<store::RecentDecision>| decisions.iter().map(|d| d.sequence).collect::<Vec<_>>();
+    assert_eq!(numbers(store.newest_decisions(1, 10).await.unwrap()), [3, 2]);
+    assert_eq!(numbers(store.newest_decisions(0, 1).await.unwrap()), [3]);
+    // Jobs say as much of what they are for.
+    let job = store.queue_list(None, 10, 0).await.unwrap().remove(0);
+    assert_eq!(
+        (job.walk, job.step, job.seed_structure.as_str(), job.origin.as_str()),
+        (0, 1, "diamond", "biased")
+    );
+    assert_eq!(
+        (job.temperature, job.relative_volume, job.original_gamma_nbr),
+        (Some(300.25), Some(1.01), Some(1.1))
+    );
 }

@@ -4,7 +4,7 @@
 mod common;
 
 use common::*;
-use store::{FailureCount, Fate, Lease, Range, Store, Unlabelled, Waiting, Work};
+use store::{FailureCount, Fate, FateCount, JobState, Lease, Range, Store, Unlabelled, Waiting, Work};
 use wire::{Candidate, CandidateBlock, ContentHash, Origin};
 
 async fn lease(store: &Store, now: i64) -> Lease {
@@ -147,4 +147,39 @@ async fn structures_that_may_be_the_same_are_those_nearest_in_energy_that_have_l
     let mut expected = [names[0].clone(), names[2].clone()];
     expected.sort();
     assert_eq!(found, expected, "-8.4 and -8.0 are nearest to -9.0");
+}
+
+#[tokio::test]
+async fn everything_that_was_collected_comes_with_its_label_if_it_has_one() {
+    let home = Home::new();
+    let (store, _) = filled(&home).await;
+    store.commit(&commit_of(vec![candidate(1, 9, Origin::Control, Fate::Accepted)])).await.unwrap();
+    let declined = Fate::Declined(wire::messages::Decline::Covered);
+    store.commit(&commit_of(vec![candidate(0, 10, Origin::Biased, declined)])).await.unwrap();
+    let dft = protocol("dft").hash;
+    let mut found = Vec::new();
+    loop {
+        let page =
+            store.collected(Some(dft), found.last().map_or(0, |last: &store::Collected| last.decision), 3);
+        let page = page.await.unwrap();
+        if page.is_empty() {
+            break;
+        }
+        found.extend(page);
+    }
+    let states: Vec<_> = found.iter().map(|row| (row.job.unwrap(), row.label_forces.is_some())).collect();
+    let (labelled, failed) = ((JobState::Labelled, true), (JobState::Failed, false));
+    let queued = (JobState::Queued, false);
+    assert_eq!(states, [labelled, labelled, labelled, failed, failed, queued, queued]);
+    assert_eq!(found[1].label_forces, Some(label(-2.0).forces));
+    assert_eq!(found.iter().filter(|row| row.origin == Origin::Control).count(), 1);
+    assert_eq!((found[3].original.gamma[0], found[3].block.view().relative_volume()), (4.0, 1.4));
+    let without = store.collected(None, 0, 100).await.unwrap();
+    assert!(without.len() == 7 && without.iter().all(|row| row.job.is_none() && row.label_forces.is_none()));
+
+    let fate = |part, fate: &str, number| FateCount { part, fate: fate.into(), number };
+    let parts = store.fates_by_decision(4).await.unwrap();
+    assert_eq!(parts, [fate(0, "accepted", 4), fate(1, "accepted", 2), fate(1, "covered", 1)]);
+    let seeds = store.fates_by_seed_structure().await.unwrap();
+    assert_eq!(seeds, [fate(0, "accepted", 6), fate(0, "covered", 1)]);
 }

@@ -67,15 +67,10 @@ async fn the_first_result_is_the_label_whoever_brings_it() {
     assert_eq!(store.fail(&holds, "timeout", "", LIMIT, 14_000).await.unwrap(), Failed::LeaseLost);
     assert_eq!(state(&store, &names[0]).await, JobState::Labelled);
 
-    let (structure, dft) = (ContentHash::of(&holds.structure), protocol("dft").hash);
-    store.supersede(structure, dft, &label(-1.5), "wrong smearing", 15_000).await.unwrap();
-    let history = store.label_history(structure, dft).await.unwrap();
+    let history = store.label_history(ContentHash::of(&holds.structure), protocol("dft").hash).await.unwrap();
     let lines: Vec<_> = history.iter().map(|record| (record.standing, record.label.energy)).collect();
-    assert_eq!(lines, [(Standing::Superseded, -1.0), (Standing::Check, -2.0), (Standing::Label, -1.5)]);
-    assert_eq!(history[0].label, label(-1.0));
-    assert_eq!(history[2].source, LabelSource::Correction { reason: "wrong smearing".into() });
-    let unknown = store.supersede(ContentHash([7; 32]), dft, &label(0.0), "", 0).await;
-    assert!(matches!(unknown, Err(StoreError::NoLabel(_))));
+    assert_eq!(lines, [(Standing::Label, -1.0), (Standing::Check, -2.0)]);
+    assert_eq!(history[0].source, LabelSource::Attempt { job: lost.job, attempt: lost.attempt });
 }
 
 #[tokio::test]

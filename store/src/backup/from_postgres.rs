@@ -76,7 +76,7 @@ const TABLES: [Table; 16] = [
     }),
     table!("job" {
         number: I, structure: I, protocol: I, decision: I, state: T, priority: I, holder: T, expires: I, attempts: I,
-        failures: I, overruled: I,
+        failures: I, overruled: I, relabel: T, relabel_after: I,
     }),
     table!("attempt" {
         job: I, attempt: I, holder: T, calculation: T, started: I, ended: I, outcome: T, class: T, log: T, cores: I,
@@ -85,6 +85,7 @@ const TABLES: [Table; 16] = [
     table!("label" {
         number: I, structure: I, protocol: I, standing: T, energy: R, forces: B, stress: B, job: I, attempt: I,
         file: T, frame: I, correction: T, received: I, details: T,
+        superseded: I, reason: T,
     }),
     table!("import" { number: I, structure: I, file: T, frame: I }),
     table!("archive" 1 { job: I, attempt: I, bytes: B, left_out: T }),

@@ -59,6 +59,7 @@ async fn ours(
             findings.push(Finding { what, then: rule.then });
         }
     }
+    findings.extend(rules::labelled_jobs(transaction).await?);
     findings.extend(rules::counts(transaction).await?);
     findings.extend(rules::job_counts(transaction).await?);
     findings.extend(rules::leases(transaction).await?);

@@ -7,6 +7,7 @@ use crate::processes::ProcessRecord;
 use crate::tables::budget::SUMS;
 use crate::tables::job_counts;
 use crate::tables::processes::{LEASED, all};
+use crate::tables::relabel;
 
 /// A query that counts what must not be, with an example.
 pub(super) struct Rule {
@@ -19,7 +20,7 @@ const LOST: &str = "something was lost or changed by hand; restore the campaign 
 const QUEUE: &str =
     "the label queue was changed by hand; calmwalk queue shows the jobs, and a backup has them whole";
 
-pub(super) const RULES: [Rule; 14] = [
+pub(super) const RULES: [Rule; 15] = [
     Rule {
         finds: "SELECT count(*), CAST(min(sequence) AS TEXT) FROM decision WHERE sequence > 1
                 AND NOT EXISTS (SELECT 1 FROM decision AS before WHERE before.sequence = decision.sequence - 1)",
@@ -91,10 +92,15 @@ pub(super) const RULES: [Rule; 14] = [
         then: LOST,
     },
     Rule {
-        finds: "SELECT count(*), CAST(min(job.number) AS TEXT) FROM job WHERE (state = 'labelled') <> EXISTS (
-                SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
-                AND standing = 'label') AND state <> 'dropped'",
-        what: "jobs that are labelled without a label, or have one and are not",
+        finds: "SELECT count(*), CAST(min(structure) AS TEXT) FROM label WHERE standing = 'superseded' AND NOT EXISTS (
+                SELECT 1 FROM label AS other WHERE other.structure = label.structure AND other.standing = 'label')",
+        what: "labels that were superseded by none, of the structure",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job WHERE state = 'superseded' AND NOT EXISTS (
+                SELECT 1 FROM job AS other WHERE other.structure = job.structure AND other.state <> 'superseded')",
+        what: "jobs that were superseded by none",
         then: QUEUE,
     },
     Rule {
@@ -111,6 +117,32 @@ pub(super) const RULES: [Rule; 14] = [
         then: QUEUE,
     },
 ];
+
+/// Jobs that do not agree with their labels.
+macro_rules! disagreeing {
+    ($but:literal) => {
+        concat!(
+            "SELECT count(*), CAST(min(job.number) AS TEXT) FROM job WHERE (state = 'labelled') <> EXISTS (
+            SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
+            AND standing = 'label') AND state <> 'dropped'",
+            $but
+        )
+    };
+}
+
+/// Jobs that are labelled have a label; others have one only if another was asked for.
+pub(super) async fn labelled_jobs(transaction: &mut Transaction) -> Result<Vec<Finding>> {
+    let sql = match relabel::is_known(transaction).await? {
+        true => disagreeing!(" AND NOT (state IN ('queued', 'leased') AND relabel IS NOT NULL)"),
+        false => disagreeing!(""),
+    };
+    let (count, example): (u64, Option<String>) = query(sql).fetch_one(&mut *transaction).await?;
+    let what = || {
+        let example = example.unwrap_or_default();
+        format!("{count} jobs that are labelled without a label, or have one and are not (such as {example})")
+    };
+    Ok((count > 0).then(|| Finding { what: what(), then: QUEUE }).into_iter().collect())
+}
 
 /// What is counted of candidates, against what is there.
 const COUNTS: &str = "SELECT count(*), min(coalesce(found.origin, kept.origin) || ' ' || coalesce(found.fate, kept.fate))

@@ -127,6 +127,19 @@ impl Transaction {
         let found: u64 = query(sql).bind(name).fetch_one(self).await?;
         Ok(found > 0)
     }
+
+    /// The same of a column.
+    pub async fn has_column(&mut self, table: &str, name: &str) -> Result<bool> {
+        let sql = match self {
+            Self::Sqlite(_) => "SELECT count(*) FROM pragma_table_info($1) WHERE name = $2",
+            Self::Postgres(..) => {
+                "SELECT count(*) FROM information_schema.columns
+                 WHERE table_schema = current_schema() AND table_name = $1 AND column_name = $2"
+            }
+        };
+        let found: u64 = query(sql).bind(table).bind(name).fetch_one(self).await?;
+        Ok(found > 0)
+    }
 }
 
 /// Where a query may be sent.

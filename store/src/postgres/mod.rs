@@ -5,7 +5,7 @@ pub mod leadership;
 
 use std::fmt;
 use std::io::{self, ErrorKind};
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
 
 use sqlx::migrate::Migrator;
@@ -19,9 +19,10 @@ use self::jobs::Jobs;
 use crate::database::{Clock, Database, Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
+use crate::migrations::{Step, migrator};
 
 /// The newest of the migrations.
-const SCHEMA: i64 = 5;
+const SCHEMA: i64 = 7;
 /// Connections of a process, at most: one that writes and some that read.
 const CONNECTIONS: u32 = 5;
 /// Connections that nobody needs are closed after this time: a server has few.
@@ -33,7 +34,17 @@ const ANSWER: Duration = Duration::from_secs(3);
 /// Between two tries to reach a server that is away.
 pub const PAUSE: Duration = Duration::from_millis(100);
 
-static MIGRATIONS: Migrator = sqlx::migrate!("migrations/postgres");
+/// The steps to the newest version.
+pub(crate) static STEPS: [Step; 6] = [
+    (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
+    (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
+    (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
+    (5, "jobs", include_str!("../../migrations/postgres/0005_jobs.sql")),
+    (6, "relabel", include_str!("../../migrations/postgres/0006_relabel.sql")),
+    (7, "listing", include_str!("../../migrations/postgres/0007_listing.sql")),
+];
+
+static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));
 
 /// A campaign on a server. Clones share its connections.
 #[derive(Clone)]

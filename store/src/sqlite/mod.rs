@@ -7,6 +7,7 @@ use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::pin::pin;
+use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
 use sqlx::migrate::Migrator;
@@ -20,6 +21,7 @@ use self::in_place::InPlace;
 use crate::database::Database;
 use crate::error::{Result, StoreError};
 use crate::filesystem::check_directory;
+use crate::migrations::{Step, migrator};
 
 /// Name of the database, in the campaign's directory.
 pub const DATABASE: &str = "campaign.sqlite";
@@ -28,7 +30,7 @@ const UNFINISHED: &str = "campaign.sqlite.new";
 /// `PRAGMA application_id` of a campaign: "CALM".
 const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` that the newest migration leaves behind.
-const SCHEMA: i64 = 5;
+const SCHEMA: i64 = 7;
 /// How long another connection may hold the database.
 const PATIENCE: Duration = Duration::from_secs(30);
 const READERS: u32 = 4;
@@ -45,7 +47,18 @@ const PAGE: u32 = 1 << 14;
 /// 0.1 s. Pages that are written again until then, as those of walks, are copied once.
 const LOG_PAGES: u32 = 1 << 12;
 
-static MIGRATIONS: Migrator = sqlx::migrate!("migrations/sqlite");
+/// The steps to the newest version.
+pub(crate) static STEPS: [Step; 7] = [
+    (1, "campaign", include_str!("../../migrations/sqlite/0001_campaign.sql")),
+    (2, "processes", include_str!("../../migrations/sqlite/0002_processes.sql")),
+    (3, "calculations", include_str!("../../migrations/sqlite/0003_calculations.sql")),
+    (4, "counts", include_str!("../../migrations/sqlite/0004_counts.sql")),
+    (5, "jobs", include_str!("../../migrations/sqlite/0005_jobs.sql")),
+    (6, "relabel", include_str!("../../migrations/sqlite/0006_relabel.sql")),
+    (7, "listing", include_str!("../../migrations/sqlite/0007_listing.sql")),
+];
+
+static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));
 
 /// An open database file. Clones share its connections.
 #[derive(Clone, Debug)]

@@ -6,7 +6,7 @@ use wire::CampaignId;
 use super::*;
 use crate::Store;
 use crate::records::{Campaign, Commit, ComponentRecord};
-use crate::tables::{by_hand, export, history, job_counts, labels, outcomes, queue, status};
+use crate::tables::{by_hand, export, history, job_counts, labels, listing, outcomes, queue, recent, status};
 
 /// The store in a directory, and its file.
 async fn store(directory: &Path) -> (Store, DatabaseFile) {
@@ -54,15 +54,28 @@ async fn what_is_asked_often_goes_through_indexes() {
         history::BEFORE,
         history::AFTER,
         labels::CURRENT,
+        listing::NEWEST,
+        listing::OLDEST,
+        listing::NEWEST_OF_FATE,
+        listing::OLDEST_OF_FATE,
+        listing::LARGEST_GAMMA,
+        listing::LEAST_GAMMA,
+        listing::LARGEST_VOLUME,
+        listing::LEAST_VOLUME,
+        listing::OF_WALK,
         job_counts::MADE_SINCE,
         outcomes::AT_WORK,
         outcomes::FINISHED,
+        recent::NEWEST,
     ] {
-        let plan = plan(&file, sql).await.replace("SCAN CONSTANT ROW", "");
+        // A page is what an index found, and no longer than was asked for.
+        let plan = plan(&file, sql).await.replace("SCAN CONSTANT ROW", "").replace("SCAN page", "");
         assert!(!plan.contains("SCAN") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");
     }
-    let page = plan(&file, by_hand::LIST).await;
-    assert!(page.contains("USING COVERING INDEX job_order (state=?)"), "{page}");
+    for sql in [by_hand::LIST, listing::QUEUE] {
+        let page = plan(&file, sql).await;
+        assert!(page.contains("USING COVERING INDEX job_order (state=?"), "{page}");
+    }
     for sql in [status::COUNTED_FATES, job_counts::COUNTED_STATES] {
         let plan = plan(&file, sql).await;
         assert!(plan.contains("COVERING INDEX") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");

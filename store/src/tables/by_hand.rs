@@ -13,23 +13,46 @@ use crate::records::JobState;
 /// Candidates shown when a name fits none or several.
 const SHOWN: usize = 5;
 
+/// What is shown of a job besides its own columns.
+macro_rules! columns {
+    () => {
+        "protocol.name, id, candidate.atoms, formula, original_gamma, original_gamma_nbr, origin, walk, step,
+        temperature, relative_volume, coalesce(seed_structure.name, '') AS seed_name"
+    };
+}
+
 /// A page is found in the index, and only its jobs are looked at.
-pub(crate) const LIST: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
+pub(crate) const LIST: &str = concat!(
+    "SELECT job.*, ",
+    columns!(),
+    "
     FROM (SELECT number AS place FROM job WHERE state = $1
           ORDER BY priority DESC, decision LIMIT $2 OFFSET $3) AS page
     CROSS JOIN job ON job.number = place CROSS JOIN candidate ON candidate.decision = job.decision
     CROSS JOIN protocol ON protocol.number = job.protocol
-    ORDER BY job.priority DESC, job.decision";
+    LEFT JOIN seed_structure ON seed = candidate.seed_structure
+    ORDER BY job.priority DESC, job.decision"
+);
 
-const LIST_ALL: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
+const LIST_ALL: &str = concat!(
+    "SELECT job.*, ",
+    columns!(),
+    "
     FROM job CROSS JOIN candidate ON candidate.decision = job.decision
     CROSS JOIN protocol ON protocol.number = job.protocol
-    ORDER BY job.number LIMIT $1 OFFSET $2";
+    LEFT JOIN seed_structure ON seed = candidate.seed_structure
+    ORDER BY job.number LIMIT $1 OFFSET $2"
+);
 
-const SHOW: &str = "SELECT job.*, protocol.name, id, candidate.atoms, formula, original_gamma
+const SHOW: &str = concat!(
+    "SELECT job.*, ",
+    columns!(),
+    "
     FROM job CROSS JOIN candidate ON candidate.decision = job.decision
     CROSS JOIN protocol ON protocol.number = job.protocol
-    WHERE job.number = $1";
+    LEFT JOIN seed_structure ON seed = candidate.seed_structure
+    WHERE job.number = $1"
+);
 
 /// Candidates of one beginning, with the newest job of their structure.
 pub(crate) const FIND: &str = "SELECT id, max(job.number) FROM candidate
@@ -50,7 +73,15 @@ struct Row {
     atoms: u32,
     formula: String,
     original_gamma: Option<f64>,
+    original_gamma_nbr: Option<f64>,
+    origin: String,
+    seed_name: String,
+    walk: u32,
+    step: u64,
+    temperature: Option<f64>,
+    relative_volume: Option<f64>,
     overruled: bool,
+    relabel: Option<String>,
 }
 
 impl FromRow for Row {
@@ -69,7 +100,15 @@ impl FromRow for Row {
             atoms: row.get("atoms")?,
             formula: row.get("formula")?,
             original_gamma: row.get("original_gamma")?,
+            original_gamma_nbr: row.get("original_gamma_nbr")?,
+            origin: row.get("origin")?,
+            seed_name: row.get("seed_name")?,
+            walk: row.get("walk")?,
+            step: row.get("step")?,
+            temperature: row.get("temperature")?,
+            relative_volume: row.get("relative_volume")?,
             overruled: row.get_or_default::<Option<i64>>("overruled")?.is_some(),
+            relabel: row.get_or_default("relabel")?,
         })
     }
 }
@@ -228,7 +267,15 @@ impl Row {
             atoms: self.atoms,
             formula: self.formula,
             original_gamma: self.original_gamma,
+            original_gamma_nbr: self.original_gamma_nbr,
+            origin: self.origin,
+            seed_structure: self.seed_name,
+            walk: self.walk,
+            step: self.step,
+            temperature: self.temperature,
+            relative_volume: self.relative_volume,
             overruled: self.overruled,
+            relabel: self.relabel,
         })
     }
 }

@@ -3,9 +3,10 @@
 use super::protocols;
 use crate::Store;
 use crate::database::{Transaction, query};
-use crate::error::Result;
+use crate::error::{Result, StoreError};
 use crate::jobs::OldestLease;
 use crate::outcomes::Waiting;
+use crate::records::JobState;
 use wire::ContentHash;
 
 const HOUR: i64 = 3_600_000;
@@ -14,6 +15,15 @@ const STATES: &str = "SELECT state, CAST(sum(number) AS BIGINT) FROM job_count G
 
 /// The same in tables of an earlier version.
 pub(crate) const COUNTED_STATES: &str = "SELECT state, count(*) FROM job GROUP BY state";
+
+const PROTOCOLS: &str = "SELECT protocol.name, state, CAST(sum(job_count.number) AS BIGINT) FROM job_count
+    JOIN protocol ON protocol.number = job_count.protocol GROUP BY protocol.number, protocol.name, state
+    HAVING sum(job_count.number) > 0 ORDER BY protocol.number, state";
+
+/// The same in tables of an earlier version.
+const COUNTED_PROTOCOLS: &str = "SELECT protocol.name, state, count(*) FROM job
+    JOIN protocol ON protocol.number = job.protocol GROUP BY protocol.number, protocol.name, state
+    ORDER BY protocol.number, state";
 
 const WAITING: &str = "SELECT seed_structure, formula, atoms, CAST(sum(number) AS BIGINT) FROM job_count
     WHERE state IN ('queued', 'leased') AND protocol = $1 GROUP BY seed_structure, formula, atoms
@@ -59,6 +69,20 @@ pub(super) async fn made_in_the_last_hour(transaction: &mut Transaction, now: i6
 }
 
 impl Store {
+    /// Numbers of label jobs by the name of their protocol and by state, in the order in which protocols came.
+    pub async fn jobs_by_protocol(&self) -> Result<Vec<(String, JobState, u64)>> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let sql = if are_kept(&mut transaction).await? { PROTOCOLS } else { COUNTED_PROTOCOLS };
+        let rows: Vec<(String, String, u64)> = query(sql).fetch_all(&mut transaction).await?;
+        transaction.commit().await?;
+        let row = |(protocol, state, number): (String, String, u64)| {
+            let known = JobState::named(&state);
+            let state = known.ok_or_else(|| StoreError::damaged("the state of a job", state))?;
+            Ok((protocol, state, number))
+        };
+        rows.into_iter().map(row).collect()
+    }
+
     /// The jobs of this protocol that have no label yet and may get one, by their sizes.
     pub async fn waiting_jobs(&self, protocol: ContentHash) -> Result<Vec<Waiting>> {
         let mut transaction = self.database.begin_to_read().await?;

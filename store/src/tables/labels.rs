@@ -1,15 +1,15 @@
-//! Labels: the first valid result is the label, later ones are checks, corrections supersede. Nothing is
-//! overwritten.
+//! Labels: the first valid result is the label, later ones are checks, and one that was asked for anew supersedes what was there.
+//! Nothing is overwritten.
 
 use wire::ContentHash;
 
-use super::protocols;
 use super::queue::{end_attempt, job_row};
+use super::relabel::standing;
 use crate::Store;
 use crate::database::{FromRow, Row, Transaction, query};
 use crate::encoding::{decode_matrix, decode_vectors, encode_vectors, integer};
 use crate::error::{Result, StoreError};
-use crate::jobs::{Completed, LabelRecord, LabelSource, Standing};
+use crate::jobs::{Completed, LabelRecord, LabelSource, Standing, Superseded};
 use crate::records::{Label, LabelDetails, Lease};
 
 pub(crate) const CURRENT: &str =
@@ -25,9 +25,10 @@ pub(super) struct LabelRow {
     attempt: Option<u32>,
     file: Option<String>,
     frame: Option<u64>,
-    correction: Option<String>,
     received: i64,
     details: Option<String>,
+    superseded: Option<i64>,
+    reason: Option<String>,
 }
 
 impl FromRow for LabelRow {
@@ -41,17 +42,19 @@ impl FromRow for LabelRow {
             attempt: row.get("attempt")?,
             file: row.get("file")?,
             frame: row.get("frame")?,
-            correction: row.get("correction")?,
             received: row.get("received")?,
             details: row.get_or_default("details")?,
+            superseded: row.get_or_default("superseded")?,
+            reason: row.get_or_default("reason")?,
         })
     }
 }
 
 impl Store {
     /// Brings the result of a leased job. The first valid one for structure and protocol is the label, whether or not
-    /// the lease still lasts; later ones are kept as checks. A job that was dropped meanwhile stays dropped. Bringing
-    /// the result of one attempt twice changes nothing.
+    /// the lease still lasts; later ones are kept as checks. Where another was asked for ([`Store::relabel`]), the first of the
+    /// attempts that began since then is the label, and what was there is superseded. A job that was dropped or superseded
+    /// meanwhile stays so. Bringing the result of one attempt twice changes nothing.
     ///
     /// # Errors
     /// [`StoreError::InvalidLabel`] for a wrong number of forces, or numbers that are not finite.
@@ -82,32 +85,6 @@ impl Store {
         finish_job(&mut transaction, job.structure, job.protocol, now).await?;
         transaction.commit().await?;
         Ok(if standing == Standing::Label { Completed::Label } else { Completed::KeptAsCheck })
-    }
-
-    /// Puts a corrected label in the place of the present one, which stays in the history.
-    pub async fn supersede(
-        &self,
-        structure: ContentHash,
-        protocol: ContentHash,
-        label: &Label,
-        reason: &str,
-        now: i64,
-    ) -> Result<()> {
-        let mut transaction = self.database.begin().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
-        let number = query("SELECT number FROM structure WHERE hash = $1").bind(&structure.0[..]);
-        let number: Option<i64> = number.fetch_optional(&mut transaction).await?;
-        let number = number.ok_or(StoreError::NoLabel(structure))?;
-        check(&mut transaction, number, label).await?;
-        let sql = "UPDATE label SET standing = 'superseded'
-                   WHERE structure = $1 AND protocol = $2 AND standing = 'label'";
-        let superseded = query(sql).bind(number).bind(protocol);
-        if superseded.execute(&mut transaction).await? == 0 {
-            return Err(StoreError::NoLabel(structure));
-        }
-        let source = LabelSource::Correction { reason: reason.to_owned() };
-        add(&mut transaction, number, protocol, label, &source, now).await?;
-        transaction.commit().await
     }
 
     /// Every label and check of a structure under a protocol, oldest first.
@@ -152,7 +129,7 @@ pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: 
     Ok(())
 }
 
-/// Adds a result: the label if there is none, otherwise a check.
+/// Adds a result: the label if there is none or another was asked for, otherwise a check.
 pub(super) async fn add(
     transaction: &mut Transaction,
     structure: i64,
@@ -161,20 +138,18 @@ pub(super) async fn add(
     source: &LabelSource,
     now: i64,
 ) -> Result<Standing> {
-    let labelled: bool = query(CURRENT).bind(structure).bind(protocol).fetch_one(&mut *transaction).await?;
-    let standing = if labelled { Standing::Check } else { Standing::Label };
-    let (mut job, mut attempt, mut file, mut frame, mut correction) = (None, None, None, None, None);
+    let standing = standing(transaction, structure, protocol, source, now).await?;
+    let (mut job, mut attempt, mut file, mut frame) = (None, None, None, None);
     match source {
         LabelSource::Attempt { job: j, attempt: a } => (job, attempt) = (Some(*j), Some(*a)),
         LabelSource::Import { file: name, frame: number } => {
             (file, frame) = (Some(name.as_str()), Some(integer("frame", *number)?));
         }
-        LabelSource::Correction { reason } => correction = Some(reason.as_str()),
     }
     let sql =
         "INSERT INTO label (structure, protocol, standing, energy, forces, stress, job, attempt, file, frame,
-                                  correction, received, details)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)";
+                                  received, details)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12)";
     query(sql)
         .bind(structure)
         .bind(protocol)
@@ -186,7 +161,6 @@ pub(super) async fn add(
         .bind(attempt)
         .bind(file)
         .bind(frame)
-        .bind(correction)
         .bind(now)
         .bind(encode_details(&label.details))
         .execute(&mut *transaction)
@@ -194,7 +168,7 @@ pub(super) async fn add(
     Ok(standing)
 }
 
-/// The structure has its label: its job, if it has one that was not dropped, is done.
+/// The structure has its label: its job, if it has one that was not dropped and waits for no other label, is done.
 pub(super) async fn finish_job(
     transaction: &mut Transaction,
     structure: i64,
@@ -203,7 +177,7 @@ pub(super) async fn finish_job(
 ) -> Result<()> {
     let sql = "UPDATE job SET state = 'labelled', holder = NULL, expires = NULL
                WHERE structure = $1 AND protocol = $2 AND state IN ('queued', 'leased', 'failed')
-               RETURNING number";
+               AND relabel IS NULL RETURNING number";
     let job = query(sql).bind(structure).bind(protocol);
     if let Some(job) = job.fetch_optional(&mut *transaction).await? {
         end_attempt(transaction, job, "overtaken", now).await?;
@@ -215,14 +189,14 @@ impl LabelRow {
     pub(super) fn into_record(self) -> Result<LabelRecord> {
         let unknown = || StoreError::damaged("a label", "unknown standing or source");
         let standing = Standing::named(&self.standing).ok_or_else(unknown)?;
-        let source = match (self.job, self.attempt, self.file, self.frame, self.correction) {
-            (Some(job), Some(attempt), None, None, None) => LabelSource::Attempt { job, attempt },
-            (None, None, Some(file), Some(frame), None) => LabelSource::Import { file, frame },
-            (None, None, None, None, Some(reason)) => LabelSource::Correction { reason },
+        let source = match (self.job, self.attempt, self.file, self.frame) {
+            (Some(job), Some(attempt), None, None) => LabelSource::Attempt { job, attempt },
+            (None, None, Some(file), Some(frame)) => LabelSource::Import { file, frame },
             _ => return Err(unknown()),
         };
         let label = decode_label(self.energy, &self.forces, self.stress.as_deref(), self.details.as_deref())?;
-        Ok(LabelRecord { standing, label, source, received: self.received })
+        let superseded = self.superseded.zip(self.reason).map(|(time, reason)| Superseded { time, reason });
+        Ok(LabelRecord { standing, label, source, received: self.received, superseded })
     }
 }
 

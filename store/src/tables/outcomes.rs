@@ -60,7 +60,8 @@ const FAILED: &str = "SELECT coalesce(name, '') AS seed_name, candidate.formula 
     GROUP BY candidate.seed_structure, name, candidate.formula ORDER BY candidate.seed_structure, candidate.formula";
 
 pub(crate) const FINISHED: &str =
-    "SELECT candidate.decision AS decision, id, state, origin, coalesce(name, '') AS seed_name, formula,
+    "SELECT candidate.decision AS decision, id, CASE state WHEN 'failed' THEN 'failed' ELSE 'labelled' END AS state,
+        origin, coalesce(name, '') AS seed_name, formula,
         original_gamma, original_gamma_nbr, relative_volume,
         CASE WHEN state = 'failed' THEN original_grades END AS unlabelled,
         CASE WHEN state = 'failed' THEN (SELECT class FROM attempt WHERE attempt.job = job.number
@@ -68,7 +69,9 @@ pub(crate) const FINISHED: &str =
     FROM candidate CROSS JOIN job ON job.structure = candidate.structure AND job.protocol = $2
     CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
     LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-    WHERE candidate.decision > $1 AND job.state IN ('labelled', 'failed')
+    WHERE candidate.decision > $1 AND (job.state IN ('labelled', 'failed')
+        OR (job.state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
+            AND label.protocol = job.protocol AND standing = 'label')))
     ORDER BY candidate.decision LIMIT $3";
 
 /// A label takes some time, whatever the clock says.

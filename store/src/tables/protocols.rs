@@ -161,22 +161,8 @@ impl Store {
     /// when they were found) get one; those with a job of an earlier protocol keep that.
     pub async fn add_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;
-        let sql =
-            "INSERT INTO protocol (hash, name, settings) VALUES ($1, $2, $3) ON CONFLICT (hash) DO NOTHING";
-        let insert = query(sql).bind(&protocol.hash.0[..]).bind(&protocol.name);
-        let insert = insert.bind(protocol.settings.to_string());
-        let added = insert.execute(&mut transaction).await.map_err(|error| match error {
-            StoreError::Database(sqlx::Error::Database(error)) if error.is_unique_violation() => {
-                StoreError::ProtocolName(protocol.name.clone())
-            }
-            _ => error,
-        })?;
-        let hash = protocol.hash.to_string();
-        set_campaign_value(&mut transaction, "protocol", &hash).await?;
-        if added > 0 {
-            let detail = serde_json::json!({ "name": protocol.name, "hash": hash });
-            insert_operation(&mut transaction, now, "protocol", &detail).await?;
-        }
+        know(&mut transaction, protocol, now).await?;
+        set_campaign_value(&mut transaction, "protocol", &protocol.hash.to_string()).await?;
         let number = number(&mut transaction, protocol.hash).await?;
         let sql = "SELECT content, min(decision) FROM candidate WHERE structure IS NOT NULL
                    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure)
@@ -184,6 +170,20 @@ impl Store {
         let late: Vec<(Vec<u8>, i64)> = query(sql).fetch_all(&mut transaction).await?;
         enqueue(&mut transaction, &late, number, LATE_PRIORITY).await?;
         transaction.commit().await
+    }
+
+    /// Adds a protocol by which no new label is made.
+    pub async fn know_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
+        let mut transaction = self.database.begin_to_lead().await?;
+        know(&mut transaction, protocol, now).await?;
+        transaction.commit().await
+    }
+
+    /// Whether this is the protocol of new label jobs.
+    pub async fn is_in_force(&self, protocol: ContentHash) -> Result<bool> {
+        let hash = query("SELECT value FROM campaign WHERE key = 'protocol'");
+        let hash: Option<String> = hash.fetch_optional(&self.database).await?;
+        Ok(hash.is_some_and(|hash| hash == protocol.to_string()))
     }
 
     /// Every protocol, in the order in which they were added.
@@ -198,6 +198,24 @@ fn protocol((hash, name, settings): (Vec<u8>, String, String)) -> Result<Protoco
     let settings = serde_json::from_str(&settings);
     let settings = settings.map_err(|error| StoreError::damaged("a protocol", error))?;
     Ok(Protocol { hash: decode_hash(&hash)?, name, settings })
+}
+
+/// Adds a protocol, unless it is there.
+pub(super) async fn know(transaction: &mut Transaction, protocol: &Protocol, now: i64) -> Result<()> {
+    let sql = "INSERT INTO protocol (hash, name, settings) VALUES ($1, $2, $3) ON CONFLICT (hash) DO NOTHING";
+    let insert = query(sql).bind(&protocol.hash.0[..]).bind(&protocol.name);
+    let insert = insert.bind(protocol.settings.to_string());
+    let added = insert.execute(&mut *transaction).await.map_err(|error| match error {
+        StoreError::Database(sqlx::Error::Database(error)) if error.is_unique_violation() => {
+            StoreError::ProtocolName(protocol.name.clone())
+        }
+        _ => error,
+    })?;
+    if added > 0 {
+        let detail = serde_json::json!({ "name": protocol.name, "hash": protocol.hash.to_string() });
+        insert_operation(transaction, now, "protocol", &detail).await?;
+    }
+    Ok(())
 }
 
 pub(super) async fn set_campaign_value(transaction: &mut Transaction, key: &str, value: &str) -> Result<()> {

@@ -8,6 +8,7 @@
 use atoms::Structure;
 use wire::ContentHash;
 
+use super::labels::CURRENT;
 use super::{budget, processes, protocols};
 use crate::Store;
 use crate::database::{Transaction, from_columns, query};
@@ -23,7 +24,8 @@ pub(crate) const NEXT: &str = "SELECT number, structure, decision, attempts, fai
 
 pub(crate) const EXPIRED: &str = "SELECT number, holder FROM job WHERE state = 'leased' AND expires <= $1";
 
-pub(crate) const UNFINISHED: &str = "SELECT count(*) FROM job WHERE state IN ('queued', 'leased')";
+pub(crate) const UNFINISHED: &str = "SELECT (SELECT count(*) FROM job WHERE state IN ('queued', 'leased'))
+    - (SELECT count(*) FROM job WHERE state IN ('queued', 'leased') AND relabel IS NOT NULL)";
 
 pub(crate) const HELD: &str = "SELECT number FROM job WHERE state = 'leased'
     AND (holder = $1 OR substr(holder, 1, length($1) + 1) = $1 || '/')";
@@ -197,8 +199,8 @@ impl Store {
         let lost = match held {
             false => Failed::LeaseLost,
             true => match end_in_vain(&mut transaction, lease.job, InVain::Lost("lost"), now).await? {
-                JobState::Failed => Failed::GivenUp,
-                _ => Failed::Requeued,
+                JobState::Queued => Failed::Requeued,
+                _ => Failed::GivenUp,
             },
         };
         transaction.commit().await?;
@@ -221,8 +223,8 @@ impl Store {
         let failed = if job.state == "leased" && job.attempts == lease.attempt {
             let how = InVain::Failed { class, log, limit: attempt_limit };
             match end_in_vain(&mut transaction, lease.job, how, now).await? {
-                JobState::Failed => Failed::GivenUp,
-                _ => Failed::Requeued,
+                JobState::Queued => Failed::Requeued,
+                _ => Failed::GivenUp,
             }
         } else {
             explain(&mut transaction, lease.job, lease.attempt, class, log).await?;
@@ -276,7 +278,7 @@ impl Store {
         query(sql).fetch_one(&self.database).await
     }
 
-    /// Number of jobs that are queued or leased.
+    /// Number of jobs that are queued or leased for a first label: those that are labelled again do not come from walks.
     pub async fn unfinished_jobs(&self) -> Result<u64> {
         query(UNFINISHED).fetch_one(&self.database).await
     }
@@ -325,14 +327,14 @@ pub(super) async fn end_attempt(
     Ok(())
 }
 
-/// Ends the attempt that is under way without a result: the job waits for another, or is given up. Returns which.
+/// Ends the attempt that is under way without a result: the job waits for another, or is given up. Returns its state.
 pub(crate) async fn end_in_vain(
     transaction: &mut Transaction,
     job: i64,
     how: InVain<'_>,
     now: i64,
 ) -> Result<JobState> {
-    let JobRow { attempts, mut failures, .. } = job_row(transaction, job).await?;
+    let JobRow { structure, protocol, attempts, mut failures, .. } = job_row(transaction, job).await?;
     let given_up = match how {
         InVain::Failed { class, log, limit } => {
             end_attempt(transaction, job, "failed", now).await?;
@@ -350,11 +352,20 @@ pub(crate) async fn end_in_vain(
             losses >= LOSS_LIMIT
         }
     };
-    let state = if given_up { JobState::Failed } else { JobState::Queued };
+    let state = match given_up {
+        false => JobState::Queued,
+        // Another label was asked for in vain, and the one that there is stays.
+        true if has_label(transaction, structure, protocol).await? => JobState::Labelled,
+        true => JobState::Failed,
+    };
     let sql = "UPDATE job SET state = $1, failures = $2, holder = NULL, expires = NULL WHERE number = $3";
     let query = query(sql).bind(state.name()).bind(failures).bind(job);
     query.execute(&mut *transaction).await?;
     Ok(state)
+}
+
+async fn has_label(transaction: &mut Transaction, structure: i64, protocol: i64) -> Result<bool> {
+    query(CURRENT).bind(structure).bind(protocol).fetch_one(&mut *transaction).await
 }
 
 /// Keeps with an attempt why it failed.

@@ -1,6 +1,8 @@
 //! The state of a campaign, from indexes.
 
-use super::{budget, job_counts, pace, processes};
+use wire::WalkId;
+
+use super::{budget, job_counts, pace, pauses, processes, relabel};
 use crate::Store;
 use crate::budget::{Budget, BudgetStatus};
 use crate::database::query;
@@ -22,8 +24,8 @@ pub(crate) const COUNTED_FATES: &str =
 macro_rules! walks {
     ($which:literal) => {
         concat!(
-            "SELECT walk, coalesce(name, '') AS seed_structure, origin, state, reason, step, segment, tau,
-                temperature, relative_volume, gamma_max, CAST(NULL AS DOUBLE PRECISION) AS steps_per_second, accepted,
+            "SELECT walk, coalesce(name, '') AS seed_structure, origin, state, reason, FALSE AS paused, step, segment,
+                tau, temperature, relative_volume, gamma_max, CAST(NULL AS DOUBLE PRECISION) AS steps_per_second, accepted,
                 refused, returns
             FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure ",
             $which
@@ -44,6 +46,7 @@ impl Store {
         let fates = query(if are_counted { FATES } else { COUNTED_FATES });
         let fates: Vec<(String, String, u64)> = fates.fetch_all(&mut transaction).await?;
         let states = job_counts::states(&mut transaction).await?;
+        let asked = relabel::asked(&mut transaction).await?;
         let oldest_lease = job_counts::oldest_lease(&mut transaction).await?;
         let labels_last_hour = job_counts::made_in_the_last_hour(&mut transaction, now).await?;
         let mut walks: Vec<WalkStatus> = query(walks!("ORDER BY walk")).fetch_all(&mut transaction).await?;
@@ -56,19 +59,22 @@ impl Store {
         let processes = processes::all(&mut transaction).await?;
         let (limits, used) = budget::read(&mut transaction, now).await?;
         advance(&mut walks, &pace::fresh(&mut transaction, now).await?);
+        let paused = pauses::read(&mut transaction).await?;
         let steps_per_second = pace::of_all(&mut transaction, now).await?;
         transaction.commit().await?;
-        let labels = labels(&states);
+        let labels = labels(&states, &asked);
         let time_used_up = limits.time_used_up(&used);
         name_budget(&mut walks, time_used_up, &limits);
-        let under_way = |walk: &WalkStatus| matches!(walk.state.as_str(), "waiting" | "running");
+        for walk in &mut walks {
+            walk.paused = walk.is_under_way() && paused.contains(&WalkId(walk.walk));
+        }
         let no_more_labels = labels.leased == 0 && (labels.queued == 0 || limits.allows_no_attempt(&used));
         Ok(Status {
             candidates: candidates(&fates, refused),
             imported,
             mixture_version,
             round,
-            finished: !walks.is_empty() && !walks.iter().any(under_way) && no_more_labels,
+            finished: !walks.is_empty() && !walks.iter().any(WalkStatus::is_under_way) && no_more_labels,
             budget: BudgetStatus { used_up: used_up(time_used_up, &walks), limits, used },
             labels,
             oldest_lease,
@@ -82,7 +88,7 @@ impl Store {
 
 /// Says of walks under way how fast they are, and where they are between their checkpoints.
 fn advance(walks: &mut [WalkStatus], paces: &[Pace]) {
-    for walk in walks.iter_mut().filter(|walk| matches!(walk.state.as_str(), "waiting" | "running")) {
+    for walk in walks.iter_mut().filter(|walk| walk.is_under_way()) {
         let Ok(found) = paces.binary_search_by_key(&walk.walk, |pace| pace.walk) else { continue };
         let pace = &paces[found];
         walk.steps_per_second = pace.steps_per_second;
@@ -135,14 +141,20 @@ fn candidates(fates: &[(String, String, u64)], refused_by_walkers: u64) -> Candi
     candidates
 }
 
-fn labels(states: &[(String, u64)]) -> Labels {
-    let number = |name: &str| states.iter().find(|(state, _)| state == name).map_or(0, |(_, count)| *count);
+fn labels(states: &[(String, u64)], asked: &[(String, u64)]) -> Labels {
+    let of = |states: &[(String, u64)], name: &str| {
+        states.iter().find(|(state, _)| state == name).map_or(0, |(_, count)| *count)
+    };
+    let (number, asked) = (|name: &str| of(states, name), |name: &str| of(asked, name));
     Labels {
         queued: number("queued"),
         leased: number("leased"),
         labelled: number("labelled"),
         failed: number("failed"),
         dropped: number("dropped"),
+        again: asked("queued") + asked("leased"),
+        again_in_vain: asked("labelled") + asked("failed"),
+        failed_again: asked("failed"),
     }
 }
 

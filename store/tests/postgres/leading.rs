@@ -111,10 +111,10 @@ async fn foreign_tables_and_newer_versions_are_left_alone() {
     connection.execute("DROP TABLE job").await.unwrap();
     home.create().await;
     let newer = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
-                 VALUES (7, 'newer', true, '', 0)";
+                 VALUES (1000, 'newer', true, '', 0)";
     connection.execute(newer).await.unwrap();
     for opened in [Store::open(home.location()).await, Store::open_read_only(home.location()).await] {
-        assert!(matches!(opened, Err(StoreError::Version { found: 7, reads: 5, .. })), "{opened:?}");
+        assert!(matches!(opened, Err(StoreError::Version { found: 1000, .. })), "{opened:?}");
     }
 }
 

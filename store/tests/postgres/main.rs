@@ -28,4 +28,6 @@ mod protection;
 mod queue;
 #[path = "../queue_model.rs"]
 mod queue_model;
+#[path = "../relabel.rs"]
+mod relabel;
 mod secrets;

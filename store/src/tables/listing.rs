@@ -1,0 +1,168 @@
+//! Pages of the table of candidates. Each goes through an index from its first row on, however many rows there are.
+
+use crate::Store;
+use crate::database::{from_columns, query};
+use crate::error::Result;
+use crate::listing::{ListOrder, ListPlace, ListedCandidate};
+use crate::records::JobState;
+
+from_columns!(ListedCandidate {
+    decision,
+    id,
+    origin,
+    fate,
+    walk,
+    segment,
+    step,
+    seed_structure,
+    mixture_version,
+    atoms,
+    formula,
+    temperature,
+    relative_volume,
+    walker_gamma,
+    gamma,
+    gamma_nbr,
+    job_state,
+    priority,
+    attempts
+});
+
+macro_rules! lines {
+    ($($rest:literal),*) => {
+        concat!(
+            "SELECT candidate.decision AS decision, id, origin, coalesce(candidate.reason, fate) AS fate, walk, segment,
+                step, coalesce(name, '') AS seed_structure, mixture_version, candidate.atoms AS atoms,
+                candidate.formula AS formula, temperature, relative_volume, walker_gamma, original_gamma AS gamma,
+                original_gamma_nbr AS gamma_nbr, job.state AS job_state, priority, attempts ",
+            $($rest),*
+        )
+    };
+}
+
+macro_rules! page {
+    ($which:literal, $order:literal, $limit:literal) => {
+        lines!(
+            "FROM candidate
+            LEFT JOIN job ON job.number = (SELECT max(newest.number) FROM job AS newest
+                                           WHERE newest.structure = candidate.structure)
+            LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
+            WHERE ",
+            $which,
+            " ORDER BY ",
+            $order,
+            " LIMIT ",
+            $limit
+        )
+    };
+}
+
+pub(crate) const NEWEST: &str = page!("candidate.decision < $1", "candidate.decision DESC", "$2");
+pub(crate) const OLDEST: &str = page!("candidate.decision > $1", "candidate.decision", "$2");
+
+pub(crate) const NEWEST_OF_FATE: &str = page!(
+    "candidate.decision < $1 AND origin = $2 AND fate = $3 AND candidate.reason IS NOT DISTINCT FROM $4",
+    "candidate.decision DESC",
+    "$5"
+);
+pub(crate) const OLDEST_OF_FATE: &str = page!(
+    "candidate.decision > $1 AND origin = $2 AND fate = $3 AND candidate.reason IS NOT DISTINCT FROM $4",
+    "candidate.decision",
+    "$5"
+);
+
+pub(crate) const LARGEST_GAMMA: &str = page!(
+    "(original_gamma, candidate.decision) < ($1, $2)",
+    "original_gamma DESC, candidate.decision DESC",
+    "$3"
+);
+pub(crate) const LEAST_GAMMA: &str =
+    page!("(original_gamma, candidate.decision) > ($1, $2)", "original_gamma, candidate.decision", "$3");
+
+pub(crate) const LARGEST_VOLUME: &str = page!(
+    "(relative_volume, candidate.decision) < ($1, $2)",
+    "relative_volume DESC, candidate.decision DESC",
+    "$3"
+);
+pub(crate) const LEAST_VOLUME: &str =
+    page!("(relative_volume, candidate.decision) > ($1, $2)", "relative_volume, candidate.decision", "$3");
+
+/// Of one walk, in the order of their names.
+pub(crate) const OF_WALK: &str = page!("id >= $1 AND id < $1 || '~'", "id", "$2");
+
+/// The jobs are found in the index, and only those of the page are looked at.
+pub(crate) const QUEUE: &str = lines!(
+    "FROM (SELECT number AS place FROM job WHERE state = $1 AND priority <= $2
+              AND (priority < $2 OR decision > $3) ORDER BY priority DESC, decision LIMIT $4) AS page
+        CROSS JOIN job ON job.number = place
+        CROSS JOIN candidate ON candidate.decision = job.decision
+        LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
+        ORDER BY job.priority DESC, job.decision"
+);
+
+impl Store {
+    /// At most `limit` candidates behind a place (none: from the first on), the largest first if `descending`.
+    pub async fn list_candidates(
+        &self,
+        order: ListOrder,
+        descending: bool,
+        after: Option<ListPlace>,
+        limit: u32,
+    ) -> Result<Vec<ListedCandidate>> {
+        let ListPlace { value, decision } = after.unwrap_or(first(descending));
+        let query = match (order, descending) {
+            (ListOrder::Decision, true) => query(NEWEST),
+            (ListOrder::Decision, false) => query(OLDEST),
+            (ListOrder::Gamma, true) => query(LARGEST_GAMMA).bind(value),
+            (ListOrder::Gamma, false) => query(LEAST_GAMMA).bind(value),
+            (ListOrder::Volume, true) => query(LARGEST_VOLUME).bind(value),
+            (ListOrder::Volume, false) => query(LEAST_VOLUME).bind(value),
+        };
+        query.bind(decision).bind(limit).fetch_all(&self.database).await
+    }
+
+    /// The same in the order of decisions, only those of this origin and fate; `reason` belongs to `declined`.
+    pub async fn list_fate(
+        &self,
+        origin: &str,
+        reason: Option<&str>,
+        descending: bool,
+        after: Option<i64>,
+        limit: u32,
+    ) -> Result<Vec<ListedCandidate>> {
+        let fate = if reason.is_some() { "declined" } else { "accepted" };
+        let query = query(if descending { NEWEST_OF_FATE } else { OLDEST_OF_FATE });
+        let query = query.bind(after.unwrap_or(first(descending).decision)).bind(origin).bind(fate);
+        query.bind(reason).bind(limit).fetch_all(&self.database).await
+    }
+
+    /// Those whose jobs are in a state, in the order in which they would be leased. `after`: priority and decision.
+    pub async fn list_queue(
+        &self,
+        state: JobState,
+        after: Option<(i32, i64)>,
+        limit: u32,
+    ) -> Result<Vec<ListedCandidate>> {
+        let (priority, decision) = after.unwrap_or((i32::MAX, 0));
+        let query = query(QUEUE).bind(state.name()).bind(priority).bind(decision);
+        query.bind(limit).fetch_all(&self.database).await
+    }
+
+    /// Candidates of a walk in the order of its steps; of walks that offered more than `limit`, some.
+    pub async fn list_walk(&self, walk: u32, limit: u32) -> Result<Vec<ListedCandidate>> {
+        let campaign = self.campaign_value("id").await?;
+        let begin = format!("{}-{walk}.", campaign.get(..8).unwrap_or_default());
+        let query = query(OF_WALK).bind(begin).bind(limit);
+        let mut found: Vec<ListedCandidate> = query.fetch_all(&self.database).await?;
+        found.sort_by_key(|candidate| (candidate.segment, candidate.step, candidate.decision));
+        Ok(found)
+    }
+}
+
+/// Before everything.
+fn first(descending: bool) -> ListPlace {
+    match descending {
+        true => ListPlace { value: f64::MAX, decision: i64::MAX },
+        false => ListPlace { value: f64::MIN, decision: 0 },
+    }
+}

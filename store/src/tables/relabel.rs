@@ -1,0 +1,255 @@
+//! Labels that are made anew: by the same protocol because they are doubtful, or by another that comes into force.
+//!
+//! A job whose `relabel` says why waits for another label while there is one. Until that comes nothing changes for anybody who
+//! reads labels; if it does not come, nothing has changed. A job by an earlier protocol is superseded when the label by the newer
+//! one is there, or if it has none itself, when the newer protocol comes into force.
+
+use std::collections::HashSet;
+
+use serde_json::json;
+use wire::ContentHash;
+
+use super::labels::CURRENT;
+use super::logs::insert_operation;
+use super::protocols::{in_force, know, number, set_campaign_value};
+use crate::Store;
+use crate::database::{FromRow, Row, Transaction, Value, for_rows, from_columns, query};
+use crate::encoding::decode_hash;
+use crate::error::{Result, StoreError};
+use crate::jobs::{LabelSource, Standing};
+use crate::records::JobState;
+use crate::relabel::{NewProtocol, Relabel, Relabellable, Requeued};
+
+/// Jobs with their labels; of a structure that has labels by several protocols, all of them.
+pub(crate) const LABELLED: &str =
+    "SELECT structure.hash AS hash, job.decision AS decision, protocol.name AS protocol, own.state AS state,
+        candidate.seed_structure AS seed_structure, candidate.formula AS formula, candidate.atoms AS atoms
+    FROM job
+    CROSS JOIN label ON label.structure = job.structure AND label.protocol = job.protocol AND standing = 'label'
+    CROSS JOIN structure ON structure.number = job.structure
+    CROSS JOIN candidate ON candidate.decision = job.decision
+    CROSS JOIN protocol ON protocol.number = job.protocol
+    LEFT JOIN job AS own ON own.structure = job.structure AND own.protocol = $1
+    WHERE job.state <> 'dropped' ORDER BY job.decision, job.number";
+
+/// Those that have no job by that protocol get one. `own` is the job by which the present label was made.
+macro_rules! request {
+    ($states:literal) => {
+        concat!(
+            "INSERT INTO job (structure, protocol, decision, priority, state, overruled, relabel, relabel_after)
+            SELECT own.structure, new.protocol, own.decision, own.priority, 'queued', 1, new.reason, 0
+            FROM {rows} CROSS JOIN structure ON structure.hash = new.hash
+            CROSS JOIN job AS own ON own.structure = structure.number AND own.number = (
+                SELECT max(job.number) FROM job CROSS JOIN label ON label.structure = job.structure
+                AND label.protocol = job.protocol AND standing = 'label'
+                WHERE job.structure = structure.number AND job.state <> 'dropped')
+            WHERE TRUE
+            ON CONFLICT (structure, protocol) DO UPDATE SET state = 'queued', failures = 0, overruled = 1,
+                relabel = excluded.relabel, relabel_after = job.attempts WHERE job.state IN (",
+            $states,
+            ")"
+        )
+    };
+}
+const REQUEST: &str = request!("'failed', 'superseded'");
+const REQUEST_AGAIN: &str = request!("'labelled', 'failed', 'superseded'");
+
+/// Other labels that were asked for by a protocol which is no longer in force: those that there are stay.
+const WITHDRAW: &str =
+    "UPDATE job SET state = 'labelled', relabel = NULL, relabel_after = NULL, holder = NULL,
+        expires = NULL
+    WHERE protocol <> $1 AND state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label
+        WHERE label.structure = job.structure AND label.protocol = job.protocol AND standing = 'label')";
+
+/// What has no label by an earlier protocol goes over to the one in force, unless that has a job for it which says something else.
+const GO_OVER: &str = "INSERT INTO job (structure, protocol, decision, priority, state, overruled, relabel, relabel_after)
+    SELECT structure, CAST($1 AS BIGINT), decision, priority, CASE WHEN EXISTS (SELECT 1 FROM label
+            WHERE label.structure = job.structure AND label.protocol = $1 AND standing = 'label')
+            THEN 'labelled' ELSE 'queued' END, overruled, relabel, 0
+        FROM job WHERE protocol <> $1 AND state IN ('queued', 'leased', 'failed')
+    ON CONFLICT (structure, protocol) DO UPDATE SET state = 'queued', failures = 0, overruled = excluded.overruled,
+        relabel = excluded.relabel, relabel_after = job.attempts WHERE job.state = 'superseded'";
+
+const LEAVE_BEHIND: &str =
+    "UPDATE job SET state = 'superseded', relabel = NULL, relabel_after = NULL, holder = NULL,
+        expires = NULL
+    WHERE protocol <> $1 AND state IN ('queued', 'leased', 'failed')";
+
+/// Attempts at jobs that nobody has any more.
+const END_ATTEMPTS: &str = "UPDATE attempt SET ended = $1, outcome = 'dropped' WHERE outcome IS NULL
+    AND EXISTS (SELECT 1 FROM job WHERE job.number = attempt.job AND state <> 'leased')";
+
+/// Labels that were made or taken in for a job of the structure; others belong to other data sets.
+const SUPERSEDE: &str = "UPDATE label SET standing = 'superseded', superseded = $2, reason = $3
+    WHERE structure = $1 AND standing = 'label' AND EXISTS (SELECT 1 FROM job
+        WHERE job.structure = label.structure AND job.protocol = label.protocol)";
+
+const SUPERSEDE_JOBS: &str =
+    "UPDATE job SET state = 'superseded', relabel = NULL, relabel_after = NULL, holder = NULL,
+        expires = NULL
+    WHERE structure = $1 AND protocol <> $2 AND state NOT IN ('dropped', 'superseded')";
+
+/// Jobs for which another label was asked, by state.
+const ASKED: &str = "SELECT state, count(*) FROM job WHERE relabel IS NOT NULL GROUP BY state";
+
+/// A job, as far as it decides what a result is.
+struct Asked {
+    number: i64,
+    state: String,
+    relabel: Option<String>,
+    relabel_after: Option<u32>,
+}
+
+from_columns!(Asked { number, state, relabel, relabel_after });
+
+impl FromRow for Relabellable {
+    fn from_row(row: &Row) -> Result<Self> {
+        let (hash, state): (Vec<u8>, Option<String>) = (row.get("hash")?, row.get("state")?);
+        let named = |state: String| {
+            JobState::named(&state).ok_or_else(|| StoreError::damaged("the state of a job", state))
+        };
+        Ok(Self {
+            content: decode_hash(&hash)?,
+            decision: row.get("decision")?,
+            protocol: row.get("protocol")?,
+            job: state.map(named).transpose()?,
+            seed_structure: row.get("seed_structure")?,
+            formula: row.get("formula")?,
+            atoms: row.get("atoms")?,
+        })
+    }
+}
+
+impl Store {
+    /// Every structure that has its label and was not dropped, in decision order, with its job by that protocol, which the campaign
+    /// need not know.
+    pub async fn relabellable(&self, protocol: ContentHash) -> Result<Vec<Relabellable>> {
+        let mut transaction = self.database.begin_to_read().await?;
+        let own = query("SELECT number FROM protocol WHERE hash = $1").bind(protocol.0.to_vec());
+        let own: Option<i64> = own.fetch_optional(&mut transaction).await?;
+        let found: Vec<Relabellable> =
+            query(LABELLED).bind(own.unwrap_or(0)).fetch_all(&mut transaction).await?;
+        transaction.commit().await?;
+        let mut structures: Vec<Relabellable> = Vec::with_capacity(found.len());
+        for one in found {
+            match structures.last_mut().filter(|last| last.content == one.content) {
+                // The newest job is the one that counts.
+                Some(last) => *last = one,
+                None => structures.push(one),
+            }
+        }
+        Ok(structures)
+    }
+
+    /// Number of structures without a label whose jobs are of another protocol than this: they go over to it when it comes into
+    /// force.
+    pub async fn unlabelled_by_others(&self, protocol: ContentHash) -> Result<u64> {
+        let sql = "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed')
+                   AND protocol <> coalesce((SELECT number FROM protocol WHERE hash = $1), 0)
+                   AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
+                                   AND label.protocol = job.protocol AND standing = 'label')";
+        query(sql).bind(protocol.0.to_vec()).fetch_one(&self.database).await
+    }
+
+    /// Asks for other labels of structures that have theirs: by the protocol in force, or by one that comes into force. In that
+    /// case all that has no label goes over to it, and calculations under way are for nothing. Structures that wait already, or were
+    /// dropped, are left alone, so asking twice is asking once. Leaves a line `relabel` in the operations log.
+    ///
+    /// # Errors
+    /// [`StoreError::ProtocolName`] if another protocol has the name of the new one. [`StoreError::LockLost`] if a protocol is to
+    /// come into force and somebody else leads the campaign.
+    pub async fn relabel(&self, order: &Relabel<'_>, now: i64) -> Result<Requeued> {
+        let mut transaction = match order.protocol {
+            Some(_) => self.database.begin_to_lead().await?,
+            None => self.database.begin().await?,
+        };
+        let mut requeued = Requeued::default();
+        if let Some(new) = &order.protocol {
+            requeued.moved = change_protocol(&mut transaction, new, now).await?;
+        }
+        let none = || StoreError::damaged("the campaign", "it has no label protocol");
+        let protocol = in_force(&mut transaction).await?.ok_or_else(none)?;
+        let row = |content: &ContentHash| -> Vec<Value> {
+            vec![content.0.to_vec().into(), protocol.into(), order.reason.into()]
+        };
+        // One statement writes a row once.
+        let mut seen = HashSet::new();
+        let rows = order.structures.iter().filter(|content| seen.insert(content.0)).map(row).collect();
+        let sql = if order.again { REQUEST_AGAIN } else { REQUEST };
+        requeued.again = for_rows(&mut transaction, sql, &["hash", "protocol", "reason"], rows).await?;
+        if order.protocol.is_some() || requeued.again > 0 {
+            let Requeued { again, moved } = requeued;
+            let detail = json!({ "reason": order.reason, "again": again, "moved": moved });
+            insert_operation(&mut transaction, now, "relabel", &detail).await?;
+        }
+        transaction.commit().await?;
+        Ok(requeued)
+    }
+}
+
+/// Whether the tables are not those of an earlier version, in which nothing is labelled again.
+pub(crate) async fn is_known(transaction: &mut Transaction) -> Result<bool> {
+    transaction.has_column("job", "relabel").await
+}
+
+/// Numbers of jobs for which another label was asked and has not come, by state.
+pub(super) async fn asked(transaction: &mut Transaction) -> Result<Vec<(String, u64)>> {
+    if !is_known(transaction).await? {
+        return Ok(Vec::new());
+    }
+    query(ASKED).fetch_all(transaction).await
+}
+
+/// Brings a protocol into force. Returns how many structures without a label went over to it.
+async fn change_protocol(transaction: &mut Transaction, new: &NewProtocol<'_>, now: i64) -> Result<u64> {
+    know(transaction, new.protocol, now).await?;
+    set_campaign_value(transaction, "protocol", &new.protocol.hash.to_string()).await?;
+    set_campaign_value(transaction, "configuration_in_force", new.configuration).await?;
+    for (name, note) in new.notes {
+        set_campaign_value(transaction, &format!("note/{name}"), note).await?;
+    }
+    for change in new.changes {
+        insert_operation(transaction, now, "configuration", change).await?;
+    }
+    let protocol = number(transaction, new.protocol.hash).await?;
+    query(WITHDRAW).bind(protocol).execute(&mut *transaction).await?;
+    query(GO_OVER).bind(protocol).execute(&mut *transaction).await?;
+    let moved = query(LEAVE_BEHIND).bind(protocol).execute(&mut *transaction).await?;
+    let now = transaction.time(now).await?;
+    query(END_ATTEMPTS).bind(now).execute(&mut *transaction).await?;
+    Ok(moved)
+}
+
+/// What a result is. If it is the label that was asked for, those in whose place it comes are superseded.
+pub(super) async fn standing(
+    transaction: &mut Transaction,
+    structure: i64,
+    protocol: i64,
+    source: &LabelSource,
+    now: i64,
+) -> Result<Standing> {
+    let labelled: bool = query(CURRENT).bind(structure).bind(protocol).fetch_one(&mut *transaction).await?;
+    let first = if labelled { Standing::Check } else { Standing::Label };
+    let sql = "SELECT number, state, relabel, relabel_after FROM job WHERE structure = $1 AND protocol = $2";
+    let job = query(sql).bind(structure).bind(protocol).locked();
+    let job: Option<Asked> = job.fetch_optional(&mut *transaction).await?;
+    let Some(Asked { number, state, relabel, relabel_after }) = job else { return Ok(first) };
+    if state == JobState::Superseded.name() {
+        return Ok(Standing::Check);
+    }
+    let Some(reason) = relabel else { return Ok(first) };
+    let began_since = match source {
+        LabelSource::Attempt { attempt, .. } => *attempt > relabel_after.unwrap_or(0),
+        // It may be the very one that is doubted.
+        LabelSource::Import { .. } => !labelled,
+    };
+    if !began_since || state == JobState::Dropped.name() {
+        return Ok(Standing::Check);
+    }
+    query(SUPERSEDE).bind(structure).bind(now).bind(reason).execute(&mut *transaction).await?;
+    let came = query("UPDATE job SET relabel = NULL, relabel_after = NULL WHERE number = $1");
+    came.bind(number).execute(&mut *transaction).await?;
+    query(SUPERSEDE_JOBS).bind(structure).bind(protocol).execute(&mut *transaction).await?;
+    query(END_ATTEMPTS).bind(now).execute(&mut *transaction).await?;
+    Ok(Standing::Label)
+}
