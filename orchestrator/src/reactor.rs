@@ -25,8 +25,8 @@ use wire::transport::{Incoming, Work};
 use self::arrivals::{Arrival, Arrivals};
 use crate::selector::{Next, Selector, SelectorError};
 
-/// How often a full label queue is looked at again, and for how long a count of another is good.
-const QUEUE_LOOK: Duration = Duration::from_millis(200);
+/// How often a full label queue and paused walks are looked at again, and for how long what was found is good.
+const LOOK: Duration = Duration::from_millis(200);
 /// A turn may cost so many walkers, which crashed with it in hand; then its walk is over.
 const MOST_WALKERS: u32 = 3;
 
@@ -93,6 +93,8 @@ struct Shell {
     costs: HashMap<WalkId, u32>,
     /// Label jobs that are unfinished at most, and when they were counted.
     unfinished: Option<(u64, Instant)>,
+    /// When it was last looked which walks people have paused.
+    paused_at: Option<Instant>,
 }
 
 type Reply = oneshot::Sender<Option<Work>>;
@@ -112,7 +114,7 @@ impl Reactor {
             Arrivals::new(self.incoming, self.selector.examiner().clone(), self.selector.mixture());
         let mut shell = Shell::new(self.selector, self.store, self.stopping, self.queue_limit);
         // An interval, not a time since the last message: walkers at work may report progress without a pause.
-        let mut look = tokio::time::interval(QUEUE_LOOK);
+        let mut look = tokio::time::interval(LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         // One commit at a time.
         let mut writing = JoinSet::new();
@@ -177,6 +179,7 @@ impl Shell {
             at_work: HashMap::new(),
             costs: HashMap::new(),
             unfinished: None,
+            paused_at: None,
         }
     }
 
@@ -264,6 +267,7 @@ impl Shell {
         if self.is_queue_full(watch).await? {
             return Ok(());
         }
+        self.look_for_pauses().await?;
         while let Some((walker, reply)) = self.waiting.pop_front() {
             match self.selector.next_turn() {
                 Next::Turn(assignment) => {
@@ -288,7 +292,7 @@ impl Shell {
     /// the commit. It is not counted each time, since for a while it grows by what is decided here and nothing else.
     async fn is_queue_full(&mut self, watch: &mut impl FnMut(Notice<'_>)) -> Result<bool, ReactorError> {
         let limit = self.selector.most_unfinished(self.queue_limit);
-        if self.unfinished.is_some_and(|(most, at)| most <= limit && at.elapsed() < QUEUE_LOOK) {
+        if self.unfinished.is_some_and(|(most, at)| most <= limit && at.elapsed() < LOOK) {
             return Ok(false);
         }
         let unfinished = self.store.unfinished_jobs().await?;
@@ -299,6 +303,15 @@ impl Shell {
         self.unfinished = Some((most, Instant::now()));
         self.selector.set_unfinished_jobs(most);
         Ok(most > limit)
+    }
+
+    /// Finds out which walks are to get no turn.
+    async fn look_for_pauses(&mut self) -> Result<(), StoreError> {
+        if self.paused_at.is_none_or(|at| at.elapsed() >= LOOK) {
+            self.selector.set_paused(self.store.paused_walks().await?);
+            self.paused_at = Some(Instant::now());
+        }
+        Ok(())
     }
 
     fn send_home(&mut self) {

@@ -340,3 +340,28 @@ async fn a_turn_that_kills_its_walkers_ends_its_walk() {
         assert_eq!(log.contains(expected), fault, "{log}");
     }
 }
+
+/// A paused walk gets no turn, its round waits for it, and what is decided is the same as without a pause.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_paused_walk_stands_still_and_changes_nothing() {
+    let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    let whole = open(folders[0].path()).await;
+    assert_eq!(run(&whole, 2, usize::MAX).await, Ended::Done);
+
+    let store = open(folders[1].path()).await;
+    let stopping = Arc::new(AtomicBool::new(false));
+    let (reactor, to_reactor) = reactor(&store, &stopping).await;
+    let threads = start_walkers(2, to_reactor, &stopping);
+    store.pause_walks(&[WalkId(1)], true, 0).await.unwrap();
+    let running = tokio::spawn(end_of(reactor, |_| {}));
+    let turns = async || {
+        let walks = store.load_walks().await.unwrap();
+        walks.iter().map(|walk| walk.turn).collect::<Vec<_>>()
+    };
+    tokio::time::sleep(Duration::from_millis(700)).await;
+    assert_eq!((turns().await, running.is_finished()), (vec![0; 3], false), "the first round waits");
+    store.pause_walks(&[WalkId(1)], false, 0).await.unwrap();
+    assert_eq!(running.await.unwrap(), Ended::Done);
+    threads.into_iter().for_each(|thread| thread.join().unwrap());
+    assert_eq!(content(&store).await, content(&whole).await);
+}

@@ -329,3 +329,16 @@ fn a_seed_structure_that_cannot_be_graded_is_named() {
     let message = found.err().expect("refused").to_string();
     assert_eq!(message, "seed structure 'seed-0': atom 1 is Cu, which the model does not know");
 }
+
+#[test]
+fn a_paused_walk_gets_no_turn_and_the_others_go_on_in_live_mode() {
+    let mut selector = restore(&settings(Mode::Live), 3, Snapshot::default());
+    let _ = selector.begin_walks();
+    selector.set_paused([WalkId(0), WalkId(2)].into());
+    assert_eq!(turn(&mut selector).walk, WalkId(1));
+    assert!(matches!(selector.next_turn(), Next::Wait) && !selector.is_done());
+    selector.set_paused([WalkId(0)].into());
+    assert_eq!(turn(&mut selector).walk, WalkId(2));
+    selector.set_paused([].into());
+    assert_eq!(turn(&mut selector).walk, WalkId(0));
+}

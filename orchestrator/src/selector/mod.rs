@@ -20,7 +20,7 @@ mod staleness;
 mod turns;
 mod walk;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use atoms::Structure;
@@ -177,6 +177,8 @@ pub struct Selector {
     judge: Judge,
     /// Walks of the round in hand, with the reports that have come in.
     in_round: BTreeMap<WalkId, Option<ExaminedReport>>,
+    /// Walks that get no turn for now.
+    paused: BTreeSet<WalkId>,
 }
 
 impl Selector {
@@ -192,7 +194,7 @@ impl Selector {
         snapshot: Snapshot,
     ) -> Result<Self, SelectorError> {
         let judge = Judge::restore(settings, &seeds, grader, original, training, snapshot)?;
-        Ok(Self { campaign, seeds, judge, in_round: BTreeMap::new() })
+        Ok(Self { campaign, seeds, judge, in_round: BTreeMap::new(), paused: BTreeSet::new() })
     }
 
     /// The mixture of the turns that [`Selector::next_turn`] gives out.
@@ -227,6 +229,12 @@ impl Selector {
     /// Says how many label jobs are unfinished, for decisions and turns from now on.
     pub fn set_unfinished_jobs(&mut self, unfinished: u64) {
         self.judge.raised = self.judge.backlog.map_or(1.0, |backlog| backlog.factor(unfinished));
+    }
+
+    /// From now on these walks, and no others, get no turn. In reproducible mode their round waits for them, and so the other
+    /// walks do: what is decided does not depend on who was paused when.
+    pub fn set_paused(&mut self, walks: BTreeSet<WalkId>) {
+        self.paused = walks;
     }
 
     /// Walkers have to wait while more label jobs than this are unfinished, where they are to wait above `limit` unless the

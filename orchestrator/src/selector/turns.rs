@@ -11,7 +11,7 @@ use super::{Mode, Selector};
 pub enum Next {
     /// This turn, under the mixture of [`Selector::mixture`].
     Turn(Box<Assignment>),
-    /// Nothing now: turns are out whose reports decide what comes next.
+    /// Nothing now: turns are out whose reports decide what comes next, or walks are paused.
     Wait,
     /// Nothing any more.
     Done,
@@ -28,7 +28,7 @@ impl Selector {
                 Mode::Live => !walk.has_ended(),
                 Mode::Reproducible => self.in_round.get(id).is_some_and(Option::is_none),
             };
-            (in_turn && !walk.out).then_some(*id)
+            (in_turn && !walk.out && !self.paused.contains(id)).then_some(*id)
         };
         if let Some(id) = self.judge.walks.iter().find_map(ready) {
             return Next::Turn(Box::new(self.assign(id)));

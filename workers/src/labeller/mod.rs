@@ -226,8 +226,12 @@ async fn look(
         return Ok(if last_look { Found::TheEnd } else { Found::Nothing });
     }
     let (protocol, seconds) = (settings.protocol.hash, settings.timing.lease_seconds());
-    let lease = store.lease(protocol, &settings.holder, now, seconds).await?;
-    Ok(lease.map_or(Found::Nothing, |lease| Found::Job(Box::new(lease))))
+    match store.lease(protocol, &settings.holder, now, seconds).await? {
+        Some(lease) => Ok(Found::Job(Box::new(lease))),
+        // What there is to do is for others.
+        None if !store.is_in_force(protocol).await? => Ok(Found::TheEnd),
+        None => Ok(Found::Nothing),
+    }
 }
 
 /// Waits until there may be work after `idle` without any, or until something else is `wanted`. Returns how long, at most.
