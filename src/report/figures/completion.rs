@@ -1,0 +1,79 @@
+//! Which structures got their labels, by how new and how stretched they are.
+
+use ::figures::{Axis, Colour, Figure, Marker, Panel, Rectangle, Scale};
+use analysis::CompletionBin;
+
+use super::super::gathered::Gathered;
+use super::super::style::{WIDTH, grouped};
+use super::super::{Csv, Drawn, csv};
+use super::row;
+
+pub fn draw(gathered: &Gathered) -> Result<Drawn, String> {
+    let none = "No label has been made, and none has finally failed.";
+    let labels = gathered.labels.as_ref().ok_or(none)?;
+    let (by_gamma, by_expansion) = (labels.learned.by_gamma.bins(), labels.learned.by_expansion.bins());
+    let (labelled, failed) = counts(&by_gamma);
+    if labelled + failed == 0 {
+        return Err(none.into());
+    }
+    let description = "Share of structures that got their labels, by grade and by volume";
+    let mut figure = Figure::new("completion", description, WIDTH, 176.0);
+    let mut numbers =
+        Csv::new(&["panel", "above", "up_to", "labelled", "failed", "share", "share_low", "share_high"]);
+    let places = row(2, [46.0, 56.0, 12.0], 22.0, 112.0);
+    for ((letter, title, bins), place) in
+        [('a', "γ_{max}", by_gamma), ('b', "V / V_{0}", by_expansion)].into_iter().zip(places)
+    {
+        draw_bins(&mut figure, &mut numbers, (letter, title), &bins, place);
+    }
+    let caption = format!(
+        "Share of the structures that have their labels among those whose labels were made or finally failed, by (a) their largest γ \
+         under the original mixture and (b) their volume by that of the seed structure. Bars, 95 % intervals (Wilson); above the axis, \
+         how many structures are in the bin. {} structures are labelled and {} failed, frames of control walks included. What failed was \
+         collected and is missing from every statement about force errors.",
+        grouped(labelled),
+        grouped(failed)
+    );
+    Ok(Drawn { figure, caption, numbers })
+}
+
+fn counts(bins: &[CompletionBin<String>]) -> (u64, u64) {
+    (bins.iter().map(|bin| bin.labelled).sum(), bins.iter().map(|bin| bin.failed.len() as u64).sum())
+}
+
+fn draw_bins(
+    figure: &mut Figure,
+    numbers: &mut Csv,
+    (letter, title): (char, &str),
+    bins: &[CompletionBin<String>],
+    place: Rectangle,
+) {
+    // Ends of bins stand where bins end; behind the last, what has no value.
+    let ends = bins.iter().enumerate().filter_map(|(k, bin)| match (bin.above, bin.up_to) {
+        (_, Some(end)) => Some((k as f64 + 1.0, end.to_string())),
+        (None, None) => Some((k as f64 + 0.5, "unknown".to_owned())),
+        _ => None,
+    });
+    let y = Axis::new("labelled (%)", Scale::Linear, 0.0, 118.0);
+    let mut panel = Panel::new(place, Axis::of_bins(title, bins.len(), ends), y);
+    for (k, bin) in bins.iter().enumerate() {
+        let x = k as f64 + 0.5;
+        let failed = bin.failed.len() as u64;
+        if let Some((share, (low, high))) = bin.share.zip(bin.interval) {
+            panel.line([[x, 100.0 * low], [x, 100.0 * high]], Colour::BLUE.line(1.2));
+            for end in [low, high] {
+                panel.line([[x - 0.12, 100.0 * end], [x + 0.12, 100.0 * end]], Colour::BLUE.line(1.2));
+            }
+            panel.dots([[x, 100.0 * share]], Marker::Disc, 2.6, Colour::BLUE, None);
+        }
+        let all = grouped(bin.labelled + failed);
+        panel.words([x, 108.0], [0.0, 2.5], &all, ::figures::Anchor::Middle).colour = Colour::GREY;
+        let (low, high) = bin.interval.unzip();
+        let mut cells = vec![letter.to_string(), csv::number(bin.above), csv::number(bin.up_to)];
+        cells.extend([bin.labelled.to_string(), failed.to_string()]);
+        cells.extend([bin.share, low, high].map(csv::number));
+        numbers.push(&cells);
+    }
+    panel.letter(letter);
+    panel.draw(figure);
+}

@@ -1,0 +1,75 @@
+//! What came of a campaign, as a document: read from the store (`gathered`), drawn (`figures`), told (`page`). The same campaign
+//! gives the same bytes: nothing of the clock or of where it is made is in it.
+
+mod csv;
+mod features;
+mod figures;
+mod gathered;
+mod page;
+mod sample;
+mod style;
+mod tables;
+#[cfg(test)]
+mod tests;
+
+use ::figures::{to_png, to_svg};
+use store::Store;
+
+use self::csv::Csv;
+use self::gathered::Gathered;
+use crate::outcome::Failure;
+
+/// Dots an inch of the images.
+const RESOLUTION: f64 = 300.0;
+
+/// A figure with what is said of it, or why there is none.
+struct Part {
+    /// Name of its files.
+    name: &'static str,
+    /// Its title.
+    title: &'static str,
+    /// The figure, or why it is missing.
+    drawn: Result<Drawn, String>,
+}
+
+/// A figure, its caption, and the numbers in it.
+struct Drawn {
+    figure: ::figures::Figure,
+    /// With `_{…}` and `^{…}`.
+    caption: String,
+    numbers: Csv,
+}
+
+/// A file of a report.
+pub struct File {
+    /// Its path in the report's directory.
+    pub path: String,
+    /// What is in it.
+    pub bytes: Vec<u8>,
+}
+
+/// Reads the campaign and makes all files of its report, the page first.
+pub async fn of(store: &Store) -> Result<Vec<File>, Failure> {
+    let gathered = Gathered::of(store).await?;
+    let parts = figures::all(&gathered);
+    let tables = tables::all(&gathered);
+    let page = page::write(&gathered, &parts, &tables);
+    let mut files = vec![File { path: PAGE.to_owned(), bytes: page.into_bytes() }];
+    for part in parts {
+        let Ok(drawn) = part.drawn else { continue };
+        let path = |ending: &str| format!("figures/{}.{ending}", part.name);
+        let image = to_png(&drawn.figure, RESOLUTION).map_err(Failure::failed)?;
+        let svg = to_svg(&drawn.figure);
+        files.push(File { path: path("svg"), bytes: svg.into_bytes() });
+        files.push(File { path: path("png"), bytes: image });
+        files.push(File { path: path("csv"), bytes: drawn.numbers.into_bytes() });
+    }
+    for table in &tables {
+        let path = format!("tables/{}.csv", table.name);
+        files.push(File { path, bytes: table.csv().into_bytes() });
+    }
+    Ok(files)
+}
+
+/// The page's file.
+pub const PAGE: &str = "report.html";

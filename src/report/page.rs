@@ -1,0 +1,214 @@
+//! The page: one HTML file with its font and figures in it, which asks nobody for anything.
+
+use std::fmt::Write;
+
+use figures::{BOLD, REGULAR, escape, to_html, to_svg};
+
+use super::gathered::Gathered;
+use super::style::grouped;
+use super::tables::{Cell, Table, collection_rule};
+use super::{Drawn, Part};
+
+const STYLE: &str = include_str!("page.css");
+/// Rows of a table on the page; its file has all.
+const ROWS: usize = 60;
+
+/// What stands below a heading.
+enum Block<'a> {
+    Paragraph(String),
+    Figure(&'a Part, usize),
+    Table(&'a Table, usize),
+}
+
+/// The page.
+pub fn write(gathered: &Gathered, parts: &[Part], tables: &[Table]) -> String {
+    let title = format!("Campaign {}", gathered.campaign.id);
+    let mut html = format!(
+        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n<title>{}</title>\n<style>\n{}{}{STYLE}</style>\n\
+         </head>\n<body>\n<h1>{}</h1>\n<p class=\"lead\">{}</p>\n",
+        escape(&title),
+        face(REGULAR, "normal"),
+        face(BOLD, "bold"),
+        escape(&title),
+        to_html(&lead(gathered))
+    );
+    for (heading, blocks) in sections(gathered, parts, tables) {
+        if blocks.is_empty() {
+            continue;
+        }
+        let _ = writeln!(html, "<section>\n<h2>{}</h2>", escape(heading));
+        for block in blocks {
+            match block {
+                Block::Paragraph(words) => {
+                    let _ = writeln!(html, "<p>{}</p>", to_html(&words));
+                }
+                Block::Figure(part, number) => write_figure(&mut html, part, number),
+                Block::Table(table, number) => write_table(&mut html, table, number),
+            }
+        }
+        html.push_str("</section>\n");
+    }
+    html.push_str("</body>\n</html>\n");
+    html
+}
+
+fn sections<'a>(
+    gathered: &Gathered,
+    parts: &'a [Part],
+    tables: &'a [Table],
+) -> Vec<(&'static str, Vec<Block<'a>>)> {
+    // Figures are numbered as far as they are there, tables likewise.
+    let numbered = |name: &str| {
+        let place = parts.iter().position(|part| part.name == name)?;
+        let before = parts[..place].iter().filter(|part| part.drawn.is_ok()).count();
+        Some(Block::Figure(&parts[place], before + 1))
+    };
+    let table = |name: &str| {
+        let place = tables.iter().position(|table| table.name == name)?;
+        Some(Block::Table(&tables[place], place + 1))
+    };
+    let blocks = |blocks: Vec<Option<Block<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
+    let why = collection_rule(&gathered.configuration).map(|rule| {
+        Block::Paragraph(format!(
+            "A structure of a biased walk becomes a candidate when {rule}, under the mixture that the walker sees; the selector \
+             decides with the newest."
+        ))
+    });
+    vec![
+        ("Summary", blocks(vec![table("summary")])),
+        ("What was collected, and why", blocks(vec![why, numbered("collection"), table("seed-structures")])),
+        (
+            "Biased against control walks",
+            blocks(vec![
+                numbered("distributions"),
+                numbered("errors"),
+                numbered("space"),
+                numbered("features"),
+            ]),
+        ),
+        (
+            "Force errors by grade",
+            blocks(vec![
+                numbered("grades"),
+                table("correlations"),
+                table("quantiles-gamma"),
+                table("quantiles-gamma-nbr"),
+            ]),
+        ),
+        (
+            "Cost, failures, and what has no label",
+            blocks(vec![numbered("cost"), table("failures"), numbered("completion"), table("unlabelled")]),
+        ),
+        ("Settings", blocks(vec![table("settings")])),
+        ("Versions and provenance", blocks(vec![table("provenance")])),
+    ]
+}
+
+fn lead(gathered: &Gathered) -> String {
+    let candidates = &gathered.standing.candidates;
+    let (biased, control) = (&gathered.sample.biased, &gathered.sample.control);
+    format!(
+        "{} structures were accepted of {} candidates of biased walks, and {} frames were kept of control walks; {} of all these have \
+         labels. Grades are those of the original mixture, with which the campaign began, unless it is said otherwise.",
+        grouped(candidates.accepted),
+        grouped(candidates.seen),
+        grouped(candidates.control),
+        grouped(biased.labelled() + control.labelled())
+    )
+}
+
+fn write_figure(html: &mut String, part: &Part, number: usize) {
+    let Part { name, title, drawn } = part;
+    let _ = match drawn {
+        Ok(Drawn { figure, caption, .. }) => writeln!(
+            html,
+            "<figure id=\"figure-{name}\">\n{}<figcaption><strong>Figure {number}. {}.</strong> {} \
+             <span class=\"files\">Files: figures/{name}.svg, .png, .csv.</span></figcaption>\n</figure>",
+            to_svg(figure),
+            escape(title),
+            to_html(caption)
+        ),
+        Err(why) => writeln!(
+            html,
+            "<p class=\"missing\" id=\"figure-{name}\"><strong>{}:</strong> not shown. {}</p>",
+            escape(title),
+            escape(why)
+        ),
+    };
+}
+
+fn write_table(html: &mut String, table: &Table, number: usize) {
+    let Table { name, caption, titles, rows } = table;
+    let more = match rows.len().saturating_sub(ROWS) {
+        0 => String::new(),
+        more => format!(" {} more rows are only in its file.", grouped(more as u64)),
+    };
+    let _ = writeln!(
+        html,
+        "<div class=\"scroll\"><table id=\"table-{name}\">\n<caption><strong>Table {number}.</strong> {}{more} \
+         <span class=\"files\">File: tables/{name}.csv.</span></caption>",
+        to_html(caption)
+    );
+    let is_number = |k: usize| rows.iter().all(|row| row.get(k).is_some_and(|cell| cell.is_number));
+    if titles.iter().skip(1).any(|title| *title != "value") {
+        let head = titles.iter().enumerate().map(|(k, title)| {
+            let class = if is_number(k) { " class=\"number\"" } else { "" };
+            format!("<th scope=\"col\"{class}>{}</th>", to_html(title))
+        });
+        let _ = writeln!(html, "<thead><tr>{}</tr></thead>", head.collect::<String>());
+    }
+    html.push_str("<tbody>\n");
+    for row in rows.iter().take(ROWS) {
+        let cells = row.iter().enumerate().map(|(k, cell)| write_cell(k, cell));
+        let _ = writeln!(html, "<tr>{}</tr>", cells.collect::<String>());
+    }
+    html.push_str("</tbody>\n</table></div>\n");
+}
+
+fn write_cell(column: usize, cell: &Cell) -> String {
+    let shown = escape(&cell.shown);
+    match (column, cell.is_number) {
+        (0, _) => format!("<th scope=\"row\">{shown}</th>"),
+        (_, true) => format!("<td class=\"number\">{shown}</td>"),
+        _ => format!("<td class=\"word\">{shown}</td>"),
+    }
+}
+
+/// The font in the page, so that it looks the same everywhere.
+fn face(font: &[u8], weight: &str) -> String {
+    format!(
+        "@font-face {{ font-family: 'Report Sans'; font-weight: {weight}; \
+         src: url(data:font/ttf;base64,{}) format('truetype'); }}\n",
+        base64(font)
+    )
+}
+
+/// Base 64 (RFC 4648).
+fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for group in bytes.chunks(3) {
+        let byte = |k: usize| u32::from(group.get(k).copied().unwrap_or(0));
+        let bits = byte(0) << 16 | byte(1) << 8 | byte(2);
+        for k in 0..4 {
+            let digit = DIGITS[(bits >> (18 - 6 * k) & 63) as usize];
+            text.push(if k <= group.len() { char::from(digit) } else { '=' });
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_are_written_in_base_64() {
+        for (bytes, expected) in
+            [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")]
+        {
+            assert_eq!(base64(bytes.as_bytes()), expected);
+        }
+    }
+}

@@ -1,0 +1,90 @@
+//! The tables of a report: what people read, and every digit of it for a file.
+
+mod facts;
+mod labels;
+mod seeds;
+
+use super::csv::{self, Csv};
+use super::gathered::Gathered;
+
+pub use facts::collection_rule;
+
+/// Rows below titles.
+pub struct Table {
+    /// Name of its file, and the place on the page.
+    pub name: &'static str,
+    /// What it shows; with `_{…}` and `^{…}`, as the titles.
+    pub caption: String,
+    /// Titles of columns.
+    pub titles: Vec<&'static str>,
+    /// Rows.
+    pub rows: Vec<Vec<Cell>>,
+}
+
+/// A cell.
+#[derive(Clone, Debug)]
+pub struct Cell {
+    /// As people read it.
+    pub shown: String,
+    /// With every digit.
+    pub exact: String,
+    /// Numbers stand to the right.
+    pub is_number: bool,
+}
+
+impl Table {
+    fn new(name: &'static str, caption: &str, titles: &[&'static str]) -> Self {
+        Self { name, caption: caption.into(), titles: titles.to_vec(), rows: Vec::new() }
+    }
+
+    /// Its file.
+    pub fn csv(&self) -> Csv {
+        let titles: Vec<_> = self.titles.iter().map(|title| figures::plain(title)).collect();
+        let titles: Vec<_> = titles.iter().map(String::as_str).collect();
+        let mut csv = Csv::new(&titles);
+        for row in &self.rows {
+            let cells: Vec<_> = row.iter().map(|cell| cell.exact.as_str()).collect();
+            csv.push(&cells);
+        }
+        csv
+    }
+}
+
+/// Words.
+fn text(words: impl Into<String>) -> Cell {
+    let words = words.into();
+    Cell { shown: words.clone(), exact: words, is_number: false }
+}
+
+/// A count.
+fn count(number: u64) -> Cell {
+    Cell { shown: super::style::grouped(number), exact: number.to_string(), is_number: true }
+}
+
+/// A number with so many decimals for people, a dash where there is none.
+fn real(x: impl Into<Option<f64>>, decimals: usize) -> Cell {
+    let x = x.into();
+    Cell { shown: crate::output::decimals(x, decimals), exact: csv::number(x), is_number: true }
+}
+
+/// A share, shown in percent; its file has the same.
+fn percent(share: Option<f64>) -> Cell {
+    real(share.map(|share| 100.0 * share), 1)
+}
+
+/// All that have rows, in the order of the page.
+pub fn all(gathered: &Gathered) -> Vec<Table> {
+    let mut tables = vec![facts::summary(gathered), seeds::of(gathered)];
+    if let Some(found) = &gathered.labels {
+        tables.extend([
+            labels::correlations(&found.learned),
+            labels::quantiles("quantiles-gamma", "γ", &found.learned.all.gamma),
+            labels::quantiles("quantiles-gamma-nbr", "γ_{nbr}", &found.learned.all.gamma_nbr),
+            labels::failures(&found.failures),
+            labels::unlabelled(&found.unlabelled),
+        ]);
+    }
+    tables.extend([facts::settings(gathered), facts::provenance(gathered)]);
+    tables.retain(|table| !table.rows.is_empty());
+    tables
+}

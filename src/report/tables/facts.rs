@@ -1,0 +1,177 @@
+//! What the campaign is: in numbers, by its settings, and where it comes from.
+
+use std::collections::BTreeSet;
+
+use calm::CollectionRule;
+use serde_json::Value;
+
+use super::super::gathered::Gathered;
+use super::super::style::grouped;
+use super::{Table, text};
+
+/// The campaign in a few lines.
+pub fn summary(gathered: &Gathered) -> Table {
+    let mut table = Table::new("summary", "The campaign in numbers.", &["", "value"]);
+    let status = &gathered.standing;
+    let mut row = |name: &str, value: String| table.rows.push(vec![text(name), text(value)]);
+    row("campaign", format!("{}, {} mode", gathered.campaign.id, gathered.campaign.mode));
+    let walks = |origin: &str| status.walks.iter().filter(|walk| walk.origin == origin).count() as u64;
+    let state = if status.finished { "has ended" } else { "is not over: numbers are those of the moment" };
+    row("state", state.into());
+    row("walks", format!("{} biased, {} control", grouped(walks("biased")), grouped(walks("control"))));
+    let candidates = &status.candidates;
+    row(
+        "candidates",
+        format!("{} seen, {} accepted", grouped(candidates.seen), grouped(candidates.accepted)),
+    );
+    row("control frames", grouped(candidates.control));
+    let labels = &status.labels;
+    row(
+        "label jobs",
+        format!(
+            "{} labelled, {} failed, {} dropped, {} in work, {} waiting",
+            grouped(labels.labelled),
+            grouped(labels.failed),
+            grouped(labels.dropped),
+            grouped(labels.leased),
+            grouped(labels.queued)
+        ),
+    );
+    row("imported structures", grouped(status.imported));
+    row("cost of labels", format!("{:.4} core-hours", status.budget.used.core_hours));
+    let mut mixture = format!("version {}", status.mixture_version);
+    let training = gathered.values.get("training_frames");
+    let number = |key: &str| training.and_then(|training| training[key].as_f64());
+    if let Some((median, share)) = number("median").zip(number("share_above_one")) {
+        mixture +=
+            &format!("; training atoms under it: median γ {median:.2}, {:.1} % above 1", 100.0 * share);
+    }
+    row("mixture", mixture);
+    if let Some(key) = &status.budget.used_up {
+        row("ended by", format!("the budget {key}"));
+    }
+    table
+}
+
+/// When a structure becomes a candidate, in words; `None` where the configuration does not say.
+pub fn collection_rule(configuration: &Value) -> Option<String> {
+    let rule = serde_json::from_value(configuration["collect"]["when"].clone()).ok()?;
+    Some(match rule {
+        CollectionRule::MaximumGrade { threshold } => {
+            format!("the largest γ of its atoms is above {}", f64::from(threshold))
+        }
+        CollectionRule::AtomCount { threshold, fraction, least } => format!(
+            "at least max({least}, ⌈{} N⌉) of its N atoms have γ above {}",
+            f64::from(fraction),
+            f64::from(threshold)
+        ),
+    })
+}
+
+/// Every key of the configuration in force.
+pub fn settings(gathered: &Gathered) -> Table {
+    let caption = "The configuration in force, with every default filled in. Units are those of the documentation: eV, Å, fs, K.";
+    let mut table = Table::new("settings", caption, &["key", "value"]);
+    let mut pairs = Vec::new();
+    flatten("", &gathered.configuration, &mut pairs);
+    pairs.retain(|(key, _)| !key.starts_with("files."));
+    table.rows = pairs.into_iter().map(|(key, value)| vec![text(key), text(value)]).collect();
+    table
+}
+
+fn flatten(key: &str, value: &Value, pairs: &mut Vec<(String, String)>) {
+    match value {
+        Value::Object(object) => {
+            for (name, value) in object {
+                let key = if key.is_empty() { name.clone() } else { format!("{key}.{name}") };
+                flatten(&key, value, pairs);
+            }
+        }
+        Value::Null => {}
+        Value::String(text) => pairs.push((key.to_owned(), text.clone())),
+        other => pairs.push((key.to_owned(), other.to_string())),
+    }
+}
+
+/// Versions, hashes, and where everything comes from.
+pub fn provenance(gathered: &Gathered) -> Table {
+    let mut table = Table::new("provenance", "Where it comes from.", &["", "value"]);
+    let mut row = |name: String, value: String| table.rows.push(vec![text(name), text(value)]);
+    let campaign = &gathered.campaign;
+    row("campaign".into(), campaign.id.to_string());
+    if let Some(begun) = gathered.begun {
+        row("begun".into(), date(begun));
+    }
+    row("begun by".into(), format!("calmwalk {}", campaign.program_version));
+    row("report by".into(), format!("calmwalk {}", env!("CARGO_PKG_VERSION")));
+    if let Some(labels) = &gathered.labels {
+        row("label protocol".into(), labels.protocol.name.clone());
+        row("protocol hash (BLAKE3)".into(), labels.protocol.hash.to_string());
+        let mut pairs = Vec::new();
+        flatten("protocol", &labels.protocol.settings, &mut pairs);
+        pairs.into_iter().for_each(|(key, value)| row(key, value));
+    }
+    if let Some(files) = gathered.configuration["files"].as_object() {
+        for (key, hash) in files {
+            row(format!("file {key} (BLAKE3)"), hash.as_str().unwrap_or_default().to_owned());
+        }
+    }
+    let sources: BTreeSet<_> = gathered.seeds.iter().map(|seed| seed.source.as_str()).collect();
+    let seeds = gathered.seeds.len() as u64;
+    row(
+        "seed structures".into(),
+        format!("{} of {}", grouped(seeds), sources.into_iter().collect::<Vec<_>>().join(", ")),
+    );
+    let hosts: BTreeSet<_> =
+        gathered.standing.processes.iter().map(|process| process.host.as_str()).collect();
+    if !hosts.is_empty() {
+        row("hosts".into(), hosts.into_iter().collect::<Vec<_>>().join(", "));
+    }
+    table
+}
+
+/// ms since 1970 as a date, UTC (the calendar of Howard Hinnant's `civil_from_days`).
+fn date(milliseconds: i64) -> String {
+    let minutes = milliseconds.div_euclid(60_000);
+    let (days, minute) = (minutes.div_euclid(1440), minutes.rem_euclid(1440));
+    let z = days + 719_468;
+    let (era, day_of_era) = (z.div_euclid(146_097), z.rem_euclid(146_097));
+    let year = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year + year / 4 - year / 100);
+    let month = (5 * day_of_year + 2) / 153;
+    let (day, month) =
+        (day_of_year - (153 * month + 2) / 5 + 1, if month < 10 { month + 3 } else { month - 9 });
+    let year = year + era * 400 + i64::from(month <= 2);
+    format!("{year:04}-{month:02}-{day:02} {:02}:{:02} UTC", minute / 60, minute % 60)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn dates_are_those_of_the_calendar() {
+        for (milliseconds, expected) in [
+            (0, "1970-01-01 00:00 UTC"),
+            (951_827_696_000, "2000-02-29 12:34 UTC"),
+            (1_735_689_599_999, "2024-12-31 23:59 UTC"),
+            (-60_000, "1969-12-31 23:59 UTC"),
+        ] {
+            assert_eq!(date(milliseconds), expected);
+        }
+    }
+
+    #[test]
+    fn settings_are_flat_and_rules_are_words() {
+        let mut pairs = Vec::new();
+        flatten("", &json!({ "a": { "b": 1, "c": [1, 2] }, "d": "x", "e": null }), &mut pairs);
+        let expected = [("a.b", "1"), ("a.c", "[1,2]"), ("d", "x")];
+        assert_eq!(pairs, expected.map(|(key, value)| (key.to_owned(), value.to_owned())));
+        let rule = |when: Value| collection_rule(&json!({ "collect": { "when": when } }));
+        let count = json!({ "rule": "atom_count", "threshold": 1.3, "fraction": 0.15, "least": 3 });
+        assert_eq!(rule(count).unwrap(), "at least max(3, ⌈0.15 N⌉) of its N atoms have γ above 1.3");
+        assert_eq!(rule(json!({})), None);
+    }
+}

@@ -1,0 +1,64 @@
+//! What came of each seed structure.
+
+use std::collections::BTreeMap;
+
+use super::super::gathered::Gathered;
+use super::{Table, count, text};
+
+/// By seed structure: walks, candidates by fate, labels.
+pub fn of(gathered: &Gathered) -> Table {
+    let caption = "What came of each seed structure: biased walks and how they ended, candidates by what the selector decided, frames of \
+                   its control walks, and labels of both.";
+    let titles = [
+        "seed structure",
+        "formula",
+        "walks",
+        "ended",
+        "candidates",
+        "accepted",
+        "covered",
+        "duplicate",
+        "guard",
+        "budget",
+        "backlog",
+        "control frames",
+        "labelled",
+        "failed",
+    ];
+    let mut table = Table::new("seed-structures", caption, &titles);
+    let mut fates: BTreeMap<u64, BTreeMap<&str, u64>> = BTreeMap::new();
+    for fate in &gathered.fates_by_seed {
+        fates.entry(fate.part).or_default().insert(&fate.fate, fate.number);
+    }
+    for seed in &gathered.seeds {
+        let fate =
+            |name: &str| fates.get(&seed.index.into()).and_then(|of| of.get(name)).copied().unwrap_or(0);
+        let biased = gathered.sample.biased.labels.get(&seed.index).copied().unwrap_or_default();
+        let control = gathered.sample.control.labels.get(&seed.index).copied().unwrap_or_default();
+        let (walks, ended) = walks(gathered, &seed.name);
+        let names = ["accepted", "covered", "duplicate", "guard", "budget", "backlog"];
+        let mut row = vec![text(&seed.name), text(seed.structure.formula()), count(walks), text(ended)];
+        row.push(count(names.iter().map(|name| fate(name)).sum()));
+        row.extend(names.map(|name| count(fate(name))));
+        row.extend([count(control.structures), count(biased.labelled + control.labelled)]);
+        row.push(count(biased.failed + control.failed));
+        table.rows.push(row);
+    }
+    table
+}
+
+/// Biased walks from a seed structure, and how many of them ended in which way.
+fn walks(gathered: &Gathered, seed: &str) -> (u64, String) {
+    let walks = gathered.standing.walks.iter();
+    let walks = walks.filter(|walk| walk.seed_structure == seed && walk.origin == "biased");
+    let mut states: BTreeMap<&str, u64> = BTreeMap::new();
+    for walk in walks {
+        *states.entry(&walk.state).or_default() += 1;
+    }
+    let all = states.values().sum();
+    let words = |(state, number): (&&str, &u64)| {
+        let state = state.replace('_', " ");
+        if all == 1 { state } else { format!("{number} {state}") }
+    };
+    (all, states.iter().map(words).collect::<Vec<_>>().join(", "))
+}

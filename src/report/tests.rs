@@ -1,0 +1,206 @@
+use atoms::{Cell, Structure};
+use quick_xml::Reader;
+use quick_xml::events::Event;
+use serde_json::json;
+use store::{
+    AtomGrades, Campaign, CandidateRecord, Commit, Decision, Fate, Label, Protocol, SeedStructure, Store,
+};
+use wire::messages::Decline;
+use wire::{CampaignId, Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
+
+use super::*;
+
+const CAMPAIGN: CampaignId = CampaignId([7; 16]);
+const ATOMS: usize = 8;
+const DIMENSION: usize = 3;
+
+/// A row of atoms, `distance` Å apart, in a long cell.
+fn structure(distance: f64) -> Structure {
+    Structure {
+        species: vec!["Al".parse().unwrap(); ATOMS],
+        positions: (0..ATOMS).map(|k| [distance * k as f64, 0.0, 0.0]).collect(),
+        cell: Cell::orthorhombic(distance * ATOMS as f64, 10.0, 10.0),
+        periodic: [true; 3],
+    }
+}
+
+async fn begin(directory: &std::path::Path, configuration: &str) -> Store {
+    let campaign = Campaign {
+        id: CAMPAIGN,
+        program_version: "0.1.0".into(),
+        mode: "reproducible".into(),
+        configuration: String::new(),
+        resolved_configuration: configuration.into(),
+        configuration_in_force: configuration.into(),
+    };
+    let (name, source) = ("a<b>&\"row\"".into(), "rows.extxyz".into());
+    let seed = SeedStructure { index: 0, name, source, structure: structure(2.5) };
+    Store::create(directory, &campaign, &[seed], 951_827_696_000).await.unwrap()
+}
+
+async fn offer(store: &Store, step: u64, origin: Origin, fate: Fate, keep_features: bool) {
+    let structure = structure(2.5 + 0.01 * step as f64);
+    let content = ContentHash::of(&structure);
+    // Each atom a little newer than the one before it.
+    let grades: Vec<_> = (0..ATOMS).map(|k| 0.2 * (k + 1) as f64).collect();
+    let walk = WalkId(u32::from(origin == Origin::Control));
+    let id = CandidateId { campaign: CAMPAIGN, walk, segment: 0, step, content };
+    let features = (0..DIMENSION * ATOMS).map(|k| (0.7 * (step + 1) as f64 * k as f64).sin()).collect();
+    let block = CandidateBlock::encode(&Candidate {
+        id,
+        origin,
+        mixture_version: 0,
+        temperature: 300.0,
+        relative_volume: 1.0 + 0.01 * step as f64,
+        energy: -1.0,
+        virial: [[0.0; 3]; 3],
+        structure,
+        forces: vec![[0.0; 3]; ATOMS],
+        gamma: grades.clone(),
+        gamma_nbr: grades.clone(),
+        features,
+    });
+    let original = AtomGrades { gamma: grades.clone(), gamma_nbr: grades };
+    let selector = original.clone();
+    let record =
+        CandidateRecord { block, fate, seed_structure: 0, selector, original, keep_features, priority: 0 };
+    let kind = match (origin, fate) {
+        (Origin::Control, _) => "control",
+        (_, Fate::Accepted) => "accepted",
+        _ => "declined",
+    };
+    let (walk, candidate) = (Some(walk), Some(id));
+    let decision = Decision { round: 1, kind, walk, candidate, mixture_version: step, detail: json!({}) };
+    store
+        .commit(&Commit { decisions: vec![decision], candidates: vec![record], ..Commit::default() })
+        .await
+        .unwrap();
+}
+
+async fn label_all(store: &Store) {
+    let settings = json!({ "code": "dft" });
+    let protocol = Protocol { hash: ContentHash([3; 32]), name: "dft".into(), settings };
+    store.add_protocol(&protocol, 0).await.unwrap();
+    while let Some(lease) = store.lease(protocol.hash, "a", 0, 1000).await.unwrap() {
+        // The error of an atom is a half of its grade.
+        let forces = (0..ATOMS).map(|k| [0.1 * (k + 1) as f64, 0.0, 0.0]).collect();
+        let label = Label { energy: -1.0, forces, stress: None, details: Default::default() };
+        store.complete(&lease, &label, 500).await.unwrap();
+    }
+}
+
+/// Checks that a text is XML, and returns its words.
+fn words(text: &str) -> String {
+    let mut reader = Reader::from_str(text);
+    let (mut words, mut open) = (String::new(), 0);
+    loop {
+        match reader.read_event().unwrap_or_else(|error| panic!("{error}: {text:.300}")) {
+            Event::Start(start) => {
+                start.attributes().for_each(|attribute| drop(attribute.expect("an attribute")));
+                open += 1;
+            }
+            Event::End(_) => open -= 1,
+            Event::Text(text) => words += &text,
+            Event::GeneralRef(name) => words += &format!("&{};", &*name),
+            Event::Eof => break,
+            _ => {}
+        }
+    }
+    assert_eq!(open, 0);
+    words
+}
+
+fn file<'a>(files: &'a [File], path: &str) -> &'a str {
+    let file = files.iter().find(|file| file.path == path);
+    std::str::from_utf8(&file.unwrap_or_else(|| panic!("no {path}")).bytes).unwrap()
+}
+
+#[tokio::test]
+async fn what_is_missing_is_said() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = begin(directory.path(), "{}").await;
+    let files = of(&store).await.unwrap();
+    assert!(!files.iter().any(|file| file.path.starts_with("figures/")), "nothing to draw");
+    let page = words(file(&files, PAGE));
+    for expected in [
+        "not shown. No structure has been collected yet.",
+        "No candidate has reached",
+        "&lt;b&gt;",
+        "2000-02-29 12:34 UTC",
+    ] {
+        assert!(page.contains(expected), "{expected}: {page}");
+    }
+
+    // Structures without labels, controls or features.
+    for step in 0..30 {
+        offer(&store, step, Origin::Biased, Fate::Accepted, false).await;
+    }
+    offer(&store, 99, Origin::Biased, Fate::Declined(Decline::Covered), false).await;
+    let files = of(&store).await.unwrap();
+    let page = words(file(&files, PAGE));
+    for expected in ["no force error is known", "The store has no features", "n = 31", "240 atoms"] {
+        assert!(page.replace('\u{a0}', "").contains(expected), "{expected}: {page}");
+    }
+    let drawn: Vec<_> =
+        files.iter().filter(|file| file.path.ends_with(".svg")).map(|f| f.path.as_str()).collect();
+    assert_eq!(drawn, ["figures/collection.svg", "figures/distributions.svg", "figures/space.svg"]);
+    assert!(!file(&files, "figures/space.csv").contains("control"));
+}
+
+#[tokio::test]
+async fn figures_have_the_numbers_of_the_store() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = begin(directory.path(), &json!({ "walk": { "tau": 0.5 } }).to_string()).await;
+    for step in 0..40 {
+        offer(&store, step, Origin::Biased, Fate::Accepted, true).await;
+        offer(&store, step, Origin::Control, Fate::Accepted, true).await;
+        offer(&store, 1000 + step, Origin::Biased, Fate::Declined(Decline::Duplicate), true).await;
+    }
+    label_all(&store).await;
+    let files = of(&store).await.unwrap();
+    assert_eq!(files.iter().filter(|file| file.path.ends_with(".png")).count(), 8);
+    for svg in files.iter().filter(|file| file.path.ends_with(".svg")) {
+        words(std::str::from_utf8(&svg.bytes).unwrap());
+    }
+    let page = file(&files, PAGE);
+    words(page);
+    assert!(
+        !page.contains("http://") || page.matches("http://").count() == 8,
+        "only names of SVG's elements"
+    );
+    assert!(!page.contains("https://") && page.contains("walk.tau"));
+
+    // Eight atoms of each of 80 structures; the grades 1.2, 1.4 and 1.6 have errors of a half of that.
+    let correlations = file(&files, "tables/correlations.csv");
+    let all: Vec<_> = correlations.lines().nth(1).unwrap().split(',').collect();
+    assert_eq!((all[1], all[2], all[6]), ("80", "640", "1"), "{correlations}");
+    assert!((all[3].parse::<f64>().unwrap() - 0.45).abs() < 1e-12 && all[4] == "37.5");
+    let bands = file(&files, "figures/errors.csv");
+    let mut atoms = 0;
+    for row in bands.lines().skip(1).filter(|row| row.starts_with("a,biased")) {
+        let cells: Vec<_> = row.split(',').map(|cell| cell.parse::<f64>().unwrap_or(f64::NAN)).collect();
+        atoms += cells[4] as u64;
+        let is_inside =
+            2.0 * cells[7] >= cells[2] * (1.0 - 1e-9) && 2.0 * cells[7] <= cells[3] * (1.0 + 1e-9);
+        assert!(cells[4] == 0.0 || is_inside, "{row}");
+    }
+    assert_eq!(atoms, 320);
+    // The cell is stretched with the atoms, evenly: one distance a structure, 1 to 1.156.
+    let stretched: u64 = bands
+        .lines()
+        .filter(|row| row.starts_with("b,control"))
+        .map(|row| row.split(',').nth(4).unwrap().parse::<u64>().unwrap())
+        .sum();
+    assert_eq!(stretched, 320);
+    let collection = file(&files, "figures/collection.csv");
+    assert!(collection.contains("a,duplicate,40,\n") && collection.ends_with("b,,80,40\n"), "{collection}");
+    let features = file(&files, "figures/features.csv");
+    let rows = |start: &str| features.lines().filter(|row| row.starts_with(start)).count();
+    assert_eq!((rows("Al,biased,atom"), rows("Al,control,centroid")), (320, 40));
+    assert!(rows("Al,biased,contour,0") > 20);
+    let seeds = file(&files, "tables/seed-structures.csv");
+    assert!(seeds.contains("\"a<b>&\"\"row\"\"\",Al8,0,,80,40,0,40,0,0,0,40,80,0"), "{seeds}");
+
+    let again = of(&store).await.unwrap();
+    assert!(files.iter().zip(&again).all(|(a, b)| a.path == b.path && a.bytes == b.bytes), "the same bytes");
+}
