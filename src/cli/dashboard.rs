@@ -1,0 +1,37 @@
+//! `calmwalk dashboard`
+
+use std::net::SocketAddr;
+
+use store::Store;
+
+use super::{CampaignLocation, Ended, Failure, block_on};
+use crate::output::say;
+use crate::web::{self, dashboard};
+
+/// Show a campaign in a browser, to look at it only
+///
+/// Of a campaign that runs elsewhere, has ended, or is a copy; `calmwalk run --dashboard` shows the one that it runs. Ends with
+/// Ctrl-C. docs/dashboard.md says what there is to see.
+#[derive(Debug, clap::Args)]
+pub struct Dashboard {
+    #[command(flatten)]
+    location: CampaignLocation,
+    /// Address of this host; port 0: any that is free
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
+    at: SocketAddr,
+}
+
+impl Dashboard {
+    pub fn run(self) -> Result<Ended, Failure> {
+        block_on(async {
+            let listener = web::listen(self.at).await?;
+            let store = Store::open_read_only(&self.location.get()?).await?;
+            let address = listener.local_addr().map_err(Failure::failed)?;
+            let serving = web::serve(listener, dashboard::Dashboard::new(store, None).router());
+            say(format_args!("dashboard at http://{address}/"));
+            tokio::signal::ctrl_c().await.map_err(Failure::failed)?;
+            serving.abort();
+            Ok(Ended::Done)
+        })?
+    }
+}

@@ -1,0 +1,110 @@
+//! One candidate or imported structure: its story, its atoms, and files of them.
+
+use atoms::Structure;
+use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, write_frame};
+use atoms::poscar::write_poscar;
+use axum::extract::{Path, State};
+use axum::http::{StatusCode, header};
+use axum::response::IntoResponse;
+use serde_json::json;
+use store::{Standing, Store, StoreError, StoredCandidate};
+use wire::ContentHash;
+
+use super::Dashboard;
+use super::answer::{Answer, Refusal, json};
+use crate::story;
+
+/// What may be shown of it.
+struct Found {
+    /// Its name.
+    id: String,
+    structure: Structure,
+    content: ContentHash,
+    /// None of imported structures.
+    candidate: Option<StoredCandidate>,
+}
+
+/// `GET /api/candidates/ID`: what `calmwalk explain ID --json` prints.
+pub async fn story(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> Answer {
+    json(&story::read(&dashboard.store, &id).await?)
+}
+
+/// `GET /api/candidates/ID/structure`: species, positions and cell (Å).
+pub async fn structure(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> Answer {
+    let Found { id, structure, .. } = find(&dashboard.store, &id).await?;
+    let species: Vec<_> = structure.species.iter().map(|species| species.symbol()).collect();
+    json(&json!({
+        "id": id, "species": species, "positions": structure.positions, "cell": structure.cell.0,
+        "periodic": structure.periodic,
+    }))
+}
+
+/// `GET /api/candidates/ID/structure.extxyz`: with γ and γ_nbr of the original mixture, and the label if there is one.
+pub async fn extxyz(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> Answer {
+    let store = &dashboard.store;
+    let found = find(store, &id).await?;
+    let id = found.id.clone();
+    let mut bytes = Vec::new();
+    write_frame(&mut bytes, &frame(store, found).await?).map_err(unwritable)?;
+    Ok(file(&format!("{id}.extxyz"), bytes))
+}
+
+/// `GET /api/candidates/ID/structure.poscar`
+pub async fn poscar(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> Answer {
+    let Found { id, structure, .. } = find(&dashboard.store, &id).await?;
+    let mut bytes = Vec::new();
+    write_poscar(&mut bytes, &structure, &id).map_err(unwritable)?;
+    Ok(file(&format!("{id}.poscar"), bytes))
+}
+
+async fn find(store: &Store, id: &str) -> Result<Found, Refusal> {
+    if let Some(number) = id.strip_prefix(story::IMPORT) {
+        let found = match number.parse() {
+            Ok(number) => store.imported_structure(number).await?,
+            Err(_) => None,
+        };
+        let imported = store.imported_structures().await?;
+        let found = found.ok_or(StoreError::UnknownImport { id: id.to_owned(), imported })?;
+        let (structure, content) = (found.structure, found.content);
+        return Ok(Found { id: id.to_owned(), structure, content, candidate: None });
+    }
+    let named = store.find_candidate(id).await?;
+    let gone = || Refusal::new(StatusCode::NOT_FOUND, format!("{} is not there", named.candidate));
+    let candidate = store.candidate(&named.candidate).await?.ok_or_else(gone)?;
+    let view = candidate.block.view();
+    let (structure, content) = (view.structure(), view.id().content);
+    Ok(Found { id: named.candidate, structure, content, candidate: Some(candidate) })
+}
+
+async fn frame(store: &Store, found: Found) -> Result<Frame, StoreError> {
+    let mut frame = Frame::from(found.structure);
+    let labels = store.labels_of(found.content).await?;
+    if let Some(labelled) = labels.into_iter().find(|label| label.record.standing == Standing::Label) {
+        let label = labelled.record.label;
+        let labels = Labels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
+        frame.set_labels(&labels, Keys::Ase);
+        frame.info.insert("protocol".to_owned(), labelled.protocol.name.into());
+    }
+    frame.info.insert("campaign".to_owned(), store.campaign().await?.id.to_string().into());
+    let Some(candidate) = found.candidate else { return Ok(frame) };
+    let view = candidate.block.view();
+    frame.info.insert("candidate_id".to_owned(), found.id.into());
+    frame.info.insert("origin".to_owned(), view.origin().name().into());
+    frame.info.insert("relative_volume".to_owned(), view.relative_volume().into());
+    let grades = [("gamma", candidate.original.gamma), ("gamma_nbr", candidate.original.gamma_nbr)];
+    for (name, values) in grades.into_iter().filter(|(_, values)| values.len() == frame.structure.len()) {
+        frame.arrays.insert(name.to_owned(), Column { width: 1, entries: Entries::Real(values) });
+    }
+    Ok(frame)
+}
+
+/// To be kept under this name, which is that of a candidate: no quotes, no line breaks.
+fn file(name: &str, bytes: Vec<u8>) -> axum::response::Response {
+    let kept = format!("attachment; filename=\"{name}\"");
+    let kind = "text/plain; charset=utf-8".to_owned();
+    ([(header::CONTENT_TYPE, kind), (header::CONTENT_DISPOSITION, kept)], bytes).into_response()
+}
+
+fn unwritable(error: impl ToString) -> Refusal {
+    Refusal::new(StatusCode::UNPROCESSABLE_ENTITY, error)
+}

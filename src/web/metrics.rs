@@ -1,0 +1,174 @@
+//! `/metrics` for Prometheus: what `calmwalk status` reads, read when it is asked for. docs/metrics.md lists it.
+
+use std::collections::BTreeMap;
+
+use axum::Router;
+use axum::extract::State;
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use store::{Status, Store, unix_milliseconds};
+
+use super::exposition::{CONTENT_TYPE, Text};
+use crate::cli::status::Snapshot;
+
+const SECONDS_PER_HOUR: f64 = 3600.0;
+
+/// The metrics of a campaign.
+pub fn router(store: Store) -> Router {
+    Router::new().route("/metrics", get(metrics)).with_state(store)
+}
+
+async fn metrics(State(store): State<Store>) -> Response {
+    match Snapshot::of(&store).await {
+        Ok(snapshot) => ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&snapshot)).into_response(),
+        Err(failure) => (StatusCode::SERVICE_UNAVAILABLE, failure.to_string()).into_response(),
+    }
+}
+
+/// Everything. Labels have few values each: kinds, states, reasons and classes, never walks or structures.
+pub fn text(snapshot: &Snapshot) -> String {
+    let (campaign, status) = (snapshot.campaign(), snapshot.standing());
+    let mut text = Text::default();
+    let id = campaign.id.to_string();
+    let labels =
+        [("campaign", id.as_str()), ("mode", &campaign.mode), ("version", env!("CARGO_PKG_VERSION"))];
+    text.gauge("calmwalk_info", "What runs: always 1.", &[(&labels, 1.0)]);
+    text.gauge(
+        "calmwalk_finished",
+        "Whether the campaign is finished.",
+        &[(&[], f64::from(status.finished))],
+    );
+    candidates(&mut text, status);
+    walks(&mut text, status);
+    label_queue(&mut text, status);
+    let failures: Vec<_> =
+        snapshot.failures().iter().map(|failure| [("class", failure.class.as_str())]).collect();
+    let samples: Vec<_> = failures
+        .iter()
+        .zip(snapshot.failures())
+        .map(|(labels, found)| (&labels[..], (found.labelled + found.given_up + found.unfinished) as f64))
+        .collect();
+    text.gauge("calmwalk_failed_label_jobs", "Label jobs that met a class of failures.", &samples);
+    processes(&mut text, status);
+    if let Some(share) = snapshot.share_above_one() {
+        text.gauge(
+            "calmwalk_training_atoms_above_one_ratio",
+            "Share of the training atoms with an extrapolation grade above 1 under the newest mixture.",
+            &[(&[], share)],
+        );
+    }
+    text.gauge("calmwalk_store_bytes", "Size of the database.", &[(&[], snapshot.bytes() as f64)]);
+    if let Some(end) = snapshot.end().time {
+        text.gauge(
+            "calmwalk_expected_end_timestamp_seconds",
+            "When the campaign is expected to end, as things are now.",
+            &[(&[], end as f64 / 1000.0)],
+        );
+    }
+    text.into_string()
+}
+
+fn candidates(text: &mut Text, status: &Status) {
+    let candidates = &status.candidates;
+    let declined = &candidates.declined;
+    let fates = [
+        ("accepted", candidates.accepted),
+        ("covered", declined.covered),
+        ("duplicate", declined.duplicate),
+        ("guard", declined.guard),
+        ("budget", declined.budget),
+        ("backlog", declined.backlog),
+    ];
+    let labels = fates.map(|(fate, _)| [("fate", fate)]);
+    let samples: Vec<_> =
+        labels.iter().zip(fates).map(|(labels, (_, count))| (&labels[..], count as f64)).collect();
+    text.counter(
+        "calmwalk_candidates_total",
+        "Candidates of biased walks, by what became of them.",
+        &samples,
+    );
+    let control = candidates.control as f64;
+    text.counter("calmwalk_control_frames_total", "Frames of control walks.", &[(&[], control)]);
+    let refused = candidates.refused_by_walkers as f64;
+    text.counter(
+        "calmwalk_refused_structures_total",
+        "Structures that walkers' own guards refused.",
+        &[(&[], refused)],
+    );
+    let version = status.mixture_version as f64;
+    text.gauge("calmwalk_mixture_version", "Version of the mixture in force.", &[(&[], version)]);
+}
+
+fn walks(text: &mut Text, status: &Status) {
+    let mut states: BTreeMap<&str, u64> = BTreeMap::new();
+    status.walks.iter().for_each(|walk| *states.entry(&walk.state).or_default() += 1);
+    let labels: Vec<_> = states.keys().map(|state| [("state", *state)]).collect();
+    let samples: Vec<_> =
+        labels.iter().zip(states.values()).map(|(labels, count)| (&labels[..], *count as f64)).collect();
+    text.gauge("calmwalk_walks", "Walks by state.", &samples);
+    if let Some(pace) = status.steps_per_second {
+        text.gauge("calmwalk_steps_per_second", "Steps of all walks together.", &[(&[], pace)]);
+    }
+    let under_way = status.walks.iter().filter(|walk| matches!(walk.state.as_str(), "waiting" | "running"));
+    if let Some(gamma) = under_way.filter_map(|walk| walk.gamma_max).reduce(f64::max) {
+        text.gauge(
+            "calmwalk_walk_grade_max",
+            "Largest extrapolation grade of the walks under way.",
+            &[(&[], gamma)],
+        );
+    }
+}
+
+fn label_queue(text: &mut Text, status: &Status) {
+    let labels = &status.labels;
+    let states = [
+        ("queued", labels.queued),
+        ("leased", labels.leased),
+        ("labelled", labels.labelled),
+        ("failed", labels.failed),
+        ("dropped", labels.dropped),
+    ];
+    let names = states.map(|(state, _)| [("state", state)]);
+    let samples: Vec<_> =
+        names.iter().zip(states).map(|(labels, (_, count))| (&labels[..], count as f64)).collect();
+    text.gauge("calmwalk_label_jobs", "Label jobs by state.", &samples);
+    if let Some(lease) = &status.oldest_lease {
+        let age = (unix_milliseconds() - lease.started).max(0) as f64 / 1000.0;
+        text.gauge(
+            "calmwalk_oldest_lease_age_seconds",
+            "Age of the oldest label attempt under way.",
+            &[(&[], age)],
+        );
+    }
+    let used = &status.budget.used;
+    let made = used.labels as f64;
+    text.counter("calmwalk_labels_made_total", "Labels made, also those kept beside others.", &[(&[], made)]);
+    let core_seconds = used.core_hours * SECONDS_PER_HOUR;
+    // What an attempt took is only known when it has ended: until then it is reckoned, and so the sum may fall.
+    text.gauge(
+        "calmwalk_label_core_seconds",
+        "Core-seconds of label attempts, those under way so far.",
+        &[(&[], core_seconds)],
+    );
+    let seconds = used.wall_hours * SECONDS_PER_HOUR;
+    text.counter(
+        "calmwalk_under_way_seconds_total",
+        "Time for which the campaign was under way.",
+        &[(&[], seconds)],
+    );
+}
+
+fn processes(text: &mut Text, status: &Status) {
+    let mut kinds: BTreeMap<(&str, &str), u64> = BTreeMap::new();
+    for process in &status.processes {
+        // What else is said of a process may be anything.
+        let known = ["running", "stopping", "pausing", "silent", "gone"];
+        let state = known.into_iter().find(|state| process.state == *state).unwrap_or("given_up");
+        *kinds.entry((&process.kind, state)).or_default() += 1;
+    }
+    let labels: Vec<_> = kinds.keys().map(|(kind, state)| [("kind", *kind), ("state", *state)]).collect();
+    let samples: Vec<_> =
+        labels.iter().zip(kinds.values()).map(|(labels, count)| (&labels[..], *count as f64)).collect();
+    text.gauge("calmwalk_processes", "Processes by kind and state.", &samples);
+}

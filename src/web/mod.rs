@@ -1,0 +1,124 @@
+//! What a campaign shows over HTTP, to this host only.
+
+pub mod dashboard;
+pub mod exposition;
+mod guard;
+pub mod metrics;
+
+use std::net::SocketAddr;
+
+use axum::{Router, middleware};
+use store::{Location, Store};
+use tokio::net::TcpListener;
+use tokio::task::AbortHandle;
+
+use self::dashboard::{Acting, Dashboard};
+use crate::outcome::Failure;
+use crate::output::say;
+
+/// Where a campaign is shown, as arguments.
+#[derive(Debug, clap::Args)]
+pub struct Addresses {
+    /// Show the campaign in a browser at this address of this host, as 127.0.0.1:8080 (docs/dashboard.md)
+    #[arg(long, value_name = "ADDRESS")]
+    dashboard: Option<SocketAddr>,
+    /// Serve metrics for Prometheus at this address of this host, as 127.0.0.1:9464 (docs/metrics.md)
+    #[arg(long, value_name = "ADDRESS")]
+    metrics: Option<SocketAddr>,
+}
+
+/// The same, held.
+#[derive(Debug)]
+pub struct Listening {
+    dashboard: Option<TcpListener>,
+    metrics: Option<TcpListener>,
+}
+
+/// What is served, until this is dropped.
+#[derive(Debug, Default)]
+pub struct Serving {
+    servers: Vec<AbortHandle>,
+    shown: Option<Store>,
+}
+
+impl Serving {
+    fn add(&mut self, listener: TcpListener, router: Router) {
+        self.servers.push(serve(listener, router));
+    }
+
+    /// Serves no more, and closes what was read from: whoever closes a database last tidies it up.
+    pub async fn end(self) {
+        self.servers.iter().for_each(AbortHandle::abort);
+        if let Some(shown) = &self.shown {
+            shown.close().await;
+        }
+    }
+}
+
+impl Drop for Serving {
+    fn drop(&mut self) {
+        self.servers.iter().for_each(AbortHandle::abort);
+    }
+}
+
+impl Addresses {
+    /// Takes the addresses, before any work begins that would be in vain.
+    pub async fn listen(&self) -> Result<Listening, Failure> {
+        let (mut dashboard, mut metrics) = (None, None);
+        if let Some(address) = self.dashboard {
+            dashboard = Some(listen(address).await?);
+        }
+        if let Some(address) = self.metrics {
+            metrics = Some(listen(address).await?);
+        }
+        Ok(Listening { dashboard, metrics })
+    }
+}
+
+impl Listening {
+    /// Begins to serve. What is shown is read through connections of its own: whoever asks often does not keep the campaign
+    /// waiting. What is changed goes through `store`.
+    pub async fn serve(self, location: &Location, store: &Store) -> Result<Serving, Failure> {
+        let mut serving = Serving::default();
+        if self.dashboard.is_none() && self.metrics.is_none() {
+            return Ok(serving);
+        }
+        let shown = Store::open_read_only(location).await?;
+        serving.shown = Some(shown.clone());
+        if let Some(listener) = self.metrics {
+            let address = listener.local_addr().map_err(Failure::failed)?;
+            say(format_args!("metrics at http://{address}/metrics"));
+            serving.add(listener, metrics::router(shown.clone()));
+        }
+        if let Some(listener) = self.dashboard {
+            let acting = Acting::new(store.clone())?;
+            let address = listener.local_addr().map_err(Failure::failed)?;
+            say(format_args!("dashboard at http://{address}/#token={}", acting.token()));
+            serving.add(listener, Dashboard::new(shown, Some(acting)).router());
+        }
+        Ok(serving)
+    }
+}
+
+/// An address to serve on, before any work begins that would be in vain. What is served asks nobody who he is, so it is
+/// one of this host.
+pub async fn listen(address: SocketAddr) -> Result<TcpListener, Failure> {
+    if !address.ip().is_loopback() {
+        return Err(Failure::Input(format!(
+            "will not listen on {address}: whoever reaches it could read the campaign; name an address of this host, as \
+             127.0.0.1:{port}, and reach it from elsewhere with ssh -L {port}:127.0.0.1:{port}",
+            port = address.port()
+        )));
+    }
+    TcpListener::bind(address).await.map_err(|error| {
+        Failure::Input(format!(
+            "cannot listen on {address}: {error}; name another port, or port 0 for any that is free"
+        ))
+    })
+}
+
+/// Serves in a task of its own.
+pub fn serve(listener: TcpListener, router: Router) -> AbortHandle {
+    let router = router.layer(middleware::from_fn(guard::asked_by_name_of_this_host));
+    tokio::spawn(async move { axum::serve(listener, router).await }).abort_handle()
+}

@@ -1,0 +1,47 @@
+// What this page asks the program for.
+
+/** The answer as JSON; throws an Error that says why there is none. */
+export async function ask(path, signal) {
+  return answered(await fetch(path, { signal, cache: "no-store" }));
+}
+
+/** Changes something about a candidate. */
+export async function act(id, action, token, what) {
+  const headers = { "content-type": "application/json", "x-calmwalk-token": token };
+  return answered(await fetch(ofCandidate(id, `/${action}`), { method: "POST", headers, body: JSON.stringify(what) }));
+}
+
+async function answered(response) {
+  const found = await response.json().catch(() => ({}));
+  if (!response.ok) throw new Error(found.error ?? `the program answers ${response.status}`);
+  return found;
+}
+
+/** The path of a candidate's own things. */
+export function ofCandidate(id, what = "") {
+  return `/api/candidates/${encodeURIComponent(id)}${what}`;
+}
+
+const listeners = new Set();
+let newest = null;
+
+/** Calls `hear` with the newest news and with all that come, until the signal. */
+export function listen(hear, signal) {
+  listeners.add(hear);
+  signal.addEventListener("abort", () => listeners.delete(hear));
+  if (newest) hear(newest);
+}
+
+/** Begins to listen to the program; `tell` hears how the connection is. */
+export function connect(tell) {
+  const source = new EventSource("/api/events");
+  source.onopen = () => tell("live");
+  source.onerror = () => tell("lost");
+  source.onmessage = (event) => {
+    const news = JSON.parse(event.data);
+    tell(news.error ? "blind" : "live", news.error);
+    if (news.error) return;
+    newest = news;
+    listeners.forEach((hear) => hear(news));
+  };
+}

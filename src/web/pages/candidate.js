@@ -1,0 +1,155 @@
+// The story of one candidate: what `calmwalk explain` tells, with its atoms in space.
+
+import { buttons } from "./actions.js";
+import { ask, ofCandidate } from "./api.js";
+import { DASHES, LINES } from "./colours.js";
+import { element, facts, section, state, table } from "./dom.js";
+import { decimals, digits, duration, percent, shortName, time, whole } from "./format.js";
+import { plot } from "./plot.js";
+import { view } from "./structure.js";
+
+export const TITLE = "Candidate";
+
+export async function show(content, address, signal) {
+  const id = decodeURIComponent(address);
+  const [story, structure] = await Promise.all([ask(ofCandidate(id), signal), ask(ofCandidate(id, "/structure"), signal)]);
+  content.replaceChildren(element("h1", {}, shortName(story.id)), head(story));
+  const { found, grades, decision } = story;
+  content.append(section("Structure", about(story), downloads(story), view(structure, grades?.atoms, story.labels)));
+  if (grades) content.append(section("Grades", graded(grades)));
+  if (decision) content.append(section("Decision", decided(decision)));
+  if (found) content.append(trace(found, grades, signal));
+  if (decision) content.append(...covered(decision.coverage));
+  content.append(section("Label", ...labels(story, () => show(content, address, signal), signal)));
+  content.append(section("Not recorded", element("ul", {}, story.not_recorded.map((what) => element("li", {}, what)))));
+}
+
+function head({ id, kind, decision, jobs }) {
+  const fate = decision && (decision.reason ?? decision.kind);
+  return element("p", { class: "head" }, state(kind), fate && state(fate), jobs.map((job) => state(job.state)), element("code", {}, id));
+}
+
+function about({ structure, found, file, frame, same_structure: same, same_import: imported }) {
+  const { atoms, formula, volume } = structure;
+  const near = found?.distances;
+  return facts([
+    ["formula", `${formula}, ${whole(atoms)} atoms`],
+    ["volume", volume && `${digits(volume, "Å³")} (${digits(volume / atoms, "Å³")} an atom)${found ? `, V/V₀ ${decimals(found.relative_volume, 4)}` : ""}`],
+    ["found", found && element("span", {}, `walk ${found.walk} of seed structure ${found.seed_structure_name}, segment ${found.segment}, step ${whole(found.step)}, `,
+      `at ${decimals(found.temperature, 0, "K")}`)],
+    ["energy by the potential", found && `${decimals(found.energy / atoms, 4, "eV")} an atom`],
+    ["a control of", found?.control_of != null && element("span", {}, `walk ${found.control_of}`, found.partner && [": ", link(found.partner)])],
+    ["shortest distance", near?.shortest && `${decimals(near.shortest, 3, "Å")} (atoms ${near.atoms.join(" and ")})` +
+      (near.least == null ? "" : `; the selector's guard asks for ${decimals(near.least, 3, "Å")}`)],
+    ["imported from", file && `${file}, frame ${frame}`],
+    ["the same structure", (same.length > 0 || imported) && element("span", {}, same.map((named) => [link(named), " "]).flat(),
+      imported && element("a", { href: `#candidate/import-${imported}` }, `import-${imported}`))],
+  ]);
+}
+
+function link({ candidate, decision }) {
+  return element("a", { href: `#candidate/${encodeURIComponent(candidate)}`, title: candidate }, `${shortName(candidate)} (${decision})`);
+}
+
+function downloads({ id }) {
+  const file = (kind, name) => element("a", { href: ofCandidate(id, `/structure.${kind}`), download: "" }, name);
+  return element("p", { class: "downloads" }, file("extxyz", "extended XYZ"), " ", file("poscar", "POSCAR"));
+}
+
+function graded(grades) {
+  const columns = [["mixture"], ["version", true], ["γ_max", true], ["γ_nbr, largest", true], ["atoms with γ > 1", true]];
+  const row = (name, grade) => [name, whole(grade.mixture_version), decimals(grade.gamma_max, 3), decimals(grade.gamma_nbr_max, 3), whole(grade.atoms_above_1)];
+  const rows = [row("the walker's", grades.walker), row("the selector's, at the decision", grades.selector), row("the original one", grades.original)];
+  const { trigger } = grades;
+  return element("div", {}, table("Grades under three mixtures", columns, rows), facts([
+    ["staleness", `the selector's mixture was newer by ${whole(grades.staleness)} versions`],
+    ["collection rule", trigger && `${trigger.needed} atoms with γ > ${digits(trigger.threshold)} make a candidate; there were ` +
+      `${trigger.above_walker} under the walker's mixture, ${trigger.above_selector} under the selector's`],
+  ]));
+}
+
+function decided(decision) {
+  const { update } = decision;
+  const list = facts([
+    ["number", whole(decision.number)],
+    ["round", decision.round > 0 ? whole(decision.round) : null],
+    ["decision", decision.reason ? `${decision.kind}: ${decision.reason}` : decision.kind],
+    ["threshold raised", decision.raised_by && `by a factor of ${digits(decision.raised_by)} to ${digits(decision.raised_threshold)}, since many waited for labels`],
+    ["mixture afterwards", `version ${whole(decision.mixture_version)}`],
+    ["update", update && `${update.combination ?? ""} with α = ${digits(update.alpha)}; search ended by ${JSON.stringify(update.ended_by).replaceAll('"', "")}`],
+    ["γ_max afterwards", update && decimals(update.gamma_max_after, 3)],
+    ["components changed", update && whole(update.components.length)],
+    ["training atoms with γ > 1", update?.training_frames && percent(update.training_frames.share_above_one)],
+  ]);
+  if (!update || update.trials.length === 0) return list;
+  const columns = [["α", true], ["γ_max", true], ["atoms above", true]];
+  return element("div", {}, list, table("Every α that was tried", columns,
+    update.trials.map((trial) => [digits(trial.alpha), decimals(trial.gamma_max, 3), whole(trial.above)])));
+}
+
+/** What the walk offered before: the store knows the walk's γ where it was a candidate, and nowhere else. */
+function trace(found, grades, signal) {
+  const place = element("div", { class: "plots" });
+  const draw = (offered) => {
+    const before = offered.filter((one) => one.segment === found.segment && one.step <= found.step);
+    const points = (key) => before.filter((one) => one[key] != null).map((one) => [one.step, one[key]]);
+    const marks = (key, shape, k) => ({ name: key === "gamma" ? "original mixture" : "the walker's mixture", shape, colour: LINES[k],
+      points: before.filter((one) => one[key] != null).map((one) => [one.step, one[key], `#candidate/${encodeURIComponent(one.id)}`,
+        `step ${one.step}: ${one.fate}`]) });
+    place.replaceChildren(plot({ title: `Walk ${found.walk}, segment ${found.segment}: what it offered until then`,
+      x: { title: "step" }, y: { title: "γ_max", least: 0 },
+      lines: [{ colour: LINES[0], points: points("gamma") }, { colour: LINES[1], dash: DASHES[1], points: points("walker_gamma") }],
+      marks: [marks("gamma", "circle", 0), marks("walker_gamma", "diamond", 1)] }));
+  };
+  ask(`/api/walks/${found.walk}/candidates`, signal).then(draw).catch(() => {});
+  return section("Before", place);
+}
+
+function covered({ by, later, looked_until: until }) {
+  const list = (named) => element("ul", {}, named.slice(0, 50).map((one) => element("li", {}, link(one))));
+  const more = (named) => (named.length > 50 ? element("p", { class: "quiet" }, `… and ${whole(named.length - 50)} more`) : "");
+  const parts = [];
+  if (by.length > 0) parts.push(section("Covered by updates of", list(by), more(by)));
+  if (later.length > 0) parts.push(section("Covered later", list(later), more(later)));
+  if (until) parts.push(element("p", { class: "quiet" }, `The log was followed to decision ${whole(until)}.`));
+  return parts;
+}
+
+function labels({ jobs, labels: made }, again, signal) {
+  if (jobs.length + made.length === 0) return [element("p", {}, "It has no label job.")];
+  return [...jobs.map((found) => element("div", {}, job(found), buttons(found, again, signal))), ...made.map(label)];
+}
+
+function job(found) {
+  const { holder, attempts_made: attempts, by_hand: byHand } = found;
+  return element("div", {}, facts([
+    ["job", `${found.job}, protocol ${found.protocol}`],
+    ["state", element("span", {}, state(found.state), ` priority ${found.priority}`)],
+    ["held by", holder && `${holder}, until ${time(found.expires)}`],
+    ["cost", found.core_seconds == null ? null : digits(found.core_seconds, "core-seconds")],
+    ["by hand", byHand.map((done) => `${done.action}${done.priority == null ? "" : ` ${done.priority}`}, ${time(done.time)}`).join("; ")],
+  ]), attempts.map(attempt));
+}
+
+function attempt(made) {
+  const how = made.outcome ?? "under way";
+  const lasted = made.ended == null ? `since ${time(made.started)}` : `after ${duration(made.ended - made.started)}`;
+  const failed = made.class ? ` (${made.class})` : "";
+  const line = `attempt ${made.attempt}: ${how}${failed} ${lasted}, by ${made.holder}`;
+  const more = [made.calculation && `calculation ${made.calculation}`, made.remedies && `changed after failures: ${made.remedies}`, made.difference, made.log]
+    .filter(Boolean).join("\n");
+  return more ? element("details", { class: "attempt" }, element("summary", {}, line), element("pre", { tabindex: "0" }, more))
+    : element("p", { class: "attempt" }, line);
+}
+
+function label(made) {
+  const { model } = made;
+  return facts([
+    [made.standing, `protocol ${made.protocol}; ${made.source}; ${time(made.received)}`],
+    ["energy", `${decimals(made.energy, 6, "eV")} (${decimals(made.energy_per_atom, 6, "eV")} an atom)`],
+    ["largest force", decimals(made.largest_force, 4, "eV/Å")],
+    ["pressure", made.pressure == null ? null : digits(made.pressure, "eV/Å³")],
+    ["error of the potential's energy", model && `${decimals(1000 * model.energy_per_atom, 2, "meV")} an atom`],
+    ["errors of its forces", model && `mean ${decimals(model.mean, 4)}, largest ${decimals(model.largest, 4, "eV/Å")} (atom ${model.atom})`],
+  ]);
+}

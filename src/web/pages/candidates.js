@@ -1,0 +1,118 @@
+// The table of candidates: the program sorts, filters and pages; this asks for a page and shows it.
+
+import { ask } from "./api.js";
+import { FATES } from "./colours.js";
+import { element, state } from "./dom.js";
+import { decimals, shortName, whole } from "./format.js";
+
+export const TITLE = "Candidates";
+
+const LENGTH = 50;
+const STATES = ["queued", "leased", "labelled", "failed", "dropped"];
+/** Columns: title, whether it holds numbers, and the order that its title asks for. */
+const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["γ_max", true, "gamma"],
+  ["γ_nbr", true], ["V/V₀", true, "volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["attempts", true]];
+
+export function show(content, rest, signal) {
+  // What is asked for stands in the address, so that it can be kept and sent to others.
+  const asked = new URLSearchParams(rest);
+  const place = element("div");
+  const change = (changes) => {
+    for (const [key, value] of Object.entries(changes)) value ? asked.set(key, value) : asked.delete(key);
+    // The queue's order is that of one state.
+    if (asked.get("order") === "queue" && !asked.get("state")) asked.set("state", "queued");
+    history.replaceState(null, "", `#candidates/${asked}`);
+    pages.length = 0;
+    load(null);
+  };
+  const pages = [];
+  let last = 0;
+  const load = async (after) => {
+    const mine = ++last;
+    const wait = setTimeout(() => place.setAttribute("aria-busy", "true"), 200);
+    try {
+      const page = await wholePage(asked, after, signal, (looked) => {
+        if (mine === last) place.replaceChildren(element("p", { role: "status" }, `looked at ${whole(looked)} candidates …`));
+      }, () => mine !== last);
+      if (mine === last) place.replaceChildren(...lines(page, asked, change, pages, after, load));
+    } catch (error) {
+      if (error.name !== "AbortError" && mine === last) place.replaceChildren(element("p", { class: "wrong", role: "alert" }, error.message));
+    } finally {
+      clearTimeout(wait);
+      if (mine === last) place.removeAttribute("aria-busy");
+    }
+  };
+  content.append(filters(asked, change), place);
+  return load(null);
+}
+
+/** A rare kind takes several looks. */
+async function wholePage(asked, after, signal, tell, isOver) {
+  let [found, looked, next] = [[], 0, after];
+  do {
+    const query = new URLSearchParams(asked);
+    query.set("limit", LENGTH - found.length);
+    if (next) query.set("after", next);
+    const page = await ask(`/api/candidates?${query}`, signal);
+    found = found.concat(page.candidates);
+    looked += page.looked_at;
+    next = page.next;
+    if (next && found.length < LENGTH) tell(looked);
+  } while (next && found.length < LENGTH && !isOver());
+  return { candidates: found, next };
+}
+
+function filters(asked, change) {
+  const choice = (label, key, names) => element("label", {}, label, element("select", { onchange: (event) => change({ [key]: event.target.value }) },
+    element("option", { value: "" }, "all"), names.map((name) => element("option", { value: name, selected: asked.get(key) === name }, name))));
+  const where = element("input", { type: "search", size: 34, value: asked.get("where") ?? "", placeholder: "gamma > 2 and element = Mo",
+    spellcheck: "false", autocomplete: "off" });
+  const submit = (event) => {
+    event.preventDefault();
+    change({ where: where.value.trim() });
+  };
+  return element("form", { class: "filters", role: "search", onsubmit: submit }, choice("fate", "fate", Object.keys(FATES)),
+    choice("label", "state", STATES), element("label", {}, "where", where), element("button", {}, "Show"),
+    element("details", {}, element("summary", {}, "What may stand there"), element("p", {},
+      "gamma, gamma_nbr (original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version, atoms with = != < <= > >=; " +
+      "element, kind, seed with = and !=; and, or, not and parentheses.")));
+}
+
+function lines({ candidates, next }, asked, change, pages, after, load) {
+  const order = asked.get("order") || "decision";
+  const ascending = asked.get("ascending") === "true";
+  const head = ([title, isNumber, key]) => {
+    if (!key) return element("th", { scope: "col", class: isNumber && "number" }, title);
+    const isIt = key === order;
+    const turn = () => change({ order: key, ascending: key !== "queue" && isIt && !ascending ? "true" : "" });
+    const sorted = isIt && (key === "queue" ? "descending" : ascending ? "ascending" : "descending");
+    return element("th", { scope: "col", class: isNumber && "number", "aria-sort": sorted },
+      element("button", { type: "button", class: "sort", onclick: turn }, title, isIt ? (ascending ? " ▲" : " ▼") : ""));
+  };
+  const back = () => load(pages.pop());
+  const on = () => {
+    pages.push(after);
+    load(next);
+  };
+  const table = element("table", { class: "candidates" }, element("caption", { class: "unseen" }, "Candidates"),
+    element("thead", {}, element("tr", {}, COLUMNS.map(head))), element("tbody", {}, candidates.map(line)));
+  const number = pages.length + 1;
+  return [
+    element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": "Candidates" }, table),
+    candidates.length === 0 && element("p", {}, "No candidate is so."),
+    element("p", { class: "turn", role: "status" },
+      element("button", { type: "button", disabled: pages.length === 0, onclick: back }, "← before"),
+      ` page ${number} `, element("button", { type: "button", disabled: !next, onclick: on }, "next →")),
+  ].filter(Boolean);
+}
+
+function line(candidate) {
+  const fate = candidate.origin === "control" ? "control" : candidate.fate;
+  const cells = [
+    element("a", { href: `#candidate/${encodeURIComponent(candidate.id)}`, title: candidate.id }, shortName(candidate.id)),
+    whole(candidate.decision), state(fate), candidate.job_state ? state(candidate.job_state) : "–",
+    candidate.priority ?? "–", decimals(candidate.gamma, 2), decimals(candidate.gamma_nbr, 2),
+    decimals(candidate.relative_volume, 4), decimals(candidate.temperature, 0, "K"), candidate.seed_structure, candidate.formula,
+    whole(candidate.atoms), candidate.attempts ?? "–"];
+  return element("tr", {}, cells.map((cell, k) => element("td", { class: COLUMNS[k][1] && "number" }, cell)));
+}

@@ -1,0 +1,47 @@
+// Elements of a page. Whatever comes from a campaign becomes text, never markup.
+
+/** An element with attributes (`on…`: a function that is called on the event) and children (texts or elements). */
+export function element(name, attributes = {}, ...children) {
+  return fill(document.createElement(name), attributes, children);
+}
+
+/** The same for drawings. */
+export function drawing(name, attributes = {}, ...children) {
+  return fill(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, children);
+}
+
+function fill(made, attributes, children) {
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else if (value === true) made.setAttribute(key, "");
+    else if (value !== false && value != null) made.setAttribute(key, value);
+  }
+  made.append(...children.flat().filter((child) => child != null && child !== false));
+  return made;
+}
+
+/** A heading with what belongs to it. */
+export function section(title, ...children) {
+  return element("section", {}, element("h2", {}, title), ...children);
+}
+
+/** Names with their values; those without a value are left out. */
+export function facts(pairs) {
+  const shown = pairs.filter(([, value]) => value != null && value !== "" && value !== false);
+  return element("dl", {}, shown.map(([name, value]) => element("div", {}, element("dt", {}, name), element("dd", {}, value))));
+}
+
+/** A table; a column is [title, whether it holds numbers]. */
+export function table(caption, columns, rows) {
+  const head = columns.map(([title, isNumber]) => element("th", { scope: "col", class: isNumber && "number" }, title));
+  const cell = (value, k) => element("td", { class: columns[k][1] && "number" }, value ?? "–");
+  const lines = rows.map((row) => element("tr", {}, row.map(cell)));
+  return element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": caption },
+    element("table", {}, element("caption", { class: "unseen" }, caption),
+      element("thead", {}, element("tr", {}, head)), element("tbody", {}, lines)));
+}
+
+/** A word that says a state, with a mark that does not depend on its colour. */
+export function state(name) {
+  return element("span", { class: "state", "data-state": name }, name);
+}

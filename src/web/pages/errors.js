@@ -1,0 +1,80 @@
+// Whether the grade told where the potential errs: force errors of the labels by grade.
+
+import { ask } from "./api.js";
+import { LINES } from "./colours.js";
+import { element, section, table } from "./dom.js";
+import { decimals, percent, tick, whole } from "./format.js";
+import { plot } from "./plot.js";
+
+export const TITLE = "Errors";
+
+const KINDS = [["all", "all structures"], ["biased", "biased walks"], ["control", "control walks"]];
+
+export async function show(content, _, signal) {
+  const again = element("button", { type: "button", onclick: () => load() }, "Reckon again");
+  const place = element("div", { role: "status" }, element("p", {}, "reading all labels …"));
+  content.append(element("p", {}, "Force errors |F_model − F_label| (eV/Å) by the grade of each atom under the original mixture. ", again), place);
+  const load = async () => {
+    place.setAttribute("aria-busy", "true");
+    try {
+      place.replaceChildren(...shown(await ask("/api/errors", signal)));
+    } finally {
+      place.removeAttribute("aria-busy");
+    }
+  };
+  await load();
+}
+
+function shown(errors) {
+  const { all } = errors;
+  if (all.atoms === 0) return [element("p", {}, "There are no labels of candidates yet.")];
+  return [
+    section(`Protocol ${errors.protocol}`, correlations(errors),
+      element("div", { class: "plots" }, figure("γ", all.gamma), figure("γ_nbr", all.gamma_nbr))),
+    section("By γ", quantiles("γ", all.gamma, errors.large)), section("By γ_nbr", quantiles("γ_nbr", all.gamma_nbr, errors.large)),
+    section("Structures without a label", completion("γ_max", errors.completion_by_gamma), completion("V/V₀", errors.completion_by_relative_volume)),
+  ];
+}
+
+function correlations(errors) {
+  const columns = [["structures of"], ["structures", true], ["atoms", true], ["mean (eV/Å)", true], ["ρ(γ)", true], ["ρ(γ_nbr)", true],
+    [`ROC-AUC(γ), error > ${tick(errors.large)} eV/Å`, true], ["ROC-AUC(γ_nbr)", true]];
+  const rows = KINDS.map(([key, name]) => {
+    const { structures, atoms, mean_error: mean, gamma, gamma_nbr: near } = errors[key];
+    return [name, whole(structures), whole(atoms), decimals(mean, 4), decimals(gamma.spearman, 3), decimals(near.spearman, 3),
+      decimals(gamma.roc_auc, 3), decimals(near.roc_auc, 3)];
+  });
+  return table("Rank correlations, and the area under the ROC curve", columns, rows);
+}
+
+/** Median and percentiles over the middle of each bin. */
+function figure(name, { bins }) {
+  const filled = bins.filter((bin) => bin.atoms > 0 && bin.median != null);
+  const middle = ({ above, up_to: upTo }) => (upTo == null ? 1.25 * above : above == null ? upTo / 2 : (above + upTo) / 2);
+  const points = (key) => filled.map((bin) => [middle(bin), bin[key]]);
+  return plot({ title: `Force error by ${name}`, x: { title: name, least: 0 }, y: { title: "|ΔF| (eV/Å)", logarithmic: true },
+    bands: [{ colour: LINES[0], points: filled.map((bin) => [middle(bin), bin.median, bin.p90]) },
+      { colour: LINES[5], points: filled.map((bin) => [middle(bin), bin.p90, bin.p99]) }],
+    lines: [{ name: "median", colour: LINES[0], points: points("median") }, { name: "90 %", colour: LINES[0], dash: "6 3", points: points("p90") },
+      { name: "99 %", colour: LINES[5], dash: "2 3", points: points("p99") }] });
+}
+
+function range({ above, up_to: upTo }) {
+  if (upTo == null) return `> ${tick(above)}`;
+  return above == null ? `≤ ${tick(upTo)}` : `${tick(above)} to ${tick(upTo)}`;
+}
+
+function quantiles(name, { bins }, large) {
+  const columns = [[name], ["atoms", true], ["share", true], ["median (eV/Å)", true], ["90 % (eV/Å)", true], ["99 % (eV/Å)", true],
+    [`errors > ${tick(large)} eV/Å`, true], ["atoms without a label", true]];
+  const rows = bins.map((bin) => [range(bin), whole(bin.atoms), percent(bin.share), decimals(bin.median, 4), decimals(bin.p90, 4),
+    decimals(bin.p99, 4), percent(bin.share_large), whole(bin.atoms_without_label)]);
+  return table(`Force errors by ${name}`, columns, rows);
+}
+
+function completion(name, bins) {
+  const columns = [[name], ["labelled", true], ["failed", true], ["share labelled", true], ["95 % interval", true]];
+  const rows = bins.filter((bin) => bin.labelled + bin.failed.length > 0).map((bin) => [range(bin), whole(bin.labelled), whole(bin.failed.length),
+    percent(bin.share), bin.share_between ? bin.share_between.map(percent).join(" to ") : "–"]);
+  return table(`Labels by ${name}`, columns, rows);
+}

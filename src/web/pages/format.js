@@ -1,0 +1,63 @@
+// Numbers as people read them, each with its unit.
+
+const NONE = "–";
+
+/** With a number of decimals. */
+export function decimals(value, digits, unit = "") {
+  if (value == null || !Number.isFinite(value)) return NONE;
+  return value.toFixed(digits).replace("-", "−") + (unit && `\u202f${unit}`);
+}
+
+/** Whole, in groups of three digits. */
+export function whole(value, unit = "") {
+  if (value == null) return NONE;
+  const text = Math.round(value).toString();
+  return text.replace(/\B(?=(\d{3})+$)/g, "\u202f") + (unit && `\u202f${unit}`);
+}
+
+/** With three digits that count. */
+export function digits(value, unit = "") {
+  if (value == null || !Number.isFinite(value)) return NONE;
+  const size = Math.abs(value);
+  if (size !== 0 && (size < 1e-3 || size >= 1e6)) return value.toExponential(2).replace("-", "−") + (unit && `\u202f${unit}`);
+  return decimals(value, size >= 100 ? 0 : size >= 10 ? 1 : size >= 1 ? 2 : 3, unit);
+}
+
+/** A round number, with as many digits as it has. */
+export function tick(value) {
+  return String(Number(value.toPrecision(6))).replace("-", "−");
+}
+
+/** A part of a whole. */
+export function percent(part) {
+  return part == null ? NONE : `${digits(100 * part)}\u202f%`;
+}
+
+/** Bytes. */
+export function bytes(value) {
+  return value >= 1e9 ? digits(value / 1e9, "GB") : digits(value / 1e6, "MB");
+}
+
+/** A time, ms since 1970, in the reader's zone. */
+export function time(milliseconds) {
+  if (milliseconds == null) return NONE;
+  return new Date(milliseconds).toLocaleString([], { dateStyle: "medium", timeStyle: "medium" });
+}
+
+/** How long something lasts, ms. */
+export function duration(milliseconds) {
+  const seconds = Math.max(0, milliseconds / 1000);
+  if (seconds < 120) return digits(seconds, "s");
+  if (seconds < 7200) return digits(seconds / 60, "min");
+  return seconds < 172800 ? digits(seconds / 3600, "h") : digits(seconds / 86400, "d");
+}
+
+/** How long ago a time was. */
+export function ago(milliseconds) {
+  return milliseconds == null ? NONE : `${duration(Date.now() - milliseconds)} ago`;
+}
+
+/** The part of a candidate's name that tells it from others of its campaign. */
+export function shortName(id) {
+  return id.replace(/^[0-9a-f]{8}-/, "").replace(/-[0-9a-f]{16}$/, "");
+}

@@ -1,0 +1,25 @@
+// Hosts, and the processes that work there for the campaign.
+
+import { listen } from "./api.js";
+import { element, section, state, table } from "./dom.js";
+import { ago, time } from "./format.js";
+
+export const TITLE = "Hosts";
+
+const COLUMNS = [["process"], ["number", true], ["state"], ["last sign of life"], ["started"], ["pid", true],
+  ["restarts", true], ["remark"]];
+
+export function show(content, _, signal) {
+  const place = element("div");
+  content.append(place);
+  listen(({ status }) => place.replaceChildren(...hosts(status.processes)), signal);
+}
+
+function hosts(processes) {
+  if (processes.length === 0) return [element("p", {}, "No process works for this campaign.")];
+  const names = [...new Set(processes.map((process) => process.host))].sort();
+  return names.map((host) => section(host, table(`Processes of ${host}`, COLUMNS,
+    processes.filter((process) => process.host === host).map((process) => [
+      process.kind, process.number, state(process.state), ago(process.last_seen), time(process.started), process.pid,
+      process.restarts, process.remark]))));
+}

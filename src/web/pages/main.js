@@ -1,0 +1,77 @@
+// Which page is shown: the part of the address behind '#' says it.
+
+import { connect, listen } from "./api.js";
+import { element } from "./dom.js";
+import * as candidate from "./candidate.js";
+import * as candidates from "./candidates.js";
+import * as errors from "./errors.js";
+import * as hosts from "./hosts.js";
+import * as overview from "./overview.js";
+
+/** Pages in the order of the menu, by the first word of their address. */
+const PAGES = { overview, candidates, errors, hosts };
+const CONNECTIONS = { live: "● live", lost: "○ no connection: trying again", blind: "○ the database does not answer" };
+
+let shown = new AbortController();
+
+function show() {
+  const [name, ...rest] = location.hash.slice(1).split("/").filter(Boolean);
+  const page = name === "candidate" ? candidate : PAGES[name] ?? overview;
+  shown.abort();
+  shown = new AbortController();
+  const content = document.getElementById("content");
+  content.replaceChildren(element("h1", {}, page.TITLE));
+  document.title = `${page.TITLE} – calmwalk`;
+  const current = page === candidate ? candidates : page;
+  for (const link of document.querySelectorAll("#pages a")) {
+    link.toggleAttribute("data-current", PAGES[link.dataset.page] === current);
+    if (PAGES[link.dataset.page] === current) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+  const failed = (error) => {
+    if (error.name !== "AbortError") content.append(element("p", { class: "wrong", role: "alert" }, error.message));
+  };
+  Promise.resolve(page.show(content, rest.join("/"), shown.signal)).catch(failed);
+}
+
+function menu() {
+  const link = ([name, page]) => element("a", { href: `#${name}`, "data-page": name }, page.TITLE);
+  document.getElementById("pages").append(...Object.entries(PAGES).map(link));
+}
+
+/** Light, dark, or as the system has it. */
+function theme() {
+  const button = document.getElementById("theme");
+  const names = ["system", "light", "dark"];
+  let chosen = localStorage.getItem("theme") ?? "system";
+  const use = () => {
+    document.documentElement.dataset.theme = chosen;
+    button.textContent = `${{ system: "◐", light: "☀", dark: "☾" }[chosen]} ${chosen}`;
+    button.setAttribute("aria-label", `Colours: ${chosen}; press for others`);
+  };
+  button.addEventListener("click", () => {
+    chosen = names[(names.indexOf(chosen) + 1) % names.length];
+    localStorage.setItem("theme", chosen);
+    use();
+    show();
+  });
+  use();
+}
+
+function connection(how, why = "") {
+  const line = document.getElementById("connection");
+  if (line.dataset.how !== how) line.textContent = CONNECTIONS[how];
+  line.dataset.how = how;
+  line.title = why;
+}
+
+menu();
+theme();
+connect(connection);
+listen((news) => { document.title = document.title.replace(/calmwalk.*$/, `calmwalk ${news.status.campaign.slice(0, 8)}`); },
+  new AbortController().signal);
+addEventListener("hashchange", () => {
+  show();
+  document.getElementById("content").focus();
+});
+show();

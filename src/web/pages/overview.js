@@ -1,0 +1,109 @@
+// How the campaign stands.
+
+import { listen } from "./api.js";
+import { element, facts, section, state, table } from "./dom.js";
+import { bytes, decimals, digits, duration, percent, time, whole } from "./format.js";
+import { overTime } from "./plots.js";
+
+export const TITLE = "Overview";
+
+/** Walks that are shown; those under way before the others. */
+const WALKS = 40;
+
+const WALK_COLUMNS = [["walk", true], ["seed structure"], ["origin"], ["state"], ["step", true], ["T", true], ["V/V₀", true],
+  ["γ_max", true], ["τ", true], ["steps/s", true], ["accepted", true], ["refused", true]];
+
+export function show(content, _, signal) {
+  const tiles = element("div", { class: "tiles" });
+  const plots = element("div", { class: "plots" });
+  const rest = element("div");
+  content.append(tiles, section("Since this program began to look", plots), rest);
+  overTime(plots, signal);
+  listen(({ status }) => {
+    tiles.replaceChildren(...summary(status));
+    rest.replaceChildren(
+      section("Label queue", queue(status)),
+      section("Budget and end", budget(status)),
+      section("Walks", walks(status.walks)));
+  }, signal);
+}
+
+function tile(title, value, ...more) {
+  return element("div", { class: "tile" }, element("span", { class: "title" }, title), element("strong", {}, value),
+    ...more.map((line) => element("span", {}, line)));
+}
+
+function summary(status) {
+  const { candidates, labels, walks, mixture_version: version, staleness, training_frames: training } = status;
+  const underWay = walks.filter(isUnderWay).length;
+  const led = status.processes.some((process) => process.kind === "orchestrator" && process.state === "running");
+  const declined = Object.entries(candidates.declined).filter(([, count]) => count > 0)
+    .map(([reason, count]) => `${whole(count)} ${reason}`).join(", ");
+  const how = status.finished ? "finished" : led ? "running" : "stopped";
+  return [
+    tile("Campaign", state(how), `${status.campaign.slice(0, 8)}, ${status.mode} mode`,
+      status.round > 0 ? `round ${whole(status.round)}` : "", `${bytes(status.disk.bytes)} on disk`),
+    tile("Walks", `${whole(underWay)} under way`, `${whole(walks.length - underWay)} ended`,
+      status.steps_per_second == null ? "" : `${digits(status.steps_per_second)} steps/s in all`),
+    tile("Candidates", `${whole(candidates.accepted)} accepted`,
+      `of ${whole(candidates.seen)} seen (${percent(share(candidates.accepted, candidates.seen))})`,
+      declined && `declined: ${declined}`, `${whole(candidates.control)} control frames`),
+    tile("Labels", `${whole(labels.labelled)} made`, `${whole(labels.queued)} wait, ${whole(labels.leased)} in work`,
+      `${whole(labels.failed)} failed, ${whole(labels.dropped)} dropped`,
+      `${whole(status.labels_last_hour)} in the last hour`),
+    tile("Mixture", `version ${whole(version)}`,
+      training ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not watched",
+      training?.alarm ? element("span", { class: "wrong" }, "it forgets: more than calm.forgetting_alarm") : "",
+      staleness ? `walkers saw the newest in ${percent(staleness.share_of_newest)} of the decisions` : ""),
+  ];
+}
+
+function share(part, all) {
+  return all > 0 ? part / all : null;
+}
+
+function queue(status) {
+  const { oldest_lease: oldest, cost, failures } = status;
+  const remaining = cost.queue.remaining;
+  const list = facts([
+    ["labels per hour", status.labels_per_hour == null ? null : digits(status.labels_per_hour, "/h")],
+    ["oldest lease", oldest && `job ${oldest.job}, for ${duration(Date.now() - oldest.started)}, by ${oldest.holder}`],
+    ["cost so far", digits(cost.core_hours, "core-hours")],
+    ["cost of the queue", remaining && `${digits(remaining.expected)} (${digits(remaining.low)} to ${digits(remaining.high)}) core-hours`],
+  ]);
+  if (failures.length === 0) return list;
+  const columns = [["class of failures"], ["given up", true], ["labelled all the same", true], ["not done", true]];
+  const rows = failures.map((failure) => [failure.class, whole(failure.given_up), whole(failure.labelled), whole(failure.unfinished)]);
+  return element("div", {}, list, table("Failures of labels by class", columns, rows));
+}
+
+function budget(status) {
+  const { limits, used, used_up: over } = status.budget;
+  const end = status.expected_end;
+  const of = (what, limit, unit) => `${digits(what)}${limit == null ? "" : ` of ${digits(limit)}`}\u202f${unit}`;
+  const hours = (value) => (value == null ? null : digits(value, "h"));
+  return facts([
+    ["labels", `${whole(used.labels)}${limits.labels == null ? "" : ` of ${whole(limits.labels)}`}`],
+    ["core-hours", of(used.core_hours, limits.core_hours, "core-hours")],
+    ["time under way", of(used.wall_hours, limits.wall_hours, "h")],
+    ["used up", over],
+    ["expected end", end.time == null ? null : `${time(end.time)} at the latest, as things are now`],
+    ["walks need", hours(end.walks_hours)],
+    ["labels need", hours(end.labels_hours)],
+  ]);
+}
+
+function walks(all) {
+  const order = [...all].sort((a, b) => isUnderWay(b) - isUnderWay(a) || a.walk - b.walk);
+  const rows = order.slice(0, WALKS).map((walk) => [
+    whole(walk.walk), walk.seed_structure, walk.origin, element("span", {}, state(walk.state), walk.reason && ` ${walk.reason}`),
+    whole(walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
+    digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.refused)]);
+  const more = all.length - rows.length;
+  return element("div", {}, table("Walks, those under way first", WALK_COLUMNS, rows),
+    more > 0 && element("p", { class: "quiet" }, `… and ${whole(more)} more (calmwalk status --all)`));
+}
+
+function isUnderWay(walk) {
+  return walk.state === "running" || walk.state === "waiting";
+}

@@ -1,0 +1,123 @@
+// Plots: lines or points over two axes, drawn as SVG, with a sentence for those who do not see them.
+
+import { drawing, element } from "./dom.js";
+import { digits, tick } from "./format.js";
+
+const [WIDTH, HEIGHT, LEFT, BOTTOM, TOP, RIGHT] = [440, 230, 54, 40, 10, 12];
+
+const SHAPES = {
+  circle: "M-3 0a3 3 0 1 0 6 0a3 3 0 1 0 -6 0", square: "M-2.6 -2.6h5.2v5.2h-5.2z", diamond: "M0 -3.6L3.6 0L0 3.6L-3.6 0z",
+  triangle: "M0 -3.4L3.4 2.8H-3.4z", cross: "M-3 -3L3 3M-3 3L3 -3", plus: "M-3.4 0H3.4M0 -3.4V3.4",
+  ring: "M-3 0a3 3 0 1 0 6 0a3 3 0 1 0 -6 0",
+};
+const HOLLOW = new Set(["cross", "plus", "ring"]);
+
+/**
+ * A plot: `title`, `x` and `y` (axes: title; `ticks` makes a text of a number; `least`, `most`: what must be seen; `logarithmic`), and
+ * `lines` ({name, colour, dash, points: [[x, y], …]}), `bands` ({colour, points: [[x, low, high], …]}) and `marks` ({name, colour, shape,
+ * points: [[x, y, href, text], …]}). A y of null breaks a line.
+ */
+export function plot({ title, x, y, lines = [], bands = [], marks = [] }) {
+  const points = [...lines, ...marks].flatMap((one) => one.points).filter(([, value]) => value != null);
+  const edges = bands.flatMap((band) => band.points.flatMap(([at, low, high]) => [[at, low], [at, high]]));
+  const all = [...points, ...edges].filter(([a, b]) => Number.isFinite(a) && Number.isFinite(b));
+  if (all.length === 0) return figure(title, [], element("p", { class: "quiet empty" }, "nothing to show yet"));
+  const across = axis(x, all.map(([value]) => value), LEFT, WIDTH - RIGHT);
+  const up = axis(y, all.map(([, value]) => value), HEIGHT - BOTTOM, TOP);
+  const svg = drawing("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": described(title, x, y, lines, marks, all) },
+    grid(across, up), titles(x, y),
+    bands.map((band) => drawing("path", { d: area(band.points, across, up), fill: band.colour, "fill-opacity": 0.2 })),
+    lines.map((line) => drawing("path", { d: path(line.points, across, up), fill: "none", stroke: line.colour, "stroke-width": 1.7,
+      "stroke-dasharray": line.dash ?? "", "stroke-linejoin": "round" })),
+    marks.flatMap((kind) => kind.points.map((point) => mark(kind, point, across, up))));
+  return figure(title, [...lines, ...marks].filter((one) => one.name), svg);
+}
+
+function figure(title, named, ...children) {
+  const key = named.map((one) => element("li", {}, sample(one), one.name));
+  return element("figure", {}, element("figcaption", {}, title), ...children, key.length > 1 && element("ul", { class: "key" }, key));
+}
+
+function sample({ colour, dash, shape }) {
+  const drawn = shape
+    ? drawing("path", { d: SHAPES[shape], transform: "translate(11 6)", ...paint(colour, shape) })
+    : drawing("path", { d: "M1 6H21", stroke: colour, "stroke-width": 2, "stroke-dasharray": dash ?? "" });
+  return drawing("svg", { class: "sample", viewBox: "0 0 22 12", "aria-hidden": "true" }, drawn);
+}
+
+function paint(colour, shape) {
+  return HOLLOW.has(shape) ? { fill: "none", stroke: colour, "stroke-width": 1.5 } : { fill: colour, "fill-opacity": 0.75 };
+}
+
+function mark({ colour, shape }, [x, y, href, text], across, up) {
+  const drawn = drawing("path", { d: SHAPES[shape], transform: `translate(${across.at(x).toFixed(1)} ${up.at(y).toFixed(1)})`,
+    ...paint(colour, shape) }, text && drawing("title", {}, text));
+  return href ? drawing("a", { href, tabindex: "-1" }, drawn) : drawn;
+}
+
+/** Where numbers stand between two places, and the round ones among them. */
+function axis({ least, most, logarithmic, ticks = tick }, values, from, to) {
+  let low = values.reduce((a, b) => Math.min(a, b), least ?? Infinity);
+  let high = values.reduce((a, b) => Math.max(a, b), most ?? -Infinity);
+  if (logarithmic) [low, high] = [Math.log10(Math.max(low, 1e-12)), Math.log10(Math.max(high, 1e-12))];
+  if (high - low < 1e-9 * Math.max(1, Math.abs(high))) [low, high] = [low - 0.5, high + 0.5];
+  const at = (value) => {
+    const place = logarithmic ? Math.log10(Math.max(value, 1e-12)) : value;
+    return from + ((place - low) / (high - low)) * (to - from);
+  };
+  const round = roundNumbers(low, high, Math.abs(to - from) / 55).filter((value) => !logarithmic || Number.isInteger(value));
+  return { at, ticks: round.map((value) => (logarithmic ? 10 ** value : value)), text: ticks };
+}
+
+function roundNumbers(low, high, number) {
+  const rough = (high - low) / Math.max(number, 2);
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].map((factor) => factor * power).find((candidate) => candidate >= rough);
+  const first = Math.ceil(low / step);
+  return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, k) => (first + k) * step);
+}
+
+function grid(across, up) {
+  return drawing("g", { class: "grid" },
+    across.ticks.map((value) => [
+      drawing("path", { d: `M${across.at(value)} ${TOP}V${HEIGHT - BOTTOM}` }),
+      drawing("text", { x: across.at(value), y: HEIGHT - BOTTOM + 14, "text-anchor": "middle" }, across.text(value))]).flat(),
+    up.ticks.map((value) => [
+      drawing("path", { d: `M${LEFT} ${up.at(value)}H${WIDTH - RIGHT}` }),
+      drawing("text", { x: LEFT - 6, y: up.at(value) + 3.5, "text-anchor": "end" }, up.text(value))]).flat());
+}
+
+function titles(x, y) {
+  const middle = (TOP + HEIGHT - BOTTOM) / 2;
+  return drawing("g", { class: "titles" },
+    drawing("text", { x: (LEFT + WIDTH - RIGHT) / 2, y: HEIGHT - 6, "text-anchor": "middle" }, x.title),
+    drawing("text", { x: 11, y: middle, "text-anchor": "middle", transform: `rotate(-90 11 ${middle})` }, y.title));
+}
+
+function path(points, across, up) {
+  let begins = true;
+  return points.map(([x, y]) => {
+    if (y == null) {
+      begins = true;
+      return "";
+    }
+    const drawn = `${begins ? "M" : "L"}${across.at(x).toFixed(1)} ${up.at(y).toFixed(1)}`;
+    begins = false;
+    return drawn;
+  }).join("");
+}
+
+function area(points, across, up) {
+  const edge = (k) => points.map((point) => [point[0], point[k]]);
+  return `${path(edge(2), across, up)}${path(edge(1).reverse(), across, up).replace("M", "L")}Z`;
+}
+
+function described(title, x, y, lines, marks, all) {
+  const values = all.map(([, value]) => value);
+  const [low, high] = [values.reduce((a, b) => Math.min(a, b)), values.reduce((a, b) => Math.max(a, b))];
+  const parts = [...lines, ...marks].filter((one) => one.name && one.points.length > 0).map((one) => {
+    const last = one.points.findLast(([, value]) => value != null);
+    return one.shape ? `${one.points.length} ${one.name}` : `${one.name} now ${last ? digits(last[1]) : "unknown"}`;
+  });
+  return `${title}: ${y.title} against ${x.title}, from ${digits(low)} to ${digits(high)}. ${parts.join(", ")}`;
+}

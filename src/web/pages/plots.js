@@ -1,0 +1,72 @@
+// The plots of the overview: over time since the program began to look, and of the newest candidates.
+
+import { ask, listen } from "./api.js";
+import { DASHES, FATES, LINES } from "./colours.js";
+import { shortName, tick, whole } from "./format.js";
+import { plot } from "./plot.js";
+
+/** Samples that are kept here beside those that the program had. */
+const ROOM = 2000;
+/** Newest candidates that are shown. */
+const NEWEST = 200;
+
+export function overTime(place, signal) {
+  let samples = [];
+  let newest = [];
+  let seen = -1;
+  const draw = () => place.replaceChildren(...(samples.length > 1 ? drawn(samples) : []), newestCandidates(newest));
+  const begin = ask("/api/samples", signal).then((found) => { samples = found; }).catch(() => {});
+  listen(async ({ status, sample }) => {
+    await begin;
+    if (samples.at(-1)?.time !== sample.time) samples.push(sample);
+    if (samples.length > ROOM) samples = samples.filter((_, k) => k % 2 === 0);
+    const now = status.candidates.seen + status.candidates.control;
+    if (now !== seen) {
+      seen = now;
+      newest = await ask(`/api/candidates?limit=${NEWEST}`, signal).then((page) => page.candidates).catch(() => newest);
+    }
+    // Who points at something, or reads it, keeps it.
+    if (!signal.aborted && !place.contains(document.activeElement)) draw();
+  }, signal);
+}
+
+function drawn(samples) {
+  const last = samples.at(-1).time;
+  const x = axisOfTime(last - samples[0].time);
+  const at = (sample) => (sample.time - last) / x.unit;
+  const line = (read) => samples.map((sample) => [at(sample), read(sample)]);
+  const rate = (from, scale) => samples.map((sample, k) => {
+    const before = samples[Math.max(0, k - Math.max(5, Math.floor(samples.length / 20)))];
+    return [at(sample), sample === before ? null : scale(from(sample) - from(before), sample, before)];
+  });
+  const walks = [...new Set(samples.flatMap((sample) => Object.keys(sample.gamma)))].slice(-LINES.length * DASHES.length);
+  return [
+    plot({ title: "Grade of walks", x, y: { title: "γ_max", least: 0, most: 1 }, lines: walks.map((walk, k) => ({
+      name: `walk ${walk}`, colour: LINES[k % LINES.length], dash: DASHES[Math.floor(k / LINES.length) % DASHES.length],
+      points: line((sample) => sample.gamma[walk]) })) }),
+    plot({ title: "Acceptance", x, y: { title: "accepted of seen (%)", least: 0, most: 100 }, lines: [{
+      colour: LINES[0], points: rate((sample) => sample.accepted, (accepted, now, then) =>
+        (now.seen > then.seen ? (100 * accepted) / (now.seen - then.seen) : null)) }] }),
+    plot({ title: "Label rate", x, y: { title: "labels per hour (1/h)", least: 0, most: 1 }, lines: [{
+      colour: LINES[2], points: rate((sample) => sample.labels, (labels, now, then) =>
+        (3.6e6 * labels) / (now.time - then.time)) }] }),
+    plot({ title: "Label queue", x, y: { title: "jobs", least: 0, most: 4, ticks: whole }, lines: [
+      { name: "waiting", colour: LINES[0], points: line((sample) => sample.queued) },
+      { name: "in work", colour: LINES[1], dash: DASHES[1], points: line((sample) => sample.leased) }] }),
+  ];
+}
+
+function axisOfTime(span) {
+  const [unit, name] = span > 1.5e8 ? [8.64e7, "d"] : span > 5.4e6 ? [3.6e6, "h"] : span > 9e4 ? [6e4, "min"] : [1e3, "s"];
+  return { title: `time before now (${name})`, unit, ticks: (value) => tick(Math.abs(value)) };
+}
+
+function newestCandidates(newest) {
+  const fate = (candidate) => (candidate.origin === "control" ? "control" : candidate.fate);
+  const point = (candidate) => [candidate.relative_volume, candidate.gamma, `#candidate/${encodeURIComponent(candidate.id)}`,
+    `${shortName(candidate.id)}: ${fate(candidate)}`];
+  const marks = Object.entries(FATES).map(([name, look]) => ({ name, ...look,
+    points: newest.filter((one) => fate(one) === name && one.gamma != null && one.relative_volume != null).map(point) }));
+  return plot({ title: `Grade and volume of the newest ${NEWEST} candidates`, x: { title: "V/V₀" },
+    y: { title: "γ_max (original mixture)", least: 0 }, marks: marks.filter((kind) => kind.points.length > 0) });
+}

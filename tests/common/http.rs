@@ -1,0 +1,83 @@
+//! Asking a program over HTTP, with whatever headers.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::process::Child;
+use std::time::Duration;
+
+use serde_json::Value;
+
+/// What was answered.
+#[derive(Clone, Debug)]
+pub struct Answer {
+    pub status: u16,
+    /// Status line and headers.
+    pub head: String,
+    pub body: String,
+}
+
+impl Answer {
+    /// The body as JSON.
+    pub fn json(&self) -> Value {
+        serde_json::from_str(&self.body).unwrap_or_else(|error| panic!("{error}: {self:?}"))
+    }
+}
+
+/// Sends a request; without a header `Host` it calls the host by its address.
+pub fn request(address: &str, method: &str, path: &str, headers: &[(&str, &str)], body: &str) -> Answer {
+    let mut stream = BufReader::new(send(address, method, path, headers, body));
+    let mut head = String::new();
+    while !head.ends_with("\r\n\r\n") {
+        assert!(stream.read_line(&mut head).expect("a head") > 0, "the answer ends in its head: {head}");
+    }
+    let length = head.lines().find_map(|line| {
+        let (name, value) = line.split_once(':')?;
+        name.eq_ignore_ascii_case("content-length").then(|| value.trim().parse().expect("a length"))
+    });
+    // Some keep the line open behind it.
+    let mut body = String::new();
+    stream.take(length.unwrap_or(u64::MAX)).read_to_string(&mut body).expect("a body");
+    let status = head.split(' ').nth(1).and_then(|status| status.parse().ok()).expect("a status");
+    Answer { status, head, body }
+}
+
+/// The answer to a plain question.
+pub fn get(address: &str, path: &str) -> Answer {
+    request(address, "GET", path, &[], "")
+}
+
+/// The first event of a stream of server-sent events, as JSON.
+pub fn first_event(address: &str, path: &str) -> Value {
+    let mut lines = BufReader::new(send(address, "GET", path, &[], "")).lines();
+    let data = lines.find_map(|line| Some(line.expect("a line").strip_prefix("data: ")?.to_owned()));
+    serde_json::from_str(&data.expect("an event")).expect("JSON")
+}
+
+fn send(address: &str, method: &str, path: &str, headers: &[(&str, &str)], body: &str) -> TcpStream {
+    let mut stream = TcpStream::connect(address).expect("somebody listens");
+    stream.set_read_timeout(Some(Duration::from_secs(60))).expect("a socket");
+    let mut text =
+        format!("{method} {path} HTTP/1.1\r\nConnection: close\r\nContent-Length: {}\r\n", body.len());
+    if !headers.iter().any(|(name, _)| *name == "Host") {
+        text += &format!("Host: {address}\r\n");
+    }
+    headers.iter().for_each(|(name, value)| text += &format!("{name}: {value}\r\n"));
+    write!(stream, "{text}\r\n{body}").expect("a request is sent");
+    stream
+}
+
+/// What stands behind `begin` on a line of the standard error, which is read on to its end.
+pub fn said<const N: usize>(child: &mut Child, begins: [&str; N]) -> [String; N] {
+    let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();
+    let mut found = begins.map(|_| None);
+    while found.iter().any(Option::is_none) {
+        let line = lines.next().expect("it says where it listens").expect("a line");
+        for (begin, found) in begins.iter().zip(&mut found) {
+            if let Some(rest) = line.strip_prefix(begin) {
+                *found = Some(rest.to_owned());
+            }
+        }
+    }
+    std::thread::spawn(move || lines.for_each(drop));
+    found.map(|found| found.expect("all are found"))
+}

@@ -1,0 +1,249 @@
+//! The dashboard of a campaign that runs, and of one that is only looked at: pages, news, the table, candidates, and actions,
+//! which only who knows the token may do, and no page of another site.
+
+mod common;
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+use std::process::Stdio;
+
+use atoms::extxyz::Reader;
+use atoms::poscar::read_poscar;
+use common::campaign::Small;
+use common::http::{first_event, get, request, said};
+use common::processes::wait_until;
+use common::{Running, program, refuse, succeed};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+/// A campaign that has collected all it may, and waits for labels from elsewhere.
+struct Live {
+    directory: TempDir,
+    _run: Running,
+    address: String,
+    token: String,
+}
+
+impl Live {
+    fn begin() -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let here = directory.path();
+        let path = Small::default().write(here);
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, text.replace("[label]", "[label]\nslots = 0")).unwrap();
+        let mut command = program(here);
+        command.args(["run", "campaign.toml", "--dashboard", "127.0.0.1:0"]);
+        let mut run = Running(command.stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap());
+        let [said] = said(&mut run.0, ["dashboard at http://"]);
+        let (address, token) = said.split_once("/#token=").unwrap();
+        let live = Self { address: address.into(), token: token.into(), _run: run, directory };
+        wait_until("all is collected", || {
+            let status = live.status();
+            let over = |walk: &Value| !["waiting", "running"].contains(&walk["state"].as_str().unwrap());
+            let walks = status["walks"].as_array().unwrap();
+            walks.len() >= 2 && walks.iter().all(over) && status["labels"]["queued"].as_u64() > Some(2)
+        });
+        live
+    }
+
+    fn here(&self) -> &Path {
+        self.directory.path()
+    }
+
+    fn status(&self) -> Value {
+        serde_json::from_str(&succeed(self.here(), ["status", "campaign", "--json"])).unwrap()
+    }
+
+    fn job(&self, id: &str) -> Value {
+        let shown = succeed(self.here(), ["queue", "campaign", "show", id, "--json"]);
+        serde_json::from_str(&shown).unwrap()
+    }
+
+    fn act(&self, id: &str, action: &str, headers: &[(&str, &str)], body: &Value) -> (u16, Value) {
+        let path = format!("/api/candidates/{id}/{action}");
+        let answer = request(&self.address, "POST", &path, headers, &body.to_string());
+        (answer.status, answer.json())
+    }
+}
+
+/// Every line of the table, a few at a time.
+fn all_lines(address: &str, query: &str, limit: usize) -> Vec<Value> {
+    let (mut lines, mut after) = (Vec::new(), String::new());
+    loop {
+        let page = get(address, &format!("/api/candidates?limit={limit}&{query}{after}"));
+        assert_eq!(page.status, 200, "{page:?}");
+        let page = page.json();
+        let found = page["candidates"].as_array().unwrap();
+        assert!(found.len() <= limit);
+        lines.extend(found.iter().cloned());
+        let Some(next) = page["next"].as_str() else { return lines };
+        after = format!("&after={next}");
+    }
+}
+
+fn check_pages(address: &str) {
+    let index = get(address, "/");
+    assert_eq!(index.status, 200);
+    let wanted = "content-security-policy: default-src 'none'; script-src 'self'";
+    assert!(
+        index.head.contains(wanted) && index.head.contains("x-content-type-options: nosniff"),
+        "{}",
+        index.head
+    );
+    for file in index.body.split('"').filter(|word| word.starts_with("/pages/")) {
+        let file = get(address, file);
+        assert!(file.status == 200 && file.head.contains("content-security-policy"), "{}", file.head);
+    }
+    assert_eq!(get(address, "/pages/../Cargo.toml").status, 404);
+    assert_eq!(get(address, "/pages/none.js").status, 404);
+    let rebound = request(address, "GET", "/api/samples", &[("Host", "rebound.example:80")], "");
+    assert_eq!((rebound.status, rebound.body.contains("time")), (403, false));
+    assert_eq!(request(address, "GET", "/api/samples", &[("Host", "localhost:9999")], "").status, 200);
+}
+
+fn check_table(live: &Live) {
+    let address = &live.address;
+    let status = live.status();
+    let count = |pointer: &str| status.pointer(pointer).unwrap().as_u64().unwrap() as usize;
+    let all = all_lines(address, "", 3);
+    assert_eq!(all.len(), count("/candidates/seen") + count("/candidates/control"));
+    let names: BTreeSet<_> = all.iter().map(|line| line["id"].as_str().unwrap()).collect();
+    assert_eq!(names.len(), all.len());
+    let column =
+        |lines: &[Value], key: &str| lines.iter().map(|line| line[key].as_f64().unwrap()).collect::<Vec<_>>();
+    let mut ascending = all_lines(address, "ascending=true", 7);
+    ascending.reverse();
+    assert_eq!(ascending, all);
+    for (order, key) in [("gamma", "gamma"), ("volume", "relative_volume")] {
+        let falling = column(&all_lines(address, &format!("order={order}"), 2), key);
+        assert!(falling.len() == all.len() && falling.is_sorted_by(|a, b| a >= b), "{falling:?}");
+        let rising = column(&all_lines(address, &format!("order={order}&ascending=true"), 5), key);
+        assert!(rising.len() == all.len() && rising.is_sorted(), "{rising:?}");
+    }
+    for fate in ["accepted", "covered", "duplicate", "guard", "budget", "control"] {
+        let wanted = |line: &&Value| match line["origin"].as_str() {
+            Some("control") => fate == "control",
+            _ => line["fate"] == fate,
+        };
+        let expected: Vec<_> = all.iter().filter(wanted).cloned().collect();
+        assert_eq!(all_lines(address, &format!("fate={fate}"), 2), expected, "{fate}");
+        assert_eq!(
+            all_lines(address, &format!("fate={fate}&order=gamma"), 2).len(),
+            expected.len(),
+            "{fate}"
+        );
+    }
+    let queue = all_lines(address, "order=queue&state=queued", 2);
+    let shown =
+        succeed(live.here(), ["queue", "campaign", "list", "--state", "queued", "--limit", "1000", "--json"]);
+    let listed: Vec<Value> = serde_json::from_str(&shown).unwrap();
+    let names = |lines: &[Value], key: &str| lines.iter().map(|line| line[key].clone()).collect::<Vec<_>>();
+    assert_eq!(names(&queue, "id"), names(&listed, "candidate"));
+    let found = all_lines(address, "where=gamma+%3E+1.1+and+element+%3D+Al+and+kind+%3D+biased", 4);
+    let expected = |line: &&Value| line["gamma"].as_f64() > Some(1.1) && line["origin"] == "biased";
+    assert_eq!(found, all.iter().filter(expected).cloned().collect::<Vec<_>>());
+    assert_eq!(all_lines(address, "where=energy+%3C+1", 4), Vec::<Value>::new(), "there is no label");
+    let wrong = get(address, "/api/candidates?where=gama+%3E+1");
+    assert!(
+        wrong.status == 400 && wrong.json()["error"].as_str().unwrap().contains("gamma_nbr"),
+        "{wrong:?}"
+    );
+}
+
+fn check_candidate(live: &Live, id: &str) {
+    let story = get(&live.address, &format!("/api/candidates/{id}")).json();
+    let explained = succeed(live.here(), ["explain", "campaign", id, "--json"]);
+    assert_eq!(story, serde_json::from_str::<Value>(&explained).unwrap());
+    let shown = get(&live.address, &format!("/api/candidates/{id}/structure")).json();
+    let file = get(&live.address, &format!("/api/candidates/{id}/structure.extxyz"));
+    assert!(file.head.contains(&format!("attachment; filename=\"{id}.extxyz\"")), "{}", file.head);
+    let frame = Reader::new(file.body.as_bytes()).next().unwrap().unwrap();
+    assert_eq!(shown["positions"], json!(frame.structure.positions));
+    assert_eq!(shown["cell"], json!(frame.structure.cell.0));
+    let gamma = frame.arrays["gamma"].reals().unwrap();
+    let largest = gamma.iter().copied().fold(0.0, f64::max);
+    assert_eq!(story["grades"]["original"]["gamma_max"], largest);
+    let poscar = get(&live.address, &format!("/api/candidates/{id}/structure.poscar"));
+    assert_eq!(read_poscar(poscar.body.as_bytes()).unwrap().structure.len(), gamma.len());
+    let walk = story["found"]["walk"].as_u64().unwrap();
+    let trace = get(&live.address, &format!("/api/walks/{walk}/candidates")).json();
+    assert!(trace.as_array().unwrap().iter().any(|line| line["id"] == id), "{trace}");
+    let unknown = get(&live.address, "/api/candidates/nobody");
+    assert!(unknown.status == 404 && unknown.body.contains("nobody"), "{unknown:?}");
+}
+
+fn check_actions(live: &Live, id: &str) {
+    let token = ("x-calmwalk-token", live.token.as_str());
+    let origin = format!("http://{}", live.address);
+    let before = live.job(id);
+    let priority = json!({ "priority": 99 });
+    let wrong = "0".repeat(live.token.len());
+    for (status, headers) in [
+        (401, vec![]),
+        (401, vec![("x-calmwalk-token", wrong.as_str())]),
+        (401, vec![("x-calmwalk-token", &live.token[1..])]),
+        (403, vec![token, ("Origin", "http://example.org")]),
+        (403, vec![token, ("Origin", "null")]),
+        (403, vec![token, ("Sec-Fetch-Site", "cross-site")]),
+        (403, vec![token, ("Sec-Fetch-Site", "same-site")]),
+    ] {
+        let (found, why) = live.act(id, "prioritise", &headers, &priority);
+        assert_eq!(found, status, "{headers:?} {why}");
+    }
+    let path = format!("/api/candidates/{id}/drop");
+    let rebound = request(&live.address, "POST", &path, &[token, ("Host", "rebound.example")], "{}");
+    assert_eq!(rebound.status, 403);
+    assert_eq!(get(&live.address, &path).status, 405);
+    let asked = request(&live.address, "OPTIONS", &path, &[("Origin", "http://example.org")], "");
+    assert!(!asked.head.contains("access-control"), "{}", asked.head);
+    assert_eq!(live.job(id), before, "nothing of that changed anything");
+
+    let headers = [token, ("Origin", origin.as_str()), ("Sec-Fetch-Site", "same-origin")];
+    assert_eq!(live.act(id, "prioritise", &headers, &json!({})).0, 400);
+    let (status, job) = live.act(id, "prioritise", &headers, &priority);
+    assert_eq!((status, &job["priority"]), (200, &json!(99)));
+    assert_eq!(live.job(id)["priority"], 99);
+    for (action, state) in [("drop", "dropped"), ("retry", "queued")] {
+        let (status, job) = live.act(id, action, &headers, &json!({}));
+        assert_eq!((status, &job["state"]), (200, &json!(state)));
+        assert_eq!(live.job(id)["state"], state);
+    }
+    let (status, why) = live.act(id, "retry", &headers, &json!({}));
+    assert!(status == 409 && why["error"].as_str().unwrap().contains("queued"), "{why}");
+    let allowed = request(&live.address, "GET", "/api/actions", &[token], "").json();
+    assert_eq!(allowed, json!({ "possible": true, "token_is_right": true }));
+}
+
+#[test]
+fn a_live_campaign_is_looked_at_and_changed() {
+    let live = Live::begin();
+    check_pages(&live.address);
+    let news = first_event(&live.address, "/api/events");
+    assert_eq!(news["status"]["campaign"], live.status()["campaign"]);
+    let samples = get(&live.address, "/api/samples").json();
+    assert!(samples[0]["time"].as_i64() > Some(0), "{samples}");
+    check_table(&live);
+    let queue = all_lines(&live.address, "order=queue&state=queued", 50);
+    let id = queue[0]["id"].as_str().unwrap();
+    check_candidate(&live, id);
+    check_actions(&live, id);
+    check_copy(&live, id);
+}
+
+/// What is only looked at can only be looked at.
+fn check_copy(live: &Live, id: &str) {
+    let here = live.here();
+    succeed(here, ["store", "backup", "campaign", "copy"]);
+    let mut command = program(here);
+    command.args(["dashboard", "copy", "--at", "127.0.0.1:0"]);
+    let mut shown = Running(command.stderr(Stdio::piped()).spawn().unwrap());
+    let [address] = said(&mut shown.0, ["dashboard at http://"]);
+    let address = address.trim_end_matches('/');
+    assert_eq!(all_lines(address, "", 50), all_lines(&live.address, "", 50));
+    assert_eq!(get(address, "/api/actions").json()["possible"], false);
+    let token = [("x-calmwalk-token", live.token.as_str())];
+    assert_eq!(request(address, "POST", &format!("/api/candidates/{id}/drop"), &token, "{}").status, 403);
+    let open = refuse(here, ["dashboard", "copy", "--at", "0.0.0.0:0"]);
+    assert!(open.contains("ssh -L"), "{open}");
+}
