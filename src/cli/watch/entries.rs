@@ -1,0 +1,164 @@
+//! Walks, label jobs and decisions as lines of their lists, and as a condition sees them.
+
+use atoms::Species;
+use store::{DecidedCandidate, Job, JobState, RecentDecision, WalkStatus};
+
+use super::pane::{Entry, Tone};
+use crate::cli::status::page::cut;
+use crate::cli::status::walks;
+use crate::condition::{self, Condition, Facts};
+use crate::output::decimals;
+
+/// Columns of the queue; those of numbers begin with `>`, and blanks are room for what may come.
+pub const JOBS: [&str; 7] =
+    ["candidate                 ", "state   ", ">priority", ">atoms", "formula  ", ">γ_max", ">tries"];
+
+/// Columns of the decisions.
+pub const DECISIONS: [&str; 8] =
+    [">number", "what               ", ">walk", "seed structure", ">   step", ">T (K)", ">V/V₀", ">γ_max"];
+
+/// A line for each that meets the condition.
+pub fn of_walks(walks: &[WalkStatus], filter: Option<&Condition>) -> Vec<Entry> {
+    let meets = |walk: &&WalkStatus| filter.is_none_or(|filter| filter.is_met(&facts_of_walk(walk)));
+    let tone = |walk: &WalkStatus| match walk.state.as_str() {
+        _ if walk.paused => Tone::Attention,
+        "running" => Tone::Good,
+        "waiting" => Tone::Plain,
+        "trapped" | "blew_up" | "bad_start" => Tone::Attention,
+        _ => Tone::Past,
+    };
+    let entry = |walk: &WalkStatus| Entry {
+        key: walk.walk.to_string(),
+        columns: walks::line(walk, walks::NAME),
+        tone: tone(walk),
+        candidate: None,
+    };
+    walks.iter().filter(meets).map(entry).collect()
+}
+
+/// The same of label jobs.
+pub fn of_jobs(jobs: &[Job], filter: Option<&Condition>) -> Vec<Entry> {
+    let meets = |job: &&Job| {
+        let species = condition::species(&job.formula);
+        filter.is_none_or(|filter| filter.is_met(&facts_of_job(job, &species)))
+    };
+    let tone = |state: JobState| match state {
+        JobState::Leased | JobState::Labelled => Tone::Good,
+        JobState::Queued => Tone::Plain,
+        JobState::Failed => Tone::Attention,
+        JobState::Dropped | JobState::Superseded => Tone::Past,
+    };
+    let entry = |job: &Job| Entry {
+        key: job.job.to_string(),
+        columns: vec![
+            without_campaign(&job.candidate).to_owned(),
+            job.state.to_string(),
+            job.priority.to_string(),
+            job.atoms.to_string(),
+            cut(&job.formula, 12),
+            decimals(job.original_gamma, 2),
+            job.attempts.to_string(),
+        ],
+        tone: tone(job.state),
+        candidate: Some(job.candidate.clone()),
+    };
+    jobs.iter().filter(meets).map(entry).collect()
+}
+
+/// The same of decisions.
+pub fn of_decisions<'a>(
+    decisions: impl Iterator<Item = &'a RecentDecision>,
+    filter: Option<&Condition>,
+) -> Vec<Entry> {
+    let meets = |decision: &&RecentDecision| {
+        let formula = decision.candidate.as_ref().map_or("", |found| &found.formula);
+        let species = condition::species(formula);
+        filter.is_none_or(|filter| filter.is_met(&facts_of_decision(decision, &species)))
+    };
+    decisions.filter(meets).map(of_decision).collect()
+}
+
+fn of_decision(decision: &RecentDecision) -> Entry {
+    let RecentDecision { sequence, kind, walk, detail, candidate, .. } = decision;
+    let found = candidate.as_ref();
+    let number = |of: fn(&DecidedCandidate) -> Option<f64>, digits| match found {
+        Some(found) => decimals(of(found), digits),
+        None => String::new(),
+    };
+    let what = match (found.and_then(|found| found.reason.as_deref()), detail["end"].as_str()) {
+        (Some(reason), _) => format!("{kind}: {reason}"),
+        (None, Some(end)) => format!("{kind}: {}", end.replace('_', " ")),
+        (None, None) => kind.clone(),
+    };
+    let name = found.map(|found| found.seed_structure.as_str()).or_else(|| detail["seed_structure"].as_str());
+    let step = found.map(|found| found.step).or_else(|| detail["step"].as_u64());
+    Entry {
+        key: sequence.to_string(),
+        columns: vec![
+            sequence.to_string(),
+            what,
+            walk.map_or(String::new(), |walk| walk.to_string()),
+            cut(name.unwrap_or_default(), walks::NAME),
+            step.map_or(String::new(), |step| step.to_string()),
+            number(|found| found.temperature, 0),
+            number(|found| found.relative_volume, 3),
+            number(|found| found.original_gamma, 2),
+        ],
+        tone: match kind.as_str() {
+            "accepted" => Tone::Good,
+            "declined" | "control" => Tone::Plain,
+            _ => Tone::Past,
+        },
+        candidate: found.map(|found| found.candidate.clone()),
+    }
+}
+
+/// The name of a candidate behind its campaign's part, which is the same in all.
+pub fn without_campaign(candidate: &str) -> &str {
+    candidate.split_once('-').map_or(candidate, |(_, rest)| rest)
+}
+
+fn facts_of_walk(walk: &WalkStatus) -> Facts<'_> {
+    Facts {
+        gamma: walk.gamma_max,
+        volume: walk.relative_volume,
+        temperature: walk.temperature,
+        walk: Some(walk.walk),
+        step: Some(walk.step),
+        kind: &walk.origin,
+        seed: Some(&walk.seed_structure),
+        ..Facts::default()
+    }
+}
+
+fn facts_of_job<'a>(job: &'a Job, species: &'a [Species]) -> Facts<'a> {
+    Facts {
+        gamma: job.original_gamma,
+        gamma_nbr: job.original_gamma_nbr,
+        volume: job.relative_volume,
+        temperature: job.temperature,
+        walk: Some(job.walk),
+        step: Some(job.step),
+        species,
+        kind: &job.origin,
+        seed: Some(&job.seed_structure),
+        ..Facts::default()
+    }
+}
+
+fn facts_of_decision<'a>(decision: &'a RecentDecision, species: &'a [Species]) -> Facts<'a> {
+    let of_walk =
+        Facts { walk: decision.walk, mixture_version: Some(decision.mixture_version), ..Facts::default() };
+    let Some(found) = &decision.candidate else { return of_walk };
+    Facts {
+        gamma: found.original_gamma,
+        gamma_nbr: found.original_gamma_nbr,
+        volume: found.relative_volume,
+        temperature: found.temperature,
+        step: Some(found.step),
+        species,
+        kind: found.origin.name(),
+        seed: Some(&found.seed_structure),
+        ..of_walk
+    }
+}

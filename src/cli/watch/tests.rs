@@ -1,0 +1,276 @@
+use ratatui::Terminal;
+use ratatui::backend::TestBackend;
+use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
+use ratatui::style::{Color, Modifier};
+use store::{DecidedCandidate, Job, JobState, RecentDecision};
+use wire::Origin;
+
+use super::draw::{Theme, draw};
+use super::keys::Request;
+use super::reader::Seen;
+use super::state::{DECISIONS, Jobs, Message, Mode, QUEUE, State, WALKS};
+use super::*;
+use crate::cli::queue::Action;
+use crate::cli::status;
+
+const PLAIN: Theme = Theme { colours: false };
+
+fn job(number: i64, state: JobState) -> Job {
+    Job {
+        job: number,
+        candidate: format!("07070707-3.0.{number}-0123456789abcdef"),
+        protocol: "dft".into(),
+        state,
+        priority: 10,
+        holder: None,
+        expires: None,
+        attempts: 0,
+        failures: 0,
+        atoms: 54,
+        formula: if number % 2 == 0 { "CMo53" } else { "Mo54" }.into(),
+        original_gamma: Some(1.0 + number as f64 / 10.0),
+        original_gamma_nbr: None,
+        origin: "biased".into(),
+        seed_structure: "bcc-100".into(),
+        walk: 3,
+        step: number as u64,
+        temperature: Some(300.0),
+        relative_volume: Some(1.01),
+        overruled: false,
+        relabel: None,
+    }
+}
+
+fn decision(sequence: i64) -> RecentDecision {
+    let accepted = sequence % 4 == 0;
+    let candidate = DecidedCandidate {
+        candidate: format!("07070707-3.0.{sequence}-fedcba9876543210"),
+        origin: Origin::Biased,
+        reason: (!accepted).then(|| "covered".into()),
+        step: sequence as u64,
+        seed_structure: "bcc-100".into(),
+        atoms: 54,
+        formula: "Mo54".into(),
+        temperature: Some(301.0),
+        relative_volume: Some(1.02),
+        selector_gamma: Some(1.2),
+        original_gamma: Some(1.0 + sequence as f64 / 100.0),
+        original_gamma_nbr: Some(1.1),
+    };
+    RecentDecision {
+        sequence,
+        kind: if accepted { "accepted" } else { "declined" }.into(),
+        walk: Some(3),
+        mixture_version: 7,
+        detail: serde_json::Value::Null,
+        candidate: Some(candidate),
+    }
+}
+
+fn seen(jobs: Vec<Job>, decisions: std::ops::Range<i64>) -> Seen {
+    Seen {
+        snapshot: status::tests::large(),
+        which: Jobs::Waiting,
+        jobs,
+        decisions: decisions.rev().map(decision).collect(),
+    }
+}
+
+fn state() -> State {
+    let jobs = vec![job(1, JobState::Leased), job(2, JobState::Queued), job(3, JobState::Queued)];
+    State::new(seen(jobs, 1..101))
+}
+
+fn press(state: &mut State, keys: &str) -> Option<Request> {
+    let code = |key: &str| match key {
+        "Tab" => KeyCode::Tab,
+        "Enter" => KeyCode::Enter,
+        "Esc" => KeyCode::Esc,
+        "Down" => KeyCode::Down,
+        "End" => KeyCode::End,
+        "Back" => KeyCode::Backspace,
+        key => KeyCode::Char(key.chars().next().unwrap()),
+    };
+    let press = |key| state.key(KeyEvent::new(code(key), KeyModifiers::NONE));
+    keys.split(' ').map(press).last().flatten()
+}
+
+fn write(state: &mut State, text: &str) {
+    for character in text.chars() {
+        assert_eq!(state.key(KeyEvent::new(KeyCode::Char(character), KeyModifiers::NONE)), None);
+    }
+}
+
+fn terminal(state: &mut State, width: u16, height: u16, theme: Theme) -> Terminal<TestBackend> {
+    let mut terminal = Terminal::new(TestBackend::new(width, height)).unwrap();
+    terminal.draw(|frame| draw(frame, state, &theme)).unwrap();
+    terminal
+}
+
+fn shown(state: &mut State, width: u16, height: u16) -> String {
+    terminal(state, width, height, PLAIN).backend().to_string()
+}
+
+#[test]
+fn every_pane_has_its_place_on_a_small_terminal() {
+    let mut state = state();
+    let text = shown(&mut state, 80, 24);
+    for words in [
+        "07070707070707070707070707070707, reproducible mode",
+        "1 walks: 1000",
+        "2 queue: 3",
+        "3 decisions: 100",
+        "a-long-name-o…",
+        "3.0.1-0123456789abcdef",
+        "accepted",
+        "declined: covered",
+        "γ_max of 100: median 1.51, most 2.0",
+        "accepted: 25 % of the last 100",
+        "expected in 30 h",
+        "p pause",
+    ] {
+        assert!(text.contains(words), "{words}:\n{text}");
+    }
+}
+
+#[test]
+fn terminals_of_every_size_are_drawn_on() {
+    for width in [1, 2, 10, 40, 79, 150, 300] {
+        for height in [1, 2, 3, 7, 13, 14, 16, 20, 22, 70] {
+            let mut state = state();
+            for keys in ["1", "G", "2", "3", "i", "q", "?", "q", "2", "d", "n", "/"] {
+                press(&mut state, keys);
+                shown(&mut state, width, height);
+            }
+        }
+    }
+    let text = shown(&mut state(), 200, 40);
+    assert!(text.lines().any(|line| line.contains("1 walks") && line.contains("2 queue")), "{text}");
+    let flat = shown(&mut state(), 60, 12);
+    assert!(flat.contains("1 walks") && !flat.contains("queue:"), "{flat}");
+}
+
+#[test]
+fn there_are_no_colours_where_none_are_wanted() {
+    let colours = |theme| {
+        let terminal = terminal(&mut state(), 80, 24, theme);
+        let cells = terminal.backend().buffer().content.clone();
+        cells.iter().filter(|cell| cell.fg != Color::Reset || cell.bg != Color::Reset).count()
+    };
+    assert_eq!(colours(PLAIN), 0);
+    assert!(colours(Theme { colours: true }) > 0);
+}
+
+#[test]
+fn a_condition_chooses_what_a_pane_shows_and_what_is_wrong_in_it_is_said() {
+    let mut state = state();
+    press(&mut state, "2 /");
+    write(&mut state, "gamma > 1.1 and element = C");
+    assert!(shown(&mut state, 80, 24).contains("filter: gamma > 1.1 and element = C"));
+    press(&mut state, "Enter");
+    assert_eq!((state.panes[QUEUE].entries.len(), state.panes[QUEUE].all), (1, 3));
+    assert!(shown(&mut state, 80, 24).contains("2 queue: 1 of 3  where"), "{}", shown(&mut state, 80, 24));
+    // It holds for what comes later, and for this pane alone.
+    state.take_in(Ok(seen(vec![job(4, JobState::Queued), job(5, JobState::Queued)], 101..103)));
+    assert_eq!((state.panes[QUEUE].entries.len(), state.panes[DECISIONS].entries.len()), (1, 102));
+    press(&mut state, "Esc");
+    assert_eq!(state.panes[QUEUE].entries.len(), 2);
+    press(&mut state, "/");
+    write(&mut state, "gamma >");
+    press(&mut state, "Enter");
+    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("expected a number")));
+    write(&mut state, " 1.45");
+    press(&mut state, "Enter");
+    assert_eq!((state.panes[QUEUE].entries.len(), &state.message), (1, &None));
+    // Other jobs are shown when they are read, and no others until then.
+    press(&mut state, "Esc");
+    assert_eq!((press(&mut state, "s"), state.panes[QUEUE].all), (Some(Request::Look), 0));
+    state.take_in(Ok(seen(vec![job(4, JobState::Queued)], 103..103)));
+    assert_eq!(state.panes[QUEUE].all, 0);
+    state.take_in(Ok(Seen { which: Jobs::Failed, ..seen(vec![job(4, JobState::Failed)], 103..103) }));
+    assert!(shown(&mut state, 80, 24).contains("2 failed labels: 1"));
+    press(&mut state, "s s s");
+    // Of a walk its decisions.
+    press(&mut state, "1 Down Down Down Enter");
+    assert_eq!(state.focus, DECISIONS);
+    assert_eq!(state.panes[DECISIONS].entries.len(), 102);
+    press(&mut state, "1 Down Enter");
+    assert_eq!(state.panes[DECISIONS].entries.len(), 0);
+}
+
+#[test]
+fn what_cannot_be_undone_is_asked_about_first() {
+    let mut state = state();
+    press(&mut state, "2 Down");
+    assert_eq!(press(&mut state, "d"), None);
+    let text = shown(&mut state, 100, 24);
+    assert!(text.contains("drop 3.0.2-0123456789abcdef (queued)?") && text.contains("y: yes"), "{text}");
+    // What comes meanwhile does not change what was asked.
+    state.take_in(Ok(seen(vec![job(9, JobState::Leased), job(8, JobState::Queued)], 101..101)));
+    let id = |number| job(number, JobState::Queued).candidate;
+    assert_eq!(press(&mut state, "y"), Some(Request::Queue(Action::Drop { ids: vec![id(2)] })));
+    assert_eq!(press(&mut state, "d n"), None);
+    assert_eq!(state.message, Some(Message::Done("nothing was changed".into())));
+    assert_eq!(press(&mut state, "t"), None);
+    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("only what failed")));
+
+    press(&mut state, "g =");
+    write(&mut state, "x");
+    assert_eq!(press(&mut state, "Enter"), None);
+    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("'10x' is no priority")));
+    let request = press(&mut state, "Back Back Back - 5 Enter");
+    assert_eq!(request, Some(Request::Queue(Action::Prioritise { id: id(9), priority: -5 })));
+
+    let walks = |walks: &[u32], all| walks::Which { walks: walks.to_vec(), all };
+    assert_eq!(press(&mut state, "d"), None);
+    press(&mut state, "n");
+    let request = press(&mut state, "1 Down p");
+    assert_eq!(request, Some(Request::Walks(walks::Action::Pause(walks(&[1], false)))));
+    assert_eq!(press(&mut state, "R"), None);
+    assert_eq!(press(&mut state, "y"), Some(Request::Walks(walks::Action::Resume(walks(&[], true)))));
+    assert_eq!(press(&mut state, "3 p"), None);
+    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("for the walks")));
+}
+
+#[test]
+fn a_story_is_shown_when_it_comes_unless_nobody_waits_for_it() {
+    let mut state = state();
+    let id = job(2, JobState::Queued).candidate;
+    assert_eq!(press(&mut state, "2 Down Enter"), Some(Request::Story(id.clone())));
+    assert!(shown(&mut state, 80, 24).contains("reading …"));
+    state.done(Done::Story("another".into(), Ok("wrong".into())));
+    let lines: Vec<_> = (1..=50).map(|k| format!("line {k}.")).collect();
+    state.done(Done::Story(id.clone(), Ok(lines.join("\n"))));
+    let text = shown(&mut state, 80, 24);
+    assert!(text.contains("line 1.") && text.contains(&id) && text.contains("lines 1 to 21 of 50"), "{text}");
+    press(&mut state, "End");
+    let text = shown(&mut state, 80, 24);
+    assert!(text.contains("line 50.") && !text.contains("line 29."), "{text}");
+    press(&mut state, "k");
+    assert!(shown(&mut state, 80, 24).contains("line 29."), "one line up from the end");
+    press(&mut state, "q");
+    state.done(Done::Story(id, Ok("late".into())));
+    assert!(matches!(state.mode, Mode::Panes));
+    assert_eq!(press(&mut state, "q"), Some(Request::Leave(Ended::Done)));
+}
+
+#[test]
+fn what_was_seen_stays_while_the_campaign_cannot_be_read() {
+    let mut state = state();
+    state.take_in(Err(Failure::Failed("the server is away".into())));
+    let text = shown(&mut state, 80, 24);
+    assert!(text.contains("what you see is old: the server is away") && text.contains("1 walks: 1000"));
+    state.take_in(Ok(seen(Vec::new(), 101..102)));
+    assert!(!shown(&mut state, 80, 24).contains("old"));
+    assert_eq!((state.focus, state.panes[QUEUE].entries.len()), (WALKS, 0));
+    let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
+    assert_eq!(state.key(control_c), Some(Request::Leave(Ended::Interrupted)));
+}
+
+#[test]
+fn the_chosen_line_is_seen_without_colours() {
+    let terminal = terminal(&mut state(), 80, 24, PLAIN);
+    let reversed =
+        terminal.backend().buffer().content.iter().filter(|cell| cell.modifier.contains(Modifier::REVERSED));
+    assert_eq!(reversed.count(), 160, "the title of the pane that has the keys, and its first line");
+}

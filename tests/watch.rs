@@ -1,0 +1,286 @@
+//! `calmwalk watch` in a real terminal: keys are sent, and the screen is looked at. Needs tmux (Debian: `tmux`):
+//! cargo test --test watch
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use common::campaign::Small;
+use common::processes::{carrying_out, signal, wait_until};
+use common::{Running, program, succeed};
+use serde_json::Value;
+
+/// A terminal with the program in it; when that has ended, its exit code is on the screen.
+struct Terminal {
+    socket: String,
+}
+
+impl Terminal {
+    fn open(here: &Path, name: &str, size: (u32, u32), environment: &str) -> Self {
+        let terminal = Self { socket: format!("calmwalk-{}-{name}", std::process::id()) };
+        let (width, height) = (size.0.to_string(), size.1.to_string());
+        let program = env!("CARGO_BIN_EXE_calmwalk");
+        let command = format!("{environment} {program} watch here --every 0.2; echo code $?; exec cat");
+        let here = here.display().to_string();
+        let arguments = ["-f", "/dev/null", "new-session", "-d", "-c", &here, "-x", &width, "-y", &height];
+        terminal.tmux(&[&arguments[..], &[&command]].concat());
+        terminal
+    }
+
+    fn tmux(&self, arguments: &[&str]) -> String {
+        let mut tmux = Command::new("tmux");
+        tmux.args(["-u", "-L", &self.socket]).args(arguments).env("LC_ALL", "C.UTF-8").env_remove("NO_COLOR");
+        let output = tmux.output().expect("tmux is needed: apt-get install tmux");
+        assert!(output.status.success(), "{arguments:?}: {}", common::stderr(&output));
+        String::from_utf8(output.stdout).expect("text")
+    }
+
+    fn press(&self, keys: &str) {
+        keys.split(' ').for_each(|key| drop(self.tmux(&["send-keys", key])));
+    }
+
+    fn write(&self, text: &str) {
+        self.tmux(&["send-keys", "-l", text]);
+    }
+
+    fn screen(&self) -> String {
+        self.tmux(&["capture-pane", "-p"])
+    }
+
+    fn wait_for(&self, words: &str) -> String {
+        let mut screen = String::new();
+        wait_until(&format!("the screen shows '{words}'; {}", self.screen()), || {
+            screen = self.screen();
+            screen.contains(words)
+        });
+        screen
+    }
+
+    fn resize(&self, width: u32, height: u32) {
+        self.tmux(&["resize-window", "-x", &width.to_string(), "-y", &height.to_string()]);
+    }
+
+    /// The program has ended so, and the terminal is as it was: the screen, the cursor, and what is typed is seen.
+    fn is_given_back(&self, code: &str) {
+        let screen = self.wait_for(code);
+        assert!(!screen.contains("1 walks"), "{screen}");
+        let flags = self.tmux(&["display-message", "-p", "#{alternate_on} #{cursor_flag}"]);
+        assert_eq!(flags.trim(), "0 1");
+        self.write("typed");
+        self.wait_for("typed");
+    }
+}
+
+impl Drop for Terminal {
+    fn drop(&mut self) {
+        let _ = Command::new("tmux").args(["-L", &self.socket, "kill-server"]).output();
+    }
+}
+
+fn status(here: &Path) -> Value {
+    serde_json::from_str(&succeed(here, ["status", "here", "--json"])).unwrap()
+}
+
+fn start(here: &Path) -> Running {
+    let mut run = program(here);
+    run.args(["run", "campaign.toml", "--directory", "here"]).stdout(Stdio::null()).stderr(Stdio::null());
+    Running(run.spawn().unwrap())
+}
+
+/// Two walks that find nothing and are not done for a long time.
+fn endless(here: &Path) -> Running {
+    let path = Small { steps: 1_000_000, ..Small::default() }.write(here);
+    let text = fs::read_to_string(&path).unwrap().replace("threshold = 1.0", "threshold = 1e6");
+    fs::write(path, text).unwrap();
+    let run = start(here);
+    wait_until("both walks are there", || {
+        here.join("here/campaign.sqlite").exists() && status(here)["walks"].as_array().unwrap().len() == 2
+    });
+    run
+}
+
+/// A campaign whose walks are over and whose structures wait for labels that nobody makes.
+fn waiting(here: &Path) {
+    let path = Small::default().write(here);
+    let text = fs::read_to_string(&path).unwrap().replace("[label]", "[label]\nslots = 0");
+    fs::write(path, text).unwrap();
+    let mut run = start(here);
+    wait_until("every walk is over", || {
+        here.join("here/campaign.sqlite").exists() && {
+            let status = status(here);
+            let walks = status["walks"].as_array().unwrap();
+            // Two biased ones and their controls.
+            walks.len() == 4
+                && walks.iter().all(|walk| !["waiting", "running"].contains(&walk["state"].as_str().unwrap()))
+        }
+    });
+    signal(run.0.id(), "INT");
+    run.0.wait().unwrap();
+}
+
+fn queue(here: &Path, state: &str) -> Vec<Value> {
+    let list = succeed(here, ["queue", "here", "list", "--state", state, "--json"]);
+    serde_json::from_str(&list).unwrap()
+}
+
+#[test]
+fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let _run = endless(here);
+    let terminal = Terminal::open(here, "runs", (80, 24), "");
+    let screen = terminal.wait_for("reproducible mode: running");
+    for words in
+        ["1 walks: 2", "2 queue: 0", "3 decisions: 2", "fcc-100", "vacancy", "begun", "no candidates yet"]
+    {
+        assert!(screen.contains(words), "{words}:\n{screen}");
+    }
+    assert!(
+        screen.lines().count() == 24 && screen.lines().all(|line| line.chars().count() <= 80),
+        "{screen}"
+    );
+    terminal.wait_for("steps/s; mixture");
+
+    // The second walk stands still; in reproducible mode the first waits for it.
+    terminal.press("Down p");
+    terminal.wait_for("walk 1 is paused");
+    terminal.wait_for("2 under way (1 paused)");
+    let paused = |of: Value| {
+        of["walks"].as_array().unwrap().iter().map(|walk| walk["paused"] == true).collect::<Vec<_>>()
+    };
+    assert_eq!(paused(status(here)), [false, true]);
+    let mut steps = Value::Null;
+    wait_until("both stand still", || {
+        std::thread::sleep(std::time::Duration::from_millis(1500));
+        let now = status(here)["walks"].as_array().unwrap().iter().map(|walk| walk["step"].clone()).collect();
+        std::mem::replace(&mut steps, now) == steps
+    });
+    assert!(terminal.screen().contains("paused"));
+    terminal.press("r");
+    terminal.wait_for("walk 1 goes on");
+    wait_until("both go on", || {
+        let now: Value =
+            status(here)["walks"].as_array().unwrap().iter().map(|walk| walk["step"].clone()).collect();
+        now != steps
+    });
+
+    // All of them, but only if that is meant.
+    terminal.press("P");
+    terminal.wait_for("pause every walk that has more steps to make?");
+    terminal.press("n");
+    terminal.wait_for("nothing was changed");
+    assert_eq!(paused(status(here)), [false, false]);
+
+    for (width, height) in [(160, 50), (60, 12), (20, 5), (80, 24)] {
+        terminal.resize(width, height);
+        wait_until("it is drawn anew", || {
+            let screen = terminal.screen();
+            let fits = screen.lines().all(|line| line.chars().count() <= width as usize);
+            let is_wide = screen.lines().any(|line| line.contains("1 walks") && line.contains("2 queue"));
+            fits && screen.contains("1 walks") && is_wide == (width == 160)
+        });
+    }
+    terminal.press("i");
+    terminal.wait_for("calmwalk status --all: lines 1 to");
+    terminal.press("End");
+    terminal.wait_for("orchestrator");
+    terminal.press("q q");
+    terminal.is_given_back("code 0");
+}
+
+#[test]
+fn structures_in_the_queue_are_changed_and_candidates_told_about() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    waiting(here);
+    let queued = queue(here, "queued");
+    let short = |job: &Value| job["candidate"].as_str().unwrap().split_once('-').unwrap().1.to_owned();
+    let terminal = Terminal::open(here, "queue", (100, 40), "NO_COLOR=1");
+    let screen = terminal.wait_for("not running");
+    assert!(screen.contains(&format!("2 queue: {}", queued.len())), "{screen}");
+    assert!(screen.contains("accepted") && screen.contains("γ_max of "), "{screen}");
+    let colours = terminal.tmux(&["capture-pane", "-p", "-e"]);
+    assert!(!colours.contains("[38;5;") && colours.contains(";7m"), "{colours:?}");
+
+    // The third becomes the first.
+    terminal.press("2 Down Down = C-u");
+    terminal.write("99");
+    terminal.press("Enter");
+    terminal.wait_for("has priority 99 now");
+    let now = queue(here, "queued");
+    assert_eq!((short(&now[0]), &now[0]["priority"]), (short(&queued[2]), &99.into()));
+    // It is still the chosen one.
+    terminal.press("d");
+    terminal.wait_for(&format!("drop {} (queued)?", short(&queued[2])));
+    terminal.press("n");
+    terminal.wait_for("nothing was changed");
+    terminal.press("d y");
+    terminal.wait_for("is dropped");
+    assert_eq!(short(&queue(here, "dropped")[0]), short(&queued[2]));
+    terminal.press("s s");
+    terminal.wait_for("2 dropped: 1");
+    terminal.press("t y");
+    terminal.wait_for("is queued again");
+    assert_eq!((queue(here, "queued").len(), queue(here, "dropped").len()), (queued.len(), 0));
+    terminal.press("s s");
+    terminal.wait_for("2 queue:");
+
+    terminal.press("/");
+    terminal.write("gamma > 1000");
+    terminal.press("Enter");
+    terminal.wait_for(&format!("2 queue: 0 of {}  where gamma > 1000", queued.len()));
+    terminal.press("Escape");
+    terminal.wait_for(&format!("2 queue: {}", queued.len()));
+
+    // As calmwalk explain tells it.
+    terminal.press("3 /");
+    terminal.write("kind = biased and gamma > 0");
+    terminal.press("Enter");
+    terminal.wait_for("where (kind = 'biased') and (gamma > 0.0)");
+    terminal.press("Enter");
+    let screen = terminal.wait_for("trigger");
+    let id = screen.lines().nth(1).unwrap().trim().to_owned();
+    let story = succeed(here, ["explain", "here", &id]);
+    let first: Vec<_> = story.lines().filter(|line| line.chars().count() <= 100).take(20).collect();
+    assert!(
+        first.len() == 20 && first.iter().all(|line| screen.contains(line.trim_end())),
+        "{screen}\n{story}"
+    );
+    terminal.press("q C-c");
+    terminal.is_given_back("code 130");
+}
+
+#[test]
+fn the_terminal_is_given_back_however_it_ends() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    waiting(here);
+    succeed(here, ["store", "backup", "here", "copy"]);
+    fs::rename(here.join("here"), here.join("original")).unwrap();
+    fs::rename(here.join("copy"), here.join("here")).unwrap();
+    let watching = || carrying_out(here, "watch");
+    for (name, how) in [("terminated", "TERM"), ("interrupted", "INT")] {
+        let terminal = Terminal::open(here, name, (80, 24), "");
+        terminal.wait_for("1 walks: 4");
+        let colours = terminal.tmux(&["capture-pane", "-p", "-e"]);
+        assert!(colours.contains("[38;5;6m"), "charts have a colour: {colours:?}");
+        signal(watching()[0], how);
+        terminal.is_given_back("code 130");
+    }
+    let terminal = Terminal::open(here, "closed", (80, 24), "");
+    terminal.wait_for("1 walks: 4");
+    // A campaign that is away for a moment is no end of watching it.
+    fs::rename(here.join("here"), here.join("away")).unwrap();
+    terminal.wait_for("what you see is old:");
+    fs::rename(here.join("away"), here.join("here")).unwrap();
+    wait_until("it is seen again", || !terminal.screen().contains("what you see is old"));
+    drop(terminal);
+    wait_until("nobody watches", || watching().is_empty());
+    // What cannot be watched is said on the terminal as it is.
+    fs::remove_dir_all(here.join("here")).unwrap();
+    let terminal = Terminal::open(here, "nothing", (80, 24), "");
+    terminal.wait_for("calmwalk: ");
+    terminal.is_given_back("code 2");
+}
