@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use analysis::{CostModel, Measured, Predicted, Size};
 use serde::Serialize;
-use store::{LabelCost, Store, StoreError, Waiting};
+use store::{LabelCost, Protocol, Store, StoreError, Waiting};
 use wire::ContentHash;
 
 /// Labels that are learned from: the newest.
@@ -52,16 +52,23 @@ pub struct Costs {
 impl Costs {
     /// Learns from the labels that were made by `protocol`.
     pub async fn of(store: &Store, protocol: ContentHash) -> Result<Self, StoreError> {
-        let costs = store.label_costs(protocol, LEARNED_FROM).await?;
+        let (mut costs, mut labels, mut brought) = (Vec::new(), 0, 0.0);
+        for Protocol { hash, .. } in store.protocols().await? {
+            let of_protocol = store.label_costs(hash, LEARNED_FROM).await?;
+            labels += of_protocol.len();
+            brought += of_protocol.iter().map(|cost| cost.core_seconds).sum::<f64>();
+            if hash == protocol {
+                costs = of_protocol;
+            }
+        }
         let measured: Vec<_> = costs.iter().map(measured).collect();
         let mut sizes = HashMap::new();
         for cost in costs.iter().rev() {
             sizes.insert((cost.seed_structure, cost.formula.clone()), size(cost));
         }
         let all = store.label_work().await?.core_seconds;
-        let brought: f64 = costs.iter().map(|cost| cost.core_seconds).sum();
         // The sum of all attempts fits only to all labels.
-        let overhead = all.filter(|_| (1..LEARNED_FROM as usize).contains(&costs.len()));
+        let overhead = all.filter(|_| (1..LEARNED_FROM as usize).contains(&labels));
         let overhead = overhead.map_or(1.0, |all| (all / brought).max(1.0));
         Ok(Self { model: CostModel::fit(&measured, None), sizes, overhead })
     }
@@ -109,6 +116,42 @@ pub async fn of(store: &Store, protocol: ContentHash) -> Result<Bill, StoreError
         cores: work.cores,
         hours_left,
     })
+}
+
+/// What labels that are made again may cost.
+pub struct Again {
+    /// None before a first label.
+    pub hours: Option<CoreHours>,
+    /// Labels whose cost was measured.
+    pub measured: usize,
+    /// Name of their protocol.
+    pub protocol: String,
+}
+
+/// What these will cost, as labels of the protocol in force did; before it has any, as those of the last one that has.
+pub async fn again(store: &Store, in_force: &Protocol, structures: &[Waiting]) -> Result<Again, StoreError> {
+    let mut protocol = in_force.clone();
+    let mut costs = Costs::of(store, protocol.hash).await?;
+    for earlier in store.protocols().await?.into_iter().rev() {
+        if costs.measured() == 0 {
+            costs = Costs::of(store, earlier.hash).await?;
+            protocol = earlier;
+        }
+    }
+    let hours = costs.predict(structures.iter().map(|waiting| (costs.size_of(waiting), waiting.jobs)));
+    Ok(Again { hours, measured: costs.measured(), protocol: protocol.name })
+}
+
+impl std::fmt::Display for Again {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { hours, measured, protocol } = self;
+        match hours {
+            Some(hours) => {
+                write!(f, "about {hours}, if they take as long as {measured} labels by '{protocol}' did")
+            }
+            None => write!(f, "unknown, since that of no label was measured"),
+        }
+    }
 }
 
 impl CoreHours {

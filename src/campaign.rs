@@ -16,6 +16,7 @@ use wire::{CampaignId, ContentHash};
 use workers::settings::{GuardSettings, WalkSettings};
 
 use crate::config::{Config, ConfigError, LabelMethod, without_changeable};
+use crate::labelling::resolved_method;
 use crate::outcome::Failure;
 use crate::setup::MethodSetup;
 use load::Loader;
@@ -134,10 +135,7 @@ impl Campaign {
         let hashes = self.file_hashes.iter().map(|(key, hash)| (key.clone(), json!(hash)));
         value["files"] = Value::Object(hashes.collect());
         value["label"]["protocol"] = json!(self.config.label.protocol_name());
-        if let LabelMethod::Code(settings) = &self.config.label.method {
-            // What makes a label what it is; how its program is called may change.
-            value["label"]["method"] = json!({ settings.name(): self.protocol.settings });
-        }
+        value["label"]["method"] = resolved_method(&self.config.label, &self.protocol);
         // Where a campaign is kept is no part of what it is.
         value["run"].as_object_mut().map(|run| run.remove("store"));
         if self.config.campaign.mode == Mode::Reproducible {

@@ -1,9 +1,11 @@
 //! How the labels of a campaign are made, as its store says: for labellers that have no configuration at hand.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use atoms::Species;
 use dft::Code;
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -79,6 +81,48 @@ pub fn identity(method: &str, code: &dyn Code) -> Value {
 /// The same of a reference potential.
 pub fn reference_identity(kind: PotentialKind, file_hash: &str) -> Value {
     json!({ "method": "reference", "kind": kind, "file_hash": file_hash })
+}
+
+/// What of the method stands in the configuration of a campaign: what makes a label what it is. How its program is called may
+/// change, and so may the places of files.
+pub fn resolved_method(label: &LabelSection, protocol: &Protocol) -> Value {
+    match &label.method {
+        LabelMethod::Reference(PotentialFile { kind, .. }) => {
+            json!({ "reference": { "kind": kind, "file": null } })
+        }
+        LabelMethod::Code(settings) => json!({ settings.name(): protocol.settings }),
+    }
+}
+
+/// The configuration of a campaign with another protocol of labels.
+pub fn with_protocol(configuration: &Value, label: &LabelSection, protocol: &Protocol) -> Value {
+    let mut configuration = configuration.clone();
+    configuration["label"]["protocol"] = json!(protocol.name);
+    configuration["label"]["method"] = resolved_method(label, protocol);
+    if let Some(files) = configuration["files"].as_object_mut() {
+        files.remove(REFERENCE_FILE);
+        if let LabelMethod::Reference(_) = label.method {
+            files.insert(REFERENCE_FILE.to_owned(), protocol.settings["file_hash"].clone());
+        }
+    }
+    configuration
+}
+
+/// Whether labels of these elements can be made; why not.
+pub fn supports(label: &LabelSection, species: &BTreeSet<Species>) -> Result<(), String> {
+    match &label.method {
+        LabelMethod::Reference(reference) => {
+            let potential = reference.load()?;
+            match species.iter().find(|species| !potential.species().contains(species)) {
+                Some(missing) => Err(format!("the label potential does not know {missing}")),
+                None => Ok(()),
+            }
+        }
+        LabelMethod::Code(settings) => {
+            let code = settings.prepare().map_err(|error| error.to_string())?;
+            code.supports(species).map_err(|error| error.to_string())
+        }
+    }
 }
 
 impl Labelling {

@@ -18,10 +18,12 @@ mod outcome;
 mod output;
 mod progress;
 mod replay;
+mod report;
 mod setup;
 mod story;
 mod summary;
 mod unlabelled;
+mod web;
 mod whole_file;
 
 use std::process::ExitCode;

@@ -52,6 +52,16 @@ pub fn decimals(x: Option<f64>, decimals: usize) -> String {
     x.map_or("–".to_owned(), |x| format!("{x:.decimals$}"))
 }
 
+/// A range in words, such as that of a bin: open below, above, or both, which is where there is no value.
+pub fn range(above: Option<f64>, up_to: Option<f64>) -> String {
+    match (above, up_to) {
+        (Some(above), Some(up_to)) => format!("{above}–{up_to}"),
+        (None, Some(up_to)) => format!("≤ {up_to}"),
+        (Some(above), None) => format!("> {above}"),
+        (None, None) => "unknown".into(),
+    }
+}
+
 /// Lines whose columns stand below each other.
 pub struct Table {
     /// Each column's width so far, and whether it holds numbers, which stand to the right.

@@ -1,4 +1,4 @@
-//! What labels teach: `calmwalk errors`, and what `status` and the summary say of labels that failed.
+//! What labels teach: `calmwalk errors`, `calmwalk report`, and what `status` and the summary say of labels that failed.
 
 mod common;
 
@@ -126,6 +126,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
         assert!(text.contains(&format!("the labels of {} structures failed", lost.len())), "{text}");
     }
     assert!(!succeed(here, ["status", "whole"]).contains("unlabelled"));
+    common::report::check(here, "strict", &status, &errors);
     // Another protocol than there is.
     let wrong = common::refuse(here, ["errors", "whole", "--protocol", "nothing"]);
     assert!(wrong.contains("no protocol 'nothing'; it has 'reference'"), "{wrong}");

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 /// Every package, where it lives, and the packages that it may depend on.
-const HOUSE: [(&str, &str, &[&str]); 13] = [
+const HOUSE: [(&str, &str, &[&str]); 14] = [
     ("atoms", "crates/atoms", &[]),
     ("npz", "crates/npz", &[]),
     ("calm", "crates/calm", &["npz"]),
@@ -14,6 +14,7 @@ const HOUSE: [(&str, &str, &[&str]); 13] = [
     ("md", "crates/md", &["atoms"]),
     ("dft", "crates/dft", &["atoms"]),
     ("analysis", "crates/analysis", &[]),
+    ("figures", "crates/figures", &[]),
     ("slurm", "crates/slurm", &[]),
     ("wire", "crates/wire", &["atoms", "calm"]),
     ("store", "store", &["atoms", "wire"]),
@@ -34,6 +35,7 @@ const HOUSE: [(&str, &str, &[&str]); 13] = [
             "md",
             "dft",
             "analysis",
+            "figures",
             "wire",
             "store",
             "workers",

@@ -10,3 +10,5 @@
 mod backup;
 #[path = "label.rs"]
 mod label;
+#[path = "relabel.rs"]
+mod relabel;

@@ -8,7 +8,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use common::campaign::Small;
 use common::processes::wait_until;
-use common::{Running, program, succeed};
+use common::{Running, program, refuse, succeed};
 use serde_json::Value;
 
 /// Two walks that find nothing and are not done for a long time.
@@ -66,5 +66,7 @@ fn walks_are_seen_to_advance_and_a_copy_says_the_same() {
     for key in ["version", "campaign", "candidates", "labels", "mixture_version", "budget", "imported"] {
         assert_eq!(copy[key], killed[key], "{key}");
     }
+    let refused = refuse(here, ["watch", "copy"]);
+    assert!(refused.contains("watch draws on a terminal, and the standard output is none"), "{refused}");
     assert!(copy["version"] == 1 && copy["walks"].as_array().unwrap().len() == 2);
 }

@@ -45,9 +45,12 @@ fn other_files_in_the_place_of_the_database_are_refused_unchanged() {
         bytes[place..place + 4].copy_from_slice(&value.to_be_bytes());
         bytes
     };
+    let known = u32::from_be_bytes(good[60..64].try_into().unwrap());
+    let refused =
+        |version: u32| format!("has a schema of version {version}; this program reads version {known}");
     for (content, words) in [
-        (patched(60, 7), "has a schema of version 7; this program reads version 5"),
-        (patched(60, 0), "has a schema of version 0; this program reads version 5"),
+        (patched(60, known + 1), refused(known + 1).as_str()),
+        (patched(60, 0), refused(0).as_str()),
         (patched(68, 5), "is a database of another program (application id 0x5,"),
         (b"units metal\natom_style atomic\n".to_vec(), "is no SQLite database: it begins with 'units metal"),
         (Vec::new(), "is no SQLite database: it begins with ''"),

@@ -8,7 +8,7 @@ use store::{Protocol, Store};
 
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::learned::{self, Grades, LARGE, Learned};
-use crate::output::{Table, decimals, print, print_json};
+use crate::output::{Table, decimals, print, print_json, range};
 
 /// Names of failed structures that a line shows.
 const NAMES: usize = 3;
@@ -172,17 +172,8 @@ fn write_completion(out: &mut dyn Write, name: &str, bins: &[CompletionBin<Strin
     table.write(out)
 }
 
-/// A bin in words.
-fn range(above: Option<f64>, up_to: Option<f64>) -> String {
-    match (above, up_to) {
-        (Some(above), Some(up_to)) => format!("{above}–{up_to}"),
-        (None, Some(up_to)) => format!("≤ {up_to}"),
-        (Some(above), None) => format!("> {above}"),
-        (None, None) => "unknown".into(),
-    }
-}
-
-fn as_json(protocol: &Protocol, learned: &Learned) -> Value {
+/// What `--json` prints.
+pub fn as_json(protocol: &Protocol, learned: &Learned) -> Value {
     json!({
         "protocol": protocol.name,
         "protocol_hash": protocol.hash.to_string(),

@@ -103,11 +103,7 @@ fn label(frame: &Frame) -> Result<Label, String> {
 
 /// The protocol by which the campaign itself labels.
 async fn own_protocol(store: &Store) -> Result<Protocol, Failure> {
-    let configuration = store.campaign().await?.configuration_in_force;
-    let configuration: serde_json::Value = serde_json::from_str(&configuration).map_err(Failure::failed)?;
-    let name = configuration["label"]["protocol"].as_str().unwrap_or_default();
-    let own = store.protocols().await?.into_iter().find(|protocol| protocol.name == name);
-    own.ok_or_else(|| {
+    store.protocol_in_force().await?.ok_or_else(|| {
         Failure::Input(
             "the campaign has no label protocol yet: run it first, or name one with --protocol".to_owned(),
         )
@@ -125,10 +121,6 @@ async fn protocol_named(store: &Store, name: &str) -> Result<Protocol, Failure> 
     let settings = serde_json::json!({ "method": "import" });
     let hash = ContentHash(*blake3::hash(format!("calmwalk import protocol {name}").as_bytes()).as_bytes());
     let protocol = Protocol { hash, name: name.to_owned(), settings };
-    // A protocol that is added becomes that of new label jobs, so the campaign's own is put back. Whoever is killed
-    // here does no harm: a run begins by putting its own protocol in force.
-    let own = own_protocol(store).await?;
-    store.add_protocol(&protocol, unix_milliseconds()).await?;
-    store.add_protocol(&own, unix_milliseconds()).await?;
+    store.know_protocol(&protocol, unix_milliseconds()).await?;
     Ok(protocol)
 }

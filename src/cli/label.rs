@@ -80,23 +80,34 @@ impl Label {
         let store = self.store.clone().unwrap_or_default();
         let location: Location = store.to_str().map_or_else(|| Ok(Location::from(&store)), str::parse)?;
         say_if_unprotected(&location);
-        let Some((opened, labelling)) = self.begin(&location, &stopping, &stop).await? else {
-            return Ok(Ended::Interrupted);
+        let place = match &location {
+            Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
+            // With its password, if it has one.
+            Location::Server(_) => store,
         };
-        let slots = Slots {
-            number: self.slots,
-            location: match location {
-                Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
-                // With its password, if it has one.
-                Location::Server(_) => store,
-            },
-            labelling,
-            until_empty: self.until_empty,
-            grace: Duration::from_secs_f64(self.grace),
-        };
-        let ended = slots::work(&opened, slots, &stopping, &stop).await;
-        opened.close().await;
-        ended
+        loop {
+            let Some((opened, labelling)) = self.begin(&location, &stopping, &stop).await? else {
+                return Ok(Ended::Interrupted);
+            };
+            let protocol = labelling.protocol.clone();
+            let slots = Slots {
+                number: self.slots,
+                location: place.clone(),
+                labelling,
+                until_empty: self.until_empty,
+                grace: Duration::from_secs_f64(self.grace),
+            };
+            let ended = slots::work(&opened, slots, &stopping, &stop).await?;
+            let is_in_force = opened.is_in_force(protocol.hash).await?;
+            opened.close().await;
+            if ended == Ended::Interrupted || is_in_force {
+                return Ok(ended);
+            }
+            let name = protocol.name;
+            say(format_args!(
+                "the campaign labels by another protocol than '{name}' now: going on with that"
+            ));
+        }
     }
 
     /// Opens the store, as soon as there is a campaign in it; `None` if somebody asked to stop first.

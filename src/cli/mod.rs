@@ -3,7 +3,8 @@
 mod agent;
 mod calm;
 mod clean;
-mod errors;
+mod dashboard;
+pub mod errors;
 mod explain;
 mod export;
 mod import;
@@ -15,12 +16,16 @@ mod launch;
 mod md;
 mod plan;
 mod queue;
+mod relabel;
 mod replay;
+mod report;
 mod run;
 pub mod status;
 mod store;
 mod validate;
 mod walker;
+mod walks;
+mod watch;
 
 use std::future::Future;
 use std::path::PathBuf;
@@ -51,10 +56,15 @@ enum Command {
     Label(label::Label),
     Launch(launch::Launch),
     Status(status::Status),
+    Dashboard(dashboard::Dashboard),
+    Watch(watch::Watch),
     Errors(errors::Errors),
     Queue(queue::Queue),
+    Relabel(relabel::Relabel),
+    Walks(walks::Walks),
     Explain(explain::Explain),
     Export(export::Export),
+    Report(report::Report),
     Replay(replay::Replay),
     #[command(subcommand)]
     Calm(calm::Calm),
@@ -81,10 +91,15 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Label(command) => command.run(),
         Command::Launch(command) => command.run(),
         Command::Status(command) => command.run(),
+        Command::Dashboard(command) => command.run(),
+        Command::Watch(command) => command.run(),
         Command::Errors(command) => command.run(),
         Command::Queue(command) => command.run(),
+        Command::Relabel(command) => command.run(),
+        Command::Walks(command) => command.run(),
         Command::Explain(command) => command.run(),
         Command::Export(command) => command.run(),
+        Command::Report(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Calm(command) => command.run(),
         Command::Import(command) => command.run(),

@@ -26,8 +26,8 @@ pub struct Queue {
     json: bool,
 }
 
-#[derive(Debug, clap::Subcommand)]
-enum Action {
+#[derive(Clone, Debug, PartialEq, clap::Subcommand)]
+pub enum Action {
     /// List jobs: those in one state in the order in which they would be labelled, or all as they came
     List(List),
     /// Show everything about one, with its attempts and the logs of those that failed
@@ -65,8 +65,8 @@ enum Action {
     },
 }
 
-#[derive(Debug, clap::Args)]
-struct List {
+#[derive(Clone, Debug, PartialEq, clap::Args)]
+pub struct List {
     /// Only those in this state
     #[arg(long, value_parser = parse_state)]
     state: Option<JobState>,
@@ -127,7 +127,8 @@ async fn read_details(location: &Location, id: &str) -> Result<JobDetails, Failu
     Ok(store.queue_show(id).await?)
 }
 
-async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>) -> Result<(), Failure> {
+/// Changes what it names; `changed` has the jobs as they stand then, also before a failure.
+pub async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>) -> Result<(), Failure> {
     let store = Store::open(location).await?;
     let ids = match action {
         Action::Drop { ids } | Action::Retry { ids } => ids.as_slice(),
@@ -148,12 +149,21 @@ async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>) ->
     Ok(())
 }
 
-fn outcome(action: &Action, job: &Job) -> String {
+/// What was done, in words.
+pub fn outcome(action: &Action, job: &Job) -> String {
     let Job { candidate, state, priority, .. } = job;
     match action {
         Action::Drop { .. } => format!("{candidate} is dropped: it will not be labelled, and not exported"),
         Action::Prioritise { .. } => format!("{candidate} has priority {priority} now"),
         _ => format!("{candidate} is {state} again"),
+    }
+}
+
+/// Its state, and whether there is a label while it waits for another.
+fn state_of(job: &Job) -> String {
+    match (&job.relabel, job.state) {
+        (Some(_), JobState::Queued | JobState::Leased) => format!("{} again", job.state),
+        _ => job.state.to_string(),
     }
 }
 
@@ -176,7 +186,7 @@ fn write_list(out: &mut dyn Write, jobs: &[Job], list: &List) -> io::Result<()> 
     for job in jobs {
         table.push(vec![
             job.candidate.clone(),
-            job.state.to_string(),
+            state_of(job),
             job.priority.to_string(),
             job.atoms.to_string(),
             job.formula.clone(),
@@ -206,11 +216,15 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
         atoms,
         formula,
         original_gamma,
+        relabel,
         ..
     } = &details.job;
     writeln!(out, "{candidate}")?;
     writeln!(out, "  job       {job}, protocol '{protocol}'")?;
     writeln!(out, "  state     {state}, priority {priority}")?;
+    if let Some(reason) = relabel {
+        writeln!(out, "  again     another label was asked for: {reason}")?;
+    }
     if let (Some(holder), Some(expires)) = (holder, expires) {
         let left = (expires - unix_milliseconds()) / 1000;
         writeln!(out, "  held by   {holder}, for {left} s more")?;

@@ -24,7 +24,7 @@ use crate::config::{Change, compare, place};
 use crate::forecast::{self, Forecast, megabytes};
 use crate::labelling::LABEL_METHOD;
 use crate::output::{print, say, say_if_unprotected};
-use crate::summary;
+use crate::{summary, web};
 
 /// Run a campaign to its end, or go on with one that was interrupted
 ///
@@ -54,6 +54,8 @@ pub struct Run {
     /// Name by which other hosts know this one, to be announced [default: its host name]
     #[arg(long, value_name = "NAME", requires = "announce")]
     host: Option<String>,
+    #[command(flatten)]
+    shown_at: web::Addresses,
     /// Wait so long for another process that runs this campaign, which may be about to end, min
     #[arg(long, value_name = "MINUTES", default_value_t = 0.0, value_parser = minutes)]
     patience: f64,
@@ -82,9 +84,11 @@ impl Run {
         let ended = block_on(async {
             let location = campaign.config.location(&directory)?;
             say_if_unprotected(&location);
+            let web = self.shown_at.listen().await?;
             let _lock = lock::directory(&directory, &location, patience).await?;
             listen.iter().try_for_each(actors::Listen::begins)?;
-            run(&campaign, &directory, &location, self.in_process, listen.as_ref(), patience).await
+            let how = How { in_process: self.in_process, listen: listen.as_ref(), web, patience };
+            run(&campaign, &directory, &location, how).await
         })?
         .map_err(|failure| failure.in_campaign(&directory))?;
         listen.iter().try_for_each(|listen| listen.has_ended(ended))?;
@@ -95,14 +99,21 @@ impl Run {
     }
 }
 
+/// What the command line says besides the configuration.
+struct How<'a> {
+    in_process: bool,
+    listen: Option<&'a actors::Listen>,
+    web: web::Listening,
+    patience: Duration,
+}
+
 async fn run(
     campaign: &Campaign,
     directory: &Path,
     location: &Location,
-    in_process: bool,
-    listen: Option<&actors::Listen>,
-    patience: Duration,
+    how: How<'_>,
 ) -> Result<Ended, Failure> {
+    let How { in_process, listen, web, patience } = how;
     let lock = lock::server(location, patience).await?;
     let store = open_store(campaign, location).await?;
     let store = lock.iter().fold(store, Store::led_by);
@@ -125,6 +136,7 @@ async fn run(
         }
         if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
     };
+    let serving = web.serve(location, &store).await?;
     let mut notifier = Notifier::new(&campaign.config.notify, &store, location).await?;
     let worked = tokio::select! {
         ended = work => ended,
@@ -133,6 +145,7 @@ async fn run(
         never = notify::keep(&mut notifier) => match never {},
     };
     notify::finish(notifier, worked.as_ref().err()).await;
+    serving.end().await;
     let ended = worked?;
     // Hours of work do not end as a failure because a server is away in the last second.
     let store = store.patient(SERVER_AWAY);

@@ -4,19 +4,19 @@ mod end;
 mod jobs;
 mod json;
 mod labels;
-mod page;
+pub mod page;
 mod processes;
 #[cfg(test)]
-mod tests;
+pub mod tests;
 mod values;
-mod walks;
+pub mod walks;
 
 use std::io::{self, Write};
 
 use serde_json::Value;
 use store::{Candidates, Location, Status as Standing, Store};
 
-use self::end::End;
+pub use self::end::End;
 use self::jobs::Jobs;
 use self::labels::LabelsSoFar;
 use self::page::Page;
@@ -95,9 +95,52 @@ impl Snapshot {
         })
     }
 
+    /// What it does, in words.
+    pub fn state(&self) -> String {
+        processes::state(&self.standing)
+    }
+
+    /// All that the command prints with `--all`, in lines of at most `width` columns; without jobs of a batch system.
+    pub fn text(&self, width: usize) -> String {
+        let (mut text, page) = (Vec::new(), Page { width, ..Page::of_all() });
+        // Memory takes everything.
+        let _ = self.write(&mut text, &Jobs::None, page, None);
+        String::from_utf8_lossy(&text).into_owned()
+    }
+
     /// As docs/status.md has it, without jobs of a batch system.
     pub fn to_json(&self) -> serde_json::Result<Value> {
         json::of(self, &Jobs::None)
+    }
+
+    /// The campaign.
+    pub fn campaign(&self) -> &store::Campaign {
+        &self.campaign
+    }
+
+    /// How it stands.
+    pub fn standing(&self) -> &Standing {
+        &self.standing
+    }
+
+    /// Failures of labels by class.
+    pub fn failures(&self) -> &[store::FailureCount] {
+        &self.labels.failures
+    }
+
+    /// Share of the training atoms with γ > 1 under the newest mixture, if they are watched.
+    pub fn share_above_one(&self) -> Option<f64> {
+        self.values.training_frames()["share_above_one"].as_f64()
+    }
+
+    /// Size of the store, bytes.
+    pub fn bytes(&self) -> u64 {
+        self.disk.bytes
+    }
+
+    /// When it is expected to end.
+    pub fn end(&self) -> &End {
+        &self.end
     }
 
     fn write(&self, out: &mut dyn Write, jobs: &Jobs, page: Page, walks: Option<usize>) -> io::Result<()> {
@@ -151,7 +194,7 @@ impl Disk {
 }
 
 fn walks_in_words(status: &Standing) -> String {
-    let under_way = status.walks.iter().filter(|walk| walks::is_under_way(walk)).count();
+    let under_way = status.walks.iter().filter(|walk| walk.is_under_way()).count();
     let ended = status.walks.len() - under_way;
     let pace = status.steps_per_second.filter(|_| under_way > 0);
     let pace = pace.map_or(String::new(), |pace| format!("; {} steps/s", decimals(Some(pace), 1)));

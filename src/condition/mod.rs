@@ -1,4 +1,4 @@
-//! Conditions on labelled structures, as `gamma > 2 and element = Mo`: a small language, described in docs/export.md.
+//! Conditions on structures, as `gamma > 2 and element = Mo`: a small language, described in docs/export.md.
 
 mod parse;
 #[cfg(test)]
@@ -29,10 +29,10 @@ pub struct Facts<'a> {
     /// Version of the mixture after the decision.
     pub mixture_version: Option<u64>,
     /// Energy of the label, eV.
-    pub energy: f64,
+    pub energy: Option<f64>,
     /// Largest force of the label, eV/Å.
-    pub max_force: f64,
-    /// The elements of its atoms, an entry an atom.
+    pub max_force: Option<f64>,
+    /// The elements of its atoms, an entry an atom; none if they are not known.
     pub species: &'a [Species],
     /// `biased`, `control` or `imported`.
     pub kind: &'a str,
@@ -147,7 +147,7 @@ impl Comparison {
 
 impl Facts<'_> {
     fn number(&self, column: Number) -> Option<f64> {
-        let atoms = self.species.len() as f64;
+        let atoms = (!self.species.is_empty()).then_some(self.species.len() as f64);
         match column {
             Number::Gamma => self.gamma,
             Number::GammaNbr => self.gamma_nbr,
@@ -156,21 +156,40 @@ impl Facts<'_> {
             Number::Walk => self.walk.map(f64::from),
             Number::Step => self.step.map(|step| step as f64),
             Number::MixtureVersion => self.mixture_version.map(|version| version as f64),
-            Number::Atoms => Some(atoms),
-            Number::Energy => Some(self.energy),
-            Number::EnergyPerAtom => Some(self.energy / atoms),
-            Number::MaxForce => Some(self.max_force),
+            Number::Atoms => atoms,
+            Number::Energy => self.energy,
+            Number::EnergyPerAtom => self.energy.zip(atoms).map(|(energy, atoms)| energy / atoms),
+            Number::MaxForce => self.max_force,
         }
     }
 
     /// Whether the text is this one; of elements, whether one of the atoms is it.
     fn is_text(&self, column: Text, value: &str) -> Option<bool> {
         match column {
+            Text::Element if self.species.is_empty() => None,
             Text::Element => Some(self.species.iter().any(|species| species.symbol() == value)),
             Text::Kind => Some(self.kind == value),
             Text::Seed => self.seed.map(|seed| seed == value),
         }
     }
+}
+
+/// The atoms of a formula as `Al31Mo`, an entry an atom.
+pub fn species(formula: &str) -> Vec<Species> {
+    let mut species = Vec::new();
+    let mut rest = formula;
+    while !rest.is_empty() {
+        let of_symbol = |(place, c): &(usize, char)| *place == 0 || c.is_ascii_lowercase();
+        let symbol = rest.char_indices().take_while(of_symbol).map(|(place, c)| place + c.len_utf8()).last();
+        let (symbol, after) = rest.split_at(symbol.unwrap_or(rest.len()));
+        let digits = after.find(|c: char| !c.is_ascii_digit()).unwrap_or(after.len());
+        let (number, after) = after.split_at(digits);
+        if let Ok(found) = symbol.parse::<Species>() {
+            species.extend(std::iter::repeat_n(found, number.parse().unwrap_or(1)));
+        }
+        rest = after;
+    }
+    species
 }
 
 impl FromStr for Condition {

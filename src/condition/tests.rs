@@ -17,7 +17,7 @@ fn facts() -> Facts<'static> {
 
 fn is_met(text: &str) -> bool {
     let species: Vec<Species> = ["Mo", "Mo", "C"].map(|symbol| symbol.parse().unwrap()).to_vec();
-    text.parse::<Condition>().unwrap().is_met(&Facts { species: &species, energy: -6.0, ..facts() })
+    text.parse::<Condition>().unwrap().is_met(&Facts { species: &species, energy: Some(-6.0), ..facts() })
 }
 
 #[test]

@@ -77,10 +77,12 @@ pub enum Change {
 pub enum Refused {
     /// A key that cannot change.
     #[error(
-        "{key} is {}, but this campaign began with {}: {}. Put the old value back",
+        "{key} is {}, but this campaign {} {}: {}. Put the old value back{}",
         shown(after),
+        if is_label(key) { "labels with" } else { "began with" },
         shown(before),
-        reason(key)
+        reason(key),
+        way_out(key)
     )]
     Key {
         /// Dotted key.
@@ -92,8 +94,9 @@ pub enum Refused {
     },
     /// A file with other content.
     #[error(
-        "{key}: the file has another content (BLAKE3 {after}) than when this campaign began ({before}): {OTHER_PHYSICS}. \
-         Put the old file back"
+        "{key}: the file has another content (BLAKE3 {after}) than this campaign has ({before}): {}. Put the old file back{}",
+        reason(key),
+        way_out(key)
     )]
     File {
         /// Dotted key of the configuration that names the file.
@@ -127,8 +130,22 @@ fn reason(key: &str) -> &'static str {
             "this machine's processor gives other last digits than the one on which it began, which mode = \
              \"reproducible\" promises not to happen"
         }
+        key if is_label(key) => "labels of two protocols do not belong in one data set",
         _ => OTHER_PHYSICS,
     }
+}
+
+/// Whether it is a part of how labels are made.
+fn is_label(key: &str) -> bool {
+    key.starts_with("label.method")
+}
+
+fn way_out(key: &str) -> &'static str {
+    if !is_label(key) {
+        return "";
+    }
+    ", have the labels made by the new protocol from now on (calmwalk relabel --config with this file; --dry-run tells what that \
+     may cost)"
 }
 
 impl Refused {

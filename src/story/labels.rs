@@ -5,7 +5,7 @@ use atoms::cell::{norm, sub};
 use serde::Serialize;
 use store::{
     JobDetails, LabelDetails, LabelRecord, LabelSource, Operation, Standing, Store, StoreError,
-    StructureLabel,
+    StructureLabel, Superseded,
 };
 use wire::{CandidateView, ContentHash};
 
@@ -45,6 +45,8 @@ pub struct StoryLabel {
     pub source: String,
     /// When it came, ms since 1970.
     pub received: i64,
+    /// When and why another came in its place.
+    pub superseded: Option<Superseded>,
     /// Energy, eV.
     pub energy: f64,
     /// Energy an atom, eV.
@@ -105,7 +107,7 @@ impl ByHand {
 impl StoryLabel {
     fn of(label: StructureLabel, model: Option<&CandidateView<'_>>) -> Self {
         let StructureLabel { protocol, record } = label;
-        let LabelRecord { standing, label, source, received } = record;
+        let LabelRecord { standing, label, source, received, superseded } = record;
         let atoms = label.forces.len().max(1) as f64;
         Self {
             protocol: protocol.name,
@@ -113,6 +115,7 @@ impl StoryLabel {
             standing,
             source: in_words(&source),
             received,
+            superseded,
             energy: label.energy,
             energy_per_atom: label.energy / atoms,
             largest_force: label.forces.iter().map(|force| norm(*force)).fold(0.0, f64::max),
@@ -127,7 +130,6 @@ fn in_words(source: &LabelSource) -> String {
     match source {
         LabelSource::Attempt { job, attempt } => format!("attempt {attempt} of job {job}"),
         LabelSource::Import { file, frame } => format!("{file}, frame {frame}"),
-        LabelSource::Correction { reason } => format!("correction: {reason}"),
     }
 }
 

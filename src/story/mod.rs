@@ -26,7 +26,7 @@ pub use walk::{Distances, Found};
 pub const FORMAT: u32 = 1;
 
 /// How imported structures are named: `import-1` is the first.
-const IMPORT: &str = "import-";
+pub const IMPORT: &str = "import-";
 
 /// The story of one structure.
 #[derive(Clone, Debug, Serialize)]

@@ -5,9 +5,11 @@ pub mod campaign;
 pub mod clock;
 pub mod desk;
 pub mod hosts;
+pub mod http;
 pub mod line;
 pub mod place;
 pub mod processes;
+pub mod report;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output};

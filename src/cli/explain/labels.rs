@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use store::{Attempt, Job, unix_milliseconds};
+use store::{Attempt, Job, Superseded, unix_milliseconds};
 
 use super::line;
 use crate::story::{ForceError, LabelJob, Story, StoryLabel};
@@ -19,7 +19,7 @@ pub fn write(out: &mut dyn Write, story: &Story) -> io::Result<()> {
 }
 
 fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
-    let Job { job: number, protocol, state, priority, attempts, holder, expires, overruled, .. } =
+    let Job { job: number, protocol, state, priority, attempts, holder, expires, overruled, relabel, .. } =
         &job.details.job;
     let cost = job.core_seconds.map_or(String::new(), |seconds| format!(", {seconds:.1} core-seconds"));
     line(
@@ -32,6 +32,9 @@ fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
     if let (Some(holder), Some(expires)) = (holder, expires) {
         let left = (expires - unix_milliseconds()) / 1000;
         line(out, "", &format!("held by {holder}, for {left} s more"))?;
+    }
+    if let Some(reason) = relabel {
+        line(out, "", &format!("another label was asked for: {reason}"))?;
     }
     if *overruled {
         line(out, "", "put into the queue by hand: the labellers' guard lets it pass")?;
@@ -78,6 +81,9 @@ fn write_label(out: &mut dyn Write, label: &StoryLabel, atoms: usize) -> io::Res
         ),
     )?;
     line(out, "", &format!("protocol '{protocol}' ({}), from {source}", &protocol_hash[..16]))?;
+    if let Some(Superseded { time, reason }) = &label.superseded {
+        line(out, "", &format!("superseded {} ago: {reason}", since(*time)))?;
+    }
     let Some(ForceError { energy_per_atom, mean, largest, atom, .. }) = &label.model else { return Ok(()) };
     line(
         out,

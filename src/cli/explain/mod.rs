@@ -47,6 +47,13 @@ impl Explain {
     }
 }
 
+/// All that the command prints.
+pub async fn text(location: Location, id: &str) -> Result<String, Failure> {
+    let (mut text, story) = (Vec::new(), read(location, id).await?);
+    write(&mut text, &story).map_err(Failure::failed)?;
+    Ok(String::from_utf8_lossy(&text).into_owned())
+}
+
 async fn read(location: Location, id: &str) -> Result<Story, Failure> {
     let store = Store::open_read_only(&location).await?;
     let story = story::read(&store, id).await?;

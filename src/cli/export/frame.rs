@@ -11,8 +11,8 @@ pub fn facts(row: &ExportRow) -> Facts<'_> {
     let largest = |grades: &[f64]| grades.iter().copied().reduce(f64::max);
     let forces = row.label.forces.iter().map(|force| norm(*force));
     let of_label = Facts {
-        energy: row.label.energy,
-        max_force: forces.fold(0.0, f64::max),
+        energy: Some(row.label.energy),
+        max_force: Some(forces.fold(0.0, f64::max)),
         species: &row.structure.species,
         kind: "imported",
         ..Facts::default()

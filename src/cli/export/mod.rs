@@ -1,6 +1,6 @@
 //! `calmwalk export`
 
-mod frame;
+pub mod frame;
 mod split;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 use atoms::extxyz::{Keys, write_frame};
 use store::records::Protocol;
-use store::{DATABASE, ExportFilter, ExportRow, ExportSource, LOCK, Store};
+use store::{DATABASE, ExportFilter, ExportRow, ExportSource, JobState, LOCK, Store};
 
 use self::split::Shares;
 use super::{CampaignLocation, Ended, Failure, block_on};
@@ -89,6 +89,15 @@ struct Count {
     seed_structures: BTreeSet<u32>,
 }
 
+/// An export, and what is not in it.
+struct Exported {
+    /// Files, what they hold, and how many seed structures go there.
+    counts: Vec<(PathBuf, Count, usize)>,
+    labels: store::Labels,
+    /// Structures whose labels are by other protocols.
+    others: u64,
+}
+
 /// A file to write, and what goes there.
 struct Part {
     path: PathBuf,
@@ -100,7 +109,7 @@ struct Part {
 
 impl Export {
     pub fn run(self) -> Result<Ended, Failure> {
-        let (counts, labels) = block_on(self.export())??;
+        let Exported { counts, labels, others } = block_on(self.export())??;
         for (path, count, _) in &counts {
             if matches!(self.keys, KeyNames::Grace) && (1..count.frames).contains(&count.without_stress) {
                 let (without, frames, path) = (count.without_stress, count.frames, path.display());
@@ -121,11 +130,19 @@ impl Export {
                 };
                 writeln!(out, "{} structures in {}{from}", count.frames, path.display())?;
             }
-            let store::Labels { queued, leased, failed, dropped, .. } = labels;
-            if queued + leased + failed + dropped == 0 {
+            if others > 0 {
+                writeln!(
+                    out,
+                    "{others} structures have their labels by other protocols, which --protocol chooses"
+                )?;
+            }
+            let store::Labels { queued, leased, failed, dropped, again, failed_again, .. } = labels;
+            // Those that are labelled again have labels.
+            let (waiting, failed) =
+                ((queued + leased).saturating_sub(again), failed.saturating_sub(failed_again));
+            if waiting + failed + dropped == 0 {
                 return writeln!(out, "every accepted structure is labelled");
             }
-            let waiting = queued + leased;
             writeln!(
                 out,
                 "accepted without a label: {waiting} not labelled yet, {failed} failed, {dropped} dropped"
@@ -134,7 +151,7 @@ impl Export {
         Ok(Ended::Done)
     }
 
-    async fn export(&self) -> Result<(Vec<(PathBuf, Count, usize)>, store::Labels), Failure> {
+    async fn export(&self) -> Result<Exported, Failure> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let protocol = self.choose_protocol(&store).await?;
         let (filter, campaign) = (self.filter(&protocol), store.campaign().await?.id.to_string());
@@ -167,8 +184,12 @@ impl Export {
             counts.push((path, count, dealt));
         }
         let labels = store.status().await?.labels;
+        let jobs = store.jobs_by_protocol().await?.into_iter();
+        let by_others =
+            jobs.filter(|(name, state, _)| *name != protocol.name && *state == JobState::Labelled);
+        let others = by_others.map(|(.., count)| count).sum();
         store.close().await;
-        Ok((counts, labels))
+        Ok(Exported { counts, labels, others })
     }
 
     /// The files to write, and which of them each seed structure goes to.

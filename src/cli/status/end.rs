@@ -4,7 +4,6 @@ use serde::Serialize;
 use serde_json::Value;
 use store::{ProcessRecord, Status, unix_milliseconds};
 
-use super::walks::is_under_way;
 use crate::bill::{Bill, SECONDS_PER_HOUR, digits};
 
 /// As things are now: walks that there are, at their speed, and labels that wait, on the cores at work.
@@ -32,7 +31,7 @@ impl End {
         }
         let steps = |key: &str| configuration["walk"][key].as_u64().unwrap_or_default();
         let of_a_walk = steps("equilibration") + steps("steps");
-        let under_way = status.walks.iter().filter(|walk| is_under_way(walk));
+        let under_way = status.walks.iter().filter(|walk| walk.is_under_way());
         let left: u64 = under_way.map(|walk| of_a_walk.saturating_sub(walk.step)).sum();
         let pace = status.steps_per_second.filter(|pace| is_led && *pace > 0.0);
         let walks_hours = match left {

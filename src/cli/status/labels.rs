@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use serde_json::{Value, json};
-use store::{FailureCount, Labels, Status, Store, StoreError, Unlabelled};
+use store::{FailureCount, JobState, Labels, Status, Store, StoreError, Unlabelled};
 
 use super::page::{Page, cut};
 use super::processes::since;
@@ -19,6 +19,8 @@ pub struct LabelsSoFar {
     pub(super) bill: Bill,
     pub(super) failures: Vec<FailureCount>,
     pub(super) unlabelled: Vec<Unlabelled>,
+    /// What became of label jobs by each protocol, in words.
+    pub(super) by_protocol: Vec<String>,
 }
 
 impl LabelsSoFar {
@@ -30,7 +32,8 @@ impl LabelsSoFar {
             (0, _) => Vec::new(),
             (_, labelled) => store.unlabelled(protocol.hash, labelled <= LOOKED_THROUGH).await?,
         };
-        Ok(Self { bill: bill::of(store, protocol.hash).await?, failures, unlabelled })
+        let by_protocol = by_protocol(&store.jobs_by_protocol().await?, &protocol.name);
+        Ok(Self { bill: bill::of(store, protocol.hash).await?, failures, unlabelled, by_protocol })
     }
 
     /// What labels have cost and will.
@@ -49,6 +52,12 @@ impl LabelsSoFar {
     /// The queue, what it costs, failures and what is unlabelled because of them.
     pub fn write(&self, out: &mut dyn Write, page: &Page, status: &Status) -> io::Result<()> {
         page.titled(out, "labels", &queue(status))?;
+        if let Some(again) = again(&status.labels) {
+            page.titled(out, "", &again)?;
+        }
+        if self.by_protocol.len() > 1 {
+            page.titled(out, "protocols", &self.by_protocol.join("; "))?;
+        }
         page.titled(out, "", &made(status))?;
         page.titled(out, "cost", &self.cost(status.budget.used.core_hours))?;
         for (k, failure) in self.failures.iter().take(page.few).enumerate() {
@@ -86,7 +95,7 @@ impl LabelsSoFar {
 }
 
 fn queue(status: &Status) -> String {
-    let Labels { queued, leased, labelled, failed, dropped } = &status.labels;
+    let Labels { queued, leased, labelled, failed, dropped, .. } = &status.labels;
     let oldest = status.oldest_lease.as_ref();
     let oldest = oldest.map_or(String::new(), |lease| format!(" (the oldest for {})", since(lease.started)));
     let imported = status.imported;
@@ -94,6 +103,28 @@ fn queue(status: &Status) -> String {
         "{queued} queued, {leased} leased{oldest}, {labelled} labelled, {failed} failed, {dropped} dropped; \
          {imported} structures imported"
     )
+}
+
+/// What is labelled again, and what could not be.
+fn again(labels: &Labels) -> Option<String> {
+    let said = [
+        (labels.again, "of those that wait keep their labels until the new ones come"),
+        (labels.again_in_vain, "could not be labelled again and keep their labels"),
+    ];
+    let said: Vec<_> = said.iter().filter(|(count, _)| *count > 0).collect();
+    let said: Vec<_> = said.iter().map(|(count, what)| format!("{count} {what}")).collect();
+    (!said.is_empty()).then(|| said.join("; "))
+}
+
+/// A text for each protocol.
+fn by_protocol(jobs: &[(String, JobState, u64)], in_force: &str) -> Vec<String> {
+    let of_one = |jobs: &[(String, JobState, u64)]| {
+        let name = &jobs[0].0;
+        let counts: Vec<_> = jobs.iter().map(|(_, state, count)| format!("{count} {state}")).collect();
+        let which = if name == in_force { " (in force)" } else { "" };
+        format!("'{name}'{which}: {}", counts.join(", "))
+    };
+    jobs.chunk_by(|a, b| a.0 == b.0).map(of_one).collect()
 }
 
 fn made(status: &Status) -> String {

@@ -14,7 +14,7 @@ use super::*;
 use crate::bill::{Bill, CoreHours};
 
 /// A campaign in which there is something of everything, and much of what there may be much of.
-fn large() -> Snapshot {
+pub fn large() -> Snapshot {
     let staleness = json!({ "counts": { "0": 900_000, "3": 100_000 }, "largest": 3 });
     let training = json!({
         "atoms": 20_000, "median": 0.51, "percentile_95": 1.2, "maximum": 7.0, "share_above_one": 0.25, "alarm": true,
@@ -61,6 +61,7 @@ fn large() -> Snapshot {
             bill,
             failures: ["not_converged", "out_of_memory", "implausible"].map(failure).into(),
             unlabelled: vec![unlabelled],
+            by_protocol: Vec::new(),
         },
         end: End {
             walks_hours: Some(12.0),
@@ -100,7 +101,14 @@ fn standing() -> Standing {
             control: 80_000,
             refused_by_walkers: 123_456,
         },
-        labels: Labels { queued: 12_345, leased: 1024, labelled: 140_000, failed: 2000, dropped: 12 },
+        labels: Labels {
+            queued: 12_345,
+            leased: 1024,
+            labelled: 140_000,
+            failed: 2000,
+            dropped: 12,
+            ..Labels::default()
+        },
         oldest_lease: Some(OldestLease { job: 17, holder: "node7-17-0/3".into(), started: 0 }),
         labels_last_hour: 512,
         imported: 10_000,

@@ -9,12 +9,11 @@ use super::page::{Page, cut};
 use crate::output::{Table, decimals};
 
 /// Columns of the name of a seed structure, unless everything is shown.
-const NAME: usize = 14;
+pub const NAME: usize = 14;
 
-/// Whether it has more steps to make.
-pub fn is_under_way(walk: &WalkStatus) -> bool {
-    matches!(walk.state.as_str(), "waiting" | "running")
-}
+/// Titles of the columns, as [`Table::new`] has them.
+pub const TITLES: [&str; 9] =
+    [">walk", "seed structure", "state", ">step", ">steps/s", ">T (K)", ">V/V₀", ">γ_max", ">taken"];
 
 /// Those that advance first, the newest structures before the others; then those that began last. In order of their
 /// numbers.
@@ -22,7 +21,7 @@ fn shown(walks: &[WalkStatus], most: usize) -> Vec<&WalkStatus> {
     let mut shown: Vec<_> = walks.iter().collect();
     if shown.len() > most {
         let gamma = |walk: &WalkStatus| (1e6 * walk.gamma_max.unwrap_or_default().clamp(0.0, 1e9)) as u64;
-        shown.sort_by_cached_key(|walk| match is_under_way(walk) {
+        shown.sort_by_cached_key(|walk| match walk.is_under_way() {
             true => (0, walk.steps_per_second.is_none(), Reverse(gamma(walk)), Reverse(walk.walk)),
             false => (1, true, Reverse(0), Reverse(walk.walk)),
         });
@@ -38,28 +37,19 @@ pub fn write(out: &mut dyn Write, walks: &[WalkStatus], page: &Page) -> io::Resu
     if shown.is_empty() {
         return Ok(());
     }
-    let mut table = Table::new(&[
-        ">walk",
-        "seed structure",
-        "state",
-        ">step",
-        ">steps/s",
-        ">T (K)",
-        ">V/V₀",
-        ">γ_max",
-        ">taken",
-    ]);
+    let mut table = Table::new(&TITLES);
+    let name = if page.walks == usize::MAX { usize::MAX } else { NAME };
     for walk in &shown {
-        table.push(line(walk, page));
+        table.push(line(walk, name));
     }
     page.table(out, &table, shown.len(), walks.len(), "walks")
 }
 
-fn line(walk: &WalkStatus, page: &Page) -> Vec<String> {
+/// One walk below [`TITLES`], with so many characters of the name of its seed structure.
+pub fn line(walk: &WalkStatus, name: usize) -> Vec<String> {
     let control = if walk.origin == "control" { "c: " } else { "" };
-    let name = format!("{control}{}", walk.seed_structure);
-    let name = if page.walks == usize::MAX { name } else { cut(&name, NAME) };
-    let state = walk.state.replace('_', " ");
+    let name = cut(&format!("{control}{}", walk.seed_structure), name);
+    let state = if walk.paused { "paused".to_owned() } else { walk.state.replace('_', " ") };
     vec![
         walk.walk.to_string(),
         name,

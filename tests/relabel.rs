@@ -1,0 +1,200 @@
+//! `calmwalk relabel`: doubtful labels are made again, and a campaign labels by another protocol. The same tests on PostgreSQL are
+//! in `postgres_whole.rs`.
+
+mod common;
+
+use std::fs;
+use std::time::Duration;
+
+use common::campaign::Small;
+use common::place::Place;
+use common::processes::{signal, wait_until};
+use common::{calmwalk, config, random, refuse, stderr, succeed};
+use serde_json::Value;
+use store::{CampaignLock, JobState};
+
+/// A campaign that is over, and how many labels it has.
+fn labelled() -> (Place, u64) {
+    let place = Place::new(&Small { steps: 120, ..Small::default() }, &[]);
+    assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
+    let labels = place.jobs("labelled");
+    assert!(labels > 2, "{labels}");
+    (place, labels)
+}
+
+/// Writes `fine.toml`: the same campaign with another label potential, by a protocol of this name.
+fn another_protocol(place: &Place, name: &str) {
+    let potential = config("data/Al_mm.eam.fs");
+    let text = fs::read_to_string(place.path().join("campaign.toml")).unwrap();
+    let text = text.replace(&potential.display().to_string(), "fine.eam.fs");
+    let text = text.replace("[label]", &format!("[label]\nprotocol = \"{name}\""));
+    fs::write(place.path().join("fine.toml"), text).unwrap();
+    let potential = format!("another comment {}", fs::read_to_string(potential).unwrap());
+    fs::write(place.path().join("fine.eam.fs"), potential).unwrap();
+}
+
+fn relabel(place: &Place, arguments: &[&str]) -> String {
+    succeed(place.path(), [&["relabel", place.argument()], arguments].concat())
+}
+
+fn run(place: &Place, configuration: &str) {
+    let mut run = place.start(&["run", configuration, "--directory", "."]);
+    assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
+}
+
+/// Names of the protocols in an export, one a structure, and names of their candidates.
+fn exported(place: &Place) -> Vec<(String, String)> {
+    let text = String::from_utf8(place.export()).unwrap();
+    let value = |line: &str, key: &str| {
+        let (_, rest) = line.split_once(&format!(" {key}=")).unwrap();
+        rest.split_whitespace().next().unwrap().trim_matches('"').to_owned()
+    };
+    let comments = text.lines().filter(|line| line.contains("protocol_hash="));
+    comments.map(|line| (value(line, "protocol"), value(line, "candidate_id"))).collect()
+}
+
+fn check(place: &Place) {
+    let found = succeed(place.path(), ["store", "check", place.argument()]);
+    assert!(found.starts_with("nothing found"), "{found}");
+}
+
+#[test]
+fn a_campaign_goes_over_to_another_protocol_label_by_label() {
+    let (place, labels) = labelled();
+    another_protocol(&place, "fine");
+    let (here, campaign) = (place.path(), place.argument());
+    let refused = refuse(here, ["run", "fine.toml", "--directory", "."]);
+    assert!(
+        refused.contains("labels of two protocols") && refused.contains("calmwalk relabel --config"),
+        "{refused}"
+    );
+
+    let with = ["--config", "fine.toml", "--all", "--reason", "a finer grid"];
+    let planned = relabel(&place, &[&with[..], &["--dry-run"]].concat());
+    for words in [
+        "label.protocol is now \"fine\" (was \"reference\")".to_owned(),
+        "protocol 'fine' would come in force".to_owned(),
+        format!(
+            "{labels} structures would be labelled again by protocol 'fine', in the place of {labels} labels by 'reference'"
+        ),
+        format!("if they take as long as {labels} labels by 'reference' did"),
+        "nothing was changed".to_owned(),
+    ] {
+        assert!(planned.contains(&words), "{words} in {planned}");
+    }
+    assert_eq!((place.jobs("again"), place.jobs("labelled")), (0, labels));
+
+    assert!(relabel(&place, &with).contains(&format!("{labels} structures are labelled again")));
+    let twice: Value = serde_json::from_str(&relabel(&place, &[&with[..], &["--json"]].concat())).unwrap();
+    assert_eq!((&twice["again"], &twice["waiting_already"]), (&0.into(), &labels.into()));
+    assert_eq!((place.jobs("again"), place.jobs("queued")), (labels, labels));
+    let before = exported(&place);
+    // A structure that was found twice has one label.
+    assert!(before.len() as u64 >= labels && before.iter().all(|(protocol, _)| protocol == "reference"));
+    check(&place);
+    assert!(refuse(here, ["run", "campaign.toml", "--directory", "."]).contains("labels of two protocols"));
+
+    run(&place, "fine.toml");
+    let after = exported(&place);
+    assert!(after.iter().all(|(protocol, _)| protocol == "fine"), "{after:?}");
+    let names = |rows: &[(String, String)]| rows.iter().map(|row| row.1.clone()).collect::<Vec<_>>();
+    assert_eq!(names(&after), names(&before));
+    assert_eq!((place.jobs("labelled"), place.jobs("again"), place.jobs("queued")), (labels, 0, 0));
+    let story = succeed(here, ["explain", campaign, &after[0].1]);
+    for words in ["superseded", "ago: a finer grid", "protocol 'fine'", "protocol 'reference'"] {
+        assert!(story.contains(words), "{words} in {story}");
+    }
+    check(&place);
+    let nothing = relabel(&place, &["--all"]);
+    assert!(nothing.contains("0 structures are labelled again"), "{nothing}");
+    assert!(nothing.contains(&format!("{labels} structures are left alone")), "{nothing}");
+}
+
+#[test]
+fn a_protocol_needs_a_name_of_its_own_and_a_campaign_that_nobody_runs() {
+    let (place, _) = labelled();
+    another_protocol(&place, "reference");
+    let with = ["relabel", place.argument(), "--config", "fine.toml", "--all"];
+    let refused = refuse(place.path(), with);
+    assert!(refused.contains("give this one a name of its own"), "{refused}");
+    another_protocol(&place, "fine");
+    let lock = CampaignLock::acquire(place.path(), "somebody");
+    if place.argument() == "." {
+        let output = calmwalk(place.path(), with);
+        assert!(!output.status.success() && stderr(&output).contains("somebody"), "{}", stderr(&output));
+    }
+    drop(lock);
+    assert_eq!(place.jobs("again"), 0);
+    check(&place);
+}
+
+#[test]
+fn doubtful_labels_are_made_again_by_the_same_protocol() {
+    let (place, labels) = labelled();
+    let before = exported(&place);
+    let (doubtful, bytes) = (&before[1].1, place.export());
+    let all = relabel(&place, &["--where", "max_force >= 0"]);
+    assert!(
+        all.contains("0 structures are labelled again") && all.contains("--again asks for others"),
+        "{all}"
+    );
+    assert!(
+        refuse(place.path(), ["relabel", place.argument(), "--where", "max_force > 1e9"])
+            .contains("no labelled structure")
+    );
+    relabel(&place, &[doubtful, "--reason", "a sick node"]);
+    let listed = succeed(place.path(), ["queue", place.argument(), "list", "--state", "queued"]);
+    assert!(listed.contains(doubtful) && listed.contains("queued again"), "{listed}");
+    let shown = succeed(place.path(), ["queue", place.argument(), "show", doubtful]);
+    assert!(shown.contains("another label was asked for: a sick node"), "{shown}");
+    assert_eq!(place.export(), bytes, "the label stays");
+    check(&place);
+    assert_eq!(place.label(&["--until-empty"]).0.wait().unwrap().code(), Some(0), "{}", place.said());
+    assert_eq!((place.jobs("labelled"), place.jobs("queued")), (labels, 0));
+    assert_eq!(place.export(), bytes, "the same potential");
+    let job = place.job(doubtful);
+    assert_eq!((job.job.attempts, job.energies.len(), job.job.relabel), (2, 2, None));
+    check(&place);
+}
+
+#[test]
+fn killed_at_any_instant_all_or_nothing_is_asked_for() {
+    let (place, labels) = labelled();
+    let before = exported(&place);
+    for kill in 0..8 {
+        let mut running = place.start(&["relabel", place.argument(), "--all", "--again"]);
+        std::thread::sleep(Duration::from_millis(random(kill) % 60));
+        signal(running.0.id(), "KILL");
+        running.0.wait().unwrap();
+        assert!([0, labels].contains(&place.jobs("again")), "{}", place.status());
+    }
+    relabel(&place, &["--all", "--again"]);
+    assert_eq!(place.jobs("again"), labels);
+    // Labellers that are killed leave nothing undone either.
+    for kill in 0..4 {
+        let mut running = place.label(&["--until-empty"]);
+        std::thread::sleep(Duration::from_millis(random(100 + kill) % 400));
+        running.0.kill().unwrap();
+        running.0.wait().unwrap();
+    }
+    assert_eq!(place.label(&["--until-empty"]).0.wait().unwrap().code(), Some(0), "{}", place.said());
+    assert_eq!((place.jobs("labelled"), place.jobs("again")), (labels, 0));
+    assert_eq!(exported(&place), before);
+    check(&place);
+}
+
+#[test]
+fn labellers_go_on_with_the_new_protocol() {
+    let (place, labels) = labelled();
+    another_protocol(&place, "fine");
+    let name = place.queue_large();
+    let mut label = place.label(&[]);
+    wait_until("the structure is leased", || place.jobs("leased") == 1);
+    relabel(&place, &["--config", "fine.toml", "--all"]);
+    assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    assert!(place.said().contains("by another protocol than 'reference' now"), "{}", place.said());
+    let job = place.job(&name).job;
+    assert_eq!((job.protocol.as_str(), job.state), ("fine", JobState::Labelled));
+    assert_eq!((place.jobs("labelled"), place.jobs("again")), (labels + 1, 0));
+    assert!(exported(&place).iter().all(|(protocol, _)| protocol == "fine"));
+}
