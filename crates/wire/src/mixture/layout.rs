@@ -7,6 +7,7 @@ use std::path::Path;
 use calm::Mixture;
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
+use super::blocks::SPARE;
 use super::error::SharedMixtureError;
 
 const MAGIC: [u8; 8] = *b"CALMMIXT";
@@ -96,7 +97,8 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    /// The layout for mixtures with the shape of `mixture`. An extent has room for two of each component.
+    /// The layout for mixtures with the shape of `mixture`. An extent has room for two of each component, and at least for
+    /// one of each and the spare ones, which are reserved at the start.
     pub fn of(mixture: &Mixture, readers: u32) -> Result<Self, SharedMixtureError> {
         let (elements, dimension) = (mixture.element_count(), mixture.dimension());
         let components = |element| mixture.components(element).unwrap_or_default().len().try_into().ok();
@@ -104,7 +106,8 @@ impl Layout {
             let shape: Vec<u32> = (0..elements).map(components).collect::<Option<_>>()?;
             let count = shape.iter().try_fold(0_u32, |sum, &count| sum.checked_add(count))?;
             let rows = readers.checked_mul(4)?.checked_add(SPARE_ROWS)?;
-            Self::new(dimension.try_into().ok()?, shape, readers, rows, count.checked_mul(2)?)
+            let blocks = count.checked_mul(2)?.max(count.checked_add(SPARE)?);
+            Self::new(dimension.try_into().ok()?, shape, readers, rows, blocks)
         };
         layout().ok_or(SharedMixtureError::TooLarge { elements, dimension, readers })
     }

@@ -194,9 +194,9 @@ impl SharedMixture {
     }
 }
 
-/// Blocks at the start: one for each component and a few to change.
+/// Blocks at the start: one for each component and a few to change. An extent has room for them.
 fn initial_blocks(layout: &Layout) -> u32 {
-    layout.components.saturating_add(SPARE).min(layout.extent_blocks)
+    layout.components.saturating_add(SPARE)
 }
 
 /// Bytes to reserve at the start.

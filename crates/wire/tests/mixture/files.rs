@@ -70,11 +70,12 @@ fn no_damage_leads_beyond_the_file() {
         fs::write(&path, &sound[..length]).unwrap();
         assert!(matches!(MixtureReader::open(&path, 0), Err(SharedMixtureError::Damaged { .. })), "{length}");
     }
-    // The row of version 0 with each block number replaced: another component, another extent, one far away.
+    // The row of version 0 with each block number replaced: another component, another extent, one far away. An extent
+    // has 22 blocks: one for each of six components and 16 to spare.
     let words = 64 * 3 + 8 * (64 + 4 * 2);
     let row = 4096 + (words as usize).next_multiple_of(64);
     for place in 0..6 {
-        for block in [(place + 1) % 6, 12, 1 << 20, u32::MAX] {
+        for block in [(place + 1) % 6, 22, 1 << 20, u32::MAX] {
             let mut bytes = sound.clone();
             bytes[row + 4 * place as usize..][..4].copy_from_slice(&block.to_le_bytes());
             fs::write(&path, bytes).unwrap();
