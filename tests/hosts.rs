@@ -10,8 +10,8 @@ use std::time::Duration;
 use common::campaign::{Small, outcome};
 use common::hosts::{Hosts, undisturbed};
 use common::line::SlowLine;
-use common::processes::{carrying_out, signal, wait_until};
-use common::{kills, random};
+use common::processes::{carrying_out, go_on, hold_walkers, signal, wait_until};
+use common::{Running, kills, random};
 
 /// A silent agent is soon taken for dead.
 fn hosts(small: &Small, others: usize) -> Hosts {
@@ -21,12 +21,18 @@ fn hosts(small: &Small, others: usize) -> Hosts {
 #[test]
 fn a_campaign_on_three_hosts_comes_to_the_same() {
     let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
-    let hosts = hosts(&small, 2);
+    let hosts = Hosts::new(&small, 2, "");
     // An agent may be there before its orchestrator.
     let mut first = hosts.agent(0);
     wait_until("the agent waits", || hosts.said(0).contains("waiting for the orchestrator"));
     let mut orchestrator = hosts.lead();
+    // One that comes late to a campaign that is over would wait for the next run of it.
+    let held = hold_walkers(hosts.home.path(), 1);
     let mut second = hosts.agent(1);
+    for host in 0..2 {
+        wait_until("it has joined", || hosts.said(host).contains("joined: 1 walkers"));
+    }
+    go_on(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
     assert_eq!((first.0.wait().unwrap().code(), second.0.wait().unwrap().code()), (Some(0), Some(0)));
     for host in 0..2 {
@@ -39,18 +45,25 @@ fn a_campaign_on_three_hosts_comes_to_the_same() {
 #[test]
 fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     let small = Small::default();
-    let hosts = hosts(&small, 2);
+    let hosts = Hosts::new(&small, 2, "");
     let mut orchestrator = hosts.lead();
+    let held = hold_walkers(hosts.home.path(), 1);
     let mut agents = [hosts.agent(0), hosts.agent(1)];
     let at_work = |host: usize| !carrying_out(hosts.others[host].path(), "walker").is_empty();
     wait_until("walkers are at work", || at_work(0) && at_work(1));
     signal(agents[0].0.id(), "TERM");
     assert_eq!(agents[0].0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
     signal(orchestrator.0.id(), "TERM");
+    go_on(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(130));
     assert_eq!(agents[1].0.wait().unwrap().code(), Some(130), "{}", hosts.said(1));
     hosts.are_empty();
-    let (mut orchestrator, mut agent) = (hosts.lead(), hosts.agent(0));
+    let mut orchestrator = hosts.lead();
+    let held = hold_walkers(hosts.home.path(), 1);
+    let joined = hosts.said(0).matches("joined: 1 walkers").count();
+    let mut agent = hosts.agent(0);
+    wait_until("it has joined", || hosts.said(0).matches("joined: 1 walkers").count() > joined);
+    go_on(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
     assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
@@ -68,11 +81,9 @@ fn a_slow_line_changes_nothing() {
     let mut agent = hosts.agent(0);
     let mut orchestrator = hosts.lead();
     // On an idle machine the orchestrator's own walker would be through before the agent has joined.
-    let own = || carrying_out(hosts.home.path(), "walker");
-    wait_until("there is a walker", || !own().is_empty());
-    own().into_iter().for_each(|pid| signal(pid, "STOP"));
+    let held = hold_walkers(hosts.home.path(), 1);
     wait_until("the agent has joined", || hosts.said(0).contains("joined: 1 walkers"));
-    own().into_iter().for_each(|pid| signal(pid, "CONT"));
+    go_on(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
     assert!(!hosts.head_said().contains("gives no sign of life"), "{}", hosts.head_said());
@@ -92,8 +103,7 @@ fn what_a_killed_agent_leaves_is_removed_by_the_next() {
     let waits = || hosts.said(0).matches("waiting for the orchestrator").count();
     let mut killed = hosts.agent(0);
     wait_until("the first waits", || waits() == 1);
-    signal(killed.0.id(), "KILL");
-    killed.0.wait().unwrap();
+    kill(&mut killed);
     let left = directories();
     assert_eq!(left.len(), 1);
     let (mut second, third) = (hosts.agent(0), hosts.agent(0));
@@ -104,6 +114,12 @@ fn what_a_killed_agent_leaves_is_removed_by_the_next() {
     }
     assert_eq!(second.0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
     hosts.are_empty();
+}
+
+/// Kills a process, which is seen to be dead then.
+fn kill(running: &mut Running) {
+    running.0.kill().unwrap();
+    running.0.wait().unwrap();
 }
 
 /// Kills the orchestrator, an agent, or a walker of an agent; whoever is no more is started again.
@@ -134,21 +150,19 @@ fn kills_on_every_host_change_nothing() {
                 }
             }
             if done == kills() {
-                let ended = orchestrator.0.wait().unwrap();
-                break ended;
+                break orchestrator.0.wait().unwrap();
             }
             let choice = random(9000 + done);
             let host = (choice / 4) as usize % 2;
             match choice % 4 {
-                0 => signal(orchestrator.0.id(), "KILL"),
-                1 | 2 => signal(agents[host].0.id(), "KILL"),
+                0 => kill(&mut orchestrator),
+                1 | 2 => kill(&mut agents[host]),
                 _ => {
                     let walkers = carrying_out(hosts.others[host].path(), "walker");
                     walkers.into_iter().for_each(|pid| signal(pid, "KILL"));
                 }
             }
             done += 1;
-            std::thread::sleep(Duration::from_millis(5));
         };
         assert_eq!(ended.code(), Some(0), "after {done} kills");
         // One that came late to a campaign that was over waits for the next run of it.

@@ -8,8 +8,10 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use common::campaign::{Outcome, Small, outcome};
-use common::processes::{carrying_out, nothing_is_left, processes_in, signal, wait_until};
+use common::campaign::{Counters, Outcome, Small, outcome};
+use common::processes::{
+    carrying_out, go_on, hold_walkers, nothing_is_left, processes_in, signal, wait_until,
+};
 use common::{Running, kills, program, random};
 
 fn start(directory: &Path, options: &[&str]) -> Running {
@@ -91,14 +93,16 @@ fn kills_of_the_one_process_change_nothing() {
 #[test]
 fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
     let small = Small::default();
-    let (expected, takes) = undisturbed(&small);
+    let (expected, _) = undisturbed(&small);
     for name in ["INT", "TERM"] {
         let directory = tempfile::tempdir().unwrap();
         small.write(directory.path());
         let mut running = start(directory.path(), &[]);
-        wait_until("walkers are at work", || !carrying_out(directory.path(), "walker").is_empty());
-        std::thread::sleep(takes.mul_f64(0.2));
+        wait_until("structures are found", || Counters::of(".", directory.path()).sent > 0);
+        // It must not be over before it is told.
+        let held = hold_walkers(directory.path(), 2);
         signal(running.0.id(), name);
+        go_on(&held);
         assert_eq!(running.0.wait().unwrap().code(), Some(130), "{name}");
         assert_eq!(start(directory.path(), &[]).0.wait().unwrap().code(), Some(0));
         assert_eq!(outcome(directory.path()), expected, "{name}");

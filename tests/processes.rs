@@ -5,10 +5,11 @@ mod common;
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::time::Duration;
 
 use common::campaign::{Outcome, Small, outcome};
-use common::processes::{carrying_out, nothing_is_left, one_carrying_out, processes_in, signal, wait_until};
+use common::processes::{
+    carrying_out, go_on, hold_walkers, nothing_is_left, one_carrying_out, processes_in, signal, wait_until,
+};
 use common::{Running, calmwalk, config, program, refuse, succeed};
 use serde_json::Value;
 use store::Store;
@@ -104,20 +105,20 @@ fn wait_for_work(directory: &Path) {
         let status = serde_json::from_slice::<Value>(&output.stdout).unwrap_or_default();
         status["mixture_version"].as_u64().is_some_and(|version| version > 0)
     });
-    assert_eq!(carrying_out(directory, "walker").len(), 2);
+    wait_until("both are there", || carrying_out(directory, "walker").len() == 2);
 }
 
 #[test]
 fn a_hung_walker_is_killed_and_replaced() {
     let mut hung = 0;
-    let directory = disturbed("silence_limit = 5.0", |here| {
+    let directory = disturbed("silence_limit = 10.0", |here| {
         hung = one_carrying_out(here, "walker");
         signal(hung, "STOP");
     });
     assert!(!processes_in(directory.path()).iter().any(|process| process.pid == hung));
     let endings = endings(directory.path());
     let hung =
-        |ending: &String| ending.contains("silent for 5 s, killed") && ending.contains(r#""kind":"walker""#);
+        |ending: &String| ending.contains("silent for 10 s, killed") && ending.contains(r#""kind":"walker""#);
     assert_eq!(endings.iter().filter(|ending| hung(ending)).count(), 1, "{endings:?}");
 }
 
@@ -131,26 +132,30 @@ fn a_walker_that_is_told_to_end_leaves_its_walk_to_another() {
 #[test]
 fn a_labeller_that_is_told_to_end_is_replaced() {
     disturbed("", |here| {
+        let held = hold_walkers(here, 2);
         let labeller = one_carrying_out(here, "labeller");
         signal(labeller, "TERM");
         wait_until("another is there", || {
             carrying_out(here, "labeller").first().is_some_and(|other| *other != labeller)
         });
+        go_on(&held);
     });
 }
 
 #[test]
 fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
-    let small = Small { steps: 1800, ..Small::default() };
+    let small = long();
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     with_own_model(&small, here);
     with_keys(&here.join("campaign.toml"), "restarts = 1");
     let running = start(here);
     wait_for_work(here);
+    // The other does not end the campaign before this one was given up.
+    let held = hold_walkers(here, 2);
     let model = fs::read(here.join("model.npz")).unwrap();
     fs::write(here.join("model.npz"), b"spoiled").unwrap();
-    signal(one_carrying_out(here, "walker"), "KILL");
+    signal(held[0], "KILL");
     let given_up = |process: &Value| {
         let remark = process["remark"].as_str().unwrap_or_default();
         process["kind"] == "walker" && process["state"] == "given up" && remark.contains("another content")
@@ -159,6 +164,7 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
     let table = succeed(here, ["status", "."]);
     assert!(table.contains("given up") && table.contains("another content"), "{table}");
     fs::write(here.join("model.npz"), model).unwrap();
+    go_on(&held);
     ends_as_undisturbed(running, here, &small);
 }
 
@@ -171,9 +177,10 @@ fn without_any_walker_the_campaign_fails_and_can_go_on() {
     with_keys(&here.join("campaign.toml"), "restarts = 1");
     let mut running = start(here);
     wait_for_work(here);
+    let held = hold_walkers(here, 2);
     let model = fs::read(here.join("model.npz")).unwrap();
     fs::write(here.join("model.npz"), b"spoiled").unwrap();
-    carrying_out(here, "walker").into_iter().for_each(|walker| signal(walker, "KILL"));
+    held.into_iter().for_each(|walker| signal(walker, "KILL"));
     assert_eq!(wait(&mut running), Some(1), "{}", said(here));
     let message = said(here);
     assert!(message.contains("no walker is left") && message.contains("another content"), "{message}");
@@ -199,10 +206,11 @@ fn walkers_end_with_their_orchestrator_and_labellers_are_adopted() {
     wait_until("walkers are gone", || carrying_out(here, "walker").is_empty());
     let running = start(here);
     wait_until("there are walkers again", || carrying_out(here, "walker").len() == 2);
-    signal(labellers[0], "CONT");
-    assert_eq!(carrying_out(here, "labeller"), labellers);
+    // While a labeller is held, the campaign does not end either.
     let second = refuse(here, RUN);
     assert!(second.contains(&format!("process {}", running.0.id())), "{second}");
+    signal(labellers[0], "CONT");
+    assert_eq!(carrying_out(here, "labeller"), labellers);
     ends_as_undisturbed(running, here, &small);
 }
 
@@ -308,16 +316,21 @@ fn shared_memory_is_the_users_alone() {
     long().write(here);
     let mut running = start(here);
     wait_for_work(here);
+    let held = hold_walkers(here, 2);
     let place = wire::place::Place::of(here).unwrap();
     assert_eq!(fs::metadata(place.directory()).unwrap().mode() & 0o777, 0o700);
+    let mut segments = 0;
     for file in fs::read_dir("/dev/shm").unwrap().flatten() {
-        if file.file_name().to_string_lossy().starts_with(place.prefix()) {
-            let mode = file.metadata().unwrap().mode();
-            assert_eq!(mode & 0o077, 0, "{:?} {mode:o}", file.path());
+        // Those that nobody needs any more are removed at any time.
+        let (name, Ok(data)) = (file.file_name(), file.metadata()) else { continue };
+        if name.to_string_lossy().starts_with(place.prefix()) {
+            segments += 1;
+            assert_eq!(data.mode() & 0o077, 0, "{:?} {:o}", file.path(), data.mode());
         }
     }
+    assert!(segments > 0);
     signal(running.0.id(), "TERM");
+    go_on(&held);
     assert_eq!(wait(&mut running), Some(130));
-    std::thread::sleep(Duration::from_millis(100));
     nothing_is_left(here);
 }

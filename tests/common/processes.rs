@@ -50,6 +50,22 @@ pub fn signal(pid: u32, name: &str) {
     sent.expect("kill runs");
 }
 
+/// Stops all walkers as soon as there are so many. Nothing is found and no campaign ends until they [`go_on`].
+pub fn hold_walkers(directory: &Path, number: usize) -> Vec<u32> {
+    let mut walkers = Vec::new();
+    wait_until(&format!("there are {number} walkers"), || {
+        walkers = carrying_out(directory, "walker");
+        walkers.len() == number
+    });
+    walkers.iter().for_each(|pid| signal(*pid, "STOP"));
+    walkers
+}
+
+/// Lets them go on who were stopped.
+pub fn go_on(held: &[u32]) {
+    held.iter().for_each(|pid| signal(*pid, "CONT"));
+}
+
 /// Waits until something is so.
 pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     let begun = Instant::now();
