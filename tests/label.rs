@@ -7,10 +7,10 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use common::campaign::{Outcome, Small, outcome, outcome_at};
-use common::place::{Place, on_store};
-use common::processes::{carrying_out, nothing_is_left, one_carrying_out, processes_in, signal, wait_until};
+use common::place::Place;
+use common::processes::{carrying_out, go_on, nothing_is_left, processes_in, signal, wait_until};
 use common::{Running, calmwalk, config, program, refuse, succeed};
-use store::{JobState, Standing, Store};
+use store::{JobState, Standing};
 
 /// `run` starts no labellers of its own.
 const NO_SLOTS: (&str, &str) = ("[label]", "[label]\nslots = 0");
@@ -33,12 +33,6 @@ fn with_large_structure(changes: &[(&str, &str)]) -> (Place, String) {
     assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
     let name = place.queue_large();
     (place, name)
-}
-
-/// Asks the store itself: to start the program for it may take longer than the label.
-fn wait_for_lease(place: &Place) {
-    let leased = async |store: &Store| store.queue_list(Some(JobState::Leased), 1, 0).await.unwrap().len();
-    wait_until("the structure is leased", || on_store(place.location(), leased) == 1);
 }
 
 #[test]
@@ -88,7 +82,8 @@ fn everything_in_one_process_waits_for_labels_of_others() {
 fn what_it_is_killed_over_is_labelled_by_the_next() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--until-empty"]);
-    wait_for_lease(&place);
+    // Its slot is held so that the label is not made before it is killed.
+    place.hold_in_mid_label();
     label.0.kill().unwrap();
     label.0.wait().unwrap();
     wait_until("its slot ends with it", || processes_in(place.path()).is_empty());
@@ -104,12 +99,15 @@ fn what_it_is_killed_over_is_labelled_by_the_next() {
 fn a_slot_that_is_killed_is_replaced_and_the_others_go_on() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--slots", "2", "--until-empty"]);
-    wait_for_lease(&place);
+    place.wait_for_lease();
+    let slots = carrying_out(place.path(), "labeller");
+    // The label is not made before its slot is found.
+    slots.iter().for_each(|slot| signal(*slot, "STOP"));
     let holder = place.job(&name).job.holder.unwrap();
     let pid: u32 = holder.rsplit('-').nth(1).unwrap().parse().unwrap();
-    let slots = carrying_out(place.path(), "labeller");
     assert!(slots.len() == 2 && slots.contains(&pid), "{slots:?} {holder}");
     signal(pid, "KILL");
+    go_on(&slots);
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
     assert!(place.said().contains("killed by signal 9 (SIGKILL); pausing"), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Labelled);
@@ -120,14 +118,14 @@ fn a_slot_that_is_killed_is_replaced_and_the_others_go_on() {
 fn a_stop_finishes_the_label_in_hand_or_gives_it_back() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--grace", "0"]);
-    wait_for_lease(&place);
+    place.wait_for_lease();
     signal(label.0.id(), "TERM");
     assert_eq!(ended(&mut label), Some(130), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Queued);
     assert_eq!(place.job(&name).attempts_made[0].outcome.as_deref(), Some("released"));
     assert!(place.said().contains("is given back"), "{}", place.said());
     let mut label = place.label(&["--grace", "100"]);
-    wait_for_lease(&place);
+    place.wait_for_lease();
     signal(label.0.id(), "INT");
     assert_eq!(ended(&mut label), Some(130), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Labelled);
@@ -215,10 +213,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     let Some(command) = elsewhere(&place) else { return };
     let arguments = ["label", "--until-empty", "--store", place.argument()];
     let mut late = place.spawn(command, &arguments);
-    wait_for_lease(&place);
-    let slot = carrying_out(place.path(), "labeller");
-    assert_eq!(slot.len(), 1);
-    signal(slot[0], "STOP");
+    let slot = place.hold_in_mid_label();
     let begun = Instant::now();
     let first = place.job(&name).job;
     assert_eq!(
@@ -230,7 +225,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     assert_eq!(ended(&mut place.label(&["--until-empty"])), Some(0), "{}", place.said());
     assert!(begun.elapsed() > Duration::from_secs(1), "not before the lease was over");
     let exported = place.export();
-    signal(slot[0], "CONT");
+    signal(slot, "CONT");
     assert_eq!(ended(&mut late), Some(0), "{}", place.said());
     assert!(place.said().contains("had its label already; this one is kept as a check"), "{}", place.said());
     let job = place.job(&name);
@@ -248,9 +243,7 @@ fn a_labeller_elsewhere_keeps_its_job_when_a_run_starts() {
     let Some(command) = elsewhere(&place) else { return };
     let arguments = ["label", "--until-empty", "--store", place.argument()];
     let mut label = place.spawn(command, &arguments);
-    wait_for_lease(&place);
-    let slot = one_carrying_out(place.path(), "labeller");
-    signal(slot, "STOP");
+    let slot = place.hold_in_mid_label();
     let mut run = place.run();
     wait_until("it runs", || {
         let output = calmwalk(place.path(), ["status", place.argument()]);

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use common::campaign::Small;
 use common::place::Place;
-use common::processes::{signal, wait_until};
+use common::processes::signal;
 use common::{calmwalk, config, random, refuse, stderr, succeed};
 use serde_json::Value;
 use store::{CampaignLock, JobState};
@@ -189,8 +189,9 @@ fn labellers_go_on_with_the_new_protocol() {
     another_protocol(&place, "fine");
     let name = place.queue_large();
     let mut label = place.label(&[]);
-    wait_until("the structure is leased", || place.jobs("leased") == 1);
+    let slot = place.hold_in_mid_label();
     relabel(&place, &["--config", "fine.toml", "--all"]);
+    signal(slot, "CONT");
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert!(place.said().contains("by another protocol than 'reference' now"), "{}", place.said());
     let job = place.job(&name).job;

@@ -8,12 +8,14 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use atoms::{Cell, Structure};
 use serde_json::Value;
 use store::{
-    AtomGrades, CandidateRecord, Commit, Decision, Fate, JobDetails, Location, Store, unix_milliseconds,
+    AtomGrades, CandidateRecord, Commit, Decision, Fate, JobDetails, JobState, Location, Store,
+    unix_milliseconds,
 };
 use tempfile::TempDir;
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 use super::campaign::Small;
+use super::processes::{one_carrying_out, signal, wait_until};
 use super::{Running, calmwalk, program, succeed};
 
 /// A directory with `campaign.toml`, and the URL of the store if that is on a server.
@@ -100,6 +102,21 @@ impl Place {
     /// A job with its attempts.
     pub fn job(&self, candidate: &str) -> JobDetails {
         on_store(self.location(), async |store| store.queue_show(candidate).await.unwrap())
+    }
+
+    /// Waits until a job is leased; asks the store itself: to start the program for it may take longer than the label.
+    pub fn wait_for_lease(&self) {
+        let leased =
+            async |store: &Store| store.queue_list(Some(JobState::Leased), 1, 0).await.unwrap().len();
+        wait_until("a structure is leased", || on_store(self.location(), leased) == 1);
+    }
+
+    /// Stops the only labeller when it has something in hand; its process number.
+    pub fn hold_in_mid_label(&self) -> u32 {
+        let labeller = one_carrying_out(self.path(), "labeller");
+        self.wait_for_lease();
+        signal(labeller, "STOP");
+        labeller
     }
 
     /// Queues a structure whose label takes a second or more. Returns the name of its candidate.
