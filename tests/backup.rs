@@ -5,7 +5,7 @@ mod common;
 
 use std::fs;
 use std::path::Path;
-use std::time::Duration;
+use std::time::Instant;
 
 use common::campaign::{Small, outcome, outcome_at};
 use common::place::{Place, on_store};
@@ -75,10 +75,14 @@ fn a_killed_backup_leaves_nothing_that_looks_like_one() {
     let elsewhere = tempfile::tempdir().unwrap();
     let target = elsewhere.path().join("copy");
     let copy = target.display().to_string();
+    let begun = Instant::now();
+    succeed(place.path(), ["store", "backup", place.argument(), &copy]);
+    let takes = begun.elapsed();
+    fs::remove_dir_all(&target).unwrap();
     let (mut unfinished, mut whole) = (0, 0);
     for kill in 0..kills() {
         let mut backup = place.start(&["store", "backup", place.argument(), &copy]);
-        std::thread::sleep(Duration::from_millis(random(kill) % 500));
+        std::thread::sleep(takes.mul_f64((random(kill) % 1000) as f64 / 1000.0));
         backup.0.kill().unwrap();
         backup.0.wait().unwrap();
         if target.exists() {

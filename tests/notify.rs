@@ -71,12 +71,14 @@ fn the_end_is_told_once_with_the_state_of_the_campaign() {
 
 #[test]
 fn a_command_that_fails_or_hangs_is_a_line_in_the_log() {
-    for (last, words) in
-        [("echo no network >&2; exit 3", "no network"), ("sleep 1000", "not done after 0.5 s, and killed")]
-    {
+    for (last, limit, words) in [
+        ("echo no network >&2; exit 3", 60, "no network"),
+        ("exec sleep 1000", 3, "not done after 3 s, and killed"),
+    ] {
         let directory = tempfile::tempdir().unwrap();
         let here = directory.path();
-        write(here, &Small::default(), "on = [\"end\"]\ntime_limit = 0.5", ("", ""), last);
+        let notify = format!("on = [\"end\"]\ntime_limit = {limit}");
+        write(here, &Small::default(), &notify, ("", ""), last);
         succeed(here, RUN);
         assert_eq!(events(here), ["end"]);
         let log = operations(here, &["notified", "not_notified"]);
