@@ -1,5 +1,6 @@
 //! Clocks that are wrong by an hour, or jump by as much (NTP, a hand): nothing depends on them. libfaketime makes them wrong.
 
+use std::cell::Cell;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
@@ -11,7 +12,7 @@ use serde_json::Value;
 use crate::common::campaign::{Counters, Small, outcome};
 use crate::common::clock::Clock;
 use crate::common::hosts::{Hosts, started, undisturbed};
-use crate::common::processes::{carrying_out, nothing_is_left, signal, wait_until};
+use crate::common::processes::{carrying_out, go_on, hold_walkers, nothing_is_left, signal, wait_until};
 use crate::common::{calmwalk, random, through};
 
 #[test]
@@ -68,7 +69,9 @@ fn a_clock_that_jumps_changes_nothing_and_nobody_is_taken_for_dead() {
         let status = calmwalk(here, ["status", ".", "--json"]);
         let status: Value = serde_json::from_slice(&status.stdout).unwrap();
         for process in status["processes"].as_array().unwrap() {
-            assert!(process["state"] == "running" || process["state"] == "stopping", "{process}");
+            // One that was sent home is gone for a moment before its record is.
+            let state = process["state"].as_str().unwrap();
+            assert!(["running", "stopping", "gone"].contains(&state), "{process}");
             assert_eq!(process["restarts"], 0, "{process}");
         }
     });
@@ -80,10 +83,15 @@ fn a_clock_that_jumps_changes_nothing_and_nobody_is_taken_for_dead() {
 #[test]
 fn labellers_that_are_killed_while_the_clock_jumps_lose_and_double_nothing() {
     let small = Small { steps: 1600, per_seed: 16, ..Small::default() };
+    let killed = Cell::new(0);
     jumping(&small, |here, jump| {
-        let labellers = carrying_out(here, "labeller");
-        if jump % 2 == 0 && !labellers.is_empty() {
-            signal(labellers[0], "KILL");
+        // After one more it would be given up.
+        if jump % 2 == 0
+            && killed.get() < 5
+            && let Some(labeller) = carrying_out(here, "labeller").first()
+        {
+            signal(*labeller, "KILL");
+            killed.set(killed.get() + 1);
         }
     });
 }
@@ -98,9 +106,10 @@ fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
         seeds: &["fcc-100", "vacancy", "fcc-097"],
         ..Small::default()
     };
-    let mut hosts = Hosts::new(&small, 2, "agent_silence_limit = 5.0");
+    let mut hosts = Hosts::new(&small, 2, "agent_silence_limit = 60.0");
     let clocks = tempfile::tempdir().unwrap();
     let mut orchestrator = hosts.lead();
+    let held = hold_walkers(hosts.home.path(), 1);
     let mut agents = Vec::new();
     let mut set = Vec::new();
     for (host, offset) in ["+1h", "-1h"].into_iter().enumerate() {
@@ -114,6 +123,7 @@ fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
     for host in 0..2 {
         wait_until("it has joined", || hosts.said(host).contains("joined: 1 walkers"));
     }
+    go_on(&held);
     for jump in 0.. {
         set[jump % 2].set(["-1h", "+1h", "+0"][jump % 3]);
         sleep(Duration::from_millis(300));

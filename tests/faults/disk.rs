@@ -9,7 +9,7 @@ use tempfile::TempDir;
 
 use crate::common::campaign::{Counters, Small, outcome};
 use crate::common::hosts::{started, undisturbed};
-use crate::common::processes::{nothing_is_left, one_carrying_out, processes_in, wait_until};
+use crate::common::processes::{go_on, hold_walkers, nothing_is_left, processes_in, signal, wait_until};
 use crate::common::{Running, program, random, through};
 use crate::must;
 
@@ -76,9 +76,12 @@ fn a_full_disk_ends_a_run_and_loses_nothing() {
     for full in 0..2 {
         let mut run = disk.run();
         wait_until("the campaign advances", || Counters::of(".", &disk.at).sent > before.sent);
-        std::thread::sleep(Duration::from_millis(random(full) % 700));
+        std::thread::sleep(Duration::from_millis(random(full) % 200));
+        // It must not be over before the disk is full.
+        let held = hold_walkers(&disk.at, 2);
         before = Counters::of(".", &disk.at);
         disk.fill();
+        go_on(&held);
         assert_eq!(run.0.wait().unwrap().code(), Some(1));
         let said = disk.said();
         let words = "the disk is full: nothing was written, and what was committed before is safe; make space and start again";
@@ -115,10 +118,11 @@ fn shared_memory_that_others_fill_does_no_harm() {
     let said = here.join("said");
     let mut run = started(through(&starter, here).args(RUN), &said);
     wait_until("walkers are at work", || Counters::of(".", here).sent > 0);
+    let held = hold_walkers(here, 2);
     must(&format!("{inside} sh -c '! dd if=/dev/zero of=/dev/shm/filler bs=64k'"));
     // Those that are started now find it full.
-    let walker = one_carrying_out(here, "walker");
-    crate::common::processes::signal(walker, "KILL");
+    signal(held[0], "KILL");
+    go_on(&held);
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", fs::read_to_string(&said).unwrap());
     wait_until("every process is gone", || processes_in(here).is_empty());
     must(&format!("{inside} sh -c 'rm /dev/shm/filler && ! ls /dev/shm | grep ^cw-'"));

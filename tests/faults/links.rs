@@ -9,7 +9,7 @@ use crate::cable::{Cable, HEAD, NODE};
 use crate::common::Running;
 use crate::common::campaign::{Counters, Outcome, Small, outcome};
 use crate::common::hosts::{Hosts, undisturbed};
-use crate::common::processes::{carrying_out, one_carrying_out, signal, wait_until};
+use crate::common::processes::{carrying_out, go_on, hold_walkers, wait_until};
 use crate::must;
 
 /// Three walks side by side: one for the orchestrator's own walker, two for the agent.
@@ -53,12 +53,13 @@ impl Linked {
     }
 
     fn are_at_work(&self) {
-        let works = |path: &Path| !carrying_out(path, "walker").is_empty();
-        wait_until("both hosts are at work", || {
-            works(self.hosts.home.path())
-                && works(self.hosts.others[0].path())
-                && self.counters().accepted > 0
+        // It does not end the campaign before the other host has joined.
+        let held = hold_walkers(self.hosts.home.path(), 1);
+        wait_until("the other host is at work", || {
+            !carrying_out(self.hosts.others[0].path(), "walker").is_empty()
         });
+        go_on(&held);
+        wait_until("structures are found", || self.counters().accepted > 0);
     }
 
     fn counters(&self) -> Counters {
@@ -123,13 +124,12 @@ fn cut_for_a_minute() {
     let handed_on = linked.counters();
     wait_until("they go on elsewhere", || linked.counters().sent > handed_on.sent);
     // So that there is something left to do for the host that comes back.
-    let walker = one_carrying_out(linked.hosts.home.path(), "walker");
-    signal(walker, "STOP");
+    let held = hold_walkers(linked.hosts.home.path(), 1);
     sleep(Duration::from_secs(60).saturating_sub(begun.elapsed()));
     linked.cable.mend();
     wait_until("the agent is back", || linked.agent_says("the orchestrator answers again"));
-    wait_until("it joins anew", || linked.hosts.head_said().matches("): joined").count() == 2);
-    signal(walker, "CONT");
+    wait_until("it joins anew", || linked.hosts.head_said().matches("): joined").count() >= 2);
+    go_on(&held);
     let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
 }

@@ -7,7 +7,7 @@ use crate::common::campaign::{Small, outcome};
 use crate::common::config;
 use crate::common::hosts::{Hosts, undisturbed};
 use crate::common::line::SlowLine;
-use crate::common::processes::{carrying_out, one_carrying_out, signal, wait_until};
+use crate::common::processes::{carrying_out, go_on, hold_walkers, signal, wait_until};
 
 /// Long enough to kill somebody while a question is on its way.
 const DELAY: Duration = Duration::from_secs(1);
@@ -31,22 +31,18 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     hosts.endpoints[1] = format!("tcp/{}", line.here);
 
     // So that there is something left to do for the host that comes, and comes back.
-    let held = || {
-        let walker = one_carrying_out(hosts.home.path(), "walker");
-        signal(walker, "STOP");
-        walker
-    };
+    let hold = || hold_walkers(hosts.home.path(), 1);
     let mut orchestrator = hosts.lead();
-    held();
+    hold();
     let mut agent = hosts.agent(0);
     wait_until("the agent asks for the model", || hosts.said(0).contains("fetching the model"));
     signal(orchestrator.0.id(), "KILL");
     orchestrator.0.wait().unwrap();
     wait_until("its walker is gone", || carrying_out(hosts.home.path(), "walker").is_empty());
     let mut orchestrator = hosts.lead();
-    let walker = held();
+    let held = hold();
     wait_until("the agent has joined it", || hosts.said(0).contains("joined: 1 walkers"));
-    signal(walker, "CONT");
+    go_on(&held);
     assert!(hosts.said(0).contains("joining anew"), "{}", hosts.said(0));
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
