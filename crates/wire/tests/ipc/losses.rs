@@ -7,7 +7,7 @@ use wire::place::Place;
 use wire::transport::Incoming;
 
 use crate::desk::{Desk, check, files_of, work};
-use crate::process::{Role, start};
+use crate::process::{AT_WORK, Role, start};
 
 fn kill(child: &mut Child) {
     child.kill().unwrap();
@@ -40,8 +40,10 @@ async fn a_slow_decision_is_waited_for() {
     let mut desk = Desk::open(directory.path(), 1, 1 << 16);
     let mut walker = desk.start(0, 1, Role::Walker);
     let first = desk.offer().await;
-    tokio::time::sleep(Duration::from_secs(5)).await;
-    assert!(desk.heard.lock().unwrap().len() >= 3, "an offer and two questions: signs of life");
+    // An offer and two questions: signs of life.
+    while desk.heard.lock().unwrap().len() < 3 {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
     assert!(desk.incoming.try_recv().is_err(), "nothing is offered twice");
     let last = desk.go_on(first, 1, (3, 4)).await;
     last.reply.send(None).unwrap();
@@ -119,10 +121,11 @@ async fn a_killed_orchestrator_leaves_nothing_that_matters() {
     let place = Place::of(directory.path()).unwrap();
     for _ in 0..2 {
         let mut dead = start(&Role::Orchestrator(directory.path().to_str().unwrap().to_owned()));
-        while files_of(&place).len() < SERVER_FILES + 4 {
+        while !directory.path().join(AT_WORK).exists() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
         kill(&mut dead);
+        std::fs::remove_file(directory.path().join(AT_WORK)).unwrap();
     }
     let left = place.prepare(0).unwrap().removed;
     assert!(left.files > 20 && left.bytes > 50_000, "{left:?}");

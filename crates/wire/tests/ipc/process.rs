@@ -18,6 +18,8 @@ use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 use crate::desk::Desk;
 
 const ROLE: &str = "CALMWALK_TEST_ROLE";
+/// What [`Role::Orchestrator`] makes in its directory when a turn is done.
+pub const AT_WORK: &str = "at-work";
 
 /// What a process is to be.
 #[derive(Serialize, Deserialize)]
@@ -79,6 +81,9 @@ fn orchestrate(directory: &str) {
         let mut last = desk.offer().await;
         for turn in 1.. {
             last = desk.go_on(last, turn, (2, 3)).await;
+            if turn == 1 {
+                std::fs::write(Path::new(directory).join(AT_WORK), "").unwrap();
+            }
         }
     });
 }

@@ -100,10 +100,16 @@ impl Head {
         timeout(LIMIT, self.task).await.expect("in time").unwrap().unwrap();
     }
 
-    /// Ends at once, as a process that is killed.
+    /// Ends at once, as a process that is killed; another may listen in its place then.
     pub async fn kill(self) -> u16 {
         self.task.abort();
         let _ = self.task.await;
+        let free = async {
+            while TcpListener::bind(("127.0.0.1", self.port)).is_err() {
+                sleep(Duration::from_millis(10)).await;
+            }
+        };
+        timeout(LIMIT, free).await.expect("nobody listens any more");
         self.port
     }
 }

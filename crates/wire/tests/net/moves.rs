@@ -13,7 +13,11 @@ use crate::head::{Head, LIMIT, Wanted, agent, endpoint, report, work};
 async fn an_agent_follows_the_orchestrator_to_another_endpoint() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("endpoint");
-    let write = |announcement: Announcement| fs::write(&path, announcement.to_string()).unwrap();
+    // At once, as a reader sees it.
+    let write = |announcement: Announcement| {
+        fs::write(path.with_extension("new"), announcement.to_string()).unwrap();
+        fs::rename(path.with_extension("new"), &path).unwrap();
+    };
     let address = Address::In(path.clone());
     // Before it has been anywhere the agent waits.
     let (why, whys) = std::sync::mpsc::channel();

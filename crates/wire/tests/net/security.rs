@@ -94,16 +94,17 @@ async fn only_who_has_a_certificate_of_the_campaign_takes_part() {
     let tls = |folder: usize, name: &str| Tls::in_directory(&folders[folder].path().join(name));
     let head = Head::open(Wanted { tls: Some(tls(0, "localhost")), ..Wanted::default() }).await;
     let endpoint = format!("tcp/localhost:{}", head.port).parse().unwrap();
-    let join = async |tls: Option<Tls>| {
-        let (agent, patience) = (agent("a", 1), Duration::from_secs(4));
-        let uplink = timeout(patience, Uplink::open(&endpoint, tls.as_ref(), agent, |_| {})).await.ok()?;
+    let join = async |tls: Option<Tls>, patience: Duration| {
+        let opening = Uplink::open(&endpoint, tls.as_ref(), agent("a", 1), |_| {});
+        let uplink = timeout(patience, opening).await.ok()?;
         let uplink = Arc::new(uplink.ok()?);
         let joined = timeout(patience, uplink.join()).await.ok()?;
         Some((uplink, joined.unwrap()))
     };
-    assert!(join(None).await.is_none(), "no certificate");
-    assert!(join(Some(tls(1, "localhost"))).await.is_none(), "one of another authority");
-    let (_uplink, joined) = join(Some(tls(0, "node1"))).await.expect("one of this authority");
+    let a_while = Duration::from_secs(4);
+    assert!(join(None, a_while).await.is_none(), "no certificate");
+    assert!(join(Some(tls(1, "localhost")), a_while).await.is_none(), "one of another authority");
+    let (_uplink, joined) = join(Some(tls(0, "node1")), LIMIT).await.expect("one of this authority");
     joined.leave().await;
     head.close().await;
 }
