@@ -92,8 +92,8 @@ async fn labellers_whose_clocks_are_an_hour_apart_respect_each_other() {
         ProcessRecord { birth: format!("{place}0/{ticks}"), ..here }
     };
     assert!(store.renew(&slow, now - HOUR, 1).await.unwrap());
-    store.upsert_process(&elsewhere("slow", now + HOUR)).await.unwrap();
     let begun = Instant::now();
+    store.upsert_process(&elsewhere("slow", now + HOUR)).await.unwrap();
     let again = loop {
         if let Some(lease) = lease(&store, "fast", now - HOUR, 1).await {
             break lease;
@@ -128,7 +128,7 @@ async fn whoever_waits_is_told_of_new_jobs() {
     let store = with_jobs(&home, 1).await;
     let long = Duration::from_secs(60);
     // Until it listens.
-    store.wait_for_jobs(Duration::from_secs(1)).await;
+    store.wait_for_jobs(long).await;
     let (waiting, begun) = (store.clone(), Instant::now());
     let wait = tokio::spawn(async move { waiting.wait_for_jobs(long).await });
     tokio::time::sleep(Duration::from_millis(100)).await;
