@@ -211,7 +211,8 @@ async fn a_process_that_says_nothing_from_its_start_is_killed() {
 
 #[tokio::test]
 async fn a_stopped_process_is_killed_and_started_again() {
-    let silence = Duration::from_secs(1);
+    const BEATS: u32 = 75;
+    let silence = Duration::from_secs(3);
     let beat = "while :; do echo alive >&2; sleep 0.05; done";
     let launch = move |_, _| Launch::shell(beat);
     let mut children = Children::new(1, Limits { silence, ..LIMITS }, launch);
@@ -224,12 +225,12 @@ async fn a_stopped_process_is_killed_and_started_again() {
                 beats += 1;
                 children.signs().heard(0);
                 // After more than the time of silence: it lives as long as it speaks.
-                if beats == 25 {
+                if beats == BEATS {
                     signal(first, Signal::STOP);
                 }
             }
             Event::Ended { ended, .. } => {
-                assert!(beats >= 25, "killed while it spoke");
+                assert!(beats >= BEATS, "killed while it spoke");
                 assert_eq!(ended.ending, Ending::Silent(silence));
                 assert!(!Path::new(&format!("/proc/{first}")).exists());
             }
@@ -247,7 +248,7 @@ async fn a_stop_ends_those_that_obey_and_kills_those_that_do_not() {
         "trap '' TERM; echo ready >&2; while :; do sleep 0.02; done",
         "echo ready >&2; exec sleep 1000",
     ];
-    let grace = Duration::from_millis(500);
+    let grace = Duration::from_secs(3);
     let mut children = children(&SCRIPTS, Limits { grace, ..LIMITS });
     let (mut ready, mut last) = (0, 0);
     while ready < SCRIPTS.len() {
