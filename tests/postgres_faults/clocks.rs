@@ -9,7 +9,7 @@ use crate::common::campaign::{Small, outcome_at};
 use crate::common::clock::Clock;
 use crate::common::hosts::undisturbed;
 use crate::common::place::Place;
-use crate::common::processes::{carrying_out, one_carrying_out, signal, wait_until};
+use crate::common::processes::{carrying_out, signal, wait_until};
 use crate::common::{random, through};
 
 /// `calmwalk label` with this clock on another host, as far as one can show it: with process numbers of its own, and
@@ -70,9 +70,7 @@ fn a_lease_lasts_however_late_others_think_it_is() {
     let name = place.queue_large();
     let [ahead, behind] = clocks(&place);
     let mut first = label(&place, &behind);
-    wait_until("the structure is leased", || place.jobs("leased") == 1);
-    let slot = one_carrying_out(place.path(), "labeller");
-    signal(slot, "STOP");
+    let slot = place.hold_in_mid_label();
     assert_eq!(place.jobs("leased"), 1, "it was stopped too late: {}", place.said());
     let mut second = label(&place, &ahead);
     wait_until("another looks", || carrying_out(place.path(), "labeller").len() == 2);

@@ -18,7 +18,7 @@ struct Killed {
 
 impl Killed {
     fn new(small: &Small, name: &str) -> Self {
-        let campaign = Campaign::new(small, name, 2);
+        let campaign = Campaign::new(small, name, 2, "agent_silence_limit = 0.5");
         let orchestrator = campaign.hosts.lead();
         let agents = [campaign.hosts.agent(0), campaign.hosts.agent(1)];
         Self { campaign, orchestrator, agents }

@@ -19,7 +19,7 @@ fn long() -> Small {
 fn restarts_change_nothing() {
     let small = long();
     let expected = undisturbed(&small);
-    let campaign = Campaign::new(&small, "restarts", 1);
+    let campaign = Campaign::new(&small, "restarts", 1, "");
     let (mut orchestrator, mut agent) = (campaign.hosts.lead(), campaign.hosts.agent(0));
     let mut before = campaign.counters();
     for restart in 0..4 {
@@ -44,7 +44,7 @@ fn restarts_change_nothing() {
 fn restarts_change_nothing_in_one_process() {
     let small = long();
     let expected = undisturbed(&small);
-    let mut campaign = Campaign::new(&small, "one", 0);
+    let mut campaign = Campaign::new(&small, "one", 0, "");
     campaign.hosts.listens = false;
     campaign.hosts.options[0] = vec!["--in-process".into()];
     let mut orchestrator = campaign.hosts.lead();
@@ -63,7 +63,7 @@ fn restarts_change_nothing_in_one_process() {
 fn a_server_that_is_away_for_a_minute_is_waited_for() {
     let small = long();
     let expected = undisturbed(&small);
-    let campaign = Campaign::new(&small, "away", 1);
+    let campaign = Campaign::new(&small, "away", 1, "");
     let (mut orchestrator, mut agent) = (campaign.hosts.lead(), campaign.hosts.agent(0));
     wait_until("labels are made", || campaign.counters().labels > 0);
     let before = campaign.counters();

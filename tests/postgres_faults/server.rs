@@ -30,9 +30,10 @@ pub struct Campaign {
 }
 
 impl Campaign {
-    pub fn new(small: &Small, name: &str, others: usize) -> Self {
+    /// With these keys in the section `[run]` besides.
+    pub fn new(small: &Small, name: &str, others: usize, keys: &str) -> Self {
         let location = location(name);
-        let keys = format!("store = \"{location}\"\nagent_silence_limit = 0.5");
+        let keys = format!("store = \"{location}\"\n{keys}");
         Self { hosts: Hosts::new(small, others, &keys), location }
     }
 
