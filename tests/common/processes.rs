@@ -70,7 +70,7 @@ pub fn go_on(held: &[u32]) {
 pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !is_so() {
-        assert!(begun.elapsed() < Duration::from_secs(120), "waited in vain until {what}");
+        assert!(begun.elapsed() < Duration::from_secs(300), "waited in vain until {what}");
         std::thread::sleep(Duration::from_millis(20));
     }
 }
