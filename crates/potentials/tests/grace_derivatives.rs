@@ -10,7 +10,7 @@ use std::sync::Arc;
 use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
 use common::{assert_close, check_forces, check_virial, position_gradient, strain_gradient};
 use golden::committed;
-use potentials::grace::{Architecture, Grace, GraceModel, PullBack, RadialPath};
+use potentials::grace::{Architecture, Grace, GraceModel, Instructions, PullBack, RadialPath};
 
 fn model(name: &str, path: RadialPath) -> Arc<GraceModel> {
     let file = match name {
@@ -152,6 +152,11 @@ fn check_bits(model: Arc<GraceModel>, structure: &Structure, other: &Structure) 
     for skin in [0.0, 0.3, 1.1] {
         assert_eq!(run(&mut used, skin), first);
         assert_eq!(run(&mut Grace::new(model.clone()), skin), first);
+    }
+    for instructions in Instructions::all() {
+        let mut grace = Grace::with_instructions(model.clone(), instructions);
+        assert_eq!(run(&mut grace, 0.0), first, "{instructions:?}");
+        assert_eq!(common::evaluate(&mut grace, structure), first.1, "{instructions:?}");
     }
 }
 

@@ -1,14 +1,11 @@
 //! Puts a model together from its layers.
 
-use std::ops::Range;
-
 use atoms::Species;
 use npz::Archive;
 
 use super::error::{GraceError, mismatch};
 use super::globals::refuse_left_over;
 use super::layer::{Layer, LayerDraft};
-use super::matrix::LANES;
 use super::model::{Architecture, GraceDescription, GraceModel};
 use super::networks::readout;
 use super::projection::{Projection, ProjectionMaps, rows_of_projection};
@@ -41,13 +38,7 @@ impl Draft<'_> {
         let messages = messages.into_iter().chain([None]);
         let layers: Vec<Layer> =
             self.layers.into_iter().zip(messages).map(|(layer, message)| layer.finish(message)).collect();
-        let mut end = 0;
-        let ends = layers.iter().map(|layer| {
-            end += layer.basis.lanes();
-            end
-        });
-        let basis_ends = ends.collect();
-        Ok(GraceModel { elements: self.elements, layers, basis_ends, readout, projection, description })
+        Ok(GraceModel { elements: self.elements, layers, readout, projection, description })
     }
 
     fn describe(
@@ -82,21 +73,14 @@ fn basis_dimension(sources: &[Vec<(usize, usize)>]) -> usize {
     sources.iter().flatten().map(|(components, channels)| components * channels).sum()
 }
 
-/// The row of the projection matrix for each place of the padded basis, in which the layers follow one
-/// another, and the lanes of the blocks in the file's order.
-fn places(sources: &[Vec<(usize, usize)>], block_order: &[usize]) -> (Vec<Option<usize>>, Vec<Range<usize>>) {
+/// The row of the projection matrix for each place of the padded basis of each layer.
+fn places(sources: &[Vec<(usize, usize)>], block_order: &[usize]) -> Vec<Vec<Option<usize>>> {
     let (mut firsts, mut first) = (vec![0; sources.len()], 0);
     for layer in block_order {
         firsts[*layer] = first;
         first += basis_dimension(&sources[*layer..=*layer]);
     }
-    let (mut rows, mut of_layers) = (Vec::new(), Vec::new());
-    for (first, sources) in firsts.into_iter().zip(sources) {
-        let start = rows.len() / LANES;
-        rows.extend(rows_of_projection(first, sources));
-        of_layers.push(start..rows.len() / LANES);
-    }
-    (rows, block_order.iter().map(|layer| of_layers[*layer].clone()).collect())
+    firsts.into_iter().zip(sources).map(|(first, sources)| rows_of_projection(first, sources)).collect()
 }
 
 /// The feature map, if the file holds one. `sources` are those of each layer's basis, `block_order` the layers in the
@@ -128,8 +112,9 @@ fn projection(
             format!("{expected}, which its flags mean"),
         ));
     }
-    let (rows, blocks) = places(sources, block_order);
-    let maps = ProjectionMaps::new(&matrix, dimension, &rows);
+    let layers = places(sources, block_order);
+    let maps = layers.iter().map(|rows| ProjectionMaps::new(&matrix, dimension, rows)).collect();
+    let blocks = block_order.to_vec();
     let density_scale = archive.scalar_or("uq_rp_density_scale", 1.0)? as f32;
     let projection =
         Projection { matrix, dimension, normalize, density_channels, density_scale, asinh, blocks, maps };

@@ -3,11 +3,14 @@
 //!
 //! A_a,lm,n = Σ_j R_nl(r) Y_lm(v) ζ_n(μ_j), with d = r_j − r_a, r = √(d·d + 10⁻¹⁰) and v = d / r.
 
+use std::ops::Range;
+
 use atoms::{NeighbourList, Structure, Vec3};
 
 use super::layer::Layer;
 use super::matrix::{LANES, Lanes, ZERO, add_product, add_scaled, product};
 use super::radial_network::RadialWork;
+use super::tape::Slot;
 
 /// Keeps r differentiable at d = 0, Å².
 const SQUARE_FLOOR: f64 = 1e-10;
@@ -25,14 +28,16 @@ pub(super) struct Bond {
     pub r: f64,
 }
 
-/// The bonds of all atoms, in the order of the neighbour list, and what the forward pass leaves of them for
-/// the reverse sweep.
+/// The bonds of all atoms, those of an atom in the order of the neighbour list, and what the forward pass leaves of them
+/// for the reverse sweep. Atoms stand in the order in which they are evaluated.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Bonds {
     pub offsets: Vec<usize>,
     pub bonds: Vec<Bond>,
     /// First block of eight bonds of each atom.
     pub block_offsets: Vec<usize>,
+    /// The first block that `values` and `derivatives` hold.
+    first_block: usize,
     /// R_nl ζ_n, \[block\]\[l\]\[channel\]\[bond\]; in later layers R_nl, \[block\]\[bond\]\[l\]\[channel\].
     pub values: Vec<Lanes>,
     /// The same of dR_nl/dr.
@@ -47,6 +52,7 @@ impl Bonds {
         structure: &Structure,
         neighbours: &NeighbourList,
         elements: &[usize],
+        order: &[u32],
     ) {
         self.offsets.clear();
         self.offsets.push(0);
@@ -54,22 +60,40 @@ impl Bonds {
         self.block_offsets.push(0);
         self.bonds.clear();
         let mut blocks = 0;
-        for (i, centre) in elements.iter().enumerate() {
+        for (place, i) in order.iter().map(|i| *i as usize).enumerate() {
+            let centre = elements[i];
             for neighbour in neighbours.of(i) {
                 let element = elements[neighbour.atom as usize];
                 let d = neighbour.displacement(structure, i);
                 let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + SQUARE_FLOOR).sqrt();
-                if r < layer.radial.cutoff(layer.radial.pair(*centre, element)) {
+                if r < layer.radial.cutoff(layer.radial.pair(centre, element)) {
                     self.bonds.push(Bond { neighbour: neighbour.atom, element: element as u32, d, r });
                 }
             }
-            blocks += (self.bonds.len() - self.offsets[i]).div_ceil(LANES);
+            blocks += (self.bonds.len() - self.offsets[place]).div_ceil(LANES);
             self.offsets.push(self.bonds.len());
             self.block_offsets.push(blocks);
         }
-        let lanes = LANES * layer.radial.output_lanes();
-        self.values.resize(blocks * lanes, ZERO);
-        self.derivatives.resize(blocks * lanes, ZERO);
+    }
+
+    /// Makes room for the values of the atoms at some places, and forgets others.
+    pub fn hold(&mut self, layer: &Layer, places: Range<usize>) {
+        self.first_block = self.block_offsets[places.start];
+        let lanes = (self.block_offsets[places.end] - self.first_block) * LANES * layer.radial.output_lanes();
+        if self.values.len() < lanes {
+            self.values.resize(lanes, ZERO);
+            self.derivatives.resize(lanes, ZERO);
+        }
+    }
+
+    /// The bonds of the atom at a place, eight at a time, with the lanes where their values are.
+    #[inline(always)]
+    pub fn blocks(&self, place: usize, layer: &Layer) -> impl Iterator<Item = (&[Bond], Range<usize>)> {
+        let (lanes, first) =
+            (LANES * layer.radial.output_lanes(), self.block_offsets[place] - self.first_block);
+        let bonds = &self.bonds[self.offsets[place]..self.offsets[place + 1]];
+        let range = move |block: usize| block * lanes..(block + 1) * lanes;
+        bonds.chunks(LANES).enumerate().map(move |(k, bonds)| (bonds, range(first + k)))
     }
 }
 
@@ -167,29 +191,30 @@ pub(super) fn directions(bonds: &[Bond]) -> ([Lanes; 3], Lanes) {
 }
 
 impl Bonds {
-    /// Adds the bonds of atom `i` of element `centre` to its density, \[lm\]\[channel\].
+    /// Adds the bonds of the atom at a place, of element `centre`, to its density, \[lm\]\[channel\].
     #[inline(always)]
     pub fn accumulate(
         &mut self,
-        i: usize,
+        place: usize,
         layer: &Layer,
         centre: usize,
-        density: &mut [Lanes],
+        (density, slot): (&mut [Lanes], Slot),
         work: &mut BondWork,
     ) {
-        let (lanes, first) = (layer.radial.output_lanes(), self.block_offsets[i]);
-        for (k, bonds) in self.bonds[self.offsets[i]..self.offsets[i + 1]].chunks(LANES).enumerate() {
+        let (mut values, mut derivatives) =
+            (std::mem::take(&mut self.values), std::mem::take(&mut self.derivatives));
+        for (bonds, block) in self.blocks(place, layer) {
             let (v, r) = directions(bonds);
             layer.harmonics.evaluate::<false>(&v, &mut work.harmonics, &mut work.gradients);
             work.radial(layer, centre, bonds, &r);
-            let block = (first + k) * LANES * lanes..(first + k + 1) * LANES * lanes;
-            transpose(&work.values, &mut self.values[block.clone()]);
-            transpose(&work.derivatives, &mut self.derivatives[block]);
-            add_eight(layer, density, work);
+            transpose(&work.values, &mut values[block.clone()]);
+            transpose(&work.derivatives, &mut derivatives[block]);
+            add_eight(layer, density, slot, work);
         }
+        (self.values, self.derivatives) = (values, derivatives);
     }
 
-    /// ∂/∂d of Σ A·Ā for each bond of atom `i` and for `N` cotangents Ā of its density at once, handed to
+    /// ∂/∂d of Σ A·Ā for each bond of the atom at a place and for `N` cotangents Ā of its density at once, handed to
     /// `sink` bond by bond.
     ///
     /// With c_lm = Σ_n Ā_lm,n R_nl ζ_n and c′_lm from dR/dr it is g v + (G − (G·v) v)/r, where
@@ -197,21 +222,19 @@ impl Bonds {
     #[inline(always)]
     pub fn reverse<const N: usize>(
         &self,
-        i: usize,
+        place: usize,
         layer: &Layer,
-        cotangents: [&[Lanes]; N],
+        (cotangent, slots): (&[Lanes], [Slot; N]),
         work: &mut BondWork,
         mut sink: impl FnMut(&Bond, [Vec3; N]),
     ) {
-        let (lanes, first) = (layer.radial.output_lanes(), self.block_offsets[i]);
-        for (k, bonds) in self.bonds[self.offsets[i]..self.offsets[i + 1]].chunks(LANES).enumerate() {
+        for (bonds, block) in self.blocks(place, layer) {
             let (v, r) = directions(bonds);
             layer.harmonics.evaluate::<true>(&v, &mut work.harmonics, &mut work.gradients);
-            let block = (first + k) * LANES * lanes..(first + k + 1) * LANES * lanes;
             let radial = (&self.values[block.clone()], &self.derivatives[block]);
             let mut gradients = [[ZERO; 3]; N];
-            for (gradient, cotangent) in gradients.iter_mut().zip(cotangents) {
-                *gradient = gradient_of_eight(layer, &v, &r, cotangent, radial, work);
+            for (gradient, slot) in gradients.iter_mut().zip(slots) {
+                *gradient = gradient_of_eight(layer, &v, &r, (cotangent, slot), radial, work);
             }
             for (b, bond) in bonds.iter().enumerate() {
                 sink(bond, gradients.map(|gradient| gradient.map(|axis| axis[b])));
@@ -222,14 +245,14 @@ impl Bonds {
 
 /// A_lm,n += Σ_b Y_lm(v_b) R_nl(r_b) ζ_n over eight bonds.
 #[inline(always)]
-fn add_eight(layer: &Layer, density: &mut [Lanes], work: &BondWork) {
+fn add_eight(layer: &Layer, density: &mut [Lanes], slot: Slot, work: &BondWork) {
     let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
-    let mut rows = density.chunks_exact_mut(width).zip(&work.harmonics);
     for l in 0..=layer.harmonics.lmax() {
-        for (row, y) in rows.by_ref().take(2 * l + 1) {
+        for lm in l * l..(l + 1) * (l + 1) {
+            let row = &mut density[slot.row(&layer.density, lm)..][..width];
             for (c, sum) in row.iter_mut().enumerate() {
                 let mut density = *sum;
-                for (y, values) in y.iter().zip(work.values.chunks_exact(lanes)) {
+                for (y, values) in work.harmonics[lm].iter().zip(work.values.chunks_exact(lanes)) {
                     add_scaled(&mut density, *y, &values[l * width + c]);
                 }
                 *sum = density;
@@ -243,24 +266,24 @@ fn gradient_of_eight(
     layer: &Layer,
     v: &[Lanes; 3],
     r: &Lanes,
-    cotangent: &[Lanes],
+    (cotangent, slot): (&[Lanes], Slot),
     (values, derivatives): (&[Lanes], &[Lanes]),
     work: &BondWork,
 ) -> [Lanes; 3] {
     let (width, channels) = (layer.density.width, layer.density.channels);
     let (mut along, mut across) = (ZERO, [ZERO; 3]);
-    let mut functions = cotangent.chunks_exact(width).zip(work.harmonics.iter().zip(&work.gradients));
     let orders = values.chunks_exact(width * LANES).zip(derivatives.chunks_exact(width * LANES));
     for (l, (values, derivatives)) in orders.enumerate() {
-        for (row, (y, gradient)) in functions.by_ref().take(2 * l + 1) {
+        for lm in l * l..(l + 1) * (l + 1) {
+            let row = &cotangent[slot.row(&layer.density, lm)..][..width];
             let (mut c, mut c_prime) = (ZERO, ZERO);
-            let row = &row.as_flattened()[..channels];
-            for ((a, value), derivative) in row.iter().zip(values).zip(derivatives) {
+            for ((a, value), derivative) in row.as_flattened()[..channels].iter().zip(values).zip(derivatives)
+            {
                 add_scaled(&mut c, *a, value);
                 add_scaled(&mut c_prime, *a, derivative);
             }
-            add_product(&mut along, y, &c_prime);
-            for (across, gradient) in across.iter_mut().zip(gradient) {
+            add_product(&mut along, &work.harmonics[lm], &c_prime);
+            for (across, gradient) in across.iter_mut().zip(&work.gradients[lm]) {
                 add_product(across, gradient, &c);
             }
         }

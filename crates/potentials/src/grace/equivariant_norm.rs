@@ -1,7 +1,7 @@
 //! The normalisation of an equivariant tensor before it is sent to neighbours.
 
 use super::matrix::{LANES, Lanes, add_product, add_scaled, horizontal_sum, product, scaled};
-use super::tape::Tensor;
+use super::tape::{Slot, Tensor};
 
 /// y_w,n = a_w,n x′_w,n / √(mean_n Σ_w d_w x′² + ε), where x′ is x, or x without its mean over channels in the
 /// components that do not change under rotation.
@@ -24,9 +24,11 @@ pub(super) struct EquivariantNorm {
 impl EquivariantNorm {
     /// Rows of x with the mean over channels that is taken away.
     #[inline(always)]
-    fn rows<'a>(&'a self, x: &'a [Lanes]) -> impl Iterator<Item = (usize, &'a [Lanes], f64)> {
-        let rows = x[self.from.start..self.from.end()].chunks_exact(self.from.width);
-        rows.zip(&self.centred).enumerate().map(|(w, (row, centred))| (w, row, centred * self.mean(row)))
+    fn rows<'a>(&'a self, x: &'a [Lanes], slot: Slot) -> impl Iterator<Item = (usize, &'a [Lanes], f64)> {
+        self.centred.iter().enumerate().map(move |(w, centred)| {
+            let row = &x[slot.row(&self.from, w)..][..self.from.width];
+            (w, row, centred * self.mean(row))
+        })
     }
 
     /// Mean over channels.
@@ -46,9 +48,9 @@ impl EquivariantNorm {
 
     /// (mean_n Σ_w d_w x′² + ε)^(−1/2)
     #[inline(always)]
-    fn inverse(&self, tape: &[Lanes]) -> f64 {
+    fn inverse(&self, tape: &[Lanes], slot: Slot) -> f64 {
         let mut square = 0.0;
-        for (w, row, mean) in self.rows(tape) {
+        for (w, row, mean) in self.rows(tape, slot) {
             let mut sum = [0.0; LANES];
             for (c, x) in row.iter().enumerate() {
                 let x = self.centre(x, mean, c);
@@ -60,45 +62,54 @@ impl EquivariantNorm {
     }
 
     #[inline(always)]
-    pub fn forward(&self, tape: &mut [Lanes]) {
-        let inverse = self.inverse(tape);
-        let (before, out) = tape.split_at_mut(self.to.start);
-        for (w, row, mean) in self.rows(before) {
-            for (c, x) in row.iter().enumerate() {
-                let place = w * self.to.width + c;
-                let x = scaled(inverse, &self.centre(x, mean, c));
-                out[place] = product(&x, &self.affine[place]);
+    pub fn forward(&self, atoms: usize, tape: &mut [Lanes]) {
+        let (before, out) = tape.split_at_mut(self.to.start * atoms);
+        for slot in (0..atoms).map(|slot| Slot { slot, slots: atoms }) {
+            let inverse = self.inverse(before, slot);
+            for (w, row, mean) in self.rows(before, slot) {
+                let first = slot.row(&self.to, w) - self.to.start * atoms;
+                for (c, x) in row.iter().enumerate() {
+                    let x = scaled(inverse, &self.centre(x, mean, c));
+                    out[first + c] = product(&x, &self.affine[w * self.to.width + c]);
+                }
             }
         }
     }
 
-    /// Adds to the cotangent of x: with the inverse root i,
+    /// Adds to the cotangents of x: with the inverse root i,
     /// x̄′ = i a ȳ − i³ d_w x′/n_channels Σ a ȳ x′, from which the mean over channels is taken away as it was from x.
     #[inline(always)]
-    pub fn backward(&self, tape: &[Lanes], cotangent: &mut [Lanes]) {
-        let inverse = self.inverse(tape);
-        let (before, out) = cotangent.split_at_mut(self.to.start);
+    pub fn backward<const N: usize>(&self, atoms: usize, tape: &[Lanes], cotangent: &mut [Lanes]) {
+        for k in 0..N * atoms {
+            let of_tape = Slot { slot: k % atoms, slots: atoms };
+            self.backward_one(tape, of_tape, cotangent, Slot { slot: k, slots: N * atoms });
+        }
+    }
+
+    #[inline(always)]
+    fn backward_one(&self, tape: &[Lanes], of_tape: Slot, cotangent: &mut [Lanes], slot: Slot) {
+        let inverse = self.inverse(tape, of_tape);
         let mut along = [0.0; LANES];
-        for (w, row, mean) in self.rows(tape) {
+        for (w, row, mean) in self.rows(tape, of_tape) {
+            let out = &cotangent[slot.row(&self.to, w)..];
             for (c, x) in row.iter().enumerate() {
-                let place = w * self.to.width + c;
-                let ay = product(&out[place], &self.affine[place]);
+                let ay = product(&out[c], &self.affine[w * self.to.width + c]);
                 add_product(&mut along, &ay, &self.centre(x, mean, c));
             }
         }
         let along = horizontal_sum(&along) * inverse.powi(3) / self.from.channels as f64;
-        for (w, row, mean) in self.rows(tape) {
-            let first = self.from.row(w);
+        for (w, row, mean) in self.rows(tape, of_tape) {
+            let (first, out) = (slot.row(&self.from, w), slot.row(&self.to, w));
             let mut sum = 0.0;
             for (c, x) in row.iter().enumerate() {
-                let place = w * self.to.width + c;
-                let mut of_x = scaled(inverse, &product(&out[place], &self.affine[place]));
+                let ay = product(&cotangent[out + c], &self.affine[w * self.to.width + c]);
+                let mut of_x = scaled(inverse, &ay);
                 add_scaled(&mut of_x, -along * self.degree_weights[w], &self.centre(x, mean, c));
                 sum += horizontal_sum(&of_x);
-                add_scaled(&mut before[first + c], 1.0, &of_x);
+                add_scaled(&mut cotangent[first + c], 1.0, &of_x);
             }
             let mean = self.centred[w] * sum / self.from.channels as f64;
-            for (c, x) in before[first..first + self.from.width].iter_mut().enumerate() {
+            for (c, x) in cotangent[first..first + self.from.width].iter_mut().enumerate() {
                 *x = self.centre(x, mean, c);
             }
         }

@@ -4,11 +4,13 @@ use std::sync::Arc;
 
 use atoms::{Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
 
-use super::layer_work::{BasisCotangents, LayerWork};
-use super::matrix::{Lanes, ZERO};
+use super::batches::{Batches, Placed};
+use super::instructions::{Instructions, Pass};
+use super::layer::{Layer, Message};
+use super::layer_work::LayerWork;
 use super::model::GraceModel;
-use super::projection::ProjectionWork;
-use super::readout::ReadoutWork;
+use super::projection::{Projection, ProjectionWork};
+use super::readout::{Block, ReadoutWork};
 
 /// The derivatives of a function H of the features: its cotangent ∂H/∂z pulled back to the atoms.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -35,35 +37,36 @@ impl PullBack {
 #[derive(Clone, Debug)]
 pub struct Grace {
     model: Arc<GraceModel>,
-    instructions: pulp::Arch,
+    instructions: Instructions,
     elements: Vec<usize>,
+    batches: Batches,
     layers: Vec<LayerWork>,
-    /// B, [n, lanes of the basis]
-    bases: Vec<Lanes>,
-    /// ∂E/∂(W B) of each layer, [n, lanes of the densities]
-    density_cotangents: Vec<Lanes>,
+    /// Those of a batch, in its order.
+    batch_energies: Vec<f64>,
     atomic_energies: Vec<f64>,
     features: Vec<f64>,
     readout: ReadoutWork,
     projection: ProjectionWork,
-    /// Cotangent of B from the features, [n, lanes of the basis]
-    basis_cotangents: Vec<Lanes>,
 }
 
 impl Grace {
     /// An evaluator of `model`; nothing is computed yet.
     pub fn new(model: Arc<GraceModel>) -> Self {
+        Self::with_instructions(model, Instructions::best())
+    }
+
+    /// As [`Grace::new`], with these vector instructions; results do not depend on them.
+    pub fn with_instructions(model: Arc<GraceModel>, instructions: Instructions) -> Self {
         Self {
-            instructions: pulp::Arch::new(),
+            instructions,
             elements: Vec::new(),
+            batches: Batches::default(),
             layers: model.layers.iter().map(LayerWork::new).collect(),
-            bases: Vec::new(),
-            density_cotangents: Vec::new(),
+            batch_energies: Vec::new(),
             atomic_energies: Vec::new(),
             features: Vec::new(),
             readout: ReadoutWork::default(),
             projection: ProjectionWork::default(),
-            basis_cotangents: Vec::new(),
             model,
         }
     }
@@ -85,7 +88,11 @@ impl Grace {
         neighbours: &NeighbourList,
     ) -> Result<(), PotentialError> {
         self.take(structure, neighbours)?;
-        self.instructions.dispatch(Forward { grace: self, features: true });
+        let layers = self.layers.len();
+        self.hold_all(layers);
+        self.forward_layers(layers);
+        (0..self.batches.batches.len()).for_each(|batch| self.energies(batch));
+        self.project(None);
         Ok(())
     }
 
@@ -94,57 +101,39 @@ impl Grace {
         self.elements.clear();
         self.atomic_energies.clear();
         self.features.clear();
+        self.batches.update(&[], 0);
         let needed = self.model.cutoff();
         if neighbours.cutoff() < needed {
             return Err(PotentialError::Cutoff { list: neighbours.cutoff(), needed });
         }
         self.model.write_element_indices(&structure.species, &mut self.elements)?;
+        self.batches.update(&self.elements, self.model.tape_bytes());
+        self.atomic_energies.resize(self.elements.len(), 0.0);
         for (work, layer) in self.layers.iter_mut().zip(&self.model.layers) {
-            work.bonds.update(layer, structure, neighbours, &self.elements);
+            work.bonds.update(layer, structure, neighbours, &self.elements, &self.batches.order);
+            work.begin_messages(layer, &self.elements);
         }
         Ok(())
     }
 
-    /// Layer after layer, all atoms of one before the next, which needs the messages of neighbours.
-    #[inline(always)]
-    fn forward_layers(&mut self) {
+    /// Makes the first `layers` keep their tapes of all atoms.
+    fn hold_all(&mut self, layers: usize) {
         let model = &*self.model;
-        let basis_lanes = model.basis_lanes();
-        self.bases.resize(self.elements.len() * basis_lanes, ZERO);
-        for (k, layer) in model.layers.iter().enumerate() {
-            let (before, work) = self.layers.split_at_mut(k);
-            if let (Some(before), Some(layer_before)) = (before.last(), k.checked_sub(1)) {
-                work[0].take_messages(layer, &self.elements, before, &model.layers[layer_before]);
-            }
-            let place = (model.basis_start(k), basis_lanes);
-            work[0].forward(layer, &self.elements, &mut self.bases, place);
-        }
-    }
-
-    #[inline(always)]
-    fn forward_energies(&mut self) {
-        let model = &*self.model;
-        let density_lanes = model.readout.density_lanes();
-        self.density_cotangents.resize(self.elements.len() * density_lanes, ZERO);
-        let bases = self.bases.chunks_exact(model.basis_lanes());
-        let cotangents = self.density_cotangents.chunks_exact_mut(density_lanes);
-        for ((element, basis), cotangent) in self.elements.iter().zip(bases).zip(cotangents) {
-            let (readout, work) = (&model.readout, &mut self.readout);
-            self.atomic_energies.push(readout.evaluate(*element, basis, &model.basis_ends, cotangent, work));
-        }
-    }
-
-    #[inline(always)]
-    fn forward_features(&mut self) {
-        if let Some(projection) = &self.model.projection {
-            let n = self.elements.len();
-            projection.forward(n, &self.bases, &mut self.features, &mut self.projection);
+        for ((work, layer), block) in
+            self.layers.iter_mut().zip(&model.layers).zip(&model.readout.blocks).take(layers)
+        {
+            work.hold(layer, block, 0..self.elements.len());
         }
     }
 
     /// Energy of each atom at the last [`Grace::forward`], [n], eV.
     pub fn atomic_energies(&self) -> &[f64] {
         &self.atomic_energies
+    }
+
+    /// Number of bonds of each layer at the last structure.
+    pub(super) fn bonds(&self) -> impl Iterator<Item = usize> {
+        self.layers.iter().map(|work| work.bonds.bonds.len())
     }
 
     /// Features z at the last [`Grace::forward`], [n, D] row-major; empty for a model without them.
@@ -164,91 +153,209 @@ impl Grace {
         energy: &mut Evaluation,
         pull_back: &mut PullBack,
     ) {
-        pull_back.reset(self.elements.len());
         if let Some(cotangent) = feature_cotangent {
             assert_eq!(cotangent.len(), self.features.len(), "a cotangent for every feature");
         }
-        self.sweep(feature_cotangent, energy, pull_back);
-    }
-
-    fn sweep(
-        &mut self,
-        feature_cotangent: Option<&[f64]>,
-        energy: &mut Evaluation,
-        pull_back: &mut PullBack,
-    ) {
         energy.reset(self.elements.len());
-        energy.atomic_energies.copy_from_slice(&self.atomic_energies);
-        self.instructions.dispatch(Backward { grace: self, feature_cotangent, energy, pull_back });
-        energy.virial = symmetric(&energy.virial).map(|row| row.map(|x| -x));
+        pull_back.reset(self.elements.len());
+        let layers = self.layers.len();
+        if feature_cotangent.is_some() && self.model.projection.is_some() {
+            self.project(feature_cotangent);
+            self.backward_layers::<2>(layers, energy, pull_back);
+        } else {
+            self.backward_layers::<1>(layers, energy, pull_back);
+        }
+        self.complete(energy);
         pull_back.virial = symmetric(&pull_back.virial);
     }
 
-    #[inline(always)]
-    fn backward_features(&mut self, cotangent: &[f64]) {
-        if let Some(projection) = &self.model.projection {
-            let (n, out) = (self.elements.len(), &mut self.basis_cotangents);
-            projection.backward(n, &self.bases, cotangent, out, &mut self.projection);
+    /// Features from the bases, or the cotangents of the bases from those of the features.
+    fn project(&mut self, cotangent: Option<&[f64]>) {
+        let Some(projection) = &self.model.projection else { return };
+        self.instructions.run(Features {
+            projection,
+            work: &mut self.projection,
+            layers: &mut self.layers,
+            order: &self.batches.order,
+            features: &mut self.features,
+            cotangent,
+            instructions: self.instructions,
+        });
+    }
+
+    /// Energies and forces alone: a batch goes forwards and backwards through the last layer while its tape is in the
+    /// cache, and no other tape of that layer is kept.
+    fn plain(&mut self, energy: &mut Evaluation, pull_back: &mut PullBack) {
+        let (model, last) = (Arc::clone(&self.model), self.layers.len() - 1);
+        self.hold_all(last);
+        self.forward_layers(last);
+        self.layers[last].begin_backward::<1>(&model.layers[last], self.elements.len());
+        for batch in 0..self.batches.batches.len() {
+            let places = self.batches.batches[batch].0.clone();
+            self.layers[last].hold(&model.layers[last], &model.readout.blocks[last], places);
+            self.forward_batch(last, batch);
+            self.energies(batch);
+            self.backward_batch::<1>(last, batch, energy, pull_back);
+        }
+        self.backward_layers::<1>(last, energy, pull_back);
+    }
+
+    /// What the passes leave to be done.
+    fn complete(&self, energy: &mut Evaluation) {
+        energy.atomic_energies.copy_from_slice(&self.atomic_energies);
+        energy.virial = symmetric(&energy.virial).map(|row| row.map(|x| -x));
+    }
+
+    /// A batch of layer `k`, and what it tells the next one.
+    fn forward_batch(&mut self, k: usize, batch: usize) {
+        let layers = &self.model.layers;
+        let placed = self.batches.placed(batch, self.instructions);
+        self.instructions.run(Forward { work: &mut self.layers[k], layer: &layers[k], placed });
+        let (before, after) = self.layers.split_at_mut(k + 1);
+        if let Some(next) = after.first_mut() {
+            next.take_messages(&layers[k + 1], &placed, &before[k], &layers[k]);
         }
     }
 
-    /// The layers backwards, all atoms of one before the next, which needs the cotangents of its messages from all
-    /// neighbours; `N` is 2 with a cotangent of the features.
-    #[inline(always)]
-    fn backward_layers<const N: usize>(&mut self, energy: &mut Evaluation, pull_back: &mut PullBack) {
+    /// The energies of a batch that has passed all layers.
+    fn energies(&mut self, batch: usize) {
+        let placed = self.batches.placed(batch, self.instructions);
+        self.batch_energies.clear();
+        self.batch_energies.resize(placed.batch.atoms, 0.0);
+        let (layers, work) = (&mut self.layers[..], &mut self.readout);
+        let energies = &mut self.batch_energies[..];
+        self.instructions.run(Energies { model: &self.model, layers, placed, work, energies });
+        for ((_, atom), energy) in placed.atoms().zip(&self.batch_energies) {
+            self.atomic_energies[atom] = *energy;
+        }
+    }
+
+    fn backward_batch<const N: usize>(
+        &mut self,
+        k: usize,
+        batch: usize,
+        energy: &mut Evaluation,
+        pull_back: &mut PullBack,
+    ) {
         let model = &*self.model;
-        for k in (0..model.layers.len()).rev() {
-            let (work, after) = self.layers.split_at_mut(k + 1);
-            let cotangents = BasisCotangents {
-                model,
-                layer: k,
-                densities: &self.density_cotangents,
-                from_features: &self.basis_cotangents,
-            };
-            let returned = after.first().map(|after| (&model.layers[k + 1].message, after));
-            work[k].backward::<N>(&self.elements, &cotangents, returned, energy, pull_back);
+        let placed = self.batches.placed(batch, self.instructions);
+        let (work, after) = self.layers.split_at_mut(k + 1);
+        let returned = after.first().map(|after| (&model.layers[k + 1].message, after));
+        let (layer, block) = (&model.layers[k], &model.readout.blocks[k]);
+        let work = &mut work[k];
+        let pass = Backward::<N> { work, layer, block, placed, returned, energy, pull_back };
+        self.instructions.run(pass);
+    }
+
+    /// The first `layers` backwards, all atoms of one before the next, which needs the cotangents of its messages from
+    /// all neighbours; `N` is 2 with a cotangent of the features.
+    fn backward_layers<const N: usize>(
+        &mut self,
+        layers: usize,
+        energy: &mut Evaluation,
+        pull_back: &mut PullBack,
+    ) {
+        for k in (0..layers).rev() {
+            self.layers[k].begin_backward::<N>(&self.model.layers[k], self.elements.len());
+            for batch in 0..self.batches.batches.len() {
+                self.backward_batch::<N>(k, batch, energy, pull_back);
+            }
+        }
+    }
+
+    fn forward_layers(&mut self, layers: usize) {
+        for k in 0..layers {
+            for batch in 0..self.batches.batches.len() {
+                self.forward_batch(k, batch);
+            }
         }
     }
 }
 
-/// The forward pass, compiled for the widest vectors of the processor.
+/// A batch forwards through one layer.
 struct Forward<'a> {
-    grace: &'a mut Grace,
-    features: bool,
+    work: &'a mut LayerWork,
+    layer: &'a Layer,
+    placed: Placed<'a>,
 }
 
-impl pulp::WithSimd for Forward<'_> {
-    type Output = ();
-
+impl Pass for Forward<'_> {
     #[inline(always)]
-    fn with_simd<S: pulp::Simd>(self, _: S) {
-        self.grace.forward_layers();
-        self.grace.forward_energies();
-        if self.features {
-            self.grace.forward_features();
+    fn run(self, _: bool) {
+        self.work.forward(self.layer, &self.placed);
+    }
+}
+
+/// A batch from its bases to energies.
+struct Energies<'a> {
+    model: &'a GraceModel,
+    layers: &'a mut [LayerWork],
+    placed: Placed<'a>,
+    work: &'a mut ReadoutWork,
+    energies: &'a mut [f64],
+}
+
+impl Pass for Energies<'_> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        let Self { model, layers, placed, work, energies } = self;
+        model.readout.begin(placed.batch.atoms, work);
+        for (k, layer) in model.layers.iter().enumerate() {
+            let basis = (layers[k].basis(layer, &placed), layer.basis.lanes());
+            model.readout.add_densities(k, &placed.batch, basis, work);
+        }
+        model.readout.evaluate(&placed.batch, energies, work);
+        for (k, block) in model.readout.blocks.iter().enumerate() {
+            model.readout.density_cotangent(k, layers[k].densities(block, &placed), work);
         }
     }
 }
 
-/// The reverse sweep, compiled likewise.
-struct Backward<'a> {
-    grace: &'a mut Grace,
-    feature_cotangent: Option<&'a [f64]>,
+/// A batch backwards through one layer, with `N` cotangents.
+struct Backward<'a, const N: usize> {
+    work: &'a mut LayerWork,
+    layer: &'a Layer,
+    block: &'a Block,
+    placed: Placed<'a>,
+    returned: Option<(&'a Message, &'a LayerWork)>,
     energy: &'a mut Evaluation,
     pull_back: &'a mut PullBack,
 }
 
-impl pulp::WithSimd for Backward<'_> {
-    type Output = ();
-
+impl<const N: usize> Pass for Backward<'_, N> {
     #[inline(always)]
-    fn with_simd<S: pulp::Simd>(self, _: S) {
-        match self.feature_cotangent {
-            Some(cotangent) if self.grace.model.projection.is_some() => {
-                self.grace.backward_features(cotangent);
-                self.grace.backward_layers::<2>(self.energy, self.pull_back);
-            }
-            _ => self.grace.backward_layers::<1>(self.energy, self.pull_back),
+    fn run(self, _: bool) {
+        let Self { work, layer, block, placed, returned, energy, pull_back } = self;
+        work.backward::<N>(layer, block, &placed, returned, energy, pull_back);
+    }
+}
+
+/// From the bases of all atoms to their features, or, with a cotangent of these, back.
+struct Features<'a> {
+    projection: &'a Projection,
+    work: &'a mut ProjectionWork,
+    layers: &'a mut [LayerWork],
+    order: &'a [u32],
+    features: &'a mut Vec<f64>,
+    cotangent: Option<&'a [f64]>,
+    instructions: Instructions,
+}
+
+impl Pass for Features<'_> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        let Self { projection, work, layers, order, features, cotangent, instructions } = self;
+        if let Some(cotangent) = cotangent {
+            let layers = layers.iter_mut().map(|work| (&work.bases[..], &mut work.basis_cotangents));
+            projection.backward(order, layers, cotangent, work, instructions);
+        } else {
+            projection.forward(
+                order,
+                layers.iter().map(|work| &work.bases[..]),
+                features,
+                work,
+                instructions,
+            );
         }
     }
 }
@@ -274,8 +381,9 @@ impl Potential for Grace {
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
         self.take(structure, neighbours)?;
-        self.instructions.dispatch(Forward { grace: self, features: false });
-        self.sweep(None, out, &mut PullBack::default());
+        out.reset(self.elements.len());
+        self.plain(out, &mut PullBack::default());
+        self.complete(out);
         Ok(())
     }
 }

@@ -6,8 +6,8 @@ use npz::Archive;
 
 use super::error::{GraceError, mismatch, unsupported};
 use super::matrix::lanes_for;
-use super::product::{Combination, Product, ProductOutput, Term};
-use super::tape::{Gather, Linear, LinearPart, Operation, Tensor};
+use super::product::{Combination, Coupled, Product, Term};
+use super::tape::{Gather, Linear, LinearPart, Operation, Tensor, Used};
 use super::weights::Weights;
 
 /// A longer tape than this is taken for damage (64 MiB an atom).
@@ -16,6 +16,8 @@ const LONGEST_TAPE: usize = 1 << 20;
 /// A graph under construction.
 pub(super) struct Graph<'a> {
     pub(super) archive: &'a Archive,
+    /// All tensors, as they stand on the tape.
+    tensors: Vec<Tensor>,
     /// Tensors that a reduction may name.
     named: Vec<(String, Tensor)>,
     end: usize,
@@ -38,6 +40,7 @@ impl<'a> Graph<'a> {
     ) -> Result<Self, GraceError> {
         let mut graph = Self {
             archive,
+            tensors: Vec::new(),
             named: Vec::new(),
             end: 0,
             operations: Vec::new(),
@@ -68,6 +71,7 @@ impl<'a> Graph<'a> {
                 format!("'{name}' has {components} components of {channels}"),
             ));
         }
+        self.tensors.push(tensor);
         self.named.push((name.to_owned(), tensor));
         self.end = tensor.end();
         Ok(tensor)
@@ -121,7 +125,7 @@ impl<'a> Graph<'a> {
             let (from, to) = rows.into_iter().unzip();
             LinearPart { weights, from, to }
         };
-        let parts = rows.into_iter().map(part).collect();
+        let parts = merged(rows.into_iter().map(part).collect());
         self.operations.push(Operation::Linear(Linear { start: out.start, parts }));
         Ok(out)
     }
@@ -176,13 +180,15 @@ impl<'a> Graph<'a> {
         let components = sums.iter().max().map_or(0, |last| last + 1);
 
         let out = self.push(name, components, left.channels)?;
-        let mut outputs: Vec<ProductOutput> =
-            (0..components).map(|f| ProductOutput { row: out.row(f), terms: Vec::new() }).collect();
+        let mut outputs: Vec<Coupled> =
+            (0..components).map(|f| Coupled { row: out.row(f), terms: Vec::new() }).collect();
         for (((l, r), sum), coefficient) in lefts.iter().zip(&rights).zip(&sums).zip(coefficients) {
             let (left, right) = (left.row(*l) as u32, right.row(*r) as u32);
             outputs[*sum].terms.push(Term { left, right, coefficient });
         }
-        self.operations.push(Operation::Product(Product { start: out.start, width: out.width, outputs }));
+        let (start, width, channels) = (out.start, out.width, out.channels);
+        let product = Product { start, width, channels, outputs, inputs: Vec::new() };
+        self.operations.push(Operation::Product(product));
         Ok(out)
     }
 
@@ -200,7 +206,8 @@ impl<'a> Graph<'a> {
         for (to, from, factor) in terms {
             outputs[*to].1.push((tensor.row(*from) as u32, *factor));
         }
-        let combination = Combination { start: out.start, width: out.width, outputs };
+        let (start, width, channels) = (out.start, out.width, out.channels);
+        let combination = Combination { start, width, channels, outputs };
         self.operations.push(Operation::Combination(combination));
         Ok(out)
     }
@@ -217,17 +224,41 @@ impl<'a> Graph<'a> {
         })
     }
 
-    /// Length of the tape, the operations without results that neither the basis nor `message` needs, and
-    /// the basis.
-    pub fn finish(mut self, message: Option<Tensor>) -> (usize, Vec<Operation>, Gather) {
+    /// The operations without results that neither the basis nor `message` needs.
+    pub fn finish(mut self, message: Option<Tensor>) -> FinishedGraph {
+        let density = self.density();
         let mut needed = vec![false; self.end];
         self.basis.rows.iter().for_each(|(row, _)| needed[*row] = true);
-        if let Some(message) = message {
-            (0..message.components).for_each(|q| needed[message.row(q)] = true);
+        for tensor in [Some(density), message].into_iter().flatten() {
+            (0..tensor.components).for_each(|w| needed[tensor.row(w)] = true);
         }
         self.operations.iter_mut().rev().for_each(|operation| operation.keep(&mut needed));
-        (self.end, self.operations, self.basis)
+        let tensors = self.tensors.iter();
+        let rows = tensors.flat_map(|t| (0..t.components).map(move |w| (t.row(w), t.width)));
+        let used = Used::new(rows.filter(|(row, _)| needed[*row]));
+        FinishedGraph { tape_lanes: self.end, used, operations: self.operations, basis: self.basis }
     }
+}
+
+/// What a layer evaluates.
+pub(super) struct FinishedGraph {
+    /// Length of the tape for one slot.
+    pub tape_lanes: usize,
+    pub used: Used,
+    pub operations: Vec<Operation>,
+    pub basis: Gather,
+}
+
+/// One part in place of those that take the same rows to the same rows.
+fn merged(parts: Vec<LinearPart>) -> Vec<LinearPart> {
+    let mut found: Vec<LinearPart> = Vec::new();
+    for part in parts {
+        match found.iter_mut().find(|other| other.from == part.from && other.to == part.to) {
+            Some(other) => other.weights.add(&part.weights),
+            None => found.push(part),
+        }
+    }
+    found
 }
 
 /// Weights [k, n, tile] that mix channels.

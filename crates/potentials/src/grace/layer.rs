@@ -5,7 +5,7 @@ use super::harmonics::Harmonics;
 use super::matrix::Lanes;
 use super::radial::RadialFunctions;
 use super::readout::Block;
-use super::tape::{Gather, Operation, Tensor};
+use super::tape::{Gather, Operation, Tensor, Used};
 
 /// The weights of one layer: T_q,lm,n = Σ_j R_nl(r) Y_lm(v) m_q,n(j), the messages m of the neighbours being
 /// the results of the layer before, and the operations on T. In the first layer a message is just a
@@ -19,6 +19,8 @@ pub(super) struct Layer {
     pub density: Tensor,
     /// Length of an atom's tape.
     pub tape_lanes: usize,
+    /// What of it holds anything.
+    pub used: Used,
     pub operations: Vec<Operation>,
     /// The rows of the tape that this layer gives to the basis B.
     pub basis: Gather,
@@ -61,15 +63,16 @@ impl LayerDraft<'_> {
     /// `message` is what the next layer takes from this one.
     pub fn finish(self, message: Option<Tensor>) -> Layer {
         let density = self.graph.density();
-        let (tape_lanes, operations, basis) = self.graph.finish(message);
+        let graph = self.graph.finish(message);
         Layer {
             radial: self.radial,
             harmonics: Harmonics::new(self.lmax),
             message: self.message,
             density,
-            tape_lanes,
-            operations,
-            basis,
+            tape_lanes: graph.tape_lanes,
+            used: graph.used,
+            operations: graph.operations,
+            basis: graph.basis,
         }
     }
 }

@@ -2,7 +2,12 @@
 //!
 //! Channels are the innermost index of every array, padded with zeros to whole [`Lanes`]. Loops over
 //! a lane array have a fixed length, so the compiler turns them into vector instructions; additions
-//! keep their written order whatever the width of the processor's vectors, so the bits do too.
+//! keep their written order whatever the width of the processor's vectors, so the bits do too. Products are added
+//! with one rounding.
+
+use std::ops::Range;
+
+use super::instructions::{Instructions, Pass};
 
 /// Channels that are worked on together.
 pub(super) const LANES: usize = 8;
@@ -31,7 +36,7 @@ pub(super) fn to_lanes(channels: &[f64]) -> Vec<Lanes> {
 pub(super) fn add_scaled(sum: &mut Lanes, s: f64, x: &Lanes) {
     let (mut out, x) = (*sum, *x);
     for k in 0..LANES {
-        out[k] += s * x[k];
+        out[k] = s.mul_add(x[k], out[k]);
     }
     *sum = out;
 }
@@ -41,7 +46,7 @@ pub(super) fn add_scaled(sum: &mut Lanes, s: f64, x: &Lanes) {
 pub(super) fn add_product(sum: &mut Lanes, x: &Lanes, y: &Lanes) {
     let (mut out, x, y) = (*sum, *x, *y);
     for k in 0..LANES {
-        out[k] += x[k] * y[k];
+        out[k] = x[k].mul_add(y[k], out[k]);
     }
     *sum = out;
 }
@@ -76,6 +81,7 @@ pub(super) fn horizontal_sum(x: &Lanes) -> f64 {
 #[derive(Clone, Debug)]
 pub(super) struct Matrix {
     inputs: usize,
+    outputs: usize,
     /// [panels × inputs]
     panels: Vec<Lanes>,
 }
@@ -89,7 +95,17 @@ impl Matrix {
                 panels[output / LANES * inputs + input][output % LANES] = element(input, output);
             }
         }
-        Self { inputs, panels }
+        Self { inputs, outputs, panels }
+    }
+
+    /// Inputs times outputs.
+    pub fn size(&self) -> u64 {
+        self.inputs as u64 * self.outputs as u64
+    }
+
+    /// Lanes of one row of inputs.
+    pub fn input_lanes(&self) -> usize {
+        lanes_for(self.inputs)
     }
 
     /// Lanes of one row of outputs.
@@ -97,53 +113,180 @@ impl Matrix {
         self.panels.len() / self.inputs.max(1)
     }
 
-    /// Adds x M to `out` for several rows: row r of x begins at lane `from[r]` of `x`, its result is
-    /// added at lane `to[r]` of `out`.
-    #[inline(always)]
-    pub fn multiply_add(&self, x: &[Lanes], from: &[u32], out: &mut [Lanes], to: &[u32]) {
-        assert_eq!(from.len(), to.len());
-        let x = x.as_flattened();
-        for (p, panel) in self.panels.chunks_exact(self.inputs.max(1)).enumerate() {
-            let mut rows = from.chunks_exact(4).zip(to.chunks_exact(4));
-            for (from, to) in &mut rows {
-                multiply_rows::<4>(panel, x, from, out, to, p);
-            }
-            let done = from.len() / 4 * 4;
-            let (from, to) = (&from[done..], &to[done..]);
-            match from.len() {
-                3 => multiply_rows::<3>(panel, x, from, out, to, p),
-                2 => multiply_rows::<2>(panel, x, from, out, to, p),
-                1 => multiply_rows::<1>(panel, x, from, out, to, p),
-                _ => {}
-            }
+    /// Adds another matrix of the same shape.
+    pub fn add(&mut self, other: &Self) {
+        for (x, y) in self.panels.iter_mut().zip(&other.panels) {
+            add_scaled(x, 1.0, y);
         }
     }
 
-    /// [`Matrix::multiply_add`] for one row at the beginning of `x` and of `out`.
+    /// Adds x M to the rows `to` of `out`, x being the rows `from` of `x`, as many.
+    pub fn multiply_add(
+        &self,
+        x: &[Lanes],
+        from: Rows,
+        out: &mut [Lanes],
+        to: Rows,
+        instructions: Instructions,
+    ) {
+        assert_eq!(from.len(), to.len());
+        instructions.run(Multiply { matrix: self, x, from, out, to });
+    }
+
+    /// `PANELS` panels at a time, which stay in the first cache for all rows.
     #[inline(always)]
-    pub fn multiply_add_row(&self, x: &[Lanes], out: &mut [Lanes]) {
-        self.multiply_add(x, &[0], out, &[0]);
+    fn multiply_panels<const ROWS: usize, const PANELS: usize>(
+        &self,
+        inputs: Range<usize>,
+        x: &[Lanes],
+        from: Rows,
+        out: &mut [Lanes],
+        to: Rows,
+    ) {
+        let lanes = self.output_lanes();
+        let panel = |p: usize| &self.panels[p * self.inputs..][inputs.clone()];
+        let mut p = 0;
+        while p + PANELS <= lanes {
+            let panels: [&[Lanes]; PANELS] = std::array::from_fn(|k| panel(p + k));
+            multiply_rows::<ROWS, PANELS>(panels, inputs.start, x, from, out, to.after(p));
+            p += PANELS;
+        }
+        for p in p..lanes {
+            multiply_rows::<ROWS, 1>([panel(p)], inputs.start, x, from, out, to.after(p));
+        }
     }
 }
 
-#[inline(always)]
-fn multiply_rows<const ROWS: usize>(
-    panel: &[Lanes],
-    x: &[f64],
-    from: &[u32],
-    out: &mut [Lanes],
-    to: &[u32],
-    panel_index: usize,
-) {
-    let rows: [&[f64]; ROWS] = std::array::from_fn(|r| &x[from[r] as usize * LANES..][..panel.len()]);
-    let mut sums = [ZERO; ROWS];
-    for (i, weights) in panel.iter().enumerate() {
-        for r in 0..ROWS {
-            add_scaled(&mut sums[r], rows[r][i], weights);
+/// x M, compiled once for all who need it.
+struct Multiply<'a> {
+    matrix: &'a Matrix,
+    x: &'a [Lanes],
+    from: Rows<'a>,
+    out: &'a mut [Lanes],
+    to: Rows<'a>,
+}
+
+impl Pass for Multiply<'_> {
+    /// Blocks are larger where there are registers for them, which changes no bits.
+    #[inline(always)]
+    fn run(self, wide: bool) {
+        let Self { matrix, x, from, out, to } = self;
+        for first in (0..matrix.inputs).step_by(INNER_BLOCK) {
+            let inputs = first..matrix.inputs.min(first + INNER_BLOCK);
+            if wide {
+                matrix.multiply_panels::<8, 2>(inputs, x, from, out, to);
+            } else {
+                matrix.multiply_panels::<4, 1>(inputs, x, from, out, to);
+            }
         }
     }
-    for r in 0..ROWS {
-        add_scaled(&mut out[to[r] as usize + panel_index], 1.0, &sums[r]);
+}
+
+/// Inputs that are worked on before the results are written: few enough for a pair of panels to stay in the first
+/// cache.
+const INNER_BLOCK: usize = 256;
+
+/// Rows of an array: that of component r and slot s begins at lane `starts[r]` · `slots` + s · `stride` + `shift`.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Rows<'a> {
+    /// Where each component begins if there is one slot.
+    pub starts: &'a [u32],
+    /// Number of atoms (times cotangents).
+    pub slots: usize,
+    /// Lanes from one atom's row to the next.
+    pub stride: usize,
+    /// Lanes to be left out at the beginning.
+    pub shift: usize,
+}
+
+impl Rows<'static> {
+    /// A row for each of `slots` atoms.
+    #[inline(always)]
+    pub fn of_atoms(slots: usize, stride: usize) -> Self {
+        Self { starts: &[0], slots, stride, shift: 0 }
+    }
+}
+
+impl Rows<'_> {
+    #[inline(always)]
+    fn len(&self) -> usize {
+        self.starts.len() * self.slots
+    }
+
+    #[inline(always)]
+    fn after(mut self, lanes: usize) -> Self {
+        self.shift += lanes;
+        self
+    }
+
+    /// First lanes of `N` rows from the given one.
+    #[inline(always)]
+    fn block<const N: usize>(&self, first: usize) -> [usize; N] {
+        let (mut r, mut s) = (first / self.slots, first % self.slots);
+        std::array::from_fn(|_| {
+            let lane = self.starts[r] as usize * self.slots + s * self.stride + self.shift;
+            s += 1;
+            if s == self.slots {
+                (r, s) = (r + 1, 0);
+            }
+            lane
+        })
+    }
+}
+
+/// `ROWS` rows at a time, then fewer.
+#[inline(always)]
+fn multiply_rows<const ROWS: usize, const PANELS: usize>(
+    panels: [&[Lanes]; PANELS],
+    first_input: usize,
+    x: &[Lanes],
+    from: Rows,
+    out: &mut [Lanes],
+    to: Rows,
+) {
+    let (n, mut row) = (from.len(), 0);
+    while row + ROWS <= n {
+        multiply_block::<ROWS, PANELS>(panels, first_input, x, from.block(row), out, to.block(row));
+        row += ROWS;
+    }
+    if ROWS > 4 && row + 4 <= n {
+        multiply_block::<4, PANELS>(panels, first_input, x, from.block(row), out, to.block(row));
+        row += 4;
+    }
+    if row + 2 <= n {
+        multiply_block::<2, PANELS>(panels, first_input, x, from.block(row), out, to.block(row));
+        row += 2;
+    }
+    if row < n {
+        multiply_block::<1, PANELS>(panels, first_input, x, from.block(row), out, to.block(row));
+    }
+}
+
+/// Some rows times some panels, the sums in registers.
+#[inline(always)]
+fn multiply_block<const ROWS: usize, const PANELS: usize>(
+    panels: [&[Lanes]; PANELS],
+    first_input: usize,
+    x: &[Lanes],
+    from: [usize; ROWS],
+    out: &mut [Lanes],
+    to: [usize; ROWS],
+) {
+    let (x, inputs) = (x.as_flattened(), panels[0].len());
+    let rows: [&[f64]; ROWS] = std::array::from_fn(|r| &x[from[r] * LANES + first_input..][..inputs]);
+    let panels = panels.map(|panel| &panel[..inputs]);
+    let mut sums = [[ZERO; PANELS]; ROWS];
+    for i in 0..inputs {
+        for r in 0..ROWS {
+            for p in 0..PANELS {
+                add_scaled(&mut sums[r][p], rows[r][i], &panels[p][i]);
+            }
+        }
+    }
+    for (to, sums) in to.into_iter().zip(&sums) {
+        for (out, sum) in out[to..to + PANELS].iter_mut().zip(sums) {
+            add_scaled(out, 1.0, sum);
+        }
     }
 }
 
@@ -151,24 +294,31 @@ fn multiply_rows<const ROWS: usize>(
 mod tests {
     use super::*;
 
+    /// Two components of `slots` atoms each.
+    fn rows(starts: &[u32], slots: usize, stride: usize) -> Rows<'_> {
+        Rows { starts, slots, stride, shift: 0 }
+    }
+
     #[test]
     fn the_blocked_product_is_the_product() {
-        for (inputs, outputs) in [(1, 1), (5, 9), (8, 8), (13, 24)] {
+        for (inputs, outputs) in [(1, 1), (5, 9), (8, 8), (13, 24), (2 * INNER_BLOCK + 3, 17)] {
             let element = |i: usize, o: usize| ((3 * i + 7 * o) % 11) as f64 - 4.5;
             let matrix = Matrix::from_fn(inputs, outputs, element);
-            for rows in 1..=9_usize {
+            let ways = |slots| Instructions::all().into_iter().map(move |instructions| (slots, instructions));
+            for (slots, instructions) in (1..=9_usize).flat_map(ways) {
                 let (xl, yl) = (lanes_for(inputs), lanes_for(outputs));
-                let mut x = vec![ZERO; rows * xl];
+                let mut x = vec![ZERO; 2 * slots * xl];
                 x.as_flattened_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k % 7) as f64 - 3.0);
-                let mut out = vec![[1.0; LANES]; rows * yl];
-                let offsets = |stride: usize| (0..rows).map(|r| (r * stride) as u32).collect::<Vec<_>>();
-                matrix.multiply_add(&x, &offsets(xl), &mut out, &offsets(yl));
-                for r in 0..rows {
-                    for o in 0..outputs {
-                        let direct: f64 =
-                            (0..inputs).map(|i| x.as_flattened()[r * xl * LANES + i] * element(i, o)).sum();
-                        assert_eq!(out.as_flattened()[r * yl * LANES + o], 1.0 + direct);
-                    }
+                let mut out = vec![[1.0; LANES]; 2 * slots * yl];
+                let (from, to) = ([0, xl as u32], [yl as u32, 0]);
+                let (from, to) = (rows(&from, slots, xl), rows(&to, slots, yl));
+                matrix.multiply_add(&x, from, &mut out, to, instructions);
+                for (r, o) in (0..2 * slots).flat_map(|r| (0..outputs).map(move |o| (r, o))) {
+                    let direct: f64 =
+                        (0..inputs).map(|i| x.as_flattened()[r * xl * LANES + i] * element(i, o)).sum();
+                    // The components change places.
+                    let to = (r + slots) % (2 * slots);
+                    assert_eq!(out.as_flattened()[to * yl * LANES + o], 1.0 + direct);
                 }
             }
         }

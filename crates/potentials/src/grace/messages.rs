@@ -7,6 +7,7 @@ use atoms::Vec3;
 use super::bonds::{Bond, BondWork, Bonds, bond_gradient, directions, pairs};
 use super::layer::Layer;
 use super::matrix::{LANES, Lanes, ZERO, add_product, add_scaled, horizontal_sum, product, scaled};
+use super::tape::Slot;
 
 /// The messages of all atoms, [n, q, channels], and where up to two of their cotangents are summed, of the
 /// components that depend on the layer before.
@@ -27,45 +28,45 @@ struct Block<'a> {
 }
 
 impl Bonds {
-    /// Adds the messages of the neighbours of atom `i` of element `centre` to its T.
+    /// Adds the messages of the neighbours of the atom at a place, of element `centre`, to its T.
     #[inline(always)]
     pub fn accumulate_messages(
         &mut self,
-        i: usize,
+        place: usize,
         layer: &Layer,
         centre: usize,
         messages: &[Lanes],
-        density: &mut [Lanes],
+        density: (&mut [Lanes], Slot),
         work: &mut BondWork,
     ) {
-        let (lanes, first) = (layer.radial.output_lanes(), self.block_offsets[i]);
-        for (k, bonds) in self.bonds[self.offsets[i]..self.offsets[i + 1]].chunks(LANES).enumerate() {
+        let (mut all_values, mut all_derivatives) =
+            (std::mem::take(&mut self.values), std::mem::take(&mut self.derivatives));
+        let (density, slot) = density;
+        for (bonds, block) in self.blocks(place, layer) {
             let (v, r) = directions(bonds);
             layer.harmonics.evaluate::<false>(&v, &mut work.harmonics, &mut work.gradients);
-            let block = (first + k) * LANES * lanes..(first + k + 1) * LANES * lanes;
-            let (values, derivatives) = (&mut self.values[block.clone()], &mut self.derivatives[block]);
+            let (values, derivatives) = (&mut all_values[block.clone()], &mut all_derivatives[block]);
             let pairs = pairs(layer, centre, bonds);
             layer.radial.evaluate(bonds.len(), &pairs, &r, &mut work.radial, values, derivatives);
-            add_eight(layer, bonds, values, &work.harmonics, messages, density);
+            add_eight(layer, (bonds, values, &work.harmonics), messages, density, slot);
         }
+        (self.values, self.derivatives) = (all_values, all_derivatives);
     }
 
     /// As [`Bonds::reverse`], from `N` ≤ 2 cotangents of T; adds to the cotangents of the neighbours' messages.
     #[inline(always)]
     pub fn reverse_messages<const N: usize>(
         &self,
-        i: usize,
+        place: usize,
         layer: &Layer,
-        cotangents: [&[Lanes]; N],
+        (cotangent, slots): (&[Lanes], [Slot; N]),
         messages: Messages,
         work: &mut BondWork,
         mut sink: impl FnMut(&Bond, [Vec3; N]),
     ) {
-        let (lanes, first) = (layer.radial.output_lanes(), self.block_offsets[i]);
-        for (k, bonds) in self.bonds[self.offsets[i]..self.offsets[i + 1]].chunks(LANES).enumerate() {
+        for (bonds, range) in self.blocks(place, layer) {
             let (v, r) = directions(bonds);
             layer.harmonics.evaluate::<true>(&v, &mut work.harmonics, &mut work.gradients);
-            let range = (first + k) * LANES * lanes..(first + k + 1) * LANES * lanes;
             let block = Block {
                 bonds,
                 values: &self.values[range.clone()],
@@ -74,10 +75,11 @@ impl Bonds {
                 gradients: &work.gradients,
             };
             let mut gradients = [[ZERO; 3]; N];
-            for n in 0..N {
-                let (along, across) = slopes_of_eight(layer, &block, cotangents[n], messages.sent);
+            for (n, slot) in slots.into_iter().enumerate() {
+                let cotangent = (cotangent, slot);
+                let (along, across) = slopes_of_eight(layer, &block, cotangent, messages.sent);
                 gradients[n] = bond_gradient(&v, &r, &along, &across);
-                return_messages(layer, &block, cotangents[n], messages.cotangents[n]);
+                return_messages(layer, &block, cotangent, messages.cotangents[n]);
             }
             for (b, bond) in bonds.iter().enumerate() {
                 sink(bond, gradients.map(|gradient| gradient.map(|axis| axis[b])));
@@ -90,11 +92,10 @@ impl Bonds {
 #[inline(always)]
 fn add_eight(
     layer: &Layer,
-    bonds: &[Bond],
-    values: &[Lanes],
-    harmonics: &[Lanes],
+    (bonds, values, harmonics): (&[Bond], &[Lanes], &[Lanes]),
     messages: &[Lanes],
     density: &mut [Lanes],
+    slot: Slot,
 ) {
     let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
     let (of_message, functions) = (layer.message.lanes(), layer.harmonics.len());
@@ -105,7 +106,7 @@ fn add_eight(
                 *term = scaled(harmonics[lm][b], &values[b * lanes + l * width + c]);
             }
             for q in 0..layer.message.components {
-                let sum = &mut density[(q * functions + lm) * width + c];
+                let sum = &mut density[slot.row(&layer.density, q * functions + lm) + c];
                 let mut total = *sum;
                 for (bond, term) in bonds.iter().zip(&terms) {
                     let message = &messages[bond.neighbour as usize * of_message + q * width + c];
@@ -123,7 +124,7 @@ fn add_eight(
 fn slopes_of_eight(
     layer: &Layer,
     block: &Block,
-    cotangent: &[Lanes],
+    (cotangent, slot): (&[Lanes], Slot),
     messages: &[Lanes],
 ) -> (Lanes, [Lanes; 3]) {
     let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
@@ -137,7 +138,8 @@ fn slopes_of_eight(
                 let mut sum = ZERO;
                 for q in 0..layer.message.components {
                     let message = &messages[bond.neighbour as usize * of_message + q * width + k];
-                    add_product(&mut sum, &cotangent[(q * functions + lm) * width + k], message);
+                    let row = slot.row(&layer.density, q * functions + lm);
+                    add_product(&mut sum, &cotangent[row + k], message);
                 }
                 add_product(&mut value, &sum, &block.values[b * lanes + l * width + k]);
                 add_product(&mut derivative, &sum, &block.derivatives[b * lanes + l * width + k]);
@@ -154,7 +156,12 @@ fn slopes_of_eight(
 
 /// m̄_q,n(j) += Σ_l R_nl Σ_m Y_lm T̄_q,lm,n for each of up to eight bonds.
 #[inline(always)]
-fn return_messages(layer: &Layer, block: &Block, cotangent: &[Lanes], message_cotangents: &mut [Lanes]) {
+fn return_messages(
+    layer: &Layer,
+    block: &Block,
+    (cotangent, slot): (&[Lanes], Slot),
+    message_cotangents: &mut [Lanes],
+) {
     let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
     let (passed, functions) = (layer.message.passed(), layer.harmonics.len());
     for (b, bond) in block.bonds.iter().enumerate() {
@@ -165,7 +172,7 @@ fn return_messages(layer: &Layer, block: &Block, cotangent: &[Lanes], message_co
                 for l in 0..=layer.harmonics.lmax() {
                     let mut sum = ZERO;
                     for lm in l * l..(l + 1) * (l + 1) {
-                        let row = &cotangent[(q * functions + lm) * width + c];
+                        let row = &cotangent[slot.row(&layer.density, q * functions + lm) + c];
                         add_scaled(&mut sum, block.harmonics[lm][b], row);
                     }
                     let sum = product(&sum, &block.values[b * lanes + l * width + c]);

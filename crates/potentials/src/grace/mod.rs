@@ -22,8 +22,10 @@
 //! ```
 
 mod assembly;
+mod batches;
 mod bonds;
 mod copies;
+mod cost;
 mod equivariant_graph;
 mod equivariant_norm;
 mod error;
@@ -31,6 +33,7 @@ mod evaluate;
 mod globals;
 mod graph;
 mod harmonics;
+mod instructions;
 mod invariant_norm;
 mod layer;
 mod layer_work;
@@ -54,6 +57,7 @@ mod weights;
 
 pub use error::GraceError;
 pub use evaluate::{Grace, PullBack};
+pub use instructions::Instructions;
 pub use model::{Architecture, GraceDescription, GraceModel};
 pub use projection::Projection;
 pub use radial::RadialPath;

@@ -7,6 +7,7 @@ use npz::Archive;
 
 use super::error::GraceError;
 use super::layer::Layer;
+use super::matrix::Lanes;
 use super::projection::Projection;
 use super::radial::RadialPath;
 use super::readout::Readout;
@@ -80,8 +81,6 @@ pub struct GraceDescription {
 pub struct GraceModel {
     pub(super) elements: Vec<Species>,
     pub(super) layers: Vec<Layer>,
-    /// One lane past each layer's part of the basis B, which stand behind one another.
-    pub(super) basis_ends: Vec<usize>,
     pub(super) readout: Readout,
     pub(super) projection: Option<Projection>,
     pub(super) description: GraceDescription,
@@ -133,16 +132,10 @@ impl GraceModel {
         cutoffs.fold(0.0, f64::max)
     }
 
-    /// First lane of a layer's part of the basis.
-    #[inline(always)]
-    pub(super) fn basis_start(&self, layer: usize) -> usize {
-        layer.checked_sub(1).map_or(0, |before| self.basis_ends[before])
-    }
-
-    /// Lanes of the basis of one atom.
-    #[inline(always)]
-    pub(super) fn basis_lanes(&self) -> usize {
-        self.basis_start(self.layers.len())
+    /// What an atom takes on the longest tape, bytes.
+    pub(super) fn tape_bytes(&self) -> usize {
+        let lanes = self.layers.iter().map(|layer| layer.used.lanes()).max();
+        lanes.unwrap_or(0) * size_of::<Lanes>()
     }
 
     /// D, the dimension of z; 0 for a model without feature arrays.

@@ -1,5 +1,7 @@
 //! Tensors coupled channel by channel, and rows of one tensor combined.
 
+use std::collections::BTreeMap;
+
 use super::matrix::{Lanes, ZERO, add_product, add_scaled, scaled};
 
 /// out_n,f = Σ_c C_c left_n,l(c) right_n,r(c), the sum over the terms c of f.
@@ -9,16 +11,20 @@ pub(super) struct Product {
     pub start: usize,
     /// Lanes of a component, the same for result and factors.
     pub width: usize,
+    /// Channels of a component.
+    pub channels: usize,
     /// Each component of the result that is needed.
-    pub outputs: Vec<ProductOutput>,
+    pub outputs: Vec<Coupled>,
+    /// Each component of the factors with the derivatives of the result: terms of the result's cotangent (left, lanes
+    /// from the beginning of the result) and the other factor (right). Made by [`Product::keep`].
+    pub inputs: Vec<Coupled>,
 }
 
-/// One component of a product.
+/// One component, and what it sums.
 #[derive(Clone, Debug)]
-pub(super) struct ProductOutput {
+pub(super) struct Coupled {
     /// First lane on the tape.
     pub row: usize,
-    /// What it sums.
     pub terms: Vec<Term>,
 }
 
@@ -33,34 +39,42 @@ pub(super) struct Term {
     pub coefficient: f64,
 }
 
+/// Lanes that are summed together, so that a term is looked at once for all of them.
+const TOGETHER: usize = 4;
+
 impl Product {
     #[inline(always)]
-    pub fn forward(&self, tape: &mut [Lanes]) {
-        let (before, out) = tape.split_at_mut(self.start);
+    pub fn forward(&self, atoms: usize, tape: &mut [Lanes]) {
+        let (before, out) = tape.split_at_mut(self.start * atoms);
+        let lanes = self.width * atoms;
         for output in &self.outputs {
-            for (c, out) in out[output.row - self.start..][..self.width].iter_mut().enumerate() {
-                let mut sum = ZERO;
-                for term in &output.terms {
-                    let left = scaled(term.coefficient, &before[term.left as usize + c]);
-                    add_product(&mut sum, &left, &before[term.right as usize + c]);
-                }
-                *out = sum;
+            let out = &mut out[(output.row - self.start) * atoms..][..lanes];
+            let whole = lanes / TOGETHER * TOGETHER;
+            for c in (0..whole).step_by(TOGETHER) {
+                let [sums] = couple::<1, TOGETHER>(&output.terms, before, 0, before, atoms, c);
+                out[c..c + TOGETHER].copy_from_slice(&sums);
+            }
+            for c in whole..lanes {
+                let [sums] = couple::<1, 1>(&output.terms, before, 0, before, atoms, c);
+                out[c..c + 1].copy_from_slice(&sums);
             }
         }
     }
 
-    /// Adds to the cotangents of both factors.
+    /// Adds to `N` cotangents of both factors.
     #[inline(always)]
-    pub fn backward(&self, tape: &[Lanes], cotangent: &mut [Lanes]) {
-        let (before, out) = cotangent.split_at_mut(self.start);
-        for output in &self.outputs {
-            for (c, out) in out[output.row - self.start..][..self.width].iter().enumerate() {
-                for term in &output.terms {
-                    let (left, right) = (term.left as usize + c, term.right as usize + c);
-                    let cotangent = scaled(term.coefficient, out);
-                    add_product(&mut before[left], &cotangent, &tape[right]);
-                    add_product(&mut before[right], &cotangent, &tape[left]);
-                }
+    pub fn backward<const N: usize>(&self, atoms: usize, tape: &[Lanes], cotangent: &mut [Lanes]) {
+        let (before, out) = cotangent.split_at_mut(self.start * N * atoms);
+        let lanes = self.width * atoms;
+        for input in &self.inputs {
+            let whole = lanes / TOGETHER * TOGETHER;
+            for c in (0..whole).step_by(TOGETHER) {
+                let sums = couple::<N, TOGETHER>(&input.terms, out, lanes, tape, atoms, c);
+                add::<N, TOGETHER>(&mut before[input.row * N * atoms + c..], lanes, &sums);
+            }
+            for c in whole..lanes {
+                let sums = couple::<N, 1>(&input.terms, out, lanes, tape, atoms, c);
+                add::<N, 1>(&mut before[input.row * N * atoms + c..], lanes, &sums);
             }
         }
     }
@@ -72,6 +86,61 @@ impl Product {
             needed[term.left as usize] = true;
             needed[term.right as usize] = true;
         }
+        self.inputs = self.derivatives();
+    }
+
+    /// ∂out/∂x for every component x of the factors, with one term for each pair of result and other factor.
+    fn derivatives(&self) -> Vec<Coupled> {
+        let mut inputs: BTreeMap<u32, BTreeMap<(u32, u32), f64>> = BTreeMap::new();
+        for output in &self.outputs {
+            for Term { left, right, coefficient } in &output.terms {
+                for (x, other) in [(left, right), (right, left)] {
+                    let terms = inputs.entry(*x).or_default();
+                    *terms.entry(((output.row - self.start) as u32, *other)).or_default() += coefficient;
+                }
+            }
+        }
+        let term = |((left, right), coefficient): ((u32, u32), f64)| Term { left, right, coefficient };
+        let coupled = |(x, terms): (u32, BTreeMap<(u32, u32), f64>)| Coupled {
+            row: x as usize,
+            terms: terms.into_iter().map(term).collect(),
+        };
+        inputs.into_iter().map(coupled).collect()
+    }
+}
+
+/// Σ C left_k right over some terms, for `L` lanes from lane `c` of their rows; the `N` left factors stand `apart` lanes
+/// from one another.
+#[inline(always)]
+fn couple<const N: usize, const L: usize>(
+    terms: &[Term],
+    left: &[Lanes],
+    apart: usize,
+    right: &[Lanes],
+    atoms: usize,
+    c: usize,
+) -> [[Lanes; L]; N] {
+    let mut sums = [[ZERO; L]; N];
+    for term in terms {
+        let right = &right[term.right as usize * atoms + c..][..L];
+        let right: [Lanes; L] = std::array::from_fn(|l| scaled(term.coefficient, &right[l]));
+        for (k, sums) in sums.iter_mut().enumerate() {
+            let left = &left[term.left as usize * N * atoms + k * apart + c..][..L];
+            for l in 0..L {
+                add_product(&mut sums[l], &left[l], &right[l]);
+            }
+        }
+    }
+    sums
+}
+
+/// Adds sums to `N` rows `apart` lanes from one another.
+#[inline(always)]
+fn add<const N: usize, const L: usize>(rows: &mut [Lanes], apart: usize, sums: &[[Lanes; L]; N]) {
+    for (k, sums) in sums.iter().enumerate() {
+        for (out, sum) in rows[k * apart..][..L].iter_mut().zip(sums) {
+            add_scaled(out, 1.0, sum);
+        }
     }
 }
 
@@ -82,19 +151,22 @@ pub(super) struct Combination {
     pub start: usize,
     /// Lanes of a component.
     pub width: usize,
+    /// Channels of a component.
+    pub channels: usize,
     /// For each component that is needed its first lane, and the first lane and factor of what it sums.
     pub outputs: Vec<(usize, Vec<(u32, f64)>)>,
 }
 
 impl Combination {
     #[inline(always)]
-    pub fn forward(&self, tape: &mut [Lanes]) {
-        let (before, out) = tape.split_at_mut(self.start);
+    pub fn forward(&self, slots: usize, tape: &mut [Lanes]) {
+        let (before, out) = tape.split_at_mut(self.start * slots);
         for (row, terms) in &self.outputs {
-            for (c, out) in out[row - self.start..][..self.width].iter_mut().enumerate() {
+            let out = &mut out[(row - self.start) * slots..][..self.width * slots];
+            for (c, out) in out.iter_mut().enumerate() {
                 let mut sum = ZERO;
                 for (from, coefficient) in terms {
-                    add_scaled(&mut sum, *coefficient, &before[*from as usize + c]);
+                    add_scaled(&mut sum, *coefficient, &before[*from as usize * slots + c]);
                 }
                 *out = sum;
             }
@@ -103,12 +175,13 @@ impl Combination {
 
     /// Adds to the cotangents of what it read.
     #[inline(always)]
-    pub fn backward(&self, cotangent: &mut [Lanes]) {
-        let (before, out) = cotangent.split_at_mut(self.start);
+    pub fn backward(&self, slots: usize, cotangent: &mut [Lanes]) {
+        let (before, out) = cotangent.split_at_mut(self.start * slots);
         for (row, terms) in &self.outputs {
-            for (c, out) in out[row - self.start..][..self.width].iter().enumerate() {
+            let out = &out[(row - self.start) * slots..][..self.width * slots];
+            for (c, out) in out.iter().enumerate() {
                 for (from, coefficient) in terms {
-                    add_scaled(&mut before[*from as usize + c], *coefficient, out);
+                    add_scaled(&mut before[*from as usize * slots + c], *coefficient, out);
                 }
             }
         }

@@ -1,8 +1,7 @@
 //! The CALM feature z: the invariant basis, normalised, projected, with its norms.
 
-use std::ops::Range;
-
-use super::matrix::{LANES, Lanes, Matrix, ZERO, add_product, horizontal_sum};
+use super::instructions::Instructions;
+use super::matrix::{LANES, Lanes, Matrix, Rows, ZERO, add_product, horizontal_sum, scaled};
 use super::weights::with_transpose;
 
 /// ε_0 of the paper (Methods, "Latent features and uncertainty models").
@@ -27,12 +26,13 @@ pub struct Projection {
     pub density_scale: f32,
     /// Whether T is asinh (identity otherwise).
     pub asinh: bool,
-    /// The lanes of the basis of each layer, in the order of their norms in z.
-    pub(super) blocks: Vec<Range<usize>>,
-    pub(super) maps: ProjectionMaps,
+    /// The layers in the order of their norms in z.
+    pub(super) blocks: Vec<usize>,
+    /// Of the basis of each layer.
+    pub(super) maps: Vec<ProjectionMaps>,
 }
 
-/// R and its transpose for the basis in the order of evaluation.
+/// The rows of R for the basis of one layer, and their transpose.
 #[derive(Clone, Debug)]
 pub(super) struct ProjectionMaps {
     forward: Matrix,
@@ -40,7 +40,7 @@ pub(super) struct ProjectionMaps {
 }
 
 impl ProjectionMaps {
-    /// `row_of` gives the row of R for each place of the padded basis, none for padding.
+    /// `row_of` gives the row of R for each place of the layer's padded basis, none for padding.
     pub fn new(matrix: &[f32], dimension: usize, row_of: &[Option<usize>]) -> Self {
         let element = |place: usize, column: usize| {
             row_of[place].map_or(0.0, |row| f64::from(matrix[row * dimension + column]))
@@ -50,15 +50,13 @@ impl ProjectionMaps {
     }
 }
 
-/// What the reverse sweep needs of the forward one, for all atoms.
+/// What the reverse sweep needs of the forward one, for all atoms in the order of evaluation.
 #[derive(Clone, Debug, Default)]
 pub(super) struct ProjectionWork {
     /// B̂ R before T, [n, lanes of d].
     projected: Vec<Lanes>,
-    /// ‖B‖, ‖B_1‖, …, [n, 1 + blocks].
+    /// ‖B‖ and ‖B_k‖ of each layer, [n, 1 + layers].
     norms: Vec<f64>,
-    basis_offsets: Vec<u32>,
-    projected_offsets: Vec<u32>,
 }
 
 impl Projection {
@@ -83,117 +81,105 @@ impl Projection {
         bytes
     }
 
-    /// z of `n` atoms into `features` [n, D] from their bases [n, lanes].
+    /// z of atoms into `features` [n, D] from the bases of each layer, [n, lanes] in the given order of the atoms.
     #[inline(always)]
-    pub(super) fn forward(
+    pub(super) fn forward<'a>(
         &self,
-        n: usize,
-        basis: &[Lanes],
+        order: &[u32],
+        bases: impl Iterator<Item = &'a [Lanes]>,
         features: &mut Vec<f64>,
         work: &mut ProjectionWork,
+        instructions: Instructions,
     ) {
-        let (basis_lanes, lanes, width) = self.lanes(n, basis);
+        let (n, lanes, width) = (order.len(), self.lanes(), self.feature_dimension());
         work.norms.clear();
-        work.basis_offsets.clear();
-        work.projected_offsets.clear();
-        for (i, basis) in basis.chunks_exact(basis_lanes).enumerate() {
-            work.norms.push(norm(basis));
-            work.norms.extend(self.blocks.iter().map(|block| norm(&basis[block.clone()])));
-            work.basis_offsets.push((i * basis_lanes) as u32);
-            work.projected_offsets.push((i * lanes) as u32);
-        }
+        work.norms.resize(n * self.n_norms(), SQUARE_FLOOR);
         work.projected.clear();
         work.projected.resize(n * lanes, ZERO);
-        self.maps.forward.multiply_add(
-            basis,
-            &work.basis_offsets,
-            &mut work.projected,
-            &work.projected_offsets,
-        );
+        for (layer, (maps, bases)) in self.maps.iter().zip(bases).enumerate() {
+            let of_atom = maps.forward.input_lanes();
+            for (norms, basis) in work.norms.chunks_exact_mut(self.n_norms()).zip(bases.chunks_exact(of_atom))
+            {
+                let square = dot(basis, basis);
+                norms[0] += square;
+                norms[layer + 1] += square;
+            }
+            let (from, to) = (Rows::of_atoms(n, of_atom), Rows::of_atoms(n, lanes));
+            maps.forward.multiply_add(bases, from, &mut work.projected, to, instructions);
+        }
+        work.norms.iter_mut().for_each(|square| *square = square.sqrt());
         features.clear();
         features.resize(n * width, 0.0);
-        let norms = work.norms.chunks_exact(self.n_norms());
-        for ((z, projected), norms) in
-            features.chunks_exact_mut(width).zip(work.projected.chunks_exact_mut(lanes)).zip(norms)
-        {
+        let rows = work.projected.chunks_exact_mut(lanes).zip(work.norms.chunks_exact(self.n_norms()));
+        for (atom, (projected, norms)) in order.iter().zip(rows) {
+            let z = &mut features[*atom as usize * width..][..width];
             let scale = if self.normalize { 1.0 / (norms[0] + NORM_FLOOR) } else { 1.0 };
             let projected = &mut projected.as_flattened_mut()[..self.dimension];
             for (z, p) in z.iter_mut().zip(projected) {
                 *p *= scale;
                 *z = if self.asinh { p.asinh() } else { *p };
             }
+            let norms = std::iter::once(norms[0]).chain(self.blocks.iter().map(|layer| norms[layer + 1]));
             for (z, norm) in z[self.dimension..].iter_mut().zip(norms) {
                 *z = f64::from(self.density_scale) * (norm + NORM_FLOOR).ln();
             }
         }
     }
 
-    /// The cotangent of the bases, [n, lanes], from that of z, [n, D].
+    /// The cotangents of the bases of each layer, [n, lanes] in the given order of the atoms, from that of z, [n, D].
+    /// `layers` gives each layer's bases and where to write.
+    ///
+    /// B̄ = R p̄/(N + ε_0) + \[L̄/(N + ε_0) − (p̄ · p)/(N + ε_0)\] B/N with p = B̂ R, and in block k besides
+    /// L̄_k/(N_k + ε_0) B/N_k.
     #[inline(always)]
-    pub(super) fn backward(
+    pub(super) fn backward<'a>(
         &self,
-        n: usize,
-        basis: &[Lanes],
+        order: &[u32],
+        layers: impl Iterator<Item = (&'a [Lanes], &'a mut Vec<Lanes>)>,
         feature_cotangent: &[f64],
-        basis_cotangent: &mut Vec<Lanes>,
         work: &mut ProjectionWork,
+        instructions: Instructions,
     ) {
-        let (basis_lanes, lanes, width) = self.lanes(n, basis);
-        for (cotangent, projected) in
-            feature_cotangent.chunks_exact(width).zip(work.projected.chunks_exact_mut(lanes))
-        {
-            for (c, p) in cotangent[..self.dimension].iter().zip(projected.as_flattened_mut()) {
-                *p = if self.asinh { c / (1.0 + *p * *p).sqrt() } else { *c };
+        let (n, lanes, width) = (order.len(), self.lanes(), self.feature_dimension());
+        let rows = work.projected.chunks_exact_mut(lanes).zip(work.norms.chunks_exact_mut(self.n_norms()));
+        for (atom, (projected, norms)) in order.iter().zip(rows) {
+            let (of_projected, of_norms) =
+                feature_cotangent[*atom as usize * width..][..width].split_at(self.dimension);
+            let inverse = 1.0 / (norms[0] + NORM_FLOOR);
+            let (scale, mut along) = (if self.normalize { inverse } else { 1.0 }, 0.0);
+            for (c, p) in of_projected.iter().zip(projected.as_flattened_mut()) {
+                let cotangent = if self.asinh { c / (1.0 + *p * *p).sqrt() } else { *c };
+                along += cotangent * *p;
+                *p = scale * cotangent;
             }
+            self.norm_cotangents(norms, if self.normalize { along } else { 0.0 }, of_norms);
         }
-        basis_cotangent.clear();
-        basis_cotangent.resize(n * basis_lanes, ZERO);
-        self.maps.transposed.multiply_add(
-            &work.projected,
-            &work.projected_offsets,
-            basis_cotangent,
-            &work.basis_offsets,
-        );
-        let norms = work.norms.chunks_exact(self.n_norms());
-        let cotangents = feature_cotangent.chunks_exact(width).zip(norms);
-        for ((basis, out), (cotangent, norms)) in
-            basis.chunks_exact(basis_lanes).zip(basis_cotangent.chunks_exact_mut(basis_lanes)).zip(cotangents)
-        {
-            self.through_norms(norms, &cotangent[self.dimension..], basis, out);
+        for (layer, (maps, (bases, out))) in self.maps.iter().zip(layers).enumerate() {
+            let of_atom = maps.forward.input_lanes();
+            out.clear();
+            for (basis, factors) in bases.chunks_exact(of_atom).zip(work.norms.chunks_exact(self.n_norms())) {
+                out.extend(basis.iter().map(|b| scaled(factors[0] + factors[layer + 1], b)));
+            }
+            let (from, to) = (Rows::of_atoms(n, lanes), Rows::of_atoms(n, of_atom));
+            maps.transposed.multiply_add(&work.projected, from, out, to, instructions);
         }
     }
 
-    /// From the cotangent of B̂ (in `out`) and those of log(‖B‖ + ε_0) and log(‖B_1‖ + ε_0), … to that of B:
-    /// B̄ = B̂̄/(N + ε_0) + \[L̄/(N + ε_0) − (B̂̄ · B)/(N + ε_0)²\] B/N, and in block k L̄_k/(N_k + ε_0) B/N_k.
+    /// Puts in place of ‖B‖ and ‖B_k‖ the factors of B in its cotangent, the first for all layers.
     #[inline(always)]
-    fn through_norms(&self, norms: &[f64], log_cotangents: &[f64], basis: &[Lanes], out: &mut [Lanes]) {
-        let log_cotangent = |k: usize| {
-            log_cotangents.get(k).map_or(0.0, |c| f64::from(self.density_scale) * c) / (norms[k] + NORM_FLOOR)
-        };
-        let inverse = 1.0 / (norms[0] + NORM_FLOOR);
-        let (mut scale, mut along) = (1.0, log_cotangent(0));
-        if self.normalize {
-            along -= dot(out, basis) * inverse * inverse;
-            scale = inverse;
+    fn norm_cotangents(&self, norms: &mut [f64], along: f64, of_norms: &[f64]) {
+        let (scale, density) = (f64::from(self.density_scale), |k: usize| of_norms.get(k).copied());
+        let factor = |norm: f64, cotangent: f64| cotangent / (norm + NORM_FLOOR) / norm;
+        for (k, layer) in self.blocks.iter().enumerate() {
+            norms[layer + 1] = factor(norms[layer + 1], scale * density(k + 1).unwrap_or(0.0));
         }
-        for (k, block) in self.blocks.iter().enumerate() {
-            let factor = along / norms[0] + log_cotangent(k + 1) / norms[k + 1];
-            let (out, basis) = (&mut out[block.clone()], &basis[block.clone()]);
-            for (out, b) in out.as_flattened_mut().iter_mut().zip(basis.as_flattened()) {
-                *out = scale * *out + factor * b;
-            }
-        }
+        norms[0] = factor(norms[0], scale * density(0).unwrap_or(0.0) - along);
     }
 
-    fn lanes(&self, n: usize, basis: &[Lanes]) -> (usize, usize, usize) {
-        (basis.len() / n.max(1), self.maps.forward.output_lanes(), self.feature_dimension())
+    /// Lanes of B̂ R.
+    fn lanes(&self) -> usize {
+        self.maps.first().map_or(0, |maps| maps.forward.output_lanes())
     }
-}
-
-/// √(Σ B² + 10⁻³⁰)
-#[inline(always)]
-fn norm(basis: &[Lanes]) -> f64 {
-    (dot(basis, basis) + SQUARE_FLOOR).sqrt()
 }
 
 #[inline(always)]

@@ -1,6 +1,7 @@
 //! The small network on a Chebyshev basis that gives the radial functions, with two derivatives.
 
-use super::matrix::{Lanes, Matrix, ZERO, add_scaled, lanes_for};
+use super::instructions::Instructions;
+use super::matrix::{Lanes, Matrix, Rows, ZERO, add_scaled, lanes_for};
 
 /// x ↦ silu(W_k … silu(W_1 g + b_1) + b_k), where g_k(r) = T_k(x) f_p(u), u = r/r_c, x = 2u − 1, k = 1 …, and
 ///
@@ -35,12 +36,14 @@ impl RadialNetwork {
     /// R_nl and its first two derivatives at distance `r` for the cutoff r_c, Å; the polynomials simply go
     /// on beyond the cutoff, where no bond is.
     pub fn evaluate<'a>(&self, r: f64, cutoff: f64, pair: usize, work: &'a mut RadialWork) -> &'a Jet {
+        let instructions = Instructions::best();
         self.basis(r, cutoff, &mut work.input);
         for (k, layer) in self.layers.iter().enumerate() {
             for (input, output) in work.input.iter().zip(&mut work.output) {
                 output.clear();
                 output.resize(layer.output_lanes(), ZERO);
-                layer.multiply_add_row(input, output);
+                let row = Rows::of_atoms(1, 0);
+                layer.multiply_add(input, row, output, row, instructions);
             }
             let bias = if k == 0 { self.pair_biases.get(pair) } else { self.biases.get(k) };
             for (y, b) in work.output[0].iter_mut().zip(bias.into_iter().flatten()) {

@@ -1,7 +1,8 @@
-//! From the invariant basis of an atom to its energy.
+//! From the invariant basis of atoms to their energies.
 
 use super::invariant_norm::InvariantNorm;
-use super::matrix::{Lanes, Matrix, ZERO};
+use super::matrix::{Lanes, Matrix, Rows, ZERO};
+use super::tape::Batch;
 use super::weights::Weights;
 
 /// Non-linearity of the readout.
@@ -56,11 +57,19 @@ pub(super) struct Block {
     pub norm: Option<InvariantNorm>,
 }
 
-/// Work arrays of [`Readout::evaluate`].
+impl Block {
+    /// Lanes of the densities.
+    #[inline(always)]
+    pub fn lanes(&self) -> usize {
+        self.weights.forward(0).output_lanes()
+    }
+}
+
+/// Work arrays for one batch of atoms; each array has a row for each atom.
 #[derive(Clone, Debug, Default)]
 pub(super) struct ReadoutWork {
-    /// W B of one layer after another.
-    densities: Vec<Lanes>,
+    /// W B of each layer.
+    densities: Vec<Vec<Lanes>>,
     /// Values after each layer of the perceptron, its input first.
     values: Vec<Vec<Lanes>>,
     /// Derivatives of the activations.
@@ -70,104 +79,105 @@ pub(super) struct ReadoutWork {
 }
 
 impl Readout {
-    /// Lanes of the densities of one layer.
-    fn block_lanes(&self) -> usize {
-        self.blocks.first().map_or(0, |block| block.weights.forward(0).output_lanes())
+    /// Lanes of y.
+    fn density_lanes(&self) -> usize {
+        self.blocks.first().map_or(0, Block::lanes)
     }
 
-    /// Lanes of the densities of all layers of one atom.
-    pub fn density_lanes(&self) -> usize {
-        self.blocks.len() * self.block_lanes()
-    }
-
-    /// The energy of one atom, eV, from its basis, whose lanes `ends` divides into layers, and the derivatives
-    /// of the energy with respect to the densities W B of each layer into `density_cotangent`.
+    /// Begins with a batch of so many atoms.
     #[inline(always)]
-    pub fn evaluate(
-        &self,
-        element: usize,
-        basis: &[Lanes],
-        ends: &[usize],
-        density_cotangent: &mut [Lanes],
-        work: &mut ReadoutWork,
-    ) -> f64 {
+    pub fn begin(&self, atoms: usize, work: &mut ReadoutWork) {
+        work.densities.resize(self.blocks.len(), Vec::new());
         work.values.resize(self.layers.len() + 1, Vec::new());
         work.slopes.resize(self.layers.len(), Vec::new());
-        self.sum_densities(element, basis, ends, work);
+        zeros(&mut work.values[0], atoms * self.density_lanes());
+    }
+
+    /// Adds the densities of one layer to y, from its basis, a row of `stride` lanes for each atom.
+    #[inline(always)]
+    pub fn add_densities(
+        &self,
+        layer: usize,
+        batch: &Batch,
+        basis: (&[Lanes], usize),
+        work: &mut ReadoutWork,
+    ) {
+        let (block, lanes, atoms) = (&self.blocks[layer], self.density_lanes(), batch.atoms);
+        let densities = &mut work.densities[layer];
+        zeros(densities, atoms * lanes);
+        let (from, to) = (Rows::of_atoms(atoms, basis.1), Rows::of_atoms(atoms, lanes));
+        block.weights.forward(batch.element).multiply_add(basis.0, from, densities, to, batch.instructions);
+        let rows = densities.chunks_exact(lanes).zip(work.values[0].chunks_exact_mut(lanes));
+        for (densities, sum) in rows.map(|(d, sum)| (d.as_flattened(), sum.as_flattened_mut())) {
+            match &block.norm {
+                Some(norm) => norm.forward(densities, sum),
+                None => sum.iter_mut().zip(densities).for_each(|(sum, y)| *sum += y),
+            }
+        }
+    }
+
+    /// The energies of the atoms, eV, when all layers have added their densities; leaves ∂E/∂y in `work`.
+    #[inline(always)]
+    pub fn evaluate(&self, batch: &Batch, energies: &mut [f64], work: &mut ReadoutWork) {
+        let atoms = batch.atoms;
         for (k, (layer, _)) in self.layers.iter().enumerate() {
             let (before, after) = work.values.split_at_mut(k + 1);
-            zeros(&mut after[0], layer.output_lanes());
-            layer.multiply_add_row(&before[k], &mut after[0]);
+            zeros(&mut after[0], atoms * layer.output_lanes());
+            let from = Rows::of_atoms(atoms, layer.input_lanes());
+            let to = Rows::of_atoms(atoms, layer.output_lanes());
+            layer.multiply_add(&before[k], from, &mut after[0], to, batch.instructions);
             if k + 1 < self.layers.len() {
-                zeros(&mut work.slopes[k], layer.output_lanes());
+                zeros(&mut work.slopes[k], atoms * layer.output_lanes());
                 let values = after[0].as_flattened_mut().iter_mut();
                 for (x, slope) in values.zip(work.slopes[k].as_flattened_mut()) {
                     (*x, *slope) = self.activation.evaluate(*x);
                 }
             }
         }
-        self.backward(density_cotangent, work);
-        let perceptron = if self.layers.is_empty() { 0.0 } else { work.values[self.layers.len()][0][0] };
-        self.scale * (work.values[0][0][0] + perceptron) + self.shifts[element]
-    }
-
-    /// y into the first of `work.values`.
-    #[inline(always)]
-    fn sum_densities(&self, element: usize, basis: &[Lanes], ends: &[usize], work: &mut ReadoutWork) {
-        let (lanes, mut start) = (self.block_lanes(), 0);
-        zeros(&mut work.densities, self.density_lanes());
-        zeros(&mut work.values[0], lanes);
-        let densities = work.densities.chunks_exact_mut(lanes.max(1));
-        for ((block, end), densities) in self.blocks.iter().zip(ends).zip(densities) {
-            block.weights.forward(element).multiply_add_row(&basis[start..*end], densities);
-            let sum = work.values[0].as_flattened_mut();
-            match &block.norm {
-                Some(norm) => norm.forward(densities.as_flattened(), sum),
-                None => sum.iter_mut().zip(densities.as_flattened()).for_each(|(sum, y)| *sum += y),
-            }
-            start = *end;
+        let lanes = self.density_lanes();
+        for (atom, energy) in energies.iter_mut().enumerate() {
+            let perceptron =
+                if self.layers.is_empty() { 0.0 } else { work.values[self.layers.len()][atom][0] };
+            *energy =
+                self.scale * (work.values[0][atom * lanes][0] + perceptron) + self.shifts[batch.element];
         }
+        self.backward(batch, work);
     }
 
+    /// ∂E/∂y into `work.cotangent`.
     #[inline(always)]
-    fn backward(&self, density_cotangent: &mut [Lanes], work: &mut ReadoutWork) {
-        zeros(&mut work.cotangent, 1);
-        work.cotangent[0][0] = self.scale;
+    fn backward(&self, batch: &Batch, work: &mut ReadoutWork) {
+        let (atoms, lanes) = (batch.atoms, self.density_lanes());
+        zeros(&mut work.cotangent, atoms);
+        work.cotangent.iter_mut().for_each(|cotangent| cotangent[0] = self.scale);
         for (k, (_, transposed)) in self.layers.iter().enumerate().rev() {
             if k + 1 < self.layers.len() {
                 let cotangent = work.cotangent.as_flattened_mut().iter_mut();
                 cotangent.zip(work.slopes[k].as_flattened()).for_each(|(c, slope)| *c *= slope);
             }
-            zeros(&mut work.swap, transposed.output_lanes());
-            transposed.multiply_add_row(&work.cotangent, &mut work.swap);
+            zeros(&mut work.swap, atoms * transposed.output_lanes());
+            let from = Rows::of_atoms(atoms, transposed.input_lanes());
+            let to = Rows::of_atoms(atoms, transposed.output_lanes());
+            transposed.multiply_add(&work.cotangent, from, &mut work.swap, to, batch.instructions);
             std::mem::swap(&mut work.swap, &mut work.cotangent);
         }
-        let lanes = self.block_lanes();
         if self.layers.is_empty() {
-            zeros(&mut work.cotangent, lanes);
+            zeros(&mut work.cotangent, atoms * lanes);
         }
-        work.cotangent[0][0] += self.scale;
-        let blocks = density_cotangent.chunks_exact_mut(lanes.max(1)).zip(&self.blocks);
-        for ((cotangent, block), densities) in blocks.zip(work.densities.chunks_exact(lanes.max(1))) {
-            cotangent.copy_from_slice(&work.cotangent);
-            if let Some(norm) = &block.norm {
-                norm.backward(densities.as_flattened(), cotangent.as_flattened_mut());
-            }
-        }
+        work.cotangent.chunks_exact_mut(lanes).for_each(|cotangent| cotangent[0][0] += self.scale);
     }
 
-    /// Adds ∂E/∂B of one layer to `basis_cotangent`.
+    /// ∂E/∂(W B) of one layer, a row for each atom, after [`Readout::evaluate`].
     #[inline(always)]
-    pub fn basis_cotangent(
-        &self,
-        layer: usize,
-        element: usize,
-        density_cotangent: &[Lanes],
-        basis_cotangent: &mut [Lanes],
-    ) {
-        let lanes = self.block_lanes();
-        let cotangent = &density_cotangent[layer * lanes..][..lanes];
-        self.blocks[layer].weights.transposed(element).multiply_add_row(cotangent, basis_cotangent);
+    pub fn density_cotangent(&self, layer: usize, out: &mut [Lanes], work: &ReadoutWork) {
+        out.copy_from_slice(&work.cotangent);
+        let Some(norm) = &self.blocks[layer].norm else { return };
+        let lanes = self.density_lanes();
+        for (cotangent, densities) in
+            out.chunks_exact_mut(lanes).zip(work.densities[layer].chunks_exact(lanes))
+        {
+            norm.backward(densities.as_flattened(), cotangent.as_flattened_mut());
+        }
     }
 }
 

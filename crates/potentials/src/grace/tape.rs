@@ -1,11 +1,13 @@
-//! The equivariant tensors of one atom, and the operations that make one from others.
+//! The equivariant tensors of some atoms, and the operations that make one from others.
 //!
-//! All tensors of an atom stand behind one another on a tape, each \[component\]\[channel\]. An operation
-//! reads rows that stand before its result. Cotangents stand on a second tape of the same layout, which
-//! the operations walk backwards.
+//! All tensors stand behind one another on a tape, each \[component\]\[slot\]\[channel\], with a slot for each atom of a
+//! batch: weights are read once for all of them. An operation reads rows that stand before its result. Cotangents stand
+//! on a second tape of the same layout, which the operations walk backwards; its slots are \[cotangent\]\[atom\].
+//! Places on a tape are those for one slot; with more slots a component begins at that many times the lane.
 
 use super::equivariant_norm::EquivariantNorm;
-use super::matrix::{Lanes, add_scaled};
+use super::instructions::Instructions;
+use super::matrix::{Lanes, Rows, ZERO, add_scaled};
 use super::product::{Combination, Product};
 use super::weights::Weights;
 
@@ -23,14 +25,40 @@ pub(super) struct Tensor {
 }
 
 impl Tensor {
-    /// First lane of a component.
+    /// First lane of a component, for one slot.
     pub fn row(&self, component: usize) -> usize {
         self.start + component * self.width
     }
 
-    /// One lane past the tensor.
+    /// One lane past the tensor, for one slot.
     pub fn end(&self) -> usize {
         self.start + self.components * self.width
+    }
+}
+
+/// Atoms that pass a tape together.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Batch {
+    /// The element of all of them.
+    pub element: usize,
+    /// How many they are.
+    pub atoms: usize,
+    pub instructions: Instructions,
+}
+
+/// The place of one atom, or of one of its cotangents, on a tape.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Slot {
+    pub slot: usize,
+    /// How many there are.
+    pub slots: usize,
+}
+
+impl Slot {
+    /// First lane of a component.
+    #[inline(always)]
+    pub fn row(self, tensor: &Tensor, component: usize) -> usize {
+        tensor.row(component) * self.slots + self.slot * tensor.width
     }
 }
 
@@ -48,25 +76,24 @@ pub(super) enum Operation {
 }
 
 impl Operation {
-    /// `element` is that of the atom.
     #[inline(always)]
-    pub fn forward(&self, element: usize, tape: &mut [Lanes]) {
+    pub fn forward(&self, batch: &Batch, tape: &mut [Lanes]) {
         match self {
-            Self::Linear(linear) => linear.forward(element, tape),
-            Self::Product(product) => product.forward(tape),
-            Self::Combination(combination) => combination.forward(tape),
-            Self::EquivariantNorm(norm) => norm.forward(tape),
+            Self::Linear(linear) => linear.forward(batch, tape),
+            Self::Product(product) => product.forward(batch.atoms, tape),
+            Self::Combination(combination) => combination.forward(batch.atoms, tape),
+            Self::EquivariantNorm(norm) => norm.forward(batch.atoms, tape),
         }
     }
 
-    /// Adds to the cotangents of what it read.
+    /// Adds to `N` cotangents of what it read.
     #[inline(always)]
-    pub fn backward(&self, element: usize, tape: &[Lanes], cotangent: &mut [Lanes]) {
+    pub fn backward<const N: usize>(&self, batch: &Batch, tape: &[Lanes], cotangent: &mut [Lanes]) {
         match self {
-            Self::Linear(linear) => linear.backward(element, cotangent),
-            Self::Product(product) => product.backward(tape, cotangent),
-            Self::Combination(combination) => combination.backward(cotangent),
-            Self::EquivariantNorm(norm) => norm.backward(tape, cotangent),
+            Self::Linear(linear) => linear.backward::<N>(batch, cotangent),
+            Self::Product(product) => product.backward::<N>(batch.atoms, tape, cotangent),
+            Self::Combination(combination) => combination.backward(N * batch.atoms, cotangent),
+            Self::EquivariantNorm(norm) => norm.backward::<N>(batch.atoms, tape, cotangent),
         }
     }
 
@@ -104,18 +131,20 @@ pub(super) struct LinearPart {
 
 impl Linear {
     #[inline(always)]
-    fn forward(&self, element: usize, tape: &mut [Lanes]) {
-        let (before, out) = tape.split_at_mut(self.start);
+    fn forward(&self, batch: &Batch, tape: &mut [Lanes]) {
+        let (before, out) = tape.split_at_mut(self.start * batch.atoms);
         for part in &self.parts {
-            part.weights.forward(element).multiply_add(before, &part.from, out, &part.to);
+            let (from, to) = part.rows(batch.atoms);
+            part.weights.forward(batch.element).multiply_add(before, from, out, to, batch.instructions);
         }
     }
 
     #[inline(always)]
-    fn backward(&self, element: usize, cotangent: &mut [Lanes]) {
-        let (before, out) = cotangent.split_at_mut(self.start);
+    fn backward<const N: usize>(&self, batch: &Batch, cotangent: &mut [Lanes]) {
+        let (before, out) = cotangent.split_at_mut(self.start * N * batch.atoms);
         for part in &self.parts {
-            part.weights.transposed(element).multiply_add(out, &part.to, before, &part.from);
+            let (from, to) = part.rows(N * batch.atoms);
+            part.weights.transposed(batch.element).multiply_add(out, to, before, from, batch.instructions);
         }
     }
 
@@ -128,6 +157,15 @@ impl Linear {
             (part.from, part.to) = kept.into_iter().unzip();
         }
         self.parts.retain(|part| !part.from.is_empty());
+    }
+}
+
+impl LinearPart {
+    #[inline(always)]
+    fn rows(&self, slots: usize) -> (Rows<'_>, Rows<'_>) {
+        let weights = self.weights.forward(0);
+        let rows = |starts, stride| Rows { starts, slots, stride, shift: 0 };
+        (rows(&self.from, weights.input_lanes()), rows(&self.to, weights.output_lanes()))
     }
 }
 
@@ -144,24 +182,68 @@ impl Gather {
         self.rows.iter().map(|(_, width)| width).sum()
     }
 
+    /// Into `out`, a row of `stride` lanes for each atom.
     #[inline(always)]
-    pub fn forward(&self, tape: &[Lanes], out: &mut [Lanes]) {
+    pub fn forward(&self, atoms: usize, tape: &[Lanes], out: &mut [Lanes], stride: usize) {
         let mut position = 0;
         for (row, width) in &self.rows {
-            out[position..position + width].copy_from_slice(&tape[*row..row + width]);
+            for atom in 0..atoms {
+                let (to, from) = (atom * stride + position, row * atoms + atom * width);
+                out[to..to + width].copy_from_slice(&tape[from..from + width]);
+            }
             position += width;
         }
     }
 
-    /// Adds to the cotangents of the rows.
+    /// Adds to the cotangents of the rows in the slots from `slot` of `slots`, from a row of `stride` lanes for each
+    /// atom.
     #[inline(always)]
-    pub fn backward(&self, out: &[Lanes], cotangent: &mut [Lanes]) {
+    pub fn backward(
+        &self,
+        atoms: usize,
+        (out, stride): (&[Lanes], usize),
+        cotangent: &mut [Lanes],
+        (slot, slots): (usize, usize),
+    ) {
         let mut position = 0;
         for (row, width) in &self.rows {
-            for (sum, x) in cotangent[*row..row + width].iter_mut().zip(&out[position..]) {
-                add_scaled(sum, 1.0, x);
+            for atom in 0..atoms {
+                let (from, to) = (atom * stride + position, row * slots + (slot + atom) * width);
+                for (sum, x) in cotangent[to..to + width].iter_mut().zip(&out[from..from + width]) {
+                    add_scaled(sum, 1.0, x);
+                }
             }
             position += width;
+        }
+    }
+}
+
+/// Ranges of the tape that hold anything, for one slot.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Used(Vec<(usize, usize)>);
+
+impl Used {
+    /// From the first lanes and the numbers of lanes of rows, in ascending order.
+    pub fn new(rows: impl Iterator<Item = (usize, usize)>) -> Self {
+        let mut ranges: Vec<(usize, usize)> = Vec::new();
+        for (row, width) in rows {
+            match ranges.last_mut() {
+                Some((_, end)) if *end == row => *end = row + width,
+                _ => ranges.push((row, row + width)),
+            }
+        }
+        Self(ranges)
+    }
+
+    /// Lanes of all ranges together.
+    pub fn lanes(&self) -> usize {
+        self.0.iter().map(|(start, end)| end - start).sum()
+    }
+
+    #[inline(always)]
+    pub fn clear(&self, slots: usize, tape: &mut [Lanes]) {
+        for (start, end) in &self.0 {
+            tape[start * slots..end * slots].fill(ZERO);
         }
     }
 }

@@ -30,6 +30,14 @@ impl Weights {
         &self.of(element).1
     }
 
+    /// Adds other weights of the same shape.
+    pub fn add(&mut self, other: &Self) {
+        for ((matrix, transposed), other) in self.0.iter_mut().zip(&other.0) {
+            matrix.add(&other.0);
+            transposed.add(&other.1);
+        }
+    }
+
     #[inline(always)]
     fn of(&self, element: usize) -> &(Matrix, Matrix) {
         &self.0[if self.0.len() == 1 { 0 } else { element }]
