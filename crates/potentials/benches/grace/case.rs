@@ -1,0 +1,175 @@
+//! Models and crystals that are measured.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use atoms::{Cell, Evaluation, NeighbourList, Potential, Structure};
+use calm::{Artifact, Grades, Mixture};
+use potentials::grace::{Grace, GraceModel, PullBack};
+
+/// A model, and how gracemaker gets one like it.
+pub struct Model {
+    pub name: &'static str,
+    /// Where it is below the repository; below `CALMWALK_PEER_DATA` otherwise.
+    committed: Option<&'static str>,
+    peer_data: &'static str,
+    /// Edge of a cubic cell of four atoms, Å.
+    edge: f64,
+    /// Preset and its arguments as JSON; without one there is a checkpoint beside the model's peer data.
+    pub preset: Option<(&'static str, &'static str)>,
+}
+
+pub const MODELS: [Model; 3] = [
+    Model {
+        name: "al_eam_1l",
+        committed: Some("configs/data/al_eam_1l"),
+        peer_data: "models/al_eam_1l",
+        edge: 4.05,
+        preset: None,
+    },
+    Model {
+        name: "grace1l_paper",
+        committed: None,
+        peer_data: "grace/grace1l_paper",
+        edge: 4.03,
+        preset: Some((
+            "GRACE_1LAYER_latest",
+            r#"{"lmax": 4, "n_rad_base": 8, "n_rad_max": 32, "prod_func_n_max": 64, "n_mlp_dens": 12}"#,
+        )),
+    },
+    Model {
+        name: "grace2l_small",
+        committed: None,
+        peer_data: "grace/grace2l_small",
+        edge: 4.03,
+        preset: Some((
+            "GRACE_2LAYER_latest",
+            r#"{"lmax": [4, 3], "n_rad_max": [32, 32], "prod_func_n_max": [32, 32], "n_mlp_dens": 12, "n_rad_base": 8}"#,
+        )),
+    },
+];
+
+impl Model {
+    /// Where it is, if anywhere.
+    pub fn folder(&self) -> Option<PathBuf> {
+        match self.committed {
+            Some(path) => Some(Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path)),
+            None => self.peer_folder(),
+        }
+    }
+
+    /// Where gracemaker finds its checkpoint and its mixture.
+    pub fn peer_folder(&self) -> Option<PathBuf> {
+        std::env::var_os("CALMWALK_PEER_DATA").map(|data| Path::new(&data).join(self.peer_data))
+    }
+}
+
+/// What is asked of the model.
+#[derive(Clone, Copy)]
+pub enum Call {
+    Plain,
+    Graded,
+}
+
+/// A model and a hot fcc crystal of its elements.
+pub struct Case {
+    pub structure: Structure,
+    grace: Grace,
+    neighbours: NeighbourList,
+    elements: Vec<usize>,
+    mixture: Mixture,
+    grades: Grades,
+    cotangent: Vec<f64>,
+    pull_back: PullBack,
+}
+
+impl Case {
+    pub fn new(model: &Model, cells: usize) -> Self {
+        let folder = model.folder().expect("the model is here");
+        let weights = Arc::new(GraceModel::load(&folder.join("kokkos.npz")).expect("a model"));
+        let mixture = Artifact::load_export(folder.join("kokkos.npz")).expect("CALM arrays").mixture;
+        let structure = crystal(&weights, cells, model.edge);
+        let mut neighbours = NeighbourList::new(weights.cutoff(), 0.5);
+        neighbours.update(&structure).expect("a crystal");
+        let elements = weights.element_indices(&structure.species).expect("elements of the model");
+        Self {
+            structure,
+            grace: Grace::new(weights),
+            neighbours,
+            elements,
+            mixture,
+            grades: Grades::default(),
+            cotangent: Vec::new(),
+            pull_back: PullBack::default(),
+        }
+    }
+
+    /// Energy and forces.
+    pub fn plain(&mut self, out: &mut Evaluation) {
+        self.grace.evaluate(&self.structure, &self.neighbours, out).expect("known elements");
+    }
+
+    /// Energy and forces, γ and ∇Σγ with its virial.
+    pub fn graded(&mut self, out: &mut Evaluation) {
+        self.grace.forward(&self.structure, &self.neighbours).expect("known elements");
+        let features = self.grace.features();
+        self.cotangent.resize(features.len(), 0.0);
+        let cotangent = Some(self.cotangent.as_mut_slice());
+        self.grades.evaluate(&self.mixture, &self.elements, features, cotangent).expect("finite features");
+        self.grace.backward(Some(&self.cotangent), out, &mut self.pull_back);
+    }
+
+    /// Å
+    pub fn cutoff(&self) -> f64 {
+        self.grace.cutoff()
+    }
+
+    /// Symbols of the model's elements, in order.
+    pub fn symbols(&self) -> Vec<&'static str> {
+        self.grace.species().iter().map(|species| species.symbol()).collect()
+    }
+
+    /// Of one call, for all atoms.
+    pub fn multiply_adds(&self, call: Call) -> u64 {
+        self.grace.multiply_adds(matches!(call, Call::Graded))
+    }
+
+    /// Directed bonds within the cutoff.
+    pub fn bonds(&self) -> usize {
+        let cutoff = self.grace.cutoff();
+        let within = |i: usize| {
+            let d = |n: &atoms::Neighbour| n.displacement(&self.structure, i);
+            self.neighbours
+                .of(i)
+                .iter()
+                .filter(|n| d(n).iter().map(|x| x * x).sum::<f64>() < cutoff * cutoff)
+                .count()
+        };
+        (0..self.structure.len()).map(within).sum()
+    }
+}
+
+/// fcc with elements in turn, every atom moved by up to 0.15 Å along each axis.
+fn crystal(model: &GraceModel, cells: usize, edge: f64) -> Structure {
+    const SITES: [[f64; 3]; 4] = [[0.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]];
+    let mut state = 1_u64;
+    let mut noise = || {
+        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        0.3 * ((state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5)
+    };
+    let mut positions = Vec::new();
+    for cell in 0..cells * cells * cells {
+        let corner = [cell / (cells * cells), cell / cells % cells, cell % cells];
+        for site in SITES {
+            positions.push(std::array::from_fn(|a| edge * (corner[a] as f64 + site[a]) + noise()));
+        }
+    }
+    let length = edge * cells as f64;
+    let known = model.elements();
+    Structure {
+        species: (0..positions.len()).map(|k| known[k % known.len()]).collect(),
+        positions,
+        cell: Cell::orthorhombic(length, length, length),
+        periodic: [true; 3],
+    }
+}

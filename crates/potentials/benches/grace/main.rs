@@ -1,0 +1,106 @@
+//! GRACE measured: energy and forces, and with them γ and ∇Σγ, on one thread; against gracemaker's own calculator where
+//! `CALMWALK_GRACEMAKER_PYTHON` names a Python that has it.
+//!
+//! `cargo bench -p potentials --bench grace [-- MODEL…]`; the larger models are those of `CALMWALK_PEER_DATA`.
+
+mod case;
+mod peak;
+mod peer;
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use atoms::Evaluation;
+use case::{Call, Case, MODELS, Model};
+
+/// Atoms along an edge of the crystals, four in a cell: 108 and 500 atoms.
+const EDGES: [usize; 2] = [3, 5];
+
+/// Seconds that each crystal is measured for.
+const SECONDS: f64 = 4.0;
+
+fn main() {
+    let wanted: Vec<String> =
+        std::env::args().skip(1).filter(|argument| !argument.starts_with('-')).collect();
+    let peak = peak::report();
+    for model in
+        MODELS.iter().filter(|model| wanted.is_empty() || wanted.iter().any(|name| name == model.name))
+    {
+        match model.folder() {
+            Some(folder) if folder.join("kokkos.npz").exists() => report(model, peak),
+            _ => println!("\n{}: not here (CALMWALK_PEER_DATA names the folder that has it)", model.name),
+        }
+    }
+}
+
+fn report(model: &Model, peak: f64) {
+    println!("\n{}", model.name);
+    let mut cases: Vec<Case> = EDGES.iter().map(|edge| Case::new(model, *edge)).collect();
+    let peers = peer::seconds(model, &cases);
+    for (k, case) in cases.iter_mut().enumerate() {
+        let atoms = case.structure.len() as f64;
+        let found = measure(case);
+        let peer = peers.as_ref().map(|peers| &peers[k]);
+        println!("  {atoms} atoms, {:.1} bonds an atom", case.bonds() as f64 / atoms);
+        for (name, call, times) in
+            [("energy, forces", Call::Plain, &found.plain), ("with γ and ∇Σγ", Call::Graded, &found.graded)]
+        {
+            let [low, median, high] = quantiles(times);
+            let count = case.multiply_adds(call) as f64;
+            println!(
+                "    {name}: {:.4} ms an atom ({:.4} to {:.4}); {:.3} M multiply-adds an atom, {:.0} % of the peak",
+                1e3 * median / atoms,
+                1e3 * low / atoms,
+                1e3 * high / atoms,
+                1e-6 * count / atoms,
+                100.0 * count / median / peak
+            );
+            if let Some(peer) = peer.map(|peer| peer.of(call)).filter(|times| !times.is_empty()) {
+                let [low, theirs, high] = quantiles(peer);
+                println!(
+                    "      gracemaker: {:.3} ms an atom ({:.3} to {:.3}), {:.1} times ours",
+                    1e3 * theirs / atoms,
+                    1e3 * low / atoms,
+                    1e3 * high / atoms,
+                    theirs / median
+                );
+            }
+        }
+        let ratios: Vec<f64> =
+            found.graded.iter().zip(&found.plain).map(|(both, plain)| both / plain).collect();
+        let [low, median, high] = quantiles(&ratios);
+        println!("    both gradients over plain: {median:.2} ({low:.2} to {high:.2})");
+    }
+}
+
+/// Seconds of calls that were made in turn.
+struct Found {
+    plain: Vec<f64>,
+    graded: Vec<f64>,
+}
+
+fn measure(case: &mut Case) -> Found {
+    let mut found = Found { plain: Vec::new(), graded: Vec::new() };
+    let mut out = Evaluation::default();
+    for _ in 0..2 {
+        case.plain(&mut out);
+        case.graded(&mut out);
+    }
+    let begin = Instant::now();
+    while begin.elapsed().as_secs_f64() < SECONDS || found.plain.len() < 5 {
+        let start = Instant::now();
+        case.plain(black_box(&mut out));
+        found.plain.push(start.elapsed().as_secs_f64());
+        let start = Instant::now();
+        case.graded(black_box(&mut out));
+        found.graded.push(start.elapsed().as_secs_f64());
+    }
+    found
+}
+
+/// Lower quartile, median and upper quartile.
+pub fn quantiles(times: &[f64]) -> [f64; 3] {
+    let mut sorted = times.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    [1, 2, 3].map(|quarter| sorted[(sorted.len() - 1) * quarter / 4])
+}
