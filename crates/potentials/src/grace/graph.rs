@@ -7,6 +7,7 @@ use npz::Archive;
 use super::error::{GraceError, mismatch, unsupported};
 use super::matrix::lanes_for;
 use super::product::{Combination, Coupled, Product, Term};
+use super::schedule::depth_first;
 use super::tape::{Gather, Linear, LinearPart, Operation, Tensor, Used};
 use super::weights::Weights;
 
@@ -236,7 +237,8 @@ impl<'a> Graph<'a> {
         let tensors = self.tensors.iter();
         let rows = tensors.flat_map(|t| (0..t.components).map(move |w| (t.row(w), t.width)));
         let used = Used::new(rows.filter(|(row, _)| needed[*row]));
-        FinishedGraph { tape_lanes: self.end, used, operations: self.operations, basis: self.basis }
+        let operations = depth_first(self.operations);
+        FinishedGraph { tape_lanes: self.end, used, operations, basis: self.basis }
     }
 }
 

@@ -49,6 +49,7 @@ mod radial_network;
 mod radial_table;
 mod readout;
 mod reduction;
+mod schedule;
 mod symmetry;
 mod tape;
 mod three_layers;

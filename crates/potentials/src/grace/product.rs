@@ -89,6 +89,13 @@ impl Product {
         self.inputs = self.derivatives();
     }
 
+    /// Some of the results alone.
+    pub fn with_outputs(&self, outputs: Vec<Coupled>) -> Self {
+        let mut product = Self { outputs, inputs: Vec::new(), ..*self };
+        product.inputs = product.derivatives();
+        product
+    }
+
     /// ∂out/∂x for every component x of the factors, with one term for each pair of result and other factor.
     fn derivatives(&self) -> Vec<Coupled> {
         let mut inputs: BTreeMap<u32, BTreeMap<(u32, u32), f64>> = BTreeMap::new();

@@ -97,6 +97,39 @@ impl Operation {
         }
     }
 
+    /// First lanes of the rows that it reads, for one slot.
+    pub fn reads(&self) -> Vec<usize> {
+        match self {
+            Self::Linear(linear) => {
+                linear.parts.iter().flat_map(|part| &part.from).map(|row| *row as usize).collect()
+            }
+            Self::Product(product) => {
+                let terms = product.outputs.iter().flat_map(|output| &output.terms);
+                terms.flat_map(|term| [term.left as usize, term.right as usize]).collect()
+            }
+            Self::Combination(combination) => {
+                let terms = combination.outputs.iter().flat_map(|(_, terms)| terms);
+                terms.map(|(row, _)| *row as usize).collect()
+            }
+            Self::EquivariantNorm(norm) => (0..norm.from.components).map(|w| norm.from.row(w)).collect(),
+        }
+    }
+
+    /// First lanes of the rows that it makes.
+    pub fn writes(&self) -> Vec<usize> {
+        match self {
+            Self::Linear(linear) => linear
+                .parts
+                .iter()
+                .flat_map(|part| &part.to)
+                .map(|row| linear.start + *row as usize)
+                .collect(),
+            Self::Product(product) => product.outputs.iter().map(|output| output.row).collect(),
+            Self::Combination(combination) => combination.outputs.iter().map(|(row, _)| *row).collect(),
+            Self::EquivariantNorm(norm) => (0..norm.to.components).map(|w| norm.to.row(w)).collect(),
+        }
+    }
+
     /// Drops every result that nobody needs, and marks as needed what the others read;
     /// `needed` says it for each lane of the tape at which a row begins.
     pub fn keep(&mut self, needed: &mut [bool]) {

@@ -1,0 +1,93 @@
+//! The order in which operations run.
+//!
+//! An operation is divided into pieces that share no rows where they can be, and a piece runs right before what needs it: what
+//! it leaves is then still in the cache, in the reverse sweep as well.
+
+use std::collections::BTreeMap;
+
+use super::product::Term;
+use super::tape::{Linear, Operation};
+
+/// The same operations in pieces, depth first from those whose results no other takes.
+pub(super) fn depth_first(operations: Vec<Operation>) -> Vec<Operation> {
+    let pieces: Vec<Operation> = operations.into_iter().flat_map(divided).collect();
+    let needs = needs(&pieces);
+    let mut taken = vec![false; pieces.len()];
+    needs.iter().flatten().for_each(|k| taken[*k] = true);
+    let (mut order, mut placed) = (Vec::new(), vec![false; pieces.len()]);
+    for last in (0..pieces.len()).filter(|k| !taken[*k]) {
+        place(last, &needs, &mut placed, &mut order);
+    }
+    let mut pieces: Vec<Option<Operation>> = pieces.into_iter().map(Some).collect();
+    order.into_iter().filter_map(|k| pieces[k].take()).collect()
+}
+
+/// For each piece those whose rows it reads.
+fn needs(pieces: &[Operation]) -> Vec<Vec<usize>> {
+    let writes =
+        pieces.iter().enumerate().flat_map(|(k, piece)| piece.writes().into_iter().map(move |row| (row, k)));
+    let makers: BTreeMap<usize, usize> = writes.collect();
+    let needs = |piece: &Operation| {
+        let mut needs: Vec<usize> = piece.reads().iter().filter_map(|row| makers.get(row).copied()).collect();
+        needs.dedup();
+        needs
+    };
+    pieces.iter().map(needs).collect()
+}
+
+fn place(k: usize, needs: &[Vec<usize>], placed: &mut [bool], order: &mut Vec<usize>) {
+    if std::mem::replace(&mut placed[k], true) {
+        return;
+    }
+    needs[k].iter().for_each(|needed| place(*needed, needs, placed, order));
+    order.push(k);
+}
+
+/// Parts of a linear map that add to different rows, and groups of a product's results that share no factor.
+fn divided(operation: Operation) -> Vec<Operation> {
+    match operation {
+        Operation::Linear(Linear { start, parts }) => {
+            let groups = connected(parts, |part| part.to.clone());
+            groups.into_iter().map(|parts| Operation::Linear(Linear { start, parts })).collect()
+        }
+        Operation::Product(product) => {
+            let rows = |terms: &[Term]| terms.iter().flat_map(|t| [t.left, t.right]).collect();
+            let groups = connected(product.outputs.clone(), |output| rows(&output.terms));
+            groups.into_iter().map(|outputs| Operation::Product(product.with_outputs(outputs))).collect()
+        }
+        whole => vec![whole],
+    }
+}
+
+/// Groups of items that have rows in common, directly or through others, in the order of their first rows.
+fn connected<T>(items: Vec<T>, rows: impl Fn(&T) -> Vec<u32>) -> Vec<Vec<T>> {
+    let mut groups: Vec<(Vec<u32>, Vec<T>)> = Vec::new();
+    for item in items {
+        let (mut rows, mut together) = (rows(&item), Vec::new());
+        let (joined, apart): (Vec<_>, Vec<_>) =
+            groups.into_iter().partition(|(others, _)| others.iter().any(|row| rows.contains(row)));
+        for (others, items) in joined {
+            rows.extend(others);
+            together.extend(items);
+        }
+        together.push(item);
+        rows.sort_unstable();
+        rows.dedup();
+        groups = apart;
+        groups.push((rows, together));
+    }
+    groups.sort_by_key(|(rows, _)| rows[0]);
+    groups.into_iter().map(|(_, items)| items).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_has_rows_in_common_stays_together() {
+        let items = vec![vec![1, 2], vec![5], vec![3], vec![2, 3], vec![7, 5]];
+        let groups = connected(items, Vec::clone);
+        assert_eq!(groups, [vec![vec![1, 2], vec![3], vec![2, 3]], vec![vec![5], vec![7, 5]]]);
+    }
+}
