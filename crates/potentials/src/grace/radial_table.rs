@@ -1,6 +1,7 @@
 //! Radial functions as splines of degree seven.
 
-use super::matrix::{LANES, Lanes, ZERO, add_scaled, scaled};
+use super::instructions::{Instructions, Pass};
+use super::matrix::{LANES, Lanes, ZERO, add_scaled};
 use super::radial_network::{RadialNetwork, RadialWork};
 
 /// Intervals to begin with, and the most that are tried.
@@ -135,23 +136,60 @@ impl RadialTable {
     ) {
         let n = self.lanes;
         let rows = &self.coefficients[interval * n..][..SUPPORT * n];
-        for (c, (value, derivative)) in values.iter_mut().zip(derivatives).enumerate() {
-            let (mut sum, mut slope) = (ZERO, ZERO);
-            for k in 0..SUPPORT {
-                let row = &rows[k * n + c];
-                add_scaled(&mut sum, weights[k][bond], row);
-                add_scaled(&mut slope, slopes[k][bond], row);
-            }
-            *value = sum;
-            *derivative = scaled(self.knots_per_length, &slope);
+        let whole = n / TOGETHER * TOGETHER;
+        let weights = (weights.map(|w| w[bond]), slopes.map(|s| s[bond] * self.knots_per_length));
+        for c in (0..whole).step_by(TOGETHER) {
+            sum_of_rows::<TOGETHER>(&rows[c..], n, &weights, &mut values[c..], &mut derivatives[c..]);
+        }
+        for c in whole..n {
+            sum_of_rows::<1>(&rows[c..], n, &weights, &mut values[c..], &mut derivatives[c..]);
         }
     }
 
     /// R_nl(r) and its derivative.
     pub(super) fn evaluate_one(&self, r: f64, values: &mut [Lanes], derivatives: &mut [Lanes]) {
-        let (interval, t) = self.locate(r);
-        self.combine(interval, 0, &b_splines(&[t; LANES]), values, derivatives);
+        Instructions::best().run(One { table: self, r, values, derivatives });
     }
+}
+
+/// One bond, for whoever is compiled for the baseline.
+struct One<'a> {
+    table: &'a RadialTable,
+    r: f64,
+    values: &'a mut [Lanes],
+    derivatives: &'a mut [Lanes],
+}
+
+impl Pass for One<'_> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        let (interval, t) = self.table.locate(self.r);
+        self.table.combine(interval, 0, &b_splines(&[t; LANES]), self.values, self.derivatives);
+    }
+}
+
+/// Lanes of a row that are summed together: they are neighbours in memory.
+const TOGETHER: usize = 4;
+
+/// Σ_k weights\[k\] of row k, for `L` lanes of rows that stand `n` lanes from one another, with two sets of weights.
+#[inline(always)]
+fn sum_of_rows<const L: usize>(
+    rows: &[Lanes],
+    n: usize,
+    (weights, slopes): &([f64; SUPPORT], [f64; SUPPORT]),
+    values: &mut [Lanes],
+    derivatives: &mut [Lanes],
+) {
+    let (mut sums, mut slope_sums) = ([ZERO; L], [ZERO; L]);
+    for k in 0..SUPPORT {
+        let row = &rows[k * n..][..L];
+        for l in 0..L {
+            add_scaled(&mut sums[l], weights[k], &row[l]);
+            add_scaled(&mut slope_sums[l], slopes[k], &row[l]);
+        }
+    }
+    values[..L].copy_from_slice(&sums);
+    derivatives[..L].copy_from_slice(&slope_sums);
 }
 
 /// The B-splines of degree p = 7 within an interval and their derivatives, at places t of eight bonds:
