@@ -152,7 +152,7 @@ impl Potential for BiasedPotential {
         let graded = biased && self.grade_error.is_none();
         let cotangent = graded.then_some(self.cotangent.as_slice());
         self.grace.backward(cotangent, out, &mut self.pull_back);
-        self.physical.clone_from(out);
+        copy(out, &mut self.physical);
         if graded {
             self.add_bias(out);
         }
@@ -161,4 +161,11 @@ impl Potential for BiasedPotential {
         }
         Ok(())
     }
+}
+
+/// `from` into `to`, whose memory is used again.
+fn copy(from: &Evaluation, to: &mut Evaluation) {
+    to.atomic_energies.clone_from(&from.atomic_energies);
+    to.forces.clone_from(&from.forces);
+    to.virial = from.virial;
 }

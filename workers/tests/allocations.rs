@@ -1,0 +1,82 @@
+//! A biased step takes no memory from the system: work arrays are used again.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use atoms::{Structure, read_extxyz};
+use calm::Artifact;
+use md::{Dynamics, Langevin, Settings, State, Stream, Thermostat};
+use potentials::Zbl;
+use potentials::grace::GraceModel;
+use workers::bias::BiasedPotential;
+
+thread_local! {
+    /// Of this thread alone: what runs the tests may allocate beside it.
+    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+fn count() {
+    // Not while a thread ends.
+    let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
+}
+
+/// The system's allocator with a count.
+struct Counting;
+
+#[allow(unsafe_code)] // The only way to see allocations; everything goes to the system's allocator as it came.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count();
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        unsafe { System.dealloc(pointer, layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        count();
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+fn data(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data").join(path)
+}
+
+fn seed() -> Structure {
+    read_extxyz(&data("aluminium_seeds.extxyz")).unwrap().swap_remove(0).structure
+}
+
+#[test]
+fn a_biased_step_allocates_nothing() {
+    let structure = seed();
+    let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
+    let mixture = Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture);
+    let zbl = Zbl::new(&structure.species, 1.6, 2.4).unwrap();
+    let mut potential = BiasedPotential::new(model, mixture, Some(zbl), 2, &structure.species).unwrap();
+    let stream = Stream::new(3, 0, 0);
+    let state = State::thermal(structure, 50.0, &stream);
+    let settings = Settings {
+        time_step: 1.0,
+        thermostat: Thermostat::Langevin(Langevin { temperature: 50.0, friction: 0.01 }),
+        ramp: None,
+        stream,
+        // At 50 K no atom moves by half of this in a few steps, so the list is not made anew.
+        skin: 1.0,
+    };
+    for tau in [0.0, 0.15] {
+        potential.tau = tau;
+        let mut dynamics = Dynamics::new(state.clone(), settings.clone(), &mut potential).unwrap();
+        (0..3).for_each(|_| dynamics.step(&mut potential).unwrap());
+        let before = ALLOCATIONS.get();
+        (0..3).for_each(|_| dynamics.step(&mut potential).unwrap());
+        assert_eq!(ALLOCATIONS.get() - before, 0, "τ = {tau}");
+        assert_eq!(potential.grades().unwrap().gamma.len(), dynamics.structure().len());
+    }
+}
