@@ -13,6 +13,7 @@ mod frames;
 mod interrupt;
 mod labelling;
 mod learned;
+mod log;
 mod notify;
 mod outcome;
 mod output;
@@ -35,7 +36,8 @@ fn main() -> ExitCode {
     match cli::run(arguments) {
         Ok(ended) => ended.exit_code(),
         Err(failure) => {
-            output::say(format_args!("calmwalk: {failure}"));
+            tracing::error!("{failure}");
+            output::show(format_args!("calmwalk: {failure}"));
             failure.exit_code()
         }
     }

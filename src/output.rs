@@ -24,9 +24,21 @@ pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(),
     }
 }
 
-/// Writes a line to the standard error. That nobody reads it, or that it cannot be kept, stops no work.
-pub fn say(line: impl Display) {
+/// Writes a line to the standard error, and nowhere else. That nobody reads it, or that it cannot be kept, stops no work.
+pub fn show(line: impl Display) {
     let _ = writeln!(io::stderr().lock(), "{line}");
+}
+
+/// The same, and in the log.
+pub fn say(line: impl Display) {
+    tracing::info!("{line}");
+    show(line);
+}
+
+/// The same of what should not be.
+pub fn warn(line: impl Display) {
+    tracing::warn!("{line}");
+    show(line);
 }
 
 /// Says that what goes to the store may be read by others, if its URL allows that.
@@ -34,7 +46,7 @@ pub fn say_if_unprotected(location: &Location) {
     if let Location::Server(url) = location
         && url.is_unprotected()
     {
-        say(format_args!(
+        warn(format_args!(
             "WARNING: what goes to and from {url} is not encrypted (sslmode=disable): whoever is on the network can read and \
              change it"
         ));

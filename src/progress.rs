@@ -9,7 +9,7 @@ use orchestrator::reactor::Notice;
 use store::Fate;
 use wire::{Origin, WalkId};
 
-use crate::output::say;
+use crate::output::show;
 
 /// Time between two plain lines that only say where the walks stand.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
@@ -22,6 +22,8 @@ pub struct Display {
     /// Steps of a whole walk.
     walk_steps: u64,
     accepted: u64,
+    /// Whether it was said that walkers wait for labels.
+    waiting: bool,
     last_line: Instant,
 }
 
@@ -40,7 +42,8 @@ impl Display {
             steps.insert(walk, step);
         }
         let bars = std::io::stderr().is_terminal().then(Bars::new);
-        let mut display = Self { bars, names, steps, walk_steps, accepted: 0, last_line: Instant::now() };
+        let mut display =
+            Self { bars, names, steps, walk_steps, accepted: 0, waiting: false, last_line: Instant::now() };
         display.draw();
         display
     }
@@ -50,11 +53,10 @@ impl Display {
         match notice {
             Notice::Progress(walk, progress) => {
                 self.steps.insert(*walk, progress.step);
+                self.waiting = false;
             }
             Notice::Committed(commit) => self.committed(commit),
-            Notice::QueueFull(jobs) => {
-                self.say(&format!("walkers wait: {jobs} structures are waiting for labels"))
-            }
+            Notice::QueueFull(jobs) => self.queue_full(*jobs),
         }
         self.draw();
     }
@@ -84,20 +86,31 @@ impl Display {
                 Fate::Declined(reason) => format!("declined ({})", reason.name()),
             };
             self.accepted += u64::from(candidate.fate == Fate::Accepted && view.origin() == Origin::Biased);
-            self.say(&format!("{}: step {}, γ_max {gamma_max:.2}, {what}", self.name(id.walk), id.step));
+            self.show(&format!("{}: step {}, γ_max {gamma_max:.2}, {what}", self.name(id.walk), id.step));
         }
         let alarm = |decision: &&store::Decision| decision.detail["forgetting_alarm"] == true;
         if let Some(decision) = commit.decisions.iter().rfind(alarm) {
             let share = &decision.detail["training_frames"]["share_above_one"];
-            self.say(&format!("ALARM: the mixture forgets its training data (share above γ = 1: {share})"));
+            let alarm = format!("ALARM: the mixture forgets its training data (share above γ = 1: {share})");
+            tracing::warn!("{alarm}");
+            self.show(&alarm);
         }
         for decision in commit.decisions.iter().filter(|decision| decision.kind == "ended") {
             if let Some(walk) = decision.walk {
                 // Whatever was left of its steps will not be made.
                 self.steps.insert(walk, self.walk_steps);
                 let end = decision.detail["end"].as_str().unwrap_or_default().replace('_', " ");
-                self.say(&format!("{}: ended ({end}) at step {}", self.name(walk), decision.detail["step"]));
+                self.show(&format!("{}: ended ({end}) at step {}", self.name(walk), decision.detail["step"]));
             }
+        }
+    }
+
+    /// Said once, until a walk goes on.
+    fn queue_full(&mut self, jobs: u64) {
+        if !std::mem::replace(&mut self.waiting, true) {
+            let line = format!("walkers wait: {jobs} structures are waiting for labels");
+            tracing::info!("{line}");
+            self.show(&line);
         }
     }
 
@@ -105,10 +118,10 @@ impl Display {
         self.names.get(&walk).map_or("?", String::as_str)
     }
 
-    fn say(&self, line: &str) {
+    fn show(&self, line: &str) {
         match &self.bars {
             Some(bars) => bars.message.set_message(line.to_owned()),
-            None => say(line),
+            None => show(line),
         }
     }
 
@@ -120,7 +133,7 @@ impl Display {
             bars.steps.set_message(format!("{} accepted", self.accepted));
         } else if self.last_line.elapsed() > LINE_INTERVAL {
             self.last_line = Instant::now();
-            say(format_args!("{done} of {all} steps, {} accepted in this run", self.accepted));
+            show(format_args!("{done} of {all} steps, {} accepted in this run", self.accepted));
         }
     }
 }

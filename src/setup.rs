@@ -16,6 +16,7 @@ use workers::settings::WalkSettings;
 
 use crate::config::PotentialKind;
 use crate::labelling::{self, Labelling};
+use crate::log;
 use crate::outcome::Failure;
 
 /// What a walker's process needs to know.
@@ -32,6 +33,8 @@ pub struct WalkerSetup {
     pub model_hash: String,
     /// Dynamics, bias and guards.
     pub settings: WalkSettings,
+    /// Its log.
+    pub log: Option<log::Setup>,
 }
 
 /// What an agent needs to know.
@@ -74,6 +77,8 @@ pub struct LabellerSetup {
     pub largest_force: f64,
     /// How long a job is leased.
     pub lease: Duration,
+    /// Its log. One that is adopted keeps the log that it began with.
+    pub log: Option<log::Setup>,
 }
 
 /// What tells a slot of `calmwalk label` from a labeller of a run.
@@ -145,14 +150,14 @@ impl LabellerSetup {
     /// That of a labeller without a number.
     pub fn new(location: PathBuf, labelling: Labelling) -> Self {
         let Labelling { method, protocol, attempts, largest_force, lease } = labelling;
-        let (number, restarts, slot) = (None, 0, None);
-        Self { number, restarts, slot, location, method, protocol, attempts, largest_force, lease }
+        let (number, restarts, slot, log) = (None, 0, None, log::for_children());
+        Self { number, restarts, slot, location, method, protocol, attempts, largest_force, lease, log }
     }
 
-    /// What tells two setups of labellers apart, whatever their numbers: one that was started with another must be
+    /// What tells two setups of labellers apart, whatever their numbers and logs: one that was started with another must be
     /// replaced.
     pub fn hash(&self) -> String {
-        blake3::hash(&bytes(&Self { number: None, restarts: 0, ..self.clone() })).to_string()
+        blake3::hash(&bytes(&Self { number: None, restarts: 0, log: None, ..self.clone() })).to_string()
     }
 }
 

@@ -6,6 +6,7 @@
 
 mod arrivals;
 pub mod group;
+mod log;
 
 use std::collections::{HashMap, VecDeque};
 use std::panic::resume_unwind;
@@ -18,6 +19,7 @@ use store::{Store, StoreError};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::MissedTickBehavior;
+use tracing::{debug, warn};
 use wire::WalkId;
 use wire::messages::Progress;
 use wire::transport::{Incoming, Work};
@@ -157,7 +159,9 @@ impl Reactor {
 }
 
 async fn write(store: Store, commit: Commit) -> Result<Commit, StoreError> {
+    let begun = Instant::now();
     store.commit(&commit).await?;
+    log::committed(&commit, begun.elapsed());
     Ok(commit)
 }
 
@@ -242,6 +246,7 @@ impl Shell {
             return Ok(None);
         }
         let Some(walk) = self.at_work.remove(&walker) else { return Ok(None) };
+        warn!(walker, walk = walk.0, fault, "a walker was lost with a turn in hand");
         if fault {
             let cost = self.costs.entry(walk).or_default();
             *cost += 1;
@@ -324,7 +329,10 @@ impl Shell {
         for Promise { walker, reply, work } in self.promised.drain(..) {
             let walk = work.as_ref().map(|work| work.assignment.walk);
             match (reply.send(work), walk) {
-                (Ok(()), Some(walk)) => drop(self.at_work.insert(walker, walk)),
+                (Ok(()), Some(walk)) => {
+                    debug!(walker, walk = walk.0, "gave a turn");
+                    self.at_work.insert(walker, walk);
+                }
                 // A walker that is gone needs no answer, and another gets its turn.
                 (Err(_), Some(walk)) => self.selector.lost(walk),
                 (_, None) => {}

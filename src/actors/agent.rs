@@ -20,8 +20,9 @@ use workers::agent::{self, Agent, News};
 
 use super::crew::all_given_up;
 use super::{CHANNEL, STOPPING, asked_to_stop};
+use crate::log;
 use crate::outcome::{Ended, Failure};
-use crate::output::say;
+use crate::output::{say, warn};
 use crate::setup::{self, AgentSetup, WalkerSetup};
 
 /// Works for a campaign until it is over or this process is asked to stop. What is needed in the meantime lies in
@@ -57,7 +58,7 @@ pub async fn work(
                 flag.store(true, Ordering::Relaxed);
                 asked.notify_one();
             }
-            News::Silent { untold, idle } => say(format_args!(
+            News::Silent { untold, idle } => warn(format_args!(
                 "the orchestrator does not answer: {untold} reports are kept for it, {idle} of {walkers} walkers wait"
             )),
             News::Back => say("the orchestrator answers again"),
@@ -77,7 +78,7 @@ async fn join(
     agent: net::Agent,
     directory: &Path,
 ) -> Result<(Arc<Uplink>, Joined, AgentSetup), Failure> {
-    let waiting = |why: &NetError| say(format_args!("waiting for the orchestrator: {why}"));
+    let waiting = |why: &NetError| warn(format_args!("waiting for the orchestrator: {why}"));
     let uplink = Uplink::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
     let uplink = Arc::new(uplink);
     loop {
@@ -163,6 +164,7 @@ fn launch(setup: &AgentSetup, line: ipc::Handle) -> impl FnMut(u32, u32) -> Laun
             model: setup.model.clone(),
             model_hash: setup.model_hash.clone(),
             settings: setup.settings.clone(),
+            log: log::for_children(),
         };
         Launch::this_program(["walker"], setup::bytes(&setup))
     }
@@ -206,7 +208,7 @@ impl Host {
                 if ended.then == Standing::GoneHome {
                     self.walkers.close();
                 } else {
-                    say(format_args!("walker {number}: {}; {}", ended.ending, ended.then));
+                    warn(format_args!("walker {number}: {}; {}", ended.ending, ended.then));
                 }
             }
             launcher::Event::AllGone => {

@@ -16,7 +16,7 @@ use workers::labeller::SIGN_OF_LIFE;
 
 use super::Run;
 use crate::outcome::Failure;
-use crate::output::say;
+use crate::output::{say, warn};
 use crate::setup::{self, AgentSetup};
 
 /// Where they join, if they may.
@@ -101,7 +101,7 @@ async fn keep_records(store: &Store, mut events: mpsc::UnboundedReceiver<AgentEv
             _ = look.tick() => signs_of_life(store, &mut records).await,
         };
         if let Err(error) = written {
-            say(format_args!("cannot write down how agents are: {error}"));
+            warn(format_args!("cannot write down how agents are: {error}"));
         }
     }
 }
@@ -133,7 +133,7 @@ async fn keep_record(
         AgentEvent::Lost(agent) => (agent, "was silent for too long: others get its walks", "lost"),
         AgentEvent::Left(agent) => (agent, "left", "left"),
         AgentEvent::Dropped(why) => {
-            say(format_args!("a message from another host was dropped: {why}"));
+            warn(format_args!("a message from another host was dropped: {why}"));
             return store.log_operation(now, "messages_dropped", &json!({ "remark": why })).await;
         }
     };

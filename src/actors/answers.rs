@@ -2,7 +2,7 @@
 
 use store::StoreError;
 
-use crate::output::say;
+use crate::output::{say, warn};
 
 /// What is known of it.
 #[derive(Debug, Default)]
@@ -16,7 +16,7 @@ impl Answers {
         match written {
             Err(error) if error.is_transient() => {
                 if !std::mem::replace(&mut self.awaited, true) {
-                    say(format_args!("waiting for the database: {error}"));
+                    warn(format_args!("waiting for the database: {error}"));
                 }
             }
             _ => {

@@ -16,7 +16,7 @@ use crate::cli::status;
 use crate::config::{NotifyEvent, NotifySection};
 use crate::notify::{Due, NOTE, Watch};
 use crate::outcome::Failure;
-use crate::output::say;
+use crate::output::warn;
 
 /// Longest time between two looks.
 const LOOK: Duration = Duration::from_secs(15);
@@ -104,7 +104,7 @@ impl<'a> Notifier<'a> {
         let (kind, detail) = match how {
             Ok(()) => ("notified", json!({ "event": event.name() })),
             Err(how) => {
-                say(format_args!("notify.command on {}: {how}", event.name()));
+                warn(format_args!("notify.command on {}: {how}", event.name()));
                 ("not_notified", json!({ "event": event.name(), "how": how }))
             }
         };

@@ -9,7 +9,7 @@ use serde_json::json;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use wire::ipc::Traffic;
 
-use crate::output::say;
+use crate::output::warn;
 
 /// The records of a crew. Labellers keep their own while they live.
 pub struct Records<'a> {
@@ -96,7 +96,7 @@ impl<'a> Records<'a> {
         let records: Vec<_> = self.walkers.values().chain([&self.process]).cloned().collect();
         self.store.upsert_processes(&records).await?;
         if let Some(strangers) = strangers {
-            say(&strangers);
+            warn(&strangers);
             let detail = json!({ "dropped": traffic.dropped, "remark": strangers });
             self.store.log_operation(now, "messages_dropped", &detail).await?;
             self.dropped = traffic.dropped;
@@ -121,7 +121,7 @@ pub async fn write_down(store: &Store, record: ProcessRecord, ended: &Ended) -> 
 
 fn tell(kind: &str, number: u32, ended: &Ended) {
     if ended.then != Standing::GoneHome {
-        say(format_args!("{kind} {number}: {}; {}", ended.ending, ended.then));
+        warn(format_args!("{kind} {number}: {}; {}", ended.ending, ended.then));
     }
 }
 

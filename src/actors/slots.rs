@@ -18,7 +18,7 @@ use super::processes::LABELLER_SILENCE;
 use super::records;
 use crate::labelling::Labelling;
 use crate::outcome::{Ended, Failure};
-use crate::output::{Bar, say};
+use crate::output::{Bar, say, show};
 use crate::setup::{self, LabellerSetup, SlotSetup};
 
 /// A slot that was asked to stop needs some time beyond its grace to give its label back.
@@ -165,7 +165,8 @@ impl Display {
                 return self.bar.set(self.labels, || line.to_owned());
             }
         }
-        self.line(&format!("slot {slot}: {line}"));
+        // It stands in the log already, as that of the slot.
+        self.bar.suspend(|| show(format_args!("slot {slot}: {line}")));
     }
 
     fn queue(&mut self, jobs: bool, led: bool) {

@@ -13,6 +13,7 @@ use super::Run;
 use super::labellers::Labellers;
 use crate::campaign::Campaign;
 use crate::labelling::Labelling;
+use crate::log;
 use crate::outcome::Failure;
 use crate::setup::{self, LabellerSetup, WalkerSetup};
 
@@ -32,6 +33,7 @@ pub fn walker(
             model: model.clone(),
             model_hash: model_hash.clone(),
             settings: settings.clone(),
+            log: log::for_children(),
         };
         Launch::this_program(["walker"], setup::bytes(&setup))
     })

@@ -9,6 +9,7 @@ use wire::net::{self, Address, Tls};
 use super::{Ended, Failure, block_on};
 use crate::actors::scratch::{self, Scratch};
 use crate::actors::{agent, cores};
+use crate::log::Options;
 
 /// Let this host take part in a campaign that `calmwalk run --listen` leads on another
 ///
@@ -35,10 +36,13 @@ pub struct Agent {
     /// Directory with authority.pem, certificate.pem and key.pem: needed for everything but loopback
     #[arg(long, value_name = "DIR")]
     tls: Option<PathBuf>,
+    #[command(flatten)]
+    log: Options,
 }
 
 impl Agent {
     pub fn run(self) -> Result<Ended, Failure> {
+        self.log.begin("agent")?;
         let walkers = self.walkers.unwrap_or_else(cores);
         let patience = Duration::from_secs_f64(60.0 * self.patience);
         let tls = self.tls.as_deref().map(Tls::in_directory);

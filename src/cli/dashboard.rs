@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use store::Store;
 
 use super::{CampaignLocation, Ended, Failure, block_on};
+use crate::log::Options;
 use crate::output::say;
 use crate::web::{self, dashboard};
 
@@ -19,10 +20,13 @@ pub struct Dashboard {
     /// Address of this host; port 0: any that is free
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
     at: SocketAddr,
+    #[command(flatten)]
+    log: Options,
 }
 
 impl Dashboard {
     pub fn run(self) -> Result<Ended, Failure> {
+        self.log.begin("dashboard")?;
         block_on(async {
             let listener = web::listen(self.at).await?;
             let store = Store::open_read_only(&self.location.get()?).await?;

@@ -15,6 +15,7 @@ use crate::actors::asked_to_stop;
 use crate::actors::slots::{self, Slots};
 use crate::config::Config;
 use crate::labelling::{Here, Labelling};
+use crate::log::Options;
 use crate::output::{say, say_if_unprotected};
 
 /// Between two looks whether the campaign is there.
@@ -64,10 +65,13 @@ pub struct Label {
     /// Wait so long for a campaign that has not begun yet, or whose store cannot be reached yet, min
     #[arg(long, value_name = "MINUTES", default_value_t = 0.0, value_parser = seconds)]
     wait: f64,
+    #[command(flatten)]
+    log: Options,
 }
 
 impl Label {
     pub fn run(self) -> Result<Ended, Failure> {
+        self.log.begin("label")?;
         block_on(self.label())?
     }
 

@@ -9,7 +9,8 @@ use tokio::signal::unix::{SignalKind, signal};
 use workers::labeller::{Closing, LabellerSettings, Method, Stay, Timing, insist, serve};
 
 use super::{Ended, Failure, block_on};
-use crate::output::say;
+use crate::log;
+use crate::output::show;
 use crate::setup::{self, LabellerSetup};
 
 /// A labeller's process; `calmwalk run` and `calmwalk label` start it
@@ -23,6 +24,7 @@ impl Labeller {
     pub fn run(self) -> Result<Ended, Failure> {
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
         let setup: LabellerSetup = setup::read()?;
+        log::begin(setup.log.clone(), "labeller", setup.number)?;
         match &setup.slot {
             Some(slot) => launcher::end_with_parent(slot.parent).map_err(Failure::failed)?,
             None => launcher::own_session().map_err(Failure::failed)?,
@@ -66,7 +68,7 @@ async fn label(setup: LabellerSetup, method: Method, closing: &Arc<Closing>) -> 
     let tells = slot.is_some();
     let tell = |line: &str| {
         if tells {
-            say(line);
+            show(line);
         }
     };
     serve(store.clone(), method, settings, record, closing, unix_milliseconds, tell).await?;

@@ -23,8 +23,8 @@ use crate::campaign::Campaign;
 use crate::config::{Change, compare, place};
 use crate::forecast::{self, Forecast, megabytes};
 use crate::labelling::LABEL_METHOD;
-use crate::output::{print, say, say_if_unprotected};
-use crate::{summary, web};
+use crate::output::{print, say, say_if_unprotected, warn};
+use crate::{log, summary, web};
 
 /// Run a campaign to its end, or go on with one that was interrupted
 ///
@@ -56,6 +56,8 @@ pub struct Run {
     host: Option<String>,
     #[command(flatten)]
     shown_at: web::Addresses,
+    #[command(flatten)]
+    log: log::Options,
     /// Wait so long for another process that runs this campaign, which may be about to end, min
     #[arg(long, value_name = "MINUTES", default_value_t = 0.0, value_parser = minutes)]
     patience: f64,
@@ -63,6 +65,7 @@ pub struct Run {
 
 impl Run {
     pub fn run(self) -> Result<Ended, Failure> {
+        self.log.begin("orchestrator")?;
         let campaign = Campaign::load(&self.config)?;
         let stem = self.config.file_stem().unwrap_or_default();
         let directory = self.directory.unwrap_or_else(|| PathBuf::from(stem));
@@ -234,7 +237,7 @@ async fn warn_of_the_disk(campaign: &Campaign, directory: &Path, store: &Store) 
     let needed = (forecast.bytes() + forecast::LOG).saturating_sub(store.size().await?);
     let free = store::free_space(directory)?;
     if free < needed {
-        say(format_args!(
+        warn(format_args!(
             "WARNING: the campaign will take {} more on the disk of {}, where {} are free (forecast: {forecast})",
             megabytes(needed),
             directory.display(),

@@ -8,8 +8,8 @@ use workers::walk::WalkContext;
 use workers::walker;
 
 use super::{Ended, Failure};
-use crate::interrupt;
 use crate::setup::{self, WalkerSetup};
+use crate::{interrupt, log};
 
 /// A walker's process; `calmwalk run` starts it
 ///
@@ -20,6 +20,7 @@ pub struct Walker {}
 impl Walker {
     pub fn run(self) -> Result<Ended, Failure> {
         let setup: WalkerSetup = setup::read()?;
+        log::begin(setup.log.clone(), "walker", Some(setup.door.walker()))?;
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
         launcher::end_with_parent(setup.parent).map_err(Failure::failed)?;
         let stopping = interrupt::flag()?;

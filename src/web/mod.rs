@@ -14,7 +14,7 @@ use tokio::task::AbortHandle;
 
 use self::dashboard::{Acting, Dashboard};
 use crate::outcome::Failure;
-use crate::output::say;
+use crate::output::{say, show};
 
 /// Where a campaign is shown, as arguments.
 #[derive(Debug, clap::Args)]
@@ -93,7 +93,9 @@ impl Listening {
         if let Some(listener) = self.dashboard {
             let acting = Acting::new(store.clone())?;
             let address = listener.local_addr().map_err(Failure::failed)?;
-            say(format_args!("dashboard at http://{address}/#token={}", acting.token()));
+            tracing::info!("dashboard at http://{address}/");
+            // The token is for whoever reads this, and for no file.
+            show(format_args!("dashboard at http://{address}/#token={}", acting.token()));
             serving.add(listener, Dashboard::new(shown, Some(acting)).router());
         }
         Ok(serving)

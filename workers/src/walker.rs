@@ -4,6 +4,7 @@ use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
+use tracing::debug;
 use wire::Candidate;
 use wire::messages::{End, Outcome, Progress, Report};
 use wire::transport::{Transport, Work};
@@ -30,8 +31,11 @@ pub fn run(context: &WalkContext, transport: &mut impl Transport) -> Ended {
             return Ended::Stopped;
         }
         // A crash is a defect of this program; it ends the walk that met it, not the campaign.
+        let begun = Instant::now();
         let turn = catch_unwind(AssertUnwindSafe(|| work_on(context, &work, transport)));
-        report = Some(turn.unwrap_or_else(|_| crashed(&work)));
+        let made = turn.unwrap_or_else(|_| crashed(&work));
+        tell(&work, &made, begun.elapsed());
+        report = Some(made);
     }
     Ended::SentHome
 }
@@ -47,6 +51,20 @@ fn work_on(context: &WalkContext, work: &Work, transport: &impl Transport) -> Re
         }
     };
     advance(context, &work.assignment, work.mixture.clone(), stopping, watch)
+}
+
+/// Says in the log what came of a turn.
+fn tell(work: &Work, made: &Report<Candidate>, time: Duration) {
+    let (walk, turn, seconds) = (made.walk.0, made.turn, time.as_secs_f64());
+    let Progress { step, gamma_max, .. } = made.progress;
+    let version = work.mixture.version();
+    let outcome = match &made.outcome {
+        Outcome::Candidate(_) => "candidate",
+        Outcome::Turn => "turn",
+        Outcome::Paused => "paused",
+        Outcome::Ended(_) => "ended",
+    };
+    debug!(walk, turn, step, gamma_max, mixture_version = version, seconds, outcome, "made a turn");
 }
 
 fn crashed(work: &Work) -> Report<Candidate> {

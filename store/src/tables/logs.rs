@@ -98,6 +98,8 @@ pub(crate) async fn insert_operation(
     detail: &Value,
 ) -> Result<()> {
     let sql = "INSERT INTO operation (time, kind, detail) VALUES ($1, $2, $3)";
-    query(sql).bind(now).bind(kind).bind(detail.to_string()).execute(&mut *transaction).await?;
+    let detail = detail.to_string();
+    tracing::info!(kind, detail, "operation");
+    query(sql).bind(now).bind(kind).bind(detail).execute(&mut *transaction).await?;
     Ok(())
 }

@@ -30,6 +30,7 @@ use std::time::{Duration, Instant};
 use dft::{Calculated, Failure, FailureClass};
 use store::records::{Label, LabelDetails, Lease, Protocol};
 use store::{Store, StoreError, Whereabouts};
+use tracing::{debug, info, warn};
 
 use closing::Wanted;
 use code::Ended;
@@ -131,6 +132,10 @@ pub async fn run(
     now: impl Fn() -> i64,
     tell: impl Fn(&str),
 ) -> Result<(), StoreError> {
+    let say = |line: &str| {
+        info!("{line}");
+        tell(line);
+    };
     let mut idle = Duration::ZERO;
     method.begin(&store, closing).await?;
     loop {
@@ -148,38 +153,43 @@ pub async fn run(
             }
         };
         idle = Duration::ZERO;
+        debug!(candidate = lease.candidate, job = lease.job, attempt = lease.attempt, "leased");
         let begun = Instant::now();
         let size = method.size(&lease.structure);
         if let Some(reason) = insist(closing, || guard::refusal(&store, &lease, size)).await? {
             // Whatever was tried before, another attempt would be refused as well.
             insist(closing, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
-            tell(&format!("{} is refused: {reason}", lease.candidate));
+            say(&format!("{} is refused: {reason}", lease.candidate));
             continue;
         }
         let made = match make(&store, &method, &lease, &settings.timing, closing, &now).await? {
             Work::Done(made) => *made,
             Work::NotWanted => {
                 method.stop().await?;
-                tell(&format!(
-                    "{} is given up here: it has its label, or is wanted no more",
-                    lease.candidate
-                ));
+                say(&format!("{} is given up here: it has its label, or is wanted no more", lease.candidate));
                 continue;
             }
             Work::LetGo => {
                 method.let_go();
-                tell(&format!("{} is finished by somebody else here", lease.candidate));
+                say(&format!("{} is finished by somebody else here", lease.candidate));
                 continue;
             }
             Work::TooLate => {
                 method.stop().await?;
-                tell(&format!("{} is given back: there is no time to finish it", lease.candidate));
+                say(&format!("{} is given back: there is no time to finish it", lease.candidate));
                 return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
             }
         };
         let Brought { judged, became, ended } =
             bring(&store, &method, &lease, &settings, made, closing, &now).await?;
-        tell(&told::line(&lease, &judged, &became, begun.elapsed().as_secs_f64()));
+        let line = told::line(&lease, &judged, &became, begun.elapsed().as_secs_f64());
+        match &judged {
+            Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
+            Err(failure) => {
+                warn!(job = lease.job, attempt = lease.attempt, class = failure.class.name(), "{line}");
+            }
+        }
+        tell(&line);
         if let Some(ended) = ended {
             method.put_away(&store, &lease, closing, ended, judged.is_err()).await?;
         }

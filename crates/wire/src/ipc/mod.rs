@@ -56,6 +56,13 @@ pub struct Door {
     caller: Caller,
 }
 
+impl Door {
+    /// The number of the walker that it is for.
+    pub fn walker(&self) -> u32 {
+        self.caller.walker
+    }
+}
+
 /// Why the transport does not work.
 #[derive(Debug, thiserror::Error)]
 pub enum IpcError {

@@ -1,0 +1,117 @@
+//! A line of the log.
+
+use std::fmt::{Debug, Write};
+
+use serde_json::{Map, Value};
+use tracing::Level;
+use tracing::field::{Field, Visit};
+
+const DAY: i64 = 86_400_000;
+
+/// What an event says: its message, and numbers and words with names.
+#[derive(Debug, Default)]
+pub struct Fields {
+    message: String,
+    named: Map<String, Value>,
+}
+
+/// An event and where it comes from.
+#[derive(Debug)]
+pub struct Line<'a> {
+    /// ms since 1970.
+    pub time: i64,
+    pub level: Level,
+    /// What process this is, as `walker 3`.
+    pub process: &'a str,
+    pub pid: u32,
+    /// The module that says it.
+    pub target: &'a str,
+    pub fields: Fields,
+}
+
+impl Line<'_> {
+    /// For people. Whatever is said is one line.
+    pub fn text(&self) -> String {
+        let Self { time, level, process, pid, fields, .. } = self;
+        let mut text = format!("{} {level:<5} {process} [{pid}] ", utc(*time));
+        for character in fields.message.chars() {
+            match character.is_control() {
+                true => text.extend(character.escape_default()),
+                false => text.push(character),
+            }
+        }
+        for (name, value) in &fields.named {
+            // Writing to a string cannot fail.
+            let _ = write!(text, " {name}={value}");
+        }
+        text.push('\n');
+        text
+    }
+
+    /// One JSON object.
+    pub fn json(&self) -> String {
+        let Self { time, level, process, pid, target, fields } = self;
+        let object = serde_json::json!({
+            "time": utc(*time), "level": level.as_str().to_lowercase(), "process": process, "pid": pid,
+            "target": target, "message": fields.message, "fields": fields.named,
+        });
+        format!("{object}\n")
+    }
+}
+
+impl Visit for Fields {
+    fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
+        match field.name() {
+            "message" => self.message = format!("{value:?}"),
+            // Where libraries keep what a message of the crate log has besides.
+            name if name.starts_with("log.") => {}
+            name => drop(self.named.insert(name.to_owned(), format!("{value:?}").into())),
+        }
+    }
+
+    fn record_str(&mut self, field: &Field, value: &str) {
+        match field.name() {
+            "message" => self.message = value.to_owned(),
+            name => drop(self.named.insert(name.to_owned(), value.into())),
+        }
+    }
+
+    fn record_f64(&mut self, field: &Field, value: f64) {
+        self.named.insert(field.name().to_owned(), value.into());
+    }
+
+    fn record_i64(&mut self, field: &Field, value: i64) {
+        self.named.insert(field.name().to_owned(), value.into());
+    }
+
+    fn record_u64(&mut self, field: &Field, value: u64) {
+        self.named.insert(field.name().to_owned(), value.into());
+    }
+
+    fn record_bool(&mut self, field: &Field, value: bool) {
+        self.named.insert(field.name().to_owned(), value.into());
+    }
+}
+
+/// As 2026-03-01T12:00:00.250Z (RFC 3339), from ms since 1970.
+pub fn utc(milliseconds: i64) -> String {
+    let (year, month, day) = date(milliseconds.div_euclid(DAY));
+    let of_day = milliseconds.rem_euclid(DAY);
+    let (hour, minute) = (of_day / 3_600_000, of_day / 60_000 % 60);
+    let (second, thousandth) = (of_day / 1000 % 60, of_day % 1000);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{thousandth:03}Z")
+}
+
+/// The Gregorian date of a day, counted from 1970-01-01. Years are taken to begin in March, so that a leap day is their last.
+fn date(day: i64) -> (i64, i64, i64) {
+    // From 0000-03-01; 400 years have 146 097 days.
+    let day = day + 719_468;
+    let (era, day) = (day.div_euclid(146_097), day.rem_euclid(146_097));
+    let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
+    let day = day - (365 * year + year / 4 - year / 100);
+    // Months from March have 31, 30, 31, 30, 31 days, twice, and then 31 and the rest.
+    let month = (5 * day + 2) / 153;
+    let in_month = day - (153 * month + 2) / 5 + 1;
+    let month = if month < 10 { month + 3 } else { month - 9 };
+    (400 * era + year + i64::from(month <= 2), month, in_month)
+}

@@ -1,0 +1,95 @@
+use std::fs;
+use std::sync::Arc;
+use std::thread;
+
+use tracing::{debug, info, warn};
+
+use super::format::utc;
+use super::*;
+
+fn log(file: &Path, format: Format, level: LogLevel) -> Log {
+    let file = OpenOptions::new().append(true).create(true).open(file).unwrap();
+    Log { file, level: level.into(), format, name: "walker 3".to_owned() }
+}
+
+#[test]
+fn a_time_is_a_date() {
+    assert_eq!(utc(0), "1970-01-01T00:00:00.000Z");
+    assert_eq!(utc(951_782_400_000), "2000-02-29T00:00:00.000Z");
+    assert_eq!(utc(1_709_251_199_999), "2024-02-29T23:59:59.999Z");
+    assert_eq!(utc(1_709_251_200_000), "2024-03-01T00:00:00.000Z");
+    assert_eq!(utc(4_107_542_400_000), "2100-03-01T00:00:00.000Z");
+    assert_eq!(utc(-1), "1969-12-31T23:59:59.999Z");
+}
+
+#[test]
+fn an_event_is_one_line_whatever_it_says() {
+    let directory = tempfile::tempdir().unwrap();
+    for format in [Format::Text, Format::Json] {
+        let path = directory.path().join("log");
+        let said = || warn!(walk = 3_u64, gamma = 1.5, name = "a \"b\"\nc", "two\nlines, é");
+        tracing::subscriber::with_default(log(&path, format, LogLevel::Info), said);
+        let text = fs::read_to_string(&path).unwrap();
+        assert_eq!(text.lines().count(), 1, "{text}");
+        fs::remove_file(&path).unwrap();
+        if format == Format::Text {
+            let pid = std::process::id();
+            let rest = text.split_once(' ').unwrap().1;
+            let said = r#"two\nlines, é gamma=1.5 name="a \"b\"\nc" walk=3"#;
+            assert_eq!(rest, format!("WARN  walker 3 [{pid}] {said}\n"));
+        } else {
+            let object: serde_json::Value = serde_json::from_str(&text).unwrap();
+            assert_eq!(object["level"], "warn");
+            assert_eq!(object["process"], "walker 3");
+            assert_eq!(object["message"], "two\nlines, é");
+            assert_eq!(
+                object["fields"],
+                serde_json::json!({ "walk": 3, "gamma": 1.5, "name": "a \"b\"\nc" })
+            );
+        }
+    }
+}
+
+#[test]
+fn what_is_less_serious_is_left_out_and_so_is_what_libraries_tell() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("log");
+    tracing::subscriber::with_default(log(&path, Format::Text, LogLevel::Info), || {
+        debug!("too fine");
+        info!("just right");
+        info!(target: "zenoh::net", "of a library");
+        warn!(target: "zenoh::net", "a warning");
+        let _span = tracing::error_span!("nothing").entered();
+    });
+    let text = fs::read_to_string(&path).unwrap();
+    let said: Vec<_> = text.lines().map(|line| line.split_once("] ").unwrap().1).collect();
+    assert_eq!(said, ["just right", "a warning"]);
+}
+
+#[test]
+fn writers_to_one_file_tear_no_lines() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = Arc::new(directory.path().join("log"));
+    let writers: Vec<_> = (0..8_u64)
+        .map(|writer| {
+            let path = Arc::clone(&path);
+            let long = "x".repeat(500 * writer as usize);
+            thread::spawn(move || {
+                // Each has opened the file for itself, as processes do.
+                tracing::subscriber::with_default(log(&path, Format::Json, LogLevel::Info), || {
+                    (0..200_u64).for_each(|line| info!(writer, line, "{long}"));
+                });
+            })
+        })
+        .collect();
+    writers.into_iter().for_each(|writer| writer.join().unwrap());
+    let text = fs::read_to_string(&*path).unwrap();
+    let mut next = [0; 8];
+    for line in text.lines() {
+        let event: serde_json::Value = serde_json::from_str(line).unwrap();
+        let writer = event["fields"]["writer"].as_u64().unwrap() as usize;
+        assert_eq!(event["fields"]["line"], next[writer]);
+        next[writer] += 1;
+    }
+    assert_eq!(next, [200; 8]);
+}
