@@ -60,9 +60,13 @@ impl fmt::Display for Summary {
             declined.backlog
         )?;
         writeln!(f, "                 {} refused by walkers' own guards", candidates.refused_by_walkers)?;
+        let superseded = match labels.superseded {
+            0 => String::new(),
+            jobs => format!(", {jobs} superseded"),
+        };
         writeln!(
             f,
-            "labels           {} biased and {} control structures labelled, {} failed, {} dropped",
+            "labels           {} biased and {} control structures labelled, {} failed, {} dropped{superseded}",
             self.learned.biased.structures, self.learned.control.structures, labels.failed, labels.dropped
         )?;
         write!(f, "{}", unlabelled::shown(&self.unlabelled, 17, SHOWN))?;

@@ -78,7 +78,7 @@ fn a_live_campaign_is_scraped_and_agrees_with_its_status() {
     );
     assert_eq!(value("calmwalk_control_frames_total", ""), number("/candidates/control"));
     assert_eq!(value("calmwalk_mixture_version", ""), number("/mixture_version"));
-    for state in ["queued", "leased", "labelled", "failed", "dropped"] {
+    for state in ["queued", "leased", "labelled", "failed", "dropped", "superseded"] {
         let labels = format!("state=\"{state}\"");
         assert_eq!(value("calmwalk_label_jobs", &labels), number(&format!("/labels/{state}")));
     }

@@ -100,6 +100,12 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     let names = |rows: &[(String, String)]| rows.iter().map(|row| row.1.clone()).collect::<Vec<_>>();
     assert_eq!(names(&after), names(&before));
     assert_eq!((place.jobs("labelled"), place.jobs("again"), place.jobs("queued")), (labels, 0, 0));
+    assert_eq!(place.jobs("superseded"), labels);
+    assert!(succeed(here, ["status", campaign]).contains(&format!(", {labels} superseded; ")));
+    succeed(here, ["report", campaign, "-o", "report"]);
+    let summary = fs::read_to_string(here.join("report/tables/summary.csv")).unwrap();
+    let words = format!("{labels} labelled, 0 failed, 0 dropped, {labels} superseded, 0 in work, 0 waiting");
+    assert!(summary.contains(&words), "{summary}");
     let story = succeed(here, ["explain", campaign, &after[0].1]);
     for words in ["superseded", "ago: a finer grid", "protocol 'fine'", "protocol 'reference'"] {
         assert!(story.contains(words), "{words} in {story}");

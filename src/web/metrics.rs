@@ -128,6 +128,7 @@ fn label_queue(text: &mut Text, status: &Status) {
         ("labelled", labels.labelled),
         ("failed", labels.failed),
         ("dropped", labels.dropped),
+        ("superseded", labels.superseded),
     ];
     let names = states.map(|(state, _)| [("state", state)]);
     let samples: Vec<_> =

@@ -79,6 +79,8 @@ pub struct Labels {
     pub failed: u64,
     /// Taken out by hand.
     pub dropped: u64,
+    /// Of an earlier protocol: a job of a later one has taken their place.
+    pub superseded: u64,
     /// Of those that wait or are in work: there is a label, which stays until the new one has come.
     pub again: u64,
     /// Labels that were to be made again and could not be: those that there are stay.

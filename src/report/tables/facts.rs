@@ -29,10 +29,11 @@ pub fn summary(gathered: &Gathered) -> Table {
     row(
         "label jobs",
         format!(
-            "{} labelled, {} failed, {} dropped, {} in work, {} waiting",
+            "{} labelled, {} failed, {} dropped, {} superseded, {} in work, {} waiting",
             grouped(labels.labelled),
             grouped(labels.failed),
             grouped(labels.dropped),
+            grouped(labels.superseded),
             grouped(labels.leased),
             grouped(labels.queued)
         ),

@@ -8,7 +8,7 @@ import { decimals, shortName, whole } from "./format.js";
 export const TITLE = "Candidates";
 
 const LENGTH = 50;
-const STATES = ["queued", "leased", "labelled", "failed", "dropped"];
+const STATES = ["queued", "leased", "labelled", "failed", "dropped", "superseded"];
 /** Columns: title, whether it holds numbers, and the order that its title asks for. */
 const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["γ_max", true, "gamma"],
   ["γ_nbr", true], ["V/V₀", true, "volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["attempts", true]];

@@ -152,6 +152,7 @@ fn labels(states: &[(String, u64)], asked: &[(String, u64)]) -> Labels {
         labelled: number("labelled"),
         failed: number("failed"),
         dropped: number("dropped"),
+        superseded: number("superseded"),
         again: asked("queued") + asked("leased"),
         again_in_vain: asked("labelled") + asked("failed"),
         failed_again: asked("failed"),
