@@ -14,6 +14,7 @@ mod interrupt;
 mod labelling;
 mod learned;
 mod log;
+mod mixture;
 mod notify;
 mod outcome;
 mod output;

@@ -13,11 +13,11 @@ use atoms::poscar::read_poscar;
 use common::campaign::Small;
 use common::http::{first_event, get, request, said};
 use common::processes::wait_until;
-use common::{Running, program, refuse, succeed};
+use common::{Running, config, program, refuse, succeed};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// A campaign that has collected all it may, and waits for labels from elsewhere.
+/// A campaign that waits for labels from elsewhere.
 struct Live {
     directory: TempDir,
     _run: Running,
@@ -26,18 +26,9 @@ struct Live {
 }
 
 impl Live {
+    /// One that has collected all it may.
     fn begin() -> Self {
-        let directory = tempfile::tempdir().unwrap();
-        let here = directory.path();
-        let path = Small::default().write(here);
-        let text = fs::read_to_string(&path).unwrap();
-        fs::write(&path, text.replace("[label]", "[label]\nslots = 0")).unwrap();
-        let mut command = program(here);
-        command.args(["run", "campaign.toml", "--dashboard", "127.0.0.1:0"]);
-        let mut run = Running(command.stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap());
-        let [said] = said(&mut run.0, ["dashboard at http://"]);
-        let (address, token) = said.split_once("/#token=").unwrap();
-        let live = Self { address: address.into(), token: token.into(), _run: run, directory };
+        let live = Self::labelling("slots = 0");
         wait_until("all is collected", || {
             let status = live.status();
             let over = |walk: &Value| !["waiting", "running"].contains(&walk["state"].as_str().unwrap());
@@ -45,6 +36,21 @@ impl Live {
             walks.len() >= 2 && walks.iter().all(over) && status["labels"]["queued"].as_u64() > Some(2)
         });
         live
+    }
+
+    /// With these lines of its section `[label]`.
+    fn labelling(label: &str) -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let here = directory.path();
+        let path = Small::default().write(here);
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, text.replace("[label]", &format!("[label]\n{label}"))).unwrap();
+        let mut command = program(here);
+        command.args(["run", "campaign.toml", "--dashboard", "127.0.0.1:0"]);
+        let mut run = Running(command.stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap());
+        let [said] = said(&mut run.0, ["dashboard at http://"]);
+        let (address, token) = said.split_once("/#token=").unwrap();
+        Self { address: address.into(), token: token.into(), _run: run, directory }
     }
 
     fn here(&self) -> &Path {
@@ -65,6 +71,12 @@ impl Live {
         let answer = request(&self.address, "POST", &path, headers, &body.to_string());
         (answer.status, answer.json())
     }
+}
+
+/// A walk is paused or resumed: the answer's status, and what it says.
+fn change_walk(live: &Live, path: &str, headers: &[(&str, &str)]) -> (u16, Value) {
+    let answer = request(&live.address, "POST", &format!("/api/walks/{path}"), headers, "{}");
+    (answer.status, answer.json())
 }
 
 /// Every line of the table, a few at a time.
@@ -228,7 +240,78 @@ fn a_live_campaign_is_looked_at_and_changed() {
     let id = queue[0]["id"].as_str().unwrap();
     check_candidate(&live, id);
     check_actions(&live, id);
+    let token = [("x-calmwalk-token", live.token.as_str())];
+    let (status, why) = change_walk(&live, "0/pause", &token);
+    assert!(status == 409 && why["error"].as_str().unwrap().contains("walk 0"), "{why}");
+    check_mixture(&live);
     check_copy(&live, id);
+}
+
+/// The components are those of the artifact, and some have moved.
+fn check_mixture(live: &Live) {
+    let mixture = get(&live.address, "/api/mixture").json();
+    assert_eq!(mixture["version"], live.status()["mixture_version"]);
+    let artifact = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
+    let shown = succeed(live.here(), ["calm", "info", &artifact, "--json"]);
+    let artifact: Value = serde_json::from_str(&shown).unwrap();
+    let (found, before) =
+        (mixture["components"].as_array().unwrap(), artifact["components"].as_array().unwrap());
+    assert_eq!(found.len(), before.len());
+    for (found, before) in found.iter().zip(before) {
+        for (key, of_artifact) in [
+            ("element", "element"),
+            ("component", "component"),
+            ("threshold", "threshold"),
+            ("environments_before", "count"),
+        ] {
+            assert_eq!(found[key], before[of_artifact], "{key}");
+        }
+        let number = |key: &str| found[key].as_f64().unwrap();
+        let has_moved = found["moved"] == true;
+        assert_eq!(number("distance") > 0.0, has_moved, "{found}");
+        assert_eq!(number("environments") > number("environments_before"), has_moved, "{found}");
+        assert!(number("shrunk") <= number("grown") && number("condition_number") >= 1.0, "{found}");
+    }
+    assert!(found.iter().any(|component| component["moved"] == true));
+}
+
+#[test]
+fn walks_are_paused_and_resumed_by_who_knows_the_token() {
+    // Walkers wait for ever when that many structures wait for labels, and walks stay under way.
+    let live = Live::labelling("slots = 0\nqueue_limit = 4");
+    wait_until("walkers wait", || live.status()["labels"]["queued"].as_u64() > Some(4));
+    let paused = || {
+        let status = live.status();
+        let walks = status["walks"].as_array().unwrap().iter().filter(|walk| walk["paused"] == true);
+        walks.map(|walk| walk["walk"].as_u64().unwrap()).collect::<Vec<_>>()
+    };
+    let status = live.status();
+    let walks = status["walks"].as_array().unwrap().iter();
+    let going = walks.filter(|walk| ["waiting", "running"].contains(&walk["state"].as_str().unwrap()));
+    let going: Vec<_> = going.map(|walk| walk["walk"].as_u64().unwrap()).collect();
+    let pause = format!("{}/pause", going[0]);
+    let token = ("x-calmwalk-token", live.token.as_str());
+    for (status, headers) in [
+        (401, vec![]),
+        (403, vec![token, ("Origin", "http://example.org")]),
+        (403, vec![token, ("Sec-Fetch-Site", "cross-site")]),
+    ] {
+        let (found, why) = change_walk(&live, &pause, &headers);
+        assert_eq!(found, status, "{headers:?} {why}");
+    }
+    assert_eq!(get(&live.address, &format!("/api/walks/{pause}")).status, 405);
+    assert_eq!(paused(), [0; 0], "nothing of that changed anything");
+
+    assert_eq!(change_walk(&live, &pause, &[token]), (200, json!({ "changed": [going[0]], "paused": true })));
+    assert_eq!(paused(), [going[0]]);
+    assert_eq!(change_walk(&live, &pause, &[token]), (200, json!({ "changed": [], "paused": true })));
+    assert_eq!(change_walk(&live, "all/pause", &[token]).1["changed"], json!(going[1..]));
+    assert_eq!(paused(), going);
+    assert_eq!(change_walk(&live, "all/resume", &[token]).1["changed"], json!(going));
+    assert_eq!(paused(), [0; 0]);
+    for (path, status) in [("77/pause", 404), ("0/stop", 404), ("first/pause", 400), ("-1/pause", 400)] {
+        assert_eq!(change_walk(&live, path, &[token]).0, status, "{path}");
+    }
 }
 
 /// What is only looked at can only be looked at.
@@ -241,9 +324,11 @@ fn check_copy(live: &Live, id: &str) {
     let [address] = said(&mut shown.0, ["dashboard at http://"]);
     let address = address.trim_end_matches('/');
     assert_eq!(all_lines(address, "", 50), all_lines(&live.address, "", 50));
+    assert_eq!(get(address, "/api/mixture").json(), get(&live.address, "/api/mixture").json());
     assert_eq!(get(address, "/api/actions").json()["possible"], false);
     let token = [("x-calmwalk-token", live.token.as_str())];
     assert_eq!(request(address, "POST", &format!("/api/candidates/{id}/drop"), &token, "{}").status, 403);
+    assert_eq!(request(address, "POST", "/api/walks/0/pause", &token, "{}").status, 403);
     let open = refuse(here, ["dashboard", "copy", "--at", "0.0.0.0:0"]);
     assert!(open.contains("ssh -L"), "{open}");
 }

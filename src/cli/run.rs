@@ -139,7 +139,7 @@ async fn run(
         }
         if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
     };
-    let serving = web.serve(location, &store).await?;
+    let serving = web.serve(location, &store, &campaign.artifact).await?;
     let mut notifier = Notifier::new(&campaign.config.notify, &store, location).await?;
     let worked = tokio::select! {
         ended = work => ended,

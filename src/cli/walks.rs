@@ -55,7 +55,7 @@ pub async fn change(location: &Location, action: &Action) -> Result<Vec<String>,
     };
     let store = Store::open(location).await?;
     let walks = match which.all {
-        true => all(&store).await?,
+        true => store.walks_under_way().await?,
         false => which.walks.iter().copied().map(WalkId).collect(),
     };
     let changed = store.pause_walks(&walks, paused, unix_milliseconds()).await?;
@@ -65,10 +65,4 @@ pub async fn change(location: &Location, action: &Action) -> Result<Vec<String>,
         [] => vec!["nothing to do: it was so already".to_owned()],
         changed => changed.iter().map(|walk| format!("walk {walk} {state}")).collect(),
     })
-}
-
-/// Walks that have more steps to make.
-async fn all(store: &Store) -> Result<Vec<WalkId>, Failure> {
-    let walks = store.status().await?.walks;
-    Ok(walks.iter().filter(|walk| walk.is_under_way()).map(|walk| WalkId(walk.walk)).collect())
 }

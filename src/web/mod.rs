@@ -8,11 +8,13 @@ pub mod metrics;
 use std::net::SocketAddr;
 
 use axum::{Router, middleware};
+use calm::Artifact;
 use store::{Location, Store};
 use tokio::net::TcpListener;
 use tokio::task::AbortHandle;
 
 use self::dashboard::{Acting, Dashboard};
+use crate::mixture::Original;
 use crate::outcome::Failure;
 use crate::output::{say, show};
 
@@ -78,7 +80,12 @@ impl Addresses {
 impl Listening {
     /// Begins to serve. What is shown is read through connections of its own: whoever asks often does not keep the campaign
     /// waiting. What is changed goes through `store`.
-    pub async fn serve(self, location: &Location, store: &Store) -> Result<Serving, Failure> {
+    pub async fn serve(
+        self,
+        location: &Location,
+        store: &Store,
+        artifact: &Artifact,
+    ) -> Result<Serving, Failure> {
         let mut serving = Serving::default();
         if self.dashboard.is_none() && self.metrics.is_none() {
             return Ok(serving);
@@ -91,12 +98,13 @@ impl Listening {
             serving.add(listener, metrics::router(shown.clone()));
         }
         if let Some(listener) = self.dashboard {
+            let original = Original { symbols: artifact.symbols.clone(), mixture: artifact.mixture.clone() };
             let acting = Acting::new(store.clone())?;
             let address = listener.local_addr().map_err(Failure::failed)?;
             tracing::info!("dashboard at http://{address}/");
             // The token is for whoever reads this, and for no file.
             show(format_args!("dashboard at http://{address}/#token={}", acting.token()));
-            serving.add(listener, Dashboard::new(shown, Some(acting)).router());
+            serving.add(listener, Dashboard::new(shown, Some(acting), Some(original)).router());
         }
         Ok(serving)
     }

@@ -16,6 +16,7 @@ pub mod grade;
 mod ladder;
 mod linear;
 pub mod mixture;
+pub mod movement;
 pub mod neighbourhood;
 mod numbers;
 pub mod rules;

@@ -89,6 +89,18 @@ pub(crate) fn eigen(matrix: MatRef<'_, f64>) -> Result<Eigen, LinearError> {
     Ok(Eigen { values, vectors })
 }
 
+/// Its eigenvalues alone, ascending.
+pub(crate) fn eigenvalues(matrix: MatRef<'_, f64>) -> Result<Vec<f64>, LinearError> {
+    let dimension = matrix.nrows();
+    let mut values = faer::diag::Diag::zeros(dimension);
+    let scratch =
+        self_adjoint_evd_scratch::<f64>(dimension, ComputeEigenvectors::No, Par::Seq, Default::default());
+    let memory = &mut MemBuffer::new(scratch);
+    self_adjoint_evd(matrix, values.as_mut(), None, Par::Seq, MemStack::new(memory), Default::default())
+        .map_err(|_| LinearError::NoConvergence { dimension })?;
+    Ok(values.column_vector().iter().copied().collect())
+}
+
 /// The factor L of A = LLᵀ, or `None` when A is not positive definite in floating point.
 pub(crate) fn cholesky(matrix: &[f64], dimension: usize) -> Option<Mat<f64>> {
     let mut factor = view(matrix, dimension, dimension).to_owned();

@@ -148,7 +148,11 @@ fn restored<T: DeserializeOwned>(
     read.map(Some).map_err(|error| SelectorError::Snapshot(format!("{name} is damaged: {error}")))
 }
 
-pub(super) fn restored_mixture(
+/// The mixture of this version: the original one with the components that the store has, which are all that ever changed.
+///
+/// # Errors
+/// Components that are damaged, or are none of this mixture's.
+pub fn restored_mixture(
     original: &Mixture,
     version: u64,
     components: &[ComponentRecord],

@@ -36,6 +36,7 @@ use backlog::Backlog;
 pub use decide::TrainingFrames;
 pub use examine::{Examined, ExaminedReport, Examiner};
 use judge::Judge;
+pub use judge::restored_mixture;
 pub use replay::{Replay, ReplayError, Replayed};
 pub use staleness::Staleness;
 pub use turns::Next;

@@ -1,4 +1,4 @@
-//! What may be done from a page: what `calmwalk queue` does. It takes the token that is said when the campaign starts, in a header
+//! What may be done from a page: what `calmwalk queue` and `calmwalk walks` do. It takes the token that is said when the campaign starts, in a header
 //! that no page of another site can send.
 
 use std::fs::File;
@@ -9,6 +9,7 @@ use axum::extract::{Path, State};
 use axum::http::{HeaderMap, StatusCode};
 use serde_json::{Value, json};
 use store::{Store, unix_milliseconds};
+use wire::WalkId;
 
 use super::Dashboard;
 use super::answer::{self, Answer, Refusal};
@@ -60,6 +61,41 @@ pub async fn act(
     headers: HeaderMap,
     body: Bytes,
 ) -> Answer {
+    let (store, now) = (may_change(&dashboard, &headers)?, unix_milliseconds());
+    let candidate = match action.as_str() {
+        "drop" => store.drop_job(&id, now).await?,
+        "retry" => store.retry_job(&id, now).await?,
+        "prioritise" => store.prioritise_job(&id, priority(&body)?, now).await?,
+        _ => return Err(Refusal::new(StatusCode::NOT_FOUND, "there is drop, retry and prioritise")),
+    };
+    answer::json(&store.queue_show(&candidate).await?.job)
+}
+
+/// `POST /api/walks/N/pause` or `resume`, `all` for N being every walk that has more steps to make: returns the walks that were
+/// changed.
+pub async fn act_on_walks(
+    State(dashboard): State<Dashboard>,
+    Path((walk, action)): Path<(String, String)>,
+    headers: HeaderMap,
+) -> Answer {
+    let store = may_change(&dashboard, &headers)?;
+    let paused = match action.as_str() {
+        "pause" => true,
+        "resume" => false,
+        _ => return Err(Refusal::new(StatusCode::NOT_FOUND, "there is pause and resume")),
+    };
+    let walks = match walk.as_str() {
+        "all" => store.walks_under_way().await?,
+        number => {
+            vec![WalkId(number.parse().map_err(|_| Refusal::wrong("expected the number of a walk, or all"))?)]
+        }
+    };
+    let changed = store.pause_walks(&walks, paused, unix_milliseconds()).await?;
+    answer::json(&json!({ "changed": changed, "paused": paused }))
+}
+
+/// What may be changed, if whoever asks may do so.
+fn may_change<'a>(dashboard: &'a Dashboard, headers: &HeaderMap) -> Result<&'a Store, Refusal> {
     let refused = Refusal::new;
     let Some(acting) = &dashboard.acting else {
         return Err(refused(
@@ -67,21 +103,14 @@ pub async fn act(
             "this campaign is only looked at: nothing can be changed here",
         ));
     };
-    if !guard::is_of_this_site(&headers) {
+    if !guard::is_of_this_site(headers) {
         return Err(refused(StatusCode::FORBIDDEN, "only pages of this dashboard may change something"));
     }
-    if !acting.knows(&headers) {
+    if !acting.knows(headers) {
         let why = "that takes the token which calmwalk run has printed behind the address";
         return Err(refused(StatusCode::UNAUTHORIZED, why));
     }
-    let (store, now) = (&acting.store, unix_milliseconds());
-    let candidate = match action.as_str() {
-        "drop" => store.drop_job(&id, now).await?,
-        "retry" => store.retry_job(&id, now).await?,
-        "prioritise" => store.prioritise_job(&id, priority(&body)?, now).await?,
-        _ => return Err(refused(StatusCode::NOT_FOUND, "there is drop, retry and prioritise")),
-    };
-    answer::json(&store.queue_show(&candidate).await?.job)
+    Ok(&acting.store)
 }
 
 fn priority(body: &[u8]) -> Result<i32, Refusal> {

@@ -56,10 +56,11 @@ impl From<StoreError> for Refusal {
     fn from(error: StoreError) -> Self {
         use StoreError as E;
         let status = match error {
-            E::UnknownCandidate { .. } | E::UnknownImport { .. } | E::UnknownJob { .. } => {
-                StatusCode::NOT_FOUND
-            }
-            E::AmbiguousJob { .. } | E::WrongState { .. } => StatusCode::CONFLICT,
+            E::UnknownCandidate { .. }
+            | E::UnknownImport { .. }
+            | E::UnknownJob { .. }
+            | E::UnknownWalk { .. } => StatusCode::NOT_FOUND,
+            E::AmbiguousJob { .. } | E::WrongState { .. } | E::EndedWalk { .. } => StatusCode::CONFLICT,
             _ => StatusCode::SERVICE_UNAVAILABLE,
         };
         Self::new(status, error)

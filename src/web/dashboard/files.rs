@@ -27,6 +27,7 @@ const FILES: &[(&str, &str)] = files![
     "hosts.js",
     "icon.svg",
     "main.js",
+    "mixture.js",
     "overview.js",
     "plot.js",
     "plots.js",

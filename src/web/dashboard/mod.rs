@@ -5,7 +5,9 @@ mod answer;
 mod candidate;
 mod errors;
 mod files;
+mod kept;
 mod live;
+mod mixture;
 mod samples;
 mod table;
 
@@ -17,9 +19,10 @@ use store::Store;
 
 pub use self::actions::Acting;
 use self::answer::{Answer, json};
-use self::errors::Errors;
+use self::kept::Kept;
 use self::live::Live;
 use super::guard;
+use crate::mixture::Original;
 
 /// Candidates of a walk that are shown as its trace, at most.
 const TRACE: u32 = 2000;
@@ -30,15 +33,19 @@ pub struct Dashboard {
     /// To be read only, through connections of its own.
     store: Store,
     live: Live,
-    errors: Errors,
+    errors: Kept,
+    mixture: Kept,
+    /// Where the campaign is run here, the mixture that it began with.
+    original: Option<Original>,
     /// None where nothing may be changed.
     acting: Option<Acting>,
 }
 
 impl Dashboard {
     /// Shows what this store has, and begins to look at it every few seconds.
-    pub fn new(store: Store, acting: Option<Acting>) -> Self {
-        Self { live: Live::begin(store.clone()), errors: Errors::default(), store, acting }
+    pub fn new(store: Store, acting: Option<Acting>, original: Option<Original>) -> Self {
+        let (errors, mixture) = (Kept::default(), Kept::default());
+        Self { live: Live::begin(store.clone()), errors, mixture, original, store, acting }
     }
 
     /// Its pages.
@@ -56,7 +63,9 @@ impl Dashboard {
             .route("/api/candidates/{id}/{action}", post(actions::act))
             .route("/api/actions", get(actions::allowed))
             .route("/api/errors", get(errors::errors))
+            .route("/api/mixture", get(mixture::mixture))
             .route("/api/walks/{walk}/candidates", get(trace))
+            .route("/api/walks/{walk}/{action}", post(actions::act_on_walks))
             .fallback(answer::nothing_there)
             .layer(middleware::map_response(guard::shut_in))
             .with_state(self)

@@ -5,10 +5,10 @@ export async function ask(path, signal) {
   return answered(await fetch(path, { signal, cache: "no-store" }));
 }
 
-/** Changes something about a candidate. */
-export async function act(id, action, token, what) {
+/** Changes something, which has this path. */
+export async function act(path, token, what) {
   const headers = { "content-type": "application/json", "x-calmwalk-token": token };
-  return answered(await fetch(ofCandidate(id, `/${action}`), { method: "POST", headers, body: JSON.stringify(what) }));
+  return answered(await fetch(path, { method: "POST", headers, body: JSON.stringify(what) }));
 }
 
 async function answered(response) {

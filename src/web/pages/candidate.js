@@ -117,7 +117,7 @@ function covered({ by, later, looked_until: until }) {
 
 function labels({ jobs, labels: made }, again, signal) {
   if (jobs.length + made.length === 0) return [element("p", {}, "It has no label job.")];
-  return [...jobs.map((found) => element("div", {}, job(found), buttons(found, again, signal))), ...made.map(label)];
+  return [...jobs.map((found) => element("div", {}, job(found), buttons(found, again))), ...made.map(label)];
 }
 
 function job(found) {

@@ -41,6 +41,17 @@ export function table(caption, columns, rows) {
       element("thead", {}, element("tr", {}, head)), element("tbody", {}, lines)));
 }
 
+/** Puts children into a place. What had the keyboard's focus there has it again, if it is there again (`data-keep`, or the name of
+ *  a region), and regions stay scrolled as they were. */
+export function renew(place, ...children) {
+  const name = (found) => found?.dataset?.keep ?? found?.getAttribute("aria-label");
+  const had = place.contains(document.activeElement) ? name(document.activeElement) : null;
+  const scrolled = new Map([...place.querySelectorAll(".scrolls")].map((region) => [name(region), [region.scrollLeft, region.scrollTop]]));
+  place.replaceChildren(...children);
+  for (const region of place.querySelectorAll(".scrolls")) [region.scrollLeft, region.scrollTop] = scrolled.get(name(region)) ?? [0, 0];
+  if (had) [...place.querySelectorAll("[data-keep], [aria-label]")].find((found) => name(found) === had)?.focus({ preventScroll: true });
+}
+
 /** A word that says a state, with a mark that does not depend on its colour. */
 export function state(name) {
   return element("span", { class: "state", "data-state": name }, name);

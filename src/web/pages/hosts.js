@@ -1,7 +1,7 @@
 // Hosts, and the processes that work there for the campaign.
 
 import { listen } from "./api.js";
-import { element, section, state, table } from "./dom.js";
+import { element, renew, section, state, table } from "./dom.js";
 import { ago, time } from "./format.js";
 
 export const TITLE = "Hosts";
@@ -12,7 +12,7 @@ const COLUMNS = [["process"], ["number", true], ["state"], ["last sign of life"]
 export function show(content, _, signal) {
   const place = element("div");
   content.append(place);
-  listen(({ status }) => place.replaceChildren(...hosts(status.processes)), signal);
+  listen(({ status }) => renew(place, ...hosts(status.processes)), signal);
 }
 
 function hosts(processes) {

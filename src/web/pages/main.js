@@ -6,10 +6,11 @@ import * as candidate from "./candidate.js";
 import * as candidates from "./candidates.js";
 import * as errors from "./errors.js";
 import * as hosts from "./hosts.js";
+import * as mixture from "./mixture.js";
 import * as overview from "./overview.js";
 
 /** Pages in the order of the menu, by the first word of their address. */
-const PAGES = { overview, candidates, errors, hosts };
+const PAGES = { overview, candidates, mixture, errors, hosts };
 const CONNECTIONS = { live: "● live", lost: "○ no connection: trying again", blind: "○ the database does not answer" };
 
 let shown = new AbortController();

@@ -1,7 +1,8 @@
 // How the campaign stands.
 
+import { canPause, pauseButton } from "./actions.js";
 import { listen } from "./api.js";
-import { element, facts, section, state, table } from "./dom.js";
+import { element, facts, renew, section, state, table } from "./dom.js";
 import { bytes, decimals, digits, duration, percent, time, whole } from "./format.js";
 import { overTime } from "./plots.js";
 
@@ -19,12 +20,21 @@ export function show(content, _, signal) {
   const rest = element("div");
   content.append(tiles, section("Since this program began to look", plots), rest);
   overTime(plots, signal);
-  listen(({ status }) => {
+  let [status, changes] = [null, false];
+  const draw = () => {
     tiles.replaceChildren(...summary(status));
-    rest.replaceChildren(
+    renew(rest,
       section("Label queue", queue(status)),
       section("Budget and end", budget(status)),
-      section("Walks", walks(status.walks)));
+      section("Walks", walks(status.walks, changes && draw)));
+  };
+  canPause().then((can) => {
+    changes = can;
+    if (status) draw();
+  });
+  listen((news) => {
+    status = news.status;
+    draw();
   }, signal);
 }
 
@@ -93,14 +103,25 @@ function budget(status) {
   ]);
 }
 
-function walks(all) {
+/** `changed` is called when walks were paused here or resumed; false where they cannot be. */
+function walks(all, changed) {
   const order = [...all].sort((a, b) => isUnderWay(b) - isUnderWay(a) || a.walk - b.walk);
+  const change = (some, isPaused) => () => {
+    // The next news say so too.
+    some.forEach((walk) => { walk.paused = isPaused; });
+    changed();
+  };
+  const button = (walk) => (isUnderWay(walk) || walk.paused) && pauseButton(walk.walk, walk.paused, change([walk], !walk.paused));
   const rows = order.slice(0, WALKS).map((walk) => [
-    whole(walk.walk), walk.seed_structure, walk.origin, element("span", {}, state(walk.state), walk.reason && ` ${walk.reason}`),
+    whole(walk.walk), walk.seed_structure, walk.origin, element("span", {}, state(walk.paused ? "paused" : walk.state), walk.reason && ` ${walk.reason}`),
     whole(walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
-    digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.refused)]);
+    digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.refused), ...(changed ? [button(walk) || ""] : [])]);
   const more = all.length - rows.length;
-  return element("div", {}, table("Walks, those under way first", WALK_COLUMNS, rows),
+  const [going, paused] = [all.filter((walk) => isUnderWay(walk) && !walk.paused), all.filter((walk) => walk.paused)];
+  return element("div", {},
+    changed && element("p", { class: "actions" }, going.length > 0 && pauseButton(null, false, change(going, true)),
+      paused.length > 0 && pauseButton(null, true, change(paused, false))),
+    table("Walks, those under way first", changed ? [...WALK_COLUMNS, ["pause"]] : WALK_COLUMNS, rows),
     more > 0 && element("p", { class: "quiet" }, `… and ${whole(more)} more (calmwalk status --all)`));
 }
 

@@ -23,6 +23,13 @@ impl Store {
         decode(found)
     }
 
+    /// Walks that have more steps to make.
+    pub async fn walks_under_way(&self) -> Result<Vec<WalkId>> {
+        let sql = "SELECT walk FROM walk WHERE state IN ('waiting', 'running') ORDER BY walk";
+        let walks: Vec<u32> = query(sql).fetch_all(&self.database).await?;
+        Ok(walks.into_iter().map(WalkId).collect())
+    }
+
     /// Asks that these walks get no turn until they are resumed, or that they get turns again. Each change leaves a line in the
     /// operations log; what is so already is none. Returns the walks that were changed.
     ///

@@ -1,0 +1,125 @@
+//! Chromium without a screen, which is driven over HTTP by `chromedriver`. Debian's packages: chromium and chromium-driver.
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use serde_json::{Value, json};
+
+use super::Running;
+use super::http::{get, request};
+use super::processes::wait_until;
+
+/// A browser with one window.
+pub struct Browser {
+    address: String,
+    session: String,
+    _driver: Running,
+}
+
+impl Browser {
+    /// With a window of this size, on dark ground or on light.
+    pub fn start(dark: bool, (width, height): (u32, u32)) -> Self {
+        let driver = Command::new("chromedriver").arg("--port=0").stdout(Stdio::piped()).spawn();
+        let mut driver = Running(driver.expect("chromedriver, of Debian's package chromium-driver"));
+        let mut lines = BufReader::new(driver.0.stdout.take().unwrap()).lines();
+        let port = lines.find_map(|line| {
+            let line = line.unwrap();
+            Some(line.split_once("started successfully on port ")?.1.trim_end_matches('.').to_owned())
+        });
+        std::thread::spawn(move || lines.for_each(drop));
+        let address = format!("127.0.0.1:{}", port.expect("chromedriver says its port"));
+        let mut browser = Self { address, session: String::new(), _driver: driver };
+        let size = format!("--window-size={width},{height}");
+        let mut arguments =
+            vec!["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", &size];
+        arguments.extend(dark.then_some("--force-dark-mode"));
+        let wanted = json!({ "alwaysMatch": {
+            "goog:chromeOptions": { "args": arguments },
+            "goog:loggingPrefs": { "browser": "ALL", "performance": "ALL" },
+        } });
+        let session = browser.tell("", &json!({ "capabilities": wanted }));
+        browser.session = format!("/{}", session["sessionId"].as_str().unwrap());
+        browser
+    }
+
+    fn tell(&self, what: &str, body: &Value) -> Value {
+        let path = format!("/session{}{what}", self.session);
+        let headers = [("Content-Type", "application/json")];
+        let answer = request(&self.address, "POST", &path, &headers, &body.to_string());
+        assert_eq!(answer.status, 200, "{what} {body}: {answer:?}");
+        answer.json()["value"].take()
+    }
+
+    /// Goes to an address.
+    pub fn show(&self, url: &str) {
+        self.tell("/url", &json!({ "url": url }));
+    }
+
+    /// What a script returns.
+    pub fn run(&self, script: &str) -> Value {
+        self.tell("/execute/sync", &json!({ "script": script, "args": [] }))
+    }
+
+    /// Waits until a script finds something true.
+    pub fn wait(&self, script: &str) {
+        wait_until(script, || self.run(&format!("return Boolean({script})")) == true);
+    }
+
+    /// Lines of one of its logs.
+    pub fn log(&self, kind: &str) -> Vec<Value> {
+        let Value::Array(lines) = self.tell("/se/log", &json!({ "type": kind })) else { panic!("a list") };
+        lines
+    }
+
+    /// Writes what the window shows, or an element alone (a CSS selector), as PNG into a file.
+    pub fn picture(&self, file: &Path, of: Option<&str>) {
+        let of = of.map(|selector| {
+            let found = self.tell("/element", &json!({ "using": "css selector", "value": selector }));
+            let id = found.as_object().unwrap().values().next().unwrap().as_str().unwrap().to_owned();
+            format!("/element/{id}")
+        });
+        let path = format!("/session{}{}/screenshot", self.session, of.unwrap_or_default());
+        let answer = get(&self.address, &path).json();
+        let bytes = from_base64(answer["value"].as_str().unwrap());
+        assert!(bytes.starts_with(b"\x89PNG"));
+        fs::create_dir_all(file.parent().unwrap()).unwrap();
+        fs::write(file, bytes).unwrap();
+    }
+
+    /// Every address that pages asked for.
+    pub fn asked_for(&self) -> Vec<String> {
+        let asked = |line: Value| -> Option<String> {
+            let message: Value = serde_json::from_str(line["message"].as_str()?).ok()?;
+            let is_request = message["message"]["method"] == "Network.requestWillBeSent";
+            let url = message.pointer("/message/params/request/url")?.as_str()?.to_owned();
+            is_request.then_some(url)
+        };
+        self.log("performance").into_iter().filter_map(asked).collect()
+    }
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        if !self.session.is_empty() {
+            request(&self.address, "DELETE", &format!("/session{}", self.session), &[], "");
+        }
+    }
+}
+
+fn from_base64(text: &str) -> Vec<u8> {
+    let digit = |c: u8| match c {
+        b'A'..=b'Z' => c - b'A',
+        b'a'..=b'z' => c - b'a' + 26,
+        b'0'..=b'9' => c - b'0' + 52,
+        b'+' => 62,
+        _ => 63,
+    };
+    let digits: Vec<u8> = text.bytes().filter(|c| *c != b'=').map(digit).collect();
+    let bytes = digits.chunks(4).flat_map(|four| {
+        let number = four.iter().fold(0u32, |sum, d| (sum << 6) | u32::from(*d)) << (6 * (4 - four.len()));
+        number.to_be_bytes()[1..four.len()].to_vec()
+    });
+    bytes.collect()
+}
