@@ -53,6 +53,13 @@ pub fn first_event(address: &str, path: &str) -> Value {
     serde_json::from_str(&data.expect("an event")).expect("JSON")
 }
 
+/// Listens to a stream of events and reads all that comes, until this process ends or the stream does.
+pub fn listen(address: &str, path: &str) -> std::thread::JoinHandle<()> {
+    let mut stream = send(address, "GET", path, &[], "");
+    stream.set_read_timeout(None).expect("a socket");
+    std::thread::spawn(move || drop(std::io::copy(&mut stream, &mut std::io::sink())))
+}
+
 fn send(address: &str, method: &str, path: &str, headers: &[(&str, &str)], body: &str) -> TcpStream {
     let mut stream = TcpStream::connect(address).expect("somebody listens");
     stream.set_read_timeout(Some(Duration::from_secs(300))).expect("a socket");
