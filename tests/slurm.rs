@@ -1,4 +1,4 @@
-//! Campaigns on a real Slurm of one node, one of them kept on a PostgreSQL server:
+//! Campaigns on a real Slurm, one of them kept on a PostgreSQL server:
 //! `SLURM_CONF=$(.ci/slurm start) CALMWALK_POSTGRES=$(.ci/postgres start) cargo test --test slurm`.
 
 mod common;
@@ -7,18 +7,16 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::MutexGuard;
 use std::time::{Duration, Instant};
 
 use common::campaign::{Outcome, Small, outcome_at};
 use common::hosts::undisturbed;
 use common::processes::{carrying_out, nothing_is_left, wait_until};
+use common::slurm::{ci, hold, slurm};
 use common::{Running, calmwalk, program, stderr, succeed};
 use serde_json::Value;
 use tempfile::TempDir;
-
-/// One campaign at a time: they share the node, and one test kills slurmctld.
-static NODE: Mutex<()> = Mutex::new(());
 
 /// A campaign that is launched on Slurm.
 struct OnSlurm {
@@ -47,26 +45,14 @@ fn long() -> Small {
     }
 }
 
-fn slurm(arguments: &[&str]) -> String {
-    let output = Command::new(arguments[0]).args(&arguments[1..]).output().expect("Slurm's commands");
-    assert!(output.status.success(), "{arguments:?}: {}", stderr(&output));
-    String::from_utf8(output.stdout).unwrap()
-}
-
-/// `.ci/slurm`, which started what is tested on.
-fn ci(order: &str) {
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join(".ci/slurm");
-    assert!(Command::new(script).arg(order).status().unwrap().success(), "{order}");
-}
-
+/// That of the partition that jobs go to.
 fn this_node() -> String {
-    slurm(&["sinfo", "--noheader", "--format=%N"]).trim().to_owned()
+    slurm(&["sinfo", "--noheader", "--partition=all", "--format=%N"]).trim().to_owned()
 }
 
 impl OnSlurm {
     fn new(small: &Small, agents: u32) -> Self {
-        assert!(std::env::var_os("SLURM_CONF").is_some(), "SLURM_CONF=$(.ci/slurm start) is needed");
-        let _node = NODE.lock().unwrap_or_else(PoisonError::into_inner);
+        let _node = hold();
         let home = tempfile::tempdir().unwrap();
         small.write(home.path());
         let options = vec![format!("--agents={agents}"), "--".into(), format!("--nodelist={}", this_node())];

@@ -214,6 +214,16 @@ fn a_mixture_without_statistics_can_be_scored_with_but_not_updated() {
 }
 
 #[test]
+fn options_of_label_jobs_must_leave_them_where_they_are_found() {
+    let desk = Desk::new();
+    for option in ["--clusters=other", "-Mother"] {
+        let keys =
+            format!("[label]\nbatch_system = \"slurm\"\nscratch = \"/s\"\nbatch_options = [{option:?}]");
+        desk.refused_with("[label]", &keys, &["label.batch_options", option, "in the cluster of the host"]);
+    }
+}
+
+#[test]
 fn training_frames_and_label_potentials_must_fit() {
     let desk = Desk::new();
     let (frames, label) = (path("data/al_eam_1l/seed_frames.extxyz"), path("data/Al_mm.eam.fs"));

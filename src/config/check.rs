@@ -125,6 +125,12 @@ pub fn check_label(label: &LabelSection) -> Result<(), Wrong> {
         let expected = "options of sbatch, each with its value in one piece: \"--partition=long\"";
         return wrong("label.batch_options", format!("{option:?}"), expected);
     }
+    let another = |option: &&String| option.starts_with("--cluster") || option.starts_with("-M");
+    if let Some(option) = label.batch_options.iter().find(another) {
+        let expected =
+            "jobs in the cluster of the host where labels are made: they would not be found in another";
+        return wrong("label.batch_options", format!("{option:?}"), expected);
+    }
     match &label.scratch {
         None if label.batch_system.is_some() => {
             let expected = "with label.batch_system, a directory that every node sees by the same name";

@@ -11,6 +11,7 @@ pub mod line;
 pub mod place;
 pub mod processes;
 pub mod report;
+pub mod slurm;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output};

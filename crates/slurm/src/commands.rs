@@ -136,7 +136,9 @@ impl Commands {
         // Habits of the user, too, would show something else than is expected.
         for (name, _) in std::env::vars_os() {
             let text = name.to_string_lossy();
-            let is_in_the_way = ["SQUEUE_", "SCANCEL_", "SLURM_"].iter().any(|begin| text.starts_with(begin));
+            let is_in_the_way = ["SQUEUE_", "SCANCEL_", "SLURM_", "SBATCH_CLUSTERS"]
+                .iter()
+                .any(|begin| text.starts_with(begin));
             if is_in_the_way && !KEPT.contains(&text.as_ref()) {
                 command.env_remove(&name);
             }

@@ -15,7 +15,7 @@ pub(super) fn tail(work: &Path) -> String {
 }
 
 /// As many whole lines as fit, or the end of the only one; nothing of a file that cannot be read.
-fn last_lines(path: &Path) -> String {
+pub(super) fn last_lines(path: &Path) -> String {
     let read = || -> std::io::Result<(u64, Vec<u8>)> {
         let mut file = File::open(path)?;
         let length = file.metadata()?.len();

@@ -5,7 +5,8 @@
 //! the one that makes the directory [`BEGUN`] calculates, so what was submitted twice, because an answer was lost, is calculated once.
 //!
 //! The end is what the keeper leaves, as everywhere. Slurm is asked seldom, only to find jobs that cannot leave one any more;
-//! as long as it does not answer nothing is concluded.
+//! as long as it does not answer nothing is concluded. It knows every job that lives, and forgets others after a while
+//! (`MinJobAge`): one that it does not know is over, and what Slurm wrote into the job's log before tells why.
 
 mod script;
 mod shared;
@@ -25,7 +26,7 @@ use tokio::time::sleep;
 use super::begun::Found;
 use super::code::file;
 use super::keeper::End;
-use told::Told;
+use told::{Told, Traces};
 
 pub(super) use script::{Wanted, write};
 
@@ -63,6 +64,9 @@ pub(super) struct Job {
     pub directory: PathBuf,
     /// That of no other calculation.
     pub name: String,
+    /// Who has submitted it: others may not see it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub user: Option<u32>,
     /// Where it failed, if it may go better on another node.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub node: Option<String>,
@@ -87,7 +91,7 @@ impl Slurm {
         let campaign = directory.parent().map(last).filter(|name| name.starts_with("calmwalk-"));
         let name = campaign.into_iter().chain([last(directory)]).collect::<Vec<_>>().join("-");
         let cluster = self.cluster(directory).await?.to_owned();
-        Ok(Job { cluster, directory: directory.to_owned(), name, node: None })
+        Ok(Job { cluster, directory: directory.to_owned(), name, user: Some(own_user()), node: None })
     }
 
     /// Submits a job that Slurm does not know. An answer that was lost is looked for; where Slurm answers, and will not have
@@ -116,7 +120,8 @@ impl Slurm {
         if let Some(end) = End::read(&job.directory) {
             return Ok(Found::Ended(end));
         }
-        if self.cluster(&job.directory).await? != job.cluster {
+        let others = job.user.is_some_and(|user| user != own_user());
+        if others || self.cluster(&job.directory).await? != job.cluster {
             return Ok(Found::Elsewhere);
         }
         let jobs = self.jobs(job).await?;
@@ -152,7 +157,7 @@ impl Slurm {
             _ => {}
         }
         // Slurm forgets it before long.
-        let end = told::end(told);
+        let end = told::end(told, &Traces::read(&job.directory));
         end.write(&job.directory).map_err(|error| file(&job.directory, error))?;
         Ok(Found::Ended(end))
     }
@@ -212,7 +217,8 @@ impl Slurm {
     async fn ask(&self, job: &Job) -> Result<Vec<Told>, SlurmError> {
         let name = format!("--name={}", job.name);
         let text = self.commands.queue(Told::FORMAT, &["--states=all", &name]).await?;
-        text.lines().map(Told::parse).collect()
+        let jobs: Vec<_> = text.lines().map(Told::parse).collect::<Result<_, _>>()?;
+        Ok(jobs.into_iter().filter(|told| !told.was_refused()).collect())
     }
 
     async fn cluster(&self, directory: &Path) -> Result<&str, StoreError> {
@@ -231,6 +237,10 @@ impl Slurm {
 
 const SHARED: &str = "label.scratch has to be a directory that this host and every node see by the same name";
 
+fn own_user() -> u32 {
+    rustix::process::getuid().as_raw()
+}
+
 fn cannot(job: &Job, why: impl ToString) -> StoreError {
     file(&job.directory, io::Error::other(why.to_string()))
 }
@@ -240,4 +250,22 @@ async fn settle(directory: &Path) {
     sleep(SETTLING).await;
     let new = directory.join("look");
     let _ = fs::write(&new, "").and_then(|()| fs::remove_file(&new));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn what_another_user_has_submitted_is_not_looked_for() {
+        let directory = tempfile::tempdir().unwrap();
+        let job = Job {
+            cluster: "any".to_owned(),
+            directory: directory.path().to_owned(),
+            name: "calmwalk-1".to_owned(),
+            user: Some(own_user() + 1),
+            node: None,
+        };
+        assert_eq!(Slurm::default().look(&job).await.unwrap(), Found::Elsewhere);
+    }
 }

@@ -94,6 +94,8 @@ pub(super) fn arguments(job: &Job) -> Vec<OsString> {
         format!("--job-name={}", job.name).into(),
         "--dependency=singleton".into(),
         "--no-requeue".into(),
+        // One that comes late and does nothing must not wipe out what was said of the first.
+        "--open-mode=append".into(),
         option("--chdir=", &job.directory),
         option("--output=", log.as_ref()),
         job.directory.join(SCRIPT).into(),

@@ -1,12 +1,15 @@
 //! What Slurm says of a job.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::fs;
+use std::path::{Path, PathBuf};
 
 use ::slurm::{Phase, SlurmError};
 use dft::Exit;
 
 use super::super::keeper::{End, How};
+use super::super::log::last_lines;
+use super::{BEGUN, LOG};
 
 /// A job, as `squeue` shows it.
 #[derive(Clone, Debug, PartialEq)]
@@ -52,11 +55,18 @@ impl Told {
         matches!(self.state.as_str(), "COMPLETED" | "FAILED")
     }
 
-    fn exit(&self) -> Exit {
+    /// Whether this is only the trace of a call of `sbatch` that failed: such a job never was.
+    pub fn was_refused(&self) -> bool {
+        self.state == "FAILED" && self.nodes.is_empty()
+    }
+
+    /// What the state alone tells. Where memory is measured and not confined, Slurm calls what it kills for that `FAILED`.
+    fn exit(&self) -> Option<Exit> {
         match self.state.as_str() {
-            "TIMEOUT" | "DEADLINE" => Exit::TimeLimit,
-            "OUT_OF_MEMORY" => Exit::OutOfMemory,
-            _ => Exit::LostNode,
+            "TIMEOUT" | "DEADLINE" => Some(Exit::TimeLimit),
+            "OUT_OF_MEMORY" => Some(Exit::OutOfMemory),
+            "NODE_FAIL" | "BOOT_FAIL" | "PREEMPTED" => Some(Exit::LostNode),
+            _ => None,
         }
     }
 
@@ -87,16 +97,47 @@ pub(super) fn last(jobs: &[Told]) -> Option<&Told> {
     said_more.or_else(|| jobs.first())
 }
 
+/// What is left of a job in its directory.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Traces {
+    /// The end of what Slurm wrote into its log: why it has ended a job stands there.
+    log: String,
+    /// From its begin to the last words of the log.
+    seconds: f64,
+}
+
+impl Traces {
+    pub fn read(directory: &Path) -> Self {
+        let log = directory.join(LOG);
+        let changed = |path: &Path| fs::metadata(path).and_then(|file| file.modified()).ok();
+        let times = changed(&directory.join(BEGUN)).zip(changed(&log));
+        let lasted = times.and_then(|(begun, ended)| ended.duration_since(begun).ok());
+        Self { log: last_lines(&log), seconds: lasted.unwrap_or_default().as_secs_f64() }
+    }
+
+    fn exit(&self) -> Option<Exit> {
+        let speaks_of = |words: &[&str]| words.iter().any(|words| self.log.contains(words));
+        if speaks_of(&["memory limit", "oom_kill", "oom-kill", "OOM Killed"]) {
+            return Some(Exit::OutOfMemory);
+        }
+        speaks_of(&["DUE TO TIME LIMIT"]).then_some(Exit::TimeLimit)
+    }
+}
+
 /// How the calculation of a job ended that is over, or that Slurm has forgotten, and whose keeper has left no end.
-pub(super) fn end(told: Option<&Told>) -> End {
-    let remark = match told {
+pub(super) fn end(told: Option<&Told>, traces: &Traces) -> End {
+    let mut remark = match told {
         Some(told) => format!("Slurm says: {told}; its keeper has left no end"),
         None => "Slurm does not know its job any more, and its keeper has left no end".to_owned(),
     };
+    if let Some(last) = traces.log.lines().next_back() {
+        remark += &format!("; the job's log ends with: {last}");
+    }
+    let exit = told.and_then(Told::exit).or_else(|| traces.exit());
     End {
-        how: How::Ended(told.map_or(Exit::LostNode, Told::exit)),
+        how: How::Ended(exit.unwrap_or(Exit::LostNode)),
         program: PathBuf::new(),
-        seconds: told.map_or(0.0, |told| told.seconds),
+        seconds: told.map_or(traces.seconds, |told| told.seconds),
         memory: 0,
         node: told.and_then(Told::node),
         remark: Some(remark),
@@ -145,12 +186,44 @@ mod tests {
             ("PREEMPTED", LostNode, None),
         ];
         for (state, exit, node) in expected {
-            let end = end(Some(&told(state)));
+            let end = end(Some(&told(state)), &Traces::default());
             assert_eq!((end.how, end.node.as_deref()), (How::Ended(exit), node), "{state}");
             assert_eq!(end.seconds, 61.0);
             assert!(end.remark.unwrap().contains(state));
         }
-        assert_eq!(end(None).how, How::Ended(LostNode));
+    }
+
+    /// Lines of Slurm 22.05.
+    #[test]
+    fn the_log_tells_what_slurm_has_forgotten() {
+        use Exit::{LostNode, OutOfMemory, TimeLimit};
+        let cancelled = "slurmstepd-n1: error: *** JOB 1 ON n1 CANCELLED AT 2026-11-22T12:06:38";
+        let memory = "slurmstepd-n1: error: StepId=1.batch exceeded memory limit (434741248 > 104857600), being killed";
+        let killed = "slurmstepd: error: Detected 1 oom_kill event in StepId=1.batch. Some of the step tasks have been OOM Killed.";
+        let logs = [
+            (String::new(), LostNode),
+            (format!("{cancelled} ***"), LostNode),
+            (format!("{cancelled} DUE TO NODE FAILURE, SEE SLURMCTLD LOG FOR DETAILS ***"), LostNode),
+            (format!("{cancelled} DUE TO TIME LIMIT ***"), TimeLimit),
+            (format!("{memory}\n{cancelled} ***"), OutOfMemory),
+            (killed.to_owned(), OutOfMemory),
+        ];
+        for (log, exit) in logs {
+            let traces = Traces { log: log.clone(), seconds: 7.0 };
+            let forgotten = end(None, &traces);
+            assert_eq!((forgotten.how, forgotten.seconds, forgotten.node), (How::Ended(exit), 7.0, None));
+            assert!(forgotten.remark.unwrap().ends_with(log.lines().last().unwrap_or("no end")));
+            // What Slurm itself has no word for.
+            assert_eq!(end(Some(&told("FAILED")), &traces).how, How::Ended(exit), "{log}");
+            assert_eq!(end(Some(&told("TIMEOUT")), &traces).how, How::Ended(TimeLimit), "{log}");
+        }
+    }
+
+    #[test]
+    fn a_job_that_slurm_refused_never_was() {
+        let refused = Told::parse("3|FAILED||0:00|BadConstraints").unwrap();
+        assert!(refused.was_refused() && !told("FAILED").was_refused());
+        assert!(!Told::parse("3|CANCELLED||0:00|None").unwrap().was_refused());
     }
 
     #[test]

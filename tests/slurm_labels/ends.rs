@@ -1,0 +1,143 @@
+//! How Slurm ends jobs, and what the labeller makes of it.
+
+use std::fs;
+
+use crate::common::processes::wait_until;
+use crate::common::slurm::{ci, slurm};
+use crate::jobs::{Jobs, once_each, only};
+
+/// Slurm looks at time limits every half minute.
+fn end_its_time(id: &str) {
+    slurm(&["scontrol", "update", &format!("jobid={id}"), "EndTime=now"]);
+}
+
+/// The node comes back by itself: its daemon lives.
+fn lose_node(name: &str) {
+    slurm(&["scontrol", "update", &format!("nodename={name}"), "state=down", "reason=test"]);
+}
+
+#[test]
+fn a_job_that_is_cancelled_is_lost_and_tried_again() {
+    let jobs = Jobs::new();
+    let run = jobs.place.run();
+    let label = jobs.place.label(&["--wait", "2"]);
+    wait_until("a job is at work", || jobs.begun().len() == 1);
+    slurm(&["scancel", &jobs.jobs()[0][0]]);
+    wait_until("it is begun again", || jobs.begun().len() == 2);
+    jobs.go();
+    let labels = jobs.finish(run, label);
+    once_each(&jobs, labels + 1);
+    let lost = only(&jobs, "lost_node");
+    assert!(lost["log"].as_str().unwrap().contains("is CANCELLED"), "{lost}");
+    // Whoever has ended it did not mean the node.
+    assert!(!lost["calculation"].as_str().unwrap().contains("\"node\""), "{lost}");
+}
+
+#[test]
+fn a_job_whose_time_is_over_gets_twice_as_much() {
+    let jobs = Jobs::with("time_limit = 600.0", "--comment=label");
+    let run = jobs.place.run();
+    let label = jobs.place.label(&["--wait", "2"]);
+    wait_until("a job is at work", || jobs.begun().len() == 1);
+    end_its_time(&jobs.jobs()[0][0]);
+    wait_until("it is begun again", || jobs.begun().len() == 2);
+    // A minute more than the keeper gives it.
+    let times: Vec<_> = jobs.told("%j|%l|%r").into_iter().skip(1).map(|[_, limit, _]| limit).collect();
+    assert_eq!(times, ["21:00"]);
+    jobs.go();
+    let labels = jobs.finish(run, label);
+    once_each(&jobs, labels + 1);
+    let ended = only(&jobs, "time_limit");
+    assert!(ended["log"].as_str().unwrap().contains("is TIMEOUT"), "{ended}");
+    assert!(ended["core_seconds"].as_f64() > Some(0.0), "{ended}");
+    assert!(jobs.attempts().iter().any(|attempt| attempt["remedies"] == "more_time"), "{ended}");
+}
+
+/// Where memory is only measured, Slurm says `FAILED` of what it kills, and why in the job's log.
+#[test]
+fn a_job_that_slurm_kills_for_its_memory_was_out_of_memory() {
+    let jobs = Jobs::with("", "--mem=100M");
+    let eat = jobs.home.path().join("eat");
+    fs::write(&eat, "").unwrap();
+    let run = jobs.place.run();
+    let label = jobs.place.label(&["--wait", "2"]);
+    wait_until("a job is at work", || jobs.begun().len() == 1);
+    fs::remove_file(eat).unwrap();
+    wait_until("it is begun again", || jobs.begun().len() == 2);
+    jobs.go();
+    let labels = jobs.finish(run, label);
+    once_each(&jobs, labels + 1);
+    let ended = only(&jobs, "out_of_memory");
+    assert!(ended["log"].as_str().unwrap().contains("the job's log ends with"), "{ended}");
+}
+
+#[test]
+fn a_job_whose_node_is_lost_goes_to_another() {
+    let jobs = Jobs::with("", "--partition=pair");
+    let run = jobs.place.run();
+    let label = jobs.place.label(&["--wait", "2"]);
+    wait_until("a job is at work", || jobs.begun().len() == 1);
+    let lost = jobs.told("%i|%T|%N")[0][2].clone();
+    lose_node(&lost);
+    wait_until("it is begun again", || jobs.begun().len() == 2);
+    assert_ne!(jobs.told("%i|%T|%N")[1][2], lost);
+    jobs.go();
+    let labels = jobs.finish(run, label);
+    once_each(&jobs, labels + 1);
+    let attempt = only(&jobs, "lost_node");
+    assert!(attempt["log"].as_str().unwrap().contains(&format!("is NODE_FAIL on {lost}")), "{attempt}");
+}
+
+/// `sbatch` refuses a job that excludes every node, and Slurm keeps a record of it all the same.
+#[test]
+fn where_there_is_no_other_node_it_goes_to_the_same() {
+    let jobs = Jobs::new();
+    let run = jobs.place.run();
+    let label = jobs.place.label(&["--wait", "2"]);
+    wait_until("a job is at work", || jobs.begun().len() == 1);
+    lose_node(&jobs.told("%i|%T|%N")[0][2]);
+    wait_until("it is begun again", || jobs.begun().len() == 2);
+    jobs.go();
+    let labels = jobs.finish(run, label);
+    once_each(&jobs, labels + 1);
+    only(&jobs, "lost_node");
+    assert!(!jobs.place.said().contains("label.scratch"), "{}", jobs.place.said());
+}
+
+/// Slurm forgets jobs that are over after some minutes (`MinJobAge`); here at once.
+#[test]
+fn what_slurm_has_forgotten_stands_in_the_log_of_the_job() {
+    let jobs = Jobs::new();
+    let run = jobs.place.run();
+    let mut label = jobs.place.label(&["--wait", "2"]);
+    wait_until("a job is at work", || jobs.begun().len() == 1);
+    jobs.kill(&mut label);
+    end_its_time(&jobs.jobs()[0][0]);
+    wait_until("its time is over", || jobs.jobs()[0][1] == "TIMEOUT");
+    ci("forget");
+    assert!(jobs.jobs().is_empty());
+    let label = jobs.place.label(&[]);
+    wait_until("it is begun again", || jobs.begun().len() == 2);
+    jobs.go();
+    let labels = jobs.finish(run, label);
+    assert_eq!(jobs.begun().len(), labels + 1, "{}", jobs.place.said());
+    let ended = only(&jobs, "time_limit");
+    let log = ended["log"].as_str().unwrap();
+    assert!(log.contains("does not know its job any more") && log.contains("DUE TO TIME LIMIT"), "{ended}");
+    assert!(ended["core_seconds"].as_f64() > Some(0.0), "{ended}");
+}
+
+/// A slurmctld that has lost what it knew ends what runs on its nodes.
+#[test]
+fn a_job_that_slurm_loses_in_its_midst_is_made_again_once() {
+    let jobs = Jobs::new();
+    let run = jobs.place.run();
+    let label = jobs.place.label(&["--wait", "2"]);
+    wait_until("a job is at work", || jobs.begun().len() == 1);
+    ci("forget");
+    wait_until("it is begun again", || jobs.begun().len() == 2);
+    jobs.go();
+    let labels = jobs.finish(run, label);
+    assert_eq!(jobs.begun().len(), labels + 1, "{}", jobs.place.said());
+    only(&jobs, "lost_node");
+}

@@ -1,0 +1,178 @@
+//! A campaign whose labels are jobs.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+use std::sync::MutexGuard;
+
+use serde_json::Value;
+use store::{ExportFilter, Store};
+use tempfile::TempDir;
+
+use crate::common::campaign::{Small, outcome_at};
+use crate::common::place::{Place, on_store};
+use crate::common::processes::{carrying_out, processes_in, signal, wait_until};
+use crate::common::slurm::{ci, hold, slurm};
+use crate::common::{Running, succeed};
+
+/// Says that it has begun, and leaves a label when it may; takes 400 MB if it is told to.
+const SCRIPT: &str = r#"
+pwd >> $HERE/begun
+if [ -e $HERE/eat ]; then
+    { head -c 400000000 /dev/zero; sleep 600; } | tail
+fi
+while [ ! -e $HERE/go ]; do sleep 0.1; done
+awk '
+    NR == 1 { print; next }
+    NR == 2 { sub(/Properties=[^ ]*/, "Properties=species:S:1:pos:R:3:forces:R:3"); print $0 " energy=-1.5"; next }
+    { print $0, 0.25, 0, 0 }
+' structure.extxyz > unfinished
+mv unfinished label.extxyz
+"#;
+
+/// A campaign whose labels are jobs of their own.
+pub struct Jobs {
+    pub place: Place,
+    /// Its scratch directory is there, and what tells the script what to do.
+    pub home: TempDir,
+    _node: MutexGuard<'static, ()>,
+}
+
+impl Jobs {
+    pub fn new() -> Self {
+        Self::with("", "--comment=label")
+    }
+
+    /// With these keys of `[label]` besides, and this option of `sbatch`.
+    pub fn with(more: &str, option: &str) -> Self {
+        let keys = format!("{more}\nbatch_system = \"slurm\"\nbatch_options = [{option:?}]");
+        Self::calling(r#"["sh", "label.sh"]"#, &keys)
+    }
+
+    /// With this command, and these keys of `[label]`.
+    pub fn calling(command: &str, keys: &str) -> Self {
+        let _node = hold();
+        let home = tempfile::tempdir().unwrap();
+        let scratch = home.path().canonicalize().unwrap().join("scratch");
+        fs::create_dir(&scratch).unwrap();
+        let command =
+            format!(r#"{{ command = {{ command = {command}, files = ["label.sh"], version = "1" }} }}"#);
+        let keys = format!(
+            "[label]\n{keys}\nslots = 0\nscratch = {:?}\nmethod = {command} # ",
+            scratch.display().to_string()
+        );
+        let small = Small { walkers: 1, steps: 120, ..Small::default() };
+        let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
+        let script = SCRIPT.replace("$HERE", &home.path().display().to_string());
+        fs::write(place.path().join("label.sh"), script).unwrap();
+        Self { place, home, _node }
+    }
+
+    /// Has every calculation end.
+    pub fn go(&self) {
+        fs::write(self.home.path().join("go"), "").unwrap();
+    }
+
+    /// Directories in which calculations have begun, one for each time.
+    pub fn begun(&self) -> Vec<String> {
+        let text = fs::read_to_string(self.home.path().join("begun")).unwrap_or_default();
+        text.lines().map(str::to_owned).collect()
+    }
+
+    /// Number, state and name of each job that Slurm knows, the oldest first.
+    pub fn jobs(&self) -> Vec<[String; 3]> {
+        self.told("%i|%T|%j")
+    }
+
+    /// Three things of each job, in the words of `squeue --format`.
+    pub fn told(&self, format: &str) -> Vec<[String; 3]> {
+        let format = format!("--format={format}|%Z|%T%N");
+        let text = slurm(&["squeue", "--noheader", "--states=all", "--sort=i", &format]);
+        let scratch = self.home.path().canonicalize().unwrap();
+        let job = |line: &str| {
+            let [a, b, c, directory, end] = line.split('|').collect::<Vec<_>>()[..] else { panic!("{line}") };
+            // One without a node was refused when it was submitted.
+            let ours = Path::new(directory).starts_with(&scratch) && end != "FAILED";
+            ours.then(|| [a, b, c].map(str::to_owned))
+        };
+        text.lines().filter_map(job).collect()
+    }
+
+    /// Lets the campaign come to its end, and checks that each label is there once. Returns their number.
+    pub fn finish(&self, mut run: Running, mut label: Running) -> usize {
+        wait_until("the campaign is over", || {
+            if label.0.try_wait().unwrap().is_some() {
+                label = self.place.label(&["--slots", "2"]);
+            }
+            run.0.try_wait().unwrap().is_some()
+        });
+        assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", self.place.said());
+        label.0.wait().unwrap();
+        outcome_at(self.place.argument(), self.place.path());
+        wait_until("nobody is left", || processes_in(self.place.path()).is_empty());
+        on_store(self.place.location(), are_single)
+    }
+
+    /// The queue, as `queue list` has it.
+    pub fn attempts(&self) -> Vec<Value> {
+        let list = succeed(self.place.path(), ["queue", ".", "list", "--json"]);
+        let jobs: Vec<Value> = serde_json::from_str(&list).unwrap();
+        let show = |job: &Value| {
+            let id = job["candidate"].as_str().unwrap();
+            let text = succeed(self.place.path(), ["queue", ".", "show", id, "--json"]);
+            let details: Value = serde_json::from_str(&text).unwrap();
+            details["attempts_made"].as_array().unwrap().clone()
+        };
+        jobs.iter().flat_map(show).collect()
+    }
+
+    /// Kills whoever makes labels, with no time to tidy up.
+    pub fn kill(&self, label: &mut Running) {
+        carrying_out(self.place.path(), "labeller").into_iter().for_each(|pid| signal(pid, "KILL"));
+        label.0.kill().unwrap();
+        label.0.wait().unwrap();
+    }
+}
+
+impl Drop for Jobs {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            ci("revive");
+        }
+        self.jobs().iter().for_each(|[id, ..]| drop(slurm(&["scancel", "--quiet", id])));
+    }
+}
+
+/// Each label once, and no other result beside it.
+async fn are_single(store: &Store) -> usize {
+    let protocol = store.protocols().await.unwrap()[0].hash;
+    let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+    let rows = store.labelled(&filter, None, u32::MAX).await.unwrap();
+    for row in &rows {
+        let structure = wire::ContentHash::of(&row.structure);
+        assert_eq!(store.label_history(structure, protocol).await.unwrap().len(), 1);
+        assert_eq!((row.label.energy, row.label.forces[0]), (-1.5, [0.25, 0.0, 0.0]));
+    }
+    // Two walks may have come by the same structure.
+    rows.iter().map(|row| wire::ContentHash::of(&row.structure).0).collect::<BTreeSet<_>>().len()
+}
+
+/// The only attempt of this class.
+pub fn only(jobs: &Jobs, class: &str) -> Value {
+    let mut attempts = jobs.attempts();
+    attempts.retain(|attempt| attempt["class"] == class);
+    assert_eq!(attempts.len(), 1, "{class}: {attempts:#?}\n{}", jobs.place.said());
+    attempts.remove(0)
+}
+
+/// No job of a name was there twice, and no calculation begun twice; so many were.
+pub fn once_each(jobs: &Jobs, expected: usize) {
+    let mut names: Vec<_> = jobs.jobs().into_iter().map(|[_, _, name]| name).collect();
+    let mut begun = jobs.begun();
+    assert_eq!((names.len(), begun.len()), (expected, expected), "{names:?}\n{}", jobs.place.said());
+    names.sort();
+    names.dedup();
+    begun.sort();
+    begun.dedup();
+    assert_eq!((names.len(), begun.len()), (expected, expected), "{names:?}");
+}
