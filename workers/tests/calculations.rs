@@ -64,6 +64,9 @@ impl Code for Script {
         match exit {
             Exit::Code(0) => {}
             Exit::Code(3) => return Err(FailureClass::NotConverged.because("the script says so")),
+            Exit::Code(4) => {
+                return Err(FailureClass::OtherProgram.because("calculated by script 2, and not 1"));
+            }
             exit => return Err(exit.failure()),
         }
         let text = fs::read_to_string(directory.join("energy")).unwrap_or_default();
@@ -510,6 +513,18 @@ async fn a_program_that_cannot_be_started_is_the_hosts_fault_and_not_the_jobs() 
     place.script = "no-such-program at all".to_owned();
     let error = place.labeller().await.ended().await.unwrap_err();
     assert!(error.to_string().contains("cannot use no-such-program"), "{error}");
+    let job = place.job().await;
+    assert_eq!((job.job.state, job.job.failures), (JobState::Queued, 0));
+    place.script = "echo -7.5 > energy".to_owned();
+    place.work().await;
+    place.nothing_is_left();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn another_version_of_a_program_is_the_hosts_fault_and_not_the_jobs() {
+    let mut place = Place::new(1, "exit 4").await;
+    let error = place.labeller().await.ended().await.unwrap_err();
+    assert_eq!(error.to_string(), "cannot use sh (calculated by script 2, and not 1)");
     let job = place.job().await;
     assert_eq!((job.job.state, job.job.failures), (JobState::Queued, 0));
     place.script = "echo -7.5 > energy".to_owned();

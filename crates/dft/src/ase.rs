@@ -4,7 +4,8 @@
 //! all. `input.json` has `species`, `positions` and `cell` (Å), `periodic`, `moments` (μ_B, or null) and the names of the
 //! `remedies`. `result.json` is either `{"converged": {…}}` with `species`, `positions`, `cell`, `energy` (eV, the one whose
 //! derivative the forces are), `energy_without_smearing`, `forces` (eV/Å), `stress` (eV/Å³, xx yy zz yz xz xy), `moments`,
-//! `magnetisation` (μ_B) and `steps`, null where there is none; or `{"failure": {"class": …, "message": …}}`.
+//! `magnetisation` (μ_B) and `steps`, null where there is none; or `{"failure": {"class": …, "message": …}}`. In either case `by`
+//! has the versions of ASE and of the calculator's file, which must be those of the protocol.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -142,7 +143,8 @@ impl Code for Ase {
     }
 
     fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
-        match script_result::read(structure, directory)? {
+        let by = [("ase", self.who.ase.as_str()), ("version", self.who.version.as_str())];
+        match script_result::read(structure, directory, &by)? {
             Some(calculated) => Ok(calculated),
             None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
         }

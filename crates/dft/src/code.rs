@@ -32,7 +32,8 @@ pub trait Code: Send + Sync {
 
     /// Judges the calculation that was run in `directory` and ended so, and reads its numbers. Nothing is believed
     /// unless the program says that it converged and has calculated the very structure that was asked for: atoms, order,
-    /// species and cell.
+    /// species and cell. What says that another version of the program has made it is
+    /// [`FailureClass::OtherProgram`](crate::FailureClass).
     ///
     /// # Errors
     /// Why it is no label. What can no longer be read is a failure like any other.

@@ -19,6 +19,9 @@ pub enum FailureClass {
     LostNode,
     /// It says that all is well, but its numbers cannot be believed.
     Implausible,
+    /// What was run is not the program of the protocol, or another version of it. That is a fault of where it ran, and not of
+    /// the structure.
+    OtherProgram,
 }
 
 /// A failure with what is known of it.
@@ -33,7 +36,7 @@ pub struct Failure {
 
 impl FailureClass {
     /// All of them.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::Crashed,
         Self::OutOfMemory,
         Self::TimeLimit,
@@ -41,6 +44,7 @@ impl FailureClass {
         Self::BadInput,
         Self::LostNode,
         Self::Implausible,
+        Self::OtherProgram,
     ];
 
     /// Short name, as the store keeps it.
@@ -53,6 +57,7 @@ impl FailureClass {
             Self::BadInput => "bad_input",
             Self::LostNode => "lost_node",
             Self::Implausible => "implausible",
+            Self::OtherProgram => "other_program",
         }
     }
 
@@ -77,6 +82,7 @@ impl fmt::Display for FailureClass {
             Self::BadInput => "bad input",
             Self::LostNode => "lost node",
             Self::Implausible => "implausible result",
+            Self::OtherProgram => "another program",
         })
     }
 }

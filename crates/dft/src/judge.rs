@@ -58,6 +58,18 @@ fn tail(path: &Path) -> Option<String> {
     (!last.is_empty()).then_some(last)
 }
 
+/// Looks at which version a result says it is of; versions as people read them.
+///
+/// # Errors
+/// [`FailureClass::OtherProgram`]
+pub(crate) fn same_version(program: &str, found: &str, expected: &str) -> Result<(), Failure> {
+    let another = || {
+        let message = format!("calculated by {program} {found}, where the protocol is of {expected}");
+        FailureClass::OtherProgram.because(message)
+    };
+    if found == expected { Ok(()) } else { Err(another()) }
+}
+
 /// Looks at the numbers: as many as atoms, and finite.
 ///
 /// # Errors

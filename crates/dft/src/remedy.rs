@@ -59,7 +59,7 @@ fn ladder(class: FailureClass) -> &'static [&'static [Remedy]] {
         FailureClass::OutOfMemory => &[&[MoreMemory], &[OtherNode]],
         FailureClass::Crashed => &[&[], &[OtherNode]],
         FailureClass::Implausible => &[&[SlowerMixing, OtherMoments]],
-        FailureClass::BadInput | FailureClass::LostNode => &[],
+        FailureClass::BadInput | FailureClass::LostNode | FailureClass::OtherProgram => &[],
     }
 }
 

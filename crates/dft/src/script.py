@@ -24,10 +24,11 @@ def say(result):
         print(json.dumps(result), flush=True)
 
 
-def leave(result):
+def leave(result, by):
+    """The result, and the versions of what has made it."""
     if world.rank == 0:
         with open("result.json.part", "w") as file:
-            json.dump(result, file)
+            json.dump({**result, "by": by}, file)
             file.flush()
             os.fsync(file.fileno())
         os.replace("result.json.part", "result.json")

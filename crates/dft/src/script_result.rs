@@ -1,5 +1,6 @@
 //! What our Python scripts leave: `result.json`, whole or not at all.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use atoms::cell::{Matrix3, Vec3};
@@ -12,12 +13,13 @@ use crate::{Calculated, Failure, FailureClass, judge};
 /// Numbers go to the script and back without a loss.
 const DIGITS: f64 = 1e-9;
 
-/// `result.json`
+/// `result.json`: one of the first two, and versions by the names of what has made it.
 #[derive(Deserialize)]
-#[serde(rename_all = "snake_case")]
-enum Outcome {
-    Converged(Box<Converged>),
-    Failure(Told),
+#[serde(deny_unknown_fields)]
+struct Outcome {
+    converged: Option<Box<Converged>>,
+    failure: Option<Told>,
+    by: BTreeMap<String, String>,
 }
 
 #[derive(Deserialize)]
@@ -42,22 +44,29 @@ struct Told {
     message: String,
 }
 
-/// The calculation of `structure` that was run in `directory`; `None` if there is no whole result.
-pub(crate) fn read(structure: &Structure, directory: &Path) -> Result<Option<Calculated>, Failure> {
+/// The calculation of `structure` that was run in `directory`, by programs of these names and versions; `None` if there is
+/// no whole result.
+pub(crate) fn read(
+    structure: &Structure,
+    directory: &Path,
+    by: &[(&str, &str)],
+) -> Result<Option<Calculated>, Failure> {
     match std::fs::read(directory.join("result.json")) {
-        Ok(bytes) => parse(structure, &bytes),
+        Ok(bytes) => parse(structure, &bytes, by),
         Err(_) => Ok(None),
     }
 }
 
-fn parse(structure: &Structure, bytes: &[u8]) -> Result<Option<Calculated>, Failure> {
-    let result = match serde_json::from_slice(bytes) {
-        Ok(Outcome::Converged(result)) => result,
-        Ok(Outcome::Failure(Told { class, message })) => {
-            return Err(FailureClass::named(&class).unwrap_or(FailureClass::Crashed).because(message));
-        }
-        Err(_) => return Ok(None),
-    };
+fn parse(structure: &Structure, bytes: &[u8], by: &[(&str, &str)]) -> Result<Option<Calculated>, Failure> {
+    let Ok(outcome) = serde_json::from_slice::<Outcome>(bytes) else { return Ok(None) };
+    for (name, expected) in by {
+        let found = outcome.by.get(*name).map_or("of an unknown version", String::as_str);
+        judge::same_version(name, found, expected)?;
+    }
+    if let Some(Told { class, message }) = outcome.failure {
+        return Err(FailureClass::named(&class).unwrap_or(FailureClass::Crashed).because(message));
+    }
+    let Some(result) = outcome.converged else { return Ok(None) };
     let Converged {
         species,
         positions,

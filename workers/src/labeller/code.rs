@@ -238,6 +238,13 @@ impl CodeMethod {
             How::Ended(exit) => exit,
         };
         let mut result = blocking(move || read(&*code, &structure, &directory, exit)).await;
+        if let Err(Failure { class: FailureClass::OtherProgram, message }) = &result {
+            // Whatever the structure: no calculation here would be one of the protocol.
+            let error = file(&end.program, io::Error::other(message.clone()));
+            begun.remove().await?;
+            self.reap();
+            return Err(error);
+        }
         if let (Err(failure), Some(remark)) = (&mut result, &end.remark) {
             failure.message.clone_from(remark);
         }

@@ -21,16 +21,7 @@ pub(super) fn read(
 ) -> Result<Option<Calculated>, Failure> {
     let text =
         |name| String::from_utf8_lossy(&std::fs::read(directory.join(name)).unwrap_or_default()).into_owned();
-    let (output, printed) = (text("run.abo"), text("stdout"));
-    if let Some(message) = error(&printed) {
-        let class = match message.to_lowercase() {
-            words if words.contains("spheres are overlapping") => FailureClass::BadInput,
-            words if words.contains("memory") || words.contains("allocat") => FailureClass::OutOfMemory,
-            _ => FailureClass::Crashed,
-        };
-        return Err(class.because(format!("ABINIT says: {message}")));
-    }
-    parse(structure, &output, &printed, version, smearing)
+    parse(structure, &text("run.abo"), &text("stdout"), version, smearing)
 }
 
 /// As [`read`].
@@ -41,6 +32,18 @@ pub(super) fn parse(
     version: &str,
     smearing: Smearing,
 ) -> Result<Option<Calculated>, Failure> {
+    let calculated_by = stated_version(output);
+    if let Some(found) = calculated_by {
+        judge::same_version("ABINIT", found, version)?;
+    }
+    if let Some(message) = error(printed) {
+        let class = match message.to_lowercase() {
+            words if words.contains("spheres are overlapping") => FailureClass::BadInput,
+            words if words.contains("memory") || words.contains("allocat") => FailureClass::OutOfMemory,
+            _ => FailureClass::Crashed,
+        };
+        return Err(class.because(format!("ABINIT says: {message}")));
+    }
     if !is_whole(output) {
         return Ok(None);
     }
@@ -49,11 +52,7 @@ pub(super) fn parse(
         return Err(FailureClass::NotConverged.because(format!("not in {} electronic steps", steps.len())));
     }
     let unreadable = || FailureClass::Implausible.because("run.abo is whole, but its numbers cannot be read");
-    let calculated_by = output.split(".Version ").nth(1).and_then(|rest| rest.split_whitespace().next());
-    if calculated_by != Some(version) {
-        let by = calculated_by.unwrap_or("an unknown version");
-        return Err(FailureClass::Implausible.because(format!("calculated by ABINIT {by}, not {version}")));
-    }
+    calculated_by.ok_or_else(unreadable)?;
     same_structure(structure, &found(output).ok_or_else(unreadable)?, DIGITS)?;
     let calculated = numbers(output, &steps, smearing).ok_or_else(unreadable)?;
     judge::numbers(&calculated, structure.len())?;
@@ -63,6 +62,12 @@ pub(super) fn parse(
         }
         false => Ok(Some(calculated)),
     }
+}
+
+/// `9.6.2` of `.Version 9.6.2 of ABINIT`; nothing where that is cut off.
+fn stated_version(output: &str) -> Option<&str> {
+    let (_, rest) = output.split_once(".Version ")?;
+    rest.split_once(" of ABINIT").map(|(version, _)| version.trim())
 }
 
 /// Whether it says that it is completed and ends with the time that it took.

@@ -19,11 +19,12 @@ ABSENT = (PropertyNotImplementedError, NotImplementedError, AttributeError)
 
 def main():
     user = load("calculator.py")
+    versions = {"ase": ase.__version__, "version": str(getattr(user, "version", ""))}
     try:
         with open("input.json") as file:
             task = json.load(file)
     except FileNotFoundError:
-        return say({"ase": ase.__version__, "version": str(getattr(user, "version", ""))})
+        return say(versions)
 
     atoms = Atoms(task["species"], positions=task["positions"], cell=task["cell"], pbc=task["periodic"])
     if task["moments"] is not None:
@@ -35,7 +36,7 @@ def main():
     except Exception as error:
         traceback.print_exc()
         result = failure(kind(error), f"{type(error).__name__}: {error}")
-    leave(result)
+    leave(result, versions)
 
 
 def load(name):

@@ -50,7 +50,8 @@ fn read(mut converged: Value) -> Result<Calculated, Failure> {
         converged[key] = structure[key].clone();
     }
     let directory = tempfile::tempdir().unwrap();
-    let text = json!({ "converged": converged }).to_string();
+    let by = json!({ "ase": "3.22.1", "version": "mine" });
+    let text = json!({ "converged": converged, "by": by }).to_string();
     std::fs::write(directory.path().join("result.json"), text).unwrap();
     ase(Moments::new()).read(&copper(), directory.path(), Exit::Code(0))
 }

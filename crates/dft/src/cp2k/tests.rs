@@ -126,7 +126,7 @@ fn an_output_of_something_else_is_implausible() {
     assert_eq!(class(&other, OUTPUT), FailureClass::Implausible);
     assert_eq!(
         class(&silicon(), &OUTPUT.replace("version 2023.1", "version 2024.1")),
-        FailureClass::Implausible
+        FailureClass::OtherProgram
     );
 }
 

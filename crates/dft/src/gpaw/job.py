@@ -12,12 +12,13 @@ from gpaw.utilities import AtomsTooClose
 
 
 def main():
+    versions = {"gpaw": gpaw.__version__, "ase": ase.__version__}
     try:
         with open("input.json") as file:
             task = json.load(file)
     except FileNotFoundError:
         paths = [str(path) for path in gpaw.setup_paths]
-        return say({"gpaw": gpaw.__version__, "ase": ase.__version__, "setup_paths": paths})
+        return say({**versions, "setup_paths": paths})
 
     calculator = GPAW(mode=PW(task["cutoff"]), **task["parameters"])
     atoms = Atoms(task["species"], positions=task["positions"], cell=task["cell"], pbc=True, calculator=calculator)
@@ -31,7 +32,7 @@ def main():
         result = failure("bad_input", str(error))
     except MemoryError as error:
         result = failure("out_of_memory", str(error))
-    leave(result)
+    leave(result, versions)
 
 
 def calculate(atoms, spin):

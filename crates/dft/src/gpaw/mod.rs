@@ -215,7 +215,8 @@ impl Code for Gpaw {
 
     fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
         let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        match script_result::read(&enclosed.structure, directory)? {
+        let by = [("gpaw", self.who.gpaw.as_str()), ("ase", self.who.ase.as_str())];
+        match script_result::read(&enclosed.structure, directory, &by)? {
             Some(calculated) => Ok(enclosed.seen_from_outside(calculated)),
             None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
         }

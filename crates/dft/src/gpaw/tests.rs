@@ -42,6 +42,10 @@ fn read(structure: &Structure, result: &[u8]) -> Result<Calculated, Failure> {
     gpaw(Settings::default()).read(structure, left(result).path(), Exit::Code(0))
 }
 
+fn by(gpaw: &str) -> Value {
+    json!({ "gpaw": gpaw, "ase": "3.22.1" })
+}
+
 #[test]
 fn the_protocol_of_the_paper_is_written() {
     let code = gpaw(Settings::default());
@@ -125,10 +129,27 @@ fn a_result_of_another_structure_is_implausible() {
 #[test]
 fn failures_that_the_script_tells_keep_their_class() {
     for class in ["not_converged", "bad_input", "out_of_memory", "implausible"] {
-        let told = json!({ "failure": { "class": class, "message": "why" } });
+        let told = json!({ "failure": { "class": class, "message": "why" }, "by": by("22.8.0") });
         let failure = read(&silicon(), told.to_string().as_bytes()).unwrap_err();
         assert_eq!((failure.class.name(), failure.message.as_str()), (class, "why"));
     }
+}
+
+#[test]
+fn a_result_of_another_version_is_of_another_program() {
+    let with = |by: Value| {
+        let mut result: Value = serde_json::from_slice(RESULT).unwrap();
+        result["by"] = by;
+        read(&silicon(), result.to_string().as_bytes())
+    };
+    assert!(with(by("22.8.0")).is_ok());
+    let failure = with(by("23.9.1")).unwrap_err();
+    let expected = "another program: calculated by gpaw 23.9.1, where the protocol is of 22.8.0";
+    assert_eq!((failure.class, failure.to_string().as_str()), (FailureClass::OtherProgram, expected));
+    assert_eq!(with(json!({ "gpaw": "22.8.0" })).unwrap_err().class, FailureClass::OtherProgram);
+    let told = json!({ "failure": { "class": "not_converged", "message": "why" }, "by": by("23.9.1") });
+    let failure = read(&silicon(), told.to_string().as_bytes()).unwrap_err();
+    assert_eq!(failure.class, FailureClass::OtherProgram);
 }
 
 #[test]

@@ -59,7 +59,7 @@ fn check(output: &Output, asked: &Structure, version: &str) -> Result<(), Failur
         let found = &output.version;
         let message =
             format!("calculated by VASP {found}, but `version` says {version}: correct one of them");
-        return Err(FailureClass::BadInput.because(message));
+        return Err(FailureClass::OtherProgram.because(message));
     }
     if output.steps >= output.most_steps {
         let message = format!("the electrons did not converge in {} steps", output.steps);

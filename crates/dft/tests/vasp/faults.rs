@@ -85,7 +85,7 @@ fn changes_in_vasprun_are_seen() {
         NotConverged
     );
     assert_eq!(changed(" </calculation>\n", " </calculation>\n <calculation></calculation>\n"), Crashed);
-    assert_eq!(changed("5.4.4.18Apr17", "5.4.1"), BadInput);
+    assert_eq!(changed("5.4.4.18Apr17", "5.4.1"), OtherProgram);
 }
 
 #[test]
@@ -120,7 +120,7 @@ fn changes_in_outcar_are_seen() {
         NotConverged
     );
     assert_eq!(changed("NELM   =     60", "NELM   =      3"), NotConverged);
-    assert_eq!(changed(" vasp.5.4.4.", " vasp.6.4.4."), BadInput);
+    assert_eq!(changed(" vasp.5.4.4.", " vasp.6.4.4."), OtherProgram);
     assert_eq!(changed("General timing", "general timing"), Crashed);
 }
 
