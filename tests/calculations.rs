@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use common::campaign::{Small, outcome_at};
 use common::place::{Place, on_store};
-use common::processes::{carrying_out, processes_in, signal, wait_until};
+use common::processes::{calculating, carrying_out, processes_in, signal, wait_until};
 use store::{ExportFilter, Store};
 
 /// Leaves no label before half a second is over, and starts what never ends by itself.
@@ -62,19 +62,6 @@ fn place(scratch: &Path) -> Place {
     let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
     fs::write(place.path().join("label.sh"), SCRIPT).unwrap();
     place
-}
-
-/// Process numbers of what calculations below `scratch` have started, with the command.
-fn calculating(scratch: &Path) -> Vec<(u32, String)> {
-    let mark = format!("CALMWALK_CALCULATION={}/", scratch.display());
-    let numbers = fs::read_dir("/proc").unwrap().flatten();
-    let numbers = numbers.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
-    let marked = |pid: u32| {
-        let environment = fs::read(format!("/proc/{pid}/environ")).ok()?;
-        let command = fs::read_to_string(format!("/proc/{pid}/cmdline")).ok()?.replace('\0', " ");
-        String::from_utf8_lossy(&environment).contains(&mark).then_some((pid, command))
-    };
-    numbers.filter_map(marked).collect()
 }
 
 fn directories(scratch: &Path) -> Vec<PathBuf> {

@@ -44,6 +44,19 @@ pub fn one_carrying_out(directory: &Path, command: &str) -> u32 {
     found.expect("it was waited for")
 }
 
+/// What calculations in directories below `scratch` have started: numbers of processes, with their commands.
+pub fn calculating(scratch: &Path) -> Vec<(u32, String)> {
+    let mark = format!("CALMWALK_CALCULATION={}/", scratch.display());
+    let numbers = fs::read_dir("/proc").expect("/proc").flatten();
+    let numbers = numbers.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+    let marked = |pid: u32| {
+        let environment = fs::read(format!("/proc/{pid}/environ")).ok()?;
+        let command = fs::read_to_string(format!("/proc/{pid}/cmdline")).ok()?.replace('\0', " ");
+        String::from_utf8_lossy(&environment).contains(&mark).then_some((pid, command))
+    };
+    numbers.filter_map(marked).collect()
+}
+
 /// Sends a signal; nothing happens to a process that is gone.
 pub fn signal(pid: u32, name: &str) {
     let sent = Command::new("kill").args([format!("-{name}"), pid.to_string()]).output();

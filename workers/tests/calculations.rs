@@ -471,6 +471,17 @@ async fn the_time_limit_ends_everything_and_is_doubled_once() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_has_to_end_is_asked_first_and_then_killed() {
+    let script = "trap 'echo asked >> $HERE/asked' TERM; while true; do sleep 1000; done";
+    let mut place = Place::new(1, script).await;
+    place.running.time_limit = 0.4;
+    place.work().await;
+    assert_eq!(outcomes(&place.attempts().await), [("failed", Some("time_limit")); 2]);
+    assert_eq!(fs::read_to_string(place.home.path().join("asked")).unwrap(), "asked\nasked\n");
+    place.nothing_is_left();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn too_much_memory_of_all_processes_together_ends_it() {
     // `tail` keeps a line that never ends; two of them have twice as much.
     let hungry = "head -c 60000000 /dev/zero | tail -n 1 | { sleep 2; cat > /dev/null; }";

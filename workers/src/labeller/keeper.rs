@@ -156,7 +156,8 @@ pub fn keep() -> io::Result<()> {
 
 /// Returns only if that fails.
 fn become_program(keeper: u32, directory: &Path, command: &[String]) -> io::Error {
-    if let Err(error) = set_parent_process_death_signal(Some(Signal::KILL)) {
+    // A request: what starts others on other nodes has to end them.
+    if let Err(error) = set_parent_process_death_signal(Some(Signal::TERM)) {
         return error.into();
     }
     // It may have died before.

@@ -3,6 +3,7 @@
 //! While the keeper lives they are those of its session. When it is gone that number may be given to another, so they are
 //! known by their mark alone, which each inherits in its environment.
 
+use std::collections::HashSet;
 use std::fs;
 use std::io;
 use std::os::unix::ffi::OsStrExt;
@@ -18,6 +19,9 @@ use super::keeper::MARK;
 
 /// Between two looks at whether all are gone.
 const LOOK: Duration = Duration::from_millis(2);
+/// How long a program may take to end what it has started, when it is asked to. Whoever has started it on other nodes of an
+/// allocation (`srun`, `mpirun`) has to end it there, and cannot if it is killed.
+const GRACE: Duration = Duration::from_secs(5);
 /// A process that the system does not let go within this time will not go.
 const PATIENCE: Duration = Duration::from_secs(20);
 
@@ -52,9 +56,9 @@ pub(super) fn end_one(pid: u32, birth: &str) -> io::Result<()> {
     end(|found| found.as_raw_nonzero().get().unsigned_abs() == pid && is_running(pid, birth))
 }
 
-/// Kills what is ours until nothing of it is left.
+/// Asks what is ours to end, and kills it if it does not, until nothing of it is left.
 fn end(is_ours: impl Fn(Pid) -> bool) -> io::Result<()> {
-    let begun = Instant::now();
+    let (begun, mut asked) = (Instant::now(), HashSet::new());
     loop {
         let found: Vec<_> = processes().filter(|pid| is_ours(*pid)).collect();
         let Some(first) = found.first() else { return Ok(()) };
@@ -62,18 +66,25 @@ fn end(is_ours: impl Fn(Pid) -> bool) -> io::Result<()> {
             let message = format!("process {} cannot be ended", first.as_raw_nonzero());
             return Err(io::Error::new(io::ErrorKind::TimedOut, message));
         }
-        found.iter().try_for_each(|pid| kill(*pid, &is_ours))?;
+        for pid in found {
+            if begun.elapsed() >= GRACE {
+                send(Signal::KILL, pid, &is_ours)?;
+            } else if asked.insert(pid) {
+                // Once: to be told again means haste to some.
+                send(Signal::TERM, pid, &is_ours)?;
+            }
+        }
         thread::sleep(LOOK);
     }
 }
 
-/// Numbers are given out again: what is looked at and what is killed has to be the same process.
-fn kill(pid: Pid, is_ours: impl Fn(Pid) -> bool) -> io::Result<()> {
-    let killed = pidfd_open(pid, PidfdFlags::empty()).and_then(|process| match is_ours(pid) {
-        true => pidfd_send_signal(&process, Signal::KILL),
+/// Numbers are given out again: what is looked at and what gets the signal has to be the same process.
+fn send(signal: Signal, pid: Pid, is_ours: impl Fn(Pid) -> bool) -> io::Result<()> {
+    let sent = pidfd_open(pid, PidfdFlags::empty()).and_then(|process| match is_ours(pid) {
+        true => pidfd_send_signal(&process, signal),
         false => Ok(()),
     });
-    match killed {
+    match sent {
         Ok(()) | Err(Errno::SRCH) => Ok(()),
         Err(error) => Err(error.into()),
     }

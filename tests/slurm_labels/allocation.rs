@@ -1,0 +1,41 @@
+//! A labeller in an allocation, whose calculations are steps of it.
+
+use std::fs;
+
+use crate::common::processes::{calculating, carrying_out, signal, wait_until};
+use crate::common::program;
+use crate::common::slurm::slurm;
+use crate::jobs::Jobs;
+
+/// Submits a job in which labels are made, and which lasts until calculations may end.
+fn submit(jobs: &Jobs) {
+    let (here, home) = (jobs.place.path().canonicalize().unwrap(), jobs.home.path().display());
+    let label = program(&here).get_program().display().to_string();
+    let script = here.join("labeller.sh");
+    let text = format!(
+        "#!/bin/sh\n{label} label --store . --wait 2 2>> said\nwhile [ -d {home} ] && [ ! -e {home}/go ]; do sleep 0.2; done\n"
+    );
+    fs::write(&script, text).unwrap();
+    let (directory, output) = (format!("--chdir={}", here.display()), format!("--output={home}/job.log"));
+    slurm(&["sbatch", "--ntasks=2", "--no-requeue", &directory, &output, &script.display().to_string()]);
+}
+
+/// The tasks of a step are not children of `srun`: who only kills that leaves them behind.
+#[test]
+fn a_step_ends_with_its_keeper_and_its_label_is_made_again() {
+    let jobs = Jobs::calling(r#"["srun", "--ntasks=1", "--overlap", "sh", "label.sh"]"#, "");
+    let scratch = jobs.home.path().canonicalize().unwrap().join("scratch");
+    let run = jobs.place.run();
+    submit(&jobs);
+    wait_until("a step is at work", || jobs.begun().len() == 1);
+    // Nobody is left who might tidy up.
+    for who in ["label", "labeller", "keep"] {
+        carrying_out(jobs.place.path(), who).into_iter().for_each(|pid| signal(pid, "KILL"));
+    }
+    wait_until("the step has ended", || calculating(&scratch).is_empty());
+    let label = jobs.place.label(&["--wait", "2"]);
+    wait_until("it is begun again", || jobs.begun().len() == 2);
+    jobs.go();
+    let labels = jobs.finish(run, label);
+    assert_eq!(jobs.begun().len(), labels + 1, "{}", jobs.place.said());
+}
