@@ -22,6 +22,9 @@ pub async fn whole(home: &Home) -> Store {
     store.commit(&commit).await.unwrap();
     let lease = store.lease(protocol("dft").hash, "l", 0, 600).await.unwrap().unwrap();
     store.complete(&lease, &label(-1.0), 1).await.unwrap();
+    // An empty tar file, compressed.
+    let packed = zstd::encode_all(&[0; 1024][..], 3).unwrap();
+    store.keep_archive(lease.job, lease.attempt, &packed, "").await.unwrap();
     store
 }
 
@@ -103,6 +106,10 @@ async fn each_damage_is_found_and_told_in_words() {
         ),
         ("UPDATE label SET forces = substr(forces, 1, 24)", "label 1: 1 forces for 2 atoms"),
         ("UPDATE decision SET detail = '{' WHERE sequence = 5", "decision 5: its text is no JSON"),
+        (
+            "UPDATE archive SET bytes = substr(bytes, 1, 8)",
+            "files of job 1, attempt 1: it cannot be unpacked",
+        ),
     ] {
         let home = Home::new();
         let store = whole(&home).await;

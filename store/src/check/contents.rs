@@ -1,8 +1,9 @@
-//! What stands in the long columns: structures, candidates, labels, texts of JSON.
+//! What stands in the long columns: structures, candidates, labels, texts of JSON, packed directories.
 
 use wire::{CandidateBlock, ContentHash};
 
 use super::Finding;
+use super::archives::Packed;
 use crate::database::{FromRow, Transaction, from_columns, query};
 use crate::encoding::decode_structure;
 use crate::error::Result;
@@ -34,7 +35,8 @@ const PROTOCOLS: &str =
     "SELECT number AS place, settings AS text FROM protocol WHERE number > $1 ORDER BY number LIMIT $2";
 
 const ROWS: &str = "SELECT (SELECT count(*) FROM structure) + (SELECT count(*) FROM candidate_data)
-    + (SELECT count(*) FROM label) + (SELECT count(*) FROM decision) + (SELECT count(*) FROM protocol)";
+    + (SELECT count(*) FROM label) + (SELECT count(*) FROM decision) + (SELECT count(*) FROM protocol)
+    + (SELECT count(*) FROM archive)";
 
 struct Structure {
     place: i64,
@@ -100,6 +102,7 @@ impl<'a> Contents<'a> {
         contents.table::<Label>("label", LABELS).await?;
         contents.table::<Text>("decision", DECISIONS).await?;
         contents.table::<Text>("protocol", PROTOCOLS).await?;
+        contents.archives().await?;
         Ok(contents.findings)
     }
 
@@ -109,19 +112,40 @@ impl<'a> Contents<'a> {
             let page: Vec<C> = query(sql).bind(after).bind(PAGE).fetch_all(&mut *self.transaction).await?;
             let Some(last) = page.last() else { break };
             after = last.place();
-            self.read += page.len() as u64;
-            (self.tell)(self.read, self.all);
+            self.have_read(page.len() as u64);
             let of_page =
                 page.iter().filter_map(|row| Some(format!("{what} {}: {}", row.place(), row.fault()?)));
             faults.extend(of_page);
         }
+        self.found(faults);
+        Ok(())
+    }
+
+    /// One at a time: each may have as much as a calculation may leave.
+    async fn archives(&mut self) -> Result<()> {
+        let (mut last, mut faults) = ((0, 0), Vec::new());
+        while let Some(packed) = Packed::after(self.transaction, last.0, last.1).await? {
+            last = (packed.job, packed.attempt);
+            self.have_read(1);
+            let fault = packed.fault();
+            faults.extend(fault.map(|fault| format!("files of job {}, attempt {}: {fault}", last.0, last.1)));
+        }
+        self.found(faults);
+        Ok(())
+    }
+
+    fn have_read(&mut self, rows: u64) {
+        self.read += rows;
+        (self.tell)(self.read, self.all);
+    }
+
+    fn found(&mut self, faults: Vec<String>) {
         let then = "its content is damaged; restore the campaign from a backup";
         if faults.len() > TOLD {
             let more = format!("{} more rows of the same table are like the following", faults.len() - TOLD);
             self.findings.push(Finding { what: more, then });
         }
         self.findings.extend(faults.into_iter().take(TOLD).map(|what| Finding { what, then }));
-        Ok(())
     }
 }
 

@@ -2,6 +2,7 @@
 //!
 //! Everything is seen at one instant and only read, so a campaign may run meanwhile. Rows are read some at a time.
 
+mod archives;
 mod contents;
 mod rules;
 

@@ -21,7 +21,9 @@ pub(super) struct Packed {
 
 /// Packs the files below a directory, in order of their names, each as long as it is not too large and there is room.
 pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
-    let mut archive = tar::Builder::new(zstd::Encoder::new(Vec::new(), LEVEL)?);
+    let mut encoder = zstd::Encoder::new(Vec::new(), LEVEL)?;
+    encoder.include_checksum(true)?;
+    let mut archive = tar::Builder::new(encoder);
     // A link may lead anywhere.
     archive.follow_symlinks(false);
     let (mut left_out, mut room) = (String::new(), MOST);

@@ -1,0 +1,76 @@
+//! Whether packed directories of calculations can be unpacked. Nothing is written: each is read through, one at a time.
+
+use std::io::{self, Read};
+
+use crate::database::{Transaction, from_columns, query};
+use crate::error::Result;
+
+const NEXT: &str = "SELECT job, attempt, bytes FROM archive WHERE (job, attempt) > ($1, $2)
+    ORDER BY job, attempt LIMIT 1";
+
+/// A packed directory.
+pub(super) struct Packed {
+    pub job: i64,
+    pub attempt: u32,
+    bytes: Vec<u8>,
+}
+
+from_columns!(Packed { job, attempt, bytes });
+
+impl Packed {
+    /// The one after that of this attempt.
+    pub async fn after(transaction: &mut Transaction, job: i64, attempt: u32) -> Result<Option<Self>> {
+        query(NEXT).bind(job).bind(attempt).fetch_optional(transaction).await
+    }
+
+    pub fn fault(&self) -> Option<String> {
+        unpack(&self.bytes).err().map(|error| format!("it cannot be unpacked ({error})"))
+    }
+}
+
+/// Reads a compressed tar file to its end, however large it is unpacked.
+fn unpack(bytes: &[u8]) -> io::Result<()> {
+    if bytes.is_empty() {
+        return Err(io::ErrorKind::UnexpectedEof.into());
+    }
+    let mut archive = tar::Archive::new(zstd::Decoder::with_buffer(bytes)?);
+    for entry in archive.entries()? {
+        let mut entry = entry?;
+        let (expected, found) = (entry.size(), io::copy(&mut entry, &mut io::sink())?);
+        if found != expected {
+            return Err(io::Error::other(format!("{found} bytes of a file of {expected}")));
+        }
+    }
+    // What follows the last file is only read for the sake of the checksum.
+    io::copy(&mut archive.into_inner().by_ref(), &mut io::sink()).map(drop)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn packed(content: &[u8]) -> Vec<u8> {
+        let mut encoder = zstd::Encoder::new(Vec::new(), 3).unwrap();
+        encoder.include_checksum(true).unwrap();
+        let mut archive = tar::Builder::new(encoder);
+        let mut header = tar::Header::new_gnu();
+        header.set_size(content.len() as u64);
+        archive.append_data(&mut header, "run.abo", content).unwrap();
+        archive.into_inner().unwrap().finish().unwrap()
+    }
+
+    #[test]
+    fn what_is_cut_or_changed_anywhere_is_found() {
+        let content: Vec<u8> =
+            (0..20_000_u32).flat_map(|n| n.wrapping_mul(2_654_435_761).to_le_bytes()).collect();
+        let whole = packed(&content);
+        unpack(&whole).unwrap();
+        unpack(&packed(&[])).unwrap();
+        for place in (0..whole.len()).step_by(whole.len() / 200).chain([whole.len() - 1]) {
+            assert!(unpack(&whole[..place]).is_err(), "cut at {place}");
+            let mut changed = whole.clone();
+            changed[place] ^= 16;
+            assert!(unpack(&changed).is_err(), "changed at {place}");
+        }
+    }
+}
