@@ -11,26 +11,11 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use atoms::extxyz::Frame;
-use atoms::read_extxyz;
-use common::processes::{carrying_out, signal, wait_until};
-use common::{config, deviation, program, random, succeed};
+use atoms::{Cell, Structure, Vec3, read_extxyz};
+use common::place::queue;
+use common::processes::{calculating, carrying_out, signal, wait_until};
+use common::{config, demo, deviation, program, random, succeed};
 use serde_json::Value;
-
-/// A variable in the environment of everything that a calculation starts: its directory.
-const MARK: &[u8] = b"CALMWALK_CALCULATION=";
-
-/// Whose calculations are in this scratch directory: every process, keepers and programs.
-fn of_calculations(scratch: &Path) -> Vec<(u32, String)> {
-    let numbers = fs::read_dir("/proc").unwrap().flatten();
-    let numbers = numbers.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
-    let marked = |pid: &u32| {
-        let environment = fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
-        let mark = [MARK, scratch.as_os_str().as_encoded_bytes()].concat();
-        environment.split(|byte| *byte == 0).any(|variable| variable.starts_with(&mark))
-    };
-    let name = |pid| Some((pid, fs::read_to_string(format!("/proc/{pid}/comm")).ok()?.trim().to_owned()));
-    numbers.filter(marked).filter_map(name).collect()
-}
 
 /// Directories of calculations: a campaign has a directory in `scratch`, and each calculation one in it.
 fn directories(scratch: &Path) -> Vec<PathBuf> {
@@ -68,6 +53,10 @@ fn the_demo_makes_at_least_ten_dft_labels() {
     assert_eq!(last.info["protocol"].text(), Some("abinit"));
 }
 
+fn is_abinit(command: &str) -> bool {
+    command.starts_with("abinit ")
+}
+
 /// Labeller, keeper and code are killed at random moments: each label is made once, none is lost and nothing is left.
 #[test]
 fn labels_survive_kills_of_labeller_keeper_and_code() {
@@ -89,24 +78,25 @@ fn labels_survive_kills_of_labeller_keeper_and_code() {
     for round in 0..6 {
         let begun = Instant::now();
         wait_until("ABINIT is at work", || {
-            of_calculations(&scratch).iter().any(|(_, name)| name == "abinit")
+            calculating(&scratch).iter().any(|(_, command)| is_abinit(command))
                 || run.try_wait().unwrap().is_some()
         });
         if run.try_wait().unwrap().is_some() {
             break;
         }
         std::thread::sleep(Duration::from_millis(random(round) % 3000));
-        let calculations = of_calculations(&scratch);
         let victim = match round % 3 {
-            0 => calculations.iter().find(|(_, name)| name == "abinit").map(|(pid, _)| *pid),
+            0 => {
+                calculating(&scratch).into_iter().find(|(_, command)| is_abinit(command)).map(|(pid, _)| pid)
+            }
             1 => carrying_out(here, "labeller").first().copied(),
-            _ => calculations.iter().find(|(_, name)| name != "abinit").map(|(pid, _)| *pid),
+            _ => carrying_out(here, "keep").first().copied(),
         };
         victim.into_iter().for_each(|pid| signal(pid, "KILL"));
         assert!(begun.elapsed() < Duration::from_secs(300));
     }
     assert!(run.wait().unwrap().success());
-    wait_until("every calculation is gone", || of_calculations(&scratch).is_empty());
+    wait_until("every calculation is gone", || calculating(&scratch).is_empty());
     // What a killed labeller had only just made is cleared away by those who come a minute later.
     for directory in directories(&scratch) {
         let touched = Command::new("touch").args(["-d", "2 minutes ago"]).arg(directory).status();
@@ -121,6 +111,81 @@ fn labels_survive_kills_of_labeller_keeper_and_code() {
     let queue: Value = serde_json::from_str(&succeed(here, ["queue", "campaign", "list", "--json"])).unwrap();
     let attempts = queue.as_array().unwrap().iter().map(|job| job["attempts"].as_u64().unwrap()).sum::<u64>();
     assert!(attempts > queue.as_array().unwrap().len() as u64, "nothing was killed: {queue}");
+}
+
+/// Silicon at these places, Å.
+fn silicon(positions: &[Vec3], cell: [Vec3; 3]) -> Structure {
+    let (species, positions) = (vec!["Si".parse().unwrap(); positions.len()], positions.to_vec());
+    Structure { species, positions, cell: Cell(cell), periodic: [true; 3] }
+}
+
+/// The attempts at the label of a candidate.
+fn attempts(here: &Path, candidate: &str) -> Vec<Value> {
+    let text = succeed(here, ["queue", "campaign", "show", candidate, "--json"]);
+    let details: Value = serde_json::from_str(&text).unwrap();
+    details["attempts_made"].as_array().unwrap().clone()
+}
+
+/// Checks that a guard has refused a candidate for this reason, and ABINIT has not been started.
+fn is_refused(here: &Path, candidate: &str, reason: &str) {
+    let [attempt] = &attempts(here, candidate)[..] else { panic!("{candidate}: more than one attempt") };
+    assert_eq!((&attempt["class"], &attempt["calculation"]), (&"refused".into(), &Value::Null), "{attempt}");
+    assert!(attempt["log"].as_str().unwrap().contains(reason), "{attempt}");
+}
+
+#[test]
+fn guards_stand_before_abinit() {
+    const GUARD: &str = "guard = { shortest_bond = { \"Si-Si\" = 1.8 }, least_height = 3.0, most_atoms = 8, near_duplicate = 0.01";
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    // One label by the campaign itself.
+    let text = demo("silicon-dft.toml").replace("# control = true", "control = false");
+    let text = text.replace("# total = 100 ", "total = 1 ");
+    let write = |guard: &str| {
+        fs::write(here.join("campaign.toml"), text.replace("[label]\n", &format!("[label]\n{guard}\n")))
+            .unwrap();
+    };
+    write(&format!("{GUARD} }}"));
+    succeed(here, ["run", "campaign.toml"]);
+
+    let primitive = [[0.0, 2.8, 2.8], [2.8, 0.0, 2.8], [2.8, 2.8, 0.0]];
+    let pair = |x: f64| silicon(&[[0.0; 3], [x, 1.4, 1.4]], primitive);
+    let row: Vec<Vec3> = (0..9).map(|k| [2.4 * f64::from(k), 0.0, 0.0]).collect();
+    // Two of each atom.
+    let features = |atoms: usize, scale: f64| (0..2 * atoms).map(|k| scale * (k as f64 - 1.5)).collect();
+    let add = |step, structure: Structure, scale| {
+        let features = features(structure.len(), scale);
+        queue(here.join("campaign").as_path().into(), step, structure, features)
+    };
+    let good = add(1, pair(1.4), 1.0);
+    let again = add(2, pair(1.4), 1.0);
+    let near = add(3, pair(1.401), 1.001);
+    let other = add(4, pair(1.45), 2.0);
+    let short = add(5, silicon(&[[0.0; 3], [1.5, 0.0, 0.0]], primitive), 3.0);
+    let flat = add(
+        6,
+        silicon(&[[0.0; 3], [0.0, 2.5, 2.5]], [[2.5, 0.0, 0.0], [0.0, 5.0, 0.0], [0.0, 0.0, 5.0]]),
+        3.0,
+    );
+    let many = add(7, silicon(&row, [[21.6, 0.0, 0.0], [0.0, 5.0, 0.0], [0.0, 0.0, 5.0]]), 3.0);
+    succeed(here, ["label", "--store", "campaign", "--until-empty"]);
+    let is_labelled = |candidate: &str| attempts(here, candidate).last().unwrap()["outcome"] == "labelled";
+    // The same structure has one job.
+    assert!(is_labelled(&good) && is_labelled(&other) && attempts(here, &again) == attempts(here, &good));
+    is_refused(here, &short, "label.guard.shortest_bond of Si-Si is 1.8");
+    is_refused(here, &flat, "label.guard.least_height is 3");
+    is_refused(here, &many, "9 atoms, where label.guard.most_atoms is 8");
+    is_refused(here, &near, &format!("from those of {good}, which has its label"));
+    succeed(here, ["queue", "campaign", "retry", &near]);
+    succeed(here, ["label", "--store", "campaign", "--until-empty"]);
+    assert!(is_labelled(&near));
+
+    // From now on nothing is cheap enough.
+    write(&format!("{GUARD}, largest_cost = 1e-6 }}"));
+    succeed(here, ["run", "campaign.toml"]);
+    let dear = add(8, pair(1.5), 4.0);
+    succeed(here, ["label", "--store", "campaign", "--until-empty"]);
+    is_refused(here, &dear, "core-seconds, as 4 others did, where label.guard.largest_cost is 0.000001");
 }
 
 /// The program itself, not a stand-in.

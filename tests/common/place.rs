@@ -121,30 +121,36 @@ impl Place {
 
     /// Queues a structure whose label takes a second or more. Returns the name of its candidate.
     pub fn queue_large(&self) -> String {
-        let candidate = large();
-        let name = candidate.id.to_string();
-        let grades = AtomGrades { gamma: candidate.gamma.clone(), gamma_nbr: candidate.gamma_nbr.clone() };
-        let record = CandidateRecord {
-            block: CandidateBlock::encode(&candidate),
-            fate: Fate::Accepted,
-            seed_structure: 0,
-            selector: grades.clone(),
-            original: grades,
-            keep_features: false,
-            priority: 10,
-        };
-        let decision = Decision {
-            round: 0,
-            kind: "accepted",
-            walk: Some(candidate.id.walk),
-            candidate: Some(candidate.id),
-            mixture_version: 0,
-            detail: Value::Null,
-        };
-        let commit = Commit { decisions: vec![decision], candidates: vec![record], ..Commit::default() };
-        on_store(self.location(), async |store| store.commit(&commit).await.unwrap());
-        name
+        queue(self.location(), 1, large(), Vec::new())
     }
+}
+
+/// Queues a structure, as if a walk had collected it at this step, with its features [n × D] if there are any. Returns the
+/// name of its candidate.
+pub fn queue(location: Location, step: u64, structure: Structure, features: Vec<f64>) -> String {
+    let candidate = collected(step, structure, features);
+    let name = candidate.id.to_string();
+    let grades = AtomGrades { gamma: candidate.gamma.clone(), gamma_nbr: candidate.gamma_nbr.clone() };
+    let record = CandidateRecord {
+        block: CandidateBlock::encode(&candidate),
+        fate: Fate::Accepted,
+        seed_structure: 0,
+        selector: grades.clone(),
+        original: grades,
+        keep_features: !candidate.features.is_empty(),
+        priority: 10,
+    };
+    let decision = Decision {
+        round: 0,
+        kind: "accepted",
+        walk: Some(candidate.id.walk),
+        candidate: Some(candidate.id),
+        mixture_version: 0,
+        detail: Value::Null,
+    };
+    let commit = Commit { decisions: vec![decision], candidates: vec![record], ..Commit::default() };
+    on_store(location, async |store| store.commit(&commit).await.unwrap());
+    name
 }
 
 /// Does something with the store.
@@ -158,7 +164,7 @@ pub fn on_store<T>(location: Location, act: impl AsyncFnOnce(&Store) -> T) -> T 
 }
 
 /// Aluminium, fcc, of so many atoms that its label takes a while.
-fn large() -> Candidate {
+fn large() -> Structure {
     const CELLS: usize = 28;
     let (a, basis) = (4.05, [[0.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]]);
     let corners = (0..CELLS.pow(3)).map(|k| [k / CELLS / CELLS, k / CELLS % CELLS, k % CELLS]);
@@ -167,17 +173,21 @@ fn large() -> Candidate {
     });
     let positions: Vec<[f64; 3]> = atoms.collect();
     let (n, edge) = (positions.len(), a * CELLS as f64);
-    let structure = Structure {
+    Structure {
         species: vec!["Al".parse().unwrap(); n],
         positions,
         cell: Cell::orthorhombic(edge, edge, edge),
         periodic: [true; 3],
-    };
+    }
+}
+
+fn collected(step: u64, structure: Structure, features: Vec<f64>) -> Candidate {
+    let n = structure.len();
     let id = CandidateId {
         campaign: wire::CampaignId([1; 16]),
         walk: WalkId(0),
         segment: 0,
-        step: 1,
+        step,
         content: ContentHash::of(&structure),
     };
     Candidate {
@@ -191,7 +201,7 @@ fn large() -> Candidate {
         forces: vec![[0.0; 3]; n],
         gamma: vec![2.0; n],
         gamma_nbr: vec![2.0; n],
-        features: Vec::new(),
+        features,
         structure,
     }
 }
