@@ -32,6 +32,8 @@ const LOOK: Duration = Duration::from_millis(500);
 pub(super) const MARK: &str = "CALMWALK_CALCULATION";
 /// In this variable Slurm says on which node a job runs.
 const NODE: &str = "SLURMD_NODENAME";
+/// Slurm ends all processes of a job, one after the other: the keeper may outlive its program for so long.
+const LAST: Duration = Duration::from_secs(5);
 /// What the second process leaves there if it could not become the program.
 const NOT_STARTED: &str = "not-started";
 
@@ -183,7 +185,12 @@ impl Calculation {
         let mut program = self.start()?;
         let (limit, memory) = self.wait(&program, begun)?;
         session::end_others()?;
-        let status = program.wait()?;
+        let (status, seconds) = (program.wait()?, begun.elapsed().as_secs_f64());
+        let node = std::env::var(NODE).ok();
+        if node.is_some() && limit.is_none() && !status.success() {
+            // If it was not the program's fault, this process ends here as well, and Slurm tells why.
+            std::thread::sleep(LAST);
+        }
         let how = match (self.not_started(), limit) {
             (Some(number), _) => How::NotStarted(number),
             (None, Some(limit)) => How::Ended(limit),
@@ -193,7 +200,6 @@ impl Calculation {
             (None, None) => How::Ended(exit(status)),
         };
         let program = self.command.first().map(PathBuf::from).unwrap_or_default();
-        let (seconds, node) = (begun.elapsed().as_secs_f64(), std::env::var(NODE).ok());
         End { how, program, seconds, memory, node, remark: None }.write(&self.directory)
     }
 
