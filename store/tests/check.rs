@@ -82,7 +82,7 @@ async fn each_damage_is_found_and_told_in_words() {
             "1 kinds of label jobs are counted wrongly (such as queued)",
         ),
         ("DELETE FROM label", "1 jobs that are labelled without a label, or have one and are not"),
-        ("DELETE FROM attempt", "1 labels that do not belong to their job"),
+        ("DELETE FROM archive; DELETE FROM attempt", "1 labels that do not belong to their job"),
         (
             "UPDATE job SET attempts = 5 WHERE state = 'queued'",
             "1 jobs that count other attempts than there are",
