@@ -9,9 +9,8 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use common::campaign::{Small, outcome_at};
-use common::place::{Place, on_store};
+use common::place::{Place, are_single, on_store};
 use common::processes::{calculating, carrying_out, processes_in, signal, wait_until};
-use store::{ExportFilter, Store};
 
 /// Leaves no label before half a second is over, and starts what never ends by itself.
 const SCRIPT: &str = r#"
@@ -85,20 +84,6 @@ fn victims(place: &Place, scratch: &Path, who: Victim) -> Vec<u32> {
         Program => started("sh label.sh"),
         Child => started("sleep 1000"),
     }
-}
-
-/// Each label once, and no other result beside it.
-async fn are_single(store: &Store) -> usize {
-    let protocol = store.protocols().await.unwrap()[0].hash;
-    let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
-    let rows = store.labelled(&filter, None, u32::MAX).await.unwrap();
-    for row in &rows {
-        let structure = wire::ContentHash::of(&row.structure);
-        assert_eq!(store.label_history(structure, protocol).await.unwrap().len(), 1);
-        assert_eq!((row.label.energy, row.label.forces[0]), (-1.5, [0.25, 0.0, 0.0]));
-    }
-    assert_eq!(store.check(|_, _| ()).await.unwrap(), []);
-    rows.len()
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Where a test keeps a campaign that others label: its directory; in the test targets `postgres…` a schema of a server.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -8,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use atoms::{Cell, Structure};
 use serde_json::Value;
 use store::{
-    AtomGrades, CandidateRecord, Commit, Decision, Fate, JobDetails, JobState, Location, Store,
+    AtomGrades, CandidateRecord, Commit, Decision, ExportFilter, Fate, JobDetails, JobState, Location, Store,
     unix_milliseconds,
 };
 use tempfile::TempDir;
@@ -161,6 +162,22 @@ pub fn on_store<T>(location: Location, act: impl AsyncFnOnce(&Store) -> T) -> T 
         store.close().await;
         done
     })
+}
+
+/// Checks that each structure has one label, which is that of the tests' script, and no other result beside it. How many have one.
+pub async fn are_single(store: &Store) -> usize {
+    let protocol = store.protocols().await.unwrap()[0].hash;
+    let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+    let mut structures = BTreeSet::new();
+    for row in store.labelled(&filter, None, u32::MAX).await.unwrap() {
+        let structure = ContentHash::of(&row.structure);
+        assert_eq!(store.label_history(structure, protocol).await.unwrap().len(), 1);
+        assert_eq!((row.label.energy, row.label.forces[0]), (-1.5, [0.25, 0.0, 0.0]));
+        // Two walks may have come by the same structure.
+        structures.insert(structure.0);
+    }
+    assert_eq!(store.check(|_, _| ()).await.unwrap(), []);
+    structures.len()
 }
 
 /// Aluminium, fcc, of so many atoms that its label takes a while.

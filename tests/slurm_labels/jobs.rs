@@ -1,16 +1,14 @@
 //! A campaign whose labels are jobs.
 
-use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 use std::sync::MutexGuard;
 
 use serde_json::Value;
-use store::{ExportFilter, Store};
 use tempfile::TempDir;
 
 use crate::common::campaign::{Small, outcome_at};
-use crate::common::place::{Place, on_store};
+use crate::common::place::{Place, are_single, on_store};
 use crate::common::processes::{carrying_out, processes_in, signal, wait_until};
 use crate::common::slurm::{ci, hold, slurm};
 use crate::common::{Running, succeed};
@@ -141,20 +139,6 @@ impl Drop for Jobs {
         }
         self.jobs().iter().for_each(|[id, ..]| drop(slurm(&["scancel", "--quiet", id])));
     }
-}
-
-/// Each label once, and no other result beside it.
-async fn are_single(store: &Store) -> usize {
-    let protocol = store.protocols().await.unwrap()[0].hash;
-    let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
-    let rows = store.labelled(&filter, None, u32::MAX).await.unwrap();
-    for row in &rows {
-        let structure = wire::ContentHash::of(&row.structure);
-        assert_eq!(store.label_history(structure, protocol).await.unwrap().len(), 1);
-        assert_eq!((row.label.energy, row.label.forces[0]), (-1.5, [0.25, 0.0, 0.0]));
-    }
-    // Two walks may have come by the same structure.
-    rows.iter().map(|row| wire::ContentHash::of(&row.structure).0).collect::<BTreeSet<_>>().len()
 }
 
 /// The only attempt of this class.
