@@ -7,10 +7,10 @@ mod golden;
 use std::path::Path;
 use std::sync::Arc;
 
-use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
+use atoms::{Cell, Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
 use common::{assert_close, check_forces, check_virial, position_gradient, strain_gradient};
 use golden::committed;
-use potentials::grace::{Architecture, Grace, GraceModel, Instructions, PullBack, RadialPath};
+use potentials::grace::{Architecture, Grace, GraceModel, Instructions, PullBack, RadialPath, Threads};
 
 fn model(name: &str, path: RadialPath) -> Arc<GraceModel> {
     let file = match name {
@@ -136,6 +136,59 @@ fn equal_structures_give_equal_bits() {
     }
 }
 
+/// Copies of a cell along each axis.
+fn copies(structure: &Structure, n: usize) -> Structure {
+    let mut large =
+        Structure { cell: Cell(structure.cell.0.map(|row| row.map(|x| n as f64 * x))), ..structure.clone() };
+    (large.positions, large.species) = (Vec::new(), Vec::new());
+    for k in 0..n * n * n {
+        let shift = [k / (n * n), k / n % n, k % n].map(|k| k as f64);
+        for (r, species) in structure.positions.iter().zip(&structure.species) {
+            let along = |a: usize| (0..3).map(|c| shift[c] * structure.cell.0[c][a]).sum::<f64>();
+            large.positions.push(std::array::from_fn(|a| r[a] + along(a)));
+            large.species.push(*species);
+        }
+    }
+    large
+}
+
+/// Features, energies and forces, and the pull-back of z itself.
+fn everything(grace: &mut Grace, structure: &Structure) -> (Vec<f64>, Evaluation, PullBack) {
+    let z = features(grace, structure);
+    let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
+    grace.backward(Some(&z), &mut energy, &mut pull_back);
+    (z, energy, pull_back)
+}
+
+#[test]
+fn copies_of_a_cell_have_its_forces_with_the_same_bits_on_any_number_of_threads() {
+    let cells = [
+        ("al_eam_1l", small("Al", 4.1, [true; 3])),
+        ("two_layers", alloy([true; 3])),
+        ("three_layers", alloy([true; 3])),
+    ];
+    for (name, cell) in cells {
+        let model = model(name, RadialPath::Table);
+        let (large, one) = (copies(&cell, 3), everything(&mut Grace::new(model.clone()), &cell));
+        let many = everything(&mut Grace::new(model.clone()), &large);
+        let repeated = |of_one: &[Vec3]| of_one.iter().copied().cycle().take(large.len()).collect::<Vec<_>>();
+        let times = |tensor: &Matrix3| tensor.map(|row| row.map(|x| 27.0 * x));
+        let check = |what: &str, found: &[Vec3], one: &[Vec3]| {
+            assert_close(&format!("{name}, {what}"), found.as_flattened(), one.as_flattened(), 1e-11);
+        };
+        check("forces", &many.1.forces, &repeated(&one.1.forces));
+        check("gradient", &many.2.gradient, &repeated(&one.2.gradient));
+        check("virial", &many.1.virial, &times(&one.1.virial));
+        check("pulled back virial", &many.2.virial, &times(&one.2.virial));
+        for n in [2, 3, 5] {
+            let mut grace = Grace::with(model.clone(), Instructions::best(), Threads::new(n).unwrap());
+            assert_eq!(everything(&mut grace, &large), many, "{name}, {n} threads");
+            assert_eq!(common::evaluate(&mut grace, &large), many.1, "{name}, {n} threads");
+            assert_eq!(everything(&mut grace, &cell), one, "{name}, {n} threads");
+        }
+    }
+}
+
 fn check_bits(model: Arc<GraceModel>, structure: &Structure, other: &Structure) {
     let run = |grace: &mut Grace, skin: f64| {
         let mut neighbours = NeighbourList::new(grace.cutoff(), skin);
@@ -154,7 +207,7 @@ fn check_bits(model: Arc<GraceModel>, structure: &Structure, other: &Structure) 
         assert_eq!(run(&mut Grace::new(model.clone()), skin), first);
     }
     for instructions in Instructions::all() {
-        let mut grace = Grace::with_instructions(model.clone(), instructions);
+        let mut grace = Grace::with(model.clone(), instructions, Threads::default());
         assert_eq!(run(&mut grace, 0.0), first, "{instructions:?}");
         assert_eq!(common::evaluate(&mut grace, structure), first.1, "{instructions:?}");
     }

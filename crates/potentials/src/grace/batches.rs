@@ -11,13 +11,29 @@ const MOST: usize = 16;
 /// What the tape of a batch may take in memory, bytes; with its cotangents it should stay in the second cache.
 const TAPE_BYTES: usize = 1 << 19;
 
-/// The atoms of a structure, those of an element behind one another, and divided into batches.
+/// Places that a thread takes at once, about.
+const CHUNK: usize = 32;
+
+/// Batches behind one another that one thread evaluates.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Chunk {
+    /// How many there are before it.
+    pub number: usize,
+    pub batches: Range<usize>,
+    pub places: Range<usize>,
+}
+
+/// The atoms of a structure in the order in which they are evaluated: those of an element behind one another, divided into
+/// batches, and these into chunks. All of it follows from the elements alone.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Batches {
     /// The atom at each place.
     pub order: Vec<u32>,
+    /// The place of each atom.
+    pub places: Vec<u32>,
     /// Places, and the element of all atoms there.
     pub batches: Vec<(Range<usize>, usize)>,
+    pub chunks: Vec<Chunk>,
 }
 
 impl Batches {
@@ -27,6 +43,10 @@ impl Batches {
         self.order.clear();
         self.order.extend(0..elements.len() as u32);
         self.order.sort_unstable_by_key(|atom| (elements[*atom as usize], *atom));
+        self.places.resize(elements.len(), 0);
+        for (place, atom) in self.order.iter().enumerate() {
+            self.places[*atom as usize] = place as u32;
+        }
         self.batches.clear();
         let mut start = 0;
         for atoms in self.order.chunk_by(|a, b| elements[*a as usize] == elements[*b as usize]) {
@@ -35,32 +55,41 @@ impl Batches {
                 start += batch.len();
             }
         }
+        self.divide();
+    }
+
+    fn divide(&mut self) {
+        self.chunks.clear();
+        let (mut first, mut start) = (0, 0);
+        for (k, (places, _)) in self.batches.iter().enumerate() {
+            if places.end - start >= CHUNK || k + 1 == self.batches.len() {
+                let (batches, places) = (first..k + 1, start..places.end);
+                (first, start) = (k + 1, places.end);
+                self.chunks.push(Chunk { number: self.chunks.len(), batches, places });
+            }
+        }
     }
 
     #[inline(always)]
-    pub fn placed(&self, batch: usize, instructions: Instructions) -> Placed<'_> {
+    pub fn placed(&self, batch: usize, instructions: Instructions) -> Placed {
         let (places, element) = &self.batches[batch];
         let batch = Batch { element: *element, atoms: places.len(), instructions };
-        Placed { batch, first: places.start, order: &self.order }
+        Placed { batch, first: places.start }
     }
 }
 
 /// A batch, and where it stands.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Placed<'a> {
+pub(super) struct Placed {
     pub batch: Batch,
     /// Its first place.
     pub first: usize,
-    /// The atom at each place of the whole structure.
-    order: &'a [u32],
 }
 
-impl Placed<'_> {
-    /// Places and atoms.
+impl Placed {
     #[inline(always)]
-    pub fn atoms(&self) -> impl Iterator<Item = (usize, usize)> {
-        let order = self.order;
-        (self.first..self.first + self.batch.atoms).map(move |place| (place, order[place] as usize))
+    pub fn places(&self) -> Range<usize> {
+        self.first..self.first + self.batch.atoms
     }
 }
 
@@ -87,6 +116,14 @@ mod tests {
                 end = places.end;
             }
             assert_eq!(end, 50);
+            assert!((0..50).all(|atom| batches.order[batches.places[atom] as usize] as usize == atom));
+            let (mut batch, mut place) = (0, 0);
+            for (number, chunk) in batches.chunks.iter().enumerate() {
+                assert_eq!((chunk.number, chunk.batches.start, chunk.places.start), (number, batch, place));
+                assert_eq!(batches.batches[chunk.batches.end - 1].0.end, chunk.places.end);
+                (batch, place) = (chunk.batches.end, chunk.places.end);
+            }
+            assert_eq!((batch, place), (batches.batches.len(), 50));
         }
     }
 }

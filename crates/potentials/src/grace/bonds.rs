@@ -3,10 +3,9 @@
 //!
 //! A_a,lm,n = Σ_j R_nl(r) Y_lm(v) ζ_n(μ_j), with d = r_j − r_a, r = √(d·d + 10⁻¹⁰) and v = d / r.
 
-use std::ops::Range;
+use atoms::{Matrix3, NeighbourList, Structure, Vec3};
 
-use atoms::{NeighbourList, Structure, Vec3};
-
+use super::batches::Batches;
 use super::layer::Layer;
 use super::matrix::{LANES, Lanes, ZERO, add_product, add_scaled, product};
 use super::radial_network::RadialWork;
@@ -18,7 +17,7 @@ const SQUARE_FLOOR: f64 = 1e-10;
 /// A bond within the cutoff of its pair.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Bond {
-    /// Index of the neighbour.
+    /// Place of the neighbour.
     pub neighbour: u32,
     /// Its element index.
     pub element: u32,
@@ -28,20 +27,17 @@ pub(super) struct Bond {
     pub r: f64,
 }
 
-/// The bonds of all atoms, those of an atom in the order of the neighbour list, and what the forward pass leaves of them
-/// for the reverse sweep. Atoms stand in the order in which they are evaluated.
+/// The bonds of all atoms, those of an atom in the order of the neighbour list. Atoms stand in the order in which they are
+/// evaluated.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Bonds {
     pub offsets: Vec<usize>,
     pub bonds: Vec<Bond>,
     /// First block of eight bonds of each atom.
     pub block_offsets: Vec<usize>,
-    /// The first block that `values` and `derivatives` hold.
-    first_block: usize,
-    /// R_nl ζ_n, \[block\]\[l\]\[channel\]\[bond\]; in later layers R_nl, \[block\]\[bond\]\[l\]\[channel\].
-    pub values: Vec<Lanes>,
-    /// The same of dR_nl/dr.
-    pub derivatives: Vec<Lanes>,
+    incoming_offsets: Vec<usize>,
+    /// The bonds of which an atom is the neighbour, in ascending order.
+    incoming: Vec<u32>,
 }
 
 impl Bonds {
@@ -52,7 +48,7 @@ impl Bonds {
         structure: &Structure,
         neighbours: &NeighbourList,
         elements: &[usize],
-        order: &[u32],
+        batches: &Batches,
     ) {
         self.offsets.clear();
         self.offsets.push(0);
@@ -60,41 +56,77 @@ impl Bonds {
         self.block_offsets.push(0);
         self.bonds.clear();
         let mut blocks = 0;
-        for (place, i) in order.iter().map(|i| *i as usize).enumerate() {
+        for (place, i) in batches.order.iter().map(|i| *i as usize).enumerate() {
             let centre = elements[i];
             for neighbour in neighbours.of(i) {
-                let element = elements[neighbour.atom as usize];
+                let j = neighbour.atom as usize;
                 let d = neighbour.displacement(structure, i);
                 let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + SQUARE_FLOOR).sqrt();
-                if r < layer.radial.cutoff(layer.radial.pair(centre, element)) {
-                    self.bonds.push(Bond { neighbour: neighbour.atom, element: element as u32, d, r });
+                if r < layer.radial.cutoff(layer.radial.pair(centre, elements[j])) {
+                    self.bonds.push(Bond { neighbour: batches.places[j], element: elements[j] as u32, d, r });
                 }
             }
             blocks += (self.bonds.len() - self.offsets[place]).div_ceil(LANES);
             self.offsets.push(self.bonds.len());
             self.block_offsets.push(blocks);
         }
+        self.find_incoming();
     }
 
-    /// Makes room for the values of the atoms at some places, and forgets others.
-    pub fn hold(&mut self, layer: &Layer, places: Range<usize>) {
-        self.first_block = self.block_offsets[places.start];
-        let lanes = (self.block_offsets[places.end] - self.first_block) * LANES * layer.radial.output_lanes();
-        if self.values.len() < lanes {
-            self.values.resize(lanes, ZERO);
-            self.derivatives.resize(lanes, ZERO);
+    fn find_incoming(&mut self) {
+        let n = self.offsets.len() - 1;
+        // The bonds of a place are counted two behind it, so that the sums of these are where the next one of it goes.
+        self.incoming_offsets.clear();
+        self.incoming_offsets.resize(n + 2, 0);
+        for bond in &self.bonds {
+            self.incoming_offsets[bond.neighbour as usize + 2] += 1;
+        }
+        for place in 2..n + 2 {
+            self.incoming_offsets[place] += self.incoming_offsets[place - 1];
+        }
+        self.incoming.resize(self.bonds.len(), 0);
+        for (k, bond) in self.bonds.iter().enumerate() {
+            let next = &mut self.incoming_offsets[bond.neighbour as usize + 1];
+            self.incoming[*next] = k as u32;
+            *next += 1;
         }
     }
 
-    /// The bonds of the atom at a place, eight at a time, with the lanes where their values are.
+    /// The bonds of the atom at a place.
     #[inline(always)]
-    pub fn blocks(&self, place: usize, layer: &Layer) -> impl Iterator<Item = (&[Bond], Range<usize>)> {
-        let (lanes, first) =
-            (LANES * layer.radial.output_lanes(), self.block_offsets[place] - self.first_block);
-        let bonds = &self.bonds[self.offsets[place]..self.offsets[place + 1]];
-        let range = move |block: usize| block * lanes..(block + 1) * lanes;
-        bonds.chunks(LANES).enumerate().map(move |(k, bonds)| (bonds, range(first + k)))
+    pub fn of(&self, place: usize) -> &[Bond] {
+        &self.bonds[self.offsets[place]..self.offsets[place + 1]]
     }
+
+    /// With g = ∂H/∂d of each bond: adds −∂H/∂r of the atom at a place to `force`, and gives Σ g ⊗ d over its own bonds.
+    #[inline(always)]
+    pub fn gather(&self, place: usize, gradients: &[Vec3], force: &mut Vec3) -> Matrix3 {
+        let own = self.offsets[place]..self.offsets[place + 1];
+        let incoming = &self.incoming[self.incoming_offsets[place]..self.incoming_offsets[place + 1]];
+        let mut virial = [[0.0; 3]; 3];
+        let before = incoming.partition_point(|k| (*k as usize) < own.start);
+        for k in &incoming[..before] {
+            subtract(force, &gradients[*k as usize]);
+        }
+        for (bond, g) in self.bonds[own.clone()].iter().zip(&gradients[own.clone()]) {
+            // The force of an atom on an image of itself is also one of the image on the atom.
+            if bond.neighbour as usize != place {
+                (0..3).for_each(|a| force[a] += g[a]);
+            }
+            for (row, g) in virial.iter_mut().zip(g) {
+                (0..3).for_each(|b| row[b] += g * bond.d[b]);
+            }
+        }
+        for k in incoming[before..].iter().skip_while(|k| (**k as usize) < own.end) {
+            subtract(force, &gradients[*k as usize]);
+        }
+        virial
+    }
+}
+
+#[inline(always)]
+fn subtract(sum: &mut Vec3, x: &Vec3) {
+    (0..3).for_each(|a| sum[a] -= x[a]);
 }
 
 /// Work arrays for eight bonds of one atom.
@@ -190,56 +222,77 @@ pub(super) fn directions(bonds: &[Bond]) -> ([Lanes; 3], Lanes) {
     (v, r)
 }
 
-impl Bonds {
-    /// Adds the bonds of the atom at a place, of element `centre`, to its density, \[lm\]\[channel\].
-    #[inline(always)]
-    pub fn accumulate(
-        &mut self,
-        place: usize,
-        layer: &Layer,
-        centre: usize,
-        (density, slot): (&mut [Lanes], Slot),
-        work: &mut BondWork,
-    ) {
-        let (mut values, mut derivatives) =
-            (std::mem::take(&mut self.values), std::mem::take(&mut self.derivatives));
-        for (bonds, block) in self.blocks(place, layer) {
-            let (v, r) = directions(bonds);
-            layer.harmonics.evaluate::<false>(&v, &mut work.harmonics, &mut work.gradients);
-            work.radial(layer, centre, bonds, &r);
-            transpose(&work.values, &mut values[block.clone()]);
-            transpose(&work.derivatives, &mut derivatives[block]);
-            add_eight(layer, density, slot, work);
-        }
-        (self.values, self.derivatives) = (values, derivatives);
-    }
+/// The bonds of one atom, with what the forward pass leaves of them for the reverse sweep.
+pub(super) struct OwnBonds<'a> {
+    pub bonds: &'a [Bond],
+    /// R_nl ζ_n, \[block\]\[l\]\[channel\]\[bond\]; in later layers R_nl, \[block\]\[bond\]\[l\]\[channel\].
+    pub values: &'a mut [Lanes],
+    /// The same of dR_nl/dr.
+    pub derivatives: &'a mut [Lanes],
+}
 
-    /// ∂/∂d of Σ A·Ā for each bond of the atom at a place and for `N` cotangents Ā of its density at once, handed to
-    /// `sink` bond by bond.
-    ///
-    /// With c_lm = Σ_n Ā_lm,n R_nl ζ_n and c′_lm from dR/dr it is g v + (G − (G·v) v)/r, where
-    /// g = Σ c′_lm Y_lm and G = Σ c_lm ∂Y_lm/∂v.
+impl<'a> OwnBonds<'a> {
+    /// Eight bonds at a time, with their values and derivatives.
     #[inline(always)]
-    pub fn reverse<const N: usize>(
-        &self,
-        place: usize,
+    pub fn blocks(
+        self,
         layer: &Layer,
-        (cotangent, slots): (&[Lanes], [Slot; N]),
-        work: &mut BondWork,
-        mut sink: impl FnMut(&Bond, [Vec3; N]),
-    ) {
-        for (bonds, block) in self.blocks(place, layer) {
-            let (v, r) = directions(bonds);
-            layer.harmonics.evaluate::<true>(&v, &mut work.harmonics, &mut work.gradients);
-            let radial = (&self.values[block.clone()], &self.derivatives[block]);
-            let mut gradients = [[ZERO; 3]; N];
-            for (gradient, slot) in gradients.iter_mut().zip(slots) {
-                *gradient = gradient_of_eight(layer, &v, &r, (cotangent, slot), radial, work);
-            }
-            for (b, bond) in bonds.iter().enumerate() {
-                sink(bond, gradients.map(|gradient| gradient.map(|axis| axis[b])));
-            }
+    ) -> impl Iterator<Item = (&'a [Bond], &'a mut [Lanes], &'a mut [Lanes])> + use<'a> {
+        let lanes = LANES * layer.radial.output_lanes();
+        let values = self.values.chunks_exact_mut(lanes).zip(self.derivatives.chunks_exact_mut(lanes));
+        self.bonds
+            .chunks(LANES)
+            .zip(values)
+            .map(|(bonds, (values, derivatives))| (bonds, values, derivatives))
+    }
+}
+
+/// Adds the bonds of an atom of element `centre` to its density, \[lm\]\[channel\].
+#[inline(always)]
+pub(super) fn accumulate(
+    layer: &Layer,
+    centre: usize,
+    own: OwnBonds,
+    (density, slot): (&mut [Lanes], Slot),
+    work: &mut BondWork,
+) {
+    for (bonds, values, derivatives) in own.blocks(layer) {
+        let (v, r) = directions(bonds);
+        layer.harmonics.evaluate::<false>(&v, &mut work.harmonics, &mut work.gradients);
+        work.radial(layer, centre, bonds, &r);
+        transpose(&work.values, values);
+        transpose(&work.derivatives, derivatives);
+        add_eight(layer, density, slot, work);
+    }
+}
+
+/// ∂/∂d of Σ A·Ā for each bond of an atom and for `N` cotangents Ā of its density at once.
+///
+/// With c_lm = Σ_n Ā_lm,n R_nl ζ_n and c′_lm from dR/dr it is g v + (G − (G·v) v)/r, where
+/// g = Σ c′_lm Y_lm and G = Σ c_lm ∂Y_lm/∂v.
+#[inline(always)]
+pub(super) fn reverse<const N: usize>(
+    layer: &Layer,
+    own: OwnBonds,
+    (cotangent, slots): (&[Lanes], [Slot; N]),
+    work: &mut BondWork,
+    mut gradients: [&mut [Vec3]; N],
+) {
+    for (block, (bonds, values, derivatives)) in own.blocks(layer).enumerate() {
+        let (v, r) = directions(bonds);
+        layer.harmonics.evaluate::<true>(&v, &mut work.harmonics, &mut work.gradients);
+        for (gradients, slot) in gradients.iter_mut().zip(slots) {
+            let of_eight = gradient_of_eight(layer, &v, &r, (cotangent, slot), (values, derivatives), work);
+            put(&of_eight, &mut gradients[block * LANES..][..bonds.len()]);
         }
+    }
+}
+
+/// The gradients of up to eight bonds, bond by bond.
+#[inline(always)]
+pub(super) fn put(of_eight: &[Lanes; 3], gradients: &mut [Vec3]) {
+    for (b, gradient) in gradients.iter_mut().enumerate() {
+        *gradient = of_eight.map(|axis| axis[b]);
     }
 }
 

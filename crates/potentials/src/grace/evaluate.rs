@@ -1,16 +1,17 @@
 //! Energy, features and their derivatives for one structure.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use atoms::{Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
 
-use super::batches::{Batches, Placed};
-use super::instructions::{Instructions, Pass};
-use super::layer::{Layer, Message};
+use super::batches::Batches;
+use super::instructions::Instructions;
 use super::layer_work::LayerWork;
+use super::matrix::Lanes;
 use super::model::GraceModel;
-use super::projection::{Projection, ProjectionWork};
-use super::readout::{Block, ReadoutWork};
+use super::passes::Scratch;
+use super::projection::ProjectionWork;
+use super::threads::Threads;
 
 /// The derivatives of a function H of the features: its cotangent ∂H/∂z pulled back to the atoms.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -30,43 +31,62 @@ impl PullBack {
     }
 }
 
-/// A GRACE model with the work arrays of one thread; after the first step it allocates no more.
+/// A GRACE model with its work arrays; after the first step it allocates no more.
 ///
 /// [`Grace::forward`] gives energies and features, then [`Grace::backward`] the derivatives at the same
-/// structure.
-#[derive(Clone, Debug)]
+/// structure. Results do not depend on the number of threads.
+#[derive(Debug)]
 pub struct Grace {
-    model: Arc<GraceModel>,
-    instructions: Instructions,
+    pub(super) model: Arc<GraceModel>,
+    pub(super) instructions: Instructions,
+    pub(super) threads: Threads,
+    /// Element of each atom.
     elements: Vec<usize>,
-    batches: Batches,
-    layers: Vec<LayerWork>,
-    /// Those of a batch, in its order.
-    batch_energies: Vec<f64>,
+    pub(super) batches: Batches,
+    pub(super) layers: Vec<LayerWork>,
+    /// One for each thread.
+    pub(super) scratch: Vec<Mutex<Scratch>>,
+    // In the order of evaluation:
+    /// E, [n]
+    pub(super) energies: Vec<f64>,
+    /// ∂E/∂(W B), [n, layers, lanes]
+    pub(super) density_cotangents: Vec<Lanes>,
+    /// −∂E/∂r and −∂H/∂r, [n]
+    pub(super) forces: [Vec<Vec3>; 2],
+    /// ∂E/∂ε and ∂H/∂ε of each chunk.
+    pub(super) virials: Vec<[Matrix3; 2]>,
+    pub(super) projection: ProjectionWork,
+    // In the order of the structure:
     atomic_energies: Vec<f64>,
     features: Vec<f64>,
-    readout: ReadoutWork,
-    projection: ProjectionWork,
+    /// A number for each atom, for whoever needs it.
+    numbers: Vec<u32>,
 }
 
 impl Grace {
-    /// An evaluator of `model`; nothing is computed yet.
+    /// An evaluator of `model` on the calling thread; nothing is computed yet.
     pub fn new(model: Arc<GraceModel>) -> Self {
-        Self::with_instructions(model, Instructions::best())
+        Self::with(model, Instructions::best(), Threads::default())
     }
 
-    /// As [`Grace::new`], with these vector instructions; results do not depend on them.
-    pub fn with_instructions(model: Arc<GraceModel>, instructions: Instructions) -> Self {
+    /// As [`Grace::new`], with these vector instructions and threads; results do not depend on them.
+    pub fn with(model: Arc<GraceModel>, instructions: Instructions, threads: Threads) -> Self {
+        let scratch = (0..threads.count()).map(|_| Mutex::new(Scratch::new(&model))).collect();
         Self {
             instructions,
+            threads,
             elements: Vec::new(),
             batches: Batches::default(),
-            layers: model.layers.iter().map(LayerWork::new).collect(),
-            batch_energies: Vec::new(),
+            layers: model.layers.iter().map(|_| LayerWork::default()).collect(),
+            scratch,
+            energies: Vec::new(),
+            density_cotangents: Vec::new(),
+            forces: Default::default(),
+            virials: Vec::new(),
+            projection: ProjectionWork::default(),
             atomic_energies: Vec::new(),
             features: Vec::new(),
-            readout: ReadoutWork::default(),
-            projection: ProjectionWork::default(),
+            numbers: Vec::new(),
             model,
         }
     }
@@ -88,11 +108,13 @@ impl Grace {
         neighbours: &NeighbourList,
     ) -> Result<(), PotentialError> {
         self.take(structure, neighbours)?;
-        let layers = self.layers.len();
-        self.hold_all(layers);
-        self.forward_layers(layers);
-        (0..self.batches.batches.len()).for_each(|batch| self.energies(batch));
-        self.project(None);
+        self.threads.clone().run(|| {
+            (0..self.layers.len()).for_each(|k| self.forward_layer(k));
+            self.read_out();
+            self.project();
+        });
+        self.put_energies();
+        self.put_features();
         Ok(())
     }
 
@@ -108,22 +130,12 @@ impl Grace {
         }
         self.model.write_element_indices(&structure.species, &mut self.elements)?;
         self.batches.update(&self.elements, self.model.tape_bytes());
-        self.atomic_energies.resize(self.elements.len(), 0.0);
         for (work, layer) in self.layers.iter_mut().zip(&self.model.layers) {
-            work.bonds.update(layer, structure, neighbours, &self.elements, &self.batches.order);
-            work.begin_messages(layer, &self.elements);
+            work.bonds.update(layer, structure, neighbours, &self.elements, &self.batches);
+            work.begin(layer, &self.batches, &self.elements, &mut self.numbers);
         }
+        self.begin_passes();
         Ok(())
-    }
-
-    /// Makes the first `layers` keep their tapes of all atoms.
-    fn hold_all(&mut self, layers: usize) {
-        let model = &*self.model;
-        for ((work, layer), block) in
-            self.layers.iter_mut().zip(&model.layers).zip(&model.readout.blocks).take(layers)
-        {
-            work.hold(layer, block, 0..self.elements.len());
-        }
     }
 
     /// Energy of each atom at the last [`Grace::forward`], [n], eV.
@@ -156,207 +168,80 @@ impl Grace {
         if let Some(cotangent) = feature_cotangent {
             assert_eq!(cotangent.len(), self.features.len(), "a cotangent for every feature");
         }
-        energy.reset(self.elements.len());
-        pull_back.reset(self.elements.len());
-        let layers = self.layers.len();
-        if feature_cotangent.is_some() && self.model.projection.is_some() {
-            self.project(feature_cotangent);
-            self.backward_layers::<2>(layers, energy, pull_back);
-        } else {
-            self.backward_layers::<1>(layers, energy, pull_back);
-        }
-        self.complete(energy);
-        pull_back.virial = symmetric(&pull_back.virial);
-    }
-
-    /// Features from the bases, or the cotangents of the bases from those of the features.
-    fn project(&mut self, cotangent: Option<&[f64]>) {
-        let Some(projection) = &self.model.projection else { return };
-        self.instructions.run(Features {
-            projection,
-            work: &mut self.projection,
-            layers: &mut self.layers,
-            order: &self.batches.order,
-            features: &mut self.features,
-            cotangent,
-            instructions: self.instructions,
+        let cotangent = feature_cotangent.filter(|_| self.model.projection.is_some());
+        self.begin_derivatives();
+        // There are no bonds of a structure that was refused.
+        let layers = if self.batches.order.is_empty() { 0 } else { self.layers.len() };
+        self.threads.clone().run(|| match cotangent {
+            Some(cotangent) => {
+                self.project_back(cotangent);
+                (0..layers).rev().for_each(|k| self.backward_layer::<2>(k));
+            }
+            None => (0..layers).rev().for_each(|k| self.backward_layer::<1>(k)),
         });
+        self.put_forces(energy);
+        self.put_pull_back(cotangent.is_some(), pull_back);
     }
 
     /// Energies and forces alone: a batch goes forwards and backwards through the last layer while its tape is in the
     /// cache, and no other tape of that layer is kept.
-    fn plain(&mut self, energy: &mut Evaluation, pull_back: &mut PullBack) {
-        let (model, last) = (Arc::clone(&self.model), self.layers.len() - 1);
-        self.hold_all(last);
-        self.forward_layers(last);
-        self.layers[last].begin_backward::<1>(&model.layers[last], self.elements.len());
-        for batch in 0..self.batches.batches.len() {
-            let places = self.batches.batches[batch].0.clone();
-            self.layers[last].hold(&model.layers[last], &model.readout.blocks[last], places);
-            self.forward_batch(last, batch);
-            self.energies(batch);
-            self.backward_batch::<1>(last, batch, energy, pull_back);
-        }
-        self.backward_layers::<1>(last, energy, pull_back);
+    fn plain(&mut self) {
+        let last = self.layers.len() - 1;
+        (0..last).for_each(|k| self.forward_layer(k));
+        self.pass_last_layer();
+        (0..last).rev().for_each(|k| self.backward_layer::<1>(k));
     }
 
-    /// What the passes leave to be done.
-    fn complete(&self, energy: &mut Evaluation) {
+    // From the order of evaluation to that of the structure.
+
+    fn put_energies(&mut self) {
+        self.atomic_energies.resize(self.elements.len(), 0.0);
+        for (atom, energy) in self.batches.order.iter().zip(&self.energies) {
+            self.atomic_energies[*atom as usize] = *energy;
+        }
+    }
+
+    fn put_features(&mut self) {
+        let Some(projection) = &self.model.projection else { return };
+        let width = projection.feature_dimension();
+        self.features.resize(self.elements.len() * width, 0.0);
+        for (atom, z) in self.batches.order.iter().zip(self.projection.features.chunks_exact(width)) {
+            self.features[*atom as usize * width..][..width].copy_from_slice(z);
+        }
+    }
+
+    fn put_forces(&self, energy: &mut Evaluation) {
+        energy.reset(self.elements.len());
         energy.atomic_energies.copy_from_slice(&self.atomic_energies);
-        energy.virial = symmetric(&energy.virial).map(|row| row.map(|x| -x));
-    }
-
-    /// A batch of layer `k`, and what it tells the next one.
-    fn forward_batch(&mut self, k: usize, batch: usize) {
-        let layers = &self.model.layers;
-        let placed = self.batches.placed(batch, self.instructions);
-        self.instructions.run(Forward { work: &mut self.layers[k], layer: &layers[k], placed });
-        let (before, after) = self.layers.split_at_mut(k + 1);
-        if let Some(next) = after.first_mut() {
-            next.take_messages(&layers[k + 1], &placed, &before[k], &layers[k]);
+        for (atom, force) in self.batches.order.iter().zip(&self.forces[0]) {
+            energy.forces[*atom as usize] = *force;
         }
+        energy.virial = self.strain_derivative(0).map(|row| row.map(|x| -x));
     }
 
-    /// The energies of a batch that has passed all layers.
-    fn energies(&mut self, batch: usize) {
-        let placed = self.batches.placed(batch, self.instructions);
-        self.batch_energies.clear();
-        self.batch_energies.resize(placed.batch.atoms, 0.0);
-        let (layers, work) = (&mut self.layers[..], &mut self.readout);
-        let energies = &mut self.batch_energies[..];
-        self.instructions.run(Energies { model: &self.model, layers, placed, work, energies });
-        for ((_, atom), energy) in placed.atoms().zip(&self.batch_energies) {
-            self.atomic_energies[atom] = *energy;
-        }
-    }
-
-    fn backward_batch<const N: usize>(
-        &mut self,
-        k: usize,
-        batch: usize,
-        energy: &mut Evaluation,
-        pull_back: &mut PullBack,
-    ) {
-        let model = &*self.model;
-        let placed = self.batches.placed(batch, self.instructions);
-        let (work, after) = self.layers.split_at_mut(k + 1);
-        let returned = after.first().map(|after| (&model.layers[k + 1].message, after));
-        let (layer, block) = (&model.layers[k], &model.readout.blocks[k]);
-        let work = &mut work[k];
-        let pass = Backward::<N> { work, layer, block, placed, returned, energy, pull_back };
-        self.instructions.run(pass);
-    }
-
-    /// The first `layers` backwards, all atoms of one before the next, which needs the cotangents of its messages from
-    /// all neighbours; `N` is 2 with a cotangent of the features.
-    fn backward_layers<const N: usize>(
-        &mut self,
-        layers: usize,
-        energy: &mut Evaluation,
-        pull_back: &mut PullBack,
-    ) {
-        for k in (0..layers).rev() {
-            self.layers[k].begin_backward::<N>(&self.model.layers[k], self.elements.len());
-            for batch in 0..self.batches.batches.len() {
-                self.backward_batch::<N>(k, batch, energy, pull_back);
+    fn put_pull_back(&self, is_computed: bool, pull_back: &mut PullBack) {
+        pull_back.reset(self.elements.len());
+        if is_computed {
+            for (atom, force) in self.batches.order.iter().zip(&self.forces[1]) {
+                pull_back.gradient[*atom as usize] = force.map(|x| -x);
             }
+            pull_back.virial = self.strain_derivative(1);
         }
     }
 
-    fn forward_layers(&mut self, layers: usize) {
-        for k in 0..layers {
-            for batch in 0..self.batches.batches.len() {
-                self.forward_batch(k, batch);
-            }
+    /// ∂E/∂ε or ∂H/∂ε, the chunks' added in their order.
+    fn strain_derivative(&self, k: usize) -> Matrix3 {
+        let mut sum = [[0.0; 3]; 3];
+        for virials in &self.virials {
+            add(&mut sum, &virials[k]);
         }
+        symmetric(&sum)
     }
 }
 
-/// A batch forwards through one layer.
-struct Forward<'a> {
-    work: &'a mut LayerWork,
-    layer: &'a Layer,
-    placed: Placed<'a>,
-}
-
-impl Pass for Forward<'_> {
-    #[inline(always)]
-    fn run(self, _: bool) {
-        self.work.forward(self.layer, &self.placed);
-    }
-}
-
-/// A batch from its bases to energies.
-struct Energies<'a> {
-    model: &'a GraceModel,
-    layers: &'a mut [LayerWork],
-    placed: Placed<'a>,
-    work: &'a mut ReadoutWork,
-    energies: &'a mut [f64],
-}
-
-impl Pass for Energies<'_> {
-    #[inline(always)]
-    fn run(self, _: bool) {
-        let Self { model, layers, placed, work, energies } = self;
-        model.readout.begin(placed.batch.atoms, work);
-        for (k, layer) in model.layers.iter().enumerate() {
-            let basis = (layers[k].basis(layer, &placed), layer.basis.lanes());
-            model.readout.add_densities(k, &placed.batch, basis, work);
-        }
-        model.readout.evaluate(&placed.batch, energies, work);
-        for (k, block) in model.readout.blocks.iter().enumerate() {
-            model.readout.density_cotangent(k, layers[k].densities(block, &placed), work);
-        }
-    }
-}
-
-/// A batch backwards through one layer, with `N` cotangents.
-struct Backward<'a, const N: usize> {
-    work: &'a mut LayerWork,
-    layer: &'a Layer,
-    block: &'a Block,
-    placed: Placed<'a>,
-    returned: Option<(&'a Message, &'a LayerWork)>,
-    energy: &'a mut Evaluation,
-    pull_back: &'a mut PullBack,
-}
-
-impl<const N: usize> Pass for Backward<'_, N> {
-    #[inline(always)]
-    fn run(self, _: bool) {
-        let Self { work, layer, block, placed, returned, energy, pull_back } = self;
-        work.backward::<N>(layer, block, &placed, returned, energy, pull_back);
-    }
-}
-
-/// From the bases of all atoms to their features, or, with a cotangent of these, back.
-struct Features<'a> {
-    projection: &'a Projection,
-    work: &'a mut ProjectionWork,
-    layers: &'a mut [LayerWork],
-    order: &'a [u32],
-    features: &'a mut Vec<f64>,
-    cotangent: Option<&'a [f64]>,
-    instructions: Instructions,
-}
-
-impl Pass for Features<'_> {
-    #[inline(always)]
-    fn run(self, _: bool) {
-        let Self { projection, work, layers, order, features, cotangent, instructions } = self;
-        if let Some(cotangent) = cotangent {
-            let layers = layers.iter_mut().map(|work| (&work.bases[..], &mut work.basis_cotangents));
-            projection.backward(order, layers, cotangent, work, instructions);
-        } else {
-            projection.forward(
-                order,
-                layers.iter().map(|work| &work.bases[..]),
-                features,
-                work,
-                instructions,
-            );
-        }
+pub(super) fn add(sum: &mut Matrix3, x: &Matrix3) {
+    for (sum, x) in sum.as_flattened_mut().iter_mut().zip(x.as_flattened()) {
+        *sum += x;
     }
 }
 
@@ -381,9 +266,10 @@ impl Potential for Grace {
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
         self.take(structure, neighbours)?;
-        out.reset(self.elements.len());
-        self.plain(out, &mut PullBack::default());
-        self.complete(out);
+        self.begin_derivatives();
+        self.threads.clone().run(|| self.plain());
+        self.put_energies();
+        self.put_forces(out);
         Ok(())
     }
 }

@@ -2,272 +2,292 @@
 
 use std::ops::Range;
 
-use atoms::{Evaluation, Matrix3, Vec3};
+use atoms::Vec3;
 
-use super::batches::Placed;
-use super::bonds::{Bond, BondWork, Bonds};
-use super::evaluate::PullBack;
+use super::batches::{Batches, Chunk, Placed};
+use super::bonds::{BondWork, Bonds, OwnBonds, accumulate, reverse};
 use super::layer::{Layer, Message};
-use super::matrix::{Lanes, Rows, ZERO, add_scaled};
-use super::messages::Messages;
+use super::matrix::{LANES, Lanes, Rows, ZERO, add_scaled};
+use super::messages::{Returns, accumulate_messages, reverse_messages};
+use super::parts::{Divide, Layout, OfChunks, Parts};
 use super::readout::Block;
-use super::tape::Slot;
+use super::tape::{Slot, Tensor};
 
-/// Work arrays of one layer. Atoms stand in the order in which they are evaluated, but for messages, which stand in the
-/// order of the structure.
-#[derive(Clone, Debug)]
+/// Arrays of one layer for all atoms, in the order in which they are evaluated.
+#[derive(Clone, Debug, Default)]
 pub(super) struct LayerWork {
     pub bonds: Bonds,
-    /// What the arrays below hold.
-    held: Range<usize>,
-    /// The tape of one batch after another, [held places, tape]
-    tapes: Vec<Lanes>,
-    /// The basis B of this layer, [held places, lanes]
-    pub bases: Vec<Lanes>,
-    /// Its cotangent from the features, [held places, lanes]
+    pub trace: Trace,
+    /// Cotangents of the basis from the features, [n, lanes]
     pub basis_cotangents: Vec<Lanes>,
-    /// ∂E/∂(W B), [held places, lanes of the densities]
-    pub density_cotangents: Vec<Lanes>,
     /// m, [n, lanes of a message]; empty in the first layer.
-    messages: Vec<Lanes>,
+    pub messages: Vec<Lanes>,
     /// Cotangents of what depends on the layer before, from the energy and from the features, [n, lanes].
-    message_cotangents: [Vec<Lanes>; 2],
-    /// Cotangents of the basis from the energy, of one batch.
-    energy_basis_cotangents: Vec<Lanes>,
-    /// Cotangents of the tape for the energy and for the features, of one batch.
-    cotangent_tape: Vec<Lanes>,
-    bond_work: BondWork,
-}
-
-/// The part of an array with `lanes` for each place that belongs to a batch.
-#[inline(always)]
-fn part(held: &Range<usize>, placed: &Placed, lanes: usize) -> Range<usize> {
-    let first = placed.first - held.start;
-    first * lanes..(first + placed.batch.atoms) * lanes
+    pub message_cotangents: [Vec<Lanes>; 2],
+    /// What each chunk adds to them.
+    pub returns: Vec<Returns>,
+    /// The row of each bond's neighbour there.
+    pub rows: Vec<u32>,
+    /// ∂/∂d of the energy and of H for each bond.
+    pub gradients: [Vec<Vec3>; 2],
 }
 
 impl LayerWork {
-    pub fn new(layer: &Layer) -> Self {
-        Self {
-            bonds: Bonds::default(),
-            held: 0..0,
-            tapes: Vec::new(),
-            bases: Vec::new(),
-            basis_cotangents: Vec::new(),
-            density_cotangents: Vec::new(),
-            messages: Vec::new(),
-            message_cotangents: Default::default(),
-            energy_basis_cotangents: Vec::new(),
-            cotangent_tape: Vec::new(),
-            bond_work: BondWork::new(layer),
-        }
-    }
-
-    /// Makes room for the atoms at some places, and forgets others.
-    pub fn hold(&mut self, layer: &Layer, block: &Block, places: Range<usize>) {
-        let grow = |lanes: &mut Vec<Lanes>, of_one: usize| {
-            if lanes.len() < places.len() * of_one {
-                lanes.resize(places.len() * of_one, ZERO);
-            }
-        };
-        grow(&mut self.tapes, layer.tape_lanes);
-        grow(&mut self.bases, layer.basis.lanes());
-        grow(&mut self.density_cotangents, block.lanes());
-        self.bonds.hold(layer, places.clone());
-        self.held = places;
-    }
-
-    /// The basis of the atoms of a batch, a row each.
-    #[inline(always)]
-    pub fn basis(&self, layer: &Layer, placed: &Placed) -> &[Lanes] {
-        &self.bases[part(&self.held, placed, layer.basis.lanes())]
-    }
-
-    /// ∂E/∂(W B) of the atoms of a batch, a row each.
-    #[inline(always)]
-    pub fn densities(&mut self, block: &Block, placed: &Placed) -> &mut [Lanes] {
-        &mut self.density_cotangents[part(&self.held, placed, block.lanes())]
-    }
-
-    /// The messages of all `n` atoms before the layer before has added what depends on their surroundings.
-    #[inline(always)]
-    pub fn begin_messages(&mut self, layer: &Layer, elements: &[usize]) {
+    /// The bonds of a structure are known: makes room for what belongs to them.
+    pub fn begin(&mut self, layer: &Layer, batches: &Batches, elements: &[usize], row_of: &mut Vec<u32>) {
+        self.gradients.iter_mut().for_each(|gradients| gradients.resize(self.bonds.bonds.len(), [0.0; 3]));
         if layer.message.from.is_none() {
             return;
         }
         self.messages.resize(elements.len() * layer.message.lanes(), ZERO);
-        for (element, message) in elements.iter().zip(self.messages.chunks_exact_mut(layer.message.lanes())) {
-            message.copy_from_slice(&layer.message.constants[*element]);
+        for (atom, message) in batches.order.iter().zip(self.messages.chunks_exact_mut(layer.message.lanes()))
+        {
+            message.copy_from_slice(&layer.message.constants[elements[*atom as usize]]);
         }
-    }
-
-    /// Adds what the tapes of a batch in the layer before say.
-    #[inline(always)]
-    pub fn take_messages(
-        &mut self,
-        layer: &Layer,
-        placed: &Placed,
-        before: &LayerWork,
-        layer_before: &Layer,
-    ) {
-        let Some(tensor) = layer.message.from else { return };
-        let tape = &before.tapes[part(&before.held, placed, layer_before.tape_lanes)];
-        for (place, i) in placed.atoms() {
-            let slot = Slot { slot: place - placed.first, slots: placed.batch.atoms };
-            let message = &mut self.messages[i * layer.message.lanes()..][..layer.message.lanes()];
-            for (q, row) in message.chunks_exact_mut(tensor.width).take(tensor.components).enumerate() {
-                for (m, x) in row.iter_mut().zip(&tape[slot.row(&tensor, q)..]) {
-                    add_scaled(m, 1.0, x);
-                }
-            }
+        row_of.resize(elements.len(), 0);
+        self.rows.resize(self.bonds.bonds.len(), 0);
+        if self.returns.len() < batches.chunks.len() {
+            self.returns.resize_with(batches.chunks.len(), Returns::default);
         }
-    }
-
-    /// Tapes of a batch, and its part of the basis.
-    #[inline(always)]
-    pub fn forward(&mut self, layer: &Layer, placed: &Placed) {
-        let batch = &placed.batch;
-        let tape = &mut self.tapes[part(&self.held, placed, layer.tape_lanes)];
-        layer.used.clear(batch.atoms, tape);
-        for slot in 0..batch.atoms {
-            let density = (&mut *tape, Slot { slot, slots: batch.atoms });
-            let (bonds, work, place) = (&mut self.bonds, &mut self.bond_work, placed.first + slot);
-            match layer.message.from {
-                None => bonds.accumulate(place, layer, batch.element, density, work),
-                Some(_) => {
-                    bonds.accumulate_messages(place, layer, batch.element, &self.messages, density, work);
-                }
-            }
-        }
-        for operation in &layer.operations {
-            operation.forward(batch, tape);
-        }
-        let lanes = layer.basis.lanes();
-        layer.basis.forward(batch.atoms, tape, &mut self.bases[part(&self.held, placed, lanes)], lanes);
-    }
-
-    /// Sets the cotangents of `n` messages to zero.
-    #[inline(always)]
-    pub fn begin_backward<const N: usize>(&mut self, layer: &Layer, n: usize) {
-        for cotangents in &mut self.message_cotangents[..N] {
-            cotangents.clear();
-            cotangents.resize(n * layer.message.passed() * layer.density.width, ZERO);
-        }
-    }
-
-    /// A batch back along the tape, then along the bonds. `returned` is the message of the next layer
-    /// and the work that holds its cotangents.
-    #[inline(always)]
-    pub fn backward<const N: usize>(
-        &mut self,
-        layer: &Layer,
-        block: &Block,
-        placed: &Placed,
-        returned: Option<(&Message, &LayerWork)>,
-        energy: &mut Evaluation,
-        pull_back: &mut PullBack,
-    ) {
-        let (batch, lanes) = (&placed.batch, layer.basis.lanes());
-        let (atoms, slots) = (batch.atoms, N * batch.atoms);
-        let mut cotangent = std::mem::take(&mut self.cotangent_tape);
-        if cotangent.len() < slots * layer.tape_lanes {
-            cotangent.resize(slots * layer.tape_lanes, ZERO);
-        }
-        layer.used.clear(slots, &mut cotangent);
-        self.energy_basis_cotangent(block, placed, lanes);
-        layer.basis.backward(atoms, (&self.energy_basis_cotangents, lanes), &mut cotangent, (0, slots));
-        if N == 2 {
-            let of_features = &self.basis_cotangents[part(&self.held, placed, lanes)];
-            layer.basis.backward(atoms, (of_features, lanes), &mut cotangent, (atoms, slots));
-        }
-        if let Some((message, after)) = returned {
-            for (k, cotangents) in after.message_cotangents.iter().enumerate().take(N) {
-                for (place, i) in placed.atoms() {
-                    let slot = Slot { slot: k * atoms + place - placed.first, slots };
-                    add_returned(message, i, cotangents, &mut cotangent, slot);
-                }
-            }
-        }
-        let tape = &self.tapes[part(&self.held, placed, layer.tape_lanes)];
-        for operation in layer.operations.iter().rev() {
-            operation.backward::<N>(batch, tape, &mut cotangent);
-        }
-        for (place, i) in placed.atoms() {
-            let slot = |k: usize| Slot { slot: k * atoms + place - placed.first, slots };
-            let cotangent = (&cotangent[..], std::array::from_fn(slot));
-            self.backward_bonds::<N>(place, i, layer, cotangent, energy, pull_back);
-        }
-        self.cotangent_tape = cotangent;
-    }
-
-    /// ∂E/∂B of a batch.
-    #[inline(always)]
-    fn energy_basis_cotangent(&mut self, block: &Block, placed: &Placed, lanes: usize) {
-        let atoms = placed.batch.atoms;
-        let mut out = std::mem::take(&mut self.energy_basis_cotangents);
-        out.clear();
-        out.resize(atoms * lanes, ZERO);
-        let (from, to) = (Rows::of_atoms(atoms, block.lanes()), Rows::of_atoms(atoms, lanes));
-        let densities = self.densities(block, placed);
-        let weights = block.weights.transposed(placed.batch.element);
-        weights.multiply_add(densities, from, &mut out, to, placed.batch.instructions);
-        self.energy_basis_cotangents = out;
-    }
-
-    #[inline(always)]
-    fn backward_bonds<const N: usize>(
-        &mut self,
-        place: usize,
-        i: usize,
-        layer: &Layer,
-        cotangent: (&[Lanes], [Slot; N]),
-        energy: &mut Evaluation,
-        pull_back: &mut PullBack,
-    ) {
-        let sink = |bond: &Bond, gradients: [Vec3; N]| {
-            let j = bond.neighbour as usize;
-            add_bond(&mut energy.forces, &mut energy.virial, j, i, bond.d, gradients[0]);
-            if N == 2 {
-                add_bond(&mut pull_back.gradient, &mut pull_back.virial, i, j, bond.d, gradients[N - 1]);
-            }
-        };
-        let (bonds, work) = (&self.bonds, &mut self.bond_work);
-        if layer.message.from.is_none() {
-            return bonds.reverse(place, layer, cotangent, work, sink);
-        }
-        let cotangents = self.message_cotangents.each_mut().map(Vec::as_mut_slice);
-        let messages = Messages { sent: &self.messages, cotangents };
-        bonds.reverse_messages(place, layer, cotangent, messages, work, sink);
-    }
-}
-
-/// Adds the cotangent of atom `i`'s message to its cotangent tape.
-#[inline(always)]
-fn add_returned(message: &Message, i: usize, cotangents: &[Lanes], tape: &mut [Lanes], slot: Slot) {
-    let Some(tensor) = message.from else { return };
-    let lanes = tensor.components * tensor.width;
-    for (q, row) in cotangents[i * lanes..][..lanes].chunks_exact(tensor.width).enumerate() {
-        for (x, c) in tape[slot.row(&tensor, q)..].iter_mut().zip(row) {
-            add_scaled(x, 1.0, c);
+        for (chunk, returns) in batches.chunks.iter().zip(&mut self.returns) {
+            returns.find(&self.bonds, chunk, row_of, &mut self.rows);
         }
     }
 }
 
-/// With g = ∂/∂d: `gradient` loses g at `less` and gains it at `more`; `virial` gains g ⊗ d.
+/// What the forward pass leaves of some atoms for the reverse sweep.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Trace {
+    /// The tape of one batch after another, [places, tape]
+    tapes: Vec<Lanes>,
+    /// The basis B of this layer, [places, lanes]
+    pub bases: Vec<Lanes>,
+    /// Radial values of bonds and their derivatives, block by block.
+    values: Vec<Lanes>,
+    derivatives: Vec<Lanes>,
+}
+
+/// The trace of some atoms, to be divided.
+pub(super) struct Traced<'a> {
+    tapes: Parts<'a, Lanes>,
+    pub bases: Parts<'a, Lanes>,
+    values: Parts<'a, Lanes>,
+    derivatives: Parts<'a, Lanes>,
+}
+
+impl Trace {
+    /// Makes room for the atoms at some places.
+    pub fn hold<'a>(&'a mut self, layer: &Layer, bonds: &'a Bonds, places: &Range<usize>) -> Traced<'a> {
+        let blocks = bonds.block_offsets[places.end] - bonds.block_offsets[places.start];
+        let of_block = LANES * layer.radial.output_lanes();
+        grow(&mut self.tapes, places.len() * layer.tape_lanes);
+        grow(&mut self.bases, places.len() * layer.basis.lanes());
+        grow(&mut self.values, blocks * of_block);
+        grow(&mut self.derivatives, blocks * of_block);
+        let of_bonds = Layout::Ragged(&bonds.block_offsets, of_block);
+        Traced {
+            tapes: Parts::new(Layout::Even(layer.tape_lanes), places.start, &mut self.tapes),
+            bases: Parts::new(Layout::Even(layer.basis.lanes()), places.start, &mut self.bases),
+            values: Parts::new(of_bonds, places.start, &mut self.values),
+            derivatives: Parts::new(of_bonds, places.start, &mut self.derivatives),
+        }
+    }
+}
+
+impl Divide for Traced<'_> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let (tapes, bases) = (self.tapes.divide(chunk), self.bases.divide(chunk));
+        let (values, derivatives) = (self.values.divide(chunk), self.derivatives.divide(chunk));
+        (
+            Self { tapes: tapes.0, bases: bases.0, values: values.0, derivatives: derivatives.0 },
+            Self { tapes: tapes.1, bases: bases.1, values: values.1, derivatives: derivatives.1 },
+        )
+    }
+}
+
+/// Makes an array at least so long.
+pub(super) fn grow(lanes: &mut Vec<Lanes>, length: usize) {
+    if lanes.len() < length {
+        lanes.resize(length, ZERO);
+    }
+}
+
+/// Tapes of a batch, and its part of the basis. `received` are the messages of all atoms.
 #[inline(always)]
-pub(super) fn add_bond(
-    gradient: &mut [Vec3],
-    virial: &mut Matrix3,
-    less: usize,
-    more: usize,
-    d: Vec3,
-    g: Vec3,
+pub(super) fn forward(
+    layer: &Layer,
+    placed: &Placed,
+    (bonds, received): (&Bonds, &[Lanes]),
+    trace: &mut Traced,
+    work: &mut BondWork,
 ) {
-    for a in 0..3 {
-        gradient[less][a] -= g[a];
-        gradient[more][a] += g[a];
-        for b in 0..3 {
-            virial[a][b] += g[a] * d[b];
+    let (batch, places) = (&placed.batch, placed.places());
+    let tape = trace.tapes.of(&places);
+    layer.used.clear(batch.atoms, tape);
+    for (slot, place) in places.clone().enumerate() {
+        let density = (&mut *tape, Slot { slot, slots: batch.atoms });
+        let own = trace_of(place, bonds, &mut trace.values, &mut trace.derivatives);
+        match layer.message.from {
+            None => accumulate(layer, batch.element, own, density, work),
+            Some(_) => accumulate_messages(layer, batch.element, own, received, density, work),
+        }
+    }
+    for operation in &layer.operations {
+        operation.forward(batch, tape);
+    }
+    layer.basis.forward(batch.atoms, tape, trace.bases.of(&places), layer.basis.lanes());
+}
+
+#[inline(always)]
+fn trace_of<'a>(
+    place: usize,
+    bonds: &'a Bonds,
+    values: &'a mut Parts<Lanes>,
+    derivatives: &'a mut Parts<Lanes>,
+) -> OwnBonds<'a> {
+    let places = place..place + 1;
+    OwnBonds { bonds: bonds.of(place), values: values.of(&places), derivatives: derivatives.of(&places) }
+}
+
+/// Adds what the tapes of a batch say to the messages of its atoms, which begin as constants.
+#[inline(always)]
+pub(super) fn send(
+    tensor: &Tensor,
+    of_message: usize,
+    placed: &Placed,
+    trace: &mut Traced,
+    messages: &mut [Lanes],
+) {
+    let tape = trace.tapes.of(&placed.places());
+    for (slot, message) in messages.chunks_exact_mut(of_message).enumerate() {
+        let slot = Slot { slot, slots: placed.batch.atoms };
+        for (q, row) in message.chunks_exact_mut(tensor.width).take(tensor.components).enumerate() {
+            for (m, x) in row.iter_mut().zip(&tape[slot.row(tensor, q)..]) {
+                add_scaled(m, 1.0, x);
+            }
+        }
+    }
+}
+
+/// Where the cotangents of a batch come from.
+pub(super) struct Cotangents<'a> {
+    /// ∂E/∂(W B) of the layer's block, a row of `stride` lanes for each atom.
+    pub densities: (&'a [Lanes], usize),
+    /// Those of the basis from the features, a row for each atom.
+    pub basis: &'a [Lanes],
+    /// The message of the next layer and its cotangents, a row for each atom.
+    pub returned: Option<(&'a Message, [&'a [Lanes]; 2])>,
+}
+
+/// Where they go to.
+pub(super) struct Gradients<'a> {
+    /// Of the energy and of H, for each bond.
+    pub bonds: [Parts<'a, Vec3>; 2],
+    /// Of messages, one for each chunk.
+    pub returns: OfChunks<'a, Returns>,
+}
+
+impl Divide for Gradients<'_> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let (bonds, returns) = (self.bonds.divide(chunk), self.returns.divide(chunk));
+        (Self { bonds: bonds.0, returns: returns.0 }, Self { bonds: bonds.1, returns: returns.1 })
+    }
+}
+
+/// Arrays of one thread for a batch in a layer.
+#[derive(Clone, Debug, Default)]
+pub(super) struct BackwardWork {
+    /// Cotangents of the basis from the energy.
+    basis: Vec<Lanes>,
+    /// Cotangents of the tape for the energy and for the features.
+    tape: Vec<Lanes>,
+}
+
+/// A batch back along the tape.
+#[inline(always)]
+pub(super) fn backward_tape<const N: usize>(
+    layer: &Layer,
+    block: &Block,
+    placed: &Placed,
+    trace: &mut Traced,
+    from: &Cotangents,
+    work: &mut BackwardWork,
+) {
+    let (batch, lanes) = (&placed.batch, layer.basis.lanes());
+    let (atoms, slots) = (batch.atoms, N * batch.atoms);
+    grow(&mut work.tape, slots * layer.tape_lanes);
+    let cotangent = &mut work.tape[..];
+    layer.used.clear(slots, cotangent);
+    energy_basis_cotangent(block, placed, from.densities, lanes, &mut work.basis);
+    layer.basis.backward(atoms, (&work.basis, lanes), cotangent, (0, slots));
+    if N == 2 {
+        layer.basis.backward(atoms, (from.basis, lanes), cotangent, (atoms, slots));
+    }
+    if let Some((Message { from: Some(tensor), .. }, returned)) = &from.returned {
+        for (k, rows) in returned.iter().enumerate().take(N) {
+            add_returned(tensor, rows, cotangent, (k * atoms, slots));
+        }
+    }
+    let tape = trace.tapes.of(&placed.places());
+    for operation in layer.operations.iter().rev() {
+        operation.backward::<N>(batch, tape, cotangent);
+    }
+}
+
+/// ∂E/∂B of a batch.
+#[inline(always)]
+fn energy_basis_cotangent(
+    block: &Block,
+    placed: &Placed,
+    (densities, stride): (&[Lanes], usize),
+    lanes: usize,
+    out: &mut Vec<Lanes>,
+) {
+    let atoms = placed.batch.atoms;
+    out.clear();
+    out.resize(atoms * lanes, ZERO);
+    let (from, to) = (Rows::of_atoms(atoms, stride), Rows::of_atoms(atoms, lanes));
+    let weights = block.weights.transposed(placed.batch.element);
+    weights.multiply_add(densities, from, out, to, placed.batch.instructions);
+}
+
+/// Adds the cotangents of messages, a row for each atom, to the cotangents of the tape in the slots from `first` of `slots`.
+#[inline(always)]
+fn add_returned(tensor: &Tensor, rows: &[Lanes], tape: &mut [Lanes], (first, slots): (usize, usize)) {
+    for (atom, row) in rows.chunks_exact(tensor.components * tensor.width).enumerate() {
+        let slot = Slot { slot: first + atom, slots };
+        for (q, row) in row.chunks_exact(tensor.width).enumerate() {
+            for (x, c) in tape[slot.row(tensor, q)..].iter_mut().zip(row) {
+                add_scaled(x, 1.0, c);
+            }
+        }
+    }
+}
+
+/// A batch from the cotangents of its tape back along its bonds.
+#[inline(always)]
+pub(super) fn backward_bonds<const N: usize>(
+    layer: &Layer,
+    placed: &Placed,
+    (here, received, rows): (&Bonds, &[Lanes], &[u32]),
+    trace: &mut Traced,
+    (to, mut returns): (&mut [Parts<Vec3>; 2], Option<&mut Returns>),
+    (tape, work): (&BackwardWork, &mut BondWork),
+) {
+    let atoms = placed.batch.atoms;
+    for (slot, place) in placed.places().enumerate() {
+        let slots = std::array::from_fn(|k| Slot { slot: k * atoms + slot, slots: N * atoms });
+        let cotangent = (&tape.tape[..], slots);
+        let own = trace_of(place, here, &mut trace.values, &mut trace.derivatives);
+        let mut both = to.each_mut().map(|part| Some(part.of(&(place..place + 1))));
+        let gradients: [&mut [Vec3]; N] = std::array::from_fn(|k| both[k].take().unwrap_or_default());
+        match &mut returns {
+            None => reverse(layer, own, cotangent, work, gradients),
+            Some(returns) => {
+                let rows = &rows[here.offsets[place]..here.offsets[place + 1]];
+                let returns = (rows, &mut **returns);
+                reverse_messages(layer, own, received, cotangent, work, gradients, returns);
+            }
         }
     }
 }

@@ -2,18 +2,73 @@
 //!
 //! T_a,q,lm,n = Σ_j R_nl(r) Y_lm(v) m_q,n(j).
 
+use std::ops::Range;
+
 use atoms::Vec3;
 
-use super::bonds::{Bond, BondWork, Bonds, bond_gradient, directions, pairs};
+use super::batches::Chunk;
+use super::bonds::{Bond, BondWork, Bonds, OwnBonds, bond_gradient, directions, pairs, put};
 use super::layer::Layer;
 use super::matrix::{LANES, Lanes, ZERO, add_product, add_scaled, horizontal_sum, product, scaled};
 use super::tape::Slot;
 
-/// The messages of all atoms, [n, q, channels], and where up to two of their cotangents are summed, of the
-/// components that depend on the layer before.
-pub(super) struct Messages<'a> {
-    pub sent: &'a [Lanes],
-    pub cotangents: [&'a mut [Lanes]; 2],
+/// What a chunk of atoms returns to those whose messages it got: up to two cotangents of the components that depend on the
+/// layer before. Every chunk sums its own, and the sums are added in the order of chunks, so that it does not matter who
+/// worked them out.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Returns {
+    /// Places of those, in ascending order.
+    to: Vec<u32>,
+    /// A row for each of them.
+    cotangents: [Vec<Lanes>; 2],
+}
+
+impl Returns {
+    /// Finds out to whom the chunk returns, and writes the row of each bond's neighbour. `row_of` has a number for each atom of
+    /// the structure, which is not read.
+    pub fn find(&mut self, bonds: &Bonds, chunk: &Chunk, row_of: &mut [u32], rows: &mut [u32]) {
+        const NONE: u32 = u32::MAX;
+        row_of.fill(NONE);
+        let range = bonds.offsets[chunk.places.start]..bonds.offsets[chunk.places.end];
+        let bonds = &bonds.bonds[range.clone()];
+        self.to.clear();
+        for bond in bonds {
+            if row_of[bond.neighbour as usize] == NONE {
+                row_of[bond.neighbour as usize] = 0;
+                self.to.push(bond.neighbour);
+            }
+        }
+        self.to.sort_unstable();
+        for (row, place) in self.to.iter().enumerate() {
+            row_of[*place as usize] = row as u32;
+        }
+        for (row, bond) in rows[range].iter_mut().zip(bonds) {
+            *row = row_of[bond.neighbour as usize];
+        }
+    }
+
+    /// Sets `n` cotangents to zero, of so many lanes for each atom.
+    #[inline(always)]
+    pub fn begin(&mut self, n: usize, lanes: usize) {
+        for cotangents in &mut self.cotangents[..n] {
+            cotangents.clear();
+            cotangents.resize(self.to.len() * lanes, ZERO);
+        }
+    }
+
+    /// Adds what there is for some places to their cotangent number `k`.
+    #[inline(always)]
+    pub fn add_to(&self, k: usize, places: &Range<usize>, lanes: usize, sums: &mut [Lanes]) {
+        let first = self.to.partition_point(|place| (*place as usize) < places.start);
+        let rows = self.cotangents[k][first * lanes..].chunks_exact(lanes);
+        for (place, row) in self.to[first..].iter().zip(rows) {
+            if *place as usize >= places.end {
+                break;
+            }
+            let sum = &mut sums[(*place as usize - places.start) * lanes..][..lanes];
+            sum.iter_mut().zip(row).for_each(|(sum, x)| add_scaled(sum, 1.0, x));
+        }
+    }
 }
 
 /// Up to eight bonds of one atom as the reverse sweep sees them.
@@ -27,63 +82,49 @@ struct Block<'a> {
     gradients: &'a [[Lanes; 3]],
 }
 
-impl Bonds {
-    /// Adds the messages of the neighbours of the atom at a place, of element `centre`, to its T.
-    #[inline(always)]
-    pub fn accumulate_messages(
-        &mut self,
-        place: usize,
-        layer: &Layer,
-        centre: usize,
-        messages: &[Lanes],
-        density: (&mut [Lanes], Slot),
-        work: &mut BondWork,
-    ) {
-        let (mut all_values, mut all_derivatives) =
-            (std::mem::take(&mut self.values), std::mem::take(&mut self.derivatives));
-        let (density, slot) = density;
-        for (bonds, block) in self.blocks(place, layer) {
-            let (v, r) = directions(bonds);
-            layer.harmonics.evaluate::<false>(&v, &mut work.harmonics, &mut work.gradients);
-            let (values, derivatives) = (&mut all_values[block.clone()], &mut all_derivatives[block]);
-            let pairs = pairs(layer, centre, bonds);
-            layer.radial.evaluate(bonds.len(), &pairs, &r, &mut work.radial, values, derivatives);
-            add_eight(layer, (bonds, values, &work.harmonics), messages, density, slot);
-        }
-        (self.values, self.derivatives) = (all_values, all_derivatives);
+/// Adds the messages of the neighbours of an atom of element `centre` to its T.
+#[inline(always)]
+pub(super) fn accumulate_messages(
+    layer: &Layer,
+    centre: usize,
+    own: OwnBonds,
+    messages: &[Lanes],
+    (density, slot): (&mut [Lanes], Slot),
+    work: &mut BondWork,
+) {
+    for (bonds, values, derivatives) in own.blocks(layer) {
+        let (v, r) = directions(bonds);
+        layer.harmonics.evaluate::<false>(&v, &mut work.harmonics, &mut work.gradients);
+        let pairs = pairs(layer, centre, bonds);
+        layer.radial.evaluate(bonds.len(), &pairs, &r, &mut work.radial, values, derivatives);
+        add_eight(layer, (bonds, values, &work.harmonics), messages, density, slot);
     }
+}
 
-    /// As [`Bonds::reverse`], from `N` ≤ 2 cotangents of T; adds to the cotangents of the neighbours' messages.
-    #[inline(always)]
-    pub fn reverse_messages<const N: usize>(
-        &self,
-        place: usize,
-        layer: &Layer,
-        (cotangent, slots): (&[Lanes], [Slot; N]),
-        messages: Messages,
-        work: &mut BondWork,
-        mut sink: impl FnMut(&Bond, [Vec3; N]),
-    ) {
-        for (bonds, range) in self.blocks(place, layer) {
-            let (v, r) = directions(bonds);
-            layer.harmonics.evaluate::<true>(&v, &mut work.harmonics, &mut work.gradients);
-            let block = Block {
-                bonds,
-                values: &self.values[range.clone()],
-                derivatives: &self.derivatives[range],
-                harmonics: &work.harmonics,
-                gradients: &work.gradients,
-            };
-            let mut gradients = [[ZERO; 3]; N];
-            for (n, slot) in slots.into_iter().enumerate() {
-                let cotangent = (cotangent, slot);
-                let (along, across) = slopes_of_eight(layer, &block, cotangent, messages.sent);
-                gradients[n] = bond_gradient(&v, &r, &along, &across);
-                return_messages(layer, &block, cotangent, messages.cotangents[n]);
-            }
-            for (b, bond) in bonds.iter().enumerate() {
-                sink(bond, gradients.map(|gradient| gradient.map(|axis| axis[b])));
-            }
+/// As [`super::bonds::reverse`], from `N` ≤ 2 cotangents of T; adds to the cotangents of the neighbours' messages, whose
+/// rows stand in `rows`.
+#[inline(always)]
+pub(super) fn reverse_messages<const N: usize>(
+    layer: &Layer,
+    own: OwnBonds,
+    messages: &[Lanes],
+    (cotangent, slots): (&[Lanes], [Slot; N]),
+    work: &mut BondWork,
+    gradients: [&mut [Vec3]; N],
+    (rows, returns): (&[u32], &mut Returns),
+) {
+    let blocks = own.blocks(layer).zip(rows.chunks(LANES));
+    for (k, ((bonds, values, derivatives), rows)) in blocks.enumerate() {
+        let (v, r) = directions(bonds);
+        layer.harmonics.evaluate::<true>(&v, &mut work.harmonics, &mut work.gradients);
+        let block =
+            Block { bonds, values, derivatives, harmonics: &work.harmonics, gradients: &work.gradients };
+        for (n, slot) in slots.into_iter().enumerate() {
+            let cotangent = (cotangent, slot);
+            let (along, across) = slopes_of_eight(layer, &block, cotangent, messages);
+            let of_eight = bond_gradient(&v, &r, &along, &across);
+            put(&of_eight, &mut gradients[n][k * LANES..][..bonds.len()]);
+            return_messages(layer, &block, cotangent, rows, &mut returns.cotangents[n]);
         }
     }
 }
@@ -160,12 +201,13 @@ fn return_messages(
     layer: &Layer,
     block: &Block,
     (cotangent, slot): (&[Lanes], Slot),
+    rows: &[u32],
     message_cotangents: &mut [Lanes],
 ) {
     let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
     let (passed, functions) = (layer.message.passed(), layer.harmonics.len());
-    for (b, bond) in block.bonds.iter().enumerate() {
-        let to = bond.neighbour as usize * passed * width;
+    for (b, row) in rows.iter().enumerate() {
+        let to = *row as usize * passed * width;
         for q in 0..passed {
             for c in 0..width {
                 let mut total = ZERO;

@@ -1,7 +1,11 @@
 //! The CALM feature z: the invariant basis, normalised, projected, with its norms.
 
+use std::ops::Range;
+
+use super::batches::Chunk;
 use super::instructions::Instructions;
 use super::matrix::{LANES, Lanes, Matrix, Rows, ZERO, add_product, horizontal_sum, scaled};
+use super::parts::{Divide, Layout, Parts};
 use super::weights::with_transpose;
 
 /// ε_0 of the paper (Methods, "Latent features and uncertainty models").
@@ -50,13 +54,52 @@ impl ProjectionMaps {
     }
 }
 
-/// What the reverse sweep needs of the forward one, for all atoms in the order of evaluation.
+/// What the reverse sweep needs of the forward one, for all atoms in the order of evaluation; and z.
 #[derive(Clone, Debug, Default)]
 pub(super) struct ProjectionWork {
     /// B̂ R before T, [n, lanes of d].
     projected: Vec<Lanes>,
     /// ‖B‖ and ‖B_k‖ of each layer, [n, 1 + layers].
     norms: Vec<f64>,
+    /// [n, D]
+    pub features: Vec<f64>,
+}
+
+/// The part of it that belongs to some atoms.
+pub(super) struct Projected<'a> {
+    projected: Parts<'a, Lanes>,
+    norms: Parts<'a, f64>,
+    features: Parts<'a, f64>,
+}
+
+impl ProjectionWork {
+    /// Makes room for `n` atoms.
+    pub fn resize(&mut self, projection: &Projection, n: usize) {
+        self.projected.resize(n * projection.lanes(), ZERO);
+        self.norms.resize(n * projection.n_norms(), 0.0);
+        self.features.resize(n * projection.feature_dimension(), 0.0);
+    }
+
+    /// To be divided.
+    pub fn parts(&mut self, projection: &Projection) -> Projected<'_> {
+        let even = Layout::Even;
+        Projected {
+            projected: Parts::new(even(projection.lanes()), 0, &mut self.projected),
+            norms: Parts::new(even(projection.n_norms()), 0, &mut self.norms),
+            features: Parts::new(even(projection.feature_dimension()), 0, &mut self.features),
+        }
+    }
+}
+
+impl Divide for Projected<'_> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let (projected, norms) = (self.projected.divide(chunk), self.norms.divide(chunk));
+        let features = self.features.divide(chunk);
+        (
+            Self { projected: projected.0, norms: norms.0, features: features.0 },
+            Self { projected: projected.1, norms: norms.1, features: features.1 },
+        )
+    }
 }
 
 impl Projection {
@@ -81,38 +124,33 @@ impl Projection {
         bytes
     }
 
-    /// z of atoms into `features` [n, D] from the bases of each layer, [n, lanes] in the given order of the atoms.
+    /// z of the atoms at some places from the bases of each layer, [places, lanes].
     #[inline(always)]
     pub(super) fn forward<'a>(
         &self,
-        order: &[u32],
+        places: &Range<usize>,
         bases: impl Iterator<Item = &'a [Lanes]>,
-        features: &mut Vec<f64>,
-        work: &mut ProjectionWork,
+        work: &mut Projected,
         instructions: Instructions,
     ) {
-        let (n, lanes, width) = (order.len(), self.lanes(), self.feature_dimension());
-        work.norms.clear();
-        work.norms.resize(n * self.n_norms(), SQUARE_FLOOR);
-        work.projected.clear();
-        work.projected.resize(n * lanes, ZERO);
+        let (n, lanes, width) = (places.len(), self.lanes(), self.feature_dimension());
+        let (all_norms, all_projected) = (work.norms.of(places), work.projected.of(places));
+        all_norms.fill(SQUARE_FLOOR);
+        all_projected.fill(ZERO);
         for (layer, (maps, bases)) in self.maps.iter().zip(bases).enumerate() {
             let of_atom = maps.forward.input_lanes();
-            for (norms, basis) in work.norms.chunks_exact_mut(self.n_norms()).zip(bases.chunks_exact(of_atom))
+            for (norms, basis) in all_norms.chunks_exact_mut(self.n_norms()).zip(bases.chunks_exact(of_atom))
             {
                 let square = dot(basis, basis);
                 norms[0] += square;
                 norms[layer + 1] += square;
             }
             let (from, to) = (Rows::of_atoms(n, of_atom), Rows::of_atoms(n, lanes));
-            maps.forward.multiply_add(bases, from, &mut work.projected, to, instructions);
+            maps.forward.multiply_add(bases, from, all_projected, to, instructions);
         }
-        work.norms.iter_mut().for_each(|square| *square = square.sqrt());
-        features.clear();
-        features.resize(n * width, 0.0);
-        let rows = work.projected.chunks_exact_mut(lanes).zip(work.norms.chunks_exact(self.n_norms()));
-        for (atom, (projected, norms)) in order.iter().zip(rows) {
-            let z = &mut features[*atom as usize * width..][..width];
+        all_norms.iter_mut().for_each(|square| *square = square.sqrt());
+        let rows = all_projected.chunks_exact_mut(lanes).zip(all_norms.chunks_exact(self.n_norms()));
+        for (z, (projected, norms)) in work.features.of(places).chunks_exact_mut(width).zip(rows) {
             let scale = if self.normalize { 1.0 / (norms[0] + NORM_FLOOR) } else { 1.0 };
             let projected = &mut projected.as_flattened_mut()[..self.dimension];
             for (z, p) in z.iter_mut().zip(projected) {
@@ -126,25 +164,22 @@ impl Projection {
         }
     }
 
-    /// The cotangents of the bases of each layer, [n, lanes] in the given order of the atoms, from that of z, [n, D].
-    /// `layers` gives each layer's bases and where to write.
+    /// The first half of the way back, for the atoms at some places: the cotangents of B̂ R, and the factors of B, from those
+    /// of z, `cotangent_of(place)`.
     ///
     /// B̄ = R p̄/(N + ε_0) + \[L̄/(N + ε_0) − (p̄ · p)/(N + ε_0)\] B/N with p = B̂ R, and in block k besides
     /// L̄_k/(N_k + ε_0) B/N_k.
     #[inline(always)]
-    pub(super) fn backward<'a>(
+    pub(super) fn begin_backward<'a>(
         &self,
-        order: &[u32],
-        layers: impl Iterator<Item = (&'a [Lanes], &'a mut Vec<Lanes>)>,
-        feature_cotangent: &[f64],
-        work: &mut ProjectionWork,
-        instructions: Instructions,
+        places: &Range<usize>,
+        cotangent_of: impl Fn(usize) -> &'a [f64],
+        work: &mut Projected,
     ) {
-        let (n, lanes, width) = (order.len(), self.lanes(), self.feature_dimension());
-        let rows = work.projected.chunks_exact_mut(lanes).zip(work.norms.chunks_exact_mut(self.n_norms()));
-        for (atom, (projected, norms)) in order.iter().zip(rows) {
-            let (of_projected, of_norms) =
-                feature_cotangent[*atom as usize * width..][..width].split_at(self.dimension);
+        let rows = work.projected.of(places).chunks_exact_mut(self.lanes());
+        let rows = rows.zip(work.norms.of(places).chunks_exact_mut(self.n_norms()));
+        for (place, (projected, norms)) in places.clone().zip(rows) {
+            let (of_projected, of_norms) = cotangent_of(place).split_at(self.dimension);
             let inverse = 1.0 / (norms[0] + NORM_FLOOR);
             let (scale, mut along) = (if self.normalize { inverse } else { 1.0 }, 0.0);
             for (c, p) in of_projected.iter().zip(projected.as_flattened_mut()) {
@@ -154,15 +189,29 @@ impl Projection {
             }
             self.norm_cotangents(norms, if self.normalize { along } else { 0.0 }, of_norms);
         }
-        for (layer, (maps, (bases, out))) in self.maps.iter().zip(layers).enumerate() {
-            let of_atom = maps.forward.input_lanes();
-            out.clear();
-            for (basis, factors) in bases.chunks_exact(of_atom).zip(work.norms.chunks_exact(self.n_norms())) {
-                out.extend(basis.iter().map(|b| scaled(factors[0] + factors[layer + 1], b)));
+    }
+
+    /// The second half: the cotangents of the bases of one layer, [places, lanes], into `out`.
+    #[inline(always)]
+    pub(super) fn backward(
+        &self,
+        layer: usize,
+        places: &Range<usize>,
+        bases: &[Lanes],
+        out: &mut [Lanes],
+        work: &mut Projected,
+        instructions: Instructions,
+    ) {
+        let (maps, norms) = (&self.maps[layer], work.norms.of(places));
+        let of_atom = maps.forward.input_lanes();
+        let rows = bases.chunks_exact(of_atom).zip(out.chunks_exact_mut(of_atom));
+        for ((basis, out), factors) in rows.zip(norms.chunks_exact(self.n_norms())) {
+            for (out, b) in out.iter_mut().zip(basis) {
+                *out = scaled(factors[0] + factors[layer + 1], b);
             }
-            let (from, to) = (Rows::of_atoms(n, lanes), Rows::of_atoms(n, of_atom));
-            maps.transposed.multiply_add(&work.projected, from, out, to, instructions);
         }
+        let (from, to) = (Rows::of_atoms(places.len(), self.lanes()), Rows::of_atoms(places.len(), of_atom));
+        maps.transposed.multiply_add(work.projected.of(places), from, out, to, instructions);
     }
 
     /// Puts in place of ‖B‖ and ‖B_k‖ the factors of B in its cotangent, the first for all layers.

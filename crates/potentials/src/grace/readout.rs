@@ -80,7 +80,7 @@ pub(super) struct ReadoutWork {
 
 impl Readout {
     /// Lanes of y.
-    fn density_lanes(&self) -> usize {
+    pub fn density_lanes(&self) -> usize {
         self.blocks.first().map_or(0, Block::lanes)
     }
 
@@ -167,16 +167,19 @@ impl Readout {
         work.cotangent.chunks_exact_mut(lanes).for_each(|cotangent| cotangent[0][0] += self.scale);
     }
 
-    /// ∂E/∂(W B) of one layer, a row for each atom, after [`Readout::evaluate`].
+    /// ∂E/∂(W B) of all layers after [`Readout::evaluate`], [atoms, layers, lanes].
     #[inline(always)]
-    pub fn density_cotangent(&self, layer: usize, out: &mut [Lanes], work: &ReadoutWork) {
-        out.copy_from_slice(&work.cotangent);
-        let Some(norm) = &self.blocks[layer].norm else { return };
+    pub fn density_cotangents(&self, out: &mut [Lanes], work: &ReadoutWork) {
         let lanes = self.density_lanes();
-        for (cotangent, densities) in
-            out.chunks_exact_mut(lanes).zip(work.densities[layer].chunks_exact(lanes))
-        {
-            norm.backward(densities.as_flattened(), cotangent.as_flattened_mut());
+        let rows = out.chunks_exact_mut(self.blocks.len() * lanes).zip(work.cotangent.chunks_exact(lanes));
+        for (atom, (row, cotangent)) in rows.enumerate() {
+            for (layer, out) in row.chunks_exact_mut(lanes).enumerate() {
+                out.copy_from_slice(cotangent);
+                if let Some(norm) = &self.blocks[layer].norm {
+                    let densities = &work.densities[layer][atom * lanes..][..lanes];
+                    norm.backward(densities.as_flattened(), out.as_flattened_mut());
+                }
+            }
         }
     }
 }

@@ -1,0 +1,111 @@
+//! Arrays with a part for each place, to be divided among threads.
+
+use std::ops::Range;
+
+use super::batches::Chunk;
+
+/// Something of which chunks of atoms have a part each.
+pub(super) trait Divide: Sized + Send {
+    /// What stands before a chunk, and the rest.
+    fn divide(self, chunk: &Chunk) -> (Self, Self);
+}
+
+/// How many numbers a place has.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Layout<'a> {
+    /// Each has as many.
+    Even(usize),
+    /// Those of a place begin at its offset, times a factor.
+    Ragged(&'a [usize], usize),
+}
+
+impl Layout<'_> {
+    #[inline(always)]
+    fn begin(&self, place: usize) -> usize {
+        match self {
+            Self::Even(n) => place * n,
+            Self::Ragged(offsets, n) => offsets[place] * n,
+        }
+    }
+}
+
+/// The numbers of some places.
+#[derive(Debug)]
+pub(super) struct Parts<'a, T> {
+    layout: Layout<'a>,
+    /// Where the array begins.
+    begin: usize,
+    numbers: &'a mut [T],
+}
+
+impl<'a, T> Parts<'a, T> {
+    /// Of an array that begins with the numbers of the place `first`.
+    #[inline(always)]
+    pub fn new(layout: Layout<'a>, first: usize, numbers: &'a mut [T]) -> Self {
+        Self { layout, begin: layout.begin(first), numbers }
+    }
+
+    /// Those of some places.
+    #[inline(always)]
+    pub fn of(&mut self, places: &Range<usize>) -> &mut [T] {
+        &mut self.numbers
+            [self.layout.begin(places.start) - self.begin..self.layout.begin(places.end) - self.begin]
+    }
+}
+
+impl<T: Send> Divide for Parts<'_, T> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let begin = self.layout.begin(chunk.places.start);
+        let Self { layout, begin: start, numbers } = self;
+        let (first, second) = numbers.split_at_mut(begin - start);
+        (Self { layout, begin: start, numbers: first }, Self { layout, begin, numbers: second })
+    }
+}
+
+/// One for each chunk.
+#[derive(Debug)]
+pub(super) struct OfChunks<'a, T> {
+    first: usize,
+    items: &'a mut [T],
+}
+
+impl<'a, T> OfChunks<'a, T> {
+    /// Of all chunks; there may be none at all.
+    pub fn new(items: &'a mut [T]) -> Self {
+        Self { first: 0, items }
+    }
+
+    /// That of the only chunk that is left.
+    pub fn only(self) -> Option<&'a mut T> {
+        self.items.first_mut()
+    }
+}
+
+impl<T: Send> Divide for OfChunks<'_, T> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let middle = (chunk.number - self.first).min(self.items.len());
+        let (first, second) = self.items.split_at_mut(middle);
+        (Self { first: self.first, items: first }, Self { first: chunk.number, items: second })
+    }
+}
+
+impl<A: Divide, B: Divide> Divide for (A, B) {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let (a, b) = (self.0.divide(chunk), self.1.divide(chunk));
+        ((a.0, b.0), (a.1, b.1))
+    }
+}
+
+impl<A: Divide, B: Divide, C: Divide> Divide for (A, B, C) {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let (a, b, c) = (self.0.divide(chunk), self.1.divide(chunk), self.2.divide(chunk));
+        ((a.0, b.0, c.0), (a.1, b.1, c.1))
+    }
+}
+
+impl<A: Divide> Divide for [A; 2] {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let [a, b] = self.map(|part| part.divide(chunk));
+        ([a.0, b.0], [a.1, b.1])
+    }
+}
