@@ -8,7 +8,7 @@ use atoms::Vec3;
 use super::batches::Placed;
 use super::bonds::{BondWork, Bonds};
 use super::evaluate::{Grace, add};
-use super::instructions::Pass;
+use super::instructions::{Instructions, Pass};
 use super::layer::Layer;
 use super::layer_work::{
     BackwardWork, Cotangents, Gradients, LayerWork, Trace, Traced, backward_bonds, backward_tape, forward,
@@ -18,6 +18,7 @@ use super::matrix::{Lanes, ZERO};
 use super::messages::Returns;
 use super::model::GraceModel;
 use super::parts::{Layout, OfChunks, Parts};
+use super::projection::{Projected, Projection};
 use super::readout::{Block, Readout, ReadoutWork};
 
 /// Work arrays of one thread.
@@ -268,8 +269,9 @@ impl Grace {
         let Some(projection) = &model.projection else { return };
         let work = work.parts(projection);
         self.threads.share(&self.batches.chunks, work, &|places, mut work| {
-            let bases = (0..layers.len()).map(|k| basis(&model.layers[k], &layers[k], places));
-            instructions.run(Project { act: || projection.forward(places, bases, &mut work, *instructions) });
+            let bases = |k: usize| basis(&model.layers[k], &layers[k], places);
+            let work = &mut work;
+            instructions.run(Project { projection, places, bases, work, instructions: *instructions });
         });
     }
 
@@ -281,7 +283,7 @@ impl Grace {
         let of_place = |place: usize| &cotangent[batches.order[place] as usize * width..][..width];
         let work = projected.parts(projection);
         self.threads.share(&batches.chunks, work, &|places, mut work| {
-            instructions.run(Project { act: || projection.begin_backward(places, of_place, &mut work) });
+            instructions.run(BeginProjectBack { projection, places, of_place, work: &mut work });
         });
         for (k, (work, layer)) in layers.iter_mut().zip(&model.layers).enumerate() {
             let (lanes, bases) = (layer.basis.lanes(), &work.trace.bases);
@@ -290,8 +292,9 @@ impl Grace {
             let work = (projected.parts(projection), out);
             self.threads.share(&batches.chunks, work, &|places, (mut work, mut out)| {
                 let (bases, out) = (part(bases, places, lanes), out.of(places));
-                let act = || projection.backward(k, places, bases, out, &mut work, *instructions);
-                instructions.run(Project { act });
+                let (work, instructions) = (&mut work, *instructions);
+                let pass = ProjectBack { projection, layer: k, places, bases, out, work, instructions };
+                instructions.run(pass);
             });
         }
     }
@@ -392,14 +395,52 @@ impl<const N: usize> Pass for Backward<'_, '_, '_, N> {
     }
 }
 
-/// One of the ways between bases and features.
-struct Project<F> {
-    act: F,
+/// From the bases of some atoms to their features.
+struct Project<'a, 'b, B> {
+    projection: &'a Projection,
+    places: &'a Range<usize>,
+    bases: B,
+    work: &'a mut Projected<'b>,
+    instructions: Instructions,
 }
 
-impl<F: FnOnce()> Pass for Project<F> {
+impl<'c, B: Fn(usize) -> &'c [Lanes]> Pass for Project<'_, '_, B> {
     #[inline(always)]
     fn run(self, _: bool) {
-        (self.act)();
+        self.projection.forward(self.places, self.bases, self.work, self.instructions);
+    }
+}
+
+/// From the cotangents of features to those of their projections.
+struct BeginProjectBack<'a, 'b, C> {
+    projection: &'a Projection,
+    places: &'a Range<usize>,
+    of_place: C,
+    work: &'a mut Projected<'b>,
+}
+
+impl<'c, C: Fn(usize) -> &'c [f64]> Pass for BeginProjectBack<'_, '_, C> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        self.projection.begin_backward(self.places, self.of_place, self.work);
+    }
+}
+
+/// From there to those of the bases of one layer.
+struct ProjectBack<'a, 'b> {
+    projection: &'a Projection,
+    layer: usize,
+    places: &'a Range<usize>,
+    bases: &'a [Lanes],
+    out: &'a mut [Lanes],
+    work: &'a mut Projected<'b>,
+    instructions: Instructions,
+}
+
+impl Pass for ProjectBack<'_, '_> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        let Self { projection, layer, places, bases, out, work, instructions } = self;
+        projection.backward(layer, places, bases, out, work, instructions);
     }
 }

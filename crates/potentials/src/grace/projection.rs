@@ -129,7 +129,7 @@ impl Projection {
     pub(super) fn forward<'a>(
         &self,
         places: &Range<usize>,
-        bases: impl Iterator<Item = &'a [Lanes]>,
+        bases: impl Fn(usize) -> &'a [Lanes],
         work: &mut Projected,
         instructions: Instructions,
     ) {
@@ -137,8 +137,8 @@ impl Projection {
         let (all_norms, all_projected) = (work.norms.of(places), work.projected.of(places));
         all_norms.fill(SQUARE_FLOOR);
         all_projected.fill(ZERO);
-        for (layer, (maps, bases)) in self.maps.iter().zip(bases).enumerate() {
-            let of_atom = maps.forward.input_lanes();
+        for (layer, maps) in self.maps.iter().enumerate() {
+            let (bases, of_atom) = (bases(layer), maps.forward.input_lanes());
             for (norms, basis) in all_norms.chunks_exact_mut(self.n_norms()).zip(bases.chunks_exact(of_atom))
             {
                 let square = dot(basis, basis);
