@@ -1,10 +1,12 @@
 //! The neighbour list.
 
 mod linked_cells;
+mod sites;
 
 use crate::cell::{self, Matrix3, Vec3};
 use crate::structure::{Structure, StructureError};
 use linked_cells::LinkedCells;
+use sites::Sites;
 
 /// More neighbours than this of one atom mean that atoms overlap or the cell has collapsed.
 const MOST_NEIGHBOURS: usize = 20_000;
@@ -51,13 +53,24 @@ pub struct NeighbourList {
     /// The structure the list was built for.
     reference: Option<Structure>,
     offsets: Vec<usize>,
+    /// Where the later neighbours of each atom begin.
+    later: Vec<usize>,
     neighbours: Vec<Neighbour>,
+    sites: Sites,
 }
 
 impl NeighbourList {
     /// An empty list that [`NeighbourList::update`] fills. `cutoff` and `skin` in Å.
     pub fn new(cutoff: f64, skin: f64) -> Self {
-        Self { cutoff, skin, reference: None, offsets: vec![0], neighbours: Vec::new() }
+        Self {
+            cutoff,
+            skin,
+            reference: None,
+            offsets: vec![0],
+            later: Vec::new(),
+            neighbours: Vec::new(),
+            sites: Sites::default(),
+        }
     }
 
     /// Makes the list valid for `structure`; true if it had to be built anew.
@@ -101,6 +114,30 @@ impl NeighbourList {
         &self.neighbours[self.offsets[i]..self.offsets[i + 1]]
     }
 
+    /// Those neighbours of atom `i` that come later than `i` itself in canonical order: over all atoms each pair once.
+    #[inline]
+    pub fn later(&self, i: usize) -> &[Neighbour] {
+        &self.neighbours[self.later[i]..self.offsets[i + 1]]
+    }
+
+    /// Where each neighbour [of](Self::of) atom `i` stands in [`NeighbourList::site_positions`].
+    #[inline]
+    pub fn sites_of(&self, i: usize) -> &[u32] {
+        &self.sites.of_neighbour[self.offsets[i]..self.offsets[i + 1]]
+    }
+
+    /// The same of its [later](Self::later) neighbours.
+    #[inline]
+    pub fn later_sites(&self, i: usize) -> &[u32] {
+        &self.sites.of_neighbour[self.later[i]..self.offsets[i + 1]]
+    }
+
+    /// Writes the positions of all atoms, Å, and after them those of all periodic images that are neighbours: each is
+    /// worked out once instead of once a bond.
+    pub fn site_positions(&self, structure: &Structure, positions: &mut Vec<Vec3>) {
+        self.sites.positions(structure, positions);
+    }
+
     /// Writes the bonds of atom `i` shorter than `cutoff` (Å, at most that of the list) into `bonds`.
     #[inline]
     pub fn bonds_within(&self, structure: &Structure, i: usize, cutoff: f64, bonds: &mut Vec<Bond>) {
@@ -117,7 +154,9 @@ impl NeighbourList {
     fn clear(&mut self) {
         self.reference = None;
         self.offsets.truncate(1);
+        self.later.clear();
         self.neighbours.clear();
+        self.sites.clear();
     }
 
     fn build(&mut self, structure: &Structure) -> Result<(), StructureError> {
@@ -144,6 +183,11 @@ impl NeighbourList {
             ends.push(found.len());
         }
         self.sort(&found, &ends);
+        for i in 0..structure.len() {
+            let own = Neighbour { atom: i as u32, image: [0; 3] };
+            self.later.push(self.offsets[i] + self.of(i).partition_point(|neighbour| *neighbour < own));
+        }
+        self.sites.number(&self.offsets, &self.neighbours);
         Ok(())
     }
 
@@ -206,15 +250,16 @@ pub fn shortest_distance(structure: &Structure, neighbours: &NeighbourList) -> O
     let mut shortest = None;
     let mut least = f64::INFINITY;
     for i in 0..neighbours.len() {
-        for neighbour in neighbours.of(i).iter().filter(|neighbour| neighbour.atom as usize >= i) {
-            let r = cell::norm(neighbour.displacement(structure, i));
-            if r < least {
-                least = r;
-                shortest = Some((i, neighbour.atom as usize, r));
+        for neighbour in neighbours.later(i) {
+            let d = neighbour.displacement(structure, i);
+            let squared = cell::dot(d, d);
+            if squared < least {
+                least = squared;
+                shortest = Some((i, neighbour.atom as usize));
             }
         }
     }
-    shortest
+    shortest.map(|(i, j)| (i, j, least.sqrt()))
 }
 
 /// F with h = h₀ F, for lattice vectors as rows; directions that do not repeat only turn with the others.

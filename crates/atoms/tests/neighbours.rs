@@ -84,6 +84,32 @@ fn is_complete(structure: &Structure, cutoff: f64, skin: f64) -> Result<(), Test
     for (i, expected) in all_pairs(structure, cutoff + skin).iter().enumerate() {
         prop_assert_eq!(list.of(i), expected.as_slice());
     }
+    each_pair_comes_once_and_stands_at_its_site(structure, &list)
+}
+
+fn each_pair_comes_once_and_stands_at_its_site(
+    structure: &Structure,
+    list: &NeighbourList,
+) -> Result<(), TestCaseError> {
+    let mut sites = vec![[9.0; 3]; 3];
+    list.site_positions(structure, &mut sites);
+    prop_assert_eq!(&sites[..structure.len()], &structure.positions[..]);
+    let mut pairs = 0;
+    for i in 0..structure.len() {
+        for (neighbour, site) in list.of(i).iter().zip(list.sites_of(i)) {
+            let d = atoms::cell::sub(sites[*site as usize], structure.positions[i]);
+            let off = atoms::cell::norm(atoms::cell::sub(d, neighbour.displacement(structure, i)));
+            prop_assert!(off < 1e-10, "site {} of atom {} is off by {} Å", site, i, off);
+        }
+        let own = Neighbour { atom: i as u32, image: [0; 3] };
+        let later: Vec<Neighbour> = list.of(i).iter().copied().filter(|neighbour| *neighbour > own).collect();
+        prop_assert_eq!(list.later(i), later.as_slice());
+        prop_assert!(list.sites_of(i).ends_with(list.later_sites(i)));
+        prop_assert_eq!(list.later_sites(i).len(), later.len());
+        pairs += later.len();
+    }
+    let directed: usize = (0..structure.len()).map(|i| list.of(i).len()).sum();
+    prop_assert_eq!(2 * pairs, directed);
     Ok(())
 }
 

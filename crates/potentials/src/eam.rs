@@ -2,11 +2,13 @@
 
 use std::path::Path;
 
-use atoms::cell::dot;
-use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
+use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
 
+use crate::eam_pairs::{AddForces, AddPairs, Bonds, Functions};
 use crate::eam_spline::{self, Cubic};
-use crate::pairs::{self, Elements};
+use crate::grace::Instructions;
+use crate::near_pairs::NearPairs;
+use crate::pairs::Elements;
 use crate::potential_file::PotentialFileError;
 use crate::setfl::{EamStyle, Setfl};
 
@@ -22,42 +24,20 @@ use crate::setfl::{EamStyle, Setfl};
 #[derive(Clone, Debug)]
 pub struct Eam {
     elements: Elements,
-    cutoff: f64,
-    /// 1 / spacing of r, 1/Å.
-    distance_scale: f64,
+    functions: Functions,
     /// 1 / spacing of ρ.
     density_scale: f64,
     /// F(ρ) of each element.
     embedding: Vec<Vec<Cubic>>,
-    /// `[host * elements + source]`.
-    functions: Vec<Vec<PairPiece>>,
-    densities: Vec<f64>,
+    instructions: Instructions,
+    near: NearPairs,
+    /// The element of each atom.
+    kinds: Vec<usize>,
+    /// Pair energy, eV, and density at each atom.
+    sums: Vec<[f64; 2]>,
     /// F′(ρ_i), eV per unit of density.
     embedding_slopes: Vec<f64>,
-    bonds: Vec<Bond>,
-}
-
-/// One interval of the functions of r for an ordered pair of elements, side by side in memory.
-#[derive(Clone, Copy, Debug)]
-struct PairPiece {
-    /// r φ(r), eV Å.
-    pair: Cubic,
-    /// ρ(r) of the source on the host.
-    density: Cubic,
-}
-
-/// A pair within the cutoff, kept until the densities are known.
-#[derive(Clone, Copy, Debug)]
-struct Bond {
-    i: u32,
-    j: u32,
-    d: Vec3,
-    /// φ′(r) / r, eV/Å².
-    pair_slope: f64,
-    /// ρ′(r) / r of j on i, 1/Å².
-    slope_on_i: f64,
-    /// ρ′(r) / r of i on j, 1/Å².
-    slope_on_j: f64,
+    bonds: Bonds,
 }
 
 impl Eam {
@@ -75,84 +55,27 @@ impl Eam {
     }
 
     fn new(tables: Setfl, style: EamStyle) -> Self {
-        let n = tables.species.len();
-        let mut functions = Vec::new();
-        for host in 0..n {
-            for source in 0..n {
-                let column = if style == EamStyle::FinnisSinclair { host } else { 0 };
-                let density = eam_spline::cubic_pieces(&tables.density[source][column]);
-                let pair = eam_spline::cubic_pieces(&tables.pair[host.max(source)][host.min(source)]);
-                let pieces = pair.into_iter().zip(density);
-                functions.push(pieces.map(|(pair, density)| PairPiece { pair, density }).collect());
-            }
-        }
         Self {
-            elements: Elements::new(tables.species),
-            cutoff: tables.cutoff,
-            distance_scale: 1.0 / tables.distance_spacing,
+            functions: Functions::new(&tables, style),
             density_scale: 1.0 / tables.density_spacing,
             embedding: tables.embedding.iter().map(|values| eam_spline::cubic_pieces(values)).collect(),
-            functions,
-            densities: Vec::new(),
+            elements: Elements::new(tables.species),
+            instructions: Instructions::best(),
+            near: NearPairs::default(),
+            kinds: Vec::new(),
+            sums: Vec::new(),
             embedding_slopes: Vec::new(),
-            bonds: Vec::new(),
-        }
-    }
-
-    /// Pair energies, the density at each atom, and the list of bonds.
-    fn add_pairs(&mut self, structure: &Structure, neighbours: &NeighbourList, out: &mut Evaluation) {
-        let n = self.elements.len();
-        self.bonds.clear();
-        self.densities.clear();
-        self.densities.resize(structure.len(), 0.0);
-        for i in 0..structure.len() {
-            let element_i = self.elements.index(structure.species[i]);
-            for neighbour in neighbours.of(i) {
-                if !pairs::represents_pair(i, neighbour) {
-                    continue;
-                }
-                let d = neighbour.displacement(structure, i);
-                let squared = dot(d, d);
-                if squared >= self.cutoff * self.cutoff {
-                    continue;
-                }
-                let j = neighbour.atom as usize;
-                let element_j = self.elements.index(structure.species[j]);
-                let r = squared.sqrt();
-                let on_i = &self.functions[element_i * n + element_j];
-                let (k, p) = eam_spline::locate(r * self.distance_scale, on_i.len());
-                let on_i = &on_i[k];
-                let on_j =
-                    if element_i == element_j { on_i } else { &self.functions[element_j * n + element_i][k] };
-                let per_r = 1.0 / r;
-                let phi = eam_spline::value(&on_i.pair, p) * per_r;
-                let slope = self.distance_scale * per_r;
-                self.densities[i] += eam_spline::value(&on_i.density, p);
-                self.densities[j] += eam_spline::value(&on_j.density, p);
-                out.atomic_energies[i] += 0.5 * phi;
-                out.atomic_energies[j] += 0.5 * phi;
-                self.bonds.push(Bond {
-                    i: i as u32,
-                    j: neighbour.atom,
-                    d,
-                    // φ = (r φ) / r, so φ′ = ((r φ)′ − φ) / r.
-                    pair_slope: (eam_spline::slope(&on_i.pair, p) * self.distance_scale - phi)
-                        * per_r
-                        * per_r,
-                    slope_on_i: eam_spline::slope(&on_i.density, p) * slope,
-                    slope_on_j: eam_spline::slope(&on_j.density, p) * slope,
-                });
-            }
+            bonds: Bonds::default(),
         }
     }
 
     /// F(ρ_i) into the energies, F′(ρ_i) into `embedding_slopes`.
-    fn embed(&mut self, structure: &Structure, out: &mut Evaluation) {
+    fn embed(&mut self, energies: &mut [f64]) {
         self.embedding_slopes.clear();
-        for (i, (species, density)) in structure.species.iter().zip(&self.densities).enumerate() {
-            let pieces = &self.embedding[self.elements.index(*species)];
+        for ((energy, kind), [pair_energy, density]) in energies.iter_mut().zip(&self.kinds).zip(&self.sums) {
+            let pieces = &self.embedding[*kind];
             let (k, p) = eam_spline::locate(density * self.density_scale, pieces.len());
-            out.atomic_energies[i] += eam_spline::value(&pieces[k], p);
+            *energy = pair_energy + eam_spline::value(&pieces[k], p);
             self.embedding_slopes.push(eam_spline::slope(&pieces[k], p) * self.density_scale);
         }
     }
@@ -160,7 +83,7 @@ impl Eam {
 
 impl Potential for Eam {
     fn cutoff(&self) -> f64 {
-        self.cutoff
+        self.functions.cutoff
     }
 
     fn species(&self) -> &[Species] {
@@ -173,17 +96,27 @@ impl Potential for Eam {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
-        self.elements.check(structure, neighbours, self.cutoff)?;
+        self.elements.check(structure, neighbours, self.functions.cutoff)?;
         out.reset(structure.len());
-        self.add_pairs(structure, neighbours, out);
-        self.embed(structure, out);
-        for bond in &self.bonds {
-            let (i, j) = (bond.i as usize, bond.j as usize);
-            let slope = bond.pair_slope
-                + self.embedding_slopes[i] * bond.slope_on_i
-                + self.embedding_slopes[j] * bond.slope_on_j;
-            pairs::add_pair_force(out, i, j, bond.d, slope);
-        }
+        self.elements.indices(structure, &mut self.kinds);
+        neighbours.site_positions(structure, &mut self.near.positions);
+        self.sums.clear();
+        self.sums.resize(structure.len(), [0.0; 2]);
+        self.bonds.clear();
+        self.instructions.run(AddPairs {
+            neighbours,
+            functions: &self.functions,
+            kinds: &self.kinds,
+            near: &mut self.near,
+            sums: &mut self.sums,
+            bonds: &mut self.bonds,
+        });
+        self.embed(&mut out.atomic_energies);
+        self.instructions.run(AddForces {
+            bonds: &self.bonds,
+            embedding_slopes: &self.embedding_slopes,
+            out,
+        });
         Ok(())
     }
 }

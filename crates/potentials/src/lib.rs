@@ -1,8 +1,10 @@
 //! Interatomic potentials: GRACE, EAM, Stillinger–Weber, ZBL.
 
 mod eam;
+mod eam_pairs;
 mod eam_spline;
 pub mod grace;
+mod near_pairs;
 mod pairs;
 mod potential_file;
 mod setfl;

@@ -37,6 +37,12 @@ impl Elements {
         usize::from(self.by_atomic_number[usize::from(species.atomic_number())])
     }
 
+    /// The places of all atoms' elements, which must be known.
+    pub(crate) fn indices(&self, structure: &Structure, indices: &mut Vec<usize>) {
+        indices.clear();
+        indices.extend(structure.species.iter().map(|species| self.index(*species)));
+    }
+
     /// Whether a potential of these elements and this cutoff (Å) can evaluate the structure.
     pub(crate) fn check(
         &self,

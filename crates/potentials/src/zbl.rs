@@ -81,10 +81,7 @@ impl Zbl {
         self.elements.check(structure, neighbours, self.outer)?;
         for i in 0..structure.len() {
             let row = self.elements.index(structure.species[i]) * self.elements.len();
-            for neighbour in neighbours.of(i) {
-                if !pairs::represents_pair(i, neighbour) {
-                    continue;
-                }
+            for neighbour in neighbours.later(i) {
                 let d = neighbour.displacement(structure, i);
                 let squared = dot(d, d);
                 if squared >= self.outer * self.outer {

@@ -19,7 +19,7 @@ enum Set {
 }
 
 /// Some work; what it calls must be `inline(always)`, or it is compiled for the baseline.
-pub(super) trait Pass {
+pub(crate) trait Pass {
     /// `wide` says whether there are 32 registers of eight numbers.
     fn run(self, wide: bool);
 }
@@ -49,7 +49,7 @@ impl Instructions {
 
     /// Runs a pass, compiled for these instructions.
     #[allow(unsafe_code)] // The processor has them: `best` has asked.
-    pub(super) fn run(self, pass: impl Pass) {
+    pub(crate) fn run(self, pass: impl Pass) {
         match self.0 {
             #[cfg(target_arch = "x86_64")]
             Set::Avx512 => unsafe { x86::with_avx512(pass) },

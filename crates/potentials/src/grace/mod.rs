@@ -62,6 +62,7 @@ mod weights;
 pub use error::GraceError;
 pub use evaluate::{Grace, PullBack};
 pub use instructions::Instructions;
+pub(crate) use instructions::Pass;
 pub use model::{Architecture, GraceDescription, GraceModel};
 pub use projection::Projection;
 pub use radial::RadialPath;
