@@ -9,20 +9,14 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use common::campaign::{Small, outcome_at};
-use common::place::{Place, are_single, on_store};
+use common::place::{LEAVE_LABEL, Place, are_single, on_store};
 use common::processes::{calculating, carrying_out, processes_in, signal, wait_until};
 
-/// Leaves no label before half a second is over, and starts what never ends by itself.
+/// Takes half a second, and starts what never ends by itself.
 const SCRIPT: &str = r#"
 sleep 1000 &
 setsid sleep 1000 &
 sleep 0.5
-awk '
-    NR == 1 { print; next }
-    NR == 2 { sub(/Properties=[^ ]*/, "Properties=species:S:1:pos:R:3:forces:R:3"); print $0 " energy=-1.5"; next }
-    { print $0, 0.25, 0, 0 }
-' structure.extxyz > unfinished
-mv unfinished label.extxyz
 "#;
 
 /// Programs may be killed so often: each time counts as a failure of a job, which has two rungs.
@@ -59,7 +53,7 @@ fn place(scratch: &Path) -> Place {
     );
     let small = Small { walkers: 1, steps: 120, ..Small::default() };
     let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
-    fs::write(place.path().join("label.sh"), SCRIPT).unwrap();
+    fs::write(place.path().join("label.sh"), SCRIPT.to_owned() + LEAVE_LABEL).unwrap();
     place
 }
 

@@ -8,24 +8,18 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::common::campaign::{Small, outcome_at};
-use crate::common::place::{Place, are_single, on_store};
+use crate::common::place::{LEAVE_LABEL, Place, are_single, on_store};
 use crate::common::processes::{carrying_out, processes_in, signal, wait_until};
 use crate::common::slurm::{ci, hold, slurm};
 use crate::common::{Running, succeed};
 
-/// Says that it has begun, and leaves a label when it may; takes 400 MB if it is told to.
+/// Says that it has begun, and ends when it may; takes 400 MB if it is told to.
 const SCRIPT: &str = r#"
 pwd >> $HERE/begun
 if [ -e $HERE/eat ]; then
     { head -c 400000000 /dev/zero; sleep 600; } | tail
 fi
 while [ ! -e $HERE/go ]; do sleep 0.1; done
-awk '
-    NR == 1 { print; next }
-    NR == 2 { sub(/Properties=[^ ]*/, "Properties=species:S:1:pos:R:3:forces:R:3"); print $0 " energy=-1.5"; next }
-    { print $0, 0.25, 0, 0 }
-' structure.extxyz > unfinished
-mv unfinished label.extxyz
 "#;
 
 /// A campaign whose labels are jobs of their own.
@@ -62,7 +56,7 @@ impl Jobs {
         let small = Small { walkers: 1, steps: 120, ..Small::default() };
         let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
         let script = SCRIPT.replace("$HERE", &home.path().display().to_string());
-        fs::write(place.path().join("label.sh"), script).unwrap();
+        fs::write(place.path().join("label.sh"), script + LEAVE_LABEL).unwrap();
         Self { place, home, _node }
     }
 
