@@ -4,6 +4,7 @@
 mod common;
 
 mod allocation;
+mod daemon;
 mod ends;
 mod found_again;
 mod jobs;

@@ -1,0 +1,84 @@
+//! The daemon of the node is killed while a label is made there.
+
+use std::fs;
+use std::path::Path;
+
+use crate::common::processes::{calculating, signal, wait_until};
+use crate::common::slurm::ci;
+use crate::jobs::{Jobs, only};
+
+/// Every process of the node that belongs to this job of Slurm: the daemon's own for the job, and what works in `scratch`.
+fn of_job(id: &str, scratch: &Path) -> Vec<u32> {
+    let numbers = fs::read_dir("/proc").unwrap().flatten();
+    let numbers = numbers.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
+    let belongs = |pid: &u32| {
+        let line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+        let place = fs::read_link(format!("/proc/{pid}/cwd")).unwrap_or_default();
+        line.starts_with(format!("slurmstepd: [{id}.").as_bytes()) || place.starts_with(scratch)
+    };
+    numbers.filter(belongs).collect()
+}
+
+/// Nothing of any calculation goes on.
+fn nothing_is_left(jobs: &Jobs, scratch: &Path) {
+    wait_until("every calculation is gone", || calculating(scratch).is_empty());
+    let over = ["COMPLETED", "FAILED", "CANCELLED", "NODE_FAIL"];
+    wait_until("every job is over", || jobs.jobs().iter().all(|[_, state, _]| over.contains(&&**state)));
+    assert!(jobs.jobs().iter().all(|[id, ..]| of_job(id, scratch).is_empty()));
+}
+
+/// What slurmd has started does not need it any more, and tells slurmctld itself that it has ended.
+#[test]
+fn a_label_outlives_the_daemon_of_its_node() {
+    let jobs = Jobs::new();
+    let scratch = jobs.home.path().canonicalize().unwrap().join("scratch");
+    let run = jobs.place.run();
+    let label = jobs.place.label(&["--wait", "2"]);
+    wait_until("a job is at work", || jobs.begun().len() == 1);
+    ci("kill-node");
+    ci("revive");
+    assert_eq!((jobs.jobs()[0][1].as_str(), jobs.begun().len()), ("RUNNING", 1));
+    ci("kill-node");
+    jobs.go();
+    wait_until("its label is read without the daemon", || jobs.place.jobs("labelled") == 1);
+    ci("revive");
+    let labels = jobs.finish(run, label);
+    // Of what was to begin meanwhile Slurm may have lost some: that never began.
+    let mut begun = jobs.begun();
+    begun.sort();
+    begun.dedup();
+    assert!(labels > 2 && begun.len() == labels && jobs.begun().len() == labels, "{}", jobs.place.said());
+    assert!(
+        jobs.attempts().iter().all(|attempt| attempt["class"].is_null() || attempt["class"] == "lost_node")
+    );
+    nothing_is_left(&jobs, &scratch);
+}
+
+/// As when the node loses its power: only slurmctld is left, and the node comes back knowing of nothing.
+#[test]
+fn a_label_whose_node_dies_is_made_again_once() {
+    let jobs = Jobs::new();
+    let scratch = jobs.home.path().canonicalize().unwrap().join("scratch");
+    let run = jobs.place.run();
+    let label = jobs.place.label(&["--wait", "2"]);
+    wait_until("a job is at work", || jobs.begun().len() == 1);
+    let id = jobs.jobs()[0][0].clone();
+    ci("kill-node");
+    wait_until("everything of the job is gone", || {
+        let left = of_job(&id, &scratch);
+        left.iter().for_each(|pid| signal(*pid, "KILL"));
+        left.is_empty()
+    });
+    // slurmctld misses the job when the node registers, but not one that has only just begun.
+    wait_until("Slurm knows that it is lost", || {
+        ci("kill-node");
+        ci("revive");
+        jobs.jobs()[0][1] != "RUNNING"
+    });
+    wait_until("it is begun again", || jobs.begun().len() == 2);
+    jobs.go();
+    let labels = jobs.finish(run, label);
+    assert_eq!(jobs.begun().len(), labels + 1, "{}", jobs.place.said());
+    only(&jobs, "lost_node");
+    nothing_is_left(&jobs, &scratch);
+}
