@@ -1,11 +1,13 @@
 //! GRACE measured: energy and forces, and with them γ and ∇Σγ, on one thread; against gracemaker's own calculator where
 //! `CALMWALK_GRACEMAKER_PYTHON` names a Python that has it.
 //!
-//! `cargo bench -p potentials --bench grace [-- MODEL…]`; the larger models are those of `CALMWALK_PEER_DATA`.
+//! `cargo bench -p potentials --bench grace [-- MODEL…]`; the larger models are those of `CALMWALK_PEER_DATA`. With `scale` before
+//! the models it is time and memory of crystals from 108 to 19 652 atoms.
 
 mod case;
 mod peak;
 mod peer;
+mod scale;
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -20,13 +22,18 @@ const EDGES: [usize; 2] = [3, 5];
 const SECONDS: f64 = 4.0;
 
 fn main() {
-    let wanted: Vec<String> =
+    let mut wanted: Vec<String> =
         std::env::args().skip(1).filter(|argument| !argument.starts_with('-')).collect();
-    let peak = peak::report();
+    let grow = wanted.first().is_some_and(|first| first == "scale");
+    if grow {
+        wanted.remove(0);
+    }
+    let peak = if grow { f64::NAN } else { peak::report() };
     for model in
         MODELS.iter().filter(|model| wanted.is_empty() || wanted.iter().any(|name| name == model.name))
     {
         match model.folder() {
+            Some(folder) if folder.join("kokkos.npz").exists() && grow => scale::report(model),
             Some(folder) if folder.join("kokkos.npz").exists() => report(model, peak),
             _ => println!("\n{}: not here (CALMWALK_PEER_DATA names the folder that has it)", model.name),
         }

@@ -1,0 +1,130 @@
+//! A biased walk of 108 atoms that benchmarks share.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use atoms::{Cell, Species, Structure};
+use calm::Mixture;
+use potentials::grace::GraceModel;
+use wire::messages::{Assignment, Outcome, Report};
+use wire::{CampaignId, Candidate, Origin, WalkId};
+use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
+use workers::walk::{WalkContext, advance};
+
+/// A turn of a walk whose bias is at work, which begins at the same checkpoint each time.
+#[derive(Clone)]
+pub struct Turn {
+    context: WalkContext,
+    mixture: Arc<Mixture>,
+    assignment: Assignment,
+    /// Where it begins.
+    pub structure: Structure,
+}
+
+impl Turn {
+    pub fn new(model: &Arc<GraceModel>, mixture: &Arc<Mixture>, seed: Structure) -> Self {
+        let context =
+            |threshold| WalkContext { model: Arc::clone(model), settings: Arc::new(settings(threshold)) };
+        let mut assignment = assignment(seed, u64::MAX);
+        // Any structure is a candidate, from the first that may be offered on.
+        let report = go(&context(1e-9), &assignment, mixture);
+        let Outcome::Candidate(candidate) = report.outcome else {
+            panic!("the walk has ended before its bias began: {:?}", report.outcome)
+        };
+        assignment.checkpoint = Some(report.checkpoint);
+        Self {
+            context: context(1e9),
+            mixture: Arc::clone(mixture),
+            assignment,
+            structure: candidate.structure,
+        }
+    }
+
+    /// Seconds a step, of so many.
+    pub fn seconds(&mut self, steps: u64) -> f64 {
+        self.assignment.until = EQUILIBRATION + 1 + steps;
+        let start = Instant::now();
+        let report = go(&self.context, &self.assignment, &self.mixture);
+        let seconds = start.elapsed().as_secs_f64();
+        assert_eq!(report.outcome, Outcome::Turn, "the walk makes all its steps");
+        seconds / steps as f64
+    }
+}
+
+fn go(context: &WalkContext, assignment: &Assignment, mixture: &Arc<Mixture>) -> Report<Candidate> {
+    advance(context, assignment, Arc::clone(mixture), || false, |_| {})
+}
+
+const EQUILIBRATION: u64 = 100;
+
+/// Those of the aluminium campaign, at constant volume, so that every call has as many bonds; a structure is a candidate
+/// if its largest grade is above `threshold`.
+fn settings(threshold: f64) -> WalkSettings {
+    WalkSettings {
+        rng_seed: 3,
+        temperature: 600.0,
+        thermostat: ThermostatKind::Langevin { friction: 0.01 },
+        time_step: None,
+        equilibration: EQUILIBRATION,
+        steps: 10_000_000,
+        tau: 0.15,
+        average_steps: 10,
+        volume_ramp: Some((1.0, 1.0)),
+        skin: 0.5,
+        collection: toml::from_str(&format!("rule = 'maximum_grade'\nthreshold = {threshold:e}"))
+            .expect("a rule"),
+        gap: 200,
+        declined_gap: 20,
+        zbl: Some((1.6, 2.4)),
+        guard: GuardSettings {
+            least_distance: 1.2,
+            least_distance_fraction: 0.5,
+            highest_temperature: 20_000.0,
+            refusals_in_a_row: 10,
+            most_returns: 3,
+            tau_factor: 0.5,
+            checkpoint_interval: 100,
+        },
+    }
+}
+
+fn assignment(seed_structure: Structure, until: u64) -> Assignment {
+    Assignment {
+        campaign: CampaignId([1; 16]),
+        walk: WalkId(0),
+        turn: 0,
+        origin: Origin::Biased,
+        random_walk: WalkId(0),
+        seed_structure,
+        checkpoint: None,
+        verdict: None,
+        until,
+        wanted: Vec::new(),
+        raised: 1.0,
+    }
+}
+
+/// fcc, 108 atoms, elements in turn; `edge` of the cube of four atoms in Å.
+pub fn crystal(elements: &[Species], edge: f64) -> Structure {
+    const SITES: [[f64; 3]; 4] = [[0.0; 3], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]];
+    const CELLS: usize = 3;
+    let mut positions = Vec::new();
+    for cell in 0..CELLS.pow(3) {
+        let corner = [cell / (CELLS * CELLS), cell / CELLS % CELLS, cell % CELLS];
+        positions
+            .extend(SITES.iter().map(|site| std::array::from_fn(|k| edge * (corner[k] as f64 + site[k]))));
+    }
+    let length = edge * CELLS as f64;
+    Structure {
+        species: (0..positions.len()).map(|k| elements[k % elements.len()]).collect(),
+        positions,
+        cell: Cell::orthorhombic(length, length, length),
+        periodic: [true; 3],
+    }
+}
+
+/// Lower quartile, median, upper quartile.
+pub fn quartiles(mut values: Vec<f64>) -> [f64; 3] {
+    values.sort_by(f64::total_cmp);
+    [1, 2, 3].map(|quarter| values[(values.len() - 1) * quarter / 4])
+}

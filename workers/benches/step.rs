@@ -1,0 +1,109 @@
+//! A whole biased step of a walk against the call of its potential alone: neighbour list, both gradients, mixture, bias, repulsion,
+//! integrator, guards and grades, over energies, forces, γ and ∇Σγ. Turns of the walk and as many calls are made in turn.
+//!
+//! `cargo bench -p workers --bench step`; grace1l_paper is in the folder that `CALMWALK_PEER_DATA` names.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use atoms::{Evaluation, NeighbourList, Structure};
+use calm::{Artifact, Grades, Mixture};
+use common::{Turn, crystal, quartiles};
+use potentials::grace::{Grace, GraceModel, PullBack};
+
+/// Times that a turn and as many calls are measured.
+const ROUNDS: usize = 11;
+
+fn main() {
+    let committed = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data/al_eam_1l");
+    let peer_data = std::env::var_os("CALMWALK_PEER_DATA").map(PathBuf::from);
+    let models = [
+        ("al_eam_1l", Some(committed), 4.05, 250),
+        ("grace1l_paper", peer_data.map(|data| data.join("grace/grace1l_paper")), 4.03, 25),
+    ];
+    for (name, folder, edge, steps) in models {
+        match folder {
+            Some(folder) if folder.exists() => report(name, &folder, edge, steps),
+            _ => println!("{name}: not here (CALMWALK_PEER_DATA names the folder that has it)"),
+        }
+    }
+}
+
+fn report(name: &str, folder: &Path, edge: f64, steps: u64) {
+    let model = Arc::new(GraceModel::load(&folder.join("kokkos.npz")).expect("a model"));
+    let mixture = Arc::new(Artifact::load_export(folder.join("kokkos.npz")).expect("a CALM mixture").mixture);
+    let mut turn = Turn::new(&model, &mixture, crystal(model.elements(), edge));
+    let mut call = Call::new(model, mixture, turn.structure.clone());
+    let (mut ratios, mut step_times, mut call_times) = (Vec::new(), Vec::new(), Vec::new());
+    for round in 0..=ROUNDS {
+        let (step, alone) = if round % 2 == 0 {
+            let step = turn.seconds(steps);
+            (step, call.seconds(steps))
+        } else {
+            let alone = call.seconds(steps);
+            (turn.seconds(steps), alone)
+        };
+        // The first round warms up.
+        if round > 0 {
+            ratios.push(step / alone);
+            step_times.push(1e3 * step);
+            call_times.push(1e3 * alone);
+        }
+    }
+    println!("{name}, {} atoms, turns of {steps} steps", turn.structure.len());
+    for (what, values) in [("step, ms", step_times), ("call, ms", call_times), ("step / call", ratios)] {
+        let [low, median, high] = quartiles(values);
+        println!("  {what}: {median:.4} ({low:.4} to {high:.4})");
+    }
+}
+
+/// The potential without a walk.
+struct Call {
+    grace: Grace,
+    mixture: Arc<Mixture>,
+    structure: Structure,
+    neighbours: NeighbourList,
+    elements: Vec<usize>,
+    grades: Grades,
+    cotangent: Vec<f64>,
+    pull_back: PullBack,
+    out: Evaluation,
+}
+
+impl Call {
+    fn new(model: Arc<GraceModel>, mixture: Arc<Mixture>, structure: Structure) -> Self {
+        let mut neighbours = NeighbourList::new(model.cutoff(), 0.5);
+        neighbours.update(&structure).expect("a crystal");
+        let elements = model.element_indices(&structure.species).expect("elements of the model");
+        Self {
+            grace: Grace::new(model),
+            mixture,
+            structure,
+            neighbours,
+            elements,
+            grades: Grades::default(),
+            cotangent: Vec::new(),
+            pull_back: PullBack::default(),
+            out: Evaluation::default(),
+        }
+    }
+
+    /// Of one call, among so many.
+    fn seconds(&mut self, calls: u64) -> f64 {
+        let start = Instant::now();
+        for _ in 0..calls {
+            self.grace.forward(&self.structure, &self.neighbours).expect("known elements");
+            let features = self.grace.features();
+            self.cotangent.resize(features.len(), 0.0);
+            let cotangent = Some(self.cotangent.as_mut_slice());
+            self.grades
+                .evaluate(&self.mixture, &self.elements, features, cotangent)
+                .expect("finite features");
+            self.grace.backward(Some(&self.cotangent), &mut self.out, &mut self.pull_back);
+        }
+        start.elapsed().as_secs_f64() / calls as f64
+    }
+}
