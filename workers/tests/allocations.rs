@@ -9,7 +9,7 @@ use atoms::{Structure, read_extxyz};
 use calm::Artifact;
 use md::{Dynamics, Langevin, Settings, State, Stream, Thermostat};
 use potentials::Zbl;
-use potentials::grace::GraceModel;
+use potentials::grace::{GraceModel, Precision, RadialPath};
 use workers::bias::BiasedPotential;
 
 thread_local! {
@@ -55,8 +55,14 @@ fn seed() -> Structure {
 
 #[test]
 fn a_biased_step_allocates_nothing() {
+    check(Precision::Double);
+    check(Precision::Mixed);
+}
+
+fn check(precision: Precision) {
     let structure = seed();
-    let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
+    let file = data("al_eam_1l/kokkos.npz");
+    let model = Arc::new(GraceModel::load_in(&file, precision, RadialPath::default()).unwrap());
     let mixture = Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture);
     let zbl = Zbl::new(&structure.species, 1.6, 2.4).unwrap();
     let mut potential = BiasedPotential::new(model, mixture, Some(zbl), 2, &structure.species).unwrap();
@@ -76,7 +82,7 @@ fn a_biased_step_allocates_nothing() {
         (0..3).for_each(|_| dynamics.step(&mut potential).unwrap());
         let before = ALLOCATIONS.get();
         (0..3).for_each(|_| dynamics.step(&mut potential).unwrap());
-        assert_eq!(ALLOCATIONS.get() - before, 0, "τ = {tau}");
+        assert_eq!(ALLOCATIONS.get() - before, 0, "{precision}, τ = {tau}");
         assert_eq!(potential.grades().unwrap().gamma.len(), dynamics.structure().len());
     }
 }

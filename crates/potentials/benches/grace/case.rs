@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, NeighbourList, Potential, Structure};
 use calm::{Artifact, Grades, Mixture};
-use potentials::grace::{Grace, GraceModel, PullBack};
+use potentials::grace::{Grace, GraceModel, Precision, PullBack, RadialPath};
 
 /// A model, and how gracemaker gets one like it.
 pub struct Model {
@@ -84,9 +84,11 @@ pub struct Case {
 }
 
 impl Case {
-    pub fn new(model: &Model, cells: usize) -> Self {
+    pub fn new(model: &Model, cells: usize, precision: Precision) -> Self {
         let folder = model.folder().expect("the model is here");
-        let weights = Arc::new(GraceModel::load(&folder.join("kokkos.npz")).expect("a model"));
+        let weights = GraceModel::load_in(&folder.join("kokkos.npz"), precision, RadialPath::default())
+            .expect("a model");
+        let weights = Arc::new(weights);
         let mixture = Artifact::load_export(folder.join("kokkos.npz")).expect("CALM arrays").mixture;
         let structure = crystal(&weights, cells, model.edge);
         let mut neighbours = NeighbourList::new(weights.cutoff(), 0.5);

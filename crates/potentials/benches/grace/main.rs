@@ -1,5 +1,5 @@
-//! GRACE measured: energy and forces, and with them γ and ∇Σγ, on one thread; against gracemaker's own calculator where
-//! `CALMWALK_GRACEMAKER_PYTHON` names a Python that has it.
+//! GRACE measured: energy and forces, and with them γ and ∇Σγ, on one thread, in double and in mixed precision; in double
+//! precision against gracemaker's own calculator where `CALMWALK_GRACEMAKER_PYTHON` names a Python that has it.
 //!
 //! `cargo bench -p potentials --bench grace [-- MODEL…]`; the larger models are those of `CALMWALK_PEER_DATA`. With `scale` before
 //! the models it is time and memory of crystals from 108 to 19 652 atoms.
@@ -14,6 +14,8 @@ use std::time::Instant;
 
 use atoms::Evaluation;
 use case::{Call, Case, MODELS, Model};
+use peer::Seconds;
+use potentials::grace::Precision;
 
 /// Atoms along an edge of the crystals, four in a cell: 108 and 500 atoms.
 const EDGES: [usize; 2] = [3, 5];
@@ -41,13 +43,20 @@ fn main() {
 }
 
 fn report(model: &Model, peak: f64) {
-    println!("\n{}", model.name);
-    let mut cases: Vec<Case> = EDGES.iter().map(|edge| Case::new(model, *edge)).collect();
-    let peers = peer::seconds(model, &cases);
+    for precision in [Precision::Double, Precision::Mixed] {
+        println!("\n{}, {precision} precision", model.name);
+        let cases: Vec<Case> = EDGES.iter().map(|edge| Case::new(model, *edge, precision)).collect();
+        let peers = (precision == Precision::Double).then(|| peer::seconds(model, &cases)).flatten();
+        report_cases(cases, peers.as_deref(), peak);
+    }
+}
+
+/// `peak` is that of double precision.
+fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, peak: f64) {
     for (k, case) in cases.iter_mut().enumerate() {
         let atoms = case.structure.len() as f64;
         let found = measure(case);
-        let peer = peers.as_ref().map(|peers| &peers[k]);
+        let peer = peers.map(|peers| &peers[k]);
         println!("  {atoms} atoms, {:.1} bonds an atom", case.bonds() as f64 / atoms);
         for (name, call, times) in
             [("energy, forces", Call::Plain, &found.plain), ("with γ and ∇Σγ", Call::Graded, &found.graded)]

@@ -1,5 +1,7 @@
 //! Whether time and memory grow in proportion to the number of atoms.
 
+use potentials::grace::Precision;
+
 use crate::case::{Case, Model};
 use crate::{measure, quantiles};
 
@@ -12,7 +14,7 @@ pub fn report(model: &Model) {
     println!("\n{}, growing crystals", model.name);
     for edge in EDGES {
         let before = resident_kilobytes();
-        let mut case = Case::new(model, edge);
+        let mut case = Case::new(model, edge, Precision::Double);
         let found = measure(&mut case);
         let atoms = case.structure.len() as f64;
         let [plain, graded] =

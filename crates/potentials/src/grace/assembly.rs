@@ -6,16 +6,18 @@ use npz::Archive;
 use super::error::{GraceError, mismatch};
 use super::globals::refuse_left_over;
 use super::layer::{Layer, LayerDraft};
-use super::model::{Architecture, GraceDescription, GraceModel};
+use super::model::{Architecture, GraceDescription};
+use super::network::Network;
 use super::networks::readout;
-use super::projection::{Projection, ProjectionMaps, rows_of_projection};
+use super::projection::{FeatureMap, Projection, ProjectionMaps, rows_of_projection};
+use super::vector::Vector;
 
 /// What a reader found out about a file.
-pub(super) struct Draft<'a> {
+pub(super) struct Draft<'a, V: Vector> {
     pub archive: &'a Archive,
     pub architecture: Architecture,
     pub elements: Vec<Species>,
-    pub layers: Vec<LayerDraft<'a>>,
+    pub layers: Vec<LayerDraft<'a, V>>,
     /// The layers in the order of their blocks of the basis B in the file.
     pub block_order: Vec<usize>,
     /// Number of densities y.
@@ -24,27 +26,40 @@ pub(super) struct Draft<'a> {
     pub weights: usize,
 }
 
-impl Draft<'_> {
+/// A whole model, as it was read.
+pub(super) struct Reading<V: Vector> {
+    pub network: Network<V>,
+    /// The largest r_c of all layers for centre and neighbour element, [n_elements²], Å.
+    pub pair_cutoffs: Vec<f64>,
+    pub description: GraceDescription,
+}
+
+impl<V: Vector> Draft<'_, V> {
     /// Reads what follows the layers, and refuses the file if any array is left over.
-    pub fn finish(mut self) -> Result<GraceModel, GraceError> {
+    pub fn finish(mut self) -> Result<Reading<V>, GraceError> {
         let archive = self.archive;
         let blocks = self.layers.iter().map(|layer| layer.block.clone()).collect();
         let readout = readout(archive, blocks, self.n_densities, self.elements.len(), &mut self.weights)?;
         let sources: Vec<_> = self.layers.iter().map(|layer| layer.graph.sources.clone()).collect();
-        let projection = projection(archive, &sources, &self.block_order)?;
+        let feature_map = feature_map(archive, &sources, &self.block_order)?;
         refuse_left_over(archive, self.architecture.number_of_layers())?;
-        let description = self.describe(basis_dimension(&sources), projection.as_ref())?;
+        let description = self.describe(basis_dimension(&sources), feature_map.as_ref())?;
+        let pairs = 0..self.elements.len() * self.elements.len();
+        let radial = self.layers.iter().map(|layer| &layer.radial);
+        let cutoff = |pair| radial.clone().map(|radial| radial.cutoff(pair)).fold(0.0, f64::max);
+        let pair_cutoffs = pairs.map(cutoff).collect();
         let messages: Vec<_> = self.layers.iter().skip(1).map(|layer| layer.message.from).collect();
         let messages = messages.into_iter().chain([None]);
-        let layers: Vec<Layer> =
+        let layers: Vec<Layer<V>> =
             self.layers.into_iter().zip(messages).map(|(layer, message)| layer.finish(message)).collect();
-        Ok(GraceModel { elements: self.elements, layers, readout, projection, description })
+        let network = Network { layers, readout, feature_map };
+        Ok(Reading { network, pair_cutoffs, description })
     }
 
     fn describe(
         &self,
         basis_dimension: usize,
-        projection: Option<&Projection>,
+        feature_map: Option<&FeatureMap<V>>,
     ) -> Result<GraceDescription, GraceError> {
         let radial = self.layers.iter().map(|layer| &layer.radial);
         let first = &self.layers[0];
@@ -58,7 +73,7 @@ impl Draft<'_> {
             channels: first.graph.density().channels,
             basis_functions: self.layers.iter().flat_map(|layer| layer.graph.source_names.clone()).collect(),
             basis_dimension,
-            feature_dimension: projection.map_or(0, Projection::feature_dimension),
+            feature_dimension: feature_map.map_or(0, |map| map.projection.feature_dimension()),
             weights: self.weights + self.layers.iter().map(|layer| layer.graph.weights).sum::<usize>(),
             radial_tables: radial
                 .flat_map(|radial| radial.tables())
@@ -74,22 +89,22 @@ fn basis_dimension(sources: &[Vec<(usize, usize)>]) -> usize {
 }
 
 /// The row of the projection matrix for each place of the padded basis of each layer.
-fn places(sources: &[Vec<(usize, usize)>], block_order: &[usize]) -> Vec<Vec<Option<usize>>> {
+fn places<V: Vector>(sources: &[Vec<(usize, usize)>], block_order: &[usize]) -> Vec<Vec<Option<usize>>> {
     let (mut firsts, mut first) = (vec![0; sources.len()], 0);
     for layer in block_order {
         firsts[*layer] = first;
         first += basis_dimension(&sources[*layer..=*layer]);
     }
-    firsts.into_iter().zip(sources).map(|(first, sources)| rows_of_projection(first, sources)).collect()
+    firsts.into_iter().zip(sources).map(|(first, sources)| rows_of_projection::<V>(first, sources)).collect()
 }
 
 /// The feature map, if the file holds one. `sources` are those of each layer's basis, `block_order` the layers in the
 /// order of their blocks in the file.
-fn projection(
+fn feature_map<V: Vector>(
     archive: &Archive,
     sources: &[Vec<(usize, usize)>],
     block_order: &[usize],
-) -> Result<Option<Projection>, GraceError> {
+) -> Result<Option<FeatureMap<V>>, GraceError> {
     if !archive.contains("uq_schema_version") {
         return Ok(None);
     }
@@ -112,12 +127,12 @@ fn projection(
             format!("{expected}, which its flags mean"),
         ));
     }
-    let layers = places(sources, block_order);
+    let layers = places::<V>(sources, block_order);
     let maps = layers.iter().map(|rows| ProjectionMaps::new(&matrix, dimension, rows)).collect();
     let blocks = block_order.to_vec();
     let density_scale = archive.scalar_or("uq_rp_density_scale", 1.0)? as f32;
     let projection =
-        Projection { matrix, dimension, normalize, density_channels, density_scale, asinh, blocks, maps };
+        Projection { matrix, dimension, normalize, density_channels, density_scale, asinh, blocks };
     archive.expect_count("uq_feature_dim", projection.feature_dimension())?;
-    Ok(Some(projection))
+    Ok(Some(FeatureMap { projection, maps }))
 }

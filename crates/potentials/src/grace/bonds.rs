@@ -7,9 +7,9 @@ use atoms::{Matrix3, NeighbourList, Structure, Vec3};
 
 use super::batches::Batches;
 use super::layer::Layer;
-use super::matrix::{LANES, Lanes, ZERO, add_product, add_scaled, product};
 use super::radial_network::RadialWork;
 use super::tape::Slot;
+use super::vector::{MOST_LANES, Number, Vector};
 
 /// Keeps r differentiable at d = 0, Å².
 const SQUARE_FLOOR: f64 = 1e-10;
@@ -33,7 +33,7 @@ pub(super) struct Bond {
 pub(super) struct Bonds {
     pub offsets: Vec<usize>,
     pub bonds: Vec<Bond>,
-    /// First block of eight bonds of each atom.
+    /// First block of bonds of each atom, as many as a vector has lanes.
     pub block_offsets: Vec<usize>,
     incoming_offsets: Vec<usize>,
     /// The bonds of which an atom is the neighbour, in ascending order.
@@ -42,9 +42,9 @@ pub(super) struct Bonds {
 
 impl Bonds {
     /// Collects the bonds that are shorter than the cutoff of their pair.
-    pub fn update(
+    pub fn update<V: Vector>(
         &mut self,
-        layer: &Layer,
+        layer: &Layer<V>,
         structure: &Structure,
         neighbours: &NeighbourList,
         elements: &[usize],
@@ -66,7 +66,7 @@ impl Bonds {
                     self.bonds.push(Bond { neighbour: batches.places[j], element: elements[j] as u32, d, r });
                 }
             }
-            blocks += (self.bonds.len() - self.offsets[place]).div_ceil(LANES);
+            blocks += (self.bonds.len() - self.offsets[place]).div_ceil(V::LANES);
             self.offsets.push(self.bonds.len());
             self.block_offsets.push(blocks);
         }
@@ -129,119 +129,128 @@ fn subtract(sum: &mut Vec3, x: &Vec3) {
     (0..3).for_each(|a| sum[a] -= x[a]);
 }
 
-/// Work arrays for eight bonds of one atom.
+/// Work arrays for one block of bonds.
 #[derive(Clone, Debug, Default)]
-pub(super) struct BondWork {
+pub(super) struct BondWork<V> {
     /// Y_lm, \[lm\]\[bond\]
-    pub harmonics: Vec<Lanes>,
+    pub harmonics: Vec<V>,
     /// ∂Y_lm/∂v
-    pub gradients: Vec<[Lanes; 3]>,
+    pub gradients: Vec<[V; 3]>,
     /// R_nl ζ_n, \[bond\]\[l\]\[channel\]
-    values: Vec<Lanes>,
+    values: Vec<V>,
     /// dR_nl/dr ζ_n
-    derivatives: Vec<Lanes>,
+    derivatives: Vec<V>,
+    /// R_nl Y_lm, \[bond\], in later layers.
+    pub terms: Vec<V>,
     pub radial: RadialWork,
 }
 
-impl BondWork {
-    pub fn new(layer: &Layer) -> Self {
-        let (functions, lanes) = (layer.harmonics.len(), LANES * layer.radial.output_lanes());
+impl<V: Vector> BondWork<V> {
+    pub fn new(layer: &Layer<V>) -> Self {
+        let (functions, lanes) = (layer.harmonics.len(), V::LANES * layer.radial.output_lanes());
         Self {
-            harmonics: vec![ZERO; functions],
-            gradients: vec![[ZERO; 3]; functions],
-            values: vec![ZERO; lanes],
-            derivatives: vec![ZERO; lanes],
+            harmonics: vec![V::ZERO; functions],
+            gradients: vec![[V::ZERO; 3]; functions],
+            values: vec![V::ZERO; lanes],
+            derivatives: vec![V::ZERO; lanes],
+            terms: vec![V::ZERO; V::LANES],
             radial: RadialWork::default(),
         }
     }
 
-    /// R_nl(r) ζ_n and derivatives of up to eight bonds, zero where there are fewer.
+    /// R_nl(r) ζ_n and derivatives of a block, zero where it is not full.
     #[inline(always)]
-    fn radial(&mut self, layer: &Layer, centre: usize, bonds: &[Bond], r: &Lanes) {
-        let (lanes, pairs) = (layer.radial.output_lanes(), pairs(layer, centre, bonds));
+    fn radial(&mut self, layer: &Layer<V>, centre: usize, bonds: &[Bond]) {
+        let (lanes, distances) = (layer.radial.output_lanes(), distances(layer, centre, bonds));
         let (values, derivatives) = (&mut self.values[..], &mut self.derivatives[..]);
-        layer.radial.evaluate(bonds.len(), &pairs, r, &mut self.radial, values, derivatives);
+        layer.radial.evaluate(&distances[..bonds.len()], &mut self.radial, values, derivatives);
         for (b, bond) in bonds.iter().enumerate() {
             let (row, embedding) =
                 (b * lanes..(b + 1) * lanes, &layer.message.constants[bond.element as usize][..]);
             multiply_channels(&mut values[row.clone()], embedding);
             multiply_channels(&mut derivatives[row], embedding);
         }
-        values[bonds.len() * lanes..].fill(ZERO);
-        derivatives[bonds.len() * lanes..].fill(ZERO);
+        values[bonds.len() * lanes..].fill(V::ZERO);
+        derivatives[bonds.len() * lanes..].fill(V::ZERO);
     }
 }
 
-/// Index of the pair of elements of up to eight bonds.
+/// Index of the pair of elements and distance of each bond, Å.
 #[inline(always)]
-pub(super) fn pairs(layer: &Layer, centre: usize, bonds: &[Bond]) -> [usize; LANES] {
-    let mut pairs = [0; LANES];
-    for (pair, bond) in pairs.iter_mut().zip(bonds) {
-        *pair = layer.radial.pair(centre, bond.element as usize);
+pub(super) fn distances<V: Vector>(
+    layer: &Layer<V>,
+    centre: usize,
+    bonds: &[Bond],
+) -> [(usize, f64); MOST_LANES] {
+    let mut distances = [(0, 0.0); MOST_LANES];
+    for (distance, bond) in distances.iter_mut().zip(bonds) {
+        *distance = (layer.radial.pair(centre, bond.element as usize), bond.r);
     }
-    pairs
+    distances
 }
 
 #[inline(always)]
-fn multiply_channels(orders: &mut [Lanes], embedding: &[Lanes]) {
+fn multiply_channels<V: Vector>(orders: &mut [V], embedding: &[V]) {
     let mut channels = embedding.iter().cycle();
     for (x, e) in orders.iter_mut().zip(&mut channels) {
-        *x = product(x, e);
+        *x = x.product(e);
     }
 }
 
-/// \[bond\]\[function\] → \[function\]\[bond\] for eight bonds.
+/// \[bond\]\[function\] → \[function\]\[bond\] for a block.
 #[inline(always)]
-fn transpose(rows: &[Lanes], columns: &mut [Lanes]) {
-    let lanes = rows.len() / LANES;
-    for (c, block) in columns.chunks_exact_mut(LANES).enumerate() {
-        for b in 0..LANES {
+fn transpose<V: Vector>(rows: &[V], columns: &mut [V]) {
+    let lanes = rows.len() / V::LANES;
+    for (c, block) in columns.chunks_exact_mut(V::LANES).enumerate() {
+        for b in 0..V::LANES {
             let row = &rows[b * lanes + c];
-            for k in 0..LANES {
+            for k in 0..V::LANES {
                 block[k][b] = row[k];
             }
         }
     }
 }
 
-/// v and r of up to eight bonds; v is zero where there are fewer.
+/// v and r of a block; v is zero where it is not full. Both are rounded after the division.
 #[inline(always)]
-pub(super) fn directions(bonds: &[Bond]) -> ([Lanes; 3], Lanes) {
-    let (mut v, mut r) = ([ZERO; 3], [1.0; LANES]);
+pub(super) fn directions<V: Vector>(bonds: &[Bond]) -> ([V; 3], V) {
+    let (mut ds, mut rs) = ([[0.0; MOST_LANES]; 3], [1.0; MOST_LANES]);
     for (b, bond) in bonds.iter().enumerate() {
-        r[b] = bond.r;
-        for (v, d) in v.iter_mut().zip(bond.d) {
-            v[b] = d;
+        rs[b] = bond.r;
+        for (axis, d) in ds.iter_mut().zip(bond.d) {
+            axis[b] = d;
         }
     }
-    for axis in &mut v {
-        for b in 0..LANES {
-            axis[b] /= r[b];
+    let (mut v, mut r) = ([V::ZERO; 3], V::ZERO);
+    for b in 0..V::LANES {
+        r[b] = V::Number::round(rs[b]);
+        for (v, d) in v.iter_mut().zip(&ds) {
+            v[b] = V::Number::round(d[b] / rs[b]);
         }
     }
     (v, r)
 }
 
 /// The bonds of one atom, with what the forward pass leaves of them for the reverse sweep.
-pub(super) struct OwnBonds<'a> {
+pub(super) struct OwnBonds<'a, V> {
     pub bonds: &'a [Bond],
     /// R_nl ζ_n, \[block\]\[l\]\[channel\]\[bond\]; in later layers R_nl, \[block\]\[bond\]\[l\]\[channel\].
-    pub values: &'a mut [Lanes],
+    pub values: &'a mut [V],
     /// The same of dR_nl/dr.
-    pub derivatives: &'a mut [Lanes],
+    pub derivatives: &'a mut [V],
 }
 
-impl<'a> OwnBonds<'a> {
-    /// Eight bonds at a time, with their values and derivatives.
+impl<'a, V: Vector> OwnBonds<'a, V> {
+    /// As many bonds at a time as a vector has lanes, with their values and derivatives.
     #[inline(always)]
     pub fn blocks(
         self,
-        layer: &Layer,
-    ) -> impl Iterator<Item = (&'a [Bond], &'a mut [Lanes], &'a mut [Lanes])> + use<'a> {
-        let lanes = LANES * layer.radial.output_lanes();
+        layer: &Layer<V>,
+    ) -> impl Iterator<Item = (&'a [Bond], &'a mut [V], &'a mut [V])> + use<'a, V> {
+        let lanes = V::LANES * layer.radial.output_lanes();
         let values = self.values.chunks_exact_mut(lanes).zip(self.derivatives.chunks_exact_mut(lanes));
         self.bonds
-            .chunks(LANES)
+            .chunks(V::LANES)
             .zip(values)
             .map(|(bonds, (values, derivatives))| (bonds, values, derivatives))
     }
@@ -249,20 +258,20 @@ impl<'a> OwnBonds<'a> {
 
 /// Adds the bonds of an atom of element `centre` to its density, \[lm\]\[channel\].
 #[inline(always)]
-pub(super) fn accumulate(
-    layer: &Layer,
+pub(super) fn accumulate<V: Vector>(
+    layer: &Layer<V>,
     centre: usize,
-    own: OwnBonds,
-    (density, slot): (&mut [Lanes], Slot),
-    work: &mut BondWork,
+    own: OwnBonds<V>,
+    (density, slot): (&mut [V], Slot),
+    work: &mut BondWork<V>,
 ) {
     for (bonds, values, derivatives) in own.blocks(layer) {
-        let (v, r) = directions(bonds);
-        layer.harmonics.evaluate::<false>(&v, &mut work.harmonics, &mut work.gradients);
-        work.radial(layer, centre, bonds, &r);
+        let (v, _) = directions(bonds);
+        layer.harmonics.evaluate::<V, false>(&v, &mut work.harmonics, &mut work.gradients);
+        work.radial(layer, centre, bonds);
         transpose(&work.values, values);
         transpose(&work.derivatives, derivatives);
-        add_eight(layer, density, slot, work);
+        add_bonds(layer, density, slot, work);
     }
 }
 
@@ -271,42 +280,42 @@ pub(super) fn accumulate(
 /// With c_lm = Σ_n Ā_lm,n R_nl ζ_n and c′_lm from dR/dr it is g v + (G − (G·v) v)/r, where
 /// g = Σ c′_lm Y_lm and G = Σ c_lm ∂Y_lm/∂v.
 #[inline(always)]
-pub(super) fn reverse<const N: usize>(
-    layer: &Layer,
-    own: OwnBonds,
-    (cotangent, slots): (&[Lanes], [Slot; N]),
-    work: &mut BondWork,
+pub(super) fn reverse<V: Vector, const N: usize>(
+    layer: &Layer<V>,
+    own: OwnBonds<V>,
+    (cotangent, slots): (&[V], [Slot; N]),
+    work: &mut BondWork<V>,
     mut gradients: [&mut [Vec3]; N],
 ) {
     for (block, (bonds, values, derivatives)) in own.blocks(layer).enumerate() {
         let (v, r) = directions(bonds);
-        layer.harmonics.evaluate::<true>(&v, &mut work.harmonics, &mut work.gradients);
+        layer.harmonics.evaluate::<V, true>(&v, &mut work.harmonics, &mut work.gradients);
         for (gradients, slot) in gradients.iter_mut().zip(slots) {
-            let of_eight = gradient_of_eight(layer, &v, &r, (cotangent, slot), (values, derivatives), work);
-            put(&of_eight, &mut gradients[block * LANES..][..bonds.len()]);
+            let of_block = gradient_of_bonds(layer, &v, &r, (cotangent, slot), (values, derivatives), work);
+            put(&of_block, &mut gradients[block * V::LANES..][..bonds.len()]);
         }
     }
 }
 
-/// The gradients of up to eight bonds, bond by bond.
+/// The gradients of a block, bond by bond.
 #[inline(always)]
-pub(super) fn put(of_eight: &[Lanes; 3], gradients: &mut [Vec3]) {
+pub(super) fn put<V: Vector>(of_block: &[V; 3], gradients: &mut [Vec3]) {
     for (b, gradient) in gradients.iter_mut().enumerate() {
-        *gradient = of_eight.map(|axis| axis[b]);
+        *gradient = of_block.map(|axis| axis[b].into());
     }
 }
 
-/// A_lm,n += Σ_b Y_lm(v_b) R_nl(r_b) ζ_n over eight bonds.
+/// A_lm,n += Σ_b Y_lm(v_b) R_nl(r_b) ζ_n over a block.
 #[inline(always)]
-fn add_eight(layer: &Layer, density: &mut [Lanes], slot: Slot, work: &BondWork) {
+fn add_bonds<V: Vector>(layer: &Layer<V>, density: &mut [V], slot: Slot, work: &BondWork<V>) {
     let (width, lanes) = (layer.density.width, layer.radial.output_lanes());
     for l in 0..=layer.harmonics.lmax() {
         for lm in l * l..(l + 1) * (l + 1) {
             let row = &mut density[slot.row(&layer.density, lm)..][..width];
             for (c, sum) in row.iter_mut().enumerate() {
                 let mut density = *sum;
-                for (y, values) in work.harmonics[lm].iter().zip(work.values.chunks_exact(lanes)) {
-                    add_scaled(&mut density, *y, &values[l * width + c]);
+                for (b, values) in work.values.chunks_exact(lanes).enumerate() {
+                    density.add_scaled(work.harmonics[lm][b], &values[l * width + c]);
                 }
                 *sum = density;
             }
@@ -315,40 +324,39 @@ fn add_eight(layer: &Layer, density: &mut [Lanes], slot: Slot, work: &BondWork) 
 }
 
 #[inline(always)]
-fn gradient_of_eight(
-    layer: &Layer,
-    v: &[Lanes; 3],
-    r: &Lanes,
-    (cotangent, slot): (&[Lanes], Slot),
-    (values, derivatives): (&[Lanes], &[Lanes]),
-    work: &BondWork,
-) -> [Lanes; 3] {
+fn gradient_of_bonds<V: Vector>(
+    layer: &Layer<V>,
+    v: &[V; 3],
+    r: &V,
+    (cotangent, slot): (&[V], Slot),
+    (values, derivatives): (&[V], &[V]),
+    work: &BondWork<V>,
+) -> [V; 3] {
     let (width, channels) = (layer.density.width, layer.density.channels);
-    let (mut along, mut across) = (ZERO, [ZERO; 3]);
-    let orders = values.chunks_exact(width * LANES).zip(derivatives.chunks_exact(width * LANES));
+    let (mut along, mut across) = (V::ZERO, [V::ZERO; 3]);
+    let orders = values.chunks_exact(width * V::LANES).zip(derivatives.chunks_exact(width * V::LANES));
     for (l, (values, derivatives)) in orders.enumerate() {
         for lm in l * l..(l + 1) * (l + 1) {
             let row = &cotangent[slot.row(&layer.density, lm)..][..width];
-            let (mut c, mut c_prime) = (ZERO, ZERO);
-            for ((a, value), derivative) in row.as_flattened()[..channels].iter().zip(values).zip(derivatives)
-            {
-                add_scaled(&mut c, *a, value);
-                add_scaled(&mut c_prime, *a, derivative);
+            let (mut c, mut c_prime) = (V::ZERO, V::ZERO);
+            for ((a, value), derivative) in V::flat(row)[..channels].iter().zip(values).zip(derivatives) {
+                c.add_scaled(*a, value);
+                c_prime.add_scaled(*a, derivative);
             }
-            add_product(&mut along, &work.harmonics[lm], &c_prime);
+            along.add_product(&work.harmonics[lm], &c_prime);
             for (across, gradient) in across.iter_mut().zip(&work.gradients[lm]) {
-                add_product(across, gradient, &c);
+                across.add_product(gradient, &c);
             }
         }
     }
     bond_gradient(v, r, &along, &across)
 }
 
-/// g v + (G − (G·v) v)/r of eight bonds, from g and G.
+/// g v + (G − (G·v) v)/r of a block, from g and G.
 #[inline(always)]
-pub(super) fn bond_gradient(v: &[Lanes; 3], r: &Lanes, along: &Lanes, across: &[Lanes; 3]) -> [Lanes; 3] {
-    let mut result = [ZERO; 3];
-    for b in 0..LANES {
+pub(super) fn bond_gradient<V: Vector>(v: &[V; 3], r: &V, along: &V, across: &[V; 3]) -> [V; 3] {
+    let mut result = [V::ZERO; 3];
+    for b in 0..V::LANES {
         let radial = across[0][b] * v[0][b] + across[1][b] * v[1][b] + across[2][b] * v[2][b];
         for axis in 0..3 {
             result[axis][b] = along[b] * v[axis][b] + (across[axis][b] - radial * v[axis][b]) / r[b];

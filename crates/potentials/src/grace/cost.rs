@@ -1,27 +1,26 @@
 //! How much arithmetic a call is.
 
-use super::evaluate::Grace;
+use super::evaluate::Evaluator;
 use super::layer::Layer;
 use super::product::Coupled;
 use super::radial_table::SUPPORT;
 use super::tape::Operation;
+use super::vector::Vector;
 use super::weights::Weights;
 
-impl Grace {
-    /// Multiply-adds of a call at the structure of the last one, for all atoms: energies and forces, or with them the
-    /// features and the pull-back of their cotangents. Counted are sums of products over channels, bonds and couplings
-    /// without padding and with tables of radial functions; spherical harmonics, norms and activations are not.
+impl<V: Vector> Evaluator<V> {
+    /// As [`super::Grace::multiply_adds`].
     pub fn multiply_adds(&self, with_features: bool) -> u64 {
-        let (model, cotangents) = (self.model(), 1 + u64::from(with_features));
+        let (network, cotangents) = (&*self.network, 1 + u64::from(with_features));
         let atoms = self.atomic_energies().len() as u64;
-        let maps = model.readout.blocks.iter().map(|block| &block.weights);
+        let maps = network.readout.blocks.iter().map(|block| &block.weights);
         let mut of_atom = 2 * maps.map(size).sum::<u64>();
-        of_atom += 2 * model.readout.layers.iter().map(|(layer, _)| layer.size()).sum::<u64>();
-        if let Some(projection) = model.projection().filter(|_| with_features) {
+        of_atom += 2 * network.readout.layers.iter().map(|(layer, _)| layer.size()).sum::<u64>();
+        if let Some(projection) = network.projection().filter(|_| with_features) {
             of_atom += 2 * projection.matrix.len() as u64;
         }
         let mut of_bonds = 0;
-        for (layer, bonds) in model.layers.iter().zip(self.bonds()) {
+        for (layer, bonds) in network.layers.iter().zip(self.bonds()) {
             of_bonds += bonds as u64 * of_bond(layer, cotangents);
             of_atom +=
                 layer.operations.iter().map(|operation| of_operation(operation, cotangents)).sum::<u64>();
@@ -30,11 +29,11 @@ impl Grace {
     }
 }
 
-fn size(weights: &Weights) -> u64 {
+fn size<V: Vector>(weights: &Weights<V>) -> u64 {
     weights.forward(0).size()
 }
 
-fn of_bond(layer: &Layer, cotangents: u64) -> u64 {
+fn of_bond<V: Vector>(layer: &Layer<V>, cotangents: u64) -> u64 {
     let (functions, channels) = (layer.harmonics.len() as u64, layer.density.channels as u64);
     let radial = 2 * SUPPORT as u64 * (layer.harmonics.lmax() as u64 + 1) * channels;
     let (components, passed) = (layer.message.components as u64, layer.message.passed() as u64);
@@ -46,8 +45,8 @@ fn of_bond(layer: &Layer, cotangents: u64) -> u64 {
     radial + forward + cotangents * backward * functions * channels
 }
 
-fn of_operation(operation: &Operation, cotangents: u64) -> u64 {
-    let terms = |coupled: &[Coupled]| coupled.iter().map(|c| c.terms.len() as u64).sum::<u64>();
+fn of_operation<V: Vector>(operation: &Operation<V>, cotangents: u64) -> u64 {
+    let terms = |coupled: &[Coupled<V>]| coupled.iter().map(|c| c.terms.len() as u64).sum::<u64>();
     match operation {
         Operation::Linear(linear) => {
             let parts = linear.parts.iter().map(|part| part.from.len() as u64 * size(&part.weights));

@@ -3,11 +3,11 @@
 use super::equivariant_norm::EquivariantNorm;
 use super::error::{GraceError, mismatch};
 use super::graph::Graph;
-use super::matrix::to_lanes;
 use super::tape::{Linear, LinearPart, Operation, Tensor};
+use super::vector::{Vector, to_lanes};
 use super::weights::Weights;
 
-impl Graph<'_> {
+impl<V: Vector> Graph<'_, V> {
     /// The product of left and right whose channels have been mixed with weights U and V, which are those of the
     /// group of each component.
     pub fn mixed_product(&mut self, name: &str, left: Tensor, right: Tensor) -> Result<Tensor, GraceError> {

@@ -1,12 +1,12 @@
 //! The normalisation of an equivariant tensor before it is sent to neighbours.
 
-use super::matrix::{LANES, Lanes, add_product, add_scaled, horizontal_sum, product, scaled};
 use super::tape::{Slot, Tensor};
+use super::vector::{Number, Vector};
 
 /// y_w,n = a_w,n x′_w,n / √(mean_n Σ_w d_w x′² + ε), where x′ is x, or x without its mean over channels in the
 /// components that do not change under rotation.
 #[derive(Clone, Debug)]
-pub(super) struct EquivariantNorm {
+pub(super) struct EquivariantNorm<V> {
     /// x
     pub from: Tensor,
     /// y, of the same shape
@@ -16,15 +16,15 @@ pub(super) struct EquivariantNorm {
     /// d
     pub degree_weights: Vec<f64>,
     /// a, \[w\]\[channel\], zero in the padding.
-    pub affine: Vec<Lanes>,
+    pub affine: Vec<V>,
     /// ε
     pub floor: f64,
 }
 
-impl EquivariantNorm {
+impl<V: Vector> EquivariantNorm<V> {
     /// Rows of x with the mean over channels that is taken away.
     #[inline(always)]
-    fn rows<'a>(&'a self, x: &'a [Lanes], slot: Slot) -> impl Iterator<Item = (usize, &'a [Lanes], f64)> {
+    fn rows<'a>(&'a self, x: &'a [V], slot: Slot) -> impl Iterator<Item = (usize, &'a [V], f64)> {
         self.centred.iter().enumerate().map(move |(w, centred)| {
             let row = &x[slot.row(&self.from, w)..][..self.from.width];
             (w, row, centred * self.mean(row))
@@ -33,44 +33,44 @@ impl EquivariantNorm {
 
     /// Mean over channels.
     #[inline(always)]
-    fn mean(&self, row: &[Lanes]) -> f64 {
-        row.iter().map(horizontal_sum).sum::<f64>() / self.from.channels as f64
+    fn mean(&self, row: &[V]) -> f64 {
+        row.iter().map(|x| x.horizontal_sum().into()).sum::<f64>() / self.from.channels as f64
     }
 
     /// x′ of lane `c`, zero in the padding.
     #[inline(always)]
-    fn centre(&self, x: &Lanes, mean: f64, c: usize) -> Lanes {
+    fn centre(&self, x: &V, mean: f64, c: usize) -> V {
         let mut out = *x;
-        let filled = (self.from.channels - c * LANES).min(LANES);
-        out[..filled].iter_mut().for_each(|x| *x -= mean);
+        let (mean, filled) = (V::Number::round(mean), (self.from.channels - c * V::LANES).min(V::LANES));
+        (0..filled).for_each(|k| out[k] -= mean);
         out
     }
 
     /// (mean_n Σ_w d_w x′² + ε)^(−1/2)
     #[inline(always)]
-    fn inverse(&self, tape: &[Lanes], slot: Slot) -> f64 {
+    fn inverse(&self, tape: &[V], slot: Slot) -> f64 {
         let mut square = 0.0;
         for (w, row, mean) in self.rows(tape, slot) {
-            let mut sum = [0.0; LANES];
+            let mut sum = V::ZERO;
             for (c, x) in row.iter().enumerate() {
                 let x = self.centre(x, mean, c);
-                add_product(&mut sum, &x, &x);
+                sum.add_product(&x, &x);
             }
-            square += self.degree_weights[w] * horizontal_sum(&sum);
+            square += self.degree_weights[w] * sum.horizontal_sum().into();
         }
         1.0 / (square / self.from.channels as f64 + self.floor).sqrt()
     }
 
     #[inline(always)]
-    pub fn forward(&self, atoms: usize, tape: &mut [Lanes]) {
+    pub fn forward(&self, atoms: usize, tape: &mut [V]) {
         let (before, out) = tape.split_at_mut(self.to.start * atoms);
         for slot in (0..atoms).map(|slot| Slot { slot, slots: atoms }) {
             let inverse = self.inverse(before, slot);
             for (w, row, mean) in self.rows(before, slot) {
                 let first = slot.row(&self.to, w) - self.to.start * atoms;
                 for (c, x) in row.iter().enumerate() {
-                    let x = scaled(inverse, &self.centre(x, mean, c));
-                    out[first + c] = product(&x, &self.affine[w * self.to.width + c]);
+                    let x = self.centre(x, mean, c).scaled(V::Number::round(inverse));
+                    out[first + c] = x.product(&self.affine[w * self.to.width + c]);
                 }
             }
         }
@@ -79,7 +79,7 @@ impl EquivariantNorm {
     /// Adds to the cotangents of x: with the inverse root i,
     /// x̄′ = i a ȳ − i³ d_w x′/n_channels Σ a ȳ x′, from which the mean over channels is taken away as it was from x.
     #[inline(always)]
-    pub fn backward<const N: usize>(&self, atoms: usize, tape: &[Lanes], cotangent: &mut [Lanes]) {
+    pub fn backward<const N: usize>(&self, atoms: usize, tape: &[V], cotangent: &mut [V]) {
         for k in 0..N * atoms {
             let of_tape = Slot { slot: k % atoms, slots: atoms };
             self.backward_one(tape, of_tape, cotangent, Slot { slot: k, slots: N * atoms });
@@ -87,26 +87,27 @@ impl EquivariantNorm {
     }
 
     #[inline(always)]
-    fn backward_one(&self, tape: &[Lanes], of_tape: Slot, cotangent: &mut [Lanes], slot: Slot) {
+    fn backward_one(&self, tape: &[V], of_tape: Slot, cotangent: &mut [V], slot: Slot) {
         let inverse = self.inverse(tape, of_tape);
-        let mut along = [0.0; LANES];
+        let mut along = V::ZERO;
         for (w, row, mean) in self.rows(tape, of_tape) {
             let out = &cotangent[slot.row(&self.to, w)..];
             for (c, x) in row.iter().enumerate() {
-                let ay = product(&out[c], &self.affine[w * self.to.width + c]);
-                add_product(&mut along, &ay, &self.centre(x, mean, c));
+                let ay = out[c].product(&self.affine[w * self.to.width + c]);
+                along.add_product(&ay, &self.centre(x, mean, c));
             }
         }
-        let along = horizontal_sum(&along) * inverse.powi(3) / self.from.channels as f64;
+        let along = along.horizontal_sum().into() * inverse.powi(3) / self.from.channels as f64;
         for (w, row, mean) in self.rows(tape, of_tape) {
             let (first, out) = (slot.row(&self.from, w), slot.row(&self.to, w));
-            let mut sum = 0.0;
+            let mut sum = 0.0_f64;
             for (c, x) in row.iter().enumerate() {
-                let ay = product(&cotangent[out + c], &self.affine[w * self.to.width + c]);
-                let mut of_x = scaled(inverse, &ay);
-                add_scaled(&mut of_x, -along * self.degree_weights[w], &self.centre(x, mean, c));
-                sum += horizontal_sum(&of_x);
-                add_scaled(&mut cotangent[first + c], 1.0, &of_x);
+                let ay = cotangent[out + c].product(&self.affine[w * self.to.width + c]);
+                let mut of_x = ay.scaled(V::Number::round(inverse));
+                let factor = V::Number::round(-along * self.degree_weights[w]);
+                of_x.add_scaled(factor, &self.centre(x, mean, c));
+                sum += of_x.horizontal_sum().into();
+                cotangent[first + c].add(&of_x);
             }
             let mean = self.centred[w] * sum / self.from.channels as f64;
             for (c, x) in cotangent[first..first + self.from.width].iter_mut().enumerate() {

@@ -2,16 +2,17 @@
 
 use std::sync::{Arc, Mutex};
 
-use atoms::{Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
+use atoms::{Evaluation, Matrix3, NeighbourList, PotentialError, Structure, Vec3};
 
 use super::batches::Batches;
 use super::instructions::Instructions;
 use super::layer_work::LayerWork;
-use super::matrix::Lanes;
 use super::model::GraceModel;
+use super::network::Network;
 use super::passes::Scratch;
 use super::projection::ProjectionWork;
 use super::threads::Threads;
+use super::vector::Vector;
 
 /// The derivatives of a function H of the features: its cotangent ∂H/∂z pulled back to the atoms.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -31,31 +32,30 @@ impl PullBack {
     }
 }
 
-/// A GRACE model with its work arrays; after the first step it allocates no more.
-///
-/// [`Grace::forward`] gives energies and features, then [`Grace::backward`] the derivatives at the same
-/// structure. Results do not depend on the number of threads.
+/// A network with its work arrays.
 #[derive(Debug)]
-pub struct Grace {
-    pub(super) model: Arc<GraceModel>,
+pub(super) struct Evaluator<V: Vector> {
+    model: Arc<GraceModel>,
+    /// That of the model.
+    pub(super) network: Arc<Network<V>>,
     pub(super) instructions: Instructions,
     pub(super) threads: Threads,
     /// Element of each atom.
     elements: Vec<usize>,
     pub(super) batches: Batches,
-    pub(super) layers: Vec<LayerWork>,
+    pub(super) layers: Vec<LayerWork<V>>,
     /// One for each thread.
-    pub(super) scratch: Vec<Mutex<Scratch>>,
+    pub(super) scratch: Vec<Mutex<Scratch<V>>>,
     // In the order of evaluation:
     /// E, [n]
     pub(super) energies: Vec<f64>,
     /// ∂E/∂(W B), [n, layers, lanes]
-    pub(super) density_cotangents: Vec<Lanes>,
+    pub(super) density_cotangents: Vec<V>,
     /// −∂E/∂r and −∂H/∂r, [n]
     pub(super) forces: [Vec<Vec3>; 2],
     /// ∂E/∂ε and ∂H/∂ε of each chunk.
     pub(super) virials: Vec<[Matrix3; 2]>,
-    pub(super) projection: ProjectionWork,
+    pub(super) projection: ProjectionWork<V>,
     // In the order of the structure:
     atomic_energies: Vec<f64>,
     features: Vec<f64>,
@@ -63,21 +63,20 @@ pub struct Grace {
     numbers: Vec<u32>,
 }
 
-impl Grace {
-    /// An evaluator of `model` on the calling thread; nothing is computed yet.
-    pub fn new(model: Arc<GraceModel>) -> Self {
-        Self::with(model, Instructions::best(), Threads::default())
-    }
-
-    /// As [`Grace::new`], with these vector instructions and threads; results do not depend on them.
-    pub fn with(model: Arc<GraceModel>, instructions: Instructions, threads: Threads) -> Self {
-        let scratch = (0..threads.count()).map(|_| Mutex::new(Scratch::new(&model))).collect();
+impl<V: Vector> Evaluator<V> {
+    pub fn new(
+        model: Arc<GraceModel>,
+        network: Arc<Network<V>>,
+        instructions: Instructions,
+        threads: Threads,
+    ) -> Self {
+        let scratch = (0..threads.count()).map(|_| Mutex::new(Scratch::new(&*network))).collect();
         Self {
             instructions,
             threads,
             elements: Vec::new(),
             batches: Batches::default(),
-            layers: model.layers.iter().map(|_| LayerWork::default()).collect(),
+            layers: network.layers.iter().map(|_| LayerWork::default()).collect(),
             scratch,
             energies: Vec::new(),
             density_cotangents: Vec::new(),
@@ -88,20 +87,15 @@ impl Grace {
             features: Vec::new(),
             numbers: Vec::new(),
             model,
+            network,
         }
     }
 
-    /// The weights.
     pub fn model(&self) -> &Arc<GraceModel> {
         &self.model
     }
 
-    /// Computes atomic energies and features z of `structure`.
-    ///
-    /// `neighbours` must be up to date for it.
-    ///
-    /// # Errors
-    /// An element the model does not know, or a neighbour list shorter than [`GraceModel::cutoff`].
+    /// As [`super::Grace::forward`].
     pub fn forward(
         &mut self,
         structure: &Structure,
@@ -129,8 +123,8 @@ impl Grace {
             return Err(PotentialError::Cutoff { list: neighbours.cutoff(), needed });
         }
         self.model.write_element_indices(&structure.species, &mut self.elements)?;
-        self.batches.update(&self.elements, self.model.tape_bytes());
-        for (work, layer) in self.layers.iter_mut().zip(&self.model.layers) {
+        self.batches.update(&self.elements, self.network.tape_bytes());
+        for (work, layer) in self.layers.iter_mut().zip(&self.network.layers) {
             work.bonds.update(layer, structure, neighbours, &self.elements, &self.batches);
             work.begin(layer, &self.batches, &self.elements, &mut self.numbers);
         }
@@ -138,7 +132,7 @@ impl Grace {
         Ok(())
     }
 
-    /// Energy of each atom at the last [`Grace::forward`], [n], eV.
+    /// As [`super::Grace::atomic_energies`].
     pub fn atomic_energies(&self) -> &[f64] {
         &self.atomic_energies
     }
@@ -148,17 +142,12 @@ impl Grace {
         self.layers.iter().map(|work| work.bonds.bonds.len())
     }
 
-    /// Features z at the last [`Grace::forward`], [n, D] row-major; empty for a model without them.
+    /// As [`super::Grace::features`].
     pub fn features(&self) -> &[f64] {
         &self.features
     }
 
-    /// The derivatives at the structure of the last [`Grace::forward`], in one reverse sweep: of the
-    /// energy into `energy`, and, where a cotangent ∂H/∂z [n, D] is given, of H into `pull_back`
-    /// (zero otherwise).
-    ///
-    /// # Panics
-    /// If the cotangent is not as long as [`Grace::features`].
+    /// As [`super::Grace::backward`].
     pub fn backward(
         &mut self,
         feature_cotangent: Option<&[f64]>,
@@ -168,7 +157,7 @@ impl Grace {
         if let Some(cotangent) = feature_cotangent {
             assert_eq!(cotangent.len(), self.features.len(), "a cotangent for every feature");
         }
-        let cotangent = feature_cotangent.filter(|_| self.model.projection.is_some());
+        let cotangent = feature_cotangent.filter(|_| self.network.feature_map.is_some());
         self.begin_derivatives();
         // There are no bonds of a structure that was refused.
         let layers = if self.batches.order.is_empty() { 0 } else { self.layers.len() };
@@ -192,6 +181,21 @@ impl Grace {
         (0..last).rev().for_each(|k| self.backward_layer::<1>(k));
     }
 
+    /// As [`super::Grace`] as a potential.
+    pub fn evaluate(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        self.take(structure, neighbours)?;
+        self.begin_derivatives();
+        self.threads.clone().run(|| self.plain());
+        self.put_energies();
+        self.put_forces(out);
+        Ok(())
+    }
+
     // From the order of evaluation to that of the structure.
 
     fn put_energies(&mut self) {
@@ -202,7 +206,7 @@ impl Grace {
     }
 
     fn put_features(&mut self) {
-        let Some(projection) = &self.model.projection else { return };
+        let Some(projection) = self.network.projection() else { return };
         let width = projection.feature_dimension();
         self.features.resize(self.elements.len() * width, 0.0);
         for (atom, z) in self.batches.order.iter().zip(self.projection.features.chunks_exact(width)) {
@@ -248,28 +252,4 @@ pub(super) fn add(sum: &mut Matrix3, x: &Matrix3) {
 /// The tensor is symmetric because energy and features do not change under rotation; this removes rounding.
 fn symmetric(tensor: &Matrix3) -> Matrix3 {
     std::array::from_fn(|a| std::array::from_fn(|b| 0.5 * (tensor[a][b] + tensor[b][a])))
-}
-
-impl Potential for Grace {
-    fn cutoff(&self) -> f64 {
-        self.model.cutoff()
-    }
-
-    fn species(&self) -> &[Species] {
-        self.model.elements()
-    }
-
-    fn evaluate(
-        &mut self,
-        structure: &Structure,
-        neighbours: &NeighbourList,
-        out: &mut Evaluation,
-    ) -> Result<(), PotentialError> {
-        self.take(structure, neighbours)?;
-        self.begin_derivatives();
-        self.threads.clone().run(|| self.plain());
-        self.put_energies();
-        self.put_forces(out);
-        Ok(())
-    }
 }

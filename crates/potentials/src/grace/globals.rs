@@ -5,8 +5,8 @@ use npz::Archive;
 
 use super::error::{GraceError, mismatch, unsupported};
 use super::graph::Graph;
-use super::matrix::{Lanes, to_lanes};
 use super::tape::Tensor;
+use super::vector::{Double, Vector, to_lanes};
 
 pub(super) fn elements(archive: &Archive) -> Result<Vec<Species>, GraceError> {
     let names = archive.strings("element_names")?;
@@ -119,7 +119,7 @@ impl Embedding {
 
     /// Z_i W + Z_j W′ + b for centre i and neighbour j, [element²][outputs]; W and W′, row-major
     /// [size, outputs], stand behind one another.
-    pub fn pair_biases(&self, weights: &[f64], bias: &[f64]) -> Vec<Vec<Lanes>> {
+    pub fn pair_biases(&self, weights: &[f64], bias: &[f64]) -> Vec<Vec<Double>> {
         let outputs = bias.len();
         let pairs = self.rows().flat_map(|i| self.rows().map(move |j| (i, j)));
         let sum = |(i, j): (&[f64], &[f64]), o: usize| -> f64 {
@@ -130,14 +130,14 @@ impl Embedding {
     }
 
     /// Z W for each element with the weights `{prefix}_W` [size, channels] times `{prefix}_norm` times `scale`.
-    pub fn transformed(
+    pub fn transformed<V: Vector>(
         &self,
         archive: &Archive,
         prefix: &str,
         channels: usize,
         scale: f64,
         weights: &mut usize,
-    ) -> Result<Vec<Vec<Lanes>>, GraceError> {
+    ) -> Result<Vec<Vec<V>>, GraceError> {
         let transform = archive.floats(&format!("{prefix}_W"), &[self.size, channels])?;
         let scale = archive.scalar(&format!("{prefix}_norm"))? * scale;
         *weights += transform.len();
@@ -167,7 +167,7 @@ impl Powers<'_> {
     }
 
     /// Makes as many as the reductions take, and says how many orders that are.
-    pub fn make(&self, graph: &mut Graph, x: Tensor) -> Result<usize, GraceError> {
+    pub fn make<V: Vector>(&self, graph: &mut Graph<V>, x: Tensor) -> Result<usize, GraceError> {
         let [one, two, three, four] = &self.names();
         let order = self.highest_order(graph.archive)?;
         if order >= 2 {

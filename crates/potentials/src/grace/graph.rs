@@ -5,24 +5,24 @@ use std::collections::BTreeMap;
 use npz::Archive;
 
 use super::error::{GraceError, mismatch, unsupported};
-use super::matrix::lanes_for;
-use super::product::{Combination, Coupled, Product, Term};
+use super::product::{Combination, Coupled, Product, Summands, Term};
 use super::schedule::depth_first;
 use super::tape::{Gather, Linear, LinearPart, Operation, Tensor, Used};
+use super::vector::{Number, Vector, lanes_for};
 use super::weights::Weights;
 
 /// A longer tape than this is taken for damage (64 MiB an atom).
 const LONGEST_TAPE: usize = 1 << 20;
 
 /// A graph under construction.
-pub(super) struct Graph<'a> {
+pub(super) struct Graph<'a, V: Vector> {
     pub(super) archive: &'a Archive,
     /// All tensors, as they stand on the tape.
     tensors: Vec<Tensor>,
     /// Tensors that a reduction may name.
     named: Vec<(String, Tensor)>,
     end: usize,
-    pub(super) operations: Vec<Operation>,
+    pub(super) operations: Vec<Operation<V>>,
     pub(super) basis: Gather,
     /// Components and channels of each source of the basis.
     pub(super) sources: Vec<(usize, usize)>,
@@ -31,7 +31,7 @@ pub(super) struct Graph<'a> {
     pub weights: usize,
 }
 
-impl<'a> Graph<'a> {
+impl<'a, V: Vector> Graph<'a, V> {
     /// A graph that holds the sum over neighbours alone; errors call it `name`.
     pub fn new(
         archive: &'a Archive,
@@ -65,7 +65,7 @@ impl<'a> Graph<'a> {
         components: usize,
         channels: usize,
     ) -> Result<Tensor, GraceError> {
-        let tensor = Tensor { start: self.end, components, channels, width: lanes_for(channels) };
+        let tensor = Tensor { start: self.end, components, channels, width: lanes_for::<V>(channels) };
         if components.saturating_mul(tensor.width) > LONGEST_TAPE - self.end {
             return Err(unsupported(
                 self.archive,
@@ -181,10 +181,11 @@ impl<'a> Graph<'a> {
         let components = sums.iter().max().map_or(0, |last| last + 1);
 
         let out = self.push(name, components, left.channels)?;
-        let mut outputs: Vec<Coupled> =
+        let mut outputs: Vec<Coupled<V>> =
             (0..components).map(|f| Coupled { row: out.row(f), terms: Vec::new() }).collect();
         for (((l, r), sum), coefficient) in lefts.iter().zip(&rights).zip(&sums).zip(coefficients) {
             let (left, right) = (left.row(*l) as u32, right.row(*r) as u32);
+            let coefficient = V::Number::round(coefficient);
             outputs[*sum].terms.push(Term { left, right, coefficient });
         }
         let (start, width, channels) = (out.start, out.width, out.channels);
@@ -202,10 +203,10 @@ impl<'a> Graph<'a> {
         terms: &[(usize, usize, f64)],
     ) -> Result<Tensor, GraceError> {
         let out = self.push(name, components, tensor.channels)?;
-        let mut outputs: Vec<(usize, Vec<(u32, f64)>)> =
+        let mut outputs: Vec<(usize, Summands<V>)> =
             (0..components).map(|f| (out.row(f), Vec::new())).collect();
         for (to, from, factor) in terms {
-            outputs[*to].1.push((tensor.row(*from) as u32, *factor));
+            outputs[*to].1.push((tensor.row(*from) as u32, V::Number::round(*factor)));
         }
         let (start, width, channels) = (out.start, out.width, out.channels);
         let combination = Combination { start, width, channels, outputs };
@@ -226,7 +227,7 @@ impl<'a> Graph<'a> {
     }
 
     /// The operations without results that neither the basis nor `message` needs.
-    pub fn finish(mut self, message: Option<Tensor>) -> FinishedGraph {
+    pub fn finish(mut self, message: Option<Tensor>) -> FinishedGraph<V> {
         let density = self.density();
         let mut needed = vec![false; self.end];
         self.basis.rows.iter().for_each(|(row, _)| needed[*row] = true);
@@ -243,17 +244,17 @@ impl<'a> Graph<'a> {
 }
 
 /// What a layer evaluates.
-pub(super) struct FinishedGraph {
+pub(super) struct FinishedGraph<V: Vector> {
     /// Length of the tape for one slot.
     pub tape_lanes: usize,
     pub used: Used,
-    pub operations: Vec<Operation>,
+    pub operations: Vec<Operation<V>>,
     pub basis: Gather,
 }
 
 /// One part in place of those that take the same rows to the same rows.
-fn merged(parts: Vec<LinearPart>) -> Vec<LinearPart> {
-    let mut found: Vec<LinearPart> = Vec::new();
+fn merged<V: Vector>(parts: Vec<LinearPart<V>>) -> Vec<LinearPart<V>> {
+    let mut found: Vec<LinearPart<V>> = Vec::new();
     for part in parts {
         match found.iter_mut().find(|other| other.from == part.from && other.to == part.to) {
             Some(other) => other.weights.add(&part.weights),

@@ -1,6 +1,6 @@
 //! Real spherical harmonics as polynomials in Cartesian components, with their gradients.
 
-use super::matrix::{LANES, Lanes, ZERO, product, scaled};
+use super::vector::{Number, Vector};
 
 /// Y_lm for l = 0 … lmax at index l² + l + m, normalised so that Y_00 = 1 (√4π times orthonormal):
 ///
@@ -45,26 +45,27 @@ impl Harmonics {
         (self.lmax + 1) * (self.lmax + 1)
     }
 
-    /// Y_lm at eight directions v = [x, y, z] at once, into `values` [lm]; with `GRADIENT` also
+    /// Y_lm at directions v = [x, y, z], one in each lane, into `values` [lm]; with `GRADIENT` also
     /// ∂Y_lm/∂v into `gradients` [lm].
     #[inline(always)]
-    pub fn evaluate<const GRADIENT: bool>(
+    pub fn evaluate<V: Vector, const GRADIENT: bool>(
         &self,
-        [x, y, z]: &[Lanes; 3],
-        values: &mut [Lanes],
-        gradients: &mut [[Lanes; 3]],
+        [x, y, z]: &[V; 3],
+        values: &mut [V],
+        gradients: &mut [[V; 3]],
     ) {
-        let mut recursion = self.recursion.iter();
+        let (mut recursion, round) = (self.recursion.iter(), V::Number::round);
         // (x + iy)^m and (x + iy)^(m−1)
-        let (mut c, mut s) = ([1.0; LANES], ZERO);
-        let (mut c_before, mut s_before) = (ZERO, ZERO);
+        let (mut c, mut s) = (V::splat(round(1.0)), V::ZERO);
+        let (mut c_before, mut s_before) = (V::ZERO, V::ZERO);
         for m in 0..=self.lmax {
-            let mut q = [self.diagonal[m]; LANES];
-            let (mut dq, mut q_before, mut dq_before) = (ZERO, ZERO, ZERO);
+            let mut q = V::splat(round(self.diagonal[m]));
+            let (mut dq, mut q_before, mut dq_before) = (V::ZERO, V::ZERO, V::ZERO);
             for l in m..=self.lmax {
                 if l > m {
                     let (a, b) = recursion.next().copied().unwrap_or_default();
-                    for k in 0..LANES {
+                    let (a, b) = (round(a), round(b));
+                    for k in 0..V::LANES {
                         let q_next = a * (z[k] * q[k] + b * q_before[k]);
                         let dq_next = a * (q[k] + z[k] * dq[k] + b * dq_before[k]);
                         (q_before[k], q[k]) = (q[k], q_next);
@@ -72,22 +73,22 @@ impl Harmonics {
                     }
                 }
                 let (plus, minus) = (l * l + l + m, l * l + l - m);
-                values[plus] = product(&c, &q);
+                values[plus] = c.product(&q);
                 if m > 0 {
-                    values[minus] = product(&s, &q);
+                    values[minus] = s.product(&q);
                 }
                 if GRADIENT {
-                    let mq = scaled(m as f64, &q);
-                    let along_x = product(&c_before, &mq);
-                    let along_y = product(&s_before, &mq);
-                    gradients[plus] = [along_x, scaled(-1.0, &along_y), product(&c, &dq)];
+                    let mq = q.scaled(round(m as f64));
+                    let along_x = c_before.product(&mq);
+                    let along_y = s_before.product(&mq);
+                    gradients[plus] = [along_x, along_y.scaled(round(-1.0)), c.product(&dq)];
                     if m > 0 {
-                        gradients[minus] = [along_y, along_x, product(&s, &dq)];
+                        gradients[minus] = [along_y, along_x, s.product(&dq)];
                     }
                 }
             }
             (c_before, s_before) = (c, s);
-            for k in 0..LANES {
+            for k in 0..V::LANES {
                 c[k] = x[k] * c_before[k] - y[k] * s_before[k];
                 s[k] = x[k] * s_before[k] + y[k] * c_before[k];
             }
@@ -97,12 +98,13 @@ impl Harmonics {
 
 #[cfg(test)]
 mod tests {
+    use super::super::vector::Double;
     use super::*;
 
     fn at(harmonics: &Harmonics, v: [f64; 3]) -> (Vec<f64>, Vec<[f64; 3]>) {
-        let mut values = vec![ZERO; harmonics.len()];
-        let mut gradients = vec![[ZERO; 3]; harmonics.len()];
-        harmonics.evaluate::<true>(&v.map(|x| [x; 8]), &mut values, &mut gradients);
+        let mut values = vec![Double::ZERO; harmonics.len()];
+        let mut gradients = vec![[Double::ZERO; 3]; harmonics.len()];
+        harmonics.evaluate::<Double, true>(&v.map(Double::splat), &mut values, &mut gradients);
         (values.iter().map(|y| y[3]).collect(), gradients.iter().map(|g| g.map(|g| g[3])).collect())
     }
 

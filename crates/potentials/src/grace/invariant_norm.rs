@@ -1,5 +1,7 @@
 //! The normalisation of a layer's invariants before they are summed over layers.
 
+use super::vector::Number;
+
 /// Keeps the norm differentiable where all invariants vanish.
 const SQUARE_FLOOR: f64 = 1e-10;
 
@@ -19,39 +21,40 @@ impl InvariantNorm {
 
     /// Channels that are normalised, and (mean x² + 10⁻¹⁰)^(−1/2).
     #[inline(always)]
-    fn inverse<'a>(&self, x: &'a [f64]) -> (&'a [f64], f64) {
+    fn inverse<'a, T: Number>(&self, x: &'a [T]) -> (&'a [T], f64) {
         let x = &x[self.first()..][..self.scale.len()];
-        let mean = x.iter().map(|x| x * x).sum::<f64>() / x.len().max(1) as f64;
+        let squares = x.iter().map(|x| (*x).into()).map(|x: f64| x * x);
+        let mean = squares.sum::<f64>() / x.len().max(1) as f64;
         (x, 1.0 / (mean + SQUARE_FLOOR).sqrt())
     }
 
     /// Adds y to `sum`.
     #[inline(always)]
-    pub fn forward(&self, x: &[f64], sum: &mut [f64]) {
+    pub fn forward<T: Number>(&self, x: &[T], sum: &mut [T]) {
         if let Some(factor) = self.linear {
-            sum[0] += factor * x[0];
+            sum[0] += T::round(factor * x[0].into());
         }
         let (normalised, inverse) = self.inverse(x);
         for ((sum, x), scale) in sum[self.first()..].iter_mut().zip(normalised).zip(&self.scale) {
-            *sum += x * inverse * scale;
+            *sum += T::round((*x).into() * inverse * scale);
         }
     }
 
     /// The cotangent of x from that of y, in place:
     /// x̄_k = i s_k ȳ_k − i³ x_k/n Σ_j s_j ȳ_j x_j with the inverse root i.
     #[inline(always)]
-    pub fn backward(&self, x: &[f64], cotangent: &mut [f64]) {
+    pub fn backward<T: Number>(&self, x: &[T], cotangent: &mut [T]) {
         if let Some(factor) = self.linear {
-            cotangent[0] *= factor;
+            cotangent[0] *= T::round(factor);
         }
         let (x, inverse) = self.inverse(x);
         let cotangent = &mut cotangent[self.first()..];
         let mut along = 0.0;
         for ((c, x), scale) in cotangent.iter_mut().zip(x).zip(&self.scale) {
-            *c *= scale * inverse;
-            along += *c * x;
+            *c *= T::round(scale * inverse);
+            along += (*c).into() * (*x).into();
         }
         along *= inverse * inverse / x.len().max(1) as f64;
-        cotangent.iter_mut().zip(x).for_each(|(c, x)| *c -= along * x);
+        cotangent.iter_mut().zip(x).for_each(|(c, x)| *c -= T::round(along * (*x).into()));
     }
 }

@@ -2,26 +2,26 @@
 
 use super::graph::Graph;
 use super::harmonics::Harmonics;
-use super::matrix::Lanes;
 use super::radial::RadialFunctions;
 use super::readout::Block;
 use super::tape::{Gather, Operation, Tensor, Used};
+use super::vector::Vector;
 
 /// The weights of one layer: T_q,lm,n = Σ_j R_nl(r) Y_lm(v) m_q,n(j), the messages m of the neighbours being
 /// the results of the layer before, and the operations on T. In the first layer a message is just a
 /// factor for each channel.
 #[derive(Clone, Debug)]
-pub(super) struct Layer {
-    pub radial: RadialFunctions,
+pub(super) struct Layer<V: Vector> {
+    pub radial: RadialFunctions<V>,
     pub harmonics: Harmonics,
-    pub message: Message,
+    pub message: Message<V>,
     /// T, \[q\]\[lm\]\[channel\], at the beginning of the tape.
     pub density: Tensor,
     /// Length of an atom's tape.
     pub tape_lanes: usize,
     /// What of it holds anything.
     pub used: Used,
-    pub operations: Vec<Operation>,
+    pub operations: Vec<Operation<V>>,
     /// The rows of the tape that this layer gives to the basis B.
     pub basis: Gather,
 }
@@ -29,16 +29,16 @@ pub(super) struct Layer {
 /// What an atom tells its neighbours: m_q,n = x_q,n + c_q,n with the tensor x of the layer before, zero beyond its
 /// components, and constants c of the atom's element.
 #[derive(Clone, Debug)]
-pub(super) struct Message {
+pub(super) struct Message<V> {
     /// x on the tape of the layer before; none in the first layer.
     pub from: Option<Tensor>,
     /// Number of components q.
     pub components: usize,
     /// c, [element][q][channel]
-    pub constants: Vec<Vec<Lanes>>,
+    pub constants: Vec<Vec<V>>,
 }
 
-impl Message {
+impl<V: Vector> Message<V> {
     /// Components that depend on the atom's surroundings.
     pub fn passed(&self) -> usize {
         self.from.map_or(0, |tensor| tensor.components)
@@ -51,17 +51,17 @@ impl Message {
 }
 
 /// A layer whose graph is complete.
-pub(super) struct LayerDraft<'a> {
-    pub graph: Graph<'a>,
-    pub radial: RadialFunctions,
+pub(super) struct LayerDraft<'a, V: Vector> {
+    pub graph: Graph<'a, V>,
+    pub radial: RadialFunctions<V>,
     pub lmax: usize,
-    pub message: Message,
-    pub block: Block,
+    pub message: Message<V>,
+    pub block: Block<V>,
 }
 
-impl LayerDraft<'_> {
+impl<V: Vector> LayerDraft<'_, V> {
     /// `message` is what the next layer takes from this one.
-    pub fn finish(self, message: Option<Tensor>) -> Layer {
+    pub fn finish(self, message: Option<Tensor>) -> Layer<V> {
         let density = self.graph.density();
         let graph = self.graph.finish(message);
         Layer {

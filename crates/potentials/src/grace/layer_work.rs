@@ -7,39 +7,40 @@ use atoms::Vec3;
 use super::batches::{Batches, Chunk, Placed};
 use super::bonds::{BondWork, Bonds, OwnBonds, accumulate, reverse};
 use super::layer::{Layer, Message};
-use super::matrix::{LANES, Lanes, Rows, ZERO, add_scaled};
+use super::matrix::Rows;
 use super::messages::{Returns, accumulate_messages, reverse_messages};
 use super::parts::{Divide, Layout, OfChunks, Parts};
 use super::readout::Block;
 use super::tape::{Slot, Tensor};
+use super::vector::Vector;
 
 /// Arrays of one layer for all atoms, in the order in which they are evaluated.
 #[derive(Clone, Debug, Default)]
-pub(super) struct LayerWork {
+pub(super) struct LayerWork<V> {
     pub bonds: Bonds,
-    pub trace: Trace,
+    pub trace: Trace<V>,
     /// Cotangents of the basis from the features, [n, lanes]
-    pub basis_cotangents: Vec<Lanes>,
+    pub basis_cotangents: Vec<V>,
     /// m, [n, lanes of a message]; empty in the first layer.
-    pub messages: Vec<Lanes>,
+    pub messages: Vec<V>,
     /// Cotangents of what depends on the layer before, from the energy and from the features, [n, lanes].
-    pub message_cotangents: [Vec<Lanes>; 2],
+    pub message_cotangents: [Vec<V>; 2],
     /// What each chunk adds to them.
-    pub returns: Vec<Returns>,
+    pub returns: Vec<Returns<V>>,
     /// The row of each bond's neighbour there.
     pub rows: Vec<u32>,
     /// ∂/∂d of the energy and of H for each bond.
     pub gradients: [Vec<Vec3>; 2],
 }
 
-impl LayerWork {
+impl<V: Vector> LayerWork<V> {
     /// The bonds of a structure are known: makes room for what belongs to them.
-    pub fn begin(&mut self, layer: &Layer, batches: &Batches, elements: &[usize], row_of: &mut Vec<u32>) {
+    pub fn begin(&mut self, layer: &Layer<V>, batches: &Batches, elements: &[usize], row_of: &mut Vec<u32>) {
         self.gradients.iter_mut().for_each(|gradients| gradients.resize(self.bonds.bonds.len(), [0.0; 3]));
         if layer.message.from.is_none() {
             return;
         }
-        self.messages.resize(elements.len() * layer.message.lanes(), ZERO);
+        self.messages.resize(elements.len() * layer.message.lanes(), V::ZERO);
         for (atom, message) in batches.order.iter().zip(self.messages.chunks_exact_mut(layer.message.lanes()))
         {
             message.copy_from_slice(&layer.message.constants[elements[*atom as usize]]);
@@ -57,29 +58,34 @@ impl LayerWork {
 
 /// What the forward pass leaves of some atoms for the reverse sweep.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Trace {
+pub(super) struct Trace<V> {
     /// The tape of one batch after another, [places, tape]
-    tapes: Vec<Lanes>,
+    tapes: Vec<V>,
     /// The basis B of this layer, [places, lanes]
-    pub bases: Vec<Lanes>,
+    pub bases: Vec<V>,
     /// Radial values of bonds and their derivatives, block by block.
-    values: Vec<Lanes>,
-    derivatives: Vec<Lanes>,
+    values: Vec<V>,
+    derivatives: Vec<V>,
 }
 
 /// The trace of some atoms, to be divided.
-pub(super) struct Traced<'a> {
-    tapes: Parts<'a, Lanes>,
-    pub bases: Parts<'a, Lanes>,
-    values: Parts<'a, Lanes>,
-    derivatives: Parts<'a, Lanes>,
+pub(super) struct Traced<'a, V> {
+    tapes: Parts<'a, V>,
+    pub bases: Parts<'a, V>,
+    values: Parts<'a, V>,
+    derivatives: Parts<'a, V>,
 }
 
-impl Trace {
+impl<V: Vector> Trace<V> {
     /// Makes room for the atoms at some places.
-    pub fn hold<'a>(&'a mut self, layer: &Layer, bonds: &'a Bonds, places: &Range<usize>) -> Traced<'a> {
+    pub fn hold<'a>(
+        &'a mut self,
+        layer: &Layer<V>,
+        bonds: &'a Bonds,
+        places: &Range<usize>,
+    ) -> Traced<'a, V> {
         let blocks = bonds.block_offsets[places.end] - bonds.block_offsets[places.start];
-        let of_block = LANES * layer.radial.output_lanes();
+        let of_block = V::LANES * layer.radial.output_lanes();
         grow(&mut self.tapes, places.len() * layer.tape_lanes);
         grow(&mut self.bases, places.len() * layer.basis.lanes());
         grow(&mut self.values, blocks * of_block);
@@ -94,7 +100,7 @@ impl Trace {
     }
 }
 
-impl Divide for Traced<'_> {
+impl<V: Send> Divide for Traced<'_, V> {
     fn divide(self, chunk: &Chunk) -> (Self, Self) {
         let (tapes, bases) = (self.tapes.divide(chunk), self.bases.divide(chunk));
         let (values, derivatives) = (self.values.divide(chunk), self.derivatives.divide(chunk));
@@ -106,20 +112,20 @@ impl Divide for Traced<'_> {
 }
 
 /// Makes an array at least so long.
-pub(super) fn grow(lanes: &mut Vec<Lanes>, length: usize) {
+pub(super) fn grow<V: Vector>(lanes: &mut Vec<V>, length: usize) {
     if lanes.len() < length {
-        lanes.resize(length, ZERO);
+        lanes.resize(length, V::ZERO);
     }
 }
 
 /// Tapes of a batch, and its part of the basis. `received` are the messages of all atoms.
 #[inline(always)]
-pub(super) fn forward(
-    layer: &Layer,
+pub(super) fn forward<V: Vector>(
+    layer: &Layer<V>,
     placed: &Placed,
-    (bonds, received): (&Bonds, &[Lanes]),
-    trace: &mut Traced,
-    work: &mut BondWork,
+    (bonds, received): (&Bonds, &[V]),
+    trace: &mut Traced<V>,
+    work: &mut BondWork<V>,
 ) {
     let (batch, places) = (&placed.batch, placed.places());
     let tape = trace.tapes.of(&places);
@@ -139,55 +145,55 @@ pub(super) fn forward(
 }
 
 #[inline(always)]
-fn trace_of<'a>(
+fn trace_of<'a, V>(
     place: usize,
     bonds: &'a Bonds,
-    values: &'a mut Parts<Lanes>,
-    derivatives: &'a mut Parts<Lanes>,
-) -> OwnBonds<'a> {
+    values: &'a mut Parts<V>,
+    derivatives: &'a mut Parts<V>,
+) -> OwnBonds<'a, V> {
     let places = place..place + 1;
     OwnBonds { bonds: bonds.of(place), values: values.of(&places), derivatives: derivatives.of(&places) }
 }
 
 /// Adds what the tapes of a batch say to the messages of its atoms, which begin as constants.
 #[inline(always)]
-pub(super) fn send(
+pub(super) fn send<V: Vector>(
     tensor: &Tensor,
     of_message: usize,
     placed: &Placed,
-    trace: &mut Traced,
-    messages: &mut [Lanes],
+    trace: &mut Traced<V>,
+    messages: &mut [V],
 ) {
     let tape = trace.tapes.of(&placed.places());
     for (slot, message) in messages.chunks_exact_mut(of_message).enumerate() {
         let slot = Slot { slot, slots: placed.batch.atoms };
         for (q, row) in message.chunks_exact_mut(tensor.width).take(tensor.components).enumerate() {
             for (m, x) in row.iter_mut().zip(&tape[slot.row(tensor, q)..]) {
-                add_scaled(m, 1.0, x);
+                m.add(x);
             }
         }
     }
 }
 
 /// Where the cotangents of a batch come from.
-pub(super) struct Cotangents<'a> {
+pub(super) struct Cotangents<'a, V> {
     /// ∂E/∂(W B) of the layer's block, a row of `stride` lanes for each atom.
-    pub densities: (&'a [Lanes], usize),
+    pub densities: (&'a [V], usize),
     /// Those of the basis from the features, a row for each atom.
-    pub basis: &'a [Lanes],
+    pub basis: &'a [V],
     /// The message of the next layer and its cotangents, a row for each atom.
-    pub returned: Option<(&'a Message, [&'a [Lanes]; 2])>,
+    pub returned: Option<(&'a Message<V>, [&'a [V]; 2])>,
 }
 
 /// Where they go to.
-pub(super) struct Gradients<'a> {
+pub(super) struct Gradients<'a, V> {
     /// Of the energy and of H, for each bond.
     pub bonds: [Parts<'a, Vec3>; 2],
     /// Of messages, one for each chunk.
-    pub returns: OfChunks<'a, Returns>,
+    pub returns: OfChunks<'a, Returns<V>>,
 }
 
-impl Divide for Gradients<'_> {
+impl<V: Send> Divide for Gradients<'_, V> {
     fn divide(self, chunk: &Chunk) -> (Self, Self) {
         let (bonds, returns) = (self.bonds.divide(chunk), self.returns.divide(chunk));
         (Self { bonds: bonds.0, returns: returns.0 }, Self { bonds: bonds.1, returns: returns.1 })
@@ -196,22 +202,22 @@ impl Divide for Gradients<'_> {
 
 /// Arrays of one thread for a batch in a layer.
 #[derive(Clone, Debug, Default)]
-pub(super) struct BackwardWork {
+pub(super) struct BackwardWork<V> {
     /// Cotangents of the basis from the energy.
-    basis: Vec<Lanes>,
+    basis: Vec<V>,
     /// Cotangents of the tape for the energy and for the features.
-    tape: Vec<Lanes>,
+    tape: Vec<V>,
 }
 
 /// A batch back along the tape.
 #[inline(always)]
-pub(super) fn backward_tape<const N: usize>(
-    layer: &Layer,
-    block: &Block,
+pub(super) fn backward_tape<V: Vector, const N: usize>(
+    layer: &Layer<V>,
+    block: &Block<V>,
     placed: &Placed,
-    trace: &mut Traced,
-    from: &Cotangents,
-    work: &mut BackwardWork,
+    trace: &mut Traced<V>,
+    from: &Cotangents<V>,
+    work: &mut BackwardWork<V>,
 ) {
     let (batch, lanes) = (&placed.batch, layer.basis.lanes());
     let (atoms, slots) = (batch.atoms, N * batch.atoms);
@@ -236,16 +242,16 @@ pub(super) fn backward_tape<const N: usize>(
 
 /// ∂E/∂B of a batch.
 #[inline(always)]
-fn energy_basis_cotangent(
-    block: &Block,
+fn energy_basis_cotangent<V: Vector>(
+    block: &Block<V>,
     placed: &Placed,
-    (densities, stride): (&[Lanes], usize),
+    (densities, stride): (&[V], usize),
     lanes: usize,
-    out: &mut Vec<Lanes>,
+    out: &mut Vec<V>,
 ) {
     let atoms = placed.batch.atoms;
     out.clear();
-    out.resize(atoms * lanes, ZERO);
+    out.resize(atoms * lanes, V::ZERO);
     let (from, to) = (Rows::of_atoms(atoms, stride), Rows::of_atoms(atoms, lanes));
     let weights = block.weights.transposed(placed.batch.element);
     weights.multiply_add(densities, from, out, to, placed.batch.instructions);
@@ -253,12 +259,12 @@ fn energy_basis_cotangent(
 
 /// Adds the cotangents of messages, a row for each atom, to the cotangents of the tape in the slots from `first` of `slots`.
 #[inline(always)]
-fn add_returned(tensor: &Tensor, rows: &[Lanes], tape: &mut [Lanes], (first, slots): (usize, usize)) {
+fn add_returned<V: Vector>(tensor: &Tensor, rows: &[V], tape: &mut [V], (first, slots): (usize, usize)) {
     for (atom, row) in rows.chunks_exact(tensor.components * tensor.width).enumerate() {
         let slot = Slot { slot: first + atom, slots };
         for (q, row) in row.chunks_exact(tensor.width).enumerate() {
             for (x, c) in tape[slot.row(tensor, q)..].iter_mut().zip(row) {
-                add_scaled(x, 1.0, c);
+                x.add(c);
             }
         }
     }
@@ -266,13 +272,13 @@ fn add_returned(tensor: &Tensor, rows: &[Lanes], tape: &mut [Lanes], (first, slo
 
 /// A batch from the cotangents of its tape back along its bonds.
 #[inline(always)]
-pub(super) fn backward_bonds<const N: usize>(
-    layer: &Layer,
+pub(super) fn backward_bonds<V: Vector, const N: usize>(
+    layer: &Layer<V>,
     placed: &Placed,
-    (here, received, rows): (&Bonds, &[Lanes], &[u32]),
-    trace: &mut Traced,
-    (to, mut returns): (&mut [Parts<Vec3>; 2], Option<&mut Returns>),
-    (tape, work): (&BackwardWork, &mut BondWork),
+    (here, received, rows): (&Bonds, &[V], &[u32]),
+    trace: &mut Traced<V>,
+    (to, mut returns): (&mut [Parts<Vec3>; 2], Option<&mut Returns<V>>),
+    (tape, work): (&BackwardWork<V>, &mut BondWork<V>),
 ) {
     let atoms = placed.batch.atoms;
     for (slot, place) in placed.places().enumerate() {

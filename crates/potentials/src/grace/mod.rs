@@ -1,4 +1,5 @@
-//! The graph atomic cluster expansion (GRACE) and its CALM features, in double precision.
+//! The graph atomic cluster expansion (GRACE) and its CALM features, in double precision or mostly in single
+//! ([`Precision`]).
 //!
 //! Reads the `kokkos.npz` file that gracemaker exports for LAMMPS. The model's maths is that of
 //! Bochkarev, Lysogorskiy and Drautz, Phys. Rev. X 14, 021036 (2024); the feature map is that of the CALM paper
@@ -40,10 +41,13 @@ mod layer_work;
 mod matrix;
 mod messages;
 mod model;
+mod network;
 mod networks;
 mod one_layer;
 mod parts;
 mod passes;
+mod potential;
+mod precision;
 mod product;
 mod projection;
 mod radial;
@@ -57,13 +61,16 @@ mod tape;
 mod threads;
 mod three_layers;
 mod two_layers;
+mod vector;
 mod weights;
 
 pub use error::GraceError;
-pub use evaluate::{Grace, PullBack};
+pub use evaluate::PullBack;
 pub use instructions::Instructions;
 pub(crate) use instructions::Pass;
 pub use model::{Architecture, GraceDescription, GraceModel};
+pub use potential::Grace;
+pub use precision::Precision;
 pub use projection::Projection;
 pub use radial::RadialPath;
 pub use threads::Threads;

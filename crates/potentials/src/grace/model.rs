@@ -1,17 +1,19 @@
 //! A GRACE model: weights that never change, shared between threads.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use atoms::{PotentialError, Species};
 use npz::Archive;
 
+use super::assembly::Reading;
 use super::error::GraceError;
-use super::layer::Layer;
-use super::matrix::Lanes;
+use super::network::{AnyNetwork, Network};
+use super::precision::Precision;
 use super::projection::Projection;
 use super::radial::RadialPath;
-use super::readout::Readout;
 use super::symmetry::require_invariance;
+use super::vector::Vector;
 use super::{one_layer, three_layers, two_layers};
 
 /// How many message-passing layers a model has.
@@ -76,18 +78,17 @@ pub struct GraceDescription {
     pub radial_tables: Vec<(usize, [f64; 2])>,
 }
 
-/// A GRACE model read from a `kokkos.npz` export, in double precision.
+/// A GRACE model read from a `kokkos.npz` export.
 #[derive(Clone, Debug)]
 pub struct GraceModel {
-    pub(super) elements: Vec<Species>,
-    pub(super) layers: Vec<Layer>,
-    pub(super) readout: Readout,
-    pub(super) projection: Option<Projection>,
-    pub(super) description: GraceDescription,
+    pub(super) network: AnyNetwork,
+    /// r_c for centre and neighbour element, [n_elements²], Å.
+    pair_cutoffs: Vec<f64>,
+    description: GraceDescription,
 }
 
 impl GraceModel {
-    /// Reads a model, radial functions tabulated.
+    /// Reads a model, radial functions tabulated, to be evaluated in double precision.
     ///
     /// # Errors
     /// Names the file, the array, what was found and what was expected.
@@ -100,22 +101,52 @@ impl GraceModel {
     /// # Errors
     /// As [`GraceModel::load`].
     pub fn load_with(path: &Path, radial: RadialPath) -> Result<Self, GraceError> {
+        Self::load_in(path, Precision::Double, radial)
+    }
+
+    /// Reads a model to be evaluated in this precision.
+    ///
+    /// # Errors
+    /// As [`GraceModel::load`].
+    pub fn load_in(path: &Path, precision: Precision, radial: RadialPath) -> Result<Self, GraceError> {
         let archive = Archive::open(path)?;
-        match detect(&archive) {
-            Architecture::OneLayer => one_layer::read(&archive, radial),
-            Architecture::TwoLayer => require_invariance(&archive, two_layers::read(&archive, radial)?),
-            Architecture::ThreeLayer => require_invariance(&archive, three_layers::read(&archive, radial)?),
+        match precision {
+            Precision::Double => Self::read(&archive, radial, AnyNetwork::Double),
+            Precision::Mixed => Self::read(&archive, radial, AnyNetwork::Mixed),
         }
+    }
+
+    fn read<V: Vector>(
+        archive: &Archive,
+        path: RadialPath,
+        any: fn(Arc<Network<V>>) -> AnyNetwork,
+    ) -> Result<Self, GraceError> {
+        let architecture = detect(archive);
+        let Reading { network, pair_cutoffs, description } = match architecture {
+            Architecture::OneLayer => one_layer::read(archive, path)?,
+            Architecture::TwoLayer => two_layers::read(archive, path)?,
+            Architecture::ThreeLayer => three_layers::read(archive, path)?,
+        };
+        let model = Self { network: any(Arc::new(network)), pair_cutoffs, description };
+        match architecture {
+            Architecture::OneLayer => Ok(model),
+            _ => require_invariance(archive, model),
+        }
+    }
+
+    /// The precision in which it is evaluated.
+    pub fn precision(&self) -> Precision {
+        self.network.precision()
     }
 
     /// The elements it knows; an element's index is its position.
     pub fn elements(&self) -> &[Species] {
-        &self.elements
+        &self.description.elements
     }
 
     /// The largest cutoff, Å.
     pub fn cutoff(&self) -> f64 {
-        self.layers.iter().map(|layer| layer.radial.largest_cutoff()).fold(0.0, f64::max)
+        self.description.cutoff
     }
 
     /// The cutoff of a pair by element indices (centre, neighbour), Å.
@@ -123,29 +154,19 @@ impl GraceModel {
     /// # Panics
     /// If an index is not below the number of elements.
     pub fn pair_cutoff(&self, centre: usize, neighbour: usize) -> f64 {
-        assert!(
-            centre < self.elements.len() && neighbour < self.elements.len(),
-            "element index out of range"
-        );
-        let cutoffs =
-            self.layers.iter().map(|layer| layer.radial.cutoff(layer.radial.pair(centre, neighbour)));
-        cutoffs.fold(0.0, f64::max)
-    }
-
-    /// What an atom takes on the longest tape, bytes.
-    pub(super) fn tape_bytes(&self) -> usize {
-        let lanes = self.layers.iter().map(|layer| layer.used.lanes()).max();
-        lanes.unwrap_or(0) * size_of::<Lanes>()
+        let n = self.elements().len();
+        assert!(centre < n && neighbour < n, "element index out of range");
+        self.pair_cutoffs[centre * n + neighbour]
     }
 
     /// D, the dimension of z; 0 for a model without feature arrays.
     pub fn feature_dimension(&self) -> usize {
-        self.projection.as_ref().map_or(0, Projection::feature_dimension)
+        self.projection().map_or(0, Projection::feature_dimension)
     }
 
     /// The feature map, if the file holds one.
     pub fn projection(&self) -> Option<&Projection> {
-        self.projection.as_ref()
+        self.network.projection()
     }
 
     /// What the model is made of.
@@ -170,11 +191,11 @@ impl GraceModel {
     ) -> Result<(), PotentialError> {
         indices.clear();
         for (atom, species) in species.iter().enumerate() {
-            match self.elements.iter().position(|known| known == species) {
+            match self.elements().iter().position(|known| known == species) {
                 Some(index) => indices.push(index),
                 None => {
                     indices.clear();
-                    let known: Vec<&str> = self.elements.iter().map(|known| known.symbol()).collect();
+                    let known: Vec<&str> = self.elements().iter().map(|known| known.symbol()).collect();
                     return Err(PotentialError::Species { atom, species: *species, known: known.join(", ") });
                 }
             }

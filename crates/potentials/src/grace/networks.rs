@@ -4,14 +4,15 @@ use npz::Archive;
 
 use super::error::{GraceError, mismatch};
 use super::globals::Embedding;
-use super::matrix::{LANES, Matrix, to_lanes};
+use super::matrix::Matrix;
 use super::radial::column_by_order;
 use super::radial_network::RadialNetwork;
 use super::readout::{Activation, Block, Readout};
+use super::vector::{Double, Vector, to_lanes};
 use super::weights::with_transpose;
 
-/// The network `prefix` for channels × (lmax + 1) radial functions.
-pub(super) fn radial_network(
+/// The network `prefix` for channels × (lmax + 1) radial functions, channels padded to whole vectors `V`.
+pub(super) fn radial_network<V: Vector>(
     archive: &Archive,
     prefix: &str,
     lmax: usize,
@@ -26,7 +27,14 @@ pub(super) fn radial_network(
         let (outputs, layer) = dense(archive, prefix, k, inputs)?;
         *weights += layer.len();
         layers.push(if k + 1 == n_layers {
-            last_radial_layer(archive, &format!("{prefix}_W{k}"), [inputs, outputs], lmax, channels, &layer)?
+            last_radial_layer::<V>(
+                archive,
+                &format!("{prefix}_W{k}"),
+                [inputs, outputs],
+                lmax,
+                channels,
+                &layer,
+            )?
         } else {
             Matrix::from_fn(inputs, outputs, |i, o| layer[i * outputs + o])
         });
@@ -45,7 +53,7 @@ pub(super) fn radial_network(
 
 /// The network of layer `name` in a model of three: its inputs are the polynomials and the embeddings of centre and
 /// neighbour, and all layers but the last have a bias.
-pub(super) fn enveloped_network(
+pub(super) fn enveloped_network<V: Vector>(
     archive: &Archive,
     name: &str,
     lmax: usize,
@@ -63,7 +71,7 @@ pub(super) fn enveloped_network(
         *weights += layer.len();
         if k + 1 == n_layers {
             let key = format!("{prefix}_W{k}");
-            layers.push(last_radial_layer(archive, &key, [inputs, outputs], lmax, channels, &layer)?);
+            layers.push(last_radial_layer::<V>(archive, &key, [inputs, outputs], lmax, channels, &layer)?);
             break;
         }
         let norm = archive.scalar(&format!("{prefix}_norm{k}"))?;
@@ -82,22 +90,22 @@ pub(super) fn enveloped_network(
     Ok(RadialNetwork { basis_size, envelope_exponent, envelope_last: true, layers, biases, pair_biases })
 }
 
-/// The layer whose columns are radial functions, row-major [channel, l] in the file.
-fn last_radial_layer(
+/// The layer whose columns are radial functions, padded to whole vectors `V`; row-major [channel, l] in the file.
+fn last_radial_layer<V: Vector>(
     archive: &Archive,
     key: &str,
     [inputs, outputs]: [usize; 2],
     lmax: usize,
     channels: usize,
     weights: &[f64],
-) -> Result<Matrix, GraceError> {
+) -> Result<Matrix<Double>, GraceError> {
     if outputs != channels * (lmax + 1) {
         let expected = format!("{channels} channels × {} orders", lmax + 1);
         return Err(mismatch(archive, key, format!("{outputs} columns wide"), expected));
     }
-    let places = (lmax + 1) * channels.next_multiple_of(LANES);
+    let places = (lmax + 1) * channels.next_multiple_of(V::LANES);
     Ok(Matrix::from_fn(inputs, places, |i, place| {
-        column_by_order(channels, lmax + 1, place).map_or(0.0, |o| weights[i * outputs + o])
+        column_by_order::<V>(channels, lmax + 1, place).map_or(0.0, |o| weights[i * outputs + o])
     }))
 }
 
@@ -114,13 +122,13 @@ fn dense(archive: &Archive, prefix: &str, k: usize, inputs: usize) -> Result<(us
 }
 
 /// The readout of densities whose number each layer's `blocks` agree on.
-pub(super) fn readout(
+pub(super) fn readout<V: Vector>(
     archive: &Archive,
-    blocks: Vec<Block>,
+    blocks: Vec<Block<V>>,
     n_densities: usize,
     n_elements: usize,
     weights: &mut usize,
-) -> Result<Readout, GraceError> {
+) -> Result<Readout<V>, GraceError> {
     let n_layers = match archive.contains("energy_mlp_n_layers") || n_densities > 1 {
         true => archive.count("energy_mlp_n_layers", 1, 64)?,
         false => 0,

@@ -5,17 +5,18 @@
 
 use npz::Archive;
 
-use super::assembly::Draft;
+use super::assembly::{Draft, Reading};
 use super::error::GraceError;
 use super::globals::{Embedding, Powers, cutoffs, elements, refuse_other_radial_variants};
 use super::graph::Graph;
 use super::layer::{LayerDraft, Message};
-use super::model::{Architecture, GraceModel};
+use super::model::Architecture;
 use super::networks::radial_network;
 use super::radial::{RadialFunctions, RadialPath};
 use super::readout::Block;
+use super::vector::Vector;
 
-pub(super) fn read(archive: &Archive, path: RadialPath) -> Result<GraceModel, GraceError> {
+pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Reading<V>, GraceError> {
     let elements = elements(archive)?;
     refuse_other_radial_variants(archive, "mlp_rad", "A")?;
     let lmax = archive.count("lmax", 0, 12)?;
@@ -25,7 +26,7 @@ pub(super) fn read(archive: &Archive, path: RadialPath) -> Result<GraceModel, Gr
     }
     let cutoffs = cutoffs(archive, elements.len())?;
     let mut weights = 0;
-    let network = radial_network(archive, "mlp_rad", lmax, channels, &mut weights)?;
+    let network = radial_network::<V>(archive, "mlp_rad", lmax, channels, &mut weights)?;
     let embedding = Embedding::read(archive, elements.len(), &mut weights)?;
     let scale = archive.scalar("A_inv_avg_n_neigh")?;
     let constants = embedding.transformed(archive, "A_lin_transform", channels, scale, &mut weights)?;

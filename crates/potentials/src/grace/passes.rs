@@ -7,35 +7,35 @@ use atoms::Vec3;
 
 use super::batches::Placed;
 use super::bonds::{BondWork, Bonds};
-use super::evaluate::{Grace, add};
+use super::evaluate::{Evaluator, add};
 use super::instructions::{Instructions, Pass};
 use super::layer::Layer;
 use super::layer_work::{
     BackwardWork, Cotangents, Gradients, LayerWork, Trace, Traced, backward_bonds, backward_tape, forward,
     send,
 };
-use super::matrix::{Lanes, ZERO};
 use super::messages::Returns;
-use super::model::GraceModel;
+use super::network::Network;
 use super::parts::{Layout, OfChunks, Parts};
-use super::projection::{Projected, Projection};
+use super::projection::{FeatureMap, Projected};
 use super::readout::{Block, Readout, ReadoutWork};
+use super::vector::Vector;
 
 /// Work arrays of one thread.
 #[derive(Clone, Debug)]
-pub(super) struct Scratch {
+pub(super) struct Scratch<V> {
     /// For each layer.
-    bonds: Vec<BondWork>,
-    readout: ReadoutWork,
-    backward: BackwardWork,
+    bonds: Vec<BondWork<V>>,
+    readout: ReadoutWork<V>,
+    backward: BackwardWork<V>,
     /// Of a batch whose trace is not kept.
-    trace: Trace,
+    trace: Trace<V>,
 }
 
-impl Scratch {
-    pub fn new(model: &GraceModel) -> Self {
+impl<V: Vector> Scratch<V> {
+    pub fn new(network: &Network<V>) -> Self {
         Self {
-            bonds: model.layers.iter().map(BondWork::new).collect(),
+            bonds: network.layers.iter().map(BondWork::new).collect(),
             readout: ReadoutWork::default(),
             backward: BackwardWork::default(),
             trace: Trace::default(),
@@ -44,18 +44,18 @@ impl Scratch {
 }
 
 /// A thread that panicked has left nothing in its arrays that anybody reads.
-fn of_thread(scratch: &[Mutex<Scratch>], thread: usize) -> MutexGuard<'_, Scratch> {
+fn of_thread<V>(scratch: &[Mutex<Scratch<V>>], thread: usize) -> MutexGuard<'_, Scratch<V>> {
     scratch[thread].lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl Grace {
+impl<V: Vector> Evaluator<V> {
     /// Makes room for what the passes leave.
     pub(super) fn begin_passes(&mut self) {
-        let (n, readout) = (self.batches.order.len(), &self.model.readout);
+        let (n, readout) = (self.batches.order.len(), &self.network.readout);
         self.energies.resize(n, 0.0);
-        self.density_cotangents.resize(n * readout.blocks.len() * readout.density_lanes(), ZERO);
-        if let Some(projection) = &self.model.projection {
-            self.projection.resize(projection, n);
+        self.density_cotangents.resize(n * readout.blocks.len() * readout.density_lanes(), V::ZERO);
+        if let Some(map) = &self.network.feature_map {
+            self.projection.resize(map, n);
         }
     }
 
@@ -71,24 +71,24 @@ impl Grace {
 
     /// All atoms forwards through layer `k`, and what they tell the next one.
     pub(super) fn forward_layer(&mut self, k: usize) {
-        let Self { model, instructions, batches, scratch, .. } = self;
+        let Self { network, instructions, batches, scratch, .. } = self;
         let (here, after) = self.layers.split_at_mut(k + 1);
         let LayerWork { bonds, trace, messages: received, .. } = &mut here[k];
         let (bonds, received) = (&*bonds, &received[..]);
         let sent = match after.first_mut() {
             Some(next) => {
-                Parts::new(Layout::Even(model.layers[k + 1].message.lanes()), 0, &mut next.messages)
+                Parts::new(Layout::Even(network.layers[k + 1].message.lanes()), 0, &mut next.messages)
             }
             None => Parts::new(Layout::Even(0), 0, &mut [][..]),
         };
-        let work = (trace.hold(&model.layers[k], bonds, &(0..batches.order.len())), sent);
+        let work = (trace.hold(&network.layers[k], bonds, &(0..batches.order.len())), sent);
         self.threads.each(&batches.chunks, work, &|chunk, (mut trace, mut sent), thread| {
             let work = &mut of_thread(scratch, thread).bonds[k];
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
-                let (layer, trace) = (&model.layers[k], &mut trace);
+                let (layer, trace) = (&network.layers[k], &mut trace);
                 instructions.run(Forward { layer, placed, bonds, received, trace, work });
-                if let Some(next) = model.layers.get(k + 1) {
+                if let Some(next) = network.layers.get(k + 1) {
                     let sent = sent.of(&placed.places());
                     if let Some(tensor) = &next.message.from {
                         send(tensor, next.message.lanes(), &placed, trace, sent);
@@ -100,8 +100,8 @@ impl Grace {
 
     /// Energies from the bases of all layers.
     pub(super) fn read_out(&mut self) {
-        let Self { model, instructions, batches, layers, scratch, .. } = self;
-        let per_atom = model.readout.blocks.len() * model.readout.density_lanes();
+        let Self { network, instructions, batches, layers, scratch, .. } = self;
+        let per_atom = network.readout.blocks.len() * network.readout.density_lanes();
         let work = (
             Parts::new(Layout::Even(1), 0, &mut self.energies[..]),
             Parts::new(Layout::Even(per_atom), 0, &mut self.density_cotangents[..]),
@@ -111,9 +111,9 @@ impl Grace {
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
                 let places = placed.places();
-                let basis = |k: usize| basis(&model.layers[k], &layers[k], &places);
+                let basis = |k: usize| basis(&network.layers[k], &layers[k], &places);
                 let (energies, cotangents) = (energies.of(&places), cotangents.of(&places));
-                let readout = &model.readout;
+                let readout = &network.readout;
                 instructions.run(Energies { readout, placed, basis, energies, cotangents, work });
             }
         });
@@ -121,23 +121,23 @@ impl Grace {
 
     /// All atoms through the last layer, forwards and backwards; only energies and forces are kept.
     pub(super) fn pass_last_layer(&mut self) {
-        let Self { model, instructions, batches, scratch, .. } = self;
+        let Self { network, instructions, batches, scratch, .. } = self;
         let last = self.layers.len() - 1;
         let (before, here) = self.layers.split_at_mut(last);
-        let (layer, readout) = (&model.layers[last], &model.readout);
+        let (layer, readout) = (&network.layers[last], &network.readout);
         let per_atom = readout.blocks.len() * readout.density_lanes();
         let LayerWork { bonds, messages: received, gradients, returns, rows, .. } = &mut here[0];
         let (bonds, received, rows) = (&*bonds, &received[..], &rows[..]);
         let work = (
             Parts::new(Layout::Even(1), 0, &mut self.energies[..]),
             Parts::new(Layout::Even(per_atom), 0, &mut self.density_cotangents[..]),
-            gradients_of::<1>(layer, bonds, gradients, returns),
+            gradients_of::<V, 1>(layer, bonds, gradients, returns),
         );
         self.threads.each(&batches.chunks, work, &|chunk, (mut energies, mut cotangents, to), thread| {
             let Scratch { bonds: work, readout: readout_work, backward, trace } =
                 &mut *of_thread(scratch, thread);
             let (mut gradients, mut returns) = (to.bonds, to.returns.only());
-            begin_returns::<1>(layer, &mut returns);
+            begin_returns::<V, 1>(layer, &mut returns);
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
                 let places = placed.places();
@@ -146,7 +146,7 @@ impl Grace {
                 instructions.run(Forward { layer, placed, bonds, received, trace, work });
                 let own = &*trace.bases.of(&places);
                 let basis =
-                    |k: usize| if k < last { basis(&model.layers[k], &before[k], &places) } else { own };
+                    |k: usize| if k < last { basis(&network.layers[k], &before[k], &places) } else { own };
                 let (energies, cotangents) = (energies.of(&places), cotangents.of(&places));
                 let energy_work = &mut *readout_work;
                 instructions.run(Energies {
@@ -162,7 +162,7 @@ impl Grace {
                 let (to, returns) = (&mut gradients, returns.as_deref_mut());
                 let (block, work) = (&readout.blocks[last], (&mut *backward, work));
                 let here = (bonds, received, rows);
-                instructions.run(Backward::<1> {
+                instructions.run(Backward::<V, 1> {
                     layer,
                     block,
                     placed,
@@ -180,29 +180,29 @@ impl Grace {
 
     /// All atoms backwards through layer `k`, with `N` cotangents: of the energy, and of the features.
     pub(super) fn backward_layer<const N: usize>(&mut self, k: usize) {
-        let Self { model, instructions, batches, scratch, density_cotangents, .. } = self;
+        let Self { network, instructions, batches, scratch, density_cotangents, .. } = self;
         let (here, after) = self.layers.split_at_mut(k + 1);
-        let (layer, block) = (&model.layers[k], &model.readout.blocks[k]);
+        let (layer, block) = (&network.layers[k], &network.readout.blocks[k]);
         let LayerWork {
             bonds, trace, basis_cotangents, messages: received, gradients, returns, rows, ..
         } = &mut here[k];
         let (bonds, received, rows) = (&*bonds, &received[..], &rows[..]);
         let work = (
             trace.hold(layer, bonds, &(0..batches.order.len())),
-            gradients_of::<N>(layer, bonds, gradients, returns),
+            gradients_of::<V, N>(layer, bonds, gradients, returns),
         );
         self.threads.each(&batches.chunks, work, &|chunk, (mut trace, to), thread| {
             let Scratch { bonds: work, backward, .. } = &mut *of_thread(scratch, thread);
             let (mut gradients, mut returns) = (to.bonds, to.returns.only());
-            begin_returns::<N>(layer, &mut returns);
+            begin_returns::<V, N>(layer, &mut returns);
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
                 let places = placed.places();
                 let (lanes, stride) =
-                    (block.lanes(), model.readout.blocks.len() * model.readout.density_lanes());
+                    (block.lanes(), network.readout.blocks.len() * network.readout.density_lanes());
                 let returned = after.first().map(|next| {
-                    let message = &model.layers[k + 1].message;
-                    let of_atom = message.passed() * model.layers[k + 1].density.width;
+                    let message = &network.layers[k + 1].message;
+                    let of_atom = message.passed() * network.layers[k + 1].density.width;
                     (message, next.message_cotangents.each_ref().map(|all| part(all, &places, of_atom)))
                 });
                 let from = Cotangents {
@@ -213,7 +213,7 @@ impl Grace {
                 let (to, returns) = (&mut gradients, returns.as_deref_mut());
                 let (here, trace) = ((bonds, received, rows), &mut trace);
                 let work = (&mut *backward, &mut work[k]);
-                instructions.run(Backward::<N> {
+                instructions.run(Backward::<V, N> {
                     layer,
                     block,
                     placed,
@@ -231,8 +231,8 @@ impl Grace {
 
     /// Sums what bonds and chunks have left of layer `k`.
     fn finish_layer<const N: usize>(&mut self, k: usize) {
-        let Self { model, batches, layers, .. } = self;
-        let (layer, n) = (&model.layers[k], batches.order.len());
+        let Self { network, batches, layers, .. } = self;
+        let (layer, n) = (&network.layers[k], batches.order.len());
         let LayerWork { bonds, gradients, returns, message_cotangents, .. } = &mut layers[k];
         let [of_energy, of_features] = &mut self.forces;
         let even = Layout::Even(1);
@@ -253,7 +253,7 @@ impl Grace {
         }
         for (k, sums) in message_cotangents.iter_mut().enumerate().take(N) {
             sums.clear();
-            sums.resize(n * lanes, ZERO);
+            sums.resize(n * lanes, V::ZERO);
             let sums = Parts::new(Layout::Even(lanes), 0, sums);
             let returns = &returns[..batches.chunks.len()];
             self.threads.each(&batches.chunks, sums, &|chunk, mut sums, _| {
@@ -265,35 +265,35 @@ impl Grace {
 
     /// Features from the bases.
     pub(super) fn project(&mut self) {
-        let Self { model, instructions, layers, projection: work, .. } = self;
-        let Some(projection) = &model.projection else { return };
-        let work = work.parts(projection);
+        let Self { network, instructions, layers, projection: work, .. } = self;
+        let Some(map) = &network.feature_map else { return };
+        let work = work.parts(map);
         self.threads.share(&self.batches.chunks, work, &|places, mut work| {
-            let bases = |k: usize| basis(&model.layers[k], &layers[k], places);
+            let bases = |k: usize| basis(&network.layers[k], &layers[k], places);
             let work = &mut work;
-            instructions.run(Project { projection, places, bases, work, instructions: *instructions });
+            instructions.run(Project { map, places, bases, work, instructions: *instructions });
         });
     }
 
     /// The cotangents of the bases from those of the features, [n, D] in the order of the structure.
     pub(super) fn project_back(&mut self, cotangent: &[f64]) {
-        let Self { model, instructions, layers, batches, projection: projected, .. } = self;
-        let Some(projection) = &model.projection else { return };
-        let width = projection.feature_dimension();
+        let Self { network, instructions, layers, batches, projection: projected, .. } = self;
+        let Some(map) = &network.feature_map else { return };
+        let width = map.projection.feature_dimension();
         let of_place = |place: usize| &cotangent[batches.order[place] as usize * width..][..width];
-        let work = projected.parts(projection);
+        let work = projected.parts(map);
         self.threads.share(&batches.chunks, work, &|places, mut work| {
-            instructions.run(BeginProjectBack { projection, places, of_place, work: &mut work });
+            instructions.run(BeginProjectBack { map, places, of_place, work: &mut work });
         });
-        for (k, (work, layer)) in layers.iter_mut().zip(&model.layers).enumerate() {
+        for (k, (work, layer)) in layers.iter_mut().zip(&network.layers).enumerate() {
             let (lanes, bases) = (layer.basis.lanes(), &work.trace.bases);
-            work.basis_cotangents.resize(batches.order.len() * lanes, ZERO);
+            work.basis_cotangents.resize(batches.order.len() * lanes, V::ZERO);
             let out = Parts::new(Layout::Even(lanes), 0, &mut work.basis_cotangents[..]);
-            let work = (projected.parts(projection), out);
+            let work = (projected.parts(map), out);
             self.threads.share(&batches.chunks, work, &|places, (mut work, mut out)| {
                 let (bases, out) = (part(bases, places, lanes), out.of(places));
                 let (work, instructions) = (&mut work, *instructions);
-                let pass = ProjectBack { projection, layer: k, places, bases, out, work, instructions };
+                let pass = ProjectBack { map, layer: k, places, bases, out, work, instructions };
                 instructions.run(pass);
             });
         }
@@ -301,21 +301,21 @@ impl Grace {
 }
 
 /// The numbers of some places, `of_one` for each.
-fn part<'a>(numbers: &'a [Lanes], places: &Range<usize>, of_one: usize) -> &'a [Lanes] {
+fn part<'a, V>(numbers: &'a [V], places: &Range<usize>, of_one: usize) -> &'a [V] {
     numbers.get(places.start * of_one..places.end * of_one).unwrap_or_default()
 }
 
-fn basis<'a>(layer: &Layer, work: &'a LayerWork, places: &Range<usize>) -> &'a [Lanes] {
+fn basis<'a, V: Vector>(layer: &Layer<V>, work: &'a LayerWork<V>, places: &Range<usize>) -> &'a [V] {
     part(&work.trace.bases, places, layer.basis.lanes())
 }
 
 /// Where `N` cotangents of a layer go to.
-fn gradients_of<'a, const N: usize>(
-    layer: &Layer,
+fn gradients_of<'a, V: Vector, const N: usize>(
+    layer: &Layer<V>,
     bonds: &'a Bonds,
     [of_energy, of_features]: &'a mut [Vec<Vec3>; 2],
-    returns: &'a mut [Returns],
-) -> Gradients<'a> {
+    returns: &'a mut [Returns<V>],
+) -> Gradients<'a, V> {
     let ragged = Layout::Ragged(&bonds.offsets, 1);
     let of_features = match N {
         1 => Parts::new(Layout::Even(0), 0, &mut [][..]),
@@ -325,23 +325,23 @@ fn gradients_of<'a, const N: usize>(
     Gradients { bonds: [Parts::new(ragged, 0, of_energy), of_features], returns: OfChunks::new(returns) }
 }
 
-fn begin_returns<const N: usize>(layer: &Layer, returns: &mut Option<&mut Returns>) {
+fn begin_returns<V: Vector, const N: usize>(layer: &Layer<V>, returns: &mut Option<&mut Returns<V>>) {
     if let Some(returns) = returns {
         returns.begin(N, layer.message.passed() * layer.density.width);
     }
 }
 
 /// A batch forwards through one layer.
-struct Forward<'a, 'b> {
-    layer: &'a Layer,
+struct Forward<'a, 'b, V: Vector> {
+    layer: &'a Layer<V>,
     placed: Placed,
     bonds: &'a Bonds,
-    received: &'a [Lanes],
-    trace: &'a mut Traced<'b>,
-    work: &'a mut BondWork,
+    received: &'a [V],
+    trace: &'a mut Traced<'b, V>,
+    work: &'a mut BondWork<V>,
 }
 
-impl Pass for Forward<'_, '_> {
+impl<V: Vector> Pass for Forward<'_, '_, V> {
     #[inline(always)]
     fn run(self, _: bool) {
         forward(self.layer, &self.placed, (self.bonds, self.received), self.trace, self.work);
@@ -349,16 +349,16 @@ impl Pass for Forward<'_, '_> {
 }
 
 /// A batch from its bases to energies, and to ∂E/∂(W B).
-struct Energies<'a, B> {
-    readout: &'a Readout,
+struct Energies<'a, V, B> {
+    readout: &'a Readout<V>,
     placed: Placed,
     basis: B,
     energies: &'a mut [f64],
-    cotangents: &'a mut [Lanes],
-    work: &'a mut ReadoutWork,
+    cotangents: &'a mut [V],
+    work: &'a mut ReadoutWork<V>,
 }
 
-impl<'b, B: Fn(usize) -> &'b [Lanes]> Pass for Energies<'_, B> {
+impl<'b, V: Vector, B: Fn(usize) -> &'b [V]> Pass for Energies<'_, V, B> {
     #[inline(always)]
     fn run(self, _: bool) {
         let Self { readout, placed, basis, energies, cotangents, work } = self;
@@ -373,74 +373,74 @@ impl<'b, B: Fn(usize) -> &'b [Lanes]> Pass for Energies<'_, B> {
 }
 
 /// A batch backwards through one layer, with `N` cotangents.
-struct Backward<'a, 'b, 'c, const N: usize> {
-    layer: &'a Layer,
-    block: &'a Block,
+struct Backward<'a, 'b, 'c, V: Vector, const N: usize> {
+    layer: &'a Layer<V>,
+    block: &'a Block<V>,
     placed: Placed,
-    here: (&'a Bonds, &'a [Lanes], &'a [u32]),
-    trace: &'a mut Traced<'b>,
-    from: Cotangents<'a>,
+    here: (&'a Bonds, &'a [V], &'a [u32]),
+    trace: &'a mut Traced<'b, V>,
+    from: Cotangents<'a, V>,
     to: &'a mut [Parts<'c, Vec3>; 2],
-    returns: Option<&'a mut Returns>,
-    work: (&'a mut BackwardWork, &'a mut BondWork),
+    returns: Option<&'a mut Returns<V>>,
+    work: (&'a mut BackwardWork<V>, &'a mut BondWork<V>),
 }
 
-impl<const N: usize> Pass for Backward<'_, '_, '_, N> {
+impl<V: Vector, const N: usize> Pass for Backward<'_, '_, '_, V, N> {
     #[inline(always)]
     fn run(self, _: bool) {
         let Self { layer, block, placed, here, trace, from, to, returns, work } = self;
         let (backward, bonds) = work;
-        backward_tape::<N>(layer, block, &placed, trace, &from, backward);
-        backward_bonds::<N>(layer, &placed, here, trace, (to, returns), (backward, bonds));
+        backward_tape::<V, N>(layer, block, &placed, trace, &from, backward);
+        backward_bonds::<V, N>(layer, &placed, here, trace, (to, returns), (backward, bonds));
     }
 }
 
 /// From the bases of some atoms to their features.
-struct Project<'a, 'b, B> {
-    projection: &'a Projection,
+struct Project<'a, 'b, V, B> {
+    map: &'a FeatureMap<V>,
     places: &'a Range<usize>,
     bases: B,
-    work: &'a mut Projected<'b>,
+    work: &'a mut Projected<'b, V>,
     instructions: Instructions,
 }
 
-impl<'c, B: Fn(usize) -> &'c [Lanes]> Pass for Project<'_, '_, B> {
+impl<'c, V: Vector, B: Fn(usize) -> &'c [V]> Pass for Project<'_, '_, V, B> {
     #[inline(always)]
     fn run(self, _: bool) {
-        self.projection.forward(self.places, self.bases, self.work, self.instructions);
+        self.map.forward(self.places, self.bases, self.work, self.instructions);
     }
 }
 
 /// From the cotangents of features to those of their projections.
-struct BeginProjectBack<'a, 'b, C> {
-    projection: &'a Projection,
+struct BeginProjectBack<'a, 'b, V, C> {
+    map: &'a FeatureMap<V>,
     places: &'a Range<usize>,
     of_place: C,
-    work: &'a mut Projected<'b>,
+    work: &'a mut Projected<'b, V>,
 }
 
-impl<'c, C: Fn(usize) -> &'c [f64]> Pass for BeginProjectBack<'_, '_, C> {
+impl<'c, V: Vector, C: Fn(usize) -> &'c [f64]> Pass for BeginProjectBack<'_, '_, V, C> {
     #[inline(always)]
     fn run(self, _: bool) {
-        self.projection.begin_backward(self.places, self.of_place, self.work);
+        self.map.begin_backward(self.places, self.of_place, self.work);
     }
 }
 
 /// From there to those of the bases of one layer.
-struct ProjectBack<'a, 'b> {
-    projection: &'a Projection,
+struct ProjectBack<'a, 'b, V> {
+    map: &'a FeatureMap<V>,
     layer: usize,
     places: &'a Range<usize>,
-    bases: &'a [Lanes],
-    out: &'a mut [Lanes],
-    work: &'a mut Projected<'b>,
+    bases: &'a [V],
+    out: &'a mut [V],
+    work: &'a mut Projected<'b, V>,
     instructions: Instructions,
 }
 
-impl Pass for ProjectBack<'_, '_> {
+impl<V: Vector> Pass for ProjectBack<'_, '_, V> {
     #[inline(always)]
     fn run(self, _: bool) {
-        let Self { projection, layer, places, bases, out, work, instructions } = self;
-        projection.backward(layer, places, bases, out, work, instructions);
+        let Self { map, layer, places, bases, out, work, instructions } = self;
+        map.backward(layer, places, bases, out, work, instructions);
     }
 }

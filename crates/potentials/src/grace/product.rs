@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use super::matrix::{Lanes, ZERO, add_product, add_scaled, scaled};
+use super::vector::{Number, Vector};
 
 /// out_n,f = Σ_c C_c left_n,l(c) right_n,r(c), the sum over the terms c of f.
 #[derive(Clone, Debug)]
-pub(super) struct Product {
+pub(super) struct Product<V: Vector> {
     /// First lane of the result.
     pub start: usize,
     /// Lanes of a component, the same for result and factors.
@@ -14,48 +14,48 @@ pub(super) struct Product {
     /// Channels of a component.
     pub channels: usize,
     /// Each component of the result that is needed.
-    pub outputs: Vec<Coupled>,
+    pub outputs: Vec<Coupled<V>>,
     /// Each component of the factors with the derivatives of the result: terms of the result's cotangent (left, lanes
     /// from the beginning of the result) and the other factor (right). Made by [`Product::keep`].
-    pub inputs: Vec<Coupled>,
+    pub inputs: Vec<Coupled<V>>,
 }
 
 /// One component, and what it sums.
 #[derive(Clone, Debug)]
-pub(super) struct Coupled {
+pub(super) struct Coupled<V: Vector> {
     /// First lane on the tape.
     pub row: usize,
-    pub terms: Vec<Term>,
+    pub terms: Vec<Term<V>>,
 }
 
 /// One coupling.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Term {
+pub(super) struct Term<V: Vector> {
     /// First lane of the left factor on the tape.
     pub left: u32,
     /// First lane of the right factor on the tape.
     pub right: u32,
     /// Clebsch–Gordan coefficient.
-    pub coefficient: f64,
+    pub coefficient: V::Number,
 }
 
 /// Lanes that are summed together, so that a term is looked at once for all of them.
 const TOGETHER: usize = 4;
 
-impl Product {
+impl<V: Vector> Product<V> {
     #[inline(always)]
-    pub fn forward(&self, atoms: usize, tape: &mut [Lanes]) {
+    pub fn forward(&self, atoms: usize, tape: &mut [V]) {
         let (before, out) = tape.split_at_mut(self.start * atoms);
         let lanes = self.width * atoms;
         for output in &self.outputs {
             let out = &mut out[(output.row - self.start) * atoms..][..lanes];
             let whole = lanes / TOGETHER * TOGETHER;
             for c in (0..whole).step_by(TOGETHER) {
-                let [sums] = couple::<1, TOGETHER>(&output.terms, before, 0, before, atoms, c);
+                let [sums] = couple::<V, 1, TOGETHER>(&output.terms, before, 0, before, atoms, c);
                 out[c..c + TOGETHER].copy_from_slice(&sums);
             }
             for c in whole..lanes {
-                let [sums] = couple::<1, 1>(&output.terms, before, 0, before, atoms, c);
+                let [sums] = couple::<V, 1, 1>(&output.terms, before, 0, before, atoms, c);
                 out[c..c + 1].copy_from_slice(&sums);
             }
         }
@@ -63,18 +63,18 @@ impl Product {
 
     /// Adds to `N` cotangents of both factors.
     #[inline(always)]
-    pub fn backward<const N: usize>(&self, atoms: usize, tape: &[Lanes], cotangent: &mut [Lanes]) {
+    pub fn backward<const N: usize>(&self, atoms: usize, tape: &[V], cotangent: &mut [V]) {
         let (before, out) = cotangent.split_at_mut(self.start * N * atoms);
         let lanes = self.width * atoms;
         for input in &self.inputs {
             let whole = lanes / TOGETHER * TOGETHER;
             for c in (0..whole).step_by(TOGETHER) {
-                let sums = couple::<N, TOGETHER>(&input.terms, out, lanes, tape, atoms, c);
-                add::<N, TOGETHER>(&mut before[input.row * N * atoms + c..], lanes, &sums);
+                let sums = couple::<V, N, TOGETHER>(&input.terms, out, lanes, tape, atoms, c);
+                add::<V, N, TOGETHER>(&mut before[input.row * N * atoms + c..], lanes, &sums);
             }
             for c in whole..lanes {
-                let sums = couple::<N, 1>(&input.terms, out, lanes, tape, atoms, c);
-                add::<N, 1>(&mut before[input.row * N * atoms + c..], lanes, &sums);
+                let sums = couple::<V, N, 1>(&input.terms, out, lanes, tape, atoms, c);
+                add::<V, N, 1>(&mut before[input.row * N * atoms + c..], lanes, &sums);
             }
         }
     }
@@ -90,24 +90,29 @@ impl Product {
     }
 
     /// Some of the results alone.
-    pub fn with_outputs(&self, outputs: Vec<Coupled>) -> Self {
+    pub fn with_outputs(&self, outputs: Vec<Coupled<V>>) -> Self {
         let mut product = Self { outputs, inputs: Vec::new(), ..*self };
         product.inputs = product.derivatives();
         product
     }
 
     /// ∂out/∂x for every component x of the factors, with one term for each pair of result and other factor.
-    fn derivatives(&self) -> Vec<Coupled> {
+    fn derivatives(&self) -> Vec<Coupled<V>> {
         let mut inputs: BTreeMap<u32, BTreeMap<(u32, u32), f64>> = BTreeMap::new();
         for output in &self.outputs {
             for Term { left, right, coefficient } in &output.terms {
                 for (x, other) in [(left, right), (right, left)] {
                     let terms = inputs.entry(*x).or_default();
-                    *terms.entry(((output.row - self.start) as u32, *other)).or_default() += coefficient;
+                    *terms.entry(((output.row - self.start) as u32, *other)).or_default() +=
+                        (*coefficient).into();
                 }
             }
         }
-        let term = |((left, right), coefficient): ((u32, u32), f64)| Term { left, right, coefficient };
+        let term = |((left, right), coefficient): ((u32, u32), f64)| Term {
+            left,
+            right,
+            coefficient: V::Number::round(coefficient),
+        };
         let coupled = |(x, terms): (u32, BTreeMap<(u32, u32), f64>)| Coupled {
             row: x as usize,
             terms: terms.into_iter().map(term).collect(),
@@ -119,22 +124,22 @@ impl Product {
 /// Σ C left_k right over some terms, for `L` lanes from lane `c` of their rows; the `N` left factors stand `apart` lanes
 /// from one another.
 #[inline(always)]
-fn couple<const N: usize, const L: usize>(
-    terms: &[Term],
-    left: &[Lanes],
+fn couple<V: Vector, const N: usize, const L: usize>(
+    terms: &[Term<V>],
+    left: &[V],
     apart: usize,
-    right: &[Lanes],
+    right: &[V],
     atoms: usize,
     c: usize,
-) -> [[Lanes; L]; N] {
-    let mut sums = [[ZERO; L]; N];
+) -> [[V; L]; N] {
+    let mut sums = [[V::ZERO; L]; N];
     for term in terms {
         let right = &right[term.right as usize * atoms + c..][..L];
-        let right: [Lanes; L] = std::array::from_fn(|l| scaled(term.coefficient, &right[l]));
+        let right: [V; L] = std::array::from_fn(|l| right[l].scaled(term.coefficient));
         for (k, sums) in sums.iter_mut().enumerate() {
             let left = &left[term.left as usize * N * atoms + k * apart + c..][..L];
             for l in 0..L {
-                add_product(&mut sums[l], &left[l], &right[l]);
+                sums[l].add_product(&left[l], &right[l]);
             }
         }
     }
@@ -143,17 +148,20 @@ fn couple<const N: usize, const L: usize>(
 
 /// Adds sums to `N` rows `apart` lanes from one another.
 #[inline(always)]
-fn add<const N: usize, const L: usize>(rows: &mut [Lanes], apart: usize, sums: &[[Lanes; L]; N]) {
+fn add<V: Vector, const N: usize, const L: usize>(rows: &mut [V], apart: usize, sums: &[[V; L]; N]) {
     for (k, sums) in sums.iter().enumerate() {
         for (out, sum) in rows[k * apart..][..L].iter_mut().zip(sums) {
-            add_scaled(out, 1.0, sum);
+            out.add(sum);
         }
     }
 }
 
+/// First lanes of rows, and the factor of each.
+pub(super) type Summands<V> = Vec<(u32, <V as Vector>::Number)>;
+
 /// out_n,f = Σ_c C_c x_n,r(c), the sum over the terms c of f.
 #[derive(Clone, Debug)]
-pub(super) struct Combination {
+pub(super) struct Combination<V: Vector> {
     /// First lane of the result.
     pub start: usize,
     /// Lanes of a component.
@@ -161,19 +169,19 @@ pub(super) struct Combination {
     /// Channels of a component.
     pub channels: usize,
     /// For each component that is needed its first lane, and the first lane and factor of what it sums.
-    pub outputs: Vec<(usize, Vec<(u32, f64)>)>,
+    pub outputs: Vec<(usize, Summands<V>)>,
 }
 
-impl Combination {
+impl<V: Vector> Combination<V> {
     #[inline(always)]
-    pub fn forward(&self, slots: usize, tape: &mut [Lanes]) {
+    pub fn forward(&self, slots: usize, tape: &mut [V]) {
         let (before, out) = tape.split_at_mut(self.start * slots);
         for (row, terms) in &self.outputs {
             let out = &mut out[(row - self.start) * slots..][..self.width * slots];
             for (c, out) in out.iter_mut().enumerate() {
-                let mut sum = ZERO;
+                let mut sum = V::ZERO;
                 for (from, coefficient) in terms {
-                    add_scaled(&mut sum, *coefficient, &before[*from as usize * slots + c]);
+                    sum.add_scaled(*coefficient, &before[*from as usize * slots + c]);
                 }
                 *out = sum;
             }
@@ -182,13 +190,13 @@ impl Combination {
 
     /// Adds to the cotangents of what it read.
     #[inline(always)]
-    pub fn backward(&self, slots: usize, cotangent: &mut [Lanes]) {
+    pub fn backward(&self, slots: usize, cotangent: &mut [V]) {
         let (before, out) = cotangent.split_at_mut(self.start * slots);
         for (row, terms) in &self.outputs {
             let out = &out[(row - self.start) * slots..][..self.width * slots];
             for (c, out) in out.iter().enumerate() {
                 for (from, coefficient) in terms {
-                    add_scaled(&mut before[*from as usize * slots + c], *coefficient, out);
+                    before[*from as usize * slots + c].add_scaled(*coefficient, out);
                 }
             }
         }

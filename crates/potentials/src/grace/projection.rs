@@ -4,8 +4,9 @@ use std::ops::Range;
 
 use super::batches::Chunk;
 use super::instructions::Instructions;
-use super::matrix::{LANES, Lanes, Matrix, Rows, ZERO, add_product, horizontal_sum, scaled};
+use super::matrix::{Matrix, Rows};
 use super::parts::{Divide, Layout, Parts};
+use super::vector::{Number, Vector};
 use super::weights::with_transpose;
 
 /// ε_0 of the paper (Methods, "Latent features and uncertainty models").
@@ -32,18 +33,16 @@ pub struct Projection {
     pub asinh: bool,
     /// The layers in the order of their norms in z.
     pub(super) blocks: Vec<usize>,
-    /// Of the basis of each layer.
-    pub(super) maps: Vec<ProjectionMaps>,
 }
 
 /// The rows of R for the basis of one layer, and their transpose.
 #[derive(Clone, Debug)]
-pub(super) struct ProjectionMaps {
-    forward: Matrix,
-    transposed: Matrix,
+pub(super) struct ProjectionMaps<V> {
+    forward: Matrix<V>,
+    transposed: Matrix<V>,
 }
 
-impl ProjectionMaps {
+impl<V: Vector> ProjectionMaps<V> {
     /// `row_of` gives the row of R for each place of the layer's padded basis, none for padding.
     pub fn new(matrix: &[f32], dimension: usize, row_of: &[Option<usize>]) -> Self {
         let element = |place: usize, column: usize| {
@@ -56,9 +55,9 @@ impl ProjectionMaps {
 
 /// What the reverse sweep needs of the forward one, for all atoms in the order of evaluation; and z.
 #[derive(Clone, Debug, Default)]
-pub(super) struct ProjectionWork {
+pub(super) struct ProjectionWork<V> {
     /// B̂ R before T, [n, lanes of d].
-    projected: Vec<Lanes>,
+    projected: Vec<V>,
     /// ‖B‖ and ‖B_k‖ of each layer, [n, 1 + layers].
     norms: Vec<f64>,
     /// [n, D]
@@ -66,32 +65,33 @@ pub(super) struct ProjectionWork {
 }
 
 /// The part of it that belongs to some atoms.
-pub(super) struct Projected<'a> {
-    projected: Parts<'a, Lanes>,
+pub(super) struct Projected<'a, V> {
+    projected: Parts<'a, V>,
     norms: Parts<'a, f64>,
     features: Parts<'a, f64>,
 }
 
-impl ProjectionWork {
+impl<V: Vector> ProjectionWork<V> {
     /// Makes room for `n` atoms.
-    pub fn resize(&mut self, projection: &Projection, n: usize) {
-        self.projected.resize(n * projection.lanes(), ZERO);
+    pub fn resize(&mut self, map: &FeatureMap<V>, n: usize) {
+        let projection = &map.projection;
+        self.projected.resize(n * map.lanes(), V::ZERO);
         self.norms.resize(n * projection.n_norms(), 0.0);
         self.features.resize(n * projection.feature_dimension(), 0.0);
     }
 
     /// To be divided.
-    pub fn parts(&mut self, projection: &Projection) -> Projected<'_> {
-        let even = Layout::Even;
+    pub fn parts(&mut self, map: &FeatureMap<V>) -> Projected<'_, V> {
+        let (even, projection) = (Layout::Even, &map.projection);
         Projected {
-            projected: Parts::new(even(projection.lanes()), 0, &mut self.projected),
+            projected: Parts::new(even(map.lanes()), 0, &mut self.projected),
             norms: Parts::new(even(projection.n_norms()), 0, &mut self.norms),
             features: Parts::new(even(projection.feature_dimension()), 0, &mut self.features),
         }
     }
 }
 
-impl Divide for Projected<'_> {
+impl<V: Send> Divide for Projected<'_, V> {
     fn divide(self, chunk: &Chunk) -> (Self, Self) {
         let (projected, norms) = (self.projected.divide(chunk), self.norms.divide(chunk));
         let features = self.features.divide(chunk);
@@ -124,96 +124,6 @@ impl Projection {
         bytes
     }
 
-    /// z of the atoms at some places from the bases of each layer, [places, lanes].
-    #[inline(always)]
-    pub(super) fn forward<'a>(
-        &self,
-        places: &Range<usize>,
-        bases: impl Fn(usize) -> &'a [Lanes],
-        work: &mut Projected,
-        instructions: Instructions,
-    ) {
-        let (n, lanes, width) = (places.len(), self.lanes(), self.feature_dimension());
-        let (all_norms, all_projected) = (work.norms.of(places), work.projected.of(places));
-        all_norms.fill(SQUARE_FLOOR);
-        all_projected.fill(ZERO);
-        for (layer, maps) in self.maps.iter().enumerate() {
-            let (bases, of_atom) = (bases(layer), maps.forward.input_lanes());
-            for (norms, basis) in all_norms.chunks_exact_mut(self.n_norms()).zip(bases.chunks_exact(of_atom))
-            {
-                let square = dot(basis, basis);
-                norms[0] += square;
-                norms[layer + 1] += square;
-            }
-            let (from, to) = (Rows::of_atoms(n, of_atom), Rows::of_atoms(n, lanes));
-            maps.forward.multiply_add(bases, from, all_projected, to, instructions);
-        }
-        all_norms.iter_mut().for_each(|square| *square = square.sqrt());
-        let rows = all_projected.chunks_exact_mut(lanes).zip(all_norms.chunks_exact(self.n_norms()));
-        for (z, (projected, norms)) in work.features.of(places).chunks_exact_mut(width).zip(rows) {
-            let scale = if self.normalize { 1.0 / (norms[0] + NORM_FLOOR) } else { 1.0 };
-            let projected = &mut projected.as_flattened_mut()[..self.dimension];
-            for (z, p) in z.iter_mut().zip(projected) {
-                *p *= scale;
-                *z = if self.asinh { p.asinh() } else { *p };
-            }
-            let norms = std::iter::once(norms[0]).chain(self.blocks.iter().map(|layer| norms[layer + 1]));
-            for (z, norm) in z[self.dimension..].iter_mut().zip(norms) {
-                *z = f64::from(self.density_scale) * (norm + NORM_FLOOR).ln();
-            }
-        }
-    }
-
-    /// The first half of the way back, for the atoms at some places: the cotangents of B̂ R, and the factors of B, from those
-    /// of z, `cotangent_of(place)`.
-    ///
-    /// B̄ = R p̄/(N + ε_0) + \[L̄/(N + ε_0) − (p̄ · p)/(N + ε_0)\] B/N with p = B̂ R, and in block k besides
-    /// L̄_k/(N_k + ε_0) B/N_k.
-    #[inline(always)]
-    pub(super) fn begin_backward<'a>(
-        &self,
-        places: &Range<usize>,
-        cotangent_of: impl Fn(usize) -> &'a [f64],
-        work: &mut Projected,
-    ) {
-        let rows = work.projected.of(places).chunks_exact_mut(self.lanes());
-        let rows = rows.zip(work.norms.of(places).chunks_exact_mut(self.n_norms()));
-        for (place, (projected, norms)) in places.clone().zip(rows) {
-            let (of_projected, of_norms) = cotangent_of(place).split_at(self.dimension);
-            let inverse = 1.0 / (norms[0] + NORM_FLOOR);
-            let (scale, mut along) = (if self.normalize { inverse } else { 1.0 }, 0.0);
-            for (c, p) in of_projected.iter().zip(projected.as_flattened_mut()) {
-                let cotangent = if self.asinh { c / (1.0 + *p * *p).sqrt() } else { *c };
-                along += cotangent * *p;
-                *p = scale * cotangent;
-            }
-            self.norm_cotangents(norms, if self.normalize { along } else { 0.0 }, of_norms);
-        }
-    }
-
-    /// The second half: the cotangents of the bases of one layer, [places, lanes], into `out`.
-    #[inline(always)]
-    pub(super) fn backward(
-        &self,
-        layer: usize,
-        places: &Range<usize>,
-        bases: &[Lanes],
-        out: &mut [Lanes],
-        work: &mut Projected,
-        instructions: Instructions,
-    ) {
-        let (maps, norms) = (&self.maps[layer], work.norms.of(places));
-        let of_atom = maps.forward.input_lanes();
-        let rows = bases.chunks_exact(of_atom).zip(out.chunks_exact_mut(of_atom));
-        for ((basis, out), factors) in rows.zip(norms.chunks_exact(self.n_norms())) {
-            for (out, b) in out.iter_mut().zip(basis) {
-                *out = scaled(factors[0] + factors[layer + 1], b);
-            }
-        }
-        let (from, to) = (Rows::of_atoms(places.len(), self.lanes()), Rows::of_atoms(places.len(), of_atom));
-        maps.transposed.multiply_add(work.projected.of(places), from, out, to, instructions);
-    }
-
     /// Puts in place of ‖B‖ and ‖B_k‖ the factors of B in its cotangent, the first for all layers.
     #[inline(always)]
     fn norm_cotangents(&self, norms: &mut [f64], along: f64, of_norms: &[f64]) {
@@ -224,6 +134,110 @@ impl Projection {
         }
         norms[0] = factor(norms[0], scale * density(0).unwrap_or(0.0) - along);
     }
+}
+
+/// A projection with its matrix as the passes over atoms take it.
+#[derive(Clone, Debug)]
+pub(super) struct FeatureMap<V> {
+    pub projection: Projection,
+    /// Of the basis of each layer.
+    pub maps: Vec<ProjectionMaps<V>>,
+}
+
+impl<V: Vector> FeatureMap<V> {
+    /// z of the atoms at some places from the bases of each layer, [places, lanes].
+    #[inline(always)]
+    pub fn forward<'a>(
+        &self,
+        places: &Range<usize>,
+        bases: impl Fn(usize) -> &'a [V],
+        work: &mut Projected<V>,
+        instructions: Instructions,
+    ) {
+        let (map, n, lanes) = (&self.projection, places.len(), self.lanes());
+        let width = map.feature_dimension();
+        let (all_norms, all_projected) = (work.norms.of(places), work.projected.of(places));
+        all_norms.fill(SQUARE_FLOOR);
+        all_projected.fill(V::ZERO);
+        for (layer, maps) in self.maps.iter().enumerate() {
+            let (bases, of_atom) = (bases(layer), maps.forward.input_lanes());
+            for (norms, basis) in all_norms.chunks_exact_mut(map.n_norms()).zip(bases.chunks_exact(of_atom)) {
+                let square = dot(basis, basis);
+                norms[0] += square;
+                norms[layer + 1] += square;
+            }
+            let (from, to) = (Rows::of_atoms(n, of_atom), Rows::of_atoms(n, lanes));
+            maps.forward.multiply_add(bases, from, all_projected, to, instructions);
+        }
+        all_norms.iter_mut().for_each(|square| *square = square.sqrt());
+        let rows = all_projected.chunks_exact_mut(lanes).zip(all_norms.chunks_exact(map.n_norms()));
+        for (z, (projected, norms)) in work.features.of(places).chunks_exact_mut(width).zip(rows) {
+            let scale = if map.normalize { 1.0 / (norms[0] + NORM_FLOOR) } else { 1.0 };
+            let projected = &mut V::flat_mut(projected)[..map.dimension];
+            for (z, p) in z.iter_mut().zip(projected) {
+                *p *= V::Number::round(scale);
+                let p: f64 = (*p).into();
+                *z = if map.asinh { p.asinh() } else { p };
+            }
+            let norms = std::iter::once(norms[0]).chain(map.blocks.iter().map(|layer| norms[layer + 1]));
+            for (z, norm) in z[map.dimension..].iter_mut().zip(norms) {
+                *z = f64::from(map.density_scale) * (norm + NORM_FLOOR).ln();
+            }
+        }
+    }
+
+    /// The first half of the way back, for the atoms at some places: the cotangents of B̂ R, and the factors of B, from those
+    /// of z, `cotangent_of(place)`.
+    ///
+    /// B̄ = R p̄/(N + ε_0) + \[L̄/(N + ε_0) − (p̄ · p)/(N + ε_0)\] B/N with p = B̂ R, and in block k besides
+    /// L̄_k/(N_k + ε_0) B/N_k.
+    #[inline(always)]
+    pub fn begin_backward<'a>(
+        &self,
+        places: &Range<usize>,
+        cotangent_of: impl Fn(usize) -> &'a [f64],
+        work: &mut Projected<V>,
+    ) {
+        let map = &self.projection;
+        let rows = work.projected.of(places).chunks_exact_mut(self.lanes());
+        let rows = rows.zip(work.norms.of(places).chunks_exact_mut(map.n_norms()));
+        for (place, (projected, norms)) in places.clone().zip(rows) {
+            let (of_projected, of_norms) = cotangent_of(place).split_at(map.dimension);
+            let inverse = 1.0 / (norms[0] + NORM_FLOOR);
+            let (scale, mut along) = (if map.normalize { inverse } else { 1.0 }, 0.0);
+            for (c, p) in of_projected.iter().zip(V::flat_mut(projected)) {
+                let of_z: f64 = (*p).into();
+                let cotangent = if map.asinh { c / (1.0 + of_z * of_z).sqrt() } else { *c };
+                along += cotangent * of_z;
+                *p = V::Number::round(scale * cotangent);
+            }
+            map.norm_cotangents(norms, if map.normalize { along } else { 0.0 }, of_norms);
+        }
+    }
+
+    /// The second half: the cotangents of the bases of one layer, [places, lanes], into `out`.
+    #[inline(always)]
+    pub fn backward(
+        &self,
+        layer: usize,
+        places: &Range<usize>,
+        bases: &[V],
+        out: &mut [V],
+        work: &mut Projected<V>,
+        instructions: Instructions,
+    ) {
+        let (maps, norms) = (&self.maps[layer], work.norms.of(places));
+        let of_atom = maps.forward.input_lanes();
+        let rows = bases.chunks_exact(of_atom).zip(out.chunks_exact_mut(of_atom));
+        for ((basis, out), factors) in rows.zip(norms.chunks_exact(self.projection.n_norms())) {
+            let factor = V::Number::round(factors[0] + factors[layer + 1]);
+            for (out, b) in out.iter_mut().zip(basis) {
+                *out = b.scaled(factor);
+            }
+        }
+        let (from, to) = (Rows::of_atoms(places.len(), self.lanes()), Rows::of_atoms(places.len(), of_atom));
+        maps.transposed.multiply_add(work.projected.of(places), from, out, to, instructions);
+    }
 
     /// Lanes of B̂ R.
     fn lanes(&self) -> usize {
@@ -232,12 +246,12 @@ impl Projection {
 }
 
 #[inline(always)]
-fn dot(a: &[Lanes], b: &[Lanes]) -> f64 {
-    let mut sum = ZERO;
+fn dot<V: Vector>(a: &[V], b: &[V]) -> f64 {
+    let mut sum = V::ZERO;
     for (a, b) in a.iter().zip(b) {
-        add_product(&mut sum, a, b);
+        sum.add_product(a, b);
     }
-    horizontal_sum(&sum)
+    sum.horizontal_sum().into()
 }
 
 /// Components and channels of the sources of one layer's basis.
@@ -245,10 +259,10 @@ pub(super) type Sources = [(usize, usize)];
 
 /// The row of R for each place of the padded basis of one layer, whose first row is `first`: sources one after
 /// another, the file channel-major (row n · components + c), the evaluation \[component\]\[padded channel\].
-pub(super) fn rows_of_projection(mut first: usize, sources: &Sources) -> Vec<Option<usize>> {
+pub(super) fn rows_of_projection<V: Vector>(mut first: usize, sources: &Sources) -> Vec<Option<usize>> {
     let mut rows = Vec::new();
     for (components, channels) in sources {
-        let padded = channels.next_multiple_of(LANES);
+        let padded = channels.next_multiple_of(V::LANES);
         for c in 0..*components {
             rows.extend((0..padded).map(|n| (n < *channels).then_some(first + n * components + c)));
         }

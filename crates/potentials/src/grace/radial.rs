@@ -1,8 +1,8 @@
 //! Radial functions R_nl(r) of every pair of elements, evaluated exactly or from tables.
 
-use super::matrix::{LANES, Lanes, ZERO, lanes_for};
 use super::radial_network::{RadialNetwork, RadialWork};
 use super::radial_table::{RadialTable, b_splines};
+use super::vector::{Double, MOST_LANES, Number, Vector, lanes_for};
 
 /// Where each pair of elements needs a table, more bytes than this in all are not worth it.
 const LARGEST_TABLES: usize = 1 << 28;
@@ -12,37 +12,37 @@ const LARGEST_TABLES: usize = 1 << 28;
 pub enum RadialPath {
     /// The network itself, for every bond.
     Exact,
-    /// Splines of degree seven; the errors of values and of derivatives are at most 10⁻¹¹ of the largest,
-    /// measured when a model is read. Where tables for every pair of elements would take more than 256 MiB (three
-    /// layers, tens of elements) the network itself is evaluated.
+    /// Splines of degree seven; the errors of values and of derivatives are at most 10⁻¹¹ of the largest, 10⁻⁸ in mixed
+    /// precision before coefficients are rounded, measured when a model is read. Where tables for every pair of elements
+    /// would take more than 256 MiB (three layers, tens of elements) the network itself is evaluated.
     #[default]
     Table,
 }
 
 /// The radial functions of every pair of elements.
 #[derive(Clone, Debug)]
-pub(super) struct RadialFunctions {
+pub(super) struct RadialFunctions<V> {
     network: RadialNetwork,
     n_elements: usize,
     /// r_c for centre and neighbour element, [n_elements²], Å.
     cutoffs: Vec<f64>,
     /// One table for each distinct cutoff, or for each pair where the elements matter; none for the exact path.
-    tables: Vec<RadialTable>,
+    tables: Vec<RadialTable<V>>,
     /// Which table belongs to centre and neighbour element, [n_elements²].
     table_of_pair: Vec<usize>,
 }
 
-impl RadialFunctions {
+impl<V: Vector> RadialFunctions<V> {
     pub fn new(network: RadialNetwork, n_elements: usize, cutoffs: Vec<f64>, path: RadialPath) -> Self {
-        let mut tables: Vec<RadialTable> = Vec::new();
+        let mut tables: Vec<RadialTable<V>> = Vec::new();
         let mut table_of_pair = Vec::new();
         let exact = path == RadialPath::Exact;
         for (pair, cutoff) in cutoffs.iter().enumerate().take_while(|_| !exact) {
-            let same = |table: &RadialTable| network.pair_biases.is_empty() && table.cutoff() == *cutoff;
+            let same = |table: &RadialTable<V>| network.pair_biases.is_empty() && table.cutoff() == *cutoff;
             let known = tables.iter().position(same);
             table_of_pair.push(known.unwrap_or(tables.len()));
             if known.is_none() {
-                tables.push(RadialTable::new(&network, *cutoff, pair));
+                tables.push(RadialTable::new(&network, *cutoff, pair, V::Number::TABLE_ERROR).rounded());
             }
             if !network.pair_biases.is_empty() && tables[0].bytes() * cutoffs.len() > LARGEST_TABLES {
                 tables.clear();
@@ -71,7 +71,7 @@ impl RadialFunctions {
 
     /// Lanes of R_nl of one bond, \[l\]\[channel\].
     pub fn output_lanes(&self) -> usize {
-        self.network.output_lanes()
+        self.network.output_lanes() * Double::LANES / V::LANES
     }
 
     /// Number of Chebyshev polynomials.
@@ -80,36 +80,34 @@ impl RadialFunctions {
     }
 
     /// The tables, for a description of the model.
-    pub fn tables(&self) -> &[RadialTable] {
+    pub fn tables(&self) -> &[RadialTable<V>] {
         &self.tables
     }
 
-    /// R_nl and dR_nl/dr of `n` ≤ 8 bonds at distances `r` between pairs of elements, each
-    /// \[bond\]\[l\]\[channel\]; r within the cutoff of the pair.
+    /// R_nl and dR_nl/dr of no more bonds than a vector has lanes, each \[bond\]\[l\]\[channel\], from the pair of elements
+    /// and the distance of each, within the cutoff of the pair.
     #[inline(always)]
     pub fn evaluate(
         &self,
-        n: usize,
-        pairs: &[usize; LANES],
-        r: &Lanes,
+        bonds: &[(usize, f64)],
         work: &mut RadialWork,
-        values: &mut [Lanes],
-        derivatives: &mut [Lanes],
+        values: &mut [V],
+        derivatives: &mut [V],
     ) {
         if self.tables.is_empty() {
-            return self.evaluate_exactly(n, pairs, r, work, values, derivatives);
+            return self.evaluate_exactly(bonds, work, values, derivatives);
         }
-        let (lanes, mut places) = (self.output_lanes(), ZERO);
-        let mut located = [(&self.tables[0], 0); LANES];
-        for b in 0..n {
-            let table = &self.tables[self.table_of_pair[pairs[b]]];
-            let (interval, t) = table.locate(r[b]);
-            places[b] = t;
+        let (lanes, mut places) = (self.output_lanes(), V::ZERO);
+        let mut located = [(&self.tables[0], 0); MOST_LANES];
+        for (b, (pair, r)) in bonds.iter().enumerate() {
+            let table = &self.tables[self.table_of_pair[*pair]];
+            let (interval, t) = table.locate(*r);
+            places[b] = V::Number::round(t);
             located[b] = (table, interval);
         }
         let weights = b_splines(&places);
         let rows = values.chunks_exact_mut(lanes).zip(derivatives.chunks_exact_mut(lanes));
-        for (b, (values, derivatives)) in rows.enumerate().take(n) {
+        for (b, (values, derivatives)) in rows.enumerate().take(bonds.len()) {
             let (table, interval) = located[b];
             table.combine(interval, b, &weights, values, derivatives);
         }
@@ -117,27 +115,31 @@ impl RadialFunctions {
 
     fn evaluate_exactly(
         &self,
-        n: usize,
-        pairs: &[usize; LANES],
-        r: &Lanes,
+        bonds: &[(usize, f64)],
         work: &mut RadialWork,
-        values: &mut [Lanes],
-        derivatives: &mut [Lanes],
+        values: &mut [V],
+        derivatives: &mut [V],
     ) {
         let lanes = self.output_lanes();
         let rows = values.chunks_exact_mut(lanes).zip(derivatives.chunks_exact_mut(lanes));
-        for (b, (values, derivatives)) in rows.enumerate().take(n) {
-            let [value, derivative, _] = self.network.evaluate(r[b], self.cutoffs[pairs[b]], pairs[b], work);
-            values.copy_from_slice(value);
-            derivatives.copy_from_slice(derivative);
+        for ((pair, r), (values, derivatives)) in bonds.iter().zip(rows) {
+            let [value, derivative, _] = self.network.evaluate(*r, self.cutoffs[*pair], *pair, work);
+            round(value, values);
+            round(derivative, derivatives);
         }
+    }
+}
+
+fn round<V: Vector>(from: &[Double], to: &mut [V]) {
+    for (to, from) in V::flat_mut(to).iter_mut().zip(from.as_flattened()) {
+        *to = V::Number::round(*from);
     }
 }
 
 /// Columns of the last layer, given as row-major [channel, l], put in the order \[l\]\[channel\] with
 /// whole lanes of channels: the column of the file at each place, if there is one.
-pub(super) fn column_by_order(n_channels: usize, n_orders: usize, place: usize) -> Option<usize> {
-    let width = lanes_for(n_channels) * LANES;
+pub(super) fn column_by_order<V: Vector>(n_channels: usize, n_orders: usize, place: usize) -> Option<usize> {
+    let width = lanes_for::<V>(n_channels) * V::LANES;
     let (l, n) = (place / width, place % width);
     (n < n_channels).then_some(n * n_orders + l)
 }
@@ -156,12 +158,12 @@ mod tests {
 
     fn check_table(network: &RadialNetwork) {
         let cutoff = 5.0;
-        let table = RadialTable::new(network, cutoff, 0);
+        let table = RadialTable::new(network, cutoff, 0, 1e-11);
         let stated = table.errors();
         assert!(stated[0] <= 1e-11 && stated[1] <= 1e-11, "{stated:?}");
         let (mut work, mut worst) = (RadialWork::default(), [0.0_f64; 2]);
         let (mut largest, n) = ([0.0_f64; 2], network.output_lanes());
-        let (mut values, mut derivatives) = (vec![ZERO; n], vec![ZERO; n]);
+        let (mut values, mut derivatives) = (vec![Double::ZERO; n], vec![Double::ZERO; n]);
         for k in 0..5000 {
             let r = cutoff * (k as f64 + 0.37) / 5000.0;
             let exact = network.evaluate(r, cutoff, 0, &mut work);

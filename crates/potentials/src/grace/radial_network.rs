@@ -1,7 +1,8 @@
-//! The small network on a Chebyshev basis that gives the radial functions, with two derivatives.
+//! The small network on a Chebyshev basis that gives the radial functions, with two derivatives, in double precision.
 
 use super::instructions::Instructions;
-use super::matrix::{Lanes, Matrix, Rows, ZERO, add_scaled, lanes_for};
+use super::matrix::{Matrix, Rows};
+use super::vector::{Double, Vector, lanes_for};
 
 /// x ↦ silu(W_k … silu(W_1 g + b_1) + b_k), where g_k(r) = T_k(x) f_p(u), u = r/r_c, x = 2u − 1, k = 1 …, and
 ///
@@ -16,16 +17,16 @@ pub(super) struct RadialNetwork {
     pub envelope_exponent: i32,
     /// Whether f_p multiplies the result.
     pub envelope_last: bool,
-    /// The last one gives \[l\]\[channel\].
-    pub layers: Vec<Matrix>,
+    /// The last one gives \[l\]\[channel\], its channels padded as those of the layer.
+    pub layers: Vec<Matrix<Double>>,
     /// b of each layer after the first; empty where there is none.
-    pub biases: Vec<Vec<Lanes>>,
+    pub biases: Vec<Vec<Double>>,
     /// b of the first layer for centre and neighbour element, [n_elements²]; empty where there is none.
-    pub pair_biases: Vec<Vec<Lanes>>,
+    pub pair_biases: Vec<Vec<Double>>,
 }
 
 /// A value and its first and second derivative with respect to r, each a row of lanes.
-pub(super) type Jet = [Vec<Lanes>; 3];
+pub(super) type Jet = [Vec<Double>; 3];
 
 impl RadialNetwork {
     /// Lanes of one row of results.
@@ -41,13 +42,13 @@ impl RadialNetwork {
         for (k, layer) in self.layers.iter().enumerate() {
             for (input, output) in work.input.iter().zip(&mut work.output) {
                 output.clear();
-                output.resize(layer.output_lanes(), ZERO);
+                output.resize(layer.output_lanes(), Double::ZERO);
                 let row = Rows::of_atoms(1, 0);
                 layer.multiply_add(input, row, output, row, instructions);
             }
             let bias = if k == 0 { self.pair_biases.get(pair) } else { self.biases.get(k) };
             for (y, b) in work.output[0].iter_mut().zip(bias.into_iter().flatten()) {
-                add_scaled(y, 1.0, b);
+                y.add(b);
             }
             if k + 1 < self.layers.len() {
                 silu(&mut work.output);
@@ -76,7 +77,7 @@ impl RadialNetwork {
     fn basis(&self, r: f64, cutoff: f64, out: &mut Jet) {
         for row in out.iter_mut() {
             row.clear();
-            row.resize(lanes_for(self.basis_size), ZERO);
+            row.resize(lanes_for::<Double>(self.basis_size), Double::ZERO);
         }
         let u = r / cutoff;
         let x = 2.0 * u - 1.0;
@@ -132,7 +133,6 @@ pub(super) struct RadialWork {
 
 #[cfg(test)]
 pub(super) mod tests {
-    use super::super::matrix::LANES;
     use super::*;
 
     pub fn network(envelope_last: bool) -> RadialNetwork {
@@ -141,8 +141,8 @@ pub(super) mod tests {
             basis_size: 5,
             envelope_exponent: 16,
             envelope_last,
-            biases: if envelope_last { vec![vec![], vec![[0.3; LANES]]] } else { vec![] },
-            pair_biases: if envelope_last { vec![vec![[-0.2; LANES]; 2]] } else { vec![] },
+            biases: if envelope_last { vec![vec![], vec![Double::splat(0.3)]] } else { vec![] },
+            pair_biases: if envelope_last { vec![vec![Double::splat(-0.2); 2]] } else { vec![] },
             layers: vec![
                 Matrix::from_fn(5, 12, element),
                 Matrix::from_fn(12, 12, element),

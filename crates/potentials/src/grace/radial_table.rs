@@ -1,14 +1,11 @@
 //! Radial functions as splines of degree seven.
 
 use super::instructions::{Instructions, Pass};
-use super::matrix::{LANES, Lanes, ZERO, add_scaled};
 use super::radial_network::{RadialNetwork, RadialWork};
+use super::vector::{Double, Number, Vector, to_lanes};
 
 /// Intervals to begin with, and the most that are tried.
 const INTERVALS: std::ops::RangeInclusive<usize> = 256..=16384;
-
-/// The errors of values and of derivatives, each relative to the largest, at which refinement ends.
-const TARGET_ERRORS: [f64; 2] = [1e-11, 1e-11];
 
 /// Degree of the spline.
 const DEGREE: usize = 7;
@@ -31,7 +28,7 @@ const MARGIN: usize = 64;
 /// the exact values at the equidistant knots r = k h. It has six continuous derivatives, and its own
 /// derivative gives the forces, so energy is conserved.
 #[derive(Clone, Debug)]
-pub struct RadialTable {
+pub(super) struct RadialTable<V> {
     cutoff: f64,
     intervals: usize,
     /// 1/h, 1/Å
@@ -40,14 +37,16 @@ pub struct RadialTable {
     /// Lanes of one row: all R_nl of a bond.
     lanes: usize,
     /// c_k from k = −3, [intervals + 7, lanes].
-    coefficients: Vec<Lanes>,
+    coefficients: Vec<V>,
 }
 
-impl RadialTable {
-    /// Halves the spacing until the errors are small enough.
-    pub(super) fn new(network: &RadialNetwork, cutoff: f64, pair: usize) -> Self {
+impl RadialTable<Double> {
+    /// Halves the spacing until the errors of values and of derivatives, each relative to the largest, are at most
+    /// `target`.
+    pub fn new(network: &RadialNetwork, cutoff: f64, pair: usize, target: f64) -> Self {
         let mut table = Self::with_intervals(network, cutoff, pair, *INTERVALS.start());
-        while table.is_coarse() && table.intervals < *INTERVALS.end() {
+        let is_coarse = |table: &Self| table.errors.iter().any(|error| *error > target);
+        while is_coarse(&table) && table.intervals < *INTERVALS.end() {
             table = Self::with_intervals(network, cutoff, pair, 2 * table.intervals);
         }
         table
@@ -70,15 +69,11 @@ impl RadialTable {
         table
     }
 
-    fn is_coarse(&self) -> bool {
-        self.errors.iter().zip(TARGET_ERRORS).any(|(error, target)| *error > target)
-    }
-
     /// The largest error of values and of derivatives between knots, relative to the largest of each. They
     /// are largest near the middle and near the quarters of an interval.
     fn measure(&self, network: &RadialNetwork, pair: usize) -> [f64; 2] {
         let mut work = RadialWork::default();
-        let mut found = [vec![ZERO; self.lanes], vec![ZERO; self.lanes]];
+        let mut found = [vec![Double::ZERO; self.lanes], vec![Double::ZERO; self.lanes]];
         let (mut errors, mut largest) = ([0.0_f64; 2], [f64::MIN_POSITIVE; 2]);
         for k in 0..2 * self.intervals {
             let within = if k % 2 == 0 { 0.5 } else { 0.25 };
@@ -96,13 +91,23 @@ impl RadialTable {
         [errors[0] / largest[0], errors[1] / largest[1]]
     }
 
+    /// The same with coefficients in another precision.
+    pub fn rounded<V: Vector>(&self) -> RadialTable<V> {
+        let Self { cutoff, intervals, knots_per_length, errors, .. } = *self;
+        let coefficients = to_lanes(self.coefficients.as_flattened());
+        let lanes = self.lanes * Double::LANES / V::LANES;
+        RadialTable { cutoff, intervals, knots_per_length, errors, lanes, coefficients }
+    }
+}
+
+impl<V: Vector> RadialTable<V> {
     /// The cutoff it was made for, Å.
     pub fn cutoff(&self) -> f64 {
         self.cutoff
     }
 
     /// What it takes in memory.
-    pub(super) fn bytes(&self) -> usize {
+    pub fn bytes(&self) -> usize {
         size_of_val(&self.coefficients[..])
     }
 
@@ -118,7 +123,7 @@ impl RadialTable {
 
     /// The interval of r and the place within it, from 0 to 1; 0 ≤ r ≤ cutoff, Å.
     #[inline(always)]
-    pub(super) fn locate(&self, r: f64) -> (usize, f64) {
+    pub fn locate(&self, r: f64) -> (usize, f64) {
         let position = r * self.knots_per_length;
         let interval = (position as usize).min(self.intervals - 1);
         (interval, position - interval as f64)
@@ -126,45 +131,52 @@ impl RadialTable {
 
     /// Σ_k weights\[k\]\[bond\] c_(interval + k), all R_nl of one bond, and dR_nl/dr in the same way.
     #[inline(always)]
-    pub(super) fn combine(
+    pub fn combine(
         &self,
         interval: usize,
         bond: usize,
-        (weights, slopes): &([Lanes; SUPPORT], [Lanes; SUPPORT]),
-        values: &mut [Lanes],
-        derivatives: &mut [Lanes],
+        (weights, slopes): &([V; SUPPORT], [V; SUPPORT]),
+        values: &mut [V],
+        derivatives: &mut [V],
     ) {
         let n = self.lanes;
         let rows = &self.coefficients[interval * n..][..SUPPORT * n];
         let whole = n / TOGETHER * TOGETHER;
-        let weights = (weights.map(|w| w[bond]), slopes.map(|s| s[bond] * self.knots_per_length));
+        let knots_per_length = V::Number::round(self.knots_per_length);
+        let weights = (weights.map(|w| w[bond]), slopes.map(|s| s[bond] * knots_per_length));
         for c in (0..whole).step_by(TOGETHER) {
-            sum_of_rows::<TOGETHER>(&rows[c..], n, &weights, &mut values[c..], &mut derivatives[c..]);
+            sum_of_rows::<V, TOGETHER>(&rows[c..], n, &weights, &mut values[c..], &mut derivatives[c..]);
         }
         for c in whole..n {
-            sum_of_rows::<1>(&rows[c..], n, &weights, &mut values[c..], &mut derivatives[c..]);
+            sum_of_rows::<V, 1>(&rows[c..], n, &weights, &mut values[c..], &mut derivatives[c..]);
         }
     }
 
     /// R_nl(r) and its derivative.
-    pub(super) fn evaluate_one(&self, r: f64, values: &mut [Lanes], derivatives: &mut [Lanes]) {
+    pub fn evaluate_one(&self, r: f64, values: &mut [V], derivatives: &mut [V]) {
         Instructions::best().run(One { table: self, r, values, derivatives });
     }
 }
 
 /// One bond, for whoever is compiled for the baseline.
-struct One<'a> {
-    table: &'a RadialTable,
+struct One<'a, V> {
+    table: &'a RadialTable<V>,
     r: f64,
-    values: &'a mut [Lanes],
-    derivatives: &'a mut [Lanes],
+    values: &'a mut [V],
+    derivatives: &'a mut [V],
 }
 
-impl Pass for One<'_> {
+impl<V: Vector> Pass for One<'_, V> {
     #[inline(always)]
     fn run(self, _: bool) {
         let (interval, t) = self.table.locate(self.r);
-        self.table.combine(interval, 0, &b_splines(&[t; LANES]), self.values, self.derivatives);
+        self.table.combine(
+            interval,
+            0,
+            &b_splines(&V::splat(V::Number::round(t))),
+            self.values,
+            self.derivatives,
+        );
     }
 }
 
@@ -173,39 +185,40 @@ const TOGETHER: usize = 4;
 
 /// Σ_k weights\[k\] of row k, for `L` lanes of rows that stand `n` lanes from one another, with two sets of weights.
 #[inline(always)]
-fn sum_of_rows<const L: usize>(
-    rows: &[Lanes],
+fn sum_of_rows<V: Vector, const L: usize>(
+    rows: &[V],
     n: usize,
-    (weights, slopes): &([f64; SUPPORT], [f64; SUPPORT]),
-    values: &mut [Lanes],
-    derivatives: &mut [Lanes],
+    (weights, slopes): &([V::Number; SUPPORT], [V::Number; SUPPORT]),
+    values: &mut [V],
+    derivatives: &mut [V],
 ) {
-    let (mut sums, mut slope_sums) = ([ZERO; L], [ZERO; L]);
+    let (mut sums, mut slope_sums) = ([V::ZERO; L], [V::ZERO; L]);
     for k in 0..SUPPORT {
         let row = &rows[k * n..][..L];
         for l in 0..L {
-            add_scaled(&mut sums[l], weights[k], &row[l]);
-            add_scaled(&mut slope_sums[l], slopes[k], &row[l]);
+            sums[l].add_scaled(weights[k], &row[l]);
+            slope_sums[l].add_scaled(slopes[k], &row[l]);
         }
     }
     values[..L].copy_from_slice(&sums);
     derivatives[..L].copy_from_slice(&slope_sums);
 }
 
-/// The B-splines of degree p = 7 within an interval and their derivatives, at places t of eight bonds:
+/// The B-splines of degree p = 7 within an interval and their derivatives, at the place t of a bond in each lane:
 /// p b_j^p = (p − j + t) b_(j−1)^(p−1) + (j + 1 − t) b_j^(p−1) and db_j^p/dt = b_(j−1)^(p−1) − b_j^(p−1).
 #[inline(always)]
-pub(super) fn b_splines(t: &Lanes) -> ([Lanes; SUPPORT], [Lanes; SUPPORT]) {
-    let (mut b, mut slopes) = ([ZERO; SUPPORT], [ZERO; SUPPORT]);
-    b[0] = [1.0 / FACTORIAL; LANES];
+pub(super) fn b_splines<V: Vector>(t: &V) -> ([V; SUPPORT], [V; SUPPORT]) {
+    let round = V::Number::round;
+    let (mut b, mut slopes) = ([V::ZERO; SUPPORT], [V::ZERO; SUPPORT]);
+    b[0] = V::splat(round(1.0 / FACTORIAL));
     for p in 1..=DEGREE {
-        let mut before = ZERO;
+        let mut before = V::ZERO;
         for j in 0..=p {
-            let (here, mut next, mut slope) = (b[j], ZERO, ZERO);
-            for k in 0..LANES {
-                let (rising, falling) = ((p - j) as f64 + t[k], (j + 1) as f64 - t[k]);
+            let (here, mut next, mut slope) = (b[j], V::ZERO, V::ZERO);
+            for k in 0..V::LANES {
+                let (rising, falling) = (round((p - j) as f64) + t[k], round((j + 1) as f64) - t[k]);
                 next[k] = rising * before[k] + falling * here[k];
-                slope[k] = DEGREE as f64 * (before[k] - here[k]);
+                slope[k] = round(DEGREE as f64) * (before[k] - here[k]);
             }
             slopes[j] = slope;
             (before, b[j]) = (here, next);
@@ -216,13 +229,13 @@ pub(super) fn b_splines(t: &Lanes) -> ([Lanes; SUPPORT], [Lanes; SUPPORT]) {
 
 /// Turns samples at equidistant knots, [knots, lanes], into spline coefficients by the recursive filter of
 /// Unser, Aldroubi and Eden; near the ends they belong to some other end condition.
-fn to_coefficients(samples: &mut [Lanes], lanes: usize) {
+fn to_coefficients(samples: &mut [Double], lanes: usize) {
     let gain: f64 = POLES.iter().map(|z| (1.0 - z) * (1.0 - 1.0 / z)).product();
     samples.as_flattened_mut().iter_mut().for_each(|x| *x *= gain);
     for z in POLES {
         for k in lanes..samples.len() {
             let before = samples[k - lanes];
-            add_scaled(&mut samples[k], z, &before);
+            samples[k].add_scaled(z, &before);
         }
         for k in (0..samples.len() - lanes).rev() {
             let after = samples[k + lanes];

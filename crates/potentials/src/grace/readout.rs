@@ -1,8 +1,9 @@
 //! From the invariant basis of atoms to their energies.
 
 use super::invariant_norm::InvariantNorm;
-use super::matrix::{Lanes, Matrix, Rows, ZERO};
+use super::matrix::{Matrix, Rows};
 use super::tape::Batch;
+use super::vector::{Number, Vector};
 use super::weights::Weights;
 
 /// Non-linearity of the readout.
@@ -34,12 +35,12 @@ impl Activation {
 /// E = s (y_0 + MLP(y_1, y_2, …)) + shift of the element, with the densities y = Σ over layers of norm(W B), B
 /// being the invariants of the layer.
 #[derive(Clone, Debug)]
-pub(super) struct Readout {
+pub(super) struct Readout<V> {
     /// Densities of each layer.
-    pub blocks: Vec<Block>,
+    pub blocks: Vec<Block<V>>,
     /// Layers of the perceptron with their transposes. The first has an input for y_0 as well, with
     /// weights zero, so that it takes y as it stands.
-    pub layers: Vec<(Matrix, Matrix)>,
+    pub layers: Vec<(Matrix<V>, Matrix<V>)>,
     /// After every layer but the last.
     pub activation: Activation,
     /// s
@@ -50,14 +51,14 @@ pub(super) struct Readout {
 
 /// The densities that one layer adds.
 #[derive(Clone, Debug)]
-pub(super) struct Block {
+pub(super) struct Block<V> {
     /// W
-    pub weights: Weights,
+    pub weights: Weights<V>,
     /// Left out in models of one layer.
     pub norm: Option<InvariantNorm>,
 }
 
-impl Block {
+impl<V: Vector> Block<V> {
     /// Lanes of the densities.
     #[inline(always)]
     pub fn lanes(&self) -> usize {
@@ -67,18 +68,18 @@ impl Block {
 
 /// Work arrays for one batch of atoms; each array has a row for each atom.
 #[derive(Clone, Debug, Default)]
-pub(super) struct ReadoutWork {
+pub(super) struct ReadoutWork<V> {
     /// W B of each layer.
-    densities: Vec<Vec<Lanes>>,
+    densities: Vec<Vec<V>>,
     /// Values after each layer of the perceptron, its input first.
-    values: Vec<Vec<Lanes>>,
+    values: Vec<Vec<V>>,
     /// Derivatives of the activations.
-    slopes: Vec<Vec<Lanes>>,
-    cotangent: Vec<Lanes>,
-    swap: Vec<Lanes>,
+    slopes: Vec<Vec<V>>,
+    cotangent: Vec<V>,
+    swap: Vec<V>,
 }
 
-impl Readout {
+impl<V: Vector> Readout<V> {
     /// Lanes of y.
     pub fn density_lanes(&self) -> usize {
         self.blocks.first().map_or(0, Block::lanes)
@@ -86,7 +87,7 @@ impl Readout {
 
     /// Begins with a batch of so many atoms.
     #[inline(always)]
-    pub fn begin(&self, atoms: usize, work: &mut ReadoutWork) {
+    pub fn begin(&self, atoms: usize, work: &mut ReadoutWork<V>) {
         work.densities.resize(self.blocks.len(), Vec::new());
         work.values.resize(self.layers.len() + 1, Vec::new());
         work.slopes.resize(self.layers.len(), Vec::new());
@@ -99,8 +100,8 @@ impl Readout {
         &self,
         layer: usize,
         batch: &Batch,
-        basis: (&[Lanes], usize),
-        work: &mut ReadoutWork,
+        basis: (&[V], usize),
+        work: &mut ReadoutWork<V>,
     ) {
         let (block, lanes, atoms) = (&self.blocks[layer], self.density_lanes(), batch.atoms);
         let densities = &mut work.densities[layer];
@@ -108,17 +109,17 @@ impl Readout {
         let (from, to) = (Rows::of_atoms(atoms, basis.1), Rows::of_atoms(atoms, lanes));
         block.weights.forward(batch.element).multiply_add(basis.0, from, densities, to, batch.instructions);
         let rows = densities.chunks_exact(lanes).zip(work.values[0].chunks_exact_mut(lanes));
-        for (densities, sum) in rows.map(|(d, sum)| (d.as_flattened(), sum.as_flattened_mut())) {
+        for (densities, sum) in rows.map(|(d, sum)| (V::flat(d), V::flat_mut(sum))) {
             match &block.norm {
                 Some(norm) => norm.forward(densities, sum),
-                None => sum.iter_mut().zip(densities).for_each(|(sum, y)| *sum += y),
+                None => sum.iter_mut().zip(densities).for_each(|(sum, y)| *sum += *y),
             }
         }
     }
 
     /// The energies of the atoms, eV, when all layers have added their densities; leaves ∂E/∂y in `work`.
     #[inline(always)]
-    pub fn evaluate(&self, batch: &Batch, energies: &mut [f64], work: &mut ReadoutWork) {
+    pub fn evaluate(&self, batch: &Batch, energies: &mut [f64], work: &mut ReadoutWork<V>) {
         let atoms = batch.atoms;
         for (k, (layer, _)) in self.layers.iter().enumerate() {
             let (before, after) = work.values.split_at_mut(k + 1);
@@ -128,32 +129,33 @@ impl Readout {
             layer.multiply_add(&before[k], from, &mut after[0], to, batch.instructions);
             if k + 1 < self.layers.len() {
                 zeros(&mut work.slopes[k], atoms * layer.output_lanes());
-                let values = after[0].as_flattened_mut().iter_mut();
-                for (x, slope) in values.zip(work.slopes[k].as_flattened_mut()) {
-                    (*x, *slope) = self.activation.evaluate(*x);
+                let values = V::flat_mut(&mut after[0]).iter_mut();
+                for (x, slope) in values.zip(V::flat_mut(&mut work.slopes[k])) {
+                    let (y, dy) = self.activation.evaluate((*x).into());
+                    (*x, *slope) = (V::Number::round(y), V::Number::round(dy));
                 }
             }
         }
         let lanes = self.density_lanes();
         for (atom, energy) in energies.iter_mut().enumerate() {
             let perceptron =
-                if self.layers.is_empty() { 0.0 } else { work.values[self.layers.len()][atom][0] };
-            *energy =
-                self.scale * (work.values[0][atom * lanes][0] + perceptron) + self.shifts[batch.element];
+                if self.layers.is_empty() { 0.0 } else { work.values[self.layers.len()][atom][0].into() };
+            *energy = self.scale * (work.values[0][atom * lanes][0].into() + perceptron)
+                + self.shifts[batch.element];
         }
         self.backward(batch, work);
     }
 
     /// ∂E/∂y into `work.cotangent`.
     #[inline(always)]
-    fn backward(&self, batch: &Batch, work: &mut ReadoutWork) {
+    fn backward(&self, batch: &Batch, work: &mut ReadoutWork<V>) {
         let (atoms, lanes) = (batch.atoms, self.density_lanes());
         zeros(&mut work.cotangent, atoms);
-        work.cotangent.iter_mut().for_each(|cotangent| cotangent[0] = self.scale);
+        work.cotangent.iter_mut().for_each(|cotangent| cotangent[0] = V::Number::round(self.scale));
         for (k, (_, transposed)) in self.layers.iter().enumerate().rev() {
             if k + 1 < self.layers.len() {
-                let cotangent = work.cotangent.as_flattened_mut().iter_mut();
-                cotangent.zip(work.slopes[k].as_flattened()).for_each(|(c, slope)| *c *= slope);
+                let cotangent = V::flat_mut(&mut work.cotangent).iter_mut();
+                cotangent.zip(V::flat(&work.slopes[k])).for_each(|(c, slope)| *c *= *slope);
             }
             zeros(&mut work.swap, atoms * transposed.output_lanes());
             let from = Rows::of_atoms(atoms, transposed.input_lanes());
@@ -164,12 +166,14 @@ impl Readout {
         if self.layers.is_empty() {
             zeros(&mut work.cotangent, atoms * lanes);
         }
-        work.cotangent.chunks_exact_mut(lanes).for_each(|cotangent| cotangent[0][0] += self.scale);
+        work.cotangent
+            .chunks_exact_mut(lanes)
+            .for_each(|cotangent| cotangent[0][0] += V::Number::round(self.scale));
     }
 
     /// ∂E/∂(W B) of all layers after [`Readout::evaluate`], [atoms, layers, lanes].
     #[inline(always)]
-    pub fn density_cotangents(&self, out: &mut [Lanes], work: &ReadoutWork) {
+    pub fn density_cotangents(&self, out: &mut [V], work: &ReadoutWork<V>) {
         let lanes = self.density_lanes();
         let rows = out.chunks_exact_mut(self.blocks.len() * lanes).zip(work.cotangent.chunks_exact(lanes));
         for (atom, (row, cotangent)) in rows.enumerate() {
@@ -177,7 +181,7 @@ impl Readout {
                 out.copy_from_slice(cotangent);
                 if let Some(norm) = &self.blocks[layer].norm {
                     let densities = &work.densities[layer][atom * lanes..][..lanes];
-                    norm.backward(densities.as_flattened(), out.as_flattened_mut());
+                    norm.backward(V::flat(densities), V::flat_mut(out));
                 }
             }
         }
@@ -185,7 +189,7 @@ impl Readout {
 }
 
 #[inline(always)]
-fn zeros(lanes: &mut Vec<Lanes>, n: usize) {
+fn zeros<V: Vector>(lanes: &mut Vec<V>, n: usize) {
     lanes.clear();
-    lanes.resize(n, ZERO);
+    lanes.resize(n, V::ZERO);
 }

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use super::error::{GraceError, mismatch};
 use super::graph::Graph;
-use super::matrix::LANES;
 use super::tape::{Linear, LinearPart, Operation, Tensor};
+use super::vector::Vector;
 use super::weights::Weights;
 
 /// What a reduction takes from one tensor.
@@ -38,10 +38,10 @@ impl Reduction {
     }
 }
 
-impl Graph<'_> {
+impl<V: Vector> Graph<'_, V> {
     /// The invariant reduction `prefix`: gathers the basis B of its sources and returns the weights W of
     /// y_k = Σ_b W_kb B_b.
-    pub fn invariants(&mut self, prefix: &str, n_elements: usize) -> Result<Weights, GraceError> {
+    pub fn invariants(&mut self, prefix: &str, n_elements: usize) -> Result<Weights<V>, GraceError> {
         let key = format!("{prefix}_only_invar");
         if self.archive.contains(&key) {
             self.archive.expect_count(&key, 1)?;
@@ -55,7 +55,7 @@ impl Graph<'_> {
                 self.basis.rows.push((source.tensor.row(*component), source.tensor.width));
                 let channels = source.tensor.channels;
                 places.extend(
-                    (0..source.tensor.width * LANES).map(|n| (n < channels).then_some((source, *tile, n))),
+                    (0..source.tensor.width * V::LANES).map(|n| (n < channels).then_some((source, *tile, n))),
                 );
             }
             self.sources.push((source.collect.len(), source.tensor.channels));

@@ -7,10 +7,11 @@ use std::collections::BTreeMap;
 
 use super::product::Term;
 use super::tape::{Linear, Operation};
+use super::vector::Vector;
 
 /// The same operations in pieces, depth first from those whose results no other takes.
-pub(super) fn depth_first(operations: Vec<Operation>) -> Vec<Operation> {
-    let pieces: Vec<Operation> = operations.into_iter().flat_map(divided).collect();
+pub(super) fn depth_first<V: Vector>(operations: Vec<Operation<V>>) -> Vec<Operation<V>> {
+    let pieces: Vec<Operation<V>> = operations.into_iter().flat_map(divided).collect();
     let needs = needs(&pieces);
     let mut taken = vec![false; pieces.len()];
     needs.iter().flatten().for_each(|k| taken[*k] = true);
@@ -18,16 +19,16 @@ pub(super) fn depth_first(operations: Vec<Operation>) -> Vec<Operation> {
     for last in (0..pieces.len()).filter(|k| !taken[*k]) {
         place(last, &needs, &mut placed, &mut order);
     }
-    let mut pieces: Vec<Option<Operation>> = pieces.into_iter().map(Some).collect();
+    let mut pieces: Vec<Option<Operation<V>>> = pieces.into_iter().map(Some).collect();
     order.into_iter().filter_map(|k| pieces[k].take()).collect()
 }
 
 /// For each piece those whose rows it reads.
-fn needs(pieces: &[Operation]) -> Vec<Vec<usize>> {
+fn needs<V: Vector>(pieces: &[Operation<V>]) -> Vec<Vec<usize>> {
     let writes =
         pieces.iter().enumerate().flat_map(|(k, piece)| piece.writes().into_iter().map(move |row| (row, k)));
     let makers: BTreeMap<usize, usize> = writes.collect();
-    let needs = |piece: &Operation| {
+    let needs = |piece: &Operation<V>| {
         let mut needs: Vec<usize> = piece.reads().iter().filter_map(|row| makers.get(row).copied()).collect();
         needs.dedup();
         needs
@@ -44,14 +45,14 @@ fn place(k: usize, needs: &[Vec<usize>], placed: &mut [bool], order: &mut Vec<us
 }
 
 /// Parts of a linear map that add to different rows, and groups of a product's results that share no factor.
-fn divided(operation: Operation) -> Vec<Operation> {
+fn divided<V: Vector>(operation: Operation<V>) -> Vec<Operation<V>> {
     match operation {
         Operation::Linear(Linear { start, parts }) => {
             let groups = connected(parts, |part| part.to.clone());
             groups.into_iter().map(|parts| Operation::Linear(Linear { start, parts })).collect()
         }
         Operation::Product(product) => {
-            let rows = |terms: &[Term]| terms.iter().flat_map(|t| [t.left, t.right]).collect();
+            let rows = |terms: &[Term<V>]| terms.iter().flat_map(|t| [t.left, t.right]).collect();
             let groups = connected(product.outputs.clone(), |output| rows(&output.terms));
             groups.into_iter().map(|outputs| Operation::Product(product.with_outputs(outputs))).collect()
         }

@@ -9,8 +9,8 @@ use atoms::{Cell, NeighbourList, Structure, Vec3};
 use npz::Archive;
 
 use super::error::{GraceError, unsupported};
-use super::evaluate::Grace;
 use super::model::GraceModel;
+use super::potential::Grace;
 
 /// The largest change, relative to the largest energy without shifts: far beyond rounding, even of weights that were
 /// single-precision numbers once.
@@ -62,6 +62,6 @@ fn energies(grace: &mut Grace, place: impl Fn(Vec3) -> Vec3) -> Vec<f64> {
     let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
     neighbours.update(&structure).expect("a few atoms some Å apart");
     grace.forward(&structure, &neighbours).expect("a list as long as the cutoff, and elements of the model");
-    let shifts = elements.map(|element| model.readout.shifts[element]);
+    let shifts = elements.map(|element| model.network.shifts()[element]);
     grace.atomic_energies().iter().zip(shifts).map(|(energy, shift)| energy - shift).collect()
 }

@@ -7,8 +7,9 @@
 
 use super::equivariant_norm::EquivariantNorm;
 use super::instructions::Instructions;
-use super::matrix::{Lanes, Rows, ZERO, add_scaled};
+use super::matrix::Rows;
 use super::product::{Combination, Product};
+use super::vector::Vector;
 use super::weights::Weights;
 
 /// Where a tensor stands on the tape.
@@ -64,20 +65,20 @@ impl Slot {
 
 /// One step along the tape.
 #[derive(Clone, Debug)]
-pub(super) enum Operation {
+pub(super) enum Operation<V: Vector> {
     /// Channels mixed with weights.
-    Linear(Linear),
+    Linear(Linear<V>),
     /// Components coupled, channel by channel.
-    Product(Product),
+    Product(Product<V>),
     /// Components summed with factors.
-    Combination(Combination),
+    Combination(Combination<V>),
     /// Components divided by their norm.
-    EquivariantNorm(EquivariantNorm),
+    EquivariantNorm(EquivariantNorm<V>),
 }
 
-impl Operation {
+impl<V: Vector> Operation<V> {
     #[inline(always)]
-    pub fn forward(&self, batch: &Batch, tape: &mut [Lanes]) {
+    pub fn forward(&self, batch: &Batch, tape: &mut [V]) {
         match self {
             Self::Linear(linear) => linear.forward(batch, tape),
             Self::Product(product) => product.forward(batch.atoms, tape),
@@ -88,7 +89,7 @@ impl Operation {
 
     /// Adds to `N` cotangents of what it read.
     #[inline(always)]
-    pub fn backward<const N: usize>(&self, batch: &Batch, tape: &[Lanes], cotangent: &mut [Lanes]) {
+    pub fn backward<const N: usize>(&self, batch: &Batch, tape: &[V], cotangent: &mut [V]) {
         match self {
             Self::Linear(linear) => linear.backward::<N>(batch, cotangent),
             Self::Product(product) => product.backward::<N>(batch.atoms, tape, cotangent),
@@ -144,27 +145,27 @@ impl Operation {
 
 /// out_k,w = Σ over parts, Σ_n W_kn x_n,w′.
 #[derive(Clone, Debug)]
-pub(super) struct Linear {
+pub(super) struct Linear<V> {
     /// First lane of the result.
     pub start: usize,
     /// Rows that share weights.
-    pub parts: Vec<LinearPart>,
+    pub parts: Vec<LinearPart<V>>,
 }
 
 /// Rows of one or more tensors multiplied by the same weights.
 #[derive(Clone, Debug)]
-pub(super) struct LinearPart {
+pub(super) struct LinearPart<V> {
     /// [n_in × n_out]
-    pub weights: Weights,
+    pub weights: Weights<V>,
     /// Where each row is read, lanes from the beginning of the tape.
     pub from: Vec<u32>,
     /// Where each is added, lanes from the beginning of the result.
     pub to: Vec<u32>,
 }
 
-impl Linear {
+impl<V: Vector> Linear<V> {
     #[inline(always)]
-    fn forward(&self, batch: &Batch, tape: &mut [Lanes]) {
+    fn forward(&self, batch: &Batch, tape: &mut [V]) {
         let (before, out) = tape.split_at_mut(self.start * batch.atoms);
         for part in &self.parts {
             let (from, to) = part.rows(batch.atoms);
@@ -173,7 +174,7 @@ impl Linear {
     }
 
     #[inline(always)]
-    fn backward<const N: usize>(&self, batch: &Batch, cotangent: &mut [Lanes]) {
+    fn backward<const N: usize>(&self, batch: &Batch, cotangent: &mut [V]) {
         let (before, out) = cotangent.split_at_mut(self.start * N * batch.atoms);
         for part in &self.parts {
             let (from, to) = part.rows(N * batch.atoms);
@@ -193,7 +194,7 @@ impl Linear {
     }
 }
 
-impl LinearPart {
+impl<V: Vector> LinearPart<V> {
     #[inline(always)]
     fn rows(&self, slots: usize) -> (Rows<'_>, Rows<'_>) {
         let weights = self.weights.forward(0);
@@ -217,7 +218,7 @@ impl Gather {
 
     /// Into `out`, a row of `stride` lanes for each atom.
     #[inline(always)]
-    pub fn forward(&self, atoms: usize, tape: &[Lanes], out: &mut [Lanes], stride: usize) {
+    pub fn forward<V: Vector>(&self, atoms: usize, tape: &[V], out: &mut [V], stride: usize) {
         let mut position = 0;
         for (row, width) in &self.rows {
             for atom in 0..atoms {
@@ -231,11 +232,11 @@ impl Gather {
     /// Adds to the cotangents of the rows in the slots from `slot` of `slots`, from a row of `stride` lanes for each
     /// atom.
     #[inline(always)]
-    pub fn backward(
+    pub fn backward<V: Vector>(
         &self,
         atoms: usize,
-        (out, stride): (&[Lanes], usize),
-        cotangent: &mut [Lanes],
+        (out, stride): (&[V], usize),
+        cotangent: &mut [V],
         (slot, slots): (usize, usize),
     ) {
         let mut position = 0;
@@ -243,7 +244,7 @@ impl Gather {
             for atom in 0..atoms {
                 let (from, to) = (atom * stride + position, row * slots + (slot + atom) * width);
                 for (sum, x) in cotangent[to..to + width].iter_mut().zip(&out[from..from + width]) {
-                    add_scaled(sum, 1.0, x);
+                    sum.add(x);
                 }
             }
             position += width;
@@ -274,9 +275,9 @@ impl Used {
     }
 
     #[inline(always)]
-    pub fn clear(&self, slots: usize, tape: &mut [Lanes]) {
+    pub fn clear<V: Vector>(&self, slots: usize, tape: &mut [V]) {
         for (start, end) in &self.0 {
-            tape[start * slots..end * slots].fill(ZERO);
+            tape[start * slots..end * slots].fill(V::ZERO);
         }
     }
 }

@@ -9,20 +9,20 @@
 
 use npz::Archive;
 
-use super::assembly::Draft;
+use super::assembly::{Draft, Reading};
 use super::error::{GraceError, mismatch};
 use super::globals::{Embedding, elements, refuse_other_variants};
 use super::graph::Graph;
 use super::layer::{LayerDraft, Message};
-use super::matrix::{Lanes, scaled};
-use super::model::{Architecture, GraceModel};
+use super::model::Architecture;
 use super::networks::enveloped_network;
 use super::radial::{RadialFunctions, RadialPath};
 use super::readout::Block;
 use super::tape::Tensor;
 use super::two_layers::{expect_list, invariant_norm};
+use super::vector::{Number, Vector};
 
-pub(super) fn read(archive: &Archive, path: RadialPath) -> Result<GraceModel, GraceError> {
+pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Reading<V>, GraceError> {
     let elements = elements(archive)?;
     refuse_other_variants(
         archive,
@@ -63,11 +63,11 @@ struct Reader<'a> {
 
 impl<'a> Reader<'a> {
     /// A layer from the message of the one before, and its own message.
-    fn layer(
+    fn layer<V: Vector>(
         &mut self,
         number: usize,
         indicator: Option<Tensor>,
-    ) -> Result<(LayerDraft<'a>, Option<Tensor>), GraceError> {
+    ) -> Result<(LayerDraft<'a, V>, Option<Tensor>), GraceError> {
         let archive = self.archive;
         let name = format!("A{number}");
         let lmax = archive.count(&format!("{name}_lmax"), 0, 12)?;
@@ -101,7 +101,12 @@ impl<'a> Reader<'a> {
         Ok((LayerDraft { graph, radial, lmax, message, block }, sent))
     }
 
-    fn radial(&mut self, name: &str, lmax: usize, channels: usize) -> Result<RadialFunctions, GraceError> {
+    fn radial<V: Vector>(
+        &mut self,
+        name: &str,
+        lmax: usize,
+        channels: usize,
+    ) -> Result<RadialFunctions<V>, GraceError> {
         let archive = self.archive;
         let tiles = archive.integers(&format!("{name}_l_tile"))?.data;
         let orders = (0..=lmax).flat_map(|l| vec![l as i64; 2 * l + 1]);
@@ -114,12 +119,13 @@ impl<'a> Reader<'a> {
             let expected = "a cutoff from 0.1 to 100 Å";
             return Err(mismatch(archive, &format!("{name}_rcut"), format!("{cutoff} Å"), expected));
         }
-        let network = enveloped_network(archive, name, lmax, channels, &self.embedding, &mut self.weights)?;
+        let network =
+            enveloped_network::<V>(archive, name, lmax, channels, &self.embedding, &mut self.weights)?;
         let cutoffs = vec![cutoff; self.n_elements * self.n_elements];
         Ok(RadialFunctions::new(network, self.n_elements, cutoffs, self.path))
     }
 
-    fn scalar_message(&mut self, name: &str, channels: usize) -> Result<Message, GraceError> {
+    fn scalar_message<V: Vector>(&mut self, name: &str, channels: usize) -> Result<Message<V>, GraceError> {
         let scale = self.archive.scalar(&format!("{name}_inv_avg_n_neigh"))?;
         let prefix = format!("{name}_lin_transform");
         let constants =
@@ -128,7 +134,12 @@ impl<'a> Reader<'a> {
     }
 
     /// The indicator of the layer before, and in its invariant components what the neighbour's element adds.
-    fn message(&mut self, name: &str, channels: usize, indicator: Tensor) -> Result<Message, GraceError> {
+    fn message<V: Vector>(
+        &mut self,
+        name: &str,
+        channels: usize,
+        indicator: Tensor,
+    ) -> Result<Message<V>, GraceError> {
         let archive = self.archive;
         if indicator.channels != channels {
             let found = format!("{channels}, where the message has {} channels", indicator.channels);
@@ -139,14 +150,19 @@ impl<'a> Reader<'a> {
         let mask = archive.floats(&format!("{name}_chem_l0_mask"), &[components])?;
         let prefix = format!("{name}_chem_linear");
         let rows = self.embedding.transformed(archive, &prefix, channels, 1.0, &mut self.weights)?;
-        let constants = |row: &Vec<Lanes>| -> Vec<Lanes> {
-            mask.iter().flat_map(|m| row.iter().map(|x| scaled(*m, x))).collect()
+        let constants = |row: &Vec<V>| -> Vec<V> {
+            mask.iter().flat_map(|m| row.iter().map(|x| x.scaled(V::Number::round(*m)))).collect()
         };
         Ok(Message { from: Some(indicator), components, constants: rows.iter().map(constants).collect() })
     }
 
     /// A_f = Σ W_(y,q),f T_y,q, with 1/(mean number of neighbours).
-    fn coupled_messages(&self, graph: &mut Graph, name: &str, functions: usize) -> Result<(), GraceError> {
+    fn coupled_messages<V: Vector>(
+        &self,
+        graph: &mut Graph<V>,
+        name: &str,
+        functions: usize,
+    ) -> Result<(), GraceError> {
         let (archive, t) = (self.archive, graph.density());
         let of_message = t.components / functions;
         let components = archive.count(&format!("{name}_nfunc"), 1, 1 << 16)?;
@@ -165,7 +181,12 @@ impl<'a> Reader<'a> {
 }
 
 /// The products of x with itself up to the fourth order, each reduced.
-fn powers(graph: &mut Graph, name: &str, x: Tensor, n_elements: usize) -> Result<(), GraceError> {
+fn powers<V: Vector>(
+    graph: &mut Graph<V>,
+    name: &str,
+    x: Tensor,
+    n_elements: usize,
+) -> Result<(), GraceError> {
     graph.mixed_product(&format!("{name}_2"), x, x)?;
     let x2 = graph.reduce(&format!("{name}_2_red"), n_elements)?;
     let x2a = graph.linear(&format!("{name}_2a"), x2, x)?;

@@ -7,24 +7,24 @@
 
 use npz::Archive;
 
-use super::assembly::Draft;
+use super::assembly::{Draft, Reading};
 use super::copies::{BlockNames, ignore_copies};
 use super::error::{GraceError, mismatch, unsupported};
 use super::globals::{Embedding, Powers, cutoffs, elements, refuse_other_radial_variants};
 use super::graph::Graph;
 use super::invariant_norm::InvariantNorm;
 use super::layer::{LayerDraft, Message};
-use super::matrix::{Lanes, ZERO};
-use super::model::{Architecture, GraceModel};
+use super::model::Architecture;
 use super::networks::radial_network;
 use super::radial::{RadialFunctions, RadialPath};
 use super::readout::Block;
 use super::tape::Tensor;
+use super::vector::Vector;
 
 const FIRST: Powers = Powers { letter: "A", third_with_mixed: false, taken_by: &["I1", "rho"] };
 const SECOND: Powers = Powers { letter: "B", third_with_mixed: false, taken_by: &["I2"] };
 
-pub(super) fn read(archive: &Archive, path: RadialPath) -> Result<GraceModel, GraceError> {
+pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Reading<V>, GraceError> {
     let elements = elements(archive)?;
     let names = BlockNames::read(archive)?;
     let mut weights = 0;
@@ -68,7 +68,10 @@ struct Reader<'a> {
 
 impl<'a> Reader<'a> {
     /// The layer, its message and the order of its products.
-    fn first_layer(&mut self, n_densities: usize) -> Result<(LayerDraft<'a>, Tensor, usize), GraceError> {
+    fn first_layer<V: Vector>(
+        &mut self,
+        n_densities: usize,
+    ) -> Result<(LayerDraft<'a, V>, Tensor, usize), GraceError> {
         let (archive, lmax) = (self.archive, self.lmax);
         let (channels, radial) = self.radial("R", "A")?;
         let constants = self.scalar_message("A", channels)?;
@@ -85,11 +88,11 @@ impl<'a> Reader<'a> {
         Ok((LayerDraft { graph, radial, lmax, message, block }, indicator, order))
     }
 
-    fn second_layer(
+    fn second_layer<V: Vector>(
         &mut self,
         indicator: Tensor,
         n_densities: usize,
-    ) -> Result<(LayerDraft<'a>, usize), GraceError> {
+    ) -> Result<(LayerDraft<'a, V>, usize), GraceError> {
         let (archive, lmax) = (self.archive, self.lmax);
         let (channels, radial) = self.radial("R1", "B0")?;
         if indicator.channels != channels {
@@ -97,8 +100,8 @@ impl<'a> Reader<'a> {
             return Err(mismatch(archive, "I_n_out", found, format!("{channels}, as its radial functions")));
         }
         // The last component of a message is the factor of B0.
-        let mut constants = vec![vec![ZERO; indicator.components * indicator.width]; self.n_elements];
-        for (constants, scalar) in constants.iter_mut().zip(self.scalar_message("B0", channels)?) {
+        let mut constants = vec![vec![V::ZERO; indicator.components * indicator.width]; self.n_elements];
+        for (constants, scalar) in constants.iter_mut().zip(self.scalar_message::<V>("B0", channels)?) {
             constants.extend(scalar);
         }
         let components = indicator.components + 1;
@@ -120,22 +123,26 @@ impl<'a> Reader<'a> {
     }
 
     /// Number of channels and radial functions of one layer.
-    fn radial(&mut self, name: &str, density: &str) -> Result<(usize, RadialFunctions), GraceError> {
+    fn radial<V: Vector>(
+        &mut self,
+        name: &str,
+        density: &str,
+    ) -> Result<(usize, RadialFunctions<V>), GraceError> {
         let (archive, prefix) = (self.archive, format!("mlp_rad_{name}"));
         refuse_other_radial_variants(archive, &prefix, density)?;
         let channels = archive.count(&format!("{prefix}_n_rad_max"), 1, 4096)?;
-        let network = radial_network(archive, &prefix, self.lmax, channels, &mut self.weights)?;
+        let network = radial_network::<V>(archive, &prefix, self.lmax, channels, &mut self.weights)?;
         Ok((channels, RadialFunctions::new(network, self.n_elements, self.cutoffs.clone(), self.path)))
     }
 
-    fn scalar_message(&mut self, name: &str, channels: usize) -> Result<Vec<Vec<Lanes>>, GraceError> {
+    fn scalar_message<V: Vector>(&mut self, name: &str, channels: usize) -> Result<Vec<Vec<V>>, GraceError> {
         let scale = self.archive.scalar(&format!("{name}_inv_avg_n_neigh"))?;
         let prefix = format!("{name}_lin_transform");
         self.embedding.transformed(self.archive, &prefix, channels, scale, &mut self.weights)
     }
 
     /// YI_f = Σ_c C_c T_y(c),q(c), with 1/(mean number of neighbours).
-    fn coupled_messages(&self, graph: &mut Graph, of_message: usize) -> Result<(), GraceError> {
+    fn coupled_messages<V: Vector>(&self, graph: &mut Graph<V>, of_message: usize) -> Result<(), GraceError> {
         let (archive, t) = (self.archive, graph.density());
         let functions = (self.lmax + 1) * (self.lmax + 1);
         let coefficients = archive.numbers("YI_cg_coeff")?.finite()?.data;

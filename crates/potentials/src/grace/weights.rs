@@ -1,12 +1,13 @@
 //! Matrices with their transposes, one for each element of the central atom where these differ.
 
 use super::matrix::Matrix;
+use super::vector::Vector;
 
 /// Weights W_kn of a linear map and of its reverse.
 #[derive(Clone, Debug)]
-pub(super) struct Weights(Vec<(Matrix, Matrix)>);
+pub(super) struct Weights<V>(Vec<(Matrix<V>, Matrix<V>)>);
 
-impl Weights {
+impl<V: Vector> Weights<V> {
     /// From `element(type, input, output)` for `n_types` elements of the central atom, or for one type that
     /// stands for all.
     pub fn new(
@@ -20,13 +21,13 @@ impl Weights {
 
     /// [inputs × outputs]
     #[inline(always)]
-    pub fn forward(&self, element: usize) -> &Matrix {
+    pub fn forward(&self, element: usize) -> &Matrix<V> {
         &self.of(element).0
     }
 
     /// [outputs × inputs]
     #[inline(always)]
-    pub fn transposed(&self, element: usize) -> &Matrix {
+    pub fn transposed(&self, element: usize) -> &Matrix<V> {
         &self.of(element).1
     }
 
@@ -39,17 +40,17 @@ impl Weights {
     }
 
     #[inline(always)]
-    fn of(&self, element: usize) -> &(Matrix, Matrix) {
+    fn of(&self, element: usize) -> &(Matrix<V>, Matrix<V>) {
         &self.0[if self.0.len() == 1 { 0 } else { element }]
     }
 }
 
 /// A matrix and its transpose.
-pub(super) fn with_transpose(
+pub(super) fn with_transpose<V: Vector>(
     inputs: usize,
     outputs: usize,
     element: impl Fn(usize, usize) -> f64,
-) -> (Matrix, Matrix) {
+) -> (Matrix<V>, Matrix<V>) {
     let transposed = Matrix::from_fn(outputs, inputs, |i, o| element(o, i));
     (Matrix::from_fn(inputs, outputs, element), transposed)
 }
