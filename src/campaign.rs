@@ -9,7 +9,7 @@ use calm::Artifact;
 use calm::watch::ForgettingAlarm;
 use orchestrator::grader::Grader;
 use orchestrator::selector::{self, Mode, SeedStructure, TrainingFrames};
-use potentials::grace::GraceModel;
+use potentials::grace::{GraceModel, Precision};
 use serde_json::{Value, json};
 use store::Protocol;
 use wire::{CampaignId, ContentHash};
@@ -136,6 +136,10 @@ impl Campaign {
         value["files"] = Value::Object(hashes.collect());
         value["label"]["protocol"] = json!(self.config.label.protocol_name());
         value["label"]["method"] = resolved_method(&self.config.label, &self.protocol);
+        // What a campaign has that began before there was a choice.
+        if self.config.potential.precision == Precision::Double {
+            value["potential"].as_object_mut().map(|potential| potential.remove("precision"));
+        }
         // Where a campaign is kept is no part of what it is.
         value["run"].as_object_mut().map(|run| run.remove("store"));
         if self.config.campaign.mode == Mode::Reproducible {

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use potentials::grace::GraceModel;
+use potentials::grace::{GraceModel, Precision, RadialPath};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use store::Protocol;
@@ -31,6 +31,8 @@ pub struct WalkerSetup {
     pub model: PathBuf,
     /// BLAKE3 of that file.
     pub model_hash: String,
+    /// In which it is evaluated.
+    pub precision: Precision,
     /// Dynamics, bias and guards.
     pub settings: WalkSettings,
     /// Its log.
@@ -45,6 +47,8 @@ pub struct AgentSetup {
     pub model: PathBuf,
     /// BLAKE3 of that file.
     pub model_hash: String,
+    /// In which it is evaluated.
+    pub precision: Precision,
     /// Dynamics, bias and guards.
     pub settings: WalkSettings,
     /// Bytes of the largest message of a walker.
@@ -165,7 +169,8 @@ impl WalkerSetup {
     /// Reads the model, which must be the one that the campaign's run began with.
     pub fn load_model(&self) -> Result<Arc<GraceModel>, Failure> {
         unchanged(&self.model, &self.model_hash)?;
-        Ok(Arc::new(GraceModel::load(&self.model).map_err(Failure::input)?))
+        let model = GraceModel::load_in(&self.model, self.precision, RadialPath::default());
+        Ok(Arc::new(model.map_err(Failure::input)?))
     }
 }
 

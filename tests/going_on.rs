@@ -245,3 +245,38 @@ fn seed_structures_cannot_be_changed_moved_or_taken_away() {
     small().write(here);
     assert_eq!(go_on(here), "");
 }
+
+#[test]
+fn precision_is_part_of_what_a_campaign_is() {
+    let directory = finished();
+    let here = directory.path();
+    let before = look(here, async |store| store.decision_log_text().await.unwrap());
+    replace(here, "[potential]\n", "[potential]\nprecision = \"double\"\n");
+    assert_eq!(go_on(here), "");
+    replace(here, "\"double\"", "\"mixed\"");
+    let message = refuse(here, RUN);
+    assert!(
+        message.contains("campaign.toml:") && message.contains("potential.precision is \"mixed\""),
+        "{message}"
+    );
+
+    // One that begins in mixed precision gives the same with walkers as processes and in one process.
+    let [processes, together] = [&[][..], &["--in-process"]].map(|options| {
+        let directory = tempfile::tempdir().unwrap();
+        small().write(directory.path());
+        replace(directory.path(), "[potential]\n", "[potential]\nprecision = \"mixed\"\n");
+        succeed(directory.path(), RUN.iter().chain(options).copied());
+        directory
+    });
+    let decisions =
+        |directory: &TempDir| look(directory.path(), async |store| store.decision_log_text().await.unwrap());
+    assert!(decisions(&processes).contains("accepted"));
+    assert_eq!(decisions(&processes), decisions(&together));
+    assert_ne!(decisions(&processes), before);
+    replace(processes.path(), "\"mixed\"", "\"double\"");
+    let message = refuse(processes.path(), RUN);
+    assert!(
+        message.contains("potential.precision is left out, but this campaign began with \"mixed\""),
+        "{message}"
+    );
+}

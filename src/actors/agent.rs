@@ -163,6 +163,7 @@ fn launch(setup: &AgentSetup, line: ipc::Handle) -> impl FnMut(u32, u32) -> Laun
             door: line.door(number, incarnation),
             model: setup.model.clone(),
             model_hash: setup.model_hash.clone(),
+            precision: setup.precision,
             settings: setup.settings.clone(),
             log: log::for_children(),
         };

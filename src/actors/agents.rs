@@ -48,6 +48,7 @@ impl Agents {
         let setup = AgentSetup {
             model: model.clone(),
             model_hash: model_hash.clone(),
+            precision: config.potential.precision,
             settings: run.campaign.walk_settings(),
             message_bytes: run.campaign.largest_message(),
             silence_limit: config.run.silence_limit.get(),

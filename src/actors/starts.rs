@@ -25,6 +25,7 @@ pub fn walker(
     let (model, model_hash) =
         (absolute(campaign.config.potential.model.get_ref())?, campaign.hash_of("potential.model"));
     let (parent, settings) = (std::process::id(), campaign.walk_settings());
+    let precision = campaign.config.potential.precision;
     Ok(move |number, incarnation| {
         line.expect(number, incarnation);
         let setup = WalkerSetup {
@@ -32,6 +33,7 @@ pub fn walker(
             door: line.door(number, incarnation),
             model: model.clone(),
             model_hash: model_hash.clone(),
+            precision,
             settings: settings.clone(),
             log: log::for_children(),
         };

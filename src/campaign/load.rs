@@ -6,7 +6,7 @@ use std::sync::Arc;
 use atoms::{NeighbourList, Structure, extxyz, read_structures, shortest_distance};
 use calm::{Artifact, ArtifactError, Mixture};
 use orchestrator::selector::{SeedStructure, TrainingFrames};
-use potentials::grace::{Grace, GraceModel};
+use potentials::grace::{Grace, GraceModel, RadialPath};
 use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
@@ -38,7 +38,9 @@ impl Loader<'_> {
     pub fn model(&self) -> Result<Arc<GraceModel>, ConfigError> {
         let file = &self.config.potential.model;
         let wrong = |message: String| self.wrong("potential.model", file, message);
-        let model = GraceModel::load(file.get_ref()).map_err(|error| wrong(error.to_string()))?;
+        let precision = self.config.potential.precision;
+        let model = GraceModel::load_in(file.get_ref(), precision, RadialPath::default())
+            .map_err(|error| wrong(error.to_string()))?;
         if model.projection().is_none() {
             let shown = file.get_ref().display();
             return Err(wrong(format!(

@@ -15,6 +15,7 @@ use std::path::{Path, PathBuf};
 use calm::rules::{Combination, Fraction, Positive};
 use calm::{CollectionRule, UpdateSettings};
 use orchestrator::selector::{Mode, UpdateProtocol};
+use potentials::grace::Precision;
 use serde::{Deserialize, Serialize};
 use store::{Location, StoreError};
 use toml::Spanned;
@@ -78,6 +79,9 @@ pub struct CampaignSection {
 pub struct PotentialSection {
     /// The exported model, `kokkos.npz`.
     pub model: Spanned<PathBuf>,
+    /// In which walkers evaluate it.
+    #[serde(default)]
+    pub precision: Precision,
 }
 
 /// `[calm]`
