@@ -14,7 +14,7 @@ use calm::watch::ForgettingAlarm;
 use calm::{Artifact, UpdateSettings};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{Mode, Next, SeedStructure, Selector, Settings, Snapshot, UpdateProtocol};
-use potentials::grace::GraceModel;
+use potentials::grace::{GraceModel, Threads};
 use rustix::time::{ClockId, clock_gettime};
 use wire::messages::{Outcome, Report};
 use wire::{CampaignId, CandidateBlock};
@@ -50,7 +50,11 @@ struct Turn(Duration, u64, Report);
 impl Campaign {
     fn run(mode: Mode, turn_steps: u64) -> Self {
         let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
-        let context = WalkContext { model: Arc::clone(&model), settings: Arc::new(walk_settings()) };
+        let context = WalkContext {
+            model: Arc::clone(&model),
+            threads: Threads::default(),
+            settings: Arc::new(walk_settings()),
+        };
         let mut selector = selector(mode, turn_steps, &model);
         selector.begin_walks();
         let (mut campaign, mut turns, mut begun) = (Self::default(), BinaryHeap::new(), 0);

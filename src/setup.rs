@@ -33,6 +33,8 @@ pub struct WalkerSetup {
     pub model_hash: String,
     /// In which it is evaluated.
     pub precision: Precision,
+    /// Threads that evaluate it.
+    pub threads: usize,
     /// Dynamics, bias and guards.
     pub settings: WalkSettings,
     /// Its log.

@@ -31,6 +31,7 @@ pub async fn work(
     address: &Address,
     tls: Option<&Tls>,
     agent: net::Agent,
+    threads: usize,
     patience: Duration,
     directory: &Path,
 ) -> Result<Ended, Failure> {
@@ -64,7 +65,7 @@ pub async fn work(
             News::Back => say("the orchestrator answers again"),
         }))
     };
-    let ended = work_in(&place, &setup, walkers, &mixture, deal, &stop).await;
+    let ended = work_in(&place, &setup, (walkers, threads), &mixture, deal, &stop).await;
     let removed = place.remove().map_err(Failure::failed);
     let ended = ended?;
     removed?;
@@ -127,7 +128,7 @@ type Dealing = JoinHandle<Result<agent::Ended, Parted>>;
 async fn work_in(
     place: &Place,
     setup: &AgentSetup,
-    walkers: u32,
+    (walkers, threads): (u32, usize),
     mixture: &Mixture,
     deal: impl FnOnce(mpsc::Receiver<Incoming>) -> Dealing,
     stop: &Notify,
@@ -144,7 +145,7 @@ async fn work_in(
         restarts: setup.restarts,
         ..Limits::default()
     };
-    let walkers = Children::new(walkers, limits, launch(setup, line.clone()));
+    let walkers = Children::new(walkers, limits, launch(setup, threads, line.clone()));
     let (to_agent, incoming) = mpsc::channel(CHANNEL);
     let signs = walkers.signs();
     let heard = move |walker, useful| if useful { signs.useful(walker) } else { signs.heard(walker) };
@@ -154,7 +155,11 @@ async fn work_in(
 }
 
 /// How walkers are started.
-fn launch(setup: &AgentSetup, line: ipc::Handle) -> impl FnMut(u32, u32) -> Launch + Send + 'static {
+fn launch(
+    setup: &AgentSetup,
+    threads: usize,
+    line: ipc::Handle,
+) -> impl FnMut(u32, u32) -> Launch + Send + 'static {
     let (setup, parent) = (setup.clone(), std::process::id());
     move |number, incarnation| {
         line.expect(number, incarnation);
@@ -164,6 +169,7 @@ fn launch(setup: &AgentSetup, line: ipc::Handle) -> impl FnMut(u32, u32) -> Laun
             model: setup.model.clone(),
             model_hash: setup.model_hash.clone(),
             precision: setup.precision,
+            threads,
             settings: setup.settings.clone(),
             log: log::for_children(),
         };

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use orchestrator::reactor;
 use orchestrator::selector::Selector;
+use potentials::grace::Threads;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
@@ -143,11 +144,11 @@ fn start_walkers(
     to_reactor: &mpsc::Sender<Incoming>,
     stopping: &Arc<AtomicBool>,
 ) -> Result<Vec<JoinHandle<walker::Ended>>, Failure> {
-    let context =
-        WalkContext { model: Arc::clone(&campaign.model), settings: Arc::new(campaign.walk_settings()) };
+    let (model, settings) = (Arc::clone(&campaign.model), Arc::new(campaign.walk_settings()));
     let start = |number| {
         let mut transport = InProcess::new(number, to_reactor.clone(), Arc::clone(stopping));
-        let context = context.clone();
+        let threads = Threads::new(campaign.config.run.threads.get()).map_err(Failure::failed)?;
+        let context = WalkContext { model: Arc::clone(&model), threads, settings: Arc::clone(&settings) };
         thread::Builder::new()
             .name(format!("walker-{number}"))
             .spawn(move || walker::run(&context, &mut transport))

@@ -104,7 +104,7 @@ fn start_reactor(
 /// Walkers side by side, as the configuration has it.
 fn wanted_walkers(campaign: &Campaign) -> u32 {
     match campaign.config.run.walkers {
-        0 => cores(),
+        0 => (cores() / campaign.config.run.threads.get() as u32).max(1),
         wanted => wanted as u32,
     }
 }

@@ -26,6 +26,7 @@ pub fn walker(
         (absolute(campaign.config.potential.model.get_ref())?, campaign.hash_of("potential.model"));
     let (parent, settings) = (std::process::id(), campaign.walk_settings());
     let precision = campaign.config.potential.precision;
+    let threads = campaign.config.run.threads.get();
     Ok(move |number, incarnation| {
         line.expect(number, incarnation);
         let setup = WalkerSetup {
@@ -34,6 +35,7 @@ pub fn walker(
             model: model.clone(),
             model_hash: model_hash.clone(),
             precision,
+            threads,
             settings: settings.clone(),
             log: log::for_children(),
         };

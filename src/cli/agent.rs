@@ -23,9 +23,12 @@ pub struct Agent {
     /// again whenever it does not answer
     #[arg(long, value_name = "ENDPOINT")]
     join: Address,
-    /// Walkers to start here [default: one a core]
+    /// Walkers to start here [default: as many as the cores allow]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
     walkers: Option<u32>,
+    /// Threads of each
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    threads: u32,
     /// Turns to take beyond one a walker: so many candidates may wait for their verdict before walkers have to. Only of
     /// use where a campaign has more walks than walkers
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=4096))]
@@ -43,7 +46,7 @@ pub struct Agent {
 impl Agent {
     pub fn run(self) -> Result<Ended, Failure> {
         self.log.begin("agent")?;
-        let walkers = self.walkers.unwrap_or_else(cores);
+        let walkers = self.walkers.unwrap_or_else(|| (cores() / self.threads).max(1));
         let patience = Duration::from_secs_f64(60.0 * self.patience);
         let tls = self.tls.as_deref().map(Tls::in_directory);
         scratch::clean();
@@ -62,7 +65,14 @@ impl Agent {
             walkers,
             ahead: self.ahead,
         };
-        block_on(agent::work(&self.join, tls.as_ref(), agent, patience, scratch.path()))?
+        block_on(agent::work(
+            &self.join,
+            tls.as_ref(),
+            agent,
+            self.threads as usize,
+            patience,
+            scratch.path(),
+        ))?
     }
 }
 

@@ -41,6 +41,9 @@ pub struct Launch {
     /// Walkers of each agent
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=4096))]
     walkers: u32,
+    /// Threads of each walker
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    threads: u32,
     /// Jobs with labellers, for a campaign whose store is PostgreSQL
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=10_000))]
     labellers: u32,

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use orchestrator::launcher;
+use potentials::grace::Threads;
 use wire::ipc::IpcWalker;
 use workers::walk::WalkContext;
 use workers::walker;
@@ -24,7 +25,8 @@ impl Walker {
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
         launcher::end_with_parent(setup.parent).map_err(Failure::failed)?;
         let stopping = interrupt::flag()?;
-        let context = WalkContext { model: setup.load_model()?, settings: Arc::new(setup.settings) };
+        let threads = Threads::new(setup.threads).map_err(Failure::failed)?;
+        let context = WalkContext { model: setup.load_model()?, threads, settings: Arc::new(setup.settings) };
         let mut transport = IpcWalker::connect(&setup.door, stopping).map_err(Failure::failed)?;
         let ended = walker::run(&context, &mut transport);
         match (ended, transport.failure()) {

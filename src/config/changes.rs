@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 41] = [
+pub(super) const CHANGEABLE: [&str; 42] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -37,6 +37,7 @@ pub(super) const CHANGEABLE: [&str; 41] = [
     "budget.core_hours",
     "budget.wall_hours",
     "run.walkers",
+    "run.threads",
     "run.silence_limit",
     "run.agent_silence_limit",
     "run.restarts",

@@ -63,6 +63,7 @@ fn check_limits(config: &Config) -> Result<(), Wrong> {
         ("notify.stall", config.notify.stall.get(), 1e6),
         ("notify.time_limit", config.notify.time_limit.get(), 86_400.0),
         ("run.walkers", run.walkers as f64, 1024.0),
+        ("run.threads", run.threads.get() as f64, 256.0),
         ("run.silence_limit", run.silence_limit.get(), 1e6),
         ("run.agent_silence_limit", run.agent_silence_limit.get(), 1e6),
         ("run.turn_steps", run.turn_steps.get() as f64, most_steps),

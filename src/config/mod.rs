@@ -291,8 +291,10 @@ pub struct BudgetSection {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunSection {
-    /// Walkers side by side; 0 for one a processor core.
+    /// Walkers side by side; 0 for as many as the processor cores allow.
     pub walkers: usize,
+    /// Threads of each.
+    pub threads: NonZeroUsize,
     /// A process that gives no sign of life for so long is hung and replaced, s.
     pub silence_limit: Positive,
     /// An agent on another host that gives no sign of life for so long is taken for dead: its walks go to others, s.
@@ -446,6 +448,7 @@ impl Default for RunSection {
     fn default() -> Self {
         Self {
             walkers: 0,
+            threads: NonZeroUsize::MIN,
             silence_limit: defaults::positive(120.0),
             agent_silence_limit: defaults::positive(60.0),
             restarts: 5,

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
 use calm::{GradeError, Grades, Mixture};
 use potentials::Zbl;
-use potentials::grace::{Grace, GraceModel, PullBack};
+use potentials::grace::{Grace, PullBack};
 use serde::{Deserialize, Serialize};
 
 /// The bias's own memory, part of a walk's checkpoint.
@@ -60,15 +60,15 @@ impl BiasedPotential {
     /// # Errors
     /// An element that the model does not know.
     pub fn new(
-        model: Arc<GraceModel>,
+        grace: Grace,
         mixture: Arc<Mixture>,
         zbl: Option<Zbl>,
         average_steps: u64,
         species: &[Species],
     ) -> Result<Self, PotentialError> {
-        let elements = model.element_indices(species)?;
+        let elements = grace.model().element_indices(species)?;
         Ok(Self {
-            grace: Grace::new(model),
+            grace,
             elements,
             zbl,
             mixture,

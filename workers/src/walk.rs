@@ -11,7 +11,7 @@ use std::sync::Arc;
 use atoms::PotentialError;
 use calm::{CollectionRule, GradeError, Mixture};
 use md::{Dynamics, DynamicsError, Stream};
-use potentials::grace::GraceModel;
+use potentials::grace::{Grace, GraceModel, Instructions, Threads};
 use potentials::{Zbl, ZblRangeError};
 use wire::messages::{Assignment, End, Outcome, Progress, Report, Verdict};
 use wire::{Candidate, Origin};
@@ -26,6 +26,8 @@ use state::{Collected, WalkState, begin};
 pub struct WalkContext {
     /// The model.
     pub model: Arc<GraceModel>,
+    /// The threads that evaluate it.
+    pub threads: Threads,
     /// The settings.
     pub settings: Arc<WalkSettings>,
 }
@@ -96,12 +98,13 @@ impl<'a> Walk<'a> {
         assignment: &'a Assignment,
         mixture: Arc<Mixture>,
     ) -> Result<Self, WalkError> {
-        let WalkContext { model, settings } = context;
+        let WalkContext { model, threads, settings } = context;
         let species = &assignment.seed_structure.species;
         let zbl = settings.zbl.map(|(inner, outer)| Zbl::new(species, inner, outer)).transpose()?;
         let mixture_version = mixture.version();
         let average_steps = settings.average_steps;
-        let mut potential = BiasedPotential::new(Arc::clone(model), mixture, zbl, average_steps, species)?;
+        let grace = Grace::with(Arc::clone(model), Instructions::best(), threads.clone());
+        let mut potential = BiasedPotential::new(grace, mixture, zbl, average_steps, species)?;
         let (dynamics, state) = match &assignment.checkpoint {
             None => begin(settings, assignment, &mut potential)?,
             Some(bytes) => {

@@ -9,7 +9,7 @@ use atoms::{Structure, read_extxyz};
 use calm::Artifact;
 use md::{Dynamics, Langevin, Settings, State, Stream, Thermostat};
 use potentials::Zbl;
-use potentials::grace::{GraceModel, Precision, RadialPath};
+use potentials::grace::{Grace, GraceModel, Precision, RadialPath};
 use workers::bias::BiasedPotential;
 
 thread_local! {
@@ -65,7 +65,8 @@ fn check(precision: Precision) {
     let model = Arc::new(GraceModel::load_in(&file, precision, RadialPath::default()).unwrap());
     let mixture = Arc::new(Artifact::load(data("al_eam_1l/gmm_artifacts.npz")).unwrap().mixture);
     let zbl = Zbl::new(&structure.species, 1.6, 2.4).unwrap();
-    let mut potential = BiasedPotential::new(model, mixture, Some(zbl), 2, &structure.species).unwrap();
+    let mut potential =
+        BiasedPotential::new(Grace::new(model), mixture, Some(zbl), 2, &structure.species).unwrap();
     let stream = Stream::new(3, 0, 0);
     let state = State::thermal(structure, 50.0, &stream);
     let settings = Settings {

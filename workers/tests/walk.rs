@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList, Potential, Structure, Vec3, cell, read_extxyz};
 use calm::{Artifact, CollectionRule, Grades, Mixture};
-use potentials::grace::{Grace, GraceModel, PullBack};
+use potentials::grace::{Grace, GraceModel, PullBack, Threads};
 use wire::messages::{Assignment, End, Outcome, Report, Verdict};
 use wire::{CampaignId, Candidate, Origin, WalkId};
 use workers::bias::BiasedPotential;
@@ -74,7 +74,8 @@ fn assignment(structure: Structure, until: u64) -> Assignment {
 }
 
 fn go(settings: &WalkSettings, assignment: &Assignment) -> Report<Candidate> {
-    let context = WalkContext { model: model(), settings: Arc::new(settings.clone()) };
+    let context =
+        WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings.clone()) };
     advance(&context, assignment, mixture(), || false, |_| {})
 }
 
@@ -118,7 +119,8 @@ fn the_bias_is_the_hal_force() {
     let (model, mixture, structure) = (model(), mixture(), seed("slab-111"));
     let species = &structure.species;
     let mut biased =
-        BiasedPotential::new(Arc::clone(&model), Arc::clone(&mixture), None, 10, species).unwrap();
+        BiasedPotential::new(Grace::new(Arc::clone(&model)), Arc::clone(&mixture), None, 10, species)
+            .unwrap();
     biased.tau = 0.3;
     let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
     let (mut force_norm, mut gradient_norm) = (0.0, 0.0);

@@ -40,8 +40,8 @@ impl Order {
         let config = &campaign.config;
         // "One a core" is as many as the job is given.
         let leading = match config.run.walkers {
-            0 => 2,
-            walkers => walkers + config.label.slots,
+            0 => config.run.threads.get().max(2),
+            walkers => walkers * config.run.threads.get() + config.label.slots,
         };
         let values = |cpus: usize, command: String| {
             [
@@ -58,7 +58,8 @@ impl Order {
         let leading = values(leading, commands.orchestrator(wanted)?);
         let mut scripts = vec![script(ORCHESTRATOR, &leading)?];
         if wanted.agents > 0 {
-            scripts.push(script(AGENT, &values(launch.walkers as usize, commands.agent()?))?);
+            scripts
+                .push(script(AGENT, &values((launch.walkers * launch.threads) as usize, commands.agent()?))?);
         }
         if wanted.labellers > 0 {
             scripts.push(script(LABELLER, &values(launch.slots as usize, commands.labeller()))?);
@@ -189,10 +190,11 @@ impl<'a> Commands<'a> {
     }
 
     fn agent(&self) -> Result<String, Failure> {
-        let (join, walkers) = (format!("@{}", self.endpoint), self.launch.walkers.to_string());
+        let join = format!("@{}", self.endpoint);
+        let (walkers, threads) = (self.launch.walkers.to_string(), self.launch.threads.to_string());
         let tls = self.certificates("agent")?;
         self.check_reach(tls.is_some())?;
-        let words = ["agent", "--join", &join, "--walkers", &walkers, PATIENCE];
+        let words = ["agent", "--join", &join, "--walkers", &walkers, "--threads", &threads, PATIENCE];
         Ok(self.command(words.into_iter().chain(tls.iter().flat_map(|directory| ["--tls", directory]))))
     }
 

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use atoms::{Cell, Species, Structure};
 use calm::Mixture;
-use potentials::grace::GraceModel;
+use potentials::grace::{GraceModel, Threads};
 use wire::messages::{Assignment, Outcome, Report};
 use wire::{CampaignId, Candidate, Origin, WalkId};
 use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
@@ -23,8 +23,11 @@ pub struct Turn {
 
 impl Turn {
     pub fn new(model: &Arc<GraceModel>, mixture: &Arc<Mixture>, seed: Structure) -> Self {
-        let context =
-            |threshold| WalkContext { model: Arc::clone(model), settings: Arc::new(settings(threshold)) };
+        let context = |threshold| WalkContext {
+            model: Arc::clone(model),
+            threads: Threads::default(),
+            settings: Arc::new(settings(threshold)),
+        };
         let mut assignment = assignment(seed, u64::MAX);
         // Any structure is a candidate, from the first that may be offered on.
         let report = go(&context(1e-9), &assignment, mixture);

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, NeighbourList, Potential, Structure};
 use calm::{Artifact, Grades, Mixture};
-use potentials::grace::{Grace, GraceModel, Precision, PullBack, RadialPath};
+use potentials::grace::{Grace, GraceModel, Instructions, Precision, PullBack, RadialPath, Threads};
 
 /// A model, and how gracemaker gets one like it.
 pub struct Model {
@@ -85,6 +85,10 @@ pub struct Case {
 
 impl Case {
     pub fn new(model: &Model, cells: usize, precision: Precision) -> Self {
+        Self::with_threads(model, cells, precision, Threads::default())
+    }
+
+    pub fn with_threads(model: &Model, cells: usize, precision: Precision, threads: Threads) -> Self {
         let folder = model.folder().expect("the model is here");
         let weights = GraceModel::load_in(&folder.join("kokkos.npz"), precision, RadialPath::default())
             .expect("a model");
@@ -96,7 +100,7 @@ impl Case {
         let elements = weights.element_indices(&structure.species).expect("elements of the model");
         Self {
             structure,
-            grace: Grace::new(weights),
+            grace: Grace::with(weights, Instructions::best(), threads),
             neighbours,
             elements,
             mixture,

@@ -8,6 +8,7 @@ mod case;
 mod peak;
 mod peer;
 mod scale;
+mod threads;
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -87,6 +88,7 @@ fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, peak: f64) {
         let [low, median, high] = quantiles(&ratios);
         println!("    both gradients over plain: {median:.2} ({low:.2} to {high:.2})");
     }
+    threads::report(model, EDGES[1]);
 }
 
 /// Seconds of calls that were made in turn.
