@@ -36,6 +36,17 @@ impl BiasState {
     }
 }
 
+/// Why there are no grades of a structure.
+#[derive(Debug, thiserror::Error)]
+pub enum UngradedError {
+    /// It has no features.
+    #[error(transparent)]
+    Potential(#[from] PotentialError),
+    /// Its features have no grades.
+    #[error(transparent)]
+    Grade(#[from] GradeError),
+}
+
 /// A GRACE potential with its bias and its short-range repulsion.
 pub struct BiasedPotential {
     grace: Grace,
@@ -88,7 +99,7 @@ impl BiasedPotential {
         &self.physical
     }
 
-    /// Features at the last evaluation, [n × D].
+    /// Features of the atoms that [`BiasedPotential::grades`] graded, [n × D].
     pub fn features(&self) -> &[f64] {
         self.grace.features()
     }
@@ -98,18 +109,43 @@ impl BiasedPotential {
         &self.elements
     }
 
-    /// Grades at the last evaluation; with the bias off they are computed here.
+    /// Grades at the last evaluation, which was of this structure; with the bias off they are computed here.
     ///
     /// # Errors
     /// Features that are not finite.
-    pub fn grades(&mut self) -> Result<&Grades, GradeError> {
+    pub fn grades(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+    ) -> Result<&Grades, UngradedError> {
         if let Some(error) = self.grade_error.take() {
-            return Err(error);
+            return Err(error.into());
         }
         if self.tau == 0.0 {
+            self.grace.forward(structure, neighbours)?;
             self.grades.evaluate(&self.mixture, &self.elements, self.grace.features(), None)?;
         }
         Ok(&self.grades)
+    }
+
+    fn evaluate_biased(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        self.grace.forward(structure, neighbours)?;
+        let features = self.grace.features();
+        self.cotangent.resize(features.len(), 0.0);
+        let cotangent = Some(self.cotangent.as_mut_slice());
+        self.grade_error = self.grades.evaluate(&self.mixture, &self.elements, features, cotangent).err();
+        let graded = self.grade_error.is_none();
+        self.grace.backward(graded.then_some(&self.cotangent), out, &mut self.pull_back);
+        copy(out, &mut self.physical);
+        if graded {
+            self.add_bias(out);
+        }
+        Ok(())
     }
 
     fn add_bias(&mut self, out: &mut Evaluation) {
@@ -140,21 +176,12 @@ impl Potential for BiasedPotential {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
-        self.grace.forward(structure, neighbours)?;
-        let biased = self.tau != 0.0;
         self.grade_error = None;
-        if biased {
-            let features = self.grace.features();
-            self.cotangent.resize(features.len(), 0.0);
-            let cotangent = Some(self.cotangent.as_mut_slice());
-            self.grade_error = self.grades.evaluate(&self.mixture, &self.elements, features, cotangent).err();
-        }
-        let graded = biased && self.grade_error.is_none();
-        let cotangent = graded.then_some(self.cotangent.as_slice());
-        self.grace.backward(cotangent, out, &mut self.pull_back);
-        copy(out, &mut self.physical);
-        if graded {
-            self.add_bias(out);
+        if self.tau == 0.0 {
+            self.grace.evaluate(structure, neighbours, out)?;
+            copy(out, &mut self.physical);
+        } else {
+            self.evaluate_biased(structure, neighbours, out)?;
         }
         if let Some(zbl) = &self.zbl {
             zbl.add(structure, neighbours, out)?;

@@ -9,14 +9,14 @@ mod state;
 use std::sync::Arc;
 
 use atoms::PotentialError;
-use calm::{CollectionRule, GradeError, Mixture};
+use calm::{CollectionRule, Mixture};
 use md::{Dynamics, DynamicsError, Stream};
 use potentials::grace::{Grace, GraceModel, Instructions, Threads};
 use potentials::{Zbl, ZblRangeError};
 use wire::messages::{Assignment, End, Outcome, Progress, Report, Verdict};
 use wire::{Candidate, Origin};
 
-use crate::bias::BiasedPotential;
+use crate::bias::{BiasedPotential, UngradedError};
 use crate::guard;
 use crate::settings::WalkSettings;
 use state::{Collected, WalkState, begin};
@@ -40,7 +40,7 @@ enum WalkError {
     #[error(transparent)]
     Potential(#[from] PotentialError),
     #[error(transparent)]
-    Grade(#[from] GradeError),
+    Ungraded(#[from] UngradedError),
     #[error(transparent)]
     Zbl(#[from] ZblRangeError),
     #[error("the walk's checkpoint cannot be read: {0}")]
@@ -198,7 +198,7 @@ impl<'a> Walk<'a> {
         if biased_steps == 0 {
             return Ok(None);
         }
-        let gamma = &self.potential.grades()?.gamma;
+        let gamma = gamma(&mut self.potential, &self.dynamics)?;
         self.state.gamma_max = calm::grade::maximum(gamma);
         let collects = step >= self.state.next_offer && self.collection.is_met(gamma);
         match (collects, too_close) {
@@ -283,4 +283,9 @@ impl<'a> Walk<'a> {
         self.state.bias = self.potential.state;
         postcard::to_stdvec(&self.state).expect("plain data is encoded into memory")
     }
+}
+
+/// γ of each atom where the walk stands.
+fn gamma<'a>(potential: &'a mut BiasedPotential, dynamics: &Dynamics) -> Result<&'a [f64], UngradedError> {
+    Ok(&potential.grades(dynamics.structure(), dynamics.neighbours())?.gamma)
 }

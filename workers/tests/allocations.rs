@@ -84,6 +84,7 @@ fn check(precision: Precision) {
         let before = ALLOCATIONS.get();
         (0..3).for_each(|_| dynamics.step(&mut potential).unwrap());
         assert_eq!(ALLOCATIONS.get() - before, 0, "{precision}, τ = {tau}");
-        assert_eq!(potential.grades().unwrap().gamma.len(), dynamics.structure().len());
+        let grades = potential.grades(dynamics.structure(), dynamics.neighbours()).unwrap();
+        assert_eq!(grades.gamma.len(), dynamics.structure().len());
     }
 }

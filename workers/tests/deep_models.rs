@@ -46,7 +46,7 @@ fn evaluate(potential: &mut BiasedPotential, structure: &Structure) -> (f64, Eva
     neighbours.update(structure).unwrap();
     let mut out = Evaluation::default();
     potential.evaluate(structure, &neighbours, &mut out).unwrap();
-    (potential.grades().unwrap().gamma.iter().sum(), out)
+    (potential.grades(structure, &neighbours).unwrap().gamma.iter().sum(), out)
 }
 
 /// f′(0) from f(±h) and f(±2h).

@@ -4,12 +4,12 @@ use atoms::NeighbourList;
 use calm::neighbourhood::{Pair, neighbourhood_average};
 use wire::{Candidate, CandidateId, ContentHash};
 
-use super::{Walk, WalkError};
+use super::{Walk, WalkError, gamma};
 
 impl Walk<'_> {
     /// Where the walk stands, as a candidate.
     pub(super) fn candidate(&mut self) -> Result<Candidate, WalkError> {
-        let gamma = self.potential.grades()?.gamma.clone();
+        let gamma = gamma(&mut self.potential, &self.dynamics)?.to_vec();
         let structure = self.dynamics.structure().clone();
         let pairs = self.pairs(self.dynamics.neighbours());
         let gamma_nbr = neighbourhood_average(&gamma, pairs).expect("pairs of these very atoms");

@@ -50,6 +50,7 @@ fn report(model: &Model, peak: f64) {
         let peers = (precision == Precision::Double).then(|| peer::seconds(model, &cases)).flatten();
         report_cases(cases, peers.as_deref(), peak);
     }
+    threads::report(model, EDGES[1]);
 }
 
 /// `peak` is that of double precision.
@@ -88,7 +89,6 @@ fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, peak: f64) {
         let [low, median, high] = quantiles(&ratios);
         println!("    both gradients over plain: {median:.2} ({low:.2} to {high:.2})");
     }
-    threads::report(model, EDGES[1]);
 }
 
 /// Seconds of calls that were made in turn.
