@@ -127,7 +127,10 @@ impl MethodSetup {
         match self {
             Self::Reference { kind, file, file_hash } => {
                 unchanged(file, file_hash)?;
-                Ok(Method::reference(kind.load(file).map_err(Failure::Input)?))
+                let potential = kind.load(file).map_err(Failure::Input)?;
+                // It may have been replaced while it was read.
+                unchanged(file, file_hash)?;
+                Ok(Method::reference(potential))
             }
             Self::Code { settings, running } => {
                 let code = settings.prepare().map_err(Failure::input)?;

@@ -120,3 +120,81 @@ fn each_label_comes_once_whoever_is_killed() {
     assert_eq!(place.label(&["--until-empty"]).0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert_eq!((calculating(&scratch), directories(&scratch)), (vec![], vec![]), "{killed:?}");
 }
+
+/// Answers and calculates as GPAW does, with the energy that stands in its setup of aluminium. When the first calculation is
+/// over, the file of which the setup is a copy becomes another.
+const GPAW: &str = r#"
+if [ ! -e input.json ]; then
+    echo "{\"gpaw\": \"1\", \"ase\": \"1\", \"setup_paths\": [\"$GPAW_SETUP_PATH\"]}"
+    exit
+fi
+awk -v energy="$(sed -n 's/<!-- energy \(.*\) -->/\1/p' ../data/Al.PBE)" '
+    BEGIN { print "{\"by\": {\"gpaw\": \"1\", \"ase\": \"1\"}, \"converged\":" }
+    /"moments"/ { exit }
+    /"positions"/ { places = 1 }
+    /"cell"/ { places = 0 }
+    { print }
+    places {
+        sub(/"positions"/, "\"forces\"")
+        if (sub(/-?[0-9][0-9.e-]*/, number % 3 ? "0.0" : "0.25")) number++
+        forces = forces $0 "\n"
+    }
+    END {
+        print forces "\"energy\": " energy ", \"energy_without_smearing\": null, \"stress\": null, \"moments\": null,"
+        print "\"magnetisation\": null, \"steps\": 1}}"
+    }
+' input.json > unfinished
+mv unfinished result.json
+if mkdir "$GPAW_SETUP_PATH/replaced" 2> /dev/null; then
+    sed 's/energy -1.5/energy -2.5/' ../data/Al.PBE > "$GPAW_SETUP_PATH/new"
+    mv "$GPAW_SETUP_PATH/new" "$GPAW_SETUP_PATH/Al.PBE"
+fi
+"#;
+
+const SETUP: &str = "<atom symbol=\"Al\" Z=\"13\" core=\"10\" valence=\"3\"/>\n<xc_functional type=\"GGA\" name=\"PBE\"/>\n\
+                     <!-- energy -1.5 -->\n";
+
+/// A campaign whose labels are made by [`GPAW`].
+fn with_setup(home: &Path) -> Place {
+    fs::write(home.join("Al.PBE"), SETUP).unwrap();
+    fs::write(home.join("gpaw.sh"), GPAW).unwrap();
+    let command = ["sh".to_owned(), home.join("gpaw.sh").display().to_string()];
+    let keys = format!(
+        "[label]\nslots = 0\nscratch = {scratch:?}\nkeep = \"all\"\nmethod = {{ gpaw = {{ command = {command:?}, \
+         pseudopotentials = {scratch:?}, spin = false }} }} # ",
+        scratch = home.display().to_string()
+    );
+    Place::new(&Small { walkers: 1, steps: 120, ..Small::default() }, &[("[label]\nmethod", &keys)])
+}
+
+#[test]
+fn a_setup_that_is_replaced_between_two_labels_makes_none() {
+    let home = tempfile::tempdir().unwrap();
+    let place = with_setup(&home.path().canonicalize().unwrap());
+    let mut run = place.run();
+    let mut label = place.label(&["--wait", "2"]);
+    assert_eq!(label.0.wait().unwrap().code(), Some(1), "{}", place.said());
+    let (said, setup) = (place.said(), home.path().canonicalize().unwrap().join("Al.PBE"));
+    assert!(
+        said.contains(&format!("cannot use {} (its content has changed: BLAKE3 ", setup.display())),
+        "{said}"
+    );
+    // Who begins now is refused.
+    assert!(said.contains("labels made here would be of another protocol than 'gpaw'"), "{said}");
+    assert!(said.contains("settings.pseudopotentials.Al"), "{said}");
+    assert_eq!((place.jobs("labelled"), place.jobs("failed")), (1, 0), "{said}");
+    fs::write(&setup, SETUP).unwrap();
+    let mut label = place.label(&["--wait", "2"]);
+    assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
+    outcome_at(place.argument(), place.path());
+    // All by the setup of the protocol, and it is not kept with any of them.
+    assert!(on_store(place.location(), are_single) > 2);
+    for job in on_store(place.location(), async |store| store.queue_list(None, u32::MAX, 0).await.unwrap()) {
+        let details = place.job(&job.candidate);
+        assert!(details.attempts_made.iter().all(|attempt| attempt.class.is_none()), "{details:?}");
+        let kept = on_store(place.location(), async |store| store.archives(job.job).await.unwrap());
+        let left_out = kept.iter().map(|kept| &*kept.left_out).collect::<String>();
+        assert_eq!(left_out, format!("data/Al.PBE ({} bytes)\n", SETUP.len()));
+    }
+}

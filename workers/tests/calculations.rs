@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use atoms::{Species, Structure};
 use common::*;
-use dft::{Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, SetupError, Size};
+use dft::{Calculated, Code, Exit, Failure, FailureClass, Input, Original, Remedy, SetupError, Size};
 use serde_json::json;
 use store::{
     Attempt, JobDetails, JobState, LabelRecord, ProcessRecord, Standing, Store, StoreError, unix_milliseconds,
@@ -35,11 +35,15 @@ fn keeper_command() -> KeeperCommand {
 }
 
 /// A shell script: exit code 0 is a label whose energy stands in `energy`, 3 says not converged.
-struct Script(String);
+struct Script {
+    text: String,
+    /// A file of which it gets a copy.
+    setup: Option<Original>,
+}
 
 impl Code for Script {
     fn identity(&self) -> serde_json::Value {
-        json!(self.0)
+        json!(self.text)
     }
 
     fn supports(&self, _: &BTreeSet<Species>) -> Result<(), SetupError> {
@@ -48,8 +52,8 @@ impl Code for Script {
 
     fn input(&self, _: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
         let names: Vec<_> = remedies.iter().map(|remedy| remedy.name()).collect();
-        let files = [("job.sh", self.0.clone()), ("remedies", format!("first\n{}\n", names.join(" ")))];
-        let command = match self.0.split_once(' ') {
+        let files = [("job.sh", self.text.clone()), ("remedies", format!("first\n{}\n", names.join(" ")))];
+        let command = match self.text.split_once(' ') {
             Some(("no-such-program", _)) => vec!["no-such-program".to_owned()],
             _ => vec!["sh".to_owned(), "job.sh".to_owned()],
         };
@@ -57,6 +61,7 @@ impl Code for Script {
             files: files.map(|(name, text)| (name.to_owned(), text.into_bytes())).into(),
             command,
             environment: BTreeMap::from([("SCRIPT".to_owned(), "fake".to_owned())]),
+            data: self.setup.iter().map(|original| ("setup".to_owned(), original.clone())).collect(),
         })
     }
 
@@ -92,6 +97,7 @@ struct Place {
     candidates: Vec<String>,
     running: Running,
     script: String,
+    setup: Option<Original>,
 }
 
 impl Place {
@@ -105,11 +111,24 @@ impl Place {
         // `begun` gets a line each time that the script is run, `go` lets it end.
         let here = home.path().display();
         let script = format!("echo $$ >> {here}/begun\n{script}").replace("$HERE", &here.to_string());
-        Self { home, store, candidates, running, script }
+        Self { home, store, candidates, running, script, setup: None }
+    }
+
+    /// The same with a file of which calculations get copies, as `../data/setup`.
+    async fn with_setup(structures: u64, script: &str, content: &str) -> Self {
+        let place = Self::new(structures, script).await;
+        fs::write(place.setup_path(), content).unwrap();
+        let (original, _) = Original::hashed(place.setup_path()).unwrap();
+        Self { setup: Some(original), ..place }
+    }
+
+    fn setup_path(&self) -> PathBuf {
+        self.home.path().join("setup")
     }
 
     fn method(&self) -> Method {
-        Method::kept_by(keeper_command(), Box::new(Script(self.script.clone())), self.running.clone())
+        let script = Script { text: self.script.clone(), setup: self.setup.clone() };
+        Method::kept_by(keeper_command(), Box::new(script), self.running.clone())
     }
 
     async fn labeller(&self) -> Labeller {
@@ -540,6 +559,65 @@ async fn another_version_of_a_program_is_the_hosts_fault_and_not_the_jobs() {
     assert_eq!((job.job.state, job.job.failures), (JobState::Queued, 0));
     place.script = "echo -7.5 > energy".to_owned();
     place.work().await;
+    place.nothing_is_left();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_file_that_is_replaced_between_two_labels_ends_the_labeller() {
+    let script = "cat ../data/setup > energy; echo -8.5 > $HERE/new; mv $HERE/new $HERE/setup";
+    let place = Place::with_setup(2, script, "-7.5\n").await;
+    let error = place.labeller().await.ended().await.unwrap_err().to_string();
+    let path = place.setup_path().display().to_string();
+    let (new, _) = Original::hashed(place.setup_path()).unwrap();
+    let [found, expected] = [&new, place.setup.as_ref().unwrap()].map(|original| &original.hash()[..12]);
+    let begin = format!(
+        "cannot use {path} (its content has changed: BLAKE3 {found}…, where the protocol of the labels has {expected}…;"
+    );
+    assert!(error.starts_with(&begin), "{error}");
+    assert_eq!((place.begun(), place.labels().await[0].label.energy), (1, -7.5));
+    let second = async || place.store.queue_show(&place.candidates[1]).await.unwrap();
+    let job = second().await;
+    assert_eq!((job.job.state, job.job.failures), (JobState::Queued, 0));
+    assert_eq!(job.attempts_made[0].calculation, None);
+    place.nothing_is_left();
+    let once = label_once(&place.method(), &structure(0.0), 100.0).await.map(drop).unwrap_err();
+    assert_eq!(once.to_string(), error);
+    // The file of the protocol comes back.
+    fs::write(place.setup_path(), "-7.5\n").unwrap();
+    place.work().await;
+    assert_eq!((place.begun(), second().await.job.state), (2, JobState::Labelled));
+    place.nothing_is_left();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_under_way_has_a_copy_of_its_own() {
+    let script = "while [ ! -e $HERE/go ]; do sleep 0.01; done; cat ../data/setup > energy";
+    let place = Place::with_setup(1, script, "-7.5\n").await;
+    let labeller = place.labeller().await;
+    place.wait_until_begun(1).await;
+    labeller.kill(&place).await;
+    fs::write(place.setup_path(), "-8.5\n").unwrap();
+    place.go();
+    // Who comes next finds it, and has nothing to copy.
+    place.work().await;
+    assert_eq!((place.begun(), place.labels().await[0].label.energy), (1, -7.5));
+    place.nothing_is_left();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn copies_of_files_are_not_kept_in_the_store() {
+    let mut place = Place::with_setup(1, "cat ../data/setup > energy", "-7.5\n").await;
+    place.running.keep = Keep::All;
+    place.work().await;
+    let kept = place.store.archives(place.job().await.job.job).await.unwrap();
+    assert_eq!(kept[0].left_out, "data/setup (5 bytes)\n");
+    let mut unpacked = tar::Archive::new(zstd::Decoder::new(&kept[0].bytes[..]).unwrap());
+    let names = unpacked.entries().unwrap().map(|entry| entry.unwrap().path().unwrap().display().to_string());
+    let names: Vec<_> = names.collect();
+    assert!(
+        names.contains(&"work/energy".to_owned()) && !names.iter().any(|name| name.contains("setup")),
+        "{names:?}"
+    );
     place.nothing_is_left();
 }
 

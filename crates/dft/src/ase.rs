@@ -139,6 +139,7 @@ impl Code for Ase {
             files: files.map(|(name, content)| (name.to_owned(), content)).into(),
             command: self.settings.command.iter().cloned().chain([SCRIPT_FILE.to_owned()]).collect(),
             environment: self.environment.clone(),
+            ..Input::default()
         })
     }
 

@@ -6,7 +6,7 @@ use std::path::Path;
 use atoms::cell::{Matrix3, Vec3};
 use atoms::{Species, Structure};
 
-use crate::{Failure, FailureClass, Remedy};
+use crate::{Failure, FailureClass, Original, Remedy};
 
 /// A program that makes labels, with its settings. It is made by its module's `Settings`, which finds the program and
 /// its pseudopotentials.
@@ -52,6 +52,9 @@ pub struct Input {
     pub command: Vec<String>,
     /// What is added to its environment.
     pub environment: BTreeMap<String, String>,
+    /// Large files that the program reads besides, such as pseudopotentials: copies of these are put into the folder `data`
+    /// beside the directory, by these names. All calculations have the same, and so they need not be kept.
+    pub data: BTreeMap<String, Original>,
 }
 
 /// How a program ended.

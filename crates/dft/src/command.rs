@@ -102,7 +102,7 @@ impl Code for Command {
         files.insert(STRUCTURE.to_owned(), text);
         let names: Vec<_> = remedies.iter().map(|remedy| remedy.name()).collect();
         let environment = BTreeMap::from([("CALMWALK_REMEDIES".to_owned(), names.join(","))]);
-        Ok(Input { files, command: self.command.clone(), environment })
+        Ok(Input { files, command: self.command.clone(), environment, ..Input::default() })
     }
 
     fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {

@@ -225,6 +225,7 @@ impl Code for Vasp {
             files: files.map(|(name, content)| (name.to_owned(), content)).into(),
             command: self.settings.command.clone(),
             environment: program::environment(&self.settings.environment),
+            ..Input::default()
         })
     }
 

@@ -164,6 +164,17 @@ fn the_identity_is_that_of_command_files_and_version() {
 }
 
 #[test]
+fn calculations_read_the_files_that_were_hashed() {
+    let home = tempfile::tempdir().unwrap();
+    let more = |code: &dyn Code| code.input(&oxide(), &BTreeSet::new()).unwrap().files["more"].clone();
+    let code = settings(home.path(), "energy=1", 0).prepare().unwrap();
+    // Who has begun goes on with what there was; who begins now is of another protocol.
+    let new = settings(home.path(), "energy=2", 0).prepare().unwrap();
+    assert_eq!([more(&code), more(&new)], [b"energy=1", b"energy=2"]);
+    assert_ne!(new.identity(), code.identity());
+}
+
+#[test]
 fn what_is_missing_is_found_before_anything_runs() {
     let home = tempfile::tempdir().unwrap();
     let fault = |change: &dyn Fn(&mut dft::command::Settings)| {

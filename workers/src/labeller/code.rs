@@ -187,15 +187,15 @@ impl CodeMethod {
             memory_limit: *memory_limit,
             keeper: self.keeper.clone(),
         };
-        let written = write(directory, input);
+        write(directory, input)?;
         let ready = match self.running.batch_system {
-            None => written.and_then(|()| here::Ready::start(calculation)).map(Ready::Here),
+            None => here::Ready::start(calculation).map(Ready::Here),
             Some(BatchSystem::Slurm) => {
                 let (cores, options) = (self.running.cores, self.running.batch_options.as_slice());
                 let avoid = if *avoids_nodes { failed_on } else { &[] };
                 let wanted = slurm::Wanted { cores, options, avoid };
                 let job = self.slurm.job(directory).await?;
-                written.and_then(|()| slurm::write(calculation, &wanted)).map(|()| Ready::Slurm(job))
+                slurm::write(calculation, &wanted).map(|()| Ready::Slurm(job))
             }
         };
         ready.map_err(|error| file(directory, error))

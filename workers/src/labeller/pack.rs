@@ -5,6 +5,8 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use super::prepare::DATA;
+
 /// Larger files stay out: charge densities and wave functions are of no use without the program, and are made again.
 const LARGEST_FILE: u64 = 16 << 20;
 /// Bytes of all files together, before they are compressed.
@@ -19,7 +21,8 @@ pub(super) struct Packed {
     pub left_out: String,
 }
 
-/// Packs the files below a directory, in order of their names, each as long as it is not too large and there is room.
+/// Packs the files below a directory, in order of their names, each as long as it is not too large and there is room. What all
+/// calculations have alike ([`DATA`]) stays out.
 pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
     let mut encoder = zstd::Encoder::new(Vec::new(), LEVEL)?;
     encoder.include_checksum(true)?;
@@ -30,7 +33,7 @@ pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
     for path in files(directory)? {
         let (name, size) =
             (path.strip_prefix(directory).unwrap_or(&path), fs::symlink_metadata(&path)?.len());
-        if size > LARGEST_FILE.min(room) {
+        if name.starts_with(DATA) || size > LARGEST_FILE.min(room) {
             let _ = writeln!(left_out, "{} ({size} bytes)", name.display());
             continue;
         }

@@ -1,17 +1,21 @@
 //! Before a calculation, and after it: files and numbers, nothing runs here.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io;
 use std::path::Path;
 
 use atoms::Structure;
-use dft::{Calculated, Code, Exit, Failure, Input, Remedy};
-use store::CalculationRecord;
+use dft::{Calculated, Code, Exit, Failure, Input, Original, Remedy};
+use store::{CalculationRecord, StoreError};
 
 use super::Running;
+use super::code::file;
 use super::difference::difference;
 use super::keeper::WORK;
+
+/// Beside [`WORK`], what the program reads and all calculations have alike.
+pub(super) const DATA: &str = "data";
 
 /// Bytes of a GB.
 const GIGABYTE: f64 = 1e9;
@@ -59,14 +63,25 @@ pub(super) fn prepare(
 }
 
 /// Makes the directory of a calculation, with its input in it.
-pub(super) fn write(directory: &Path, input: &Input) -> io::Result<()> {
-    let work = directory.join(WORK);
-    fs::create_dir_all(&work)?;
-    for (name, bytes) in &input.files {
-        let path = work.join(name);
-        if let Some(folder) = path.parent() {
-            fs::create_dir_all(folder)?;
-        }
+///
+/// # Errors
+/// It cannot be made, or a file of which it gets a copy is not the one of the protocol any more.
+pub(super) fn write(directory: &Path, input: &Input) -> Result<(), StoreError> {
+    let copy = |(name, original): (&String, &Original)| match original.content() {
+        Ok(content) => Ok((name.clone(), content)),
+        Err(error) => Err(file(original.path(), error)),
+    };
+    let data = input.data.iter().map(copy).collect::<Result<BTreeMap<_, _>, _>>()?;
+    let written = fill(&directory.join(WORK), &input.files).and_then(|()| fill(&directory.join(DATA), &data));
+    written.map_err(|error| file(directory, error))
+}
+
+/// Makes a folder with these files in it.
+fn fill(folder: &Path, files: &BTreeMap<String, Vec<u8>>) -> io::Result<()> {
+    fs::create_dir_all(folder)?;
+    for (name, bytes) in files {
+        let path = folder.join(name);
+        path.parent().map_or(Ok(()), fs::create_dir_all)?;
         fs::write(path, bytes)?;
     }
     Ok(())

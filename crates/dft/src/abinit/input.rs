@@ -8,6 +8,7 @@ use atoms::{Species, Vec3};
 use super::pseudopotentials::Pseudopotential;
 use super::{Abinit, Settings};
 use crate::lattice::Enclosed;
+use crate::original::COPIES;
 use crate::{Failure, FailureClass, Input, Remedy, Smearing, moments};
 
 /// Name of the input; ABINIT calls its output after it.
@@ -25,13 +26,14 @@ pub(super) fn write(
     electrons(&mut text, &abinit.settings, enclosed, &pseudopotentials, remedies);
     steps(&mut text, &abinit.settings, pseudopotentials.values().any(|p| p.paw), remedies);
     structure(&mut text, enclosed, &pseudopotentials);
-    text += &format!("pp_dirpath \"{}\"\n", abinit.settings.pseudopotentials.display());
-    let files: Vec<_> = pseudopotentials.values().map(|p| p.file.as_str()).collect();
-    text += &format!("pseudos \"{}\"\n", files.join(", "));
+    let copies: Vec<_> = pseudopotentials.iter().map(|(species, one)| one.copy(*species)).collect();
+    text += &format!("pp_dirpath \"{COPIES}\"\npseudos \"{}\"\n", copies.join(", "));
+    let originals = pseudopotentials.values().map(|one| one.original.clone());
     Ok(Input {
         files: [(NAME.to_owned(), text.into_bytes())].into(),
         command: abinit.settings.command.iter().cloned().chain([NAME.to_owned()]).collect(),
         environment: abinit.environment.clone(),
+        data: copies.into_iter().zip(originals).collect(),
     })
 }
 

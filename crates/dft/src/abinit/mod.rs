@@ -36,9 +36,6 @@ const HARTREE: f64 = 27.211_386_245_988;
 /// Counts changes of what is written here that change a label's value.
 const RECIPE: u32 = 1;
 
-/// ABINIT keeps names of files in this many characters.
-const LONGEST_PATH: usize = 240;
-
 /// `[label.method.abinit]`
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -107,14 +104,6 @@ impl Settings {
         positive("energy_tolerance", self.energy_tolerance)?;
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
-        let path = self.pseudopotentials.to_string_lossy();
-        if path.contains('"') || path.len() > LONGEST_PATH {
-            return Err(SetupError::Setting {
-                key: "pseudopotentials",
-                found: path.into_owned(),
-                expected: format!("a path of at most {LONGEST_PATH} bytes, without quotation marks"),
-            });
-        }
         let environment = program::environment(&self.environment);
         let version = version(&self.command, &environment)?;
         let pseudopotentials = pseudopotentials::find(&self.pseudopotentials, &self.variants)?;
@@ -154,7 +143,7 @@ impl Abinit {
             let one = self.pseudopotentials.get(species);
             let one = one.ok_or_else(|| pseudopotentials::missing(*species, directory, variants))?;
             if let Some((other, before)) = chosen.iter().find(|(_, before)| before.paw != one.paw) {
-                let (file, before) = (&one.file, &before.file);
+                let [file, before] = [one, before].map(|one| one.original.path().display());
                 let reason =
                     format!("{file} cannot go with {before} of {other}: one is PAW, the other is not");
                 return Err(SetupError::Pseudopotential { species: *species, reason });
@@ -168,7 +157,7 @@ impl Abinit {
 impl Code for Abinit {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, &str> =
-            self.pseudopotentials.iter().map(|(species, p)| (species.symbol(), p.hash.as_str())).collect();
+            self.pseudopotentials.iter().map(|(species, p)| (species.symbol(), p.original.hash())).collect();
         // Destructured, so that a new setting is not forgotten here.
         let Settings {
             command: _,

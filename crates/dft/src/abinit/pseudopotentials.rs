@@ -1,23 +1,28 @@
 //! Pseudopotentials of ABINIT: `Si.psp8` (norm-conserving) or `Si.xml` (PAW) in one directory.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use atoms::Species;
 
-use crate::{SetupError, paw};
+use crate::{Original, SetupError, paw};
 
 /// What is known of a pseudopotential.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Pseudopotential {
-    /// Its file in the directory.
-    pub file: String,
-    /// BLAKE3 of the file.
-    pub hash: String,
+    /// Its file.
+    pub original: Original,
     /// Electrons that it treats.
     pub valence: f64,
     /// Whether it is a PAW setup.
     pub paw: bool,
+}
+
+impl Pseudopotential {
+    /// Name of the copy that a calculation reads: ABINIT goes by its ending.
+    pub fn copy(&self, species: Species) -> String {
+        format!("{species}.{}", if self.paw { "xml" } else { "psp8" })
+    }
 }
 
 /// All that are in the directory.
@@ -37,7 +42,7 @@ pub(super) fn find(
             }
             continue;
         };
-        found.insert(species, read(species, directory, file)?);
+        found.insert(species, read(species, directory.join(file))?);
     }
     Ok(found)
 }
@@ -58,20 +63,17 @@ pub(super) fn missing(
     SetupError::Pseudopotential { species, reason }
 }
 
-fn read(species: Species, directory: &Path, file: String) -> Result<Pseudopotential, SetupError> {
-    let path = directory.join(&file);
-    let wrong = |reason: String| SetupError::Pseudopotential {
-        species,
-        reason: format!("{}: {reason}", path.display()),
-    };
-    let bytes = std::fs::read(&path).map_err(|error| wrong(error.to_string()))?;
+fn read(species: Species, path: PathBuf) -> Result<Pseudopotential, SetupError> {
+    let shown = path.display().to_string();
+    let wrong =
+        |reason: String| SetupError::Pseudopotential { species, reason: format!("{shown}: {reason}") };
     let paw = path.extension().is_some_and(|extension| extension == "xml");
+    let (original, content) = Original::hashed(path).map_err(|error| wrong(error.to_string()))?;
     let valence = match paw {
-        true => paw::valence(&bytes, species),
-        false => valence(&bytes, species),
+        true => paw::valence(&content, species),
+        false => valence(&content, species),
     };
-    let hash = blake3::hash(&bytes).to_hex().to_string();
-    Ok(Pseudopotential { file, hash, valence: valence.map_err(wrong)?, paw })
+    Ok(Pseudopotential { original, valence: valence.map_err(wrong)?, paw })
 }
 
 /// Valence electrons of a `psp8` file: Z and the valence begin its second line, format and functional the third.

@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::FailureClass;
+use crate::{FailureClass, Original};
 
 const INPUT: &str = include_str!("../../tests/data/abinit/run.abi");
 const OUTPUT: &str = include_str!("../../tests/data/abinit/run.abo");
@@ -19,8 +19,9 @@ fn silicon() -> Structure {
 
 fn abinit(settings: Settings) -> Abinit {
     let known = [("Si", 4.0, false), ("Fe", 16.0, true)].map(|(symbol, valence, paw)| {
-        let file = format!("{symbol}.{}", if paw { "xml" } else { "psp8" });
-        (symbol.parse().unwrap(), Pseudopotential { file, hash: symbol.to_lowercase(), valence, paw })
+        let path = format!("/{symbol}.{}", if paw { "xml" } else { "psp8" });
+        let original = Original::pretended(&path, &symbol.to_lowercase());
+        (symbol.parse().unwrap(), Pseudopotential { original, valence, paw })
     });
     let environment = program::environment(&settings.environment);
     Abinit { settings, environment, version: "9.6.2".into(), pseudopotentials: known.into() }
@@ -84,10 +85,31 @@ fn paw_setups_get_a_fine_grid_and_do_not_go_with_others() {
     let error = code.supports(&both).unwrap_err().to_string();
     assert_eq!(
         error,
-        "pseudopotential of Fe: Fe.xml cannot go with Si.psp8 of Si: one is PAW, the other is not"
+        "pseudopotential of Fe: /Fe.xml cannot go with /Si.psp8 of Si: one is PAW, the other is not"
     );
     let error = code.supports(&BTreeSet::from(["U".parse().unwrap()])).unwrap_err().to_string();
     assert!(error.starts_with("pseudopotential of U: no U.psp8 or U.xml in /usr/share/abinit"), "{error}");
+}
+
+#[test]
+fn calculations_read_copies_of_what_was_hashed() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("mine.psp8");
+    let before = "Si\n14.0 4.0 170510 zatom\n8 11 2 4\n";
+    std::fs::write(&file, before).unwrap();
+    let variants = BTreeMap::from([("Si".parse().unwrap(), "mine.psp8".to_owned())]);
+    let pseudopotentials = pseudopotentials::find(directory.path(), &variants).unwrap();
+    let settings = Settings { pseudopotentials: directory.path().to_owned(), variants, ..settings() };
+    let code = Abinit { pseudopotentials, ..abinit(settings) };
+    let input = code.input(&silicon(), &BTreeSet::new()).unwrap();
+    let text = String::from_utf8(input.files["run.abi"].clone()).unwrap();
+    assert!(text.ends_with("pp_dirpath \"../data\"\npseudos \"Si.psp8\"\n"), "{text}");
+    assert_eq!(input.data.keys().collect::<Vec<_>>(), ["Si.psp8"]);
+    let hash = blake3::hash(before.as_bytes()).to_hex().to_string();
+    assert_eq!(code.identity()["pseudopotentials"], json!({ "Si": hash }));
+    assert_eq!(input.data["Si.psp8"].content().unwrap(), before.as_bytes());
+    std::fs::write(&file, before.replace("170510", "170511")).unwrap();
+    assert!(input.data["Si.psp8"].content().is_err());
 }
 
 #[test]

@@ -21,8 +21,22 @@ pub(super) struct Kind {
     pub potential: String,
     /// Electrons that it treats.
     pub valence: f64,
-    /// BLAKE3 of the entries of pseudopotential and basis set.
-    pub hash: String,
+    /// Their entries.
+    pub entries: Entries,
+}
+
+/// Entries of data files.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Entries {
+    pub potential: String,
+    pub basis: String,
+}
+
+impl Entries {
+    /// BLAKE3 of both.
+    pub fn hash(&self) -> String {
+        blake3::hash(format!("{}\n{}", self.potential, self.basis).as_bytes()).to_hex().to_string()
+    }
 }
 
 /// All elements that have both.
@@ -89,8 +103,8 @@ fn kind(
             || names.contains(&settings.basis.as_str()) && !names.iter().any(|name| name.contains("-q"))
     };
     let Some(basis) = entry(bases, species, fits) else { return Ok(None) };
-    let hash = blake3::hash(format!("{potential}\n{basis}").as_bytes()).to_hex().to_string();
-    Ok(Some(Kind { potential: name.to_owned(), valence, hash }))
+    let entries = Entries { potential: potential.to_owned(), basis: basis.to_owned() };
+    Ok(Some(Kind { potential: name.to_owned(), valence, entries }))
 }
 
 /// The lines of the first entry of this element whose names fit. An entry begins with a symbol and ends before the next.
@@ -156,10 +170,10 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let settings = settings(directory.path());
         let silicon = "Si".parse().unwrap();
-        let hash = find(&settings).unwrap()[&silicon].hash.clone();
+        let hash = find(&settings).unwrap()[&silicon].entries.hash();
         std::fs::write(directory.path().join(POTENTIALS), POTENTIAL.replace("0.3\n", "0.5\n")).unwrap();
-        assert_eq!(find(&settings).unwrap()[&silicon].hash, hash);
+        assert_eq!(find(&settings).unwrap()[&silicon].entries.hash(), hash);
         std::fs::write(directory.path().join(POTENTIALS), POTENTIAL.replace("6.26928833", "6.3")).unwrap();
-        assert_ne!(find(&settings).unwrap()[&silicon].hash, hash);
+        assert_ne!(find(&settings).unwrap()[&silicon].entries.hash(), hash);
     }
 }

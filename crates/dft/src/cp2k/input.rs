@@ -1,6 +1,6 @@
 //! `run.inp`.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
 use atoms::Structure;
@@ -14,8 +14,12 @@ const NAME: &str = "run.inp";
 
 pub(super) fn write(cp2k: &Cp2k, enclosed: &Enclosed, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
     let species = BTreeSet::from_iter(enclosed.structure.species.iter().copied());
-    for species in &species {
-        cp2k.kind(*species).map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+    // The entries that the identity holds, and no others.
+    let (mut potentials, mut bases) = (String::new(), String::new());
+    for species in species {
+        let kind = cp2k.kind(species).map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+        potentials += &format!("{}\n", kind.entries.potential);
+        bases += &format!("{}\n", kind.entries.basis);
     }
     let spins = Spins::new(cp2k, &enclosed.structure, remedies);
     let text = format!(
@@ -29,9 +33,12 @@ pub(super) fn write(cp2k: &Cp2k, enclosed: &Enclosed, remedies: &BTreeSet<Remedy
     );
     let arguments = ["-i", NAME, "-o", OUTPUT].map(str::to_owned);
     Ok(Input {
-        files: [(NAME.to_owned(), text.into_bytes())].into(),
+        files: [(NAME, text), (data::POTENTIALS, potentials), (data::BASES, bases)]
+            .map(|(name, text)| (name.to_owned(), text.into_bytes()))
+            .into(),
         command: cp2k.settings.command.iter().cloned().chain(arguments).collect(),
         environment: cp2k.environment.clone(),
+        ..Input::default()
     })
 }
 
@@ -61,13 +68,12 @@ impl Spins {
 }
 
 fn method(settings: &Settings, spins: &Spins) -> String {
-    let directory = settings.pseudopotentials.display();
     let spin = match settings.spin {
         true => format!("    UKS T\n    MULTIPLICITY {}\n", spins.multiplicity),
         false => String::new(),
     };
     format!(
-        "    BASIS_SET_FILE_NAME {directory}/{}\n    POTENTIAL_FILE_NAME {directory}/{}\n{spin}    &QS\n      EPS_DEFAULT \
+        "    BASIS_SET_FILE_NAME {}\n    POTENTIAL_FILE_NAME {}\n{spin}    &QS\n      EPS_DEFAULT \
          1.0E-12\n    &END QS\n    &MGRID\n      CUTOFF [eV] {:?}\n      REL_CUTOFF [eV] {:?}\n    &END MGRID\n    &XC\n      \
          &XC_FUNCTIONAL PBE\n      &END XC_FUNCTIONAL\n    &END XC\n    &PRINT\n      &MULLIKEN\n      &END MULLIKEN\n    \
          &END PRINT\n",
@@ -121,7 +127,7 @@ fn structure(cp2k: &Cp2k, structure: &Structure, remedies: &BTreeSet<Remedy>) ->
     }
     text += "    &END COORD\n";
     let initial = moments::initial(structure, &cp2k.settings.moments, remedies);
-    let moments = std::collections::BTreeMap::from_iter(structure.species.iter().zip(initial));
+    let moments = BTreeMap::from_iter(structure.species.iter().zip(initial));
     for (species, moment) in moments {
         let potential = cp2k.kind(*species).map_or("", |kind| kind.potential.as_str());
         let _ = writeln!(

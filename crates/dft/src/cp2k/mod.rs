@@ -151,8 +151,8 @@ impl Cp2k {
 
 impl Code for Cp2k {
     fn identity(&self) -> Value {
-        let hashes: BTreeMap<&str, &str> =
-            self.kinds.iter().map(|(species, kind)| (species.symbol(), kind.hash.as_str())).collect();
+        let hashes: BTreeMap<&str, String> =
+            self.kinds.iter().map(|(species, kind)| (species.symbol(), kind.entries.hash())).collect();
         // Destructured, so that a new setting is not forgotten here.
         let Settings {
             command: _,

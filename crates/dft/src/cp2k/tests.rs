@@ -2,6 +2,7 @@
 
 use proptest::prelude::*;
 
+use super::data::Entries;
 use super::*;
 use crate::FailureClass;
 
@@ -18,7 +19,8 @@ fn silicon() -> Structure {
 }
 
 fn cp2k(settings: Settings) -> Cp2k {
-    let kind = Kind { potential: "GTH-PBE".into(), valence: 4.0, hash: "abc".into() };
+    let entries = Entries { potential: "Si GTH-PBE".into(), basis: "Si SZV".into() };
+    let kind = Kind { potential: "GTH-PBE".into(), valence: 4.0, entries };
     let environment = program::environment(&settings.environment);
     let kinds = BTreeMap::from([("Si".parse().unwrap(), kind)]);
     Cp2k { settings, environment, version: "2023.1".into(), kinds }
@@ -76,6 +78,35 @@ fn meshes_hold_the_point_gamma() {
     assert_eq!(mesh(10.0), None);
     assert_eq!(mesh(1.2).as_deref(), Some("SCHEME MACDONALD 2 2 2 0.25 0.25 0.25"));
     assert_eq!(mesh(0.8).as_deref(), Some("SCHEME MACDONALD 3 3 3 0.0 0.0 0.0"));
+}
+
+#[test]
+fn calculations_read_the_entries_that_were_hashed() {
+    let directory = tempfile::tempdir().unwrap();
+    let write = |z: &str| {
+        let potentials = format!("#\nSi GTH-PBE-q4 GTH-PBE\n 2 2\n 0.44 1 {z}\nO GTH-PBE\n 2 4\n");
+        std::fs::write(directory.path().join(data::POTENTIALS), potentials).unwrap();
+        let bases = "Si SZV-MOLOPT-SR-GTH\n 1\nO SZV-MOLOPT-SR-GTH\n 1\n";
+        std::fs::write(directory.path().join(data::BASES), bases).unwrap();
+    };
+    write("-6.27");
+    let settings = Settings { pseudopotentials: directory.path().to_owned(), ..settings() };
+    let prepared = || Cp2k { kinds: data::find(&settings).unwrap(), ..cp2k(settings.clone()) };
+    let code = prepared();
+    let entries = |code: &Cp2k| {
+        let files = code.input(&silicon(), &BTreeSet::new()).unwrap().files;
+        assert_eq!(String::from_utf8_lossy(&files["run.inp"]), INPUT);
+        ["GTH_POTENTIALS", "BASIS_MOLOPT"].map(|name| String::from_utf8(files[name].clone()).unwrap())
+    };
+    let [potential, basis] = ["Si GTH-PBE-q4 GTH-PBE\n 2 2\n 0.44 1 -6.27", "Si SZV-MOLOPT-SR-GTH\n 1"];
+    assert_eq!(entries(&code), [format!("{potential}\n"), format!("{basis}\n")]);
+    let hash = blake3::hash(format!("{potential}\n{basis}").as_bytes()).to_hex().to_string();
+    assert_eq!(code.identity()["pseudopotentials"]["Si"], hash);
+    // Who has begun goes on with what there was; who begins now is of another protocol.
+    write("-6.28");
+    assert_eq!(entries(&code)[0], format!("{potential}\n"));
+    assert_eq!(entries(&prepared())[0], format!("{}\n", potential.replace("-6.27", "-6.28")));
+    assert_ne!(prepared().identity(), code.identity());
 }
 
 #[test]

@@ -1,15 +1,16 @@
 //! What the script is told.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use atoms::Species;
 use atoms::cell::{Matrix3, Vec3};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::{Gpaw, SCRIPT, Settings};
+use super::{Gpaw, SCRIPT, Settings, setups};
 use crate::lattice::Enclosed;
 use crate::moments;
+use crate::original::COPIES;
 use crate::{Failure, FailureClass, Input, Remedy, Smearing};
 
 /// Name of the script in the directory of a calculation.
@@ -22,6 +23,8 @@ struct Task<'a> {
     positions: &'a [Vec3],
     cell: &'a Matrix3,
     moments: Option<Vec<f64>>,
+    /// Directory of the setups.
+    setups: &'a str,
     cutoff: f64,
     /// Keyword arguments of `GPAW`.
     parameters: Value,
@@ -29,14 +32,17 @@ struct Task<'a> {
 
 pub(super) fn write(gpaw: &Gpaw, enclosed: &Enclosed, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
     let (settings, structure) = (&gpaw.settings, &enclosed.structure);
+    let mut data = BTreeMap::new();
     for species in BTreeSet::from_iter(structure.species.iter().copied()) {
-        gpaw.setup(species).map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+        let setup = gpaw.setup(species).map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+        data.insert(setups::name(species, &settings.variants), setup.original.clone());
     }
     let task = Task {
         species: &structure.species,
         positions: &structure.positions,
         cell: &structure.cell.0,
         moments: settings.spin.then(|| moments::initial(structure, &settings.moments, remedies)),
+        setups: COPIES,
         cutoff: settings.cutoff,
         parameters: parameters(
             settings,
@@ -51,6 +57,7 @@ pub(super) fn write(gpaw: &Gpaw, enclosed: &Enclosed, remedies: &BTreeSet<Remedy
         files: [(SCRIPT_FILE.to_owned(), SCRIPT.into()), ("input.json".to_owned(), task)].into(),
         command: settings.command.iter().cloned().chain([SCRIPT_FILE.to_owned()]).collect(),
         environment: gpaw.environment.clone(),
+        data,
     })
 }
 

@@ -20,6 +20,7 @@ def main():
         paths = [str(path) for path in gpaw.setup_paths]
         return say({**versions, "setup_paths": paths})
 
+    gpaw.setup_paths[:] = [task["setups"]]
     calculator = GPAW(mode=PW(task["cutoff"]), **task["parameters"])
     atoms = Atoms(task["species"], positions=task["positions"], cell=task["cell"], pbc=True, calculator=calculator)
     atoms.set_initial_magnetic_moments(task["moments"])

@@ -168,7 +168,7 @@ impl Gpaw {
 impl Code for Gpaw {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, &str> =
-            self.setups.iter().map(|(species, setup)| (species.symbol(), setup.hash.as_str())).collect();
+            self.setups.iter().map(|(species, setup)| (species.symbol(), setup.original.hash())).collect();
         // Destructured, so that a new setting is not forgotten here.
         let Settings {
             command: _,

@@ -1,19 +1,17 @@
 //! PAW setups, found as GPAW finds them: `Si.PBE` or `Si.PBE.gz` in the first of the directories that has one.
 
 use std::collections::BTreeMap;
-use std::io::{ErrorKind, Read};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use atoms::Species;
-use flate2::read::GzDecoder;
 
-use crate::{SetupError, paw};
+use crate::{Original, SetupError, paw};
 
 /// What is known of a setup.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Setup {
-    /// BLAKE3 of its text.
-    pub hash: String,
+    /// Its file.
+    pub original: Original,
     /// Electrons that it treats.
     pub valence: f64,
 }
@@ -34,9 +32,10 @@ pub(super) fn find(
             }
             continue;
         };
-        let setup = read(species, &path).map_err(|reason| SetupError::Pseudopotential {
+        let shown = path.display().to_string();
+        let setup = read(species, path).map_err(|reason| SetupError::Pseudopotential {
             species,
-            reason: format!("{}: {reason}", path.display()),
+            reason: format!("{shown}: {reason}"),
         })?;
         setups.insert(species, setup);
     }
@@ -59,31 +58,16 @@ pub(super) fn missing(
 }
 
 /// `Si.PBE`, or with a variant `Ni.10.PBE`.
-fn name(species: Species, variants: &BTreeMap<Species, String>) -> String {
+pub(super) fn name(species: Species, variants: &BTreeMap<Species, String>) -> String {
     match variants.get(&species) {
         Some(variant) => format!("{species}.{variant}.PBE"),
         None => format!("{species}.PBE"),
     }
 }
 
-fn read(species: Species, path: &Path) -> Result<Setup, String> {
-    let bytes = std::fs::read(path).map_err(|error| error.to_string())?;
-    let text = match path.extension().is_some_and(|extension| extension == "gz") {
-        true => unpacked(&bytes).map_err(|error| format!("cannot be unpacked: {error}"))?,
-        false => bytes,
-    };
-    let valence = paw::valence(&text, species)?;
-    Ok(Setup { hash: blake3::hash(&text).to_hex().to_string(), valence })
-}
-
-fn unpacked(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
-    // Setups have some 100 kB; a file that grows without end is none.
-    const MOST: u64 = 64 << 20;
-    let mut text = Vec::new();
-    match GzDecoder::new(bytes).take(MOST).read_to_end(&mut text)? as u64 {
-        MOST => Err(std::io::Error::new(ErrorKind::InvalidData, "more than 64 MB")),
-        _ => Ok(text),
-    }
+fn read(species: Species, path: PathBuf) -> Result<Setup, String> {
+    let (original, content) = Original::hashed(path).map_err(|error| format!("cannot be read: {error}"))?;
+    Ok(Setup { original, valence: paw::valence(&content, species)? })
 }
 
 #[cfg(test)]
@@ -111,7 +95,7 @@ mod tests {
         std::fs::write(paths[0].join("Si.PBE"), HEAD.replace("valence=\"4\"", "valence=\"12\"")).unwrap();
         let first = find(&paths, &none).unwrap();
         assert_eq!(first[&species("Si")].valence, 12.0);
-        assert_ne!(first[&species("Si")].hash, setups[&species("Si")].hash);
+        assert_ne!(first[&species("Si")].original.hash(), setups[&species("Si")].original.hash());
 
         std::fs::write(paths[0].join("Al.PBE"), HEAD).unwrap();
         let error = find(&paths, &none).unwrap_err().to_string();

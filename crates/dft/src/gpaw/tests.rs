@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::*;
-use crate::FailureClass;
+use crate::{FailureClass, Original};
 
 const RESULT: &[u8] = include_bytes!("../../tests/data/gpaw/result.json");
 
@@ -21,7 +21,7 @@ fn silicon() -> Structure {
 
 fn gpaw(settings: Settings) -> Gpaw {
     let who = Who { gpaw: "22.8.0".into(), ase: "3.22.1".into(), setup_paths: vec!["/setups".into()] };
-    let setup = Setup { hash: "abc".into(), valence: 4.0 };
+    let setup = Setup { original: Original::pretended("/setups/Si.PBE", "abc"), valence: 4.0 };
     let setups = BTreeMap::from([("Si".parse().unwrap(), setup)]);
     Gpaw { environment: settings.environment(), settings, who, setups }
 }
@@ -74,6 +74,27 @@ fn remedies_change_nothing_that_the_accuracy_depends_on() {
     assert!(parameters.remove("mixer").is_some());
     assert!(parameters.remove("eigensolver").is_some());
     assert_eq!(changed, plain);
+}
+
+#[test]
+fn calculations_read_copies_of_what_was_hashed() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("Si.mine.PBE");
+    let before =
+        "<atom symbol=\"Si\" valence=\"4\"/>\n<xc_functional type=\"GGA\" name=\"PBE\"/>\n<!-- 1 -->";
+    std::fs::write(&file, before).unwrap();
+    let variants = BTreeMap::from([("Si".parse().unwrap(), "mine".to_owned())]);
+    let setups = setups::find(&[directory.path().to_owned()], &variants).unwrap();
+    let code = Gpaw { setups, ..gpaw(Settings { variants, ..Settings::default() }) };
+    assert_eq!(task(&code, &[])["setups"], json!("../data"));
+    let data = code.input(&silicon(), &BTreeSet::new()).unwrap().data;
+    // By the name that GPAW looks for.
+    assert_eq!(data.keys().collect::<Vec<_>>(), ["Si.mine.PBE"]);
+    let hash = blake3::hash(before.as_bytes()).to_hex().to_string();
+    assert_eq!(code.identity()["pseudopotentials"], json!({ "Si": hash }));
+    assert_eq!(data["Si.mine.PBE"].content().unwrap(), before.as_bytes());
+    std::fs::write(&file, before.replace('1', "2")).unwrap();
+    assert!(data["Si.mine.PBE"].content().is_err());
 }
 
 #[test]

@@ -6,6 +6,7 @@
 
 mod abinit;
 mod checks;
+mod copies;
 mod cp2k;
 mod gpaw;
 mod run;

@@ -3,10 +3,11 @@
 use std::collections::BTreeSet;
 use std::fs::File;
 use std::os::unix::process::ExitStatusExt;
+use std::path::Path;
 use std::process::{Command, Stdio};
 
 use atoms::Structure;
-use dft::{Calculated, Code, Exit, Failure, FailureClass, Remedy, remedies};
+use dft::{Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, remedies};
 
 /// One calculation from its input to its judgement.
 pub fn attempt(
@@ -14,12 +15,39 @@ pub fn attempt(
     structure: &Structure,
     remedies: &BTreeSet<Remedy>,
 ) -> Result<Calculated, Failure> {
-    let directory = tempfile::tempdir().unwrap();
+    let place = tempfile::tempdir().unwrap();
+    let input = prepared(code, structure, remedies, place.path())?;
+    calculate(code, structure, input, place.path())
+}
+
+/// Writes the input into folders of this directory.
+pub fn prepared(
+    code: &dyn Code,
+    structure: &Structure,
+    remedies: &BTreeSet<Remedy>,
+    place: &Path,
+) -> Result<Input, Failure> {
     let input = code.input(structure, remedies)?;
+    let [work, data] = ["work", "data"].map(|folder| place.join(folder));
+    [&work, &data].into_iter().for_each(|folder| std::fs::create_dir(folder).unwrap());
     for (name, content) in &input.files {
-        std::fs::write(directory.path().join(name), content).unwrap();
+        std::fs::write(work.join(name), content).unwrap();
     }
-    let output = |name| Stdio::from(File::create(directory.path().join(name)).unwrap());
+    for (name, original) in &input.data {
+        std::fs::write(data.join(name), original.content().unwrap()).unwrap();
+    }
+    Ok(input)
+}
+
+/// Runs what was prepared, and judges it.
+pub fn calculate(
+    code: &dyn Code,
+    structure: &Structure,
+    input: Input,
+    place: &Path,
+) -> Result<Calculated, Failure> {
+    let directory = place.join("work");
+    let output = |name| Stdio::from(File::create(directory.join(name)).unwrap());
     let status = Command::new(&input.command[0])
         .args(&input.command[1..])
         .envs(&input.environment)
@@ -32,14 +60,9 @@ pub fn attempt(
     let exit = status.code().map(Exit::Code).or(status.signal().map(Exit::Signal)).unwrap();
     if let Some(kept) = std::env::var_os("CALMWALK_KEEP") {
         let name = format!("{:?}-{}", std::thread::current().id(), structure.formula());
-        Command::new("cp")
-            .arg("-r")
-            .arg(directory.path())
-            .arg(std::path::Path::new(&kept).join(name))
-            .status()
-            .unwrap();
+        Command::new("cp").arg("-r").arg(place).arg(Path::new(&kept).join(name)).status().unwrap();
     }
-    code.read(structure, directory.path(), exit)
+    code.read(structure, &directory, exit)
 }
 
 /// A calculation that must succeed.

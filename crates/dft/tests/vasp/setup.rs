@@ -1,5 +1,6 @@
 //! What is wrong is found before anything is run.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use dft::vasp::Settings;
@@ -39,9 +40,25 @@ fn the_identity_holds_what_changes_a_label() {
     assert!(!same(&|settings| settings.moments = [("O".parse().unwrap(), 2.0)].into()));
     assert!(!same(&|settings| drop(settings.tags.insert("LASPH".into(), ".TRUE.".into()))));
     assert_eq!(identity(&first)["pseudopotentials"]["O"]["title"], "PAW_PBE O 01Jan2000");
-    let before = identity(&first);
+}
+
+#[test]
+fn calculations_read_the_potentials_that_were_hashed() {
+    let home = TempDir::new().unwrap();
+    let settings = settings(home.path(), "5.4.4", &["Al", "O"]);
+    let potcar_of = |code: &dyn Code| {
+        let files = code.input(&alumina(), &BTreeSet::new()).unwrap().files;
+        String::from_utf8(files["POTCAR"].clone()).unwrap()
+    };
+    let code = settings.prepare().unwrap();
+    let expected = ["Al", "O"].map(|element| potcar(&format!("PAW_PBE {element} 01Jan2000"), element, 3.0));
+    assert_eq!(potcar_of(&code), expected.concat());
+    // Who has begun goes on with what there was; who begins now is of another protocol.
     std::fs::write(home.path().join("O/POTCAR"), potcar("PAW_PBE O 02Jan2000", "O", 6.0)).unwrap();
-    assert_ne!(identity(&first), before);
+    assert_eq!(potcar_of(&code), expected.concat());
+    let new = settings.prepare().unwrap();
+    assert!(potcar_of(&new).contains("PAW_PBE O 02Jan2000"));
+    assert_ne!(new.identity(), code.identity());
 }
 
 #[test]
