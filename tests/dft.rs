@@ -14,7 +14,7 @@ use atoms::extxyz::Frame;
 use atoms::{Cell, Structure, Vec3, read_extxyz};
 use common::place::queue;
 use common::processes::{calculating, carrying_out, signal, wait_until};
-use common::{config, demo, deviation, program, random, succeed};
+use common::{config, demo, deviation, program, random, stderr, succeed};
 use serde_json::Value;
 
 /// Directories of calculations: a campaign has a directory in `scratch`, and each calculation one in it.
@@ -186,6 +186,55 @@ fn guards_stand_before_abinit() {
     let dear = add(8, pair(1.5), 4.0);
     succeed(here, ["label", "--store", "campaign", "--until-empty"]);
     is_refused(here, &dear, "core-seconds, as 4 others did, where label.guard.largest_cost is 0.000001");
+}
+
+/// When ABINIT has made the first label, its pseudopotential becomes another, with which it would calculate as well.
+#[test]
+fn a_pseudopotential_that_is_replaced_between_two_labels_makes_none() {
+    const THEIRS: &str = "/usr/share/abinit/psp";
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path().canonicalize().unwrap();
+    let (file, script) = (here.join("Si.psp8"), here.join("abinit.sh"));
+    let original = Path::new(THEIRS).join("Pseudodojo_nc_sr_04_pbe_standard_psp8/Si.psp8");
+    fs::copy(&original, &file).unwrap();
+    let replace = format!("cp {THEIRS}/Si_GGA_noNLCC.psp8 new && mv new {}", file.display());
+    let text = format!(
+        "abinit \"$@\" || exit\n[ ! -e run.abo ] || ! mkdir {}/once 2> /dev/null || {{ {replace}; }}\n",
+        here.display()
+    );
+    fs::write(&script, text).unwrap();
+    let method = format!(
+        "[label.method.abinit]\ncommand = [\"sh\", {:?}]\npseudopotentials = {:?}\n",
+        script.display().to_string(),
+        here.display().to_string()
+    );
+    let text = demo("silicon-dft.toml").replace("# control = true", "control = false");
+    let text = text.replace("# total = 100 ", "total = 3 ").replace("[label.method.abinit]\n", &method);
+    fs::write(here.join("campaign.toml"), text).unwrap();
+    let output = program(&here).args(["run", "campaign.toml"]).output().unwrap();
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("labels made here would be of another protocol than 'abinit'"), "{said}");
+    let status: Value = serde_json::from_str(&succeed(&here, ["status", "campaign", "--json"])).unwrap();
+    assert_eq!(
+        (&status["labels"]["labelled"], &status["labels"]["failed"]),
+        (&1.into(), &0.into()),
+        "{said}"
+    );
+
+    fs::copy(&original, &file).unwrap();
+    succeed(&here, ["run", "campaign.toml"]);
+    let frames = export(&here);
+    assert_eq!(frames.len(), 3);
+    let bare: Vec<_> = frames.iter().map(|frame| Frame::from(frame.structure.clone())).collect();
+    common::write_frames(&here.join("bare.extxyz"), &bare);
+    let demo = config("silicon-dft.toml").display().to_string();
+    succeed(&here, ["label", "--once", "bare.extxyz", "--config", &demo, "--output", "again.extxyz"]);
+    for (frame, again) in frames.iter().zip(read_extxyz(&here.join("again.extxyz")).unwrap()) {
+        let energy = |frame: &Frame| frame.labels().unwrap().energy.unwrap();
+        assert!((energy(frame) - energy(&again)).abs() < 1e-6);
+        assert_eq!(frame.info["protocol_hash"].text(), again.info["protocol_hash"].text());
+    }
 }
 
 /// The program itself, not a stand-in.
