@@ -1,4 +1,4 @@
-//! `/metrics` of a campaign that runs: its format, its numbers, and that docs/metrics.md lists what is there.
+//! `/metrics` of a campaign that runs, and of an agent: format, numbers, and that docs/metrics.md lists what is there.
 
 mod common;
 
@@ -7,8 +7,9 @@ use std::fs;
 use std::process::Stdio;
 
 use common::campaign::Small;
+use common::hosts::Hosts;
 use common::http::{Answer, get, request, said};
-use common::processes::wait_until;
+use common::processes::{one_carrying_out, signal, wait_until};
 use common::{Running, program, refuse, succeed};
 use serde_json::Value;
 
@@ -42,6 +43,13 @@ fn parse(text: &str) -> Metrics {
         }
     }
     metrics
+}
+
+fn are_documented(metrics: &Metrics) {
+    let documented = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/metrics.md")).unwrap();
+    for (name, (kind, _)) in metrics {
+        assert!(documented.contains(&format!("| `{name}` | {kind} |")), "{name}");
+    }
 }
 
 #[test]
@@ -85,10 +93,7 @@ fn a_live_campaign_is_scraped_and_agrees_with_its_status() {
     let walks: f64 = metrics["calmwalk_walks"].1.values().sum();
     assert_eq!(walks as usize, status["walks"].as_array().unwrap().len());
     assert_eq!(value("calmwalk_processes", "kind=\"orchestrator\",state=\"running\""), 1.0);
-    let documented = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/metrics.md")).unwrap();
-    for (name, (kind, _)) in &metrics {
-        assert!(documented.contains(&format!("| `{name}` | {kind} |")), "{name}");
-    }
+    are_documented(&metrics);
     assert_eq!(get(address, "/").status, 404);
     let rebound = request(address, "GET", "/metrics", &[("Host", "rebound.example")], "");
     assert!(rebound.status == 403 && !rebound.body.contains("calmwalk_"), "{rebound:?}");
@@ -97,4 +102,74 @@ fn a_live_campaign_is_scraped_and_agrees_with_its_status() {
     let open = refuse(here, ["run", "campaign.toml", "--directory", "other", "--metrics", "0.0.0.0:0"]);
     assert!(open.contains("ssh -L"), "{open}");
     assert!(!here.join("other/campaign.sqlite").exists());
+}
+
+#[test]
+fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
+    // It does not end by itself.
+    let small = Small { mode: "live", steps: 1_000_000, per_seed: 1_000_000, ..Small::default() };
+    let mut hosts = Hosts::new(&small, 1, "");
+    hosts.options[1] = vec!["--metrics=127.0.0.1:0".into()];
+    let mut agent = hosts.agent(0);
+    let mut address = String::new();
+    wait_until("it says where", || {
+        let said = hosts.said(0);
+        let found =
+            said.lines().find_map(|line| line.strip_prefix("metrics at http://")?.strip_suffix("/metrics"));
+        address = found.unwrap_or_default().to_owned();
+        !address.is_empty()
+    });
+    let scrape = || {
+        let Answer { status, head, body } = get(&address, "/metrics");
+        assert_eq!(status, 200, "{head}");
+        assert!(head.contains("content-type: text/plain; version=0.0.4; charset=utf-8"), "{head}");
+        parse(&body)
+    };
+    let value = |name: &str, labels: &str| {
+        let metrics = scrape();
+        metrics.get(name).and_then(|(_, samples)| samples.get(labels).copied())
+    };
+    assert_eq!(value("calmwalk_agent_link_up", ""), Some(0.0));
+    assert_eq!(value("calmwalk_agent_turns_taken_total", ""), Some(0.0));
+    assert_eq!(value("calmwalk_agent_link_silence_seconds", ""), None, "nobody was ever heard");
+
+    let mut orchestrator = hosts.lead();
+    let is_above = |name: &str, labels: &str| value(name, labels) > Some(0.0);
+    wait_until("it delivers candidates", || is_above("calmwalk_agent_turns_total", "outcome=\"candidate\""));
+    wait_until("a question was answered", || is_above("calmwalk_agent_link_round_trip_seconds", ""));
+    wait_until("the mixture has moved", || is_above("calmwalk_agent_mixture_version", ""));
+    wait_until("its walker is seen", || value("calmwalk_agent_walkers", "state=\"running\"") == Some(1.0));
+    let metrics = scrape();
+    let number = |name: &str| metrics[name].1[""];
+    are_documented(&metrics);
+    assert_eq!(number("calmwalk_agent_link_up"), 1.0);
+    assert_eq!(number("calmwalk_agent_places_total"), 1.0);
+    let came: f64 = metrics["calmwalk_agent_turns_total"].1.values().sum();
+    let taken = number("calmwalk_agent_turns_taken_total");
+    assert!(
+        came > 0.0 && came <= taken && taken <= came + 1.0,
+        "one walker has one turn in hand: {metrics:?}"
+    );
+    // A turn has 40 steps at most.
+    let steps = number("calmwalk_agent_steps_total");
+    assert!(steps > 0.0 && steps <= 40.0 * taken, "{metrics:?}");
+
+    let walker = one_carrying_out(hosts.others[0].path(), "walker");
+    signal(walker, "KILL");
+    wait_until("it is replaced", || {
+        value("calmwalk_agent_walker_restarts_total", "") == Some(1.0)
+            && value("calmwalk_agent_walkers", "state=\"running\"") == Some(1.0)
+    });
+    signal(orchestrator.0.id(), "STOP");
+    wait_until("nobody answers", || value("calmwalk_agent_link_up", "") == Some(0.0));
+    assert!(value("calmwalk_agent_link_silence_seconds", "") > Some(1.0));
+    signal(orchestrator.0.id(), "CONT");
+    wait_until("it answers again", || value("calmwalk_agent_link_up", "") == Some(1.0));
+    signal(agent.0.id(), "TERM");
+    assert_eq!(agent.0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
+    signal(orchestrator.0.id(), "TERM");
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(130), "{}", hosts.head_said());
+    let open = refuse(hosts.home.path(), ["agent", "--join", "tcp/127.0.0.1:1", "--metrics", "0.0.0.0:0"]);
+    assert!(open.contains("ssh -L"), "{open}");
+    hosts.are_empty();
 }

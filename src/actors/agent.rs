@@ -2,8 +2,8 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use calm::Mixture;
@@ -11,6 +11,7 @@ use orchestrator::launcher::{self, Children, Launch};
 use orchestrator::supervisor::{Limits, Standing};
 use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinHandle;
+use tokio::time::{MissedTickBehavior, interval};
 use wire::ipc::{self, IpcError, Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
 use wire::net::{self, Address, Joined, NetError, Parted, Tls, Uplink};
@@ -24,6 +25,10 @@ use crate::log;
 use crate::outcome::{Ended, Failure};
 use crate::output::{say, warn};
 use crate::setup::{self, AgentSetup, WalkerSetup};
+use crate::web::agent::Watched;
+
+/// Between two looks at the walkers, for those who watch.
+const LOOK: Duration = Duration::from_secs(1);
 
 /// Works for a campaign until it is over or this process is asked to stop. What is needed in the meantime lies in
 /// `directory`. To be awaited on the main thread: the walkers end with the thread that starts them.
@@ -34,6 +39,7 @@ pub async fn work(
     threads: usize,
     patience: Duration,
     directory: &Path,
+    watched: &Watched,
 ) -> Result<Ended, Failure> {
     let (stopping, stop) = asked_to_stop(STOPPING)?;
     let walkers = agent.walkers;
@@ -53,8 +59,9 @@ pub async fn work(
     let place = Place::of(directory).map_err(Failure::failed)?;
     let mixture = joined.newest().await;
     let (flag, asked) = (Arc::clone(&stopping), Arc::clone(&stop));
+    let numbers = Arc::clone(&watched.numbers);
     let deal = |incoming| {
-        tokio::spawn(Agent { uplink, joined, incoming, stopping, patience }.run(move |news| match news {
+        tokio::spawn(Agent { uplink, joined, incoming, stopping, patience, numbers }.run(move |news| match news {
             News::Stop => {
                 flag.store(true, Ordering::Relaxed);
                 asked.notify_one();
@@ -65,7 +72,7 @@ pub async fn work(
             News::Back => say("the orchestrator answers again"),
         }))
     };
-    let ended = work_in(&place, &setup, (walkers, threads), &mixture, deal, &stop).await;
+    let ended = work_in(&place, &setup, (walkers, threads), &mixture, deal, &stop, watched).await;
     let removed = place.remove().map_err(Failure::failed);
     let ended = ended?;
     removed?;
@@ -116,6 +123,7 @@ async fn model(joined: &Joined, setup: &AgentSetup, directory: &Path) -> Result<
 /// The walkers of this host, and the task that deals turns to them.
 struct Host {
     walkers: Children,
+    watched: Watched,
     line: ipc::Handle,
     dealing: Dealing,
     serving: JoinHandle<Result<(), IpcError>>,
@@ -132,6 +140,7 @@ async fn work_in(
     mixture: &Mixture,
     deal: impl FnOnce(mpsc::Receiver<Incoming>) -> Dealing,
     stop: &Notify,
+    watched: &Watched,
 ) -> Result<Ended, Failure> {
     let sizes = Sizes { walkers, message_bytes: setup.message_bytes };
     let needed =
@@ -151,7 +160,7 @@ async fn work_in(
     let heard = move |walker, useful| if useful { signs.useful(walker) } else { signs.heard(walker) };
     let serving = tokio::spawn(server.run(shared, to_agent, heard));
     let dealing = deal(incoming);
-    Host { walkers, line, dealing, serving, given_up: None }.lead(stop).await
+    Host { walkers, watched: watched.clone(), line, dealing, serving, given_up: None }.lead(stop).await
 }
 
 /// How walkers are started.
@@ -181,9 +190,15 @@ impl Host {
     /// Until every walker is gone and everything is told.
     async fn lead(mut self, stop: &Notify) -> Result<Ended, Failure> {
         let (mut dealt, mut gone) = (None, false);
+        let mut look = interval(LOOK);
+        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         while dealt.is_none() || !gone {
             tokio::select! {
                 event = self.walkers.next() => gone |= self.walker(event),
+                _ = look.tick() => {
+                    let walkers = self.walkers.status();
+                    *self.watched.walkers.lock().unwrap_or_else(PoisonError::into_inner) = walkers;
+                }
                 () = stop.notified() => self.walkers.stop(),
                 ended = &mut self.dealing, if dealt.is_none() => {
                     let ended = ended.map_err(Failure::failed)?;

@@ -1,5 +1,6 @@
 //! `calmwalk agent`
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -10,6 +11,7 @@ use super::{Ended, Failure, block_on};
 use crate::actors::scratch::{self, Scratch};
 use crate::actors::{agent, cores};
 use crate::log::Options;
+use crate::web::{self, agent::Watched};
 
 /// Let this host take part in a campaign that `calmwalk run --listen` leads on another
 ///
@@ -39,6 +41,9 @@ pub struct Agent {
     /// Directory with authority.pem, certificate.pem and key.pem: needed for everything but loopback
     #[arg(long, value_name = "DIR")]
     tls: Option<PathBuf>,
+    /// Serve metrics of this agent for Prometheus at this address of this host, as 127.0.0.1:9465 (docs/metrics.md)
+    #[arg(long, value_name = "ADDRESS")]
+    metrics: Option<SocketAddr>,
     #[command(flatten)]
     log: Options,
 }
@@ -65,14 +70,14 @@ impl Agent {
             walkers,
             ahead: self.ahead,
         };
-        block_on(agent::work(
-            &self.join,
-            tls.as_ref(),
-            agent,
-            self.threads as usize,
-            patience,
-            scratch.path(),
-        ))?
+        let watched = Watched::default();
+        block_on(async {
+            if let Some(address) = self.metrics {
+                web::serve_metrics(web::listen(address).await?, web::agent::router(watched.clone()))?;
+            }
+            let (tls, threads) = (tls.as_ref(), self.threads as usize);
+            agent::work(&self.join, tls, agent, threads, patience, scratch.path(), &watched).await
+        })?
     }
 }
 

@@ -1,5 +1,6 @@
 //! What a campaign shows over HTTP, to this host only.
 
+pub mod agent;
 pub mod dashboard;
 pub mod exposition;
 mod guard;
@@ -44,10 +45,6 @@ pub struct Serving {
 }
 
 impl Serving {
-    fn add(&mut self, listener: TcpListener, router: Router) {
-        self.servers.push(serve(listener, router));
-    }
-
     /// Serves no more, and closes what was read from: whoever closes a database last tidies it up.
     pub async fn end(self) {
         self.servers.iter().for_each(AbortHandle::abort);
@@ -93,9 +90,7 @@ impl Listening {
         let shown = Store::open_read_only(location).await?;
         serving.shown = Some(shown.clone());
         if let Some(listener) = self.metrics {
-            let address = listener.local_addr().map_err(Failure::failed)?;
-            say(format_args!("metrics at http://{address}/metrics"));
-            serving.add(listener, metrics::router(shown.clone()));
+            serving.servers.push(serve_metrics(listener, metrics::router(shown.clone()))?);
         }
         if let Some(listener) = self.dashboard {
             let original = Original { symbols: artifact.symbols.clone(), mixture: artifact.mixture.clone() };
@@ -104,7 +99,8 @@ impl Listening {
             tracing::info!("dashboard at http://{address}/");
             // The token is for whoever reads this, and for no file.
             show(format_args!("dashboard at http://{address}/#token={}", acting.token()));
-            serving.add(listener, Dashboard::new(shown, Some(acting), Some(original)).router());
+            let router = Dashboard::new(shown, Some(acting), Some(original)).router();
+            serving.servers.push(serve(listener, router));
         }
         Ok(serving)
     }
@@ -125,6 +121,13 @@ pub async fn listen(address: SocketAddr) -> Result<TcpListener, Failure> {
             "cannot listen on {address}: {error}; name another port, or port 0 for any that is free"
         ))
     })
+}
+
+/// Says where metrics are served, and serves them.
+pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<AbortHandle, Failure> {
+    let address = listener.local_addr().map_err(Failure::failed)?;
+    say(format_args!("metrics at http://{address}/metrics"));
+    Ok(serve(listener, router))
 }
 
 /// Serves in a task of its own.

@@ -1,11 +1,12 @@
 //! The agent of a host: deals the turns of a campaign that is led from another host to the walkers here.
 
+mod numbers;
 mod pool;
 
 use std::collections::BTreeMap;
 use std::pin::pin;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
@@ -14,10 +15,11 @@ use futures_util::stream::FuturesUnordered;
 use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use wire::WalkId;
-use wire::messages::Progress;
+use wire::messages::{Progress, Report};
 use wire::net::{Joined, Parted, Slot, Told, Uplink};
 use wire::transport::{Incoming, Work};
 
+pub use self::numbers::{Numbers, Turns};
 use self::pool::Pool;
 
 /// Between two questions whether the orchestrator wants its agents to stop.
@@ -66,10 +68,15 @@ pub struct Agent {
     pub stopping: Arc<AtomicBool>,
     /// An orchestrator that has been silent for so long will not come back.
     pub patience: Duration,
+    /// Kept for those who watch.
+    pub numbers: Arc<Mutex<Numbers>>,
 }
 
 /// What an exchange about a slot came to.
 type Exchanged = (Slot, Told, Result<Option<Work>, Parted>);
+
+/// The answer to the question whether to stop, and how long it took.
+type Asked = (Result<Option<bool>, Parted>, Duration);
 
 /// What an agent has to say and to ask.
 struct Desk {
@@ -80,13 +87,14 @@ struct Desk {
     /// Those of them that deliver something.
     telling: usize,
     /// Whether the orchestrator wants its agents to stop.
-    question: Option<BoxFuture<'static, Result<Option<bool>, Parted>>>,
+    question: Option<BoxFuture<'static, Asked>>,
     /// A new place, when this one has been lost …
     joining: Option<BoxFuture<'static, Result<Joined, Parted>>>,
     /// … which is taken when all that was asked from the old one has been answered.
     next_place: Option<Joined>,
     /// When the orchestrator was last heard.
     heard: Instant,
+    numbers: Arc<Mutex<Numbers>>,
     /// What was told of its silence.
     silence: Option<News>,
     /// When there was last news of a walk.
@@ -102,7 +110,8 @@ impl Agent {
         let slots = self.joined.slots();
         let uplink = Arc::clone(&self.uplink);
         let mut over = pin!(uplink.address().over());
-        let mut desk = Desk::new(self.uplink, self.joined);
+        let mut desk = Desk::new(self.uplink, self.joined, self.numbers);
+        desk.numbers().mixture_version = Some(desk.joined.newest().await.version());
         desk.begin(slots);
         let mut look = interval(LOOK);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -114,7 +123,7 @@ impl Agent {
                 },
                 Some(exchanged) = desk.asking.next() => desk.exchanged(exchanged)?,
                 joined = answered(&mut desk.joining) => desk.has_joined(joined?),
-                told = answered(&mut desk.question) => if desk.is_to_stop(told)? { watch(News::Stop) },
+                (told, took) = answered(&mut desk.question) => if desk.is_to_stop(told, took)? { watch(News::Stop) },
                 _ = look.tick() => desk.look(self.patience)?.into_iter().for_each(&mut watch),
                 // Of this agent the orchestrator knew nothing any more, or it would have waited.
                 () = &mut over => {
@@ -155,7 +164,7 @@ async fn answered<T>(question: &mut Option<BoxFuture<'static, T>>) -> T {
 }
 
 impl Desk {
-    fn new(uplink: Arc<Uplink>, joined: Joined) -> Self {
+    fn new(uplink: Arc<Uplink>, joined: Joined, numbers: Arc<Mutex<Numbers>>) -> Self {
         Self {
             uplink,
             joined: Arc::new(joined),
@@ -166,12 +175,25 @@ impl Desk {
             joining: None,
             next_place: None,
             heard: Instant::now(),
+            numbers,
             silence: None,
             news: BTreeMap::new(),
         }
     }
 
+    fn numbers(&self) -> MutexGuard<'_, Numbers> {
+        self.numbers.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Somebody is there.
+    fn hear(&mut self) {
+        self.heard = Instant::now();
+        self.numbers().heard = Some(self.heard);
+    }
+
     fn begin(&mut self, slots: Vec<Slot>) {
+        self.hear();
+        self.numbers().places += 1;
         for (slot, told) in self.pool.begin(slots) {
             self.exchange(slot, told);
         }
@@ -190,22 +212,46 @@ impl Desk {
     fn take_in(&mut self, message: Incoming) {
         let next = match message {
             Incoming::Progress(walk, progress) => {
+                self.numbers().at(walk, &progress);
                 self.news(walk, progress);
                 None
             }
-            Incoming::Free { walker, report, reply } => self.pool.free(walker, report, reply),
+            Incoming::Free { walker, report, reply } => {
+                if let Some(Report { walk, progress, .. }) = &report {
+                    self.numbers().at(*walk, progress);
+                }
+                self.pool.free(walker, report, reply)
+            }
             Incoming::Gone { walker, fault } => self.pool.gone(walker, fault),
         };
         if let Some((slot, told)) = next {
             self.exchange(slot, told);
         }
+        self.count();
+    }
+
+    /// What is kept, and who waits.
+    fn count(&self) {
+        let mut numbers = self.numbers();
+        (numbers.untold, numbers.idle) = (self.untold(), self.pool.idle());
+    }
+
+    /// Reports that the orchestrator has not taken yet.
+    fn untold(&self) -> usize {
+        self.telling + self.pool.untold()
     }
 
     fn exchanged(&mut self, (slot, told, result): Exchanged) -> Result<(), Parted> {
-        self.heard = Instant::now();
+        self.hear();
         self.telling -= usize::from(!matches!(told, Told::Nothing));
+        if result.is_ok() {
+            self.numbers().told(&told);
+        }
         match result {
-            Ok(Some(work)) => self.pool.turn(slot, work),
+            Ok(Some(work)) => {
+                self.numbers().taken(&work.assignment, work.mixture.version());
+                self.pool.turn(slot, work);
+            }
             Ok(None) => self.pool.sent_home(),
             Err(Parted::Stranger(_)) => {
                 self.pool.keep(told);
@@ -214,6 +260,7 @@ impl Desk {
             Err(parted) => return Err(parted),
         }
         self.take_next_place();
+        self.count();
         Ok(())
     }
 
@@ -249,21 +296,26 @@ impl Desk {
             return Err(Parted::Silence { minutes: patience.as_secs_f64() / 60.0 });
         }
         let joined = Arc::clone(&self.joined);
-        self.question.get_or_insert_with(|| Box::pin(async move { joined.is_stopping().await }));
-        let untold = self.telling + self.pool.untold();
-        let now = (silence > SILENT).then(|| News::Silent { untold, idle: self.pool.idle() });
+        self.question.get_or_insert_with(|| {
+            Box::pin(async move {
+                let asked = Instant::now();
+                (joined.is_stopping().await, asked.elapsed())
+            })
+        });
+        let now = (silence > SILENT).then(|| News::Silent { untold: self.untold(), idle: self.pool.idle() });
         let before = std::mem::replace(&mut self.silence, now);
         Ok(if now.is_none() { before.map(|_| News::Back) } else { now.filter(|_| now != before) })
     }
 
-    fn is_to_stop(&mut self, told: Result<Option<bool>, Parted>) -> Result<bool, Parted> {
+    fn is_to_stop(&mut self, told: Result<Option<bool>, Parted>, took: Duration) -> Result<bool, Parted> {
         match told {
             Ok(None) => return Ok(false),
             Err(Parted::Stranger(_)) => self.join_anew(),
             Err(parted) => return Err(parted),
             Ok(Some(_)) => {}
         }
-        self.heard = Instant::now();
+        self.hear();
+        self.numbers().round_trip = Some(took);
         Ok(matches!(told, Ok(Some(true))))
     }
 
