@@ -1,15 +1,16 @@
 //! `calmwalk watch` in a real terminal: keys are sent, and the screen is looked at. Needs tmux (Debian: `tmux`):
-//! cargo test --test watch
+//! `cargo test --test watch`. The same on PostgreSQL is in `postgres_whole.rs`.
 
 mod common;
 
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Command;
 
 use common::campaign::Small;
+use common::place::Place;
 use common::processes::{carrying_out, signal, wait_until};
-use common::{Running, program, succeed};
+use common::{Running, succeed};
 use serde_json::Value;
 
 /// A terminal with the program in it; when that has ended, its exit code is on the screen.
@@ -18,11 +19,16 @@ struct Terminal {
 }
 
 impl Terminal {
-    fn open(here: &Path, name: &str, size: (u32, u32), environment: &str) -> Self {
+    fn open(place: &Place, name: &str, size: (u32, u32), environment: &str) -> Self {
+        Self::of(place.path(), place.argument(), name, size, environment)
+    }
+
+    fn of(here: &Path, campaign: &str, name: &str, size: (u32, u32), environment: &str) -> Self {
         let terminal = Self { socket: format!("calmwalk-{}-{name}", std::process::id()) };
         let (width, height) = (size.0.to_string(), size.1.to_string());
         let program = env!("CARGO_BIN_EXE_calmwalk");
-        let command = format!("{environment} {program} watch here --every 0.2; echo code $?; exec cat");
+        let command =
+            format!("{environment} {program} watch '{campaign}' --every 0.2; echo code $?; exec cat");
         let here = here.display().to_string();
         let arguments = ["-f", "/dev/null", "new-session", "-d", "-c", &here, "-x", &width, "-y", &height];
         terminal.tmux(&[&arguments[..], &[&command]].concat());
@@ -50,10 +56,15 @@ impl Terminal {
     }
 
     fn wait_for(&self, words: &str) -> String {
+        self.wait_for_all(&[words])
+    }
+
+    /// A screen may be looked at before the whole of it is drawn.
+    fn wait_for_all(&self, words: &[&str]) -> String {
         let mut screen = String::new();
-        wait_until(&format!("the screen shows '{words}'; {}", self.screen()), || {
+        wait_until(&format!("the screen shows {words:?}; {}", self.screen()), || {
             screen = self.screen();
-            screen.contains(words)
+            words.iter().all(|words| screen.contains(words))
         });
         screen
     }
@@ -79,64 +90,52 @@ impl Drop for Terminal {
     }
 }
 
-fn status(here: &Path) -> Value {
-    serde_json::from_str(&succeed(here, ["status", "here", "--json"])).unwrap()
-}
-
-fn start(here: &Path) -> Running {
-    let mut run = program(here);
-    run.args(["run", "campaign.toml", "--directory", "here"]).stdout(Stdio::null()).stderr(Stdio::null());
-    Running(run.spawn().unwrap())
-}
-
 /// Two walks that find nothing and are not done for a long time.
-fn endless(here: &Path) -> Running {
-    let path = Small { steps: 1_000_000, ..Small::default() }.write(here);
-    let text = fs::read_to_string(&path).unwrap().replace("threshold = 1.0", "threshold = 1e6");
-    fs::write(path, text).unwrap();
-    let run = start(here);
+fn endless() -> (Place, Running) {
+    let place = Place::new(
+        &Small { steps: 1_000_000, ..Small::default() },
+        &[("threshold = 1.0", "threshold = 1e6"), ("threshold = 1.0", "threshold = 1e6")],
+    );
+    let run = place.run();
     wait_until("both walks are there", || {
-        here.join("here/campaign.sqlite").exists() && status(here)["walks"].as_array().unwrap().len() == 2
+        place.status()["walks"].as_array().is_some_and(|walks| walks.len() == 2)
     });
-    run
+    (place, run)
 }
 
 /// A campaign whose walks are over and whose structures wait for labels that nobody makes.
-fn waiting(here: &Path) {
-    let path = Small::default().write(here);
-    let text = fs::read_to_string(&path).unwrap().replace("[label]", "[label]\nslots = 0");
-    fs::write(path, text).unwrap();
-    let mut run = start(here);
+fn waiting() -> Place {
+    let place = Place::new(&Small::default(), &[("[label]", "[label]\nslots = 0")]);
+    let mut run = place.run();
+    let over = |walk: &Value| !["waiting", "running"].contains(&walk["state"].as_str().unwrap());
     wait_until("every walk is over", || {
-        here.join("here/campaign.sqlite").exists() && {
-            let status = status(here);
-            let walks = status["walks"].as_array().unwrap();
-            // Two biased ones and their controls.
-            walks.len() == 4
-                && walks.iter().all(|walk| !["waiting", "running"].contains(&walk["state"].as_str().unwrap()))
-        }
+        // Two biased ones and their controls.
+        place.status()["walks"].as_array().is_some_and(|walks| walks.len() == 4 && walks.iter().all(over))
     });
     signal(run.0.id(), "INT");
     run.0.wait().unwrap();
+    place
 }
 
-fn queue(here: &Path, state: &str) -> Vec<Value> {
-    let list = succeed(here, ["queue", "here", "list", "--state", state, "--json"]);
+fn queue(place: &Place, state: &str) -> Vec<Value> {
+    let list = succeed(place.path(), ["queue", place.argument(), "list", "--state", state, "--json"]);
     serde_json::from_str(&list).unwrap()
 }
 
 #[test]
 fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
-    let directory = tempfile::tempdir().unwrap();
-    let here = directory.path();
-    let _run = endless(here);
-    let terminal = Terminal::open(here, "runs", (80, 24), "");
-    let screen = terminal.wait_for("reproducible mode: running");
-    for words in
-        ["1 walks: 2", "2 queue: 0", "3 decisions: 2", "fcc-100", "vacancy", "begun", "no candidates yet"]
-    {
-        assert!(screen.contains(words), "{words}:\n{screen}");
-    }
+    let (place, _run) = endless();
+    let terminal = Terminal::open(&place, "runs", (80, 24), "");
+    let screen = terminal.wait_for_all(&[
+        "reproducible mode: running",
+        "1 walks: 2",
+        "2 queue: 0",
+        "3 decisions: 2",
+        "fcc-100",
+        "vacancy",
+        "begun",
+        "no candidates yet",
+    ]);
     assert!(
         screen.lines().count() == 24 && screen.lines().all(|line| line.chars().count() <= 80),
         "{screen}"
@@ -150,11 +149,12 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
     let paused = |of: Value| {
         of["walks"].as_array().unwrap().iter().map(|walk| walk["paused"] == true).collect::<Vec<_>>()
     };
-    assert_eq!(paused(status(here)), [false, true]);
+    assert_eq!(paused(place.status()), [false, true]);
     let mut steps = Value::Null;
     wait_until("both stand still", || {
         std::thread::sleep(std::time::Duration::from_millis(1500));
-        let now = status(here)["walks"].as_array().unwrap().iter().map(|walk| walk["step"].clone()).collect();
+        let now =
+            place.status()["walks"].as_array().unwrap().iter().map(|walk| walk["step"].clone()).collect();
         std::mem::replace(&mut steps, now) == steps
     });
     assert!(terminal.screen().contains("paused"));
@@ -162,7 +162,7 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
     terminal.wait_for("walk 1 goes on");
     wait_until("both go on", || {
         let now: Value =
-            status(here)["walks"].as_array().unwrap().iter().map(|walk| walk["step"].clone()).collect();
+            place.status()["walks"].as_array().unwrap().iter().map(|walk| walk["step"].clone()).collect();
         now != steps
     });
 
@@ -171,7 +171,7 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
     terminal.wait_for("pause every walk that has more steps to make?");
     terminal.press("n");
     terminal.wait_for("nothing was changed");
-    assert_eq!(paused(status(here)), [false, false]);
+    assert_eq!(paused(place.status()), [false, false]);
 
     for (width, height) in [(160, 50), (60, 12), (20, 5), (80, 24)] {
         terminal.resize(width, height);
@@ -192,15 +192,11 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
 
 #[test]
 fn structures_in_the_queue_are_changed_and_candidates_told_about() {
-    let directory = tempfile::tempdir().unwrap();
-    let here = directory.path();
-    waiting(here);
-    let queued = queue(here, "queued");
+    let place = waiting();
+    let queued = queue(&place, "queued");
     let short = |job: &Value| job["candidate"].as_str().unwrap().split_once('-').unwrap().1.to_owned();
-    let terminal = Terminal::open(here, "queue", (100, 40), "NO_COLOR=1");
-    let screen = terminal.wait_for("not running");
-    assert!(screen.contains(&format!("2 queue: {}", queued.len())), "{screen}");
-    assert!(screen.contains("accepted") && screen.contains("γ_max of "), "{screen}");
+    let terminal = Terminal::open(&place, "queue", (100, 40), "NO_COLOR=1");
+    terminal.wait_for_all(&["not running", &format!("2 queue: {}", queued.len()), "accepted", "γ_max of "]);
     let colours = terminal.tmux(&["capture-pane", "-p", "-e"]);
     assert!(!colours.contains("[38;5;") && colours.contains(";7m"), "{colours:?}");
 
@@ -209,7 +205,7 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
     terminal.write("99");
     terminal.press("Enter");
     terminal.wait_for("has priority 99 now");
-    let now = queue(here, "queued");
+    let now = queue(&place, "queued");
     assert_eq!((short(&now[0]), &now[0]["priority"]), (short(&queued[2]), &99.into()));
     // It is still the chosen one.
     terminal.press("d");
@@ -218,12 +214,12 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
     terminal.wait_for("nothing was changed");
     terminal.press("d y");
     terminal.wait_for("is dropped");
-    assert_eq!(short(&queue(here, "dropped")[0]), short(&queued[2]));
+    assert_eq!(short(&queue(&place, "dropped")[0]), short(&queued[2]));
     terminal.press("s s");
     terminal.wait_for("2 dropped: 1");
     terminal.press("t y");
     terminal.wait_for("is queued again");
-    assert_eq!((queue(here, "queued").len(), queue(here, "dropped").len()), (queued.len(), 0));
+    assert_eq!((queue(&place, "queued").len(), queue(&place, "dropped").len()), (queued.len(), 0));
     terminal.press("s s");
     terminal.wait_for("2 queue:");
 
@@ -242,7 +238,7 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
     terminal.press("Enter");
     let screen = terminal.wait_for("trigger");
     let id = screen.lines().nth(1).unwrap().trim().to_owned();
-    let story = succeed(here, ["explain", "here", &id]);
+    let story = succeed(place.path(), ["explain", place.argument(), &id]);
     // Time passes between the two.
     let lasts = |line: &&str| line.chars().count() <= 100 && !line.ends_with(" ago");
     let first: Vec<_> = story.lines().filter(lasts).take(20).collect();
@@ -256,33 +252,40 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
 
 #[test]
 fn the_terminal_is_given_back_however_it_ends() {
-    let directory = tempfile::tempdir().unwrap();
-    let here = directory.path();
-    waiting(here);
-    succeed(here, ["store", "backup", "here", "copy"]);
-    fs::rename(here.join("here"), here.join("original")).unwrap();
-    fs::rename(here.join("copy"), here.join("here")).unwrap();
+    let place = waiting();
+    let here = place.path();
     let watching = || carrying_out(here, "watch");
     for (name, how) in [("terminated", "TERM"), ("interrupted", "INT")] {
-        let terminal = Terminal::open(here, name, (80, 24), "");
+        let terminal = Terminal::open(&place, name, (80, 24), "");
         terminal.wait_for("1 walks: 4");
         let colours = terminal.tmux(&["capture-pane", "-p", "-e"]);
         assert!(colours.contains("[38;5;6m"), "charts have a colour: {colours:?}");
         signal(watching()[0], how);
         terminal.is_given_back("code 130");
     }
-    let terminal = Terminal::open(here, "closed", (80, 24), "");
+    let terminal = Terminal::open(&place, "closed", (80, 24), "");
     terminal.wait_for("1 walks: 4");
-    // A campaign that is away for a moment is no end of watching it.
-    fs::rename(here.join("here"), here.join("away")).unwrap();
-    terminal.wait_for("what you see is old:");
-    fs::rename(here.join("away"), here.join("here")).unwrap();
-    wait_until("it is seen again", || !terminal.screen().contains("what you see is old"));
     drop(terminal);
     wait_until("nobody watches", || watching().is_empty());
+}
+
+#[test]
+fn a_copy_is_watched_through_its_absence() {
+    let place = waiting();
+    let here = place.path();
+    succeed(here, ["store", "backup", place.argument(), "copy"]);
+    let terminal = Terminal::of(here, "copy", "copy", (80, 24), "");
+    terminal.wait_for("1 walks: 4");
+    // A campaign that is away for a moment is no end of watching it.
+    fs::rename(here.join("copy"), here.join("away")).unwrap();
+    terminal.wait_for("what you see is old:");
+    fs::rename(here.join("away"), here.join("copy")).unwrap();
+    wait_until("it is seen again", || !terminal.screen().contains("what you see is old"));
+    terminal.press("q");
+    terminal.is_given_back("code 0");
     // What cannot be watched is said on the terminal as it is.
-    fs::remove_dir_all(here.join("here")).unwrap();
-    let terminal = Terminal::open(here, "nothing", (80, 24), "");
+    fs::remove_dir_all(here.join("copy")).unwrap();
+    let terminal = Terminal::of(here, "copy", "nothing", (80, 24), "");
     terminal.wait_for("calmwalk: ");
     terminal.is_given_back("code 2");
 }
