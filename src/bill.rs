@@ -8,7 +8,7 @@ use store::{LabelCost, Protocol, Store, StoreError, Waiting};
 use wire::ContentHash;
 
 /// Labels that are learned from: the newest.
-const LEARNED_FROM: u32 = 5_000;
+const LEARNED_FROM: u32 = 1_000;
 
 pub const SECONDS_PER_HOUR: f64 = 3600.0;
 
@@ -52,24 +52,15 @@ pub struct Costs {
 impl Costs {
     /// Learns from the labels that were made by `protocol`.
     pub async fn of(store: &Store, protocol: ContentHash) -> Result<Self, StoreError> {
-        let (mut costs, mut labels, mut brought) = (Vec::new(), 0, 0.0);
-        for Protocol { hash, .. } in store.protocols().await? {
-            let of_protocol = store.label_costs(hash, LEARNED_FROM).await?;
-            labels += of_protocol.len();
-            brought += of_protocol.iter().map(|cost| cost.core_seconds).sum::<f64>();
-            if hash == protocol {
-                costs = of_protocol;
-            }
-        }
+        let costs = store.label_costs(protocol, LEARNED_FROM).await?;
         let measured: Vec<_> = costs.iter().map(measured).collect();
         let mut sizes = HashMap::new();
         for cost in costs.iter().rev() {
             sizes.insert((cost.seed_structure, cost.formula.clone()), size(cost));
         }
-        let all = store.label_work().await?.core_seconds;
-        // The sum of all attempts fits only to all labels.
-        let overhead = all.filter(|_| (1..LEARNED_FROM as usize).contains(&labels));
-        let overhead = overhead.map_or(1.0, |all| (all / brought).max(1.0));
+        let work = store.label_work().await?;
+        let overhead = work.core_seconds.zip(work.label_core_seconds.filter(|brought| *brought > 0.0));
+        let overhead = overhead.map_or(1.0, |(all, brought)| (all / brought).max(1.0));
         Ok(Self { model: CostModel::fit(&measured, None), sizes, overhead })
     }
 

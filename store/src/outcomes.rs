@@ -41,6 +41,8 @@ pub struct Work {
     /// Core-seconds of all attempts that ended, also of those that brought nothing; `None` in a database of an earlier
     /// version, which keeps no such sum.
     pub core_seconds: Option<f64>,
+    /// Those of them that brought labels; `None` likewise.
+    pub label_core_seconds: Option<f64>,
     /// Cores of the attempts under way.
     pub cores: u64,
 }

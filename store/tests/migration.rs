@@ -68,8 +68,9 @@ async fn version_1(directory: &Path) -> String {
         let copy = format!("INSERT INTO main.{table} SELECT {columns} FROM other.{table}");
         sqlx::query(AssertSqlSafe(copy)).execute(&mut connection).await.unwrap();
     }
-    let sums = "DELETE FROM campaign WHERE key IN ('labels_made', 'core_milliseconds')";
-    assert_eq!(sqlx::query(sums).execute(&mut connection).await.unwrap().rows_affected(), 2);
+    let sums =
+        "DELETE FROM campaign WHERE key IN ('labels_made', 'core_milliseconds', 'label_core_milliseconds')";
+    assert_eq!(sqlx::query(sums).execute(&mut connection).await.unwrap().rows_affected(), 3);
     let sql = "INSERT INTO process VALUES ('old', 'orchestrator', ?, ?, 5, 6, 'running')";
     let query = sqlx::query(sql).bind(std::process::id()).bind(store::this_host());
     query.execute(&mut connection).await.unwrap();
@@ -111,7 +112,7 @@ async fn a_campaign_of_version_1_goes_on() {
     let directory = tempfile::tempdir().unwrap();
     let log = version_1(directory.path()).await;
     let store = Store::open(directory.path()).await.unwrap();
-    assert_eq!(version(directory.path()).await, 7);
+    assert_eq!(version(directory.path()).await, 8);
     assert_eq!(store.decision_log_text().await.unwrap(), log);
     assert_eq!((store.status().await.unwrap().candidates.accepted, counts(directory.path()).await), (2, 2));
     assert_eq!(job_counts(directory.path()).await, [("leased".into(), 1), ("queued".into(), 1)]);

@@ -56,7 +56,12 @@ async fn costs_are_those_of_the_attempts_that_brought_labels() {
     assert_eq!(store.label_costs(protocol("dft").hash, 1).await.unwrap(), costs[..1]);
     let waiting = store.waiting_jobs(protocol("dft").hash).await.unwrap();
     assert_eq!(waiting, [Waiting { seed_structure: 0, formula: "Si2".into(), atoms: 2, jobs: 1 }]);
-    assert_eq!(store.label_work().await.unwrap().cores, 0);
+    // Three attempts in vain: 5 s, and twice 1 s.
+    let expected = Work { core_seconds: Some(21.0), label_core_seconds: Some(14.0), cores: 0 };
+    assert_eq!(store.label_work().await.unwrap(), expected);
+    // There are no walks here; but the sums are those of the attempts.
+    let findings = store.check(|_, _| ()).await.unwrap();
+    assert!(findings.iter().all(|finding| finding.what.contains("walks that are not there")), "{findings:?}");
     lease(&store, 30_000).await;
     assert_eq!(store.label_work().await.unwrap(), Work { cores: 1, ..store.label_work().await.unwrap() });
 }

@@ -22,7 +22,7 @@ use crate::location::ServerUrl;
 use crate::migrations::{Step, migrator};
 
 /// The newest of the migrations.
-const SCHEMA: i64 = 7;
+const SCHEMA: i64 = 8;
 /// Connections of a process, at most: one that writes and some that read.
 const CONNECTIONS: u32 = 5;
 /// Connections that nobody needs are closed after this time: a server has few.
@@ -35,13 +35,14 @@ const ANSWER: Duration = Duration::from_secs(3);
 pub const PAUSE: Duration = Duration::from_millis(100);
 
 /// The steps to the newest version.
-pub(crate) static STEPS: [Step; 6] = [
+pub(crate) static STEPS: [Step; 7] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
     (5, "jobs", include_str!("../../migrations/postgres/0005_jobs.sql")),
     (6, "relabel", include_str!("../../migrations/postgres/0006_relabel.sql")),
     (7, "listing", include_str!("../../migrations/postgres/0007_listing.sql")),
+    (8, "brought", include_str!("../../migrations/postgres/0008_brought.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

@@ -30,7 +30,7 @@ const UNFINISHED: &str = "campaign.sqlite.new";
 /// `PRAGMA application_id` of a campaign: "CALM".
 const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` that the newest migration leaves behind.
-const SCHEMA: i64 = 7;
+const SCHEMA: i64 = 8;
 /// How long another connection may hold the database.
 const PATIENCE: Duration = Duration::from_secs(30);
 const READERS: u32 = 4;
@@ -48,7 +48,7 @@ const PAGE: u32 = 1 << 14;
 const LOG_PAGES: u32 = 1 << 12;
 
 /// The steps to the newest version.
-pub(crate) static STEPS: [Step; 7] = [
+pub(crate) static STEPS: [Step; 8] = [
     (1, "campaign", include_str!("../../migrations/sqlite/0001_campaign.sql")),
     (2, "processes", include_str!("../../migrations/sqlite/0002_processes.sql")),
     (3, "calculations", include_str!("../../migrations/sqlite/0003_calculations.sql")),
@@ -56,6 +56,7 @@ pub(crate) static STEPS: [Step; 7] = [
     (5, "jobs", include_str!("../../migrations/sqlite/0005_jobs.sql")),
     (6, "relabel", include_str!("../../migrations/sqlite/0006_relabel.sql")),
     (7, "listing", include_str!("../../migrations/sqlite/0007_listing.sql")),
+    (8, "brought", include_str!("../../migrations/sqlite/0008_brought.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

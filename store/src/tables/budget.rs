@@ -24,13 +24,19 @@ const ATTEMPTS: &str = "SELECT CAST(coalesce(sum(CASE WHEN outcome IN ('labelled
     FROM attempt";
 
 /// What the kept sums have to be, by their names.
-pub(crate) const SUMS: [(&str, &str); 2] = [
+pub(crate) const SUMS: [(&str, &str); 3] = [
     ("labels_made", "SELECT CAST(count(*) AS TEXT) FROM attempt WHERE outcome IN ('labelled', 'check')"),
     (
         "core_milliseconds",
         "SELECT CAST(coalesce(sum(coalesce(CAST(round(1000 * core_seconds) AS BIGINT),
             CASE WHEN ended > started THEN (ended - started) * coalesce(cores, 1) ELSE 0 END)), 0) AS TEXT)
         FROM attempt WHERE outcome IS NOT NULL",
+    ),
+    (
+        "label_core_milliseconds",
+        "SELECT CAST(coalesce(sum(coalesce(CAST(round(1000 * core_seconds) AS BIGINT),
+            CASE WHEN ended > started THEN (ended - started) * coalesce(cores, 1) ELSE 0 END)), 0) AS TEXT)
+        FROM attempt WHERE outcome IN ('labelled', 'check')",
     ),
 ];
 

@@ -90,15 +90,20 @@ impl Store {
     /// What attempts have used, and how many cores are at work now.
     pub async fn label_work(&self) -> Result<Work> {
         let mut transaction = self.database.begin_to_read().await?;
-        let milliseconds = query("SELECT value FROM campaign WHERE key = 'core_milliseconds'");
-        let milliseconds: Option<String> = milliseconds.fetch_optional(&mut transaction).await?;
+        let kept =
+            "SELECT key, value FROM campaign WHERE key IN ('core_milliseconds', 'label_core_milliseconds')";
+        let kept: Vec<(String, String)> = query(kept).fetch_all(&mut transaction).await?;
         let mut cores = 0;
         for row in query(AT_WORK).rows(&mut transaction).await? {
             cores += row.get_or_default::<Option<u64>>("cores")?.unwrap_or(1);
         }
         transaction.commit().await?;
-        let milliseconds = milliseconds.and_then(|text| text.parse::<f64>().ok());
-        Ok(Work { core_seconds: milliseconds.map(|milliseconds| milliseconds / 1000.0), cores })
+        let seconds = |name: &str| {
+            let (_, milliseconds) = kept.iter().find(|(key, _)| key == name)?;
+            Some(milliseconds.parse::<f64>().ok()? / 1000.0)
+        };
+        let label_core_seconds = seconds("label_core_milliseconds");
+        Ok(Work { core_seconds: seconds("core_milliseconds"), label_core_seconds, cores })
     }
 
     /// The failures that attempts of this protocol met, by class.
