@@ -11,7 +11,7 @@ use std::process::Stdio;
 use atoms::extxyz::Reader;
 use atoms::poscar::read_poscar;
 use common::campaign::Small;
-use common::http::{first_event, get, request, said};
+use common::http::{first_event, get, reckoned, request, said};
 use common::processes::wait_until;
 use common::{Running, config, program, refuse, succeed};
 use serde_json::{Value, json};
@@ -249,7 +249,7 @@ fn a_live_campaign_is_looked_at_and_changed() {
 
 /// The components are those of the artifact, and some have moved.
 fn check_mixture(live: &Live) {
-    let mixture = get(&live.address, "/api/mixture").json();
+    let mixture = reckoned(&live.address, "/api/mixture");
     assert_eq!(mixture["version"], live.status()["mixture_version"]);
     let artifact = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
     let shown = succeed(live.here(), ["calm", "info", &artifact, "--json"]);
@@ -324,7 +324,7 @@ fn check_copy(live: &Live, id: &str) {
     let [address] = said(&mut shown.0, ["dashboard at http://"]);
     let address = address.trim_end_matches('/');
     assert_eq!(all_lines(address, "", 50), all_lines(&live.address, "", 50));
-    assert_eq!(get(address, "/api/mixture").json(), get(&live.address, "/api/mixture").json());
+    assert_eq!(reckoned(address, "/api/mixture"), reckoned(&live.address, "/api/mixture"));
     assert_eq!(get(address, "/api/actions").json()["possible"], false);
     let token = [("x-calmwalk-token", live.token.as_str())];
     assert_eq!(request(address, "POST", &format!("/api/candidates/{id}/drop"), &token, "{}").status, 403);

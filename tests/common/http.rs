@@ -46,6 +46,17 @@ pub fn get(address: &str, path: &str) -> Answer {
     request(address, "GET", path, &[], "")
 }
 
+/// The answer to a question that takes time to be reckoned, when it is.
+pub fn reckoned(address: &str, path: &str) -> Value {
+    let mut answer = get(address, path);
+    while answer.status == 202 {
+        std::thread::sleep(Duration::from_millis(20));
+        answer = get(address, path);
+    }
+    assert_eq!(answer.status, 200, "{answer:?}");
+    answer.json()
+}
+
 /// The first event of a stream of server-sent events, as JSON.
 pub fn first_event(address: &str, path: &str) -> Value {
     let mut lines = BufReader::new(send(address, "GET", path, &[], "")).lines();

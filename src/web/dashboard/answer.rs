@@ -10,7 +10,7 @@ use store::StoreError;
 pub type Answer = Result<Response, Refusal>;
 
 /// Why there is no answer, in words.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Refusal {
     status: StatusCode,
     why: String,

@@ -22,7 +22,7 @@ const LOOK: Duration = Duration::from_secs(2);
 /// The same while nobody is, and at most in any case.
 const UNWATCHED: Duration = Duration::from_secs(10);
 /// Up to that, so many times as long as a look takes: to look costs less than one part in so many of a core.
-const PART: u32 = 100;
+const PART: u32 = 200;
 
 /// The newest news, as JSON, and the samples so far.
 #[derive(Clone, Debug)]

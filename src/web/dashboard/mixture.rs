@@ -2,6 +2,7 @@
 
 use axum::extract::State;
 use axum::http::StatusCode;
+use store::Store;
 
 use super::Dashboard;
 use super::answer::{Answer, Refusal};
@@ -9,16 +10,17 @@ use crate::mixture::{self, Original};
 
 /// `GET /api/mixture`: each component, and how far its covariance has moved since the campaign began.
 pub async fn mixture(State(dashboard): State<Dashboard>) -> Answer {
-    dashboard.mixture.answer(reckon(&dashboard)).await
+    let Dashboard { store, mixture, original, .. } = dashboard;
+    mixture.answer(reckon(store, original)).await
 }
 
-async fn reckon(dashboard: &Dashboard) -> Result<String, Refusal> {
+async fn reckon(store: Store, original: Option<Original>) -> Result<String, Refusal> {
     let not_found = |why: &dyn ToString| Refusal::new(StatusCode::NOT_FOUND, why.to_string());
-    let original = match dashboard.original.clone() {
+    let original = match original {
         Some(original) => original,
-        None => Original::of(&dashboard.store).await.map_err(|failure| not_found(&failure))?,
+        None => Original::of(&store).await.map_err(|failure| not_found(&failure))?,
     };
-    let newest = dashboard.store.newest_mixture().await?;
+    let newest = store.newest_mixture().await?;
     // Eigenvalues of every component may take seconds.
     let standing = tokio::task::spawn_blocking(move || mixture::standing(&original, &newest)).await;
     let broken = |error: &dyn ToString| Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, error.to_string());

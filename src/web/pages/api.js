@@ -1,8 +1,21 @@
 // What this page asks the program for.
 
+/** Between two questions for what is being reckoned, ms. */
+const PAUSE = 500;
+
 /** The answer as JSON; throws an Error that says why there is none. */
 export async function ask(path, signal) {
   return answered(await fetch(path, { signal, cache: "no-store" }));
+}
+
+/** The same of what takes long to be reckoned: asks until it is there. */
+export async function askUntilReckoned(path, signal) {
+  for (;;) {
+    const found = await ask(path, signal);
+    if (!found.reckoning) return found;
+    await new Promise((resolve) => setTimeout(resolve, PAUSE));
+    signal?.throwIfAborted();
+  }
 }
 
 /** Changes something, which has this path. */

@@ -1,6 +1,6 @@
 // Whether the grade told where the potential errs: force errors of the labels by grade.
 
-import { ask } from "./api.js";
+import { askUntilReckoned, listen } from "./api.js";
 import { LINES } from "./colours.js";
 import { element, section, table } from "./dom.js";
 import { decimals, percent, tick, whole } from "./format.js";
@@ -12,17 +12,25 @@ const KINDS = [["all", "all structures"], ["biased", "biased walks"], ["control"
 
 export async function show(content, _, signal) {
   const again = element("button", { type: "button", onclick: () => load() }, "Reckon again");
-  const place = element("div", { role: "status" }, element("p", {}, "reading all labels …"));
+  const place = element("div", { role: "status" }, element("p", {}, "Reading all labels …"));
   content.append(element("p", {}, "Force errors |F_model − F_label| (eV/Å) by the grade of each atom under the original mixture. ", again), place);
   const load = async () => {
     place.setAttribute("aria-busy", "true");
     try {
-      place.replaceChildren(...shown(await ask("/api/errors", signal)));
+      place.replaceChildren(...shown(await askUntilReckoned("/api/errors", signal)));
     } finally {
       place.removeAttribute("aria-busy");
     }
   };
   await load();
+  let [labels, due] = [null, false];
+  listen(({ status }) => {
+    const came = labels != null && status.labels.labelled !== labels;
+    labels = status.labels.labelled;
+    // Once more with the next news: what the program keeps may be older than the newest label. Who reads it keeps it.
+    if ((came || due) && !place.contains(document.activeElement)) load().catch(() => {});
+    due = came;
+  }, signal);
 }
 
 function shown(errors) {
