@@ -76,6 +76,71 @@ fn every_page_shows_what_it_should_and_nothing_comes_from_elsewhere() {
     }
 }
 
+/// With all its labels: the page of force errors, and what is wide enough to be cut: tables of a candidate and of the report.
+#[test]
+fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    Small::default().write(here);
+    succeed(here, ["run", "campaign.toml"]);
+    succeed(here, ["report", "campaign", "--output", "report"]);
+    let report = format!("file://{}", here.join("report/report.html").display());
+    let mut command = program(here);
+    command.args(["dashboard", "campaign", "--at", "127.0.0.1:0"]);
+    let mut shown = Running(command.stderr(Stdio::piped()).spawn().unwrap());
+    let [address] = said(&mut shown.0, ["dashboard at http://"]);
+    let page = format!("http://{address}");
+    let address = address.trim_end_matches('/');
+    let found = get(address, "/api/candidates?order=gamma&fate=accepted&limit=1").json();
+    let id = found["candidates"][0]["id"].as_str().unwrap().to_owned();
+    for (dark, colours) in [(false, "light"), (true, "dark")] {
+        let browser = Browser::start(dark, (1280, 1600));
+        for width in [1280, 800] {
+            browser.widen(width);
+            browser.show(&format!("{page}#errors"));
+            errors(&browser);
+            picture(&browser, &format!("errors-{colours}-{width}.png"));
+            browser.show(&format!("{page}#candidate/{id}"));
+            browser.wait("document.querySelectorAll('.atoms tbody tr').length > 20");
+            // Grades under two mixtures, that of neighbours, and the error.
+            browser.wait("document.querySelectorAll('.atoms thead th').length === 6");
+            is_not_cut(&browser, ".atoms");
+            picture(&browser, &format!("labelled-{colours}-{width}.png"));
+            browser.show(&report);
+            browser.wait("document.querySelectorAll('#table-seed-structures thead th').length === 14");
+            is_not_cut(&browser, ".scroll");
+            browser.run("document.querySelector('#table-seed-structures').scrollIntoView()");
+            picture(&browser, &format!("report-{colours}-{width}.png"));
+        }
+        let complaints = browser.log("browser");
+        assert!(complaints.is_empty(), "{complaints:?}");
+    }
+}
+
+fn errors(browser: &Browser) {
+    browser.wait("document.querySelectorAll('figure svg[role=img]').length === 2");
+    let text = browser.run("return document.querySelector('main').textContent");
+    let text = text.as_str().unwrap();
+    for words in ["ρ(γ)", "ROC-AUC(γ_nbr)", "Force errors by γ_nbr", "median (eV/Å)", "Labels by V/V₀"]
+    {
+        assert!(text.contains(words), "{words}: {text}");
+    }
+    assert!(!text.contains("NaN") && !text.contains("undefined"), "{text}");
+}
+
+/// Everything of these elements is seen without scrolling sideways.
+fn is_not_cut(browser: &Browser, selector: &str) {
+    let cut = format!(
+        "[...document.querySelectorAll('{selector}')].filter((one) => one.scrollWidth > one.clientWidth).length"
+    );
+    assert_eq!(browser.run(&format!("return {cut}")), 0, "{selector}");
+    assert!(
+        browser.run(&format!("return document.querySelectorAll('{selector}').length")).as_u64() > Some(0)
+    );
+    let page = "return document.documentElement.scrollWidth <= document.documentElement.clientWidth";
+    assert_eq!(browser.run(page), true, "{selector}: the page scrolls sideways");
+}
+
 fn table(browser: &Browser, page: &str) {
     browser.show(&format!("{page}#candidates/fate=accepted"));
     browser.wait("document.querySelectorAll('.candidates tbody tr').length > 2");

@@ -57,6 +57,11 @@ impl Browser {
         self.tell("/url", &json!({ "url": url }));
     }
 
+    /// Gives the window this width.
+    pub fn widen(&self, width: u32) {
+        self.tell("/window/rect", &json!({ "width": width, "height": 1600 }));
+    }
+
     /// What a script returns.
     pub fn run(&self, script: &str) -> Value {
         self.tell("/execute/sync", &json!({ "script": script, "args": [] }))
