@@ -2,7 +2,7 @@
 //! listen to its news.
 //!
 //! `cargo bench --bench watching`; a number behind `--` is how many candidates there are. Most of its time goes into making them: they
-//! are copies of one, which differ in their names, grades and volumes.
+//! are copies of one, which differ in their names, grades and volumes; only accepted ones have their structures.
 
 #[path = "../tests/common/mod.rs"]
 mod common;
@@ -14,9 +14,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use common::campaign::Small;
-use common::http::{get, listen, said};
+use common::http::{get, listen, reckoned, said};
 use common::{Running, program, succeed};
-use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection};
 
 /// Candidates, if not given.
@@ -28,7 +28,7 @@ const TRIES: usize = 11;
 const LISTENERS: usize = 20;
 const LISTENING: Duration = Duration::from_secs(60);
 
-const PAGES: [&str; 8] = [
+const PAGES: [&str; 9] = [
     "/",
     "/api/candidates?limit=50",
     "/api/candidates?limit=50&order=gamma",
@@ -37,38 +37,56 @@ const PAGES: [&str; 8] = [
     "/api/candidates?limit=50&order=queue&state=queued",
     "/api/candidates?limit=50&where=gamma+%3E+2.9",
     "/api/mixture",
+    "/api/errors",
 ];
 
 /// `$1` is how many candidates there are to be more; each statement is one of SQLite's.
-const MORE: [&str; 9] = [
-    "CREATE TEMP TABLE new AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < $1)
-        SELECT i, (SELECT max(sequence) FROM decision) + i AS decision, i % 20 = 0 AS is_accepted,
-            CASE WHEN i % 20 = 0 THEN NULL WHEN i % 7 = 0 THEN 'guard' WHEN i % 3 = 0 THEN 'duplicate' ELSE 'covered' END AS reason,
-            (SELECT max(number) FROM structure) + i / 20 AS structure, randomblob(32) AS hash,
-            (abs(random()) % 1000000) / 1e6 AS x FROM n",
-    "INSERT INTO decision SELECT new.decision, 0, CASE WHEN is_accepted THEN 'accepted' ELSE 'declined' END, i % 1000, NULL,
-        (SELECT max(mixture_version) FROM decision), '{}' FROM new",
-    "INSERT INTO structure SELECT new.structure, hash, 32, 'Al32', x'00' FROM new WHERE is_accepted",
-    "INSERT INTO candidate SELECT new.decision, substr(id, 1, 8) || '-' || (i % 1000) || '.0.' || i || '-' || lower(hex(substr(hash, 1, 8))),
-        hash, CASE WHEN is_accepted THEN new.structure END, i % 1000, 0, i, seed_structure, 'biased',
-        CASE WHEN is_accepted THEN 'accepted' ELSE 'declined' END, new.reason, mixture_version, atoms, formula, temperature, 1 + 0.4 * x,
-        energy, walker_gamma, walker_gamma_nbr, walker_above, selector_gamma, selector_gamma_nbr, selector_above, 1 + 2 * x,
-        original_gamma_nbr, original_above
-        FROM new CROSS JOIN (SELECT * FROM candidate WHERE origin = 'biased' LIMIT 1)",
+const MORE: [&str; 12] = [
+    "CREATE TEMP TABLE new (decision INTEGER PRIMARY KEY, i INTEGER, is_accepted INTEGER, reason TEXT, structure INTEGER, hash BLOB,
+        id TEXT, x REAL)",
+    "INSERT INTO new WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < $1)
+        SELECT i + (SELECT max(sequence) FROM decision), i, i % 20 = 0,
+            CASE WHEN i % 20 = 0 THEN NULL WHEN i % 7 = 0 THEN 'guard' WHEN i % 3 = 0 THEN 'duplicate' ELSE 'covered' END,
+            (SELECT max(number) FROM structure) + i / 20, randomblob(32),
+            (SELECT substr(value, 1, 8) FROM campaign WHERE key = 'id') || '-' || (i % 1000) || '.0.' || i || '-'
+                || lower(hex(randomblob(8))),
+            (abs(random()) % 1000000) / 1e6 FROM n",
+    "INSERT INTO decision SELECT new.decision, 0, CASE WHEN is_accepted THEN 'accepted' ELSE 'declined' END, i % 1000, new.id,
+        mixture_version, detail
+        FROM new CROSS JOIN (SELECT * FROM decision WHERE kind = 'accepted' ORDER BY sequence DESC LIMIT 1)",
+    "INSERT INTO structure SELECT new.structure, new.hash, atoms, formula, data FROM new CROSS JOIN
+        (SELECT * FROM structure ORDER BY number DESC LIMIT 1) WHERE is_accepted",
+    "INSERT INTO candidate SELECT new.decision, new.id, new.hash, CASE WHEN is_accepted THEN new.structure END, i % 1000, 0, i,
+        seed_structure, 'biased', CASE WHEN is_accepted THEN 'accepted' ELSE 'declined' END, new.reason, mixture_version, atoms,
+        formula, temperature, 1 + 0.4 * x, energy, walker_gamma, walker_gamma_nbr, walker_above, selector_gamma,
+        selector_gamma_nbr, selector_above, 1 + 2 * x, original_gamma_nbr, original_above
+        FROM new CROSS JOIN (SELECT * FROM candidate WHERE fate = 'accepted' AND origin = 'biased' ORDER BY decision DESC LIMIT 1) AS one",
+    "INSERT INTO candidate_data SELECT new.decision, block, features, selector_grades, original_grades
+        FROM new CROSS JOIN (SELECT * FROM candidate_data WHERE decision = (SELECT max(decision) FROM candidate
+            WHERE fate = 'accepted' AND origin = 'biased' AND decision < (SELECT min(decision) FROM new))) WHERE is_accepted",
     "INSERT INTO candidate_count SELECT 'biased', coalesce(reason, 'accepted'), count(*) FROM new GROUP BY 2
         ON CONFLICT (origin, fate) DO UPDATE SET number = number + excluded.number",
     "INSERT INTO job (structure, protocol, decision, state, priority, attempts)
         SELECT structure, (SELECT number FROM protocol), decision, CASE WHEN i % 200 = 0 THEN 'queued' WHEN i % 1000 = 20 THEN 'failed'
-            ELSE 'labelled' END, 0, 1 FROM new WHERE is_accepted",
+            ELSE 'labelled' END, 0, i % 200 <> 0 FROM new WHERE is_accepted",
     "INSERT INTO attempt (job, attempt, holder, started, ended, outcome, class, cores, core_seconds)
-        SELECT number, 1, 'x', 0, 1000 + number % 100, job.state, CASE job.state WHEN 'failed' THEN 'crashed' END, 1, 1 + 0.001 * (number % 100)
-        FROM job JOIN new ON new.decision = job.decision WHERE job.state IN ('labelled', 'failed')",
+        SELECT number, 1, 'x', time - 1000 - number % 100, time, job.state, CASE job.state WHEN 'failed' THEN 'crashed' END, 1,
+            1 + 0.001 * (number % 100)
+        FROM (SELECT *, 1000 * (unixepoch() - 12 * ((SELECT max(number) FROM job) - number)) AS time FROM job) AS job
+        CROSS JOIN new ON new.decision = job.decision WHERE job.state IN ('labelled', 'failed')",
     "INSERT INTO label (structure, protocol, standing, energy, forces, job, attempt, received)
-        SELECT job.structure, protocol, 'label', 0, x'00', job.number, 1, 0 FROM job JOIN new ON new.decision = job.decision
-        WHERE job.state = 'labelled'",
-    "WITH RECURSIVE n(i) AS (SELECT 1000 UNION ALL SELECT i + 1 FROM n WHERE i < 1999)
-        INSERT INTO walk SELECT i, origin, partner, seed_structure, state, reason, turn, accepted, step, segment, tau, temperature,
-            relative_volume, gamma_max, refused, returns, selector_state, checkpoint
+        SELECT job.structure, job.protocol, 'label', energy, forces, job.number, 1, ended
+        FROM job CROSS JOIN new ON new.decision = job.decision CROSS JOIN attempt ON attempt.job = job.number
+        CROSS JOIN (SELECT energy, forces FROM label WHERE structure = (SELECT structure FROM candidate
+            WHERE fate = 'accepted' AND origin = 'biased' AND decision < (SELECT min(decision) FROM new) ORDER BY decision DESC LIMIT 1)
+            LIMIT 1) WHERE job.state = 'labelled'",
+    "UPDATE campaign SET value = CASE key WHEN 'labels_made' THEN (SELECT count(*) FROM attempt WHERE outcome = 'labelled') ELSE
+        (SELECT CAST(sum(round(1000 * core_seconds)) AS INTEGER) FROM attempt
+            WHERE outcome = 'labelled' OR (key = 'core_milliseconds' AND outcome IS NOT NULL)) END
+        WHERE key IN ('labels_made', 'core_milliseconds', 'label_core_milliseconds')",
+    "WITH RECURSIVE n(i) AS (SELECT 0 UNION ALL SELECT i + 1 FROM n WHERE i < 999)
+        INSERT OR IGNORE INTO walk SELECT i, origin, partner, seed_structure, CASE WHEN i % 10 = 0 THEN 'running' ELSE state END, reason,
+            turn, accepted, step, segment, tau, temperature, relative_volume, gamma_max, refused, returns, selector_state, checkpoint
         FROM n CROSS JOIN (SELECT * FROM walk LIMIT 1)",
 ];
 
@@ -93,8 +111,15 @@ fn main() {
     let [address] = said(&mut server.0, ["dashboard at http://"]);
     let address = address.trim_end_matches('/');
     for page in PAGES {
-        row(&format!("`{page}`"), || assert_eq!(get(address, page).status, 200, "{page}"));
+        row(&format!("`{page}`"), || assert!(get(address, page).status < 300, "{page}"));
     }
+    let page = get(address, "/api/candidates?limit=1&fate=accepted").json();
+    let newest = page.pointer("/candidates/0/id").and_then(serde_json::Value::as_str).expect("a candidate");
+    let story = format!("/api/candidates/{newest}");
+    row("one candidate", || assert_eq!(get(address, &story).status, 200));
+    let begun = Instant::now();
+    reckoned(address, "/api/errors");
+    println!("\nall labels are read {:.1} s later", begun.elapsed().as_secs_f64());
     let listeners: Vec<_> = (0..LISTENERS).map(|_| listen(address, "/api/events")).collect();
     // What they are told first is not what they are told again and again.
     thread::sleep(Duration::from_secs(5));
@@ -107,13 +132,17 @@ fn main() {
     drop(listeners);
 }
 
-/// Adds candidates to a campaign that has ended.
+/// Adds candidates to a campaign that has ended, as fast as SQLite can: what is lost with the machine is made again.
 fn make(here: &Path, candidates: u64) {
     let file = here.join("campaign/campaign.sqlite");
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     runtime.block_on(async {
-        let options = SqliteConnectOptions::new().filename(file).foreign_keys(false);
-        let mut connection = options.connect().await.expect("the database");
+        let options =
+            SqliteConnectOptions::new().filename(file).foreign_keys(false).pragma("temp_store", "memory");
+        // Rows come in any order of the indexes: all of these fit.
+        let options = options.journal_mode(SqliteJournalMode::Off).pragma("cache_size", "-1000000");
+        let mut connection =
+            options.synchronous(SqliteSynchronous::Off).connect().await.expect("the database");
         for statement in MORE {
             let mut query = sqlx::query(sqlx::AssertSqlSafe(statement.to_owned()));
             if statement.contains("$1") {
@@ -121,6 +150,10 @@ fn make(here: &Path, candidates: u64) {
             }
             query.execute(&mut connection).await.unwrap_or_else(|error| panic!("{statement}: {error}"));
         }
+        sqlx::query("PRAGMA journal_mode = WAL")
+            .execute(&mut connection)
+            .await
+            .expect("as the program has it");
         connection.close().await.expect("the database is closed");
     });
 }
