@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use atoms::{Evaluation, NeighbourList, Structure};
-use calm::{Artifact, Grades, Mixture};
+use calm::{Artifact, GradesInParts, Mixture};
 use common::{Turn, crystal, quartiles};
 use potentials::grace::{Grace, GraceModel, PullBack};
 
@@ -67,8 +67,7 @@ struct Call {
     structure: Structure,
     neighbours: NeighbourList,
     elements: Vec<usize>,
-    grades: Grades,
-    cotangent: Vec<f64>,
+    grades: GradesInParts,
     pull_back: PullBack,
     out: Evaluation,
 }
@@ -84,8 +83,7 @@ impl Call {
             structure,
             neighbours,
             elements,
-            grades: Grades::default(),
-            cotangent: Vec::new(),
+            grades: GradesInParts::default(),
             pull_back: PullBack::default(),
             out: Evaluation::default(),
         }
@@ -95,14 +93,13 @@ impl Call {
     fn seconds(&mut self, calls: u64) -> f64 {
         let start = Instant::now();
         for _ in 0..calls {
-            self.grace.forward(&self.structure, &self.neighbours).expect("known elements");
-            let features = self.grace.features();
-            self.cotangent.resize(features.len(), 0.0);
-            let cotangent = Some(self.cotangent.as_mut_slice());
-            self.grades
-                .evaluate(&self.mixture, &self.elements, features, cotangent)
-                .expect("finite features");
-            self.grace.backward(Some(&self.cotangent), &mut self.out, &mut self.pull_back);
+            let Self { structure, grace, neighbours, elements, mixture, grades, pull_back, out } = &mut *self;
+            grades.begin(elements.len());
+            let mut grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
+                grades.add(mixture, elements, atoms, features, cotangent);
+            };
+            grace.evaluate_graded(structure, neighbours, &mut grade, out, pull_back).expect("known elements");
+            grades.finish().expect("finite features");
         }
         start.elapsed().as_secs_f64() / calls as f64
     }

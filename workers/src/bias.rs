@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
-use calm::{GradeError, Grades, Mixture};
+use calm::{GradeError, Grades, GradesInParts, Mixture};
 use potentials::Zbl;
 use potentials::grace::{Grace, PullBack};
 use serde::{Deserialize, Serialize};
@@ -58,10 +58,11 @@ pub struct BiasedPotential {
     /// Memory of the running averages.
     pub state: BiasState,
     average_steps: u64,
-    cotangent: Vec<f64>,
     pull_back: PullBack,
+    /// With the bias on.
+    parts: GradesInParts,
+    /// With the bias off.
     grades: Grades,
-    grade_error: Option<GradeError>,
     physical: Evaluation,
 }
 
@@ -86,10 +87,9 @@ impl BiasedPotential {
             tau: 0.0,
             state: BiasState::default(),
             average_steps,
-            cotangent: Vec::new(),
             pull_back: PullBack::default(),
+            parts: GradesInParts::default(),
             grades: Grades::default(),
-            grade_error: None,
             physical: Evaluation::default(),
         })
     }
@@ -118,13 +118,11 @@ impl BiasedPotential {
         structure: &Structure,
         neighbours: &NeighbourList,
     ) -> Result<&Grades, UngradedError> {
-        if let Some(error) = self.grade_error.take() {
-            return Err(error.into());
+        if self.tau != 0.0 {
+            return Ok(self.parts.finish()?);
         }
-        if self.tau == 0.0 {
-            self.grace.forward(structure, neighbours)?;
-            self.grades.evaluate(&self.mixture, &self.elements, self.grace.features(), None)?;
-        }
+        self.grace.forward(structure, neighbours)?;
+        self.grades.evaluate(&self.mixture, &self.elements, self.grace.features(), None)?;
         Ok(&self.grades)
     }
 
@@ -134,15 +132,14 @@ impl BiasedPotential {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
-        self.grace.forward(structure, neighbours)?;
-        let features = self.grace.features();
-        self.cotangent.resize(features.len(), 0.0);
-        let cotangent = Some(self.cotangent.as_mut_slice());
-        self.grade_error = self.grades.evaluate(&self.mixture, &self.elements, features, cotangent).err();
-        let graded = self.grade_error.is_none();
-        self.grace.backward(graded.then_some(&self.cotangent), out, &mut self.pull_back);
+        let Self { grace, mixture, elements, parts, pull_back, .. } = self;
+        parts.begin(elements.len());
+        let mut grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
+            parts.add(mixture, elements, atoms, features, cotangent);
+        };
+        grace.evaluate_graded(structure, neighbours, &mut grade, out, pull_back)?;
         copy(out, &mut self.physical);
-        if graded {
+        if self.parts.finish().is_ok() {
             self.add_bias(out);
         }
         Ok(())
@@ -176,7 +173,6 @@ impl Potential for BiasedPotential {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
-        self.grade_error = None;
         if self.tau == 0.0 {
             self.grace.evaluate(structure, neighbours, out)?;
             copy(out, &mut self.physical);

@@ -160,6 +160,21 @@ fn everything(grace: &mut Grace, structure: &Structure) -> (Vec<f64>, Evaluation
     (z, energy, pull_back)
 }
 
+/// The same in one call.
+fn at_once(grace: &mut Grace, structure: &Structure) -> (Vec<f64>, Evaluation, PullBack) {
+    let mut neighbours = NeighbourList::new(grace.cutoff(), 0.0);
+    neighbours.update(structure).unwrap();
+    let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
+    let mut graded = vec![0; structure.len()];
+    let mut grade = |atoms: &[u32], z: &[f64], cotangent: &mut [f64]| {
+        atoms.iter().for_each(|atom| graded[*atom as usize] += 1);
+        cotangent.copy_from_slice(z);
+    };
+    grace.evaluate_graded(structure, &neighbours, &mut grade, &mut energy, &mut pull_back).unwrap();
+    assert!(graded.iter().all(|times| *times == 1));
+    (grace.features().to_vec(), energy, pull_back)
+}
+
 #[test]
 fn copies_of_a_cell_have_its_forces_with_the_same_bits_on_any_number_of_threads() {
     let cells = [
@@ -171,6 +186,7 @@ fn copies_of_a_cell_have_its_forces_with_the_same_bits_on_any_number_of_threads(
         let model = model(name, RadialPath::Table);
         let (large, one) = (copies(&cell, 3), everything(&mut Grace::new(model.clone()), &cell));
         let many = everything(&mut Grace::new(model.clone()), &large);
+        assert_eq!(at_once(&mut Grace::new(model.clone()), &large), many, "{name}");
         let repeated = |of_one: &[Vec3]| of_one.iter().copied().cycle().take(large.len()).collect::<Vec<_>>();
         let times = |tensor: &Matrix3| tensor.map(|row| row.map(|x| 27.0 * x));
         let check = |what: &str, found: &[Vec3], one: &[Vec3]| {
@@ -184,6 +200,7 @@ fn copies_of_a_cell_have_its_forces_with_the_same_bits_on_any_number_of_threads(
             let mut grace = Grace::with(model.clone(), Instructions::best(), Threads::new(n).unwrap());
             assert_eq!(everything(&mut grace, &large), many, "{name}, {n} threads");
             assert_eq!(common::evaluate(&mut grace, &large), many.1, "{name}, {n} threads");
+            assert_eq!(at_once(&mut grace, &large), many, "{name}, {n} threads");
             assert_eq!(everything(&mut grace, &cell), one, "{name}, {n} threads");
         }
     }

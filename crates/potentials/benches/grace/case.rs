@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, NeighbourList, Potential, Structure};
-use calm::{Artifact, Grades, Mixture};
+use calm::{Artifact, GradesInParts, Mixture};
 use potentials::grace::{Grace, GraceModel, Instructions, Precision, PullBack, RadialPath, Threads};
 
 /// A model, and how gracemaker gets one like it.
@@ -78,8 +78,7 @@ pub struct Case {
     neighbours: NeighbourList,
     elements: Vec<usize>,
     mixture: Mixture,
-    grades: Grades,
-    cotangent: Vec<f64>,
+    grades: GradesInParts,
     pull_back: PullBack,
 }
 
@@ -104,8 +103,7 @@ impl Case {
             neighbours,
             elements,
             mixture,
-            grades: Grades::default(),
-            cotangent: Vec::new(),
+            grades: GradesInParts::default(),
             pull_back: PullBack::default(),
         }
     }
@@ -117,12 +115,13 @@ impl Case {
 
     /// Energy and forces, γ and ∇Σγ with its virial.
     pub fn graded(&mut self, out: &mut Evaluation) {
-        self.grace.forward(&self.structure, &self.neighbours).expect("known elements");
-        let features = self.grace.features();
-        self.cotangent.resize(features.len(), 0.0);
-        let cotangent = Some(self.cotangent.as_mut_slice());
-        self.grades.evaluate(&self.mixture, &self.elements, features, cotangent).expect("finite features");
-        self.grace.backward(Some(&self.cotangent), out, &mut self.pull_back);
+        let Self { structure, grace, neighbours, elements, mixture, grades, pull_back } = self;
+        grades.begin(elements.len());
+        let mut grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
+            grades.add(mixture, elements, atoms, features, cotangent);
+        };
+        grace.evaluate_graded(structure, neighbours, &mut grade, out, pull_back).expect("known elements");
+        grades.finish().expect("finite features");
     }
 
     /// Å

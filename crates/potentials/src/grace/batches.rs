@@ -70,12 +70,29 @@ impl Batches {
         }
     }
 
+    /// All of them.
+    pub fn all(&self) -> Range<usize> {
+        0..self.chunks.len()
+    }
+
+    /// Some chunks, and their places.
+    pub fn among(&self, chunks: Range<usize>) -> (&[Chunk], Range<usize>) {
+        let chunks = &self.chunks[chunks];
+        (chunks, places_of(chunks))
+    }
+
     #[inline(always)]
     pub fn placed(&self, batch: usize, instructions: Instructions) -> Placed {
         let (places, element) = &self.batches[batch];
         let batch = Batch { element: *element, atoms: places.len(), instructions };
         Placed { batch, first: places.start }
     }
+}
+
+/// The places of chunks behind one another.
+pub(super) fn places_of(chunks: &[Chunk]) -> Range<usize> {
+    let begin = chunks.first().map_or(0, |chunk| chunk.places.start);
+    begin..chunks.last().map_or(begin, |chunk| chunk.places.end)
 }
 
 /// A batch, and where it stands.

@@ -1,5 +1,6 @@
 //! Energy, features and their derivatives for one structure.
 
+use std::ops::Range;
 use std::sync::{Arc, Mutex};
 
 use atoms::{Evaluation, Matrix3, NeighbourList, PotentialError, Structure, Vec3};
@@ -32,6 +33,13 @@ impl PullBack {
     }
 }
 
+/// Chunks whose features are graded together, for each thread: enough for the projection to be read seldom, few enough for their
+/// tapes to stay in the third cache.
+const CHUNKS_OF_A_THREAD: usize = 2;
+
+/// Takes some atoms and their features z, [atoms, D], and writes ∂H/∂z of each.
+pub type Grade<'a> = dyn FnMut(&[u32], &[f64], &mut [f64]) + Send + 'a;
+
 /// A network with its work arrays.
 #[derive(Debug)]
 pub(super) struct Evaluator<V: Vector> {
@@ -59,6 +67,8 @@ pub(super) struct Evaluator<V: Vector> {
     // In the order of the structure:
     atomic_energies: Vec<f64>,
     features: Vec<f64>,
+    /// ∂H/∂z of the atoms that are graded together.
+    feature_cotangent: Vec<f64>,
     /// A number for each atom, for whoever needs it.
     numbers: Vec<u32>,
 }
@@ -85,6 +95,7 @@ impl<V: Vector> Evaluator<V> {
             projection: ProjectionWork::default(),
             atomic_energies: Vec::new(),
             features: Vec::new(),
+            feature_cotangent: Vec::new(),
             numbers: Vec::new(),
             model,
             network,
@@ -103,13 +114,67 @@ impl<V: Vector> Evaluator<V> {
     ) -> Result<(), PotentialError> {
         self.take(structure, neighbours)?;
         self.threads.clone().run(|| {
-            (0..self.layers.len()).for_each(|k| self.forward_layer(k));
-            self.read_out();
-            self.project();
+            let all = self.batches.all();
+            (0..self.layers.len()).for_each(|k| self.forward_layer(k, all.clone()));
+            self.read_out(all.clone());
+            self.project(all);
         });
         self.put_energies();
         self.put_features();
         Ok(())
+    }
+
+    /// As [`super::Grace::evaluate_graded`].
+    pub fn evaluate_graded(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        grade: &mut Grade,
+        energy: &mut Evaluation,
+        pull_back: &mut PullBack,
+    ) -> Result<(), PotentialError> {
+        if self.network.feature_map.is_none() {
+            self.evaluate(structure, neighbours, energy)?;
+            pull_back.reset(self.elements.len());
+            return Ok(());
+        }
+        self.take(structure, neighbours)?;
+        self.begin_derivatives();
+        self.threads.clone().run(|| self.graded(grade));
+        self.put_energies();
+        self.put_features();
+        self.put_forces(energy);
+        self.put_pull_back(true, pull_back);
+        Ok(())
+    }
+
+    /// Some chunks at a time pass the last layer, are graded and go back, so that no more of their tapes are kept.
+    fn graded(&mut self, grade: &mut Grade) {
+        let (last, all) = (self.layers.len() - 1, self.batches.all());
+        let together = CHUNKS_OF_A_THREAD * self.threads.count();
+        (0..last).for_each(|k| self.forward_layer(k, all.clone()));
+        for first in all.clone().step_by(together) {
+            let chunks = first..all.end.min(first + together);
+            self.forward_layer(last, chunks.clone());
+            self.read_out(chunks.clone());
+            self.project(chunks.clone());
+            self.grade(chunks, grade);
+        }
+        self.finish_layer::<2>(last);
+        self.backward_layers::<2>(last);
+    }
+
+    /// From the features of some chunks back to the gradients of their bonds in the last layer.
+    fn grade(&mut self, chunks: Range<usize>, grade: &mut Grade) {
+        let Some(projection) = self.network.projection() else { return };
+        let ((_, places), width) = (self.batches.among(chunks.clone()), projection.feature_dimension());
+        let features = &self.projection.features[places.start * width..places.end * width];
+        let mut cotangent = std::mem::take(&mut self.feature_cotangent);
+        cotangent.resize(features.len(), 0.0);
+        grade(&self.batches.order[places.clone()], features, &mut cotangent);
+        self.project_back(chunks.clone(), &cotangent);
+        self.backward_layer::<2>(self.layers.len() - 1, chunks);
+        self.feature_cotangent = cotangent;
     }
 
     /// Elements and bonds of a structure; results of an earlier one are dropped.
@@ -163,22 +228,43 @@ impl<V: Vector> Evaluator<V> {
         let layers = if self.batches.order.is_empty() { 0 } else { self.layers.len() };
         self.threads.clone().run(|| match cotangent {
             Some(cotangent) => {
-                self.project_back(cotangent);
-                (0..layers).rev().for_each(|k| self.backward_layer::<2>(k));
+                self.pull_back_features(cotangent);
+                self.backward_layers::<2>(layers);
             }
-            None => (0..layers).rev().for_each(|k| self.backward_layer::<1>(k)),
+            None => self.backward_layers::<1>(layers),
         });
         self.put_forces(energy);
         self.put_pull_back(cotangent.is_some(), pull_back);
+    }
+
+    /// The cotangents of the bases of all atoms from those of their features, [n, D] in the order of the structure.
+    fn pull_back_features(&mut self, cotangent: &[f64]) {
+        let Some(projection) = self.network.projection() else { return };
+        let width = projection.feature_dimension();
+        let mut in_order = std::mem::take(&mut self.feature_cotangent);
+        in_order.clear();
+        for atom in &self.batches.order {
+            in_order.extend_from_slice(&cotangent[*atom as usize * width..][..width]);
+        }
+        self.project_back(self.batches.all(), &in_order);
+        self.feature_cotangent = in_order;
+    }
+
+    /// All atoms backwards through the first `layers`.
+    fn backward_layers<const N: usize>(&mut self, layers: usize) {
+        for k in (0..layers).rev() {
+            self.backward_layer::<N>(k, self.batches.all());
+            self.finish_layer::<N>(k);
+        }
     }
 
     /// Energies and forces alone: a batch goes forwards and backwards through the last layer while its tape is in the
     /// cache, and no other tape of that layer is kept.
     fn plain(&mut self) {
         let last = self.layers.len() - 1;
-        (0..last).for_each(|k| self.forward_layer(k));
+        (0..last).for_each(|k| self.forward_layer(k, self.batches.all()));
         self.pass_last_layer();
-        (0..last).rev().for_each(|k| self.backward_layer::<1>(k));
+        self.backward_layers::<1>(last);
     }
 
     /// As [`super::Grace`] as a potential.

@@ -9,7 +9,7 @@ use super::bonds::{BondWork, Bonds, OwnBonds, accumulate, reverse};
 use super::layer::{Layer, Message};
 use super::matrix::Rows;
 use super::messages::{Returns, accumulate_messages, reverse_messages};
-use super::parts::{Divide, Layout, OfChunks, Parts};
+use super::parts::{Divide, Layout, OfChunks, Parts, Shared};
 use super::readout::Block;
 use super::tape::{Slot, Tensor};
 use super::vector::Vector;
@@ -19,8 +19,6 @@ use super::vector::Vector;
 pub(super) struct LayerWork<V> {
     pub bonds: Bonds,
     pub trace: Trace<V>,
-    /// Cotangents of the basis from the features, [n, lanes]
-    pub basis_cotangents: Vec<V>,
     /// m, [n, lanes of a message]; empty in the first layer.
     pub messages: Vec<V>,
     /// Cotangents of what depends on the layer before, from the energy and from the features, [n, lanes].
@@ -59,10 +57,14 @@ impl<V: Vector> LayerWork<V> {
 /// What the forward pass leaves of some atoms for the reverse sweep.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Trace<V> {
+    /// The first place of those.
+    first: usize,
     /// The tape of one batch after another, [places, tape]
     tapes: Vec<V>,
     /// The basis B of this layer, [places, lanes]
-    pub bases: Vec<V>,
+    bases: Vec<V>,
+    /// Its cotangents from the features, [places, lanes]
+    basis_cotangents: Vec<V>,
     /// Radial values of bonds and their derivatives, block by block.
     values: Vec<V>,
     derivatives: Vec<V>,
@@ -77,7 +79,7 @@ pub(super) struct Traced<'a, V> {
 }
 
 impl<V: Vector> Trace<V> {
-    /// Makes room for the atoms at some places.
+    /// Makes room for the atoms at some places, and forgets others.
     pub fn hold<'a>(
         &'a mut self,
         layer: &Layer<V>,
@@ -90,13 +92,38 @@ impl<V: Vector> Trace<V> {
         grow(&mut self.bases, places.len() * layer.basis.lanes());
         grow(&mut self.values, blocks * of_block);
         grow(&mut self.derivatives, blocks * of_block);
-        let of_bonds = Layout::Ragged(&bonds.block_offsets, of_block);
-        Traced {
-            tapes: Parts::new(Layout::Even(layer.tape_lanes), places.start, &mut self.tapes),
-            bases: Parts::new(Layout::Even(layer.basis.lanes()), places.start, &mut self.bases),
-            values: Parts::new(of_bonds, places.start, &mut self.values),
-            derivatives: Parts::new(of_bonds, places.start, &mut self.derivatives),
-        }
+        self.first = places.start;
+        self.held(layer, bonds).0
+    }
+
+    /// What it holds, and the cotangents of the basis.
+    pub fn held<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a Bonds) -> (Traced<'a, V>, Shared<'a, V>) {
+        let of_bonds = Layout::Ragged(&bonds.block_offsets, V::LANES * layer.radial.output_lanes());
+        let traced = Traced {
+            tapes: Parts::new(Layout::Even(layer.tape_lanes), self.first, &mut self.tapes),
+            bases: Parts::new(Layout::Even(layer.basis.lanes()), self.first, &mut self.bases),
+            values: Parts::new(of_bonds, self.first, &mut self.values),
+            derivatives: Parts::new(of_bonds, self.first, &mut self.derivatives),
+        };
+        (traced, Shared::new(layer.basis.lanes(), self.first, &self.basis_cotangents))
+    }
+
+    /// B.
+    pub fn bases(&self, layer: &Layer<V>) -> Shared<'_, V> {
+        Shared::new(layer.basis.lanes(), self.first, &self.bases)
+    }
+
+    /// B, and where its cotangents of some places go to.
+    pub fn basis_cotangents(
+        &mut self,
+        layer: &Layer<V>,
+        places: &Range<usize>,
+    ) -> (Shared<'_, V>, Parts<'_, V>) {
+        let lanes = layer.basis.lanes();
+        grow(&mut self.basis_cotangents, (places.end - self.first) * lanes);
+        let first = (places.start - self.first) * lanes;
+        let out = Parts::new(Layout::Even(lanes), places.start, &mut self.basis_cotangents[first..]);
+        (Shared::new(lanes, self.first, &self.bases), out)
     }
 }
 

@@ -65,7 +65,7 @@ mod vector;
 mod weights;
 
 pub use error::GraceError;
-pub use evaluate::PullBack;
+pub use evaluate::{Grade, PullBack};
 pub use instructions::Instructions;
 pub(crate) use instructions::Pass;
 pub use model::{Architecture, GraceDescription, GraceModel};

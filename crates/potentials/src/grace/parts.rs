@@ -45,6 +45,12 @@ impl<'a, T> Parts<'a, T> {
         Self { layout, begin: layout.begin(first), numbers }
     }
 
+    /// Those of some places, of an array that has all.
+    pub fn within(layout: Layout<'a>, places: &Range<usize>, numbers: &'a mut [T]) -> Self {
+        let range = layout.begin(places.start)..layout.begin(places.end);
+        Self { layout, begin: range.start, numbers: &mut numbers[range] }
+    }
+
     /// Those of some places.
     #[inline(always)]
     pub fn of(&mut self, places: &Range<usize>) -> &mut [T] {
@@ -62,6 +68,28 @@ impl<T: Send> Divide for Parts<'_, T> {
     }
 }
 
+/// The numbers of some places, for whoever reads them; as many for each.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Shared<'a, T> {
+    of_one: usize,
+    first: usize,
+    numbers: &'a [T],
+}
+
+impl<'a, T> Shared<'a, T> {
+    /// Of an array that begins with the numbers of the place `first`.
+    pub fn new(of_one: usize, first: usize, numbers: &'a [T]) -> Self {
+        Self { of_one, first, numbers }
+    }
+
+    /// Those of some places; none of what is empty.
+    #[inline(always)]
+    pub fn of(self, places: &Range<usize>) -> &'a [T] {
+        let index = |place: usize| (place - self.first) * self.of_one;
+        self.numbers.get(index(places.start)..index(places.end)).unwrap_or_default()
+    }
+}
+
 /// One for each chunk.
 #[derive(Debug)]
 pub(super) struct OfChunks<'a, T> {
@@ -70,9 +98,11 @@ pub(super) struct OfChunks<'a, T> {
 }
 
 impl<'a, T> OfChunks<'a, T> {
-    /// Of all chunks; there may be none at all.
-    pub fn new(items: &'a mut [T]) -> Self {
-        Self { first: 0, items }
+    /// Of some chunks, of a list for all; which may be empty.
+    pub fn within(chunks: &[Chunk], items: &'a mut [T]) -> Self {
+        let first = chunks.first().map_or(0, |chunk| chunk.number);
+        let end = (first + chunks.len()).min(items.len());
+        Self { first, items: &mut items[first.min(end)..end] }
     }
 
     /// That of the only chunk that is left.

@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use atoms::Vec3;
 
-use super::batches::Placed;
+use super::batches::{Chunk, Placed, places_of};
 use super::bonds::{BondWork, Bonds};
 use super::evaluate::{Evaluator, add};
 use super::instructions::{Instructions, Pass};
@@ -16,7 +16,7 @@ use super::layer_work::{
 };
 use super::messages::Returns;
 use super::network::Network;
-use super::parts::{Layout, OfChunks, Parts};
+use super::parts::{Layout, OfChunks, Parts, Shared};
 use super::projection::{FeatureMap, Projected};
 use super::readout::{Block, Readout, ReadoutWork};
 use super::vector::Vector;
@@ -69,20 +69,22 @@ impl<V: Vector> Evaluator<V> {
         self.virials.resize(self.batches.chunks.len(), Default::default());
     }
 
-    /// All atoms forwards through layer `k`, and what they tell the next one.
-    pub(super) fn forward_layer(&mut self, k: usize) {
+    /// Some chunks forwards through layer `k`, which forgets others, and what they tell the next one.
+    pub(super) fn forward_layer(&mut self, k: usize, chunks: Range<usize>) {
         let Self { network, instructions, batches, scratch, .. } = self;
         let (here, after) = self.layers.split_at_mut(k + 1);
         let LayerWork { bonds, trace, messages: received, .. } = &mut here[k];
         let (bonds, received) = (&*bonds, &received[..]);
+        let (chunks, places) = batches.among(chunks);
         let sent = match after.first_mut() {
             Some(next) => {
-                Parts::new(Layout::Even(network.layers[k + 1].message.lanes()), 0, &mut next.messages)
+                let layout = Layout::Even(network.layers[k + 1].message.lanes());
+                Parts::within(layout, &places, &mut next.messages)
             }
             None => Parts::new(Layout::Even(0), 0, &mut [][..]),
         };
-        let work = (trace.hold(&network.layers[k], bonds, &(0..batches.order.len())), sent);
-        self.threads.each(&batches.chunks, work, &|chunk, (mut trace, mut sent), thread| {
+        let work = (trace.hold(&network.layers[k], bonds, &places), sent);
+        self.threads.each(chunks, work, &|chunk, (mut trace, mut sent), thread| {
             let work = &mut of_thread(scratch, thread).bonds[k];
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
@@ -98,20 +100,21 @@ impl<V: Vector> Evaluator<V> {
         });
     }
 
-    /// Energies from the bases of all layers.
-    pub(super) fn read_out(&mut self) {
+    /// Energies of some chunks from the bases of all layers.
+    pub(super) fn read_out(&mut self, chunks: Range<usize>) {
         let Self { network, instructions, batches, layers, scratch, .. } = self;
         let per_atom = network.readout.blocks.len() * network.readout.density_lanes();
+        let (chunks, places) = batches.among(chunks);
         let work = (
-            Parts::new(Layout::Even(1), 0, &mut self.energies[..]),
-            Parts::new(Layout::Even(per_atom), 0, &mut self.density_cotangents[..]),
+            Parts::within(Layout::Even(1), &places, &mut self.energies),
+            Parts::within(Layout::Even(per_atom), &places, &mut self.density_cotangents),
         );
-        self.threads.each(&batches.chunks, work, &|chunk, (mut energies, mut cotangents), thread| {
+        self.threads.each(chunks, work, &|chunk, (mut energies, mut cotangents), thread| {
             let work = &mut of_thread(scratch, thread).readout;
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
                 let places = placed.places();
-                let basis = |k: usize| basis(&network.layers[k], &layers[k], &places);
+                let basis = |k: usize| layers[k].trace.bases(&network.layers[k]).of(&places);
                 let (energies, cotangents) = (energies.of(&places), cotangents.of(&places));
                 let readout = &network.readout;
                 instructions.run(Energies { readout, placed, basis, energies, cotangents, work });
@@ -131,7 +134,7 @@ impl<V: Vector> Evaluator<V> {
         let work = (
             Parts::new(Layout::Even(1), 0, &mut self.energies[..]),
             Parts::new(Layout::Even(per_atom), 0, &mut self.density_cotangents[..]),
-            gradients_of::<V, 1>(layer, bonds, gradients, returns),
+            gradients_of::<V, 1>(layer, bonds, &batches.chunks, gradients, returns),
         );
         self.threads.each(&batches.chunks, work, &|chunk, (mut energies, mut cotangents, to), thread| {
             let Scratch { bonds: work, readout: readout_work, backward, trace } =
@@ -145,8 +148,10 @@ impl<V: Vector> Evaluator<V> {
                 let work = &mut work[last];
                 instructions.run(Forward { layer, placed, bonds, received, trace, work });
                 let own = &*trace.bases.of(&places);
-                let basis =
-                    |k: usize| if k < last { basis(&network.layers[k], &before[k], &places) } else { own };
+                let basis = |k: usize| match before.get(k) {
+                    Some(work) => work.trace.bases(&network.layers[k]).of(&places),
+                    None => own,
+                };
                 let (energies, cotangents) = (energies.of(&places), cotangents.of(&places));
                 let energy_work = &mut *readout_work;
                 instructions.run(Energies {
@@ -178,20 +183,17 @@ impl<V: Vector> Evaluator<V> {
         self.finish_layer::<1>(last);
     }
 
-    /// All atoms backwards through layer `k`, with `N` cotangents: of the energy, and of the features.
-    pub(super) fn backward_layer<const N: usize>(&mut self, k: usize) {
+    /// Some chunks, which the layer holds, backwards through layer `k`, with `N` cotangents: of the energy, and of the features.
+    pub(super) fn backward_layer<const N: usize>(&mut self, k: usize, chunks: Range<usize>) {
         let Self { network, instructions, batches, scratch, density_cotangents, .. } = self;
         let (here, after) = self.layers.split_at_mut(k + 1);
         let (layer, block) = (&network.layers[k], &network.readout.blocks[k]);
-        let LayerWork {
-            bonds, trace, basis_cotangents, messages: received, gradients, returns, rows, ..
-        } = &mut here[k];
+        let LayerWork { bonds, trace, messages: received, gradients, returns, rows, .. } = &mut here[k];
         let (bonds, received, rows) = (&*bonds, &received[..], &rows[..]);
-        let work = (
-            trace.hold(layer, bonds, &(0..batches.order.len())),
-            gradients_of::<V, N>(layer, bonds, gradients, returns),
-        );
-        self.threads.each(&batches.chunks, work, &|chunk, (mut trace, to), thread| {
+        let (chunks, _) = batches.among(chunks);
+        let (traced, cotangents) = trace.held(layer, bonds);
+        let work = (traced, gradients_of::<V, N>(layer, bonds, chunks, gradients, returns));
+        self.threads.each(chunks, work, &|chunk, (mut trace, to), thread| {
             let Scratch { bonds: work, backward, .. } = &mut *of_thread(scratch, thread);
             let (mut gradients, mut returns) = (to.bonds, to.returns.only());
             begin_returns::<V, N>(layer, &mut returns);
@@ -207,7 +209,7 @@ impl<V: Vector> Evaluator<V> {
                 });
                 let from = Cotangents {
                     densities: (&density_cotangents[places.start * stride + k * lanes..], stride),
-                    basis: part(basis_cotangents, &places, layer.basis.lanes()),
+                    basis: cotangents.of(&places),
                     returned,
                 };
                 let (to, returns) = (&mut gradients, returns.as_deref_mut());
@@ -226,18 +228,17 @@ impl<V: Vector> Evaluator<V> {
                 });
             }
         });
-        self.finish_layer::<N>(k);
     }
 
     /// Sums what bonds and chunks have left of layer `k`.
-    fn finish_layer<const N: usize>(&mut self, k: usize) {
+    pub(super) fn finish_layer<const N: usize>(&mut self, k: usize) {
         let Self { network, batches, layers, .. } = self;
         let (layer, n) = (&network.layers[k], batches.order.len());
         let LayerWork { bonds, gradients, returns, message_cotangents, .. } = &mut layers[k];
         let [of_energy, of_features] = &mut self.forces;
         let even = Layout::Even(1);
         let forces = [Parts::new(even, 0, &mut of_energy[..]), Parts::new(even, 0, &mut of_features[..])];
-        let work = (forces, OfChunks::new(&mut self.virials));
+        let work = (forces, OfChunks::within(&batches.chunks, &mut self.virials));
         self.threads.each(&batches.chunks, work, &|chunk, (mut forces, virials), _| {
             let Some(virials) = virials.only() else { return };
             for place in chunk.places.clone() {
@@ -263,35 +264,38 @@ impl<V: Vector> Evaluator<V> {
         }
     }
 
-    /// Features from the bases.
-    pub(super) fn project(&mut self) {
+    /// Features of some chunks from their bases.
+    pub(super) fn project(&mut self, chunks: Range<usize>) {
         let Self { network, instructions, layers, projection: work, .. } = self;
         let Some(map) = &network.feature_map else { return };
-        let work = work.parts(map);
-        self.threads.share(&self.batches.chunks, work, &|places, mut work| {
-            let bases = |k: usize| basis(&network.layers[k], &layers[k], places);
+        let (chunks, places) = self.batches.among(chunks);
+        let work = work.parts(map, &places);
+        self.threads.share(chunks, work, &|places, mut work| {
+            let bases = |k: usize| layers[k].trace.bases(&network.layers[k]).of(places);
             let work = &mut work;
             instructions.run(Project { map, places, bases, work, instructions: *instructions });
         });
     }
 
-    /// The cotangents of the bases from those of the features, [n, D] in the order of the structure.
-    pub(super) fn project_back(&mut self, cotangent: &[f64]) {
-        let Self { network, instructions, layers, batches, projection: projected, .. } = self;
+    /// The cotangents of the bases of some chunks from those of their features, [places, D].
+    pub(super) fn project_back(&mut self, chunks: Range<usize>, cotangent: &[f64]) {
+        let Self { network, instructions, layers, projection: projected, .. } = self;
         let Some(map) = &network.feature_map else { return };
-        let width = map.projection.feature_dimension();
-        let of_place = |place: usize| &cotangent[batches.order[place] as usize * width..][..width];
-        let work = projected.parts(map);
-        self.threads.share(&batches.chunks, work, &|places, mut work| {
-            instructions.run(BeginProjectBack { map, places, of_place, work: &mut work });
+        let (chunks, all) = self.batches.among(chunks);
+        let cotangent = Shared::new(map.projection.feature_dimension(), all.start, cotangent);
+        self.threads.share(chunks, projected.parts(map, &all), &|places, mut work| {
+            instructions.run(BeginProjectBack {
+                map,
+                places,
+                cotangent: cotangent.of(places),
+                work: &mut work,
+            });
         });
         for (k, (work, layer)) in layers.iter_mut().zip(&network.layers).enumerate() {
-            let (lanes, bases) = (layer.basis.lanes(), &work.trace.bases);
-            work.basis_cotangents.resize(batches.order.len() * lanes, V::ZERO);
-            let out = Parts::new(Layout::Even(lanes), 0, &mut work.basis_cotangents[..]);
-            let work = (projected.parts(map), out);
-            self.threads.share(&batches.chunks, work, &|places, (mut work, mut out)| {
-                let (bases, out) = (part(bases, places, lanes), out.of(places));
+            let (bases, out) = work.trace.basis_cotangents(layer, &all);
+            let work = (projected.parts(map, &all), out);
+            self.threads.share(chunks, work, &|places, (mut work, mut out)| {
+                let (bases, out) = (bases.of(places), out.of(places));
                 let (work, instructions) = (&mut work, *instructions);
                 let pass = ProjectBack { map, layer: k, places, bases, out, work, instructions };
                 instructions.run(pass);
@@ -305,24 +309,22 @@ fn part<'a, V>(numbers: &'a [V], places: &Range<usize>, of_one: usize) -> &'a [V
     numbers.get(places.start * of_one..places.end * of_one).unwrap_or_default()
 }
 
-fn basis<'a, V: Vector>(layer: &Layer<V>, work: &'a LayerWork<V>, places: &Range<usize>) -> &'a [V] {
-    part(&work.trace.bases, places, layer.basis.lanes())
-}
-
 /// Where `N` cotangents of a layer go to.
 fn gradients_of<'a, V: Vector, const N: usize>(
     layer: &Layer<V>,
     bonds: &'a Bonds,
+    chunks: &[Chunk],
     [of_energy, of_features]: &'a mut [Vec<Vec3>; 2],
     returns: &'a mut [Returns<V>],
 ) -> Gradients<'a, V> {
-    let ragged = Layout::Ragged(&bonds.offsets, 1);
+    let (ragged, places) = (Layout::Ragged(&bonds.offsets, 1), places_of(chunks));
     let of_features = match N {
         1 => Parts::new(Layout::Even(0), 0, &mut [][..]),
-        _ => Parts::new(ragged, 0, &mut of_features[..]),
+        _ => Parts::within(ragged, &places, of_features),
     };
     let returns = if layer.message.from.is_some() { returns } else { &mut [] };
-    Gradients { bonds: [Parts::new(ragged, 0, of_energy), of_features], returns: OfChunks::new(returns) }
+    let bonds = [Parts::within(ragged, &places, of_energy), of_features];
+    Gradients { bonds, returns: OfChunks::within(chunks, returns) }
 }
 
 fn begin_returns<V: Vector, const N: usize>(layer: &Layer<V>, returns: &mut Option<&mut Returns<V>>) {
@@ -412,17 +414,17 @@ impl<'c, V: Vector, B: Fn(usize) -> &'c [V]> Pass for Project<'_, '_, V, B> {
 }
 
 /// From the cotangents of features to those of their projections.
-struct BeginProjectBack<'a, 'b, V, C> {
+struct BeginProjectBack<'a, 'b, V> {
     map: &'a FeatureMap<V>,
     places: &'a Range<usize>,
-    of_place: C,
+    cotangent: &'a [f64],
     work: &'a mut Projected<'b, V>,
 }
 
-impl<'c, V: Vector, C: Fn(usize) -> &'c [f64]> Pass for BeginProjectBack<'_, '_, V, C> {
+impl<V: Vector> Pass for BeginProjectBack<'_, '_, V> {
     #[inline(always)]
     fn run(self, _: bool) {
-        self.map.begin_backward(self.places, self.of_place, self.work);
+        self.map.begin_backward(self.places, self.cotangent, self.work);
     }
 }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
 
-use super::evaluate::{Evaluator, PullBack};
+use super::evaluate::{Evaluator, Grade, PullBack};
 use super::instructions::Instructions;
 use super::model::GraceModel;
 use super::network::AnyNetwork;
@@ -69,6 +69,25 @@ impl Grace {
         neighbours: &NeighbourList,
     ) -> Result<(), PotentialError> {
         either!(&mut self.0, evaluator => evaluator.forward(structure, neighbours))
+    }
+
+    /// Energies, features and the derivatives of both, as [`Grace::forward`] and [`Grace::backward`] give them, with the same
+    /// bits, where the cotangent ∂H/∂z of an atom depends on its own features alone: `grade` is called with some atoms at a
+    /// time. Models of one layer need a bounded memory for it, deeper ones less than for the two calls.
+    ///
+    /// # Errors
+    /// As [`Grace::forward`].
+    pub fn evaluate_graded(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        grade: &mut Grade,
+        energy: &mut Evaluation,
+        pull_back: &mut PullBack,
+    ) -> Result<(), PotentialError> {
+        either!(&mut self.0, evaluator => {
+            evaluator.evaluate_graded(structure, neighbours, grade, energy, pull_back)
+        })
     }
 
     /// Energy of each atom at the last [`Grace::forward`], [n], eV.

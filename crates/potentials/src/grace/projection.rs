@@ -80,13 +80,13 @@ impl<V: Vector> ProjectionWork<V> {
         self.features.resize(n * projection.feature_dimension(), 0.0);
     }
 
-    /// To be divided.
-    pub fn parts(&mut self, map: &FeatureMap<V>) -> Projected<'_, V> {
+    /// Those of some places, to be divided.
+    pub fn parts(&mut self, map: &FeatureMap<V>, places: &Range<usize>) -> Projected<'_, V> {
         let (even, projection) = (Layout::Even, &map.projection);
         Projected {
-            projected: Parts::new(even(map.lanes()), 0, &mut self.projected),
-            norms: Parts::new(even(projection.n_norms()), 0, &mut self.norms),
-            features: Parts::new(even(projection.feature_dimension()), 0, &mut self.features),
+            projected: Parts::within(even(map.lanes()), places, &mut self.projected),
+            norms: Parts::within(even(projection.n_norms()), places, &mut self.norms),
+            features: Parts::within(even(projection.feature_dimension()), places, &mut self.features),
         }
     }
 }
@@ -187,22 +187,17 @@ impl<V: Vector> FeatureMap<V> {
     }
 
     /// The first half of the way back, for the atoms at some places: the cotangents of B̂ R, and the factors of B, from those
-    /// of z, `cotangent_of(place)`.
+    /// of z, [places, D].
     ///
     /// B̄ = R p̄/(N + ε_0) + \[L̄/(N + ε_0) − (p̄ · p)/(N + ε_0)\] B/N with p = B̂ R, and in block k besides
     /// L̄_k/(N_k + ε_0) B/N_k.
     #[inline(always)]
-    pub fn begin_backward<'a>(
-        &self,
-        places: &Range<usize>,
-        cotangent_of: impl Fn(usize) -> &'a [f64],
-        work: &mut Projected<V>,
-    ) {
+    pub fn begin_backward(&self, places: &Range<usize>, cotangent: &[f64], work: &mut Projected<V>) {
         let map = &self.projection;
         let rows = work.projected.of(places).chunks_exact_mut(self.lanes());
         let rows = rows.zip(work.norms.of(places).chunks_exact_mut(map.n_norms()));
-        for (place, (projected, norms)) in places.clone().zip(rows) {
-            let (of_projected, of_norms) = cotangent_of(place).split_at(map.dimension);
+        for (cotangent, (projected, norms)) in cotangent.chunks_exact(map.feature_dimension()).zip(rows) {
+            let (of_projected, of_norms) = cotangent.split_at(map.dimension);
             let inverse = 1.0 / (norms[0] + NORM_FLOOR);
             let (scale, mut along) = (if map.normalize { inverse } else { 1.0 }, 0.0);
             for (c, p) in of_projected.iter().zip(V::flat_mut(projected)) {
