@@ -523,8 +523,9 @@ mod defaults {
         nonzero(600)
     }
 
+    /// As many as the longest ladder of remedies has steps.
     pub fn attempts() -> NonZeroU32 {
-        nonzero(3)
+        nonzero(4)
     }
 
     pub fn cores() -> NonZeroU32 {
