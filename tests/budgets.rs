@@ -8,7 +8,7 @@ use std::process::Stdio;
 
 use common::campaign::{Outcome, Small, outcome};
 use common::desk::Desk;
-use common::processes::{carrying_out, signal, wait_until};
+use common::processes::{carrying_out, hold, signal, wait_until};
 use common::{Running, program, succeed};
 use serde_json::Value;
 use tempfile::TempDir;
@@ -166,7 +166,7 @@ fn a_long_queue_raises_the_threshold_and_the_log_can_be_replayed() {
     // While nobody makes labels the queue only grows.
     wait_until("a labeller is at work", || !carrying_out(here, "labeller").is_empty());
     let labellers = carrying_out(here, "labeller");
-    labellers.iter().for_each(|pid| signal(*pid, "STOP"));
+    labellers.iter().for_each(|pid| hold(*pid, here.join("here").to_str().unwrap()));
     let raised = || decisions(here).into_iter().filter(|line| line.contains("\"raised_by\"")).count();
     wait_until("the threshold is raised", || here.join("here/campaign.sqlite").exists() && raised() > 0);
     labellers.iter().for_each(|pid| signal(*pid, "CONT"));

@@ -102,7 +102,7 @@ fn a_slot_that_is_killed_is_replaced_and_the_others_go_on() {
     place.wait_for_lease();
     let slots = carrying_out(place.path(), "labeller");
     // The label is not made before its slot is found.
-    slots.iter().for_each(|slot| signal(*slot, "STOP"));
+    slots.iter().for_each(|slot| place.hold(*slot));
     let holder = place.job(&name).job.holder.unwrap();
     let pid: u32 = holder.rsplit('-').nth(1).unwrap().parse().unwrap();
     assert!(slots.len() == 2 && slots.contains(&pid), "{slots:?} {holder}");

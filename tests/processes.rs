@@ -5,16 +5,14 @@ mod common;
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::time::Duration;
 
 use common::campaign::{Outcome, Small, outcome};
 use common::processes::{
-    carrying_out, go_on, hold_walkers, nothing_is_left, one_carrying_out, processes_in, signal, wait_until,
+    carrying_out, go_on, hold, hold_walkers, nothing_is_left, one_carrying_out, processes_in, signal,
+    wait_until,
 };
 use common::{Running, calmwalk, config, program, refuse, succeed};
 use serde_json::Value;
-use sqlx::ConnectOptions;
-use sqlx::sqlite::SqliteConnectOptions;
 use store::Store;
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
@@ -202,15 +200,8 @@ fn walkers_end_with_their_orchestrator_and_labellers_are_adopted() {
     wait_for_work(here);
     let labellers = carrying_out(here, "labeller");
     assert_eq!(labellers.len(), 1);
-    // So that it does not just look whether anybody needs it; but not while nobody else can write.
-    wait_until("it is held outside of a transaction", || {
-        signal(labellers[0], "STOP");
-        let may_write = may_write(here);
-        if !may_write {
-            signal(labellers[0], "CONT");
-        }
-        may_write
-    });
+    // So that it does not just look whether anybody needs it.
+    hold(labellers[0], here.to_str().unwrap());
     running.0.kill().unwrap();
     running.0.wait().unwrap();
     wait_until("walkers are gone", || carrying_out(here, "walker").is_empty());
@@ -222,16 +213,6 @@ fn walkers_end_with_their_orchestrator_and_labellers_are_adopted() {
     signal(labellers[0], "CONT");
     assert_eq!(carrying_out(here, "labeller"), labellers);
     ends_as_undisturbed(running, here, &small);
-}
-
-/// Whether nobody holds the database of a campaign for longer than a second.
-fn may_write(here: &Path) -> bool {
-    let file = here.join("campaign.sqlite");
-    tokio::runtime::Runtime::new().unwrap().block_on(async {
-        let options = SqliteConnectOptions::new().filename(file).busy_timeout(Duration::from_secs(1));
-        let mut connection = options.connect().await.unwrap();
-        sqlx::raw_sql("BEGIN IMMEDIATE; ROLLBACK").execute(&mut connection).await.is_ok()
-    })
 }
 
 #[test]

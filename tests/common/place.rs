@@ -16,7 +16,7 @@ use tempfile::TempDir;
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 use super::campaign::Small;
-use super::processes::{one_carrying_out, signal, wait_until};
+use super::processes::{hold, one_carrying_out, wait_until};
 use super::{Running, calmwalk, program, succeed};
 
 /// A directory with `campaign.toml`, and the URL of the store if that is on a server.
@@ -112,11 +112,16 @@ impl Place {
         wait_until("a structure is leased", || on_store(self.location(), leased) == 1);
     }
 
+    /// Stops a process where nobody waits for it to write.
+    pub fn hold(&self, pid: u32) {
+        hold(pid, self.url.as_deref().unwrap_or_else(|| self.path().to_str().unwrap()));
+    }
+
     /// Stops the only labeller when it has something in hand; its process number.
     pub fn hold_in_mid_label(&self) -> u32 {
         let labeller = one_carrying_out(self.path(), "labeller");
         self.wait_for_lease();
-        signal(labeller, "STOP");
+        self.hold(labeller);
         labeller
     }
 

@@ -5,6 +5,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{AssertSqlSafe, ConnectOptions, Connection, PgConnection};
 use wire::place::Place;
 
 /// A process that works in a directory: its number and the command that it carries out.
@@ -61,6 +63,34 @@ pub fn calculating(scratch: &Path) -> Vec<(u32, String)> {
 pub fn signal(pid: u32, name: &str) {
     let sent = Command::new("kill").args([format!("-{name}"), pid.to_string()]).output();
     sent.expect("kill runs");
+}
+
+/// Stops a process, but not within a transaction: others could not write, and would give up. `store` is the campaign's
+/// directory or URL.
+pub fn hold(pid: u32, store: &str) {
+    wait_until("it is held outside of a transaction", || {
+        signal(pid, "STOP");
+        let others_can_write = can_write(store);
+        if !others_can_write {
+            signal(pid, "CONT");
+        }
+        others_can_write
+    });
+}
+
+/// Whether nobody keeps the jobs of a campaign for longer than a second.
+fn can_write(store: &str) -> bool {
+    tokio::runtime::Runtime::new().expect("a runtime").block_on(async {
+        let Some((server, schema)) = store.split_once("?schema=") else {
+            let options = SqliteConnectOptions::new().filename(Path::new(store).join("campaign.sqlite"));
+            let mut connection =
+                options.busy_timeout(Duration::from_secs(1)).connect().await.expect("a database");
+            return sqlx::raw_sql("BEGIN IMMEDIATE; ROLLBACK").execute(&mut connection).await.is_ok();
+        };
+        let mut connection = PgConnection::connect(server).await.expect("a server");
+        let sql = format!("SET lock_timeout = '1s'; SELECT 1 FROM {schema}.job FOR UPDATE");
+        sqlx::raw_sql(AssertSqlSafe(sql)).execute(&mut connection).await.is_ok()
+    })
 }
 
 /// Stops all walkers as soon as there are so many. Nothing is found and no campaign ends until they [`go_on`].
