@@ -95,10 +95,10 @@ impl Call {
         for _ in 0..calls {
             let Self { structure, grace, neighbours, elements, mixture, grades, pull_back, out } = &mut *self;
             grades.begin(elements.len());
-            let mut grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
+            let grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
                 grades.add(mixture, elements, atoms, features, cotangent);
             };
-            grace.evaluate_graded(structure, neighbours, &mut grade, out, pull_back).expect("known elements");
+            grace.evaluate_graded(structure, neighbours, &grade, out, pull_back).expect("known elements");
             grades.finish().expect("finite features");
         }
         start.elapsed().as_secs_f64() / calls as f64

@@ -134,10 +134,10 @@ impl BiasedPotential {
     ) -> Result<(), PotentialError> {
         let Self { grace, mixture, elements, parts, pull_back, .. } = self;
         parts.begin(elements.len());
-        let mut grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
+        let grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
             parts.add(mixture, elements, atoms, features, cotangent);
         };
-        grace.evaluate_graded(structure, neighbours, &mut grade, out, pull_back)?;
+        grace.evaluate_graded(structure, neighbours, &grade, out, pull_back)?;
         copy(out, &mut self.physical);
         if self.parts.finish().is_ok() {
             self.add_bias(out);

@@ -76,6 +76,14 @@ impl GradeError {
         }
         self
     }
+
+    /// The atom that it is about, if it is one.
+    pub(crate) fn atom(&self) -> Option<usize> {
+        match self {
+            Self::Length { .. } => None,
+            Self::Element { atom, .. } | Self::Distance { atom, .. } => Some(*atom),
+        }
+    }
 }
 
 impl Grades {

@@ -1,61 +1,100 @@
 //! Grades of a structure that come some atoms at a time.
 
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
 use crate::grade::{GradeError, Grades};
 use crate::mixture::Mixture;
 
-/// What [`Grades::evaluate`] gives, to the last bit, where the features of a structure are known some atoms at a time.
-#[derive(Debug, Clone, Default)]
+/// What [`Grades::evaluate`] gives, to the last bit, where the features of a structure are known some atoms at a time, and by
+/// several threads.
+#[derive(Debug, Default)]
 pub struct GradesInParts {
-    all: Grades,
-    some: Grades,
-    elements: Vec<usize>,
+    found: Mutex<Found>,
+    /// Arrays that no thread has in use.
+    idle: Mutex<Vec<Work>>,
+}
+
+#[derive(Debug, Default)]
+struct Found {
+    grades: Grades,
     error: Option<GradeError>,
+}
+
+/// What one thread grades.
+#[derive(Debug, Default)]
+struct Work {
+    elements: Vec<usize>,
+    grades: Grades,
 }
 
 impl GradesInParts {
     /// Begins with a structure of `n` atoms.
     pub fn begin(&mut self, n: usize) {
-        self.error = None;
-        self.all.sigma.resize(n, 0.0);
-        self.all.gamma.resize(n, 0.0);
-        self.all.component.resize(n, 0);
+        let Found { grades, error } = self.found.get_mut().unwrap_or_else(PoisonError::into_inner);
+        *error = None;
+        grades.sigma.resize(n, 0.0);
+        grades.gamma.resize(n, 0.0);
+        grades.component.resize(n, 0);
     }
 
     /// Grades some `atoms` of it, and writes ∂γ_a/∂**z**_a, `[atoms × D]`, which is zero where they cannot be graded.
     ///
     /// `elements` are those of the whole structure, `features` those of the atoms, `[atoms × D]`.
     pub fn add(
-        &mut self,
+        &self,
         mixture: &Mixture,
         elements: &[usize],
         atoms: &[u32],
         features: &[f64],
         gradient: &mut [f64],
     ) {
-        self.elements.clear();
-        self.elements.extend(atoms.iter().map(|atom| elements[*atom as usize]));
-        if let Err(error) = self.some.evaluate(mixture, &self.elements, features, Some(gradient)) {
+        let mut work = lock(&self.idle).pop().unwrap_or_default();
+        work.elements.clear();
+        work.elements.extend(atoms.iter().map(|atom| elements[*atom as usize]));
+        let result = work.grades.evaluate(mixture, &work.elements, features, Some(&mut *gradient));
+        if result.is_err() {
             gradient.fill(0.0);
-            self.error.get_or_insert(error.of_atoms(atoms));
-            return;
         }
-        for (k, atom) in atoms.iter().map(|atom| *atom as usize).enumerate() {
-            self.all.sigma[atom] = self.some.sigma[k];
-            self.all.gamma[atom] = self.some.gamma[k];
-            self.all.component[atom] = self.some.component[k];
-        }
+        lock(&self.found).add(atoms, result.map(|()| &work.grades));
+        lock(&self.idle).push(work);
     }
 
     /// The grades of all atoms.
     ///
     /// # Errors
-    /// The first that was met.
-    pub fn finish(&self) -> Result<&Grades, GradeError> {
-        match &self.error {
+    /// That of the first atom which has one.
+    pub fn finish(&mut self) -> Result<&Grades, GradeError> {
+        let Found { grades, error } = self.found.get_mut().unwrap_or_else(PoisonError::into_inner);
+        match error {
             Some(error) => Err(error.clone()),
-            None => Ok(&self.all),
+            None => Ok(grades),
         }
     }
+}
+
+impl Found {
+    fn add(&mut self, atoms: &[u32], result: Result<&Grades, GradeError>) {
+        match result {
+            Ok(some) => {
+                for (k, atom) in atoms.iter().map(|atom| *atom as usize).enumerate() {
+                    self.grades.sigma[atom] = some.sigma[k];
+                    self.grades.gamma[atom] = some.gamma[k];
+                    self.grades.component[atom] = some.component[k];
+                }
+            }
+            Err(error) => {
+                let error = error.of_atoms(atoms);
+                if self.error.as_ref().is_none_or(|known| error.atom() < known.atom()) {
+                    self.error = Some(error);
+                }
+            }
+        }
+    }
+}
+
+/// A thread that panicked has left nothing there that anybody reads.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]
@@ -107,6 +146,7 @@ mod tests {
         let mut last = [1.0; 6];
         parts.add(&mixture, &elements, &[3, 2], &[0.1, 0.1, 0.1, 0.2, f64::NAN, 0.2], &mut last);
         assert_eq!(last, [0.0; 6]);
+        parts.add(&mixture, &elements, &[3], &[f64::NAN; 3], &mut [1.0; 3]);
         let error = parts.finish().unwrap_err();
         assert!(matches!(error, GradeError::Distance { atom: 2, element: 0, .. }), "{error}");
         parts.begin(4);

@@ -6,6 +6,7 @@ mod golden;
 
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use atoms::{Cell, Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
 use common::{assert_close, check_forces, check_virial, position_gradient, strain_gradient};
@@ -165,13 +166,15 @@ fn at_once(grace: &mut Grace, structure: &Structure) -> (Vec<f64>, Evaluation, P
     let mut neighbours = NeighbourList::new(grace.cutoff(), 0.0);
     neighbours.update(structure).unwrap();
     let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
-    let mut graded = vec![0; structure.len()];
-    let mut grade = |atoms: &[u32], z: &[f64], cotangent: &mut [f64]| {
-        atoms.iter().for_each(|atom| graded[*atom as usize] += 1);
+    let graded: Vec<AtomicU32> = structure.positions.iter().map(|_| AtomicU32::new(0)).collect();
+    let grade = |atoms: &[u32], z: &[f64], cotangent: &mut [f64]| {
+        for atom in atoms {
+            graded[*atom as usize].fetch_add(1, Ordering::Relaxed);
+        }
         cotangent.copy_from_slice(z);
     };
-    grace.evaluate_graded(structure, &neighbours, &mut grade, &mut energy, &mut pull_back).unwrap();
-    assert!(graded.iter().all(|times| *times == 1));
+    grace.evaluate_graded(structure, &neighbours, &grade, &mut energy, &mut pull_back).unwrap();
+    assert!(graded.iter().all(|times| times.load(Ordering::Relaxed) == 1));
     (grace.features().to_vec(), energy, pull_back)
 }
 

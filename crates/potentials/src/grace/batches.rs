@@ -11,8 +11,12 @@ const MOST: usize = 16;
 /// What the tape of a batch may take in memory, bytes; with its cotangents it should stay in the second cache.
 const TAPE_BYTES: usize = 1 << 19;
 
-/// Places that a thread takes at once, about.
-const CHUNK: usize = 32;
+/// Places that a thread takes at once, about: enough for the projection to be read seldom, few enough for their tapes to stay in
+/// the third cache.
+const CHUNK: usize = 64;
+
+/// Chunks of a small structure, so that two threads have something to do.
+const FEWEST_CHUNKS: usize = 2;
 
 /// Batches behind one another that one thread evaluates.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -60,25 +64,16 @@ impl Batches {
 
     fn divide(&mut self) {
         self.chunks.clear();
+        let n = self.order.len();
+        let chunks = n.div_ceil(CHUNK).max(FEWEST_CHUNKS);
         let (mut first, mut start) = (0, 0);
         for (k, (places, _)) in self.batches.iter().enumerate() {
-            if places.end - start >= CHUNK || k + 1 == self.batches.len() {
+            if places.end * chunks >= n * (self.chunks.len() + 1) {
                 let (batches, places) = (first..k + 1, start..places.end);
                 (first, start) = (k + 1, places.end);
                 self.chunks.push(Chunk { number: self.chunks.len(), batches, places });
             }
         }
-    }
-
-    /// All of them.
-    pub fn all(&self) -> Range<usize> {
-        0..self.chunks.len()
-    }
-
-    /// Some chunks, and their places.
-    pub fn among(&self, chunks: Range<usize>) -> (&[Chunk], Range<usize>) {
-        let chunks = &self.chunks[chunks];
-        (chunks, places_of(chunks))
     }
 
     #[inline(always)]
@@ -87,12 +82,6 @@ impl Batches {
         let batch = Batch { element: *element, atoms: places.len(), instructions };
         Placed { batch, first: places.start }
     }
-}
-
-/// The places of chunks behind one another.
-pub(super) fn places_of(chunks: &[Chunk]) -> Range<usize> {
-    let begin = chunks.first().map_or(0, |chunk| chunk.places.start);
-    begin..chunks.last().map_or(begin, |chunk| chunk.places.end)
 }
 
 /// A batch, and where it stands.

@@ -7,8 +7,10 @@ use atoms::{Matrix3, NeighbourList, Structure, Vec3};
 
 use super::batches::Batches;
 use super::layer::Layer;
+use super::parts::{Layout, OfChunks, Parts};
 use super::radial_network::RadialWork;
 use super::tape::Slot;
+use super::threads::Threads;
 use super::vector::{MOST_LANES, Number, Vector};
 
 /// Keeps r differentiable at d = 0, Å².
@@ -38,38 +40,48 @@ pub(super) struct Bonds {
     incoming_offsets: Vec<usize>,
     /// The bonds of which an atom is the neighbour, in ascending order.
     incoming: Vec<u32>,
+    /// The bonds of each chunk, before they stand behind one another.
+    found: Vec<Vec<Bond>>,
 }
 
 impl Bonds {
-    /// Collects the bonds that are shorter than the cutoff of their pair.
+    /// Collects the bonds that are shorter than the cutoff of their pair; to be called within [`Threads::run`].
     pub fn update<V: Vector>(
         &mut self,
         layer: &Layer<V>,
         structure: &Structure,
         neighbours: &NeighbourList,
         elements: &[usize],
-        batches: &Batches,
+        (batches, threads): (&Batches, &Threads),
     ) {
-        self.offsets.clear();
-        self.offsets.push(0);
-        self.block_offsets.clear();
-        self.block_offsets.push(0);
-        self.bonds.clear();
-        let mut blocks = 0;
-        for (place, i) in batches.order.iter().map(|i| *i as usize).enumerate() {
-            let centre = elements[i];
-            for neighbour in neighbours.of(i) {
-                let j = neighbour.atom as usize;
-                let d = neighbour.displacement(structure, i);
-                let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + SQUARE_FLOOR).sqrt();
-                if r < layer.radial.cutoff(layer.radial.pair(centre, elements[j])) {
-                    self.bonds.push(Bond { neighbour: batches.places[j], element: elements[j] as u32, d, r });
-                }
+        let Self { offsets, bonds, block_offsets, found, .. } = self;
+        let n = batches.order.len();
+        offsets.clear();
+        offsets.resize(n + 1, 0);
+        found.resize_with(batches.chunks.len().max(found.len()), Vec::new);
+        let counts = Parts::new(Layout::Even(1), 0, &mut offsets[1..]);
+        let work = (counts, OfChunks::within(&batches.chunks, found));
+        threads.each(&batches.chunks, work, &|chunk, (mut counts, mut found), _| {
+            let Some(found) = found.only() else { return };
+            found.clear();
+            for place in chunk.places.clone() {
+                let before = found.len();
+                let atom = batches.order[place] as usize;
+                found.extend(bonds_of(atom, layer, structure, neighbours, elements, batches));
+                counts.of(&(place..place + 1))[0] = found.len() - before;
             }
-            blocks += (self.bonds.len() - self.offsets[place]).div_ceil(V::LANES);
-            self.offsets.push(self.bonds.len());
-            self.block_offsets.push(blocks);
+        });
+        block_offsets.clear();
+        block_offsets.push(0);
+        for place in 0..n {
+            block_offsets.push(block_offsets[place] + offsets[place + 1].div_ceil(V::LANES));
+            offsets[place + 1] += offsets[place];
         }
+        bonds.resize(offsets[n], Bond { neighbour: 0, element: 0, d: [0.0; 3], r: 0.0 });
+        let all = Parts::new(Layout::Ragged(offsets, 1), 0, &mut bonds[..]);
+        threads.each(&batches.chunks, all, &|chunk, mut all, _| {
+            all.of(&chunk.places).copy_from_slice(&found[chunk.number]);
+        });
         self.find_incoming();
     }
 
@@ -122,6 +134,24 @@ impl Bonds {
         }
         virial
     }
+}
+
+/// The bonds of an atom that are shorter than the cutoff of their pair.
+fn bonds_of<V: Vector>(
+    atom: usize,
+    layer: &Layer<V>,
+    structure: &Structure,
+    neighbours: &NeighbourList,
+    elements: &[usize],
+    batches: &Batches,
+) -> impl Iterator<Item = Bond> {
+    neighbours.of(atom).iter().filter_map(move |neighbour| {
+        let j = neighbour.atom as usize;
+        let d = neighbour.displacement(structure, atom);
+        let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + SQUARE_FLOOR).sqrt();
+        let is_within = r < layer.radial.cutoff(layer.radial.pair(elements[atom], elements[j]));
+        is_within.then(|| Bond { neighbour: batches.places[j], element: elements[j] as u32, d, r })
+    })
 }
 
 #[inline(always)]

@@ -1,6 +1,5 @@
 //! Energy, features and their derivatives for one structure.
 
-use std::ops::Range;
 use std::sync::{Arc, Mutex};
 
 use atoms::{Evaluation, Matrix3, NeighbourList, PotentialError, Structure, Vec3};
@@ -33,12 +32,8 @@ impl PullBack {
     }
 }
 
-/// Chunks whose features are graded together, for each thread: enough for the projection to be read seldom, few enough for their
-/// tapes to stay in the third cache.
-const CHUNKS_OF_A_THREAD: usize = 2;
-
-/// Takes some atoms and their features z, [atoms, D], and writes ∂H/∂z of each.
-pub type Grade<'a> = dyn FnMut(&[u32], &[f64], &mut [f64]) + Send + 'a;
+/// Takes some atoms and their features z, [atoms, D], and writes ∂H/∂z of each; by several threads at a time.
+pub type Grade<'a> = dyn Fn(&[u32], &[f64], &mut [f64]) + Sync + 'a;
 
 /// A network with its work arrays.
 #[derive(Debug)]
@@ -67,7 +62,7 @@ pub(super) struct Evaluator<V: Vector> {
     // In the order of the structure:
     atomic_energies: Vec<f64>,
     features: Vec<f64>,
-    /// ∂H/∂z of the atoms that are graded together.
+    /// ∂H/∂z, in the order of evaluation.
     feature_cotangent: Vec<f64>,
     /// A number for each atom, for whoever needs it.
     numbers: Vec<u32>,
@@ -112,13 +107,13 @@ impl<V: Vector> Evaluator<V> {
         structure: &Structure,
         neighbours: &NeighbourList,
     ) -> Result<(), PotentialError> {
-        self.take(structure, neighbours)?;
         self.threads.clone().run(|| {
-            let all = self.batches.all();
-            (0..self.layers.len()).for_each(|k| self.forward_layer(k, all.clone()));
-            self.read_out(all.clone());
-            self.project(all);
-        });
+            self.take(structure, neighbours)?;
+            (0..self.layers.len()).for_each(|k| self.forward_layer(k));
+            self.read_out();
+            self.project();
+            Ok(())
+        })?;
         self.put_energies();
         self.put_features();
         Ok(())
@@ -129,7 +124,7 @@ impl<V: Vector> Evaluator<V> {
         &mut self,
         structure: &Structure,
         neighbours: &NeighbourList,
-        grade: &mut Grade,
+        grade: &Grade,
         energy: &mut Evaluation,
         pull_back: &mut PullBack,
     ) -> Result<(), PotentialError> {
@@ -138,43 +133,12 @@ impl<V: Vector> Evaluator<V> {
             pull_back.reset(self.elements.len());
             return Ok(());
         }
-        self.take(structure, neighbours)?;
-        self.begin_derivatives();
-        self.threads.clone().run(|| self.graded(grade));
+        self.threads.clone().run(|| self.pass::<2>(structure, neighbours, grade))?;
         self.put_energies();
         self.put_features();
         self.put_forces(energy);
         self.put_pull_back(true, pull_back);
         Ok(())
-    }
-
-    /// Some chunks at a time pass the last layer, are graded and go back, so that no more of their tapes are kept.
-    fn graded(&mut self, grade: &mut Grade) {
-        let (last, all) = (self.layers.len() - 1, self.batches.all());
-        let together = CHUNKS_OF_A_THREAD * self.threads.count();
-        (0..last).for_each(|k| self.forward_layer(k, all.clone()));
-        for first in all.clone().step_by(together) {
-            let chunks = first..all.end.min(first + together);
-            self.forward_layer(last, chunks.clone());
-            self.read_out(chunks.clone());
-            self.project(chunks.clone());
-            self.grade(chunks, grade);
-        }
-        self.finish_layer::<2>(last);
-        self.backward_layers::<2>(last);
-    }
-
-    /// From the features of some chunks back to the gradients of their bonds in the last layer.
-    fn grade(&mut self, chunks: Range<usize>, grade: &mut Grade) {
-        let Some(projection) = self.network.projection() else { return };
-        let ((_, places), width) = (self.batches.among(chunks.clone()), projection.feature_dimension());
-        let features = &self.projection.features[places.start * width..places.end * width];
-        let mut cotangent = std::mem::take(&mut self.feature_cotangent);
-        cotangent.resize(features.len(), 0.0);
-        grade(&self.batches.order[places.clone()], features, &mut cotangent);
-        self.project_back(chunks.clone(), &cotangent);
-        self.backward_layer::<2>(self.layers.len() - 1, chunks);
-        self.feature_cotangent = cotangent;
     }
 
     /// Elements and bonds of a structure; results of an earlier one are dropped.
@@ -190,7 +154,8 @@ impl<V: Vector> Evaluator<V> {
         self.model.write_element_indices(&structure.species, &mut self.elements)?;
         self.batches.update(&self.elements, self.network.tape_bytes());
         for (work, layer) in self.layers.iter_mut().zip(&self.network.layers) {
-            work.bonds.update(layer, structure, neighbours, &self.elements, &self.batches);
+            let parallel = (&self.batches, &self.threads);
+            work.bonds.update(layer, structure, neighbours, &self.elements, parallel);
             work.begin(layer, &self.batches, &self.elements, &mut self.numbers);
         }
         self.begin_passes();
@@ -246,25 +211,32 @@ impl<V: Vector> Evaluator<V> {
         for atom in &self.batches.order {
             in_order.extend_from_slice(&cotangent[*atom as usize * width..][..width]);
         }
-        self.project_back(self.batches.all(), &in_order);
+        self.project_back(&in_order);
         self.feature_cotangent = in_order;
     }
 
     /// All atoms backwards through the first `layers`.
     fn backward_layers<const N: usize>(&mut self, layers: usize) {
         for k in (0..layers).rev() {
-            self.backward_layer::<N>(k, self.batches.all());
+            self.backward_layer::<N>(k);
             self.finish_layer::<N>(k);
         }
     }
 
-    /// Energies and forces alone: a batch goes forwards and backwards through the last layer while its tape is in the
-    /// cache, and no other tape of that layer is kept.
-    fn plain(&mut self) {
+    /// All that is asked of a structure, of whose last layer nothing is kept.
+    fn pass<const N: usize>(
+        &mut self,
+        structure: &Structure,
+        neighbours: &NeighbourList,
+        grade: &Grade,
+    ) -> Result<(), PotentialError> {
+        self.take(structure, neighbours)?;
+        self.begin_derivatives();
         let last = self.layers.len() - 1;
-        (0..last).for_each(|k| self.forward_layer(k, self.batches.all()));
-        self.pass_last_layer();
-        self.backward_layers::<1>(last);
+        (0..last).for_each(|k| self.forward_layer(k));
+        self.pass_last_layer::<N>(grade);
+        self.backward_layers::<N>(last);
+        Ok(())
     }
 
     /// As [`super::Grace`] as a potential.
@@ -274,9 +246,7 @@ impl<V: Vector> Evaluator<V> {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
-        self.take(structure, neighbours)?;
-        self.begin_derivatives();
-        self.threads.clone().run(|| self.plain());
+        self.threads.clone().run(|| self.pass::<1>(structure, neighbours, &|_, _, _| ()))?;
         self.put_energies();
         self.put_forces(out);
         Ok(())

@@ -9,6 +9,7 @@ use super::bonds::{BondWork, Bonds, OwnBonds, accumulate, reverse};
 use super::layer::{Layer, Message};
 use super::matrix::Rows;
 use super::messages::{Returns, accumulate_messages, reverse_messages};
+use super::network::Network;
 use super::parts::{Divide, Layout, OfChunks, Parts, Shared};
 use super::readout::Block;
 use super::tape::{Slot, Tensor};
@@ -145,12 +146,35 @@ pub(super) fn grow<V: Vector>(lanes: &mut Vec<V>, length: usize) {
     }
 }
 
-/// Tapes of a batch, and its part of the basis. `received` are the messages of all atoms.
+/// A layer, and what is known of all atoms before it is passed.
+#[derive(Clone, Copy)]
+pub(super) struct Here<'a, V: Vector> {
+    pub layer: &'a Layer<V>,
+    /// What the readout takes from it.
+    pub block: &'a Block<V>,
+    pub bonds: &'a Bonds,
+    /// The messages of all atoms.
+    pub received: &'a [V],
+    /// As [`LayerWork::rows`].
+    pub rows: &'a [u32],
+}
+
+impl<'a, V: Vector> Here<'a, V> {
+    /// Layer `k`, with the bonds, the messages and the rows of its work arrays.
+    pub fn new(
+        network: &'a Network<V>,
+        k: usize,
+        (bonds, received, rows): (&'a Bonds, &'a [V], &'a [u32]),
+    ) -> Self {
+        Self { layer: &network.layers[k], block: &network.readout.blocks[k], bonds, received, rows }
+    }
+}
+
+/// Tapes of a batch, and its part of the basis.
 #[inline(always)]
 pub(super) fn forward<V: Vector>(
-    layer: &Layer<V>,
+    &Here { layer, bonds, received, .. }: &Here<V>,
     placed: &Placed,
-    (bonds, received): (&Bonds, &[V]),
     trace: &mut Traced<V>,
     work: &mut BondWork<V>,
 ) {
@@ -239,8 +263,7 @@ pub(super) struct BackwardWork<V> {
 /// A batch back along the tape.
 #[inline(always)]
 pub(super) fn backward_tape<V: Vector, const N: usize>(
-    layer: &Layer<V>,
-    block: &Block<V>,
+    &Here { layer, block, .. }: &Here<V>,
     placed: &Placed,
     trace: &mut Traced<V>,
     from: &Cotangents<V>,
@@ -300,9 +323,8 @@ fn add_returned<V: Vector>(tensor: &Tensor, rows: &[V], tape: &mut [V], (first, 
 /// A batch from the cotangents of its tape back along its bonds.
 #[inline(always)]
 pub(super) fn backward_bonds<V: Vector, const N: usize>(
-    layer: &Layer<V>,
+    &Here { layer, bonds, received, rows, .. }: &Here<V>,
     placed: &Placed,
-    (here, received, rows): (&Bonds, &[V], &[u32]),
     trace: &mut Traced<V>,
     (to, mut returns): (&mut [Parts<Vec3>; 2], Option<&mut Returns<V>>),
     (tape, work): (&BackwardWork<V>, &mut BondWork<V>),
@@ -311,13 +333,13 @@ pub(super) fn backward_bonds<V: Vector, const N: usize>(
     for (slot, place) in placed.places().enumerate() {
         let slots = std::array::from_fn(|k| Slot { slot: k * atoms + slot, slots: N * atoms });
         let cotangent = (&tape.tape[..], slots);
-        let own = trace_of(place, here, &mut trace.values, &mut trace.derivatives);
+        let own = trace_of(place, bonds, &mut trace.values, &mut trace.derivatives);
         let mut both = to.each_mut().map(|part| Some(part.of(&(place..place + 1))));
         let gradients: [&mut [Vec3]; N] = std::array::from_fn(|k| both[k].take().unwrap_or_default());
         match &mut returns {
             None => reverse(layer, own, cotangent, work, gradients),
             Some(returns) => {
-                let rows = &rows[here.offsets[place]..here.offsets[place + 1]];
+                let rows = &rows[bonds.offsets[place]..bonds.offsets[place + 1]];
                 let returns = (rows, &mut **returns);
                 reverse_messages(layer, own, received, cotangent, work, gradients, returns);
             }

@@ -23,6 +23,7 @@
 //! ```
 
 mod assembly;
+mod batch_passes;
 mod batches;
 mod bonds;
 mod copies;
@@ -36,6 +37,7 @@ mod graph;
 mod harmonics;
 mod instructions;
 mod invariant_norm;
+mod last_layer;
 mod layer;
 mod layer_work;
 mod matrix;

@@ -45,10 +45,9 @@ impl<'a, T> Parts<'a, T> {
         Self { layout, begin: layout.begin(first), numbers }
     }
 
-    /// Those of some places, of an array that has all.
-    pub fn within(layout: Layout<'a>, places: &Range<usize>, numbers: &'a mut [T]) -> Self {
-        let range = layout.begin(places.start)..layout.begin(places.end);
-        Self { layout, begin: range.start, numbers: &mut numbers[range] }
+    /// Nothing of any place.
+    pub fn empty() -> Self {
+        Self::new(Layout::Even(0), 0, &mut [])
     }
 
     /// Those of some places.
@@ -106,7 +105,7 @@ impl<'a, T> OfChunks<'a, T> {
     }
 
     /// That of the only chunk that is left.
-    pub fn only(self) -> Option<&'a mut T> {
+    pub fn only(&mut self) -> Option<&mut T> {
         self.items.first_mut()
     }
 }
@@ -116,6 +115,12 @@ impl<T: Send> Divide for OfChunks<'_, T> {
         let middle = (chunk.number - self.first).min(self.items.len());
         let (first, second) = self.items.split_at_mut(middle);
         (Self { first: self.first, items: first }, Self { first: chunk.number, items: second })
+    }
+}
+
+impl<A: Divide> Divide for Option<A> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        self.map(|part| part.divide(chunk)).unzip()
     }
 }
 

@@ -5,31 +5,29 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use atoms::Vec3;
 
-use super::batches::{Chunk, Placed, places_of};
+use super::batch_passes::{Backward, BeginProjectBack, Energies, Forward, Project, ProjectBack};
+use super::batches::Chunk;
 use super::bonds::{BondWork, Bonds};
 use super::evaluate::{Evaluator, add};
-use super::instructions::{Instructions, Pass};
 use super::layer::Layer;
-use super::layer_work::{
-    BackwardWork, Cotangents, Gradients, LayerWork, Trace, Traced, backward_bonds, backward_tape, forward,
-    send,
-};
+use super::layer_work::{BackwardWork, Cotangents, Gradients, Here, LayerWork, Trace, send};
 use super::messages::Returns;
 use super::network::Network;
 use super::parts::{Layout, OfChunks, Parts, Shared};
-use super::projection::{FeatureMap, Projected};
-use super::readout::{Block, Readout, ReadoutWork};
+use super::readout::ReadoutWork;
 use super::vector::Vector;
 
 /// Work arrays of one thread.
 #[derive(Clone, Debug)]
 pub(super) struct Scratch<V> {
     /// For each layer.
-    bonds: Vec<BondWork<V>>,
-    readout: ReadoutWork<V>,
-    backward: BackwardWork<V>,
-    /// Of a batch whose trace is not kept.
-    trace: Trace<V>,
+    pub bonds: Vec<BondWork<V>>,
+    pub readout: ReadoutWork<V>,
+    pub backward: BackwardWork<V>,
+    /// Of atoms whose trace is not kept.
+    pub trace: Trace<V>,
+    /// ∂H/∂z of these.
+    pub feature_cotangent: Vec<f64>,
 }
 
 impl<V: Vector> Scratch<V> {
@@ -39,12 +37,13 @@ impl<V: Vector> Scratch<V> {
             readout: ReadoutWork::default(),
             backward: BackwardWork::default(),
             trace: Trace::default(),
+            feature_cotangent: Vec::new(),
         }
     }
 }
 
 /// A thread that panicked has left nothing in its arrays that anybody reads.
-fn of_thread<V>(scratch: &[Mutex<Scratch<V>>], thread: usize) -> MutexGuard<'_, Scratch<V>> {
+pub(super) fn of_thread<V>(scratch: &[Mutex<Scratch<V>>], thread: usize) -> MutexGuard<'_, Scratch<V>> {
     scratch[thread].lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -69,27 +68,26 @@ impl<V: Vector> Evaluator<V> {
         self.virials.resize(self.batches.chunks.len(), Default::default());
     }
 
-    /// Some chunks forwards through layer `k`, which forgets others, and what they tell the next one.
-    pub(super) fn forward_layer(&mut self, k: usize, chunks: Range<usize>) {
+    /// All atoms forwards through layer `k`, and what they tell the next one.
+    pub(super) fn forward_layer(&mut self, k: usize) {
         let Self { network, instructions, batches, scratch, .. } = self;
         let (here, after) = self.layers.split_at_mut(k + 1);
-        let LayerWork { bonds, trace, messages: received, .. } = &mut here[k];
-        let (bonds, received) = (&*bonds, &received[..]);
-        let (chunks, places) = batches.among(chunks);
+        let LayerWork { bonds, trace, messages, rows, .. } = &mut here[k];
+        let here = Here::new(network, k, (bonds, messages, rows));
         let sent = match after.first_mut() {
             Some(next) => {
                 let layout = Layout::Even(network.layers[k + 1].message.lanes());
-                Parts::within(layout, &places, &mut next.messages)
+                Parts::new(layout, 0, &mut next.messages[..])
             }
-            None => Parts::new(Layout::Even(0), 0, &mut [][..]),
+            None => Parts::empty(),
         };
-        let work = (trace.hold(&network.layers[k], bonds, &places), sent);
-        self.threads.each(chunks, work, &|chunk, (mut trace, mut sent), thread| {
+        let work = (trace.hold(here.layer, bonds, &(0..batches.order.len())), sent);
+        self.threads.each(&batches.chunks, work, &|chunk, (mut trace, mut sent), thread| {
             let work = &mut of_thread(scratch, thread).bonds[k];
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
-                let (layer, trace) = (&network.layers[k], &mut trace);
-                instructions.run(Forward { layer, placed, bonds, received, trace, work });
+                let trace = &mut trace;
+                instructions.run(Forward { here, placed, trace, work });
                 if let Some(next) = network.layers.get(k + 1) {
                     let sent = sent.of(&placed.places());
                     if let Some(tensor) = &next.message.from {
@@ -100,16 +98,15 @@ impl<V: Vector> Evaluator<V> {
         });
     }
 
-    /// Energies of some chunks from the bases of all layers.
-    pub(super) fn read_out(&mut self, chunks: Range<usize>) {
+    /// Energies from the bases of all layers.
+    pub(super) fn read_out(&mut self) {
         let Self { network, instructions, batches, layers, scratch, .. } = self;
         let per_atom = network.readout.blocks.len() * network.readout.density_lanes();
-        let (chunks, places) = batches.among(chunks);
         let work = (
-            Parts::within(Layout::Even(1), &places, &mut self.energies),
-            Parts::within(Layout::Even(per_atom), &places, &mut self.density_cotangents),
+            Parts::new(Layout::Even(1), 0, &mut self.energies[..]),
+            Parts::new(Layout::Even(per_atom), 0, &mut self.density_cotangents[..]),
         );
-        self.threads.each(chunks, work, &|chunk, (mut energies, mut cotangents), thread| {
+        self.threads.each(&batches.chunks, work, &|chunk, (mut energies, mut cotangents), thread| {
             let work = &mut of_thread(scratch, thread).readout;
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
@@ -122,110 +119,35 @@ impl<V: Vector> Evaluator<V> {
         });
     }
 
-    /// All atoms through the last layer, forwards and backwards; only energies and forces are kept.
-    pub(super) fn pass_last_layer(&mut self) {
-        let Self { network, instructions, batches, scratch, .. } = self;
-        let last = self.layers.len() - 1;
-        let (before, here) = self.layers.split_at_mut(last);
-        let (layer, readout) = (&network.layers[last], &network.readout);
-        let per_atom = readout.blocks.len() * readout.density_lanes();
-        let LayerWork { bonds, messages: received, gradients, returns, rows, .. } = &mut here[0];
-        let (bonds, received, rows) = (&*bonds, &received[..], &rows[..]);
-        let work = (
-            Parts::new(Layout::Even(1), 0, &mut self.energies[..]),
-            Parts::new(Layout::Even(per_atom), 0, &mut self.density_cotangents[..]),
-            gradients_of::<V, 1>(layer, bonds, &batches.chunks, gradients, returns),
-        );
-        self.threads.each(&batches.chunks, work, &|chunk, (mut energies, mut cotangents, to), thread| {
-            let Scratch { bonds: work, readout: readout_work, backward, trace } =
-                &mut *of_thread(scratch, thread);
-            let (mut gradients, mut returns) = (to.bonds, to.returns.only());
-            begin_returns::<V, 1>(layer, &mut returns);
-            for batch in chunk.batches.clone() {
-                let placed = batches.placed(batch, *instructions);
-                let places = placed.places();
-                let trace = &mut trace.hold(layer, bonds, &places);
-                let work = &mut work[last];
-                instructions.run(Forward { layer, placed, bonds, received, trace, work });
-                let own = &*trace.bases.of(&places);
-                let basis = |k: usize| match before.get(k) {
-                    Some(work) => work.trace.bases(&network.layers[k]).of(&places),
-                    None => own,
-                };
-                let (energies, cotangents) = (energies.of(&places), cotangents.of(&places));
-                let energy_work = &mut *readout_work;
-                instructions.run(Energies {
-                    readout,
-                    placed,
-                    basis,
-                    energies,
-                    cotangents,
-                    work: energy_work,
-                });
-                let densities = (&cotangents[last * readout.density_lanes()..], per_atom);
-                let from = Cotangents { densities, basis: &[], returned: None };
-                let (to, returns) = (&mut gradients, returns.as_deref_mut());
-                let (block, work) = (&readout.blocks[last], (&mut *backward, work));
-                let here = (bonds, received, rows);
-                instructions.run(Backward::<V, 1> {
-                    layer,
-                    block,
-                    placed,
-                    here,
-                    trace,
-                    from,
-                    to,
-                    returns,
-                    work,
-                });
-            }
-        });
-        self.finish_layer::<1>(last);
-    }
-
-    /// Some chunks, which the layer holds, backwards through layer `k`, with `N` cotangents: of the energy, and of the features.
-    pub(super) fn backward_layer<const N: usize>(&mut self, k: usize, chunks: Range<usize>) {
+    /// All atoms backwards through layer `k`, with `N` cotangents: of the energy, and of the features.
+    pub(super) fn backward_layer<const N: usize>(&mut self, k: usize) {
         let Self { network, instructions, batches, scratch, density_cotangents, .. } = self;
         let (here, after) = self.layers.split_at_mut(k + 1);
-        let (layer, block) = (&network.layers[k], &network.readout.blocks[k]);
-        let LayerWork { bonds, trace, messages: received, gradients, returns, rows, .. } = &mut here[k];
-        let (bonds, received, rows) = (&*bonds, &received[..], &rows[..]);
-        let (chunks, _) = batches.among(chunks);
-        let (traced, cotangents) = trace.held(layer, bonds);
-        let work = (traced, gradients_of::<V, N>(layer, bonds, chunks, gradients, returns));
-        self.threads.each(chunks, work, &|chunk, (mut trace, to), thread| {
+        let (lanes, n_layers) = (network.readout.density_lanes(), network.layers.len());
+        let LayerWork { bonds, trace, messages, gradients, returns, rows, .. } = &mut here[k];
+        let here = Here::new(network, k, (bonds, messages, rows));
+        let (traced, cotangents) = trace.held(here.layer, bonds);
+        let work = (traced, gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns));
+        self.threads.each(&batches.chunks, work, &|chunk, (mut trace, to), thread| {
             let Scratch { bonds: work, backward, .. } = &mut *of_thread(scratch, thread);
-            let (mut gradients, mut returns) = (to.bonds, to.returns.only());
-            begin_returns::<V, N>(layer, &mut returns);
+            let Gradients { bonds: mut to, mut returns } = to;
+            if let Some(returns) = returns.only() {
+                begin_returns::<V, N>(here.layer, returns);
+            }
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
                 let places = placed.places();
-                let (lanes, stride) =
-                    (block.lanes(), network.readout.blocks.len() * network.readout.density_lanes());
                 let returned = after.first().map(|next| {
                     let message = &network.layers[k + 1].message;
                     let of_atom = message.passed() * network.layers[k + 1].density.width;
                     (message, next.message_cotangents.each_ref().map(|all| part(all, &places, of_atom)))
                 });
-                let from = Cotangents {
-                    densities: (&density_cotangents[places.start * stride + k * lanes..], stride),
-                    basis: cotangents.of(&places),
-                    returned,
-                };
-                let (to, returns) = (&mut gradients, returns.as_deref_mut());
-                let (here, trace) = ((bonds, received, rows), &mut trace);
+                let stride = n_layers * lanes;
+                let densities = (&density_cotangents[places.start * stride + k * lanes..], stride);
+                let from = Cotangents { densities, basis: cotangents.of(&places), returned };
+                let (trace, to, returns) = (&mut trace, &mut to, returns.only());
                 let work = (&mut *backward, &mut work[k]);
-                instructions.run(Backward::<V, N> {
-                    layer,
-                    block,
-                    placed,
-                    here,
-                    trace,
-                    from,
-                    to,
-                    returns,
-                    work,
-                });
+                instructions.run(Backward::<V, N> { here, placed, trace, from, to, returns, work });
             }
         });
     }
@@ -239,7 +161,7 @@ impl<V: Vector> Evaluator<V> {
         let even = Layout::Even(1);
         let forces = [Parts::new(even, 0, &mut of_energy[..]), Parts::new(even, 0, &mut of_features[..])];
         let work = (forces, OfChunks::within(&batches.chunks, &mut self.virials));
-        self.threads.each(&batches.chunks, work, &|chunk, (mut forces, virials), _| {
+        self.threads.each(&batches.chunks, work, &|chunk, (mut forces, mut virials), _| {
             let Some(virials) = virials.only() else { return };
             for place in chunk.places.clone() {
                 for k in 0..N {
@@ -264,37 +186,30 @@ impl<V: Vector> Evaluator<V> {
         }
     }
 
-    /// Features of some chunks from their bases.
-    pub(super) fn project(&mut self, chunks: Range<usize>) {
-        let Self { network, instructions, layers, projection: work, .. } = self;
+    /// Features from the bases of all layers.
+    pub(super) fn project(&mut self) {
+        let Self { network, instructions, batches, layers, projection: work, .. } = self;
         let Some(map) = &network.feature_map else { return };
-        let (chunks, places) = self.batches.among(chunks);
-        let work = work.parts(map, &places);
-        self.threads.share(chunks, work, &|places, mut work| {
+        self.threads.share(&batches.chunks, work.parts(map), &|places, mut work| {
             let bases = |k: usize| layers[k].trace.bases(&network.layers[k]).of(places);
             let work = &mut work;
             instructions.run(Project { map, places, bases, work, instructions: *instructions });
         });
     }
 
-    /// The cotangents of the bases of some chunks from those of their features, [places, D].
-    pub(super) fn project_back(&mut self, chunks: Range<usize>, cotangent: &[f64]) {
-        let Self { network, instructions, layers, projection: projected, .. } = self;
+    /// The cotangents of the bases of all layers from those of the features, [n, D].
+    pub(super) fn project_back(&mut self, cotangent: &[f64]) {
+        let Self { network, instructions, batches, layers, projection: projected, .. } = self;
         let Some(map) = &network.feature_map else { return };
-        let (chunks, all) = self.batches.among(chunks);
-        let cotangent = Shared::new(map.projection.feature_dimension(), all.start, cotangent);
-        self.threads.share(chunks, projected.parts(map, &all), &|places, mut work| {
-            instructions.run(BeginProjectBack {
-                map,
-                places,
-                cotangent: cotangent.of(places),
-                work: &mut work,
-            });
+        let cotangent = Shared::new(map.projection.feature_dimension(), 0, cotangent);
+        self.threads.share(&batches.chunks, projected.parts(map), &|places, mut work| {
+            let (cotangent, work) = (cotangent.of(places), &mut work);
+            instructions.run(BeginProjectBack { map, places, cotangent, work });
         });
         for (k, (work, layer)) in layers.iter_mut().zip(&network.layers).enumerate() {
-            let (bases, out) = work.trace.basis_cotangents(layer, &all);
-            let work = (projected.parts(map, &all), out);
-            self.threads.share(chunks, work, &|places, (mut work, mut out)| {
+            let (bases, out) = work.trace.basis_cotangents(layer, &(0..batches.order.len()));
+            let work = (projected.parts(map), out);
+            self.threads.share(&batches.chunks, work, &|places, (mut work, mut out)| {
                 let (bases, out) = (bases.of(places), out.of(places));
                 let (work, instructions) = (&mut work, *instructions);
                 let pass = ProjectBack { map, layer: k, places, bases, out, work, instructions };
@@ -310,139 +225,21 @@ fn part<'a, V>(numbers: &'a [V], places: &Range<usize>, of_one: usize) -> &'a [V
 }
 
 /// Where `N` cotangents of a layer go to.
-fn gradients_of<'a, V: Vector, const N: usize>(
+pub(super) fn gradients_of<'a, V: Vector, const N: usize>(
     layer: &Layer<V>,
     bonds: &'a Bonds,
     chunks: &[Chunk],
     [of_energy, of_features]: &'a mut [Vec<Vec3>; 2],
     returns: &'a mut [Returns<V>],
 ) -> Gradients<'a, V> {
-    let (ragged, places) = (Layout::Ragged(&bonds.offsets, 1), places_of(chunks));
-    let of_features = match N {
-        1 => Parts::new(Layout::Even(0), 0, &mut [][..]),
-        _ => Parts::within(ragged, &places, of_features),
-    };
+    let ragged = Layout::Ragged(&bonds.offsets, 1);
+    let of_features = if N == 1 { Parts::empty() } else { Parts::new(ragged, 0, &mut of_features[..]) };
     let returns = if layer.message.from.is_some() { returns } else { &mut [] };
-    let bonds = [Parts::within(ragged, &places, of_energy), of_features];
+    let bonds = [Parts::new(ragged, 0, &mut of_energy[..]), of_features];
     Gradients { bonds, returns: OfChunks::within(chunks, returns) }
 }
 
-fn begin_returns<V: Vector, const N: usize>(layer: &Layer<V>, returns: &mut Option<&mut Returns<V>>) {
-    if let Some(returns) = returns {
-        returns.begin(N, layer.message.passed() * layer.density.width);
-    }
-}
-
-/// A batch forwards through one layer.
-struct Forward<'a, 'b, V: Vector> {
-    layer: &'a Layer<V>,
-    placed: Placed,
-    bonds: &'a Bonds,
-    received: &'a [V],
-    trace: &'a mut Traced<'b, V>,
-    work: &'a mut BondWork<V>,
-}
-
-impl<V: Vector> Pass for Forward<'_, '_, V> {
-    #[inline(always)]
-    fn run(self, _: bool) {
-        forward(self.layer, &self.placed, (self.bonds, self.received), self.trace, self.work);
-    }
-}
-
-/// A batch from its bases to energies, and to ∂E/∂(W B).
-struct Energies<'a, V, B> {
-    readout: &'a Readout<V>,
-    placed: Placed,
-    basis: B,
-    energies: &'a mut [f64],
-    cotangents: &'a mut [V],
-    work: &'a mut ReadoutWork<V>,
-}
-
-impl<'b, V: Vector, B: Fn(usize) -> &'b [V]> Pass for Energies<'_, V, B> {
-    #[inline(always)]
-    fn run(self, _: bool) {
-        let Self { readout, placed, basis, energies, cotangents, work } = self;
-        readout.begin(placed.batch.atoms, work);
-        for k in 0..readout.blocks.len() {
-            let basis = basis(k);
-            readout.add_densities(k, &placed.batch, (basis, basis.len() / placed.batch.atoms), work);
-        }
-        readout.evaluate(&placed.batch, energies, work);
-        readout.density_cotangents(cotangents, work);
-    }
-}
-
-/// A batch backwards through one layer, with `N` cotangents.
-struct Backward<'a, 'b, 'c, V: Vector, const N: usize> {
-    layer: &'a Layer<V>,
-    block: &'a Block<V>,
-    placed: Placed,
-    here: (&'a Bonds, &'a [V], &'a [u32]),
-    trace: &'a mut Traced<'b, V>,
-    from: Cotangents<'a, V>,
-    to: &'a mut [Parts<'c, Vec3>; 2],
-    returns: Option<&'a mut Returns<V>>,
-    work: (&'a mut BackwardWork<V>, &'a mut BondWork<V>),
-}
-
-impl<V: Vector, const N: usize> Pass for Backward<'_, '_, '_, V, N> {
-    #[inline(always)]
-    fn run(self, _: bool) {
-        let Self { layer, block, placed, here, trace, from, to, returns, work } = self;
-        let (backward, bonds) = work;
-        backward_tape::<V, N>(layer, block, &placed, trace, &from, backward);
-        backward_bonds::<V, N>(layer, &placed, here, trace, (to, returns), (backward, bonds));
-    }
-}
-
-/// From the bases of some atoms to their features.
-struct Project<'a, 'b, V, B> {
-    map: &'a FeatureMap<V>,
-    places: &'a Range<usize>,
-    bases: B,
-    work: &'a mut Projected<'b, V>,
-    instructions: Instructions,
-}
-
-impl<'c, V: Vector, B: Fn(usize) -> &'c [V]> Pass for Project<'_, '_, V, B> {
-    #[inline(always)]
-    fn run(self, _: bool) {
-        self.map.forward(self.places, self.bases, self.work, self.instructions);
-    }
-}
-
-/// From the cotangents of features to those of their projections.
-struct BeginProjectBack<'a, 'b, V> {
-    map: &'a FeatureMap<V>,
-    places: &'a Range<usize>,
-    cotangent: &'a [f64],
-    work: &'a mut Projected<'b, V>,
-}
-
-impl<V: Vector> Pass for BeginProjectBack<'_, '_, V> {
-    #[inline(always)]
-    fn run(self, _: bool) {
-        self.map.begin_backward(self.places, self.cotangent, self.work);
-    }
-}
-
-/// From there to those of the bases of one layer.
-struct ProjectBack<'a, 'b, V> {
-    map: &'a FeatureMap<V>,
-    layer: usize,
-    places: &'a Range<usize>,
-    bases: &'a [V],
-    out: &'a mut [V],
-    work: &'a mut Projected<'b, V>,
-    instructions: Instructions,
-}
-
-impl<V: Vector> Pass for ProjectBack<'_, '_, V> {
-    #[inline(always)]
-    fn run(self, _: bool) {
-        let Self { map, layer, places, bases, out, work, instructions } = self;
-        map.backward(layer, places, bases, out, work, instructions);
-    }
+/// Makes room for the message cotangents of a chunk.
+pub(super) fn begin_returns<V: Vector, const N: usize>(layer: &Layer<V>, returns: &mut Returns<V>) {
+    returns.begin(N, layer.message.passed() * layer.density.width);
 }

@@ -73,7 +73,7 @@ impl Grace {
 
     /// Energies, features and the derivatives of both, as [`Grace::forward`] and [`Grace::backward`] give them, with the same
     /// bits, where the cotangent ∂H/∂z of an atom depends on its own features alone: `grade` is called with some atoms at a
-    /// time. Models of one layer need a bounded memory for it, deeper ones less than for the two calls.
+    /// time, by all threads. Models of one layer need a bounded memory for it, deeper ones less than for the two calls.
     ///
     /// # Errors
     /// As [`Grace::forward`].
@@ -81,7 +81,7 @@ impl Grace {
         &mut self,
         structure: &Structure,
         neighbours: &NeighbourList,
-        grade: &mut Grade,
+        grade: &Grade,
         energy: &mut Evaluation,
         pull_back: &mut PullBack,
     ) -> Result<(), PotentialError> {

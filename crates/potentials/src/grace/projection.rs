@@ -68,7 +68,8 @@ pub(super) struct ProjectionWork<V> {
 pub(super) struct Projected<'a, V> {
     projected: Parts<'a, V>,
     norms: Parts<'a, f64>,
-    features: Parts<'a, f64>,
+    /// z
+    pub features: Parts<'a, f64>,
 }
 
 impl<V: Vector> ProjectionWork<V> {
@@ -80,13 +81,13 @@ impl<V: Vector> ProjectionWork<V> {
         self.features.resize(n * projection.feature_dimension(), 0.0);
     }
 
-    /// Those of some places, to be divided.
-    pub fn parts(&mut self, map: &FeatureMap<V>, places: &Range<usize>) -> Projected<'_, V> {
+    /// Those of all atoms, to be divided.
+    pub fn parts(&mut self, map: &FeatureMap<V>) -> Projected<'_, V> {
         let (even, projection) = (Layout::Even, &map.projection);
         Projected {
-            projected: Parts::within(even(map.lanes()), places, &mut self.projected),
-            norms: Parts::within(even(projection.n_norms()), places, &mut self.norms),
-            features: Parts::within(even(projection.feature_dimension()), places, &mut self.features),
+            projected: Parts::new(even(map.lanes()), 0, &mut self.projected[..]),
+            norms: Parts::new(even(projection.n_norms()), 0, &mut self.norms[..]),
+            features: Parts::new(even(projection.feature_dimension()), 0, &mut self.features[..]),
         }
     }
 }

@@ -1,0 +1,125 @@
+//! What is done with a batch, or with some places, compiled for the processor's vector instructions.
+
+use std::ops::Range;
+
+use atoms::Vec3;
+
+use super::batches::Placed;
+use super::bonds::BondWork;
+use super::instructions::{Instructions, Pass};
+use super::layer_work::{BackwardWork, Cotangents, Here, Traced, backward_bonds, backward_tape, forward};
+use super::messages::Returns;
+use super::parts::Parts;
+use super::projection::{FeatureMap, Projected};
+use super::readout::{Readout, ReadoutWork};
+use super::vector::Vector;
+
+/// A batch forwards through one layer.
+pub(super) struct Forward<'a, 'b, V: Vector> {
+    pub here: Here<'a, V>,
+    pub placed: Placed,
+    pub trace: &'a mut Traced<'b, V>,
+    pub work: &'a mut BondWork<V>,
+}
+
+impl<V: Vector> Pass for Forward<'_, '_, V> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        forward(&self.here, &self.placed, self.trace, self.work);
+    }
+}
+
+/// A batch from its bases to energies, and to ∂E/∂(W B).
+pub(super) struct Energies<'a, V, B> {
+    pub readout: &'a Readout<V>,
+    pub placed: Placed,
+    pub basis: B,
+    pub energies: &'a mut [f64],
+    pub cotangents: &'a mut [V],
+    pub work: &'a mut ReadoutWork<V>,
+}
+
+impl<'b, V: Vector, B: Fn(usize) -> &'b [V]> Pass for Energies<'_, V, B> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        let Self { readout, placed, basis, energies, cotangents, work } = self;
+        readout.begin(placed.batch.atoms, work);
+        for k in 0..readout.blocks.len() {
+            let basis = basis(k);
+            readout.add_densities(k, &placed.batch, (basis, basis.len() / placed.batch.atoms), work);
+        }
+        readout.evaluate(&placed.batch, energies, work);
+        readout.density_cotangents(cotangents, work);
+    }
+}
+
+/// A batch backwards through one layer, with `N` cotangents.
+pub(super) struct Backward<'a, 'b, 'c, V: Vector, const N: usize> {
+    pub here: Here<'a, V>,
+    pub placed: Placed,
+    pub trace: &'a mut Traced<'b, V>,
+    pub from: Cotangents<'a, V>,
+    pub to: &'a mut [Parts<'c, Vec3>; 2],
+    pub returns: Option<&'a mut Returns<V>>,
+    pub work: (&'a mut BackwardWork<V>, &'a mut BondWork<V>),
+}
+
+impl<V: Vector, const N: usize> Pass for Backward<'_, '_, '_, V, N> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        let Self { here, placed, trace, from, to, returns, work } = self;
+        let (backward, bonds) = work;
+        backward_tape::<V, N>(&here, &placed, trace, &from, backward);
+        backward_bonds::<V, N>(&here, &placed, trace, (to, returns), (backward, bonds));
+    }
+}
+
+/// From the bases of some atoms to their features.
+pub(super) struct Project<'a, 'b, V, B> {
+    pub map: &'a FeatureMap<V>,
+    pub places: &'a Range<usize>,
+    pub bases: B,
+    pub work: &'a mut Projected<'b, V>,
+    pub instructions: Instructions,
+}
+
+impl<'c, V: Vector, B: Fn(usize) -> &'c [V]> Pass for Project<'_, '_, V, B> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        self.map.forward(self.places, self.bases, self.work, self.instructions);
+    }
+}
+
+/// From the cotangents of features to those of their projections.
+pub(super) struct BeginProjectBack<'a, 'b, V> {
+    pub map: &'a FeatureMap<V>,
+    pub places: &'a Range<usize>,
+    pub cotangent: &'a [f64],
+    pub work: &'a mut Projected<'b, V>,
+}
+
+impl<V: Vector> Pass for BeginProjectBack<'_, '_, V> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        self.map.begin_backward(self.places, self.cotangent, self.work);
+    }
+}
+
+/// From there to those of the bases of one layer.
+pub(super) struct ProjectBack<'a, 'b, V> {
+    pub map: &'a FeatureMap<V>,
+    pub layer: usize,
+    pub places: &'a Range<usize>,
+    pub bases: &'a [V],
+    pub out: &'a mut [V],
+    pub work: &'a mut Projected<'b, V>,
+    pub instructions: Instructions,
+}
+
+impl<V: Vector> Pass for ProjectBack<'_, '_, V> {
+    #[inline(always)]
+    fn run(self, _: bool) {
+        let Self { map, layer, places, bases, out, work, instructions } = self;
+        map.backward(layer, places, bases, out, work, instructions);
+    }
+}

@@ -1,0 +1,161 @@
+//! The last layer, forwards and backwards while what is needed of it is in the cache.
+
+use std::ops::Range;
+
+use super::batch_passes::{Backward, BeginProjectBack, Energies, Forward, Project, ProjectBack};
+use super::batches::{Batches, Chunk, Placed};
+use super::evaluate::{Evaluator, Grade};
+use super::instructions::Instructions;
+use super::layer_work::{Cotangents, Gradients, Here, LayerWork};
+use super::network::Network;
+use super::parts::{Divide, Layout, Parts, Shared};
+use super::passes::{Scratch, begin_returns, gradients_of, of_thread};
+use super::projection::Projected;
+use super::vector::Vector;
+
+/// The most layers before the last one.
+const BEFORE: usize = 2;
+
+/// What all threads read.
+struct Pass<'a, V: Vector> {
+    network: &'a Network<V>,
+    instructions: Instructions,
+    batches: &'a Batches,
+    here: Here<'a, V>,
+    /// Of the layers before.
+    bases: [Shared<'a, V>; BEFORE],
+    grade: &'a Grade<'a>,
+}
+
+/// What it leaves of atoms, to be divided.
+struct Results<'a, V> {
+    energies: Parts<'a, f64>,
+    /// ∂E/∂(W B)
+    densities: Parts<'a, V>,
+    gradients: Gradients<'a, V>,
+    /// None where nothing is graded.
+    projected: Option<Projected<'a, V>>,
+    /// From the features, of the bases of the layers before.
+    basis_cotangents: [Parts<'a, V>; BEFORE],
+}
+
+impl<V: Send> Divide for Results<'_, V> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let (energies, densities) = (self.energies.divide(chunk), self.densities.divide(chunk));
+        let (gradients, projected) = (self.gradients.divide(chunk), self.projected.divide(chunk));
+        let basis_cotangents = self.basis_cotangents.divide(chunk);
+        (
+            Self {
+                energies: energies.0,
+                densities: densities.0,
+                gradients: gradients.0,
+                projected: projected.0,
+                basis_cotangents: basis_cotangents.0,
+            },
+            Self {
+                energies: energies.1,
+                densities: densities.1,
+                gradients: gradients.1,
+                projected: projected.1,
+                basis_cotangents: basis_cotangents.1,
+            },
+        )
+    }
+}
+
+impl<V: Vector> Evaluator<V> {
+    /// All atoms through the last layer, forwards and backwards, with `N` cotangents: of the energy, and of what `grade` makes
+    /// of the features. With one a batch at a time, with two a chunk.
+    pub(super) fn pass_last_layer<const N: usize>(&mut self, grade: &Grade) {
+        let Self { network, instructions, batches, scratch, projection, .. } = self;
+        let last = self.layers.len() - 1;
+        let (before, here) = self.layers.split_at_mut(last);
+        let LayerWork { bonds, messages, gradients, returns, rows, .. } = &mut here[0];
+        let here = Here::new(network, last, (bonds, messages, rows));
+        let of_densities = network.readout.blocks.len() * network.readout.density_lanes();
+        let map = network.feature_map.as_ref().filter(|_| N == 2);
+        let mut results = Results {
+            energies: Parts::new(Layout::Even(1), 0, &mut self.energies[..]),
+            densities: Parts::new(Layout::Even(of_densities), 0, &mut self.density_cotangents[..]),
+            gradients: gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns),
+            projected: map.map(|map| projection.parts(map)),
+            basis_cotangents: [(); BEFORE].map(|()| Parts::empty()),
+        };
+        let mut bases = [Shared::new(0, 0, &[]); BEFORE];
+        for (k, (work, layer)) in before.iter_mut().zip(&network.layers).enumerate() {
+            let n = if N == 2 { batches.order.len() } else { 0 };
+            (bases[k], results.basis_cotangents[k]) = work.trace.basis_cotangents(layer, &(0..n));
+        }
+        let pass = Pass { network, instructions: *instructions, batches, here, bases, grade };
+        self.threads.each(&batches.chunks, results, &|chunk, mut results, thread| {
+            let scratch = &mut of_thread(scratch, thread);
+            if let Some(returns) = results.gradients.returns.only() {
+                begin_returns::<V, N>(here.layer, returns);
+            }
+            let together = if N == 1 { 1 } else { chunk.batches.len() };
+            for first in chunk.batches.clone().step_by(together) {
+                pass.run::<N>(first..first + together, &mut results, scratch);
+            }
+        });
+        self.finish_layer::<N>(last);
+    }
+}
+
+impl<V: Vector> Pass<'_, V> {
+    fn run<const N: usize>(&self, batches: Range<usize>, results: &mut Results<V>, scratch: &mut Scratch<V>) {
+        let placed = |batch: usize| self.batches.placed(batch, self.instructions);
+        let places = placed(batches.start).first..placed(batches.end - 1).places().end;
+        scratch.trace.hold(self.here.layer, self.here.bonds, &places);
+        for placed in batches.clone().map(placed) {
+            self.forward(placed, results, scratch);
+        }
+        if N == 2 {
+            self.grade(&places, results, scratch);
+        }
+        for placed in batches.map(placed) {
+            self.backward::<N>(placed, results, scratch);
+        }
+    }
+
+    fn forward(&self, placed: Placed, results: &mut Results<V>, scratch: &mut Scratch<V>) {
+        let (last, places) = (self.network.layers.len() - 1, placed.places());
+        let (mut traced, _) = scratch.trace.held(self.here.layer, self.here.bonds);
+        let (here, trace, work) = (self.here, &mut traced, &mut scratch.bonds[last]);
+        self.instructions.run(Forward { here, placed, trace, work });
+        let own = &*traced.bases.of(&places);
+        let basis = |k: usize| if k == last { own } else { self.bases[k].of(&places) };
+        let (energies, cotangents) = (results.energies.of(&places), results.densities.of(&places));
+        let (readout, work) = (&self.network.readout, &mut scratch.readout);
+        self.instructions.run(Energies { readout, placed, basis, energies, cotangents, work });
+    }
+
+    /// From the bases of some atoms to their features and back to the cotangents of the bases.
+    fn grade(&self, places: &Range<usize>, results: &mut Results<V>, scratch: &mut Scratch<V>) {
+        let (Some(map), Some(work)) = (&self.network.feature_map, &mut results.projected) else { return };
+        let (instructions, last) = (self.instructions, self.network.layers.len() - 1);
+        let (own, mut out) = scratch.trace.basis_cotangents(self.here.layer, places);
+        let bases = |k: usize| if k == last { own.of(places) } else { self.bases[k].of(places) };
+        instructions.run(Project { map, places, bases, work, instructions });
+        let (features, cotangent) = (work.features.of(places), &mut scratch.feature_cotangent);
+        cotangent.resize(features.len(), 0.0);
+        (self.grade)(&self.batches.order[places.clone()], features, cotangent);
+        instructions.run(BeginProjectBack { map, places, cotangent, work });
+        for layer in 0..=last {
+            let bases = bases(layer);
+            let out = if layer == last { out.of(places) } else { results.basis_cotangents[layer].of(places) };
+            instructions.run(ProjectBack { map, layer, places, bases, out, work, instructions });
+        }
+    }
+
+    fn backward<const N: usize>(&self, placed: Placed, results: &mut Results<V>, scratch: &mut Scratch<V>) {
+        let (readout, places) = (&self.network.readout, placed.places());
+        let (last, lanes) = (readout.blocks.len() - 1, readout.density_lanes());
+        let (mut traced, cotangents) = scratch.trace.held(self.here.layer, self.here.bonds);
+        let densities = (&results.densities.of(&places)[last * lanes..], readout.blocks.len() * lanes);
+        let from = Cotangents { densities, basis: cotangents.of(&places), returned: None };
+        let (here, trace, to) = (self.here, &mut traced, &mut results.gradients.bonds);
+        let (returns, work) =
+            (results.gradients.returns.only(), (&mut scratch.backward, &mut scratch.bonds[last]));
+        self.instructions.run(Backward::<V, N> { here, placed, trace, from, to, returns, work });
+    }
+}
