@@ -117,10 +117,10 @@ impl Case {
     pub fn graded(&mut self, out: &mut Evaluation) {
         let Self { structure, grace, neighbours, elements, mixture, grades, pull_back } = self;
         grades.begin(elements.len());
-        let mut grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
+        let grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
             grades.add(mixture, elements, atoms, features, cotangent);
         };
-        grace.evaluate_graded(structure, neighbours, &mut grade, out, pull_back).expect("known elements");
+        grace.evaluate_graded(structure, neighbours, &grade, out, pull_back).expect("known elements");
         grades.finish().expect("finite features");
     }
 

@@ -1,7 +1,7 @@
 """Times gracemaker's own calculator on one core: python gracemaker.py REQUEST.json
 
 The request names a structure, and either a checkpoint or a preset of which a model with random weights is made (the time does
-not depend on them). Prints the seconds of each call as JSON: energy and forces, and, where there is a mixture, the same with γ
+not depend on them), and the precision, "double" or "single". Prints the seconds of each call as JSON: energy and forces, and, where there is a mixture, the same with γ
 and the gradient of Σγ.
 """
 
@@ -28,24 +28,29 @@ tf.config.threading.set_intra_op_parallelism_threads(1)
 tf.config.threading.set_inter_op_parallelism_threads(1)
 
 
-def model_files(request, folder):
-    """Paths of model.yaml and checkpoint."""
+def model_files(request, dtype, folder):
+    """Paths of model.yaml and checkpoint. A checkpoint is in double precision: in single its weights are random too."""
     if "checkpoint" in request:
-        return request["checkpoint"] + "/model.yaml", request["checkpoint"] + "/checkpoint"
-    elements = {symbol: index for index, symbol in enumerate(request["elements"])}
-    preset = get_preset(request["preset"])
-    instructions = preset(element_map=elements, rcut=request["cutoff"], **request["arguments"]).get_instructions()
-    save_instructions_dict(folder + "/model.yaml", instructions)
-    potential = TensorPotential(instructions, param_dtype=tf.float64)
+        model = request["checkpoint"] + "/model.yaml"
+        if dtype == tf.float64:
+            return model, request["checkpoint"] + "/checkpoint"
+        instructions = load_instructions(model)
+    else:
+        elements = {symbol: index for index, symbol in enumerate(request["elements"])}
+        preset = get_preset(request["preset"])
+        model = folder + "/model.yaml"
+        instructions = preset(element_map=elements, rcut=request["cutoff"], **request["arguments"]).get_instructions()
+        save_instructions_dict(model, instructions)
+    potential = TensorPotential(instructions, param_dtype=dtype)
     potential.save_checkpoint(checkpoint_name=folder + "/checkpoint")
-    return folder + "/model.yaml", folder + "/checkpoint"
+    return model, folder + "/checkpoint"
 
 
-def plain_calculator(model, checkpoint):
+def plain_calculator(model, checkpoint, dtype):
     potential = TensorPotential(
         load_instructions(model),
         model_compute_function=ComputeStructureEnergyAndForcesAndVirial(),
-        param_dtype=tf.float64,
+        param_dtype=dtype,
     )
     potential.load_checkpoint(checkpoint, model_only=True, assert_consumed=False, expect_partial=True)
     potential.model.decorate_compute_function()
@@ -67,10 +72,11 @@ def seconds(calculator, atoms, repetitions):
 def main():
     with open(sys.argv[1]) as file:
         request = json.load(file)
+    dtype = {"double": tf.float64, "single": tf.float32}[request["precision"]]
     with tempfile.TemporaryDirectory() as folder:
-        model, checkpoint = model_files(request, folder)
-        plain = plain_calculator(model, checkpoint)
-        graded = "artifact" in request and get_gmm_uq_calculator(model, checkpoint, request["artifact"])
+        model, checkpoint = model_files(request, dtype, folder)
+        plain = plain_calculator(model, checkpoint, dtype)
+        graded = "artifact" in request and get_gmm_uq_calculator(model, checkpoint, request["artifact"], dtype)
         answer = []
         for s in request["structures"]:
             atoms = Atoms(s["symbols"], positions=s["positions"], cell=s["cell"], pbc=True)

@@ -1,5 +1,5 @@
-//! GRACE measured: energy and forces, and with them γ and ∇Σγ, on one thread, in double and in mixed precision; in double
-//! precision against gracemaker's own calculator where `CALMWALK_GRACEMAKER_PYTHON` names a Python that has it.
+//! GRACE measured: energy and forces, and with them γ and ∇Σγ, on one thread, in double and in mixed precision; against
+//! gracemaker's own calculator in double and in single where `CALMWALK_GRACEMAKER_PYTHON` names a Python that has it.
 //!
 //! `cargo bench -p potentials --bench grace [-- MODEL…]`; the larger models are those of `CALMWALK_PEER_DATA`. With `scale` before
 //! the models it is time and memory of crystals from 108 to 19 652 atoms.
@@ -15,6 +15,7 @@ use std::time::Instant;
 
 use atoms::Evaluation;
 use case::{Call, Case, MODELS, Model};
+use peak::Peak;
 use peer::Seconds;
 use potentials::grace::Precision;
 
@@ -31,7 +32,7 @@ fn main() {
     if grow {
         wanted.remove(0);
     }
-    let peak = if grow { f64::NAN } else { peak::report() };
+    let peak = if grow { Peak::default() } else { peak::report() };
     for model in
         MODELS.iter().filter(|model| wanted.is_empty() || wanted.iter().any(|name| name == model.name))
     {
@@ -43,17 +44,16 @@ fn main() {
     }
 }
 
-fn report(model: &Model, peak: f64) {
+fn report(model: &Model, peak: Peak) {
     for precision in [Precision::Double, Precision::Mixed] {
         println!("\n{}, {precision} precision", model.name);
         let cases: Vec<Case> = EDGES.iter().map(|edge| Case::new(model, *edge, precision)).collect();
-        let peers = (precision == Precision::Double).then(|| peer::seconds(model, &cases)).flatten();
-        report_cases(cases, peers.as_deref(), peak);
+        let peers = peer::seconds(model, precision, &cases);
+        report_cases(cases, peers.as_deref(), peak.of(precision));
     }
     threads::report(model, EDGES[1]);
 }
 
-/// `peak` is that of double precision.
 fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, peak: f64) {
     for (k, case) in cases.iter_mut().enumerate() {
         let atoms = case.structure.len() as f64;

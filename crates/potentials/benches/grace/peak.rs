@@ -3,34 +3,58 @@
 use std::time::Instant;
 
 use faer::linalg::matmul::matmul;
+use faer::traits::ComplexField;
 use faer::{Accum, Mat, Par};
+use potentials::grace::Precision;
 
 /// Rows, inner and outer dimension: a large product, and those of a map of channels and of the projection.
 const SHAPES: [[usize; 3]; 3] = [[512, 512, 512], [36, 64, 64], [108, 5664, 128]];
 
-/// Prints the rates and returns the highest, multiply-adds a second.
-pub fn report() -> f64 {
-    let mut peak: f64 = 0.0;
+/// The highest rates, multiply-adds a second.
+#[derive(Clone, Copy, Default)]
+pub struct Peak {
+    double: f64,
+    single: f64,
+}
+
+impl Peak {
+    /// That of the numbers which a precision has for each channel.
+    pub fn of(self, precision: Precision) -> f64 {
+        match precision {
+            Precision::Double => self.double,
+            Precision::Mixed => self.single,
+        }
+    }
+}
+
+/// Prints the rates and returns the highest.
+pub fn report() -> Peak {
+    let mut peak = Peak::default();
     println!("matrix products of faer, one thread");
     for shape in SHAPES {
-        let rate = rate(shape);
-        println!("  {shape:?}: {:.1} G multiply-adds/s", 1e-9 * rate);
-        peak = peak.max(rate);
+        let (double, single) = (rate::<f64>(shape), rate::<f32>(shape));
+        println!(
+            "  {shape:?}: {:.1} G multiply-adds/s, in single precision {:.1}",
+            1e-9 * double,
+            1e-9 * single
+        );
+        (peak.double, peak.single) = (peak.double.max(double), peak.single.max(single));
     }
     peak
 }
 
 /// The highest rate met in half a second.
-fn rate([rows, inner, columns]: [usize; 3]) -> f64 {
-    let a = Mat::from_fn(rows, inner, |i, j| ((i + 2 * j) % 7) as f64 - 3.0);
-    let b = Mat::from_fn(inner, columns, |i, j| ((3 * i + j) % 5) as f64 - 2.0);
-    let mut out = Mat::zeros(rows, columns);
+fn rate<T: ComplexField + From<i8>>([rows, inner, columns]: [usize; 3]) -> f64 {
+    let small = |k: usize, n: usize| T::from((k % n) as i8 - n as i8 / 2);
+    let a = Mat::from_fn(rows, inner, |i, j| small(i + 2 * j, 7));
+    let b = Mat::from_fn(inner, columns, |i, j| small(3 * i + j, 5));
+    let mut out = Mat::<T>::zeros(rows, columns);
     let products = (20_000_000 / (rows * inner * columns)).max(1);
     let (begin, mut best) = (Instant::now(), f64::INFINITY);
     while begin.elapsed().as_secs_f64() < 0.5 {
         let start = Instant::now();
         for _ in 0..products {
-            matmul(out.as_mut(), Accum::Replace, a.as_ref(), b.as_ref(), 1.0, Par::Seq);
+            matmul(out.as_mut(), Accum::Replace, a.as_ref(), b.as_ref(), T::from(1), Par::Seq);
         }
         best = best.min(start.elapsed().as_secs_f64() / products as f64);
     }

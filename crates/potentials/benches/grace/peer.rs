@@ -2,6 +2,7 @@
 
 use std::process::Command;
 
+use potentials::grace::Precision;
 use serde_json::{Value, json};
 
 use crate::case::{Call, Case, Model};
@@ -21,12 +22,13 @@ impl Seconds {
     }
 }
 
-/// Of every crystal; none without gracemaker or its data.
-pub fn seconds(model: &Model, cases: &[Case]) -> Option<Vec<Seconds>> {
+/// Of every crystal, in single precision beside our mixed; none without gracemaker or its data.
+pub fn seconds(model: &Model, precision: Precision, cases: &[Case]) -> Option<Vec<Seconds>> {
     let python = std::env::var_os("CALMWALK_GRACEMAKER_PYTHON")?;
     let folder = model.peer_folder()?;
     let file = tempfile::NamedTempFile::new().expect("a temporary file");
-    std::fs::write(file.path(), request(model, &folder, cases).to_string()).expect("the request is written");
+    std::fs::write(file.path(), request(model, precision, &folder, cases).to_string())
+        .expect("the request is written");
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/grace/gracemaker.py");
     let output = Command::new(python).arg(script).arg(file.path()).output().expect("python starts");
     assert!(output.status.success(), "gracemaker: {}", String::from_utf8_lossy(&output.stderr));
@@ -42,7 +44,7 @@ pub fn seconds(model: &Model, cases: &[Case]) -> Option<Vec<Seconds>> {
     )
 }
 
-fn request(model: &Model, folder: &std::path::Path, cases: &[Case]) -> Value {
+fn request(model: &Model, precision: Precision, folder: &std::path::Path, cases: &[Case]) -> Value {
     let structures: Vec<Value> = cases
         .iter()
         .map(|case| {
@@ -50,7 +52,8 @@ fn request(model: &Model, folder: &std::path::Path, cases: &[Case]) -> Value {
             json!({"symbols": symbols, "positions": case.structure.positions, "cell": case.structure.cell.0})
         })
         .collect();
-    let mut request = json!({"structures": structures, "repetitions": 9});
+    let precision = if precision == Precision::Double { "double" } else { "single" };
+    let mut request = json!({"structures": structures, "repetitions": 9, "precision": precision});
     let artifact = folder.join("gmm_artifacts.npz");
     if artifact.exists() {
         request["artifact"] = json!(artifact);
