@@ -98,7 +98,9 @@ impl Call {
             let grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
                 grades.add(mixture, elements, atoms, features, cotangent);
             };
-            grace.evaluate_graded(structure, neighbours, &grade, out, pull_back).expect("known elements");
+            grace
+                .evaluate_graded(structure, neighbours, &grade, out, Some(pull_back))
+                .expect("known elements");
             grades.finish().expect("finite features");
         }
         start.elapsed().as_secs_f64() / calls as f64

@@ -137,7 +137,7 @@ impl BiasedPotential {
         let grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
             parts.add(mixture, elements, atoms, features, cotangent);
         };
-        grace.evaluate_graded(structure, neighbours, &grade, out, pull_back)?;
+        grace.evaluate_graded(structure, neighbours, &grade, out, Some(pull_back))?;
         copy(out, &mut self.physical);
         if self.parts.finish().is_ok() {
             self.add_bias(out);

@@ -37,7 +37,8 @@ impl GradesInParts {
         grades.component.resize(n, 0);
     }
 
-    /// Grades some `atoms` of it, and writes ∂γ_a/∂**z**_a, `[atoms × D]`, which is zero where they cannot be graded.
+    /// Grades some `atoms` of it, and writes ∂γ_a/∂**z**_a, `[atoms × D]`, which is zero where they cannot be graded; not to an
+    /// empty `gradient`.
     ///
     /// `elements` are those of the whole structure, `features` those of the atoms, `[atoms × D]`.
     pub fn add(
@@ -51,7 +52,12 @@ impl GradesInParts {
         let mut work = lock(&self.idle).pop().unwrap_or_default();
         work.elements.clear();
         work.elements.extend(atoms.iter().map(|atom| elements[*atom as usize]));
-        let result = work.grades.evaluate(mixture, &work.elements, features, Some(&mut *gradient));
+        let result = work.grades.evaluate(
+            mixture,
+            &work.elements,
+            features,
+            (!gradient.is_empty()).then_some(&mut *gradient),
+        );
         if result.is_err() {
             gradient.fill(0.0);
         }

@@ -173,9 +173,13 @@ fn at_once(grace: &mut Grace, structure: &Structure) -> (Vec<f64>, Evaluation, P
         }
         cotangent.copy_from_slice(z);
     };
-    grace.evaluate_graded(structure, &neighbours, &grade, &mut energy, &mut pull_back).unwrap();
+    grace.evaluate_graded(structure, &neighbours, &grade, &mut energy, Some(&mut pull_back)).unwrap();
     assert!(graded.iter().all(|times| times.load(Ordering::Relaxed) == 1));
-    (grace.features().to_vec(), energy, pull_back)
+    let (z, mut alone) = (grace.features().to_vec(), Evaluation::default());
+    let unasked = |_: &[u32], _: &[f64], cotangent: &mut [f64]| assert!(cotangent.is_empty());
+    grace.evaluate_graded(structure, &neighbours, &unasked, &mut alone, None).unwrap();
+    assert_eq!((grace.features(), &alone), (&z[..], &energy));
+    (z, energy, pull_back)
 }
 
 #[test]

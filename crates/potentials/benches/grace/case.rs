@@ -1,7 +1,9 @@
 //! Models and crystals that are measured.
 
+use std::hint::black_box;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Instant;
 
 use atoms::{Cell, Evaluation, NeighbourList, Potential, Structure};
 use calm::{Artifact, GradesInParts, Mixture};
@@ -68,6 +70,8 @@ impl Model {
 #[derive(Clone, Copy)]
 pub enum Call {
     Plain,
+    /// With γ, without its gradient.
+    Gamma,
     Graded,
 }
 
@@ -80,6 +84,7 @@ pub struct Case {
     mixture: Mixture,
     grades: GradesInParts,
     pull_back: PullBack,
+    out: Evaluation,
 }
 
 impl Case {
@@ -105,23 +110,41 @@ impl Case {
             mixture,
             grades: GradesInParts::default(),
             pull_back: PullBack::default(),
+            out: Evaluation::default(),
         }
     }
 
-    /// Energy and forces.
-    pub fn plain(&mut self, out: &mut Evaluation) {
-        self.grace.evaluate(&self.structure, &self.neighbours, out).expect("known elements");
+    /// Makes a call; its seconds.
+    pub fn seconds(&mut self, call: Call) -> f64 {
+        let start = Instant::now();
+        match call {
+            Call::Plain => {
+                let Self { structure, grace, neighbours, out, .. } = &mut *self;
+                grace.evaluate(structure, neighbours, out).expect("known elements");
+            }
+            Call::Gamma => self.graded(false),
+            Call::Graded => self.graded(true),
+        }
+        black_box(&self.out);
+        start.elapsed().as_secs_f64()
     }
 
-    /// Energy and forces, γ and ∇Σγ with its virial.
-    pub fn graded(&mut self, out: &mut Evaluation) {
-        let Self { structure, grace, neighbours, elements, mixture, grades, pull_back } = self;
+    /// Energy and forces, γ and, if asked for, ∇Σγ with its virial.
+    fn graded(&mut self, with_gradient: bool) {
+        let Self { structure, grace, neighbours, elements, mixture, grades, pull_back, out } = self;
         grades.begin(elements.len());
         let grade = |atoms: &[u32], features: &[f64], cotangent: &mut [f64]| {
             grades.add(mixture, elements, atoms, features, cotangent);
         };
+        let pull_back = with_gradient.then_some(pull_back);
         grace.evaluate_graded(structure, neighbours, &grade, out, pull_back).expect("known elements");
         grades.finish().expect("finite features");
+    }
+
+    /// Multiply-adds of the projection and of the quadratic form, for all atoms.
+    pub fn of_gamma(&self) -> u64 {
+        let projection = self.grace.model().projection().map_or(0, |projection| projection.matrix.len());
+        (self.structure.len() * (projection + self.mixture.dimension().pow(2))) as u64
     }
 
     /// Å
@@ -134,7 +157,7 @@ impl Case {
         self.grace.species().iter().map(|species| species.symbol()).collect()
     }
 
-    /// Of one call, for all atoms.
+    /// Of one call, for all atoms, plain or graded.
     pub fn multiply_adds(&self, call: Call) -> u64 {
         self.grace.multiply_adds(matches!(call, Call::Graded))
     }

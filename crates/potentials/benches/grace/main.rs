@@ -10,12 +10,10 @@ mod peer;
 mod scale;
 mod threads;
 
-use std::hint::black_box;
 use std::time::Instant;
 
-use atoms::Evaluation;
 use case::{Call, Case, MODELS, Model};
-use peak::Peak;
+use peak::{Peak, Rates};
 use peer::Seconds;
 use potentials::grace::Precision;
 
@@ -54,7 +52,7 @@ fn report(model: &Model, peak: Peak) {
     threads::report(model, EDGES[1]);
 }
 
-fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, peak: f64) {
+fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, rates: Rates) {
     for (k, case) in cases.iter_mut().enumerate() {
         let atoms = case.structure.len() as f64;
         let found = measure(case);
@@ -71,7 +69,7 @@ fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, peak: f64) {
                 1e3 * low / atoms,
                 1e3 * high / atoms,
                 1e-6 * count / atoms,
-                100.0 * count / median / peak
+                100.0 * count / median / rates.highest
             );
             if let Some(peer) = peer.map(|peer| peer.of(call)).filter(|times| !times.is_empty()) {
                 let [low, theirs, high] = quantiles(peer);
@@ -84,6 +82,13 @@ fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, peak: f64) {
                 );
             }
         }
+        let differences: Vec<f64> =
+            found.gamma.iter().zip(&found.plain).map(|(both, plain)| both - plain).collect();
+        let [low, median, high] =
+            quantiles(&differences).map(|seconds| seconds * rates.projection / case.of_gamma() as f64);
+        println!(
+            "    γ alone costs {median:.2} times its projection and quadratic form as a matrix product ({low:.2} to {high:.2})"
+        );
         let ratios: Vec<f64> =
             found.graded.iter().zip(&found.plain).map(|(both, plain)| both / plain).collect();
         let [low, median, high] = quantiles(&ratios);
@@ -92,26 +97,24 @@ fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, peak: f64) {
 }
 
 /// Seconds of calls that were made in turn.
+#[derive(Default)]
 struct Found {
     plain: Vec<f64>,
+    gamma: Vec<f64>,
     graded: Vec<f64>,
 }
 
 fn measure(case: &mut Case) -> Found {
-    let mut found = Found { plain: Vec::new(), graded: Vec::new() };
-    let mut out = Evaluation::default();
+    let (mut found, begin) = (Found::default(), Instant::now());
     for _ in 0..2 {
-        case.plain(&mut out);
-        case.graded(&mut out);
+        for call in [Call::Plain, Call::Gamma, Call::Graded] {
+            case.seconds(call);
+        }
     }
-    let begin = Instant::now();
     while begin.elapsed().as_secs_f64() < SECONDS || found.plain.len() < 5 {
-        let start = Instant::now();
-        case.plain(black_box(&mut out));
-        found.plain.push(start.elapsed().as_secs_f64());
-        let start = Instant::now();
-        case.graded(black_box(&mut out));
-        found.graded.push(start.elapsed().as_secs_f64());
+        found.plain.push(case.seconds(Call::Plain));
+        found.gamma.push(case.seconds(Call::Gamma));
+        found.graded.push(case.seconds(Call::Graded));
     }
     found
 }

@@ -10,16 +10,24 @@ use potentials::grace::Precision;
 /// Rows, inner and outer dimension: a large product, and those of a map of channels and of the projection.
 const SHAPES: [[usize; 3]; 3] = [[512, 512, 512], [36, 64, 64], [108, 5664, 128]];
 
-/// The highest rates, multiply-adds a second.
+/// Multiply-adds a second.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Rates {
+    pub highest: f64,
+    /// With the shape of the projection.
+    pub projection: f64,
+}
+
+/// Those of each precision.
 #[derive(Clone, Copy, Default)]
 pub struct Peak {
-    double: f64,
-    single: f64,
+    double: Rates,
+    single: Rates,
 }
 
 impl Peak {
-    /// That of the numbers which a precision has for each channel.
-    pub fn of(self, precision: Precision) -> f64 {
+    /// Those of the numbers which a precision has for each channel.
+    pub fn of(self, precision: Precision) -> Rates {
         match precision {
             Precision::Double => self.double,
             Precision::Mixed => self.single,
@@ -27,20 +35,20 @@ impl Peak {
     }
 }
 
-/// Prints the rates and returns the highest.
+/// Prints the rates and returns them.
 pub fn report() -> Peak {
-    let mut peak = Peak::default();
     println!("matrix products of faer, one thread");
-    for shape in SHAPES {
+    let rates = SHAPES.map(|shape| {
         let (double, single) = (rate::<f64>(shape), rate::<f32>(shape));
         println!(
             "  {shape:?}: {:.1} G multiply-adds/s, in single precision {:.1}",
             1e-9 * double,
             1e-9 * single
         );
-        (peak.double, peak.single) = (peak.double.max(double), peak.single.max(single));
-    }
-    peak
+        (double, single)
+    });
+    let of = |rates: [f64; 3]| Rates { highest: rates.into_iter().fold(0.0, f64::max), projection: rates[2] };
+    Peak { double: of(rates.map(|(double, _)| double)), single: of(rates.map(|(_, single)| single)) }
 }
 
 /// The highest rate met in half a second.

@@ -17,6 +17,7 @@ impl Seconds {
     pub fn of(&self, call: Call) -> &[f64] {
         match call {
             Call::Plain => &self.plain,
+            Call::Gamma => &[],
             Call::Graded => &self.graded,
         }
     }

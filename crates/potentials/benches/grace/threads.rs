@@ -1,10 +1,8 @@
 //! Two threads against one on the larger crystal, and against two copies of it side by side: what two cores give at that time,
 //! which on a virtual machine may be little more than one.
 
-use std::hint::black_box;
 use std::time::Instant;
 
-use atoms::Evaluation;
 use potentials::grace::{Precision, Threads};
 
 use crate::case::{Call, Case, Model};
@@ -18,9 +16,9 @@ pub fn report(model: &Model, cells: usize) {
     for (name, call) in [("energy, forces", Call::Plain), ("with γ and ∇Σγ", Call::Graded)] {
         let (begin, mut of_one, mut of_copies) = (Instant::now(), Vec::new(), Vec::new());
         while begin.elapsed().as_secs_f64() < 2.0 * SECONDS || of_one.len() < 5 {
-            let threads = seconds(&mut two, call);
-            of_one.push(seconds(&mut one, call) / threads);
-            of_copies.push(side_by_side(&mut one, &mut copy, call) / seconds(&mut two, call));
+            let threads = two.seconds(call);
+            of_one.push(one.seconds(call) / threads);
+            of_copies.push(side_by_side(&mut one, &mut copy, call) / two.seconds(call));
         }
         for (other, ratios) in [("one", of_one), ("two copies", of_copies)] {
             let [low, median, high] = quantiles(&ratios);
@@ -29,21 +27,12 @@ pub fn report(model: &Model, cells: usize) {
     }
 }
 
-fn seconds(case: &mut Case, call: Call) -> f64 {
-    let (start, mut out) = (Instant::now(), Evaluation::default());
-    match call {
-        Call::Plain => case.plain(black_box(&mut out)),
-        Call::Graded => case.graded(black_box(&mut out)),
-    }
-    start.elapsed().as_secs_f64()
-}
-
 /// Seconds for each of two calls at the same time.
 fn side_by_side(a: &mut Case, b: &mut Case, call: Call) -> f64 {
     let start = Instant::now();
     std::thread::scope(|scope| {
-        let other = scope.spawn(|| seconds(b, call));
-        seconds(a, call);
+        let other = scope.spawn(|| b.seconds(call));
+        a.seconds(call);
         other.join().expect("it ends");
     });
     start.elapsed().as_secs_f64() / 2.0

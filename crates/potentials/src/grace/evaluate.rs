@@ -32,7 +32,8 @@ impl PullBack {
     }
 }
 
-/// Takes some atoms and their features z, [atoms, D], and writes ∂H/∂z of each; by several threads at a time.
+/// Takes some atoms and their features z, [atoms, D], and writes ∂H/∂z of each, to no numbers where that is not asked for; is
+/// called by several threads at a time.
 pub type Grade<'a> = dyn Fn(&[u32], &[f64], &mut [f64]) + Sync + 'a;
 
 /// A network with its work arrays.
@@ -126,18 +127,20 @@ impl<V: Vector> Evaluator<V> {
         neighbours: &NeighbourList,
         grade: &Grade,
         energy: &mut Evaluation,
-        pull_back: &mut PullBack,
+        pull_back: Option<&mut PullBack>,
     ) -> Result<(), PotentialError> {
-        if self.network.feature_map.is_none() {
-            self.evaluate(structure, neighbours, energy)?;
-            pull_back.reset(self.elements.len());
-            return Ok(());
-        }
-        self.threads.clone().run(|| self.pass::<2>(structure, neighbours, grade))?;
+        let grade = self.network.feature_map.is_some().then_some(grade);
+        let both = grade.is_some() && pull_back.is_some();
+        self.threads.clone().run(|| match both {
+            true => self.pass::<2>(structure, neighbours, grade),
+            false => self.pass::<1>(structure, neighbours, grade),
+        })?;
         self.put_energies();
         self.put_features();
         self.put_forces(energy);
-        self.put_pull_back(true, pull_back);
+        if let Some(pull_back) = pull_back {
+            self.put_pull_back(both, pull_back);
+        }
         Ok(())
     }
 
@@ -228,7 +231,7 @@ impl<V: Vector> Evaluator<V> {
         &mut self,
         structure: &Structure,
         neighbours: &NeighbourList,
-        grade: &Grade,
+        grade: Option<&Grade>,
     ) -> Result<(), PotentialError> {
         self.take(structure, neighbours)?;
         self.begin_derivatives();
@@ -246,7 +249,7 @@ impl<V: Vector> Evaluator<V> {
         neighbours: &NeighbourList,
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
-        self.threads.clone().run(|| self.pass::<1>(structure, neighbours, &|_, _, _| ()))?;
+        self.threads.clone().run(|| self.pass::<1>(structure, neighbours, None))?;
         self.put_energies();
         self.put_forces(out);
         Ok(())

@@ -24,7 +24,7 @@ struct Pass<'a, V: Vector> {
     here: Here<'a, V>,
     /// Of the layers before.
     bases: [Shared<'a, V>; BEFORE],
-    grade: &'a Grade<'a>,
+    grade: Option<&'a Grade<'a>>,
 }
 
 /// What it leaves of atoms, to be divided.
@@ -65,15 +65,15 @@ impl<V: Send> Divide for Results<'_, V> {
 
 impl<V: Vector> Evaluator<V> {
     /// All atoms through the last layer, forwards and backwards, with `N` cotangents: of the energy, and of what `grade` makes
-    /// of the features. With one a batch at a time, with two a chunk.
-    pub(super) fn pass_last_layer<const N: usize>(&mut self, grade: &Grade) {
+    /// of the features.
+    pub(super) fn pass_last_layer<const N: usize>(&mut self, grade: Option<&Grade>) {
         let Self { network, instructions, batches, scratch, projection, .. } = self;
         let last = self.layers.len() - 1;
         let (before, here) = self.layers.split_at_mut(last);
         let LayerWork { bonds, messages, gradients, returns, rows, .. } = &mut here[0];
         let here = Here::new(network, last, (bonds, messages, rows));
         let of_densities = network.readout.blocks.len() * network.readout.density_lanes();
-        let map = network.feature_map.as_ref().filter(|_| N == 2);
+        let map = network.feature_map.as_ref().filter(|_| grade.is_some());
         let mut results = Results {
             energies: Parts::new(Layout::Even(1), 0, &mut self.energies[..]),
             densities: Parts::new(Layout::Even(of_densities), 0, &mut self.density_cotangents[..]),
@@ -83,8 +83,12 @@ impl<V: Vector> Evaluator<V> {
         };
         let mut bases = [Shared::new(0, 0, &[]); BEFORE];
         for (k, (work, layer)) in before.iter_mut().zip(&network.layers).enumerate() {
-            let n = if N == 2 { batches.order.len() } else { 0 };
-            (bases[k], results.basis_cotangents[k]) = work.trace.basis_cotangents(layer, &(0..n));
+            if grade.is_none() {
+                bases[k] = work.trace.bases(layer);
+                continue;
+            }
+            let all = 0..batches.order.len();
+            (bases[k], results.basis_cotangents[k]) = work.trace.basis_cotangents(layer, &all);
         }
         let pass = Pass { network, instructions: *instructions, batches, here, bases, grade };
         self.threads.each(&batches.chunks, results, &|chunk, mut results, thread| {
@@ -92,28 +96,33 @@ impl<V: Vector> Evaluator<V> {
             if let Some(returns) = results.gradients.returns.only() {
                 begin_returns::<V, N>(here.layer, returns);
             }
-            let together = if N == 1 { 1 } else { chunk.batches.len() };
-            for first in chunk.batches.clone().step_by(together) {
-                pass.run::<N>(first..first + together, &mut results, scratch);
-            }
+            pass.run::<N>(chunk, &mut results, scratch);
         });
         self.finish_layer::<N>(last);
     }
 }
 
 impl<V: Vector> Pass<'_, V> {
-    fn run<const N: usize>(&self, batches: Range<usize>, results: &mut Results<V>, scratch: &mut Scratch<V>) {
-        let placed = |batch: usize| self.batches.placed(batch, self.instructions);
-        let places = placed(batches.start).first..placed(batches.end - 1).places().end;
-        scratch.trace.hold(self.here.layer, self.here.bonds, &places);
-        for placed in batches.clone().map(placed) {
-            self.forward(placed, results, scratch);
-        }
-        if N == 2 {
-            self.grade(&places, results, scratch);
-        }
-        for placed in batches.map(placed) {
-            self.backward::<N>(placed, results, scratch);
+    /// One cotangent goes back while the tape of its batch is in the first caches; two wait for the features.
+    fn run<const N: usize>(&self, chunk: &Chunk, results: &mut Results<V>, scratch: &mut Scratch<V>) {
+        let Here { layer, bonds, .. } = self.here;
+        let batches = chunk.batches.clone().map(|batch| self.batches.placed(batch, self.instructions));
+        scratch.trace.hold_bases(layer, &chunk.places);
+        if N == 1 {
+            for placed in batches {
+                if self.grade.is_none() {
+                    scratch.trace.hold_bases(layer, &placed.places());
+                }
+                scratch.trace.hold_tapes(layer, bonds, &placed.places());
+                self.forward(placed, results, scratch);
+                self.backward::<N>(placed, results, scratch);
+            }
+            self.grade::<N>(&chunk.places, results, scratch);
+        } else {
+            scratch.trace.hold_tapes(layer, bonds, &chunk.places);
+            batches.clone().for_each(|placed| self.forward(placed, results, scratch));
+            self.grade::<N>(&chunk.places, results, scratch);
+            batches.for_each(|placed| self.backward::<N>(placed, results, scratch));
         }
     }
 
@@ -129,16 +138,25 @@ impl<V: Vector> Pass<'_, V> {
         self.instructions.run(Energies { readout, placed, basis, energies, cotangents, work });
     }
 
-    /// From the bases of some atoms to their features and back to the cotangents of the bases.
-    fn grade(&self, places: &Range<usize>, results: &mut Results<V>, scratch: &mut Scratch<V>) {
+    /// From the bases of some atoms to their features, and with two cotangents back to those of the bases.
+    fn grade<const N: usize>(
+        &self,
+        places: &Range<usize>,
+        results: &mut Results<V>,
+        scratch: &mut Scratch<V>,
+    ) {
         let (Some(map), Some(work)) = (&self.network.feature_map, &mut results.projected) else { return };
+        let Some(grade) = self.grade else { return };
         let (instructions, last) = (self.instructions, self.network.layers.len() - 1);
         let (own, mut out) = scratch.trace.basis_cotangents(self.here.layer, places);
         let bases = |k: usize| if k == last { own.of(places) } else { self.bases[k].of(places) };
         instructions.run(Project { map, places, bases, work, instructions });
         let (features, cotangent) = (work.features.of(places), &mut scratch.feature_cotangent);
-        cotangent.resize(features.len(), 0.0);
-        (self.grade)(&self.batches.order[places.clone()], features, cotangent);
+        cotangent.resize(if N == 2 { features.len() } else { 0 }, 0.0);
+        grade(&self.batches.order[places.clone()], features, cotangent);
+        if N == 1 {
+            return;
+        }
         instructions.run(BeginProjectBack { map, places, cotangent, work });
         for layer in 0..=last {
             let bases = bases(layer);

@@ -60,6 +60,8 @@ impl<V: Vector> LayerWork<V> {
 pub(super) struct Trace<V> {
     /// The first place of those.
     first: usize,
+    /// The first of those whose basis is kept, which may be more.
+    first_basis: usize,
     /// The tape of one batch after another, [places, tape]
     tapes: Vec<V>,
     /// The basis B of this layer, [places, lanes]
@@ -80,21 +82,20 @@ pub(super) struct Traced<'a, V> {
 }
 
 impl<V: Vector> Trace<V> {
-    /// Makes room for the atoms at some places, and forgets others.
-    pub fn hold<'a>(
-        &'a mut self,
-        layer: &Layer<V>,
-        bonds: &'a Bonds,
-        places: &Range<usize>,
-    ) -> Traced<'a, V> {
+    /// Makes room for the bases of the atoms at some places, and forgets others.
+    pub fn hold_bases(&mut self, layer: &Layer<V>, places: &Range<usize>) {
+        grow(&mut self.bases, places.len() * layer.basis.lanes());
+        self.first_basis = places.start;
+    }
+
+    /// The same for all else.
+    pub fn hold_tapes(&mut self, layer: &Layer<V>, bonds: &Bonds, places: &Range<usize>) {
         let blocks = bonds.block_offsets[places.end] - bonds.block_offsets[places.start];
         let of_block = V::LANES * layer.radial.output_lanes();
         grow(&mut self.tapes, places.len() * layer.tape_lanes);
-        grow(&mut self.bases, places.len() * layer.basis.lanes());
         grow(&mut self.values, blocks * of_block);
         grow(&mut self.derivatives, blocks * of_block);
         self.first = places.start;
-        self.held(layer, bonds).0
     }
 
     /// What it holds, and the cotangents of the basis.
@@ -102,16 +103,16 @@ impl<V: Vector> Trace<V> {
         let of_bonds = Layout::Ragged(&bonds.block_offsets, V::LANES * layer.radial.output_lanes());
         let traced = Traced {
             tapes: Parts::new(Layout::Even(layer.tape_lanes), self.first, &mut self.tapes),
-            bases: Parts::new(Layout::Even(layer.basis.lanes()), self.first, &mut self.bases),
+            bases: Parts::new(Layout::Even(layer.basis.lanes()), self.first_basis, &mut self.bases),
             values: Parts::new(of_bonds, self.first, &mut self.values),
             derivatives: Parts::new(of_bonds, self.first, &mut self.derivatives),
         };
-        (traced, Shared::new(layer.basis.lanes(), self.first, &self.basis_cotangents))
+        (traced, Shared::new(layer.basis.lanes(), self.first_basis, &self.basis_cotangents))
     }
 
     /// B.
     pub fn bases(&self, layer: &Layer<V>) -> Shared<'_, V> {
-        Shared::new(layer.basis.lanes(), self.first, &self.bases)
+        Shared::new(layer.basis.lanes(), self.first_basis, &self.bases)
     }
 
     /// B, and where its cotangents of some places go to.
@@ -121,10 +122,10 @@ impl<V: Vector> Trace<V> {
         places: &Range<usize>,
     ) -> (Shared<'_, V>, Parts<'_, V>) {
         let lanes = layer.basis.lanes();
-        grow(&mut self.basis_cotangents, (places.end - self.first) * lanes);
-        let first = (places.start - self.first) * lanes;
+        grow(&mut self.basis_cotangents, (places.end - self.first_basis) * lanes);
+        let first = (places.start - self.first_basis) * lanes;
         let out = Parts::new(Layout::Even(lanes), places.start, &mut self.basis_cotangents[first..]);
-        (Shared::new(lanes, self.first, &self.bases), out)
+        (Shared::new(lanes, self.first_basis, &self.bases), out)
     }
 }
 

@@ -81,7 +81,10 @@ impl<V: Vector> Evaluator<V> {
             }
             None => Parts::empty(),
         };
-        let work = (trace.hold(here.layer, bonds, &(0..batches.order.len())), sent);
+        let all = 0..batches.order.len();
+        trace.hold_bases(here.layer, &all);
+        trace.hold_tapes(here.layer, bonds, &all);
+        let work = (trace.held(here.layer, bonds).0, sent);
         self.threads.each(&batches.chunks, work, &|chunk, (mut trace, mut sent), thread| {
             let work = &mut of_thread(scratch, thread).bonds[k];
             for batch in chunk.batches.clone() {

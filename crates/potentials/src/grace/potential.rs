@@ -71,8 +71,8 @@ impl Grace {
         either!(&mut self.0, evaluator => evaluator.forward(structure, neighbours))
     }
 
-    /// Energies, features and the derivatives of both, as [`Grace::forward`] and [`Grace::backward`] give them, with the same
-    /// bits, where the cotangent ∂H/∂z of an atom depends on its own features alone: `grade` is called with some atoms at a
+    /// Energies, features and the derivatives of both (without `pull_back` those of the energy alone), as [`Grace::forward`] and
+    /// [`Grace::backward`] give them, with the same bits, where the cotangent ∂H/∂z of an atom depends on its own features alone: `grade` is called with some atoms at a
     /// time, by all threads. Models of one layer need a bounded memory for it, deeper ones less than for the two calls.
     ///
     /// # Errors
@@ -83,7 +83,7 @@ impl Grace {
         neighbours: &NeighbourList,
         grade: &Grade,
         energy: &mut Evaluation,
-        pull_back: &mut PullBack,
+        pull_back: Option<&mut PullBack>,
     ) -> Result<(), PotentialError> {
         either!(&mut self.0, evaluator => {
             evaluator.evaluate_graded(structure, neighbours, grade, energy, pull_back)
