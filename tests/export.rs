@@ -134,56 +134,6 @@ fn whole_seed_structures_go_to_one_part() {
     assert!(message.contains("the shares add up to 1.1"), "{message}");
 }
 
-/// The loaders of gracemaker and MACE themselves, where there is a Python that has them (of PyPI: tensorpotential, mace-torch).
-#[test]
-fn training_codes_load_what_is_written() {
-    let directory = campaign();
-    let here = directory.path();
-    let loaders = [
-        (
-            "grace",
-            "CALMWALK_GRACEMAKER_PYTHON",
-            "from tensorpotential.cli.data import load_extxyz\n\
-             frames = load_extxyz('out.extxyz').to_dict('records')",
-        ),
-        (
-            "mace",
-            "CALMWALK_MACE_PYTHON",
-            "from mace.data import KeySpecification, load_from_xyz, update_keyspec_from_kwargs\n\
-             from mace.tools.default_keys import DefaultKeys\n\
-             keys = update_keyspec_from_kwargs(KeySpecification(), DefaultKeys.keydict())\n\
-             _, found = load_from_xyz('out.extxyz', keys)\n\
-             frames = [frame.properties for frame in found]",
-        ),
-    ];
-    for (keys, variable, load) in loaders {
-        let frames = export(here, &["--keys", keys]);
-        let Some(python) = std::env::var_os(variable) else {
-            eprintln!("{variable} is not set: not loaded by {keys}");
-            continue;
-        };
-        let script = format!(
-            "import json, numpy as np\n{load}\n\
-             print(json.dumps([[float(f['energy']), np.ravel(f['forces']).tolist(), np.ravel(f['stress']).tolist()] for f in frames]))"
-        );
-        let output = Command::new(&python).args(["-c", &script]).current_dir(here).output().unwrap();
-        assert!(output.status.success(), "{keys}: {}", stderr(&output));
-        let printed = String::from_utf8(output.stdout).unwrap();
-        let found: Vec<(f64, Vec<f64>, Vec<f64>)> =
-            serde_json::from_str(printed.lines().last().unwrap()).unwrap();
-        assert_eq!(found.len(), frames.len());
-        for ((energy, forces, stress), frame) in found.iter().zip(&frames) {
-            let labels = frame.labels().unwrap();
-            assert_eq!(Some(*energy), labels.energy, "{keys}");
-            assert_eq!(*forces, labels.forces.unwrap().as_flattened(), "{keys}");
-            let s = labels.stress.unwrap();
-            let voigt = [s[0][0], s[1][1], s[2][2], s[1][2], s[0][2], s[0][1]];
-            let expected = if stress.len() == 6 { &voigt } else { s.as_flattened() };
-            assert!(deviation(stress, expected) < 1e-12, "{keys}: {stress:?}");
-        }
-    }
-}
-
 /// ASE finds the labels under the names of each training code, and where each frame came from.
 #[test]
 fn training_codes_find_their_names() {
