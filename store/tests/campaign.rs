@@ -7,7 +7,7 @@ use common::*;
 use store::{
     CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
 };
-use wire::messages::Decline;
+use wire::messages::{Decline, Progress};
 use wire::{Origin, WalkId};
 
 #[tokio::test]
@@ -208,6 +208,28 @@ async fn status_counts_everything_once() {
     let status = reader.status().await.unwrap();
     assert!(status.finished);
     assert_eq!(status.processes, [next]);
+}
+
+#[tokio::test]
+async fn what_is_not_known_of_a_walk_is_no_zero() {
+    let home = Home::new();
+    let store = home.create().await;
+    let progress = |tau, gamma_max| Progress {
+        tau,
+        gamma_max,
+        temperature: 300.0,
+        relative_volume: 1.1,
+        ..Progress::default()
+    };
+    let walks = [progress(0.5, 1.2), progress(0.0, 0.0), Progress::default()];
+    let walks = (0..).zip(walks).map(|(number, progress)| WalkRecord { progress, ..walk(number, 1) });
+    store.commit(&Commit { walks: walks.collect(), ..Commit::default() }).await.unwrap();
+    let known = |walk: store::WalkStatus| (walk.tau, walk.temperature, walk.relative_volume, walk.gamma_max);
+    let walks = store.status().await.unwrap().walks.into_iter().map(known).collect::<Vec<_>>();
+    // One with a bias, one without, one that has not begun.
+    let begun = (Some(0.5), Some(300.0), Some(1.1), Some(1.2));
+    let unbiased = (Some(0.0), Some(300.0), Some(1.1), None);
+    assert_eq!(walks, [begun, unbiased, (None, None, None, None)]);
 }
 
 #[tokio::test]

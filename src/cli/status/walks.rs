@@ -58,8 +58,7 @@ pub fn line(walk: &WalkStatus, name: usize) -> Vec<String> {
         decimals(walk.steps_per_second, 1),
         decimals(walk.temperature, 0),
         decimals(walk.relative_volume, 3),
-        // Walks without bias are not graded.
-        decimals(walk.gamma_max.filter(|gamma| *gamma > 0.0), 2),
+        decimals(walk.gamma_max, 2),
         walk.accepted.to_string(),
     ]
 }

@@ -20,12 +20,13 @@ const FATES: &str = "SELECT origin, fate, number FROM candidate_count";
 pub(crate) const COUNTED_FATES: &str =
     "SELECT origin, coalesce(reason, fate), count(*) FROM candidate GROUP BY origin, fate, reason";
 
-/// The question for [`WalkStatus`], ended by which walks are meant.
+/// The question for [`WalkStatus`], ended by which walks are meant. The table has zeros before a walk begins, and where it is not graded.
 macro_rules! walks {
     ($which:literal) => {
         concat!(
             "SELECT walk, coalesce(name, '') AS seed_structure, origin, state, reason, FALSE AS paused, step, segment,
-                tau, temperature, relative_volume, gamma_max, CAST(NULL AS DOUBLE PRECISION) AS steps_per_second, accepted,
+                CASE WHEN relative_volume > 0 THEN tau END AS tau, CASE WHEN relative_volume > 0 THEN temperature END AS temperature,
+                nullif(relative_volume, 0) AS relative_volume, nullif(gamma_max, 0) AS gamma_max, CAST(NULL AS DOUBLE PRECISION) AS steps_per_second, accepted,
                 refused, returns
             FROM walk LEFT JOIN seed_structure ON seed_structure.seed = walk.seed_structure ",
             $which
