@@ -87,7 +87,8 @@ impl Watch {
         if minutes < self.settings.stall.get() {
             return None;
         }
-        let message = format!("no candidate and no label for {minutes:.0} min; so far {shown}");
+        let digits = if minutes < 10.0 { 1 } else { 0 };
+        let message = format!("no candidate and no label for {minutes:.digits$} min; so far {shown}");
         self.due(NotifyEvent::Stall, shown, message)
     }
 
