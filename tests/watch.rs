@@ -69,6 +69,16 @@ impl Terminal {
         screen
     }
 
+    /// The screen with its escape sequences, when it has this one.
+    fn wait_for_sequence(&self, sequence: &str) -> String {
+        let mut screen = String::new();
+        wait_until(&format!("the screen has {sequence:?}"), || {
+            screen = self.tmux(&["capture-pane", "-p", "-e"]);
+            screen.contains(sequence)
+        });
+        screen
+    }
+
     fn resize(&self, width: u32, height: u32) {
         self.tmux(&["resize-window", "-x", &width.to_string(), "-y", &height.to_string()]);
     }
@@ -157,7 +167,7 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
             place.status()["walks"].as_array().unwrap().iter().map(|walk| walk["step"].clone()).collect();
         std::mem::replace(&mut steps, now) == steps
     });
-    assert!(terminal.screen().contains("paused"));
+    terminal.wait_for("paused");
     terminal.press("r");
     terminal.wait_for("walk 1 goes on");
     wait_until("both go on", || {
@@ -197,8 +207,8 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
     let short = |job: &Value| job["candidate"].as_str().unwrap().split_once('-').unwrap().1.to_owned();
     let terminal = Terminal::open(&place, "queue", (100, 40), "NO_COLOR=1");
     terminal.wait_for_all(&["not running", &format!("2 queue: {}", queued.len()), "accepted", "γ_max of "]);
-    let colours = terminal.tmux(&["capture-pane", "-p", "-e"]);
-    assert!(!colours.contains("[38;5;") && colours.contains(";7m"), "{colours:?}");
+    let colours = terminal.wait_for_sequence(";7m");
+    assert!(!colours.contains("[38;5;"), "{colours:?}");
 
     // The third becomes the first.
     terminal.press("2 Down Down = C-u");
@@ -242,10 +252,8 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
     // Time passes between the two.
     let lasts = |line: &&str| line.chars().count() <= 100 && !line.ends_with(" ago");
     let first: Vec<_> = story.lines().filter(lasts).take(20).collect();
-    assert!(
-        first.len() == 20 && first.iter().all(|line| screen.contains(line.trim_end())),
-        "{screen}\n{story}"
-    );
+    assert_eq!(first.len(), 20, "{story}");
+    terminal.wait_for_all(&first.iter().map(|line| line.trim_end()).collect::<Vec<_>>());
     terminal.press("q C-c");
     terminal.is_given_back("code 130");
 }
@@ -258,8 +266,8 @@ fn the_terminal_is_given_back_however_it_ends() {
     for (name, how) in [("terminated", "TERM"), ("interrupted", "INT")] {
         let terminal = Terminal::open(&place, name, (80, 24), "");
         terminal.wait_for("1 walks: 4");
-        let colours = terminal.tmux(&["capture-pane", "-p", "-e"]);
-        assert!(colours.contains("[38;5;6m"), "charts have a colour: {colours:?}");
+        // Charts have a colour.
+        terminal.wait_for_sequence("[38;5;6m");
         signal(watching()[0], how);
         terminal.is_given_back("code 130");
     }
