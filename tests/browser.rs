@@ -8,7 +8,7 @@ use std::fs;
 use std::path::Path;
 use std::process::Stdio;
 
-use common::browser::Browser;
+use common::browser::{Browser, ENTER, ESCAPE, RIGHT, TAB};
 use common::campaign::Small;
 use common::http::{get, said};
 use common::processes::wait_until;
@@ -99,6 +99,7 @@ fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
             browser.widen(width);
             browser.show(&format!("{page}#errors"));
             errors(&browser);
+            is_not_cut(&browser, ".scrolls");
             picture(&browser, &format!("errors-{colours}-{width}.png"));
             browser.show(&format!("{page}#candidate/{id}"));
             browser.wait("document.querySelectorAll('.atoms tbody tr').length > 20");
@@ -144,11 +145,18 @@ fn is_not_cut(browser: &Browser, selector: &str) {
 fn table(browser: &Browser, page: &str) {
     browser.show(&format!("{page}#candidates/fate=accepted"));
     browser.wait("document.querySelectorAll('.candidates tbody tr').length > 2");
+    browser.run("document.querySelector('.skip').focus()");
+    browser.press(&[ENTER]);
+    assert_eq!(browser.run("return document.activeElement.id"), "content");
+    assert_eq!(browser.run("return location.hash"), "#candidates/fate=accepted", "the page stays");
+    browser.press(&[TAB]);
+    assert_eq!(browser.run("return document.activeElement.tagName"), "SELECT", "the first filter");
     let column = "[...document.querySelectorAll('.candidates tbody tr')].map((row) => Number(row.cells[5].textContent))";
-    browser.run(
-        "[...document.querySelectorAll('button.sort')].find((b) => b.textContent.includes('γ_max')).click()",
-    );
+    // With the keyboard, whose focus stays where it is.
+    browser.run("document.querySelector('button.sort[data-keep=gamma]').focus()");
+    browser.press(&[ENTER]);
     browser.wait("document.querySelector('th[aria-sort=descending]')?.textContent.includes('γ_max')");
+    assert_eq!(browser.run("return document.activeElement.dataset.keep"), "gamma");
     let found: Vec<f64> = serde_json::from_value(browser.run(&format!("return {column}"))).unwrap();
     assert!(found.len() > 2 && found.is_sorted_by(|a, b| a >= b), "{found:?}");
     assert_eq!(browser.run("return location.hash.includes('order=gamma')"), true);
@@ -161,14 +169,10 @@ fn candidate(browser: &Browser) {
     browser.wait("document.querySelector('canvas').width > 300");
     let drawn = "document.querySelector('canvas').toDataURL()";
     let before = browser.run(&format!("return {drawn}"));
-    let press = |key: &str| {
-        browser.run(&format!(
-            "document.querySelector('canvas').dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}', bubbles: true }}))"
-        ));
-    };
-    press("ArrowRight");
+    browser.run("document.querySelector('canvas').focus()");
+    browser.press(&[RIGHT]);
     assert_ne!(browser.run(&format!("return {drawn}")), before, "it turns");
-    press(".");
+    browser.press(&['.']);
     browser.wait("document.querySelector('#picked').textContent.startsWith('Atom 0: Al')");
     assert_eq!(browser.run("return document.querySelectorAll('tr[aria-selected=true]').length"), 1);
 }
@@ -180,16 +184,23 @@ fn act(browser: &Browser, here: &Path, page: &str) {
     let id = browser.run("return document.querySelector('.candidates tbody a').title");
     browser.run("document.querySelector('.candidates tbody a').click()");
     browser.wait("document.querySelector('button.grave')");
-    browser.run("document.querySelector('button.grave').click()");
+    browser.run("document.querySelector('button.grave').focus()");
+    browser.press(&[ENTER]);
     browser.wait("document.querySelector('dialog[open] input[name=token]')?.value.length === 32");
+    browser.press(&[ESCAPE]);
+    browser.wait("!document.querySelector('dialog')");
+    assert_eq!(browser.run("return document.activeElement.className"), "grave", "where it was before");
+    browser.press(&[ENTER]);
+    browser.wait("document.querySelector('dialog[open]')?.contains(document.activeElement)");
     let state = || {
         let shown = succeed(here, ["queue", "campaign", "show", id.as_str().unwrap(), "--json"]);
         serde_json::from_str::<Value>(&shown).unwrap()["state"].take()
     };
     assert_eq!(state(), "queued", "nothing is done before it is confirmed");
-    browser.run("document.querySelector('dialog button.grave').click()");
+    browser.press(&[ENTER]);
     browser.wait("!document.querySelector('dialog')");
     browser.wait("document.querySelector('.head').textContent.includes('dropped')");
+    browser.wait("document.activeElement.id === 'content'");
     assert_eq!(state(), "dropped");
 }
 

@@ -11,6 +11,12 @@ use super::Running;
 use super::http::{get, request};
 use super::processes::wait_until;
 
+/// Keys that are no characters, as WebDriver calls them.
+pub const TAB: char = '\u{e004}';
+pub const ENTER: char = '\u{e007}';
+pub const ESCAPE: char = '\u{e00c}';
+pub const RIGHT: char = '\u{e014}';
+
 /// A browser with one window.
 pub struct Browser {
     address: String,
@@ -70,6 +76,15 @@ impl Browser {
     /// Waits until a script finds something true.
     pub fn wait(&self, script: &str) {
         wait_until(script, || self.run(&format!("return Boolean({script})")) == true);
+    }
+
+    /// Presses keys, one after the other, as whoever sits before it: what has the keyboard's focus gets them.
+    pub fn press(&self, keys: &[char]) {
+        let strokes = keys
+            .iter()
+            .flat_map(|key| ["keyDown", "keyUp"].map(|kind| json!({ "type": kind, "value": key })));
+        let keyboard = json!({ "type": "key", "id": "keyboard", "actions": strokes.collect::<Vec<_>>() });
+        self.tell("/actions", &json!({ "actions": [keyboard] }));
     }
 
     /// Lines of one of its logs.

@@ -10,17 +10,29 @@ import { view } from "./structure.js";
 
 export const TITLE = "Candidate";
 
+/** Why no further α was tried. */
+const ENDS = {
+  maximum_below_target: "it brought γ_max below the target",
+  inflated: "no α sufficed, the inflation did",
+  inflation_exhausted: "no α sufficed, and the bounded inflation did not either",
+  count_below_limit: "it left few enough atoms above",
+  fallback_maximum: "no α left few enough atoms above, this one brought γ_max below the target",
+  fallback_last: "no α sufficed, the last was taken",
+};
+
 export async function show(content, address, signal) {
   const id = decodeURIComponent(address);
   const [story, structure] = await Promise.all([ask(ofCandidate(id), signal), ask(ofCandidate(id, "/structure"), signal)]);
   content.replaceChildren(element("h1", {}, shortName(story.id)), head(story));
   const { found, grades, decision } = story;
+  // The button that was pressed is gone.
+  const again = () => show(content, address, signal).then(() => content.focus());
   content.append(section("Structure", about(story), downloads(story), view(structure, grades?.atoms, story.labels)));
   if (grades) content.append(section("Grades", graded(grades)));
   if (decision) content.append(section("Decision", decided(decision)));
   if (found) content.append(trace(found, grades, signal));
   if (decision) content.append(...covered(decision.coverage));
-  content.append(section("Label", ...labels(story, () => show(content, address, signal), signal)));
+  content.append(section("Label", ...labels(story, again, signal)));
   content.append(section("Not recorded", element("ul", {}, story.not_recorded.map((what) => element("li", {}, what)))));
 }
 
@@ -76,7 +88,7 @@ function decided(decision) {
     ["decision", decision.reason ? `${decision.kind}: ${decision.reason}` : decision.kind],
     ["threshold raised", decision.raised_by && `by a factor of ${digits(decision.raised_by)} to ${digits(decision.raised_threshold)}, since many waited for labels`],
     ["mixture afterwards", `version ${whole(decision.mixture_version)}`],
-    ["update", update && `${update.combination ?? ""} with α = ${digits(update.alpha)}; search ended by ${JSON.stringify(update.ended_by).replaceAll('"', "")}`],
+    ["update", update && `${update.combination ?? ""} with α = ${digits(update.alpha)}; ${ENDS[update.ended_by]}`],
     ["γ_max afterwards", update && decimals(update.gamma_max_after, 3)],
     ["components changed", update && whole(update.components.length)],
     ["training atoms with γ > 1", update?.training_frames && percent(update.training_frames.share_above_one)],

@@ -2,7 +2,7 @@
 
 import { ask } from "./api.js";
 import { FATES } from "./colours.js";
-import { element, state } from "./dom.js";
+import { element, renew, state } from "./dom.js";
 import { decimals, shortName, whole } from "./format.js";
 
 export const TITLE = "Candidates";
@@ -16,7 +16,7 @@ const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["labe
 export function show(content, rest, signal) {
   // What is asked for stands in the address, so that it can be kept and sent to others.
   const asked = new URLSearchParams(rest);
-  const place = element("div");
+  const [place, told] = [element("div"), element("p", { role: "status" })];
   const change = (changes) => {
     for (const [key, value] of Object.entries(changes)) value ? asked.set(key, value) : asked.delete(key);
     // The queue's order is that of one state.
@@ -32,17 +32,20 @@ export function show(content, rest, signal) {
     const wait = setTimeout(() => place.setAttribute("aria-busy", "true"), 200);
     try {
       const page = await wholePage(asked, after, signal, (looked) => {
-        if (mine === last) place.replaceChildren(element("p", { role: "status" }, `looked at ${whole(looked)} candidates …`));
+        if (mine === last) told.textContent = `looked at ${whole(looked)} candidates …`;
       }, () => mine !== last);
-      if (mine === last) place.replaceChildren(...lines(page, asked, change, pages, after, load));
+      if (mine === last) renew(place, ...lines(page, asked, change, pages, after, load));
     } catch (error) {
       if (error.name !== "AbortError" && mine === last) place.replaceChildren(element("p", { class: "wrong", role: "alert" }, error.message));
     } finally {
       clearTimeout(wait);
-      if (mine === last) place.removeAttribute("aria-busy");
+      if (mine === last) {
+        told.textContent = "";
+        place.removeAttribute("aria-busy");
+      }
     }
   };
-  content.append(filters(asked, change), place);
+  content.append(filters(asked, change), told, place);
   return load(null);
 }
 
@@ -87,7 +90,7 @@ function lines({ candidates, next }, asked, change, pages, after, load) {
     const turn = () => change({ order: key, ascending: key !== "queue" && isIt && !ascending ? "true" : "" });
     const sorted = isIt && (key === "queue" ? "descending" : ascending ? "ascending" : "descending");
     return element("th", { scope: "col", class: isNumber && "number", "aria-sort": sorted },
-      element("button", { type: "button", class: "sort", onclick: turn }, title, isIt ? (ascending ? " ▲" : " ▼") : ""));
+      element("button", { type: "button", class: "sort", "data-keep": key, onclick: turn }, title, isIt ? (ascending ? "\u00a0▲" : "\u00a0▼") : ""));
   };
   const back = () => load(pages.pop());
   const on = () => {
@@ -101,8 +104,8 @@ function lines({ candidates, next }, asked, change, pages, after, load) {
     element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": "Candidates" }, table),
     candidates.length === 0 && element("p", {}, "No candidate is so."),
     element("p", { class: "turn", role: "status" },
-      element("button", { type: "button", disabled: pages.length === 0, onclick: back }, "← before"),
-      ` page ${number} `, element("button", { type: "button", disabled: !next, onclick: on }, "next →")),
+      element("button", { type: "button", "data-keep": "before", disabled: pages.length === 0, onclick: back }, "← before"),
+      ` page ${number} `, element("button", { type: "button", "data-keep": "next", disabled: !next, onclick: on }, "next →")),
   ].filter(Boolean);
 }
 

@@ -33,7 +33,7 @@ export function facts(pairs) {
 
 /** A table; a column is [title, whether it holds numbers]. */
 export function table(caption, columns, rows) {
-  const head = columns.map(([title, isNumber]) => element("th", { scope: "col", class: isNumber && "number" }, title));
+  const head = columns.map(([title, isNumber]) => element("th", { scope: "col", class: isNumber && "number" }, titleOf(title)));
   const cell = (value, k) => element("td", { class: columns[k][1] && "number" }, value ?? "–");
   const lines = rows.map((row) => element("tr", {}, row.map(cell)));
   return element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": caption },
@@ -41,18 +41,30 @@ export function table(caption, columns, rows) {
       element("thead", {}, element("tr", {}, head)), element("tbody", {}, lines)));
 }
 
+/** A title may have several lines, what stands in its parentheses has one. */
+function titleOf(title) {
+  return title.split(/(\([^)]*\))/).map((part) => (part.startsWith("(") ? element("span", { class: "whole" }, part) : part));
+}
+
+/** A sentence in a table, which may have several lines. */
+export function sentence(...parts) {
+  return element("span", { class: "sentence" }, ...parts);
+}
+
 /** Puts children into a place. What had the keyboard's focus there has it again, if it is there again (`data-keep`, or the name of
- *  a region), and regions stay scrolled as they were. */
+ *  a region), or the first region if it cannot be used; and regions stay scrolled as they were. */
 export function renew(place, ...children) {
   const name = (found) => found?.dataset?.keep ?? found?.getAttribute("aria-label");
   const had = place.contains(document.activeElement) ? name(document.activeElement) : null;
   const scrolled = new Map([...place.querySelectorAll(".scrolls")].map((region) => [name(region), [region.scrollLeft, region.scrollTop]]));
   place.replaceChildren(...children);
   for (const region of place.querySelectorAll(".scrolls")) [region.scrollLeft, region.scrollTop] = scrolled.get(name(region)) ?? [0, 0];
-  if (had) [...place.querySelectorAll("[data-keep], [aria-label]")].find((found) => name(found) === had)?.focus({ preventScroll: true });
+  if (!had) return;
+  const again = [...place.querySelectorAll("[data-keep], [aria-label]")].find((found) => name(found) === had);
+  (again?.disabled ? place.querySelector(".scrolls") : again)?.focus({ preventScroll: true });
 }
 
 /** A word that says a state, with a mark that does not depend on its colour. */
 export function state(name) {
-  return element("span", { class: "state", "data-state": name }, name);
+  return element("span", { class: "state", "data-state": name }, name.replaceAll("_", " "));
 }

@@ -1,7 +1,7 @@
 // Hosts, and the processes that work there for the campaign.
 
 import { listen } from "./api.js";
-import { element, renew, section, state, table } from "./dom.js";
+import { element, renew, section, sentence, state, table } from "./dom.js";
 import { ago, time } from "./format.js";
 
 export const TITLE = "Hosts";
@@ -21,5 +21,5 @@ function hosts(processes) {
   return names.map((host) => section(host, table(`Processes of ${host}`, COLUMNS,
     processes.filter((process) => process.host === host).map((process) => [
       process.kind, process.number, state(process.state), ago(process.last_seen), time(process.started), process.pid,
-      process.restarts, process.remark]))));
+      process.restarts, sentence(process.remark)]))));
 }

@@ -71,6 +71,11 @@ theme();
 connect(connection);
 listen((news) => { document.title = document.title.replace(/calmwalk.*$/, `calmwalk ${news.status.campaign.slice(0, 8)}`); },
   new AbortController().signal);
+// The address says which page is shown, and stays.
+document.querySelector(".skip").addEventListener("click", (event) => {
+  event.preventDefault();
+  document.getElementById("content").focus();
+});
 addEventListener("hashchange", () => {
   show();
   document.getElementById("content").focus();

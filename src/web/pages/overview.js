@@ -2,7 +2,7 @@
 
 import { canPause, pauseButton } from "./actions.js";
 import { listen } from "./api.js";
-import { element, facts, renew, section, state, table } from "./dom.js";
+import { element, facts, renew, section, sentence, state, table } from "./dom.js";
 import { bytes, decimals, digits, duration, percent, time, whole } from "./format.js";
 import { overTime } from "./plots.js";
 
@@ -113,7 +113,7 @@ function walks(all, changed) {
   };
   const button = (walk) => (isUnderWay(walk) || walk.paused) && pauseButton(walk.walk, walk.paused, change([walk], !walk.paused));
   const rows = order.slice(0, WALKS).map((walk) => [
-    whole(walk.walk), walk.seed_structure, walk.origin, element("span", {}, state(walk.paused ? "paused" : walk.state), walk.reason && ` ${walk.reason}`),
+    whole(walk.walk), walk.seed_structure, walk.origin, sentence(state(walk.paused ? "paused" : walk.state), walk.reason && ` ${walk.reason}`),
     whole(walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
     digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.refused), ...(changed ? [button(walk) || ""] : [])]);
   const more = all.length - rows.length;

@@ -28,7 +28,7 @@ export function plot({ title, x, y, lines = [], bands = [], marks = [] }) {
     grid(across, up), titles(x, y),
     bands.map((band) => drawing("path", { d: area(band.points, across, up), fill: band.colour, "fill-opacity": 0.2 })),
     lines.map((line) => drawing("path", { d: path(line.points, across, up), fill: "none", stroke: line.colour, "stroke-width": 1.7,
-      "stroke-dasharray": line.dash ?? "", "stroke-linejoin": "round" })),
+      "stroke-dasharray": line.dash ?? "", "stroke-linejoin": "round", "stroke-linecap": "round" })),
     marks.flatMap((kind) => kind.points.map((point) => mark(kind, point, across, up))));
   return figure(title, [...lines, ...marks].filter((one) => one.name), svg);
 }
@@ -65,8 +65,8 @@ function axis({ least, most, logarithmic, ticks = tick }, values, from, to) {
     const place = logarithmic ? Math.log10(Math.max(value, 1e-12)) : value;
     return from + ((place - low) / (high - low)) * (to - from);
   };
-  const round = roundNumbers(low, high, Math.abs(to - from) / 55).filter((value) => !logarithmic || Number.isInteger(value));
-  return { at, ticks: round.map((value) => (logarithmic ? 10 ** value : value)), text: ticks };
+  const number = Math.abs(to - from) / 55;
+  return { at, ticks: logarithmic ? roundPowers(low, high) : roundNumbers(low, high, number), text: ticks };
 }
 
 function roundNumbers(low, high, number) {
@@ -75,6 +75,14 @@ function roundNumbers(low, high, number) {
   const step = [1, 2, 5, 10].map((factor) => factor * power).find((candidate) => candidate >= rough);
   const first = Math.ceil(low / step);
   return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, k) => (first + k) * step);
+}
+
+/** Between 10^low and 10^high: powers of ten, with their doubles and fivefolds where there would be few. */
+function roundPowers(low, high) {
+  const factors = high - low < 2 ? [1, 2, 5] : [1];
+  const powers = Array.from({ length: Math.ceil(high) - Math.floor(low) + 1 }, (_, k) => Math.floor(low) + k);
+  const inside = (value) => value >= 10 ** low && value <= 10 ** high;
+  return powers.flatMap((power) => factors.map((factor) => factor * 10 ** power)).filter(inside);
 }
 
 function grid(across, up) {
@@ -101,7 +109,9 @@ function path(points, across, up) {
       begins = true;
       return "";
     }
-    const drawn = `${begins ? "M" : "L"}${across.at(x).toFixed(1)} ${up.at(y).toFixed(1)}`;
+    const place = `${across.at(x).toFixed(1)} ${up.at(y).toFixed(1)}`;
+    // A line of no length is a dot, where a point stands alone.
+    const drawn = begins ? `M${place}h0` : `L${place}`;
     begins = false;
     return drawn;
   }).join("");
