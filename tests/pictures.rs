@@ -1,4 +1,4 @@
-//! The pictures of the README, from the campaign of `configs/aluminium.toml`: they are written anew into `docs/pictures`. Needs
+//! The pictures of the README, from the campaign of `configs/aluminium.toml`, and a longer one like it: they are written anew into `docs/pictures`. Needs
 //! Debian's packages chromium, chromium-driver, tmux and fonts-dejavu; `cargo test --test pictures`.
 
 mod common;
@@ -10,6 +10,7 @@ use std::process::{Command, Stdio};
 
 use common::browser::Browser;
 use common::http::{get, said};
+use common::processes::signal;
 use common::{Running, demo, program, stderr, succeed};
 
 /// Bytes of a picture, at most.
@@ -23,6 +24,8 @@ fn the_readme_shows_a_campaign() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let text = demo("aluminium.toml").replace("[campaign]", "[campaign]\nmode = \"live\"");
+    // Long enough for lines over time.
+    let text = text.replace("steps = 2000", "steps = 12000").replace("# per_seed = 3", "per_seed = 20");
     fs::write(here.join("aluminium.toml"), text).unwrap();
     let mut command = program(here);
     command.args(["run", "aluminium.toml", "--dashboard", "127.0.0.1:0"]);
@@ -32,24 +35,28 @@ fn the_readme_shows_a_campaign() {
     let browser = Browser::start(false, (1280, 960));
     browser.show(&format!("http://{address}/"));
     let terminal = Terminal::open(here);
-    // Half of what it will find, and some news.
+    // A part of what it will find, and some news.
     browser.wait("document.querySelectorAll('.tile strong').length === 5");
-    browser.wait("Number(document.querySelectorAll('.tile strong')[2].textContent.split(' ')[0]) >= 12");
+    browser.wait("Number(document.querySelectorAll('.tile strong')[2].textContent.split(' ')[0]) >= 30");
     browser.picture(&picture("dashboard"), None);
     let screen = terminal.screen();
     drop(terminal);
-    let pages = get(address, "/api/candidates?order=gamma&fate=accepted&limit=1").json();
+    let pages =
+        get(address, "/api/candidates?order=gamma&fate=accepted&limit=1&where=seed+%3D+%27fcc-100%27").json();
     let id = pages["candidates"][0]["id"].as_str().unwrap().to_owned();
     browser.show(&format!("http://{address}/#candidate/{id}"));
     browser.wait("document.querySelectorAll('.atoms tbody tr').length > 20");
     browser.wait("document.querySelector('canvas').width > 300");
     browser.picture(&picture("candidate"), None);
-    assert!(run.0.wait().unwrap().success());
+    signal(run.0.id(), "TERM");
+    run.0.wait().unwrap();
 
     fs::write(here.join("screen.html"), as_html(&screen)).unwrap();
     browser.show(&format!("file://{}", here.join("screen.html").display()));
     browser.picture(&picture("watch"), Some("pre"));
-    succeed(here, ["report", "aluminium", "-o", "report"]);
+    fs::write(here.join("reported.toml"), demo("aluminium.toml")).unwrap();
+    succeed(here, ["run", "reported.toml"]);
+    succeed(here, ["report", "reported", "-o", "report"]);
     browser.show(&format!("file://{}", here.join("report/report.html").display()));
     browser.run("document.querySelectorAll('figure')[2].scrollIntoView()");
     browser.picture(&picture("report"), None);
