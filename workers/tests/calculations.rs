@@ -515,7 +515,8 @@ async fn too_much_memory_of_all_processes_together_ends_it() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn directories_of_failures_are_kept_in_the_store() {
-    let script = "mkdir deep; echo x > deep/file; head -c 20000000 /dev/zero > large; exit 3";
+    let script =
+        "mkdir deep; echo x > deep/file; head -c 20000000 /dev/zero > large; echo Zr > POTCAR; exit 3";
     for (keep, archives) in [(Keep::Nothing, 0), (Keep::Failed, 4), (Keep::All, 4)] {
         let mut place = Place::new(1, script).await;
         place.running.keep = keep;
@@ -525,7 +526,8 @@ async fn directories_of_failures_are_kept_in_the_store() {
         assert_eq!(kept.len(), archives);
         place.nothing_is_left();
         let Some(archive) = kept.first() else { continue };
-        assert_eq!((archive.attempt, archive.left_out.as_str()), (1, "work/large (20000000 bytes)\n"));
+        let left_out = "work/POTCAR (3 bytes)\nwork/large (20000000 bytes)\n";
+        assert_eq!((archive.attempt, archive.left_out.as_str()), (1, left_out));
         let mut unpacked = tar::Archive::new(zstd::Decoder::new(&archive.bytes[..]).unwrap());
         let paths = unpacked.entries().unwrap().map(|entry| entry.unwrap().path().unwrap().into_owned());
         let names: Vec<_> = paths.map(|path| path.display().to_string()).collect();

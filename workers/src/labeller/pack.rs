@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 
 use super::prepare::DATA;
 
+/// What VASP's licence lets nobody pass on.
+const LICENSED: &str = "POTCAR";
 /// Larger files stay out: charge densities and wave functions are of no use without the program, and are made again.
 const LARGEST_FILE: u64 = 16 << 20;
 /// Bytes of all files together, before they are compressed.
@@ -21,8 +23,8 @@ pub(super) struct Packed {
     pub left_out: String,
 }
 
-/// Packs the files below a directory, in order of their names, each as long as it is not too large and there is room. What all
-/// calculations have alike ([`DATA`]) stays out.
+/// Packs the files below a directory, in order of their names, each as long as it is not too large and there is room.
+/// Pseudopotentials stay out ([`DATA`], [`LICENSED`]): all calculations have the same.
 pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
     let mut encoder = zstd::Encoder::new(Vec::new(), LEVEL)?;
     encoder.include_checksum(true)?;
@@ -33,7 +35,7 @@ pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
     for path in files(directory)? {
         let (name, size) =
             (path.strip_prefix(directory).unwrap_or(&path), fs::symlink_metadata(&path)?.len());
-        if name.starts_with(DATA) || size > LARGEST_FILE.min(room) {
+        if name.starts_with(DATA) || name.ends_with(LICENSED) || size > LARGEST_FILE.min(room) {
             let _ = writeln!(left_out, "{} ({size} bytes)", name.display());
             continue;
         }
