@@ -42,6 +42,8 @@ impl Browser {
             vec!["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", &size];
         arguments.extend(dark.then_some("--force-dark-mode"));
         let wanted = json!({ "alwaysMatch": {
+            // A busy machine takes longer than the half minute that a script has otherwise.
+            "timeouts": { "script": 300_000, "pageLoad": 300_000 },
             "goog:chromeOptions": { "args": arguments },
             "goog:loggingPrefs": { "browser": "ALL", "performance": "ALL" },
         } });
