@@ -131,13 +131,6 @@ impl<A: Divide, B: Divide> Divide for (A, B) {
     }
 }
 
-impl<A: Divide, B: Divide, C: Divide> Divide for (A, B, C) {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        let (a, b, c) = (self.0.divide(chunk), self.1.divide(chunk), self.2.divide(chunk));
-        ((a.0, b.0, c.0), (a.1, b.1, c.1))
-    }
-}
-
 impl<A: Divide> Divide for [A; 2] {
     fn divide(self, chunk: &Chunk) -> (Self, Self) {
         let [a, b] = self.map(|part| part.divide(chunk));
