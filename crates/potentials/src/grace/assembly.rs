@@ -5,7 +5,7 @@ use npz::Archive;
 
 use super::error::{GraceError, mismatch};
 use super::globals::refuse_left_over;
-use super::layer::{Layer, LayerDraft};
+use super::layer::LayerDraft;
 use super::model::{Architecture, GraceDescription};
 use super::network::Network;
 use super::networks::readout;
@@ -48,10 +48,11 @@ impl<V: Vector> Draft<'_, V> {
         let radial = self.layers.iter().map(|layer| &layer.radial);
         let cutoff = |pair| radial.clone().map(|radial| radial.cutoff(pair)).fold(0.0, f64::max);
         let pair_cutoffs = pairs.map(cutoff).collect();
-        let messages: Vec<_> = self.layers.iter().skip(1).map(|layer| layer.message.from).collect();
-        let messages = messages.into_iter().chain([None]);
-        let layers: Vec<Layer<V>> =
-            self.layers.into_iter().zip(messages).map(|(layer, message)| layer.finish(message)).collect();
+        let (mut layers, mut drafts) = (Vec::new(), self.layers.into_iter().peekable());
+        while let Some(draft) = drafts.next() {
+            let message = drafts.peek_mut().and_then(|next| next.message.from.as_mut());
+            layers.push(draft.finish(message));
+        }
         let network = Network { layers, readout, feature_map };
         Ok(Reading { network, pair_cutoffs, description })
     }

@@ -7,7 +7,9 @@ use atoms::Vec3;
 use super::batches::Placed;
 use super::bonds::BondWork;
 use super::instructions::{Instructions, Pass};
-use super::layer_work::{BackwardWork, Cotangents, Here, Traced, backward_bonds, backward_tape, forward};
+use super::layer_work::{
+    BackwardWork, Cotangents, Here, Traced, TracedBonds, backward_bonds, backward_tape, forward,
+};
 use super::messages::Returns;
 use super::parts::Parts;
 use super::projection::{FeatureMap, Projected};
@@ -19,7 +21,8 @@ pub(super) struct Forward<'a, 'b, V: Vector> {
     pub here: Here<'a, V>,
     pub placed: Placed,
     pub trace: &'a mut Traced<'b, V>,
-    pub work: &'a mut BondWork<V>,
+    /// Where the tape goes to, and work arrays.
+    pub work: (&'a mut Vec<V>, &'a mut BondWork<V>),
 }
 
 impl<V: Vector> Pass for Forward<'_, '_, V> {
@@ -57,7 +60,8 @@ impl<'b, V: Vector, B: Fn(usize) -> &'b [V]> Pass for Energies<'_, V, B> {
 pub(super) struct Backward<'a, 'b, 'c, V: Vector, const N: usize> {
     pub here: Here<'a, V>,
     pub placed: Placed,
-    pub trace: &'a mut Traced<'b, V>,
+    pub tape: &'a [V],
+    pub bonds: &'a mut TracedBonds<'b, V>,
     pub from: Cotangents<'a, V>,
     pub to: &'a mut [Parts<'c, Vec3>; 2],
     pub returns: Option<&'a mut Returns<V>>,
@@ -67,10 +71,10 @@ pub(super) struct Backward<'a, 'b, 'c, V: Vector, const N: usize> {
 impl<V: Vector, const N: usize> Pass for Backward<'_, '_, '_, V, N> {
     #[inline(always)]
     fn run(self, _: bool) {
-        let Self { here, placed, trace, from, to, returns, work } = self;
-        let (backward, bonds) = work;
-        backward_tape::<V, N>(&here, &placed, trace, &from, backward);
-        backward_bonds::<V, N>(&here, &placed, trace, (to, returns), (backward, bonds));
+        let Self { here, placed, tape, bonds, from, to, returns, work } = self;
+        let (backward, of_bonds) = work;
+        backward_tape::<V, N>(&here, &placed, tape, &from, backward);
+        backward_bonds::<V, N>(&here, &placed, bonds, (to, returns), (backward, of_bonds));
     }
 }
 

@@ -8,8 +8,8 @@ use super::tape::Batch;
 /// Most atoms of a batch.
 const MOST: usize = 16;
 
-/// What the tape of a batch may take in memory, bytes; with its cotangents it should stay in the second cache.
-const TAPE_BYTES: usize = 1 << 19;
+/// What the tape of a batch and that of one cotangent may take in memory, bytes: about the second cache.
+const TAPE_BYTES: usize = 1 << 20;
 
 /// Places that a thread takes at once, about: enough for the projection to be read seldom, few enough for their tapes to stay in
 /// the third cache.

@@ -23,7 +23,7 @@ impl<V: Vector> Evaluator<V> {
         for (layer, bonds) in network.layers.iter().zip(self.bonds()) {
             of_bonds += bonds as u64 * of_bond(layer, cotangents);
             of_atom +=
-                layer.operations.iter().map(|operation| of_operation(operation, cotangents)).sum::<u64>();
+                layer.steps.operations().map(|operation| of_operation(operation, cotangents)).sum::<u64>();
         }
         atoms * of_atom + of_bonds
     }
@@ -49,7 +49,7 @@ fn of_operation<V: Vector>(operation: &Operation<V>, cotangents: u64) -> u64 {
     let terms = |coupled: &[Coupled<V>]| coupled.iter().map(|c| c.terms.len() as u64).sum::<u64>();
     match operation {
         Operation::Linear(linear) => {
-            let parts = linear.parts.iter().map(|part| part.from.len() as u64 * size(&part.weights));
+            let parts = linear.parts.iter().map(|part| part.tape[0].len() as u64 * size(&part.weights));
             (1 + cotangents) * parts.sum::<u64>()
         }
         Operation::Product(product) => {

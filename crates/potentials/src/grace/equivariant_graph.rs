@@ -3,7 +3,8 @@
 use super::equivariant_norm::EquivariantNorm;
 use super::error::{GraceError, mismatch};
 use super::graph::Graph;
-use super::tape::{Linear, LinearPart, Operation, Tensor};
+use super::linear::{Linear, LinearPart};
+use super::tape::{Operation, Tensor};
 use super::vector::{Vector, to_lanes};
 use super::weights::Weights;
 
@@ -46,12 +47,12 @@ impl<V: Vector> Graph<'_, V> {
         let mut parts = Vec::new();
         for group in 0..n_groups {
             let rows: Vec<usize> = (0..groups.len()).filter(|w| groups[*w] == group).collect();
-            let (from, to) = rows.iter().map(|w| (tensor.row(*w) as u32, (w * out.width) as u32)).unzip();
+            let rows = rows.iter().map(|w| (tensor.row(*w) as u32, out.row(*w) as u32)).unzip();
             let element = |_, n, k| norm * weights[(group * rank + k) * tensor.channels + n];
-            parts.push(LinearPart { weights: Weights::new(1, tensor.channels, rank, element), from, to });
+            parts.push(LinearPart::new(Weights::new(1, tensor.channels, rank, element), rows));
         }
-        parts.retain(|part| !part.from.is_empty());
-        self.operations.push(Operation::Linear(Linear { start: out.start, parts }));
+        parts.retain(|part| !part.tape[0].is_empty());
+        self.operations.push(Operation::Linear(Linear { parts }));
         Ok(out)
     }
 

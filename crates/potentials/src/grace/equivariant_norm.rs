@@ -118,8 +118,15 @@ impl<V: Vector> EquivariantNorm<V> {
 
     /// As [`super::tape::Operation::keep`]: the components are needed together.
     pub fn keep(&self, needed: &mut [bool]) {
-        if (0..self.to.components).any(|w| needed[self.to.row(w)]) {
-            (0..self.from.components).for_each(|w| needed[self.from.row(w)] = true);
+        if self.to.rows().any(|row| needed[row]) {
+            self.from.rows().for_each(|row| needed[row] = true);
+        }
+    }
+
+    /// As [`super::tape::Operation::rename`]; both tensors have the same lanes on both tapes.
+    pub fn rename(&mut self, on_tape: impl Fn(u32) -> u32) {
+        for tensor in [&mut self.from, &mut self.to] {
+            tensor.start = on_tape(tensor.start as u32) as usize;
         }
     }
 }

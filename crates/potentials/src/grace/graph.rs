@@ -5,9 +5,12 @@ use std::collections::BTreeMap;
 use npz::Archive;
 
 use super::error::{GraceError, mismatch, unsupported};
-use super::product::{Combination, Coupled, Product, Summands, Term};
+use super::linear::{Linear, LinearPart};
+use super::placement::place;
+use super::product::{Combination, Combined, Coupled, Product, Term};
 use super::schedule::depth_first;
-use super::tape::{Gather, Linear, LinearPart, Operation, Tensor, Used};
+use super::steps::Steps;
+use super::tape::{Operation, Tensor};
 use super::vector::{Number, Vector, lanes_for};
 use super::weights::Weights;
 
@@ -23,7 +26,8 @@ pub(super) struct Graph<'a, V: Vector> {
     named: Vec<(String, Tensor)>,
     end: usize,
     pub(super) operations: Vec<Operation<V>>,
-    pub(super) basis: Gather,
+    /// First lane and number of lanes of each row that goes into the basis B.
+    pub(super) basis: Vec<(usize, usize)>,
     /// Components and channels of each source of the basis.
     pub(super) sources: Vec<(usize, usize)>,
     pub(super) source_names: Vec<String>,
@@ -45,7 +49,7 @@ impl<'a, V: Vector> Graph<'a, V> {
             named: Vec::new(),
             end: 0,
             operations: Vec::new(),
-            basis: Gather::default(),
+            basis: Vec::new(),
             sources: Vec::new(),
             source_names: Vec::new(),
             weights: 0,
@@ -92,7 +96,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         let mut rows: BTreeMap<(bool, usize, u64), Vec<(u32, u32)>> = BTreeMap::new();
         let mut add = |is_right: bool, tile: usize, from: usize, component: usize| {
             let group = rows.entry((is_right, tile, factors[component].to_bits())).or_default();
-            group.push((from as u32, (component * out.width) as u32));
+            group.push((from as u32, out.row(component) as u32));
         };
 
         let left_weights = if archive.count(&key("left_coefs"), 0, 1)? == 1 {
@@ -123,11 +127,10 @@ impl<'a, V: Vector> Graph<'a, V> {
             let factor = f64::from_bits(factor);
             let weights =
                 Weights::new(1, weights.inputs, channels, |_, n, k| factor * weights.at(k, n, tile));
-            let (from, to) = rows.into_iter().unzip();
-            LinearPart { weights, from, to }
+            LinearPart::new(weights, rows.into_iter().unzip())
         };
         let parts = merged(rows.into_iter().map(part).collect());
-        self.operations.push(Operation::Linear(Linear { start: out.start, parts }));
+        self.operations.push(Operation::Linear(Linear { parts }));
         Ok(out)
     }
 
@@ -188,8 +191,7 @@ impl<'a, V: Vector> Graph<'a, V> {
             let coefficient = V::Number::round(coefficient);
             outputs[*sum].terms.push(Term { left, right, coefficient });
         }
-        let (start, width, channels) = (out.start, out.width, out.channels);
-        let product = Product { start, width, channels, outputs, inputs: Vec::new() };
+        let product = Product { width: out.width, channels: out.channels, outputs, inputs: Vec::new() };
         self.operations.push(Operation::Product(product));
         Ok(out)
     }
@@ -203,13 +205,11 @@ impl<'a, V: Vector> Graph<'a, V> {
         terms: &[(usize, usize, f64)],
     ) -> Result<Tensor, GraceError> {
         let out = self.push(name, components, tensor.channels)?;
-        let mut outputs: Vec<(usize, Summands<V>)> =
-            (0..components).map(|f| (out.row(f), Vec::new())).collect();
+        let mut outputs: Vec<Combined<V>> = out.rows().map(|row| (row as u32, Vec::new())).collect();
         for (to, from, factor) in terms {
             outputs[*to].1.push((tensor.row(*from) as u32, V::Number::round(*factor)));
         }
-        let (start, width, channels) = (out.start, out.width, out.channels);
-        let combination = Combination { start, width, channels, outputs };
+        let combination = Combination::new(out.width, out.channels, outputs);
         self.operations.push(Operation::Combination(combination));
         Ok(out)
     }
@@ -226,37 +226,28 @@ impl<'a, V: Vector> Graph<'a, V> {
         })
     }
 
-    /// The operations without results that neither the basis nor `message` needs.
-    pub fn finish(mut self, message: Option<Tensor>) -> FinishedGraph<V> {
-        let density = self.density();
+    /// The operations without results that neither the basis nor `message` needs, whose rows get their places on the tapes;
+    /// those of `message` too.
+    pub fn finish(mut self, message: Option<&mut Tensor>) -> Steps<V> {
         let mut needed = vec![false; self.end];
-        self.basis.rows.iter().for_each(|(row, _)| needed[*row] = true);
-        for tensor in [Some(density), message].into_iter().flatten() {
-            (0..tensor.components).for_each(|w| needed[tensor.row(w)] = true);
-        }
+        self.basis.iter().for_each(|(row, _)| needed[*row] = true);
+        let mut fixed = vec![self.density()];
+        fixed.extend(message.as_deref());
+        fixed.iter().flat_map(Tensor::rows).for_each(|row| needed[row] = true);
         self.operations.iter_mut().rev().for_each(|operation| operation.keep(&mut needed));
-        let tensors = self.tensors.iter();
-        let rows = tensors.flat_map(|t| (0..t.components).map(move |w| (t.row(w), t.width)));
-        let used = Used::new(rows.filter(|(row, _)| needed[*row]));
-        let operations = depth_first(self.operations);
-        FinishedGraph { tape_lanes: self.end, used, operations, basis: self.basis }
+        let mut widths = vec![0; self.end];
+        for tensor in &self.tensors {
+            tensor.rows().for_each(|row| widths[row] = tensor.width);
+        }
+        place(depth_first(self.operations), &widths, fixed, &self.basis, message)
     }
-}
-
-/// What a layer evaluates.
-pub(super) struct FinishedGraph<V: Vector> {
-    /// Length of the tape for one slot.
-    pub tape_lanes: usize,
-    pub used: Used,
-    pub operations: Vec<Operation<V>>,
-    pub basis: Gather,
 }
 
 /// One part in place of those that take the same rows to the same rows.
 fn merged<V: Vector>(parts: Vec<LinearPart<V>>) -> Vec<LinearPart<V>> {
     let mut found: Vec<LinearPart<V>> = Vec::new();
     for part in parts {
-        match found.iter_mut().find(|other| other.from == part.from && other.to == part.to) {
+        match found.iter_mut().find(|other| other.tape == part.tape) {
             Some(other) => other.weights.add(&part.weights),
             None => found.push(part),
         }

@@ -113,24 +113,28 @@ impl<V: Vector> Pass<'_, V> {
                 if self.grade.is_none() {
                     scratch.trace.hold_bases(layer, &placed.places());
                 }
-                scratch.trace.hold_tapes(layer, bonds, &placed.places());
-                self.forward(placed, results, scratch);
+                scratch.trace.hold(layer, bonds, &placed.places(), false);
+                self.forward::<N>(placed, results, scratch);
                 self.backward::<N>(placed, results, scratch);
             }
             self.grade::<N>(&chunk.places, results, scratch);
         } else {
-            scratch.trace.hold_tapes(layer, bonds, &chunk.places);
-            batches.clone().for_each(|placed| self.forward(placed, results, scratch));
+            scratch.trace.hold(layer, bonds, &chunk.places, true);
+            batches.clone().for_each(|placed| self.forward::<N>(placed, results, scratch));
             self.grade::<N>(&chunk.places, results, scratch);
             batches.for_each(|placed| self.backward::<N>(placed, results, scratch));
         }
     }
 
-    fn forward(&self, placed: Placed, results: &mut Results<V>, scratch: &mut Scratch<V>) {
+    fn forward<const N: usize>(&self, placed: Placed, results: &mut Results<V>, scratch: &mut Scratch<V>) {
         let (last, places) = (self.network.layers.len() - 1, placed.places());
         let (mut traced, _) = scratch.trace.held(self.here.layer, self.here.bonds);
-        let (here, trace, work) = (self.here, &mut traced, &mut scratch.bonds[last]);
+        let (here, trace) = (self.here, &mut traced);
+        let work = (&mut scratch.tape, &mut scratch.bonds[last]);
         self.instructions.run(Forward { here, placed, trace, work });
+        if N == 2 {
+            trace.keep(&places, &scratch.tape);
+        }
         let own = &*traced.bases.of(&places);
         let basis = |k: usize| if k == last { own } else { self.bases[k].of(&places) };
         let (energies, cotangents) = (results.energies.of(&places), results.densities.of(&places));
@@ -171,9 +175,10 @@ impl<V: Vector> Pass<'_, V> {
         let (mut traced, cotangents) = scratch.trace.held(self.here.layer, self.here.bonds);
         let densities = (&results.densities.of(&places)[last * lanes..], readout.blocks.len() * lanes);
         let from = Cotangents { densities, basis: cotangents.of(&places), returned: None };
-        let (here, trace, to) = (self.here, &mut traced, &mut results.gradients.bonds);
+        let tape = if N == 1 { &scratch.tape[..] } else { traced.tapes.of(&places) };
+        let (here, bonds, to) = (self.here, &mut traced.bonds, &mut results.gradients.bonds);
         let (returns, work) =
             (results.gradients.returns.only(), (&mut scratch.backward, &mut scratch.bonds[last]));
-        self.instructions.run(Backward::<V, N> { here, placed, trace, from, to, returns, work });
+        self.instructions.run(Backward::<V, N> { here, placed, tape, bonds, from, to, returns, work });
     }
 }

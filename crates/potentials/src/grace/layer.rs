@@ -4,7 +4,8 @@ use super::graph::Graph;
 use super::harmonics::Harmonics;
 use super::radial::RadialFunctions;
 use super::readout::Block;
-use super::tape::{Gather, Operation, Tensor, Used};
+use super::steps::Steps;
+use super::tape::Tensor;
 use super::vector::Vector;
 
 /// The weights of one layer: T_q,lm,n = Σ_j R_nl(r) Y_lm(v) m_q,n(j), the messages m of the neighbours being
@@ -17,13 +18,7 @@ pub(super) struct Layer<V: Vector> {
     pub message: Message<V>,
     /// T, \[q\]\[lm\]\[channel\], at the beginning of the tape.
     pub density: Tensor,
-    /// Length of an atom's tape.
-    pub tape_lanes: usize,
-    /// What of it holds anything.
-    pub used: Used,
-    pub operations: Vec<Operation<V>>,
-    /// The rows of the tape that this layer gives to the basis B.
-    pub basis: Gather,
+    pub steps: Steps<V>,
 }
 
 /// What an atom tells its neighbours: m_q,n = x_q,n + c_q,n with the tensor x of the layer before, zero beyond its
@@ -60,19 +55,14 @@ pub(super) struct LayerDraft<'a, V: Vector> {
 }
 
 impl<V: Vector> LayerDraft<'_, V> {
-    /// `message` is what the next layer takes from this one.
-    pub fn finish(self, message: Option<Tensor>) -> Layer<V> {
-        let density = self.graph.density();
-        let graph = self.graph.finish(message);
+    /// `message` is what the next layer takes from this one; learns where it stands.
+    pub fn finish(self, message: Option<&mut Tensor>) -> Layer<V> {
         Layer {
             radial: self.radial,
             harmonics: Harmonics::new(self.lmax),
             message: self.message,
-            density,
-            tape_lanes: graph.tape_lanes,
-            used: graph.used,
-            operations: graph.operations,
-            basis: graph.basis,
+            density: self.graph.density(),
+            steps: self.graph.finish(message),
         }
     }
 }

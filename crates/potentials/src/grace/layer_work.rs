@@ -62,7 +62,7 @@ pub(super) struct Trace<V> {
     first: usize,
     /// The first of those whose basis is kept, which may be more.
     first_basis: usize,
-    /// The tape of one batch after another, [places, tape]
+    /// What the reverse sweep reads of the tape of one batch after another, [places, kept lanes]
     tapes: Vec<V>,
     /// The basis B of this layer, [places, lanes]
     bases: Vec<V>,
@@ -75,24 +75,47 @@ pub(super) struct Trace<V> {
 
 /// The trace of some atoms, to be divided.
 pub(super) struct Traced<'a, V> {
-    tapes: Parts<'a, V>,
+    pub tapes: Parts<'a, V>,
     pub bases: Parts<'a, V>,
+    pub bonds: TracedBonds<'a, V>,
+}
+
+impl<V: Vector> Traced<'_, V> {
+    /// Keeps of the tape of a batch what the reverse sweep needs.
+    pub fn keep(&mut self, places: &Range<usize>, tape: &[V]) {
+        let kept = self.tapes.of(places);
+        kept.copy_from_slice(&tape[..kept.len()]);
+    }
+}
+
+/// What it holds of bonds.
+pub(super) struct TracedBonds<'a, V> {
     values: Parts<'a, V>,
     derivatives: Parts<'a, V>,
+}
+
+impl<V> TracedBonds<'_, V> {
+    /// The bonds of the atom at a place.
+    #[inline(always)]
+    fn of<'a>(&'a mut self, place: usize, bonds: &'a Bonds) -> OwnBonds<'a, V> {
+        let places = place..place + 1;
+        let (values, derivatives) = (self.values.of(&places), self.derivatives.of(&places));
+        OwnBonds { bonds: bonds.of(place), values, derivatives }
+    }
 }
 
 impl<V: Vector> Trace<V> {
     /// Makes room for the bases of the atoms at some places, and forgets others.
     pub fn hold_bases(&mut self, layer: &Layer<V>, places: &Range<usize>) {
-        grow(&mut self.bases, places.len() * layer.basis.lanes());
+        grow(&mut self.bases, places.len() * layer.steps.basis_lanes);
         self.first_basis = places.start;
     }
 
-    /// The same for all else.
-    pub fn hold_tapes(&mut self, layer: &Layer<V>, bonds: &Bonds, places: &Range<usize>) {
+    /// The same for their bonds and, if they are to be kept, their tapes.
+    pub fn hold(&mut self, layer: &Layer<V>, bonds: &Bonds, places: &Range<usize>, keep_tapes: bool) {
         let blocks = bonds.block_offsets[places.end] - bonds.block_offsets[places.start];
         let of_block = V::LANES * layer.radial.output_lanes();
-        grow(&mut self.tapes, places.len() * layer.tape_lanes);
+        grow(&mut self.tapes, if keep_tapes { places.len() * layer.steps.kept_lanes } else { 0 });
         grow(&mut self.values, blocks * of_block);
         grow(&mut self.derivatives, blocks * of_block);
         self.first = places.start;
@@ -102,17 +125,19 @@ impl<V: Vector> Trace<V> {
     pub fn held<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a Bonds) -> (Traced<'a, V>, Shared<'a, V>) {
         let of_bonds = Layout::Ragged(&bonds.block_offsets, V::LANES * layer.radial.output_lanes());
         let traced = Traced {
-            tapes: Parts::new(Layout::Even(layer.tape_lanes), self.first, &mut self.tapes),
-            bases: Parts::new(Layout::Even(layer.basis.lanes()), self.first_basis, &mut self.bases),
-            values: Parts::new(of_bonds, self.first, &mut self.values),
-            derivatives: Parts::new(of_bonds, self.first, &mut self.derivatives),
+            tapes: Parts::new(Layout::Even(layer.steps.kept_lanes), self.first, &mut self.tapes),
+            bases: Parts::new(Layout::Even(layer.steps.basis_lanes), self.first_basis, &mut self.bases),
+            bonds: TracedBonds {
+                values: Parts::new(of_bonds, self.first, &mut self.values),
+                derivatives: Parts::new(of_bonds, self.first, &mut self.derivatives),
+            },
         };
-        (traced, Shared::new(layer.basis.lanes(), self.first_basis, &self.basis_cotangents))
+        (traced, Shared::new(layer.steps.basis_lanes, self.first_basis, &self.basis_cotangents))
     }
 
     /// B.
     pub fn bases(&self, layer: &Layer<V>) -> Shared<'_, V> {
-        Shared::new(layer.basis.lanes(), self.first_basis, &self.bases)
+        Shared::new(layer.steps.basis_lanes, self.first_basis, &self.bases)
     }
 
     /// B, and where its cotangents of some places go to.
@@ -121,7 +146,7 @@ impl<V: Vector> Trace<V> {
         layer: &Layer<V>,
         places: &Range<usize>,
     ) -> (Shared<'_, V>, Parts<'_, V>) {
-        let lanes = layer.basis.lanes();
+        let lanes = layer.steps.basis_lanes;
         grow(&mut self.basis_cotangents, (places.end - self.first_basis) * lanes);
         let first = (places.start - self.first_basis) * lanes;
         let out = Parts::new(Layout::Even(lanes), places.start, &mut self.basis_cotangents[first..]);
@@ -132,10 +157,20 @@ impl<V: Vector> Trace<V> {
 impl<V: Send> Divide for Traced<'_, V> {
     fn divide(self, chunk: &Chunk) -> (Self, Self) {
         let (tapes, bases) = (self.tapes.divide(chunk), self.bases.divide(chunk));
+        let bonds = self.bonds.divide(chunk);
+        (
+            Self { tapes: tapes.0, bases: bases.0, bonds: bonds.0 },
+            Self { tapes: tapes.1, bases: bases.1, bonds: bonds.1 },
+        )
+    }
+}
+
+impl<V: Send> Divide for TracedBonds<'_, V> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
         let (values, derivatives) = (self.values.divide(chunk), self.derivatives.divide(chunk));
         (
-            Self { tapes: tapes.0, bases: bases.0, values: values.0, derivatives: derivatives.0 },
-            Self { tapes: tapes.1, bases: bases.1, values: values.1, derivatives: derivatives.1 },
+            Self { values: values.0, derivatives: derivatives.0 },
+            Self { values: values.1, derivatives: derivatives.1 },
         )
     }
 }
@@ -171,52 +206,37 @@ impl<'a, V: Vector> Here<'a, V> {
     }
 }
 
-/// Tapes of a batch, and its part of the basis.
+/// The tape of a batch, and its part of the basis.
 #[inline(always)]
 pub(super) fn forward<V: Vector>(
     &Here { layer, bonds, received, .. }: &Here<V>,
     placed: &Placed,
     trace: &mut Traced<V>,
-    work: &mut BondWork<V>,
+    (tape, work): (&mut Vec<V>, &mut BondWork<V>),
 ) {
-    let (batch, places) = (&placed.batch, placed.places());
-    let tape = trace.tapes.of(&places);
-    layer.used.clear(batch.atoms, tape);
+    let (batch, places, steps) = (&placed.batch, placed.places(), &layer.steps);
+    grow(tape, batch.atoms * steps.tape_lanes);
+    tape[..batch.atoms * steps.fixed_lanes].fill(V::ZERO);
     for (slot, place) in places.clone().enumerate() {
-        let density = (&mut *tape, Slot { slot, slots: batch.atoms });
-        let own = trace_of(place, bonds, &mut trace.values, &mut trace.derivatives);
+        let density = (&mut tape[..], Slot { slot, slots: batch.atoms });
+        let own = trace.bonds.of(place, bonds);
         match layer.message.from {
             None => accumulate(layer, batch.element, own, density, work),
             Some(_) => accumulate_messages(layer, batch.element, own, received, density, work),
         }
     }
-    for operation in &layer.operations {
-        operation.forward(batch, tape);
-    }
-    layer.basis.forward(batch.atoms, tape, trace.bases.of(&places), layer.basis.lanes());
+    steps.forward(batch, tape, trace.bases.of(&places));
 }
 
-#[inline(always)]
-fn trace_of<'a, V>(
-    place: usize,
-    bonds: &'a Bonds,
-    values: &'a mut Parts<V>,
-    derivatives: &'a mut Parts<V>,
-) -> OwnBonds<'a, V> {
-    let places = place..place + 1;
-    OwnBonds { bonds: bonds.of(place), values: values.of(&places), derivatives: derivatives.of(&places) }
-}
-
-/// Adds what the tapes of a batch say to the messages of its atoms, which begin as constants.
+/// Adds what the tape of a batch says to the messages of its atoms, which begin as constants.
 #[inline(always)]
 pub(super) fn send<V: Vector>(
     tensor: &Tensor,
     of_message: usize,
     placed: &Placed,
-    trace: &mut Traced<V>,
+    tape: &[V],
     messages: &mut [V],
 ) {
-    let tape = trace.tapes.of(&placed.places());
     for (slot, message) in messages.chunks_exact_mut(of_message).enumerate() {
         let slot = Slot { slot, slots: placed.batch.atoms };
         for (q, row) in message.chunks_exact_mut(tensor.width).take(tensor.components).enumerate() {
@@ -266,29 +286,23 @@ pub(super) struct BackwardWork<V> {
 pub(super) fn backward_tape<V: Vector, const N: usize>(
     &Here { layer, block, .. }: &Here<V>,
     placed: &Placed,
-    trace: &mut Traced<V>,
+    tape: &[V],
     from: &Cotangents<V>,
     work: &mut BackwardWork<V>,
 ) {
-    let (batch, lanes) = (&placed.batch, layer.basis.lanes());
+    let (batch, steps) = (&placed.batch, &layer.steps);
     let (atoms, slots) = (batch.atoms, N * batch.atoms);
-    grow(&mut work.tape, slots * layer.tape_lanes);
+    grow(&mut work.tape, slots * steps.cotangent_lanes);
     let cotangent = &mut work.tape[..];
-    layer.used.clear(slots, cotangent);
-    energy_basis_cotangent(block, placed, from.densities, lanes, &mut work.basis);
-    layer.basis.backward(atoms, (&work.basis, lanes), cotangent, (0, slots));
-    if N == 2 {
-        layer.basis.backward(atoms, (from.basis, lanes), cotangent, (atoms, slots));
-    }
+    cotangent[..slots * steps.fixed_lanes].fill(V::ZERO);
     if let Some((Message { from: Some(tensor), .. }, returned)) = &from.returned {
         for (k, rows) in returned.iter().enumerate().take(N) {
             add_returned(tensor, rows, cotangent, (k * atoms, slots));
         }
     }
-    let tape = trace.tapes.of(&placed.places());
-    for operation in layer.operations.iter().rev() {
-        operation.backward::<N>(batch, tape, cotangent);
-    }
+    energy_basis_cotangent(block, placed, from.densities, steps.basis_lanes, &mut work.basis);
+    let bases = std::array::from_fn(|k| if k == 0 { &work.basis[..] } else { from.basis });
+    steps.backward::<N>(batch, tape, cotangent, bases);
 }
 
 /// ∂E/∂B of a batch.
@@ -305,7 +319,7 @@ fn energy_basis_cotangent<V: Vector>(
     out.resize(atoms * lanes, V::ZERO);
     let (from, to) = (Rows::of_atoms(atoms, stride), Rows::of_atoms(atoms, lanes));
     let weights = block.weights.transposed(placed.batch.element);
-    weights.multiply_add(densities, from, out, to, placed.batch.instructions);
+    weights.multiply_add((densities, &mut out[..]), from, to, placed.batch.instructions);
 }
 
 /// Adds the cotangents of messages, a row for each atom, to the cotangents of the tape in the slots from `first` of `slots`.
@@ -326,7 +340,7 @@ fn add_returned<V: Vector>(tensor: &Tensor, rows: &[V], tape: &mut [V], (first, 
 pub(super) fn backward_bonds<V: Vector, const N: usize>(
     &Here { layer, bonds, received, rows, .. }: &Here<V>,
     placed: &Placed,
-    trace: &mut Traced<V>,
+    traced: &mut TracedBonds<V>,
     (to, mut returns): (&mut [Parts<Vec3>; 2], Option<&mut Returns<V>>),
     (tape, work): (&BackwardWork<V>, &mut BondWork<V>),
 ) {
@@ -334,7 +348,7 @@ pub(super) fn backward_bonds<V: Vector, const N: usize>(
     for (slot, place) in placed.places().enumerate() {
         let slots = std::array::from_fn(|k| Slot { slot: k * atoms + slot, slots: N * atoms });
         let cotangent = (&tape.tape[..], slots);
-        let own = trace_of(place, bonds, &mut trace.values, &mut trace.derivatives);
+        let own = traced.of(place, bonds);
         let mut both = to.each_mut().map(|part| Some(part.of(&(place..place + 1))));
         let gradients: [&mut [Vec3]; N] = std::array::from_fn(|k| both[k].take().unwrap_or_default());
         match &mut returns {

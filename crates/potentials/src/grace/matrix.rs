@@ -49,10 +49,10 @@ impl<V: Vector> Matrix<V> {
         }
     }
 
-    /// Adds x M to the rows `to` of `out`, x being the rows `from` of `x`, as many.
-    pub fn multiply_add(&self, x: &[V], from: Rows, out: &mut [V], to: Rows, instructions: Instructions) {
+    /// Adds x M to the rows `to`, x being the rows `from`, as many.
+    pub fn multiply_add(&self, lanes: impl Lanes<V>, from: Rows, to: Rows, instructions: Instructions) {
         assert_eq!(from.len(), to.len());
-        instructions.run(Multiply { matrix: self, x, from, out, to });
+        instructions.run(Multiply { matrix: self, lanes, from, to });
     }
 
     /// `PANELS` panels at a time, which stay in the first cache for all rows.
@@ -60,47 +60,75 @@ impl<V: Vector> Matrix<V> {
     fn multiply_panels<const ROWS: usize, const PANELS: usize>(
         &self,
         inputs: Range<usize>,
-        x: &[V],
+        lanes: &mut impl Lanes<V>,
         from: Rows,
-        out: &mut [V],
         to: Rows,
     ) {
-        let lanes = self.output_lanes();
+        let n = self.output_lanes();
         let panel = |p: usize| &self.panels[p * self.inputs..][inputs.clone()];
         let mut p = 0;
-        while p + PANELS <= lanes {
+        while p + PANELS <= n {
             let panels: [&[V]; PANELS] = std::array::from_fn(|k| panel(p + k));
-            multiply_rows::<V, ROWS, PANELS>(panels, inputs.start, x, from, out, to.after(p));
+            multiply_rows::<V, ROWS, PANELS>(panels, inputs.start, lanes, from, to.after(p));
             p += PANELS;
         }
-        for p in p..lanes {
-            multiply_rows::<V, ROWS, 1>([panel(p)], inputs.start, x, from, out, to.after(p));
+        for p in p..n {
+            multiply_rows::<V, ROWS, 1>([panel(p)], inputs.start, lanes, from, to.after(p));
         }
     }
 }
 
 /// x M, compiled once for all who need it.
-struct Multiply<'a, V> {
+struct Multiply<'a, V, L> {
     matrix: &'a Matrix<V>,
-    x: &'a [V],
+    lanes: L,
     from: Rows<'a>,
-    out: &'a mut [V],
     to: Rows<'a>,
 }
 
-impl<V: Vector> Pass for Multiply<'_, V> {
+impl<V: Vector, L: Lanes<V>> Pass for Multiply<'_, V, L> {
     /// Blocks are larger where there are registers for them, which changes no bits.
     #[inline(always)]
     fn run(self, wide: bool) {
-        let Self { matrix, x, from, out, to } = self;
+        let Self { matrix, mut lanes, from, to } = self;
         for first in (0..matrix.inputs).step_by(INNER_BLOCK) {
             let inputs = first..matrix.inputs.min(first + INNER_BLOCK);
             if wide {
-                matrix.multiply_panels::<8, 2>(inputs, x, from, out, to);
+                matrix.multiply_panels::<8, 2>(inputs, &mut lanes, from, to);
             } else {
-                matrix.multiply_panels::<4, 1>(inputs, x, from, out, to);
+                matrix.multiply_panels::<4, 1>(inputs, &mut lanes, from, to);
             }
         }
+    }
+}
+
+/// The array that rows are read from and the one that they are added to, which may be the same.
+pub(super) trait Lanes<V> {
+    fn read(&self) -> &[V];
+    fn write(&mut self) -> &mut [V];
+}
+
+impl<V> Lanes<V> for (&[V], &mut [V]) {
+    #[inline(always)]
+    fn read(&self) -> &[V] {
+        self.0
+    }
+
+    #[inline(always)]
+    fn write(&mut self) -> &mut [V] {
+        self.1
+    }
+}
+
+impl<V> Lanes<V> for &mut [V] {
+    #[inline(always)]
+    fn read(&self) -> &[V] {
+        self
+    }
+
+    #[inline(always)]
+    fn write(&mut self) -> &mut [V] {
+        self
     }
 }
 
@@ -161,26 +189,25 @@ impl Rows<'_> {
 fn multiply_rows<V: Vector, const ROWS: usize, const PANELS: usize>(
     panels: [&[V]; PANELS],
     first_input: usize,
-    x: &[V],
+    lanes: &mut impl Lanes<V>,
     from: Rows,
-    out: &mut [V],
     to: Rows,
 ) {
     let (n, mut row) = (from.len(), 0);
     while row + ROWS <= n {
-        multiply_block::<V, ROWS, PANELS>(panels, first_input, x, from.block(row), out, to.block(row));
+        multiply_block::<V, ROWS, PANELS>(panels, first_input, lanes, from.block(row), to.block(row));
         row += ROWS;
     }
     if ROWS > 4 && row + 4 <= n {
-        multiply_block::<V, 4, PANELS>(panels, first_input, x, from.block(row), out, to.block(row));
+        multiply_block::<V, 4, PANELS>(panels, first_input, lanes, from.block(row), to.block(row));
         row += 4;
     }
     if row + 2 <= n {
-        multiply_block::<V, 2, PANELS>(panels, first_input, x, from.block(row), out, to.block(row));
+        multiply_block::<V, 2, PANELS>(panels, first_input, lanes, from.block(row), to.block(row));
         row += 2;
     }
     if row < n {
-        multiply_block::<V, 1, PANELS>(panels, first_input, x, from.block(row), out, to.block(row));
+        multiply_block::<V, 1, PANELS>(panels, first_input, lanes, from.block(row), to.block(row));
     }
 }
 
@@ -189,12 +216,11 @@ fn multiply_rows<V: Vector, const ROWS: usize, const PANELS: usize>(
 fn multiply_block<V: Vector, const ROWS: usize, const PANELS: usize>(
     panels: [&[V]; PANELS],
     first_input: usize,
-    x: &[V],
+    lanes: &mut impl Lanes<V>,
     from: [usize; ROWS],
-    out: &mut [V],
     to: [usize; ROWS],
 ) {
-    let (x, inputs) = (V::flat(x), panels[0].len());
+    let (x, inputs) = (V::flat(lanes.read()), panels[0].len());
     let rows: [&[V::Number]; ROWS] =
         std::array::from_fn(|r| &x[from[r] * V::LANES + first_input..][..inputs]);
     let panels = panels.map(|panel| &panel[..inputs]);
@@ -206,6 +232,7 @@ fn multiply_block<V: Vector, const ROWS: usize, const PANELS: usize>(
             }
         }
     }
+    let out = lanes.write();
     for (to, sums) in to.into_iter().zip(&sums) {
         for (out, sum) in out[to..to + PANELS].iter_mut().zip(sums) {
             out.add(sum);
@@ -242,7 +269,7 @@ mod tests {
                 let mut out = vec![V::splat(V::Number::round(1.0)); 2 * slots * yl];
                 let (from, to) = ([0, xl as u32], [yl as u32, 0]);
                 let (from, to) = (rows(&from, slots, xl), rows(&to, slots, yl));
-                matrix.multiply_add(&x, from, &mut out, to, instructions);
+                matrix.multiply_add((&x[..], &mut out[..]), from, to, instructions);
                 for (r, o) in (0..2 * slots).flat_map(|r| (0..outputs).map(move |o| (r, o))) {
                     let row = &numbers[r * xl * V::LANES..];
                     let direct: f64 = (0..inputs).map(|i| row[i] * element(i, o)).sum();

@@ -18,9 +18,10 @@ pub(super) struct Network<V: Vector> {
 }
 
 impl<V: Vector> Network<V> {
-    /// What an atom takes on the longest tape, bytes.
+    /// What an atom takes on the longest tapes, its own and one of cotangents, bytes.
     pub fn tape_bytes(&self) -> usize {
-        let lanes = self.layers.iter().map(|layer| layer.used.lanes()).max();
+        let steps = self.layers.iter().map(|layer| &layer.steps);
+        let lanes = steps.map(|steps| steps.tape_lanes + steps.cotangent_lanes).max();
         lanes.unwrap_or(0) * size_of::<V>()
     }
 

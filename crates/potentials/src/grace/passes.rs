@@ -23,6 +23,8 @@ pub(super) struct Scratch<V> {
     /// For each layer.
     pub bonds: Vec<BondWork<V>>,
     pub readout: ReadoutWork<V>,
+    /// Of one batch.
+    pub tape: Vec<V>,
     pub backward: BackwardWork<V>,
     /// Of atoms whose trace is not kept.
     pub trace: Trace<V>,
@@ -35,6 +37,7 @@ impl<V: Vector> Scratch<V> {
         Self {
             bonds: network.layers.iter().map(BondWork::new).collect(),
             readout: ReadoutWork::default(),
+            tape: Vec::new(),
             backward: BackwardWork::default(),
             trace: Trace::default(),
             feature_cotangent: Vec::new(),
@@ -83,19 +86,19 @@ impl<V: Vector> Evaluator<V> {
         };
         let all = 0..batches.order.len();
         trace.hold_bases(here.layer, &all);
-        trace.hold_tapes(here.layer, bonds, &all);
+        trace.hold(here.layer, bonds, &all, true);
         let work = (trace.held(here.layer, bonds).0, sent);
         self.threads.each(&batches.chunks, work, &|chunk, (mut trace, mut sent), thread| {
-            let work = &mut of_thread(scratch, thread).bonds[k];
+            let Scratch { tape, bonds, .. } = &mut *of_thread(scratch, thread);
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
-                let trace = &mut trace;
-                instructions.run(Forward { here, placed, trace, work });
-                if let Some(next) = network.layers.get(k + 1) {
-                    let sent = sent.of(&placed.places());
-                    if let Some(tensor) = &next.message.from {
-                        send(tensor, next.message.lanes(), &placed, trace, sent);
-                    }
+                let (places, trace) = (placed.places(), &mut trace);
+                instructions.run(Forward { here, placed, trace, work: (tape, &mut bonds[k]) });
+                trace.keep(&places, tape);
+                if let Some(next) = network.layers.get(k + 1)
+                    && let Some(tensor) = &next.message.from
+                {
+                    send(tensor, next.message.lanes(), &placed, tape, sent.of(&places));
                 }
             }
         });
@@ -148,9 +151,9 @@ impl<V: Vector> Evaluator<V> {
                 let stride = n_layers * lanes;
                 let densities = (&density_cotangents[places.start * stride + k * lanes..], stride);
                 let from = Cotangents { densities, basis: cotangents.of(&places), returned };
-                let (trace, to, returns) = (&mut trace, &mut to, returns.only());
-                let work = (&mut *backward, &mut work[k]);
-                instructions.run(Backward::<V, N> { here, placed, trace, from, to, returns, work });
+                let (tape, bonds) = (&*trace.tapes.of(&places), &mut trace.bonds);
+                let (to, returns, work) = (&mut to, returns.only(), (&mut *backward, &mut work[k]));
+                instructions.run(Backward::<V, N> { here, placed, tape, bonds, from, to, returns, work });
             }
         });
     }

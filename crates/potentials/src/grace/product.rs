@@ -7,16 +7,14 @@ use super::vector::{Number, Vector};
 /// out_n,f = Σ_c C_c left_n,l(c) right_n,r(c), the sum over the terms c of f.
 #[derive(Clone, Debug)]
 pub(super) struct Product<V: Vector> {
-    /// First lane of the result.
-    pub start: usize,
     /// Lanes of a component, the same for result and factors.
     pub width: usize,
     /// Channels of a component.
     pub channels: usize,
     /// Each component of the result that is needed.
     pub outputs: Vec<Coupled<V>>,
-    /// Each component of the factors with the derivatives of the result: terms of the result's cotangent (left, lanes
-    /// from the beginning of the result) and the other factor (right). Made by [`Product::keep`].
+    /// Each component of the factors with the derivatives of the result: terms of the result's cotangent (left) and the other
+    /// factor (right). Made by [`Product::keep`].
     pub inputs: Vec<Coupled<V>>,
 }
 
@@ -45,18 +43,17 @@ const TOGETHER: usize = 4;
 impl<V: Vector> Product<V> {
     #[inline(always)]
     pub fn forward(&self, atoms: usize, tape: &mut [V]) {
-        let (before, out) = tape.split_at_mut(self.start * atoms);
         let lanes = self.width * atoms;
+        let whole = lanes / TOGETHER * TOGETHER;
         for output in &self.outputs {
-            let out = &mut out[(output.row - self.start) * atoms..][..lanes];
-            let whole = lanes / TOGETHER * TOGETHER;
+            let out = output.row * atoms;
             for c in (0..whole).step_by(TOGETHER) {
-                let [sums] = couple::<V, 1, TOGETHER>(&output.terms, before, 0, before, atoms, c);
-                out[c..c + TOGETHER].copy_from_slice(&sums);
+                let [sums] = couple::<V, 1, TOGETHER>(&output.terms, tape, 0, tape, atoms, c);
+                tape[out + c..][..TOGETHER].copy_from_slice(&sums);
             }
             for c in whole..lanes {
-                let [sums] = couple::<V, 1, 1>(&output.terms, before, 0, before, atoms, c);
-                out[c..c + 1].copy_from_slice(&sums);
+                let [[sum]] = couple::<V, 1, 1>(&output.terms, tape, 0, tape, atoms, c);
+                tape[out + c] = sum;
             }
         }
     }
@@ -64,17 +61,17 @@ impl<V: Vector> Product<V> {
     /// Adds to `N` cotangents of both factors.
     #[inline(always)]
     pub fn backward<const N: usize>(&self, atoms: usize, tape: &[V], cotangent: &mut [V]) {
-        let (before, out) = cotangent.split_at_mut(self.start * N * atoms);
         let lanes = self.width * atoms;
+        let whole = lanes / TOGETHER * TOGETHER;
         for input in &self.inputs {
-            let whole = lanes / TOGETHER * TOGETHER;
+            let out = input.row * N * atoms;
             for c in (0..whole).step_by(TOGETHER) {
-                let sums = couple::<V, N, TOGETHER>(&input.terms, out, lanes, tape, atoms, c);
-                add::<V, N, TOGETHER>(&mut before[input.row * N * atoms + c..], lanes, &sums);
+                let sums = couple::<V, N, TOGETHER>(&input.terms, cotangent, lanes, tape, atoms, c);
+                add::<V, N, TOGETHER>(&mut cotangent[out + c..], lanes, &sums);
             }
             for c in whole..lanes {
-                let sums = couple::<V, N, 1>(&input.terms, out, lanes, tape, atoms, c);
-                add::<V, N, 1>(&mut before[input.row * N * atoms + c..], lanes, &sums);
+                let sums = couple::<V, N, 1>(&input.terms, cotangent, lanes, tape, atoms, c);
+                add::<V, N, 1>(&mut cotangent[out + c..], lanes, &sums);
             }
         }
     }
@@ -87,6 +84,22 @@ impl<V: Vector> Product<V> {
             needed[term.right as usize] = true;
         }
         self.inputs = self.derivatives();
+    }
+
+    /// As [`super::tape::Operation::rename`].
+    pub fn rename(&mut self, on_tape: impl Fn(u32) -> u32, of_cotangent: impl Fn(u32) -> u32) {
+        for output in &mut self.outputs {
+            output.row = on_tape(output.row as u32) as usize;
+            for term in &mut output.terms {
+                (term.left, term.right) = (on_tape(term.left), on_tape(term.right));
+            }
+        }
+        for input in &mut self.inputs {
+            input.row = of_cotangent(input.row as u32) as usize;
+            for term in &mut input.terms {
+                (term.left, term.right) = (of_cotangent(term.left), on_tape(term.right));
+            }
+        }
     }
 
     /// Some of the results alone.
@@ -103,8 +116,7 @@ impl<V: Vector> Product<V> {
             for Term { left, right, coefficient } in &output.terms {
                 for (x, other) in [(left, right), (right, left)] {
                     let terms = inputs.entry(*x).or_default();
-                    *terms.entry(((output.row - self.start) as u32, *other)).or_default() +=
-                        (*coefficient).into();
+                    *terms.entry((output.row as u32, *other)).or_default() += (*coefficient).into();
                 }
             }
         }
@@ -156,34 +168,38 @@ fn add<V: Vector, const N: usize, const L: usize>(rows: &mut [V], apart: usize, 
     }
 }
 
-/// First lanes of rows, and the factor of each.
-pub(super) type Summands<V> = Vec<(u32, <V as Vector>::Number)>;
-
 /// out_n,f = Σ_c C_c x_n,r(c), the sum over the terms c of f.
 #[derive(Clone, Debug)]
 pub(super) struct Combination<V: Vector> {
-    /// First lane of the result.
-    pub start: usize,
     /// Lanes of a component.
-    pub width: usize,
+    width: usize,
     /// Channels of a component.
     pub channels: usize,
-    /// For each component that is needed its first lane, and the first lane and factor of what it sums.
-    pub outputs: Vec<(usize, Summands<V>)>,
+    /// Each component that is needed.
+    pub outputs: Vec<Combined<V>>,
+    /// The same on the tape of cotangents. Made by [`Combination::rename`].
+    cotangents: Vec<Combined<V>>,
 }
 
+/// First lane of a component, and the first lane and factor of each that it sums.
+pub(super) type Combined<V> = (u32, Vec<(u32, <V as Vector>::Number)>);
+
 impl<V: Vector> Combination<V> {
+    /// Of components with so many lanes and channels.
+    pub fn new(width: usize, channels: usize, outputs: Vec<Combined<V>>) -> Self {
+        Self { width, channels, outputs, cotangents: Vec::new() }
+    }
+
     #[inline(always)]
     pub fn forward(&self, slots: usize, tape: &mut [V]) {
-        let (before, out) = tape.split_at_mut(self.start * slots);
         for (row, terms) in &self.outputs {
-            let out = &mut out[(row - self.start) * slots..][..self.width * slots];
-            for (c, out) in out.iter_mut().enumerate() {
+            let out = *row as usize * slots;
+            for c in 0..self.width * slots {
                 let mut sum = V::ZERO;
                 for (from, coefficient) in terms {
-                    sum.add_scaled(*coefficient, &before[*from as usize * slots + c]);
+                    sum.add_scaled(*coefficient, &tape[*from as usize * slots + c]);
                 }
-                *out = sum;
+                tape[out + c] = sum;
             }
         }
     }
@@ -191,12 +207,12 @@ impl<V: Vector> Combination<V> {
     /// Adds to the cotangents of what it read.
     #[inline(always)]
     pub fn backward(&self, slots: usize, cotangent: &mut [V]) {
-        let (before, out) = cotangent.split_at_mut(self.start * slots);
-        for (row, terms) in &self.outputs {
-            let out = &out[(row - self.start) * slots..][..self.width * slots];
-            for (c, out) in out.iter().enumerate() {
+        for (row, terms) in &self.cotangents {
+            let out = *row as usize * slots;
+            for c in 0..self.width * slots {
+                let of_sum = cotangent[out + c];
                 for (from, coefficient) in terms {
-                    before[*from as usize * slots + c].add_scaled(*coefficient, out);
+                    cotangent[*from as usize * slots + c].add_scaled(*coefficient, &of_sum);
                 }
             }
         }
@@ -204,9 +220,21 @@ impl<V: Vector> Combination<V> {
 
     /// As [`super::tape::Operation::keep`].
     pub fn keep(&mut self, needed: &mut [bool]) {
-        self.outputs.retain(|(row, _)| needed[*row]);
+        self.outputs.retain(|(row, _)| needed[*row as usize]);
         for (from, _) in self.outputs.iter().flat_map(|(_, terms)| terms) {
             needed[*from as usize] = true;
         }
     }
+
+    /// As [`super::tape::Operation::rename`].
+    pub fn rename(&mut self, on_tape: impl Fn(u32) -> u32, of_cotangent: impl Fn(u32) -> u32) {
+        self.cotangents = renamed::<V>(&self.outputs, of_cotangent);
+        self.outputs = renamed::<V>(&self.outputs, on_tape);
+    }
+}
+
+fn renamed<V: Vector>(outputs: &[Combined<V>], name: impl Fn(u32) -> u32) -> Vec<Combined<V>> {
+    let terms =
+        |terms: &[(u32, V::Number)]| terms.iter().map(|(row, factor)| (name(*row), *factor)).collect();
+    outputs.iter().map(|(row, summed)| (name(*row), terms(summed))).collect()
 }

@@ -168,7 +168,7 @@ impl<V: Vector> FeatureMap<V> {
                 norms[layer + 1] += square;
             }
             let (from, to) = (Rows::of_atoms(n, of_atom), Rows::of_atoms(n, lanes));
-            maps.forward.multiply_add(bases, from, all_projected, to, instructions);
+            maps.forward.multiply_add((bases, &mut *all_projected), from, to, instructions);
         }
         all_norms.iter_mut().for_each(|square| *square = square.sqrt());
         let rows = all_projected.chunks_exact_mut(lanes).zip(all_norms.chunks_exact(map.n_norms()));
@@ -232,7 +232,7 @@ impl<V: Vector> FeatureMap<V> {
             }
         }
         let (from, to) = (Rows::of_atoms(places.len(), self.lanes()), Rows::of_atoms(places.len(), of_atom));
-        maps.transposed.multiply_add(work.projected.of(places), from, out, to, instructions);
+        maps.transposed.multiply_add((&*work.projected.of(places), out), from, to, instructions);
     }
 
     /// Lanes of B̂ R.

@@ -44,7 +44,7 @@ impl RadialNetwork {
                 output.clear();
                 output.resize(layer.output_lanes(), Double::ZERO);
                 let row = Rows::of_atoms(1, 0);
-                layer.multiply_add(input, row, output, row, instructions);
+                layer.multiply_add((&input[..], &mut output[..]), row, row, instructions);
             }
             let bias = if k == 0 { self.pair_biases.get(pair) } else { self.biases.get(k) };
             for (y, b) in work.output[0].iter_mut().zip(bias.into_iter().flatten()) {

@@ -107,7 +107,8 @@ impl<V: Vector> Readout<V> {
         let densities = &mut work.densities[layer];
         zeros(densities, atoms * lanes);
         let (from, to) = (Rows::of_atoms(atoms, basis.1), Rows::of_atoms(atoms, lanes));
-        block.weights.forward(batch.element).multiply_add(basis.0, from, densities, to, batch.instructions);
+        let weights = block.weights.forward(batch.element);
+        weights.multiply_add((basis.0, &mut densities[..]), from, to, batch.instructions);
         let rows = densities.chunks_exact(lanes).zip(work.values[0].chunks_exact_mut(lanes));
         for (densities, sum) in rows.map(|(d, sum)| (V::flat(d), V::flat_mut(sum))) {
             match &block.norm {
@@ -126,7 +127,7 @@ impl<V: Vector> Readout<V> {
             zeros(&mut after[0], atoms * layer.output_lanes());
             let from = Rows::of_atoms(atoms, layer.input_lanes());
             let to = Rows::of_atoms(atoms, layer.output_lanes());
-            layer.multiply_add(&before[k], from, &mut after[0], to, batch.instructions);
+            layer.multiply_add((&before[k][..], &mut after[0][..]), from, to, batch.instructions);
             if k + 1 < self.layers.len() {
                 zeros(&mut work.slopes[k], atoms * layer.output_lanes());
                 let values = V::flat_mut(&mut after[0]).iter_mut();
@@ -160,7 +161,7 @@ impl<V: Vector> Readout<V> {
             zeros(&mut work.swap, atoms * transposed.output_lanes());
             let from = Rows::of_atoms(atoms, transposed.input_lanes());
             let to = Rows::of_atoms(atoms, transposed.output_lanes());
-            transposed.multiply_add(&work.cotangent, from, &mut work.swap, to, batch.instructions);
+            transposed.multiply_add((&work.cotangent[..], &mut work.swap[..]), from, to, batch.instructions);
             std::mem::swap(&mut work.swap, &mut work.cotangent);
         }
         if self.layers.is_empty() {

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use super::error::{GraceError, mismatch};
 use super::graph::Graph;
-use super::tape::{Linear, LinearPart, Operation, Tensor};
+use super::linear::{Linear, LinearPart};
+use super::tape::{Operation, Tensor};
 use super::vector::Vector;
 use super::weights::Weights;
 
@@ -52,7 +53,7 @@ impl<V: Vector> Graph<'_, V> {
         let mut places: Vec<Option<(&Source, usize, usize)>> = Vec::new();
         for source in &reduction.sources {
             for (component, tile) in source.collect.iter().zip(&source.tiles) {
-                self.basis.rows.push((source.tensor.row(*component), source.tensor.width));
+                self.basis.push((source.tensor.row(*component), source.tensor.width));
                 let channels = source.tensor.channels;
                 places.extend(
                     (0..source.tensor.width * V::LANES).map(|n| (n < channels).then_some((source, *tile, n))),
@@ -86,16 +87,16 @@ impl<V: Vector> Graph<'_, V> {
             for ((component, tile), sum) in source.collect.iter().zip(&source.tiles).zip(&source.sums) {
                 let (from, to) = rows.entry(*tile).or_default();
                 from.push(source.tensor.row(*component) as u32);
-                to.push((sum * out.width) as u32);
+                to.push(out.row(*sum) as u32);
             }
-            for (tile, (from, to)) in rows {
+            for (tile, rows) in rows {
                 let (channels, n_out) = (source.tensor.channels, reduction.n_out);
                 let element = |t, n, k| reduction.weight(source, tile, [t, n, k]);
                 let weights = Weights::new(reduction.n_types, channels, n_out, element);
-                parts.push(LinearPart { weights, from, to });
+                parts.push(LinearPart::new(weights, rows));
             }
         }
-        self.operations.push(Operation::Linear(Linear { start: out.start, parts }));
+        self.operations.push(Operation::Linear(Linear { parts }));
         Ok(out)
     }
 

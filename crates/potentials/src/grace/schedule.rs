@@ -5,8 +5,9 @@
 
 use std::collections::BTreeMap;
 
+use super::linear::Linear;
 use super::product::Term;
-use super::tape::{Linear, Operation};
+use super::tape::Operation;
 use super::vector::Vector;
 
 /// The same operations in pieces, depth first from those whose results no other takes.
@@ -47,9 +48,9 @@ fn place(k: usize, needs: &[Vec<usize>], placed: &mut [bool], order: &mut Vec<us
 /// Parts of a linear map that add to different rows, and groups of a product's results that share no factor.
 fn divided<V: Vector>(operation: Operation<V>) -> Vec<Operation<V>> {
     match operation {
-        Operation::Linear(Linear { start, parts }) => {
-            let groups = connected(parts, |part| part.to.clone());
-            groups.into_iter().map(|parts| Operation::Linear(Linear { start, parts })).collect()
+        Operation::Linear(Linear { parts }) => {
+            let groups = connected(parts, |part| part.tape[1].clone());
+            groups.into_iter().map(|parts| Operation::Linear(Linear { parts })).collect()
         }
         Operation::Product(product) => {
             let rows = |terms: &[Term<V>]| terms.iter().flat_map(|t| [t.left, t.right]).collect();

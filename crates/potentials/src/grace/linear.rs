@@ -1,0 +1,83 @@
+//! Channels mixed with weights.
+
+use super::matrix::Rows;
+use super::tape::Batch;
+use super::vector::Vector;
+use super::weights::Weights;
+
+/// out_k,w = Σ over parts, Σ_n W_kn x_n,w′.
+#[derive(Clone, Debug)]
+pub(super) struct Linear<V> {
+    /// Rows that share weights.
+    pub parts: Vec<LinearPart<V>>,
+}
+
+/// Rows of one or more tensors multiplied by the same weights.
+#[derive(Clone, Debug)]
+pub(super) struct LinearPart<V> {
+    /// [n_in × n_out]
+    pub weights: Weights<V>,
+    /// Lanes where each row is read, and where each is added.
+    pub tape: [Vec<u32>; 2],
+    /// The same on the tape of cotangents. Made by [`Linear::rename`].
+    cotangents: [Vec<u32>; 2],
+}
+
+impl<V: Vector> LinearPart<V> {
+    /// From lanes where each row is read, and where each is added.
+    pub fn new(weights: Weights<V>, (from, to): (Vec<u32>, Vec<u32>)) -> Self {
+        Self { weights, tape: [from, to], cotangents: Default::default() }
+    }
+
+    /// Rows of inputs and of outputs at the lanes given.
+    #[inline(always)]
+    fn rows<'a>(&self, [from, to]: &'a [Vec<u32>; 2], slots: usize) -> (Rows<'a>, Rows<'a>) {
+        let weights = self.weights.forward(0);
+        let rows = |starts, stride| Rows { starts, slots, stride, shift: 0 };
+        (rows(from, weights.input_lanes()), rows(to, weights.output_lanes()))
+    }
+}
+
+impl<V: Vector> Linear<V> {
+    /// Adds to its results.
+    #[inline(always)]
+    pub fn forward(&self, batch: &Batch, tape: &mut [V]) {
+        for part in &self.parts {
+            let (from, to) = part.rows(&part.tape, batch.atoms);
+            let weights = part.weights.forward(batch.element);
+            weights.multiply_add(&mut *tape, from, to, batch.instructions);
+        }
+    }
+
+    /// Adds to `N` cotangents of what it read.
+    #[inline(always)]
+    pub fn backward<const N: usize>(&self, batch: &Batch, cotangent: &mut [V]) {
+        for part in &self.parts {
+            let (from, to) = part.rows(&part.cotangents, N * batch.atoms);
+            let weights = part.weights.transposed(batch.element);
+            weights.multiply_add(&mut *cotangent, to, from, batch.instructions);
+        }
+    }
+
+    /// As [`super::tape::Operation::keep`].
+    pub fn keep(&mut self, needed: &mut [bool]) {
+        for part in &mut self.parts {
+            let [from, to] = &part.tape;
+            let rows = from.iter().copied().zip(to.iter().copied());
+            let kept: Vec<(u32, u32)> = rows.filter(|(_, to)| needed[*to as usize]).collect();
+            kept.iter().for_each(|(from, _)| needed[*from as usize] = true);
+            let (from, to) = kept.into_iter().unzip();
+            part.tape = [from, to];
+        }
+        self.parts.retain(|part| !part.tape[0].is_empty());
+    }
+
+    /// As [`super::tape::Operation::rename`].
+    pub fn rename(&mut self, on_tape: impl Fn(u32) -> u32, of_cotangent: impl Fn(u32) -> u32) {
+        for part in &mut self.parts {
+            part.cotangents =
+                part.tape.each_ref().map(|rows| rows.iter().map(|r| of_cotangent(*r)).collect());
+            part.tape.iter_mut().flatten().for_each(|row| *row = on_tape(*row));
+        }
+    }
+}
