@@ -320,8 +320,9 @@ pub(super) fn reverse<V: Vector, const N: usize>(
     for (block, (bonds, values, derivatives)) in own.blocks(layer).enumerate() {
         let (v, r) = directions(bonds);
         layer.harmonics.evaluate::<V, true>(&v, &mut work.harmonics, &mut work.gradients);
-        for (gradients, slot) in gradients.iter_mut().zip(slots) {
-            let of_block = gradient_of_bonds(layer, &v, &r, (cotangent, slot), (values, derivatives), work);
+        let slopes = slopes(layer, (cotangent, slots), (values, derivatives), work);
+        for (gradients, (along, across)) in gradients.iter_mut().zip(&slopes) {
+            let of_block = bond_gradient(&v, &r, along, across);
             put(&of_block, &mut gradients[block * V::LANES..][..bonds.len()]);
         }
     }
@@ -353,33 +354,61 @@ fn add_bonds<V: Vector>(layer: &Layer<V>, density: &mut [V], slot: Slot, work: &
     }
 }
 
+/// g and G of a block for each cotangent.
 #[inline(always)]
-fn gradient_of_bonds<V: Vector>(
+fn slopes<V: Vector, const N: usize>(
     layer: &Layer<V>,
-    v: &[V; 3],
-    r: &V,
-    (cotangent, slot): (&[V], Slot),
+    (cotangent, slots): (&[V], [Slot; N]),
     (values, derivatives): (&[V], &[V]),
     work: &BondWork<V>,
-) -> [V; 3] {
-    let (width, channels) = (layer.density.width, layer.density.channels);
-    let (mut along, mut across) = (V::ZERO, [V::ZERO; 3]);
-    let orders = values.chunks_exact(width * V::LANES).zip(derivatives.chunks_exact(width * V::LANES));
-    for (l, (values, derivatives)) in orders.enumerate() {
-        for lm in l * l..(l + 1) * (l + 1) {
-            let row = &cotangent[slot.row(&layer.density, lm)..][..width];
-            let (mut c, mut c_prime) = (V::ZERO, V::ZERO);
-            for ((a, value), derivative) in V::flat(row)[..channels].iter().zip(values).zip(derivatives) {
-                c.add_scaled(*a, value);
-                c_prime.add_scaled(*a, derivative);
-            }
-            along.add_product(&work.harmonics[lm], &c_prime);
-            for (across, gradient) in across.iter_mut().zip(&work.gradients[lm]) {
-                across.add_product(gradient, &c);
+) -> [(V, [V; 3]); N] {
+    let of_order = layer.density.width * V::LANES;
+    let mut slopes = [(V::ZERO, [V::ZERO; 3]); N];
+    let orders = values.chunks_exact(of_order).zip(derivatives.chunks_exact(of_order));
+    for (l, order) in orders.enumerate() {
+        let (mut lm, end) = (l * l, (l + 1) * (l + 1));
+        while lm + 2 <= end {
+            add_slopes::<V, N, 2>(layer, (cotangent, slots), order, work, lm, &mut slopes);
+            lm += 2;
+        }
+        add_slopes::<V, N, 1>(layer, (cotangent, slots), order, work, lm, &mut slopes);
+    }
+    slopes
+}
+
+/// Adds to g and G what `M` harmonics from `lm` say, with c_lm = Σ_n Ā_lm,n R_nl ζ_n and c′_lm.
+#[inline(always)]
+fn add_slopes<V: Vector, const N: usize, const M: usize>(
+    layer: &Layer<V>,
+    (cotangent, slots): (&[V], [Slot; N]),
+    (values, derivatives): (&[V], &[V]),
+    work: &BondWork<V>,
+    lm: usize,
+    slopes: &mut [(V, [V; 3]); N],
+) {
+    let row = |slot: Slot, m: usize| {
+        let row = &cotangent[slot.row(&layer.density, lm + m)..][..layer.density.width];
+        &V::flat(row)[..layer.density.channels]
+    };
+    let rows: [[&[V::Number]; M]; N] = std::array::from_fn(|k| std::array::from_fn(|m| row(slots[k], m)));
+    let mut sums = [[[V::ZERO; 2]; M]; N];
+    let channels = values.iter().zip(derivatives).take(layer.density.channels);
+    for (n, (value, derivative)) in channels.enumerate() {
+        for (rows, sums) in rows.iter().zip(&mut sums) {
+            for (row, [c, c_prime]) in rows.iter().zip(sums) {
+                c.add_scaled(row[n], value);
+                c_prime.add_scaled(row[n], derivative);
             }
         }
     }
-    bond_gradient(v, r, &along, &across)
+    for ((along, across), sums) in slopes.iter_mut().zip(&sums) {
+        for (m, [c, c_prime]) in sums.iter().enumerate() {
+            along.add_product(&work.harmonics[lm + m], c_prime);
+            for (across, gradient) in across.iter_mut().zip(&work.gradients[lm + m]) {
+                across.add_product(gradient, c);
+            }
+        }
+    }
 }
 
 /// g v + (G − (G·v) v)/r of a block, from g and G.
