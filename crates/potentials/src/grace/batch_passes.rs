@@ -109,13 +109,12 @@ impl<V: Vector> Pass for BeginProjectBack<'_, '_, V> {
     }
 }
 
-/// From there to those of the bases of one layer.
+/// From there to those of the bases of one layer, in place of these.
 pub(super) struct ProjectBack<'a, 'b, V> {
     pub map: &'a FeatureMap<V>,
     pub layer: usize,
     pub places: &'a Range<usize>,
-    pub bases: &'a [V],
-    pub out: &'a mut [V],
+    pub bases: &'a mut [V],
     pub work: &'a mut Projected<'b, V>,
     pub instructions: Instructions,
 }
@@ -123,7 +122,7 @@ pub(super) struct ProjectBack<'a, 'b, V> {
 impl<V: Vector> Pass for ProjectBack<'_, '_, V> {
     #[inline(always)]
     fn run(self, _: bool) {
-        let Self { map, layer, places, bases, out, work, instructions } = self;
-        map.backward(layer, places, bases, out, work, instructions);
+        let Self { map, layer, places, bases, work, instructions } = self;
+        map.backward(layer, places, bases, work, instructions);
     }
 }

@@ -8,7 +8,7 @@ use super::evaluate::{Evaluator, Grade};
 use super::instructions::Instructions;
 use super::layer_work::{Cotangents, Gradients, Here, LayerWork};
 use super::network::Network;
-use super::parts::{Divide, Layout, Parts, Shared};
+use super::parts::{Divide, Layout, Parts};
 use super::passes::{Scratch, begin_returns, gradients_of, of_thread};
 use super::projection::Projected;
 use super::vector::Vector;
@@ -22,8 +22,6 @@ struct Pass<'a, V: Vector> {
     instructions: Instructions,
     batches: &'a Batches,
     here: Here<'a, V>,
-    /// Of the layers before.
-    bases: [Shared<'a, V>; BEFORE],
     grade: Option<&'a Grade<'a>>,
 }
 
@@ -35,29 +33,29 @@ struct Results<'a, V> {
     gradients: Gradients<'a, V>,
     /// None where nothing is graded.
     projected: Option<Projected<'a, V>>,
-    /// From the features, of the bases of the layers before.
-    basis_cotangents: [Parts<'a, V>; BEFORE],
+    /// The bases of the layers before, in whose place two cotangents leave those from the features.
+    bases: [Parts<'a, V>; BEFORE],
 }
 
 impl<V: Send> Divide for Results<'_, V> {
     fn divide(self, chunk: &Chunk) -> (Self, Self) {
         let (energies, densities) = (self.energies.divide(chunk), self.densities.divide(chunk));
         let (gradients, projected) = (self.gradients.divide(chunk), self.projected.divide(chunk));
-        let basis_cotangents = self.basis_cotangents.divide(chunk);
+        let bases = self.bases.divide(chunk);
         (
             Self {
                 energies: energies.0,
                 densities: densities.0,
                 gradients: gradients.0,
                 projected: projected.0,
-                basis_cotangents: basis_cotangents.0,
+                bases: bases.0,
             },
             Self {
                 energies: energies.1,
                 densities: densities.1,
                 gradients: gradients.1,
                 projected: projected.1,
-                basis_cotangents: basis_cotangents.1,
+                bases: bases.1,
             },
         )
     }
@@ -79,18 +77,12 @@ impl<V: Vector> Evaluator<V> {
             densities: Parts::new(Layout::Even(of_densities), 0, &mut self.density_cotangents[..]),
             gradients: gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns),
             projected: map.map(|map| projection.parts(map)),
-            basis_cotangents: [(); BEFORE].map(|()| Parts::empty()),
+            bases: [(); BEFORE].map(|()| Parts::empty()),
         };
-        let mut bases = [Shared::new(0, 0, &[]); BEFORE];
-        for (k, (work, layer)) in before.iter_mut().zip(&network.layers).enumerate() {
-            if grade.is_none() {
-                bases[k] = work.trace.bases(layer);
-                continue;
-            }
-            let all = 0..batches.order.len();
-            (bases[k], results.basis_cotangents[k]) = work.trace.basis_cotangents(layer, &all);
+        for (bases, (work, layer)) in results.bases.iter_mut().zip(before.iter_mut().zip(&network.layers)) {
+            *bases = work.trace.bases_of(layer);
         }
-        let pass = Pass { network, instructions: *instructions, batches, here, bases, grade };
+        let pass = Pass { network, instructions: *instructions, batches, here, grade };
         self.threads.each(&batches.chunks, results, &|chunk, mut results, thread| {
             let scratch = &mut of_thread(scratch, thread);
             if let Some(returns) = results.gradients.returns.only() {
@@ -98,6 +90,9 @@ impl<V: Vector> Evaluator<V> {
             }
             pass.run::<N>(chunk, &mut results, scratch);
         });
+        if N == 2 {
+            self.layers[..last].iter_mut().for_each(|work| work.trace.take_cotangents());
+        }
         self.finish_layer::<N>(last);
     }
 }
@@ -128,7 +123,7 @@ impl<V: Vector> Pass<'_, V> {
 
     fn forward<const N: usize>(&self, placed: Placed, results: &mut Results<V>, scratch: &mut Scratch<V>) {
         let (last, places) = (self.network.layers.len() - 1, placed.places());
-        let (mut traced, _) = scratch.trace.held(self.here.layer, self.here.bonds);
+        let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
         let (here, trace) = (self.here, &mut traced);
         let work = (&mut scratch.tape, &mut scratch.bonds[last]);
         self.instructions.run(Forward { here, placed, trace, work });
@@ -136,7 +131,8 @@ impl<V: Vector> Pass<'_, V> {
             trace.keep(&places, &scratch.tape);
         }
         let own = &*traced.bases.of(&places);
-        let basis = |k: usize| if k == last { own } else { self.bases[k].of(&places) };
+        let before = results.bases.each_mut().map(|bases| &*bases.of(&places));
+        let basis = |k: usize| if k == last { own } else { before[k] };
         let (energies, cotangents) = (results.energies.of(&places), results.densities.of(&places));
         let (readout, work) = (&self.network.readout, &mut scratch.readout);
         self.instructions.run(Energies { readout, placed, basis, energies, cotangents, work });
@@ -152,8 +148,10 @@ impl<V: Vector> Pass<'_, V> {
         let (Some(map), Some(work)) = (&self.network.feature_map, &mut results.projected) else { return };
         let Some(grade) = self.grade else { return };
         let (instructions, last) = (self.instructions, self.network.layers.len() - 1);
-        let (own, mut out) = scratch.trace.basis_cotangents(self.here.layer, places);
-        let bases = |k: usize| if k == last { own.of(places) } else { self.bases[k].of(places) };
+        let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
+        let own = traced.bases.of(places);
+        let mut before = results.bases.each_mut().map(|bases| bases.of(places));
+        let bases = |k: usize| if k == last { &*own } else { &*before[k] };
         instructions.run(Project { map, places, bases, work, instructions });
         let (features, cotangent) = (work.features.of(places), &mut scratch.feature_cotangent);
         cotangent.resize(if N == 2 { features.len() } else { 0 }, 0.0);
@@ -162,19 +160,18 @@ impl<V: Vector> Pass<'_, V> {
             return;
         }
         instructions.run(BeginProjectBack { map, places, cotangent, work });
-        for layer in 0..=last {
-            let bases = bases(layer);
-            let out = if layer == last { out.of(places) } else { results.basis_cotangents[layer].of(places) };
-            instructions.run(ProjectBack { map, layer, places, bases, out, work, instructions });
+        let before = before.iter_mut().take(last).map(|bases| &mut **bases);
+        for (layer, bases) in before.chain([own]).enumerate() {
+            instructions.run(ProjectBack { map, layer, places, bases, work, instructions });
         }
     }
 
     fn backward<const N: usize>(&self, placed: Placed, results: &mut Results<V>, scratch: &mut Scratch<V>) {
         let (readout, places) = (&self.network.readout, placed.places());
         let (last, lanes) = (readout.blocks.len() - 1, readout.density_lanes());
-        let (mut traced, cotangents) = scratch.trace.held(self.here.layer, self.here.bonds);
+        let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
         let densities = (&results.densities.of(&places)[last * lanes..], readout.blocks.len() * lanes);
-        let from = Cotangents { densities, basis: cotangents.of(&places), returned: None };
+        let from = Cotangents { densities, basis: traced.bases.of(&places), returned: None };
         let tape = if N == 1 { &scratch.tape[..] } else { traced.tapes.of(&places) };
         let (here, bonds, to) = (self.here, &mut traced.bonds, &mut results.gradients.bonds);
         let (returns, work) =

@@ -121,18 +121,33 @@ impl<V: Vector> Trace<V> {
         self.first = places.start;
     }
 
-    /// What it holds, and the cotangents of the basis.
-    pub fn held<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a Bonds) -> (Traced<'a, V>, Shared<'a, V>) {
-        let of_bonds = Layout::Ragged(&bonds.block_offsets, V::LANES * layer.radial.output_lanes());
+    /// What it holds.
+    pub fn held<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a Bonds) -> Traced<'a, V> {
+        self.parts(layer, bonds).0
+    }
+
+    /// What of it a reverse sweep needs, with the cotangents of the basis.
+    pub fn kept<'a>(
+        &'a mut self,
+        layer: &Layer<V>,
+        bonds: &'a Bonds,
+    ) -> (Parts<'a, V>, TracedBonds<'a, V>, Shared<'a, V>) {
+        let (Traced { tapes, bonds, .. }, cotangents) = self.parts(layer, bonds);
+        (tapes, bonds, cotangents)
+    }
+
+    fn parts<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a Bonds) -> (Traced<'a, V>, Shared<'a, V>) {
+        let (steps, of_block) = (&layer.steps, V::LANES * layer.radial.output_lanes());
+        let of_bonds = Layout::Ragged(&bonds.block_offsets, of_block);
         let traced = Traced {
-            tapes: Parts::new(Layout::Even(layer.steps.kept_lanes), self.first, &mut self.tapes),
-            bases: Parts::new(Layout::Even(layer.steps.basis_lanes), self.first_basis, &mut self.bases),
+            tapes: Parts::new(Layout::Even(steps.kept_lanes), self.first, &mut self.tapes),
+            bases: Parts::new(Layout::Even(steps.basis_lanes), self.first_basis, &mut self.bases),
             bonds: TracedBonds {
                 values: Parts::new(of_bonds, self.first, &mut self.values),
                 derivatives: Parts::new(of_bonds, self.first, &mut self.derivatives),
             },
         };
-        (traced, Shared::new(layer.steps.basis_lanes, self.first_basis, &self.basis_cotangents))
+        (traced, Shared::new(steps.basis_lanes, self.first_basis, &self.basis_cotangents))
     }
 
     /// B.
@@ -140,17 +155,20 @@ impl<V: Vector> Trace<V> {
         Shared::new(layer.steps.basis_lanes, self.first_basis, &self.bases)
     }
 
-    /// B, and where its cotangents of some places go to.
-    pub fn basis_cotangents(
-        &mut self,
-        layer: &Layer<V>,
-        places: &Range<usize>,
-    ) -> (Shared<'_, V>, Parts<'_, V>) {
-        let lanes = layer.steps.basis_lanes;
-        grow(&mut self.basis_cotangents, (places.end - self.first_basis) * lanes);
-        let first = (places.start - self.first_basis) * lanes;
-        let out = Parts::new(Layout::Even(lanes), places.start, &mut self.basis_cotangents[first..]);
-        (Shared::new(lanes, self.first_basis, &self.bases), out)
+    /// B, whose place its cotangents are to take.
+    pub fn bases_of(&mut self, layer: &Layer<V>) -> Parts<'_, V> {
+        Parts::new(Layout::Even(layer.steps.basis_lanes), self.first_basis, &mut self.bases)
+    }
+
+    /// A copy of B, whose place its cotangents are to take.
+    pub fn copy_of_bases(&mut self, layer: &Layer<V>) -> Parts<'_, V> {
+        self.basis_cotangents.clone_from(&self.bases);
+        Parts::new(Layout::Even(layer.steps.basis_lanes), self.first_basis, &mut self.basis_cotangents)
+    }
+
+    /// The cotangents of B stand in its place: there are no bases any more.
+    pub fn take_cotangents(&mut self) {
+        std::mem::swap(&mut self.bases, &mut self.basis_cotangents);
     }
 }
 

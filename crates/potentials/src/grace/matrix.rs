@@ -52,7 +52,19 @@ impl<V: Vector> Matrix<V> {
     /// Adds x M to the rows `to`, x being the rows `from`, as many.
     pub fn multiply_add(&self, lanes: impl Lanes<V>, from: Rows, to: Rows, instructions: Instructions) {
         assert_eq!(from.len(), to.len());
-        instructions.run(Multiply { matrix: self, lanes, from, to });
+        instructions.run(Multiply { matrix: self, lanes, from, to, factors: None });
+    }
+
+    /// The same, the rows `to` having been multiplied by the factor of each.
+    pub fn scale_multiply_add(
+        &self,
+        lanes: impl Lanes<V>,
+        from: Rows,
+        (to, factors): (Rows, Factors),
+        instructions: Instructions,
+    ) {
+        assert_eq!(from.len(), to.len());
+        instructions.run(Multiply { matrix: self, lanes, from, to, factors: Some(factors) });
     }
 
     /// `PANELS` panels at a time, which stay in the first cache for all rows.
@@ -62,18 +74,18 @@ impl<V: Vector> Matrix<V> {
         inputs: Range<usize>,
         lanes: &mut impl Lanes<V>,
         from: Rows,
-        to: Rows,
+        (to, factors): (Rows, Option<Factors>),
     ) {
         let n = self.output_lanes();
         let panel = |p: usize| &self.panels[p * self.inputs..][inputs.clone()];
         let mut p = 0;
         while p + PANELS <= n {
             let panels: [&[V]; PANELS] = std::array::from_fn(|k| panel(p + k));
-            multiply_rows::<V, ROWS, PANELS>(panels, inputs.start, lanes, from, to.after(p));
+            multiply_rows::<V, ROWS, PANELS>(panels, inputs.start, lanes, from, (to.after(p), factors));
             p += PANELS;
         }
         for p in p..n {
-            multiply_rows::<V, ROWS, 1>([panel(p)], inputs.start, lanes, from, to.after(p));
+            multiply_rows::<V, ROWS, 1>([panel(p)], inputs.start, lanes, from, (to.after(p), factors));
         }
     }
 }
@@ -84,15 +96,17 @@ struct Multiply<'a, V, L> {
     lanes: L,
     from: Rows<'a>,
     to: Rows<'a>,
+    factors: Option<Factors<'a>>,
 }
 
 impl<V: Vector, L: Lanes<V>> Pass for Multiply<'_, V, L> {
     /// Blocks are larger where there are registers for them, which changes no bits.
     #[inline(always)]
     fn run(self, wide: bool) {
-        let Self { matrix, mut lanes, from, to } = self;
+        let Self { matrix, mut lanes, from, to, factors } = self;
         for first in (0..matrix.inputs).step_by(INNER_BLOCK) {
             let inputs = first..matrix.inputs.min(first + INNER_BLOCK);
+            let to = (to, factors.filter(|_| first == 0));
             if wide {
                 matrix.multiply_panels::<8, 2>(inputs, &mut lanes, from, to);
             } else {
@@ -100,6 +114,14 @@ impl<V: Vector, L: Lanes<V>> Pass for Multiply<'_, V, L> {
             }
         }
     }
+}
+
+/// A number for each row.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Factors<'a> {
+    pub numbers: &'a [f64],
+    /// From that of one row to that of the next.
+    pub stride: usize,
 }
 
 /// The array that rows are read from and the one that they are added to, which may be the same.
@@ -191,36 +213,38 @@ fn multiply_rows<V: Vector, const ROWS: usize, const PANELS: usize>(
     first_input: usize,
     lanes: &mut impl Lanes<V>,
     from: Rows,
-    to: Rows,
+    to: (Rows, Option<Factors>),
 ) {
     let (n, mut row) = (from.len(), 0);
     while row + ROWS <= n {
-        multiply_block::<V, ROWS, PANELS>(panels, first_input, lanes, from.block(row), to.block(row));
+        multiply_block::<V, ROWS, PANELS>(panels, first_input, lanes, from, to, row);
         row += ROWS;
     }
     if ROWS > 4 && row + 4 <= n {
-        multiply_block::<V, 4, PANELS>(panels, first_input, lanes, from.block(row), to.block(row));
+        multiply_block::<V, 4, PANELS>(panels, first_input, lanes, from, to, row);
         row += 4;
     }
     if row + 2 <= n {
-        multiply_block::<V, 2, PANELS>(panels, first_input, lanes, from.block(row), to.block(row));
+        multiply_block::<V, 2, PANELS>(panels, first_input, lanes, from, to, row);
         row += 2;
     }
     if row < n {
-        multiply_block::<V, 1, PANELS>(panels, first_input, lanes, from.block(row), to.block(row));
+        multiply_block::<V, 1, PANELS>(panels, first_input, lanes, from, to, row);
     }
 }
 
-/// Some rows times some panels, the sums in registers.
+/// Some rows from the given one times some panels, the sums in registers.
 #[inline(always)]
 fn multiply_block<V: Vector, const ROWS: usize, const PANELS: usize>(
     panels: [&[V]; PANELS],
     first_input: usize,
     lanes: &mut impl Lanes<V>,
-    from: [usize; ROWS],
-    to: [usize; ROWS],
+    from: Rows,
+    (to, factors): (Rows, Option<Factors>),
+    row: usize,
 ) {
     let (x, inputs) = (V::flat(lanes.read()), panels[0].len());
+    let (from, to): ([usize; ROWS], [usize; ROWS]) = (from.block(row), to.block(row));
     let rows: [&[V::Number]; ROWS] =
         std::array::from_fn(|r| &x[from[r] * V::LANES + first_input..][..inputs]);
     let panels = panels.map(|panel| &panel[..inputs]);
@@ -233,6 +257,14 @@ fn multiply_block<V: Vector, const ROWS: usize, const PANELS: usize>(
         }
     }
     let out = lanes.write();
+    if let Some(Factors { numbers, stride }) = factors {
+        for (r, to) in to.into_iter().enumerate() {
+            let factor = V::Number::round(numbers[(row + r) * stride]);
+            for out in &mut out[to..to + PANELS] {
+                *out = out.scaled(factor);
+            }
+        }
+    }
     for (to, sums) in to.into_iter().zip(&sums) {
         for (out, sum) in out[to..to + PANELS].iter_mut().zip(sums) {
             out.add(sum);

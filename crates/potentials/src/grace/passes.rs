@@ -87,7 +87,7 @@ impl<V: Vector> Evaluator<V> {
         let all = 0..batches.order.len();
         trace.hold_bases(here.layer, &all);
         trace.hold(here.layer, bonds, &all, true);
-        let work = (trace.held(here.layer, bonds).0, sent);
+        let work = (trace.held(here.layer, bonds), sent);
         self.threads.each(&batches.chunks, work, &|chunk, (mut trace, mut sent), thread| {
             let Scratch { tape, bonds, .. } = &mut *of_thread(scratch, thread);
             for batch in chunk.batches.clone() {
@@ -132,9 +132,10 @@ impl<V: Vector> Evaluator<V> {
         let (lanes, n_layers) = (network.readout.density_lanes(), network.layers.len());
         let LayerWork { bonds, trace, messages, gradients, returns, rows, .. } = &mut here[k];
         let here = Here::new(network, k, (bonds, messages, rows));
-        let (traced, cotangents) = trace.held(here.layer, bonds);
-        let work = (traced, gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns));
-        self.threads.each(&batches.chunks, work, &|chunk, (mut trace, to), thread| {
+        let (tapes, traced, cotangents) = trace.kept(here.layer, bonds);
+        let to = gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns);
+        self.threads.each(&batches.chunks, ((tapes, traced), to), &|chunk, (trace, to), thread| {
+            let (mut tapes, mut bonds_of) = trace;
             let Scratch { bonds: work, backward, .. } = &mut *of_thread(scratch, thread);
             let Gradients { bonds: mut to, mut returns } = to;
             if let Some(returns) = returns.only() {
@@ -151,7 +152,7 @@ impl<V: Vector> Evaluator<V> {
                 let stride = n_layers * lanes;
                 let densities = (&density_cotangents[places.start * stride + k * lanes..], stride);
                 let from = Cotangents { densities, basis: cotangents.of(&places), returned };
-                let (tape, bonds) = (&*trace.tapes.of(&places), &mut trace.bonds);
+                let (tape, bonds) = (&*tapes.of(&places), &mut bonds_of);
                 let (to, returns, work) = (&mut to, returns.only(), (&mut *backward, &mut work[k]));
                 instructions.run(Backward::<V, N> { here, placed, tape, bonds, from, to, returns, work });
             }
@@ -213,13 +214,10 @@ impl<V: Vector> Evaluator<V> {
             instructions.run(BeginProjectBack { map, places, cotangent, work });
         });
         for (k, (work, layer)) in layers.iter_mut().zip(&network.layers).enumerate() {
-            let (bases, out) = work.trace.basis_cotangents(layer, &(0..batches.order.len()));
-            let work = (projected.parts(map), out);
-            self.threads.share(&batches.chunks, work, &|places, (mut work, mut out)| {
-                let (bases, out) = (bases.of(places), out.of(places));
-                let (work, instructions) = (&mut work, *instructions);
-                let pass = ProjectBack { map, layer: k, places, bases, out, work, instructions };
-                instructions.run(pass);
+            let work = (projected.parts(map), work.trace.copy_of_bases(layer));
+            self.threads.share(&batches.chunks, work, &|places, (mut work, mut bases)| {
+                let (bases, work, instructions) = (bases.of(places), &mut work, *instructions);
+                instructions.run(ProjectBack { map, layer: k, places, bases, work, instructions });
             });
         }
     }

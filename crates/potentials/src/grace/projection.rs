@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use super::batches::Chunk;
 use super::instructions::Instructions;
-use super::matrix::{Matrix, Rows};
+use super::matrix::{Factors, Matrix, Rows};
 use super::parts::{Divide, Layout, Parts};
 use super::vector::{Number, Vector};
 use super::weights::with_transpose;
@@ -125,15 +125,15 @@ impl Projection {
         bytes
     }
 
-    /// Puts in place of ‖B‖ and ‖B_k‖ the factors of B in its cotangent, the first for all layers.
+    /// Puts in place of ‖B_k‖ the factor of the basis of layer k in its cotangent.
     #[inline(always)]
     fn norm_cotangents(&self, norms: &mut [f64], along: f64, of_norms: &[f64]) {
         let (scale, density) = (f64::from(self.density_scale), |k: usize| of_norms.get(k).copied());
         let factor = |norm: f64, cotangent: f64| cotangent / (norm + NORM_FLOOR) / norm;
+        let of_all = factor(norms[0], scale * density(0).unwrap_or(0.0) - along);
         for (k, layer) in self.blocks.iter().enumerate() {
-            norms[layer + 1] = factor(norms[layer + 1], scale * density(k + 1).unwrap_or(0.0));
+            norms[layer + 1] = of_all + factor(norms[layer + 1], scale * density(k + 1).unwrap_or(0.0));
         }
-        norms[0] = factor(norms[0], scale * density(0).unwrap_or(0.0) - along);
     }
 }
 
@@ -211,28 +211,22 @@ impl<V: Vector> FeatureMap<V> {
         }
     }
 
-    /// The second half: the cotangents of the bases of one layer, [places, lanes], into `out`.
+    /// The second half: puts the cotangents of the bases of one layer, [places, lanes], in place of the bases.
     #[inline(always)]
     pub fn backward(
         &self,
         layer: usize,
         places: &Range<usize>,
-        bases: &[V],
-        out: &mut [V],
+        bases: &mut [V],
         work: &mut Projected<V>,
         instructions: Instructions,
     ) {
-        let (maps, norms) = (&self.maps[layer], work.norms.of(places));
-        let of_atom = maps.forward.input_lanes();
-        let rows = bases.chunks_exact(of_atom).zip(out.chunks_exact_mut(of_atom));
-        for ((basis, out), factors) in rows.zip(norms.chunks_exact(self.projection.n_norms())) {
-            let factor = V::Number::round(factors[0] + factors[layer + 1]);
-            for (out, b) in out.iter_mut().zip(basis) {
-                *out = b.scaled(factor);
-            }
-        }
-        let (from, to) = (Rows::of_atoms(places.len(), self.lanes()), Rows::of_atoms(places.len(), of_atom));
-        maps.transposed.multiply_add((&*work.projected.of(places), out), from, to, instructions);
+        let (maps, stride) = (&self.maps[layer], self.projection.n_norms());
+        let from = Rows::of_atoms(places.len(), self.lanes());
+        let to = Rows::of_atoms(places.len(), maps.forward.input_lanes());
+        let factors = Factors { numbers: &work.norms.of(places)[layer + 1..], stride };
+        let lanes = (&*work.projected.of(places), bases);
+        maps.transposed.scale_multiply_add(lanes, from, (to, factors), instructions);
     }
 
     /// Lanes of B̂ R.
