@@ -135,7 +135,7 @@ impl<V: Vector> Evaluator<V> {
         let (tapes, traced, cotangents) = trace.kept(here.layer, bonds);
         let to = gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns);
         self.threads.each(&batches.chunks, ((tapes, traced), to), &|chunk, (trace, to), thread| {
-            let (mut tapes, mut bonds_of) = trace;
+            let (mut tapes, mut traced) = trace;
             let Scratch { bonds: work, backward, .. } = &mut *of_thread(scratch, thread);
             let Gradients { bonds: mut to, mut returns } = to;
             if let Some(returns) = returns.only() {
@@ -152,7 +152,7 @@ impl<V: Vector> Evaluator<V> {
                 let stride = n_layers * lanes;
                 let densities = (&density_cotangents[places.start * stride + k * lanes..], stride);
                 let from = Cotangents { densities, basis: cotangents.of(&places), returned };
-                let (tape, bonds) = (&*tapes.of(&places), &mut bonds_of);
+                let (tape, bonds) = (&*tapes.of(&places), &mut traced);
                 let (to, returns, work) = (&mut to, returns.only(), (&mut *backward, &mut work[k]));
                 instructions.run(Backward::<V, N> { here, placed, tape, bonds, from, to, returns, work });
             }

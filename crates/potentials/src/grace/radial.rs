@@ -131,7 +131,7 @@ impl<V: Vector> RadialFunctions<V> {
 }
 
 fn round<V: Vector>(from: &[Double], to: &mut [V]) {
-    for (to, from) in V::flat_mut(to).iter_mut().zip(from.as_flattened()) {
+    for (to, from) in V::flat_mut(to).iter_mut().zip(Double::flat(from)) {
         *to = V::Number::round(*from);
     }
 }
@@ -169,7 +169,7 @@ mod tests {
             let exact = network.evaluate(r, cutoff, 0, &mut work);
             table.evaluate_one(r, &mut values, &mut derivatives);
             for (order, found) in [&values, &derivatives].into_iter().enumerate() {
-                for (f, e) in found.as_flattened().iter().zip(exact[order].as_flattened()) {
+                for (f, e) in Double::flat(found).iter().zip(Double::flat(&exact[order])) {
                     worst[order] = worst[order].max((f - e).abs());
                     largest[order] = largest[order].max(e.abs());
                 }

@@ -65,7 +65,7 @@ impl RadialNetwork {
         let [f, df, ddf] = self.envelope(r / cutoff);
         let (df, ddf) = (df / cutoff, ddf / (cutoff * cutoff));
         let rows =
-            values.as_flattened_mut().iter_mut().zip(first.as_flattened_mut()).zip(second.as_flattened_mut());
+            Double::flat_mut(values).iter_mut().zip(Double::flat_mut(first)).zip(Double::flat_mut(second));
         for ((y, dy), ddy) in rows {
             *ddy = f * *ddy + 2.0 * df * *dy + ddf * *y;
             *dy = f * *dy + df * *y;
@@ -84,7 +84,7 @@ impl RadialNetwork {
         let [f, df, ddf] = if self.envelope_last { [1.0, 0.0, 0.0] } else { self.envelope(u) };
         let mut before = [1.0, 0.0, 0.0]; // T_0, T_0′, T_0″
         let mut t = [x, 1.0, 0.0];
-        let [values, first, second] = out.each_mut().map(|row| row.as_flattened_mut());
+        let [values, first, second] = out.each_mut().map(|row| Double::flat_mut(row));
         for k in 0..self.basis_size {
             values[k] = t[0] * f;
             first[k] = (2.0 * t[1] * f + t[0] * df) / cutoff;
@@ -111,8 +111,7 @@ impl RadialNetwork {
 
 /// silu(x) = x / (1 + e^−x) on a jet.
 fn silu([values, first, second]: &mut Jet) {
-    let rows =
-        values.as_flattened_mut().iter_mut().zip(first.as_flattened_mut()).zip(second.as_flattened_mut());
+    let rows = Double::flat_mut(values).iter_mut().zip(Double::flat_mut(first)).zip(Double::flat_mut(second));
     for ((y, dy), ddy) in rows {
         let x = *y;
         let s = 1.0 / (1.0 + (-x).exp());
@@ -165,9 +164,9 @@ pub(super) mod tests {
             let (centre, plus, minus) = (jet(r), jet(r + h), jet(r - h));
             for order in 0..2 {
                 for k in 0..9 {
-                    let at = |jet: &Jet| jet[order].as_flattened()[k];
+                    let at = |jet: &Jet| Double::flat(&jet[order])[k];
                     let difference = (at(&plus) - at(&minus)) / (2.0 * h);
-                    let derivative = centre[order + 1].as_flattened()[k];
+                    let derivative = Double::flat(&centre[order + 1])[k];
                     assert!(
                         (difference - derivative).abs() < 1e-5 * (1.0 + derivative.abs()),
                         "{r} {order} {k}"
@@ -175,6 +174,6 @@ pub(super) mod tests {
                 }
             }
         }
-        assert!(jet(5.0).iter().flatten().flatten().all(|x| *x == 0.0));
+        assert!(jet(5.0).iter().all(|order| Double::flat(order).iter().all(|x| *x == 0.0)));
     }
 }

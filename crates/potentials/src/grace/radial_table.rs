@@ -82,7 +82,7 @@ impl RadialTable<Double> {
             self.evaluate_one(r, values, derivatives);
             let exact = network.evaluate(r, self.cutoff, pair, &mut work);
             for (order, found) in found.iter().enumerate() {
-                for (found, exact) in found.as_flattened().iter().zip(exact[order].as_flattened()) {
+                for (found, exact) in Double::flat(found).iter().zip(Double::flat(&exact[order])) {
                     errors[order] = errors[order].max((found - exact).abs());
                     largest[order] = largest[order].max(exact.abs());
                 }
@@ -94,7 +94,7 @@ impl RadialTable<Double> {
     /// The same with coefficients in another precision.
     pub fn rounded<V: Vector>(&self) -> RadialTable<V> {
         let Self { cutoff, intervals, knots_per_length, errors, .. } = *self;
-        let coefficients = to_lanes(self.coefficients.as_flattened());
+        let coefficients = to_lanes(Double::flat(&self.coefficients));
         let lanes = self.lanes * Double::LANES / V::LANES;
         RadialTable { cutoff, intervals, knots_per_length, errors, lanes, coefficients }
     }
@@ -231,7 +231,7 @@ pub(super) fn b_splines<V: Vector>(t: &V) -> ([V; SUPPORT], [V; SUPPORT]) {
 /// Unser, Aldroubi and Eden; near the ends they belong to some other end condition.
 fn to_coefficients(samples: &mut [Double], lanes: usize) {
     let gain: f64 = POLES.iter().map(|z| (1.0 - z) * (1.0 - 1.0 / z)).product();
-    samples.as_flattened_mut().iter_mut().for_each(|x| *x *= gain);
+    Double::flat_mut(samples).iter_mut().for_each(|x| *x *= gain);
     for z in POLES {
         for k in lanes..samples.len() {
             let before = samples[k - lanes];
@@ -239,7 +239,7 @@ fn to_coefficients(samples: &mut [Double], lanes: usize) {
         }
         for k in (0..samples.len() - lanes).rev() {
             let after = samples[k + lanes];
-            samples[k] = std::array::from_fn(|l| z * (after[l] - samples[k][l]));
+            (0..Double::LANES).for_each(|l| samples[k][l] = z * (after[l] - samples[k][l]));
         }
     }
 }

@@ -7,6 +7,8 @@
 use std::fmt::Debug;
 use std::ops::{Add, AddAssign, Div, Index, IndexMut, Mul, MulAssign, Sub, SubAssign};
 
+use bytemuck::{Pod, Zeroable, must_cast_slice, must_cast_slice_mut};
+
 /// A number as the passes over atoms calculate with it.
 pub(super) trait Number:
     Copy
@@ -94,27 +96,49 @@ pub(super) trait Vector:
     fn horizontal_sum(&self) -> Self::Number;
 }
 
-/// Vectors are copied before they are worked on, which tells the compiler that it may use its own.
+/// Vectors are copied before they are worked on, which tells the compiler that it may use its own. Each is one line of the cache:
+/// what lies across two takes twice as long to be read.
 macro_rules! vector {
-    ($number:ty, $lanes:literal) => {
-        impl Vector for [$number; $lanes] {
+    ($(#[$doc:meta])* $vector:ident, $number:ty, $lanes:literal) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+        #[repr(C, align(64))]
+        pub(super) struct $vector([$number; $lanes]);
+
+        impl Index<usize> for $vector {
+            type Output = $number;
+
+            #[inline(always)]
+            fn index(&self, lane: usize) -> &$number {
+                &self.0[lane]
+            }
+        }
+
+        impl IndexMut<usize> for $vector {
+            #[inline(always)]
+            fn index_mut(&mut self, lane: usize) -> &mut $number {
+                &mut self.0[lane]
+            }
+        }
+
+        impl Vector for $vector {
             type Number = $number;
             const LANES: usize = $lanes;
-            const ZERO: Self = [0.0; $lanes];
+            const ZERO: Self = Self([0.0; $lanes]);
 
             #[inline(always)]
             fn splat(x: $number) -> Self {
-                [x; $lanes]
+                Self([x; $lanes])
             }
 
             #[inline(always)]
             fn flat(vectors: &[Self]) -> &[$number] {
-                vectors.as_flattened()
+                must_cast_slice(vectors)
             }
 
             #[inline(always)]
             fn flat_mut(vectors: &mut [Self]) -> &mut [$number] {
-                vectors.as_flattened_mut()
+                must_cast_slice_mut(vectors)
             }
 
             #[inline(always)]
@@ -168,14 +192,18 @@ macro_rules! vector {
     };
 }
 
-vector!(f64, 8);
-vector!(f32, 16);
-
-/// Double precision.
-pub(super) type Double = [f64; 8];
-
-/// Single precision.
-pub(super) type Single = [f32; 16];
+vector!(
+    /// Double precision.
+    Double,
+    f64,
+    8
+);
+vector!(
+    /// Single precision.
+    Single,
+    f32,
+    16
+);
 
 /// The most lanes that a vector has.
 pub(super) const MOST_LANES: usize = 16;
@@ -200,8 +228,8 @@ mod tests {
 
     #[test]
     fn all_lanes_are_summed() {
-        let double: Double = std::array::from_fn(|k| (k + 1) as f64);
-        let single: Single = std::array::from_fn(|k| (k + 1) as f32);
+        let double = Double(std::array::from_fn(|k| (k + 1) as f64));
+        let single = Single(std::array::from_fn(|k| (k + 1) as f32));
         assert_eq!((double.horizontal_sum(), single.horizontal_sum()), (36.0, 136.0));
     }
 
