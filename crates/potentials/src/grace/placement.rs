@@ -39,27 +39,18 @@ impl Places {
     }
 }
 
-/// Gives places to all rows. `widths` has the number of lanes of each row, at its lane in the graph; the tensors `fixed` stay
-/// whole, as `message` does, which learns its place; `basis` has the first lanes and widths of what goes into the basis.
+/// Gives places to all rows. `widths` has the number of lanes of each row, at its lane in the graph; the tensors `whole` stay
+/// so, `message` among them, which learns its place; `basis` has the first lanes and widths of what goes into the basis.
 pub(super) fn place<V: Vector>(
-    mut operations: Vec<Operation<V>>,
+    operations: Vec<Operation<V>>,
     widths: &[usize],
-    mut fixed: Vec<Tensor>,
+    whole: Vec<Tensor>,
     basis: &[(usize, usize)],
     message: Option<&mut Tensor>,
 ) -> Steps<V> {
-    for operation in &operations {
-        if let Operation::EquivariantNorm(norm) = operation {
-            fixed.extend([norm.from, norm.to]);
-        }
-    }
-    fixed.sort_by_key(|tensor| tensor.start);
-    let mut tape = Places::default();
     let given = given(&operations, basis);
-    for row in fixed.iter().flat_map(Tensor::rows).chain(given.iter().copied()) {
-        tape.take(row, widths[row]);
-    }
-    let (fixed_lanes, mut cotangents) = (tape.end, tape.clone());
+    let fixed = fixed(&operations, whole, &given, widths);
+    let (fixed_lanes, mut tape, mut cotangents) = (fixed.end, fixed.clone(), fixed);
     for row in operations.iter().flat_map(Operation::factors) {
         tape.take(row, widths[row]);
     }
@@ -68,24 +59,20 @@ pub(super) fn place<V: Vector>(
     let fresh = along_cotangents(&operations, &mut cotangents, fixed_lanes, widths);
 
     let gather = |made_here: &dyn Fn(usize) -> bool| gather(basis, made_here, &tape, &cotangents);
-    let sums = |operation: &Operation<V>| match operation {
-        Operation::Linear(_) => ranges(operation.writes(), &tape, widths),
-        _ => Ranges::default(),
+    let step = |(mut operation, fresh): (Operation<V>, Vec<usize>)| {
+        let made = operation.writes();
+        let is_sum = matches!(operation, Operation::Linear(_));
+        let sums = if is_sum { ranges(made.clone(), &tape, widths) } else { Ranges::default() };
+        let lane = |places: &Places, row: u32| places.of[&(row as usize)] as u32;
+        operation.rename(|row| lane(&tape, row), |row| lane(&cotangents, row));
+        let (fresh, basis) = (ranges(fresh, &cotangents, widths), gather(&|row| made.contains(&row)));
+        Step { operation, sums, fresh, basis }
     };
-    let mut steps = Vec::new();
-    for (mut operation, fresh) in operations.drain(..).zip(fresh) {
-        let (sums, made) = (sums(&operation), operation.writes());
-        let basis = gather(&|row| made.contains(&row));
-        let fresh = ranges(fresh, &cotangents, widths);
-        let place = |places: &Places, row: u32| places.of[&(row as usize)] as u32;
-        operation.rename(|row| place(&tape, row), |row| place(&cotangents, row));
-        steps.push(Step { operation, sums, fresh, basis });
-    }
     if let Some(message) = message {
         message.start = tape.of[&message.start];
     }
     Steps {
-        steps,
+        steps: operations.into_iter().zip(fresh).map(step).collect(),
         given: gather(&|row| given.contains(&row)),
         fixed_lanes,
         kept_lanes,
@@ -93,6 +80,27 @@ pub(super) fn place<V: Vector>(
         cotangent_lanes: cotangents.end,
         basis_lanes: basis.iter().map(|(_, width)| width).sum(),
     }
+}
+
+/// The places of rows that stand whole at the beginning of both tapes, in their order in the graph: of the tensors `whole`, of
+/// those that are normalised, and those that no operation makes.
+fn fixed<V: Vector>(
+    operations: &[Operation<V>],
+    mut whole: Vec<Tensor>,
+    given: &BTreeSet<usize>,
+    widths: &[usize],
+) -> Places {
+    for operation in operations {
+        if let Operation::EquivariantNorm(norm) = operation {
+            whole.extend([norm.from, norm.to]);
+        }
+    }
+    whole.sort_by_key(|tensor| tensor.start);
+    let mut places = Places::default();
+    for row in whole.iter().flat_map(Tensor::rows).chain(given.iter().copied()) {
+        places.take(row, widths[row]);
+    }
+    places
 }
 
 /// Rows that are read or go into the basis, which no operation makes.
