@@ -17,7 +17,9 @@ use workers::labeller::{Closing, KeeperCommand, LabellerSettings, Method, Runnin
 use super::common::*;
 
 pub fn keeper_command() -> KeeperCommand {
-    let arguments = ["keeper", "--exact", "--ignored", "--nocapture"].map(str::to_owned).to_vec();
+    // With one thread the name of the test would stand before what the code says.
+    let arguments = ["keeper", "--exact", "--ignored", "--nocapture", "--test-threads=2"];
+    let arguments = arguments.map(str::to_owned).to_vec();
     KeeperCommand { program: std::env::current_exe().unwrap(), arguments }
 }
 
