@@ -80,7 +80,7 @@ impl<V: Vector> Evaluator<V> {
             bases: [(); BEFORE].map(|()| Parts::empty()),
         };
         for (bases, (work, layer)) in results.bases.iter_mut().zip(before.iter_mut().zip(&network.layers)) {
-            *bases = work.trace.bases_of(layer);
+            *bases = work.trace.bases_mut(layer);
         }
         let pass = Pass { network, instructions: *instructions, batches, here, grade };
         self.threads.each(&batches.chunks, results, &|chunk, mut results, thread| {

@@ -156,7 +156,7 @@ impl<V: Vector> Trace<V> {
     }
 
     /// B, whose place its cotangents are to take.
-    pub fn bases_of(&mut self, layer: &Layer<V>) -> Parts<'_, V> {
+    pub fn bases_mut(&mut self, layer: &Layer<V>) -> Parts<'_, V> {
         Parts::new(Layout::Even(layer.steps.basis_lanes), self.first_basis, &mut self.bases)
     }
 

@@ -145,9 +145,7 @@ fn along_cotangents<V: Vector>(
     fresh
 }
 
-fn ranges(mut rows: Vec<usize>, places: &Places, widths: &[usize]) -> Ranges {
-    rows.sort_unstable();
-    rows.dedup();
+fn ranges(rows: Vec<usize>, places: &Places, widths: &[usize]) -> Ranges {
     Ranges::new(rows.into_iter().map(|row| (places.of[&row], widths[row])).collect())
 }
 

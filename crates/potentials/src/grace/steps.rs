@@ -119,9 +119,10 @@ impl Gather {
 pub(super) struct Ranges(Vec<(usize, usize)>);
 
 impl Ranges {
-    /// From the first lanes and the numbers of lanes of rows.
+    /// From the first lanes and the numbers of lanes of rows, some of them more than once.
     pub fn new(mut rows: Vec<(usize, usize)>) -> Self {
         rows.sort_unstable();
+        rows.dedup();
         let mut ranges: Vec<(usize, usize)> = Vec::new();
         for (row, width) in rows {
             match ranges.last_mut() {
