@@ -78,10 +78,9 @@ pub enum Change {
 pub enum Refused {
     /// A key that cannot change.
     #[error(
-        "{key} is {}, but this campaign {} {}: {}. Put the old value back{}",
+        "{key} is {}, but this campaign {}: {}. Put the old value back{}",
         shown(after),
-        if is_label(key) { "labels with" } else { "began with" },
-        shown(before),
+        campaign_has(key, before),
         reason(key),
         way_out(key)
     )]
@@ -243,6 +242,12 @@ fn shown(value: &Value) -> String {
     if value.is_null() { "left out".to_owned() } else { value.to_string() }
 }
 
+/// What a campaign does with a key.
+fn campaign_has(key: &str, value: &Value) -> String {
+    let verb = if is_label(key) { "labels" } else { "began" };
+    if value.is_null() { format!("{verb} without it") } else { format!("{verb} with {value}") }
+}
+
 /// Name and content of a seed structure.
 fn short(seed: &str) -> String {
     let (name, hash) = seed.rsplit_once(' ').unwrap_or((seed, ""));
@@ -320,6 +325,10 @@ mod tests {
         let (key, message) = refused("/walk/tau", json!(0.2));
         assert!(message.starts_with("walk.tau is 0.2, but this campaign began with 0.15"), "{message}");
         assert_eq!(key, "walk.tau");
+        let added = json!({ "walk": { "tau": 0.15, "volume_ramp": { "to": 1.1 } }, "seeds": [] });
+        let message =
+            compare(&json!({ "walk": { "tau": 0.15 }, "seeds": [] }), &added).unwrap_err().to_string();
+        assert!(message.contains("{\"to\":1.1}, but this campaign began without it: "), "{message}");
         let (key, message) = refused("/files/potential.model", json!("cd"));
         assert!(message.contains("(BLAKE3 cd)") && message.contains("(ab)"), "{message}");
         assert_eq!(key, "potential.model");
