@@ -15,7 +15,7 @@ use common::{Turn, crystal, quartiles};
 use potentials::grace::{Grace, GraceModel, PullBack};
 
 /// Times that a turn and as many calls are measured.
-const ROUNDS: usize = 11;
+const ROUNDS: usize = 41;
 
 fn main() {
     let committed = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data/al_eam_1l");
