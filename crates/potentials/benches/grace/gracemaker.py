@@ -1,8 +1,9 @@
 """Times gracemaker's own calculator on one core: python gracemaker.py REQUEST.json
 
-The request names a structure, and either a checkpoint or a preset of which a model with random weights is made (the time does
-not depend on them), and the precision, "double" or "single". Prints the seconds of each call as JSON: energy and forces, and, where there is a mixture, the same with γ
-and the gradient of Σγ.
+The request names structures, and either a checkpoint or a preset of which a model with random weights is made (the time does
+not depend on them), the precision, "double" or "single", and the core. For every line "plain K" or "graded K" of its input
+one call is made with structure K, energy and forces or, where there is a mixture, the same with γ and the gradient of Σγ, and
+a line "seconds S" is printed.
 """
 
 import json
@@ -12,7 +13,9 @@ import tempfile
 import time
 
 os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
-os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+with open(sys.argv[1]) as file:
+    REQUEST = json.load(file)
+os.sched_setaffinity(0, {REQUEST["core"]})
 
 import numpy as np
 import tensorflow as tf
@@ -57,34 +60,42 @@ def plain_calculator(model, checkpoint, dtype):
     return TPCalculator(potential.model)
 
 
-def seconds(calculator, atoms, repetitions):
-    """Of each call, at positions that differ a little, after the calls that compile."""
-    random = np.random.default_rng(1)
-    found = []
-    for k in range(repetitions + 4):
-        atoms.positions += random.normal(0.0, 1e-3, atoms.positions.shape)
+class Case:
+    """A structure, whose positions differ a little from call to call."""
+
+    def __init__(self, structure, calculators):
+        self.atoms = Atoms(structure["symbols"], positions=structure["positions"], cell=structure["cell"], pbc=True)
+        self.calculators = calculators
+        self.random = np.random.default_rng(1)
+        self.compiled = set()
+
+    def seconds(self, name):
+        """Of one call, after those that compile; a short one is made twice, so that its data are in the caches."""
+        if name not in self.compiled:
+            self.compiled.add(name)
+            for _ in range(4):
+                self.call(name)
+        first = self.call(name)
+        return first if first > 1.0 else self.call(name)
+
+    def call(self, name):
+        self.atoms.positions += self.random.normal(0.0, 1e-3, self.atoms.positions.shape)
         start = time.perf_counter()
-        calculator.calculate(atoms, properties=["energy", "forces"])
-        found.append(time.perf_counter() - start)
-    return found[4:]
+        self.calculators[name].calculate(self.atoms, properties=["energy", "forces"])
+        return time.perf_counter() - start
 
 
 def main():
-    with open(sys.argv[1]) as file:
-        request = json.load(file)
-    dtype = {"double": tf.float64, "single": tf.float32}[request["precision"]]
+    dtype = {"double": tf.float64, "single": tf.float32}[REQUEST["precision"]]
     with tempfile.TemporaryDirectory() as folder:
-        model, checkpoint = model_files(request, dtype, folder)
-        plain = plain_calculator(model, checkpoint, dtype)
-        graded = "artifact" in request and get_gmm_uq_calculator(model, checkpoint, request["artifact"], dtype)
-        answer = []
-        for s in request["structures"]:
-            atoms = Atoms(s["symbols"], positions=s["positions"], cell=s["cell"], pbc=True)
-            times = {"atoms": len(atoms)}
-            times["plain"] = seconds(plain, atoms, request["repetitions"])
-            times["graded"] = seconds(graded, atoms, request["repetitions"]) if graded else []
-            answer.append(times)
-    print(json.dumps(answer))
+        model, checkpoint = model_files(REQUEST, dtype, folder)
+        calculators = {"plain": plain_calculator(model, checkpoint, dtype)}
+        if "artifact" in REQUEST:
+            calculators["graded"] = get_gmm_uq_calculator(model, checkpoint, REQUEST["artifact"], dtype)
+        cases = [Case(structure, calculators) for structure in REQUEST["structures"]]
+        for line in sys.stdin:
+            name, case = line.split()
+            print("seconds", cases[int(case)].seconds(name), flush=True)
 
 
 main()

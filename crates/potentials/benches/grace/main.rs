@@ -1,5 +1,6 @@
 //! GRACE measured: energy and forces, and with them γ and ∇Σγ, on one thread, in double and in mixed precision; against
-//! gracemaker's own calculator in double and in single where `CALMWALK_GRACEMAKER_PYTHON` names a Python that has it.
+//! gracemaker's own calculator in double and in single where `CALMWALK_GRACEMAKER_PYTHON` names a Python that has it: in turn, on
+//! one core, to which `taskset` (util-linux) ties both.
 //!
 //! `cargo bench -p potentials --bench grace [-- MODEL…]`; the larger models are those of `CALMWALK_PEER_DATA`. With `scale` before
 //! the models it is time and memory of crystals from 108 to 19 652 atoms.
@@ -14,7 +15,7 @@ use std::time::Instant;
 
 use case::{Call, Case, MODELS, Model};
 use peak::{Peak, Rates};
-use peer::Seconds;
+use peer::Peer;
 use potentials::grace::Precision;
 
 /// Atoms along an edge of the crystals, four in a cell: 108 and 500 atoms.
@@ -22,6 +23,9 @@ const EDGES: [usize; 2] = [3, 5];
 
 /// Seconds that each crystal is measured for.
 const SECONDS: f64 = 4.0;
+
+/// Rounds of ours and gracemaker's.
+const ROUNDS: usize = 9;
 
 fn main() {
     let mut wanted: Vec<String> =
@@ -46,21 +50,21 @@ fn report(model: &Model, peak: Peak) {
     for precision in [Precision::Double, Precision::Mixed] {
         println!("\n{}, {precision} precision", model.name);
         let cases: Vec<Case> = EDGES.iter().map(|edge| Case::new(model, *edge, precision)).collect();
-        let peers = peer::seconds(model, precision, &cases);
-        report_cases(cases, peers.as_deref(), peak.of(precision));
+        let peer = Peer::start(model, precision, &cases);
+        report_cases(cases, peer, peak.of(precision));
     }
     threads::report(model, EDGES[1]);
 }
 
-fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, rates: Rates) {
+fn report_cases(mut cases: Vec<Case>, mut peer: Option<Peer>, rates: Rates) {
     for (k, case) in cases.iter_mut().enumerate() {
         let atoms = case.structure.len() as f64;
-        let found = measure(case);
-        let peer = peers.map(|peers| &peers[k]);
+        let found = measure(case, |call| peer.as_mut().and_then(|peer| peer.seconds(k, call)));
         println!("  {atoms} atoms, {:.1} bonds an atom", case.bonds() as f64 / atoms);
-        for (name, call, times) in
-            [("energy, forces", Call::Plain, &found.plain), ("with γ and ∇Σγ", Call::Graded, &found.graded)]
-        {
+        for (name, call, times, peer) in [
+            ("energy, forces", Call::Plain, &found.plain, &found.peer_plain),
+            ("with γ and ∇Σγ", Call::Graded, &found.graded, &found.peer_graded),
+        ] {
             let [low, median, high] = quantiles(times);
             let count = case.multiply_adds(call) as f64;
             println!(
@@ -71,15 +75,12 @@ fn report_cases(mut cases: Vec<Case>, peers: Option<&[Seconds]>, rates: Rates) {
                 1e-6 * count / atoms,
                 100.0 * count / median / rates.highest
             );
-            if let Some(peer) = peer.map(|peer| peer.of(call)).filter(|times| !times.is_empty()) {
-                let [low, theirs, high] = quantiles(peer);
-                println!(
-                    "      gracemaker: {:.3} ms an atom ({:.3} to {:.3}), {:.1} times ours",
-                    1e3 * theirs / atoms,
-                    1e3 * low / atoms,
-                    1e3 * high / atoms,
-                    theirs / median
-                );
+            if !peer.is_empty() {
+                let (seconds, times): (Vec<f64>, Vec<f64>) = peer.iter().copied().unzip();
+                let [low, median, high] = quantiles(&seconds).map(|seconds| 1e3 * seconds / atoms);
+                println!("      gracemaker: {median:.3} ms an atom ({low:.3} to {high:.3})");
+                let [low, median, high] = quantiles(&times);
+                println!("      {median:.1} times ours ({low:.1} to {high:.1})");
             }
         }
         let differences: Vec<f64> =
@@ -102,19 +103,29 @@ struct Found {
     plain: Vec<f64>,
     gamma: Vec<f64>,
     graded: Vec<f64>,
+    /// Those of gracemaker, one a round, and how many times the median of ours in the round they are.
+    peer_plain: Vec<(f64, f64)>,
+    peer_graded: Vec<(f64, f64)>,
 }
 
-fn measure(case: &mut Case) -> Found {
-    let (mut found, begin) = (Found::default(), Instant::now());
+/// In every round ours for a while, then one plain and one graded call of the peer.
+fn measure(case: &mut Case, mut peer: impl FnMut(Call) -> Option<f64>) -> Found {
+    let mut found = Found::default();
     for _ in 0..2 {
         for call in [Call::Plain, Call::Gamma, Call::Graded] {
             case.seconds(call);
         }
     }
-    while begin.elapsed().as_secs_f64() < SECONDS || found.plain.len() < 5 {
-        found.plain.push(case.seconds(Call::Plain));
-        found.gamma.push(case.seconds(Call::Gamma));
-        found.graded.push(case.seconds(Call::Graded));
+    for _ in 0..ROUNDS {
+        let (begin, first) = (Instant::now(), found.plain.len());
+        while begin.elapsed().as_secs_f64() < SECONDS / ROUNDS as f64 || found.plain.len() == first {
+            found.plain.push(case.seconds(Call::Plain));
+            found.gamma.push(case.seconds(Call::Gamma));
+            found.graded.push(case.seconds(Call::Graded));
+        }
+        let beside = |seconds: f64, ours: &[f64]| (seconds, seconds / quantiles(&ours[first..])[1]);
+        found.peer_plain.extend(peer(Call::Plain).map(|seconds| beside(seconds, &found.plain)));
+        found.peer_graded.extend(peer(Call::Graded).map(|seconds| beside(seconds, &found.graded)));
     }
     found
 }

@@ -1,48 +1,75 @@
 //! gracemaker's calculator on the same crystals.
 
-use std::process::Command;
+use std::io::{BufRead, BufReader, Lines, Write};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use potentials::grace::Precision;
 use serde_json::{Value, json};
+use tempfile::NamedTempFile;
 
 use crate::case::{Call, Case, Model};
 
-/// Seconds of its calls for one crystal.
-pub struct Seconds {
-    plain: Vec<f64>,
-    graded: Vec<f64>,
+/// The core that both are tied to while they are compared.
+const CORE: usize = 0;
+
+/// gracemaker with a model, waiting for calls.
+pub struct Peer {
+    process: Child,
+    input: ChildStdin,
+    lines: Lines<BufReader<ChildStdout>>,
+    grades: bool,
+    _request: NamedTempFile,
 }
 
-impl Seconds {
-    pub fn of(&self, call: Call) -> &[f64] {
-        match call {
-            Call::Plain => &self.plain,
-            Call::Gamma => &[],
-            Call::Graded => &self.graded,
-        }
+impl Peer {
+    /// In single precision beside our mixed; none without gracemaker or its data.
+    pub fn start(model: &Model, precision: Precision, cases: &[Case]) -> Option<Self> {
+        let python = std::env::var_os("CALMWALK_GRACEMAKER_PYTHON")?;
+        let folder = model.peer_folder()?;
+        let request = request(model, precision, &folder, cases);
+        let file = NamedTempFile::new().expect("a temporary file");
+        std::fs::write(file.path(), request.to_string()).expect("the request is written");
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/grace/gracemaker.py");
+        let mut command = Command::new(python);
+        command.arg(script).arg(file.path()).stdin(Stdio::piped()).stdout(Stdio::piped());
+        let mut process = command.spawn().expect("python starts");
+        let input = process.stdin.take().expect("its input");
+        let lines = BufReader::new(process.stdout.take().expect("its output")).lines();
+        tie(&CORE.to_string());
+        Some(Self { process, input, lines, grades: request.get("artifact").is_some(), _request: file })
+    }
+
+    /// Of one call with a crystal; none where it has no mixture for the model.
+    pub fn seconds(&mut self, case: usize, call: Call) -> Option<f64> {
+        let name = match call {
+            Call::Plain => "plain",
+            Call::Graded if self.grades => "graded",
+            Call::Graded | Call::Gamma => return None,
+        };
+        writeln!(self.input, "{name} {case}").expect("gracemaker is there");
+        let answer =
+            self.lines.by_ref().map(|line| line.expect("text")).find_map(|line| {
+                line.strip_prefix("seconds ").map(|seconds| seconds.parse().expect("a number"))
+            });
+        Some(answer.expect("gracemaker answers"))
     }
 }
 
-/// Of every crystal, in single precision beside our mixed; none without gracemaker or its data.
-pub fn seconds(model: &Model, precision: Precision, cases: &[Case]) -> Option<Vec<Seconds>> {
-    let python = std::env::var_os("CALMWALK_GRACEMAKER_PYTHON")?;
-    let folder = model.peer_folder()?;
-    let file = tempfile::NamedTempFile::new().expect("a temporary file");
-    std::fs::write(file.path(), request(model, precision, &folder, cases).to_string())
-        .expect("the request is written");
-    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/grace/gracemaker.py");
-    let output = Command::new(python).arg(script).arg(file.path()).output().expect("python starts");
-    assert!(output.status.success(), "gracemaker: {}", String::from_utf8_lossy(&output.stderr));
-    let text = String::from_utf8(output.stdout).expect("text");
-    let answer: Value =
-        serde_json::from_str(text.lines().last().unwrap_or_default()).expect("its last line is JSON");
-    let times = |of: &Value, key: &str| {
-        of[key].as_array().expect("a list").iter().filter_map(Value::as_f64).collect::<Vec<_>>()
-    };
-    let answers = answer.as_array().expect("a list");
-    Some(
-        answers.iter().map(|of| Seconds { plain: times(of, "plain"), graded: times(of, "graded") }).collect(),
-    )
+impl Drop for Peer {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+        tie("0-1023");
+    }
+}
+
+/// Ties this thread to some cores.
+fn tie(cores: &str) {
+    let mut command = Command::new("taskset");
+    command.args(["--cpu-list", "--pid", cores, &std::process::id().to_string()]);
+    let status = command.stdout(Stdio::null()).status().expect("taskset of util-linux");
+    assert!(status.success(), "taskset: {status}");
 }
 
 fn request(model: &Model, precision: Precision, folder: &std::path::Path, cases: &[Case]) -> Value {
@@ -54,7 +81,7 @@ fn request(model: &Model, precision: Precision, folder: &std::path::Path, cases:
         })
         .collect();
     let precision = if precision == Precision::Double { "double" } else { "single" };
-    let mut request = json!({"structures": structures, "repetitions": 9, "precision": precision});
+    let mut request = json!({"structures": structures, "core": CORE, "precision": precision});
     let artifact = folder.join("gmm_artifacts.npz");
     if artifact.exists() {
         request["artifact"] = json!(artifact);
