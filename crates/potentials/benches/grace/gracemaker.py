@@ -1,7 +1,7 @@
-"""Times gracemaker's own calculator on one core: python gracemaker.py REQUEST.json
+"""Times gracemaker's own calculator with one thread: python gracemaker.py request.json
 
 The request names structures, and either a checkpoint or a preset of which a model with random weights is made (the time does
-not depend on them), the precision, "double" or "single", and the core. For every line "plain K" or "graded K" of its input
+not depend on them), and the precision, "double" or "single". For every line "plain K" or "graded K" of its input
 one call is made with structure K, energy and forces or, where there is a mixture, the same with γ and the gradient of Σγ, and
 a line "seconds S" is printed.
 """
@@ -13,9 +13,6 @@ import tempfile
 import time
 
 os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
-with open(sys.argv[1]) as file:
-    REQUEST = json.load(file)
-os.sched_setaffinity(0, {REQUEST["core"]})
 
 import numpy as np
 import tensorflow as tf
@@ -86,13 +83,15 @@ class Case:
 
 
 def main():
-    dtype = {"double": tf.float64, "single": tf.float32}[REQUEST["precision"]]
+    with open(sys.argv[1]) as file:
+        request = json.load(file)
+    dtype = {"double": tf.float64, "single": tf.float32}[request["precision"]]
     with tempfile.TemporaryDirectory() as folder:
-        model, checkpoint = model_files(REQUEST, dtype, folder)
+        model, checkpoint = model_files(request, dtype, folder)
         calculators = {"plain": plain_calculator(model, checkpoint, dtype)}
-        if "artifact" in REQUEST:
-            calculators["graded"] = get_gmm_uq_calculator(model, checkpoint, REQUEST["artifact"], dtype)
-        cases = [Case(structure, calculators) for structure in REQUEST["structures"]]
+        if "artifact" in request:
+            calculators["graded"] = get_gmm_uq_calculator(model, checkpoint, request["artifact"], dtype)
+        cases = [Case(structure, calculators) for structure in request["structures"]]
         for line in sys.stdin:
             name, case = line.split()
             print("seconds", cases[int(case)].seconds(name), flush=True)

@@ -10,7 +10,7 @@ use tempfile::NamedTempFile;
 use crate::case::{Call, Case, Model};
 
 /// The core that both are tied to while they are compared.
-const CORE: usize = 0;
+const CORE: &str = "0";
 
 /// gracemaker with a model, waiting for calls.
 pub struct Peer {
@@ -32,10 +32,11 @@ impl Peer {
         let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/grace/gracemaker.py");
         let mut command = Command::new(python);
         command.arg(script).arg(file.path()).stdin(Stdio::piped()).stdout(Stdio::piped());
+        // A process is tied as the thread that starts it.
+        tie(CORE);
         let mut process = command.spawn().expect("python starts");
         let input = process.stdin.take().expect("its input");
         let lines = BufReader::new(process.stdout.take().expect("its output")).lines();
-        tie(&CORE.to_string());
         Some(Self { process, input, lines, grades: request.get("artifact").is_some(), _request: file })
     }
 
@@ -47,10 +48,8 @@ impl Peer {
             Call::Graded | Call::Gamma => return None,
         };
         writeln!(self.input, "{name} {case}").expect("gracemaker is there");
-        let answer =
-            self.lines.by_ref().map(|line| line.expect("text")).find_map(|line| {
-                line.strip_prefix("seconds ").map(|seconds| seconds.parse().expect("a number"))
-            });
+        let mut lines = self.lines.by_ref().map(|line| line.expect("text"));
+        let answer = lines.find_map(|line| line.strip_prefix("seconds ")?.parse().ok());
         Some(answer.expect("gracemaker answers"))
     }
 }
@@ -81,7 +80,7 @@ fn request(model: &Model, precision: Precision, folder: &std::path::Path, cases:
         })
         .collect();
     let precision = if precision == Precision::Double { "double" } else { "single" };
-    let mut request = json!({"structures": structures, "core": CORE, "precision": precision});
+    let mut request = json!({"structures": structures, "precision": precision});
     let artifact = folder.join("gmm_artifacts.npz");
     if artifact.exists() {
         request["artifact"] = json!(artifact);
