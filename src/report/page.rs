@@ -10,8 +10,6 @@ use super::tables::{Cell, Table, collection_rule};
 use super::{Drawn, Part};
 
 const STYLE: &str = include_str!("page.css");
-/// Rows of a table on the page; its file has all.
-const ROWS: usize = 60;
 
 /// What stands below a heading.
 enum Block<'a> {
@@ -139,8 +137,8 @@ fn write_figure(html: &mut String, part: &Part, number: usize) {
 }
 
 fn write_table(html: &mut String, table: &Table, number: usize) {
-    let Table { name, caption, titles, rows } = table;
-    let more = match rows.len().saturating_sub(ROWS) {
+    let Table { name, caption, titles, rows, shown } = table;
+    let more = match rows.len().saturating_sub(*shown) {
         0 => String::new(),
         more => format!(" {} more rows are only in its file.", grouped(more as u64)),
     };
@@ -159,7 +157,15 @@ fn write_table(html: &mut String, table: &Table, number: usize) {
         let _ = writeln!(html, "<thead><tr>{}</tr></thead>", head.collect::<String>());
     }
     html.push_str("<tbody>\n");
-    for row in rows.iter().take(ROWS) {
+    for row in rows.iter().take(*shown) {
+        if let [heading] = row.as_slice() {
+            let (columns, heading) = (titles.len(), escape(&heading.shown));
+            let _ = writeln!(
+                html,
+                "<tr><th scope=\"rowgroup\" class=\"heading\" colspan=\"{columns}\">{heading}</th></tr>"
+            );
+            continue;
+        }
         let cells = row.iter().enumerate().map(|(k, cell)| write_cell(k, cell));
         let _ = writeln!(html, "<tr>{}</tr>", cells.collect::<String>());
     }

@@ -3,11 +3,15 @@
 mod facts;
 mod labels;
 mod seeds;
+mod settings;
 
 use super::csv::{self, Csv};
 use super::gathered::Gathered;
 
 pub use facts::collection_rule;
+
+/// Rows of a table on the page, where it grows with the campaign.
+const ROWS: usize = 60;
 
 /// Rows below titles.
 pub struct Table {
@@ -17,8 +21,10 @@ pub struct Table {
     pub caption: String,
     /// Titles of columns.
     pub titles: Vec<&'static str>,
-    /// Rows.
+    /// Rows. One of a single cell is a heading of those below it, and is not in the file.
     pub rows: Vec<Vec<Cell>>,
+    /// Rows on the page, at most; the file has all.
+    pub shown: usize,
 }
 
 /// A cell.
@@ -34,7 +40,12 @@ pub struct Cell {
 
 impl Table {
     fn new(name: &'static str, caption: &str, titles: &[&'static str]) -> Self {
-        Self { name, caption: caption.into(), titles: titles.to_vec(), rows: Vec::new() }
+        Self { name, caption: caption.into(), titles: titles.to_vec(), rows: Vec::new(), shown: ROWS }
+    }
+
+    /// The same with every row on the page.
+    fn whole(self) -> Self {
+        Self { shown: usize::MAX, ..self }
     }
 
     /// Its file.
@@ -42,7 +53,7 @@ impl Table {
         let titles: Vec<_> = self.titles.iter().map(|title| figures::plain(title)).collect();
         let titles: Vec<_> = titles.iter().map(String::as_str).collect();
         let mut csv = Csv::new(&titles);
-        for row in &self.rows {
+        for row in self.rows.iter().filter(|row| row.len() > 1) {
             let cells: Vec<_> = row.iter().map(|cell| cell.exact.as_str()).collect();
             csv.push(&cells);
         }
@@ -84,7 +95,7 @@ pub fn all(gathered: &Gathered) -> Vec<Table> {
             labels::unlabelled(&found.unlabelled),
         ]);
     }
-    tables.extend([facts::settings(gathered), facts::provenance(gathered)]);
+    tables.extend([settings::settings(gathered), facts::provenance(gathered)]);
     tables.retain(|table| !table.rows.is_empty());
     tables
 }

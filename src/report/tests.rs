@@ -116,6 +116,25 @@ fn file<'a>(files: &'a [File], path: &str) -> &'a str {
 }
 
 #[tokio::test]
+async fn every_setting_is_on_the_page() {
+    let directory = tempfile::tempdir().unwrap();
+    // More keys than a table that grows with the campaign shows, and one that comes last in the alphabet.
+    let keys: serde_json::Map<_, _> = (0..80).map(|k| (format!("key{k:02}"), json!(k))).collect();
+    let configuration = json!({ "guard": keys, "walk": { "temperature": 417.0, "volume_ramp": null } });
+    let store = begin(directory.path(), &configuration.to_string()).await;
+    let files = of(&store).await.unwrap();
+    let page = words(file(&files, PAGE));
+    for expected in ["[guard]", "key79", "[walk]", "temperature", "417.0", "volume_ramp", "not set"] {
+        assert!(page.contains(expected), "{expected}: {page}");
+    }
+    let csv = file(&files, "tables/settings.csv");
+    assert!(
+        csv.starts_with("key,value\nwalk.temperature,417.0\nwalk.volume_ramp,\nguard.key00,0\n"),
+        "{csv}"
+    );
+}
+
+#[tokio::test]
 async fn what_is_missing_is_said() {
     let directory = tempfile::tempdir().unwrap();
     let store = begin(directory.path(), "{}").await;
@@ -168,7 +187,7 @@ async fn figures_have_the_numbers_of_the_store() {
         !page.contains("http://") || page.matches("http://").count() == 8,
         "only names of SVG's elements"
     );
-    assert!(!page.contains("https://") && page.contains("walk.tau"));
+    assert!(!page.contains("https://") && page.contains("[walk]") && page.contains("tau"));
 
     // Eight atoms of each of 80 structures; the grades 1.2, 1.4 and 1.6 have errors of a half of that.
     let correlations = file(&files, "tables/correlations.csv");

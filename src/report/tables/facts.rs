@@ -7,6 +7,7 @@ use serde_json::Value;
 
 use super::super::gathered::Gathered;
 use super::super::style::grouped;
+use super::settings::flatten;
 use super::{Table, text};
 
 /// The campaign in a few lines.
@@ -69,34 +70,9 @@ pub fn collection_rule(configuration: &Value) -> Option<String> {
     })
 }
 
-/// Every key of the configuration in force.
-pub fn settings(gathered: &Gathered) -> Table {
-    let caption = "The configuration in force, with every default filled in. Units are those of the documentation: eV, Å, fs, K.";
-    let mut table = Table::new("settings", caption, &["key", "value"]);
-    let mut pairs = Vec::new();
-    flatten("", &gathered.configuration, &mut pairs);
-    pairs.retain(|(key, _)| !key.starts_with("files."));
-    table.rows = pairs.into_iter().map(|(key, value)| vec![text(key), text(value)]).collect();
-    table
-}
-
-fn flatten(key: &str, value: &Value, pairs: &mut Vec<(String, String)>) {
-    match value {
-        Value::Object(object) => {
-            for (name, value) in object {
-                let key = if key.is_empty() { name.clone() } else { format!("{key}.{name}") };
-                flatten(&key, value, pairs);
-            }
-        }
-        Value::Null => {}
-        Value::String(text) => pairs.push((key.to_owned(), text.clone())),
-        other => pairs.push((key.to_owned(), other.to_string())),
-    }
-}
-
 /// Versions, hashes, and where everything comes from.
 pub fn provenance(gathered: &Gathered) -> Table {
-    let mut table = Table::new("provenance", "Where it comes from.", &["", "value"]);
+    let mut table = Table::new("provenance", "Where it comes from.", &["", "value"]).whole();
     let mut row = |name: String, value: String| table.rows.push(vec![text(name), text(value)]);
     let campaign = &gathered.campaign;
     row("campaign".into(), campaign.id.to_string());
@@ -110,7 +86,9 @@ pub fn provenance(gathered: &Gathered) -> Table {
         row("protocol hash (BLAKE3)".into(), labels.protocol.hash.to_string());
         let mut pairs = Vec::new();
         flatten("protocol", &labels.protocol.settings, &mut pairs);
-        pairs.into_iter().for_each(|(key, value)| row(key, value));
+        pairs
+            .into_iter()
+            .for_each(|(key, value)| value.into_iter().for_each(|value| row(key.clone(), value)));
     }
     if let Some(files) = gathered.configuration["files"].as_object() {
         for (key, hash) in files {
@@ -165,11 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_are_flat_and_rules_are_words() {
-        let mut pairs = Vec::new();
-        flatten("", &json!({ "a": { "b": 1, "c": [1, 2] }, "d": "x", "e": null }), &mut pairs);
-        let expected = [("a.b", "1"), ("a.c", "[1,2]"), ("d", "x")];
-        assert_eq!(pairs, expected.map(|(key, value)| (key.to_owned(), value.to_owned())));
+    fn collection_rules_are_words() {
         let rule = |when: Value| collection_rule(&json!({ "collect": { "when": when } }));
         let count = json!({ "rule": "atom_count", "threshold": 1.3, "fraction": 0.15, "least": 3 });
         assert_eq!(rule(count).unwrap(), "at least max(3, ⌈0.15 N⌉) of its N atoms have γ above 1.3");

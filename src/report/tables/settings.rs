@@ -1,0 +1,120 @@
+//! Every key of the configuration in force, section by section.
+
+use serde_json::Value;
+
+use super::super::gathered::Gathered;
+use super::{Cell, Table, text};
+
+/// Sections in the order of the configuration file; the table puts any other section behind them.
+const SECTIONS: [&str; 11] = [
+    "campaign",
+    "potential",
+    "calm",
+    "seeds",
+    "walk",
+    "collect",
+    "guard",
+    "label",
+    "budget",
+    "run",
+    "notify",
+];
+/// Hashes of files and the list of seed structures have tables of their own.
+const ELSEWHERE: [&str; 2] = ["files", "seeds"];
+
+/// The table: a heading a section, then its keys. A key without a value is shown as not set.
+pub fn settings(gathered: &Gathered) -> Table {
+    let caption = "The configuration in force, with every default filled in. Units are those of the documentation: eV, Å, fs, K. \
+                   Files are named by their BLAKE3 hashes under Versions and provenance.";
+    let mut table = Table::new("settings", caption, &["key", "value"]).whole();
+    for (section, pairs) in sections(&gathered.configuration) {
+        table.rows.push(vec![text(format!("[{section}]"))]);
+        table.rows.extend(pairs.into_iter().map(|(key, value)| {
+            let name = key.strip_prefix(&format!("{section}.")).unwrap_or(&key).to_owned();
+            let shown = value.clone().unwrap_or_else(|| "not set".into());
+            let key = Cell { shown: name, exact: key, is_number: false };
+            vec![key, Cell { shown, exact: value.unwrap_or_default(), is_number: false }]
+        }));
+    }
+    table
+}
+
+/// A full key and its value; `None` where the key is not set.
+type Setting = (String, Option<String>);
+
+/// Each section that has keys, in the order of [`SECTIONS`]. Keys of no section are those of `campaign`.
+fn sections(configuration: &Value) -> Vec<(String, Vec<Setting>)> {
+    let mut found: Vec<(String, Vec<Setting>)> =
+        SECTIONS.iter().map(|name| ((*name).to_owned(), Vec::new())).collect();
+    for (name, value) in configuration.as_object().into_iter().flatten() {
+        if ELSEWHERE.contains(&name.as_str()) {
+            continue;
+        }
+        let section = if value.is_object() { name.as_str() } else { "campaign" };
+        let at = found.iter().position(|(known, _)| known == section).unwrap_or_else(|| {
+            found.push((section.to_owned(), Vec::new()));
+            found.len() - 1
+        });
+        // The hash of a file stands in its place.
+        let mut pairs = Vec::new();
+        flatten(name, value, &mut pairs);
+        let hash = |key: &str| configuration["files"][key].as_str().map(str::to_owned);
+        found[at].1.extend(pairs.into_iter().map(|(key, value)| {
+            let value = value.or_else(|| hash(&key));
+            (key, value)
+        }));
+    }
+    found.retain(|(_, pairs)| !pairs.is_empty());
+    found
+}
+
+/// Every value below a key with its full key, as text; `None` for null.
+pub(super) fn flatten(key: &str, value: &Value, pairs: &mut Vec<Setting>) {
+    match value {
+        Value::Object(object) => {
+            for (name, value) in object {
+                flatten(&format!("{key}.{name}"), value, pairs);
+            }
+        }
+        Value::Null => pairs.push((key.to_owned(), None)),
+        Value::String(text) => pairs.push((key.to_owned(), Some(text.clone()))),
+        other => pairs.push((key.to_owned(), Some(other.to_string()))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn every_key_stands_below_its_section_in_the_order_of_the_file() {
+        let configuration = json!({
+            "walk": { "temperature": 300.0, "thermostat": { "kind": "langevin" }, "volume_ramp": null },
+            "instructions": "avx2", "seeds": ["a 12ab"], "files": { "potential.model": "ff00" },
+            "potential": { "model": null }, "later": { "key": [1, 2] }, "collect": {},
+        });
+        let expected: [(&str, &[(&str, Option<&str>)]); 4] = [
+            ("campaign", &[("instructions", Some("avx2"))]),
+            ("potential", &[("potential.model", Some("ff00"))]),
+            (
+                "walk",
+                &[
+                    ("walk.temperature", Some("300.0")),
+                    ("walk.thermostat.kind", Some("langevin")),
+                    ("walk.volume_ramp", None),
+                ],
+            ),
+            ("later", &[("later.key", Some("[1,2]"))]),
+        ];
+        let expected: Vec<_> = expected
+            .iter()
+            .map(|(section, pairs)| {
+                let pairs = pairs.iter().map(|(key, value)| ((*key).to_owned(), value.map(str::to_owned)));
+                ((*section).to_owned(), pairs.collect::<Vec<_>>())
+            })
+            .collect();
+        assert_eq!(sections(&configuration), expected);
+    }
+}
