@@ -121,6 +121,18 @@ impl Condition {
     }
 }
 
+impl Condition {
+    /// The names that stand in it, as they are written.
+    pub fn names(&self) -> Vec<&'static str> {
+        match self {
+            Self::Number(column, ..) => vec![column.name()],
+            Self::Text(column, ..) => vec![column.name()],
+            Self::Not(condition) => condition.names(),
+            Self::And(left, right) | Self::Or(left, right) => [left.names(), right.names()].concat(),
+        }
+    }
+}
+
 impl Comparison {
     fn holds(self, a: f64, b: f64) -> bool {
         match self {

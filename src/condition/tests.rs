@@ -45,6 +45,12 @@ fn conditions_mean_what_they_say() {
 }
 
 #[test]
+fn names_are_those_that_stand_there() {
+    let condition: Condition = "not (gamma > 2 or element = Mo) and max_force < 5".parse().unwrap();
+    assert_eq!(condition.names(), ["gamma", "element", "max_force"]);
+}
+
+#[test]
 fn what_is_wrong_is_said_with_its_place() {
     for (text, position, found, expected) in [
         ("", 1, "the end", "gamma_nbr"),

@@ -17,6 +17,13 @@ pub const JOBS: [&str; 7] =
 pub const DECISIONS: [&str; 8] =
     [">number", "what               ", ">walk", "seed structure", ">   step", ">T (K)", ">V/V₀", ">γ_max"];
 
+/// Names of a condition that mean nothing in a pane, by its place: of walks, of label jobs, of decisions.
+pub const NOT_KNOWN: [&[&str]; 3] = [
+    &["gamma_nbr", "mixture_version", "atoms", "energy", "energy_per_atom", "max_force", "element"],
+    &["mixture_version", "energy", "energy_per_atom", "max_force"],
+    &["energy", "energy_per_atom", "max_force"],
+];
+
 /// A line for each that meets the condition.
 pub fn of_walks(walks: &[WalkStatus], filter: Option<&Condition>) -> Vec<Entry> {
     let meets = |walk: &&WalkStatus| filter.is_none_or(|filter| filter.is_met(&facts_of_walk(walk)));

@@ -4,10 +4,11 @@ use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use store::JobState;
 
 use super::super::Ended;
-use super::entries::without_campaign;
+use super::entries::{NOT_KNOWN, without_campaign};
 use super::state::{Ask, DECISIONS, Message, Mode, QUEUE, State, Text, WALKS, Wanted};
 use crate::cli::queue::Action as QueueAction;
 use crate::cli::walks::{Action as WalksAction, Which};
+use crate::condition::Condition;
 
 /// What is to be done outside.
 #[derive(Clone, Debug, PartialEq)]
@@ -111,7 +112,7 @@ impl State {
         self.mode = Mode::Text(Text { title: title.to_owned(), text: Some(text), ..Text::default() });
     }
 
-    fn filter(&mut self, filter: Option<crate::condition::Condition>) {
+    fn filter(&mut self, filter: Option<Condition>) {
         self.pane().filter = filter;
         self.arrange();
     }
@@ -213,12 +214,12 @@ impl State {
                 self.filter(None);
                 return None;
             }
-            Wanted::Filter => match text.parse() {
+            Wanted::Filter => match self.condition(text) {
                 Ok(condition) => {
                     self.filter(Some(condition));
                     return None;
                 }
-                Err(error) => format!("no condition: {error}"),
+                Err(why) => why,
             },
             Wanted::Priority(id) => match text.parse() {
                 Ok(priority) => {
@@ -230,6 +231,23 @@ impl State {
         self.message = Some(Message::Failed(wrong));
         self.mode = Mode::Ask(ask);
         None
+    }
+}
+
+impl State {
+    /// The condition that a text is, if this pane knows everything that it asks for.
+    fn condition(&self, text: &str) -> Result<Condition, String> {
+        let condition: Condition = text.parse().map_err(|error| format!("no condition: {error}"))?;
+        let is_not_known = |name: &&str| NOT_KNOWN[self.focus].contains(name);
+        match condition.names().into_iter().find(is_not_known) {
+            None => Ok(condition),
+            Some(name) => {
+                let pane = ["walks", "label jobs", "decisions"][self.focus];
+                Err(format!(
+                    "{name} is not known of {pane} here: use the dashboard's table, or export --where"
+                ))
+            }
+        }
     }
 }
 

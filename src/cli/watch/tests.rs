@@ -182,6 +182,17 @@ fn a_condition_chooses_what_a_pane_shows_and_what_is_wrong_in_it_is_said() {
     write(&mut state, " 1.45");
     press(&mut state, "Enter");
     assert_eq!((state.panes[QUEUE].entries.len(), &state.message), (1, &None));
+    // A quantity that the pane does not have is refused by name, instead of showing nothing.
+    press(&mut state, "Esc /");
+    write(&mut state, "max_force > 5");
+    press(&mut state, "Enter");
+    assert!(
+        matches!(&state.message, Some(Message::Failed(why)) if why.contains("max_force is not known of label jobs")),
+        "{:?}",
+        state.message
+    );
+    assert_eq!(state.panes[QUEUE].entries.len(), 2);
+    press(&mut state, "Esc");
     // Other jobs are shown when they are read, and no others until then.
     press(&mut state, "Esc");
     assert_eq!((press(&mut state, "s"), state.panes[QUEUE].all), (Some(Request::Look), 0));
