@@ -11,6 +11,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use store::{Protocol, Store};
 use wire::ContentHash;
+use workers::labeller::LabelBounds;
 
 use crate::config::{LabelMethod, LabelSection, PotentialFile, PotentialKind, changed_keys};
 use crate::outcome::Failure;
@@ -31,8 +32,8 @@ pub struct Labelling {
     pub protocol: Protocol,
     /// Attempts before a label counts as failed.
     pub attempts: u32,
-    /// Largest force that is believed, eV/Å.
-    pub largest_force: f64,
+    /// What is believed of a label.
+    pub bounds: LabelBounds,
     /// How long a job is leased.
     pub lease: Duration,
 }
@@ -57,7 +58,8 @@ struct InForce {
 #[derive(Deserialize)]
 struct Limits {
     attempts: u32,
-    largest_force: f64,
+    #[serde(flatten)]
+    bounds: LabelBounds,
     /// Campaigns of earlier versions have none.
     #[serde(default = "ten_minutes")]
     lease: u32,
@@ -129,7 +131,7 @@ impl Labelling {
     /// Reads it, and finds what the method needs here. `protocol` is the one in force.
     pub async fn of(store: &Store, protocol: Protocol, here: Here<'_>) -> Result<Self, Failure> {
         let text = store.campaign().await?.configuration_in_force;
-        let InForce { label: Limits { attempts, largest_force, lease } } =
+        let InForce { label: Limits { attempts, bounds, lease } } =
             serde_json::from_str(&text).map_err(unreadable)?;
         let noted = store.note(LABEL_METHOD).await?.ok_or_else(|| {
             Failure::Failed(
@@ -148,7 +150,7 @@ impl Labelling {
         }
         let method = noted.for_this_host(&protocol, here)?;
         let lease = Duration::from_secs(lease.into());
-        Ok(Self { method, protocol, attempts, largest_force, lease })
+        Ok(Self { method, protocol, attempts, bounds, lease })
     }
 }
 

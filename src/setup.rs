@@ -11,7 +11,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use store::Protocol;
 use wire::ipc::Door;
-use workers::labeller::{Method, Running};
+use workers::labeller::{LabelBounds, Method, Running};
 use workers::settings::WalkSettings;
 
 use crate::config::PotentialKind;
@@ -79,8 +79,8 @@ pub struct LabellerSetup {
     pub protocol: Protocol,
     /// Attempts before a label counts as failed.
     pub attempts: u32,
-    /// Largest force that is believed, eV/Å.
-    pub largest_force: f64,
+    /// What is believed of a label.
+    pub bounds: LabelBounds,
     /// How long a job is leased.
     pub lease: Duration,
     /// Its log. One that is adopted keeps the log that it began with.
@@ -158,9 +158,9 @@ pub fn bytes(setup: &impl Serialize) -> Vec<u8> {
 impl LabellerSetup {
     /// That of a labeller without a number.
     pub fn new(location: PathBuf, labelling: Labelling) -> Self {
-        let Labelling { method, protocol, attempts, largest_force, lease } = labelling;
+        let Labelling { method, protocol, attempts, bounds, lease } = labelling;
         let (number, restarts, slot, log) = (None, 0, None, log::for_children());
-        Self { number, restarts, slot, location, method, protocol, attempts, largest_force, lease, log }
+        Self { number, restarts, slot, location, method, protocol, attempts, bounds, lease, log }
     }
 
     /// What tells two setups of labellers apart, whatever their numbers and logs: one that was started with another must be

@@ -167,7 +167,7 @@ fn start_labellers(run: Run<'_>, closing: &Arc<Closing>) -> Result<JoinSet<Resul
             holder: format!("{}/{slot}", process.id),
             protocol: campaign.protocol.clone(),
             attempts: label.attempts.get(),
-            largest_force: label.largest_force.get(),
+            bounds: label.bounds(),
             stay: Stay::UntilEmpty,
             timing: Timing { lease: Duration::from_secs(label.lease.get().into()), ..Timing::default() },
         };

@@ -55,7 +55,7 @@ pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failur
         method: campaign.method()?,
         protocol: campaign.protocol.clone(),
         attempts: label.attempts.get(),
-        largest_force: label.largest_force.get(),
+        bounds: label.bounds(),
         lease: Duration::from_secs(label.lease.get().into()),
     };
     let setup = LabellerSetup::new(location, labelling);

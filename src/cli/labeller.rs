@@ -57,7 +57,7 @@ async fn label(setup: LabellerSetup, method: Method, closing: &Arc<Closing>) -> 
         holder: record.id.clone(),
         protocol: setup.protocol,
         attempts: setup.attempts,
-        largest_force: setup.largest_force,
+        bounds: setup.bounds,
         stay: if slot.is_none_or(|slot| slot.until_empty) { Stay::UntilEmpty } else { Stay::UntilFinished },
         timing: Timing {
             lease: setup.lease,

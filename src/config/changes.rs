@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 42] = [
+pub(super) const CHANGEABLE: [&str; 45] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -15,6 +15,9 @@ pub(super) const CHANGEABLE: [&str; 42] = [
     "label.lease",
     "label.attempts",
     "label.largest_force",
+    "label.largest_stress",
+    "label.largest_energy",
+    "label.largest_energy_difference",
     "label.cores",
     "label.time_limit",
     "label.memory",

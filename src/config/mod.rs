@@ -19,7 +19,7 @@ use potentials::grace::Precision;
 use serde::{Deserialize, Serialize};
 use store::{Location, StoreError};
 use toml::Spanned;
-use workers::labeller::{BatchSystem, Keep, LabelGuard, Running};
+use workers::labeller::{BatchSystem, Keep, LabelBounds, LabelGuard, Running};
 use workers::settings::ThermostatKind;
 
 pub use changes::{Change, changed_keys, compare, without_changeable};
@@ -235,6 +235,15 @@ pub struct LabelSection {
     /// Largest force that is believed, eV/Å.
     #[serde(default = "defaults::largest_force")]
     pub largest_force: Positive,
+    /// Largest component of a stress that is believed, eV/Å³.
+    #[serde(default = "defaults::largest_stress")]
+    pub largest_stress: Positive,
+    /// Largest energy that is believed, whatever its sign, eV an atom.
+    #[serde(default = "defaults::largest_energy")]
+    pub largest_energy: Positive,
+    /// Largest difference from the potential's energy that is believed, eV an atom.
+    #[serde(default = "defaults::largest_energy_difference")]
+    pub largest_energy_difference: Positive,
     /// Cores of a calculation by another program.
     #[serde(default = "defaults::cores")]
     pub cores: NonZeroU32,
@@ -409,6 +418,16 @@ impl LabelSection {
         self.protocol.as_deref().unwrap_or(self.method.name())
     }
 
+    /// What is believed of a label.
+    pub fn bounds(&self) -> LabelBounds {
+        LabelBounds {
+            largest_force: self.largest_force.get(),
+            largest_stress: self.largest_stress.get(),
+            largest_energy: self.largest_energy.get(),
+            largest_energy_difference: self.largest_energy_difference.get(),
+        }
+    }
+
     /// How the calculations of a program run.
     pub fn running(&self) -> Running {
         Running {
@@ -537,7 +556,19 @@ mod defaults {
     }
 
     pub fn largest_force() -> Positive {
-        positive(1000.0)
+        positive(LabelBounds::default().largest_force)
+    }
+
+    pub fn largest_stress() -> Positive {
+        positive(LabelBounds::default().largest_stress)
+    }
+
+    pub fn largest_energy() -> Positive {
+        positive(LabelBounds::default().largest_energy)
+    }
+
+    pub fn largest_energy_difference() -> Positive {
+        positive(LabelBounds::default().largest_energy_difference)
     }
 
     pub fn queue_limit() -> NonZeroU32 {

@@ -52,7 +52,9 @@ pub use listing::{ListOrder, ListPlace, ListedCandidate};
 pub use location::{Location, ServerUrl};
 pub use lock::{CampaignLock, LOCK};
 pub use numbers::NumbersError;
-pub use outcomes::{FailureCount, Finished, LabelCost, NearLabel, Range, Unlabelled, Waiting, Work};
+pub use outcomes::{
+    FailureCount, Finished, LabelCost, LabelledEnergies, NearLabel, Range, Unlabelled, Waiting, Work,
+};
 pub use pace::Pace;
 pub use processes::{ProcessRecord, this_host};
 pub use recent::{DecidedCandidate, RecentDecision};

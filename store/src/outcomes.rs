@@ -1,5 +1,6 @@
 //! What became of label jobs, and what they took.
 
+use atoms::Species;
 use serde::Serialize;
 use wire::Origin;
 
@@ -20,6 +21,17 @@ pub struct LabelCost {
     pub k_points: Option<u32>,
     /// Core-seconds of the attempt that brought it.
     pub core_seconds: f64,
+}
+
+/// Both energies of a labelled structure.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LabelledEnergies {
+    /// Numbers of atoms of its elements.
+    pub composition: Vec<(Species, u32)>,
+    /// By the potential, eV.
+    pub model: f64,
+    /// Of the label, eV.
+    pub label: f64,
 }
 
 /// Jobs of one size that have no label yet.

@@ -287,6 +287,8 @@ pub struct Lease {
     pub structure: Structure,
     /// Its candidate's name.
     pub candidate: String,
+    /// Its energy by the potential, eV, if that is a finite number.
+    pub model_energy: Option<f64>,
 }
 
 /// State of a label job.

@@ -17,7 +17,7 @@ use store::{
     DATABASE, JobState, LabelRecord, ProcessRecord, Standing, Store, StoreError, this_host, unix_milliseconds,
 };
 use tokio::task::JoinHandle;
-use workers::labeller::{Closing, LabellerSettings, Method, Stay, Timing, run, serve};
+use workers::labeller::{Closing, LabelBounds, LabellerSettings, Method, Stay, Timing, run, serve};
 
 /// A method that begins labels at once and ends them only while it is open.
 #[derive(Clone, Default)]
@@ -73,6 +73,52 @@ impl Potential for Gate {
     }
 }
 
+/// A method whose energies (eV an atom) are given, one a label.
+struct Energies(std::vec::IntoIter<f64>);
+
+impl Potential for Energies {
+    fn cutoff(&self) -> f64 {
+        1.0
+    }
+
+    fn species(&self) -> &[Species] {
+        &[]
+    }
+
+    fn evaluate(
+        &mut self,
+        structure: &Structure,
+        _: &NeighbourList,
+        out: &mut Evaluation,
+    ) -> Result<(), PotentialError> {
+        out.reset(structure.len());
+        out.atomic_energies.fill(self.0.next().expect("as many energies as labels"));
+        Ok(())
+    }
+}
+
+/// Has the first structures of a campaign labelled with these energies, eV an atom, each attempted once. Returns, in that order, energies of
+/// the labels that were believed and class and log of the others.
+async fn labelled_with(energies: &[f64]) -> Vec<Result<f64, (String, String)>> {
+    let directory = tempfile::tempdir().unwrap();
+    let store = create(directory.path()).await;
+    let candidates = accept(&store, energies.len() as u64).await;
+    let closing = Closing::default();
+    closing.set_no_more_jobs(true);
+    let method = Method::reference(Box::new(Energies(energies.to_vec().into_iter())));
+    let settings = LabellerSettings { attempts: 1, ..settings("a/0") };
+    run(store.clone(), method, settings, &closing, unix_milliseconds, |_| ()).await.unwrap();
+    let mut outcomes = Vec::new();
+    for candidate in candidates {
+        let mut details = store.queue_show(&candidate).await.unwrap();
+        outcomes.push(match (details.energies.first(), details.attempts_made.remove(0)) {
+            (Some((_, energy)), _) => Ok(energy / ATOMS as f64),
+            (None, attempt) => Err((attempt.class.unwrap(), attempt.log.unwrap())),
+        });
+    }
+    outcomes
+}
+
 async fn until(or: &str, condition: impl AsyncFn() -> bool) {
     let begun = Instant::now();
     while !condition().await {
@@ -86,7 +132,7 @@ fn settings(holder: &str) -> LabellerSettings {
         holder: holder.into(),
         protocol: protocol("dft"),
         attempts: 3,
-        largest_force: 100.0,
+        bounds: LabelBounds::default(),
         stay: Stay::UntilEmpty,
         timing: Timing {
             lease: Duration::from_secs(1),
@@ -171,6 +217,35 @@ async fn a_lease_lasts_as_long_as_the_label_takes() {
     labeller.await.unwrap().unwrap();
     let job = store.queue_show(&candidates[0]).await.unwrap();
     assert_eq!((job.job.state, job.job.attempts), (JobState::Labelled, 1));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn energies_beyond_all_bounds_are_failed_attempts_from_the_first_label_on() {
+    let outcomes = labelled_with(&[1e300, -106.0, f64::INFINITY]).await;
+    let (class, log) = outcomes[0].as_ref().unwrap_err();
+    assert_eq!(class, "implausible");
+    assert!(
+        log.contains("an energy of 1.000e300 eV/atom, beyond label.largest_energy = 2000000 eV/atom"),
+        "{log}"
+    );
+    assert_eq!(outcomes[1], Ok(-106.0));
+    let (class, log) = outcomes[2].as_ref().unwrap_err();
+    assert_eq!(class, "implausible");
+    assert!(log.contains("an energy of inf, which is not a finite number"), "{log}");
+}
+
+/// The second is believed, since nothing is known by then, and spoils nothing.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn energies_are_held_against_the_potential_when_its_zero_is_known() {
+    let energies = [-106.0, 1e6, -106.1, -105.9, -106.0, -105.0, 1e4, -107.0, -206.5, -204.0];
+    let outcomes = labelled_with(&energies).await;
+    let believed: Vec<_> = outcomes.iter().filter_map(|outcome| outcome.clone().ok()).collect();
+    assert_eq!(believed, [-106.0, 1e6, -106.1, -105.9, -106.0, -105.0, -107.0, -204.0]);
+    let (class, log) = outcomes[6].as_ref().unwrap_err();
+    assert_eq!(class, "implausible");
+    assert!(log.contains("differs by 10105.8 eV/atom") && log.contains("from 5 labels"), "{log}");
+    let (_, log) = outcomes[8].as_ref().unwrap_err();
+    assert!(log.contains("beyond label.largest_energy_difference = 100 eV/atom"), "{log}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

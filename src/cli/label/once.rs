@@ -62,13 +62,14 @@ pub async fn label(task: Task<'_>, stop: &Notify) -> Result<Ended, Failure> {
     let setup = MethodSetup::of(&section)?;
     let protocol = labelling::protocol(section.protocol_name(), setup.identity()?);
     let method = setup.load(&protocol)?;
+    let bounds = section.bounds();
     let mut output = task.output.map(WholeFile::create).transpose()?;
     for frame in frames {
         let place = format!("{}:{}", task.structures.display(), frame.line);
         let structure = frame.structure;
         structure.validate().map_err(|error| Failure::Input(format!("{place}: {error}")))?;
         let once = tokio::select! {
-            once = label_once(&method, &structure, section.largest_force.get()) => once?,
+            once = label_once(&method, &structure, &bounds) => once?,
             () = stop.notified() => {
                 method.stop().await?;
                 return Ok(Ended::Interrupted);

@@ -5,6 +5,7 @@ pub mod budget;
 pub mod by_hand;
 pub mod collected;
 mod commit;
+mod energies;
 pub mod export;
 pub mod history;
 mod imports;

@@ -112,6 +112,7 @@ impl Store {
         let sql = "INSERT INTO attempt (job, attempt, holder, started) VALUES ($1, $2, $3, $4)";
         let begun = query(sql).bind(job).bind(attempt).bind(holder).bind(now);
         begun.execute(&mut transaction).await?;
+        let (candidate, model_energy) = candidate_of(&mut transaction, next.decision).await?;
         let lease = Lease {
             job,
             attempt,
@@ -122,7 +123,8 @@ impl Store {
             failed_calculations: failed_calculations(&mut transaction, job).await?,
             overruled: next.overruled.is_some(),
             structure: structure_of(&mut transaction, next.structure).await?,
-            candidate: candidate_of(&mut transaction, next.decision).await?,
+            candidate,
+            model_energy,
         };
         transaction.commit().await?;
         Ok(Some(lease))
@@ -428,7 +430,8 @@ async fn structure_of(transaction: &mut Transaction, number: i64) -> Result<Stru
     decode_structure(&data, &hash)
 }
 
-async fn candidate_of(transaction: &mut Transaction, decision: i64) -> Result<String> {
-    let id = query("SELECT id FROM candidate WHERE decision = $1").bind(decision);
-    id.fetch_one(&mut *transaction).await
+/// Name and energy by the potential.
+async fn candidate_of(transaction: &mut Transaction, decision: i64) -> Result<(String, Option<f64>)> {
+    let candidate = query("SELECT id, energy FROM candidate WHERE decision = $1").bind(decision);
+    candidate.fetch_one(&mut *transaction).await
 }

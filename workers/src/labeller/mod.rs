@@ -6,6 +6,7 @@ mod begun;
 mod closing;
 mod code;
 mod difference;
+mod energies;
 mod guard;
 mod here;
 mod insist;
@@ -34,14 +35,17 @@ use tracing::{debug, info, warn};
 
 use closing::Wanted;
 use code::Ended;
+use energies::Offsets;
 use judge::judge;
 use method::Made;
 use told::Became;
 
 pub use closing::Closing;
 pub use code::CodeMethod;
+pub use energies::energy_offsets;
 pub use guard::{GUARD, LabelGuard, Pair};
 pub use insist::insist;
+pub use judge::LabelBounds;
 pub use keeper::{KeeperCommand, keep};
 pub use method::Method;
 pub use once::{Once, label_once};
@@ -67,8 +71,8 @@ pub struct LabellerSettings {
     pub protocol: Protocol,
     /// Attempts before a label counts as failed.
     pub attempts: u32,
-    /// Largest force that is believed, eV/Å.
-    pub largest_force: f64,
+    /// What is believed of a label.
+    pub bounds: LabelBounds,
     /// For how long it is of use, if it is a process of its own, while nobody leads the campaign.
     pub stay: Stay,
     /// How often it does what has to be done again and again.
@@ -136,7 +140,7 @@ pub async fn run(
         info!("{line}");
         tell(line);
     };
-    let mut idle = Duration::ZERO;
+    let (mut idle, mut offsets) = (Duration::ZERO, Offsets::default());
     method.begin(&store, closing).await?;
     loop {
         let wanted = closing.wanted();
@@ -181,7 +185,7 @@ pub async fn run(
             }
         };
         let Brought { judged, became, ended } =
-            bring(&store, &method, &lease, &settings, made, closing, &now).await?;
+            bring(&store, &method, &lease, &settings, &mut offsets, made, closing, &now).await?;
         let line = told::line(&lease, &judged, &became, begun.elapsed().as_secs_f64());
         match &judged {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
@@ -209,12 +213,14 @@ async fn bring(
     method: &Method,
     lease: &Lease,
     settings: &LabellerSettings,
+    offsets: &mut Offsets,
     made: Made,
     closing: &Closing,
     now: impl Fn() -> i64,
 ) -> Result<Brought, StoreError> {
     let Made { result, ended } = made;
-    let judged = result.and_then(|made| judge(made, &lease.structure, settings.largest_force));
+    let expected = offsets.expected(store, &settings.protocol, lease, &result, closing).await?;
+    let judged = result.and_then(|made| judge(made, &lease.structure, &settings.bounds, expected));
     let log = ended.as_ref().map_or("", |ended| &ended.log);
     if let Some(ended) = &ended {
         insist(closing, || store.account(lease, ended.core_seconds, log)).await?;

@@ -7,7 +7,7 @@ use atoms::Structure;
 use dft::{Calculated, Failure};
 use store::StoreError;
 
-use super::judge::judge;
+use super::judge::{LabelBounds, judge};
 use super::method::{Method, evaluate};
 
 /// What came of a single calculation.
@@ -31,7 +31,7 @@ pub struct Once {
 pub async fn label_once(
     method: &Method,
     structure: &Structure,
-    largest_force: f64,
+    bounds: &LabelBounds,
 ) -> Result<Once, StoreError> {
     let begun = Instant::now();
     let mut once = match method {
@@ -41,6 +41,6 @@ pub async fn label_once(
         }
         Method::Code(method) => method.once(structure).await?,
     };
-    once.result = once.result.and_then(|made| judge(made, structure, largest_force));
+    once.result = once.result.and_then(|made| judge(made, structure, bounds, None));
     Ok(once)
 }

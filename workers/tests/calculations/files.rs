@@ -4,7 +4,7 @@ use std::fs;
 
 use dft::Original;
 use store::JobState;
-use workers::labeller::{Keep, label_once};
+use workers::labeller::{Keep, LabelBounds, label_once};
 
 use super::common::structure;
 use super::place::*;
@@ -53,7 +53,8 @@ async fn a_file_that_is_replaced_between_two_labels_ends_the_labeller() {
     assert_eq!((job.job.state, job.job.failures), (JobState::Queued, 0));
     assert_eq!(job.attempts_made[0].calculation, None);
     place.nothing_is_left();
-    let once = label_once(&place.method(), &structure(0.0), 100.0).await.map(drop).unwrap_err();
+    let once =
+        label_once(&place.method(), &structure(0.0), &LabelBounds::default()).await.map(drop).unwrap_err();
     assert_eq!(once.to_string(), error);
     // The file of the protocol comes back.
     fs::write(place.setup_path(), "-7.5\n").unwrap();

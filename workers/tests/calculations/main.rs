@@ -14,7 +14,7 @@ use common::{ATOMS, structure};
 use dft::FailureClass;
 use place::*;
 use store::{Standing, unix_milliseconds};
-use workers::labeller::{keep, label_once};
+use workers::labeller::{LabelBounds, keep, label_once};
 
 /// Not a test: what the others start as the keepers of their calculations.
 #[test]
@@ -57,7 +57,7 @@ async fn a_label_comes_with_all_that_is_known_of_it() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn one_structure_is_labelled_without_a_campaign() {
     let place = Place::new(1, "echo said; sleep 0.1; echo -7.5 > energy").await;
-    let once = label_once(&place.method(), &structure(0.0), 100.0).await.unwrap();
+    let once = label_once(&place.method(), &structure(0.0), &LabelBounds::default()).await.unwrap();
     assert_eq!(once.result.unwrap().energy, -7.5);
     assert!(
         once.core_seconds >= 0.3 && said(Some(&once.log)) == "stdout:\nsaid\n",
@@ -66,7 +66,7 @@ async fn one_structure_is_labelled_without_a_campaign() {
         once.log
     );
     let failing = Place::new(1, "echo said; exit 3").await;
-    let once = label_once(&failing.method(), &structure(0.0), 100.0).await.unwrap();
+    let once = label_once(&failing.method(), &structure(0.0), &LabelBounds::default()).await.unwrap();
     assert_eq!(
         (once.result.unwrap_err().class, said(Some(&once.log)).as_str()),
         (FailureClass::NotConverged, "stdout:\nsaid\n")

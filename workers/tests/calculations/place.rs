@@ -12,7 +12,9 @@ use serde_json::json;
 use store::{Attempt, JobDetails, LabelRecord, ProcessRecord, Store, StoreError, unix_milliseconds};
 use tempfile::TempDir;
 use tokio::task::JoinHandle;
-use workers::labeller::{Closing, KeeperCommand, LabellerSettings, Method, Running, Stay, Timing, serve};
+use workers::labeller::{
+    Closing, KeeperCommand, LabelBounds, LabellerSettings, Method, Running, Stay, Timing, serve,
+};
 
 use super::common::*;
 
@@ -134,7 +136,7 @@ impl Place {
             holder: process.id.clone(),
             protocol: protocol("dft"),
             attempts: 5,
-            largest_force: 100.0,
+            bounds: LabelBounds::default(),
             stay: Stay::UntilEmpty,
             timing: Timing {
                 lease: Duration::from_secs(1),

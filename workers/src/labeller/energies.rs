@@ -1,0 +1,60 @@
+//! What energies of labels are compared with: the potential's, and the offsets of elements that labels show.
+
+use analysis::{EnergyOffsets, LabelledEnergy, TooFewLabels};
+use dft::Calculated;
+use store::records::{Lease, Protocol};
+use store::{Store, StoreError};
+use wire::ContentHash;
+
+use super::judge::Expected;
+use super::{Closing, insist};
+
+/// Labels that offsets are fitted to: the newest.
+const LABELS: u32 = 2_000;
+/// They are fitted again when this labeller has brought so many labels more, by those that the fit used.
+const REFIT: usize = 8;
+
+/// Fits the energy offsets of elements to the newest labels of a protocol, without those that are excluded.
+///
+/// # Errors
+/// Of the database; inside, [`TooFewLabels`] for a fit.
+pub async fn energy_offsets(
+    store: &Store,
+    protocol: ContentHash,
+) -> Result<Result<EnergyOffsets, TooFewLabels>, StoreError> {
+    let labels = store.labelled_energies(protocol, LABELS).await?;
+    let labels = labels.into_iter().map(|found| LabelledEnergy {
+        composition: found.composition.iter().map(|(species, n)| (species.atomic_number(), *n)).collect(),
+        model: found.model,
+        label: found.label,
+    });
+    Ok(EnergyOffsets::fit(&labels.collect::<Vec<_>>()))
+}
+
+/// The offsets as a labeller knows them.
+#[derive(Debug, Default)]
+pub(super) struct Offsets {
+    fitted: Option<EnergyOffsets>,
+    /// Labels until the next fit.
+    left: usize,
+}
+
+impl Offsets {
+    /// What the energy of a result is compared with; `None` if nothing is known.
+    pub async fn expected(
+        &mut self,
+        store: &Store,
+        protocol: &Protocol,
+        lease: &Lease,
+        result: &Result<Calculated, dft::Failure>,
+        closing: &Closing,
+    ) -> Result<Option<Expected<'_>>, StoreError> {
+        let Some(model) = lease.model_energy.filter(|_| result.is_ok()) else { return Ok(None) };
+        if self.left == 0 {
+            self.fitted = insist(closing, || energy_offsets(store, protocol.hash)).await?.ok();
+            self.left = self.fitted.as_ref().map_or(0, |fitted| fitted.structures() / REFIT).max(1);
+        }
+        self.left -= 1;
+        Ok(self.fitted.as_ref().map(|offsets| Expected { model, offsets }))
+    }
+}
