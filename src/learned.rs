@@ -1,9 +1,11 @@
-//! What the labels of a campaign teach: whether the grade told where the potential errs, and which structures got no label.
+//! What the labels of a campaign teach: how far the potential errs, whether the grade told where, and which structures got no label.
 
 use analysis::{Bins, Completion, ForceErrors};
 use atoms::cell::{norm, sub};
 use store::{AtomGrades, ExportFilter, ExportSource, Finished, Store, StoreError};
 use wire::{ContentHash, Origin};
+
+use crate::energies::{EnergyErrors, Zeros};
 
 /// Force errors above this are large, eV/Å, as in the paper.
 pub const LARGE: f64 = 1.0;
@@ -33,6 +35,8 @@ pub struct Learned {
     pub biased: Grades,
     /// Of frames of control walks.
     pub control: Grades,
+    /// Energy errors of all structures.
+    pub energies: EnergyErrors,
     /// Which got their labels, by the largest γ; failed ones by their names.
     pub by_gamma: Completion<String>,
     /// The same by V/V₀.
@@ -45,6 +49,7 @@ pub async fn of(store: &Store, protocol: ContentHash) -> Result<Learned, StoreEr
         all: Grades::new(),
         biased: Grades::new(),
         control: Grades::new(),
+        energies: EnergyErrors::new(Zeros::read(store, protocol).await?),
         by_gamma: Completion::new(Bins::of_grades()),
         by_expansion: Completion::new(Bins::of_expansion()),
     };
@@ -60,6 +65,7 @@ pub async fn of(store: &Store, protocol: ContentHash) -> Result<Learned, StoreEr
             let errors = forces.iter().zip(&row.label.forces).map(|(model, label)| norm(sub(*model, *label)));
             let errors: Vec<_> = errors.collect();
             learned.each(*origin, |grades| grades.labelled(original, &errors));
+            learned.energies.push(&row.structure, block.view().energy(), row.label.energy);
         }
     }
     let mut after = 0;

@@ -8,6 +8,7 @@ mod campaign;
 mod cli;
 mod condition;
 mod config;
+mod energies;
 mod forecast;
 mod frames;
 mod interrupt;

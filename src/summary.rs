@@ -87,7 +87,12 @@ impl fmt::Display for Summary {
             "           atoms   mean error   γ > 1   γ_nbr > 1   ρ(γ, error)   ρ(γ_nbr, error)   ROC-AUC(γ)   ROC-AUC(γ_nbr)"
         )?;
         writeln!(f, "  biased   {}", line(&self.learned.biased))?;
-        writeln!(f, "  control  {}", line(&self.learned.control))
+        writeln!(f, "  control  {}", line(&self.learned.control))?;
+        let energies = self.learned.energies.summary();
+        if let Some(line) = energies.line() {
+            writeln!(f, "energy error of the potential: {line}")?;
+        }
+        writeln!(f, "{}", energies.offsets.note)
     }
 }
 

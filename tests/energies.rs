@@ -1,13 +1,15 @@
-//! Energies of labels: which are believed.
+//! Energies of labels: which are believed, and how far the potential is from them when the difference of zeros is taken out.
 
 mod common;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
 use common::campaign::Small;
 use common::succeed;
 use serde_json::Value as Json;
+use store::{ExportFilter, ExportSource, Store};
 use tempfile::TempDir;
 
 /// A calculation whose energy is what the awk expression ENERGY gives; N is the number of atoms, X the first coordinate of the second.
@@ -80,9 +82,94 @@ fn bounds_are_those_of_the_configuration() {
         assert!(state == "failed" && log.contains(message), "{log}");
     }
     let here = directory.path();
+    // Without labels there are no energy errors, and it is said why.
+    let errors = json(here, ["errors", "here"]);
+    assert_eq!(
+        (&errors["energy"]["mean"], &errors["energy"]["offsets"]["structures"]),
+        (&Json::Null, &0.into())
+    );
+    let told = succeed(here, ["errors", "here"]);
+    assert!(
+        told.contains("no energy errors: ") && told.contains("at least 2 labelled structures; there are 0"),
+        "{told}"
+    );
     let arguments = ["label", "--once", "seeds.extxyz", "--config", "campaign.toml"];
     let output = common::calmwalk(here, arguments);
     assert_eq!(output.status.code(), Some(1));
-    let said = String::from_utf8_lossy(&output.stdout);
-    assert!(said.contains("beyond label.largest_energy = 50 eV/atom"), "{said} {}", common::stderr(&output));
+    let said = common::stderr(&output);
+    assert!(said.contains("beyond label.largest_energy = 50 eV/atom"), "{said}");
+}
+
+/// Energies of every labelled candidate in eV an atom, by its name: of the potential and of the label; with the structure's hash.
+fn energies(here: &Path) -> BTreeMap<String, (f64, f64, String)> {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let rows = runtime.block_on(async {
+        let store = Store::open_read_only(here.join("here")).await.unwrap();
+        let protocol = store.protocol_in_force().await.unwrap().unwrap().hash;
+        let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+        store.labelled(&filter, None, u32::MAX).await.unwrap()
+    });
+    let one = |row: store::ExportRow| {
+        let ExportSource::Candidate { id, block, .. } = row.source else { panic!("an import") };
+        let atoms = row.structure.len() as f64;
+        let content = block.view().id().content.to_string();
+        (id, (block.view().energy() / atoms, row.label.energy / atoms, content))
+    };
+    rows.into_iter().map(one).collect()
+}
+
+/// E_label − E_model of an atom: the mean over structures, each of which counts once although walks and controls may share it.
+fn offset(energies: &BTreeMap<String, (f64, f64, String)>) -> f64 {
+    let differences: BTreeMap<_, _> =
+        energies.values().map(|(model, label, content)| (content, label - model)).collect();
+    differences.values().sum::<f64>() / differences.len() as f64
+}
+
+fn near(found: &Json, expected: f64) {
+    let found = found.as_f64().unwrap();
+    assert!((found - expected).abs() < 1e-9, "{found} is not {expected}");
+}
+
+#[test]
+fn energy_errors_are_without_the_difference_of_zeros() {
+    let directory = labelled_with("N * (-56.5 + 0.01 * X)", "");
+    let here = directory.path();
+    let energies = energies(here);
+    let offset = offset(&energies);
+    assert!(energies.len() > 4 && offset < -50.0, "{offset}");
+    let errors: BTreeMap<_, _> =
+        energies.iter().map(|(id, (model, label, _))| (id, model - label + offset)).collect();
+
+    let shown = json(here, ["errors", "here"])["energy"].clone();
+    near(&shown["offsets"]["elements"][0]["offset"], offset);
+    assert_eq!(
+        (&shown["offsets"]["elements"][0]["element"], shown["structures"].as_u64()),
+        (&"Al".into(), Some(energies.len() as u64))
+    );
+    near(&shown["mean"], errors.values().map(|error| error.abs()).sum::<f64>() / errors.len() as f64);
+    near(&shown["largest"], errors.values().fold(0.0, |largest: f64, error| largest.max(error.abs())));
+    let note = format!(
+        "energy errors are without the offsets of the elements (eV an atom, E_label − E_model): Al {offset:.4}"
+    );
+    for (id, error) in &errors {
+        let story = json(here, ["explain", "here", id]);
+        let model = &story["labels"][0]["model"];
+        near(&model["energy_error_per_atom"], *error);
+        near(&model["energy_per_atom"], error - offset);
+        let told = succeed(here, ["explain", "here", id]);
+        let line = format!("E_model − E_label: {:.1} meV/atom", 1000.0 * error);
+        assert!(told.contains(&line) && told.contains(&note), "{line}\n{told}");
+    }
+    // Nowhere is the difference of zeros called an error.
+    let summary = succeed(here, ["run", "campaign.toml", "--directory", "here"]);
+    let told = succeed(here, ["errors", "here"]);
+    succeed(here, ["report", "here", "--output", "report"]);
+    let table = fs::read_to_string(here.join("report/tables/energy-offsets.csv")).unwrap();
+    assert!(table.contains(&format!("Al,{offset}")[..12]), "{table}");
+    let facts = fs::read_to_string(here.join("report/tables/summary.csv")).unwrap();
+    for text in [&summary, &told] {
+        assert!(text.contains(&note) && text.contains("meV/atom, over "), "{text}");
+    }
+    let mean = format!("mean {:.1}, ", 1000.0 * shown["mean"].as_f64().unwrap());
+    assert!(facts.contains(&mean) && told.contains(&mean), "{facts} {told}");
 }

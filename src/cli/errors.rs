@@ -13,12 +13,13 @@ use crate::output::{Table, decimals, print, print_json, range};
 /// Names of failed structures that a line shows.
 const NAMES: usize = 3;
 
-/// Show the potential's force errors by grade, and which structures got no label
+/// Show the potential's errors, the forces' by grade, and which structures got no label
 ///
 /// Compares |F_model − F_label| of every labelled atom with its γ and γ_nbr under the ORIGINAL mixture: median and
 /// percentiles in bins of the grade, Spearman's ρ, and the area under the receiver operating characteristic (ROC-AUC) of the
 /// grade as a test for errors above 1 eV/Å. Structures whose labels finally failed have errors too, which nobody
-/// knows: they are counted as censored, and named in their bins. Works while the campaign runs.
+/// knows: they are counted as censored, and named in their bins. Energy errors are without the offsets of the elements: labels and the
+/// potential have other zeros of energy. Works while the campaign runs.
 #[derive(Debug, clap::Args)]
 pub struct Errors {
     #[command(flatten)]
@@ -80,6 +81,7 @@ fn write(out: &mut dyn Write, protocol: &Protocol, learned: &Learned) -> io::Res
         let (gamma, gamma_nbr) = (all.gamma.left_out(), all.gamma_nbr.left_out());
         writeln!(out, "left out: {gamma} atoms without a finite γ, {gamma_nbr} without a finite γ_nbr")?;
     }
+    write_energies(out, learned)?;
     for (name, errors) in [("γ", &all.gamma), ("γ_nbr", &all.gamma_nbr)] {
         write_bins(out, name, &errors.bins())?;
     }
@@ -113,6 +115,15 @@ fn write_correlations(out: &mut dyn Write, learned: &Learned) -> io::Result<()> 
         ]);
     }
     table.write(out)
+}
+
+fn write_energies(out: &mut dyn Write, learned: &Learned) -> io::Result<()> {
+    let energies = learned.energies.summary();
+    writeln!(out)?;
+    if let Some(line) = energies.line() {
+        writeln!(out, "energy error |E_model − E_label|: {line}")?;
+    }
+    writeln!(out, "{}", energies.offsets.note)
 }
 
 fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<()> {
@@ -181,6 +192,7 @@ pub fn as_json(protocol: &Protocol, learned: &Learned) -> Value {
         "all": grades_as_json(&learned.all),
         "biased": grades_as_json(&learned.biased),
         "control": grades_as_json(&learned.control),
+        "energy": learned.energies.summary(),
         "completion_by_gamma": completion_as_json(&learned.by_gamma.bins()),
         "completion_by_relative_volume": completion_as_json(&learned.by_expansion.bins()),
     })

@@ -91,6 +91,7 @@ pub fn all(gathered: &Gathered) -> Vec<Table> {
             labels::correlations(&found.learned),
             labels::quantiles("quantiles-gamma", "γ", &found.learned.all.gamma),
             labels::quantiles("quantiles-gamma-nbr", "γ_{nbr}", &found.learned.all.gamma_nbr),
+            labels::energy_offsets(&found.learned),
             labels::failures(&found.failures),
             labels::unlabelled(&found.unlabelled),
         ]);

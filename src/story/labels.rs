@@ -1,5 +1,7 @@
 //! The label jobs of a structure, what became of each attempt, and how far the potential is from the labels.
 
+use std::collections::BTreeMap;
+
 use atoms::Vec3;
 use atoms::cell::{norm, sub};
 use serde::Serialize;
@@ -8,6 +10,8 @@ use store::{
     StructureLabel, Superseded,
 };
 use wire::{CandidateView, ContentHash};
+
+use crate::energies::{Offsets, Zeros};
 
 /// A label job with everything that happened to it.
 #[derive(Clone, Debug, Serialize)]
@@ -64,8 +68,12 @@ pub struct StoryLabel {
 /// The potential beside a label.
 #[derive(Clone, Debug, Serialize)]
 pub struct ForceError {
-    /// E_model − E_label an atom, eV.
+    /// E_model − E_label an atom, eV: mostly the difference of their zeros.
     pub energy_per_atom: f64,
+    /// The same without the offsets of the elements, eV; none if too few labels speak for the composition.
+    pub energy_error_per_atom: Option<f64>,
+    /// The offsets, from labels of the same protocol.
+    pub energy_offsets: Offsets,
     /// Mean of |F_model − F_label| over the atoms, eV/Å.
     pub mean: f64,
     /// The largest, eV/Å.
@@ -93,8 +101,21 @@ pub(super) async fn labels(
     content: ContentHash,
     model: Option<&CandidateView<'_>>,
 ) -> Result<Vec<StoryLabel>, StoreError> {
-    let labels = store.labels_of(content).await?;
-    Ok(labels.into_iter().map(|label| StoryLabel::of(label, model)).collect())
+    let (mut zeros, mut labels) = (BTreeMap::new(), Vec::new());
+    for label in store.labels_of(content).await? {
+        let Some(view) = model else {
+            labels.push(StoryLabel::of(label, None));
+            continue;
+        };
+        let protocol = label.protocol.hash;
+        if !zeros.contains_key(&protocol.0) {
+            zeros.insert(protocol.0, Zeros::read(store, protocol).await?);
+        }
+        let model =
+            ForceError::of(view, label.record.label.energy, &label.record.label.forces, &zeros[&protocol.0]);
+        labels.push(StoryLabel::of(label, Some(model)));
+    }
+    Ok(labels)
 }
 
 impl ByHand {
@@ -105,7 +126,7 @@ impl ByHand {
 }
 
 impl StoryLabel {
-    fn of(label: StructureLabel, model: Option<&CandidateView<'_>>) -> Self {
+    fn of(label: StructureLabel, model: Option<ForceError>) -> Self {
         let StructureLabel { protocol, record } = label;
         let LabelRecord { standing, label, source, received, superseded } = record;
         let atoms = label.forces.len().max(1) as f64;
@@ -120,7 +141,7 @@ impl StoryLabel {
             energy_per_atom: label.energy / atoms,
             largest_force: label.forces.iter().map(|force| norm(*force)).fold(0.0, f64::max),
             pressure: label.stress.map(|stress| -(stress[0][0] + stress[1][1] + stress[2][2]) / 3.0),
-            model: model.map(|view| ForceError::of(view, label.energy, &label.forces)),
+            model,
             details: label.details,
         }
     }
@@ -134,7 +155,7 @@ fn in_words(source: &LabelSource) -> String {
 }
 
 impl ForceError {
-    fn of(view: &CandidateView<'_>, energy: f64, forces: &[Vec3]) -> Self {
+    fn of(view: &CandidateView<'_>, energy: f64, forces: &[Vec3], zeros: &Zeros) -> Self {
         let pairs = view.forces.iter().zip(forces);
         let atoms: Vec<f64> = pairs.map(|(model, label)| norm(sub(*model, *label))).collect();
         let (atom, largest) =
@@ -144,6 +165,14 @@ impl ForceError {
             });
         let n = atoms.len().max(1) as f64;
         let energy_per_atom = (view.energy() - energy) / n;
-        Self { energy_per_atom, mean: atoms.iter().sum::<f64>() / n, largest, atom, atoms }
+        Self {
+            energy_per_atom,
+            energy_error_per_atom: zeros.error_per_atom(&view.structure(), view.energy(), energy),
+            energy_offsets: zeros.shown(),
+            mean: atoms.iter().sum::<f64>() / n,
+            largest,
+            atom,
+            atoms,
+        }
     }
 }

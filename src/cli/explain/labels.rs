@@ -84,16 +84,23 @@ fn write_label(out: &mut dyn Write, label: &StoryLabel, atoms: usize) -> io::Res
     if let Some(Superseded { time, reason }) = &label.superseded {
         line(out, "", &format!("superseded {} ago: {reason}", since(*time)))?;
     }
-    let Some(ForceError { energy_per_atom, mean, largest, atom, .. }) = &label.model else { return Ok(()) };
+    let Some(model) = &label.model else { return Ok(()) };
+    let ForceError { mean, largest, atom, .. } = model;
     line(
         out,
         "potential",
         &format!(
-            "|F_model − F_label|: mean {mean:.4} eV/Å over {atoms} atoms, largest {largest:.4} eV/Å (atom {atom}); \
-             E_model − E_label {:.1} meV/atom",
-            1000.0 * energy_per_atom
+            "|F_model − F_label|: mean {mean:.4} eV/Å over {atoms} atoms, largest {largest:.4} eV/Å (atom {atom})"
         ),
-    )
+    )?;
+    match model.energy_error_per_atom {
+        Some(error) => line(out, "", &format!("E_model − E_label: {:.1} meV/atom", 1000.0 * error))?,
+        None if model.energy_offsets.structures == 0 => {}
+        None => {
+            line(out, "", "E_model − E_label: not shown, since too few labels speak for this composition")?
+        }
+    }
+    line(out, "", &model.energy_offsets.note)
 }
 
 /// How long ago it was.

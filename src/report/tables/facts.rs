@@ -39,6 +39,10 @@ pub fn summary(gathered: &Gathered) -> Table {
             grouped(labels.queued)
         ),
     );
+    if let Some(found) = &gathered.labels {
+        let energies = found.learned.energies.summary();
+        row("energy error", energies.line().unwrap_or_else(|| energies.offsets.note.clone()));
+    }
     row("imported structures", grouped(status.imported));
     row("cost of labels", format!("{:.4} core-hours", status.budget.used.core_hours));
     let mut mixture = format!("version {}", status.mixture_version);

@@ -88,6 +88,23 @@ pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) 
     table
 }
 
+/// What was taken out of energies before errors are shown.
+pub fn energy_offsets(learned: &Learned) -> Table {
+    let offsets = learned.energies.summary().offsets;
+    let caption = format!(
+        "Labels and the potential have other zeros of energy: E_{{label}} − E_{{model}} of an atom of each element, by least squares over {} \
+         labelled structures ({} more are too far from the others). Energy errors are without these offsets. Where elements are not told \
+         apart by the labelled compositions, only sums of their offsets count.",
+        offsets.structures, offsets.left_out
+    );
+    let mut table = Table::new("energy-offsets", &caption, &["element", "offset (eV)", "told apart"]);
+    for offset in offsets.elements {
+        let separate = if offset.separate { "yes" } else { "no" };
+        table.rows.push(vec![text(offset.element), real(offset.offset, 4), text(separate)]);
+    }
+    table
+}
+
 /// Failures by class.
 pub fn failures(failures: &[FailureCount]) -> Table {
     let caption = "Label jobs that met a failure, by its class: those that have their labels all the same, those that were given up, and \

@@ -154,6 +154,12 @@ function attempt(made) {
     : element("p", { class: "attempt" }, line);
 }
 
+/** Without the difference of the zeros, and what was taken out; or why there is none. */
+function energyError({ energy_error_per_atom: error, energy_offsets: offsets }) {
+  if (error != null) return `${decimals(1000 * error, 2, "meV")} an atom; ${offsets.note}`;
+  return offsets.structures > 0 ? `not shown: too few labels speak for this composition; ${offsets.note}` : offsets.note;
+}
+
 function label(made) {
   const { model } = made;
   return facts([
@@ -161,7 +167,7 @@ function label(made) {
     ["energy", `${decimals(made.energy, 6, "eV")} (${decimals(made.energy_per_atom, 6, "eV")} an atom)`],
     ["largest force", decimals(made.largest_force, 4, "eV/Å")],
     ["pressure", made.pressure == null ? null : digits(made.pressure, "eV/Å³")],
-    ["error of the potential's energy", model && `${decimals(1000 * model.energy_per_atom, 2, "meV")} an atom`],
+    ["error of the potential's energy", model && energyError(model)],
     ["errors of its forces", model && `mean ${decimals(model.mean, 4)}, largest ${decimals(model.largest, 4, "eV/Å")} (atom ${model.atom})`],
   ]);
 }

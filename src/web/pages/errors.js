@@ -37,7 +37,7 @@ function shown(errors) {
   const { all } = errors;
   if (all.atoms === 0) return [element("p", {}, "There are no labels of candidates yet.")];
   return [
-    section(`Protocol ${errors.protocol}`, correlations(errors),
+    section(`Protocol ${errors.protocol}`, correlations(errors), energies(errors.energy),
       element("div", { class: "plots" }, figure("γ", all.gamma), figure("γ_nbr", all.gamma_nbr))),
     section("By γ", quantiles("γ", all.gamma, errors.large)), section("By γ_nbr", quantiles("γ_nbr", all.gamma_nbr, errors.large)),
     section("Structures without a label", completion("γ_max", errors.completion_by_gamma), completion("V/V₀", errors.completion_by_relative_volume)),
@@ -53,6 +53,14 @@ function correlations(errors) {
       decimals(gamma.roc_auc, 3), decimals(near.roc_auc, 3)];
   });
   return table("Rank correlations, and the area under the ROC curve", columns, rows);
+}
+
+/** Energy errors without the offsets of the elements, which the note gives; or why there are none. */
+function energies({ structures, mean, median, p90, largest, offsets }) {
+  const milli = (error) => decimals(1000 * error, 2);
+  const line = structures > 0 && `Energy error |E_model − E_label|: mean ${milli(mean)}, median ${milli(median)}, 90 % below ${milli(p90)}, largest `
+    + `${milli(largest)} meV/atom over ${whole(structures)} structures. `;
+  return element("p", {}, `${line || ""}Note: ${offsets.note}.`);
 }
 
 /** Median and percentiles over the middle of each bin. */

@@ -1,6 +1,9 @@
 //! What energies of labels are compared with: the potential's, and the offsets of elements that labels show.
 
+use std::collections::BTreeMap;
+
 use analysis::{EnergyOffsets, LabelledEnergy, TooFewLabels};
+use atoms::Structure;
 use dft::Calculated;
 use store::records::{Lease, Protocol};
 use store::{Store, StoreError};
@@ -29,6 +32,15 @@ pub async fn energy_offsets(
         label: found.label,
     });
     Ok(EnergyOffsets::fit(&labels.collect::<Vec<_>>()))
+}
+
+/// A structure with its energies by the potential and of its label, eV, as the fit takes it.
+pub fn labelled_energy(structure: &Structure, model: f64, label: f64) -> LabelledEnergy {
+    let mut counts = BTreeMap::new();
+    for species in &structure.species {
+        *counts.entry(species.atomic_number()).or_default() += 1;
+    }
+    LabelledEnergy { composition: counts.into_iter().collect(), model, label }
 }
 
 /// The offsets as a labeller knows them.

@@ -1,11 +1,11 @@
 //! Which results are believed.
 
-use std::collections::BTreeMap;
-
-use analysis::{EnergyOffsets, LabelledEnergy};
+use analysis::EnergyOffsets;
 use atoms::Structure;
 use dft::{Calculated, Failure, FailureClass};
 use serde::{Deserialize, Serialize};
+
+use super::energies::labelled_energy;
 
 /// So many labelled structures have to speak for a composition before an energy is held against them.
 const LEAST_SUPPORT: f64 = 5.0;
@@ -68,15 +68,6 @@ pub(super) fn judge(
     }
 }
 
-/// Numbers and atomic numbers of the elements of a structure.
-pub(super) fn composition(structure: &Structure) -> Vec<(u8, u32)> {
-    let mut counts = BTreeMap::new();
-    for species in &structure.species {
-        *counts.entry(species.atomic_number()).or_default() += 1;
-    }
-    counts.into_iter().collect()
-}
-
 fn wrong_number(made: &Calculated, atoms: usize) -> Option<String> {
     let moments = made.magnetic_moments.as_ref().map_or(atoms, Vec::len);
     let lists = [("forces", made.forces.len()), ("magnetic moments", moments)];
@@ -130,7 +121,7 @@ fn too_far(
     expected: Expected<'_>,
 ) -> Option<String> {
     let Expected { model, offsets } = expected;
-    let label = LabelledEnergy { composition: composition(structure), model, label: made.energy };
+    let label = labelled_energy(structure, model, made.energy);
     let difference = -offsets.error_per_atom(&label, LEAST_SUPPORT)?;
     let bound = bounds.largest_energy_difference;
     (difference.abs() > bound).then(|| {

@@ -42,7 +42,7 @@ use told::Became;
 
 pub use closing::Closing;
 pub use code::CodeMethod;
-pub use energies::energy_offsets;
+pub use energies::{energy_offsets, labelled_energy};
 pub use guard::{GUARD, LabelGuard, Pair};
 pub use insist::insist;
 pub use judge::LabelBounds;

@@ -1,3 +1,4 @@
+use analysis::LabelledEnergy;
 use atoms::Cell;
 
 use super::*;
