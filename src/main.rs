@@ -17,6 +17,7 @@ mod learned;
 mod log;
 mod mixture;
 mod notify;
+mod origin;
 mod outcome;
 mod output;
 mod progress;

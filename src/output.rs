@@ -59,6 +59,11 @@ pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
     print(|out| writeln!(out, "{text}"))
 }
 
+/// A number of things: `1 label`, `2 labels`.
+pub fn count(number: u64, noun: &str) -> String {
+    if number == 1 { format!("1 {noun}") } else { format!("{number} {noun}s") }
+}
+
 /// `x` with a number of decimals, or a dash where there is none.
 pub fn decimals(x: Option<f64>, decimals: usize) -> String {
     x.map_or("–".to_owned(), |x| format!("{x:.decimals$}"))

@@ -15,9 +15,10 @@ use serde_json::Value;
 /// Runs a demo to its end and checks its books; returns its labelled frames, control walks included.
 fn campaign(directory: &Path, name: &str) -> Vec<Frame> {
     let file = config(name).display().to_string();
-    let summary = succeed(directory, ["run", &file]);
-    assert!(summary.contains("walks            8 biased"), "{summary}");
+    // Beside its configuration it would be in the project.
     let here = directory.join(Path::new(name).file_stem().unwrap()).display().to_string();
+    let summary = succeed(directory, ["run", &file, "--directory", &here]);
+    assert!(summary.contains("walks            8 biased"), "{summary}");
     let status: Value = serde_json::from_str(&succeed(directory, ["status", &here, "--json"])).unwrap();
     assert_eq!(status["finished"], true, "{status}");
     let labels = &status["labels"];

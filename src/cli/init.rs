@@ -46,7 +46,8 @@ impl Init {
         }
         print(|out| {
             writeln!(out, "wrote {} and the files it names", config.display())?;
-            writeln!(out, "run it with: calmwalk run {}", config.display())
+            writeln!(out, "run it with:     calmwalk run {}", config.display())?;
+            writeln!(out, "look at it with: calmwalk status {}", self.directory.display())
         })?;
         Ok(Ended::Done)
     }

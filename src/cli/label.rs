@@ -2,7 +2,7 @@
 
 mod once;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use store::{Location, Store, StoreError};
 use tokio::sync::Notify;
 
-use super::{Ended, Failure, block_on};
+use super::{Ended, Failure, block_on, place};
 use crate::actors::asked_to_stop;
 use crate::actors::slots::{self, Slots};
 use crate::config::Config;
@@ -82,21 +82,21 @@ impl Label {
             return once::label(once::Task { structures, config, output, json }, &stop).await;
         }
         let store = self.store.clone().unwrap_or_default();
-        let location: Location = store.to_str().map_or_else(|| Ok(Location::from(&store)), str::parse)?;
-        say_if_unprotected(&location);
-        let place = match &location {
-            Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
-            // With its password, if it has one.
-            Location::Server(_) => store,
-        };
+        say_if_unprotected(&place::location(&store)?);
         loop {
-            let Some((opened, labelling)) = self.begin(&location, &stopping, &stop).await? else {
+            let Some((opened, labelling)) = self.begin(&store, &stopping, &stop).await? else {
                 return Ok(Ended::Interrupted);
+            };
+            let place = match place::location(&store)? {
+                Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
+                // With its password, if it has one.
+                Location::Server(_) if store.to_str().is_some_and(Location::is_server) => store.clone(),
+                Location::Server(url) => url.as_str().into(),
             };
             let protocol = labelling.protocol.clone();
             let slots = Slots {
                 number: self.slots,
-                location: place.clone(),
+                location: place,
                 labelling,
                 until_empty: self.until_empty,
                 grace: Duration::from_secs_f64(self.grace),
@@ -117,13 +117,14 @@ impl Label {
     /// Opens the store, as soon as there is a campaign in it; `None` if somebody asked to stop first.
     async fn begin(
         &self,
-        location: &Location,
+        store: &Path,
         stopping: &Arc<AtomicBool>,
         stop: &Notify,
     ) -> Result<Option<(Store, Labelling)>, Failure> {
         let (begun, mut told) = (Instant::now(), false);
         while !stopping.load(Ordering::Relaxed) {
-            let error = match self.open(location).await {
+            // A campaign that begins meanwhile may be below the directory.
+            let error = match self.open(&place::location(store)?).await {
                 Ok(opened) => return Ok(Some(opened)),
                 Err(Early::NotYet(error)) if begun.elapsed().as_secs_f64() < 60.0 * self.wait => error,
                 Err(Early::NotYet(error)) => return Err(error.into()),

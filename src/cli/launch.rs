@@ -11,7 +11,7 @@ use orchestrator::slurm::{JobNames, Phase, Plan, Slurm, SlurmError, Wanted, plan
 use store::Location;
 
 use self::order::Order;
-use super::{Ended, Failure, block_on};
+use super::{Ended, Failure, block_on, place};
 use crate::campaign::Campaign;
 use crate::config::Config;
 use crate::output::{print, say};
@@ -32,9 +32,12 @@ pub struct Launch {
     /// The batch system
     #[arg(long, value_name = "SYSTEM", value_enum)]
     on: System,
-    /// Directory of the campaign, also seen by all nodes [default: the name of the configuration without its extension, here]
+    /// Directory of the campaign, also seen by all nodes [default: beside the configuration, with its name but no extension]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
+    /// Go on with a campaign that belongs to another configuration file: this one takes its place
+    #[arg(long)]
+    adopt: bool,
     /// Jobs with an agent
     #[arg(long, value_name = "N", required_unless_present = "stop", value_parser = clap::value_parser!(u32).range(0..=10_000))]
     agents: Option<u32>,
@@ -107,6 +110,9 @@ impl Launch {
             block_on(self.stop(&slurm, &names))??;
         } else {
             let campaign = Campaign::load(&self.config)?;
+            if self.directory.is_none() {
+                block_on(place::refuse_if_kept_elsewhere(&campaign, &directory))??;
+            }
             let location = campaign.config.location(&directory)?;
             if let Location::Directory(directory) = &location {
                 store::check_directory(directory)?;
@@ -123,8 +129,7 @@ impl Launch {
 
     /// The campaign's directory, by its one true name, since jobs are known by it.
     fn directory(&self) -> Result<PathBuf, Failure> {
-        let stem = self.config.file_stem().unwrap_or_default();
-        let directory = self.directory.clone().unwrap_or_else(|| PathBuf::from(stem));
+        let directory = self.directory.clone().unwrap_or_else(|| place::default_directory(&self.config));
         let made = fs::create_dir_all(&directory).and_then(|()| directory.canonicalize());
         made.map_err(|error| {
             Failure::Input(format!("cannot make the directory {}: {error}", directory.display()))

@@ -14,6 +14,7 @@ mod label;
 mod labeller;
 mod launch;
 mod md;
+mod place;
 mod plan;
 mod queue;
 mod relabel;
@@ -115,7 +116,7 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
 /// Where a campaign is kept, as an argument.
 #[derive(Debug, clap::Args)]
 struct CampaignLocation {
-    /// Directory of the campaign, or the postgres:// URL of its store
+    /// Directory of the campaign or of its configuration, or the postgres:// URL of its store
     #[arg(value_name = "DIR")]
     location: PathBuf,
 }
@@ -123,7 +124,7 @@ struct CampaignLocation {
 impl CampaignLocation {
     /// Not a type of the argument: what is shown of a wrong argument would show its password.
     fn get(&self) -> Result<Location, Failure> {
-        Ok(self.location.to_str().map_or_else(|| Ok(Location::from(&self.location)), str::parse)?)
+        place::location(&self.location)
     }
 }
 

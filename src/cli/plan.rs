@@ -7,7 +7,7 @@ use analysis::{CostModel, Measured, Size};
 use serde_json::json;
 use store::{Location, Store};
 
-use super::{Ended, Failure, block_on};
+use super::{Ended, Failure, block_on, place};
 use crate::bill::{CoreHours, Costs, digits, size_of};
 use crate::campaign::Campaign;
 use crate::forecast::Forecast;
@@ -120,7 +120,7 @@ impl Plan {
         let Some(like) = &self.like else {
             return Ok((None, String::new()));
         };
-        let location = like.to_str().map_or_else(|| Ok(Location::from(like)), str::parse)?;
+        let location = place::location(like)?;
         let costs = block_on(learn(&location))??;
         let shown = format!("the {} newest labels of {}", costs.measured(), location);
         Ok((Some(costs), shown))

@@ -1,5 +1,6 @@
 //! `calmwalk run`
 
+mod begin;
 mod lock;
 
 use std::fs;
@@ -16,13 +17,13 @@ use tokio::sync::Notify;
 use wire::net::{Endpoint, Tls};
 use workers::labeller::GUARD;
 
-use super::{Ended, Failure, block_on};
+use super::{Ended, Failure, block_on, place};
 use crate::actors::notify::{self, Notifier};
 use crate::actors::{self, budget, in_process, processes};
 use crate::campaign::Campaign;
-use crate::config::{Change, compare, place};
 use crate::forecast::{self, Forecast, megabytes};
 use crate::labelling::LABEL_METHOD;
+use crate::origin::Origin;
 use crate::output::{print, say, say_if_unprotected, warn};
 use crate::{log, summary, web};
 
@@ -35,9 +36,12 @@ pub struct Run {
     /// Configuration of the campaign
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
-    /// Directory of the campaign [default: the name of the configuration without its extension, here]
+    /// Directory of the campaign [default: beside the configuration, with its name but no extension]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
+    /// Go on with a campaign that belongs to another configuration file: this one takes its place
+    #[arg(long)]
+    adopt: bool,
     /// Walkers and labellers as threads of this process, not as processes of their own; needs no shared memory
     #[arg(long)]
     in_process: bool,
@@ -67,16 +71,15 @@ impl Run {
     pub fn run(self) -> Result<Ended, Failure> {
         self.log.begin("orchestrator")?;
         let campaign = Campaign::load(&self.config)?;
-        let stem = self.config.file_stem().unwrap_or_default();
-        let directory = self.directory.unwrap_or_else(|| PathBuf::from(stem));
-        fs::create_dir_all(&directory).map_err(|source| match source.kind() {
-            ErrorKind::StorageFull => StoreError::DiskFull,
-            ErrorKind::AlreadyExists => {
-                let source = std::io::Error::new(ErrorKind::NotADirectory, "it is a file");
-                StoreError::Directory { directory: directory.clone(), source }
+        let directory = match self.directory {
+            Some(directory) => directory,
+            None => {
+                let directory = place::default_directory(&self.config);
+                block_on(place::refuse_if_kept_elsewhere(&campaign, &directory))??;
+                directory
             }
-            _ => StoreError::Directory { directory: directory.clone(), source },
-        })?;
+        };
+        make(&directory)?;
         let listen = self.listen.map(|endpoint| actors::Listen {
             endpoint,
             tls: self.tls.as_deref().map(Tls::in_directory),
@@ -90,7 +93,8 @@ impl Run {
             let web = self.shown_at.listen().await?;
             let _lock = lock::directory(&directory, &location, patience).await?;
             listen.iter().try_for_each(actors::Listen::begins)?;
-            let how = How { in_process: self.in_process, listen: listen.as_ref(), web, patience };
+            let (in_process, adopt) = (self.in_process, self.adopt);
+            let how = How { in_process, adopt, listen: listen.as_ref(), web, patience };
             run(&campaign, &directory, &location, how).await
         })?
         .map_err(|failure| failure.in_campaign(&directory))?;
@@ -102,9 +106,23 @@ impl Run {
     }
 }
 
+/// Makes the campaign's directory.
+fn make(directory: &Path) -> Result<(), Failure> {
+    let failed = |source| StoreError::Directory { directory: directory.into(), source };
+    fs::create_dir_all(directory).map_err(|source| match source.kind() {
+        ErrorKind::StorageFull => StoreError::DiskFull.into(),
+        ErrorKind::AlreadyExists => {
+            failed(std::io::Error::new(ErrorKind::NotADirectory, "it is a file")).into()
+        }
+        _ => Failure::Input(format!("{}; --directory names another one", failed(source))),
+    })
+}
+
 /// What the command line says besides the configuration.
 struct How<'a> {
     in_process: bool,
+    /// Whether the campaign may belong to another configuration file.
+    adopt: bool,
     listen: Option<&'a actors::Listen>,
     web: web::Listening,
     patience: Duration,
@@ -116,9 +134,10 @@ async fn run(
     location: &Location,
     how: How<'_>,
 ) -> Result<Ended, Failure> {
-    let How { in_process, listen, web, patience } = how;
+    let How { in_process, adopt, listen, web, patience } = how;
     let lock = lock::server(location, patience).await?;
-    let store = open_store(campaign, location).await?;
+    let origin = Origin::new(&campaign.path, &campaign.text, directory);
+    let store = open_store(campaign, location, &origin, adopt).await?;
     let store = lock.iter().fold(store, Store::led_by);
     if let Location::Directory(directory) = &location {
         warn_of_the_disk(campaign, directory, &store).await?;
@@ -192,7 +211,12 @@ fn shown(location: &Location) -> String {
 }
 
 /// Begins the campaign, or opens the one that is there and checks that it is the same.
-async fn open_store(campaign: &Campaign, location: &Location) -> Result<Store, Failure> {
+async fn open_store(
+    campaign: &Campaign,
+    location: &Location,
+    origin: &Origin,
+    adopt: bool,
+) -> Result<Store, Failure> {
     let now = unix_milliseconds();
     let resolved = campaign.resolved();
     let store = match Store::open(location).await {
@@ -205,11 +229,13 @@ async fn open_store(campaign: &Campaign, location: &Location) -> Result<Store, F
                 resolved_configuration: resolved.to_string(),
                 configuration_in_force: resolved.to_string(),
             };
-            Store::create(location, &record, &campaign.stored_seeds(), now).await?
+            let store = Store::create(location, &record, &campaign.stored_seeds(), now).await?;
+            begin::begun(&store, origin, location).await?;
+            store
         }
         opened => {
             let store = opened?;
-            go_on(campaign, &resolved, &store, location, now).await?;
+            begin::go_on(campaign, &store, location, origin, adopt).await?;
             store
         }
     };
@@ -245,39 +271,6 @@ async fn warn_of_the_disk(campaign: &Campaign, directory: &Path, store: &Store) 
         ));
     }
     Ok(())
-}
-
-/// Checks that the campaign in the store is this one, and applies what may have changed.
-async fn go_on(
-    campaign: &Campaign,
-    resolved: &serde_json::Value,
-    store: &Store,
-    location: &Location,
-    now: i64,
-) -> Result<(), Failure> {
-    let elsewhere = match location {
-        Location::Directory(_) => "with --directory",
-        Location::Server(_) => "in another schema, which ?schema=… in run.store names",
-    };
-    let in_force = store.campaign().await?.configuration_in_force;
-    let before = serde_json::from_str(&in_force).map_err(|error| {
-        Failure::Failed(format!(
-            "damaged database: the configuration in force: {error}; restore the campaign from a backup"
-        ))
-    })?;
-    let changes = compare(&before, resolved).map_err(|refused| {
-        let at = place(&campaign.path, &campaign.text, refused.key());
-        Failure::Input(format!("{at}: {refused}, or start another campaign {elsewhere}"))
-    })?;
-    if changes.is_empty() {
-        return Ok(());
-    }
-    for change in &changes {
-        say(format_args!("configuration: {change}"));
-    }
-    store.add_seed_structures(&campaign.stored_seeds()).await?;
-    let details: Vec<_> = changes.iter().map(Change::detail).collect();
-    Ok(store.set_configuration_in_force(&resolved.to_string(), &details, now).await?)
 }
 
 /// Makes this process known, and takes back what dead ones held: the lock says that there is no other.

@@ -24,6 +24,7 @@ use self::values::Values;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::budget;
 use crate::forecast::{self, Forecast, megabytes};
+use crate::origin::Origin;
 use crate::output::{decimals, print, print_json};
 
 /// Show how a campaign stands
@@ -63,6 +64,8 @@ impl Status {
 #[derive(Debug)]
 pub struct Snapshot {
     campaign: store::Campaign,
+    /// None of a campaign of an early version.
+    origin: Option<Origin>,
     standing: Standing,
     values: Values,
     disk: Disk,
@@ -87,6 +90,7 @@ impl Snapshot {
         let configuration: Value = serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default();
         Ok(Self {
             end: End::of(&standing, &configuration, labels.bill()),
+            origin: Origin::of(store).await?,
             values: Values(store.values().await?),
             disk: Disk { bytes: store.size().await?, forecast },
             campaign,
@@ -155,8 +159,12 @@ impl Snapshot {
     }
 
     fn write_head(&self, out: &mut dyn Write, page: &Page) -> io::Result<()> {
-        let Self { campaign, standing, values, disk, labels, end } = self;
-        page.titled(out, "campaign", &format!("{}, {} mode", campaign.id, campaign.mode))?;
+        let Self { campaign, origin, standing, values, disk, labels, end } = self;
+        let name = origin.as_ref().map_or(String::new(), |origin| format!("{}, ", origin.name));
+        page.titled(out, "campaign", &format!("{name}{}, {} mode", campaign.id, campaign.mode))?;
+        if let Some(origin) = origin.as_ref().filter(|_| page.has_all()) {
+            page.titled(out, "", &format!("by {}", origin.file.path))?;
+        }
         page.titled(out, "state", &processes::state(standing))?;
         page.titled(out, "walks", &walks_in_words(standing))?;
         page.titled(out, "mixture", &format!("version {}", standing.mixture_version))?;

@@ -22,7 +22,7 @@ use toml::Spanned;
 use workers::labeller::{BatchSystem, Keep, LabelBounds, LabelGuard, Running};
 use workers::settings::ThermostatKind;
 
-pub use changes::{Change, changed_keys, compare, without_changeable};
+pub use changes::{Change, Refused, changed_keys, compare, without_changeable};
 pub use error::{ConfigError, in_plain_words, place, place_of_offset};
 pub use files::{PotentialFile, PotentialKind};
 pub use method::LabelMethod;

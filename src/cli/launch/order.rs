@@ -180,6 +180,9 @@ impl<'a> Commands<'a> {
 
     fn orchestrator(&self, wanted: Wanted) -> Result<String, Failure> {
         let mut words = vec!["run", &self.config, "--directory", &self.directory, PATIENCE];
+        if self.launch.adopt {
+            words.push("--adopt");
+        }
         let tls = self.certificates("orchestrator")?;
         if wanted.agents > 0 {
             let everywhere = if tls.is_some() { "tcp/0.0.0.0:0" } else { "tcp/127.0.0.1:0" };

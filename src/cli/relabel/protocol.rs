@@ -9,6 +9,7 @@ use store::{Protocol, Store, StoreError};
 use super::Failure;
 use crate::config::{Change, Config, LabelSection, changed_keys};
 use crate::labelling::{self, LABEL_METHOD};
+use crate::origin::{self, Origin};
 use crate::setup::MethodSetup;
 
 /// How labels are made from now on.
@@ -20,7 +21,7 @@ pub struct NewLabels {
     /// How it differs from the one by which it ran.
     pub changes: Vec<Change>,
     /// What labellers on other hosts need to know.
-    pub notes: [(&'static str, String); 1],
+    pub notes: Vec<(&'static str, String)>,
 }
 
 impl NewLabels {
@@ -41,7 +42,8 @@ impl NewLabels {
         let changed = changed_keys(&before, &after).into_iter();
         let changes = changed.map(|(key, before, after)| Change::Key { key, before, after }).collect();
         let note = serde_json::to_string(&method).map_err(Failure::failed)?;
-        let notes = [(LABEL_METHOD, note)];
+        let mut notes = vec![(LABEL_METHOD, note)];
+        notes.extend(origin_note(store, path).await?);
         Ok(Some(Self { protocol, configuration: after.to_string(), changes, notes }))
     }
 
@@ -49,6 +51,15 @@ impl NewLabels {
     pub fn changes_in_words(&self) -> Vec<String> {
         self.changes.iter().map(ToString::to_string).collect()
     }
+}
+
+/// That the campaign may go on by this file.
+async fn origin_note(store: &Store, path: &Path) -> Result<Option<(&'static str, String)>, Failure> {
+    let Some(known) = Origin::of(store).await? else { return Ok(None) };
+    let text = std::fs::read_to_string(path)
+        .map_err(|error| Failure::Input(format!("cannot read {}: {error}", path.display())))?;
+    let note = serde_json::to_string(&known.relabelled(path, &text)).map_err(Failure::failed)?;
+    Ok(Some((origin::NOTE, note)))
 }
 
 /// A protocol has one name in a campaign, and a name means one protocol.

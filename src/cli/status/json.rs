@@ -10,10 +10,14 @@ pub const VERSION: u32 = 1;
 
 /// One object.
 pub fn of(snapshot: &Snapshot, jobs: &Jobs) -> serde_json::Result<Value> {
-    let Snapshot { campaign, standing, values, disk, labels, end } = snapshot;
+    let Snapshot { campaign, origin, standing, values, disk, labels, end } = snapshot;
     let mut json = serde_json::to_value(standing)?;
     json["version"] = VERSION.into();
     json["campaign"] = campaign.id.to_string().into();
+    json["name"] = json!(origin.as_ref().map(|origin| &origin.name));
+    json["configuration"] = json!(origin.as_ref().map(|origin| {
+        json!({ "path": origin.file.path, "blake3": origin.file.blake3, "began_with": origin.began_with })
+    }));
     json["mode"] = campaign.mode.clone().into();
     json["training_frames"] = values.training_frames();
     json["staleness"] = values.staleness();

@@ -40,10 +40,15 @@ impl Page {
         Self { walks: 0, others: 0, few: FEW, ..self }
     }
 
+    /// Whether nothing is left out.
+    pub fn has_all(&self) -> bool {
+        self.few == usize::MAX
+    }
+
     /// With as many rows as have room below so many lines, in so many tables; `walks` if that many were asked for.
     pub fn fitted(self, lines: usize, tables: usize, walks: Option<usize>) -> Self {
         let rows = HEIGHT.saturating_sub(lines + tables * FRAME) / tables;
-        let rows = if self.few == usize::MAX { self.few } else { rows.max(FEW) };
+        let rows = if self.has_all() { usize::MAX } else { rows.max(FEW) };
         Self { walks: walks.unwrap_or(rows), others: rows, ..self }
     }
 

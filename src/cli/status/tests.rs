@@ -1,6 +1,7 @@
 //! Whether everything has room on a screen, and whether docs/status.md says what is so.
 
 use std::collections::BTreeSet;
+use std::path::Path;
 
 use orchestrator::slurm::{Job, Role};
 use serde_json::json;
@@ -51,6 +52,11 @@ pub fn large() -> Snapshot {
             resolved_configuration: String::new(),
             configuration_in_force: String::new(),
         },
+        origin: Some(Origin::new(
+            Path::new("/scratch/a-long-name-of-a-project/a-long-name-of-a-campaign/campaign.toml"),
+            "",
+            Path::new("/scratch"),
+        )),
         standing: standing(),
         values: Values(values.map(|(name, value)| (name.to_owned(), value.to_string())).into()),
         disk: Disk {

@@ -1,0 +1,155 @@
+//! Where campaigns are kept, and that no campaign is taken for another.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+
+use common::campaign::Small;
+use common::{calmwalk, refuse, stderr, succeed};
+use serde_json::Value;
+
+/// A campaign that is over at once.
+fn write(directory: &Path) {
+    fs::create_dir_all(directory).unwrap();
+    Small { steps: 30, per_seed: 1, seeds: &["fcc-100"], ..Small::default() }.write(directory);
+}
+
+fn status(here: &Path, of: &str) -> Value {
+    serde_json::from_str(&succeed(here, ["status", of, "--json"])).unwrap()
+}
+
+/// Runs it to its end; what it said.
+fn run(here: &Path, arguments: &[&str]) -> String {
+    let output = calmwalk(here, ["run", "--in-process"].iter().chain(arguments));
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    stderr(&output)
+}
+
+#[test]
+fn campaigns_of_init_do_not_meet() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    for name in ["first", "second"] {
+        let printed = succeed(here, ["init", name]);
+        assert!(printed.contains(&format!("calmwalk status {name}\n")), "{printed}");
+        // Their content is the same, as that of `init` is: only where they are tells them apart.
+        write(&here.join(name));
+        let said = run(here, &[&format!("{name}/campaign.toml")]);
+        assert!(said.contains(&format!("campaign '{name}' begins in {name}/campaign, with /")), "{said}");
+        assert!(here.join(name).join("campaign/campaign.sqlite").is_file());
+        assert_eq!(status(here, name)["name"], name);
+    }
+    let said = run(here, &["first/campaign.toml"]);
+    assert!(said.contains("campaign 'first' in first/campaign is finished; after decision "), "{said}");
+    let entries = fs::read_dir(here).unwrap().count();
+    assert_eq!(entries, 2, "nothing was left in the working directory");
+
+    // Every command takes the directory that `init` made.
+    for command in [&["status"][..], &["errors"], &["report", "--output", "page"], &["walks"], &["store", "check"]] {
+        let arguments = command.iter().copied();
+        let last = if command == ["walks"] { &["resume", "--all"][..] } else { &[] };
+        let (words, options): (Vec<_>, Vec<_>) = arguments.partition(|word| !word.starts_with("--") && *word != "page");
+        succeed(here, words.into_iter().chain(["second"]).chain(options).chain(last.iter().copied()));
+    }
+    assert!(succeed(here, ["plan", "first/campaign.toml", "--like", "second"]).contains("newest label"));
+    succeed(here, ["label", "--store", "second", "--until-empty"]);
+}
+
+#[test]
+fn a_directory_with_several_campaigns_is_not_enough() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(here);
+    fs::copy(here.join("campaign.toml"), here.join("other.toml")).unwrap();
+    run(here, &["campaign.toml"]);
+    // One that no configuration names gives way to one that is named.
+    succeed(here, ["store", "backup", "campaign", "copy"]);
+    assert_eq!(status(here, ".")["name"], here.file_name().unwrap().to_str().unwrap());
+    run(here, &["other.toml"]);
+    let message = refuse(here, ["status", "."]);
+    assert!(message.contains(". holds 2 campaigns: name one of ./campaign, ./other"), "{message}");
+    assert_eq!(status(here, "other")["name"], "other");
+}
+
+#[test]
+fn a_campaign_refuses_the_configuration_of_another() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    for name in ["first", "second"] {
+        write(&here.join(name));
+    }
+    let both = |from: &str| ["run", from, "--directory", "shared"].map(str::to_owned);
+    run(here, &["first/campaign.toml", "--directory", "shared"]);
+    let database = fs::read(here.join("shared/campaign.sqlite")).unwrap();
+    let message = refuse(here, both("second/campaign.toml"));
+    let first = here.canonicalize().unwrap().join("first/campaign.toml");
+    let expected = format!("is 'first', which belongs to another configuration, {}", first.display());
+    for words in ["second/campaign.toml: ", &expected, "with --directory", "--adopt goes on with it"] {
+        assert!(message.contains(words), "{words}: {message}");
+    }
+    // Nor does it lead to changing the file.
+    let text = fs::read_to_string(here.join("second/campaign.toml")).unwrap();
+    fs::write(here.join("second/campaign.toml"), text.replace("tau = 0.3", "tau = 0.4")).unwrap();
+    let message = refuse(here, both("second/campaign.toml"));
+    assert!(message.contains("walk.tau") && message.contains("is 'first', by "), "{message}");
+    fs::write(here.join("second/campaign.toml"), text).unwrap();
+    assert_eq!(fs::read(here.join("shared/campaign.sqlite")).unwrap(), database);
+
+    let said = run(here, &["second/campaign.toml", "--directory", "shared", "--adopt"]);
+    assert!(said.contains("second/campaign.toml takes the place of "), "{said}");
+    run(here, &["second/campaign.toml", "--directory", "shared"]);
+    assert!(refuse(here, both("first/campaign.toml")).contains("is 'second', which belongs to another"));
+    let found = status(here, "shared");
+    assert_eq!((&found["name"], &found["configuration"]["began_with"]["path"]), (
+        &"second".into(),
+        &first.display().to_string().into()
+    ));
+}
+
+#[test]
+fn a_campaign_moves_with_its_configuration() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(&here.join("first"));
+    run(here, &["first/campaign.toml"]);
+    // Moved together, copied together, and the configuration renamed.
+    fs::rename(here.join("first"), here.join("moved")).unwrap();
+    let said = run(here, &["moved/campaign.toml"]);
+    assert!(said.contains("campaign 'moved' in moved/campaign is finished"), "{said}");
+    fs::rename(here.join("moved/campaign.toml"), here.join("moved/hot.toml")).unwrap();
+    run(here, &["moved/hot.toml", "--directory", "moved/campaign"]);
+    assert_eq!(status(here, "moved/campaign")["name"], "hot");
+    // A backup belongs to the same configuration.
+    succeed(here, ["store", "backup", "moved", "restored"]);
+    run(here, &["moved/hot.toml", "--directory", "restored"]);
+}
+
+#[test]
+fn a_campaign_in_the_working_directory_is_not_begun_anew() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(&here.join("first"));
+    // As a version of calmwalk left it that knew of no configuration files.
+    run(here, &["first/campaign.toml", "--directory", "campaign"]);
+    forget_the_configuration(&here.join("campaign"));
+    let message = refuse(here, ["run", "first/campaign.toml"]);
+    for words in ["is in ./campaign", "with --directory campaign to go on", "--directory first/campaign to begin"] {
+        assert!(message.contains(words), "{words}: {message}");
+    }
+    assert!(!here.join("first/campaign").exists());
+    run(here, &["first/campaign.toml", "--directory", "campaign"]);
+    // It has become that of this file, and is in nobody else's way.
+    write(&here.join("second"));
+    run(here, &["second/campaign.toml"]);
+    assert!(refuse(here, ["run", "first/campaign.toml"]).contains("is in ./campaign"));
+}
+
+fn forget_the_configuration(campaign: &Path) {
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let store = store::Store::open(campaign).await.unwrap();
+        store.leave_note("configuration_file", "").await.unwrap();
+        store.close().await;
+    });
+}
