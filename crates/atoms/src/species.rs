@@ -51,7 +51,8 @@ impl FromStr for Species {
             .iter()
             .position(|element| element.symbol() == symbol)
             .map(|index| Self(index as u8 + 1))
-            .ok_or_else(|| UnknownSpecies(symbol.to_owned()))
+            // It may be a line of a file that is none.
+            .ok_or_else(|| UnknownSpecies(symbol.chars().take(60).collect()))
     }
 }
 

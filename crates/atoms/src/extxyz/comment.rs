@@ -18,10 +18,9 @@ pub(super) fn parse(line: &str) -> Result<Vec<(String, Value)>, Fault> {
     let mut pairs = Vec::new();
     loop {
         cursor.skip_space();
-        let column = cursor.column();
         let Some(first) = cursor.peek() else { return Ok(pairs) };
         if first == '=' {
-            return Err(Fault::NoKey { column });
+            return Err(Fault::NoKey { column: cursor.column(cursor.at) });
         }
         let key = cursor.word(true)?;
         cursor.skip_space();
@@ -72,37 +71,37 @@ impl Cursor<'_> {
         self.at += self.rest().len() - self.rest().trim_start().len();
     }
 
-    /// Column of the next character, from 1.
-    fn column(&self) -> usize {
-        self.line.get(..self.at).unwrap_or("").chars().count() + 1
+    /// Column of the character at a byte offset, from 1. For errors only: it counts from the start of the line.
+    fn column(&self, at: usize) -> usize {
+        self.line.get(..at).unwrap_or("").chars().count() + 1
     }
 
     /// A word up to white space (or an equals sign).
     fn word(&mut self, ends_at_equals: bool) -> Result<String, Fault> {
         let mut word = String::new();
         while let Some(c) = self.peek().filter(|c| !(c.is_whitespace() || ends_at_equals && *c == '=')) {
-            let column = self.column();
             self.next();
             match c {
                 '\\' => word.extend(self.next()),
-                '"' | '\'' => self.delimited(c, c, column, &mut word)?,
-                '{' => self.delimited('{', '}', column, &mut word)?,
-                '[' => self.delimited('[', ']', column, &mut word)?,
+                '"' | '\'' => self.delimited(c, c, &mut word)?,
+                '{' => self.delimited('{', '}', &mut word)?,
+                '[' => self.delimited('[', ']', &mut word)?,
                 _ => word.push(c),
             }
         }
         Ok(word)
     }
 
-    /// What stands before the closing delimiter, which is taken too.
-    fn delimited(&mut self, open: char, close: char, column: usize, word: &mut String) -> Result<(), Fault> {
+    /// What stands between the delimiter that was just taken and the closing one, which is taken too.
+    fn delimited(&mut self, open: char, close: char, word: &mut String) -> Result<(), Fault> {
+        let start = self.at.saturating_sub(open.len_utf8());
         loop {
             match self.next() {
                 Some('\\') => word.extend(self.next()),
                 Some(c) if c == close => return Ok(()),
                 Some(c) => word.push(c),
                 None if self.lenient => return Ok(()),
-                None => return Err(Fault::Unclosed { column, delimiter: open }),
+                None => return Err(Fault::Unclosed { column: self.column(start), delimiter: open }),
             }
         }
     }
@@ -117,7 +116,7 @@ impl Cursor<'_> {
 
     /// `[[…], […]]` without quotes, up to the bracket that closes the first one.
     fn matrix(&mut self, key: &str) -> Result<Value, Fault> {
-        let (start, column) = (self.at, self.column());
+        let start = self.at;
         let mut depth = 0_usize;
         while let Some(c) = self.next() {
             match c {
@@ -130,6 +129,6 @@ impl Cursor<'_> {
                 return Value::parse_json(text).ok_or_else(|| Fault::key(key, text, "rows of numbers"));
             }
         }
-        Err(Fault::Unclosed { column, delimiter: '[' })
+        Err(Fault::Unclosed { column: self.column(start), delimiter: '[' })
     }
 }

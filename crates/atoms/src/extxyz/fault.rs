@@ -104,7 +104,7 @@ pub enum Fault {
 
 impl Fault {
     pub(super) fn key(key: &str, found: &str, expected: &'static str) -> Self {
-        Self::Key { key: key.to_owned(), found: excerpt(found), expected }
+        Self::Key { key: excerpt(key), found: excerpt(found), expected }
     }
 
     pub(super) fn at(self, line: usize) -> ExtxyzError {

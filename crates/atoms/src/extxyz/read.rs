@@ -97,7 +97,7 @@ impl Header {
                 value = matrix(&value).ok_or_else(|| fault(&key, &value, "9 numbers (or 6)"))?.into();
             }
             if info.get(&key).is_some_and(|other| *other != value) {
-                return Err(Fault::Repeated { key });
+                return Err(Fault::Repeated { key: excerpt(&key) });
             }
             info.insert(key, value);
         }

@@ -1,6 +1,6 @@
 //! The columns of the atom lines, as `Properties` describes them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::fault::{Fault, excerpt};
 use super::value::logical;
@@ -44,14 +44,15 @@ impl Table {
             return Err(fault("name:type:columns triples"));
         }
         let numbered = triples.iter().any(|[name, ..]| matches!(*name, "Z" | "numbers"));
+        let mut names = BTreeSet::new();
         let mut table = Self { columns: vec![], width: 0, exact, species: vec![], positions: vec![] };
         for [name, kind, width] in triples {
             let count = width.parse().ok().filter(|width| *width > 0);
             let columns = count.and_then(|width| table.width.checked_add(width)).zip(count);
             let (total, width) = columns.ok_or_else(|| fault("a positive number of columns"))?;
             let content = content(name, kind, width, numbered).map_err(fault)?;
-            if table.columns.iter().any(|column| column.name == *name) {
-                return Err(Fault::Repeated { key: format!("column {name}") });
+            if !names.insert(*name) {
+                return Err(Fault::Repeated { key: format!("column {}", excerpt(name)) });
             }
             table.width = total;
             table.columns.push(TableColumn { name: (*name).to_owned(), width, content });
@@ -128,7 +129,7 @@ fn content(name: &str, kind: &str, width: usize, numbered: bool) -> Result<Conte
 }
 
 fn field_fault(index: usize, name: &str, found: &str, expected: &'static str) -> Fault {
-    Fault::Field { field: index + 1, name: name.to_owned(), found: excerpt(found), expected }
+    Fault::Field { field: index + 1, name: excerpt(name), found: excerpt(found), expected }
 }
 
 /// A symbol in any case: `AL` is aluminium.

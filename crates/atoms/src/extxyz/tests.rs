@@ -92,6 +92,37 @@ fn values_of_every_type() {
     assert_eq!(info["commas"], vec![1, 2].into());
 }
 
+/// Each of these takes minutes where the time grows with the square of the length.
+#[test]
+fn long_comment_lines_take_time_in_proportion() {
+    let letters = "k".repeat(10_000_000);
+    assert_eq!(info(&letters).into_keys().next(), Some(letters.clone()));
+    assert_eq!(info(&format!("{letters}=5"))[&letters], 5.into());
+    assert_eq!(info(&format!("note=\"{letters}\""))["note"], letters.as_str().into());
+    let pairs: Vec<String> = (0..300_000).map(|number| format!("k{number}={{{number}}}")).collect();
+    assert_eq!(info(&pairs.join(" ")).len(), pairs.len());
+    let columns: Vec<String> = (0..300_000).map(|number| format!(":c{number}:R:1")).collect();
+    let comment = format!("Properties=species:S:1:pos:R:3{}", columns.concat());
+    let zeros = " 0".repeat(columns.len());
+    assert_eq!(only(&format!("1\n{comment}\nAl 0 0 0{zeros}\n")).arrays.len(), columns.len());
+}
+
+#[test]
+fn errors_in_long_lines_are_short() {
+    let letters = "k".repeat(1_000_000);
+    for (comment, shown) in [
+        (format!("a=b {letters}=\"never closed"), "column 1000006: \" is opened and never closed"),
+        (format!("{letters}=1 ={letters}"), "column 1000004: found '=', expected a key before it"),
+        (format!("{letters}=1 {letters}=2"), "is given twice"),
+        (format!("{letters}=[[1, 2], [x]]"), "expected rows of numbers"),
+        (format!("Properties={letters}"), "expected name:type:columns triples"),
+        (format!("Lattice={letters}"), "expected 9 numbers"),
+    ] {
+        let message = frames(&format!("1\n{comment}\nAl 0 0 0\n")).unwrap_err().to_string();
+        assert!(message.contains(shown) && message.len() < 300, "{}", &message[..message.len().min(500)]);
+    }
+}
+
 #[test]
 fn stress_has_nine_components_in_fortran_order_or_six_in_voigt_order() {
     let nine = info("stress=\"1 2 3 4 5 6 7 8 9\"");
