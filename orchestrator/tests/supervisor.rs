@@ -221,10 +221,31 @@ fn who_was_interrupted_by_others_is_started_again() {
 #[test]
 fn a_child_that_cannot_be_started_counts_as_failed() {
     let mut supervisor = started(1);
-    let reason = Ending::NotStarted("out of memory".to_owned());
+    let reason = Ending::NotStarted { reason: "no such program".to_owned(), is_shortage: false };
     let ended = supervisor.ended(0, reason.clone(), s(0)).unwrap();
     assert_eq!(ended, Ended { incarnation: 1, ending: reason, then: Standing::Pausing { left: s(1) } });
     assert_eq!(supervisor.due(s(1)), [start(0, 2)]);
+}
+
+#[test]
+fn a_start_that_the_host_has_no_room_for_is_tried_again_for_ever() {
+    let mut supervisor = started(1);
+    let shortage = || Ending::NotStarted { reason: "too many open files".to_owned(), is_shortage: true };
+    let mut now = s(0);
+    for (incarnation, pause) in (2..).zip([1, 2, 4].into_iter().chain([6; 100])) {
+        let ended = supervisor.ended(0, shortage(), now).unwrap();
+        assert_eq!(ended.then, Standing::Pausing { left: s(pause) }, "{incarnation}");
+        now += s(pause);
+        assert_eq!(supervisor.due(now), [start(0, incarnation)]);
+    }
+    assert_eq!(status(&supervisor, 0, now).last_failure, Some(shortage()));
+    // Nothing of that counts against the child.
+    for pause in [1, 2, 4, 6, 6] {
+        assert_eq!(supervisor.ended(0, crash(), now).unwrap().then, Standing::Pausing { left: s(pause) });
+        now += s(pause);
+        supervisor.due(now);
+    }
+    assert_eq!(supervisor.ended(0, crash(), now).unwrap().then, Standing::GivenUp);
 }
 
 #[test]
@@ -281,7 +302,7 @@ fn happening() -> impl Strategy<Value = Happening> {
         2 => Just(signal(9)),
         1 => Just(home()),
         1 => Just(Ending::Unseen),
-        1 => Just(Ending::NotStarted(String::new())),
+        1 => any::<bool>().prop_map(|is_shortage| Ending::NotStarted { reason: String::new(), is_shortage }),
     ];
     prop_oneof![
         8 => (0u64..20_000).prop_map(|ms| Happening::Pass(Duration::from_millis(ms))),
@@ -336,6 +357,11 @@ impl World {
             }
             Happening::Ended(number, ending) => {
                 let was_alive = self.alive.remove(&number).is_some();
+                if was_alive && matches!(ending, Ending::NotStarted { is_shortage: true, .. }) {
+                    // It may be started again any number of times.
+                    let starts = self.unrewarded.entry(number).or_default();
+                    *starts = starts.saturating_sub(1);
+                }
                 assert_eq!(supervisor.ended(number, ending, self.now).is_some(), was_alive);
             }
             Happening::Adopted(number) => {

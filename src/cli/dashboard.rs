@@ -31,10 +31,10 @@ impl Dashboard {
             let listener = web::listen(self.at).await?;
             let store = Store::open_read_only(&self.location.get()?).await?;
             let address = listener.local_addr().map_err(Failure::failed)?;
-            let serving = web::serve(listener, dashboard::Dashboard::new(store, None, None).router());
+            let serving = web::Server::start(listener, dashboard::Dashboard::new(store, None, None).router());
             say(format_args!("dashboard at http://{address}/"));
             tokio::signal::ctrl_c().await.map_err(Failure::failed)?;
-            serving.abort();
+            serving.end();
             Ok(Ended::Done)
         })?
     }

@@ -1,20 +1,22 @@
 //! What a campaign shows over HTTP, to this host only.
 
 pub mod agent;
+mod connections;
 pub mod dashboard;
 pub mod exposition;
 mod guard;
 pub mod metrics;
+mod serve;
 
 use std::net::SocketAddr;
 
-use axum::{Router, middleware};
+use axum::Router;
 use calm::Artifact;
 use store::{Location, Store};
 use tokio::net::TcpListener;
-use tokio::task::AbortHandle;
 
 use self::dashboard::{Acting, Dashboard};
+pub use self::serve::Server;
 use crate::mixture::Original;
 use crate::outcome::Failure;
 use crate::output::{say, show};
@@ -40,14 +42,14 @@ pub struct Listening {
 /// What is served, until this is dropped.
 #[derive(Debug, Default)]
 pub struct Serving {
-    servers: Vec<AbortHandle>,
+    servers: Vec<Server>,
     shown: Option<Store>,
 }
 
 impl Serving {
     /// Serves no more, and closes what was read from: whoever closes a database last tidies it up.
     pub async fn end(self) {
-        self.servers.iter().for_each(AbortHandle::abort);
+        self.servers.iter().for_each(Server::end);
         if let Some(shown) = &self.shown {
             shown.close().await;
         }
@@ -56,7 +58,7 @@ impl Serving {
 
 impl Drop for Serving {
     fn drop(&mut self) {
-        self.servers.iter().for_each(AbortHandle::abort);
+        self.servers.iter().for_each(Server::end);
     }
 }
 
@@ -100,7 +102,7 @@ impl Listening {
             // The token is for whoever reads this, and for no file.
             show(format_args!("dashboard at http://{address}/#token={}", acting.token()));
             let router = Dashboard::new(shown, Some(acting), Some(original)).router();
-            serving.servers.push(serve(listener, router));
+            serving.servers.push(Server::start(listener, router));
         }
         Ok(serving)
     }
@@ -124,14 +126,8 @@ pub async fn listen(address: SocketAddr) -> Result<TcpListener, Failure> {
 }
 
 /// Says where metrics are served, and serves them.
-pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<AbortHandle, Failure> {
+pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<Server, Failure> {
     let address = listener.local_addr().map_err(Failure::failed)?;
     say(format_args!("metrics at http://{address}/metrics"));
-    Ok(serve(listener, router))
-}
-
-/// Serves in a task of its own.
-pub fn serve(listener: TcpListener, router: Router) -> AbortHandle {
-    let router = router.layer(middleware::from_fn(guard::asked_by_name_of_this_host));
-    tokio::spawn(async move { axum::serve(listener, router).await }).abort_handle()
+    Ok(Server::start(listener, router))
 }

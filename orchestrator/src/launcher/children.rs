@@ -178,7 +178,7 @@ impl Children {
             match order {
                 Order::Start { number, incarnation } => match self.start(number, incarnation) {
                     Ok(pid) => self.events.push_back(Event::Started { number, incarnation, pid }),
-                    Err(error) => self.ended(number, Ending::NotStarted(error.to_string())),
+                    Err(error) => self.ended(number, not_started(&error)),
                 },
                 Order::Terminate { number } => self.signal(number, Signal::TERM),
                 Order::Kill { number } => self.signal(number, Signal::KILL),
@@ -215,6 +215,14 @@ impl fmt::Debug for Children {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Children").field("supervisor", &self.supervisor).finish_non_exhaustive()
     }
+}
+
+/// The end of a start that failed.
+fn not_started(error: &io::Error) -> Ending {
+    let is_shortage = error.raw_os_error().is_some_and(|number| {
+        [libc::EMFILE, libc::ENFILE, libc::EAGAIN, libc::ENOMEM, libc::ENOBUFS].contains(&number)
+    });
+    Ending::NotStarted { reason: error.to_string(), is_shortage }
 }
 
 /// Sleeps until then, or for ever.

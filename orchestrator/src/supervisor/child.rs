@@ -35,6 +35,8 @@ pub(super) struct Child {
     pub incarnation: u32,
     /// Failures in a row, without anything useful in between.
     pub failures: u32,
+    /// Starts in a row that failed because the host lacked something. They do not count as failures of the child.
+    shortages: u32,
     restarts: u32,
     last_failure: Option<Ending>,
 }
@@ -42,7 +44,7 @@ pub(super) struct Child {
 impl Default for Child {
     fn default() -> Self {
         let state = State::Waiting { until: Duration::ZERO };
-        Self { state, incarnation: 0, failures: 0, restarts: 0, last_failure: None }
+        Self { state, incarnation: 0, failures: 0, shortages: 0, restarts: 0, last_failure: None }
     }
 }
 
@@ -70,12 +72,15 @@ impl Child {
     pub fn leave(&mut self, ending: &Ending, limits: &Limits, stopping: bool, now: Duration) {
         let may_leave = stopping || !limits.outlives;
         let failed = !(may_leave && ending.is_in_order() || stopping && ending.is_what_stop_asks_for());
+        self.shortages = if ending.is_shortage() { self.shortages.saturating_add(1) } else { 0 };
         if failed {
-            self.failures = self.failures.saturating_add(1);
+            self.failures = self.failures.saturating_add(u32::from(!ending.is_shortage()));
             self.last_failure = Some(ending.clone());
         }
         self.state = if stopping || !failed {
             State::Home
+        } else if self.shortages > 0 {
+            State::Waiting { until: now.saturating_add(pause(limits, self.shortages)) }
         } else if self.failures > limits.restarts {
             State::GivenUp
         } else {

@@ -27,8 +27,14 @@ pub enum Ending {
     Silent(Duration),
     /// It was still there so long after it was told to end, and was killed.
     Lingering(Duration),
-    /// It could not be started, for this reason.
-    NotStarted(String),
+    /// It could not be started.
+    NotStarted {
+        /// What the system said.
+        reason: String,
+        /// Whether the host lacked descriptors, processes or memory: the start says nothing about the child, and a later
+        /// one may succeed.
+        is_shortage: bool,
+    },
     /// It ended, and how is not for us to know: an adopted process is not our child.
     Unseen,
 }
@@ -37,6 +43,11 @@ impl Ending {
     /// Whether it went home.
     pub fn is_in_order(&self) -> bool {
         matches!(self, Self::Exit { code: 0, .. })
+    }
+
+    /// Whether it was not started because the host lacked something.
+    pub(super) fn is_shortage(&self) -> bool {
+        matches!(self, Self::NotStarted { is_shortage: true, .. })
     }
 
     /// Whether the process crashed, so that the next one with the same work may well go the same way. Otherwise the end
@@ -48,7 +59,7 @@ impl Ending {
             Self::Signal { signal, .. } => {
                 matches!(signal_name(*signal), "SIGSEGV" | "SIGABRT" | "SIGBUS" | "SIGILL" | "SIGFPE")
             }
-            Self::Silent(_) | Self::Lingering(_) | Self::NotStarted(_) | Self::Unseen => false,
+            Self::Silent(_) | Self::Lingering(_) | Self::NotStarted { .. } | Self::Unseen => false,
         }
     }
 
@@ -84,7 +95,7 @@ impl fmt::Display for Ending {
             Self::Lingering(grace) => {
                 write!(f, "still there {} s after it was told to end, killed", grace.as_secs_f64())
             }
-            Self::NotStarted(reason) => write!(f, "could not be started: {reason}"),
+            Self::NotStarted { reason, .. } => write!(f, "could not be started: {reason}"),
             Self::Unseen => f.write_str("ended, it is not known how"),
         }
     }
@@ -140,7 +151,8 @@ mod tests {
             assert!(!Ending::Exit { code: not_own, words: None }.is_own_fault(), "{not_own}");
         }
         assert!(!Ending::Silent(Duration::from_secs(1)).is_own_fault());
-        assert!(!Ending::NotStarted("no memory".to_owned()).is_own_fault() && !Ending::Unseen.is_own_fault());
+        let not_started = Ending::NotStarted { reason: "no memory".to_owned(), is_shortage: true };
+        assert!(!not_started.is_own_fault() && !Ending::Unseen.is_own_fault());
     }
 
     #[test]

@@ -6,6 +6,9 @@
 //! A child that ended without having been sent home is started again after a pause, which doubles with each failure in a
 //! row. Being useful (a delivered report, a label) ends the row: a sign of life alone does not, or a child that dies
 //! of its first piece of work would be started for ever.
+//!
+//! A start that fails because the host lacks descriptors, processes or memory says nothing about the child: it is tried again,
+//! after pauses that double likewise, and never ends in giving up.
 
 mod child;
 mod ending;

@@ -1,0 +1,151 @@
+//! Serving a listener within bounds: of connections ([`Connections`]), of the time and length of a request, and of the time in
+//! which the client takes an answer.
+
+use std::convert::Infallible;
+use std::io;
+use std::time::Duration;
+
+use axum::body::{Body, HttpBody, to_bytes};
+use axum::extract::Request;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use axum::{Router, middleware};
+use hyper::server::conn::http1;
+use hyper::service::{Service, service_fn};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::task::AbortHandle;
+use tokio::time::{sleep, timeout};
+
+use super::connections::{Admission, Connections, Place, State};
+use super::guard;
+
+/// Time in which a request's headers have to be there, from the connection or the last answer on.
+const HEAD_TIME: Duration = Duration::from_secs(5);
+/// Time in which a request's body has to be there.
+const BODY_TIME: Duration = Duration::from_secs(5);
+/// Time in which the client has to take an answer.
+const ANSWER_TIME: Duration = Duration::from_secs(60);
+/// Request line and headers, bytes.
+const LONGEST_HEAD: usize = 16 << 10;
+const MOST_HEADERS: usize = 64;
+/// Body of a request, bytes.
+const LONGEST_BODY: usize = 16 << 10;
+/// Pause after the system has refused to accept a connection.
+const PAUSE: Duration = Duration::from_millis(200);
+
+/// What serves a listener, with its connections.
+#[derive(Debug)]
+pub struct Server {
+    listening: AbortHandle,
+    connections: Connections,
+}
+
+impl Server {
+    /// Serves in a task of its own, until [`Self::end`].
+    pub fn start(listener: TcpListener, router: Router) -> Self {
+        let router = router
+            .layer(middleware::from_fn(whole_body))
+            .layer(middleware::from_fn(guard::asked_by_name_of_this_host));
+        let connections = Connections::default();
+        let listening = tokio::spawn(accept(listener, router, connections.clone())).abort_handle();
+        Self { listening, connections }
+    }
+
+    /// Listens no more, and closes all connections.
+    pub fn end(&self) {
+        self.listening.abort();
+        self.connections.close();
+    }
+}
+
+async fn accept(listener: TcpListener, router: Router, connections: Connections) {
+    loop {
+        match listener.accept().await {
+            Ok((stream, _)) => {
+                if let Some(stream) = admitted(stream, &connections).await {
+                    let router = router.clone();
+                    connections.add(|place| tokio::spawn(serve(stream, router, place)));
+                }
+            }
+            // The client has gone, or the system lacks something.
+            Err(error) if error.kind() == io::ErrorKind::ConnectionAborted => {}
+            Err(error) => {
+                tracing::debug!("cannot accept a connection: {error}");
+                sleep(PAUSE).await;
+            }
+        }
+    }
+}
+
+/// The connection as soon as there is room for it; `None` if there is none.
+async fn admitted(stream: TcpStream, connections: &Connections) -> Option<TcpStream> {
+    loop {
+        match connections.admit(&stream) {
+            Admission::Now => return Some(stream),
+            Admission::After(gone) => {
+                // It is cancelled: its connection is closed when it has ended.
+                let _ = gone.await;
+                return Some(stream);
+            }
+            Admission::Later(pause) => sleep(pause).await,
+            Admission::Never => {
+                tracing::debug!("a connection was closed: there are too many");
+                return None;
+            }
+        }
+    }
+}
+
+async fn serve(stream: TcpStream, router: Router, place: Place) {
+    let (place, router) = (&place, &TowerToHyperService::new(router));
+    let answer = service_fn(move |request| async move {
+        place.enter(State::Answering);
+        let answer = router.call(request).await;
+        let is_events = answer.as_ref().is_ok_and(|answer| tells_events(answer.headers()));
+        place.enter(if is_events { State::Events } else { State::Idle });
+        Ok::<_, Infallible>(answer.unwrap_or_else(|never| match never {}))
+    });
+    let mut protocol = http1::Builder::new();
+    protocol
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEAD_TIME)
+        .max_buf_size(LONGEST_HEAD)
+        .max_headers(MOST_HEADERS);
+    tokio::select! {
+        // What is wrong with a connection is its client's affair.
+        _ = protocol.serve_connection(TokioIo::new(stream), answer) => {}
+        () = is_stuck(place) => {}
+    }
+}
+
+/// Waits until the client has taken nothing of an answer for too long. One that only waits for requests ends before.
+async fn is_stuck(place: &Place) {
+    loop {
+        let idle = place.idle();
+        if idle >= ANSWER_TIME {
+            return;
+        }
+        sleep((ANSWER_TIME - idle).max(PAUSE)).await;
+    }
+}
+
+fn tells_events(headers: &HeaderMap) -> bool {
+    headers.get(header::CONTENT_TYPE).is_some_and(|kind| kind.as_bytes().starts_with(b"text/event-stream"))
+}
+
+/// Reads the body of a request before it is answered, and refuses one that is too long or too slow.
+async fn whole_body(request: Request, next: Next) -> Response {
+    let (head, body) = request.into_parts();
+    let too_long = || (StatusCode::PAYLOAD_TOO_LARGE, "the request is too long\n").into_response();
+    if body.size_hint().lower() > LONGEST_BODY as u64 {
+        return too_long();
+    }
+    match timeout(BODY_TIME, to_bytes(body, LONGEST_BODY)).await {
+        Ok(Ok(bytes)) => next.run(Request::from_parts(head, Body::from(bytes))).await,
+        Ok(Err(_)) => too_long(),
+        Err(_) => (StatusCode::REQUEST_TIMEOUT, "the request took too long\n").into_response(),
+    }
+}
