@@ -125,6 +125,7 @@ impl Subscriber for Log {
     fn event(&self, event: &Event<'_>) {
         let mut fields = Fields::default();
         event.record(&mut fields);
+        fields.correct();
         let line = Line {
             time: store::unix_milliseconds(),
             level: *event.metadata().level(),

@@ -4,9 +4,10 @@ use std::fs;
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use wire::net::{Announcement, Endpoint, Tls};
+use wire::net::{Announcement, CertificateFault, Endpoint, Tls};
 
 use crate::outcome::{Ended, Failure};
+use crate::output::warn;
 use crate::whole_file::{WholeFile, cannot_write};
 
 /// Where agents of other hosts may join.
@@ -23,6 +24,31 @@ pub struct Listen {
 }
 
 impl Listen {
+    /// Checks the certificates before any work begins, and says what will be wrong with them before long.
+    ///
+    /// # Errors
+    /// With these certificates no agent could join.
+    pub fn check(&self) -> Result<(), Failure> {
+        let Some(tls) = &self.tls else { return Ok(()) };
+        let checked = tls.check_for_orchestrator().map_err(Failure::input)?;
+        checked.warnings.iter().for_each(|warning| warn(format_args!("WARNING: {warning}")));
+        let endpoint = self.endpoint.of_host(&self.host).map_err(Failure::input)?;
+        let host = endpoint.plain_host();
+        if checked.is_for(host) {
+            return Ok(());
+        }
+        let names = checked.names.join(", ");
+        if self.announce.is_some() {
+            let fault = CertificateFault::OtherNames { names, host: host.to_owned() };
+            return Err(Failure::input(fault.at(&tls.certificate)));
+        }
+        // By which name agents connect is not known here.
+        warn(format_args!(
+            "WARNING: agents have to connect to {names}: the certificate has no other name, as {host}"
+        ));
+        Ok(())
+    }
+
     /// Writes down where agents find this run.
     pub fn announce(&self, endpoint: &Endpoint) -> Result<(), Failure> {
         let Some(path) = &self.announce else { return Ok(()) };

@@ -11,6 +11,7 @@ use super::{Ended, Failure, block_on};
 use crate::actors::scratch::{self, Scratch};
 use crate::actors::{agent, cores};
 use crate::log::Options;
+use crate::output::warn;
 use crate::web::{self, agent::Watched};
 
 /// Let this host take part in a campaign that `calmwalk run --listen` leads on another
@@ -54,6 +55,10 @@ impl Agent {
         let walkers = self.walkers.unwrap_or_else(|| (cores() / self.threads).max(1));
         let patience = Duration::from_secs_f64(60.0 * self.patience);
         let tls = self.tls.as_deref().map(Tls::in_directory);
+        if let Some(tls) = &tls {
+            let checked = tls.check_for_agent().map_err(Failure::input)?;
+            checked.warnings.iter().for_each(|warning| warn(format_args!("WARNING: {warning}")));
+        }
         scratch::clean();
         let scratch = Scratch::new().map_err(|error| {
             Failure::Failed(format!("cannot make a directory in {}: {error}", std::env::temp_dir().display()))

@@ -86,6 +86,7 @@ impl Run {
             announce: self.announce,
             host: self.host.unwrap_or_else(store::this_host),
         });
+        listen.iter().try_for_each(actors::Listen::check)?;
         let patience = Duration::from_secs_f64(60.0 * self.patience);
         let ended = block_on(async {
             let location = campaign.config.location(&directory)?;

@@ -29,6 +29,21 @@ pub struct Line<'a> {
     pub fields: Fields,
 }
 
+/// What zenoh adds whenever it cannot accept a connection, also where a certificate was refused.
+const FILE_LIMIT_HINT: &str = ". Hint: increase the system open file limit.";
+
+impl Fields {
+    /// Takes out a hint that is wrong.
+    pub fn correct(&mut self) {
+        let is_right = |why: &str| why.contains("(os error 23)") || why.contains("(os error 24)");
+        if let Some(why) = self.message.strip_suffix(FILE_LIMIT_HINT)
+            && !is_right(why)
+        {
+            self.message = format!("a connection was refused: {why}");
+        }
+    }
+}
+
 impl Line<'_> {
     /// For people. Whatever is said is one line.
     pub fn text(&self) -> String {

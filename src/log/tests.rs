@@ -93,3 +93,23 @@ fn writers_to_one_file_tear_no_lines() {
     }
     assert_eq!(next, [200; 8]);
 }
+
+#[test]
+fn a_refused_connection_is_not_laid_to_the_limit_of_open_files() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("log");
+    let hint = "Hint: increase the system open file limit.";
+    for (why, expected) in [
+        (
+            "received fatal alert: CertificateUnknown",
+            "a connection was refused: received fatal alert: CertificateUnknown",
+        ),
+        ("Too many open files (os error 24)", "Too many open files (os error 24). Hint: increase"),
+    ] {
+        let said = || warn!("{why}. {hint}");
+        tracing::subscriber::with_default(log(&path, Format::Text, LogLevel::Info), said);
+        let text = fs::read_to_string(&path).unwrap();
+        assert!(text.contains(expected), "{text}");
+        fs::remove_file(&path).unwrap();
+    }
+}

@@ -5,6 +5,7 @@ use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use orchestrator::slurm::{Job, JobNames, Phase, Plan, Request, Role, Wanted};
+use wire::net::Tls;
 
 use super::scripts::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
 use super::{FOLDER, Launch, absolute};
@@ -215,13 +216,12 @@ impl<'a> Commands<'a> {
     fn certificates(&self, of: &str) -> Result<Option<String>, Failure> {
         let Some(tls) = &self.launch.tls else { return Ok(None) };
         let directory = absolute(&tls.join(of))?;
-        for name in ["authority.pem", "certificate.pem", "key.pem"] {
-            let path = directory.join(name);
-            File::open(&path).map_err(|error| {
-                let shown = path.display();
-                Failure::Input(format!("cannot read {shown}: {error}; docs/slurm.md says how it is made"))
-            })?;
-        }
+        let certificates = Tls::in_directory(&directory);
+        let checked = match of {
+            "orchestrator" => certificates.check_for_orchestrator(),
+            _ => certificates.check_for_agent(),
+        };
+        checked.map_err(Failure::input)?;
         text(&directory).map(Some)
     }
 

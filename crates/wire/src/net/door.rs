@@ -3,13 +3,14 @@
 use std::fmt;
 use std::io;
 use std::net::{IpAddr, TcpListener};
-use std::path::PathBuf;
 use std::str::FromStr;
+use std::time::SystemTime;
 
 use serde_json::{Value, json};
 use zenoh::{Config, Session, Wait};
 
 use super::NetError;
+use super::certificates::Tls;
 
 /// Where an orchestrator listens, or an agent connects to: `tcp/HOST:PORT`. Listening at port 0 takes one that is free.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -24,26 +25,6 @@ pub struct Endpoint {
 pub struct EndpointError {
     /// The text.
     pub found: String,
-}
-
-/// Certificates, as PEM files: both sides show one, and each trusts those that the authority has signed.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Tls {
-    /// Certificate of the authority.
-    pub authority: PathBuf,
-    /// Own certificate.
-    pub certificate: PathBuf,
-    /// Its private key.
-    pub key: PathBuf,
-}
-
-impl Tls {
-    /// `authority.pem`, `certificate.pem` and `key.pem` of a directory.
-    pub fn in_directory(directory: &std::path::Path) -> Self {
-        let [authority, certificate, key] =
-            ["authority.pem", "certificate.pem", "key.pem"].map(|name| directory.join(name));
-        Self { authority, certificate, key }
-    }
 }
 
 impl Endpoint {
@@ -73,9 +54,13 @@ impl Endpoint {
         if everywhere { format!("tcp/{name}:{}", self.port).parse() } else { Ok(self.clone()) }
     }
 
-    /// Without the brackets of IPv6.
-    fn plain_host(&self) -> &str {
+    /// Name or address, without the brackets of IPv6.
+    pub fn plain_host(&self) -> &str {
         self.host.trim_start_matches('[').trim_end_matches(']')
+    }
+
+    pub(super) fn port(&self) -> u16 {
+        self.port
     }
 
     /// As zenoh spells it.
@@ -149,11 +134,9 @@ fn config(side: Side, endpoint: &Endpoint, tls: Option<&Tls>) -> Result<Config, 
         ("scouting/gossip/enabled", json!(false)),
         ("adminspace/enabled", json!(false)),
     ];
-    if let Some(Tls { authority, certificate, key }) = tls {
-        for file in [authority, certificate, key] {
-            // zenoh's own error does not name the file.
-            std::fs::File::open(file).map_err(|source| NetError::File { path: file.clone(), source })?;
-        }
+    if let Some(tls) = tls {
+        let Tls { authority, certificate, key } = tls;
+        tls.check(side, SystemTime::now())?;
         let (own, own_key) = match side {
             Side::Orchestrator => ("listen_certificate", "listen_private_key"),
             Side::Agent => ("connect_certificate", "connect_private_key"),

@@ -15,8 +15,9 @@ use zenoh::pubsub::Subscriber;
 use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Sample, SampleKind};
 
+use super::certificates::Tls;
 use super::desk::Desk;
-use super::door::{self, Endpoint, Side, Tls};
+use super::door::{self, Endpoint, Side};
 use super::files::Files;
 use super::message::{AGENTS, Agent, ORCHESTRATOR};
 use super::{NetError, Welcome};
@@ -77,7 +78,7 @@ impl Hub {
     /// for `patience` is taken for dead.
     ///
     /// # Errors
-    /// An endpoint off loopback without certificates, files that cannot be read, whatever zenoh says.
+    /// An endpoint off loopback without certificates, certificates that cannot be used, whatever zenoh says.
     pub async fn open(
         endpoint: &Endpoint,
         tls: Option<&Tls>,

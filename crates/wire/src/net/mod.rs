@@ -14,10 +14,12 @@
 //! - **Explicit endpoints, no scouting.** Off loopback nothing listens or connects without TLS with certificates on both sides.
 
 mod address;
+mod certificates;
 mod changes;
 mod desk;
 mod door;
 mod files;
+mod handshake;
 mod hub;
 mod message;
 mod roster;
@@ -29,8 +31,10 @@ use std::fmt;
 use std::path::PathBuf;
 
 pub use address::{Address, Announcement};
+pub use certificates::{CertificateError, CertificateFault, CheckedTls, Tls};
 pub use changes::ChangesError;
-pub use door::{Endpoint, EndpointError, Tls};
+pub use door::{Endpoint, EndpointError};
+pub use handshake::HandshakeError;
 pub use hub::{AgentEvent, Handle, Hub};
 pub use message::{Agent, AgentId};
 pub use slot::{Slot, Told};
@@ -58,7 +62,13 @@ pub enum NetError {
         /// The endpoint.
         endpoint: Endpoint,
     },
-    /// A certificate or key.
+    /// A certificate or key of this host.
+    #[error(transparent)]
+    Certificate(#[from] CertificateError),
+    /// A certificate that one side does not accept.
+    #[error(transparent)]
+    Handshake(#[from] HandshakeError),
+    /// The file that says where the orchestrator is.
     #[error("cannot read {}: {source}", path.display())]
     File {
         /// The file.

@@ -14,8 +14,10 @@ use zerocopy::IntoBytes;
 
 use super::NetError;
 use super::address::{Address, Announcement};
+use super::certificates::Tls;
 use super::changes::{Arriving, ChangesError};
-use super::door::{self, Endpoint, Side, Tls};
+use super::door::{self, Endpoint, Side};
+use super::handshake;
 use super::message::{AGENTS, Agent, ORCHESTRATOR, Reply, Request};
 use super::slot::Slot;
 use crate::control::{ControlError, seal, unseal};
@@ -125,7 +127,8 @@ impl Uplink {
     /// `waiting` is told why the first try did not succeed.
     ///
     /// # Errors
-    /// An endpoint off loopback without certificates, files that cannot be read or that say something else.
+    /// An endpoint off loopback without certificates, files that cannot be read or that say something else, certificates
+    /// that one of the two sides does not accept.
     pub async fn open(
         address: &Address,
         tls: Option<&Tls>,
@@ -136,6 +139,9 @@ impl Uplink {
         let line = loop {
             match Line::find(address, tls, &agent).await {
                 Err(error @ (NetError::Open { .. } | NetError::Nobody { .. } | NetError::Over)) => {
+                    if let (NetError::Open { endpoint, .. }, Some(tls)) = (&error, tls) {
+                        can_agree(endpoint, tls).await?;
+                    }
                     waiting.take().into_iter().for_each(|waiting| waiting(&error));
                     sleep(NEXT_TRY).await;
                 }
@@ -220,6 +226,14 @@ impl Uplink {
             }
         }
     }
+}
+
+/// Checks that no certificate stands between the two sides: zenoh does not tell that from an orchestrator that is not there yet.
+async fn can_agree(endpoint: &Endpoint, tls: &Tls) -> Result<(), NetError> {
+    let (endpoint, tls) = (endpoint.clone(), tls.clone());
+    let probed = tokio::task::spawn_blocking(move || handshake::probe(&endpoint, &tls)).await;
+    // A probe that crashed has found out nothing.
+    Ok(probed.unwrap_or(Ok(()))?)
 }
 
 /// Waits a little after a question that was not even asked.

@@ -1,0 +1,269 @@
+//! Certificates of a host, looked at before anything listens or connects: zenoh says of a wrong one no more than that it is
+//! unable to connect.
+
+mod error;
+#[cfg(test)]
+mod tests;
+
+use std::fs;
+use std::net::IpAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use rustls::client::WebPkiServerVerifier;
+use rustls::crypto::{CryptoProvider, ring};
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime};
+use rustls::server::WebPkiClientVerifier;
+use rustls::sign::CertifiedKey;
+use rustls::{CertificateError as Refusal, InconsistentKeys, RootCertStore};
+use x509_parser::certificate::X509Certificate;
+use x509_parser::extensions::GeneralName;
+use x509_parser::prelude::FromDer;
+use x509_parser::time::ASN1Time;
+
+pub use self::error::{CertificateError, CertificateFault};
+use super::door::Side;
+
+/// A certificate that expires sooner is worth a warning.
+const SOON: Duration = Duration::from_secs(14 * 24 * 3600);
+
+/// Certificates, as PEM files: both sides show one, and each trusts those that the authority has signed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Tls {
+    /// Certificate of the authority.
+    pub authority: PathBuf,
+    /// Own certificate.
+    pub certificate: PathBuf,
+    /// Its private key.
+    pub key: PathBuf,
+}
+
+/// What there is to say of certificates that can be used.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CheckedTls {
+    /// The names of the own certificate: host names and addresses.
+    pub names: Vec<String>,
+    /// What will be wrong before long, a sentence each.
+    pub warnings: Vec<String>,
+}
+
+/// What the three files hold.
+pub(super) struct Credentials {
+    /// The authority.
+    pub roots: Arc<RootCertStore>,
+    /// The own certificate, then those between it and the authority.
+    pub chain: Vec<CertificateDer<'static>>,
+    /// The private key of the first.
+    pub key: PrivateKeyDer<'static>,
+}
+
+impl Tls {
+    /// `authority.pem`, `certificate.pem` and `key.pem` of a directory.
+    pub fn in_directory(directory: &Path) -> Self {
+        let [authority, certificate, key] =
+            ["authority.pem", "certificate.pem", "key.pem"].map(|name| directory.join(name));
+        Self { authority, certificate, key }
+    }
+
+    /// Checks that an orchestrator can listen with these certificates: that agents can connect to one of the names of its own.
+    ///
+    /// # Errors
+    /// As [`Self::check_for_agent`], and a certificate without names.
+    pub fn check_for_orchestrator(&self) -> Result<CheckedTls, CertificateError> {
+        self.check(Side::Orchestrator, SystemTime::now())
+    }
+
+    /// Checks that an agent can connect with these certificates.
+    ///
+    /// # Errors
+    /// A file that cannot be read or is damaged, a certificate that is not in force now or that the authority has not
+    /// signed, a key of another certificate.
+    pub fn check_for_agent(&self) -> Result<CheckedTls, CertificateError> {
+        self.check(Side::Agent, SystemTime::now())
+    }
+
+    pub(super) fn check(&self, side: Side, now: SystemTime) -> Result<CheckedTls, CertificateError> {
+        let credentials = self.load()?;
+        let mut warnings = Vec::new();
+        for (path, certificates) in [
+            (&self.authority, certificates(&self.authority)?),
+            (&self.certificate, credentials.chain.clone()),
+        ] {
+            for certificate in &certificates {
+                let parsed = parse(path, certificate)?;
+                warnings.extend(
+                    in_force(&parsed, now)
+                        .map_err(|fault| fault.at(path))?
+                        .map(|warning| format!("{} {warning}", path.display())),
+                );
+            }
+        }
+        let own = credentials
+            .chain
+            .first()
+            .ok_or_else(|| CertificateFault::Empty("certificate").at(&self.certificate))?;
+        let names = names(&parse(&self.certificate, own)?);
+        self.is_accepted(&credentials, side, &names, now)?;
+        Ok(CheckedTls { names, warnings })
+    }
+
+    /// Reads the files.
+    pub(super) fn load(&self) -> Result<Credentials, CertificateError> {
+        let mut roots = RootCertStore::empty();
+        for certificate in certificates(&self.authority)? {
+            let added = roots.add(certificate);
+            added.map_err(|why| CertificateFault::Damaged(why.to_string()).at(&self.authority))?;
+        }
+        let chain = certificates(&self.certificate)?;
+        let key = private_key(&self.key)?;
+        match CertifiedKey::from_der(chain.clone(), key.clone_key(), &provider()) {
+            Ok(_) => Ok(Credentials { roots: Arc::new(roots), chain, key }),
+            Err(rustls::Error::InconsistentKeys(InconsistentKeys::KeyMismatch)) => {
+                Err(CertificateFault::OtherKey { certificate: self.certificate.clone() }.at(&self.key))
+            }
+            Err(rustls::Error::InvalidCertificate(why)) => {
+                Err(CertificateFault::Damaged(why.to_string()).at(&self.certificate))
+            }
+            Err(why) => Err(CertificateFault::Damaged(why.to_string()).at(&self.key)),
+        }
+    }
+
+    /// Asks what the other side will ask of the own certificate.
+    fn is_accepted(
+        &self,
+        credentials: &Credentials,
+        side: Side,
+        names: &[String],
+        now: SystemTime,
+    ) -> Result<(), CertificateError> {
+        let Some((own, between)) = credentials.chain.split_first() else { return Ok(()) };
+        let roots = Arc::clone(&credentials.roots);
+        let now = UnixTime::since_unix_epoch(now.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default());
+        let provider = Arc::new(provider());
+        let fault = |why: String| CertificateFault::Damaged(why).at(&self.authority);
+        let accepted = match side {
+            Side::Orchestrator => {
+                // A name with a wildcard stands for any.
+                let name = names.iter().find_map(|name| ServerName::try_from(name.replace('*', "host")).ok());
+                let name = name.ok_or_else(|| CertificateFault::NoNames.at(&self.certificate))?;
+                let verifier = WebPkiServerVerifier::builder_with_provider(roots, provider).build();
+                let verifier = verifier.map_err(|why| fault(why.to_string()))?;
+                rustls::client::danger::ServerCertVerifier::verify_server_cert(
+                    &*verifier,
+                    own,
+                    between,
+                    &name,
+                    &[],
+                    now,
+                )
+                .map(drop)
+            }
+            Side::Agent => {
+                let verifier = WebPkiClientVerifier::builder_with_provider(roots, provider).build();
+                let verifier = verifier.map_err(|why| fault(why.to_string()))?;
+                verifier.verify_client_cert(own, between, now).map(drop)
+            }
+        };
+        accepted.map_err(|why| match why {
+            rustls::Error::InvalidCertificate(Refusal::UnknownIssuer | Refusal::BadSignature) => {
+                CertificateFault::OtherAuthority { authority: self.authority.clone() }.at(&self.certificate)
+            }
+            rustls::Error::InvalidCertificate(
+                Refusal::InvalidPurpose | Refusal::InvalidPurposeContext { .. },
+            ) => CertificateFault::Purpose(purpose(side)).at(&self.certificate),
+            why => CertificateFault::Refused(why.to_string()).at(&self.certificate),
+        })
+    }
+}
+
+impl CheckedTls {
+    /// Whether agents may call the host by this name: one of the certificate's, with a wildcard for the first label.
+    pub fn is_for(&self, host: &str) -> bool {
+        let address = |text: &str| text.parse::<IpAddr>().ok();
+        let host = host.trim_start_matches('[').trim_end_matches(']');
+        self.names.iter().any(|name| match name.strip_prefix("*.") {
+            Some(domain) => host.split_once('.').is_some_and(|(_, of)| of.eq_ignore_ascii_case(domain)),
+            None if address(host).is_some() => address(name) == address(host),
+            None => name.eq_ignore_ascii_case(host),
+        })
+    }
+}
+
+/// What does the arithmetic, as zenoh has it.
+pub(super) fn provider() -> CryptoProvider {
+    ring::default_provider()
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, CertificateError> {
+    fs::read(path).map_err(|source| CertificateFault::Unreadable(source).at(path))
+}
+
+fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, CertificateError> {
+    let found: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&read(path)?).collect();
+    let found = found.map_err(|why| CertificateFault::Damaged(why.to_string()).at(path))?;
+    if found.is_empty() { Err(CertificateFault::Empty("certificate").at(path)) } else { Ok(found) }
+}
+
+fn private_key(path: &Path) -> Result<PrivateKeyDer<'static>, CertificateError> {
+    let text = read(path)?;
+    PrivateKeyDer::from_pem_slice(&text).map_err(|why| {
+        let is_encrypted = text.windows(9).any(|part| part == b"ENCRYPTED");
+        let fault = match why {
+            _ if is_encrypted => CertificateFault::Encrypted,
+            rustls::pki_types::pem::Error::NoItemsFound => CertificateFault::Empty("private key"),
+            why => CertificateFault::Damaged(why.to_string()),
+        };
+        fault.at(path)
+    })
+}
+
+fn parse<'a>(
+    path: &Path,
+    certificate: &'a CertificateDer<'_>,
+) -> Result<X509Certificate<'a>, CertificateError> {
+    let parsed = X509Certificate::from_der(certificate);
+    parsed.map(|(_, parsed)| parsed).map_err(|why| CertificateFault::Damaged(why.to_string()).at(path))
+}
+
+/// What to say of a certificate that expires soon.
+fn in_force(certificate: &X509Certificate<'_>, now: SystemTime) -> Result<Option<String>, CertificateFault> {
+    let since = now.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    let now = i64::try_from(since.as_secs()).unwrap_or(i64::MAX);
+    let date = |time: ASN1Time| time.to_datetime().date().to_string();
+    let validity = certificate.validity();
+    let left = validity.not_after.timestamp().saturating_sub(now);
+    if now < validity.not_before.timestamp() {
+        Err(CertificateFault::NotYet { from: date(validity.not_before) })
+    } else if left < 0 {
+        Err(CertificateFault::Expired { on: date(validity.not_after) })
+    } else if left < SOON.as_secs().cast_signed() {
+        let days = left / (24 * 3600);
+        Ok(Some(format!("expires on {}, in {days} days: make another in time", date(validity.not_after))))
+    } else {
+        Ok(None)
+    }
+}
+
+/// Host names and addresses.
+fn names(certificate: &X509Certificate<'_>) -> Vec<String> {
+    let names = certificate.subject_alternative_name().ok().flatten();
+    let names = names.iter().flat_map(|names| &names.value.general_names);
+    let text = |name: &GeneralName<'_>| match name {
+        GeneralName::DNSName(name) => Some((*name).to_owned()),
+        GeneralName::IPAddress(bytes) => match *bytes {
+            [a, b, c, d] => Some(IpAddr::from([*a, *b, *c, *d]).to_string()),
+            bytes => <[u8; 16]>::try_from(bytes).ok().map(|bytes| IpAddr::from(bytes).to_string()),
+        },
+        _ => None,
+    };
+    names.filter_map(text).collect()
+}
+
+fn purpose(side: Side) -> &'static str {
+    match side {
+        Side::Orchestrator => "serverAuth",
+        Side::Agent => "clientAuth",
+    }
+}
