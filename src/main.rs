@@ -10,6 +10,7 @@ mod condition;
 mod config;
 mod energies;
 mod forecast;
+mod forgetting;
 mod frames;
 mod interrupt;
 mod labelling;

@@ -9,6 +9,7 @@ use orchestrator::reactor::Notice;
 use store::Fate;
 use wire::{Origin, WalkId};
 
+use crate::forgetting::{Alarm, Forgetting};
 use crate::output::show;
 
 /// Time between two plain lines that only say where the walks stand.
@@ -24,26 +25,35 @@ pub struct Display {
     accepted: u64,
     /// Whether it was said that walkers wait for labels.
     waiting: bool,
+    forgetting: Alarm,
     last_line: Instant,
 }
 
 struct Bars {
     steps: ProgressBar,
     message: ProgressBar,
-    _all: MultiProgress,
+    all: MultiProgress,
 }
 
 impl Display {
     /// Follows walks of `walk_steps` steps each; `walks` are (walk, seed structure, where it stands).
-    pub fn new(walk_steps: u64, walks: Vec<(WalkId, String, u64)>) -> Self {
+    pub fn new(walk_steps: u64, walks: Vec<(WalkId, String, u64)>, forgetting: Forgetting) -> Self {
         let (mut names, mut steps) = (BTreeMap::new(), BTreeMap::new());
         for (walk, name, step) in walks {
             names.insert(walk, name);
             steps.insert(walk, step);
         }
         let bars = std::io::stderr().is_terminal().then(Bars::new);
-        let mut display =
-            Self { bars, names, steps, walk_steps, accepted: 0, waiting: false, last_line: Instant::now() };
+        let mut display = Self {
+            bars,
+            names,
+            steps,
+            walk_steps,
+            accepted: 0,
+            waiting: false,
+            forgetting: Alarm::new(forgetting),
+            last_line: Instant::now(),
+        };
         display.draw();
         display
     }
@@ -88,12 +98,14 @@ impl Display {
             self.accepted += u64::from(candidate.fate == Fate::Accepted && view.origin() == Origin::Biased);
             self.show(&format!("{}: step {}, γ_max {gamma_max:.2}, {what}", self.name(id.walk), id.step));
         }
-        let alarm = |decision: &&store::Decision| decision.detail["forgetting_alarm"] == true;
-        if let Some(decision) = commit.decisions.iter().rfind(alarm) {
-            let share = &decision.detail["training_frames"]["share_above_one"];
-            let alarm = format!("ALARM: the mixture forgets its training data (share above γ = 1: {share})");
-            tracing::warn!("{alarm}");
-            self.show(&alarm);
+        for decision in &commit.decisions {
+            let share = decision.detail["training_frames"]["share_above_one"].as_f64();
+            let raised = decision.detail["forgetting_alarm"].as_bool();
+            let alarm = share.zip(raised).and_then(|(share, raised)| self.forgetting.decided(share, raised));
+            if let Some(alarm) = alarm {
+                tracing::warn!("{alarm}");
+                self.show_lasting(&alarm);
+            }
         }
         for decision in commit.decisions.iter().filter(|decision| decision.kind == "ended") {
             if let Some(walk) = decision.walk {
@@ -125,6 +137,15 @@ impl Display {
         }
     }
 
+    /// Shows what the next line must not take away.
+    fn show_lasting(&self, line: &str) {
+        match &self.bars {
+            // A terminal that is gone needs no line.
+            Some(bars) => drop(bars.all.println(line)),
+            None => show(line),
+        }
+    }
+
     fn draw(&mut self) {
         let (done, all) = (self.steps.values().sum::<u64>(), self.steps.len() as u64 * self.walk_steps);
         if let Some(bars) = &self.bars {
@@ -148,6 +169,6 @@ impl Bars {
         steps.set_style(style("walks  {bar:32} {pos}/{len} steps  {eta} left  {msg}"));
         let message = all.add(ProgressBar::new_spinner());
         message.set_style(style("{wide_msg}"));
-        Self { steps, message, _all: all }
+        Self { steps, message, all }
     }
 }

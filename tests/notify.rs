@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::Stdio;
 
 use common::campaign::Small;
-use common::processes::wait_until;
+use common::processes::{signal, wait_until};
 use common::{Running, program, succeed};
 use serde_json::Value;
 
@@ -107,6 +107,46 @@ fn a_stall_is_told_once_also_over_restarts() {
         wait_until("the walkers are gone", || common::processes::processes_in(here).is_empty());
     }
     assert_eq!(events(here), ["stall"]);
+}
+
+/// How often the selector has found so far that the mixture forgets its training data.
+fn alarms(here: &Path) -> usize {
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        // There may be no database yet.
+        let Ok(store) = store::Store::open_read_only(here.join("campaign")).await else { return 0 };
+        let decisions = store.decisions(1..=i64::MAX).await.unwrap_or_default();
+        store.close().await;
+        decisions.iter().filter(|decision| decision.detail["forgetting_alarm"] == true).count()
+    })
+}
+
+#[test]
+fn a_mixture_that_forgets_is_spoken_of_once_a_run_and_told_once() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let small = Small { steps: 900, ..Small::default() };
+    let low = ("training_frames", "forgetting_alarm = 0.001\ntraining_frames");
+    write(here, &small, "on = [\"forgetting\"]\nstall = 0.01", low, "exit 0");
+    let said = here.join("said");
+    let start = || {
+        let said = fs::File::create(&said).unwrap();
+        Running(program(here).args(RUN).stderr(said).stdout(Stdio::null()).spawn().unwrap())
+    };
+    let spoken_of = || fs::read_to_string(&said).unwrap().matches("forgets its training data").count();
+    let mut run = start();
+    wait_until("there are several alarms", || alarms(here) >= 3);
+    wait_until("it is told", || !events(here).is_empty());
+    signal(run.0.id(), "TERM");
+    run.0.wait().unwrap();
+    let text = fs::read_to_string(&said).unwrap();
+    assert_eq!(spoken_of(), 1, "{text}");
+    assert!(text.contains("ALARM: ") && text.contains("combination = \"additive\""), "{text}");
+    let before = alarms(here);
+    assert_eq!(start().0.wait().unwrap().code(), Some(0));
+    assert!(spoken_of() <= 1 && alarms(here) >= before, "{}", fs::read_to_string(&said).unwrap());
+    let told = fs::read_to_string(here.join("events")).unwrap();
+    assert_eq!(told.matches("forgetting argument the mixture forgets").count(), 1, "{told}");
 }
 
 fn operations_if_any(here: &Path) -> Vec<(String, Value)> {

@@ -13,7 +13,8 @@ use tokio::task::JoinSet;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use crate::cli::status;
-use crate::config::{NotifyEvent, NotifySection};
+use crate::config::{Config, NotifyEvent};
+use crate::forgetting::Forgetting;
 use crate::notify::{Due, NOTE, Watch};
 use crate::outcome::Failure;
 use crate::output::warn;
@@ -31,16 +32,18 @@ pub struct Notifier<'a> {
     limit: Duration,
     look: Duration,
     watch: Watch,
+    forgetting: Forgetting,
     at_work: JoinSet<(NotifyEvent, Result<(), String>)>,
 }
 
 impl<'a> Notifier<'a> {
     /// None if nobody is to be told.
     pub async fn new(
-        settings: &NotifySection,
+        config: &Config,
         store: &'a Store,
         location: &Location,
     ) -> Result<Option<Self>, StoreError> {
+        let settings = &config.notify;
         let Some(command) = settings.command.clone() else { return Ok(None) };
         let told = store.note(NOTE).await?;
         let told = told.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
@@ -52,6 +55,7 @@ impl<'a> Notifier<'a> {
             limit: Duration::from_secs_f64(settings.time_limit.get()),
             look: LOOK.min(stall / 4).max(Duration::from_millis(100)),
             watch: Watch::new(settings.clone(), told),
+            forgetting: Forgetting::new(&config.calm),
             at_work: JoinSet::new(),
         }))
     }
@@ -72,7 +76,11 @@ impl<'a> Notifier<'a> {
     }
 
     async fn look(&mut self) -> Result<(), Failure> {
-        let due = self.watch.look(&self.store.status().await?, unix_milliseconds());
+        let mut due = self.watch.look(&self.store.status().await?, unix_milliseconds());
+        let values = status::Values(self.store.values().await?);
+        if let Some((share, raised)) = values.forgetting() {
+            due.extend(self.watch.look_at_training(&self.forgetting, share, raised));
+        }
         if due.is_empty() {
             return Ok(());
         }

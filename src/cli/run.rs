@@ -160,7 +160,7 @@ async fn run(
         if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
     };
     let serving = web.serve(location, &store, &campaign.artifact).await?;
-    let mut notifier = Notifier::new(&campaign.config.notify, &store, location).await?;
+    let mut notifier = Notifier::new(&campaign.config, &store, location).await?;
     let worked = tokio::select! {
         ended = work => ended,
         error = budget::keep(&store, &limits, &over) => Err(error.into()),

@@ -20,7 +20,7 @@ pub use self::end::End;
 use self::jobs::Jobs;
 use self::labels::LabelsSoFar;
 use self::page::Page;
-use self::values::Values;
+pub use self::values::Values;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::budget;
 use crate::forecast::{self, Forecast, megabytes};

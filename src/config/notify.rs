@@ -38,11 +38,14 @@ pub enum NotifyEvent {
     Budget,
     /// Labels failed.
     FailedLabels,
+    /// The mixture forgets its training data, or does so no longer.
+    Forgetting,
 }
 
 impl NotifyEvent {
     /// All of them.
-    pub const ALL: [Self; 5] = [Self::End, Self::Failure, Self::Stall, Self::Budget, Self::FailedLabels];
+    pub const ALL: [Self; 6] =
+        [Self::End, Self::Failure, Self::Stall, Self::Budget, Self::FailedLabels, Self::Forgetting];
 
     /// As the configuration has it.
     pub fn name(self) -> &'static str {
@@ -52,6 +55,7 @@ impl NotifyEvent {
             Self::Stall => "stall",
             Self::Budget => "budget",
             Self::FailedLabels => "failed_labels",
+            Self::Forgetting => "forgetting",
         }
     }
 }

@@ -7,8 +7,11 @@ use serde::{Deserialize, Serialize};
 use store::Status;
 
 use crate::config::{NotifyEvent, NotifySection};
+use crate::forgetting::Forgetting;
 
 const MINUTE: f64 = 60_000.0;
+/// What was told last of forgetting, while the alarm holds.
+const HOLDS: &str = "holds";
 
 /// Under which name it is kept in the store what was told.
 pub const NOTE: &str = "notified";
@@ -69,6 +72,20 @@ impl Watch {
             due.extend(self.stall((candidates, labels), so_far, now));
         }
         due
+    }
+
+    /// What there is to tell of a mixture of which this share of the training atoms has γ > 1; `raised` is whether the selector
+    /// found that to be an alarm.
+    pub fn look_at_training(&mut self, forgetting: &Forgetting, share: f64, raised: bool) -> Option<Due> {
+        let event = NotifyEvent::Forgetting;
+        let (holds, was) = (forgetting.holds(share, raised)?, self.told.0.get(event.name()));
+        match holds {
+            true => self.due(event, HOLDS.to_owned(), forgetting.begun(share)),
+            false if was.is_some_and(|was| was == HOLDS) => {
+                self.due(event, "over".to_owned(), forgetting.over(share))
+            }
+            false => None,
+        }
     }
 
     /// A run could not go on. That is news each time.

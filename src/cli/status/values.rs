@@ -17,6 +17,12 @@ impl Values {
         self.read("training_frames").unwrap_or_default()
     }
 
+    /// The share of the training atoms with γ > 1, and whether that is an alarm; none before the first update.
+    pub fn forgetting(&self) -> Option<(f64, bool)> {
+        let training = self.training_frames();
+        training["share_above_one"].as_f64().zip(training["alarm"].as_bool())
+    }
+
     /// By how many versions the mixture was newer at decisions than what walkers had seen; null before the first.
     pub fn staleness(&self) -> Value {
         let Some(staleness) = self.read::<Staleness>(STALENESS) else { return Value::Null };
