@@ -1,6 +1,7 @@
 //! A campaign outlives whatever happens to its process, and ends as if nothing had happened.
 //!
-//! `CALMWALK_KILLS=200 cargo test --test interruption kills` for a long version, 1000 for a longer one.
+//! `CALMWALK_KILLS=200 cargo test --test interruption kills` for a long version, 1000 for a longer one. With `program` behind it, only
+//! campaigns whose labels are made by a program.
 
 mod common;
 
@@ -9,8 +10,9 @@ use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use common::campaign::{Counters, Outcome, Small, outcome};
+use common::place::LEAVE_LABEL;
 use common::processes::{
-    carrying_out, go_on, hold_walkers, nothing_is_left, processes_in, signal, wait_until,
+    calculating, carrying_out, go_on, hold_walkers, nothing_is_left, processes_in, signal, wait_until,
 };
 use common::{Running, kills, program, random};
 
@@ -20,43 +22,78 @@ fn start(directory: &Path, options: &[&str]) -> Running {
     Running(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("the program starts"))
 }
 
+/// How a campaign is written.
+type Write = fn(&Small, &Path);
+
+fn plain(small: &Small, directory: &Path) {
+    small.write(directory);
+}
+
+/// Its labels are made by a program, in directories below `scratch`.
+fn with_program(small: &Small, directory: &Path) {
+    let scratch = directory.canonicalize().unwrap().join("scratch").display().to_string();
+    std::fs::create_dir_all(&scratch).unwrap();
+    std::fs::write(directory.join("label.sh"), format!("sleep 0.05\n{LEAVE_LABEL}")).unwrap();
+    let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
+    let keys = format!("[label]\nattempts = 20\nscratch = {scratch:?}\nmethod = {command} # ");
+    std::fs::write(small.write(directory), small.text().replace("[label]\nmethod", &keys)).unwrap();
+}
+
 /// Runs to the end without any disturbance, all in one process.
-fn undisturbed(small: &Small) -> (Outcome, Duration) {
+fn undisturbed(small: &Small, write: Write) -> (Outcome, Duration) {
     let directory = tempfile::tempdir().unwrap();
-    small.write(directory.path());
+    write(small, directory.path());
     let begun = Instant::now();
     assert_eq!(start(directory.path(), &["--in-process"]).0.wait().unwrap().code(), Some(0));
     (outcome(directory.path()), begun.elapsed())
 }
 
-/// Kills one process of the campaign, or all of them at once; the orchestrator if there is no such process now.
-fn kill(directory: &Path, running: &Running, choice: u64) {
-    let mut victims = match choice % 4 {
+/// Programs that make labels may be killed so often in a campaign: each time counts as a failure of a job, which has two rungs.
+const PROGRAMS: u64 = 2;
+
+/// Kills one process of the campaign, or all of them at once; the orchestrator if there is no such process now. Returns whether it
+/// was a program that makes a label.
+fn kill(directory: &Path, running: &Running, choice: u64, programs_too: bool) -> bool {
+    const ALL: u64 = 3;
+    let kind = choice % 6;
+    let mut victims = match kind {
         0 => vec![running.0.id()],
         1 => carrying_out(directory, "walker"),
         2 => carrying_out(directory, "labeller"),
-        _ => processes_in(directory).iter().map(|process| process.pid).collect(),
+        ALL => processes_in(directory).iter().map(|process| process.pid).collect(),
+        4 => carrying_out(directory, "keep"),
+        _ if programs_too => {
+            let scratch = directory.canonicalize().unwrap().join("scratch");
+            calculating(&scratch)
+                .into_iter()
+                .filter(|(_, line)| line.starts_with("sh "))
+                .map(|(pid, _)| pid)
+                .collect()
+        }
+        _ => Vec::new(),
     };
+    let is_program = kind == 5 && !victims.is_empty();
     if victims.is_empty() {
         victims.push(running.0.id());
-    } else if choice % 4 != 3 {
-        victims = vec![victims[(choice / 4) as usize % victims.len()]];
+    } else if kind != ALL {
+        victims = vec![victims[(choice / 6) as usize % victims.len()]];
     }
     victims.into_iter().for_each(|pid| signal(pid, "KILL"));
+    is_program
 }
 
 /// A few kills in each campaign, at any instant from the very start on, with one walker or two.
-fn disturbed(small: &Small, options: &[&str], kills: u64) {
-    let (expected, takes) = undisturbed(&Small { walkers: 1, ..small.clone() });
+fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) {
+    let (expected, takes) = undisturbed(&Small { walkers: 1, ..small.clone() }, write);
     assert!(expected.decisions.matches("\"kind\":\"accepted\"").count() >= 4, "{}", expected.decisions);
     assert!(expected.decisions.contains("\"kind\":\"control\""));
     let (mut done, mut campaigns) = (0, 0);
     while done < kills {
         let directory = tempfile::tempdir().unwrap();
         campaigns += 1;
-        let mut finished = false;
+        let (mut finished, mut programs) = (false, 0);
         while !finished {
-            Small { walkers: 1 + (random(done) % 2) as usize, ..small.clone() }.write(directory.path());
+            write(&Small { walkers: 1 + (random(done) % 2) as usize, ..small.clone() }, directory.path());
             let mut running = start(directory.path(), options);
             let ended = loop {
                 // Another in each campaign: one that is over before it must not be tried again for ever.
@@ -67,7 +104,8 @@ fn disturbed(small: &Small, options: &[&str], kills: u64) {
                 if ended.is_some() || done == kills {
                     break ended.unwrap_or_else(|| running.0.wait().unwrap());
                 }
-                kill(directory.path(), &running, random(5000 + done));
+                let was_program = kill(directory.path(), &running, random(5000 + done), programs < PROGRAMS);
+                programs += u64::from(was_program);
                 done += 1;
                 // Of a process that was killed there may be a moment's delay until it is seen to be so.
                 std::thread::sleep(Duration::from_millis(5));
@@ -82,18 +120,23 @@ fn disturbed(small: &Small, options: &[&str], kills: u64) {
 
 #[test]
 fn kills_at_random_instants_change_nothing() {
-    disturbed(&Small::default(), &[], kills());
+    disturbed(&Small::default(), plain, &[], kills());
 }
 
 #[test]
 fn kills_of_the_one_process_change_nothing() {
-    disturbed(&Small::default(), &["--in-process"], kills().div_ceil(4));
+    disturbed(&Small::default(), plain, &["--in-process"], kills().div_ceil(4));
+}
+
+#[test]
+fn kills_of_a_campaign_whose_labels_a_program_makes_change_nothing() {
+    disturbed(&Small::default(), with_program, &[], kills().div_ceil(4));
 }
 
 #[test]
 fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
     let small = Small::default();
-    let (expected, _) = undisturbed(&small);
+    let (expected, _) = undisturbed(&small, plain);
     for name in ["INT", "TERM"] {
         let directory = tempfile::tempdir().unwrap();
         small.write(directory.path());
@@ -113,7 +156,7 @@ fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
 #[test]
 fn live_mode_loses_and_doubles_nothing() {
     let small = Small { mode: "live", ..Small::default() };
-    let (_, takes) = undisturbed(&small);
+    let (_, takes) = undisturbed(&small, plain);
     let directory = tempfile::tempdir().unwrap();
     small.write(directory.path());
     for kill in 0..5 {

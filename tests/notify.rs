@@ -126,7 +126,7 @@ fn a_mixture_that_forgets_is_spoken_of_once_a_run_and_told_once() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();
     let small = Small { steps: 900, ..Small::default() };
-    let low = ("training_frames", "forgetting_alarm = 0.001\ntraining_frames");
+    let low = ("training_frames", "ladder = [1.0]\nforgetting_alarm = 0.02\ntraining_frames");
     write(here, &small, "on = [\"forgetting\"]\nstall = 0.01", low, "exit 0");
     let said = here.join("said");
     let start = || {

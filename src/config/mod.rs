@@ -7,6 +7,8 @@ mod documented;
 mod error;
 mod files;
 mod method;
+#[cfg(test)]
+mod mutated;
 mod notify;
 
 use std::num::{NonZeroU32, NonZeroU64, NonZeroUsize};

@@ -40,7 +40,7 @@ struct Connection {
 /// What a connection does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum State {
-    /// It waits for a request, or for the client to take an answer.
+    /// It waits for a request to be complete, or for the client to take an answer.
     Idle,
     /// It is told events until the client leaves.
     Events,

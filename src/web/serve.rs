@@ -6,11 +6,10 @@ use std::io;
 use std::time::Duration;
 
 use axum::body::{Body, HttpBody, to_bytes};
-use axum::extract::Request;
-use axum::http::{HeaderMap, StatusCode, header};
-use axum::middleware::Next;
+use axum::http::{HeaderMap, Request, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Router, middleware};
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper::service::{Service, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
@@ -46,9 +45,7 @@ pub struct Server {
 impl Server {
     /// Serves in a task of its own, until [`Self::end`].
     pub fn start(listener: TcpListener, router: Router) -> Self {
-        let router = router
-            .layer(middleware::from_fn(whole_body))
-            .layer(middleware::from_fn(guard::asked_by_name_of_this_host));
+        let router = router.layer(middleware::from_fn(guard::asked_by_name_of_this_host));
         let connections = Connections::default();
         let listening = tokio::spawn(accept(listener, router, connections.clone())).abort_handle();
         Self { listening, connections }
@@ -101,12 +98,17 @@ async fn admitted(stream: TcpStream, connections: &Connections) -> Option<TcpStr
 
 async fn serve(stream: TcpStream, router: Router, place: Place) {
     let (place, router) = (&place, &TowerToHyperService::new(router));
-    let answer = service_fn(move |request| async move {
+    let answer = service_fn(move |request: Request<Incoming>| async move {
+        let (head, body) = request.into_parts();
+        let body = match whole_body(Body::new(body)).await {
+            Ok(body) => body,
+            Err(refusal) => return Ok::<_, Infallible>(refusal),
+        };
         place.enter(State::Answering);
-        let answer = router.call(request).await;
+        let answer = router.call(Request::from_parts(head, body)).await;
         let is_events = answer.as_ref().is_ok_and(|answer| tells_events(answer.headers()));
         place.enter(if is_events { State::Events } else { State::Idle });
-        Ok::<_, Infallible>(answer.unwrap_or_else(|never| match never {}))
+        answer
     });
     let mut protocol = http1::Builder::new();
     protocol
@@ -136,16 +138,15 @@ fn tells_events(headers: &HeaderMap) -> bool {
     headers.get(header::CONTENT_TYPE).is_some_and(|kind| kind.as_bytes().starts_with(b"text/event-stream"))
 }
 
-/// Reads the body of a request before it is answered, and refuses one that is too long or too slow.
-async fn whole_body(request: Request, next: Next) -> Response {
-    let (head, body) = request.into_parts();
+/// Reads the body of a request, or refuses one that is too long or too slow.
+async fn whole_body(body: Body) -> Result<Body, Response> {
     let too_long = || (StatusCode::PAYLOAD_TOO_LARGE, "the request is too long\n").into_response();
     if body.size_hint().lower() > LONGEST_BODY as u64 {
-        return too_long();
+        return Err(too_long());
     }
     match timeout(BODY_TIME, to_bytes(body, LONGEST_BODY)).await {
-        Ok(Ok(bytes)) => next.run(Request::from_parts(head, Body::from(bytes))).await,
-        Ok(Err(_)) => too_long(),
-        Err(_) => (StatusCode::REQUEST_TIMEOUT, "the request took too long\n").into_response(),
+        Ok(Ok(bytes)) => Ok(Body::from(bytes)),
+        Ok(Err(_)) => Err(too_long()),
+        Err(_) => Err((StatusCode::REQUEST_TIMEOUT, "the request took too long\n").into_response()),
     }
 }

@@ -8,6 +8,7 @@ pub mod desk;
 pub mod hosts;
 pub mod http;
 pub mod line;
+pub mod mutate;
 pub mod place;
 pub mod processes;
 pub mod report;

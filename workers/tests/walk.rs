@@ -1,5 +1,6 @@
 //! Turns of a walk: pure functions, the bias force, and the way out of a trap.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -11,6 +12,9 @@ use wire::{CampaignId, Candidate, Origin, WalkId};
 use workers::bias::BiasedPotential;
 use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
 use workers::walk::{WalkContext, advance};
+
+#[path = "../../tests/common/mutate.rs"]
+mod mutate;
 
 fn data(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data").join(path)
@@ -108,6 +112,26 @@ fn a_turn_in_pieces_is_the_same_turn() {
         turn.checkpoint = Some(go(&settings, &turn).checkpoint);
     }
     assert_eq!(turn.checkpoint, Some(whole.checkpoint));
+}
+
+/// A checkpoint that is damaged goes on, or ends its walk: `CALMWALK_MUTATIONS=5000` for the long version.
+#[test]
+fn damaged_checkpoints_stop_no_walker() {
+    let settings = WalkSettings { collection: never(), ..settings() };
+    let mut turn = assignment(seed("vacancy"), 110);
+    let checkpoint = go(&settings, &turn).checkpoint;
+    let context = WalkContext { model: model(), threads: Threads::default(), settings: Arc::new(settings) };
+    let mixture = mixture();
+    turn.until = 115;
+    let mut refused = 0;
+    for number in 0..mutate::mutations(60) {
+        turn.checkpoint = Some(mutate::mutated(&checkpoint, number));
+        let go = || advance(&context, &turn, Arc::clone(&mixture), || false, |_| {});
+        let report = catch_unwind(AssertUnwindSafe(go));
+        let report = report.unwrap_or_else(|_| panic!("a panic at mutation {number}"));
+        refused += u32::from(matches!(report.outcome, Outcome::Ended(End::BadStart { .. })));
+    }
+    assert!(refused > 0);
 }
 
 fn never() -> CollectionRule {
