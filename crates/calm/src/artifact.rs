@@ -12,7 +12,10 @@ use crate::mixture::{Mixture, MixtureError};
 pub const SCHEMAS: [usize; 3] = [3, 4, 6];
 
 /// Centroids of unused slots are filled with 10¹⁰; no feature comes near this.
-const SENTINEL: f64 = 1e9;
+pub(crate) const SENTINEL: f64 = 1e9;
+
+/// A stored matrix is symmetric if no two numbers differ by more than this share of the largest.
+const ASYMMETRY: f64 = 1e-3;
 
 /// A mixture as loaded, with what ties it to a potential.
 #[derive(Debug, Clone, PartialEq)]
@@ -198,7 +201,7 @@ impl Artifact {
         }
         let (slots, dimension) = (count(file, "uq_max_clusters")?, count(file, "uq_feature_dim")?);
         let centroids = file.numbers("uq_centroids")?.shaped(&[element_count, slots, dimension])?;
-        let inverses = file.numbers("uq_inv_cov")?.shaped(&[element_count, slots, dimension, dimension])?;
+        let inverses = symmetric(file, "uq_inv_cov", &[element_count, slots, dimension, dimension])?;
         let thresholds = file.numbers("uq_interp_thresholds")?.shaped(&[element_count, slots])?;
         if slots == 0 || dimension == 0 {
             return Err(invalid(file, "uq_centroids", "no centroid", "at least one an element"));
@@ -327,6 +330,22 @@ fn thresholds(file: &Archive, elements: usize) -> Result<Vec<Vec<f64>>, Artifact
     }
 }
 
+/// Square matrices of this shape, one after the other, each the same as its transpose but for rounding.
+fn symmetric(file: &Archive, key: &str, shape: &[usize]) -> Result<Vec<f64>, ArtifactError> {
+    let numbers = file.numbers(key)?.shaped(shape)?;
+    let dimension = shape.last().copied().unwrap_or_default();
+    for (index, matrix) in numbers.chunks_exact((dimension * dimension).max(1)).enumerate() {
+        let largest = matrix.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
+        let pairs = (0..dimension).flat_map(|row| (0..row).map(move |column| (row, column)));
+        let mut values = pairs.map(|(i, j)| (matrix[i * dimension + j], matrix[j * dimension + i]));
+        if let Some((a, b)) = values.find(|(a, b)| (a - b).abs() > ASYMMETRY * largest) {
+            let found = format!("{a:e} and {b:e} on both sides of the diagonal of matrix {index}");
+            return Err(invalid(file, key, found, "symmetric matrices"));
+        }
+    }
+    Ok(numbers)
+}
+
 /// The arrays of one element, slot by slot.
 struct Slots {
     dimension: usize,
@@ -350,8 +369,8 @@ impl Slots {
             return Err(invalid(file, &key, format!("shape {:?}", centroids.shape), "at least one centroid"));
         }
         let square = [slots, dimension, dimension];
-        let inverses = file.numbers(&format!("inv_cov_{element}"))?.shaped(&square)?;
-        let scatters = file.numbers(&format!("scatter_{element}"))?.shaped(&square)?;
+        let inverses = symmetric(file, &format!("inv_cov_{element}"), &square)?;
+        let scatters = symmetric(file, &format!("scatter_{element}"), &square)?;
         let counts = file.numbers(&format!("counts_{element}"))?.shaped(&[slots])?;
         let weighted = format!("effective_count_{element}");
         let effective = if file.contains(&weighted) {
@@ -370,14 +389,17 @@ impl Slots {
         Ok(Self { dimension, thresholds, centroids: centroids.data, inverses, statistics })
     }
 
-    /// The components of the slots up to the last that can be the nearest: trailing sentinels and repetitions of
-    /// the first centroid (an element that the artifact does not hold) are left out, indices stay.
+    /// The components of the slots up to the last that can be the nearest or has data: trailing sentinels and
+    /// repetitions of the first centroid (an element that the artifact does not hold) are left out, indices stay.
     fn components(&self, path: &Path, element: usize) -> Result<Vec<Arc<Component>>, ArtifactError> {
         let centroids: Vec<&[f64]> = self.centroids.chunks_exact(self.dimension).collect();
-        let used = |centroid: &&[f64]| {
-            centroid.iter().any(|value| value.abs() < SENTINEL) && Some(centroid) != centroids.first()
+        let has_data = |slot: usize| self.statistics.get(slot).is_some_and(|found| found.count > 0.0);
+        let used = |(slot, centroid): (usize, &&[f64])| {
+            let own =
+                Some(centroid) != centroids.first() && centroid.iter().any(|value| value.abs() < SENTINEL);
+            own || has_data(slot)
         };
-        let count = centroids.iter().rposition(used).map_or(1, |last| last + 1);
+        let count = centroids.iter().enumerate().rposition(used).map_or(1, |last| last + 1);
         let inverses = self.inverses.chunks_exact(self.dimension * self.dimension);
         let slots = centroids.iter().zip(inverses).zip(&self.thresholds).take(count).enumerate();
         let components = slots.map(|(slot, ((centroid, inverse), &threshold))| {

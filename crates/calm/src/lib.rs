@@ -22,6 +22,7 @@ mod numbers;
 mod parts;
 pub mod rules;
 pub mod search;
+pub mod soundness;
 pub mod update;
 pub mod watch;
 
@@ -37,4 +38,5 @@ pub use numbers::Lender;
 pub use parts::GradesInParts;
 pub use rules::{CollectionRule, Combination, UpdateRule, UpdateSettings};
 pub use search::{Trial, UpdateEnd, UpdateOutcome, update};
+pub use soundness::{ComponentFault, UnsoundComponent};
 pub use update::{Batch, CovarianceUpdate, UpdateError};

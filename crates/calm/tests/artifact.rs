@@ -90,6 +90,8 @@ fn a_broken_array_is_named() {
     text("'uq_centroids': found shape [1, 1, 3], expected shape [1, 1, 2]");
     write_export(&path, &[("uq_inv_cov", &[1.0, 0.0, f64::NAN, 1.0], &[1, 1, 2, 2])]);
     text("component 0 of element 0: inverse covariance: found NaN, expected a finite number");
+    write_export(&path, &[("uq_inv_cov", &[1.0, 0.5, 0.0, 1.0], &[1, 1, 2, 2])]);
+    text("'uq_inv_cov': found 0e0 and 5e-1 on both sides of the diagonal of matrix 0, expected symmetric");
     write_export(&path, &[("uq_interp_thresholds", &[-1.0], &[1, 1])]);
     text("threshold: found -1, expected a finite number that is not negative");
     write_export(&path, &[("uq_rp_dim", &[3.0], &[1])]);

@@ -1,0 +1,326 @@
+//! Whether the numbers of a mixture can have come from training data.
+//!
+//! A mixture loads as soon as its arrays fit together, and any inverse covariance gives grades: one that is a million times
+//! too small grades everything 0.001, so that nothing is ever collected. A build leaves traces that cannot be faked by
+//! accident, and they are what is checked here:
+//!
+//! - S = (C + εI)⁻¹ with ε = 10⁻⁶, so S is positive definite, none of its eigenvalues is above 1/ε, and
+//!   tr(S (C + εI)) = D. The last holds for covariances of any rank.
+//! - The mean of σ² over the training data of a component is tr(SC), and θ is a quantile of σ or a multiple of one.
+//! - Features of a normalised basis are no longer than the columns of the projection, and so are their means.
+
+use crate::artifact::{Artifact, SENTINEL};
+use crate::component::Component;
+use crate::linear::{LinearError, REGULARISATION, cholesky, eigenvalues, regularised, view};
+
+/// Numbers are stored in single precision: relative rounding of each, with room for sums that were rounded too.
+const STORED: f64 = 1.0 / (1 << 22) as f64;
+
+/// Largest deviation of tr(S (C + εI))/D from 1, besides rounding; builds deviate by 10⁻⁴.
+const TRACE_TOLERANCE: f64 = 0.05;
+
+/// Largest condition number of S: beyond it the build's pseudo-inverse leaves directions out.
+const CONDITION_LIMIT: f64 = 1e15;
+
+/// σ histograms of builds begin here, so no threshold is below.
+const LEAST_THRESHOLD: f64 = 0.01;
+
+/// Thresholds are at most this multiple of √⟨σ²⟩: fewer than 1 in 10⁴ environments are beyond it (Markov). Builds: 1 to 3.
+const THRESHOLD_SPAN: f64 = 100.0;
+
+/// Thresholds are at least this share of √⟨σ²⟩, however heavy the tail of σ is.
+const THRESHOLD_SHARE: f64 = 1e-3;
+
+/// Centroids may exceed the length of the features by this factor, for rounding.
+const REACH: f64 = 1.01;
+
+/// A component that no training data can have made.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("component {slot} of {element}: {fault}")]
+pub struct UnsoundComponent {
+    /// Chemical symbol.
+    pub element: String,
+    /// Index among the components of the element.
+    pub slot: usize,
+    /// What is wrong with it.
+    pub fault: ComponentFault,
+}
+
+/// What is wrong with a component.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ComponentFault {
+    /// S has an eigenvalue that is zero or negative.
+    #[error(
+        "its inverse covariance has eigenvalues from {least:.3e} to {largest:.3e}; expected a positive definite matrix"
+    )]
+    NotPositive {
+        /// Least eigenvalue.
+        least: f64,
+        /// Largest eigenvalue.
+        largest: f64,
+    },
+    /// The eigenvalues of S are too far apart.
+    #[error(
+        "its inverse covariance has a condition number of at least {found:.1e}; expected at most {CONDITION_LIMIT:.0e}"
+    )]
+    Condition {
+        /// A lower bound of the condition number.
+        found: f64,
+    },
+    /// S is larger than the regularisation allows.
+    #[error(
+        "its inverse covariance has {found:.3e} on the diagonal; expected at most {:.0e}, as 1e-6 is added to every \
+         variance",
+        1.0 / REGULARISATION
+    )]
+    TooLarge {
+        /// The largest element of its diagonal.
+        found: f64,
+    },
+    /// C has a negative eigenvalue.
+    #[error(
+        "its scatter has a negative eigenvalue ({least:.3e}, the largest is {largest:.3e}); expected none"
+    )]
+    Scatter {
+        /// Least eigenvalue of scatter/count.
+        least: f64,
+        /// Largest eigenvalue.
+        largest: f64,
+    },
+    /// Data without weight, or weight without data.
+    #[error(
+        "it has {count} environments of weight {effective_count} in sum; expected both to be positive, or both 0"
+    )]
+    Counts {
+        /// Number of environments.
+        count: f64,
+        /// Sum of their weights.
+        effective_count: f64,
+    },
+    /// S is not the inverse of C + εI.
+    #[error(
+        "its inverse covariance does not belong to its scatter and count: their product has a mean eigenvalue of \
+         {found:.3e}; expected 1"
+    )]
+    Inconsistent {
+        /// tr(S (C + εI))/D.
+        found: f64,
+    },
+    /// θ is beyond what σ can be.
+    #[error("its threshold is {found:.3e}; expected {least:.1e} to {most:.1e}")]
+    Threshold {
+        /// θ.
+        found: f64,
+        /// The least that makes sense.
+        least: f64,
+        /// The most that makes sense.
+        most: f64,
+    },
+    /// **μ** = 0 of a component that has data.
+    #[error("its centroid is zero; expected the mean of its features")]
+    NoCentroid,
+    /// **μ** is where no feature vector is.
+    #[error(
+        "its centroid is {found:.3e} in feature {feature}, where the model's features are between ±{most:.3e}"
+    )]
+    Centroid {
+        /// Index of the feature.
+        feature: usize,
+        /// The number there.
+        found: f64,
+        /// The largest that a feature can be.
+        most: f64,
+    },
+    /// The same centroid twice.
+    #[error("it has the centroid of component {first}; expected one of its own")]
+    Duplicate {
+        /// The component that has it too.
+        first: usize,
+    },
+    /// A matrix that linear algebra fails on.
+    #[error(transparent)]
+    Linear(#[from] LinearError),
+}
+
+impl Artifact {
+    /// The components that no training data can have made, in order, each with the first thing that is wrong with it.
+    ///
+    /// Stand-ins of elements without data, and unused slots, are sound. A matrix that is positive definite but for the
+    /// rounding of its storage is sound.
+    pub fn unsound_components(&self) -> Vec<UnsoundComponent> {
+        let reach = self.reach();
+        let elements = self.symbols.iter().enumerate();
+        let of_element = elements.filter_map(|(element, symbol)| {
+            let components: Vec<_> = self.mixture.components(element)?.iter().map(AsRef::as_ref).collect();
+            let spread = Spread::of(&components);
+            let faults = components.iter().enumerate().filter_map(|(slot, component)| {
+                let fault = check(component, &spread, &reach)
+                    .and_then(|()| unlike(&components[..slot], component))
+                    .err()?;
+                Some(UnsoundComponent { element: symbol.clone(), slot, fault })
+            });
+            Some(faults.collect::<Vec<_>>())
+        });
+        of_element.flatten().collect()
+    }
+
+    /// The largest value of each projected feature: the length of its column, if the basis has length 1 at most.
+    fn reach(&self) -> Vec<f64> {
+        let projection = &self.projection;
+        if !projection.normalised {
+            return Vec::new();
+        }
+        let mut squares = vec![0.0; projection.columns];
+        for row in projection.matrix.chunks_exact(projection.columns) {
+            squares.iter_mut().zip(row).for_each(|(sum, value)| *sum += f64::from(*value).powi(2));
+        }
+        squares.into_iter().map(f64::sqrt).collect()
+    }
+}
+
+/// √⟨σ²⟩ over the data of a component, for the components of an element.
+struct Spread {
+    least: f64,
+    largest: f64,
+}
+
+impl Spread {
+    /// Without statistics ⟨σ²⟩ is at most D. A component with few data has the largest threshold of its element.
+    fn of(components: &[&Component]) -> Self {
+        let spread = |component: &&Component| match component.statistics() {
+            Some(statistics) => mean_square(component, &statistics.covariance()).max(0.0).sqrt(),
+            None => (component.dimension() as f64).sqrt(),
+        };
+        let with_data = components.iter().filter(|component| has_data(component)).map(spread);
+        let (least, largest) = with_data.fold((f64::INFINITY, 0.0_f64), |(a, b), x| (a.min(x), b.max(x)));
+        // A component whose data are all the same has θ = 1.
+        Self { least: if least.is_finite() { least } else { 0.0 }, largest: largest.max(1.0) }
+    }
+}
+
+fn has_data(component: &Component) -> bool {
+    component.statistics().is_none_or(|statistics| statistics.effective_count > 0.0)
+}
+
+/// tr(SC).
+fn mean_square(component: &Component, covariance: &[f64]) -> f64 {
+    component.inverse().iter().zip(covariance).map(|(a, b)| a * b).sum()
+}
+
+fn check(component: &Component, spread: &Spread, reach: &[f64]) -> Result<(), ComponentFault> {
+    check_inverse(component)?;
+    check_statistics(component)?;
+    check_threshold(component.threshold(), spread)?;
+    check_centroid(component, reach)
+}
+
+fn check_inverse(component: &Component) -> Result<(), ComponentFault> {
+    let (inverse, dimension) = (component.inverse(), component.dimension());
+    let found = diagonal(inverse, dimension).fold(0.0, f64::max);
+    if found > 2.0 / REGULARISATION {
+        return Err(ComponentFault::TooLarge { found });
+    }
+    match cholesky(inverse, dimension) {
+        Some(factor) => {
+            // No pivot is less than the least eigenvalue.
+            let least = (0..dimension).map(|k| factor[(k, k)].powi(2)).fold(f64::INFINITY, f64::min);
+            match found / least {
+                found if found > CONDITION_LIMIT => Err(ComponentFault::Condition { found }),
+                _ => Ok(()),
+            }
+        }
+        None => {
+            let (least, largest) = extremes(inverse, dimension)?;
+            if largest > 0.0 && least > -rounding(largest, dimension) {
+                return Ok(());
+            }
+            Err(ComponentFault::NotPositive { least, largest })
+        }
+    }
+}
+
+fn check_statistics(component: &Component) -> Result<(), ComponentFault> {
+    let Some(statistics) = component.statistics() else { return Ok(()) };
+    let (count, effective_count) = (statistics.count, statistics.effective_count);
+    if (count > 0.0) != (effective_count > 0.0) {
+        return Err(ComponentFault::Counts { count, effective_count });
+    }
+    let dimension = component.dimension();
+    let covariance = statistics.covariance();
+    let regularised = regularised(&covariance, dimension);
+    if cholesky(&regularised, dimension).is_none() {
+        let (least, largest) = extremes(&covariance, dimension)?;
+        if least < -rounding(largest.max(0.0), dimension) - REGULARISATION {
+            return Err(ComponentFault::Scatter { least, largest });
+        }
+    }
+    let found = mean_square(component, &regularised) / dimension as f64;
+    let absolute: f64 = component.inverse().iter().zip(&regularised).map(|(a, b)| (a * b).abs()).sum();
+    let tolerance = TRACE_TOLERANCE + STORED * absolute / dimension as f64;
+    if (found - 1.0).abs() > tolerance {
+        return Err(ComponentFault::Inconsistent { found });
+    }
+    Ok(())
+}
+
+fn check_threshold(found: f64, spread: &Spread) -> Result<(), ComponentFault> {
+    let least = LEAST_THRESHOLD.max(THRESHOLD_SHARE * spread.least);
+    let most = THRESHOLD_SPAN * spread.largest;
+    if (least..=most).contains(&found) {
+        Ok(())
+    } else {
+        Err(ComponentFault::Threshold { found, least, most })
+    }
+}
+
+fn check_centroid(component: &Component, reach: &[f64]) -> Result<(), ComponentFault> {
+    let centroid = component.centroid();
+    if !is_used(component) {
+        return Ok(());
+    }
+    if centroid.iter().all(|value| *value == 0.0) {
+        return Err(ComponentFault::NoCentroid);
+    }
+    // Features that no projection bounds have to be below the fill of unused slots.
+    let bounds = reach.iter().map(|reach| REACH * reach).chain(std::iter::repeat(SENTINEL));
+    let mut beyond = centroid.iter().zip(bounds).enumerate();
+    match beyond.find(|(_, (value, most))| value.abs() > *most) {
+        Some((feature, (&found, most))) => Err(ComponentFault::Centroid { feature, found, most }),
+        None => Ok(()),
+    }
+}
+
+/// Whether a component stands for data: neither an unused slot nor the stand-in of an element without any.
+fn is_used(component: &Component) -> bool {
+    if component.statistics().is_some() {
+        return has_data(component);
+    }
+    let stand_in = |value: f64| (value * REGULARISATION - 1.0).abs() < STORED;
+    !diagonal(component.inverse(), component.dimension()).all(stand_in)
+}
+
+/// Of two components with the same centroid the second is never the nearest.
+fn unlike(before: &[&Component], component: &Component) -> Result<(), ComponentFault> {
+    if !is_used(component) {
+        return Ok(());
+    }
+    match before.iter().position(|other| other.centroid() == component.centroid()) {
+        Some(first) => Err(ComponentFault::Duplicate { first }),
+        None => Ok(()),
+    }
+}
+
+fn diagonal(matrix: &[f64], dimension: usize) -> impl Iterator<Item = f64> {
+    matrix.iter().step_by(dimension + 1).copied()
+}
+
+/// The least and the largest eigenvalue.
+fn extremes(matrix: &[f64], dimension: usize) -> Result<(f64, f64), LinearError> {
+    let values = eigenvalues(view(matrix, dimension, dimension))?;
+    Ok((values.first().copied().unwrap_or_default(), values.last().copied().unwrap_or_default()))
+}
+
+/// How far the eigenvalues of a stored matrix move by rounding, at most: by the length of the error.
+fn rounding(largest: f64, dimension: usize) -> f64 {
+    STORED * largest * dimension as f64
+}
