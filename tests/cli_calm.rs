@@ -201,12 +201,21 @@ fn what_cannot_be_graded_is_named_with_its_line() {
     write("short.extxyz", good.to_owned() + "2\nProperties=species:S:1:pos:R:3\nAl 0 0 0\n");
     write("number.extxyz", good.replace("Al 0", "Al x"));
     write("empty.extxyz", String::new());
+    let two = good.replacen('1', "2", 1) + "Al 0 0 0\n";
+    write("coincident.extxyz", good.to_owned() + &two);
+    write("near.extxyz", good.to_owned() + &two.replace("Al 0 0 0\nAl 0 0 0", "Al 0 0 0\nAl 3.8 0 0"));
     write("out.extxyz", "what was there".to_owned());
     for (file, place, reason) in [
         ("silicon.extxyz", "silicon.extxyz:4:", "atom 0 is Si"),
         ("short.extxyz", "short.extxyz:7:", "ends after 1 of the 2 atoms"),
         ("number.extxyz", "number.extxyz:3:", "found 'x'"),
         ("empty.extxyz", "empty.extxyz", "no structures"),
+        (
+            "coincident.extxyz",
+            "coincident.extxyz:4:",
+            "atoms 0 and 1 are 0.000 Å apart; expected at least 0.3 Å",
+        ),
+        ("near.extxyz", "near.extxyz:4:", "atoms 0 and 1 are 0.200 Å apart"),
         ("missing.extxyz", "missing.extxyz", "cannot be opened"),
     ] {
         let message = score(file);
@@ -214,7 +223,7 @@ fn what_cannot_be_graded_is_named_with_its_line() {
     }
     assert_eq!(std::fs::read_to_string(here.join("out.extxyz")).unwrap(), "what was there");
     let left: Vec<_> = std::fs::read_dir(here).unwrap().map(|entry| entry.unwrap().file_name()).collect();
-    assert_eq!(left.len(), 5, "{left:?}");
+    assert_eq!(left.len(), 7, "{left:?}");
 }
 
 #[test]

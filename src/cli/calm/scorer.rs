@@ -2,10 +2,13 @@
 
 use std::sync::Arc;
 
-use atoms::{Evaluation, NeighbourList, PotentialError, Structure, StructureError};
+use atoms::{Evaluation, NeighbourList, PotentialError, Structure, StructureError, shortest_distance};
 use calm::neighbourhood::{Pair, PairError};
 use calm::{GradeError, Grades, Mixture, neighbourhood_average};
 use potentials::grace::{Grace, GraceModel, PullBack};
+
+/// No two nuclei come as near as this, Å: the shortest bond, of H₂, has 0.74.
+const LEAST_DISTANCE: f64 = 0.3;
 
 /// A model, a mixture that grades its features, and the work arrays of both.
 pub struct Scorer {
@@ -41,6 +44,11 @@ pub enum ScoreError {
     /// Overlapping atoms.
     #[error("the energy is {0} eV: do atoms overlap?")]
     NotFinite(f64),
+    /// Atoms in one place, of which a model may give any energy and any grade.
+    #[error(
+        "atoms {0} and {1} are {2:.3} Å apart; expected at least {LEAST_DISTANCE} Å: no grade means anything here"
+    )]
+    Coincident(usize, usize, f64),
 }
 
 impl Scorer {
@@ -67,6 +75,10 @@ impl Scorer {
     pub fn score(&mut self, structure: &Structure, gradient: bool) -> Result<(), ScoreError> {
         let elements = self.grace.model().element_indices(&structure.species)?;
         self.neighbours.update(structure)?;
+        let shortest = shortest_distance(structure, &self.neighbours);
+        if let Some((i, j, distance)) = shortest.filter(|(_, _, distance)| *distance < LEAST_DISTANCE) {
+            return Err(ScoreError::Coincident(i, j, distance));
+        }
         self.grace.forward(structure, &self.neighbours)?;
         let energy: f64 = self.grace.atomic_energies().iter().sum();
         if !energy.is_finite() {
