@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use atoms::FileError;
 use atoms::extxyz::{Frame, Reader};
+use atoms::{FileError, open_extxyz};
 
 /// Reads an extended XYZ file frame by frame.
 pub struct Frames {
@@ -24,7 +24,7 @@ struct Counting(File, Arc<AtomicU64>);
 impl Frames {
     /// Opens the file.
     pub fn open(path: &Path) -> Result<Self, FileError> {
-        let file = File::open(path).map_err(|source| FileError::Open { path: path.to_owned(), source })?;
+        let file = open_extxyz(path)?;
         let length = file.metadata().ok().filter(|found| found.is_file()).map(|found| found.len());
         let read = Arc::new(AtomicU64::new(0));
         let input: Box<dyn BufRead> = Box::new(BufReader::new(Counting(file, Arc::clone(&read))));

@@ -16,6 +16,6 @@ pub mod units;
 pub use cell::{Cell, Matrix3, Vec3};
 pub use neighbours::{Bond, Neighbour, NeighbourList, shortest_distance};
 pub use potential::{Evaluation, Potential, PotentialError};
-pub use read::{FileError, read_extxyz, read_poscar, read_structures};
+pub use read::{FileError, open_extxyz, read_extxyz, read_poscar, read_structures};
 pub use species::{Species, UnknownSpecies};
 pub use structure::{Structure, StructureError};

@@ -1,11 +1,15 @@
 //! Reading structures from a file of any format that is known here.
 
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 
 use crate::extxyz::{self, Frame, Reader};
 use crate::poscar;
+
+/// Extensions of what other programs write, which `ase convert` reads.
+const OTHER_FORMATS: [&str; 14] =
+    ["cif", "vasp", "poscar", "pdb", "traj", "xsf", "cfg", "gen", "cell", "res", "lmp", "data", "in", "json"];
 
 /// A file that cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -19,8 +23,15 @@ pub enum FileError {
         source: std::io::Error,
     },
     /// Its name tells no format.
-    #[error("{}: unknown format: expected a name ending in .extxyz, .xyz, .poscar or .vasp, or beginning with POSCAR or CONTCAR", .0.display())]
+    #[error(
+        "{}: unknown format: expected a name ending in .extxyz, .xyz, .poscar or .vasp, or beginning with POSCAR or CONTCAR; {}",
+        .0.display(),
+        conversion(.0)
+    )]
     Format(PathBuf),
+    /// It is of another format than extended XYZ, where only that is read.
+    #[error("{}: expected extended XYZ; {}", .0.display(), conversion(.0))]
+    NotExtxyz(PathBuf),
     /// It has no frame.
     #[error("{}: the file has no structures, expected at least one", .0.display())]
     Empty(PathBuf),
@@ -48,6 +59,11 @@ pub enum FileError {
     },
 }
 
+/// How to make extended XYZ of a file.
+fn conversion(path: &Path) -> String {
+    format!("convert it with `ase convert {} {}`", path.display(), path.with_extension("extxyz").display())
+}
+
 /// All structures of a file, at least one: POSCAR (`POSCAR*`, `CONTCAR*`, `*.poscar`, `*.vasp`) or
 /// extended XYZ (`*.xyz`, `*.extxyz`), by its name in any case.
 pub fn read_structures(path: &Path) -> Result<Vec<Frame>, FileError> {
@@ -59,7 +75,25 @@ pub fn read_structures(path: &Path) -> Result<Vec<Frame>, FileError> {
         _ if name.starts_with("poscar") || name.starts_with("contcar") => {
             read_poscar(path).map(|frame| vec![frame])
         }
+        _ if path.is_dir() => Err(directory(path)),
         _ => Err(FileError::Format(path.to_owned())),
+    }
+}
+
+/// Opens a file in extended XYZ that is to be read frame by frame.
+///
+/// # Errors
+/// One that cannot be opened, a directory, a name of another format.
+pub fn open_extxyz(path: &Path) -> Result<File, FileError> {
+    // A pipe has no extension.
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    let is_other = OTHER_FORMATS.contains(&extension.as_str())
+        || name.starts_with("poscar")
+        || name.starts_with("contcar");
+    match is_other && path.is_file() {
+        true => Err(FileError::NotExtxyz(path.to_owned())),
+        false => open_file(path),
     }
 }
 
@@ -83,6 +117,18 @@ pub fn read_poscar(path: &Path) -> Result<Frame, FileError> {
 }
 
 fn open(path: &Path) -> Result<BufReader<File>, FileError> {
-    let file = File::open(path).map_err(|source| FileError::Open { path: path.to_owned(), source })?;
-    Ok(BufReader::new(file))
+    open_file(path).map(BufReader::new)
+}
+
+/// A directory can be opened, and not read.
+fn open_file(path: &Path) -> Result<File, FileError> {
+    if path.is_dir() {
+        return Err(directory(path));
+    }
+    File::open(path).map_err(|source| FileError::Open { path: path.to_owned(), source })
+}
+
+fn directory(path: &Path) -> FileError {
+    let source = io::Error::new(io::ErrorKind::IsADirectory, "it is a directory; expected a file");
+    FileError::Open { path: path.to_owned(), source }
 }

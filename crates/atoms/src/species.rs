@@ -37,6 +37,14 @@ impl Species {
         self.element().atomic_weight().into()
     }
 
+    /// Empirical radius (Slater), Å: the sum of two is about the distance of bonded neighbours. `None` for noble gases, which
+    /// form no bonds, and where none is known.
+    pub fn radius(self) -> Option<f64> {
+        const NOBLE: [u8; 7] = [2, 10, 18, 36, 54, 86, 118];
+        let radius = self.element().atomic_radius().filter(|_| !NOBLE.contains(&self.0))?;
+        Some(radius.0 / 100.0)
+    }
+
     fn element(self) -> Element {
         // The constructor admits 1 … 118 only, which is what the table holds, in order.
         mendeleev::ALL_ELEMENTS[usize::from(self.0) - 1]
@@ -85,6 +93,13 @@ impl fmt::Debug for Species {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn radii_are_those_of_bonds() {
+        let radius = |symbol: &str| symbol.parse::<Species>().unwrap().radius();
+        assert_eq!((radius("Al"), radius("Si"), radius("H")), (Some(1.25), Some(1.1), Some(0.25)));
+        assert_eq!((radius("He"), radius("Ar"), radius("Cm")), (None, None, None));
+    }
 
     #[test]
     fn every_element_goes_to_its_symbol_and_back() {
