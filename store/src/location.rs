@@ -73,10 +73,17 @@ impl Location {
 impl FromStr for Location {
     type Err = StoreError;
 
-    /// A URL that begins with `postgres://` or `postgresql://`; anything else is a directory.
+    /// A URL that begins with `postgres://` or `postgresql://`; anything else that is no URL is a directory.
     fn from_str(text: &str) -> Result<Self> {
-        if Self::is_server(text) { Ok(Self::Server(text.parse()?)) } else { Ok(Self::Directory(text.into())) }
+        let is_url = text.split_once("://").is_some_and(|(scheme, _)| is_scheme(scheme));
+        if is_url { Ok(Self::Server(text.parse()?)) } else { Ok(Self::Directory(text.into())) }
     }
+}
+
+/// RFC 3986: a letter, then letters, digits, +, - and full stops.
+fn is_scheme(text: &str) -> bool {
+    text.starts_with(|c: char| c.is_ascii_alphabetic())
+        && text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '+' | '-' | '.'))
 }
 
 impl FromStr for ServerUrl {
@@ -84,6 +91,10 @@ impl FromStr for ServerUrl {
 
     fn from_str(url: &str) -> Result<Self> {
         let Parts { shown, plain, schema, has_password } = Parts::of(url)?;
+        if !Location::is_server(url) {
+            let reason = "it must begin with postgres:// (a campaign in a directory has no run.store, and its name no ://)";
+            return Err(StoreError::Url { url: shown, reason: reason.to_owned() });
+        }
         let valid = |c: char| matches!(c, 'a'..='z' | '0'..='9' | '_');
         if schema.is_empty() || schema.len() > LONGEST_SCHEMA || !schema.chars().all(valid) {
             let reason = format!(
