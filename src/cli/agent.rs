@@ -43,7 +43,7 @@ pub struct Agent {
     #[arg(long, value_name = "DIR")]
     tls: Option<PathBuf>,
     /// Serve metrics of this agent for Prometheus at this address of this host, as 127.0.0.1:9465 (docs/metrics.md)
-    #[arg(long, value_name = "ADDRESS")]
+    #[arg(long, value_name = "ADDRESS:PORT", value_parser = web::address)]
     metrics: Option<SocketAddr>,
     #[command(flatten)]
     log: Options,

@@ -18,7 +18,7 @@ pub struct Dashboard {
     #[command(flatten)]
     location: CampaignLocation,
     /// Address of this host; port 0: any that is free
-    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
+    #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:8080", value_parser = web::address)]
     at: SocketAddr,
     #[command(flatten)]
     log: Options,

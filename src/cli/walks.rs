@@ -31,7 +31,7 @@ pub enum Action {
 #[derive(Clone, Debug, PartialEq, clap::Args)]
 pub struct Which {
     /// Numbers of walks, as calmwalk status shows them
-    #[arg(value_name = "WALK", required_unless_present = "all", conflicts_with = "all")]
+    #[arg(value_name = "WALK", required_unless_present = "all", conflicts_with = "all", value_parser = walk)]
     pub walks: Vec<u32>,
     /// Every walk that has more steps to make
     #[arg(long)]
@@ -64,5 +64,13 @@ pub async fn change(location: &Location, action: &Action) -> Result<Vec<String>,
     Ok(match changed.as_slice() {
         [] => vec!["nothing to do: it was so already".to_owned()],
         changed => changed.iter().map(|walk| format!("walk {walk} {state}")).collect(),
+    })
+}
+
+/// The number of a walk, as an argument.
+fn walk(text: &str) -> Result<u32, String> {
+    text.parse().map_err(|_| match text.eq_ignore_ascii_case("all") {
+        true => "every walk is named by --all".to_owned(),
+        false => "expected the number of a walk, as calmwalk status shows it, or --all".to_owned(),
     })
 }

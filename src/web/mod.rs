@@ -25,11 +25,23 @@ use crate::output::{say, show};
 #[derive(Debug, clap::Args)]
 pub struct Addresses {
     /// Show the campaign in a browser at this address of this host, as 127.0.0.1:8080 (docs/dashboard.md)
-    #[arg(long, value_name = "ADDRESS")]
+    #[arg(long, value_name = "ADDRESS:PORT", value_parser = address)]
     dashboard: Option<SocketAddr>,
     /// Serve metrics for Prometheus at this address of this host, as 127.0.0.1:9464 (docs/metrics.md)
-    #[arg(long, value_name = "ADDRESS")]
+    #[arg(long, value_name = "ADDRESS:PORT", value_parser = address)]
     metrics: Option<SocketAddr>,
+}
+
+/// An address to serve on, as an argument.
+pub fn address(text: &str) -> Result<SocketAddr, String> {
+    let of_this_host = text.strip_prefix("localhost:").map(|port| format!("127.0.0.1:{port}"));
+    of_this_host.as_deref().unwrap_or(text).parse().map_err(|_| {
+        let example = match text.trim_start_matches(':').parse::<u16>() {
+            Ok(port) => format!("127.0.0.1:{port}"),
+            Err(_) => "127.0.0.1:8080".to_owned(),
+        };
+        format!("expected ADDRESS:PORT, as {example}")
+    })
 }
 
 /// The same, held.
@@ -130,4 +142,21 @@ pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<Server, Fa
     let address = listener.local_addr().map_err(Failure::failed)?;
     say(format_args!("metrics at http://{address}/metrics"));
     Ok(Server::start(listener, router))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_are_told_from_ports() {
+        assert_eq!(address("127.0.0.1:8080"), Ok(([127, 0, 0, 1], 8080).into()));
+        assert_eq!(address("localhost:8080"), address("127.0.0.1:8080"));
+        for text in ["9464", ":9464"] {
+            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, as 127.0.0.1:9464");
+        }
+        for text in ["", "host", "host:8080", "127.0.0.1", "127.0.0.1:99999"] {
+            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, as 127.0.0.1:8080", "{text}");
+        }
+    }
 }
