@@ -1,6 +1,7 @@
 //! Everything that a configuration names, loaded and checked: what `validate` does and `run` begins with.
 
 mod load;
+mod seeds;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,11 +16,13 @@ use store::Protocol;
 use wire::{CampaignId, ContentHash};
 use workers::settings::{GuardSettings, WalkSettings};
 
-use crate::config::{Config, ConfigError, LabelMethod, without_changeable};
+use crate::config::{Config, ConfigError, LabelMethod, Loaded, Warning, without_changeable};
 use crate::labelling::resolved_method;
 use crate::outcome::Failure;
+use crate::output::warn;
 use crate::setup::MethodSetup;
 use load::Loader;
+pub use load::check_sound;
 
 /// Keys that name files: a campaign depends on what is in them, not on where they are.
 const FILE_KEYS: [&str; 4] =
@@ -45,6 +48,8 @@ pub struct Campaign {
     pub protocol: Protocol,
     /// Name and hash of every file whose content must not change.
     pub file_hashes: Vec<(String, String)>,
+    /// What is possible but hardly meant.
+    pub warnings: Vec<Warning>,
 }
 
 /// A seed structure and where it came from.
@@ -57,14 +62,24 @@ pub struct NamedSeed {
 
 impl Campaign {
     /// Reads a configuration and every file that it names.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the configuration; else what is wrong with the files, of each key the first.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
-        let (config, text) = Config::load(path)?;
+        let Loaded { config, text, mut warnings } = Config::load(path)?;
         let loader = Loader { path, text: &text, config: &config };
         let model = loader.model()?;
-        let artifact = loader.artifact(&model)?;
-        let seeds = loader.seeds(&model)?;
-        let training = loader.training_frames(&model, &artifact.mixture)?;
-        let (protocol, mut file_hashes) = loader.protocol(&seeds)?;
+        let grades = loader.artifact(&model).and_then(|artifact| {
+            let training = loader.training_frames(&model, &artifact.mixture)?;
+            Ok((artifact, training))
+        });
+        let labels = loader.seeds(&model).and_then(|seeds| {
+            let protocol = loader.protocol(&seeds)?;
+            Ok((seeds, protocol))
+        });
+        let ((artifact, training), (seeds, (protocol, mut file_hashes))) = both(path, grades, labels)?;
+        warnings.extend(loader.doubtful_grades(&model, &artifact, &seeds, training.as_ref())?);
+        warnings.extend(loader.doubtful_seeds(&seeds, &model));
         file_hashes.insert(0, loader.hash("potential.model", &config.potential.model)?);
         let others = [
             ("calm.artifact", &config.calm.artifact),
@@ -74,7 +89,12 @@ impl Campaign {
             file_hashes.extend(file.as_ref().map(|file| loader.hash(key, file)).transpose()?);
         }
         let path = path.to_owned();
-        Ok(Self { config, path, text, model, artifact, seeds, training, protocol, file_hashes })
+        Ok(Self { config, path, text, model, artifact, seeds, training, protocol, file_hashes, warnings })
+    }
+
+    /// Prints the warnings on the standard error and in the log.
+    pub fn print_warnings(&self) {
+        self.warnings.iter().for_each(warn);
     }
 
     /// How labels are made.
@@ -216,6 +236,19 @@ impl Campaign {
     /// What the selector needs of the configuration.
     pub fn selector_settings(&self) -> selector::Settings {
         selector_settings(&self.config)
+    }
+}
+
+/// Both, or what is wrong with either.
+fn both<A, B>(
+    path: &Path,
+    a: Result<A, ConfigError>,
+    b: Result<B, ConfigError>,
+) -> Result<(A, B), ConfigError> {
+    match (a, b) {
+        (Ok(a), Ok(b)) => Ok((a, b)),
+        (Err(error), Ok(_)) | (Ok(_), Err(error)) => Err(error),
+        (Err(a), Err(b)) => Err(ConfigError::Several { path: path.to_owned(), errors: vec![a, b] }),
     }
 }
 

@@ -141,7 +141,8 @@ mod tests {
     #[test]
     fn another_file_is_no_configuration_of_the_campaign() {
         let first = origin("/no/first/campaign.toml", "a", "/no/first/campaign");
-        let compare = |now: &Origin, holds_campaign, exists: bool| first.compare(now, holds_campaign, |_| exists);
+        let compare =
+            |now: &Origin, holds_campaign, exists: bool| first.compare(now, holds_campaign, |_| exists);
         let second = origin("/no/second/campaign.toml", "a", "/no/first/campaign");
         assert_eq!(compare(&first, true, true), Match::Same);
         assert_eq!(compare(&second, true, true), Match::Other, "the content does not tell files apart");
@@ -150,7 +151,11 @@ mod tests {
         assert_eq!(compare(&edited, true, false), Match::Other);
         let together = origin("/no/second/campaign.toml", "b", "/no/second/campaign");
         assert_eq!(compare(&together, true, true), Match::MovedTogether);
-        assert_eq!(compare(&together, false, true), Match::Other, "a server holds the campaign of both copies");
+        assert_eq!(
+            compare(&together, false, true),
+            Match::Other,
+            "a server holds the campaign of both copies"
+        );
     }
 
     #[test]

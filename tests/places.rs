@@ -46,10 +46,13 @@ fn campaigns_of_init_do_not_meet() {
     assert_eq!(entries, 2, "nothing was left in the working directory");
 
     // Every command takes the directory that `init` made.
-    for command in [&["status"][..], &["errors"], &["report", "--output", "page"], &["walks"], &["store", "check"]] {
+    for command in
+        [&["status"][..], &["errors"], &["report", "--output", "page"], &["walks"], &["store", "check"]]
+    {
         let arguments = command.iter().copied();
         let last = if command == ["walks"] { &["resume", "--all"][..] } else { &[] };
-        let (words, options): (Vec<_>, Vec<_>) = arguments.partition(|word| !word.starts_with("--") && *word != "page");
+        let (words, options): (Vec<_>, Vec<_>) =
+            arguments.partition(|word| !word.starts_with("--") && *word != "page");
         succeed(here, words.into_iter().chain(["second"]).chain(options).chain(last.iter().copied()));
     }
     assert!(succeed(here, ["plan", "first/campaign.toml", "--like", "second"]).contains("newest label"));
@@ -101,10 +104,10 @@ fn a_campaign_refuses_the_configuration_of_another() {
     run(here, &["second/campaign.toml", "--directory", "shared"]);
     assert!(refuse(here, both("first/campaign.toml")).contains("is 'second', which belongs to another"));
     let found = status(here, "shared");
-    assert_eq!((&found["name"], &found["configuration"]["began_with"]["path"]), (
-        &"second".into(),
-        &first.display().to_string().into()
-    ));
+    assert_eq!(
+        (&found["name"], &found["configuration"]["began_with"]["path"]),
+        (&"second".into(), &first.display().to_string().into())
+    );
 }
 
 #[test]
@@ -134,7 +137,9 @@ fn a_campaign_in_the_working_directory_is_not_begun_anew() {
     run(here, &["first/campaign.toml", "--directory", "campaign"]);
     forget_the_configuration(&here.join("campaign"));
     let message = refuse(here, ["run", "first/campaign.toml"]);
-    for words in ["is in ./campaign", "with --directory campaign to go on", "--directory first/campaign to begin"] {
+    for words in
+        ["is in ./campaign", "with --directory campaign to go on", "--directory first/campaign to begin"]
+    {
         assert!(message.contains(words), "{words}: {message}");
     }
     assert!(!here.join("first/campaign").exists());

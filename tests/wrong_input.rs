@@ -51,13 +51,17 @@ fn every_wrong_key_is_named_with_its_line() {
             "ladder = []",
             "expected at least one value, ascending",
         ),
-        (langevin, "thermostat = { langevin = { friction = 0 } }", "walk.thermostat is friction 0; expected"),
+        (
+            langevin,
+            "thermostat = { langevin = { friction = 0 } }",
+            "walk.thermostat.langevin.friction is 0; expected",
+        ),
         (langevin, "thermostat = { langevin = { fricton = 1 } }", "did you mean `friction`?"),
         (langevin, "thermostat = { langvin = { friction = 1 } }", "did you mean `langevin`?"),
         (
             langevin,
             "thermostat = { nose_hoover = { relaxation_time = 100, chain_length = 0 } }",
-            "walk.thermostat is chain_length 0; expected 1 to 100",
+            "walk.thermostat.nose_hoover.chain_length is 0; expected 1 to 100",
         ),
         ("from = 1.0, to = 1.4", "from = 0.0, to = 1.4", "found 0, expected a finite number above 0"),
         (

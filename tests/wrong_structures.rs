@@ -4,9 +4,8 @@ mod common;
 
 use std::fmt::Write;
 
-use common::config;
-use common::desk::{Desk, line};
-use common::succeed;
+use common::desk::{Desk, changed, line};
+use common::{calmwalk, config, stderr, succeed};
 
 const CELL: &str = "Lattice=\"8.4 0 0 0 8.4 0 0 0 8.4\"";
 
@@ -127,14 +126,87 @@ fn other_files_are_refused() {
         "absent.extxyz",
         &[&seeds.at, "absent.extxyz: cannot be opened: No such file"],
     );
-    seeds.desk.refused_with(&seeds.files, ".", &[&seeds.at, "unknown format"]);
+    seeds.desk.refused_with(
+        &seeds.files,
+        ".",
+        &[&seeds.at, ".: cannot be opened: it is a directory; expected a file"],
+    );
+}
+
+#[test]
+fn structures_from_which_nothing_can_be_collected_are_refused() {
+    let seeds = Seeds::new();
+    let two =
+        format!("2\n{} Properties=species:S:1:pos:R:3\nAl 0 0 0\nAl 2.8 0 0\n", CELL.replace("8.4", "5.6"));
+    let words =
+        ":1: the structure has 2 atoms, fewer than the 3 that must be new at once (collect.when.least)";
+    seeds.refused("two.extxyz", two, &[words]);
+    let cluster = good().replace(CELL, "pbc=\"F F F\"");
+    let words =
+        ":1: the structure has no periodic direction, and so no volume for walk.volume_ramp to change";
+    seeds.refused("cluster.extxyz", &cluster, &[words]);
+    // Without a ramp it needs no cell.
+    seeds.desk.write("c.toml", changed(&seeds.files, "cluster.extxyz").replace("volume_ramp = ", "# "));
+    succeed(seeds.desk.path(), ["validate", "c.toml"]);
+}
+
+/// What `validate` warns of, in a valid campaign with these seed structures.
+fn warnings(seeds: &Seeds, name: &str, content: impl AsRef<[u8]>) -> Vec<String> {
+    seeds.desk.write(name, content);
+    seeds.desk.write("c.toml", changed(&seeds.files, name));
+    let output = calmwalk(seeds.desk.path(), ["validate", "c.toml"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    stderr(&output).lines().map(str::to_owned).collect()
+}
+
+#[test]
+fn the_same_structure_twice_is_warned_of() {
+    let seeds = Seeds::new();
+    let other = good().replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 2.81");
+    // Other digits, the same structure.
+    let again = good().replace("Al 2.8 2.8 2.8", "Al 2.80000001 2.8 2.8");
+    let found = warnings(&seeds, "three.extxyz", format!("{}{other}{again}", good()));
+    let [warning] = found.as_slice() else { panic!("{found:?}") };
+    let words = "seed structure 'three-2' (three.extxyz:59) is the same as 'three-0' (three.extxyz:1)";
+    assert!(warning.starts_with(&format!("WARNING: {}", seeds.at)) && warning.contains(words), "{warning}");
+}
+
+#[test]
+fn lengths_in_bohr_are_warned_of() {
+    let seeds = Seeds::new();
+    let scaled = |factor: f64| {
+        let mut text = format!(
+            "27\n{} Properties=species:S:1:pos:R:3\n",
+            CELL.replace("8.4", &(8.4 * factor).to_string())
+        );
+        for atom in 0..27_u8 {
+            let [x, y, z] = [atom / 9, atom / 3 % 3, atom % 3].map(|place| 2.8 * factor * f64::from(place));
+            writeln!(text, "Al {x} {y} {z}").unwrap();
+        }
+        text
+    };
+    assert_eq!(warnings(&seeds, "angstrom.extxyz", scaled(1.0)), [""; 0]);
+    for (factor, words) in [
+        (
+            1.8897,
+            "nearest neighbours are 5.29 Å apart, 2.12 times the sum of their radii, at 0.30 g/cm³: are positions and cell in Bohr?",
+        ),
+        (0.5292, "nearest neighbours are 1.48 Å apart, 0.59 times the sum of their radii"),
+    ] {
+        let found = warnings(&seeds, "bohr.extxyz", scaled(factor));
+        let [warning] = found.as_slice() else { panic!("{found:?}") };
+        assert!(
+            warning.contains("seed structure 'bohr-0' (bohr.extxyz:1): ") && warning.contains(words),
+            "{warning}"
+        );
+    }
 }
 
 #[test]
 fn the_good_structure_is_good() {
     let seeds = Seeds::new();
     seeds.desk.write("good.extxyz", good());
-    seeds.desk.write("c.toml", common::desk::changed(&seeds.files, "good.extxyz"));
+    seeds.desk.write("c.toml", changed(&seeds.files, "good.extxyz"));
     let valid = succeed(seeds.desk.path(), ["validate", "c.toml"]);
     assert!(valid.contains("seed structures  1, of 27 to 27 atoms"), "{valid}");
 }

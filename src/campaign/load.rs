@@ -3,20 +3,32 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use atoms::{NeighbourList, Structure, extxyz, read_structures, shortest_distance};
+use atoms::{NeighbourList, Structure, read_structures};
+use calm::watch::grade_distribution;
 use calm::{Artifact, ArtifactError, Mixture};
-use orchestrator::selector::{SeedStructure, TrainingFrames};
+use orchestrator::selector::TrainingFrames;
 use potentials::grace::{Grace, GraceModel, RadialPath};
 use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
 
 use super::NamedSeed;
-use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, place, place_of_offset};
+use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
 use crate::labelling::{self, REFERENCE_FILE};
 
 /// Atoms of training frames whose grades are watched, at most: enough for the share above 1 to a percent.
 const WATCHED_ATOMS: usize = 4000;
+
+/// Atoms of seed structures whose grades are looked at.
+const GRADED_ATOMS: usize = 256;
+
+/// A mixture under which γ is less than this everywhere knows everything, and so nothing.
+const NO_GRADE: f64 = 1e-3;
+
+/// Fresh mixtures leave 2 to 9 % of their training atoms above 1.
+const DOUBTFUL_SHARE: f64 = 0.25;
+
+const TRAINING_FRAMES: &str = "calm.training_frames";
 
 /// What to do about a mixture without scatter matrices and counts.
 const NO_UPDATES: &str = "no scatter matrices and counts, so its mixture can be scored with but not updated; give the \
@@ -64,7 +76,11 @@ impl Loader<'_> {
         let model_file = &self.config.potential.model;
         let export = Artifact::load_export(model_file.get_ref())
             .map_err(|error| self.wrong("potential.model", model_file, error))?;
-        let Some(file) = &self.config.calm.artifact else { return Ok(export) };
+        let Some(file) = &self.config.calm.artifact else {
+            check_sound(&export, model_file.get_ref())
+                .map_err(|message| self.wrong("potential.model", model_file, message))?;
+            return Ok(export);
+        };
         let path = file.get_ref();
         let wrong = |message: String| self.wrong("calm.artifact", file, message);
         let artifact = Artifact::load(path).map_err(|error| wrong(why_no_artifact(path, &error)))?;
@@ -72,83 +88,80 @@ impl Loader<'_> {
         artifact.check_belongs_to(&symbols, &export.projection).map_err(|error| {
             wrong(format!("{}: {error} ({})", path.display(), model_file.get_ref().display()))
         })?;
+        check_sound(&artifact, path).map_err(wrong)?;
         Ok(artifact)
     }
 
-    /// Every frame of every file, by a name of its own.
-    pub fn seeds(&self, model: &GraceModel) -> Result<Vec<NamedSeed>, ConfigError> {
-        let mut seeds: Vec<NamedSeed> = Vec::new();
-        for file in &self.config.seeds.files {
-            let path = file.get_ref();
-            let wrong = |message: String| self.wrong("seeds.files", file, message);
-            let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            let frames = read_structures(path).map_err(|error| wrong(error.to_string()))?;
-            for (number, frame) in frames.into_iter().enumerate() {
-                let source = format!("{}:{}", path.display(), frame.line);
-                let named = frame.info.get("name").and_then(extxyz::Value::text).map(str::to_owned);
-                let name = named.unwrap_or_else(|| format!("{stem}-{number}"));
-                self.check_seed(&frame.structure, model)
-                    .map_err(|error| wrong(format!("{source}: {error}")))?;
-                if let Some(first) = seeds.iter().find(|other| other.seed.name == name) {
-                    return Err(wrong(format!(
-                        "{source}: a second seed structure named '{name}', the first is {}; give each a name of its \
-                         own (name=… in its comment line)",
-                        first.source
-                    )));
-                }
-                seeds.push(NamedSeed { seed: SeedStructure { name, structure: frame.structure }, source });
-            }
-        }
-        Ok(seeds)
-    }
-
-    /// A walk must be able to start: elements that the model knows, no atom on top of another, none out of reach of
-    /// all others.
-    fn check_seed(&self, structure: &Structure, model: &GraceModel) -> Result<(), String> {
-        structure.validate().map_err(|error| error.to_string())?;
-        model.element_indices(&structure.species).map_err(|error| error.to_string())?;
-        let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
-        neighbours.update(structure).map_err(|error| error.to_string())?;
-        let least = self.config.guard.least_distance.get();
-        if let Some((i, j, d)) = shortest_distance(structure, &neighbours).filter(|(_, _, d)| *d < least) {
-            return Err(format!(
-                "atoms {i} and {j} are {d:.3} Å apart, closer than guard.least_distance = {least} Å: no walk can start \
-                 here"
-            ));
-        }
-        let alone = (0..structure.len()).find(|i| structure.len() > 1 && neighbours.of(*i).is_empty());
-        alone.map_or(Ok(()), |atom| {
-            let cutoff = model.cutoff();
-            Err(format!("atom {atom} has no neighbour within the cutoff, {cutoff} Å: a walk would end at its first step"))
-        })
-    }
-
-    /// Features of the training frames, evenly thinned to [`WATCHED_ATOMS`].
+    /// Features of the training frames, evenly thinned to [`WATCHED_ATOMS`]. Most of them must have 0.001 < γ < 1.
     pub fn training_frames(
         &self,
         model: &Arc<GraceModel>,
         original: &Mixture,
     ) -> Result<Option<TrainingFrames>, ConfigError> {
         let Some(file) = &self.config.calm.training_frames else { return Ok(None) };
-        let wrong = |message: String| self.wrong("calm.training_frames", file, message);
+        let wrong = |message: String| self.wrong(TRAINING_FRAMES, file, message);
         let frames = read_structures(file.get_ref()).map_err(|error| wrong(error.to_string()))?;
         let atoms: usize = frames.iter().map(|frame| frame.structure.len()).sum();
         let every = atoms.div_ceil(WATCHED_ATOMS);
-        let mut grace = Grace::new(Arc::clone(model));
-        let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
-        let (mut elements, mut features) = (Vec::new(), Vec::new());
+        let mut features = Features::of(model);
         for frame in frames.iter().step_by(every) {
-            let mut evaluate = || -> Result<Vec<usize>, String> {
-                neighbours.update(&frame.structure).map_err(|error| error.to_string())?;
-                grace.forward(&frame.structure, &neighbours).map_err(|error| error.to_string())?;
-                model.element_indices(&frame.structure.species).map_err(|error| error.to_string())
-            };
-            let of_frame = evaluate();
             let place = || format!("{}:{}", file.get_ref().display(), frame.line);
-            elements.extend(of_frame.map_err(|error| wrong(format!("{}: {error}", place())))?);
-            features.extend_from_slice(grace.features());
+            features.add(&frame.structure).map_err(|error| wrong(format!("{}: {error}", place())))?;
         }
-        TrainingFrames::new(elements, features, original).map(Some).map_err(|error| wrong(error.to_string()))
+        let training = TrainingFrames::new(features.elements, features.values, original)
+            .map_err(|error| wrong(error.to_string()))?;
+        let median = training.original.median;
+        if !(NO_GRADE..=1.0).contains(&median) {
+            return Err(wrong(format!(
+                "{}: the median of γ is {median:.3e} under the mixture as it begins; expected {NO_GRADE} to 1: either \
+                 these are not the frames that the mixture was built from, or its covariances or thresholds are wrong",
+                file.get_ref().display()
+            )));
+        }
+        Ok(Some(training))
+    }
+
+    /// What is doubtful about the grades at the start.
+    pub fn doubtful_grades(
+        &self,
+        model: &Arc<GraceModel>,
+        artifact: &Artifact,
+        seeds: &[NamedSeed],
+        training: Option<&TrainingFrames>,
+    ) -> Result<Option<Warning>, ConfigError> {
+        if let (Some(training), Some(file)) = (training, &self.config.calm.training_frames) {
+            let share = training.original.share_above_one;
+            return Ok((share > DOUBTFUL_SHARE).then(|| {
+                let percent = 100.0 * share;
+                let message = format!(
+                    "{percent:.0} % of the atoms have γ > 1 under the mixture as it begins, where 2 to 9 % are usual: \
+                     are these the frames that the mixture was built from?"
+                );
+                self.warning(TRAINING_FRAMES, file, message)
+            }));
+        }
+        let file = self.config.calm.artifact.as_ref().unwrap_or(&self.config.potential.model);
+        let key = if self.config.calm.artifact.is_some() { "calm.artifact" } else { "potential.model" };
+        let wrong = |message: String| self.wrong(key, file, message);
+        let mut features = Features::of(model);
+        for named in seeds {
+            let of_seed =
+                |error| wrong(format!("seed structure '{}' ({}): {error}", named.seed.name, named.source));
+            features.add(&named.seed.structure).map_err(of_seed)?;
+            if features.elements.len() >= GRADED_ATOMS {
+                break;
+            }
+        }
+        let grades = grade_distribution(&artifact.mixture, &features.elements, &features.values)
+            .map_err(|error| wrong(error.to_string()))?;
+        Ok((grades.median < NO_GRADE).then(|| {
+            let message = format!(
+                "the median of γ over the seed structures is {:.1e}, where 0.1 to 2 is usual: with such a mixture nothing \
+                 is ever collected",
+                grades.median
+            );
+            self.warning(key, file, message)
+        }))
     }
 
     /// How labels are made, and the hashes of files by which they are made.
@@ -207,10 +220,54 @@ impl Loader<'_> {
         Ok((key.to_owned(), blake3::hash(&bytes).to_string()))
     }
 
-    fn wrong(&self, key: &str, file: &Spanned<PathBuf>, message: impl ToString) -> ConfigError {
+    pub(super) fn wrong(&self, key: &str, file: &Spanned<PathBuf>, message: impl ToString) -> ConfigError {
         let at = place_of_offset(self.path, self.text, file.span().start);
         ConfigError::File { at, key: key.to_owned(), message: message.to_string() }
     }
+
+    pub(super) fn warning(&self, key: &str, file: &Spanned<PathBuf>, message: String) -> Warning {
+        Warning { at: place_of_offset(self.path, self.text, file.span().start), key: key.to_owned(), message }
+    }
+}
+
+/// Features of one structure after another.
+struct Features {
+    grace: Grace,
+    neighbours: NeighbourList,
+    /// Element index of each atom.
+    elements: Vec<usize>,
+    /// [atoms × D]
+    values: Vec<f64>,
+}
+
+impl Features {
+    fn of(model: &Arc<GraceModel>) -> Self {
+        let (grace, neighbours) = (Grace::new(Arc::clone(model)), NeighbourList::new(model.cutoff(), 0.0));
+        Self { grace, neighbours, elements: Vec::new(), values: Vec::new() }
+    }
+
+    fn add(&mut self, structure: &Structure) -> Result<(), String> {
+        self.neighbours.update(structure).map_err(|error| error.to_string())?;
+        self.grace.forward(structure, &self.neighbours).map_err(|error| error.to_string())?;
+        let elements = self.grace.model().element_indices(&structure.species);
+        self.elements.extend(elements.map_err(|error| error.to_string())?);
+        self.values.extend_from_slice(self.grace.features());
+        Ok(())
+    }
+}
+
+/// Refuses an artifact whose numbers no training data can have made.
+pub fn check_sound(artifact: &Artifact, path: &Path) -> Result<(), String> {
+    let faults = artifact.unsound_components();
+    let Some(first) = faults.first() else { return Ok(()) };
+    let more = match faults.len() - 1 {
+        0 => String::new(),
+        more => format!(" (and {more} more: calmwalk calm info {})", path.display()),
+    };
+    Err(format!(
+        "{}: {first}{more}; build the artifact again, or copy it again from where it was built",
+        path.display()
+    ))
 }
 
 /// What is wrong with an artifact; an export, and an artifact stripped of its statistics, are mistaken for one easily.

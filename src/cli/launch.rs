@@ -105,7 +105,7 @@ impl Launch {
         let directory = self.directory()?;
         let slurm = Slurm::with_patience(PATIENCE);
         if self.stop {
-            let (config, _) = Config::load(&self.config)?;
+            let config = Config::load(&self.config)?.config;
             let names = job_names(&config.location(&directory)?);
             block_on(self.stop(&slurm, &names))??;
         } else {

@@ -80,8 +80,11 @@ pub async fn refuse_if_kept_elsewhere(campaign: &Campaign, directory: &Path) -> 
     }
     // What cannot be read is no reason not to begin elsewhere.
     let Ok(store) = Store::open_read_only(&earlier).await else { return Ok(()) };
-    let in_force: Option<Value> =
-        store.campaign().await.ok().and_then(|found| serde_json::from_str(&found.configuration_in_force).ok());
+    let in_force: Option<Value> = store
+        .campaign()
+        .await
+        .ok()
+        .and_then(|found| serde_json::from_str(&found.configuration_in_force).ok());
     let found = Origin::of(&store).await.ok().flatten();
     store.close().await;
     let is_own = match found {

@@ -71,6 +71,7 @@ impl Run {
     pub fn run(self) -> Result<Ended, Failure> {
         self.log.begin("orchestrator")?;
         let campaign = Campaign::load(&self.config)?;
+        campaign.print_warnings();
         let directory = match self.directory {
             Some(directory) => directory,
             None => {

@@ -11,6 +11,9 @@ use crate::forecast::Forecast;
 use crate::output::print;
 
 /// Check a configuration and every file that it names
+///
+/// Everything that is wrong is told at once, with file, line and key: exit code 2. What is possible but hardly meant is a warning on
+/// the standard error, which changes nothing about the exit code.
 #[derive(Debug, clap::Args)]
 pub struct Validate {
     /// Configuration of a campaign
@@ -21,6 +24,7 @@ pub struct Validate {
 impl Validate {
     pub fn run(self) -> Result<Ended, Failure> {
         let campaign = Campaign::load(&self.config)?;
+        campaign.print_warnings();
         print(|out| write(out, &self.config, &campaign))?;
         Ok(Ended::Done)
     }
@@ -44,5 +48,9 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()
     }
     writeln!(out, "  seed structures  {}, of {least} to {most} atoms", seeds.len())?;
     writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)?;
-    writeln!(out, "  disk             {}", Forecast::of(campaign))
+    writeln!(out, "  disk             {}", Forecast::of(campaign))?;
+    match campaign.warnings.len() {
+        0 => writeln!(out, "  warnings         none"),
+        count => writeln!(out, "  warnings         {count}: see above"),
+    }
 }

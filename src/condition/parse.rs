@@ -3,11 +3,28 @@
 use atoms::Species;
 
 use super::{Comparison, Condition, Number, Text};
+use crate::config::nearest;
 
 /// Parentheses and `not` inside each other, at most: each takes some of the stack.
 const DEEPEST: usize = 100;
 
 const KINDS: [&str; 3] = ["biased", "control", "imported"];
+
+/// What else a quantity may be called.
+const SYNONYMS: [(&str, &str); 12] = [
+    ("gamma_max", "gamma"),
+    ("grade", "gamma"),
+    ("natoms", "atoms"),
+    ("n_atoms", "atoms"),
+    ("force", "max_force"),
+    ("forces", "max_force"),
+    ("fmax", "max_force"),
+    ("species", "element"),
+    ("origin", "kind"),
+    ("v", "volume"),
+    ("t", "temperature"),
+    ("version", "mixture_version"),
+];
 
 /// A text that is no condition.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -76,7 +93,13 @@ fn tokens(text: &str) -> Result<Vec<(usize, Token)>, ConditionError> {
             let word: String = rest.iter().take_while(of_word).collect();
             if word.is_empty() {
                 let found = format!("'{character}'");
-                let expected = "a name, a number, a comparison or a parenthesis".to_owned();
+                let word = match character {
+                    '&' => "; conditions are joined by the word 'and'",
+                    '|' => "; conditions are joined by the word 'or'",
+                    '!' | '~' => "; the opposite is said by the word 'not'",
+                    _ => "",
+                };
+                let expected = format!("a name, a number, a comparison or a parenthesis{word}");
                 return Err(ConditionError { position: at + 1, found, expected });
             }
             let length = word.chars().count();
@@ -168,7 +191,7 @@ impl Parser {
             return Ok(Condition::Number(*column, comparison, self.number()?));
         }
         let Some((column, _)) = Text::ALL.iter().find(|(_, known)| *known == name) else {
-            return Err(self.wrong(names()));
+            return Err(self.wrong(format!("{}{}", names(), hint(&name, all_names()))));
         };
         self.take();
         let wanted = match self.peek() {
@@ -213,7 +236,8 @@ impl Parser {
                 return Err(self.wrong("the symbol of an element, as Mo"));
             }
             Text::Kind if !KINDS.contains(&text.as_str()) => {
-                return Err(self.wrong(KINDS.join(", ").replace(", imported", " or imported")));
+                let kinds = KINDS.join(", ").replace(", imported", " or imported");
+                return Err(self.wrong(format!("{kinds}{}", hint(&text, KINDS.into_iter()))));
             }
             _ => {}
         }
@@ -222,8 +246,20 @@ impl Parser {
     }
 }
 
+fn all_names() -> impl Iterator<Item = &'static str> + Clone {
+    Number::ALL.iter().map(|(_, name)| *name).chain(Text::ALL.iter().map(|(_, name)| *name))
+}
+
 fn names() -> String {
-    let numbers = Number::ALL.iter().map(|(_, name)| *name);
-    let all: Vec<_> = numbers.chain(Text::ALL.iter().map(|(_, name)| *name)).collect();
-    format!("'not', '(' or one of {}", all.join(", "))
+    format!("'not', '(' or one of {}", all_names().collect::<Vec<_>>().join(", "))
+}
+
+/// The name that was meant, if one is near.
+fn hint<'a>(found: &str, names: impl Iterator<Item = &'a str> + Clone) -> String {
+    let synonym =
+        SYNONYMS.iter().find(|(other, _)| *other == found.to_ascii_lowercase()).map(|(_, name)| *name);
+    match synonym.or_else(|| nearest(found, names)) {
+        Some(name) => format!("; did you mean '{name}'?"),
+        None => String::new(),
+    }
 }

@@ -9,8 +9,10 @@ use serde_json::{Value, json};
 
 use super::Config;
 use super::changes::differences;
+use super::ranges::{RANGES, Range, shown};
 
-const CAMPAIGNS: [&str; 3] = ["aluminium.toml", "silicon.toml", "foundation-expansion.toml"];
+const CAMPAIGNS: [&str; 4] =
+    ["aluminium.toml", "silicon.toml", "silicon-dft.toml", "foundation-expansion.toml"];
 
 fn read(path: &str) -> String {
     std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()
@@ -21,7 +23,7 @@ fn resolved(text: &str) -> Value {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("c.toml");
     std::fs::write(&path, text).unwrap();
-    let (mut config, _) = Config::load(&path).unwrap();
+    let mut config = Config::load(&path).unwrap().config;
     config.seeds.files.truncate(1);
     let text = serde_json::to_string(&config).unwrap();
     serde_json::from_str(&text.replace(&directory.path().display().to_string(), "")).unwrap()
@@ -33,6 +35,10 @@ fn keys(text: &str) -> Vec<(String, String, bool, usize)> {
     for (number, line) in text.lines().enumerate() {
         if let Some(header) = line.strip_prefix('[').and_then(|rest| rest.split(']').next()) {
             section = header.to_owned();
+            // A table of its own is a key of the table above.
+            let above =
+                header.split_once('.').map(|(above, key)| (above, key.split('.').next().unwrap_or(key)));
+            keys.extend(above.map(|(above, key)| (above.to_owned(), key.to_owned(), false, number)));
         }
         let (commented, rest) = line.strip_prefix("# ").map_or((false, line), |rest| (true, rest));
         let name = rest.split_once(" = ").map(|(name, _)| name);
@@ -122,6 +128,33 @@ fn the_reference_describes_every_key() {
         let described: BTreeSet<_> =
             rows.map(|key| key.split('.').next().unwrap_or(key).to_owned()).collect();
         assert_eq!(described, keys, "docs/configuration.md: [{section}]");
+    }
+}
+
+#[test]
+fn the_reference_has_every_range() {
+    let text = read("docs/configuration.md");
+    let chapter = text.split("\n## Usual numbers").nth(1).unwrap().split("\n## ").next().unwrap();
+    let rows: Vec<_> = chapter.lines().filter(|line| line.starts_with("| `")).collect();
+    let expected: Vec<_> = RANGES
+        .iter()
+        .map(|Range { key, unit, possible, usual, .. }| {
+            let [[least, most], [from, to]] = [possible, usual].map(|bounds| bounds.map(shown));
+            let possible =
+                if possible[0] > 0.0 { format!("{least} to {most}") } else { format!("at most {most}") };
+            format!("| `{key}` | {unit} | {possible} | {from} to {to} |").replace("|  |", "| |")
+        })
+        .collect();
+    assert_eq!(rows, expected);
+}
+
+#[test]
+fn every_range_is_that_of_a_key() {
+    let sections: std::collections::BTreeMap<_, _> = all_keys().into_iter().collect();
+    for Range { key, .. } in &RANGES {
+        let mut parts = key.split('.');
+        let (section, key) = (parts.next().unwrap(), parts.next().unwrap());
+        assert!(sections[section].contains(key), "{section}.{key}");
     }
 }
 

@@ -1,14 +1,18 @@
 //! What is wrong with a configuration, and where.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use super::check::Wrong;
+use toml::de::DeTable;
+
+use super::document;
+use super::hints::Unknown;
 
 /// Why a configuration cannot be used: exit code 2.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// A file that cannot be read.
-    #[error("cannot read {}: {source}", path.display())]
+    #[error("cannot read {}: {source}{}", path.display(), what_instead(path))]
     Read {
         /// The file.
         path: PathBuf,
@@ -53,20 +57,53 @@ pub enum ConfigError {
         /// What is wrong with the file.
         message: String,
     },
+    /// Several of these.
+    #[error("{} errors in {}:\n{}", errors.len(), path.display(), lines(errors))]
+    Several {
+        /// The file.
+        path: PathBuf,
+        /// In the order of the file.
+        errors: Vec<ConfigError>,
+    },
+}
+
+fn lines(errors: &[ConfigError]) -> String {
+    errors.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n")
+}
+
+/// The directory that `init` makes is taken for its configuration easily.
+fn what_instead(path: &Path) -> String {
+    let inside = path.join("campaign.toml");
+    if inside.is_file() { format!("; did you mean {}?", inside.display()) } else { String::new() }
 }
 
 impl ConfigError {
-    /// A wrong value in the configuration of that text.
-    pub(super) fn value(path: &Path, text: &str, (key, found, expected): Wrong) -> Self {
-        Self::Value { at: place(path, text, key), key: key.to_owned(), found, expected }
+    /// All of these, each with where it stands; `None` if there are none.
+    pub fn all(path: &Path, problems: Vec<(usize, Self)>) -> Option<Self> {
+        let mut errors: Vec<_> = problems.into_iter().map(|(_, error)| error).collect();
+        match errors.len() {
+            0 | 1 => errors.pop(),
+            _ => Some(Self::Several { path: path.to_owned(), errors }),
+        }
     }
 
-    /// The place of a TOML error in plain words, with a suggestion for an unknown key.
-    pub(crate) fn parse(path: &Path, text: &str, error: &toml::de::Error) -> Self {
-        let (line, column) = error.span().map_or((1, 1), |span| line_and_column(text, span.start));
+    /// A file of which nothing could be read.
+    pub(crate) fn unreadable(path: &Path) -> Self {
+        Self::Parse { at: path.display().to_string(), message: "expected a configuration".to_owned() }
+    }
+
+    /// What is wrong at a place of a file, with its line. `key` is the dotted key that it is about, if the message does not say.
+    pub(super) fn parse(
+        path: &Path,
+        text: &str,
+        span: Option<Range<usize>>,
+        message: String,
+        key: &str,
+    ) -> Self {
+        let (line, column) = span.map_or((1, 1), |span| line_and_column(text, span.start));
         let at = format!("{}:{line}:{column}", path.display());
         let shown = text.lines().nth(line - 1).unwrap_or_default().trim();
-        let mut message = in_plain_words(error);
+        let mut message = if key.is_empty() { message } else { format!("{key}: {message}") };
         // What the whole file lacks has no line of its own.
         let of_whole = (line, column) == (1, 1) && message.starts_with("missing");
         if !(shown.is_empty() || of_whole) {
@@ -89,14 +126,14 @@ pub fn read_text(path: &Path) -> Result<String, ConfigError> {
 /// What is wrong with TOML, with a suggestion for an unknown key.
 pub fn in_plain_words(error: &toml::de::Error) -> String {
     let message = translated(&error.message().trim().replace('\n', "; "));
-    match suggestion(&message) {
+    match Unknown::of(&message).and_then(|unknown| unknown.nearest()) {
         Some(suggestion) => format!("{message}; did you mean `{suggestion}`?"),
         None => message,
     }
 }
 
 /// The words of the parser, which are those of Rust, in the words of those who write configurations.
-fn translated(message: &str) -> String {
+pub(super) fn translated(message: &str) -> String {
     let words = [
         ("unknown field", "unknown key"),
         ("missing field", "missing key"),
@@ -120,27 +157,13 @@ fn translated(message: &str) -> String {
     }
 }
 
-/// `file:line` of a dotted key; that of its section where it is not written out, or the file alone.
+/// `file:line` of a dotted key; that of the table that should have it where it is not written out, or the file alone.
 pub fn place(path: &Path, text: &str, key: &str) -> String {
-    let (section, name) = key.rsplit_once('.').unwrap_or(("", key));
-    let mut current = "";
-    let mut nearest = path.display().to_string();
-    for (index, line) in text.lines().enumerate() {
-        let line = line.trim();
-        if let Some(header) = line.strip_prefix('[').and_then(|rest| rest.split(']').next()) {
-            current = header.trim();
-            if current == section {
-                nearest = format!("{}:{}", path.display(), index + 1);
-            }
-        }
-        let found = line.split('=').next().map(str::trim);
-        if line.contains('=')
-            && (found == Some(key) && current.is_empty() || found == Some(name) && current == section)
-        {
-            return format!("{}:{}", path.display(), index + 1);
-        }
+    let (table, _) = DeTable::parse_recoverable(text);
+    match document::nearest(table.get_ref(), key) {
+        Some(offset) => place_of_offset(path, text, offset),
+        None => path.display().to_string(),
     }
-    nearest
 }
 
 /// `file:line` of a byte offset.
@@ -148,34 +171,15 @@ pub fn place_of_offset(path: &Path, text: &str, offset: usize) -> String {
     format!("{}:{}", path.display(), line_and_column(text, offset).0)
 }
 
-fn line_and_column(text: &str, offset: usize) -> (usize, usize) {
+pub(super) fn line_and_column(text: &str, offset: usize) -> (usize, usize) {
     let before = text.get(..offset).unwrap_or(text);
     let column = before.rsplit('\n').next().map_or(0, |line| line.chars().count());
     (before.matches('\n').count() + 1, column + 1)
 }
 
-/// The nearest of the names in "unknown key `x`, expected one of `a`, `b`", if one is near.
-fn suggestion(message: &str) -> Option<&str> {
-    let mut names = message.split('`').skip(1).step_by(2);
-    if !message.starts_with("unknown") {
-        return None;
-    }
-    let found = names.next()?;
-    let likeness = |name: &str| strsim::jaro_winkler(found, name);
-    names.max_by(|a, b| likeness(a).total_cmp(&likeness(b))).filter(|name| likeness(name) > 0.7)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn an_unknown_key_gets_the_nearest_name() {
-        let message = "unknown key `temprature`, expected one of `steps`, `temperature`, `tau`";
-        assert_eq!(suggestion(message), Some("temperature"));
-        assert_eq!(suggestion("unknown key `zzz`, expected `steps`"), None);
-        assert_eq!(suggestion("invalid type: string `steps`, expected u64"), None);
-    }
 
     #[test]
     fn keys_are_found_in_their_section() {
@@ -184,5 +188,11 @@ mod tests {
         assert_eq!(place(Path::new("f"), text, "b.y"), "f:3");
         assert_eq!(place(Path::new("f"), text, "c.x"), "f");
         assert_eq!(place_of_offset(Path::new("f"), text, 5), "f:2");
+        let text = "[a]\nb = { c = { d = 1 },\n  e = 2 }\n[a.f.g]\nh = 3\n";
+        for (key, line) in
+            [("a.b.c.d", 2), ("a.b.e", 3), ("a.b.x", 2), ("a.f.g.h", 5), ("a.f.g.x", 4), ("a.x", 1)]
+        {
+            assert_eq!(place(Path::new("f"), text, key), format!("f:{line}"), "{key}");
+        }
     }
 }

@@ -9,6 +9,37 @@ use toml::Spanned;
 
 use super::PotentialFile;
 
+/// Programs that have a calculator of ASE's, and what they are called.
+const THROUGH_ASE: [&str; 27] = [
+    "quantum_espresso",
+    "quantumespresso",
+    "quantum-espresso",
+    "espresso",
+    "qe",
+    "pwscf",
+    "pw",
+    "aims",
+    "fhi_aims",
+    "fhi-aims",
+    "castep",
+    "siesta",
+    "dftb",
+    "dftbplus",
+    "orca",
+    "gaussian",
+    "nwchem",
+    "elk",
+    "exciting",
+    "openmx",
+    "octopus",
+    "turbomole",
+    "psi4",
+    "dmol",
+    "onetep",
+    "mace",
+    "lammps",
+];
+
 /// How labels are made: a table with one key, the name of the method.
 #[derive(Clone, Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -58,7 +89,10 @@ impl<'de> Visitor<'de> for Methods {
         let name: String = map.next_key()?.ok_or_else(|| A::Error::custom("found no label method"))?;
         if name != "reference" && !dft::Settings::NAMES.contains(&name.as_str()) {
             let names = dft::Settings::NAMES.join("`, `");
-            let message = format!("unknown value `{name}`, expected one of `reference`, `{names}`");
+            let mut message = format!("unknown value `{name}`, expected one of `reference`, `{names}`");
+            if THROUGH_ASE.contains(&name.to_ascii_lowercase().as_str()) {
+                message += &format!("; {name} makes labels through `ase`: see docs/dft-codes.md");
+            }
             return Err(A::Error::custom(message));
         }
         if name != "reference" {

@@ -2,14 +2,18 @@
 
 mod changes;
 mod check;
+mod document;
 #[cfg(test)]
 mod documented;
 mod error;
 mod files;
+mod hints;
 mod method;
 #[cfg(test)]
 mod mutated;
 mod notify;
+mod ranges;
+mod warning;
 
 use std::num::{NonZeroU32, NonZeroU64, NonZeroUsize};
 use std::path::{Path, PathBuf};
@@ -25,10 +29,14 @@ use workers::labeller::{BatchSystem, Keep, LabelBounds, LabelGuard, Running};
 use workers::settings::ThermostatKind;
 
 pub use changes::{Change, Refused, changed_keys, compare, without_changeable};
-pub use error::{ConfigError, in_plain_words, place, place_of_offset};
+pub use document::Document;
+pub use error::{ConfigError, in_plain_words, place, place_of_offset, read_text};
 pub use files::{PotentialFile, PotentialKind};
+pub use hints::{KnownKeys, nearest};
 pub use method::LabelMethod;
 pub use notify::{NotifyEvent, NotifySection};
+pub use ranges::impossible;
+pub use warning::Warning;
 
 /// A whole campaign.
 #[derive(Clone, Debug, Deserialize, Serialize)]
@@ -320,16 +328,42 @@ pub struct RunSection {
     pub store: Option<String>,
 }
 
+/// Values that stand in for keys that must be there and are wrong, so that the rest can be read.
+const STAND_INS: &str = r#"
+potential = { model = "-" }
+calm = {}
+seeds = { files = ["-"] }
+walk = { temperature = 300.0, steps = 1, tau = 1.0 }
+collect = { when = { rule = "maximum_grade" }, until = { rule = "maximum_grade" } }
+label = { method = { reference = { kind = "grace", file = "-" } } }
+"#;
+
+/// A configuration as it was read.
+pub struct Loaded {
+    /// The configuration, its paths resolved.
+    pub config: Config,
+    /// Its text.
+    pub text: String,
+    /// What is possible but hardly meant.
+    pub warnings: Vec<Warning>,
+}
+
 impl Config {
-    /// Reads and validates a configuration, and gives its text beside it. Paths in it are taken relative to its own
-    /// directory.
-    pub fn load(path: &Path) -> Result<(Self, String), ConfigError> {
-        let text = error::read_text(path)?;
-        let mut config: Self =
-            toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
+    /// Reads and validates a configuration. Paths in it are taken relative to its own directory.
+    ///
+    /// # Errors
+    /// Everything that is wrong with it.
+    pub fn load(path: &Path) -> Result<Loaded, ConfigError> {
+        let text = read_text(path)?;
+        let mut document = Document::parse(path, &text)?;
+        let config: Option<Self> = document.read(STAND_INS, &Self::known_keys());
+        let warnings = document.check_ranges();
+        document.check_rules(|| config.as_ref().map(check::check).unwrap_or_default());
+        document.finish()?;
+        // What could not be read was noted, and is an error.
+        let mut config = config.ok_or_else(|| ConfigError::unreadable(path))?;
         config.resolve_paths(path.parent().unwrap_or(Path::new("")));
-        config.check().map_err(|wrong| ConfigError::value(path, &text, wrong))?;
-        Ok((config, text))
+        Ok(Loaded { config, text, warnings })
     }
 
     /// Reads the `[label]` section alone, of a configuration that needs no other.
@@ -338,13 +372,34 @@ impl Config {
         struct Labels {
             label: LabelSection,
         }
-        let text = error::read_text(path)?;
-        let Labels { mut label } =
-            toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
+        let text = read_text(path)?;
+        let mut document = Document::parse(path, &text)?;
+        let labels: Option<Labels> = document.read(STAND_INS, &Self::known_keys());
+        document.check_ranges();
+        document
+            .check_rules(|| labels.as_ref().map(|all| check::check_label(&all.label)).unwrap_or_default());
+        document.finish()?;
+        let Labels { mut label } = labels.ok_or_else(|| ConfigError::unreadable(path))?;
         let directory = path.parent().unwrap_or(Path::new(""));
         label.method.paths().into_iter().for_each(|path| *path = directory.join(&*path));
-        check::check_label(&label).map_err(|wrong| ConfigError::value(path, &text, wrong))?;
         Ok(label)
+    }
+
+    /// The keys of each section.
+    fn known_keys() -> KnownKeys {
+        KnownKeys::new()
+            .with::<CampaignSection>("campaign")
+            .with::<PotentialSection>("potential")
+            .with::<CalmSection>("calm")
+            .with::<SeedsSection>("seeds")
+            .with::<WalkSection>("walk")
+            .with::<CollectSection>("collect")
+            .with::<GuardSection>("guard")
+            .with::<LabelSection>("label")
+            .with::<LabelGuard>("label.guard")
+            .with::<BudgetSection>("budget")
+            .with::<RunSection>("run")
+            .with::<NotifySection>("notify")
     }
 
     /// Where the campaign is kept, if `directory` is its directory.
@@ -355,8 +410,8 @@ impl Config {
         }
     }
 
-    /// Checks it as a whole; the first thing that is wrong.
-    pub fn check(&self) -> Result<(), check::Wrong> {
+    /// Checks it as a whole; everything that is wrong.
+    pub fn check(&self) -> Vec<check::Wrong> {
         check::check(self)
     }
 

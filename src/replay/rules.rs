@@ -4,7 +4,7 @@ use std::str::FromStr;
 
 use toml::{Table, Value};
 
-use crate::config::{Config, in_plain_words};
+use crate::config::{Config, impossible, in_plain_words};
 use crate::outcome::Failure;
 
 /// Keys that act on what the selector decides. What they do to walks has been done: those are as they were recorded.
@@ -93,10 +93,14 @@ pub fn configuration(stored: &str, settings: &[Setting]) -> Result<Config, Failu
         put(&mut table, key, value.clone()).map_err(wrong)?;
         config = toml::from_str(&table.to_string()).map_err(|error| wrong(in_plain_words(&error)))?;
     }
-    config.check().map_err(|(key, found, expected)| {
-        Failure::Input(format!("--set: {key} is {found}; expected {expected}"))
-    })?;
-    Ok(config)
+    let set = table.to_string();
+    let mut wrong = impossible(&set).into_iter().chain(config.check());
+    match wrong.next() {
+        Some((key, found, expected)) => {
+            Err(Failure::Input(format!("--set: {key} is {found}; expected {expected}")))
+        }
+        None => Ok(config),
+    }
 }
 
 fn put(table: &mut Table, key: &str, value: Value) -> Result<(), String> {

@@ -1,6 +1,7 @@
 //! Running the program as its users do.
 #![allow(dead_code)] // Each test program uses a part.
 
+pub mod arrays;
 pub mod browser;
 pub mod campaign;
 pub mod clock;

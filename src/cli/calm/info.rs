@@ -82,6 +82,8 @@ struct MixtureInfo {
     density_channels: bool,
     threshold_mode: Option<String>,
     can_be_updated: bool,
+    /// Components that no training data can have made, and why.
+    faults: Vec<String>,
     components: Vec<ComponentInfo>,
 }
 
@@ -216,6 +218,7 @@ impl MixtureInfo {
             density_channels: projection.density_channels,
             threshold_mode: text(archive, "threshold_mode"),
             can_be_updated: mixture.can_be_updated(),
+            faults: artifact.unsound_components().iter().map(ToString::to_string).collect(),
             components: components(symbols, mixture, archive),
         }
     }
@@ -242,6 +245,9 @@ impl MixtureInfo {
             if self.can_be_updated { "yes" } else { "no: without scatter matrices it can only grade" };
         line(out, "can be updated", updates)?;
         line(out, "components", format!("{} for {}", self.components.len(), self.elements.join(" ")))?;
+        for fault in self.faults.iter().take(SHOWN) {
+            line(out, "UNUSABLE", fault)?;
+        }
         writeln!(out)?;
         let mut table =
             Table::new(&["element", ">component", ">θ", ">environments", ">weighted", ">condition"]);

@@ -11,6 +11,7 @@ use npyz::{NpyWriter, WriterBuilder};
 use potentials::grace::GraceModel;
 
 use super::scorer::Scorer;
+use crate::campaign::check_sound;
 use crate::cli::{Ended, Failure};
 use crate::frames::Frames;
 use crate::output::{Bar, print};
@@ -101,11 +102,15 @@ fn load(model: &Path, artifact: Option<&Path>) -> Result<(GraceModel, Artifact),
         return Err(Failure::Input(format!("{}: {message}", export.display())));
     }
     let own = Artifact::load_export(export).map_err(Failure::input)?;
-    let Some(path) = artifact else { return Ok((model, own)) };
+    let Some(path) = artifact else {
+        check_sound(&own, export).map_err(Failure::Input)?;
+        return Ok((model, own));
+    };
     let artifact = Artifact::load(path).map_err(Failure::input)?;
     artifact
         .check_belongs_to(&own.symbols, &own.projection)
         .map_err(|error| Failure::Input(format!("{}: {error}", path.display())))?;
+    check_sound(&artifact, path).map_err(Failure::Input)?;
     Ok((model, artifact))
 }
 

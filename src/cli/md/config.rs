@@ -9,10 +9,18 @@ use md::{Langevin, NoseHooverChain, Thermostat};
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::config::{ConfigError, PotentialFile, place, place_of_offset};
+use crate::config::{ConfigError, Document, KnownKeys, PotentialFile, place, place_of_offset, read_text};
 
 /// Longer chains than this are a mistake.
 const LONGEST_CHAIN: usize = 100;
+
+/// Values that stand in for keys that must be there and are wrong, so that the rest can be read.
+const STAND_INS: &str = r#"
+structure = "-"
+potential = { kind = "grace", file = "-" }
+dynamics = { steps = 0, temperature = 300.0, thermostat = { none = {} } }
+output = { trajectory = "-" }
+"#;
 
 /// Everything in the file. Paths to read are relative to its own directory, those to write to the working directory.
 #[derive(Debug, Deserialize)]
@@ -85,10 +93,12 @@ pub struct OutputSection {
 impl MdConfig {
     /// Reads and checks the configuration, its structure and its potential.
     pub fn load(path: &Path) -> Result<(Self, Frame, Box<dyn Potential>), ConfigError> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
-        let mut config: Self =
-            toml::from_str(&text).map_err(|error| ConfigError::parse(path, &text, &error))?;
+        let text = read_text(path)?;
+        let mut document = Document::parse(path, &text)?;
+        let known = KnownKeys::new().with::<DynamicsSection>("dynamics").with::<OutputSection>("output");
+        let config = document.read(STAND_INS, &known);
+        document.finish()?;
+        let mut config: Self = config.ok_or_else(|| ConfigError::unreadable(path))?;
         let directory = path.parent().unwrap_or(Path::new(""));
         for file in [&mut config.structure, &mut config.potential.file] {
             *file.get_mut() = directory.join(file.get_ref());

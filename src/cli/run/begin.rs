@@ -35,10 +35,9 @@ pub async fn go_on(
         .map_err(|refused| other_content(campaign, location, other, &refused))?;
     match other {
         Some(known) if !adopt => return Err(other_file(campaign, location, known)),
-        Some(known) => say(format_args!(
-            "configuration: {} takes the place of {}",
-            origin.file.path, known.file.path
-        )),
+        Some(known) => {
+            say(format_args!("configuration: {} takes the place of {}", origin.file.path, known.file.path))
+        }
         None => {}
     }
     record(store, &known.map_or_else(|| origin.clone(), |known| known.continued(origin))).await?;
@@ -88,7 +87,12 @@ async fn tell_where(store: &Store, origin: &Origin, location: &Location) -> Resu
 }
 
 /// The configuration has another content than the campaign, perhaps since it is another campaign's.
-fn other_content(campaign: &Campaign, location: &Location, other: Option<&Origin>, refused: &Refused) -> Failure {
+fn other_content(
+    campaign: &Campaign,
+    location: &Location,
+    other: Option<&Origin>,
+    refused: &Refused,
+) -> Failure {
     let at = place(&campaign.path, &campaign.text, refused.key());
     let elsewhere = elsewhere(location);
     let hint = other.map_or(String::new(), |known| {

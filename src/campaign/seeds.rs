@@ -1,0 +1,161 @@
+//! Reading seed structures, and looking whether walks can begin there and find something.
+
+use std::collections::HashMap;
+
+use atoms::{NeighbourList, Structure, extxyz, read_structures, shortest_distance};
+use calm::CollectionRule;
+use orchestrator::selector::SeedStructure;
+use potentials::grace::GraceModel;
+use wire::ContentHash;
+
+use super::NamedSeed;
+use super::load::Loader;
+use crate::config::{ConfigError, Warning, place};
+
+const FILES: &str = "seeds.files";
+
+/// Nearest neighbours of solids and molecules are 0.79 to 1.48 times the sum of their radii (U, H₂) apart; the same numbers taken
+/// for Bohr, or Bohr taken for Å, are a factor of 1.89 off.
+const USUAL_BONDS: std::ops::RangeInclusive<f64> = 0.65..=1.5;
+
+impl Loader<'_> {
+    /// Every frame of every file, by a name of its own.
+    pub fn seeds(&self, model: &GraceModel) -> Result<Vec<NamedSeed>, ConfigError> {
+        let mut seeds: Vec<NamedSeed> = Vec::new();
+        for file in &self.config.seeds.files {
+            let path = file.get_ref();
+            let wrong = |message: String| self.wrong(FILES, file, message);
+            let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            let frames = read_structures(path).map_err(|error| wrong(error.to_string()))?;
+            for (number, frame) in frames.into_iter().enumerate() {
+                let source = format!("{}:{}", path.display(), frame.line);
+                let named = frame.info.get("name").and_then(extxyz::Value::text).map(str::to_owned);
+                let name = named.unwrap_or_else(|| format!("{stem}-{number}"));
+                self.check_seed(&frame.structure, model)
+                    .map_err(|error| wrong(format!("{source}: {error}")))?;
+                if let Some(first) = seeds.iter().find(|other| other.seed.name == name) {
+                    return Err(wrong(format!(
+                        "{source}: a second seed structure named '{name}', the first is {}; give each a name of its \
+                         own (name=… in its comment line)",
+                        first.source
+                    )));
+                }
+                seeds.push(NamedSeed { seed: SeedStructure { name, structure: frame.structure }, source });
+            }
+        }
+        Ok(seeds)
+    }
+
+    /// A walk must be able to start and to find something: elements that the model knows, no atom on top of another,
+    /// none out of reach of all others, as many as the collection rule asks for, a cell for the volume ramp.
+    fn check_seed(&self, structure: &Structure, model: &GraceModel) -> Result<(), String> {
+        structure.validate().map_err(|error| error.to_string())?;
+        model.element_indices(&structure.species).map_err(|error| error.to_string())?;
+        let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
+        neighbours.update(structure).map_err(|error| error.to_string())?;
+        let least = self.config.guard.least_distance.get();
+        if let Some((i, j, d)) = shortest_distance(structure, &neighbours).filter(|(_, _, d)| *d < least) {
+            return Err(format!(
+                "atoms {i} and {j} are {d:.3} Å apart, closer than guard.least_distance = {least} Å: no walk can start \
+                 here"
+            ));
+        }
+        let alone = (0..structure.len()).find(|i| structure.len() > 1 && neighbours.of(*i).is_empty());
+        if let Some(atom) = alone {
+            let cutoff = model.cutoff();
+            return Err(format!(
+                "atom {atom} has no neighbour within the cutoff, {cutoff} Å: a walk would end at its first step (are \
+                 positions and cell in Å, not Bohr?)"
+            ));
+        }
+        self.check_collectable(structure)
+    }
+
+    fn check_collectable(&self, structure: &Structure) -> Result<(), String> {
+        let atoms = structure.len();
+        if let CollectionRule::AtomCount { least, .. } = self.config.collect.when
+            && least.get() > atoms
+        {
+            return Err(format!(
+                "the structure has {atoms} atoms, fewer than the {least} that must be new at once \
+                 (collect.when.least): nothing can ever be collected from it; give a larger cell or a smaller `least`"
+            ));
+        }
+        if self.config.walk.volume_ramp.is_some() && structure.periodic == [false; 3] {
+            return Err(
+                "the structure has no periodic direction, and so no volume for walk.volume_ramp to change; give it a \
+                 cell (Lattice=… in its comment line), or leave walk.volume_ramp out"
+                    .to_owned(),
+            );
+        }
+        Ok(())
+    }
+
+    /// What is possible and hardly meant: the same structure twice, and distances that no elements have.
+    pub fn doubtful_seeds(&self, seeds: &[NamedSeed], model: &GraceModel) -> Vec<Warning> {
+        let mut first = HashMap::new();
+        let mut warnings = Vec::new();
+        for named in seeds {
+            let NamedSeed { seed: SeedStructure { name, structure }, source } = named;
+            if let Some(other) = first.insert(ContentHash::of(&rounded(structure)), named) {
+                let message = format!(
+                    "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find little that is new",
+                    other.seed.name, other.source
+                );
+                warnings.push(self.of_seeds(message));
+            }
+            if let Some(strange) = strange_distances(structure, model.cutoff()) {
+                warnings.push(self.of_seeds(format!("seed structure '{name}' ({source}): {strange}")));
+            }
+        }
+        warnings
+    }
+
+    fn of_seeds(&self, message: String) -> Warning {
+        Warning { at: place(self.path, self.text, FILES), key: FILES.to_owned(), message }
+    }
+}
+
+/// The structure with its lengths rounded to what files print, Å.
+fn rounded(structure: &Structure) -> Structure {
+    const DIGIT: f64 = 1e-4;
+    let mut structure = structure.clone();
+    let lengths = structure.cell.0.iter_mut().chain(&mut structure.positions).flatten();
+    // −0 is 0.
+    lengths.for_each(|x| *x = (*x / DIGIT).round() * DIGIT + 0.0);
+    structure
+}
+
+/// What is strange about the distances of nearest neighbours, if they are not those of the elements.
+fn strange_distances(structure: &Structure, cutoff: f64) -> Option<String> {
+    let mut neighbours = NeighbourList::new(cutoff, 0.0);
+    neighbours.update(structure).ok()?;
+    let mut bonds = Vec::new();
+    // Of each atom the neighbour that is nearest for its size: distance, and the same by the sum of radii.
+    let mut nearest: Vec<(f64, f64)> = (0..structure.len())
+        .filter_map(|i| {
+            neighbours.bonds_within(structure, i, cutoff, &mut bonds);
+            let relative = bonds.iter().filter_map(|bond| {
+                let other = structure.species[bond.atom as usize];
+                Some((bond.r, bond.r / (structure.species[i].radius()? + other.radius()?)))
+            });
+            relative.min_by(|a, b| a.1.total_cmp(&b.1))
+        })
+        .collect();
+    nearest.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let (distance, ratio) = *nearest.get(nearest.len() / 2)?;
+    if USUAL_BONDS.contains(&ratio) {
+        return None;
+    }
+    let mass: f64 = structure.species.iter().map(|species| species.mass()).sum();
+    let density = match structure.periodic {
+        // 1 u/Å³ in g/cm³.
+        [true, true, true] => format!(", at {:.2} g/cm³", 1.660_539 * mass / structure.cell.volume()),
+        _ => String::new(),
+    };
+    let instead = if ratio > 1.0 { "Bohr" } else { "nm, or in Å scaled to Bohr" };
+    Some(format!(
+        "nearest neighbours are {distance:.2} Å apart, {ratio:.2} times the sum of their radii{density}: are positions and \
+         cell in {instead}? expected Å"
+    ))
+}

@@ -1,0 +1,238 @@
+//! The numbers that make sense, for every key that is a number: a table that docs/configuration.md repeats.
+//!
+//! Outside what is possible, nothing sensible can be meant, and the file is refused; outside what is usual, `validate` and
+//! `run` warn. What is left out has its default and needs no check.
+
+use toml::de::{DeTable, DeValue};
+
+use super::check::Wrong;
+
+/// The values of a key.
+pub struct Range {
+    /// Dotted key.
+    pub key: &'static str,
+    /// Unit, or nothing.
+    pub unit: &'static str,
+    /// Least and largest possible value; 0 is below no value that serde lets pass.
+    pub possible: [f64; 2],
+    /// Least and largest usual value.
+    pub usual: [f64; 2],
+    /// What may be meant by others.
+    pub hint: &'static str,
+}
+
+/// A number of a file that has a range.
+pub struct Found {
+    /// Its range.
+    pub range: &'static Range,
+    /// The number.
+    pub value: f64,
+    /// Where it stands, bytes.
+    pub offset: usize,
+}
+
+/// Steps, in the sense of time: larger numbers would exhaust it.
+const STEPS: f64 = 1e12;
+
+const FEMTOSECONDS: &str = "it is in fs: 1 ps is 1000 fs";
+const PER_FEMTOSECOND: &str = "it is in 1/fs: 1/ps is 0.001/fs";
+const RELATIVE_VOLUME: &str = "it is V/V₀ and no percentage: +40 % is 1.4";
+const TAU: &str = "it is the bias as a part of the force: 0.15 to 2";
+const CUTOFF: &str = "it is in eV: 1 Ry is 13.6 eV, 1 Ha is 27.2 eV";
+const K_SPACING: &str = "it is in 1/Å with 2π included: the paper's is 0.125";
+const SMEARING: &str = "it is in eV: 1 Ry is 13.6 eV, 1000 K are 0.086 eV";
+const VACUUM: &str = "it is in Å";
+
+const fn range(
+    key: &'static str,
+    unit: &'static str,
+    possible: [f64; 2],
+    usual: [f64; 2],
+    hint: &'static str,
+) -> Range {
+    Range { key, unit, possible, usual, hint }
+}
+
+/// All of them, by table.
+pub static RANGES: [Range; 79] = [
+    range("walk.temperature", "K", [0.0, 1e6], [10.0, 1e4], ""),
+    range("walk.steps", "", [0.0, STEPS], [10.0, 1e7], ""),
+    range("walk.equilibration", "", [0.0, STEPS], [0.0, 1e6], ""),
+    range("walk.tau", "", [0.0, 1e3], [0.01, 5.0], TAU),
+    range("walk.time_step", "fs", [0.0, 20.0], [0.1, 5.0], FEMTOSECONDS),
+    range("walk.thermostat.langevin.friction", "1/fs", [0.0, 100.0], [1e-4, 0.2], PER_FEMTOSECOND),
+    range("walk.thermostat.nose_hoover.relaxation_time", "fs", [0.0, 1e6], [10.0, 5e3], FEMTOSECONDS),
+    range("walk.thermostat.nose_hoover.chain_length", "", [1.0, 100.0], [1.0, 10.0], ""),
+    range("walk.volume_ramp.from", "V/V₀", [0.05, 20.0], [0.4, 3.0], RELATIVE_VOLUME),
+    range("walk.volume_ramp.to", "V/V₀", [0.05, 20.0], [0.4, 3.0], RELATIVE_VOLUME),
+    range("walk.average_steps", "", [0.0, STEPS], [1.0, 1e3], ""),
+    range("walk.skin", "Å", [0.0, 10.0], [0.05, 3.0], ""),
+    range("collect.when.threshold", "", [0.0, 1e12], [0.5, 1e3], ""),
+    range("collect.when.least", "", [0.0, 1e9], [1.0, 1e3], ""),
+    range("collect.until.threshold", "", [0.0, 1e12], [0.5, 1e3], ""),
+    range("collect.until.target", "", [0.0, 1e12], [0.3, 1e3], ""),
+    range("collect.until.least", "", [0.0, 1e9], [1.0, 1e3], ""),
+    range("collect.gap", "", [0.0, STEPS], [0.0, 1e5], ""),
+    range("collect.declined_gap", "", [0.0, STEPS], [1.0, 1e5], ""),
+    range("collect.per_seed", "", [0.0, 1e9], [1.0, 1e4], ""),
+    range("collect.total", "", [0.0, 1e9], [1.0, 1e7], ""),
+    range("collect.declined_features_mb", "MB", [0.0, 1e9], [0.0, 1e6], "it is in MB"),
+    range("guard.least_distance", "Å", [0.0, 10.0], [0.3, 4.0], "it is in Å"),
+    range("guard.least_distance_fraction", "", [0.0, 1.0], [0.2, 0.95], ""),
+    range("guard.zbl.inner", "Å", [0.0, 20.0], [0.1, 4.0], "it is in Å"),
+    range("guard.zbl.outer", "Å", [0.0, 20.0], [0.2, 5.0], "it is in Å"),
+    range("guard.highest_temperature", "K", [0.0, 1e9], [300.0, 1e6], ""),
+    range("guard.refusals_in_a_row", "", [0.0, 1e9], [1.0, 1e3], ""),
+    range("guard.most_returns", "", [0.0, 1e9], [0.0, 100.0], ""),
+    range("guard.checkpoint_interval", "", [0.0, STEPS], [1.0, 1e5], ""),
+    range("label.slots", "", [0.0, 1024.0], [0.0, 256.0], ""),
+    range("label.lease", "s", [0.0, 86_400.0], [10.0, 86_400.0], "it is in s"),
+    range("label.attempts", "", [0.0, 1e9], [1.0, 20.0], ""),
+    range("label.largest_force", "eV/Å", [0.0, 1e9], [5.0, 1e5], ""),
+    range("label.largest_stress", "eV/Å³", [0.0, 1e9], [0.01, 1e3], "it is in eV/Å³: 1 GPa is 0.00624 eV/Å³"),
+    range("label.largest_energy", "eV", [0.0, 1e12], [10.0, 1e7], "it is that of an atom, in eV"),
+    range("label.largest_energy_difference", "eV", [0.0, 1e12], [0.1, 1e4], "it is that of an atom, in eV"),
+    range("label.cores", "", [0.0, 4096.0], [1.0, 2048.0], ""),
+    range("label.time_limit", "s", [0.0, 1e8], [10.0, 3e6], "it is in s: a day has 86400"),
+    range("label.memory", "GB", [0.0, 1e6], [0.1, 1e4], "it is in GB"),
+    range("label.queue_limit", "", [0.0, 1e9], [1.0, 1e6], ""),
+    range("label.guard.least_height", "Å", [0.0, 1e3], [1.0, 50.0], "it is in Å"),
+    range("label.guard.largest_edge_ratio", "", [0.0, 1e6], [1.0, 100.0], ""),
+    range("label.guard.least_volume", "Å³", [0.0, 1e3], [1.0, 50.0], "it is that of an atom, in Å³"),
+    range("label.guard.largest_volume", "Å³", [0.0, 1e6], [5.0, 1e3], "it is that of an atom, in Å³"),
+    range("label.guard.most_atoms", "", [0.0, 1e9], [1.0, 1e5], ""),
+    range("label.method.abinit.cutoff", "eV", [20.0, 1e5], [100.0, 1e4], CUTOFF),
+    range("label.method.abinit.fine_cutoff", "eV", [20.0, 1e6], [100.0, 5e4], CUTOFF),
+    range("label.method.abinit.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
+    range("label.method.abinit.smearing_width", "eV", [0.0, 20.0], [1e-3, 1.0], SMEARING),
+    range("label.method.abinit.energy_tolerance", "eV", [0.0, 10.0], [1e-12, 1e-2], ""),
+    range("label.method.abinit.steps", "", [0.0, 1e6], [10.0, 1e3], ""),
+    range("label.method.abinit.vacuum", "Å", [0.0, 1e3], [3.0, 30.0], VACUUM),
+    range("label.method.gpaw.cutoff", "eV", [20.0, 1e5], [100.0, 2e3], CUTOFF),
+    range("label.method.gpaw.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
+    range("label.method.gpaw.smearing_width", "eV", [0.0, 20.0], [1e-3, 1.0], SMEARING),
+    range("label.method.gpaw.energy_tolerance", "eV", [0.0, 10.0], [1e-12, 1e-2], ""),
+    range("label.method.gpaw.force_tolerance", "eV/Å", [0.0, 10.0], [1e-8, 0.1], ""),
+    range("label.method.gpaw.steps", "", [0.0, 1e6], [10.0, 1e3], ""),
+    range("label.method.gpaw.vacuum", "Å", [0.0, 1e3], [3.0, 30.0], VACUUM),
+    range("label.method.vasp.cutoff", "eV", [20.0, 1e5], [100.0, 2e3], CUTOFF),
+    range("label.method.vasp.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
+    range("label.method.vasp.smearing_width", "eV", [0.0, 20.0], [1e-3, 1.0], SMEARING),
+    range("label.method.vasp.energy_tolerance", "eV", [0.0, 10.0], [1e-12, 1e-2], ""),
+    range("label.method.vasp.steps", "", [0.0, 1e6], [10.0, 1e3], ""),
+    range("label.method.vasp.vacuum", "Å", [0.0, 1e3], [3.0, 30.0], VACUUM),
+    range("label.method.cp2k.cutoff", "eV", [200.0, 1e6], [1e3, 5e4], CUTOFF),
+    range("label.method.cp2k.relative_cutoff", "eV", [50.0, 1e5], [200.0, 5e3], CUTOFF),
+    range("label.method.cp2k.k_spacing", "1/Å", [0.005, 5.0], [0.03, 1.5], K_SPACING),
+    range("label.method.cp2k.smearing_width", "eV", [0.0, 20.0], [1e-3, 1.0], SMEARING),
+    range("label.method.cp2k.vacuum", "Å", [0.0, 1e3], [3.0, 30.0], VACUUM),
+    range("run.walkers", "", [0.0, 1024.0], [0.0, 512.0], ""),
+    range("run.threads", "", [0.0, 256.0], [1.0, 128.0], ""),
+    range("run.silence_limit", "s", [5.0, 1e6], [10.0, 1e5], "it is in s"),
+    range("run.agent_silence_limit", "s", [0.0, 1e6], [10.0, 1e5], "it is in s"),
+    range("run.restarts", "", [0.0, 1e9], [0.0, 100.0], ""),
+    range("run.turn_steps", "", [0.0, STEPS], [1.0, 1e5], ""),
+    range("notify.stall", "min", [0.0, 1e6], [1.0, 1e5], "it is in min"),
+    range("notify.time_limit", "s", [0.0, 86_400.0], [1.0, 3600.0], "it is in s"),
+];
+
+impl Range {
+    /// Whether it can be meant.
+    pub fn is_possible(&self, value: f64) -> bool {
+        (self.possible[0]..=self.possible[1]).contains(&value)
+    }
+
+    /// Whether it needs no second look.
+    pub fn is_usual(&self, value: f64) -> bool {
+        (self.usual[0]..=self.usual[1]).contains(&value)
+    }
+
+    /// What is possible, in words.
+    pub fn expected(&self) -> String {
+        let [least, most] = self.possible.map(shown);
+        let bounds =
+            if self.possible[0] > 0.0 { format!("{least} to {most}") } else { format!("at most {most}") };
+        match self.hint {
+            "" => with_unit(bounds, self.unit),
+            hint => format!("{}: {hint}", with_unit(bounds, self.unit)),
+        }
+    }
+
+    /// That a value is unusual, in words.
+    pub fn unusual(&self, value: f64) -> String {
+        let ([least, most], value) = (self.usual.map(shown), with_unit(shown(value), self.unit));
+        let hint = if self.hint.is_empty() { String::new() } else { format!("; {}", self.hint) };
+        format!("{value} is unusual ({} is usual){hint}", with_unit(format!("{least} to {most}"), self.unit))
+    }
+}
+
+/// A number as people write it.
+pub fn shown(x: f64) -> String {
+    if x != 0.0 && !(1e-3..1e5).contains(&x.abs()) { format!("{x:e}") } else { x.to_string() }
+}
+
+fn with_unit(number: String, unit: &str) -> String {
+    if unit.is_empty() { number } else { format!("{number} {unit}") }
+}
+
+/// The numbers of a file that have ranges.
+pub fn found(table: &DeTable<'_>) -> Vec<Found> {
+    let found = |range: &'static Range| {
+        let (value, offset) = number(table, range.key)?;
+        Some(Found { range, value, offset })
+    };
+    RANGES.iter().filter_map(found).collect()
+}
+
+/// The numbers of a text that cannot be meant.
+pub fn impossible(text: &str) -> Vec<Wrong> {
+    let (table, _) = DeTable::parse_recoverable(text);
+    let wrong = found(table.get_ref()).into_iter().filter(|found| !found.range.is_possible(found.value));
+    wrong.map(|found| (found.range.key.to_owned(), found.value.to_string(), found.range.expected())).collect()
+}
+
+/// A number by its dotted key, and where it stands.
+fn number(table: &DeTable<'_>, key: &str) -> Option<(f64, usize)> {
+    let (name, rest) = key.split_once('.').unwrap_or((key, ""));
+    let value = table.get(name)?;
+    let number = match value.get_ref() {
+        DeValue::Table(inner) if !rest.is_empty() => return number(inner, rest),
+        _ if !rest.is_empty() => return None,
+        DeValue::Float(float) => float.as_str().replace('_', "").parse().ok()?,
+        DeValue::Integer(integer) => {
+            i128::from_str_radix(&integer.as_str().replace('_', ""), integer.radix()).ok()? as f64
+        }
+        _ => return None,
+    };
+    Some((number, value.span().start))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_usual_is_possible() {
+        for Range { key, possible, usual, .. } in &RANGES {
+            assert!(possible[0] <= usual[0] && usual[0] < usual[1] && usual[1] <= possible[1], "{key}");
+        }
+    }
+
+    #[test]
+    fn numbers_are_found_by_their_keys() {
+        let text =
+            "[walk]\ntau = 1_5\n[walk.thermostat]\nlangevin = { friction = 1e1 }\n[run]\nwalkers = 0x10\n";
+        let (table, _) = DeTable::parse_recoverable(text);
+        let found: Vec<_> =
+            found(table.get_ref()).into_iter().map(|found| (found.range.key, found.value)).collect();
+        let expected =
+            [("walk.tau", 15.0), ("walk.thermostat.langevin.friction", 10.0), ("run.walkers", 16.0)];
+        assert_eq!(found, expected);
+        let friction = &RANGES[5];
+        assert_eq!(
+            friction.unusual(10.0),
+            "10 1/fs is unusual (1e-4 to 0.2 1/fs is usual); it is in 1/fs: 1/ps is 0.001/fs"
+        );
+        assert_eq!(friction.expected(), "at most 100 1/fs: it is in 1/fs: 1/ps is 0.001/fs");
+    }
+}

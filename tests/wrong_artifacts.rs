@@ -1,0 +1,138 @@
+//! Artifacts that load and mean nothing: refused where a campaign would otherwise collect nothing, or everything.
+
+mod common;
+
+use common::arrays::changed as with_arrays;
+use common::desk::{Desk, changed, line};
+use common::{calmwalk, config, refuse, stderr, succeed};
+
+const ARTIFACT: &str = "data/al_eam_1l/gmm_artifacts.npz";
+
+/// The path of a data file as the demo writes it.
+fn path(file: &str) -> String {
+    config(file).display().to_string()
+}
+
+/// An array of the aluminium artifact multiplied by a factor.
+fn scaled(array: &str, factor: f64) -> Vec<u8> {
+    with_arrays(&config(ARTIFACT), |name, numbers| {
+        if name == array {
+            numbers.iter_mut().for_each(|value| *value *= factor);
+        }
+    })
+}
+
+/// An array of the aluminium artifact taken from that of silicon.
+fn of_silicon(array: &str) -> Vec<u8> {
+    let taken = std::cell::RefCell::new(Vec::new());
+    with_arrays(&config("data/si_sw_1l/gmm_artifacts.npz"), |name, numbers| {
+        if name == array {
+            taken.replace(numbers.clone());
+        }
+    });
+    with_arrays(&config(ARTIFACT), |name, numbers| {
+        if name == array {
+            numbers.clone_from(&taken.borrow());
+        }
+    })
+}
+
+#[test]
+fn artifacts_that_are_nonsense_are_refused() {
+    let desk = Desk::new();
+    let at = format!("c.toml:{}: calm.artifact: bad.npz: component 0 of Al: ", line(&path(ARTIFACT)));
+    let inverse = "its inverse covariance";
+    for (array, factor, words) in [
+        ("inv_cov_0", 0.0, "expected a positive definite matrix"),
+        ("inv_cov_0", -1.0, "expected a positive definite matrix"),
+        ("inv_cov_0", 1e6, "on the diagonal; expected at most 1e6"),
+        ("inv_cov_0", 1e-6, "does not belong to its scatter and count"),
+        ("eff_interp_thresholds", 0.0, "its threshold is 0.000e0; expected 1.0e-2 to"),
+        ("eff_interp_thresholds", 1e6, "its threshold is 1.412e7; expected"),
+        ("centroids_0", 0.0, "its centroid is zero"),
+        ("centroids_0", 1e3, "its centroid is"),
+        ("scatter_0", 0.0, "does not belong to its scatter and count"),
+        ("scatter_0", -1.0, "its scatter has a negative eigenvalue"),
+        ("scatter_0", 1e3, "does not belong to its scatter and count"),
+        ("effective_count_0", 0.0, "5400 environments of weight 0 in sum"),
+        ("effective_count_0", 1e-3, "does not belong to its scatter and count"),
+    ] {
+        desk.write("bad.npz", scaled(array, factor));
+        desk.refused_with(&path(ARTIFACT), "bad.npz", &[&at, words]);
+    }
+    for array in ["scatter_0", "inv_cov_0"] {
+        desk.write("bad.npz", of_silicon(array));
+        desk.refused_with(&path(ARTIFACT), "bad.npz", &[&at, inverse, "does not belong"]);
+    }
+    desk.write(
+        "bad.npz",
+        with_arrays(&config(ARTIFACT), |name, numbers| {
+            if name == "inv_cov_0" {
+                numbers[1] += 1e5;
+            }
+        }),
+    );
+    desk.refused_with(&path(ARTIFACT), "bad.npz", &["array 'inv_cov_0'", "expected symmetric matrices"]);
+}
+
+/// What no single component shows: numbers that belong together, but to other data.
+#[test]
+fn the_grades_of_the_training_frames_tell() {
+    let desk = Desk::new();
+    let frames = path("data/al_eam_1l/seed_frames.extxyz");
+    let at = format!("c.toml:{}: calm.training_frames: {frames}: ", line(&frames));
+    // Another centroid, with the true covariance.
+    desk.write("bad.npz", scaled("centroids_0", 0.5));
+    desk.refused_with(&path(ARTIFACT), "bad.npz", &[&at, "the median of γ is ", "expected 0.001 to 1"]);
+}
+
+#[test]
+fn without_training_frames_the_seed_structures_tell() {
+    let desk = Desk::new();
+    // γ × 10⁻³: the export has no scatter that would show it.
+    let model = with_arrays(&config("data/al_eam_1l/kokkos.npz"), |name, numbers| {
+        if name == "uq_inv_cov" {
+            numbers.iter_mut().for_each(|value| *value *= 1e-6);
+        }
+    });
+    desk.write("model.npz", model);
+    let text = changed("artifact = ", "update = \"never\" # ").replace("training_frames = ", "# ");
+    let text = text.replace(&path("data/al_eam_1l/kokkos.npz"), "model.npz");
+    desk.write("c.toml", text);
+    let output = calmwalk(desk.path(), ["validate", "c.toml"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    let at = format!("WARNING: c.toml:{}: potential.model: ", line("model = "));
+    let warning = stderr(&output);
+    assert!(warning.contains(&at) && warning.contains("nothing is ever collected"), "{warning}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("  warnings         1: see above\n"));
+}
+
+#[test]
+fn score_refuses_nonsense_and_info_shows_it() {
+    let desk = Desk::new();
+    desk.write("bad.npz", scaled("inv_cov_0", 1e-6));
+    let (model, frames) = (path("data/al_eam_1l/kokkos.npz"), path("data/al_eam_1l/seed_frames.extxyz"));
+    let arguments = ["--model", &model, "--artifact", "bad.npz", &frames, "--output", "out.extxyz"];
+    let message = refuse(desk.path(), ["calm", "score"].into_iter().chain(arguments));
+    assert!(
+        message.contains("bad.npz: component 0 of Al: its inverse covariance does not belong"),
+        "{message}"
+    );
+    let shown = succeed(desk.path(), ["calm", "info", "bad.npz"]);
+    assert!(shown.contains("UNUSABLE        component 0 of Al: its inverse covariance"), "{shown}");
+    let shown = succeed(desk.path(), ["calm", "info", "bad.npz", "--json"]);
+    let shown: serde_json::Value = serde_json::from_str(&shown).unwrap();
+    assert_eq!(shown["faults"].as_array().unwrap().len(), 1, "{shown}");
+}
+
+#[test]
+fn the_demos_are_sound() {
+    let desk = Desk::new();
+    for name in ["aluminium.toml", "silicon.toml"] {
+        desk.write("c.toml", common::demo(name));
+        let output = calmwalk(desk.path(), ["validate", "c.toml"]);
+        assert_eq!((output.status.code(), stderr(&output).as_str()), (Some(0), ""), "{name}");
+        let shown = String::from_utf8(output.stdout).unwrap();
+        assert!(shown.ends_with("  warnings         none\n"), "{shown}");
+    }
+}

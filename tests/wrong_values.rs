@@ -1,0 +1,259 @@
+//! Values that cannot be meant, names that are nearly right, and everything that is wrong with a file at once.
+
+mod common;
+
+use std::fs;
+
+use common::desk::{Desk, changed, line};
+use common::{calmwalk, config, refuse, stderr, succeed};
+
+/// The warnings of `validate` about the demo with other values, which are also those of `run`; it must be valid.
+fn warnings(desk: &Desk, text: &str) -> Vec<String> {
+    desk.write("c.toml", text);
+    let output = calmwalk(desk.path(), ["validate", "c.toml"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    let warnings: Vec<_> = stderr(&output).lines().map(str::to_owned).collect();
+    let shown = String::from_utf8(output.stdout).unwrap();
+    let count = match warnings.len() {
+        0 => "none".to_owned(),
+        count => format!("{count}: see above"),
+    };
+    assert!(shown.ends_with(&format!("  warnings         {count}\n")), "{shown}{warnings:?}");
+    warnings
+}
+
+#[test]
+fn unusual_values_are_warned_of_at_their_own_lines() {
+    let desk = Desk::new();
+    for (from, to, expected) in [
+        (
+            "# time_step = 2.0",
+            "time_step = 0.002",
+            "walk.time_step: 0.002 fs is unusual (0.1 to 5 fs is usual); it is in fs",
+        ),
+        ("tau = 0.15", "tau = 15", "walk.tau: 15 is unusual (0.01 to 5 is usual)"),
+        (
+            "# thermostat = { langevin = { friction = 0.01 } }",
+            "thermostat = { langevin = { friction = 10 } }",
+            "walk.thermostat.langevin.friction: 10 1/fs is unusual",
+        ),
+        (
+            "temperature = 600.0",
+            "temperature = 1",
+            "walk.temperature: 1 K is unusual (10 to 10000 K is usual)",
+        ),
+        ("from = 1.0, to = 1.4", "from = 1.0, to = 14", "walk.volume_ramp.to: 14 V/V₀ is unusual"),
+        ("# time_limit = 86400.0", "time_limit = 1", "label.time_limit: 1 s is unusual"),
+    ] {
+        let found = warnings(&desk, &changed(from, to));
+        let at = format!("WARNING: c.toml:{}: ", line(from));
+        let [warning] = found.as_slice() else { panic!("{to}: {found:?}") };
+        assert!(warning.starts_with(&at) && warning.contains(expected), "{warning}\nexpected {at}{expected}");
+    }
+    assert!(warnings(&desk, &common::demo("aluminium.toml")).is_empty());
+}
+
+#[test]
+fn run_gives_the_same_warnings_and_goes_on() {
+    let desk = Desk::new();
+    let text = changed("steps = 2000 ", "steps = 5 ").replace("# equilibration = 500", "equilibration = 1");
+    let expected = warnings(&desk, &text);
+    assert_eq!(expected.len(), 1, "{expected:?}");
+    let output = calmwalk(desk.path(), ["run", "c.toml"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    assert_eq!(stderr(&output).lines().next(), Some(expected[0].as_str()));
+}
+
+#[test]
+fn values_that_nobody_can_mean_are_refused() {
+    let desk = Desk::new();
+    for (from, to, expected) in [
+        (
+            "from = 1.0, to = 1.4",
+            "from = 100, to = 140",
+            "walk.volume_ramp.from is 100; expected 0.05 to 20 V/V₀: it is V/V₀ and no percentage: +40 % is 1.4",
+        ),
+        ("# time_step = 2.0", "time_step = 50", "walk.time_step is 50; expected at most 20 fs"),
+        ("# skin = 0.5", "skin = 50", "walk.skin is 50; expected at most 10 Å"),
+        ("# silence_limit = 120.0", "silence_limit = 1", "run.silence_limit is 1; expected 5 to 1e6 s"),
+    ] {
+        desk.refused_with(from, to, &[&format!("c.toml:{}: ", line(from)), expected]);
+    }
+    // Of a table of its own, too.
+    let abinit = "[label.method.abinit]\npseudopotentials = \"/\"\ncutoff = 10\nk_spacing = 6\n";
+    let text = changed("method = { reference", "# method = { reference")
+        .replace("\n[budget]", &format!("\n{abinit}\n[budget]"));
+    let message = desk.refused(&text);
+    let at = |words: &str| 1 + text.lines().position(|line| line == words).unwrap();
+    for expected in [
+        "2 errors in c.toml:\n".to_owned(),
+        format!(
+            "c.toml:{}: label.method.abinit.cutoff is 10; expected 20 to 1e5 eV: it is in eV: 1 Ry is",
+            at("cutoff = 10")
+        ),
+        format!(
+            "c.toml:{}: label.method.abinit.k_spacing is 6; expected 0.005 to 5 1/Å",
+            at("k_spacing = 6")
+        ),
+    ] {
+        assert!(message.contains(&expected), "{message}\nexpected {expected}");
+    }
+}
+
+#[test]
+fn everything_that_is_wrong_is_told_at_once() {
+    let desk = Desk::new();
+    let mut text = changed("tau = 0.15 ", "# ").replace("temperature = 600.0", "temprature = 600.0");
+    for (from, to) in [
+        ("model = ", "modle = "),
+        ("# rng_seed = 1 ", "rng_seed = -1 "),
+        ("from = 1.0, to = 1.4", "from = 1.0, to = 140"),
+        ("# gap = 200", "gap = \"200\""),
+        ("until = ", "# until = "),
+        ("inner = 1.6, outer = 2.4", "inner = 1.6"),
+        ("# walkers = 0", "walkers = 5000"),
+        ("[notify]", "[notifi]"),
+    ] {
+        assert!(text.contains(from), "{from}");
+        text = text.replacen(from, to, 1);
+    }
+    let message = desk.refused(&text);
+    let lines: Vec<_> = message.lines().filter(|line| line.starts_with("c.toml:")).collect();
+    let expected = [
+        ("rng_seed", "campaign.rng_seed: invalid value: integer `-1`"),
+        ("modle", "unknown key `modle`, expected `model` or `precision`; did you mean `model`?"),
+        ("[walk]", "missing key `tau`"),
+        ("temprature", "unknown key `temprature`, expected one of"),
+        ("to = 140", "walk.volume_ramp.to is 140; expected"),
+        ("[collect]", "missing key `until`"),
+        ("gap = \"200\"", "collect.gap: invalid type: string \"200\", expected a whole number"),
+        ("zbl = {", "missing key `outer`"),
+        ("walkers = 5000", "run.walkers is 5000; expected at most 1024"),
+        ("[notifi]", "unknown key `notifi`, expected one of"),
+    ];
+    assert!(message.starts_with("calmwalk: 10 errors in c.toml:\n"), "{message}");
+    for (of, words) in expected {
+        let number = 1 + text.lines().position(|line| line.contains(of)).unwrap();
+        let at = format!("c.toml:{number}:");
+        assert!(
+            lines.iter().any(|line| line.starts_with(&at) && line.contains(words)),
+            "{at} {words}\n{message}"
+        );
+    }
+}
+
+#[test]
+fn missing_keys_are_told_together() {
+    let desk = Desk::new();
+    let message = desk.refused("[walk]\n[potential]\n");
+    for key in ["temperature", "steps", "tau", "model", "calm", "seeds", "collect", "label"] {
+        assert!(message.contains(&format!("missing key `{key}`")), "{key}: {message}");
+    }
+    let md = fs::read_to_string(config("md-aluminium.toml")).unwrap();
+    desk.write(
+        "md.toml",
+        md.replace("temperature = ", "temprature = ").replace("trajectory = ", "# trajectory = "),
+    );
+    let message = refuse(desk.path(), ["md", "md.toml"]);
+    for words in ["2 errors in md.toml", "did you mean `temperature`?", "missing key `trajectory`"] {
+        assert!(message.contains(words), "{words}: {message}");
+    }
+}
+
+#[test]
+fn names_that_are_nearly_right_get_a_hint() {
+    let desk = Desk::new();
+    for (from, to, expected) in [
+        ("temperature = 600.0", "temperature = 600.0\ngap = 100", "it belongs in [collect]"),
+        ("temperature = 600.0", "temperature = 600.0\ntime_limit = 100", "it belongs in [label] or [notify]"),
+        ("temperature = 600.0", "temperature = 600.0\ndt = 1", "did you mean `time_step`?"),
+        ("# gap = 200", "gaps = 200", "did you mean `gap`?"),
+        ("[campaign]", "tau = 1\n[campaign]", "it belongs in [walk]"),
+        (
+            "method = { reference",
+            "method = { quantum_espresso",
+            "makes labels through `ase`: see docs/dft-codes.md",
+        ),
+    ] {
+        desk.refused_with(from, to, &[expected]);
+    }
+    let abinit = "\n[label.method.abinit]\necut = 400\n[budget]";
+    let text = changed("method = { reference", "# method = { reference").replacen("\n[budget]", abinit, 1);
+    let message = desk.refused(text);
+    assert!(
+        message.contains("unknown key `ecut`") && message.contains("did you mean `cutoff`?"),
+        "{message}"
+    );
+}
+
+#[test]
+fn other_things_in_the_place_of_files_are_told() {
+    let desk = Desk::new();
+    let seeds = config("data/aluminium_seeds.extxyz").display().to_string();
+    for (name, expected) in [
+        ("seeds.cif", "convert it with `ase convert seeds.cif seeds.extxyz`"),
+        ("seeds.pdb", "convert it with `ase convert seeds.pdb seeds.extxyz`"),
+        ("folder", "folder: cannot be opened: it is a directory; expected a file"),
+        ("folder.extxyz", "folder.extxyz: cannot be opened: it is a directory; expected a file"),
+    ] {
+        match name.starts_with("folder") {
+            true => fs::create_dir(desk.path().join(name)).unwrap(),
+            false => desk.write(name, "data_Al\n_cell_length_a 4.05\n"),
+        }
+        desk.refused_with(&seeds, name, &["seeds.files: ", expected]);
+    }
+    let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
+    let score = |input: &str| {
+        refuse(desk.path(), ["calm", "score", "--model", &model, input, "--output", "out.extxyz"])
+    };
+    assert!(score("seeds.cif").contains("expected extended XYZ; convert it with `ase convert seeds.cif"));
+    assert!(score("folder").contains("it is a directory"));
+    // The directory that `init` makes, in the place of its configuration.
+    succeed(desk.path(), ["init", "mine"]);
+    let message = refuse(desk.path(), ["validate", "mine"]);
+    assert!(
+        message.contains("cannot read mine: Is a directory")
+            && message.contains("did you mean mine/campaign.toml?"),
+        "{message}"
+    );
+}
+
+#[test]
+fn urls_of_no_known_kind_are_no_directories() {
+    let desk = Desk::new();
+    let store = "postgre://user:secret@host/database";
+    let told = |message: String| {
+        assert!(message.contains("postgre://user@host/database"), "{message}");
+        assert!(
+            message.contains("it must begin with postgres://") && !message.contains("secret"),
+            "{message}"
+        );
+    };
+    told(desk.refused(changed("[run]", &format!("[run]\nstore = \"{store}\""))));
+    told(refuse(desk.path(), ["status", store]));
+    told(refuse(desk.path(), ["label", "--store", store]));
+    assert!(!desk.path().join("postgre:").exists());
+}
+
+#[test]
+fn arguments_that_are_nearly_right_get_a_hint() {
+    let desk = Desk::new();
+    desk.write("c.toml", common::demo("aluminium.toml"));
+    for (arguments, expected) in [
+        (vec!["run", "c.toml", "--dashboard", "8080"], "expected ADDRESS:PORT, as 127.0.0.1:8080"),
+        (vec!["run", "c.toml", "--metrics", ":9464"], "expected ADDRESS:PORT, as 127.0.0.1:9464"),
+        (vec!["dashboard", "c", "--at", "here"], "expected ADDRESS:PORT, as 127.0.0.1:8080"),
+        (vec!["walks", "c", "pause", "all"], "every walk is named by --all"),
+        (vec!["walks", "c", "pause", "x"], "expected the number of a walk"),
+        (vec!["export", "c", "--output", "o", "--where", "gama > 1"], "did you mean 'gamma'?"),
+        (vec!["export", "c", "--output", "o", "--where", "forces > 1"], "did you mean 'max_force'?"),
+        (vec!["export", "c", "--output", "o", "--where", "kind = bias"], "did you mean 'biased'?"),
+        (
+            vec!["export", "c", "--output", "o", "--where", "gamma > 1 && atoms > 1"],
+            "joined by the word 'and'",
+        ),
+    ] {
+        let message = refuse(desk.path(), &arguments);
+        assert!(message.contains(expected), "{arguments:?}: {message}");
+    }
+}
