@@ -1,8 +1,12 @@
-//! One process runs a campaign: an advisory lock on a file beside the database, or of the server. It is released when the
-//! process ends, however it ends.
+//! One process runs a campaign: an advisory lock on the campaign's directory and on a file in it, or of the server. It is
+//! released when the process ends, however it ends.
+//!
+//! The file says who holds the lock, and is all that earlier versions know. It can be deleted; the directory cannot be without
+//! the database.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Seek, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
 use crate::error::{Result, StoreError};
@@ -18,11 +22,26 @@ pub struct CampaignLock(Held);
 
 #[derive(Debug)]
 enum Held {
-    /// Closed, it is free.
-    File {
-        _file: File,
-    },
+    Directory { _lock: DirectoryLock },
     Session(Leadership),
+}
+
+/// A directory and the file in it that are locked.
+#[derive(Debug)]
+struct DirectoryLock {
+    file: File,
+    /// None where directories cannot be locked (NFS): the file is what counts there.
+    directory: Option<File>,
+}
+
+impl Drop for DirectoryLock {
+    /// Closing is not enough at once: a process that is just being started has the files too, until its program begins.
+    fn drop(&mut self) {
+        for file in self.directory.iter().chain([&self.file]) {
+            // What cannot be unlocked comes free with the last who has the file.
+            let _ = file.unlock();
+        }
+    }
 }
 
 impl CampaignLock {
@@ -39,7 +58,7 @@ impl CampaignLock {
     /// again then, if nobody else had it meanwhile. A file stays locked for as long as its process lives.
     pub async fn lost(&self) -> StoreError {
         match &self.0 {
-            Held::File { .. } => std::future::pending().await,
+            Held::Directory { .. } => std::future::pending().await,
             Held::Session(leadership) => leadership.lost().await,
         }
     }
@@ -47,7 +66,7 @@ impl CampaignLock {
     /// What tells the transactions of this holder from those of earlier ones.
     pub(crate) fn generation(&self) -> Option<i64> {
         match &self.0 {
-            Held::File { .. } => None,
+            Held::Directory { .. } => None,
             Held::Session(leadership) => Some(leadership.generation),
         }
     }
@@ -63,23 +82,30 @@ impl CampaignLock {
             io::ErrorKind::StorageFull => StoreError::DiskFull,
             _ => StoreError::File { path: path.clone(), source },
         };
-        let open = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);
-        let mut file = open.map_err(failed)?;
-        match file.try_lock() {
+        let locked = || {
+            let holder = fs::read_to_string(&path).unwrap_or_default();
+            let holder = if holder.trim().is_empty() { "another process" } else { holder.trim() };
+            StoreError::Locked { location: directory.display().to_string(), holder: holder.into() }
+        };
+        let opened = File::open(directory).map_err(failed)?;
+        let opened = match opened.try_lock() {
+            Ok(()) => Some(opened),
+            Err(TryLockError::WouldBlock) => return Err(locked()),
+            Err(TryLockError::Error(_)) => None,
+        };
+        let open =
+            OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).open(&path);
+        let mut held = DirectoryLock { file: open.map_err(failed)?, directory: opened };
+        match held.file.try_lock() {
             Ok(()) => {}
-            Err(TryLockError::WouldBlock) => {
-                let holder = fs::read_to_string(&path).unwrap_or_default();
-                let holder = if holder.trim().is_empty() { "another process" } else { holder.trim() };
-                let location = directory.display().to_string();
-                return Err(StoreError::Locked { location, holder: holder.into() });
-            }
+            Err(TryLockError::WouldBlock) => return Err(locked()),
             Err(TryLockError::Error(source)) => return Err(failed(source)),
         }
         let line = format!("process {} ({who}) on {}\n", std::process::id(), crate::processes::this_host());
-        file.set_len(0).map_err(failed)?;
-        file.rewind().map_err(failed)?;
-        file.write_all(line.as_bytes()).map_err(failed)?;
-        Ok(Self(Held::File { _file: file }))
+        held.file.set_len(0).map_err(failed)?;
+        held.file.rewind().map_err(failed)?;
+        held.file.write_all(line.as_bytes()).map_err(failed)?;
+        Ok(Self(Held::Directory { _lock: held }))
     }
 }
 
@@ -95,6 +121,30 @@ mod tests {
         assert!(message.contains(&format!("process {} (run)", std::process::id())), "{message}");
         drop(lock);
         CampaignLock::acquire(directory.path(), "again").unwrap();
+    }
+
+    #[test]
+    fn deleting_the_file_lets_nobody_in() {
+        let directory = tempfile::tempdir().unwrap();
+        let lock = CampaignLock::acquire(directory.path(), "run").unwrap();
+        fs::remove_file(directory.path().join(LOCK)).unwrap();
+        let error = CampaignLock::acquire(directory.path(), "run").unwrap_err();
+        assert!(matches!(error, StoreError::Locked { .. }), "{error}");
+        assert!(!directory.path().join(LOCK).exists(), "the holder's name is not overwritten");
+        drop(lock);
+        CampaignLock::acquire(directory.path(), "again").unwrap();
+    }
+
+    /// A version that only knows the file.
+    #[test]
+    fn who_has_only_the_file_is_respected() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = File::create(directory.path().join(LOCK)).unwrap();
+        file.lock().unwrap();
+        let error = CampaignLock::acquire(directory.path(), "run").unwrap_err();
+        assert!(matches!(error, StoreError::Locked { .. }), "{error}");
+        drop(file);
+        CampaignLock::acquire(directory.path(), "run").unwrap();
     }
 
     #[test]
