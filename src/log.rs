@@ -7,6 +7,7 @@ mod tests;
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
@@ -91,7 +92,7 @@ pub fn for_children() -> Option<Setup> {
 /// Begins the log of a process that others have started: what it is called, and its number among its like.
 pub fn begin(setup: Option<Setup>, process: &'static str, number: Option<u32>) -> Result<(), Failure> {
     let Some(setup) = setup else { return Ok(()) };
-    let opened = OpenOptions::new().append(true).create(true).open(&setup.file);
+    let opened = OpenOptions::new().append(true).create(true).mode(0o600).open(&setup.file);
     let file = opened.map_err(|error| cannot_write(&setup.file, &error))?;
     let name = number.map_or_else(|| process.to_owned(), |number| format!("{process} {number}"));
     let log = Log { file, level: setup.level.into(), format: setup.format, name };

@@ -3,7 +3,8 @@
 mod order;
 mod scripts;
 
-use std::fs;
+use std::fs::DirBuilder;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -130,7 +131,8 @@ impl Launch {
     /// The campaign's directory, by its one true name, since jobs are known by it.
     fn directory(&self) -> Result<PathBuf, Failure> {
         let directory = self.directory.clone().unwrap_or_else(|| place::default_directory(&self.config));
-        let made = fs::create_dir_all(&directory).and_then(|()| directory.canonicalize());
+        let made = DirBuilder::new().recursive(true).mode(0o700).create(&directory);
+        let made = made.and_then(|()| directory.canonicalize());
         made.map_err(|error| {
             Failure::Input(format!("cannot make the directory {}: {error}", directory.display()))
         })

@@ -3,8 +3,9 @@
 mod begin;
 mod lock;
 
-use std::fs;
+use std::fs::DirBuilder;
 use std::io::ErrorKind;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -108,10 +109,11 @@ impl Run {
     }
 }
 
-/// Makes the campaign's directory.
+/// Makes the campaign's directory, which only this user needs to read.
 fn make(directory: &Path) -> Result<(), Failure> {
     let failed = |source| StoreError::Directory { directory: directory.into(), source };
-    fs::create_dir_all(directory).map_err(|source| match source.kind() {
+    let made = DirBuilder::new().recursive(true).mode(0o700).create(directory);
+    made.map_err(|source| match source.kind() {
         ErrorKind::StorageFull => StoreError::DiskFull.into(),
         ErrorKind::AlreadyExists => {
             failed(std::io::Error::new(ErrorKind::NotADirectory, "it is a file")).into()

@@ -1,7 +1,8 @@
 //! A directory that gets its name when it is complete.
 
-use std::fs::{self, File};
+use std::fs::{self, DirBuilder, File};
 use std::io;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
 use rustix::fs::{CWD, RenameFlags, renameat_with};
@@ -29,7 +30,7 @@ impl Unfinished {
             Err(source) if source.kind() != io::ErrorKind::NotFound => return Err(failed(source)),
             _ => {}
         }
-        fs::create_dir(&path).map_err(failed)?;
+        DirBuilder::new().mode(0o700).create(&path).map_err(failed)?;
         Ok(Self { path })
     }
 
