@@ -8,6 +8,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 
+mod answers;
 mod clocks;
 mod kills;
 mod restarts;

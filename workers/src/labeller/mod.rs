@@ -238,6 +238,8 @@ async fn look(
     last_look: bool,
     now: i64,
 ) -> Result<Found, StoreError> {
+    // Its loop holds none now: leasing a job, working on it and the next look follow each other.
+    give_back_unknown(store, &settings.holder, &[], now).await?;
     if !store.awaits_labels(now).await? {
         return Ok(if last_look { Found::TheEnd } else { Found::Nothing });
     }
@@ -248,6 +250,15 @@ async fn look(
         None if !store.is_in_force(protocol).await? => Ok(Found::TheEnd),
         None => Ok(Found::Nothing),
     }
+}
+
+/// Gives back leases that the store has in the name of this labeller, and it does not know: the answer to a commit was lost.
+async fn give_back_unknown(store: &Store, holder: &str, held: &[&Lease], now: i64) -> Result<(), StoreError> {
+    let leases = store.state_leases(holder, held, now).await?;
+    if leases > 0 {
+        warn!(leases, "given back: the answer of the database to a commit was lost");
+    }
+    Ok(())
 }
 
 /// Waits until there may be work after `idle` without any, or until something else is `wanted`. Returns how long, at most.
@@ -307,6 +318,11 @@ async fn make(
                 Err(error) if error.is_transient() => true,
                 renewed => renewed?,
             };
+        }
+        // A commit that the server was still at when its connection broke may have come after the look at the queue.
+        match give_back_unknown(store, &lease.holder, &[lease], now()).await {
+            Err(error) if !error.is_transient() => return Err(error),
+            _ => {}
         }
         let Some(own) = method.calculation().filter(|_| !held) else { continue };
         match store.whereabouts(lease).await {

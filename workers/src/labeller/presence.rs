@@ -36,12 +36,17 @@ pub async fn serve(
     let (every, stay) = (settings.timing.sign_of_life, settings.stay);
     // A lease without a record of its holder would be taken back.
     insist(closing, || store.upsert_process(&process)).await?;
+    let holder = settings.holder.clone();
     let ended = tokio::select! {
         ended = run(store.clone(), method, settings, closing, &now, tell) => ended,
         error = live(&store, process.clone(), stay, closing, every, &now) => Err(error),
     };
     match ended {
-        Ok(()) => insist(closing, || store.remove_process(&process.id)).await,
+        Ok(()) => {
+            // A lease of nobody would only come back when somebody looks for those.
+            insist(closing, || store.state_leases(&holder, &[], now())).await?;
+            insist(closing, || store.remove_process(&process.id)).await
+        }
         Err(error) => match fail(&store, process, &error, now()).await {
             // Why everything else fails.
             Err(removed @ StoreError::Removed { .. }) => Err(removed),
