@@ -6,7 +6,7 @@ use std::path::Path;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection};
 use store::{ExportFilter, ExportRow, ExportSource, Store};
-use wire::ContentHash;
+use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, WalkId};
 
 use crate::common::random;
 
@@ -22,7 +22,7 @@ const PLAIN: u64 = 1 << 63;
 /// `copy`: what an accepted one has of its own.
 const ONE: [&str; 2] = [
     "CREATE TEMP TABLE one AS SELECT * FROM candidate WHERE fate = 'accepted' AND origin = 'biased' ORDER BY decision DESC LIMIT 1",
-    "CREATE TEMP TABLE copy (i INTEGER PRIMARY KEY, hash BLOB, data BLOB, forces BLOB, grades BLOB)",
+    "CREATE TEMP TABLE copy (i INTEGER PRIMARY KEY, hash BLOB, data BLOB, forces BLOB, grades BLOB, id TEXT, block BLOB)",
 ];
 
 /// `$1` is how many candidates there are to be more; each statement is one of SQLite's.
@@ -33,18 +33,18 @@ const MORE: [&str; 12] = [
         SELECT i + (SELECT max(sequence) FROM decision), i, hash IS NOT NULL,
             CASE WHEN hash IS NOT NULL THEN NULL WHEN i % 7 = 0 THEN 'guard' WHEN i % 3 = 0 THEN 'duplicate' ELSE 'covered' END,
             (SELECT max(number) FROM structure) + i / 20, coalesce(hash, randomblob(32)),
-            (SELECT substr(value, 1, 8) FROM campaign WHERE key = 'id') || '-' || (i % 1000) || '.0.' || i || '-'
-                || lower(hex(randomblob(8))),
+            coalesce(copy.id, (SELECT substr(value, 1, 8) FROM campaign WHERE key = 'id') || '-' || (i % 1000) || '.0.' || i || '-'
+                || lower(hex(randomblob(8)))),
             (abs(random()) % 1000000) / 1e6 FROM n LEFT JOIN copy USING (i)",
     "INSERT INTO decision SELECT new.decision, 0, CASE WHEN is_accepted THEN 'accepted' ELSE 'declined' END, i % 1000, new.id,
-        mixture_version, detail
+        mixture_version, detail, NULL
         FROM new CROSS JOIN (SELECT * FROM decision WHERE sequence = (SELECT decision FROM one))",
-    "INSERT INTO structure SELECT new.structure, new.hash, atoms, formula, copy.data FROM new JOIN copy USING (i) CROSS JOIN one",
+    "INSERT INTO structure SELECT new.structure, new.hash, atoms, formula, copy.data, NULL FROM new JOIN copy USING (i) CROSS JOIN one",
     "INSERT INTO candidate SELECT new.decision, new.id, new.hash, CASE WHEN is_accepted THEN new.structure END, i % 1000, 0, i,
         seed_structure, 'biased', CASE WHEN is_accepted THEN 'accepted' ELSE 'declined' END, new.reason, mixture_version, atoms,
         formula, temperature, 1 + 0.4 * x, energy, walker_gamma, walker_gamma_nbr, walker_above, selector_gamma,
-        selector_gamma_nbr, selector_above, 1 + 2 * x, original_gamma_nbr, original_above FROM new CROSS JOIN one",
-    "INSERT INTO candidate_data SELECT new.decision, block, features, selector_grades, grades FROM new JOIN copy USING (i)
+        selector_gamma_nbr, selector_above, 1 + 2 * x, original_gamma_nbr, original_above, NULL, NULL, NULL, NULL FROM new CROSS JOIN one",
+    "INSERT INTO candidate_data SELECT new.decision, copy.block, features, selector_grades, grades FROM new JOIN copy USING (i)
         CROSS JOIN (SELECT * FROM candidate_data WHERE decision = (SELECT decision FROM one))",
     "INSERT INTO candidate_count SELECT 'biased', coalesce(reason, 'accepted'), count(*) FROM new GROUP BY 2
         ON CONFLICT (origin, fate) DO UPDATE SET number = number + excluded.number",
@@ -56,8 +56,8 @@ const MORE: [&str; 12] = [
             1 + 0.001 * (number % 100)
         FROM (SELECT *, 1000 * (unixepoch() - 12 * ((SELECT max(number) FROM job) - number)) AS time FROM job) AS job
         CROSS JOIN new ON new.decision = job.decision WHERE job.state IN ('labelled', 'failed')",
-    "INSERT INTO label (structure, protocol, standing, energy, forces, job, attempt, received)
-        SELECT job.structure, job.protocol, 'label', energy, copy.forces, job.number, 1, ended
+    "INSERT INTO label (structure, protocol, standing, energy, forces, job, attempt, received, checksum)
+        SELECT job.structure, job.protocol, 'label', energy, copy.forces, job.number, 1, ended, 0
         FROM job CROSS JOIN new ON new.decision = job.decision CROSS JOIN copy ON copy.i = new.i
         CROSS JOIN attempt ON attempt.job = job.number
         CROSS JOIN (SELECT energy FROM label WHERE structure = (SELECT structure FROM one) LIMIT 1) WHERE job.state = 'labelled'",
@@ -67,7 +67,8 @@ const MORE: [&str; 12] = [
         WHERE key IN ('labels_made', 'core_milliseconds', 'label_core_milliseconds')",
     "WITH RECURSIVE n(i) AS (SELECT 0 UNION ALL SELECT i + 1 FROM n WHERE i < 999)
         INSERT OR IGNORE INTO walk SELECT i, origin, partner, seed_structure, CASE WHEN i % 10 = 0 THEN 'running' ELSE state END, reason,
-            turn, accepted, step, segment, tau, temperature, relative_volume, gamma_max, refused, returns, selector_state, checkpoint
+            turn, accepted, step, segment, tau, temperature, relative_volume, gamma_max, refused, returns, selector_state, checkpoint,
+            NULL, NULL
         FROM n CROSS JOIN (SELECT * FROM walk LIMIT 1)",
 ];
 
@@ -92,6 +93,9 @@ pub fn make(here: &Path, candidates: u64) {
         }
         execute(&mut connection, "PRAGMA journal_mode = WAL", candidates).await;
         connection.close().await.expect("the database is closed");
+        let store = Store::open(here.join("campaign").as_path()).await.expect("the campaign's database");
+        store.write_checksums().await.expect("checksums");
+        store.close().await;
     });
 }
 
@@ -115,9 +119,11 @@ async fn newest(campaign: &Path) -> ExportRow {
 
 /// Fills `copy`: one atom of each is moved, since no two structures share their content, by a ten-thousandth of an ångström at most.
 async fn copy(connection: &mut SqliteConnection, one: ExportRow, candidates: u64) {
-    let ExportRow { source: ExportSource::Candidate { original, .. }, mut structure, label, .. } = one else {
+    let ExportRow { source: ExportSource::Candidate { original, block, .. }, mut structure, label, .. } = one
+    else {
         panic!("a candidate");
     };
+    let view = block.view();
     let mut data: Vec<u8> =
         sqlx::query_scalar("SELECT data FROM structure WHERE number = (SELECT structure FROM one)")
             .fetch_one(&mut *connection)
@@ -135,12 +141,18 @@ async fn copy(connection: &mut SqliteConnection, one: ExportRow, candidates: u64
         let count = PLAIN | grades.clone().count() as u64;
         let grades = grades.zip(&mut numbers).flat_map(|(grade, u)| (2.0 * u * grade).to_le_bytes());
         let grades: Vec<u8> = count.to_le_bytes().into_iter().chain(grades).collect();
-        sqlx::query("INSERT INTO copy VALUES ($1, $2, $3, $4, $5)")
+        let content = ContentHash::of(&structure);
+        let walk = WalkId(u32::try_from(i % WALKS).expect("a walk"));
+        let id = CandidateId { walk, segment: 0, step: i, content, ..view.id() };
+        let candidate = Candidate { id, structure: structure.clone(), ..view.to_candidate() };
+        sqlx::query("INSERT INTO copy VALUES ($1, $2, $3, $4, $5, $6, $7)")
             .bind(i.cast_signed())
-            .bind(ContentHash::of(&structure).0.to_vec())
+            .bind(content.0.to_vec())
             .bind(data.clone())
             .bind(forces)
             .bind(grades)
+            .bind(id.to_string())
+            .bind(CandidateBlock::encode(&candidate).as_bytes().to_vec())
             .execute(&mut *connection)
             .await
             .expect("a row more");

@@ -3,7 +3,8 @@
 use serde_json::json;
 
 use crate::Store;
-use crate::database::{Database, query};
+use crate::checksum::CheckedColumn;
+use crate::database::{Database, for_rows, query};
 use crate::error::Result;
 use crate::tables::logs::insert_operation;
 
@@ -32,6 +33,17 @@ impl Store {
     /// [`crate::CampaignLock`]. Returns of how many.
     pub async fn drop_declined_features(&self, now: i64) -> Result<u64> {
         let mut transaction = self.database.begin_to_lead().await?;
+        // That of no features depends on the number of the candidate.
+        let with = "SELECT candidate.decision FROM candidate CROSS JOIN candidate_data
+                    ON candidate_data.decision = candidate.decision
+                    WHERE fate = 'declined' AND features IS NOT NULL";
+        let with: Vec<i64> = query(with).fetch_all(&mut transaction).await?;
+        let checksum =
+            |decision: &i64| vec![(*decision).into(), CheckedColumn::checksum(*decision, None).into()];
+        let sql = "UPDATE candidate SET features_checksum = new.checksum FROM {rows}
+                   WHERE candidate.decision = new.decision";
+        let rows = with.iter().map(checksum).collect();
+        for_rows(&mut transaction, sql, &["decision", "checksum"], rows).await?;
         let sql = "UPDATE candidate_data SET features = NULL WHERE features IS NOT NULL
                    AND decision IN (SELECT decision FROM candidate WHERE fate = 'declined')";
         let dropped = query(sql).execute(&mut transaction).await?;

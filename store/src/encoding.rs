@@ -3,6 +3,8 @@
 use atoms::{Cell, Matrix3, Species, Structure, Vec3};
 use wire::ContentHash;
 
+use crate::checksum::{Names, STRUCTURE};
+use crate::database::Row;
 use crate::error::{Result, StoreError};
 
 /// Periodicity and lattice vectors, before what counts with the atoms.
@@ -24,6 +26,13 @@ pub fn decode_structure(bytes: &[u8], hash: &[u8]) -> Result<Structure> {
     parse_structure(bytes)
         .filter(|structure| ContentHash::of(structure).0 == hash)
         .ok_or_else(|| StoreError::damaged("a structure", "its content does not have its hash"))
+}
+
+/// The structure in a row that selects `joined!(structure)`, checked against its checksum and its hash.
+pub fn read_structure(row: &Row) -> Result<Structure> {
+    STRUCTURE.verify(row, Names::Joined)?;
+    let (data, hash): (Vec<u8>, Vec<u8>) = (row.get("structure__data")?, row.get("structure__hash")?);
+    decode_structure(&data, &hash)
 }
 
 fn parse_structure(bytes: &[u8]) -> Option<Structure> {

@@ -8,6 +8,7 @@ mod backup;
 mod birth;
 mod budget;
 mod check;
+mod checksum;
 mod collected;
 mod compact;
 mod database;

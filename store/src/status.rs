@@ -3,7 +3,9 @@
 use serde::Serialize;
 
 use crate::budget::BudgetStatus;
-use crate::database::from_columns;
+use crate::checksum::{Names, WALK};
+use crate::database::{FromRow, Row};
+use crate::error::Result;
 use crate::jobs::OldestLease;
 use crate::processes::ProcessRecord;
 
@@ -133,21 +135,26 @@ impl WalkStatus {
     }
 }
 
-from_columns!(WalkStatus {
-    walk,
-    seed_structure,
-    origin,
-    state,
-    reason,
-    paused,
-    step,
-    segment,
-    tau,
-    temperature,
-    relative_volume,
-    gamma_max,
-    steps_per_second,
-    accepted,
-    refused,
-    returns
-});
+impl FromRow for WalkStatus {
+    fn from_row(row: &Row) -> Result<Self> {
+        WALK.verify(row, Names::Joined)?;
+        Ok(Self {
+            walk: row.get("walk")?,
+            seed_structure: row.get("seed_structure")?,
+            origin: row.get("origin")?,
+            state: row.get("state")?,
+            reason: row.get("reason")?,
+            paused: row.get("paused")?,
+            step: row.get("step")?,
+            segment: row.get("segment")?,
+            tau: row.get("tau")?,
+            temperature: row.get("temperature")?,
+            relative_volume: row.get("relative_volume")?,
+            gamma_max: row.get("gamma_max")?,
+            steps_per_second: row.get("steps_per_second")?,
+            accepted: row.get("accepted")?,
+            refused: row.get("refused")?,
+            returns: row.get("returns")?,
+        })
+    }
+}

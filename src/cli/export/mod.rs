@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 use atoms::extxyz::{Keys, write_frame};
 use store::records::Protocol;
-use store::{DATABASE, ExportFilter, ExportRow, ExportSource, JobState, LOCK, Store};
+use store::{DATABASE, ExportFilter, ExportPlace, ExportRow, ExportSource, JobState, LOCK, Store};
 
 use self::split::Shares;
 use super::{CampaignLocation, Ended, Failure, block_on};
@@ -107,6 +107,31 @@ struct Part {
     dealt: usize,
 }
 
+/// Refuses an export that lacks structures which have their labels.
+async fn refuse_to_miss(
+    store: &Store,
+    filter: &ExportFilter,
+    mut missing: BTreeSet<ExportPlace>,
+) -> Result<(), Failure> {
+    if missing.is_empty() {
+        return Ok(());
+    }
+    // What was dropped, or labelled again, since it was counted is not missing.
+    let now = store.labelled_places(filter).await?;
+    missing.retain(|place| now.contains(place));
+    let place = match missing.first() {
+        None => return Ok(()),
+        Some(ExportPlace::Candidate(decision)) => format!("that of decision {decision}"),
+        Some(ExportPlace::Import(number)) => format!("import-{number}"),
+    };
+    Err(Failure::Failed(format!(
+        "damaged database: {} of {} labelled structures cannot be found where they should be, the first is {place}; nothing was \
+         written: calmwalk store check says what is damaged; restore the campaign from a backup",
+        missing.len(),
+        now.len()
+    )))
+}
+
 impl Export {
     pub fn run(self) -> Result<Ended, Failure> {
         let Exported { counts, labels, others } = block_on(self.export())??;
@@ -153,15 +178,18 @@ impl Export {
 
     async fn export(&self) -> Result<Exported, Failure> {
         let store = Store::open_read_only(&self.location.get()?).await?;
+        store.check_for_export().await?;
         let protocol = self.choose_protocol(&store).await?;
         let (filter, campaign) = (self.filter(&protocol), store.campaign().await?.id.to_string());
         let (mut parts, dealt) = self.parts(&store).await?;
+        let mut missing = store.labelled_places(&filter).await?;
         let (mut frames, mut last, bar) = (0, None, Bar::new(None, BAR));
         loop {
             let page = store.labelled(&filter, last, PAGE).await?;
             let Some(row) = page.last() else { break };
             last = Some(row.place);
             for row in page {
+                missing.remove(&row.place);
                 if self.condition.as_ref().is_some_and(|condition| !condition.is_met(&frame::facts(&row))) {
                     continue;
                 }
@@ -175,6 +203,7 @@ impl Export {
             }
             bar.set(frames, String::new);
         }
+        refuse_to_miss(&store, &filter, missing).await?;
         if let (0, Some(condition)) = (frames, &self.condition) {
             return Err(Failure::Input(format!("no labelled structure meets --where '{condition}'")));
         }

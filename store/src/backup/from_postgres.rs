@@ -4,24 +4,18 @@ use std::path::Path;
 
 use sqlx::{AssertSqlSafe, Executor, Postgres};
 
+use crate::database::value::Kind;
 use crate::database::{Database, Row, Transaction, Value, for_rows, query};
 use crate::error::{Result, StoreError};
 use crate::postgres::Server;
 use crate::sqlite::DatabaseFile;
 use crate::tables::budget::sum_up;
+use crate::tables::checksums;
 
 /// Pages in a transaction of the copy.
 const PAGES: usize = 32;
 
-/// The types of columns: whole numbers, numbers, text, bytes.
-#[derive(Clone, Copy)]
-enum Kind {
-    I,
-    R,
-    T,
-    B,
-}
-use Kind::{B, I, R, T};
+use Kind::{Bytes as B, Integer as I, Real as R, Text as T};
 
 struct Table {
     name: &'static str,
@@ -52,27 +46,29 @@ macro_rules! table {
 /// jobs come in; each after those that it refers to. Some rows of the campaign's
 /// are there from the beginning.
 const TABLES: [Table; 16] = [
-    table!("campaign" { key: T, value: T }),
-    table!("value" { name: T, value: T }),
-    table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B }),
-    table!("seed_structure" { seed: I, name: T, source: T, structure: I }),
-    table!("protocol" { number: I, hash: B, name: T, settings: T }),
+    table!("campaign" { key: T, value: T, checksum: I }),
+    table!("value" { name: T, value: T, checksum: I }),
+    table!("structure" { number: I, hash: B, atoms: I, formula: T, data: B, checksum: I }),
+    table!("seed_structure" { seed: I, name: T, source: T, structure: I, checksum: I }),
+    table!("protocol" { number: I, hash: B, name: T, settings: T, checksum: I }),
     table!("decision" {
         sequence: I, round: I, kind: T, walk: I, candidate: T, mixture_version: I, detail: T,
+        checksum: I,
     }),
     table!("candidate" {
         decision: I, id: T, content: B, structure: I, walk: I, segment: I, step: I, seed_structure: I, origin: T,
         fate: T, reason: T, mixture_version: I, atoms: I, formula: T, temperature: R, relative_volume: R, energy: R,
         walker_gamma: R, walker_gamma_nbr: R, walker_above: I, selector_gamma: R, selector_gamma_nbr: R,
         selector_above: I, original_gamma: R, original_gamma_nbr: R, original_above: I,
+        checksum: I, features_checksum: I, selector_checksum: I, original_checksum: I,
     }),
     table!("candidate_count" { origin: T, fate: T, number: I }),
     table!("candidate_data" { decision: I, block: B, features: B, selector_grades: B, original_grades: B }),
-    table!("component" { element: I, slot: I, bytes: B }),
+    table!("component" { element: I, slot: I, bytes: B, checksum: I }),
     table!("walk" {
         walk: I, origin: T, partner: I, seed_structure: I, state: T, reason: T, turn: I, accepted: I, step: I,
         segment: I, tau: R, temperature: R, relative_volume: R, gamma_max: R, refused: I, returns: I,
-        selector_state: T, checkpoint: B,
+        selector_state: T, checkpoint: B, checksum: I, checkpoint_checksum: I,
     }),
     table!("job" {
         number: I, structure: I, protocol: I, decision: I, state: T, priority: I, holder: T, expires: I, attempts: I,
@@ -85,16 +81,18 @@ const TABLES: [Table; 16] = [
     table!("label" {
         number: I, structure: I, protocol: I, standing: T, energy: R, forces: B, stress: B, job: I, attempt: I,
         file: T, frame: I, correction: T, received: I, details: T,
-        superseded: I, reason: T,
+        superseded: I, reason: T, checksum: I,
     }),
-    table!("import" { number: I, structure: I, file: T, frame: I }),
-    table!("archive" 1 { job: I, attempt: I, bytes: B, left_out: T }),
+    table!("import" { number: I, structure: I, file: T, frame: I, checksum: I }),
+    table!("archive" 1 { job: I, attempt: I, bytes: B, left_out: T, checksum: I }),
 ];
 const OPERATIONS: Table = table!("operation" { number: I, time: I, kind: T, detail: T });
 
 /// Makes the copy in a directory.
 pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut(u64, u64)) -> Result<()> {
     let mut from = server.begin_to_read().await?;
+    // They have the mark of those that are unknown.
+    let without_checksums = !from.has_column("label", "checksum").await?;
     let tables = || TABLES.iter().chain([&OPERATIONS]);
     let mut all = 0;
     for table in tables() {
@@ -109,7 +107,13 @@ pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut
             })
             .await?;
         }
-        sum_up(into).await
+        sum_up(into).await?;
+        if without_checksums {
+            let mut transaction = into.begin().await?;
+            checksums::fill(&mut transaction).await?;
+            transaction.commit().await?;
+        }
+        Ok(())
     };
     DatabaseFile::create(directory, fill).await?.close().await;
     Ok(())

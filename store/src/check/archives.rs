@@ -2,29 +2,42 @@
 
 use std::io::{self, Read};
 
-use crate::database::{Transaction, from_columns, query};
+use crate::checksum::{ARCHIVE, Names};
+use crate::database::{FromRow, Row, Transaction, query};
 use crate::error::Result;
-
-const NEXT: &str = "SELECT job, attempt, bytes FROM archive WHERE (job, attempt) > ($1, $2)
-    ORDER BY job, attempt LIMIT 1";
+use crate::tables::checksums::NEXT_ARCHIVE;
 
 /// A packed directory.
 pub(super) struct Packed {
     pub job: i64,
     pub attempt: u32,
     bytes: Vec<u8>,
+    verified: Result<()>,
 }
 
-from_columns!(Packed { job, attempt, bytes });
+impl FromRow for Packed {
+    fn from_row(row: &Row) -> Result<Self> {
+        Ok(Self {
+            job: row.get("job")?,
+            attempt: row.get("attempt")?,
+            bytes: row.get("bytes")?,
+            verified: ARCHIVE.verify(row, Names::Plain),
+        })
+    }
+}
 
 impl Packed {
     /// The one after that of this attempt.
     pub async fn after(transaction: &mut Transaction, job: i64, attempt: u32) -> Result<Option<Self>> {
-        query(NEXT).bind(job).bind(attempt).fetch_optional(transaction).await
+        query(NEXT_ARCHIVE).bind(job).bind(attempt).fetch_optional(transaction).await
     }
 
     pub fn fault(&self) -> Option<String> {
-        unpack(&self.bytes).err().map(|error| format!("it cannot be unpacked ({error})"))
+        match (unpack(&self.bytes), &self.verified) {
+            (Err(error), _) => Some(format!("it cannot be unpacked ({error})")),
+            (Ok(()), Err(error)) => Some(error.to_string()),
+            (Ok(()), Ok(())) => None,
+        }
     }
 }
 

@@ -4,10 +4,14 @@ use wire::{CandidateBlock, ContentHash};
 
 use super::Finding;
 use super::archives::Packed;
-use crate::database::{FromRow, Transaction, from_columns, query};
+use crate::checksum::{
+    CANDIDATE, CheckedColumn, CheckedTable, DECISION, LABEL, LONG, Names, PROTOCOL, STRUCTURE,
+};
+use crate::database::{FromRow, Row, Transaction, from_columns, query};
 use crate::encoding::decode_structure;
-use crate::error::Result;
+use crate::error::{Result, StoreError};
 use crate::numbers::decode_numbers;
+use crate::tables::checksums;
 use crate::tables::labels::decode_label;
 
 /// Rows read at a time: a row of a large structure has megabytes.
@@ -16,11 +20,10 @@ const PAGE: u32 = 16;
 const TOLD: usize = 5;
 
 const STRUCTURES: &str =
-    "SELECT number AS place, hash, data FROM structure WHERE number > $1 ORDER BY number LIMIT $2";
+    "SELECT number AS place, structure.* FROM structure WHERE number > $1 ORDER BY number LIMIT $2";
 
 const CANDIDATES: &str =
-    "SELECT candidate_data.decision AS place, id, content, block, features, selector_grades,
-        original_grades
+    "SELECT candidate_data.decision AS place, block, features, selector_grades, original_grades, candidate.*
     FROM candidate_data JOIN candidate ON candidate.decision = candidate_data.decision
     WHERE candidate_data.decision > $1 ORDER BY candidate_data.decision LIMIT $2";
 
@@ -28,24 +31,20 @@ const LABELS: &str = "SELECT label.number AS place, atoms, label.*
     FROM label JOIN structure ON structure.number = label.structure
     WHERE label.number > $1 ORDER BY label.number LIMIT $2";
 
-const DECISIONS: &str =
-    "SELECT sequence AS place, detail AS text FROM decision WHERE sequence > $1 ORDER BY sequence LIMIT $2";
+const DECISIONS: &str = "SELECT sequence AS place, detail AS text, decision.* FROM decision WHERE sequence > $1 ORDER BY sequence LIMIT $2";
 
-const PROTOCOLS: &str =
-    "SELECT number AS place, settings AS text FROM protocol WHERE number > $1 ORDER BY number LIMIT $2";
+const PROTOCOLS: &str = "SELECT number AS place, settings AS text, protocol.* FROM protocol WHERE number > $1 ORDER BY number LIMIT $2";
 
 const ROWS: &str = "SELECT (SELECT count(*) FROM structure) + (SELECT count(*) FROM candidate_data)
     + (SELECT count(*) FROM label) + (SELECT count(*) FROM decision) + (SELECT count(*) FROM protocol)
     + (SELECT count(*) FROM archive)";
 
 struct Structure {
-    place: i64,
     hash: Vec<u8>,
     data: Vec<u8>,
 }
 
 struct Candidate {
-    place: i64,
     id: String,
     content: Vec<u8>,
     block: Vec<u8>,
@@ -55,7 +54,6 @@ struct Candidate {
 }
 
 struct Label {
-    place: i64,
     atoms: u64,
     energy: f64,
     forces: Vec<u8>,
@@ -64,21 +62,38 @@ struct Label {
 }
 
 struct Text {
-    place: i64,
     text: String,
 }
 
-from_columns!(Structure { place, hash, data });
-from_columns!(Candidate { place, id, content, block, features, selector_grades, original_grades });
-from_columns!(Label { place, atoms, energy, forces, stress, details });
-from_columns!(Text { place, text });
+from_columns!(Structure { hash, data });
+from_columns!(Candidate { id, content, block, features, selector_grades, original_grades });
+from_columns!(Label { atoms, energy, forces, stress, details });
+from_columns!(Text { text });
 
 /// A row that can be looked into.
 trait Content: FromRow {
-    /// Where it stands in the order of the query.
-    fn place(&self) -> i64;
     /// What is wrong with it.
     fn fault(&self) -> Option<String>;
+}
+
+/// The table of rows, and which of their long columns have checksums of their own.
+type Checked = (&'static CheckedTable, &'static [&'static CheckedColumn]);
+
+/// What is wrong with a row: what it holds, or that it is not what was written.
+fn fault<C: Content>(row: &Row, (table, columns): Checked) -> Option<String> {
+    let content = match C::from_row(row) {
+        Ok(content) => content.fault(),
+        Err(error) => Some(error.to_string()),
+    };
+    let verify = || {
+        let columns = columns.iter().map(|column| column.verify(row));
+        let mut verified = std::iter::once(table.verify(row, Names::Plain)).chain(columns);
+        verified.find_map(Result::err).map(|error| match error {
+            StoreError::Damaged { what, reason } => format!("{what}: {reason}"),
+            error => error.to_string(),
+        })
+    };
+    content.or_else(verify)
 }
 
 /// Looks into rows, and remembers what is wrong.
@@ -97,25 +112,29 @@ impl<'a> Contents<'a> {
     ) -> Result<Vec<Finding>> {
         let all = query(ROWS).fetch_one(&mut *transaction).await?;
         let mut contents = Self { transaction, tell, read: 0, all, findings: Vec::new() };
-        contents.table::<Structure>("structure", STRUCTURES).await?;
-        contents.table::<Candidate>("candidate", CANDIDATES).await?;
-        contents.table::<Label>("label", LABELS).await?;
-        contents.table::<Text>("decision", DECISIONS).await?;
-        contents.table::<Text>("protocol", PROTOCOLS).await?;
+        contents.table::<Structure>((&STRUCTURE, &[]), STRUCTURES).await?;
+        contents.table::<Candidate>((&CANDIDATE, &LONG), CANDIDATES).await?;
+        contents.table::<Label>((&LABEL, &[]), LABELS).await?;
+        contents.table::<Text>((&DECISION, &[]), DECISIONS).await?;
+        contents.table::<Text>((&PROTOCOL, &[]), PROTOCOLS).await?;
         contents.archives().await?;
+        let others = checksums::verify_others(contents.transaction).await?;
+        contents.found(others);
         Ok(contents.findings)
     }
 
-    async fn table<C: Content>(&mut self, what: &str, sql: &'static str) -> Result<()> {
-        let (mut after, mut faults) = (0, Vec::new());
+    async fn table<C: Content>(&mut self, checked: Checked, sql: &'static str) -> Result<()> {
+        let (mut after, mut faults, what) = (0, Vec::new(), checked.0.name);
         loop {
-            let page: Vec<C> = query(sql).bind(after).bind(PAGE).fetch_all(&mut *self.transaction).await?;
+            let page = query(sql).bind(after).bind(PAGE).rows(&mut *self.transaction).await?;
             let Some(last) = page.last() else { break };
-            after = last.place();
+            after = last.get("place")?;
             self.have_read(page.len() as u64);
-            let of_page =
-                page.iter().filter_map(|row| Some(format!("{what} {}: {}", row.place(), row.fault()?)));
-            faults.extend(of_page);
+            for row in &page {
+                if let Some(fault) = fault::<C>(row, checked) {
+                    faults.push(format!("{what} {}: {fault}", row.get::<i64>("place")?));
+                }
+            }
         }
         self.found(faults);
         Ok(())
@@ -150,20 +169,12 @@ impl<'a> Contents<'a> {
 }
 
 impl Content for Structure {
-    fn place(&self) -> i64 {
-        self.place
-    }
-
     fn fault(&self) -> Option<String> {
         decode_structure(&self.data, &self.hash).err().map(|_| "it does not have its hash".to_owned())
     }
 }
 
 impl Content for Candidate {
-    fn place(&self) -> i64 {
-        self.place
-    }
-
     fn fault(&self) -> Option<String> {
         let block = match CandidateBlock::from_bytes(&self.block) {
             Ok(block) => block,
@@ -193,10 +204,6 @@ impl Content for Candidate {
 }
 
 impl Content for Label {
-    fn place(&self) -> i64 {
-        self.place
-    }
-
     fn fault(&self) -> Option<String> {
         let label =
             match decode_label(self.energy, &self.forces, self.stress.as_deref(), self.details.as_deref()) {
@@ -217,10 +224,6 @@ impl Content for Label {
 }
 
 impl Content for Text {
-    fn place(&self) -> i64 {
-        self.place
-    }
-
     fn fault(&self) -> Option<String> {
         let parsed: serde_json::Result<serde_json::Value> = serde_json::from_str(&self.text);
         parsed.err().map(|error| format!("its text is no JSON ({error})"))

@@ -4,6 +4,7 @@
 
 mod archives;
 mod contents;
+pub(crate) mod export;
 mod rules;
 
 use std::fmt;
@@ -54,11 +55,7 @@ async fn ours(
     tell: &mut dyn FnMut(u64, u64),
 ) -> Result<()> {
     for rule in &rules::RULES {
-        let (count, example): (u64, Option<String>) = query(rule.finds).fetch_one(&mut *transaction).await?;
-        if count > 0 {
-            let what = format!("{count} {} (such as {})", rule.what, example.unwrap_or_default());
-            findings.push(Finding { what, then: rule.then });
-        }
+        findings.extend(rule.find(transaction).await?);
     }
     findings.extend(rules::labelled_jobs(transaction).await?);
     findings.extend(rules::counts(transaction).await?);
@@ -69,15 +66,26 @@ async fn ours(
     Ok(())
 }
 
+/// What SQLite finds with some of its checks; a server looks after its files itself.
+async fn own_check_of(transaction: &mut Transaction, checks: &[&'static str]) -> Result<Vec<Finding>> {
+    let mut findings = Vec::new();
+    if matches!(transaction, Transaction::Sqlite(_)) {
+        for check in checks {
+            let lines: Vec<String> = query(check).fetch_all(&mut *transaction).await?;
+            let wrong = lines.into_iter().filter(|line| line != "ok");
+            findings.extend(wrong.map(|line| Finding { what: format!("SQLite: {line}"), then: RESTORE }));
+        }
+    }
+    Ok(findings)
+}
+
 /// SQLite looks at every page, at its indexes and at references. A server looks after its files itself, and keeps
 /// references whole.
 async fn own_check(transaction: &mut Transaction, findings: &mut Vec<Finding>) -> Result<()> {
     if !matches!(transaction, Transaction::Sqlite(_)) {
         return Ok(());
     }
-    let lines: Vec<String> = query("PRAGMA integrity_check(20)").fetch_all(&mut *transaction).await?;
-    let wrong = lines.into_iter().filter(|line| line != "ok");
-    findings.extend(wrong.map(|line| Finding { what: format!("SQLite: {line}"), then: RESTORE }));
+    findings.extend(own_check_of(transaction, &["PRAGMA integrity_check(20)"]).await?);
     let sql = "SELECT count(*), min(\"table\" || ' to ' || parent) FROM pragma_foreign_key_check";
     let (count, example): (u64, Option<String>) = query(sql).fetch_one(&mut *transaction).await?;
     if count > 0 {

@@ -16,11 +16,19 @@ pub(super) struct Rule {
     pub then: &'static str,
 }
 
+impl Rule {
+    pub async fn find(&self, transaction: &mut Transaction) -> Result<Option<Finding>> {
+        let (count, example): (u64, Option<String>) = query(self.finds).fetch_one(&mut *transaction).await?;
+        let what = || format!("{count} {} (such as {})", self.what, example.unwrap_or_default());
+        Ok((count > 0).then(|| Finding { what: what(), then: self.then }))
+    }
+}
+
 const LOST: &str = "something was lost or changed by hand; restore the campaign from a backup";
 const QUEUE: &str =
     "the label queue was changed by hand; calmwalk queue shows the jobs, and a backup has them whole";
 
-pub(super) const RULES: [Rule; 15] = [
+pub(super) const RULES: [Rule; 17] = [
     Rule {
         finds: "SELECT count(*), CAST(min(sequence) AS TEXT) FROM decision WHERE sequence > 1
                 AND NOT EXISTS (SELECT 1 FROM decision AS before WHERE before.sequence = decision.sequence - 1)",
@@ -83,6 +91,18 @@ pub(super) const RULES: [Rule; 15] = [
         then: LOST,
     },
     Rule {
+        finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM import
+                WHERE NOT EXISTS (SELECT 1 FROM label WHERE label.structure = import.structure)",
+        what: "imported structures without any label",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM label WHERE file IS NOT NULL
+                AND NOT EXISTS (SELECT 1 FROM import WHERE import.structure = label.structure)",
+        what: "labels that came with structures which are not there",
+        then: LOST,
+    },
+    Rule {
         finds: "SELECT count(*), CAST(min(label.number) AS TEXT) FROM label
                 LEFT JOIN job ON job.number = label.job
                 LEFT JOIN attempt ON attempt.job = label.job AND attempt.attempt = label.attempt
@@ -117,6 +137,22 @@ pub(super) const RULES: [Rule; 15] = [
         then: QUEUE,
     },
 ];
+
+/// What says nothing about structures and labels.
+const OF_WALKS: [&str; 2] =
+    ["walks that count other accepted structures than there are", "candidates of walks that are not there"];
+
+/// What is missing or another than it was, whatever the queue and walks say.
+pub(super) async fn losses(transaction: &mut Transaction) -> Result<Vec<Finding>> {
+    let mut findings = Vec::new();
+    for rule in RULES.iter().filter(|rule| rule.then == LOST && !OF_WALKS.contains(&rule.what)) {
+        findings.extend(rule.find(transaction).await?);
+    }
+    findings.extend(labelled_jobs(transaction).await?);
+    findings.extend(counts(transaction).await?);
+    findings.extend(job_counts(transaction).await?);
+    Ok(findings)
+}
 
 /// Jobs that do not agree with their labels.
 macro_rules! disagreeing {

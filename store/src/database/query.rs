@@ -31,6 +31,12 @@ impl Query {
         self
     }
 
+    /// Binds several, one after the other.
+    pub fn bind_all(mut self, values: Vec<Value>) -> Self {
+        self.values.extend(values);
+        self
+    }
+
     /// Nobody else changes the rows that this finds until the end of the transaction. SQLite has one transaction that
     /// writes at a time.
     pub fn locked(self) -> Self {
@@ -127,13 +133,17 @@ impl Query {
     }
 }
 
-/// `CROSS JOIN … ON` tells SQLite in which order to join. PostgreSQL does not know it, and needs no telling.
+/// What tells SQLite how to find rows, and what stands in its place for PostgreSQL, which needs no telling.
+const HINTS: [(&str, &str); 2] = [("CROSS JOIN", "JOIN"), (" NOT INDEXED", "")];
+
+/// `CROSS JOIN … ON` tells SQLite in which order to join, `NOT INDEXED` to go through the table. PostgreSQL knows neither.
 pub(super) fn for_postgres(sql: &'static str, lock: &'static str) -> String {
-    let mut sql = if sql.contains("CROSS JOIN") {
-        Cow::from(sql.replace("CROSS JOIN", "JOIN"))
-    } else {
-        Cow::from(sql)
-    };
+    let mut sql = Cow::from(sql);
+    for (hint, instead) in HINTS {
+        if sql.contains(hint) {
+            sql = Cow::from(sql.replace(hint, instead));
+        }
+    }
     if !lock.is_empty() {
         sql.to_mut().push_str(lock);
     }

@@ -7,6 +7,9 @@ use sqlx::query::Query;
 use sqlx::sqlite::SqliteArguments;
 use sqlx::{Postgres, Sqlite};
 
+use super::row::Row;
+use crate::error::Result;
+
 /// A value of one of the types that both databases have. `None` is NULL.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Value {
@@ -15,6 +18,31 @@ pub enum Value {
     Real(Option<f64>),
     Text(Option<String>),
     Bytes(Option<Vec<u8>>),
+}
+
+/// The type of a column.
+#[derive(Clone, Copy, Debug)]
+pub enum Kind {
+    /// BIGINT.
+    Integer,
+    /// DOUBLE PRECISION.
+    Real,
+    /// TEXT.
+    Text,
+    /// BYTEA.
+    Bytes,
+}
+
+impl Kind {
+    /// The value of a column of this type.
+    pub fn read(self, row: &Row, name: &str) -> Result<Value> {
+        Ok(match self {
+            Self::Integer => Value::Integer(row.get(name)?),
+            Self::Real => Value::Real(row.get(name)?),
+            Self::Text => Value::Text(row.get(name)?),
+            Self::Bytes => Value::Bytes(row.get(name)?),
+        })
+    }
 }
 
 impl Value {
@@ -53,7 +81,7 @@ impl Value {
 }
 
 /// PostgreSQL takes no zero bytes in text; last words of processes may hold some.
-pub(super) fn without_zeros(text: String) -> String {
+pub fn without_zeros(text: String) -> String {
     if text.contains('\0') { text.replace('\0', "\u{fffd}") } else { text }
 }
 

@@ -20,9 +20,12 @@ use crate::database::{Clock, Database, Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::location::ServerUrl;
 use crate::migrations::{Step, migrator};
+use crate::tables::checksums;
 
 /// The newest of the migrations.
-const SCHEMA: i64 = 8;
+const SCHEMA: i64 = 9;
+/// The first version whose rows have checksums.
+const WITH_CHECKSUMS: i64 = 9;
 /// Connections of a process, at most: one that writes and some that read.
 const CONNECTIONS: u32 = 5;
 /// Connections that nobody needs are closed after this time: a server has few.
@@ -35,7 +38,7 @@ const ANSWER: Duration = Duration::from_secs(3);
 pub const PAUSE: Duration = Duration::from_millis(100);
 
 /// The steps to the newest version.
-pub(crate) static STEPS: [Step; 7] = [
+pub(crate) static STEPS: [Step; 8] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -43,6 +46,7 @@ pub(crate) static STEPS: [Step; 7] = [
     (6, "relabel", include_str!("../../migrations/postgres/0006_relabel.sql")),
     (7, "listing", include_str!("../../migrations/postgres/0007_listing.sql")),
     (8, "brought", include_str!("../../migrations/postgres/0008_brought.sql")),
+    (9, "checksums", include_str!("../../migrations/postgres/0009_checksums.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));
@@ -77,14 +81,18 @@ impl Server {
 
     /// Opens the campaign, and brings its tables up to date if it is to write.
     pub async fn open(url: &ServerUrl, writes: bool) -> Result<Self> {
-        let server = Self::connect(url, writes);
+        let mut server = Self::connect(url, writes);
         let missing = || StoreError::Missing {
             location: url.to_string(),
             lacks: "tables of a campaign in that schema",
         };
         let found = version(url, &mut *server.connection().await?).await?.ok_or_else(missing)?;
         if found < SCHEMA && writes {
-            MIGRATIONS.run(&server.pool).await.map_err(schema_error)?;
+            server.bring_up_to_date(url).await?;
+        }
+        if found < WITH_CHECKSUMS && !writes {
+            let views = checksums::views(&url.schema).into();
+            server.pool = pool(options(url), Some(views));
         }
         server.campaign().await?.ok_or_else(missing)?;
         Ok(server)
@@ -92,11 +100,7 @@ impl Server {
 
     fn connect(url: &ServerUrl, writes: bool) -> Self {
         let options = options(url);
-        let pool = PgPoolOptions::new()
-            .max_connections(CONNECTIONS)
-            .acquire_timeout(PATIENCE)
-            .idle_timeout(IDLE)
-            .connect_lazy_with(options.clone());
+        let pool = pool(options.clone(), None);
         let jobs = Arc::new(Jobs::new(options, &url.schema));
         Self {
             pool,
@@ -107,6 +111,22 @@ impl Server {
             patience: PATIENCE,
             jobs,
         }
+    }
+
+    /// Brings the tables to the newest version: all steps and the checksums of rows, or nothing. One process at a time does.
+    async fn bring_up_to_date(&self, url: &ServerUrl) -> Result<()> {
+        let mut transaction = self.begin().await?;
+        let one = "SELECT 1::BIGINT FROM pg_advisory_xact_lock(hashtext($1))";
+        let one = query(one).bind(format!("{}: new version", url.schema));
+        one.rows(&mut transaction).await?;
+        let Transaction::Postgres(connection, _) = &mut transaction else { return Ok(()) };
+        let found = version(url, &mut *connection).await?;
+        // What `run` calls. With a borrowed connection it makes no future that another thread may go on with.
+        MIGRATIONS.run_direct(None, &mut **connection, false).await.map_err(schema_error)?;
+        if found < Some(WITH_CHECKSUMS) {
+            checksums::fill(&mut transaction).await?;
+        }
+        transaction.commit().await
     }
 
     /// Id of the campaign, if there is one.
@@ -224,6 +244,21 @@ impl fmt::Debug for Server {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Server").field("url", &self.shown).field("generation", &self.generation).finish()
     }
+}
+
+/// Connections, which make these views first, if there are any.
+fn pool(options: PgConnectOptions, views: Option<Arc<str>>) -> PgPool {
+    let pool = PgPoolOptions::new().max_connections(CONNECTIONS).acquire_timeout(PATIENCE).idle_timeout(IDLE);
+    let pool = pool.after_connect(move |connection, _| {
+        let views = views.clone();
+        Box::pin(async move {
+            match views {
+                Some(views) => connection.execute(AssertSqlSafe(views.to_string())).await.map(drop),
+                None => Ok(()),
+            }
+        })
+    });
+    pool.connect_lazy_with(options)
 }
 
 /// How to connect: names without a schema are those of the campaign's.

@@ -1,10 +1,12 @@
 //! The database in one SQLite file: making it and opening it.
 
+mod earlier;
 mod in_place;
 mod room;
 
-use std::fs::{self, File};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::sync::LazyLock;
@@ -15,13 +17,14 @@ use sqlx::sqlite::{
     Sqlite, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool, SqlitePoolOptions,
     SqliteSynchronous,
 };
-use sqlx::{ConnectOptions, Connection};
+use sqlx::{ConnectOptions, Connection, Executor};
 
 use self::in_place::InPlace;
-use crate::database::Database;
+use crate::database::{Database, Transaction};
 use crate::error::{Result, StoreError};
 use crate::filesystem::check_directory;
 use crate::migrations::{Step, migrator};
+use crate::tables::checksums;
 
 /// Name of the database, in the campaign's directory.
 pub const DATABASE: &str = "campaign.sqlite";
@@ -30,7 +33,9 @@ const UNFINISHED: &str = "campaign.sqlite.new";
 /// `PRAGMA application_id` of a campaign: "CALM".
 const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` that the newest migration leaves behind.
-const SCHEMA: i64 = 8;
+const SCHEMA: i64 = 9;
+/// The first version whose rows have checksums.
+const WITH_CHECKSUMS: i64 = 9;
 /// How long another connection may hold the database.
 const PATIENCE: Duration = Duration::from_secs(30);
 const READERS: u32 = 4;
@@ -48,7 +53,7 @@ const PAGE: u32 = 1 << 14;
 const LOG_PAGES: u32 = 1 << 12;
 
 /// The steps to the newest version.
-pub(crate) static STEPS: [Step; 8] = [
+pub(crate) static STEPS: [Step; 9] = [
     (1, "campaign", include_str!("../../migrations/sqlite/0001_campaign.sql")),
     (2, "processes", include_str!("../../migrations/sqlite/0002_processes.sql")),
     (3, "calculations", include_str!("../../migrations/sqlite/0003_calculations.sql")),
@@ -57,6 +62,7 @@ pub(crate) static STEPS: [Step; 8] = [
     (6, "relabel", include_str!("../../migrations/sqlite/0006_relabel.sql")),
     (7, "listing", include_str!("../../migrations/sqlite/0007_listing.sql")),
     (8, "brought", include_str!("../../migrations/sqlite/0008_brought.sql")),
+    (9, "checksums", include_str!("../../migrations/sqlite/0009_checksums.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));
@@ -82,6 +88,7 @@ impl DatabaseFile {
         }
         let unfinished = directory.join(UNFINISHED);
         remove_database(&unfinished)?;
+        make_private(&unfinished)?;
         let writer = writer(&unfinished).await?;
         MIGRATIONS.run(&writer).await.map_err(schema_error)?;
         let file = InPlace::of(&unfinished)?;
@@ -113,15 +120,15 @@ impl DatabaseFile {
         let found = identify(&path, false).await?;
         let writer = writer(&path).await?;
         let mut tries = 1;
-        while let Err(error) = MIGRATIONS.run(&writer).await {
+        while let Err(error) = bring_up_to_date(&writer).await {
             // Others that opened it at the same time are at it: once they are done there is nothing left to do.
             if found == SCHEMA || tries == MIGRATION_TRIES {
-                return Err(schema_error(error));
+                return Err(error);
             }
             tries += 1;
             tokio::time::sleep(OPENING_PAUSE).await;
         }
-        let readers = readers(options(&path).read_only(true));
+        let readers = readers(options(&path).read_only(true), None);
         Ok(Self { writer: Some(writer), readers, file: InPlace::of(&path)? })
     }
 
@@ -136,7 +143,9 @@ impl DatabaseFile {
             Err(error) => return Err(error),
         };
         identify(&path, immutable).await?;
-        let readers = readers(options(&path).read_only(true).immutable(immutable));
+        let options = options(&path).read_only(true).immutable(immutable);
+        let views = earlier::views(&options).await?;
+        let readers = readers(options, views);
         Ok(Self { writer: None, readers, file: InPlace::of(&path)? })
     }
 
@@ -162,6 +171,7 @@ impl DatabaseFile {
         let (unfinished, path) = (directory.join(UNFINISHED), directory.join(DATABASE));
         let failed = |source| StoreError::File { path: path.clone(), source };
         let all = self.size()?;
+        make_private(&unfinished)?;
         let copy = sqlx::query("VACUUM INTO $1").bind(unfinished.to_string_lossy().into_owned());
         let mut copying = pin!(copy.execute(&self.readers));
         loop {
@@ -226,8 +236,31 @@ async fn writer(path: &Path) -> Result<SqlitePool> {
     Ok(pool.connect_with(options).await?)
 }
 
-fn readers(options: SqliteConnectOptions) -> SqlitePool {
-    SqlitePoolOptions::new().max_connections(READERS).max_lifetime(None).connect_lazy_with(options)
+/// `views` are made in each connection, see [`earlier`].
+fn readers(options: SqliteConnectOptions, views: Option<&'static str>) -> SqlitePool {
+    let pool = SqlitePoolOptions::new().max_connections(READERS).max_lifetime(None);
+    let pool = pool.after_connect(move |connection, _| {
+        Box::pin(async move {
+            match views {
+                Some(views) => connection.execute(views).await.map(drop),
+                None => Ok(()),
+            }
+        })
+    });
+    pool.connect_lazy_with(options)
+}
+
+/// Brings the tables to the newest version: all steps and the checksums of rows, or nothing.
+async fn bring_up_to_date(writer: &SqlitePool) -> Result<()> {
+    let mut transaction = writer.begin_with("BEGIN IMMEDIATE").await?;
+    let found: i64 = sqlx::query_scalar("PRAGMA user_version").fetch_one(&mut *transaction).await?;
+    // What `run` calls. With a borrowed connection it makes no future that another thread may go on with.
+    MIGRATIONS.run_direct(None, &mut *transaction, false).await.map_err(schema_error)?;
+    let mut transaction = Transaction::Sqlite(transaction);
+    if found < WITH_CHECKSUMS {
+        checksums::fill(&mut transaction).await?;
+    }
+    transaction.commit().await
 }
 
 fn existing(directory: &Path) -> Result<PathBuf> {
@@ -271,6 +304,12 @@ fn schema_error(error: sqlx::migrate::MigrateError) -> StoreError {
         | sqlx::migrate::MigrateError::ExecuteMigration(error, _) => error.into(),
         error => StoreError::Schema(error),
     }
+}
+
+/// Makes an empty file that only its owner may read, and which SQLite fills; its log and the log's index get the same mode.
+fn make_private(path: &Path) -> Result<()> {
+    let made = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path);
+    made.map(drop).map_err(|source| StoreError::File { path: path.into(), source })
 }
 
 /// Removes what a killed [`Store::create`] left behind.

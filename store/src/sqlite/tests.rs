@@ -5,6 +5,7 @@ use wire::CampaignId;
 
 use super::*;
 use crate::Store;
+use crate::check;
 use crate::records::{Campaign, Commit, ComponentRecord};
 use crate::tables::{by_hand, export, history, job_counts, labels, listing, outcomes, queue, recent, status};
 
@@ -39,6 +40,7 @@ async fn what_is_asked_often_goes_through_indexes() {
         queue::EXPIRED,
         queue::UNFINISHED,
         queue::HELD,
+        queue::HELD_BY,
         queue::LOSSES,
         by_hand::FIND,
         export::CANDIDATES,
@@ -76,6 +78,8 @@ async fn what_is_asked_often_goes_through_indexes() {
         let page = plan(&file, sql).await;
         assert!(page.contains("USING COVERING INDEX job_order (state=?"), "{page}");
     }
+    let by_structure = plan(&file, check::export::CANDIDATES).await;
+    assert!(by_structure.contains("SEARCH candidate USING INDEX candidate_structure"), "{by_structure}");
     for sql in [status::COUNTED_FATES, job_counts::COUNTED_STATES] {
         let plan = plan(&file, sql).await;
         assert!(plan.contains("COVERING INDEX") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");

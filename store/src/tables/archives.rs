@@ -1,7 +1,8 @@
 //! The directories of calculations, packed.
 
 use crate::Store;
-use crate::database::{from_columns, query};
+use crate::checksum::{ARCHIVE, Names};
+use crate::database::{self, FromRow, from_columns, query};
 use crate::error::Result;
 use crate::jobs::{Archive, PastCalculation};
 
@@ -10,16 +11,17 @@ impl Store {
     /// that are not in it.
     pub async fn keep_archive(&self, job: i64, attempt: u32, bytes: &[u8], left_out: &str) -> Result<()> {
         let mut transaction = self.database.begin().await?;
-        let sql = "INSERT INTO archive (job, attempt, bytes, left_out) VALUES ($1, $2, $3, $4)
-                   ON CONFLICT (job, attempt) DO UPDATE SET bytes = excluded.bytes, left_out = excluded.left_out";
-        let keep = query(sql).bind(job).bind(attempt).bind(bytes).bind(left_out);
-        keep.execute(&mut transaction).await?;
+        let sql = "INSERT INTO archive (job, attempt, bytes, left_out, checksum) VALUES ($1, $2, $3, $4, $5)
+                   ON CONFLICT (job, attempt) DO UPDATE SET bytes = excluded.bytes, left_out = excluded.left_out,
+                       checksum = excluded.checksum";
+        let row = vec![job.into(), attempt.into(), bytes.into(), left_out.into()];
+        query(sql).bind_all(ARCHIVE.with_checksum(row)).execute(&mut transaction).await?;
         transaction.commit().await
     }
 
     /// The packed directories of a job's calculations, by attempt.
     pub async fn archives(&self, job: i64) -> Result<Vec<Archive>> {
-        let sql = "SELECT attempt, bytes, left_out FROM archive WHERE job = $1 ORDER BY attempt";
+        let sql = "SELECT * FROM archive WHERE job = $1 ORDER BY attempt";
         query(sql).bind(job).fetch_all(&self.database).await
     }
 
@@ -47,4 +49,10 @@ struct Row {
 }
 
 from_columns!(Row { calculation, failed, wanted });
-from_columns!(Archive { attempt, bytes, left_out });
+
+impl FromRow for Archive {
+    fn from_row(row: &database::Row) -> Result<Self> {
+        ARCHIVE.verify(row, Names::Plain)?;
+        Ok(Self { attempt: row.get("attempt")?, bytes: row.get("bytes")?, left_out: row.get("left_out")? })
+    }
+}

@@ -2,12 +2,14 @@
 
 use serde_json::{Value, json};
 
+use super::labels::LabelRow;
 use super::logs::insert_operation;
 use super::queue::end_attempt;
 use crate::Store;
+use crate::checksum::{CANDIDATE, Names, joined};
 use crate::database::{self, FromRow, Transaction, query};
 use crate::error::{Result, StoreError};
-use crate::jobs::{Attempt, Job, JobDetails, Standing};
+use crate::jobs::{Attempt, Job, JobDetails};
 use crate::records::JobState;
 
 /// Candidates shown when a name fits none or several.
@@ -16,8 +18,7 @@ const SHOWN: usize = 5;
 /// What is shown of a job besides its own columns.
 macro_rules! columns {
     () => {
-        "protocol.name, id, candidate.atoms, formula, original_gamma, original_gamma_nbr, origin, walk, step,
-        temperature, relative_volume, coalesce(seed_structure.name, '') AS seed_name"
+        concat!(joined!(candidate), ", protocol.name, coalesce(seed_structure.name, '') AS seed_name")
     };
 }
 
@@ -86,10 +87,11 @@ struct Row {
 
 impl FromRow for Row {
     fn from_row(row: &database::Row) -> Result<Self> {
+        CANDIDATE.verify(row, Names::Joined)?;
         Ok(Self {
             number: row.get("number")?,
             structure: row.get("structure")?,
-            id: row.get("id")?,
+            id: row.get("candidate__id")?,
             name: row.get("name")?,
             state: row.get("state")?,
             priority: row.get("priority")?,
@@ -97,16 +99,16 @@ impl FromRow for Row {
             expires: row.get("expires")?,
             attempts: row.get("attempts")?,
             failures: row.get("failures")?,
-            atoms: row.get("atoms")?,
-            formula: row.get("formula")?,
-            original_gamma: row.get("original_gamma")?,
-            original_gamma_nbr: row.get("original_gamma_nbr")?,
-            origin: row.get("origin")?,
+            atoms: row.get("candidate__atoms")?,
+            formula: row.get("candidate__formula")?,
+            original_gamma: row.get("candidate__original_gamma")?,
+            original_gamma_nbr: row.get("candidate__original_gamma_nbr")?,
+            origin: row.get("candidate__origin")?,
             seed_name: row.get("seed_name")?,
-            walk: row.get("walk")?,
-            step: row.get("step")?,
-            temperature: row.get("temperature")?,
-            relative_volume: row.get("relative_volume")?,
+            walk: row.get("candidate__walk")?,
+            step: row.get("candidate__step")?,
+            temperature: row.get("candidate__temperature")?,
+            relative_volume: row.get("candidate__relative_volume")?,
             overruled: row.get_or_default::<Option<i64>>("overruled")?.is_some(),
             relabel: row.get_or_default("relabel")?,
         })
@@ -134,15 +136,14 @@ impl Store {
         let row: Row = query(SHOW).bind(job).fetch_one(&self.database).await?;
         let attempts = query("SELECT * FROM attempt WHERE job = $1 ORDER BY attempt").bind(job);
         let attempts: Vec<Attempt> = attempts.fetch_all(&self.database).await?;
-        let sql = "SELECT standing, energy FROM label WHERE structure = $1
+        let sql = "SELECT * FROM label WHERE structure = $1
                    AND protocol = (SELECT protocol FROM job WHERE number = $2) ORDER BY number";
-        let energies = query(sql).bind(row.structure).bind(job);
-        let energies: Vec<(String, f64)> = energies.fetch_all(&self.database).await?;
-        let standing = |(name, energy): (String, f64)| Some((Standing::named(&name)?, energy));
+        let labels = query(sql).bind(row.structure).bind(job);
+        let labels: Vec<LabelRow> = labels.fetch_all(&self.database).await?;
         Ok(JobDetails {
             job: row.into_job()?,
             attempts_made: attempts,
-            energies: energies.into_iter().filter_map(standing).collect(),
+            energies: labels.iter().filter_map(LabelRow::standing_and_energy).collect(),
         })
     }
 

@@ -1,24 +1,27 @@
 //! Everything that was collected, page by page, and what became of candidates, for reports.
 
-use wire::{CandidateBlock, ContentHash};
+use wire::ContentHash;
 
-use super::restore::{grades, origin};
+use super::labels::LabelRow;
+use super::restore::{block, grades, origin};
 use crate::Store;
+use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
 use crate::collected::{Collected, FateCount};
 use crate::database::{FromRow, Row, query};
-use crate::encoding::decode_vectors;
-use crate::error::{Result, StoreError};
+use crate::error::Result;
 use crate::records::JobState;
 
-const COLLECTED: &str =
-    "SELECT candidate.decision AS decision, candidate.seed_structure AS seed_structure, origin,
-        block, original_grades, state, CASE WHEN state = 'dropped' THEN NULL ELSE label.forces END AS forces
+const COLLECTED: &str = concat!(
+    "SELECT candidate.decision AS decision, original_checksum, block, original_grades, state AS job_state, ",
+    joined!(candidate),
+    ", label.*
     FROM candidate
     CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
     LEFT JOIN job ON job.structure = candidate.structure AND job.protocol = $1
     LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = $1 AND standing = 'label'
     WHERE candidate.decision > $2 AND fate = 'accepted'
-    ORDER BY candidate.decision LIMIT $3";
+    ORDER BY candidate.decision LIMIT $3"
+);
 
 const BY_DECISION: &str =
     "SELECT (decision - 1) / $1 AS part, coalesce(reason, fate) AS fate, count(*) AS number
@@ -64,19 +67,20 @@ impl Store {
 
 impl FromRow for Collected {
     fn from_row(row: &Row) -> Result<Self> {
-        let (block, grades_of): (Vec<u8>, Option<Vec<u8>>) = (row.get("block")?, row.get("original_grades")?);
-        let forces: Option<Vec<u8>> = row.get("forces")?;
-        let damaged = || StoreError::damaged("a label", "its forces have a wrong length");
-        let forces = forces.map(|bytes| decode_vectors(&bytes).ok_or_else(damaged)).transpose()?;
-        let state: Option<String> = row.get("state")?;
+        CANDIDATE.verify(row, Names::Joined)?;
+        ORIGINAL_GRADES.verify(row)?;
+        let grades_of: Option<Vec<u8>> = row.get("original_grades")?;
+        let job = row.get::<Option<String>>("job_state")?.and_then(|state| JobState::named(&state));
+        let has_label = row.get::<Option<i64>>("number")?.is_some();
+        let label = (has_label && job != Some(JobState::Dropped)).then(|| LabelRow::from_row(row));
         Ok(Self {
             decision: row.get("decision")?,
-            origin: origin(&row.get::<String>("origin")?)?,
-            seed_structure: row.get("seed_structure")?,
-            block: CandidateBlock::from_bytes(&block)?,
+            origin: origin(&row.get::<String>("candidate__origin")?)?,
+            seed_structure: row.get("candidate__seed_structure")?,
+            block: block(row, &row.get::<String>("candidate__id")?)?,
             original: grades(grades_of.as_deref())?,
-            job: state.and_then(|state| JobState::named(&state)),
-            label_forces: forces,
+            job,
+            label_forces: label.transpose()?.map(LabelRow::forces).transpose()?,
         })
     }
 }

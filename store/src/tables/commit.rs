@@ -10,9 +10,12 @@ use std::time::{Duration, Instant};
 use atoms::Structure;
 use wire::ContentHash;
 
-use self::rows::{CANDIDATE, CANDIDATE_COUNT, CANDIDATE_DATA, DECISION, JOB, Rows, STRUCTURE, WALK};
+use self::rows::{
+    CANDIDATE, CANDIDATE_COUNT, CANDIDATE_DATA, COMPONENT, DECISION, JOB, Rows, STRUCTURE, VALUE, WALK,
+};
 use super::protocols;
 use crate::Store;
+use crate::checksum;
 use crate::database::{Transaction, for_rows, query};
 use crate::encoding::{encode_structure, integer};
 use crate::error::{Result, StoreError};
@@ -42,7 +45,7 @@ const INSERT_JOBS: &str = "INSERT INTO job (structure, protocol, decision, prior
     ON CONFLICT (structure, protocol) DO NOTHING";
 
 const UPSERT_COMPONENTS: &str = "INSERT INTO component ({columns}) SELECT * FROM {rows} WHERE TRUE
-    ON CONFLICT (element, slot) DO UPDATE SET bytes = excluded.bytes";
+    ON CONFLICT (element, slot) DO UPDATE SET bytes = excluded.bytes, checksum = excluded.checksum";
 
 const UPSERT_WALKS: &str = "INSERT INTO walk ({columns}) SELECT * FROM {rows} WHERE TRUE
     ON CONFLICT (walk) DO UPDATE SET {excluded}";
@@ -51,7 +54,7 @@ const COUNT_CANDIDATES: &str = "INSERT INTO candidate_count ({columns}) SELECT *
     ON CONFLICT (origin, fate) DO UPDATE SET number = candidate_count.number + excluded.number";
 
 const UPSERT_VALUES: &str = "INSERT INTO value ({columns}) SELECT * FROM {rows} WHERE TRUE
-    ON CONFLICT (name) DO UPDATE SET value = excluded.value";
+    ON CONFLICT (name) DO UPDATE SET value = excluded.value, checksum = excluded.checksum";
 
 impl Store {
     /// Writes everything that was decided in one transaction, on the disk when this returns. Decisions get
@@ -110,9 +113,9 @@ async fn write(transaction: &mut Transaction, commit: &Commit, rows: Rows, last:
     if commit.restart_mixture {
         query("DELETE FROM component").execute(&mut *transaction).await?;
     }
-    for_rows(transaction, UPSERT_COMPONENTS, &["element", "slot", "bytes"], rows.components).await?;
+    for_rows(transaction, UPSERT_COMPONENTS, &COMPONENT, rows.components).await?;
     for_rows(transaction, UPSERT_WALKS, &WALK, rows.walks).await?;
-    for_rows(transaction, UPSERT_VALUES, &["name", "value"], rows.values).await?;
+    for_rows(transaction, UPSERT_VALUES, &VALUE, rows.values).await?;
     Ok(())
 }
 
@@ -134,11 +137,16 @@ pub(super) async fn structure_number(
     structure: &Structure,
     hash: ContentHash,
 ) -> Result<i64> {
-    let sql = "INSERT INTO structure (hash, atoms, formula, data) VALUES ($1, $2, $3, $4)
+    let sql = "INSERT INTO structure (hash, atoms, formula, data, checksum) VALUES ($1, $2, $3, $4, $5)
                ON CONFLICT (hash) DO UPDATE SET atoms = excluded.atoms RETURNING number";
-    let row = query(sql).bind(&hash.0[..]).bind(integer("count", structure.len() as u64)?);
-    let row = row.bind(structure.formula()).bind(encode_structure(structure));
-    row.fetch_one(&mut *transaction).await
+    let row = vec![
+        hash.0[..].into(),
+        integer("count", structure.len() as u64)?.into(),
+        structure.formula().into(),
+        encode_structure(structure).into(),
+    ];
+    let insert = query(sql).bind_all(checksum::STRUCTURE.with_checksum(row));
+    insert.fetch_one(&mut *transaction).await
 }
 
 /// Jobs for candidates that are there already, as (structure, decision).

@@ -5,8 +5,9 @@ use wire::{ContentHash, WalkId};
 use super::labels::LabelRow;
 use super::status::walks;
 use crate::Store;
+use crate::checksum::{IMPORT, Names, joined};
 use crate::database::{FromRow, Row, from_columns, query};
-use crate::encoding::{decode_hash, decode_structure};
+use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::history::{Covered, ImportedStructure, LaterCovered, Named, SameStructure, StructureLabel};
 use crate::jobs::JobDetails;
@@ -60,8 +61,13 @@ pub(crate) const AFTER: &str = "SELECT sequence, id, reason, candidate.mixture_v
     FROM decision LEFT JOIN candidate ON candidate.decision = sequence
     WHERE sequence > $1 ORDER BY sequence LIMIT $2";
 
-const IMPORT: &str = "SELECT import.number, file, frame, hash, data FROM import
-    JOIN structure ON structure.number = import.structure WHERE import.number = $1";
+const IMPORTED: &str = concat!(
+    "SELECT import.number AS place, ",
+    joined!(import),
+    ", ",
+    joined!(structure),
+    " FROM import CROSS JOIN structure ON structure.number = import.structure WHERE import.number = $1"
+);
 
 /// What people do is in the log of operations, which does not grow with the candidates.
 const BY_HAND: &str = "SELECT number, time, kind, detail FROM operation
@@ -69,15 +75,18 @@ const BY_HAND: &str = "SELECT number, time, kind, detail FROM operation
 
 from_columns!(Named { decision, candidate });
 
-struct ImportRow {
-    number: i64,
-    file: String,
-    frame: u64,
-    hash: Vec<u8>,
-    data: Vec<u8>,
+impl FromRow for ImportedStructure {
+    fn from_row(row: &Row) -> Result<Self> {
+        IMPORT.verify(row, Names::Joined)?;
+        Ok(Self {
+            number: row.get("place")?,
+            file: row.get("import__file")?,
+            frame: row.get("import__frame")?,
+            structure: read_structure(row)?,
+            content: decode_hash(&row.get::<Vec<u8>>("structure__hash")?)?,
+        })
+    }
 }
-
-from_columns!(ImportRow { number, file, frame, hash, data });
 
 struct Before {
     sequence: i64,
@@ -142,10 +151,7 @@ impl Store {
 
     /// The imported structure of that number, from 1.
     pub async fn imported_structure(&self, number: i64) -> Result<Option<ImportedStructure>> {
-        let row: Option<ImportRow> = query(IMPORT).bind(number).fetch_optional(&self.database).await?;
-        let Some(ImportRow { number, file, frame, hash, data }) = row else { return Ok(None) };
-        let (structure, content) = (decode_structure(&data, &hash)?, decode_hash(&hash)?);
-        Ok(Some(ImportedStructure { number, file, frame, structure, content }))
+        query(IMPORTED).bind(number).fetch_optional(&self.database).await
     }
 
     /// Number of imported structures.

@@ -7,6 +7,7 @@ use super::commit::structure_number;
 use super::labels::{add, check, finish_job};
 use super::protocols;
 use crate::Store;
+use crate::checksum::IMPORT;
 use crate::database::{Transaction, query};
 use crate::encoding::{encode_vectors, integer};
 use crate::error::Result;
@@ -30,10 +31,10 @@ impl Store {
         for (frame, structure, label) in frames {
             let number = structure_number(&mut transaction, structure, ContentHash::of(structure)).await?;
             check(&mut transaction, number, label).await?;
-            let sql = "INSERT INTO import (structure, file, frame) VALUES ($1, $2, $3)
+            let sql = "INSERT INTO import (structure, file, frame, checksum) VALUES ($1, $2, $3, $4)
                        ON CONFLICT (structure) DO NOTHING";
-            let query = query(sql).bind(number).bind(file).bind(integer("frame", *frame)?);
-            query.execute(&mut transaction).await?;
+            let row = vec![number.into(), file.into(), integer("frame", *frame)?.into()];
+            query(sql).bind_all(IMPORT.with_checksum(row)).execute(&mut transaction).await?;
             if is_known(&mut transaction, number, protocol, label).await? {
                 imported.known += 1;
                 continue;

@@ -1,11 +1,13 @@
 //! Labels: the first valid result is the label, later ones are checks, and one that was asked for anew supersedes what was there.
 //! Nothing is overwritten.
 
+use atoms::Vec3;
 use wire::ContentHash;
 
 use super::queue::{end_attempt, job_row};
 use super::relabel::standing;
 use crate::Store;
+use crate::checksum::{LABEL, Names};
 use crate::database::{FromRow, Row, Transaction, query};
 use crate::encoding::{decode_matrix, decode_vectors, encode_vectors, integer};
 use crate::error::{Result, StoreError};
@@ -33,6 +35,7 @@ pub(super) struct LabelRow {
 
 impl FromRow for LabelRow {
     fn from_row(row: &Row) -> Result<Self> {
+        LABEL.verify(row, Names::Plain)?;
         Ok(Self {
             standing: row.get("standing")?,
             energy: row.get("energy")?,
@@ -147,24 +150,24 @@ pub(super) async fn add(
         }
     }
     let sql =
-        "INSERT INTO label (structure, protocol, standing, energy, forces, stress, job, attempt, file, frame,
-                                  received, details)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12)";
-    query(sql)
-        .bind(structure)
-        .bind(protocol)
-        .bind(standing.name())
-        .bind(label.energy)
-        .bind(encode_vectors(&label.forces))
-        .bind(label.stress.map(|stress| encode_vectors(&stress)))
-        .bind(job)
-        .bind(attempt)
-        .bind(file)
-        .bind(frame)
-        .bind(now)
-        .bind(encode_details(&label.details))
-        .execute(&mut *transaction)
-        .await?;
+        "INSERT INTO label (structure, protocol, energy, forces, stress, job, attempt, file, frame, received, details,
+                            checksum, standing)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)";
+    let row = vec![
+        structure.into(),
+        protocol.into(),
+        label.energy.into(),
+        encode_vectors(&label.forces).into(),
+        label.stress.map(|stress| encode_vectors(&stress)).into(),
+        job.into(),
+        attempt.into(),
+        file.into(),
+        frame.into(),
+        now.into(),
+        encode_details(&label.details).into(),
+    ];
+    let insert = query(sql).bind_all(LABEL.with_checksum(row)).bind(standing.name());
+    insert.execute(&mut *transaction).await?;
     Ok(standing)
 }
 
@@ -186,6 +189,17 @@ pub(super) async fn finish_job(
 }
 
 impl LabelRow {
+    /// None for an unknown standing.
+    pub(super) fn standing_and_energy(&self) -> Option<(Standing, f64)> {
+        Some((Standing::named(&self.standing)?, self.energy))
+    }
+
+    /// Forces, [n], eV/Å.
+    pub(super) fn forces(self) -> Result<Vec<Vec3>> {
+        decode_vectors(&self.forces)
+            .ok_or_else(|| StoreError::damaged("a label", "its forces have a wrong length"))
+    }
+
     pub(super) fn into_record(self) -> Result<LabelRecord> {
         let unknown = || StoreError::damaged("a label", "unknown standing or source");
         let standing = Standing::named(&self.standing).ok_or_else(unknown)?;

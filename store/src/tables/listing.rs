@@ -1,40 +1,46 @@
 //! Pages of the table of candidates. Each goes through an index from its first row on, however many rows there are.
 
 use crate::Store;
-use crate::database::{from_columns, query};
+use crate::checksum::{CANDIDATE, Names, joined};
+use crate::database::{FromRow, Row, query};
 use crate::error::Result;
 use crate::listing::{ListOrder, ListPlace, ListedCandidate};
 use crate::records::JobState;
 
-from_columns!(ListedCandidate {
-    decision,
-    id,
-    origin,
-    fate,
-    walk,
-    segment,
-    step,
-    seed_structure,
-    mixture_version,
-    atoms,
-    formula,
-    temperature,
-    relative_volume,
-    walker_gamma,
-    gamma,
-    gamma_nbr,
-    job_state,
-    priority,
-    attempts
-});
+impl FromRow for ListedCandidate {
+    fn from_row(row: &Row) -> Result<Self> {
+        CANDIDATE.verify(row, Names::Joined)?;
+        let reason: Option<String> = row.get("candidate__reason")?;
+        Ok(Self {
+            decision: row.get("candidate__decision")?,
+            id: row.get("candidate__id")?,
+            origin: row.get("candidate__origin")?,
+            fate: reason.map_or_else(|| row.get("candidate__fate"), Ok)?,
+            walk: row.get("candidate__walk")?,
+            segment: row.get("candidate__segment")?,
+            step: row.get("candidate__step")?,
+            seed_structure: row.get("seed_name")?,
+            mixture_version: row.get("candidate__mixture_version")?,
+            atoms: row.get("candidate__atoms")?,
+            formula: row.get("candidate__formula")?,
+            temperature: row.get("candidate__temperature")?,
+            relative_volume: row.get("candidate__relative_volume")?,
+            walker_gamma: row.get("candidate__walker_gamma")?,
+            gamma: row.get("candidate__original_gamma")?,
+            gamma_nbr: row.get("candidate__original_gamma_nbr")?,
+            job_state: row.get("job_state")?,
+            priority: row.get("priority")?,
+            attempts: row.get("attempts")?,
+        })
+    }
+}
 
 macro_rules! lines {
     ($($rest:literal),*) => {
         concat!(
-            "SELECT candidate.decision AS decision, id, origin, coalesce(candidate.reason, fate) AS fate, walk, segment,
-                step, coalesce(name, '') AS seed_structure, mixture_version, candidate.atoms AS atoms,
-                candidate.formula AS formula, temperature, relative_volume, walker_gamma, original_gamma AS gamma,
-                original_gamma_nbr AS gamma_nbr, job.state AS job_state, priority, attempts ",
+            "SELECT ",
+            joined!(candidate),
+            ", coalesce(name, '') AS seed_name, job.state AS job_state, priority, attempts ",
             $($rest),*
         )
     };

@@ -6,7 +6,8 @@ use std::ops::RangeInclusive;
 use serde_json::Value;
 
 use crate::Store;
-use crate::database::{Transaction, from_columns, query};
+use crate::checksum::{DECISION, Names};
+use crate::database::{self, FromRow, Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::records::{LoggedDecision, Operation};
 
@@ -23,7 +24,20 @@ struct Row {
     detail: String,
 }
 
-from_columns!(Row { sequence, round, kind, walk, candidate, mixture_version, detail });
+impl FromRow for Row {
+    fn from_row(row: &database::Row) -> Result<Self> {
+        DECISION.verify(row, Names::Plain)?;
+        Ok(Self {
+            sequence: row.get("sequence")?,
+            round: row.get("round")?,
+            kind: row.get("kind")?,
+            walk: row.get("walk")?,
+            candidate: row.get("candidate")?,
+            mixture_version: row.get("mixture_version")?,
+            detail: row.get("detail")?,
+        })
+    }
+}
 
 impl Store {
     /// The decisions with numbers (from 1) in `range`, in order.

@@ -3,6 +3,7 @@
 mod archives;
 pub mod budget;
 pub mod by_hand;
+pub mod checksums;
 pub mod collected;
 mod commit;
 mod energies;

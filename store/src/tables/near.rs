@@ -1,26 +1,36 @@
 //! Structures that may be almost the same as one that waits for its label.
 
+use atoms::Structure;
+
 use crate::Store;
-use crate::database::{from_columns, query};
-use crate::encoding::decode_structure;
+use crate::checksum::{CANDIDATE, FEATURES, Names, joined};
+use crate::database::{FromRow, Row, query};
+use crate::encoding::read_structure;
 use crate::error::Result;
 use crate::numbers::decode_numbers;
 use crate::outcomes::NearLabel;
 use crate::records::Lease;
 
-const OWN: &str = "SELECT candidate.decision AS decision, formula, energy, features
-    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
-    CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision WHERE job.number = $1";
+const OWN: &str = concat!(
+    "SELECT candidate.decision AS decision, candidate.formula AS formula, candidate.energy AS energy, features,
+        features_checksum, ",
+    joined!(candidate),
+    " FROM job CROSS JOIN candidate ON candidate.decision = job.decision
+    CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision WHERE job.number = $1"
+);
 
 /// Only the nearest in energy are looked into: features that are almost the same have almost the same energy.
-pub(crate) const NEAR: &str = "SELECT id, hash, data, features
-    FROM (SELECT candidate.decision AS place FROM candidate
+pub(crate) const NEAR: &str = concat!(
+    "SELECT candidate.decision AS decision, id, features, features_checksum, ",
+    joined!(structure),
+    " FROM (SELECT candidate.decision AS place FROM candidate
           CROSS JOIN job ON job.structure = candidate.structure AND job.protocol = $4 AND job.state = 'labelled'
           WHERE formula = $1 AND fate = 'accepted' AND energy IS NOT NULL AND candidate.decision <> $2
           ORDER BY abs(energy - $3) LIMIT $5) AS page
     CROSS JOIN candidate ON candidate.decision = place
     CROSS JOIN candidate_data ON candidate_data.decision = place
-    CROSS JOIN structure ON structure.number = candidate.structure";
+    CROSS JOIN structure ON structure.number = candidate.structure"
+);
 
 struct Own {
     decision: i64,
@@ -31,13 +41,29 @@ struct Own {
 
 struct Near {
     id: String,
-    hash: Vec<u8>,
-    data: Vec<u8>,
+    structure: Structure,
     features: Option<Vec<u8>>,
 }
 
-from_columns!(Own { decision, formula, energy, features });
-from_columns!(Near { id, hash, data, features });
+impl FromRow for Own {
+    fn from_row(row: &Row) -> Result<Self> {
+        CANDIDATE.verify(row, Names::Joined)?;
+        FEATURES.verify(row)?;
+        Ok(Self {
+            decision: row.get("decision")?,
+            formula: row.get("formula")?,
+            energy: row.get("energy")?,
+            features: row.get("features")?,
+        })
+    }
+}
+
+impl FromRow for Near {
+    fn from_row(row: &Row) -> Result<Self> {
+        FEATURES.verify(row)?;
+        Ok(Self { id: row.get("id")?, structure: read_structure(row)?, features: row.get("features")? })
+    }
+}
 
 impl Store {
     /// Features of the leased structure, [n × D], and of those with the same atoms in the same order that have their labels
@@ -55,9 +81,9 @@ impl Store {
         let near: Vec<Near> = near.fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         let mut others = Vec::new();
-        for Near { id, hash, data, features } in near {
+        for Near { id, structure, features } in near {
             let Some(features) = features else { continue };
-            if decode_structure(&data, &hash)?.species == lease.structure.species {
+            if structure.species == lease.structure.species {
                 others.push(NearLabel { candidate: id, features: decode_numbers(&features)? });
             }
         }

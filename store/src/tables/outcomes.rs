@@ -5,6 +5,7 @@ use wire::ContentHash;
 use super::restore::{grades, origin};
 use super::{job_counts, protocols};
 use crate::Store;
+use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
 use crate::database::{FromRow, Row, query};
 use crate::error::Result;
 use crate::outcomes::{FailureCount, Finished, LabelCost, Range, Unlabelled, Work};
@@ -59,11 +60,11 @@ const FAILED: &str = "SELECT coalesce(name, '') AS seed_name, candidate.formula 
     WHERE job.state = 'failed' AND job.protocol = $1
     GROUP BY candidate.seed_structure, name, candidate.formula ORDER BY candidate.seed_structure, candidate.formula";
 
-pub(crate) const FINISHED: &str =
-    "SELECT candidate.decision AS decision, id, CASE state WHEN 'failed' THEN 'failed' ELSE 'labelled' END AS state,
-        origin, coalesce(name, '') AS seed_name, formula,
-        original_gamma, original_gamma_nbr, relative_volume,
-        CASE WHEN state = 'failed' THEN original_grades END AS unlabelled,
+pub(crate) const FINISHED: &str = concat!(
+    "SELECT candidate.decision AS decision, CASE state WHEN 'failed' THEN 'failed' ELSE 'labelled' END AS job_state,
+        coalesce(name, '') AS seed_name, original_checksum, ",
+    joined!(candidate),
+    ", CASE WHEN state = 'failed' THEN original_grades END AS original_grades,
         CASE WHEN state = 'failed' THEN (SELECT class FROM attempt WHERE attempt.job = job.number
                                          AND attempt.attempt = job.attempts) END AS class
     FROM candidate CROSS JOIN job ON job.structure = candidate.structure AND job.protocol = $2
@@ -72,7 +73,8 @@ pub(crate) const FINISHED: &str =
     WHERE candidate.decision > $1 AND (job.state IN ('labelled', 'failed')
         OR (job.state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
             AND label.protocol = job.protocol AND standing = 'label')))
-    ORDER BY candidate.decision LIMIT $3";
+    ORDER BY candidate.decision LIMIT $3"
+);
 
 /// A label takes some time, whatever the clock says.
 const LEAST_MILLISECONDS: i64 = 1;
@@ -177,20 +179,27 @@ impl FromRow for Unlabelled {
 
 impl FromRow for Finished {
     fn from_row(row: &Row) -> Result<Self> {
-        let labelled = row.get::<String>("state")? == "labelled";
-        let unlabelled: Option<Vec<u8>> = row.get("unlabelled")?;
+        CANDIDATE.verify(row, Names::Joined)?;
+        let labelled = row.get::<String>("job_state")? == "labelled";
+        let unlabelled = match labelled {
+            true => None,
+            false => {
+                ORIGINAL_GRADES.verify(row)?;
+                Some(grades(row.get::<Option<Vec<u8>>>("original_grades")?.as_deref())?)
+            }
+        };
         Ok(Self {
             decision: row.get("decision")?,
-            candidate: row.get("id")?,
+            candidate: row.get("candidate__id")?,
             labelled,
-            origin: origin(&row.get::<String>("origin")?)?,
+            origin: origin(&row.get::<String>("candidate__origin")?)?,
             seed_structure: row.get("seed_name")?,
-            formula: row.get("formula")?,
-            gamma: row.get("original_gamma")?,
-            gamma_nbr: row.get("original_gamma_nbr")?,
-            relative_volume: row.get("relative_volume")?,
+            formula: row.get("candidate__formula")?,
+            gamma: row.get("candidate__original_gamma")?,
+            gamma_nbr: row.get("candidate__original_gamma_nbr")?,
+            relative_volume: row.get("candidate__relative_volume")?,
             class: row.get("class")?,
-            unlabelled: if labelled { None } else { Some(grades(unlabelled.as_deref())?) },
+            unlabelled,
         })
     }
 }

@@ -2,32 +2,41 @@
 
 use wire::ContentHash;
 
+use super::checksums::CAMPAIGN_KEYS;
 use super::commit::{enqueue, structure_number};
 use super::logs::insert_operation;
 use crate::Store;
-use crate::database::{Database, Transaction, from_columns, query};
-use crate::encoding::{decode_hash, decode_structure};
+use crate::checksum::{CAMPAIGN, Names, PROTOCOL, SEED_STRUCTURE, joined};
+use crate::database::{Database, FromRow, Row, Transaction, Value, query};
+use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::records::{Campaign, Protocol, SeedStructure};
 
 /// Priority of jobs that are made later than their candidate.
 const LATE_PRIORITY: i32 = 0;
 
-struct SeedRow {
-    seed: u32,
-    name: String,
-    source: String,
-    hash: Vec<u8>,
-    data: Vec<u8>,
+macro_rules! seeds {
+    ($rest:literal) => {
+        concat!(
+            "SELECT ",
+            joined!(seed_structure),
+            ", ",
+            joined!(structure),
+            " FROM seed_structure JOIN structure ON structure.number = seed_structure.structure ",
+            $rest
+        )
+    };
 }
 
-from_columns!(SeedRow { seed, name, source, hash, data });
-
-impl SeedRow {
-    fn into_seed_structure(self) -> Result<SeedStructure> {
-        let Self { seed, name, source, hash, data } = self;
-        let structure = decode_structure(&data, &hash)?;
-        Ok(SeedStructure { index: seed, name, source, structure })
+impl FromRow for SeedStructure {
+    fn from_row(row: &Row) -> Result<Self> {
+        SEED_STRUCTURE.verify(row, Names::Joined)?;
+        Ok(Self {
+            index: row.get("seed_structure__seed")?,
+            name: row.get("seed_structure__name")?,
+            source: row.get("seed_structure__source")?,
+            structure: read_structure(row)?,
+        })
     }
 }
 
@@ -72,9 +81,13 @@ impl Store {
     }
 
     pub(super) async fn campaign_value(&self, key: &str) -> Result<String> {
-        let value = query("SELECT value FROM campaign WHERE key = $1").bind(key);
-        let value: Option<String> = value.fetch_optional(&self.database).await?;
-        value.ok_or_else(|| StoreError::damaged("the campaign", format!("it has no {key}")))
+        let found = query("SELECT * FROM campaign WHERE key = $1").bind(key).rows(&self.database).await?;
+        let missing = || StoreError::damaged("the campaign", format!("it has no {key}"));
+        let row = found.first().ok_or_else(missing)?;
+        if CAMPAIGN_KEYS.contains(&key) {
+            CAMPAIGN.verify(row, Names::Plain)?;
+        }
+        row.get("value")
     }
 
     /// From now on the campaign runs by another configuration (JSON). Each of the changes (JSON objects) that make it
@@ -113,8 +126,8 @@ impl Store {
     pub async fn protocol_in_force(&self) -> Result<Option<Protocol>> {
         let mut transaction = self.database.begin_to_read().await?;
         let Some(number) = in_force(&mut transaction).await? else { return Ok(None) };
-        let row = query("SELECT hash, name, settings FROM protocol WHERE number = $1").bind(number);
-        protocol(row.fetch_one(&mut transaction).await?).map(Some)
+        let row = query("SELECT * FROM protocol WHERE number = $1").bind(number);
+        row.fetch_one(&mut transaction).await.map(Some)
     }
 
     /// Where the leader of the campaign has the files that grades depend on, as it last said: a JSON object of paths.
@@ -143,18 +156,12 @@ impl Store {
 
     /// Every seed structure, by index.
     pub async fn seed_structures(&self) -> Result<Vec<SeedStructure>> {
-        let sql = "SELECT seed, name, source, hash, data FROM seed_structure
-                   JOIN structure ON structure.number = seed_structure.structure ORDER BY seed";
-        let rows: Vec<SeedRow> = query(sql).fetch_all(&self.database).await?;
-        rows.into_iter().map(SeedRow::into_seed_structure).collect()
+        query(seeds!("ORDER BY seed")).fetch_all(&self.database).await
     }
 
     /// The seed structure of that index.
     pub async fn seed_structure(&self, index: u32) -> Result<Option<SeedStructure>> {
-        let sql = "SELECT seed, name, source, hash, data FROM seed_structure
-                   JOIN structure ON structure.number = seed_structure.structure WHERE seed = $1";
-        let row: Option<SeedRow> = query(sql).bind(index).fetch_optional(&self.database).await?;
-        row.map(SeedRow::into_seed_structure).transpose()
+        query(seeds!("WHERE seed = $1")).bind(index).fetch_optional(&self.database).await
     }
 
     /// Makes `protocol` the one of new label jobs. Accepted candidates that have no job at all (there was no protocol
@@ -188,23 +195,26 @@ impl Store {
 
     /// Every protocol, in the order in which they were added.
     pub async fn protocols(&self) -> Result<Vec<Protocol>> {
-        let sql = "SELECT hash, name, settings FROM protocol ORDER BY number";
-        let rows: Vec<(Vec<u8>, String, String)> = query(sql).fetch_all(&self.database).await?;
-        rows.into_iter().map(protocol).collect()
+        query("SELECT * FROM protocol ORDER BY number").fetch_all(&self.database).await
     }
 }
 
-fn protocol((hash, name, settings): (Vec<u8>, String, String)) -> Result<Protocol> {
-    let settings = serde_json::from_str(&settings);
-    let settings = settings.map_err(|error| StoreError::damaged("a protocol", error))?;
-    Ok(Protocol { hash: decode_hash(&hash)?, name, settings })
+impl FromRow for Protocol {
+    fn from_row(row: &Row) -> Result<Self> {
+        PROTOCOL.verify(row, Names::Plain)?;
+        let (hash, settings): (Vec<u8>, String) = (row.get("hash")?, row.get("settings")?);
+        let settings = serde_json::from_str(&settings);
+        let settings = settings.map_err(|error| StoreError::damaged("a protocol", error))?;
+        Ok(Self { hash: decode_hash(&hash)?, name: row.get("name")?, settings })
+    }
 }
 
 /// Adds a protocol, unless it is there.
 pub(super) async fn know(transaction: &mut Transaction, protocol: &Protocol, now: i64) -> Result<()> {
-    let sql = "INSERT INTO protocol (hash, name, settings) VALUES ($1, $2, $3) ON CONFLICT (hash) DO NOTHING";
-    let insert = query(sql).bind(&protocol.hash.0[..]).bind(&protocol.name);
-    let insert = insert.bind(protocol.settings.to_string());
+    let sql = "INSERT INTO protocol (hash, name, settings, checksum) VALUES ($1, $2, $3, $4)
+               ON CONFLICT (hash) DO NOTHING";
+    let row = vec![protocol.hash.0[..].into(), (&protocol.name).into(), protocol.settings.to_string().into()];
+    let insert = query(sql).bind_all(PROTOCOL.with_checksum(row));
     let added = insert.execute(&mut *transaction).await.map_err(|error| match error {
         StoreError::Database(sqlx::Error::Database(error)) if error.is_unique_violation() => {
             StoreError::ProtocolName(protocol.name.clone())
@@ -219,18 +229,24 @@ pub(super) async fn know(transaction: &mut Transaction, protocol: &Protocol, now
 }
 
 pub(super) async fn set_campaign_value(transaction: &mut Transaction, key: &str, value: &str) -> Result<()> {
-    let sql = "INSERT INTO campaign (key, value) VALUES ($1, $2)
-               ON CONFLICT (key) DO UPDATE SET value = excluded.value";
-    query(sql).bind(key).bind(value).execute(&mut *transaction).await?;
+    let sql = "INSERT INTO campaign (key, value, checksum) VALUES ($1, $2, $3)
+               ON CONFLICT (key) DO UPDATE SET value = excluded.value, checksum = excluded.checksum";
+    let mut row = vec![key.into(), value.into()];
+    match CAMPAIGN_KEYS.contains(&key) {
+        true => row = CAMPAIGN.with_checksum(row),
+        false => row.push(Value::Integer(None)),
+    }
+    query(sql).bind_all(row).execute(&mut *transaction).await?;
     Ok(())
 }
 
 async fn insert_seed_structure(transaction: &mut Transaction, seed: &SeedStructure) -> Result<()> {
     let structure = structure_number(transaction, &seed.structure, ContentHash::of(&seed.structure)).await?;
-    let sql = "INSERT INTO seed_structure (seed, name, source, structure) VALUES ($1, $2, $3, $4)
-               ON CONFLICT (seed) DO UPDATE SET name = $2, source = $3, structure = $4";
-    let query = query(sql).bind(seed.index).bind(&seed.name).bind(&seed.source).bind(structure);
-    query.execute(&mut *transaction).await?;
+    let sql =
+        "INSERT INTO seed_structure (seed, name, source, structure, checksum) VALUES ($1, $2, $3, $4, $5)
+               ON CONFLICT (seed) DO UPDATE SET name = $2, source = $3, structure = $4, checksum = $5";
+    let row = vec![seed.index.into(), (&seed.name).into(), (&seed.source).into(), structure.into()];
+    query(sql).bind_all(SEED_STRUCTURE.with_checksum(row)).execute(&mut *transaction).await?;
     Ok(())
 }
 
@@ -244,7 +260,7 @@ pub(super) async fn in_force(transaction: &mut Transaction) -> Result<Option<i64
 }
 
 /// Number of the protocol's row.
-pub(super) async fn number(transaction: &mut Transaction, hash: ContentHash) -> Result<i64> {
+pub(crate) async fn number(transaction: &mut Transaction, hash: ContentHash) -> Result<i64> {
     let number = query("SELECT number FROM protocol WHERE hash = $1").bind(hash.0.to_vec());
     let number: Option<i64> = number.fetch_optional(&mut *transaction).await?;
     number.ok_or_else(|| StoreError::UnknownProtocol(hash.to_string()))

@@ -11,8 +11,9 @@ use wire::ContentHash;
 use super::labels::CURRENT;
 use super::{budget, processes, protocols};
 use crate::Store;
+use crate::checksum::joined;
 use crate::database::{Transaction, from_columns, query};
-use crate::encoding::decode_structure;
+use crate::encoding::read_structure;
 use crate::error::{Result, StoreError};
 use crate::jobs::{CalculationRecord, Failed, Whereabouts};
 use crate::processes::ProcessRecord;
@@ -29,6 +30,9 @@ pub(crate) const UNFINISHED: &str = "SELECT (SELECT count(*) FROM job WHERE stat
 
 pub(crate) const HELD: &str = "SELECT number FROM job WHERE state = 'leased'
     AND (holder = $1 OR substr(holder, 1, length($1) + 1) = $1 || '/')";
+
+/// Of exactly this holder, not of its parts.
+pub(crate) const HELD_BY: &str = "SELECT number, attempts FROM job WHERE state = 'leased' AND holder = $1";
 
 /// Attempts of a job that were lost in a row; those before it was last given up for that do not count.
 pub(crate) const LOSSES: &str = "SELECT count(*) FROM attempt WHERE job = $1 AND attempt > (
@@ -128,6 +132,32 @@ impl Store {
         };
         transaction.commit().await?;
         Ok(Some(lease))
+    }
+
+    /// States that `holder` holds these leases and no others. What it does not state is given back: a lease whose taking or giving
+    /// back was committed while the answer got lost, which its holder knows nothing of, would last for as long as that lives. Does
+    /// not count as failed attempts. Returns how many were given back.
+    ///
+    /// A holder calls this and [`Self::lease`] one after the other: it would give back what it is just being given.
+    pub async fn state_leases(&self, holder: &str, held: &[&Lease], now: i64) -> Result<usize> {
+        let is_stated = |(job, attempt): &(i64, u32)| {
+            held.iter().any(|lease| (lease.job, lease.attempt) == (*job, *attempt))
+        };
+        // Mostly there is nothing to give back, and then nothing is written.
+        let found: Vec<(i64, u32)> = query(HELD_BY).bind(holder).fetch_all(&self.database).await?;
+        if found.iter().all(is_stated) {
+            return Ok(0);
+        }
+        let mut transaction = self.database.begin().await?;
+        let now = transaction.time(now).await?;
+        let mut found: Vec<(i64, u32)> =
+            query(HELD_BY).bind(holder).locked().fetch_all(&mut transaction).await?;
+        found.retain(|lease| !is_stated(lease));
+        for (job, _) in &found {
+            end_in_vain(&mut transaction, *job, InVain::Lost("lost"), now).await?;
+        }
+        transaction.commit().await?;
+        Ok(found.len())
     }
 
     /// Makes a lease last for `seconds` from `now` on. Returns whether it is still held: if not, somebody else may
@@ -424,10 +454,10 @@ async fn classes_of_failures(transaction: &mut Transaction, job: i64, failures: 
 }
 
 async fn structure_of(transaction: &mut Transaction, number: i64) -> Result<Structure> {
-    let sql = "SELECT data, hash FROM structure WHERE number = $1";
-    let row = query(sql).bind(number);
-    let (data, hash): (Vec<u8>, Vec<u8>) = row.fetch_one(&mut *transaction).await?;
-    decode_structure(&data, &hash)
+    let sql = concat!("SELECT ", joined!(structure), " FROM structure WHERE number = $1");
+    let found = query(sql).bind(number).rows(&mut *transaction).await?;
+    let missing = || StoreError::damaged(format!("structure {number}"), "it is not there");
+    read_structure(found.first().ok_or_else(missing)?)
 }
 
 /// Name and energy by the potential.

@@ -4,16 +4,43 @@ use wire::messages::{Decline, Progress};
 use wire::{CandidateBlock, ContentHash, Origin, WalkId};
 
 use crate::Store;
-use crate::database::{Target, from_columns, query};
+use crate::checksum::{
+    CANDIDATE, CHECKPOINT, COMPONENT, DECISION, LONG, Names, STRUCTURE, VALUE, WALK, joined,
+};
+use crate::database::{FromRow, Row, Target, from_columns, query};
 use crate::encoding::decode_hash;
 use crate::error::{Result, StoreError};
 use crate::numbers::decode_numbers;
 use crate::records::{AtomGrades, ComponentRecord, Fate, NewestMixture, StoredCandidate, WalkRecord};
 
-const CANDIDATES: &str = "SELECT candidate.decision, seed_structure, fate, reason, block, features,
-        selector_grades, original_grades
-    FROM candidate CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
-    WHERE candidate.decision > $1 AND (origin = 'biased' OR $2 = 1) ORDER BY candidate.decision LIMIT $3";
+macro_rules! candidates {
+    ($rest:literal) => {
+        concat!(
+            "SELECT candidate.*, block, features, selector_grades, original_grades
+            FROM candidate CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision ",
+            $rest
+        )
+    };
+}
+
+const CANDIDATES: &str = candidates!(
+    "WHERE candidate.decision > $1 AND (origin = 'biased' OR $2 = 1) ORDER BY candidate.decision LIMIT $3"
+);
+/// Rows without their long columns read at a time.
+const PAGE: u32 = 1000;
+
+const ACCEPTED: &str =
+    "SELECT * FROM candidate WHERE decision > $1 AND origin = 'biased' AND fate = 'accepted'
+    ORDER BY decision LIMIT $2";
+
+const IMPORTED: &str = concat!(
+    "SELECT import.number AS place, ",
+    joined!(structure),
+    " FROM import CROSS JOIN structure ON structure.number = import.structure
+    WHERE import.number > $1 ORDER BY import.number LIMIT $2"
+);
+
+const CANDIDATE_OF_NAME: &str = candidates!("WHERE id = $1");
 
 struct WalkRow {
     walk: u32,
@@ -57,33 +84,10 @@ from_columns!(WalkRow {
     checkpoint
 });
 
-struct CandidateRow {
-    decision: i64,
-    seed_structure: u32,
-    fate: String,
-    reason: Option<String>,
-    block: Vec<u8>,
-    features: Option<Vec<u8>>,
-    selector_grades: Option<Vec<u8>>,
-    original_grades: Option<Vec<u8>>,
-}
-
-from_columns!(CandidateRow {
-    decision,
-    seed_structure,
-    fate,
-    reason,
-    block,
-    features,
-    selector_grades,
-    original_grades
-});
-
 impl Store {
     /// Every walk, in order.
     pub async fn load_walks(&self) -> Result<Vec<WalkRecord>> {
-        let rows: Vec<WalkRow> = query("SELECT * FROM walk ORDER BY walk").fetch_all(&self.database).await?;
-        rows.into_iter().map(WalkRow::into_record).collect()
+        query("SELECT * FROM walk ORDER BY walk").fetch_all(&self.database).await
     }
 
     /// Every component that ever changed (since the mixture last began anew), by element and slot.
@@ -93,34 +97,57 @@ impl Store {
 
     /// The selector's values, by name.
     pub async fn values(&self) -> Result<Vec<(String, String)>> {
-        query("SELECT name, value FROM value ORDER BY name").fetch_all(&self.database).await
+        let rows = query("SELECT * FROM value ORDER BY name").rows(&self.database).await?;
+        let value = |row: &Row| {
+            VALUE.verify(row, Names::Plain)?;
+            Ok((row.get("name")?, row.get("value")?))
+        };
+        rows.iter().map(value).collect()
     }
 
     /// Hashes of the structures that a new candidate must not repeat: accepted candidates of biased walks, in decision
     /// order, then imported structures.
     pub async fn known_hashes(&self) -> Result<Vec<ContentHash>> {
-        let sql =
-            "SELECT content FROM candidate WHERE origin = 'biased' AND fate = 'accepted' ORDER BY decision";
-        let hashes: Vec<Vec<u8>> = query(sql).fetch_all(&self.database).await?;
-        let mut hashes: Vec<_> = hashes.iter().map(|hash| decode_hash(hash)).collect::<Result<_>>()?;
+        let (mut hashes, mut after) = (Vec::new(), 0);
+        loop {
+            let page = query(ACCEPTED).bind(after).bind(PAGE).rows(&self.database).await?;
+            let Some(last) = page.last() else { break };
+            after = last.get("decision")?;
+            for row in &page {
+                CANDIDATE.verify(row, Names::Plain)?;
+                hashes.push(decode_hash(&row.get::<Vec<u8>>("content")?)?);
+            }
+        }
         hashes.extend(self.imported_hashes().await?);
         Ok(hashes)
     }
 
     /// Hashes of imported structures, in the order in which they came.
     pub async fn imported_hashes(&self) -> Result<Vec<ContentHash>> {
-        let sql = "SELECT hash FROM import JOIN structure ON structure.number = import.structure
-                   ORDER BY import.number";
-        let hashes: Vec<Vec<u8>> = query(sql).fetch_all(&self.database).await?;
-        hashes.iter().map(|hash| decode_hash(hash)).collect()
+        let (mut hashes, mut after) = (Vec::new(), 0);
+        loop {
+            let page = query(IMPORTED).bind(after).bind(PAGE).rows(&self.database).await?;
+            let Some(last) = page.last() else { return Ok(hashes) };
+            after = last.get("place")?;
+            for row in &page {
+                STRUCTURE.verify(row, Names::Joined)?;
+                hashes.push(decode_hash(&row.get::<Vec<u8>>("structure__hash")?)?);
+            }
+        }
     }
 
     /// How far the decisions have come, and the mixture at that instant.
     pub async fn newest_mixture(&self) -> Result<NewestMixture> {
         let mut transaction = self.database.begin_to_read().await?;
-        let sql = "SELECT sequence, mixture_version FROM decision ORDER BY sequence DESC LIMIT 1";
-        let last: Option<(i64, u64)> = query(sql).fetch_optional(&mut transaction).await?;
-        let (decision, version) = last.unwrap_or_default();
+        let last =
+            query("SELECT * FROM decision ORDER BY sequence DESC LIMIT 1").rows(&mut transaction).await?;
+        let (decision, version) = match last.first() {
+            None => (0, 0),
+            Some(row) => {
+                DECISION.verify(row, Names::Plain)?;
+                (row.get("sequence")?, row.get("mixture_version")?)
+            }
+        };
         let components = components(&mut transaction).await?;
         transaction.commit().await?;
         Ok(NewestMixture { decision, version, components })
@@ -130,18 +157,12 @@ impl Store {
     /// if `control` says so.
     pub async fn candidates(&self, after: i64, control: bool, limit: u32) -> Result<Vec<StoredCandidate>> {
         let query = query(CANDIDATES).bind(after).bind(control).bind(limit);
-        let rows: Vec<CandidateRow> = query.fetch_all(&self.database).await?;
-        rows.into_iter().map(CandidateRow::into_candidate).collect()
+        query.fetch_all(&self.database).await
     }
 
     /// The candidate of that name, `None` if there is none.
     pub async fn candidate(&self, id: &str) -> Result<Option<StoredCandidate>> {
-        let sql = "SELECT candidate.decision, seed_structure, fate, reason, block, features, selector_grades,
-                          original_grades
-                   FROM candidate JOIN candidate_data ON candidate_data.decision = candidate.decision
-                   WHERE id = $1";
-        let row: Option<CandidateRow> = query(sql).bind(id).fetch_optional(&self.database).await?;
-        row.map(CandidateRow::into_candidate).transpose()
+        query(CANDIDATE_OF_NAME).bind(id).fetch_optional(&self.database).await
     }
 
     /// Names of all candidates in decision order, at most `limit` after decision number `after`.
@@ -152,9 +173,22 @@ impl Store {
 }
 
 async fn components(from: impl Into<Target<'_>>) -> Result<Vec<ComponentRecord>> {
-    let sql = "SELECT element, slot, bytes FROM component ORDER BY element, slot";
-    let rows: Vec<(u32, u32, Vec<u8>)> = query(sql).fetch_all(from).await?;
-    Ok(rows.into_iter().map(|(element, slot, bytes)| ComponentRecord { element, slot, bytes }).collect())
+    query("SELECT * FROM component ORDER BY element, slot").fetch_all(from).await
+}
+
+impl FromRow for ComponentRecord {
+    fn from_row(row: &Row) -> Result<Self> {
+        COMPONENT.verify(row, Names::Plain)?;
+        Ok(Self { element: row.get("element")?, slot: row.get("slot")?, bytes: row.get("bytes")? })
+    }
+}
+
+impl FromRow for WalkRecord {
+    fn from_row(row: &Row) -> Result<Self> {
+        WALK.verify(row, Names::Plain)?;
+        CHECKPOINT.verify(row)?;
+        WalkRow::from_row(row)?.into_record()
+    }
 }
 
 impl WalkRow {
@@ -187,21 +221,36 @@ impl WalkRow {
     }
 }
 
-impl CandidateRow {
-    fn into_candidate(self) -> Result<StoredCandidate> {
-        let fate = match (self.fate.as_str(), self.reason.as_deref()) {
+impl FromRow for StoredCandidate {
+    fn from_row(row: &Row) -> Result<Self> {
+        CANDIDATE.verify(row, Names::Plain)?;
+        LONG.iter().try_for_each(|column| column.verify(row))?;
+        let (fate, reason): (String, Option<String>) = (row.get("fate")?, row.get("reason")?);
+        let fate = match (fate.as_str(), reason.as_deref()) {
             ("accepted", None) => Some(Fate::Accepted),
             (_, reason) => Decline::ALL.into_iter().find(|d| Some(d.name()) == reason).map(Fate::Declined),
         };
-        Ok(StoredCandidate {
-            decision: self.decision,
-            block: CandidateBlock::from_bytes(&self.block)?,
+        let [features, selector, original]: [Option<Vec<u8>>; 3] =
+            [row.get("features")?, row.get("selector_grades")?, row.get("original_grades")?];
+        Ok(Self {
+            decision: row.get("decision")?,
+            block: block(row, &row.get::<String>("id")?)?,
             fate: fate.ok_or_else(|| StoreError::damaged("a candidate", "unknown fate"))?,
-            seed_structure: self.seed_structure,
-            selector: grades(self.selector_grades.as_deref())?,
-            original: grades(self.original_grades.as_deref())?,
-            features: self.features.map(|bytes| decode_numbers(&bytes)).transpose()?,
+            seed_structure: row.get("seed_structure")?,
+            selector: grades(selector.as_deref())?,
+            original: grades(original.as_deref())?,
+            features: features.map(|bytes| decode_numbers(&bytes)).transpose()?,
         })
+    }
+}
+
+/// The block of a row, which must be that of the candidate of this name.
+pub(super) fn block(row: &Row, id: &str) -> Result<CandidateBlock> {
+    let block = CandidateBlock::from_bytes(&row.get::<Vec<u8>>("block")?)?;
+    let found = block.view().id().to_string();
+    match found == id {
+        true => Ok(block),
+        false => Err(StoreError::damaged(format!("candidate {id}"), format!("its block is that of {found}"))),
     }
 }
 

@@ -5,6 +5,7 @@ use wire::WalkId;
 use super::{budget, job_counts, pace, pauses, processes, relabel};
 use crate::Store;
 use crate::budget::{Budget, BudgetStatus};
+use crate::checksum::joined;
 use crate::database::query;
 use crate::error::Result;
 use crate::pace::Pace;
@@ -24,7 +25,9 @@ pub(crate) const COUNTED_FATES: &str =
 macro_rules! walks {
     ($which:literal) => {
         concat!(
-            "SELECT walk, coalesce(name, '') AS seed_structure, origin, state, reason, FALSE AS paused, step, segment,
+            "SELECT ",
+            joined!(walk),
+            ", walk, coalesce(name, '') AS seed_structure, origin, state, reason, FALSE AS paused, step, segment,
                 CASE WHEN relative_volume > 0 THEN tau END AS tau, CASE WHEN relative_volume > 0 THEN temperature END AS temperature,
                 nullif(relative_volume, 0) AS relative_volume, nullif(gamma_max, 0) AS gamma_max, CAST(NULL AS DOUBLE PRECISION) AS steps_per_second, accepted,
                 refused, returns

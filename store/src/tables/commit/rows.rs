@@ -5,6 +5,10 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 use wire::CandidateView;
 
 use super::newest;
+use crate::checksum::{
+    CANDIDATE as CANDIDATES, COMPONENT as COMPONENTS, CheckedColumn, DECISION as DECISIONS,
+    STRUCTURE as STRUCTURES, VALUE as VALUES, WALK as WALKS,
+};
 use crate::database::Value;
 use crate::encoding::{encode_structure, integer};
 use crate::error::{Result, StoreError};
@@ -13,10 +17,12 @@ use crate::records::{AtomGrades, CandidateRecord, Commit, Decision, Fate, WalkRe
 
 type Row = Vec<Value>;
 
-pub(super) const DECISION: [&str; 7] =
-    ["sequence", "round", "kind", "walk", "candidate", "mixture_version", "detail"];
-pub(super) const STRUCTURE: [&str; 4] = ["hash", "atoms", "formula", "data"];
-pub(super) const CANDIDATE: [&str; 25] = [
+pub(super) const DECISION: [&str; 8] =
+    ["sequence", "round", "kind", "walk", "candidate", "mixture_version", "detail", "checksum"];
+pub(super) const STRUCTURE: [&str; 5] = ["hash", "atoms", "formula", "data", "checksum"];
+pub(super) const COMPONENT: [&str; 4] = ["element", "slot", "bytes", "checksum"];
+pub(super) const VALUE: [&str; 3] = ["name", "value", "checksum"];
+pub(super) const CANDIDATE: [&str; 29] = [
     "decision",
     "id",
     "content",
@@ -42,12 +48,16 @@ pub(super) const CANDIDATE: [&str; 25] = [
     "original_gamma",
     "original_gamma_nbr",
     "original_above",
+    "checksum",
+    "features_checksum",
+    "selector_checksum",
+    "original_checksum",
 ];
 pub(super) const CANDIDATE_COUNT: [&str; 3] = ["origin", "fate", "number"];
 pub(super) const CANDIDATE_DATA: [&str; 5] =
     ["decision", "block", "features", "selector_grades", "original_grades"];
 pub(super) const JOB: [&str; 4] = ["hash", "protocol", "decision", "priority"];
-pub(super) const WALK: [&str; 18] = [
+pub(super) const WALK: [&str; 20] = [
     "walk",
     "origin",
     "partner",
@@ -65,7 +75,9 @@ pub(super) const WALK: [&str; 18] = [
     "refused",
     "returns",
     "selector_state",
+    "checksum",
     "checkpoint",
+    "checkpoint_checksum",
 ];
 
 /// The rows of each table. Decisions are numbered from 1 on until it is known how many there are before them.
@@ -94,12 +106,14 @@ impl Rows {
             jobs: Vec::new(),
             components: newest(&commit.components, |component| (component.element, component.slot))
                 .map(|component| {
-                    vec![component.element.into(), component.slot.into(), component.bytes.clone().into()]
+                    let row =
+                        vec![component.element.into(), component.slot.into(), component.bytes.clone().into()];
+                    COMPONENTS.with_checksum(row)
                 })
                 .collect(),
             walks: newest(&commit.walks, |walk| walk.walk).map(walk).collect::<Result<_>>()?,
             values: newest(&commit.values, |(name, _)| name)
-                .map(|(name, value)| vec![name.into(), value.into()])
+                .map(|(name, value)| VALUES.with_checksum(vec![name.into(), value.into()]))
                 .collect(),
         };
         let (mut decided, mut structures) = (decided(commit)?, HashSet::new());
@@ -137,12 +151,13 @@ impl Rows {
         let (structure, hash) = (view.structure(), view.id().content.0);
         if record.fate == Fate::Accepted {
             if structures.insert(hash) {
-                self.structures.push(vec![
+                let row = vec![
                     hash[..].into(),
                     count(structure.len())?.into(),
                     structure.formula().into(),
                     encode_structure(&structure).into(),
-                ]);
+                ];
+                self.structures.push(STRUCTURES.with_checksum(row));
             }
             // The protocol comes with the number of the decision.
             self.jobs.push(vec![
@@ -171,7 +186,27 @@ impl Rows {
             row[1] = protocol.into();
             shift(&mut row[2]);
         }
+        self.add_checksums();
     }
+
+    /// They are also of the numbers of the decisions.
+    fn add_checksums(&mut self) {
+        for row in &mut self.decisions {
+            *row = DECISIONS.with_checksum(std::mem::take(row));
+        }
+        for (row, data) in self.candidates.iter_mut().zip(&self.candidate_data) {
+            *row = CANDIDATES.with_checksum(std::mem::take(row));
+            if let [Value::Integer(Some(decision)), _, long @ ..] = data.as_slice() {
+                row.extend(long.iter().map(|column| long_checksum(*decision, column)));
+            }
+        }
+    }
+}
+
+/// Features and grades, in the order of their columns.
+fn long_checksum(decision: i64, column: &Value) -> Value {
+    let Value::Bytes(bytes) = column else { return Value::Integer(None) };
+    CheckedColumn::checksum(decision, bytes.as_deref()).into()
 }
 
 fn candidate_counts(commit: &Commit) -> Vec<Row> {
@@ -271,7 +306,7 @@ fn grades(id: &str, view: &CandidateView<'_>, grades: &AtomGrades) -> Result<Opt
 
 fn walk(walk: &WalkRecord) -> Result<Row> {
     let WalkRecord { progress, .. } = walk;
-    Ok(vec![
+    let row = vec![
         walk.walk.0.into(),
         walk.origin.name().into(),
         walk.partner.map(|partner| partner.0).into(),
@@ -289,8 +324,11 @@ fn walk(walk: &WalkRecord) -> Result<Row> {
         integer("number of refusals", progress.refused)?.into(),
         progress.returns.into(),
         (&walk.selector_state).into(),
-        walk.checkpoint.clone().into(),
-    ])
+    ];
+    let mut row = WALKS.with_checksum(row);
+    let checkpoint = CheckedColumn::checksum(walk.walk.0.into(), walk.checkpoint.as_deref());
+    row.extend([walk.checkpoint.clone().into(), checkpoint.into()]);
+    Ok(row)
 }
 
 fn count(number: usize) -> Result<i64> {

@@ -1,0 +1,386 @@
+//! Checksums of rows: whoever reads a stored number sees whether it is the one that was written.
+//!
+//! A checksum is a CRC-32 of the columns of a row, each with its type and length. It finds every single-bit flip, and misses other
+//! damage once in 2³². Disks and memory damage bytes by accident, so nothing is gained from a hash that withstands an adversary,
+//! which takes several times as long.
+//!
+//! Columns that SQL changes in place (the standing of a label, whatever belongs to the queue) have none: `store check` compares
+//! them with each other.
+
+use crc32fast::Hasher;
+
+use crate::database::value::{Kind, without_zeros};
+use crate::database::{Row, Value};
+use crate::error::{Result, StoreError};
+
+/// What stands in the place of the checksums of tables of an earlier version, which are only looked at.
+pub const UNKNOWN: i64 = -1;
+
+/// A table whose rows have a checksum.
+pub struct CheckedTable {
+    /// Its name.
+    pub name: &'static str,
+    /// The column by which messages name a row.
+    key: Column,
+    /// The columns that the checksum is of, in its order.
+    columns: &'static [Column],
+    checksum: Column,
+}
+
+/// A column, its name in joins (`table__column`, see [`joined`]), and its type.
+struct Column {
+    name: &'static str,
+    joined: &'static str,
+    kind: Kind,
+}
+
+/// Which names the columns of a row have.
+#[derive(Clone, Copy)]
+pub enum Names {
+    /// Those of the table.
+    Plain,
+    /// `table__column`.
+    Joined,
+}
+
+macro_rules! checked {
+    ($table:literal by $key:ident $key_kind:ident { $($column:ident: $kind:ident),* $(,)? }) => {
+        CheckedTable {
+            name: $table,
+            key: checked!(@ $table, $key, $key_kind),
+            columns: &[$(checked!(@ $table, $column, $kind)),*],
+            checksum: checked!(@ $table, checksum, Integer),
+        }
+    };
+    (@ $table:literal, $column:ident, $kind:ident) => {
+        Column {
+            name: stringify!($column),
+            joined: concat!($table, "__", stringify!($column)),
+            kind: Kind::$kind,
+        }
+    };
+}
+
+/// The values of the selector.
+pub static VALUE: CheckedTable = checked!("value" by name Text { name: Text, value: Text });
+
+/// The campaign's own values. Those that SQL changes in place have no checksum.
+pub static CAMPAIGN: CheckedTable = checked!("campaign" by key Text { key: Text, value: Text });
+
+/// Structures.
+pub static STRUCTURE: CheckedTable =
+    checked!("structure" by number Integer { hash: Bytes, atoms: Integer, formula: Text, data: Bytes });
+
+/// Seed structures.
+pub static SEED_STRUCTURE: CheckedTable = checked!("seed_structure" by seed Integer {
+    seed: Integer, name: Text, source: Text, structure: Integer,
+});
+
+/// Label protocols.
+pub static PROTOCOL: CheckedTable =
+    checked!("protocol" by name Text { hash: Bytes, name: Text, settings: Text });
+
+/// Decisions.
+pub static DECISION: CheckedTable = checked!("decision" by sequence Integer {
+    sequence: Integer, round: Integer, kind: Text, walk: Integer, candidate: Text, mixture_version: Integer,
+    detail: Text,
+});
+
+/// Candidates, without the number of their structure: its content is that of the structure.
+pub static CANDIDATE: CheckedTable = checked!("candidate" by decision Integer {
+    decision: Integer, id: Text, content: Bytes, walk: Integer, segment: Integer, step: Integer,
+    seed_structure: Integer, origin: Text, fate: Text, reason: Text, mixture_version: Integer, atoms: Integer,
+    formula: Text, temperature: Real, relative_volume: Real, energy: Real, walker_gamma: Real,
+    walker_gamma_nbr: Real, walker_above: Integer, selector_gamma: Real, selector_gamma_nbr: Real,
+    selector_above: Integer, original_gamma: Real, original_gamma_nbr: Real, original_above: Integer,
+});
+
+/// Components of the mixture.
+pub static COMPONENT: CheckedTable =
+    checked!("component" by element Integer { element: Integer, slot: Integer, bytes: Bytes });
+
+/// Walks without their checkpoints, see [`CHECKPOINT`].
+pub static WALK: CheckedTable = checked!("walk" by walk Integer {
+    walk: Integer, origin: Text, partner: Integer, seed_structure: Integer, state: Text, reason: Text, turn: Integer,
+    accepted: Integer, step: Integer, segment: Integer, tau: Real, temperature: Real, relative_volume: Real,
+    gamma_max: Real, refused: Integer, returns: Integer, selector_state: Text,
+});
+
+/// Labels, without their standing and why it changed.
+pub static LABEL: CheckedTable = checked!("label" by number Integer {
+    structure: Integer, protocol: Integer, energy: Real, forces: Bytes, stress: Bytes, job: Integer,
+    attempt: Integer, file: Text, frame: Integer, received: Integer, details: Text,
+});
+
+/// Imported structures.
+pub static IMPORT: CheckedTable =
+    checked!("import" by structure Integer { structure: Integer, file: Text, frame: Integer });
+
+/// Packed directories of calculations.
+pub static ARCHIVE: CheckedTable =
+    checked!("archive" by job Integer { job: Integer, attempt: Integer, bytes: Bytes, left_out: Text });
+
+/// A long column whose checksum stands in another: with that of the row, whoever needs the short columns would read it as well.
+pub struct CheckedColumn {
+    /// Its name.
+    name: &'static str,
+    /// The column of the number of its row.
+    key: &'static str,
+    /// The column of its checksum.
+    checksum: &'static str,
+    what: &'static str,
+}
+
+/// Features of a candidate; the checksum stands in the table `candidate`, as that of the grades.
+pub static FEATURES: CheckedColumn = CheckedColumn {
+    name: "features",
+    key: "decision",
+    checksum: "features_checksum",
+    what: "the features of candidate",
+};
+
+/// Grades of the atoms of a candidate under the selector's mixture.
+pub static SELECTOR_GRADES: CheckedColumn = CheckedColumn {
+    name: "selector_grades",
+    key: "decision",
+    checksum: "selector_checksum",
+    what: "the selector's grades of candidate",
+};
+
+/// The same under the original mixture.
+pub static ORIGINAL_GRADES: CheckedColumn = CheckedColumn {
+    name: "original_grades",
+    key: "decision",
+    checksum: "original_checksum",
+    what: "the original grades of candidate",
+};
+
+/// The long columns of a candidate, in the order of its checksums.
+pub static LONG: [&CheckedColumn; 3] = [&FEATURES, &SELECTOR_GRADES, &ORIGINAL_GRADES];
+
+/// The checkpoint of a walk.
+pub static CHECKPOINT: CheckedColumn = CheckedColumn {
+    name: "checkpoint",
+    key: "walk",
+    checksum: "checkpoint_checksum",
+    what: "the checkpoint of walk",
+};
+
+/// What queries select to verify a row of a table in a join, as [`Names::Joined`].
+macro_rules! joined {
+    (candidate) => {
+        "candidate.decision AS candidate__decision, candidate.id AS candidate__id, candidate.content AS candidate__content,
+        candidate.walk AS candidate__walk, candidate.segment AS candidate__segment, candidate.step AS candidate__step,
+        candidate.seed_structure AS candidate__seed_structure, candidate.origin AS candidate__origin,
+        candidate.fate AS candidate__fate, candidate.reason AS candidate__reason,
+        candidate.mixture_version AS candidate__mixture_version, candidate.atoms AS candidate__atoms,
+        candidate.formula AS candidate__formula, candidate.temperature AS candidate__temperature,
+        candidate.relative_volume AS candidate__relative_volume, candidate.energy AS candidate__energy,
+        candidate.walker_gamma AS candidate__walker_gamma, candidate.walker_gamma_nbr AS candidate__walker_gamma_nbr,
+        candidate.walker_above AS candidate__walker_above, candidate.selector_gamma AS candidate__selector_gamma,
+        candidate.selector_gamma_nbr AS candidate__selector_gamma_nbr, candidate.selector_above AS candidate__selector_above,
+        candidate.original_gamma AS candidate__original_gamma,
+        candidate.original_gamma_nbr AS candidate__original_gamma_nbr, candidate.original_above AS candidate__original_above,
+        candidate.checksum AS candidate__checksum"
+    };
+    (decision) => {
+        "decision.sequence AS decision__sequence, decision.round AS decision__round, decision.kind AS decision__kind,
+        decision.walk AS decision__walk, decision.candidate AS decision__candidate,
+        decision.mixture_version AS decision__mixture_version, decision.detail AS decision__detail,
+        decision.checksum AS decision__checksum"
+    };
+    (seed_structure) => {
+        "seed_structure.seed AS seed_structure__seed, seed_structure.name AS seed_structure__name,
+        seed_structure.source AS seed_structure__source, seed_structure.structure AS seed_structure__structure,
+        seed_structure.checksum AS seed_structure__checksum"
+    };
+    (import) => {
+        "import.structure AS import__structure, import.file AS import__file, import.frame AS import__frame,
+        import.checksum AS import__checksum"
+    };
+    (walk) => {
+        "walk.walk AS walk__walk, walk.origin AS walk__origin, walk.partner AS walk__partner, walk.seed_structure AS
+        walk__seed_structure, walk.state AS walk__state, walk.reason AS walk__reason, walk.turn AS walk__turn, walk.accepted
+        AS walk__accepted, walk.step AS walk__step, walk.segment AS walk__segment, walk.tau AS walk__tau, walk.temperature AS
+        walk__temperature, walk.relative_volume AS walk__relative_volume, walk.gamma_max AS walk__gamma_max, walk.refused AS
+        walk__refused, walk.returns AS walk__returns, walk.selector_state AS walk__selector_state, walk.checksum AS
+        walk__checksum"
+    };
+    (structure) => {
+        "structure.number AS structure__number, structure.hash AS structure__hash, structure.atoms AS structure__atoms,
+        structure.formula AS structure__formula, structure.data AS structure__data,
+        structure.checksum AS structure__checksum"
+    };
+}
+pub(crate) use joined;
+
+impl CheckedTable {
+    /// The values of a row with its checksum behind them.
+    pub fn with_checksum(&self, mut row: Vec<Value>) -> Vec<Value> {
+        debug_assert_eq!(row.len(), self.columns.len(), "{}", self.name);
+        row.push(checksum(&row).into());
+        row
+    }
+
+    /// The checksum that a row with these names of its columns should have.
+    pub fn compute(&self, row: &Row, names: Names) -> Result<i64> {
+        let values = self.columns.iter().map(|column| column.kind.read(row, column.called(names)));
+        Ok(checksum(&values.collect::<Result<Vec<_>>>()?))
+    }
+
+    /// Checks that a row is the one that was written.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] if it is not.
+    pub fn verify(&self, row: &Row, names: Names) -> Result<()> {
+        let found: Option<i64> = row.get(self.checksum.called(names))?;
+        if found == Some(UNKNOWN) {
+            return Ok(());
+        }
+        compare(found, self.compute(row, names)?, || {
+            let key = self.key.kind.read(row, self.key.called(names));
+            format!("{} {}", self.name.replace('_', " "), key.map_or_else(|_| "?".into(), |key| show(&key)))
+        })
+    }
+}
+
+impl Column {
+    fn called(&self, names: Names) -> &'static str {
+        match names {
+            Names::Plain => self.name,
+            Names::Joined => self.joined,
+        }
+    }
+}
+
+impl CheckedColumn {
+    /// Checksum of the column in the row with this number.
+    pub fn checksum(number: i64, bytes: Option<&[u8]>) -> i64 {
+        let mut hasher = Hasher::new();
+        add(&mut hasher, &Value::Integer(Some(number)));
+        add_bytes(&mut hasher, bytes);
+        hasher.finalize().into()
+    }
+
+    /// The checksum that the column of a row should have.
+    pub fn compute(&self, row: &Row) -> Result<i64> {
+        let (number, bytes): (i64, Option<Vec<u8>>) = (row.get(self.key)?, row.get(self.name)?);
+        Ok(Self::checksum(number, bytes.as_deref()))
+    }
+
+    /// Checks that the bytes are those that were written. The row has the number and the checksum, too.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] if they are not.
+    pub fn verify(&self, row: &Row) -> Result<()> {
+        let found: Option<i64> = row.get(self.checksum)?;
+        if found == Some(UNKNOWN) {
+            return Ok(());
+        }
+        let number: i64 = row.get(self.key)?;
+        compare(found, self.compute(row)?, || format!("{} {number}", self.what))
+    }
+}
+
+fn compare(found: Option<i64>, computed: i64, what: impl FnOnce() -> String) -> Result<()> {
+    match found {
+        Some(found) if found == computed => Ok(()),
+        Some(found) => {
+            let reason =
+                format!("its content has the checksum {computed:08x}, and {found:08x} was stored with it");
+            Err(StoreError::damaged(what(), reason))
+        }
+        None => Err(StoreError::damaged(what(), "its checksum is missing")),
+    }
+}
+
+/// The checksum of values, as the store's columns have it.
+pub fn checksum(values: &[Value]) -> i64 {
+    let mut hasher = Hasher::new();
+    values.iter().for_each(|value| add(&mut hasher, value));
+    hasher.finalize().into()
+}
+
+/// Databases keep neither the sign of zero nor zero bytes in text.
+fn add(hasher: &mut Hasher, value: &Value) {
+    let number = |hasher: &mut Hasher, kind: u8, bits: Option<[u8; 8]>| {
+        hasher.update(&[kind, u8::from(bits.is_some())]);
+        hasher.update(&bits.unwrap_or_default());
+    };
+    match value {
+        Value::Integer(value) => number(hasher, b'i', value.map(i64::to_le_bytes)),
+        Value::Real(value) => {
+            let value = value.filter(|x| !x.is_nan()).map(|x| if x == 0.0 { 0.0 } else { x });
+            number(hasher, b'r', value.map(f64::to_le_bytes));
+        }
+        Value::Text(Some(text)) if text.contains('\0') => {
+            add_bytes(hasher, Some(without_zeros(text.clone()).as_bytes()));
+        }
+        Value::Text(text) => add_bytes(hasher, text.as_ref().map(String::as_bytes)),
+        Value::Bytes(bytes) => add_bytes(hasher, bytes.as_deref()),
+    }
+}
+
+fn add_bytes(hasher: &mut Hasher, bytes: Option<&[u8]>) {
+    hasher.update(&[b'b', u8::from(bytes.is_some())]);
+    let bytes = bytes.unwrap_or_default();
+    hasher.update(&(bytes.len() as u64).to_le_bytes());
+    hasher.update(bytes);
+}
+
+fn show(value: &Value) -> String {
+    match value {
+        Value::Integer(value) => value.map_or_else(|| "?".into(), |value| value.to_string()),
+        Value::Text(value) => value.clone().unwrap_or_else(|| "?".into()),
+        _ => "?".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What databases do not keep must not count, and everything else must.
+    #[test]
+    fn values_that_come_back_the_same_have_the_same_checksum() {
+        let of = |value: Value| checksum(&[value]);
+        assert_eq!(of(0.0.into()), of((-0.0).into()));
+        assert_eq!(of(f64::NAN.into()), of(Value::Real(None)));
+        assert_eq!(of("a\0b".into()), of("a\u{fffd}b".into()));
+        let values: [Value; 10] = [
+            0_i64.into(),
+            1_i64.into(),
+            0.0.into(),
+            1.0.into(),
+            "".into(),
+            "a".into(),
+            Value::Integer(None),
+            Value::Real(None),
+            Value::Text(None),
+            "ab".into(),
+        ];
+        for (k, value) in values.iter().enumerate() {
+            assert!(values[..k].iter().all(|other| of(other.clone()) != of(value.clone())), "{value:?}");
+        }
+        assert_ne!(checksum(&["ab".into(), "c".into()]), checksum(&["a".into(), "bc".into()]));
+    }
+
+    #[test]
+    fn what_joins_select_are_the_columns_of_the_table() {
+        for (table, selected) in [
+            (&CANDIDATE, joined!(candidate)),
+            (&DECISION, joined!(decision)),
+            (&IMPORT, joined!(import)),
+            (&SEED_STRUCTURE, joined!(seed_structure)),
+            (&STRUCTURE, joined!(structure)),
+            (&WALK, joined!(walk)),
+        ] {
+            let words = |one: &str| one.split_whitespace().collect::<Vec<_>>().join(" ");
+            let selected: Vec<_> = selected.split(',').map(words).collect();
+            for column in table.columns.iter().chain([&table.key, &table.checksum]) {
+                let wanted = format!("{}.{} AS {}", table.name, column.name, column.joined);
+                assert!(selected.contains(&wanted), "{wanted}");
+            }
+        }
+    }
+}

@@ -1,0 +1,241 @@
+//! Checksums for rows that have none, and a look at every row of tables that are read for nothing else.
+
+use crate::Store;
+use crate::checksum::{
+    ARCHIVE, CAMPAIGN, CANDIDATE, CHECKPOINT, COMPONENT, CheckedColumn, CheckedTable, DECISION, IMPORT,
+    LABEL, LONG, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, UNKNOWN, VALUE, WALK,
+};
+use crate::database::{Row, Transaction, Value, for_rows, query};
+use crate::error::Result;
+
+/// Rows read at a time: one of a large structure has megabytes.
+const PAGE: u32 = 64;
+
+/// Tables that earlier versions have without checksums, with the columns for these.
+const WITHOUT: [(&str, &[&str]); 12] = [
+    ("campaign", &["checksum"]),
+    ("value", &["checksum"]),
+    ("structure", &["checksum"]),
+    ("seed_structure", &["checksum"]),
+    ("protocol", &["checksum"]),
+    ("decision", &["checksum"]),
+    ("candidate", &["checksum", "features_checksum", "selector_checksum", "original_checksum"]),
+    ("component", &["checksum"]),
+    ("walk", &["checksum", "checkpoint_checksum"]),
+    ("label", &["checksum"]),
+    ("import", &["checksum"]),
+    ("archive", &["checksum"]),
+];
+
+/// Keys of the campaign's own values that are written once in a while, and by this program alone.
+pub(crate) const CAMPAIGN_KEYS: [&str; 7] = [
+    "id",
+    "program_version",
+    "mode",
+    "configuration",
+    "resolved_configuration",
+    "configuration_in_force",
+    "protocol",
+];
+
+const CAMPAIGN_VALUE: &str = "SELECT * FROM campaign WHERE key = $1";
+const SET_CAMPAIGN: &str = "UPDATE campaign SET checksum = $1 WHERE key = $2";
+const VALUES: &str = "SELECT * FROM value ORDER BY name";
+const SET_VALUE: &str = "UPDATE value SET checksum = $1 WHERE name = $2";
+/// Of these tables a row is read at a time, after the one with a key of two numbers.
+const NEXT_COMPONENT: &str =
+    "SELECT * FROM component WHERE (element, slot) > ($1, $2) ORDER BY element, slot LIMIT 1";
+const SET_COMPONENT: &str = "UPDATE component SET checksum = $1 WHERE element = $2 AND slot = $3";
+pub(crate) const NEXT_ARCHIVE: &str =
+    "SELECT * FROM archive WHERE (job, attempt) > ($1, $2) ORDER BY job, attempt LIMIT 1";
+const SET_ARCHIVE: &str = "UPDATE archive SET checksum = $1 WHERE job = $2 AND attempt = $3";
+
+/// A table of one number as its key: how its rows are read page by page, and how they get their checksums.
+struct Paged {
+    table: &'static CheckedTable,
+    key: &'static str,
+    columns: &'static [&'static str],
+    page: &'static str,
+    update: &'static str,
+}
+
+macro_rules! paged {
+    ($table:ident, $name:literal, $key:literal) => {
+        Paged {
+            table: &$table,
+            key: $key,
+            columns: &[$key, "checksum"],
+            page: concat!("SELECT * FROM ", $name, " WHERE ", $key, " > $1 ORDER BY ", $key, " LIMIT $2"),
+            update: concat!(
+                "UPDATE ",
+                $name,
+                " SET checksum = new.checksum FROM {rows} WHERE ",
+                $name,
+                ".",
+                $key,
+                " = new.",
+                $key
+            ),
+        }
+    };
+}
+
+static STRUCTURES: Paged = paged!(STRUCTURE, "structure", "number");
+static SEED_STRUCTURES: Paged = paged!(SEED_STRUCTURE, "seed_structure", "seed");
+static PROTOCOLS: Paged = paged!(PROTOCOL, "protocol", "number");
+static DECISIONS: Paged = paged!(DECISION, "decision", "sequence");
+static LABELS: Paged = paged!(LABEL, "label", "number");
+static IMPORTS: Paged = paged!(IMPORT, "import", "number");
+static WALKS: Paged = Paged {
+    columns: &["walk", "checksum", "checkpoint_checksum"],
+    update:
+        "UPDATE walk SET checksum = new.checksum, checkpoint_checksum = new.checkpoint_checksum FROM {rows}
+        WHERE walk.walk = new.walk",
+    ..paged!(WALK, "walk", "walk")
+};
+static CANDIDATES: Paged = Paged {
+    columns: &["decision", "checksum", "features_checksum", "selector_checksum", "original_checksum"],
+    page: "SELECT candidate.*, features, selector_grades, original_grades
+        FROM candidate LEFT JOIN candidate_data ON candidate_data.decision = candidate.decision
+        WHERE candidate.decision > $1 ORDER BY candidate.decision LIMIT $2",
+    update: "UPDATE candidate SET checksum = new.checksum, features_checksum = new.features_checksum,
+            selector_checksum = new.selector_checksum, original_checksum = new.original_checksum
+        FROM {rows} WHERE candidate.decision = new.decision",
+    ..paged!(CANDIDATE, "candidate", "decision")
+};
+
+impl Paged {
+    async fn fill(&self, transaction: &mut Transaction, long: &[&CheckedColumn]) -> Result<()> {
+        // Seed structures and walks are numbered from 0 on.
+        let mut after = -1;
+        loop {
+            let page = query(self.page).bind(after).bind(PAGE).rows(&mut *transaction).await?;
+            let Some(last) = page.last() else { return Ok(()) };
+            after = last.get(self.key)?;
+            let rows = page.iter().map(|row| self.checksums(row, long)).collect::<Result<_>>()?;
+            for_rows(transaction, self.update, self.columns, rows).await?;
+        }
+    }
+
+    /// Number of the row, and its checksums.
+    fn checksums(&self, row: &Row, long: &[&CheckedColumn]) -> Result<Vec<Value>> {
+        let mut values: Vec<Value> =
+            vec![row.get::<i64>(self.key)?.into(), self.table.compute(row, Names::Plain)?.into()];
+        for column in long {
+            values.push(column.compute(row)?.into());
+        }
+        Ok(values)
+    }
+
+    async fn verify(
+        &self,
+        transaction: &mut Transaction,
+        long: &[&CheckedColumn],
+        faults: &mut Vec<String>,
+    ) -> Result<()> {
+        let mut after = -1;
+        loop {
+            let page = query(self.page).bind(after).bind(PAGE).rows(&mut *transaction).await?;
+            let Some(last) = page.last() else { return Ok(()) };
+            after = last.get(self.key)?;
+            for row in &page {
+                note(self.table.verify(row, Names::Plain), faults);
+                long.iter().for_each(|column| note(column.verify(row), faults));
+            }
+        }
+    }
+}
+
+fn note(verified: Result<()>, faults: &mut Vec<String>) {
+    faults.extend(verified.err().map(|error| error.to_string()));
+}
+
+/// Computes every checksum anew from what is stored.
+pub(crate) async fn fill(transaction: &mut Transaction) -> Result<()> {
+    for paged in [&STRUCTURES, &SEED_STRUCTURES, &PROTOCOLS, &DECISIONS, &LABELS, &IMPORTS] {
+        paged.fill(transaction, &[]).await?;
+    }
+    WALKS.fill(transaction, &[&CHECKPOINT]).await?;
+    CANDIDATES.fill(transaction, &LONG).await?;
+    for key in CAMPAIGN_KEYS {
+        for row in query(CAMPAIGN_VALUE).bind(key).rows(&mut *transaction).await? {
+            let checksum = CAMPAIGN.compute(&row, Names::Plain)?;
+            query(SET_CAMPAIGN).bind(checksum).bind(key).execute(&mut *transaction).await?;
+        }
+    }
+    for row in query(VALUES).rows(&mut *transaction).await? {
+        let (checksum, name) = (VALUE.compute(&row, Names::Plain)?, row.get::<String>("name")?);
+        query(SET_VALUE).bind(checksum).bind(name).execute(&mut *transaction).await?;
+    }
+    let mut last = (-1, -1);
+    while let Some((row, key)) = next(transaction, NEXT_COMPONENT, ["element", "slot"], last).await? {
+        let set = query(SET_COMPONENT).bind(COMPONENT.compute(&row, Names::Plain)?);
+        set.bind(key.0).bind(key.1).execute(&mut *transaction).await?;
+        last = key;
+    }
+    let mut last = (-1, -1);
+    while let Some((row, key)) = next(transaction, NEXT_ARCHIVE, ["job", "attempt"], last).await? {
+        let set = query(SET_ARCHIVE).bind(ARCHIVE.compute(&row, Names::Plain)?);
+        set.bind(key.0).bind(key.1).execute(&mut *transaction).await?;
+        last = key;
+    }
+    Ok(())
+}
+
+/// The row after one with a key of two numbers, and its own.
+async fn next(
+    transaction: &mut Transaction,
+    sql: &'static str,
+    [first, second]: [&str; 2],
+    after: (i64, i64),
+) -> Result<Option<(Row, (i64, i64))>> {
+    let found = query(sql).bind(after.0).bind(after.1).rows(transaction).await?;
+    let Some(row) = found.into_iter().next() else { return Ok(None) };
+    let key = (row.get(first)?, row.get(second)?);
+    Ok(Some((row, key)))
+}
+
+/// What is wrong with rows that no other check looks into: those of the campaign itself, seed structures, walks, imports, the
+/// selector's values and the mixture.
+pub(crate) async fn verify_others(transaction: &mut Transaction) -> Result<Vec<String>> {
+    let mut faults = Vec::new();
+    for paged in [&SEED_STRUCTURES, &IMPORTS] {
+        paged.verify(transaction, &[], &mut faults).await?;
+    }
+    WALKS.verify(transaction, &[&CHECKPOINT], &mut faults).await?;
+    for key in CAMPAIGN_KEYS {
+        for row in query(CAMPAIGN_VALUE).bind(key).rows(&mut *transaction).await? {
+            note(CAMPAIGN.verify(&row, Names::Plain), &mut faults);
+        }
+    }
+    for row in query(VALUES).rows(&mut *transaction).await? {
+        note(VALUE.verify(&row, Names::Plain), &mut faults);
+    }
+    let mut last = (-1, -1);
+    while let Some((row, key)) = next(transaction, NEXT_COMPONENT, ["element", "slot"], last).await? {
+        note(COMPONENT.verify(&row, Names::Plain), &mut faults);
+        last = key;
+    }
+    Ok(faults)
+}
+
+/// Statements that make temporary views in the place of tables without checksums. They bear the names of the tables, which
+/// stand in `schema`.
+pub(crate) fn views(schema: &str) -> String {
+    let view = |(table, columns): &(&str, &[&str])| {
+        let columns: String =
+            columns.iter().map(|name| format!(", CAST({UNKNOWN} AS BIGINT) AS {name}")).collect();
+        format!("CREATE TEMP VIEW \"{table}\" AS SELECT *{columns} FROM \"{schema}\".\"{table}\"; ")
+    };
+    WITHOUT.iter().map(view).collect()
+}
+
+impl Store {
+    /// Computes the checksum of every row anew, for whoever has written rows past this program.
+    #[doc(hidden)]
+    pub async fn write_checksums(&self) -> Result<()> {
+        let mut transaction = self.database.begin_to_lead().await?;
+        fill(&mut transaction).await?;
+        transaction.commit().await
+    }
+}
