@@ -1,9 +1,8 @@
 //! What is asked of every calculation, whatever program made it.
 
-use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
+use crate::result_file::{self, ResultFileError};
 use crate::{Calculated, Exit, Failure, FailureClass};
 
 /// Why a calculation that left no whole result is no label. `logs` are the files in `directory` whose ends tell more.
@@ -43,12 +42,8 @@ fn tail(path: &Path) -> Option<String> {
     const BYTES: u64 = 4096;
     const LINES: usize = 6;
     const CHARACTERS: usize = 400;
-    let mut file = File::open(path).ok()?;
-    let length = file.metadata().ok()?.len();
-    file.seek(SeekFrom::Start(length.saturating_sub(BYTES))).ok()?;
-    let mut end = Vec::new();
-    file.take(BYTES).read_to_end(&mut end).ok()?;
-    let end = String::from_utf8_lossy(&end);
+    let end = result_file::tail(path, BYTES).ok()?;
+    let end = String::from_utf8_lossy(&end.bytes);
     let mut lines: Vec<&str> =
         end.lines().rev().map(str::trim).filter(|line| !line.is_empty()).take(LINES).collect();
     lines.reverse();
@@ -56,6 +51,23 @@ fn tail(path: &Path) -> Option<String> {
     let surplus = joined.chars().count().saturating_sub(CHARACTERS);
     let last: String = joined.chars().skip(surplus).collect();
     (!last.is_empty()).then_some(last)
+}
+
+/// The file of that name which a calculation has left; none if there is none.
+///
+/// # Errors
+/// [`FailureClass::Crashed`] if there is something that is not to be read.
+pub(crate) fn left(directory: &Path, name: &str) -> Result<Option<Vec<u8>>, Failure> {
+    match result_file::read(&directory.join(name)) {
+        Ok(content) => Ok(Some(content)),
+        Err(ResultFileError::Missing) => Ok(None),
+        Err(error) => Err(unreadable(name, &error)),
+    }
+}
+
+/// The failure of a calculation that has left such a file.
+pub(crate) fn unreadable(name: &str, error: &ResultFileError) -> Failure {
+    FailureClass::Crashed.because(format!("{name} {error}"))
 }
 
 /// Looks at which version a result says it is of; versions as people read them.

@@ -19,6 +19,7 @@ mod original;
 mod paw;
 mod program;
 mod remedy;
+pub mod result_file;
 mod same;
 mod script_result;
 mod setting;

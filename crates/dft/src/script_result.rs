@@ -51,9 +51,9 @@ pub(crate) fn read(
     directory: &Path,
     by: &[(&str, &str)],
 ) -> Result<Option<Calculated>, Failure> {
-    match std::fs::read(directory.join("result.json")) {
-        Ok(bytes) => parse(structure, &bytes, by),
-        Err(_) => Ok(None),
+    match judge::left(directory, "result.json")? {
+        Some(bytes) => parse(structure, &bytes, by),
+        None => Ok(None),
     }
 }
 

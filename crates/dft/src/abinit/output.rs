@@ -19,9 +19,11 @@ pub(super) fn read(
     version: &str,
     smearing: Smearing,
 ) -> Result<Option<Calculated>, Failure> {
-    let text =
-        |name| String::from_utf8_lossy(&std::fs::read(directory.join(name)).unwrap_or_default()).into_owned();
-    parse(structure, &text("run.abo"), &text("stdout"), version, smearing)
+    let text = |name| {
+        let content = judge::left(directory, name)?.unwrap_or_default();
+        Ok::<_, Failure>(String::from_utf8_lossy(&content).into_owned())
+    };
+    parse(structure, &text("run.abo")?, &text("stdout")?, version, smearing)
 }
 
 /// As [`read`].

@@ -6,7 +6,7 @@ use atoms::Structure;
 use atoms::extxyz::{Frame, Reader};
 
 use crate::same::same_structure;
-use crate::{Calculated, Failure, FailureClass};
+use crate::{Calculated, Failure, FailureClass, result_file};
 
 /// What the digits allow that ASE writes.
 const TOLERANCE: f64 = 1e-6;
@@ -23,7 +23,7 @@ pub(super) fn label(structure: &Structure, path: &Path) -> Result<Calculated, Fa
 
 /// The one frame of a file; or what is wrong with it.
 fn whole_frame(path: &Path) -> Result<Frame, String> {
-    let text = std::fs::read(path).map_err(|error| format!("cannot be read: {error}"))?;
+    let text = result_file::read(path).map_err(|error| error.to_string())?;
     // A number that was cut off would be taken for another.
     if text.last() != Some(&b'\n') {
         return Err("does not end with a line break: it is not whole".to_owned());

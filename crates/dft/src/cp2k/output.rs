@@ -21,7 +21,7 @@ pub(super) fn read(
     directory: &Path,
     version: &str,
 ) -> Result<Option<Calculated>, Failure> {
-    let output = std::fs::read(directory.join(OUTPUT)).unwrap_or_default();
+    let output = judge::left(directory, OUTPUT)?.unwrap_or_default();
     parse(structure, &String::from_utf8_lossy(&output), version)
 }
 

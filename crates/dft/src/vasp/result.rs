@@ -1,7 +1,5 @@
 //! Judging what a calculation left.
 
-use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
 use atoms::Structure;
@@ -10,7 +8,7 @@ use super::outcar::Outcar;
 use super::output::Output;
 use super::vasprun;
 use crate::same::same_structure;
-use crate::{Calculated, Exit, Failure, FailureClass, judge};
+use crate::{Calculated, Exit, Failure, FailureClass, judge, result_file};
 
 /// Reads the calculation of `structure`, whose atoms stand in the files in the order `order`, by VASP of this version.
 pub(super) fn read(
@@ -20,14 +18,15 @@ pub(super) fn read(
     directory: &Path,
     exit: Exit,
 ) -> Result<Calculated, Failure> {
-    let outcar = match File::open(directory.join("OUTCAR")) {
-        Ok(file) => Outcar::read(BufReader::new(file)),
-        Err(_) => Outcar::default(),
+    let outcar = match result_file::pieces(&directory.join("OUTCAR"), b'\n') {
+        Ok(file) => Outcar::read(file),
+        Err(error) if error.is_missing() => Outcar::default(),
+        Err(error) => return Err(judge::unreadable("OUTCAR", &error)),
     };
     let magnetism = (outcar.moments.clone(), outcar.magnetisation);
     let denied = outcar.denies_convergence();
-    let xml = File::open(directory.join("vasprun.xml")).map_err(|error| error.to_string());
-    let output = match xml.and_then(|file| vasprun::read(BufReader::new(file))) {
+    let xml = result_file::pieces(&directory.join("vasprun.xml"), b'<').map_err(|error| error.to_string());
+    let output = match xml.and_then(vasprun::read) {
         Ok(output) => output,
         Err(xml) => outcar.output().map_err(|outcar| without_output(exit, directory, &xml, &outcar))?,
     };
@@ -117,15 +116,8 @@ fn without_output(exit: Exit, directory: &Path, xml: &str, outcar: &str) -> Fail
 /// The last part of a file; empty if there is none.
 fn end_of(path: &Path) -> String {
     const BYTES: u64 = 65_536;
-    let read = || -> std::io::Result<Vec<u8>> {
-        let mut file = File::open(path)?;
-        let length = file.metadata()?.len();
-        file.seek(SeekFrom::Start(length.saturating_sub(BYTES)))?;
-        let mut end = Vec::new();
-        file.take(BYTES).read_to_end(&mut end)?;
-        Ok(end)
-    };
-    String::from_utf8_lossy(&read().unwrap_or_default()).into_owned()
+    let end = result_file::tail(path, BYTES).map_or_else(|_| Vec::new(), |end| end.bytes);
+    String::from_utf8_lossy(&end).into_owned()
 }
 
 #[cfg(test)]

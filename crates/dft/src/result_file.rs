@@ -1,0 +1,232 @@
+//! Files that a program has left in its directory.
+//!
+//! Under the name of a result there may be anything: a pipe that nobody writes to, a link to a device that never ends, a
+//! sparse file that is larger than the memory. All files that a program has left are therefore opened here: without waiting
+//! and without following a link, regular files only, and up to a size.
+
+use std::fs::{File, FileType};
+use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Take};
+use std::os::unix::fs::FileTypeExt;
+use std::path::Path;
+
+use rustix::fs::{Mode, OFlags};
+use rustix::io::Errno;
+
+/// Bytes of the largest file that is read into memory as a whole: 256 MiB.
+pub const LARGEST: u64 = 256 << 20;
+/// Bytes of the largest file that is read piece by piece, as VASP's: 16 GiB.
+pub const LARGEST_IN_PIECES: u64 = 16 << 30;
+/// Bytes of the longest piece of such a file: 1 MiB.
+pub const LONGEST_PIECE: usize = 1 << 20;
+
+/// Why a file is not read. It completes a sentence that begins with the name of the file.
+#[derive(Debug, thiserror::Error)]
+pub enum ResultFileError {
+    /// There is none.
+    #[error("is missing")]
+    Missing,
+    /// Reading it might never end.
+    #[error("is {found}, expected a regular file")]
+    NotRegular {
+        /// What it is.
+        found: &'static str,
+    },
+    /// It might fill the memory.
+    #[error("has {bytes} bytes, expected at most {most}")]
+    TooLarge {
+        /// Its size.
+        bytes: u64,
+        /// The bound.
+        most: u64,
+    },
+    /// The system refuses.
+    #[error("cannot be read: {0}")]
+    Io(#[from] io::Error),
+}
+
+impl ResultFileError {
+    /// Whether there is no such file.
+    pub fn is_missing(&self) -> bool {
+        matches!(self, Self::Missing)
+    }
+}
+
+/// The last part of a file.
+#[derive(Debug)]
+pub struct Tail {
+    /// Bytes of the whole file.
+    pub length: u64,
+    /// The last of them.
+    pub bytes: Vec<u8>,
+}
+
+/// The whole content, of at most [`LARGEST`] bytes.
+///
+/// # Errors
+/// See [`ResultFileError`].
+pub fn read(path: &Path) -> Result<Vec<u8>, ResultFileError> {
+    let (file, length) = open(path)?;
+    within(length, LARGEST)?;
+    let mut content = Vec::new();
+    // It may grow while it is read.
+    let read = file.take(LARGEST + 1).read_to_end(&mut content)?;
+    within(read as u64, LARGEST)?;
+    Ok(content)
+}
+
+/// The last `bytes` of a file, however large it is.
+///
+/// # Errors
+/// See [`ResultFileError`].
+pub fn tail(path: &Path, bytes: u64) -> Result<Tail, ResultFileError> {
+    let (mut file, length) = open(path)?;
+    file.seek(SeekFrom::Start(length.saturating_sub(bytes)))?;
+    let mut end = Vec::new();
+    file.take(bytes).read_to_end(&mut end)?;
+    Ok(Tail { length, bytes: end })
+}
+
+/// A reader of a file of at most [`LARGEST_IN_PIECES`] bytes. It fails where more than [`LONGEST_PIECE`] bytes come without
+/// the byte `mark`, so that a parser that keeps what stands between two of them needs no more memory.
+///
+/// # Errors
+/// See [`ResultFileError`].
+pub fn pieces(path: &Path, mark: u8) -> Result<Pieces, ResultFileError> {
+    let (file, length) = open(path)?;
+    within(length, LARGEST_IN_PIECES)?;
+    Ok(Pieces { file: BufReader::new(file.take(LARGEST_IN_PIECES)), mark, since_mark: 0 })
+}
+
+fn within(bytes: u64, most: u64) -> Result<(), ResultFileError> {
+    if bytes > most { Err(ResultFileError::TooLarge { bytes, most }) } else { Ok(()) }
+}
+
+/// The file with its size, if it is a regular one.
+fn open(path: &Path) -> Result<(File, u64), ResultFileError> {
+    // NONBLOCK: to open a pipe waits for somebody who writes to it otherwise.
+    let flags = OFlags::RDONLY | OFlags::NONBLOCK | OFlags::NOFOLLOW | OFlags::NOCTTY | OFlags::CLOEXEC;
+    let file = match rustix::fs::open(path, flags, Mode::empty()) {
+        Ok(file) => File::from(file),
+        Err(Errno::NOENT) => return Err(ResultFileError::Missing),
+        Err(Errno::LOOP) => return Err(ResultFileError::NotRegular { found: "a symbolic link" }),
+        Err(Errno::NXIO) => return Err(ResultFileError::NotRegular { found: "a socket" }),
+        Err(error) => return Err(ResultFileError::Io(error.into())),
+    };
+    let metadata = file.metadata()?;
+    match metadata.is_file() {
+        true => Ok((file, metadata.len())),
+        false => Err(ResultFileError::NotRegular { found: describe(metadata.file_type()) }),
+    }
+}
+
+fn describe(kind: FileType) -> &'static str {
+    match kind {
+        kind if kind.is_dir() => "a directory",
+        kind if kind.is_fifo() => "a named pipe",
+        _ => "a device",
+    }
+}
+
+/// See [`pieces`].
+#[derive(Debug)]
+pub struct Pieces {
+    file: BufReader<Take<File>>,
+    mark: u8,
+    since_mark: usize,
+}
+
+impl Read for Pieces {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let read = self.fill_buf()?.read(buffer)?;
+        self.consume(read);
+        Ok(read)
+    }
+}
+
+impl BufRead for Pieces {
+    fn fill_buf(&mut self) -> io::Result<&[u8]> {
+        if self.since_mark > LONGEST_PIECE {
+            let what = if self.mark == b'\n' { "line" } else { "text without a tag" };
+            let message = format!("has a {what} of more than {LONGEST_PIECE} bytes");
+            return Err(io::Error::new(io::ErrorKind::InvalidData, message));
+        }
+        self.file.fill_buf()
+    }
+
+    fn consume(&mut self, bytes: usize) {
+        let consumed = self.file.buffer().get(..bytes).unwrap_or_default();
+        match consumed.iter().rposition(|byte| *byte == self.mark) {
+            Some(place) => self.since_mark = bytes - place,
+            None => self.since_mark += bytes,
+        }
+        self.file.consume(bytes);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::os::unix::fs::symlink;
+    use std::os::unix::net::UnixListener;
+
+    use super::*;
+
+    #[test]
+    fn a_regular_file_is_read() {
+        let home = tempfile::tempdir().unwrap();
+        let path = home.path().join("file");
+        assert!(read(&path).unwrap_err().is_missing());
+        fs::write(&path, "one\ntwo\n").unwrap();
+        assert_eq!(read(&path).unwrap(), b"one\ntwo\n");
+        let Tail { length, bytes } = tail(&path, 3).unwrap();
+        assert_eq!((length, bytes.as_slice()), (8, &b"wo\n"[..]));
+        assert_eq!(pieces(&path, b'\n').unwrap().lines().count(), 2);
+    }
+
+    /// All of these are refused by whoever reads, at once.
+    #[test]
+    fn nothing_but_a_regular_file_is_read() {
+        let home = tempfile::tempdir().unwrap();
+        let at = |name: &str| home.path().join(name);
+        rustix::fs::mkfifoat(rustix::fs::CWD, at("pipe"), Mode::RUSR | Mode::WUSR).unwrap();
+        symlink("/dev/zero", at("link")).unwrap();
+        symlink("nowhere", at("dangling")).unwrap();
+        fs::create_dir(at("directory")).unwrap();
+        let _socket = UnixListener::bind(at("socket")).unwrap();
+        let found = [
+            ("pipe", "a named pipe"),
+            ("link", "a symbolic link"),
+            ("dangling", "a symbolic link"),
+            ("directory", "a directory"),
+            ("socket", "a socket"),
+        ];
+        for (name, found) in found {
+            let expected = format!("is {found}, expected a regular file");
+            assert_eq!(read(&at(name)).unwrap_err().to_string(), expected);
+            assert_eq!(tail(&at(name), 10).unwrap_err().to_string(), expected);
+            assert_eq!(pieces(&at(name), b'\n').unwrap_err().to_string(), expected);
+        }
+        assert_eq!(
+            read(Path::new("/dev/zero")).unwrap_err().to_string(),
+            "is a device, expected a regular file"
+        );
+    }
+
+    #[test]
+    fn a_file_that_is_too_large_is_not_read() {
+        let home = tempfile::tempdir().unwrap();
+        let path = home.path().join("sparse");
+        let file = File::create(&path).unwrap();
+        file.set_len(LARGEST + 1).unwrap();
+        let message = read(&path).unwrap_err().to_string();
+        assert_eq!(message, "has 268435457 bytes, expected at most 268435456");
+        assert_eq!(tail(&path, 5).unwrap().bytes, [0; 5]);
+        // One line without an end.
+        let mut line = Vec::new();
+        let message = pieces(&path, b'\n').unwrap().read_until(b'\n', &mut line).unwrap_err().to_string();
+        assert_eq!(message, "has a line of more than 1048576 bytes");
+        assert!(line.len() < 2 * LONGEST_PIECE);
+        file.set_len(LARGEST_IN_PIECES + 1).unwrap();
+        assert!(matches!(pieces(&path, b'\n'), Err(ResultFileError::TooLarge { .. })));
+    }
+}
