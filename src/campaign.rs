@@ -110,7 +110,8 @@ impl Campaign {
                 .map(|structure| dft::Size { atoms: structure.len(), electrons: 0.0, k_points: 1 })
                 .collect(),
             LabelMethod::Code(settings) => {
-                let code = settings.prepare().map_err(|error| Failure::Input(error.to_string()))?;
+                let code = settings.prepare(&self.config.label.pass_environment);
+                let code = code.map_err(|error| Failure::Input(error.to_string()))?;
                 structures.map(|structure| code.size(structure)).collect()
             }
         })

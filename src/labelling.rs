@@ -121,7 +121,7 @@ pub fn supports(label: &LabelSection, species: &BTreeSet<Species>) -> Result<(),
             }
         }
         LabelMethod::Code(settings) => {
-            let code = settings.prepare().map_err(|error| error.to_string())?;
+            let code = settings.prepare(&label.pass_environment).map_err(|error| error.to_string())?;
             code.supports(species).map_err(|error| error.to_string())
         }
     }
@@ -186,8 +186,8 @@ impl MethodSetup {
     pub fn identity(&self) -> Result<Value, Failure> {
         match self {
             Self::Reference { kind, file_hash, .. } => Ok(reference_identity(*kind, file_hash)),
-            Self::Code { settings, .. } => {
-                let code = settings.prepare().map_err(Failure::input)?;
+            Self::Code { settings, running } => {
+                let code = settings.prepare(&running.pass_environment).map_err(Failure::input)?;
                 Ok(identity(settings.name(), &*code))
             }
         }

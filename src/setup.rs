@@ -133,7 +133,7 @@ impl MethodSetup {
                 Ok(Method::reference(potential))
             }
             Self::Code { settings, running } => {
-                let code = settings.prepare().map_err(Failure::input)?;
+                let code = settings.prepare(&running.pass_environment).map_err(Failure::input)?;
                 labelling::agrees(&labelling::identity(settings.name(), &*code), protocol)?;
                 Ok(Method::code(code, running.clone()))
             }

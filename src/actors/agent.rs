@@ -182,7 +182,7 @@ fn launch(
             settings: setup.settings.clone(),
             log: log::for_children(),
         };
-        Launch::this_program(["walker"], setup::bytes(&setup))
+        Launch::this_program(["walker"], setup::bytes(&setup)).without_database()
     }
 }
 

@@ -39,7 +39,7 @@ pub fn walker(
             settings: settings.clone(),
             log: log::for_children(),
         };
-        Launch::this_program(["walker"], setup::bytes(&setup))
+        Launch::this_program(["walker"], setup::bytes(&setup)).without_database()
     })
 }
 

@@ -202,7 +202,8 @@ impl Loader<'_> {
         let key = format!("label.method.{}", settings.name());
         let at = || place(self.path, self.text, &key);
         let wrong = |message: String| ConfigError::File { at: at(), key: key.clone(), message };
-        let code = settings.prepare().map_err(|error| wrong(error.to_string()))?;
+        let code = settings.prepare(&self.config.label.pass_environment);
+        let code = code.map_err(|error| wrong(error.to_string()))?;
         for named in seeds {
             let species = named.seed.structure.species.iter().copied().collect();
             let supported = code.supports(&species);

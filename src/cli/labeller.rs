@@ -16,7 +16,8 @@ use crate::setup::{self, LabellerSetup};
 /// A labeller's process; `calmwalk run` and `calmwalk label` start it
 ///
 /// It reads what to do from standard input. If the run that started it is killed it goes on until the queue is empty, or
-/// until the next run takes it over; with `calmwalk label` it ends. SIGTERM ends it after the label in hand.
+/// until the next run takes it over; with `calmwalk label` it ends. SIGTERM ends it after the label in hand;
+/// a calculation of another program that takes longer than some seconds goes on and is left to the next labeller.
 #[derive(Debug, clap::Args)]
 pub struct Labeller {}
 

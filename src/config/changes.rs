@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Value, json};
 
 /// Keys that may have another value when a campaign is continued; everything else is what it began with.
-pub(super) const CHANGEABLE: [&str; 45] = [
+pub(super) const CHANGEABLE: [&str; 46] = [
     "seeds",
     "collect.per_seed",
     "collect.total",
@@ -23,6 +23,7 @@ pub(super) const CHANGEABLE: [&str; 45] = [
     "label.memory",
     "label.scratch",
     "label.keep",
+    "label.pass_environment",
     "label.batch_system",
     "label.batch_options",
     "label.queue_limit",

@@ -82,8 +82,14 @@ fn check_queue(config: &Config) -> Result<(), Wrong> {
 pub fn check_label(label: &LabelSection) -> Vec<Wrong> {
     let guard =
         label.guard.fault().map(|(key, found, expected)| (key.to_owned(), found, expected.to_owned()));
-    let checks = [check_batch_options(label), check_scratch(label)];
+    let checks = [check_pass_environment(label), check_batch_options(label), check_scratch(label)];
     guard.into_iter().chain(checks.into_iter().filter_map(Result::err)).collect()
+}
+
+fn check_pass_environment(label: &LabelSection) -> Result<(), Wrong> {
+    let Some(pattern) = label.pass_environment.fault() else { return Ok(()) };
+    let expected = "names of environment variables, or their beginnings with a * behind them: [\"MYCODE_*\"]";
+    wrong("label.pass_environment", format!("{pattern:?}"), expected)
 }
 
 fn check_batch_options(label: &LabelSection) -> Result<(), Wrong> {

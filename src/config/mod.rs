@@ -20,6 +20,7 @@ use std::path::{Path, PathBuf};
 
 use calm::rules::{Combination, Fraction, Positive};
 use calm::{CollectionRule, UpdateSettings};
+use dft::PassedEnvironment;
 use orchestrator::selector::{Mode, UpdateProtocol};
 use potentials::grace::Precision;
 use serde::{Deserialize, Serialize};
@@ -267,6 +268,9 @@ pub struct LabelSection {
     /// Which of these directories are kept in the store.
     #[serde(default)]
     pub keep: Keep,
+    /// Variables of the labeller's environment that its program gets beside those that every program gets.
+    #[serde(default)]
+    pub pass_environment: PassedEnvironment,
     /// The batch system that each calculation is a job of; left out, they run beside the labeller.
     pub batch_system: Option<BatchSystem>,
     /// Further options of its jobs.
@@ -493,6 +497,7 @@ impl LabelSection {
             memory: self.memory.map(Positive::get),
             scratch: self.scratch.clone(),
             keep: self.keep,
+            pass_environment: self.pass_environment.clone(),
             batch_system: self.batch_system,
             batch_options: self.batch_options.clone(),
         }

@@ -16,8 +16,8 @@ use serde_json::{Value, json};
 
 use crate::moments::{self, Moments};
 use crate::{
-    Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, SetupError, Size, judge, program,
-    script_result,
+    Calculated, Code, Exit, Failure, FailureClass, Input, PassedEnvironment, Remedy, SetupError, Size, judge,
+    program, script_result,
 };
 
 /// The script that a calculator is run by.
@@ -61,14 +61,14 @@ impl Settings {
     ///
     /// # Errors
     /// No such file, a program that is no Python with ASE, a file that Python cannot load.
-    pub fn prepare(&self) -> Result<Ase, SetupError> {
+    pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Ase, SetupError> {
         let calculator = std::fs::read(&self.calculator).map_err(|error| SetupError::Setting {
             key: "calculator",
             found: self.calculator.display().to_string(),
             expected: format!("a Python file that defines calculator(), but: {error}"),
         })?;
         let environment = program::environment(&self.environment);
-        let who = Who::ask(&self.command, &environment, &calculator)?;
+        let who = Who::ask(&self.command, &environment, passed, &calculator)?;
         Ok(Ase { settings: self.clone(), environment, calculator, who })
     }
 }
@@ -84,10 +84,11 @@ impl Who {
     fn ask(
         command: &[String],
         environment: &BTreeMap<String, String>,
+        passed: &PassedEnvironment,
         calculator: &[u8],
     ) -> Result<Self, SetupError> {
         let files = [(SCRIPT_FILE, SCRIPT.as_bytes()), (CALCULATOR_FILE, calculator)];
-        let said = program::ask(command, &[SCRIPT_FILE], environment, &files)?;
+        let said = program::ask(command, &[SCRIPT_FILE], environment, passed, &files)?;
         said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
             let reason = format!("is no Python with ASE: it does not say its version but {:?}", said.trim());
             program::another(command, reason)

@@ -8,6 +8,7 @@ pub mod ase;
 mod code;
 pub mod command;
 pub mod cp2k;
+mod environment;
 mod failure;
 mod find;
 pub mod gpaw;
@@ -28,6 +29,7 @@ mod smearing;
 pub mod vasp;
 
 pub use code::{Calculated, Code, Exit, Input, SetupError, Size};
+pub use environment::PassedEnvironment;
 pub use failure::{Failure, FailureClass};
 pub use moments::Moments;
 pub use original::Original;

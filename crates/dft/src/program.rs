@@ -5,12 +5,13 @@ use std::io::Read;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::SetupError;
+use crate::{PassedEnvironment, SetupError};
 
 /// Programs that say who they are do so at once; a cold file system may need its time.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// What `command` with further arguments prints, run in a directory of its own with these files (name and content).
+/// What `command` with further arguments prints, run in a directory of its own with these files (name and content). Its
+/// environment is what is `passed` on of that of this process, and `environment`.
 ///
 /// # Errors
 /// [`SetupError::Program`] if it cannot be started, fails, or does not end.
@@ -18,6 +19,7 @@ pub(crate) fn ask(
     command: &[String],
     arguments: &[&str],
     environment: &BTreeMap<String, String>,
+    passed: &PassedEnvironment,
     files: &[(&str, &[u8])],
 ) -> Result<String, SetupError> {
     let words = command.iter().map(String::as_str).chain(arguments.iter().copied());
@@ -32,6 +34,8 @@ pub(crate) fn ask(
     let mut child = Command::new(program)
         .args(first)
         .args(arguments)
+        .env_clear()
+        .envs(passed.of_this_process())
         .envs(environment)
         .current_dir(directory.path())
         .stdin(Stdio::null())

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Code, SetupError, abinit, ase, command, cp2k, gpaw, vasp};
+use crate::{Code, PassedEnvironment, SetupError, abinit, ase, command, cp2k, gpaw, vasp};
 
 /// Which program makes labels, and how: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -52,17 +52,18 @@ impl Settings {
         }
     }
 
-    /// Finds the program, its version and its pseudopotentials.
+    /// Finds the program, its version and its pseudopotentials. A program that is asked gets these variables of the environment
+    /// of this process.
     ///
     /// # Errors
     /// What is missing or impossible, before anything is run.
-    pub fn prepare(&self) -> Result<Box<dyn Code>, SetupError> {
+    pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Box<dyn Code>, SetupError> {
         Ok(match self {
-            Self::Abinit(settings) => Box::new(settings.prepare()?),
-            Self::Ase(settings) => Box::new(settings.prepare()?),
+            Self::Abinit(settings) => Box::new(settings.prepare(passed)?),
+            Self::Ase(settings) => Box::new(settings.prepare(passed)?),
             Self::Command(settings) => Box::new(settings.prepare()?),
-            Self::Cp2k(settings) => Box::new(settings.prepare()?),
-            Self::Gpaw(settings) => Box::new(settings.prepare()?),
+            Self::Cp2k(settings) => Box::new(settings.prepare(passed)?),
+            Self::Gpaw(settings) => Box::new(settings.prepare(passed)?),
             Self::Vasp(settings) => Box::new(settings.prepare()?),
         })
     }

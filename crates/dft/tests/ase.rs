@@ -10,7 +10,7 @@ use std::process::Command;
 use atoms::cell::{Vec3, add};
 use atoms::{Cell, Structure};
 use dft::ase::{Ase, Settings};
-use dft::{Calculated, Code, Exit, Failure, FailureClass, Remedy, SetupError};
+use dft::{Calculated, Code, Exit, Failure, FailureClass, PassedEnvironment, Remedy, SetupError};
 use tempfile::TempDir;
 
 fn python() -> String {
@@ -24,7 +24,7 @@ fn settings(place: &TempDir, calculator: &str) -> Settings {
 }
 
 fn prepared(calculator: &str) -> Ase {
-    settings(&TempDir::new().unwrap(), calculator).prepare().unwrap()
+    settings(&TempDir::new().unwrap(), calculator).prepare(&PassedEnvironment::default()).unwrap()
 }
 
 /// Writes the input, runs the script, reads what it left.
@@ -108,7 +108,7 @@ fn a_command_that_uses_ase_gives_the_same_but_for_the_digits_of_its_file() {
         files: vec![path],
         version: "EMT".to_owned(),
     };
-    let found = run(&settings.prepare().unwrap(), &alloy(), &[]).unwrap();
+    let found = run(&settings.prepare(&PassedEnvironment::default()).unwrap(), &alloy(), &[]).unwrap();
     let expected = run(&prepared(EMT), &alloy(), &[]).unwrap();
     let numbers = |label: &Calculated| {
         let energies = [label.energy, label.energy_without_smearing.unwrap()];
@@ -199,7 +199,7 @@ fn remedies_and_moments_reach_the_calculator() {
     let place = TempDir::new().unwrap();
     let mut settings = settings(&place, &text);
     settings.moments = [("Cu".parse().unwrap(), 3.0)].into();
-    let code = settings.prepare().unwrap();
+    let code = settings.prepare(&PassedEnvironment::default()).unwrap();
     let found = run(&code, &alloy(), &[Remedy::OtherMoments, Remedy::MoreSteps]).unwrap();
     assert_eq!(found.magnetic_moments, Some(vec![0.5, 1.5, 0.5, 1.5, 0.5, 0.5, 1.5, 0.5]));
     assert_eq!(found.magnetisation, Some(4.5));
@@ -220,17 +220,24 @@ fn what_is_missing_is_found_before_anything_is_calculated() {
     let place = TempDir::new().unwrap();
     let mut missing = settings(&place, EMT);
     missing.calculator = Path::new("/no/such/file.py").to_owned();
-    let fault = missing.prepare().unwrap_err();
+    let fault = missing.prepare(&PassedEnvironment::default()).unwrap_err();
     assert!(
         matches!(&fault, SetupError::Setting { key: "calculator", found, .. } if found == "/no/such/file.py"),
         "{fault}"
     );
-    let fault = settings(&place, "def calculate():\n    pass\n").prepare().unwrap_err().to_string();
+    let fault = settings(&place, "def calculate():\n    pass\n")
+        .prepare(&PassedEnvironment::default())
+        .unwrap_err()
+        .to_string();
     assert!(fault.contains("defines no function calculator()"), "{fault}");
-    let fault = settings(&place, "import no_such_module\n").prepare().unwrap_err().to_string();
+    let fault = settings(&place, "import no_such_module\n")
+        .prepare(&PassedEnvironment::default())
+        .unwrap_err()
+        .to_string();
     assert!(fault.contains("no_such_module"), "{fault}");
     let command = vec!["no-such-python".to_owned()];
-    let fault = Settings { command, ..settings(&place, EMT) }.prepare().unwrap_err();
+    let fault =
+        Settings { command, ..settings(&place, EMT) }.prepare(&PassedEnvironment::default()).unwrap_err();
     assert!(matches!(fault, SetupError::Program { .. }), "{fault}");
 }
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use atoms::{Cell, Structure};
-use dft::{Calculated, Code, Exit, Failure, FailureClass, Remedy, Settings, SetupError};
+use dft::{Calculated, Code, Exit, Failure, FailureClass, PassedEnvironment, Remedy, Settings, SetupError};
 
 /// Takes the columns of the structure and adds the label; the words after `exit` are its code.
 const SCRIPT: &str = r#"
@@ -147,7 +147,7 @@ fn files_are_among_the_paths() {
     let mut settings: Settings = serde_json::from_str(text).unwrap();
     assert_eq!(settings.paths(), [&mut PathBuf::from("a"), &mut PathBuf::from("b")]);
     assert_eq!(settings.name(), "command");
-    assert!(settings.prepare().is_err());
+    assert!(settings.prepare(&PassedEnvironment::default()).is_err());
     assert!(serde_json::from_str::<Settings>(&text.replace("files", "file")).is_err());
 }
 

@@ -1,6 +1,6 @@
 //! Slurm's own commands, asked and told as child processes.
 
-use std::ffi::OsStr;
+use std::ffi::{OsStr, OsString};
 use std::io;
 use std::process::Stdio;
 use std::time::Duration;
@@ -17,6 +17,8 @@ const KEPT: [&str; 3] = ["SLURM_CONF", "SLURM_CONF_SERVER", "SLURM_JWT"];
 #[derive(Clone, Debug)]
 pub struct Commands {
     patience: Duration,
+    /// What they are started with instead of the environment of this process.
+    environment: Option<Vec<(OsString, OsString)>>,
 }
 
 /// Why Slurm did not do what it was asked for.
@@ -68,7 +70,12 @@ impl SlurmError {
 impl Commands {
     /// Those that are not waited for for longer than this.
     pub fn with_patience(patience: Duration) -> Self {
-        Self { patience }
+        Self { patience, environment: None }
+    }
+
+    /// The same, started with this environment and not with that of this process: jobs get it, too.
+    pub fn with_environment(self, environment: Vec<(OsString, OsString)>) -> Self {
+        Self { environment: Some(environment), ..self }
     }
 
     /// What `squeue` writes of this user's jobs, a line each, in this format. With `options` it may be asked for some of
@@ -134,13 +141,15 @@ impl Commands {
         let mut command = Command::new(program);
         command.args(arguments).stdin(Stdio::null()).kill_on_drop(true);
         // Habits of the user, too, would show something else than is expected.
-        for (name, _) in std::env::vars_os() {
+        let inherited = self.environment.clone().unwrap_or_else(|| std::env::vars_os().collect());
+        command.env_clear();
+        for (name, value) in inherited {
             let text = name.to_string_lossy();
             let is_in_the_way = ["SQUEUE_", "SCANCEL_", "SLURM_", "SBATCH_CLUSTERS"]
                 .iter()
                 .any(|begin| text.starts_with(begin));
-            if is_in_the_way && !KEPT.contains(&text.as_ref()) {
-                command.env_remove(&name);
+            if !is_in_the_way || KEPT.contains(&text.as_ref()) {
+                command.env(&name, value);
             }
         }
         command.env("SLURM_TIME_FORMAT", "standard");

@@ -17,7 +17,7 @@ mod signs;
 mod tests;
 mod watch;
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::io;
 use std::path::PathBuf;
 use std::process::Stdio;
@@ -37,6 +37,7 @@ pub struct Launch {
     arguments: Vec<OsString>,
     setup: Vec<u8>,
     own_group: bool,
+    has_database: bool,
 }
 
 impl Launch {
@@ -52,6 +53,7 @@ impl Launch {
             arguments: arguments.into_iter().map(Into::into).collect(),
             setup,
             own_group: true,
+            has_database: true,
         }
     }
 
@@ -61,17 +63,34 @@ impl Launch {
         Self { own_group: false, ..self }
     }
 
+    /// Keeps from it the variables by which clients of a database server find it and its password: `PGPASSWORD` and the like.
+    pub fn without_database(self) -> Self {
+        Self { has_database: false, ..self }
+    }
+
     /// Starts it, and gives it away to be watched together with what it is to read.
     fn start(self) -> io::Result<(Child, Vec<u8>)> {
         let mut command = Command::new(&self.program);
         command.arg0(&self.name).args(&self.arguments);
         command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
+        if !self.has_database {
+            std::env::vars_os().map(|(name, _)| name).filter(|name| is_for_databases(name)).for_each(
+                |name| {
+                    command.env_remove(name);
+                },
+            );
+        }
         if self.own_group {
             command.process_group(0);
         }
         keep_to_ourselves(&mut command);
         Ok((command.spawn()?, self.setup))
     }
+}
+
+/// Whether an environment variable of this name is one of PostgreSQL's.
+fn is_for_databases(name: &OsStr) -> bool {
+    name.as_encoded_bytes().starts_with(b"PG")
 }
 
 /// Lets the child inherit nothing but its three standard streams. What is opened for shared memory is not marked to be

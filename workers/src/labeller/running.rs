@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use dft::PassedEnvironment;
 use serde::{Deserialize, Serialize};
 
 /// How the calculations of another program run. Nothing of it changes what comes out.
@@ -20,6 +21,9 @@ pub struct Running {
     pub scratch: Option<PathBuf>,
     /// What becomes of the directory when a calculation has ended.
     pub keep: Keep,
+    /// Variables of the labeller's environment that the program gets beside those that every program gets.
+    #[serde(skip_serializing_if = "PassedEnvironment::is_empty")]
+    pub pass_environment: PassedEnvironment,
     /// The batch system that each calculation is a job of; none for processes beside the labeller.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub batch_system: Option<BatchSystem>,
@@ -68,6 +72,7 @@ impl Default for Running {
             memory: None,
             scratch: None,
             keep: Keep::default(),
+            pass_environment: PassedEnvironment::default(),
             batch_system: None,
             batch_options: Vec::new(),
         }

@@ -27,7 +27,10 @@ use serde_json::{Value, json};
 use crate::lattice::{self, Enclosed};
 use crate::moments::Moments;
 use crate::setting::{at_least, positive};
-use crate::{Calculated, Code, Exit, Failure, Input, Remedy, SetupError, Size, Smearing, judge, program};
+use crate::{
+    Calculated, Code, Exit, Failure, Input, PassedEnvironment, Remedy, SetupError, Size, Smearing, judge,
+    program,
+};
 use pseudopotentials::Pseudopotential;
 
 /// eV (CODATA 2018).
@@ -96,7 +99,7 @@ impl Settings {
     ///
     /// # Errors
     /// A program that does not answer, a setting with an impossible value, a file that is not what its name says.
-    pub fn prepare(&self) -> Result<Abinit, SetupError> {
+    pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Abinit, SetupError> {
         positive("cutoff", self.cutoff)?;
         at_least("fine_cutoff", self.fine_cutoff.unwrap_or(self.cutoff), self.cutoff)?;
         positive("k_spacing", self.k_spacing)?;
@@ -105,15 +108,19 @@ impl Settings {
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
         let environment = program::environment(&self.environment);
-        let version = version(&self.command, &environment)?;
+        let version = version(&self.command, &environment, passed)?;
         let pseudopotentials = pseudopotentials::find(&self.pseudopotentials, &self.variants)?;
         Ok(Abinit { settings: self.clone(), environment, version, pseudopotentials })
     }
 }
 
 /// `9.6.2`
-fn version(command: &[String], environment: &BTreeMap<String, String>) -> Result<String, SetupError> {
-    let said = program::ask(command, &["--version"], environment, &[])?;
+fn version(
+    command: &[String],
+    environment: &BTreeMap<String, String>,
+    passed: &PassedEnvironment,
+) -> Result<String, SetupError> {
+    let said = program::ask(command, &["--version"], environment, passed, &[])?;
     // Each process of a parallel run may say it.
     let version =
         said.split_whitespace().next().filter(|word| word.starts_with(|c: char| c.is_ascii_digit()));

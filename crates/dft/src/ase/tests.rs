@@ -79,5 +79,8 @@ fn a_setting_that_does_not_exist_is_refused() {
     let text = r#"{ "calculator": "a.py", "calculators": "b.py" }"#;
     assert!(serde_json::from_str::<Settings>(text).is_err());
     let missing = Settings { calculator: "/no/such/file.py".into(), ..Settings::default() };
-    assert!(matches!(missing.prepare(), Err(SetupError::Setting { key: "calculator", .. })));
+    assert!(matches!(
+        missing.prepare(&PassedEnvironment::default()),
+        Err(SetupError::Setting { key: "calculator", .. })
+    ));
 }

@@ -26,7 +26,9 @@ use serde_json::{Value, json};
 use crate::lattice::{self, Enclosed};
 use crate::moments::Moments;
 use crate::setting::{at_least, positive};
-use crate::{Calculated, Code, Exit, Failure, Input, Remedy, SetupError, Size, judge, program};
+use crate::{
+    Calculated, Code, Exit, Failure, Input, PassedEnvironment, Remedy, SetupError, Size, judge, program,
+};
 use data::Kind;
 
 /// eV, as CP2K has it (CODATA 2006).
@@ -104,7 +106,7 @@ impl Settings {
     ///
     /// # Errors
     /// A program that does not answer, a setting with an impossible value, data files that are missing.
-    pub fn prepare(&self) -> Result<Cp2k, SetupError> {
+    pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Cp2k, SetupError> {
         at_least("cutoff", self.cutoff, LEAST_CUTOFF)?;
         positive("cutoff", self.cutoff)?;
         positive("relative_cutoff", self.relative_cutoff)?;
@@ -115,14 +117,18 @@ impl Settings {
         at_least("steps", self.steps, 1)?;
         let kinds = data::find(self)?;
         let environment = program::environment(&self.environment);
-        let version = version(&self.command, &environment)?;
+        let version = version(&self.command, &environment, passed)?;
         Ok(Cp2k { settings: self.clone(), environment, version, kinds })
     }
 }
 
 /// `2023.1`
-fn version(command: &[String], environment: &BTreeMap<String, String>) -> Result<String, SetupError> {
-    let said = program::ask(command, &["--version"], environment, &[])?;
+fn version(
+    command: &[String],
+    environment: &BTreeMap<String, String>,
+    passed: &PassedEnvironment,
+) -> Result<String, SetupError> {
+    let said = program::ask(command, &["--version"], environment, passed, &[])?;
     let version = said.split("CP2K version ").nth(1).and_then(|rest| rest.split_whitespace().next());
     version
         .map(str::to_owned)

@@ -115,7 +115,10 @@ fn what_changes_a_value_is_in_the_identity_and_nothing_else() {
     let plain = identity(settings());
     assert_eq!(identity(Settings { steps: 7, command: vec!["mpirun".into()], ..settings() }), plain);
     assert_ne!(identity(Settings { relative_cutoff: 400.0, ..settings() }), plain);
-    let error = Settings { cutoff: 600.0, ..settings() }.prepare().unwrap_err().to_string();
+    let error = Settings { cutoff: 600.0, ..settings() }
+        .prepare(&PassedEnvironment::default())
+        .unwrap_err()
+        .to_string();
     assert_eq!(error, "cutoff: found 600, expected at least 1000");
 }
 

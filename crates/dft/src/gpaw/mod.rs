@@ -26,7 +26,8 @@ use crate::lattice::{self, Enclosed};
 use crate::moments::Moments;
 use crate::setting::{at_least, positive};
 use crate::{
-    Calculated, Code, Exit, Failure, Input, Remedy, SetupError, Size, Smearing, judge, program, script_result,
+    Calculated, Code, Exit, Failure, Input, PassedEnvironment, Remedy, SetupError, Size, Smearing, judge,
+    program, script_result,
 };
 use setups::Setup;
 
@@ -96,7 +97,7 @@ impl Settings {
     ///
     /// # Errors
     /// A program that does not answer, a setting with an impossible value.
-    pub fn prepare(&self) -> Result<Gpaw, SetupError> {
+    pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Gpaw, SetupError> {
         positive("cutoff", self.cutoff)?;
         positive("k_spacing", self.k_spacing)?;
         positive("smearing_width", self.smearing_width)?;
@@ -105,7 +106,7 @@ impl Settings {
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
         let environment = self.environment();
-        let who = Who::ask(&self.command, &environment)?;
+        let who = Who::ask(&self.command, &environment, passed)?;
         let setups = setups::find(&who.setup_paths, &self.variants)?;
         Ok(Gpaw { settings: self.clone(), environment, who, setups })
     }
@@ -128,9 +129,13 @@ struct Who {
 }
 
 impl Who {
-    fn ask(command: &[String], environment: &BTreeMap<String, String>) -> Result<Self, SetupError> {
+    fn ask(
+        command: &[String],
+        environment: &BTreeMap<String, String>,
+        passed: &PassedEnvironment,
+    ) -> Result<Self, SetupError> {
         let files = [(input::SCRIPT_FILE, SCRIPT.as_bytes())];
-        let said = program::ask(command, &[input::SCRIPT_FILE], environment, &files)?;
+        let said = program::ask(command, &[input::SCRIPT_FILE], environment, passed, &files)?;
         said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
             let reason = format!("is no Python with GPAW: it does not say its version but {:?}", said.trim());
             program::another(command, reason)

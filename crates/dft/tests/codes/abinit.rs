@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use dft::abinit::Settings;
-use dft::{Code, FailureClass, Remedy, Smearing};
+use dft::{Code, FailureClass, PassedEnvironment, Remedy, Smearing};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
@@ -15,7 +15,7 @@ fn settings() -> Settings {
 #[test]
 fn the_forces_and_the_stress_of_silicon_are_derivatives_of_its_energy() {
     // That the plane waves change with the cell adds some 2e-5 eV/Å³ at this cutoff.
-    let code = Settings { cutoff: 600.0, ..settings() }.prepare().unwrap();
+    let code = Settings { cutoff: 600.0, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let structure = structures::silicon();
     let calculated = label(&code, &structure);
     checks::forces(&code, &structure, &calculated, 1e-3);
@@ -25,7 +25,7 @@ fn the_forces_and_the_stress_of_silicon_are_derivatives_of_its_energy() {
 #[test]
 fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
     let code = Settings { smearing: Smearing::MethfesselPaxton, smearing_width: 0.2, ..settings() }
-        .prepare()
+        .prepare(&PassedEnvironment::default())
         .unwrap();
     let structure = structures::aluminium();
     let calculated = label(&code, &structure);
@@ -37,16 +37,16 @@ fn iron_is_a_magnet() {
     let pseudopotentials = "/usr/share/abinit/psp/Pseudodojo_paw_pbe_standard".into();
     let moments = BTreeMap::from([("Fe".parse().unwrap(), 3.0)]);
     let iron = Settings { pseudopotentials, moments, spin: true, cutoff: 500.0, ..settings() };
-    let calculated = label(&iron.prepare().unwrap(), &structures::iron());
+    let calculated = label(&iron.prepare(&PassedEnvironment::default()).unwrap(), &structures::iron());
     checks::magnet(&calculated, 2.0, 0.2);
 }
 
 #[test]
 fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
-    let few = Settings { steps: 5, ..settings() }.prepare().unwrap();
+    let few = Settings { steps: 5, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let (calculated, failures) = climb(&few, &structures::silicon());
     assert_eq!(failures, [FailureClass::NotConverged]);
-    let enough = settings().prepare().unwrap();
+    let enough = settings().prepare(&PassedEnvironment::default()).unwrap();
     assert_eq!(few.identity(), enough.identity());
     // Whatever the remedies, the energy is the same.
     let every = attempt(&enough, &structures::silicon(), &Remedy::ALL.into()).unwrap();

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use dft::{Code, abinit, cp2k, gpaw};
+use dft::{Code, PassedEnvironment, abinit, cp2k, gpaw};
 use tempfile::TempDir;
 
 use crate::run::{calculate, label, prepared};
@@ -36,7 +36,7 @@ fn abinit_reads_copies() {
         let pseudopotentials = data.path().to_owned();
         let settings =
             abinit::Settings { pseudopotentials, cutoff: 200.0, k_spacing: 1.2, ..Default::default() };
-        needs_no_files(&settings.prepare().unwrap(), data);
+        needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);
     }
 }
 
@@ -45,7 +45,7 @@ fn gpaw_reads_copies() {
     let data = copies("/usr/share/gpaw-setups", &["Si.PBE.gz"]);
     let pseudopotentials = Some(data.path().to_owned());
     let settings = gpaw::Settings { pseudopotentials, cutoff: 200.0, k_spacing: 1.2, ..Default::default() };
-    needs_no_files(&settings.prepare().unwrap(), data);
+    needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);
 }
 
 #[test]
@@ -60,5 +60,5 @@ fn cp2k_reads_copies() {
         k_spacing: 10.0,
         ..Default::default()
     };
-    needs_no_files(&settings.prepare().unwrap(), data);
+    needs_no_files(&settings.prepare(&PassedEnvironment::default()).unwrap(), data);
 }

@@ -1,7 +1,7 @@
 //! CP2K. Coarse grids and the smallest basis, with which it stays itself.
 
 use dft::cp2k::Settings;
-use dft::{Code, FailureClass, Remedy};
+use dft::{Code, FailureClass, PassedEnvironment, Remedy};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
@@ -20,7 +20,7 @@ fn settings() -> Settings {
 
 #[test]
 fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
-    let code = settings().prepare().unwrap();
+    let code = settings().prepare(&PassedEnvironment::default()).unwrap();
     let structure = structures::oxygen();
     let calculated = label(&code, &structure);
     checks::magnet(&calculated, 2.0, 0.01);
@@ -31,8 +31,9 @@ fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
 #[test]
 fn the_stress_of_silicon_is_a_derivative_of_its_energy() {
     // At Γ alone: what is checked is sign, unit and order.
-    let code =
-        Settings { spin: false, cutoff: 2000.0, relative_cutoff: 400.0, ..settings() }.prepare().unwrap();
+    let code = Settings { spin: false, cutoff: 2000.0, relative_cutoff: 400.0, ..settings() }
+        .prepare(&PassedEnvironment::default())
+        .unwrap();
     let structure = structures::silicon();
     let calculated = label(&code, &structure);
     checks::stress(&code, &structure, &calculated, 1e-4);
@@ -40,10 +41,10 @@ fn the_stress_of_silicon_is_a_derivative_of_its_energy() {
 
 #[test]
 fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
-    let few = Settings { steps: 12, ..settings() }.prepare().unwrap();
+    let few = Settings { steps: 12, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let (calculated, failures) = climb(&few, &structures::oxygen());
     assert_eq!(failures, [FailureClass::NotConverged]);
-    let enough = settings().prepare().unwrap();
+    let enough = settings().prepare(&PassedEnvironment::default()).unwrap();
     assert_eq!(few.identity(), enough.identity());
     // Whatever the remedies, the energy is the same.
     let every = attempt(&enough, &structures::oxygen(), &Remedy::ALL.into()).unwrap();

@@ -1,7 +1,7 @@
 //! GPAW. Real-space grids for densities make an egg-box of some 1e-4 eV/Å.
 
 use dft::gpaw::Settings;
-use dft::{Code, FailureClass, Remedy};
+use dft::{Code, FailureClass, PassedEnvironment, Remedy};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
@@ -13,7 +13,9 @@ fn settings() -> Settings {
 #[test]
 fn the_stress_of_silicon_is_a_derivative_of_the_energy() {
     // That the plane waves change with the cell adds some 1e-4 eV/Å³ at this cutoff and mesh.
-    let code = Settings { cutoff: 400.0, k_spacing: 0.8, ..settings() }.prepare().unwrap();
+    let code = Settings { cutoff: 400.0, k_spacing: 0.8, ..settings() }
+        .prepare(&PassedEnvironment::default())
+        .unwrap();
     let structure = structures::silicon();
     let calculated = label(&code, &structure);
     assert!(calculated.magnetic_moments.is_none());
@@ -22,7 +24,7 @@ fn the_stress_of_silicon_is_a_derivative_of_the_energy() {
 
 #[test]
 fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
-    let code = Settings { k_spacing: 0.9, ..settings() }.prepare().unwrap();
+    let code = Settings { k_spacing: 0.9, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let structure = structures::aluminium();
     let calculated = label(&code, &structure);
     let extrapolated = calculated.energy_without_smearing.unwrap();
@@ -32,7 +34,9 @@ fn the_forces_of_aluminium_are_derivatives_of_the_free_energy() {
 
 #[test]
 fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
-    let code = Settings { spin: true, cutoff: 400.0, vacuum: 5.0, ..settings() }.prepare().unwrap();
+    let code = Settings { spin: true, cutoff: 400.0, vacuum: 5.0, ..settings() }
+        .prepare(&PassedEnvironment::default())
+        .unwrap();
     let structure = structures::oxygen();
     let calculated = label(&code, &structure);
     checks::magnet(&calculated, 2.0, 0.01);
@@ -42,10 +46,10 @@ fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
 
 #[test]
 fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
-    let few = Settings { steps: 12, ..settings() }.prepare().unwrap();
+    let few = Settings { steps: 12, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let (calculated, failures) = climb(&few, &structures::silicon());
     assert_eq!(failures, [FailureClass::NotConverged]);
-    let enough = settings().prepare().unwrap();
+    let enough = settings().prepare(&PassedEnvironment::default()).unwrap();
     assert_eq!(few.identity(), enough.identity());
     // Whatever the remedies, the energy is the same.
     let every = attempt(&enough, &structures::silicon(), &Remedy::ALL.into()).unwrap();
