@@ -119,6 +119,7 @@ fn each_label_comes_once_whoever_is_killed() {
     }
     assert_eq!(place.label(&["--until-empty"]).0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert_eq!((calculating(&scratch), directories(&scratch)), (vec![], vec![]), "{killed:?}");
+    assert_eq!(fs::read_dir(&scratch).unwrap().count(), 0);
 }
 
 /// Answers and calculates as GPAW does, with the energy that stands in its setup of aluminium. When the first calculation is

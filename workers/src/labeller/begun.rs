@@ -1,6 +1,5 @@
 //! A calculation that was begun, wherever it runs.
 
-use std::io;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -82,10 +81,10 @@ impl Begun {
         let removed = blocking(move || match self {
             Self::Here(kept) => kept.clear(),
             // What a node has not let go of yet is cleared away later.
-            Self::Slurm(job) => match here::remove(&job.directory) {
-                Err(error) if error.kind() == io::ErrorKind::DirectoryNotEmpty => Ok(()),
-                removed => removed,
-            },
+            Self::Slurm(job) => {
+                here::remove(&job.directory);
+                Ok(())
+            }
         });
         removed.await.map_err(|error| file(&directory, error))
     }

@@ -1,11 +1,11 @@
 //! Labels by another program: calculations that outlive the labeller that began them.
 
 use std::collections::BTreeSet;
-use std::fs;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Child;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use atoms::Structure;
 use dft::{Code, Failure, FailureClass, Size};
@@ -19,8 +19,14 @@ use super::here;
 use super::keeper::{Calculation, End, How, WORK};
 use super::method::Made;
 use super::prepare::{Prepared, prepare, read, write};
+use super::scratch::{self, Home};
 use super::slurm::{self, Slurm};
-use super::{BatchSystem, Closing, KeeperCommand, Once, Running, insist, log, scratch};
+use super::{BatchSystem, Closing, KeeperCommand, Once, Running, insist, log, private};
+
+/// How long results may be read at least, also where the calculation has taken all of its time.
+const READING: Duration = Duration::from_secs(60);
+/// And how long they are read when somebody asks to stop.
+const LAST_READING: Duration = Duration::from_secs(5);
 
 /// Another program, and how it is run.
 pub struct CodeMethod {
@@ -28,7 +34,7 @@ pub struct CodeMethod {
     running: Running,
     keeper: KeeperCommand,
     /// Where the calculations of this campaign are.
-    home: OnceCell<PathBuf>,
+    home: OnceCell<Home>,
     in_hand: Mutex<Option<InHand>>,
     slurm: Slurm,
 }
@@ -58,7 +64,8 @@ enum Ready {
 
 impl CodeMethod {
     pub(super) fn new(keeper: KeeperCommand, code: Box<dyn Code>, running: Running) -> Self {
-        let (home, in_hand, slurm) = (OnceCell::new(), Mutex::default(), Slurm::default());
+        let (home, in_hand, slurm) =
+            (OnceCell::new(), Mutex::default(), Slurm::new(&running.pass_environment));
         Self { code: code.into(), running, keeper, home, in_hand, slurm }
     }
 
@@ -66,7 +73,8 @@ impl CodeMethod {
         self.code.size(structure)
     }
 
-    /// Finds the calculation that an earlier attempt began here, or starts one, and waits for its end.
+    /// Finds the calculation that an earlier attempt began here, or starts one, and waits for its end. None if its results could
+    /// not be read within seconds after `closing` asked to stop.
     ///
     /// # Errors
     /// Of the database; and where no calculation can be started here, whatever the structure.
@@ -75,16 +83,15 @@ impl CodeMethod {
         store: &Store,
         lease: &Lease,
         closing: &Closing,
-    ) -> Result<Made, StoreError> {
+    ) -> Result<Option<Made>, StoreError> {
         let prepared = match self.prepare(lease.structure.clone(), classes(lease)).await {
             Ok(prepared) => prepared,
-            Err(failure) => return Ok(Made { result: Err(failure), ended: None }),
+            Err(failure) => return Ok(Some(Made { result: Err(failure), ended: None })),
         };
         let record = async |begun: &Begun| {
             let identity = begun.identity();
             insist(closing, || store.record_calculation(lease, &identity, &prepared.record)).await
         };
-        let home = self.home(store, closing).await?;
         let begun = match self.find(&lease.earlier_calculations).await? {
             Some((begun, found)) => {
                 self.take(begun.clone(), None);
@@ -95,17 +102,18 @@ impl CodeMethod {
                 begun
             }
             None => {
-                let directory = home.join(scratch::name(lease.job, lease.attempt));
+                let directory = self.home(store, closing).await?.make(lease.job, lease.attempt)?;
                 let ready = self.ready(&directory, &prepared, &nodes(lease)).await?;
                 record(&ready.begun()).await?;
                 self.go(ready).await?
             }
         };
-        let made = self.outcome(lease.structure.clone(), begun).await?;
+        let outcome = self.outcome(lease.structure.clone(), begun, prepared.time_limit, closing).await?;
+        let Some(made) = outcome else { return Ok(None) };
         if let Some(failed) = failed_elsewhere(&made) {
             record(&failed).await?;
         }
-        Ok(made)
+        Ok(Some(made))
     }
 
     /// A calculation that no campaign knows of.
@@ -115,16 +123,29 @@ impl CodeMethod {
             Ok(prepared) => prepared,
             Err(failure) => return Ok(none(Err(failure))),
         };
-        let name = format!("calmwalk-once-{}", scratch::name(std::process::id().into(), 1));
-        let directory = self.running.scratch().join(name);
-        let begun = self.go(self.ready(&directory, &prepared, &[]).await?).await?;
-        let made = self.outcome(structure.clone(), begun).await;
+        let home = private::make(&self.running.scratch(), "calmwalk-once-")?;
+        let made = self.once_in(&home, structure, &prepared).await;
         self.abandon().await?;
+        scratch::remove_empty(&home);
         let Made { result, ended } = made?;
         Ok(match ended {
             Some(Ended { core_seconds, log, .. }) => Once { result, log, core_seconds },
             None => none(result),
         })
+    }
+
+    async fn once_in(
+        &self,
+        home: &Path,
+        structure: &Structure,
+        prepared: &Prepared,
+    ) -> Result<Made, StoreError> {
+        let directory =
+            private::make_inside(home, &scratch::name(1, 1)).map_err(|error| file(home, error))?;
+        let begun = self.go(self.ready(&directory, prepared, &[]).await?).await?;
+        let never = Closing::default();
+        let made = self.outcome(structure.clone(), begun, prepared.time_limit, &never).await?;
+        Ok(made.expect("nobody asks to stop"))
     }
 
     /// Everything that is known before anything is started.
@@ -138,15 +159,22 @@ impl CodeMethod {
     }
 
     /// Where calculations of this campaign are; what killed ones have left there is tidied up first.
-    pub(super) async fn home(&self, store: &Store, closing: &Closing) -> Result<&Path, StoreError> {
+    pub(super) async fn home(&self, store: &Store, closing: &Closing) -> Result<&Home, StoreError> {
         let make = async || {
             let campaign = insist(closing, || store.campaign()).await?.id;
-            let home = self.running.scratch().join(format!("calmwalk-{campaign}"));
-            fs::create_dir_all(&home).map_err(|error| file(&home, error))?;
-            scratch::tidy(store, &home, self.running.keep, &self.slurm, closing).await?;
+            let home = Home::of(&self.running.scratch(), campaign);
+            home.prepare()?;
+            home.tidy(store, self.running.keep, &self.slurm, closing).await?;
             Ok(home)
         };
-        self.home.get_or_try_init(make).await.map(PathBuf::as_path)
+        self.home.get_or_try_init(make).await
+    }
+
+    /// Leaves no empty directory behind.
+    pub(super) fn end(&self) {
+        if let Some(home) = self.home.get() {
+            home.remove_empty();
+        }
     }
 
     /// The newest of these calculations that goes on, or has ended and can be read. What is left of the others is removed.
@@ -183,11 +211,16 @@ impl CodeMethod {
             directory: directory.to_owned(),
             command: input.command.clone(),
             environment,
+            pass_environment: self.running.pass_environment.clone(),
             time_limit: *time_limit,
             memory_limit: *memory_limit,
             keeper: self.keeper.clone(),
         };
-        write(directory, input)?;
+        let unused = |error| {
+            here::remove(directory);
+            error
+        };
+        write(directory, input).map_err(unused)?;
         let ready = match self.running.batch_system {
             None => here::Ready::start(calculation).map(Ready::Here),
             Some(BatchSystem::Slurm) => {
@@ -198,7 +231,7 @@ impl CodeMethod {
                 slurm::write(calculation, &wanted).map(|()| Ready::Slurm(job))
             }
         };
-        ready.map_err(|error| file(directory, error))
+        ready.map_err(|error| unused(file(directory, error)))
     }
 
     /// Has the calculation begin.
@@ -217,18 +250,35 @@ impl CodeMethod {
         Ok(begun)
     }
 
-    /// Waits for the end of a calculation, and reads its numbers.
-    async fn outcome(&self, structure: Structure, begun: Begun) -> Result<Made, StoreError> {
-        match begun.end(&self.slurm).await? {
-            Some(end) => self.read(structure, begun, end).await,
-            None => self.broken_off(begun).await,
+    /// Waits for the end of a calculation of at most `time_limit` s, and reads its numbers; none if that takes too long for
+    /// somebody who wants to stop.
+    async fn outcome(
+        &self,
+        structure: Structure,
+        begun: Begun,
+        time_limit: f64,
+        closing: &Closing,
+    ) -> Result<Option<Made>, StoreError> {
+        let Some(end) = begun.end(&self.slurm).await? else { return self.broken_off(begun).await.map(Some) };
+        let left = Duration::try_from_secs_f64(time_limit - end.seconds).unwrap_or_default();
+        tokio::select! {
+            made = self.read(structure, begun, end, left.max(READING)) => made.map(Some),
+            () = async {
+                closing.stopped().await;
+                tokio::time::sleep(LAST_READING).await;
+            } => Ok(None),
         }
     }
 
-    /// Judges a calculation that has ended, and reads its numbers.
-    async fn read(&self, structure: Structure, begun: Begun, end: End) -> Result<Made, StoreError> {
-        let (code, work) = (Arc::clone(&self.code), begun.directory().join(WORK));
-        let directory = work.clone();
+    /// Judges a calculation that has ended, and reads its numbers, for so long.
+    async fn read(
+        &self,
+        structure: Structure,
+        begun: Begun,
+        end: End,
+        limit: Duration,
+    ) -> Result<Made, StoreError> {
+        let (code, directory) = (Arc::clone(&self.code), begun.directory().join(WORK));
         let exit = match end.how {
             How::NotStarted(number) => {
                 begun.remove().await?;
@@ -237,7 +287,11 @@ impl CodeMethod {
             }
             How::Ended(exit) => exit,
         };
-        let mut result = blocking(move || read(&*code, &structure, &directory, exit)).await;
+        let reading = blocking(move || (read(&*code, &structure, &directory, exit), log::tail(&directory)));
+        let (mut result, log) = tokio::time::timeout(limit, reading).await.unwrap_or_else(|_| {
+            let message = format!("its results could not be read within {:.0} s", limit.as_secs_f64());
+            (Err(FailureClass::TimeLimit.because(message)), String::new())
+        });
         if let Err(Failure { class: FailureClass::OtherProgram, message }) = &result {
             // Whatever the structure: no calculation here would be one of the protocol.
             let error = file(&end.program, io::Error::other(message.clone()));
@@ -249,7 +303,6 @@ impl CodeMethod {
             failure.message.clone_from(remark);
         }
         let core_seconds = end.seconds * f64::from(self.running.cores);
-        let log = log::tail(&work);
         Ok(Made { result, ended: Some(Ended { core_seconds, log, node: end.node, begun }) })
     }
 
@@ -281,6 +334,9 @@ impl CodeMethod {
         if let Some(begun) = begun {
             begun.clear(&self.slurm).await?;
             self.reap();
+            if let Some(home) = begun.directory().parent() {
+                scratch::remove_empty(home);
+            }
         }
         Ok(())
     }

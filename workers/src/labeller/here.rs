@@ -8,10 +8,12 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use store::{is_local, is_running, process_birth, this_host};
+use tracing::warn;
 
 use super::begun::Found;
 use super::keeper::{self, Calculation, End, Order};
-use super::session;
+use super::tree::remove_tree;
+use super::{private, session};
 
 /// Between two looks at a calculation that has just begun …
 const SHORTEST_PAUSE: Duration = Duration::from_millis(5);
@@ -40,6 +42,8 @@ impl Ready {
     /// Starts the keeper; the calculation itself only begins with [`Self::go`]. Dropped before that, it never does.
     pub fn start(calculation: Calculation) -> io::Result<Self> {
         let mut keeper = calculation.keeper.command();
+        // It outlives this process, speaks to no database, and gives its environment to the program.
+        keeper.env_clear().envs(calculation.pass_environment.of_this_process());
         keeper.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null());
         let mut child = keeper.spawn()?;
         let stdin = child.stdin.take().ok_or(io::ErrorKind::BrokenPipe)?;
@@ -59,6 +63,10 @@ impl Kept {
     pub fn look(&self) -> Found {
         if is_local(&self.birth) != Some(true) {
             return Found::Elsewhere;
+        }
+        if !private::is_own(&self.directory) {
+            // Another user may have made one of that name after it was gone.
+            return if is_running(self.pid, &self.birth) { Found::Running } else { Found::Gone };
         }
         // In this order: the last that a keeper does is to write how the calculation ended.
         let runs = is_running(self.pid, &self.birth);
@@ -92,13 +100,16 @@ impl Kept {
 /// The same for the directory of a calculation whose keeper is gone.
 pub(super) fn clear(directory: &Path) -> io::Result<()> {
     session::end_marked(directory)?;
-    remove(directory)
+    remove(directory);
+    Ok(())
 }
 
-/// A directory that is gone already is no error.
-pub(super) fn remove(directory: &Path) -> io::Result<()> {
-    match fs::remove_dir_all(directory) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
-        _ => Ok(()),
+/// A directory that is gone already is no error. What cannot be removed, or is not this user's, stays: that is no reason for
+/// a labeller to end.
+pub(super) fn remove(directory: &Path) {
+    if fs::symlink_metadata(directory).is_ok() && !private::is_own(directory) {
+        warn!("{} is not removed: it is no directory of this user", directory.display());
+    } else if let Err(error) = remove_tree(directory) {
+        warn!("{} cannot be removed: {error}", directory.display());
     }
 }

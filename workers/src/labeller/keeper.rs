@@ -6,27 +6,30 @@
 //! which ties itself to the keeper and then becomes the program.
 
 use std::fs::{self, File};
-use std::io::{self, BufRead, Write};
+use std::io::{self, BufRead, ErrorKind, Write};
 use std::os::fd::AsFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-use dft::Exit;
+use dft::{Exit, PassedEnvironment, result_file};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{
-    Pid, PidfdFlags, Signal, getppid, pidfd_open, set_parent_process_death_signal, setsid,
+    Pid, PidfdFlags, Signal, geteuid, getpid, getppid, pidfd_open, set_child_subreaper,
+    set_parent_process_death_signal, setsid,
 };
 use serde::{Deserialize, Serialize};
 
-use super::session;
+use super::private;
+use super::session::{self, Children};
+use super::tree::remove_tree;
 
 /// Where the program works, in the directory of a calculation.
 pub(super) const WORK: &str = "work";
 /// What the keeper leaves there when the calculation has ended.
 const END: &str = "end.json";
-/// Between two looks at the memory in use.
+/// Between two looks at the memory in use, and for processes that have ended.
 const LOOK: Duration = Duration::from_millis(500);
 /// The variable by which everything that a calculation starts can be known: its directory.
 pub(super) const MARK: &str = "CALMWALK_CALCULATION";
@@ -52,6 +55,9 @@ pub(super) struct Calculation {
     pub directory: PathBuf,
     pub command: Vec<String>,
     pub environment: Vec<(String, String)>,
+    /// What the program gets besides of the environment in which the keeper is started.
+    #[serde(default)]
+    pub pass_environment: PassedEnvironment,
     /// Seconds.
     pub time_limit: f64,
     /// Bytes that all its processes together may have in memory.
@@ -126,14 +132,28 @@ enum ExitOnFile {
 impl End {
     /// What a keeper left in the directory, if the calculation has ended.
     pub fn read(directory: &Path) -> Option<Self> {
-        serde_json::from_slice(&fs::read(directory.join(END)).ok()?).ok()
+        serde_json::from_slice(&result_file::read(&directory.join(END)).ok()?).ok()
     }
 
     /// It appears as a whole, and only when everything else is over.
     pub fn write(&self, directory: &Path) -> io::Result<()> {
-        let unfinished = directory.join(format!("{END}.new"));
-        fs::write(&unfinished, serde_json::to_vec(self)?)?;
-        fs::rename(unfinished, directory.join(END))
+        let (unfinished, finished) = (directory.join(format!("{END}.new")), directory.join(END));
+        // The program may have left anything under these names.
+        make_way(&unfinished)?;
+        let mut file = File::options().write(true).create_new(true).open(&unfinished)?;
+        file.write_all(&serde_json::to_vec(self)?)?;
+        make_way(&finished)?;
+        fs::rename(unfinished, finished)
+    }
+}
+
+/// Removes what has that name, whatever it is.
+fn make_way(path: &Path) -> io::Result<()> {
+    match fs::symlink_metadata(path) {
+        Ok(found) if found.is_dir() => remove_tree(path),
+        Ok(_) => fs::remove_file(path),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
+        Err(error) => Err(error),
     }
 }
 
@@ -143,8 +163,17 @@ impl End {
 /// # Errors
 /// What the system refused. Without an order, since whoever started this process is gone, nothing is done.
 pub fn keep() -> io::Result<()> {
+    let stdin = io::stdin();
+    // A batch job reads its order from a file, in whose place another user might have put one.
+    let order = rustix::fs::fstat(&stdin)?;
+    if rustix::fs::FileType::from_raw_mode(order.st_mode).is_file() && order.st_uid != geteuid().as_raw() {
+        return Err(io::Error::other(format!(
+            "the order is a file of user {}, expected one's own",
+            order.st_uid
+        )));
+    }
     let mut line = String::new();
-    io::stdin().lock().read_line(&mut line)?;
+    stdin.lock().read_line(&mut line)?;
     // An order that was cut off was not given.
     match line.ends_with('\n').then(|| serde_json::from_str(&line)) {
         None => Ok(()),
@@ -166,7 +195,7 @@ fn become_program(keeper: u32, directory: &Path, command: &[String]) -> io::Erro
     if getppid().map(|pid| pid.as_raw_nonzero().get().unsigned_abs()) != Some(keeper) {
         return io::Error::other("the keeper of this calculation is gone");
     }
-    let [program, arguments @ ..] = command else { return io::ErrorKind::InvalidInput.into() };
+    let [program, arguments @ ..] = command else { return ErrorKind::InvalidInput.into() };
     let error = Command::new(program).args(arguments).stdin(Stdio::null()).exec();
     let number = error.raw_os_error().unwrap_or_default();
     match fs::write(directory.join(NOT_STARTED), number.to_string()) {
@@ -178,14 +207,23 @@ fn become_program(keeper: u32, directory: &Path, command: &[String]) -> io::Erro
 impl Calculation {
     /// Starts the program, waits for it, and ends it at a limit.
     fn keep(self) -> io::Result<()> {
+        if !private::is_own(&self.directory) {
+            let message = format!("{} is no directory of this user", self.directory.display());
+            return Err(io::Error::other(message));
+        }
         // Neither Ctrl-C nor the end of the labeller's group reaches this process or its program.
         setsid()?;
+        // Whatever the program starts stays below this process, also when those that started it are gone.
+        set_child_subreaper(Some(getpid()))?;
         let kills = out_of_memory_kills();
         let begun = Instant::now();
-        let mut program = self.start()?;
-        let (limit, memory) = self.wait(&program, begun)?;
-        session::end_others()?;
-        let (status, seconds) = (program.wait()?, begun.elapsed().as_secs_f64());
+        let program = self.start()?;
+        let program = i32::try_from(program.id()).ok().and_then(Pid::from_raw);
+        let program = program.ok_or(ErrorKind::InvalidInput)?;
+        let mut children = Children::new(program);
+        let (limit, memory) = self.wait(program, &mut children, begun)?;
+        let status = children.end()?;
+        let seconds = begun.elapsed().as_secs_f64();
         let node = std::env::var(NODE).ok();
         if node.is_some() && limit.is_none() && !status.success() {
             // If it was not the program's fault, this process ends here as well, and Slurm tells why.
@@ -209,6 +247,8 @@ impl Calculation {
             .keeper
             .command()
             .current_dir(&work)
+            .env_clear()
+            .envs(self.pass_environment.of_this_process())
             .envs(self.environment.iter().map(|(name, value)| (name, value)))
             .env(MARK, &self.directory)
             .stdin(Stdio::piped())
@@ -220,14 +260,13 @@ impl Calculation {
         let order = Order::Become { keeper, directory, command: self.command.clone() };
         match child.stdin.take() {
             Some(stdin) => give(stdin, &order).map(|()| child),
-            None => Err(io::ErrorKind::BrokenPipe.into()),
+            None => Err(ErrorKind::BrokenPipe.into()),
         }
     }
 
     /// Waits until the program has ended, or must end: then the limit. The second is how much memory was seen in use.
-    fn wait(&self, program: &Child, begun: Instant) -> io::Result<(Option<Exit>, u64)> {
-        let pid = i32::try_from(program.id()).ok().and_then(Pid::from_raw);
-        let end = pidfd_open(pid.ok_or(io::ErrorKind::InvalidInput)?, PidfdFlags::empty())?;
+    fn wait(&self, program: Pid, children: &mut Children, begun: Instant) -> io::Result<(Option<Exit>, u64)> {
+        let end = pidfd_open(program, PidfdFlags::empty())?;
         let limit = Duration::try_from_secs_f64(self.time_limit).unwrap_or(Duration::MAX);
         let mut most = 0;
         loop {
@@ -235,9 +274,10 @@ impl Calculation {
             if left.is_zero() {
                 return Ok((Some(Exit::TimeLimit), most));
             }
-            if has_ended(&end, if self.memory_limit.is_some() { left.min(LOOK) } else { left })? {
+            if has_ended(&end, left.min(LOOK))? {
                 return Ok((None, most));
             }
+            children.reap()?;
             if let Some(limit) = self.memory_limit {
                 most = most.max(session::memory());
                 if most > limit {
@@ -248,7 +288,8 @@ impl Calculation {
     }
 
     fn not_started(&self) -> Option<i32> {
-        fs::read_to_string(self.directory.join(NOT_STARTED)).ok()?.parse().ok()
+        let number = result_file::read(&self.directory.join(NOT_STARTED)).ok()?;
+        String::from_utf8(number).ok()?.parse().ok()
     }
 }
 

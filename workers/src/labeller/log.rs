@@ -1,8 +1,8 @@
 //! The end of what a program said.
 
-use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
+
+use dft::result_file;
 
 /// Bytes of each stream that are kept.
 const TAIL: u64 = 3000;
@@ -16,18 +16,10 @@ pub(super) fn tail(work: &Path) -> String {
 
 /// As many whole lines as fit, or the end of the only one; nothing of a file that cannot be read.
 pub(super) fn last_lines(path: &Path) -> String {
-    let read = || -> std::io::Result<(u64, Vec<u8>)> {
-        let mut file = File::open(path)?;
-        let length = file.metadata()?.len();
-        file.seek(SeekFrom::Start(length.saturating_sub(TAIL)))?;
-        let mut bytes = Vec::new();
-        file.take(TAIL).read_to_end(&mut bytes)?;
-        Ok((length, bytes))
-    };
-    let Ok((length, bytes)) = read() else { return String::new() };
-    let text = String::from_utf8_lossy(&bytes);
+    let Ok(tail) = result_file::tail(path, TAIL) else { return String::new() };
+    let text = String::from_utf8_lossy(&tail.bytes);
     let text = match text.split_once('\n') {
-        Some((_, whole)) if length > TAIL && !whole.trim().is_empty() => whole,
+        Some((_, whole)) if tail.length > TAIL && !whole.trim().is_empty() => whole,
         _ => &text,
     };
     text.trim().to_owned()

@@ -43,6 +43,11 @@ impl Method {
         Self::Code(Box::new(CodeMethod::new(keeper, code, running)))
     }
 
+    /// Whether a calculation goes on without this labeller, and another finds it.
+    pub(super) fn outlives_its_labeller(&self) -> bool {
+        matches!(self, Self::Code(_))
+    }
+
     /// Ends the calculation in hand, if there is one, and removes its directory.
     ///
     /// # Errors
@@ -59,6 +64,13 @@ impl Method {
         match self {
             Self::Reference(_) => Ok(()),
             Self::Code(method) => method.home(store, closing).await.map(drop),
+        }
+    }
+
+    /// Nothing more is to be done.
+    pub(super) fn end(&self) {
+        if let Self::Code(method) = self {
+            method.end();
         }
     }
 
@@ -84,17 +96,18 @@ impl Method {
         }
     }
 
-    /// Makes the result for a job. A potential takes a thread of its own.
+    /// Makes the result for a job. A potential takes a thread of its own. None if somebody asked to stop and it would take longer
+    /// to read it.
     pub(super) async fn make(
         &self,
         store: &Store,
         lease: &Lease,
         closing: &Closing,
-    ) -> Result<Made, StoreError> {
+    ) -> Result<Option<Made>, StoreError> {
         match self {
             Self::Reference(method) => {
                 let result = evaluate(Arc::clone(method), lease.structure.clone()).await;
-                Ok(Made { result, ended: None })
+                Ok(Some(Made { result, ended: None }))
             }
             Self::Code(method) => method.make(store, lease, closing).await,
         }

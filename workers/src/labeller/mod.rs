@@ -18,12 +18,14 @@ mod once;
 mod pack;
 mod prepare;
 mod presence;
+mod private;
 mod reference;
 mod running;
 mod scratch;
 mod session;
 mod slurm;
 mod told;
+mod tree;
 
 use std::pin::pin;
 use std::time::{Duration, Instant};
@@ -92,7 +94,8 @@ pub struct Timing {
     /// Between two signs of life of a labeller that is a process.
     pub sign_of_life: Duration,
     /// How long the label in hand may go on when the labeller is asked to stop, before it is given back and its calculation
-    /// ended; none for as long as it takes.
+    /// ended. With none the label is finished, but a calculation that outlives the labeller is left to the next one after some
+    /// seconds.
     pub grace: Option<Duration>,
 }
 
@@ -121,6 +124,9 @@ enum Found {
     TheEnd,
 }
 
+/// After it was asked to stop, a labeller waits so long for a calculation that goes on without it.
+const LAST_LABEL: Duration = Duration::from_secs(5);
+
 /// Labels until there is nothing more to do. `now` is asked for ms since 1970; `tell` gets a line for each job.
 ///
 /// A database that is busy or full is no reason to end: the queue is looked at again later, and a label that was made is
@@ -136,23 +142,36 @@ pub async fn run(
     now: impl Fn() -> i64,
     tell: impl Fn(&str),
 ) -> Result<(), StoreError> {
+    let done = work(&store, &method, &settings, closing, now, tell).await;
+    method.end();
+    done
+}
+
+async fn work(
+    store: &Store,
+    method: &Method,
+    settings: &LabellerSettings,
+    closing: &Closing,
+    now: impl Fn() -> i64,
+    tell: impl Fn(&str),
+) -> Result<(), StoreError> {
     let say = |line: &str| {
         info!("{line}");
         tell(line);
     };
     let (mut idle, mut offsets) = (Duration::ZERO, Offsets::default());
-    method.begin(&store, closing).await?;
+    method.begin(store, closing).await?;
     loop {
         let wanted = closing.wanted();
         if wanted.stop {
             return Ok(());
         }
-        let lease = match look(&store, &settings, wanted.no_more_jobs, now()).await {
+        let lease = match look(store, settings, wanted.no_more_jobs, now()).await {
             Ok(Found::Job(lease)) => lease,
             Ok(Found::TheEnd) => return Ok(()),
             Err(error) if !error.is_transient() => return Err(error),
             looked => {
-                idle += wait(&store, idle, settings.timing.idle, looked.is_ok(), closing, wanted).await;
+                idle += wait(store, idle, settings.timing.idle, looked.is_ok(), closing, wanted).await;
                 continue;
             }
         };
@@ -160,13 +179,13 @@ pub async fn run(
         debug!(candidate = lease.candidate, job = lease.job, attempt = lease.attempt, "leased");
         let begun = Instant::now();
         let size = method.size(&lease.structure);
-        if let Some(reason) = insist(closing, || guard::refusal(&store, &lease, size)).await? {
+        if let Some(reason) = insist(closing, || guard::refusal(store, &lease, size)).await? {
             // Whatever was tried before, another attempt would be refused as well.
             insist(closing, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
             say(&format!("{} is refused: {reason}", lease.candidate));
             continue;
         }
-        let made = match make(&store, &method, &lease, &settings.timing, closing, &now).await? {
+        let made = match make(store, method, &lease, &settings.timing, closing, &now).await? {
             Work::Done(made) => *made,
             Work::NotWanted => {
                 method.stop().await?;
@@ -178,6 +197,11 @@ pub async fn run(
                 say(&format!("{} is finished by somebody else here", lease.candidate));
                 continue;
             }
+            Work::LeftToOthers => {
+                method.let_go();
+                say(&format!("{} goes on and is left to the next labeller here", lease.candidate));
+                return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
+            }
             Work::TooLate => {
                 method.stop().await?;
                 say(&format!("{} is given back: there is no time to finish it", lease.candidate));
@@ -185,7 +209,7 @@ pub async fn run(
             }
         };
         let Brought { judged, became, ended } =
-            bring(&store, &method, &lease, &settings, &mut offsets, made, closing, &now).await?;
+            bring(store, method, &lease, settings, &mut offsets, made, closing, &now).await?;
         let line = told::line(&lease, &judged, &became, begun.elapsed().as_secs_f64());
         match &judged {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
@@ -195,7 +219,7 @@ pub async fn run(
         }
         tell(&line);
         if let Some(ended) = ended {
-            method.put_away(&store, &lease, closing, ended, judged.is_err()).await?;
+            method.put_away(store, &lease, closing, ended, judged.is_err()).await?;
         }
     }
 }
@@ -288,6 +312,8 @@ enum Work {
     NotWanted,
     /// Somebody else waits for this very calculation.
     LetGo,
+    /// Somebody asked to stop, and it goes on without this labeller, or waits to be read.
+    LeftToOthers,
     /// There was no time to end it.
     TooLate,
 }
@@ -304,12 +330,23 @@ async fn make(
 ) -> Result<Work, StoreError> {
     let mut making = pin!(method.make(store, lease, closing));
     let mut too_late = pin!(end_of_grace(timing.grace, closing));
+    // Who has no time of grace is followed by others, who find the calculation.
+    let leaves = timing.grace.is_none() && method.outlives_its_labeller();
+    let mut leave = pin!(async {
+        end_of_grace(leaves.then_some(LAST_LABEL), closing).await;
+        while method.calculation().is_none() {
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    });
     let seconds = timing.lease_seconds();
     let mut held = true;
     loop {
         tokio::select! {
-            made = &mut making => return made.map(|made| Work::Done(Box::new(made))),
+            made = &mut making => {
+                return Ok(made?.map_or(Work::LeftToOthers, |made| Work::Done(Box::new(made))));
+            }
             () = &mut too_late => return Ok(Work::TooLate),
+            () = &mut leave => return Ok(Work::LeftToOthers),
             () = tokio::time::sleep(Duration::from_secs(seconds.into()) / 3) => {}
         }
         if held {

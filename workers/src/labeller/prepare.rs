@@ -62,10 +62,10 @@ pub(super) fn prepare(
     })
 }
 
-/// Makes the directory of a calculation, with its input in it.
+/// Writes its input into the directory of a calculation.
 ///
 /// # Errors
-/// It cannot be made, or a file of which it gets a copy is not the one of the protocol any more.
+/// It cannot be written, or a file of which it gets a copy is not the one of the protocol any more.
 pub(super) fn write(directory: &Path, input: &Input) -> Result<(), StoreError> {
     let copy = |(name, original): (&String, &Original)| match original.content() {
         Ok(content) => Ok((name.clone(), content)),

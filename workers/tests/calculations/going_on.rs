@@ -111,6 +111,42 @@ async fn who_is_stopped_ends_the_calculation_after_the_grace_and_gives_the_label
     place.nothing_is_left();
 }
 
+/// Who has a time of grace ends the calculation after it, since nobody may come to take it over.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn who_is_stopped_without_a_time_of_grace_leaves_the_calculation_to_the_next() {
+    let place = Place::new(1, WITH_CHILDREN).await;
+    let labeller = place.labeller().await;
+    place.wait_until_begun(1).await;
+    labeller.closing.stop();
+    labeller.ended().await.unwrap();
+    assert_eq!(outcomes(&place.attempts().await), [("released", None)]);
+    assert!(!place.processes().is_empty());
+    place.go();
+    place.work().await;
+    assert_eq!((place.begun(), place.labels().await.len()), (1, 1));
+    place.nothing_is_left();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn who_is_stopped_while_results_cannot_be_read_ends_all_the_same() {
+    for grace in [None, Some(Duration::from_secs(600))] {
+        let place = Place::new(1, "echo -7.5 > energy").await;
+        let slow = place.home.path().join("slow");
+        fs::write(&slow, "").unwrap();
+        let labeller = place.labeller_with(|settings| settings.timing.grace = grace).await;
+        place.wait_until_begun(1).await;
+        until("it does not end", async || place.processes().is_empty()).await;
+        labeller.closing.stop();
+        labeller.ended().await.unwrap();
+        assert_eq!(outcomes(&place.attempts().await), [("released", None)]);
+        // The next one reads what is there.
+        fs::remove_file(slow).unwrap();
+        place.work().await;
+        assert_eq!((place.begun(), place.labels().await.len()), (1, 1));
+        place.nothing_is_left();
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_calculation_that_nobody_waits_for_any_more_is_ended() {
     let place = Place::new(1, WITH_CHILDREN).await;

@@ -7,7 +7,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use atoms::{Species, Structure};
-use dft::{Calculated, Code, Exit, Failure, FailureClass, Input, Original, Remedy, SetupError, Size};
+use dft::{
+    Calculated, Code, Exit, Failure, FailureClass, Input, Original, Remedy, SetupError, Size, result_file,
+};
 use serde_json::json;
 use store::{Attempt, JobDetails, LabelRecord, ProcessRecord, Store, StoreError, unix_milliseconds};
 use tempfile::TempDir;
@@ -30,6 +32,8 @@ pub struct Script {
     text: String,
     /// A file of which it gets a copy.
     setup: Option<Original>,
+    /// As long as there is a file of this name, reading results takes.
+    slow: PathBuf,
 }
 
 impl Code for Script {
@@ -65,8 +69,15 @@ impl Code for Script {
             }
             exit => return Err(exit.failure()),
         }
-        let text = fs::read_to_string(directory.join("energy")).unwrap_or_default();
-        let energy = text.trim().parse().map_err(|_| FailureClass::Crashed.because("no energy"))?;
+        // As from a file system that does not answer.
+        while self.slow.exists() {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let text = result_file::read(&directory.join("energy")).unwrap_or_default();
+        let energy = String::from_utf8_lossy(&text)
+            .trim()
+            .parse()
+            .map_err(|_| FailureClass::Crashed.because("no energy"))?;
         Ok(Calculated {
             energy,
             forces: vec![[0.0; 3]; structure.len()],
@@ -118,7 +129,11 @@ impl Place {
     }
 
     pub fn method(&self) -> Method {
-        let script = Script { text: self.script.clone(), setup: self.setup.clone() };
+        let script = Script {
+            text: self.script.clone(),
+            setup: self.setup.clone(),
+            slow: self.home.path().join("slow"),
+        };
         Method::kept_by(keeper_command(), Box::new(script), self.running.clone())
     }
 

@@ -12,12 +12,14 @@ mod script;
 mod shared;
 mod told;
 
+use std::ffi::OsStr;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use ::slurm::{Commands, Phase, SlurmError};
+use dft::PassedEnvironment;
 use serde::{Deserialize, Serialize};
 use store::StoreError;
 use tokio::sync::OnceCell;
@@ -26,9 +28,11 @@ use tokio::time::sleep;
 use super::begun::Found;
 use super::code::file;
 use super::keeper::End;
+use super::private;
 use told::{Told, Traces};
 
 pub(super) use script::{Wanted, write};
+pub(super) use shared::forget;
 
 /// Made in the directory by the job that calculates.
 const BEGUN: &str = "begun";
@@ -78,13 +82,19 @@ pub(super) struct Slurm {
     cluster: OnceCell<String>,
 }
 
-impl Default for Slurm {
-    fn default() -> Self {
-        Self { commands: Commands::with_patience(PATIENCE), cluster: OnceCell::new() }
-    }
-}
-
 impl Slurm {
+    /// Slurm's commands, with the variables of this environment that programs get: `sbatch` gives its own to its job.
+    pub fn new(passed: &PassedEnvironment) -> Self {
+        let of_slurm = |name: &OsStr| {
+            let name = name.to_string_lossy();
+            name.starts_with("SBATCH_") || name == "SLURM_JWT"
+        };
+        let own = std::env::vars_os().filter(|(name, _)| of_slurm(name));
+        let environment = passed.of_this_process().chain(own).collect();
+        let commands = Commands::with_patience(PATIENCE).with_environment(environment);
+        Self { commands, cluster: OnceCell::new() }
+    }
+
     /// The job of the calculation in this directory, below that of its campaign.
     pub async fn job(&self, directory: &Path) -> Result<Job, StoreError> {
         let last = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -117,6 +127,10 @@ impl Slurm {
     }
 
     pub async fn look(&self, job: &Job) -> Result<Found, StoreError> {
+        if job.directory.symlink_metadata().is_ok() && !private::is_own(&job.directory) {
+            // Another user has made one of that name after it was gone, or has submitted the job.
+            return Ok(Found::Elsewhere);
+        }
         if let Some(end) = End::read(&job.directory) {
             return Ok(Found::Ended(end));
         }
@@ -249,7 +263,8 @@ fn cannot(job: &Job, why: impl ToString) -> StoreError {
 async fn settle(directory: &Path) {
     sleep(SETTLING).await;
     let new = directory.join("look");
-    let _ = fs::write(&new, "").and_then(|()| fs::remove_file(&new));
+    // A program may have left something of that name, and a pipe would hold this up.
+    let _ = fs::File::create_new(&new).and_then(|_| fs::remove_file(&new));
 }
 
 #[cfg(test)]
@@ -266,6 +281,6 @@ mod tests {
             user: Some(own_user() + 1),
             node: None,
         };
-        assert_eq!(Slurm::default().look(&job).await.unwrap(), Found::Elsewhere);
+        assert_eq!(Slurm::new(&PassedEnvironment::default()).look(&job).await.unwrap(), Found::Elsewhere);
     }
 }

@@ -6,6 +6,8 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
+use dft::result_file;
+
 use super::super::KeeperCommand;
 use super::super::keeper::{self, Calculation, Order};
 use super::{BEGUN, Job, LOG, ORDER, SCRIPT};
@@ -72,7 +74,8 @@ fn quoted(word: impl AsRef<Path>) -> String {
 /// Lets the job run anywhere. Returns whether there was a node that it avoided.
 pub(super) fn avoid_none(directory: &Path) -> io::Result<bool> {
     let path = directory.join(SCRIPT);
-    let script = fs::read_to_string(&path)?;
+    let script = result_file::read(&path).map_err(io::Error::other)?;
+    let script = String::from_utf8_lossy(&script);
     let (avoiding, others): (Vec<_>, Vec<_>) =
         script.split_inclusive('\n').partition(|line| line.starts_with(EXCLUDE));
     if !avoiding.is_empty() {
@@ -111,6 +114,7 @@ mod tests {
             directory: directory.to_owned(),
             command: vec!["abinit".to_owned()],
             environment: Vec::new(),
+            pass_environment: Default::default(),
             time_limit: 3600.0,
             memory_limit: Some(2_000_000_000),
             keeper: KeeperCommand {

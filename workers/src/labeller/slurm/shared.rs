@@ -6,6 +6,7 @@ use std::fs;
 use std::path::Path;
 
 use ::slurm::Commands;
+use dft::result_file;
 
 use super::{Job, LOOK};
 
@@ -28,10 +29,18 @@ pub(super) async fn lives(commands: &Commands, job: &Job) -> bool {
     names.lines().any(|name| name == job.name)
 }
 
+/// Removes it from the directory that held those of calculations.
+pub(in super::super) fn forget(home: &Path) {
+    let _ = fs::remove_file(home.join(FILE));
+}
+
 /// The answer, if it is not old. Clocks that do not agree make it look older, or ask for it again.
 fn lately(path: &Path) -> Option<String> {
     let age = fs::metadata(path).and_then(|file| file.modified()).ok()?.elapsed().ok()?;
-    if age >= LOOK { None } else { fs::read_to_string(path).ok() }
+    if age >= LOOK {
+        return None;
+    }
+    String::from_utf8(result_file::read(path).ok()?).ok()
 }
 
 /// What cannot be written is asked again by all.
