@@ -64,9 +64,13 @@ impl fmt::Display for Summary {
             0 => String::new(),
             jobs => format!(", {jobs} superseded"),
         };
+        let excluded = match labels.excluded {
+            0 => String::new(),
+            labels => format!(", {labels} excluded by hand"),
+        };
         writeln!(
             f,
-            "labels           {} biased and {} control structures labelled, {} failed, {} dropped{superseded}",
+            "labels           {} biased and {} control structures labelled, {} failed, {} dropped{superseded}{excluded}",
             self.learned.biased.structures, self.learned.control.structures, labels.failed, labels.dropped
         )?;
         write!(f, "{}", unlabelled::shown(&self.unlabelled, 17, SHOWN))?;

@@ -5,6 +5,7 @@ mod calm;
 mod clean;
 mod dashboard;
 pub mod errors;
+mod exclude;
 mod explain;
 mod export;
 mod import;
@@ -62,6 +63,7 @@ enum Command {
     Errors(errors::Errors),
     Queue(queue::Queue),
     Relabel(relabel::Relabel),
+    Exclude(exclude::Exclude),
     Walks(walks::Walks),
     Explain(explain::Explain),
     Export(export::Export),
@@ -97,6 +99,7 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Errors(command) => command.run(),
         Command::Queue(command) => command.run(),
         Command::Relabel(command) => command.run(),
+        Command::Exclude(command) => command.run(),
         Command::Walks(command) => command.run(),
         Command::Explain(command) => command.run(),
         Command::Export(command) => command.run(),

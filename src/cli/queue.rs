@@ -43,7 +43,7 @@ pub enum Action {
         #[arg(long, value_name = "DIR", default_value = ".")]
         into: PathBuf,
     },
-    /// Take structures out of the queue and out of exports
+    /// Take structures that wait for a label out of the queue and out of exports (calmwalk exclude takes labels out)
     Drop {
         /// Candidates
         #[arg(value_name = "ID", required = true)]
@@ -159,11 +159,12 @@ pub fn outcome(action: &Action, job: &Job) -> String {
     }
 }
 
-/// Its state, and whether there is a label while it waits for another.
+/// Its state, whether there is a label while it waits for another, and whether that is excluded.
 fn state_of(job: &Job) -> String {
+    let excluded = if job.excluded.is_some() { ", excluded" } else { "" };
     match (&job.relabel, job.state) {
-        (Some(_), JobState::Queued | JobState::Leased) => format!("{} again", job.state),
-        _ => job.state.to_string(),
+        (Some(_), JobState::Queued | JobState::Leased) => format!("{} again{excluded}", job.state),
+        _ => format!("{}{excluded}", job.state),
     }
 }
 
@@ -217,6 +218,7 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
         formula,
         original_gamma,
         relabel,
+        excluded,
         ..
     } = &details.job;
     writeln!(out, "{candidate}")?;
@@ -224,6 +226,9 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
     writeln!(out, "  state     {state}, priority {priority}")?;
     if let Some(reason) = relabel {
         writeln!(out, "  again     another label was asked for: {reason}")?;
+    }
+    if let Some(reason) = excluded {
+        writeln!(out, "  excluded  its label is left out of exports and statistics: {reason}")?;
     }
     if let (Some(holder), Some(expires)) = (holder, expires) {
         let left = (expires - unix_milliseconds()) / 1000;

@@ -6,7 +6,7 @@ use atoms::Vec3;
 use atoms::cell::{norm, sub};
 use serde::Serialize;
 use store::{
-    JobDetails, LabelDetails, LabelRecord, LabelSource, Operation, Standing, Store, StoreError,
+    Exclusion, JobDetails, LabelDetails, LabelRecord, LabelSource, Operation, Standing, Store, StoreError,
     StructureLabel, Superseded,
 };
 use wire::{CandidateView, ContentHash};
@@ -21,7 +21,7 @@ pub struct LabelJob {
     pub details: JobDetails,
     /// Core-seconds of all its attempts, as far as they are known; none if of none.
     pub core_seconds: Option<f64>,
-    /// What people did to it: `drop`, `retry`, `prioritise`.
+    /// What people did to it and its labels: `drop`, `retry`, `prioritise`, `exclude`, `include`.
     pub by_hand: Vec<ByHand>,
 }
 
@@ -30,13 +30,15 @@ pub struct LabelJob {
 pub struct ByHand {
     /// ms since 1970.
     pub time: i64,
-    /// `drop`, `retry` or `prioritise`.
+    /// `drop`, `retry`, `prioritise`, `exclude` or `include`.
     pub action: String,
     /// The priority that it was given.
     pub priority: Option<i64>,
+    /// Why its label was excluded.
+    pub reason: Option<String>,
 }
 
-/// A label, a check or a superseded label.
+/// A label, a check, a superseded or an excluded label.
 #[derive(Clone, Debug, Serialize)]
 pub struct StoryLabel {
     /// Name of the protocol.
@@ -51,6 +53,8 @@ pub struct StoryLabel {
     pub received: i64,
     /// When and why another came in its place.
     pub superseded: Option<Superseded>,
+    /// When and why it was taken out of the data set.
+    pub excluded: Option<Exclusion>,
     /// Energy, eV.
     pub energy: f64,
     /// Energy an atom, eV.
@@ -121,14 +125,15 @@ pub(super) async fn labels(
 impl ByHand {
     fn of(operation: Operation) -> Self {
         let priority = operation.detail["priority"].as_i64();
-        Self { time: operation.time, action: operation.kind, priority }
+        let reason = operation.detail["reason"].as_str().map(str::to_owned);
+        Self { time: operation.time, action: operation.kind, priority, reason }
     }
 }
 
 impl StoryLabel {
     fn of(label: StructureLabel, model: Option<ForceError>) -> Self {
         let StructureLabel { protocol, record } = label;
-        let LabelRecord { standing, label, source, received, superseded } = record;
+        let LabelRecord { standing, label, source, received, superseded, excluded } = record;
         let atoms = label.forces.len().max(1) as f64;
         Self {
             protocol: protocol.name,
@@ -137,6 +142,7 @@ impl StoryLabel {
             source: in_words(&source),
             received,
             superseded,
+            excluded,
             energy: label.energy,
             energy_per_atom: label.energy / atoms,
             largest_force: label.forces.iter().map(|force| norm(*force)).fold(0.0, f64::max),

@@ -256,7 +256,7 @@ pub enum StoreError {
         state: String,
     },
     /// The job is not in a state where that makes sense.
-    #[error("cannot {action} {candidate}: its label job is {state}, and only {allowed} jobs can be {past}", past = past(action))]
+    #[error("cannot {action} {candidate}: its label job is {state}, and only {allowed} jobs can be {past}{}", exclude_instead(action, *state), past = past(action))]
     WrongState {
         /// `drop`, `retry`, `prioritise`.
         action: &'static str,
@@ -266,6 +266,14 @@ pub enum StoreError {
         state: JobState,
         /// The states in which it could be done.
         allowed: &'static str,
+    },
+    /// A structure has no label that could be excluded, or included again.
+    #[error("{id} has no label to exclude: {why}")]
+    NoLabel {
+        /// The candidate or import.
+        id: String,
+        /// Why it has none.
+        why: String,
     },
     /// Not a protocol of this campaign.
     #[error("the campaign has no label protocol {0}: add it first")]
@@ -384,5 +392,13 @@ fn past(action: &str) -> &'static str {
         "drop" => "dropped",
         "retry" => "tried again",
         _ => "given another priority",
+    }
+}
+
+/// What takes a label out of the data set that is there already.
+fn exclude_instead(action: &str, state: JobState) -> &'static str {
+    match (action, state) {
+        ("drop", JobState::Labelled) => "; calmwalk exclude takes its label out of the data set",
+        _ => "",
     }
 }

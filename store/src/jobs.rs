@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use crate::database::{FromRow, Row, from_columns};
 use crate::error::Result;
+use crate::exclude::Exclusion;
 use crate::records::{JobState, Label};
 
 /// The label attempt under way that began first.
@@ -133,6 +134,8 @@ pub struct Job {
     pub overruled: bool,
     /// Why another label was asked for in the place of the one that there is, until it has come.
     pub relabel: Option<String>,
+    /// Why its label is excluded from the data set; none if it is not.
+    pub excluded: Option<String>,
 }
 
 /// An attempt at a job.
@@ -224,6 +227,8 @@ pub enum Standing {
     Check,
     /// It was the label until another came that was asked for anew.
     Superseded,
+    /// It would be the label, but somebody has taken it out of the data set.
+    Excluded,
 }
 
 impl Standing {
@@ -232,11 +237,14 @@ impl Standing {
             Self::Label => "label",
             Self::Check => "check",
             Self::Superseded => "superseded",
+            Self::Excluded => "excluded",
         }
     }
 
     pub(crate) fn named(name: &str) -> Option<Self> {
-        [Self::Label, Self::Check, Self::Superseded].into_iter().find(|standing| standing.name() == name)
+        [Self::Label, Self::Check, Self::Superseded, Self::Excluded]
+            .into_iter()
+            .find(|standing| standing.name() == name)
     }
 }
 
@@ -272,6 +280,8 @@ pub struct LabelRecord {
     pub received: i64,
     /// When and why another came in its place.
     pub superseded: Option<Superseded>,
+    /// When and why it was taken out of the data set.
+    pub excluded: Option<Exclusion>,
 }
 
 /// How a label was superseded.

@@ -89,6 +89,8 @@ pub struct Labels {
     pub again_in_vain: u64,
     /// Of them, those that were to be made by another protocol: their jobs count as failed.
     pub failed_again: u64,
+    /// Labels that were taken out of the data set by hand; the jobs of those that were made here count as labelled.
+    pub excluded: u64,
 }
 
 /// Where a walk stands.

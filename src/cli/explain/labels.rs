@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use store::{Attempt, Job, Superseded, unix_milliseconds};
+use store::{Attempt, Exclusion, Job, Superseded, unix_milliseconds};
 
 use super::line;
 use crate::story::{ForceError, LabelJob, Story, StoryLabel};
@@ -41,7 +41,8 @@ fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
     }
     for done in &job.by_hand {
         let to = done.priority.map_or(String::new(), |priority| format!(", to {priority}"));
-        line(out, "", &format!("by hand: {}{to}, {} ago", done.action, since(done.time)))?;
+        let why = done.reason.as_ref().map_or(String::new(), |reason| format!(" ({reason})"));
+        line(out, "", &format!("by hand: {}{to}{why}, {} ago", done.action, since(done.time)))?;
     }
     job.details.attempts_made.iter().try_for_each(|attempt| write_attempt(out, attempt))
 }
@@ -81,6 +82,9 @@ fn write_label(out: &mut dyn Write, label: &StoryLabel, atoms: usize) -> io::Res
         ),
     )?;
     line(out, "", &format!("protocol '{protocol}' ({}), from {source}", &protocol_hash[..16]))?;
+    if let Some(Exclusion { time, reason }) = &label.excluded {
+        line(out, "", &format!("excluded from exports and statistics {} ago: {reason}", since(*time)))?;
+    }
     if let Some(Superseded { time, reason }) = &label.superseded {
         line(out, "", &format!("superseded {} ago: {reason}", since(*time)))?;
     }

@@ -161,7 +161,10 @@ impl Export {
                     "{others} structures have their labels by other protocols, which --protocol chooses"
                 )?;
             }
-            let store::Labels { queued, leased, failed, dropped, again, failed_again, .. } = labels;
+            let store::Labels { queued, leased, failed, dropped, again, failed_again, excluded, .. } = labels;
+            if excluded > 0 {
+                writeln!(out, "excluded by hand and left out: {excluded} (calmwalk exclude --list)")?;
+            }
             // Those that are labelled again have labels.
             let (waiting, failed) =
                 ((queued + leased).saturating_sub(again), failed.saturating_sub(failed_again));
@@ -284,12 +287,12 @@ impl Export {
     }
 
     fn nothing_to_export(&self, status: &store::Status) -> String {
-        let store::Labels { queued, leased, failed, dropped, .. } = status.labels;
+        let store::Labels { queued, leased, failed, dropped, excluded, .. } = status.labels;
         let imported =
             if self.imported || status.imported == 0 { "" } else { "; --imported adds what was imported" };
         format!(
             "nothing to export: no structure has a label ({} not labelled yet, {failed} failed, {dropped} \
-             dropped){imported}",
+             dropped, {excluded} excluded){imported}",
             queued + leased
         )
     }

@@ -95,13 +95,15 @@ impl LabelsSoFar {
 }
 
 fn queue(status: &Status) -> String {
-    let Labels { queued, leased, labelled, failed, dropped, superseded, .. } = &status.labels;
+    let Labels { queued, leased, labelled, failed, dropped, superseded, excluded, .. } = &status.labels;
     let oldest = status.oldest_lease.as_ref();
     let oldest = oldest.map_or(String::new(), |lease| format!(" (the oldest for {})", since(lease.started)));
     let superseded = if *superseded > 0 { format!(", {superseded} superseded") } else { String::new() };
+    let excluded =
+        if *excluded > 0 { format!(", {excluded} labels excluded by hand") } else { String::new() };
     let imported = status.imported;
     format!(
-        "{queued} queued, {leased} leased{oldest}, {labelled} labelled, {failed} failed, {dropped} dropped{superseded}; \
+        "{queued} queued, {leased} leased{oldest}, {labelled} labelled, {failed} failed, {dropped} dropped{superseded}{excluded}; \
          {imported} structures imported"
     )
 }

@@ -17,6 +17,7 @@ const PLAIN: Theme = Theme { colours: false };
 
 fn job(number: i64, state: JobState) -> Job {
     Job {
+        excluded: None,
         job: number,
         candidate: format!("07070707-3.0.{number}-0123456789abcdef"),
         protocol: "dft".into(),

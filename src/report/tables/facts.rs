@@ -30,13 +30,14 @@ pub fn summary(gathered: &Gathered) -> Table {
     row(
         "label jobs",
         format!(
-            "{} labelled, {} failed, {} dropped, {} superseded, {} in work, {} waiting",
+            "{} labelled, {} failed, {} dropped, {} superseded, {} in work, {} waiting; {} labels excluded by hand",
             grouped(labels.labelled),
             grouped(labels.failed),
             grouped(labels.dropped),
             grouped(labels.superseded),
             grouped(labels.leased),
-            grouped(labels.queued)
+            grouped(labels.queued),
+            grouped(labels.excluded)
         ),
     );
     if let Some(found) = &gathered.labels {

@@ -137,9 +137,10 @@ function job(found) {
   return element("div", {}, facts([
     ["job", `${found.job}, protocol ${found.protocol}`],
     ["state", element("span", {}, state(found.state), ` priority ${found.priority}`)],
+    ["excluded", found.excluded && `its label is left out of exports and statistics: ${found.excluded}`],
     ["held by", holder && `${holder}, until ${time(found.expires)}`],
     ["cost", found.core_seconds == null ? null : digits(found.core_seconds, "core-seconds")],
-    ["by hand", byHand.map((done) => `${done.action}${done.priority == null ? "" : ` ${done.priority}`}, ${time(done.time)}`).join("; ")],
+    ["by hand", byHand.map((done) => `${done.action}${done.priority == null ? "" : ` ${done.priority}`}${done.reason ? ` (${done.reason})` : ""}, ${time(done.time)}`).join("; ")],
   ]), attempts.map(attempt));
 }
 
@@ -164,6 +165,7 @@ function label(made) {
   const { model } = made;
   return facts([
     [made.standing, `protocol ${made.protocol}; ${made.source}; ${time(made.received)}`],
+    ["excluded", made.excluded && `${made.excluded.reason}; ${time(made.excluded.time)}`],
     ["energy", `${decimals(made.energy, 6, "eV")} (${decimals(made.energy_per_atom, 6, "eV")} an atom)`],
     ["largest force", decimals(made.largest_force, 4, "eV/Å")],
     ["pressure", made.pressure == null ? null : digits(made.pressure, "eV/Å³")],

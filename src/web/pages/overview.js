@@ -59,7 +59,8 @@ function summary(status) {
       `of ${whole(candidates.seen)} seen (${percent(share(candidates.accepted, candidates.seen))})`,
       declined && `declined: ${declined}`, `${whole(candidates.control)} control frames`),
     tile("Labels", `${whole(labels.labelled)} made`, `${whole(labels.queued)} wait, ${whole(labels.leased)} in work`,
-      `${whole(labels.failed)} failed, ${whole(labels.dropped)} dropped${labels.superseded > 0 ? `, ${whole(labels.superseded)} superseded` : ""}`,
+      `${whole(labels.failed)} failed, ${whole(labels.dropped)} dropped${labels.superseded > 0 ? `, ${whole(labels.superseded)} superseded` : ""}${
+        labels.excluded > 0 ? `, ${whole(labels.excluded)} excluded` : ""}`,
       `${whole(status.labels_last_hour)} in the last hour`),
     tile("Mixture", `version ${whole(version)}`,
       training ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not watched",

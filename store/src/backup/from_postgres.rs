@@ -81,7 +81,7 @@ const TABLES: [Table; 16] = [
     table!("label" {
         number: I, structure: I, protocol: I, standing: T, energy: R, forces: B, stress: B, job: I, attempt: I,
         file: T, frame: I, correction: T, received: I, details: T,
-        superseded: I, reason: T, checksum: I,
+        superseded: I, reason: T, checksum: I, excluded: I, exclusion: T,
     }),
     table!("import" { number: I, structure: I, file: T, frame: I, checksum: I }),
     table!("archive" 1 { job: I, attempt: I, bytes: B, left_out: T, checksum: I }),

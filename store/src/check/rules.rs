@@ -113,7 +113,8 @@ pub(super) const RULES: [Rule; 17] = [
     },
     Rule {
         finds: "SELECT count(*), CAST(min(structure) AS TEXT) FROM label WHERE standing = 'superseded' AND NOT EXISTS (
-                SELECT 1 FROM label AS other WHERE other.structure = label.structure AND other.standing = 'label')",
+                SELECT 1 FROM label AS other WHERE other.structure = label.structure
+                AND other.standing IN ('label', 'excluded'))",
         what: "labels that were superseded by none, of the structure",
         then: LOST,
     },
@@ -160,7 +161,7 @@ macro_rules! disagreeing {
         concat!(
             "SELECT count(*), CAST(min(job.number) AS TEXT) FROM job WHERE (state = 'labelled') <> EXISTS (
             SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
-            AND standing = 'label') AND state <> 'dropped'",
+            AND standing IN ('label', 'excluded')) AND state <> 'dropped'",
             $but
         )
     };

@@ -23,7 +23,7 @@ use crate::migrations::{Step, migrator};
 use crate::tables::checksums;
 
 /// The newest of the migrations.
-const SCHEMA: i64 = 9;
+const SCHEMA: i64 = 10;
 /// The first version whose rows have checksums.
 const WITH_CHECKSUMS: i64 = 9;
 /// Connections of a process, at most: one that writes and some that read.
@@ -38,7 +38,7 @@ const ANSWER: Duration = Duration::from_secs(3);
 pub const PAUSE: Duration = Duration::from_millis(100);
 
 /// The steps to the newest version.
-pub(crate) static STEPS: [Step; 8] = [
+pub(crate) static STEPS: [Step; 9] = [
     (1, "campaign", include_str!("../../migrations/postgres/0001_campaign.sql")),
     (2, "calculations", include_str!("../../migrations/postgres/0002_calculations.sql")),
     (4, "counts", include_str!("../../migrations/postgres/0004_counts.sql")),
@@ -47,6 +47,7 @@ pub(crate) static STEPS: [Step; 8] = [
     (7, "listing", include_str!("../../migrations/postgres/0007_listing.sql")),
     (8, "brought", include_str!("../../migrations/postgres/0008_brought.sql")),
     (9, "checksums", include_str!("../../migrations/postgres/0009_checksums.sql")),
+    (10, "exclude", include_str!("../../migrations/postgres/0010_exclude.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

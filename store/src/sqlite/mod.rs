@@ -33,7 +33,7 @@ const UNFINISHED: &str = "campaign.sqlite.new";
 /// `PRAGMA application_id` of a campaign: "CALM".
 const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` that the newest migration leaves behind.
-const SCHEMA: i64 = 9;
+const SCHEMA: i64 = 10;
 /// The first version whose rows have checksums.
 const WITH_CHECKSUMS: i64 = 9;
 /// How long another connection may hold the database.
@@ -53,7 +53,7 @@ const PAGE: u32 = 1 << 14;
 const LOG_PAGES: u32 = 1 << 12;
 
 /// The steps to the newest version.
-pub(crate) static STEPS: [Step; 9] = [
+pub(crate) static STEPS: [Step; 10] = [
     (1, "campaign", include_str!("../../migrations/sqlite/0001_campaign.sql")),
     (2, "processes", include_str!("../../migrations/sqlite/0002_processes.sql")),
     (3, "calculations", include_str!("../../migrations/sqlite/0003_calculations.sql")),
@@ -63,6 +63,7 @@ pub(crate) static STEPS: [Step; 9] = [
     (7, "listing", include_str!("../../migrations/sqlite/0007_listing.sql")),
     (8, "brought", include_str!("../../migrations/sqlite/0008_brought.sql")),
     (9, "checksums", include_str!("../../migrations/sqlite/0009_checksums.sql")),
+    (10, "exclude", include_str!("../../migrations/sqlite/0010_exclude.sql")),
 ];
 
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| migrator(&STEPS));

@@ -7,7 +7,9 @@ use super::*;
 use crate::Store;
 use crate::check;
 use crate::records::{Campaign, Commit, ComponentRecord};
-use crate::tables::{by_hand, export, history, job_counts, labels, listing, outcomes, queue, recent, status};
+use crate::tables::{
+    by_hand, exclude, export, history, job_counts, labels, listing, outcomes, queue, recent, status,
+};
 
 /// The store in a directory, and its file.
 async fn store(directory: &Path) -> (Store, DatabaseFile) {
@@ -56,6 +58,7 @@ async fn what_is_asked_often_goes_through_indexes() {
         history::BEFORE,
         history::AFTER,
         labels::CURRENT,
+        exclude::STANDING,
         listing::NEWEST,
         listing::OLDEST,
         listing::NEWEST_OF_FATE,

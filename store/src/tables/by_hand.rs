@@ -1,7 +1,10 @@
 //! What people do to the label queue. Each change leaves a line in the operations log.
 
+use std::collections::BTreeMap;
+
 use serde_json::{Value, json};
 
+use super::exclude;
 use super::labels::LabelRow;
 use super::logs::insert_operation;
 use super::queue::end_attempt;
@@ -122,8 +125,10 @@ impl Store {
             Some(state) => query(LIST).bind(state.name()),
             None => query(LIST_ALL),
         };
-        let rows: Vec<Row> = query.bind(limit).bind(offset).fetch_all(&self.database).await?;
-        rows.into_iter().map(Row::into_job).collect()
+        let mut transaction = self.database.begin_to_read().await?;
+        let rows: Vec<Row> = query.bind(limit).bind(offset).fetch_all(&mut transaction).await?;
+        let excluded = exclude::by_job(&mut transaction).await?;
+        rows.into_iter().map(|row| row.into_job(&excluded)).collect()
     }
 
     /// A job by the name of its candidate or the beginning of it; the campaign's part of the name may be left out.
@@ -140,8 +145,9 @@ impl Store {
                    AND protocol = (SELECT protocol FROM job WHERE number = $2) ORDER BY number";
         let labels = query(sql).bind(row.structure).bind(job);
         let labels: Vec<LabelRow> = labels.fetch_all(&self.database).await?;
+        let excluded = exclude::by_job(&mut self.database.begin_to_read().await?).await?;
         Ok(JobDetails {
-            job: row.into_job()?,
+            job: row.into_job(&excluded)?,
             attempts_made: attempts,
             energies: labels.iter().filter_map(LabelRow::standing_and_energy).collect(),
         })
@@ -165,7 +171,7 @@ impl Store {
         let mut change = self.change("retry", id, &allowed, "failed and dropped").await?;
         let sql = "UPDATE job SET failures = 0, overruled = 1, state = CASE WHEN EXISTS (
                        SELECT 1 FROM label WHERE label.structure = job.structure
-                       AND label.protocol = job.protocol AND standing = 'label'
+                       AND label.protocol = job.protocol AND standing IN ('label', 'excluded')
                    ) THEN 'labelled' ELSE 'queued' END WHERE number = $1";
         query(sql).bind(change.job).execute(&mut change.transaction).await?;
         change.log("retry", json!({}), now).await
@@ -254,7 +260,7 @@ impl Change {
 }
 
 impl Row {
-    fn into_job(self) -> Result<Job> {
+    fn into_job(self, excluded: &BTreeMap<i64, String>) -> Result<Job> {
         Ok(Job {
             job: self.number,
             candidate: self.id,
@@ -277,6 +283,7 @@ impl Row {
             relative_volume: self.relative_volume,
             overruled: self.overruled,
             relabel: self.relabel,
+            excluded: excluded.get(&self.number).cloned(),
         })
     }
 }

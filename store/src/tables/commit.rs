@@ -40,7 +40,7 @@ const INSERT_CANDIDATE_DATA: &str = "INSERT INTO candidate_data ({columns}) SELE
 const INSERT_JOBS: &str = "INSERT INTO job (structure, protocol, decision, priority, state)
     SELECT structure.number, new.protocol, new.decision, new.priority, CASE WHEN EXISTS (
         SELECT 1 FROM label WHERE label.structure = structure.number AND label.protocol = new.protocol
-        AND standing = 'label') THEN 'labelled' ELSE 'queued' END
+        AND standing IN ('label', 'excluded')) THEN 'labelled' ELSE 'queued' END
     FROM {rows} CROSS JOIN structure ON structure.hash = new.hash WHERE TRUE
     ON CONFLICT (structure, protocol) DO NOTHING";
 

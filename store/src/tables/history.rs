@@ -71,7 +71,7 @@ const IMPORTED: &str = concat!(
 
 /// What people do is in the log of operations, which does not grow with the candidates.
 const BY_HAND: &str = "SELECT number, time, kind, detail FROM operation
-    WHERE kind IN ('drop', 'retry', 'prioritise') ORDER BY number";
+    WHERE kind IN ('drop', 'retry', 'prioritise', 'exclude', 'include') ORDER BY number";
 
 from_columns!(Named { decision, candidate });
 

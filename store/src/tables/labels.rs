@@ -1,5 +1,5 @@
 //! Labels: the first valid result is the label, later ones are checks, and one that was asked for anew supersedes what was there.
-//! Nothing is overwritten.
+//! Nothing is overwritten. One that is excluded still is in the way of other results.
 
 use atoms::Vec3;
 use wire::ContentHash;
@@ -11,11 +11,13 @@ use crate::checksum::{LABEL, Names};
 use crate::database::{FromRow, Row, Transaction, query};
 use crate::encoding::{decode_matrix, decode_vectors, encode_vectors, integer};
 use crate::error::{Result, StoreError};
+use crate::exclude::Exclusion;
 use crate::jobs::{Completed, LabelRecord, LabelSource, Standing, Superseded};
 use crate::records::{Label, LabelDetails, Lease};
 
-pub(crate) const CURRENT: &str =
-    "SELECT EXISTS (SELECT 1 FROM label WHERE structure = $1 AND protocol = $2 AND standing = 'label')";
+/// Whether there is a label, excluded or not.
+pub(crate) const CURRENT: &str = "SELECT EXISTS (SELECT 1 FROM label WHERE structure = $1 AND protocol = $2
+    AND standing IN ('label', 'excluded'))";
 
 /// A label as a row.
 pub(super) struct LabelRow {
@@ -31,6 +33,8 @@ pub(super) struct LabelRow {
     details: Option<String>,
     superseded: Option<i64>,
     reason: Option<String>,
+    excluded: Option<i64>,
+    exclusion: Option<String>,
 }
 
 impl FromRow for LabelRow {
@@ -49,6 +53,8 @@ impl FromRow for LabelRow {
             details: row.get_or_default("details")?,
             superseded: row.get_or_default("superseded")?,
             reason: row.get_or_default("reason")?,
+            excluded: row.get_or_default("excluded")?,
+            exclusion: row.get_or_default("exclusion")?,
         })
     }
 }
@@ -210,7 +216,8 @@ impl LabelRow {
         };
         let label = decode_label(self.energy, &self.forces, self.stress.as_deref(), self.details.as_deref())?;
         let superseded = self.superseded.zip(self.reason).map(|(time, reason)| Superseded { time, reason });
-        Ok(LabelRecord { standing, label, source, received: self.received, superseded })
+        let excluded = self.excluded.zip(self.exclusion).map(|(time, reason)| Exclusion { time, reason });
+        Ok(LabelRecord { standing, label, source, received: self.received, superseded, excluded })
     }
 }
 

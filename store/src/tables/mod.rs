@@ -7,6 +7,7 @@ pub mod checksums;
 pub mod collected;
 mod commit;
 mod energies;
+pub mod exclude;
 pub mod export;
 pub mod history;
 mod imports;

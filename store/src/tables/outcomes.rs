@@ -42,6 +42,8 @@ pub(crate) const UNLABELLED: &str = "SELECT coalesce(name, '') AS seed_name, for
     FROM job CROSS JOIN candidate ON candidate.decision = job.decision
     LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
     WHERE job.state IN ('failed', 'labelled') AND job.protocol = $1
+    AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure AND label.protocol = job.protocol
+                    AND standing = 'excluded')
     GROUP BY candidate.seed_structure, name, formula
     HAVING sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) > 0
     ORDER BY candidate.seed_structure, formula";
@@ -50,7 +52,11 @@ pub(crate) const UNLABELLED: &str = "SELECT coalesce(name, '') AS seed_name, for
 const FAILED: &str = "SELECT coalesce(name, '') AS seed_name, candidate.formula AS formula, count(*) AS failed,
         (SELECT CAST(coalesce(sum(job_count.number), 0) AS BIGINT) FROM job_count
          WHERE job_count.protocol = $1 AND job_count.state = 'labelled'
-         AND job_count.seed_structure = candidate.seed_structure AND job_count.formula = candidate.formula) AS labelled,
+         AND job_count.seed_structure = candidate.seed_structure AND job_count.formula = candidate.formula)
+        - (SELECT count(*) FROM label CROSS JOIN job AS own ON own.structure = label.structure AND own.protocol = label.protocol
+           CROSS JOIN candidate AS found ON found.decision = own.decision
+           WHERE label.protocol = $1 AND standing = 'excluded' AND own.state = 'labelled'
+           AND found.seed_structure = candidate.seed_structure AND found.formula = candidate.formula) AS labelled,
         min(original_gamma) AS gamma_low, max(original_gamma) AS gamma_high,
         min(relative_volume) AS volume_low, max(relative_volume) AS volume_high,
         CAST(NULL AS DOUBLE PRECISION) AS labelled_gamma_low, CAST(NULL AS DOUBLE PRECISION) AS labelled_gamma_high,
@@ -70,7 +76,9 @@ pub(crate) const FINISHED: &str = concat!(
     FROM candidate CROSS JOIN job ON job.structure = candidate.structure AND job.protocol = $2
     CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision
     LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
-    WHERE candidate.decision > $1 AND (job.state IN ('labelled', 'failed')
+    WHERE candidate.decision > $1 AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
+        AND label.protocol = job.protocol AND standing = 'excluded')
+    AND (job.state IN ('labelled', 'failed')
         OR (job.state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
             AND label.protocol = job.protocol AND standing = 'label')))
     ORDER BY candidate.decision LIMIT $3"

@@ -25,7 +25,7 @@ pub(crate) const LABELLED: &str =
     "SELECT structure.hash AS hash, job.decision AS decision, protocol.name AS protocol, own.state AS state,
         candidate.seed_structure AS seed_structure, candidate.formula AS formula, candidate.atoms AS atoms
     FROM job
-    CROSS JOIN label ON label.structure = job.structure AND label.protocol = job.protocol AND standing = 'label'
+    CROSS JOIN label ON label.structure = job.structure AND label.protocol = job.protocol AND standing IN ('label', 'excluded')
     CROSS JOIN structure ON structure.number = job.structure
     CROSS JOIN candidate ON candidate.decision = job.decision
     CROSS JOIN protocol ON protocol.number = job.protocol
@@ -41,7 +41,7 @@ macro_rules! request {
             FROM {rows} CROSS JOIN structure ON structure.hash = new.hash
             CROSS JOIN job AS own ON own.structure = structure.number AND own.number = (
                 SELECT max(job.number) FROM job CROSS JOIN label ON label.structure = job.structure
-                AND label.protocol = job.protocol AND standing = 'label'
+                AND label.protocol = job.protocol AND standing IN ('label', 'excluded')
                 WHERE job.structure = structure.number AND job.state <> 'dropped')
             WHERE TRUE
             ON CONFLICT (structure, protocol) DO UPDATE SET state = 'queued', failures = 0, overruled = 1,
@@ -59,12 +59,12 @@ const WITHDRAW: &str =
     "UPDATE job SET state = 'labelled', relabel = NULL, relabel_after = NULL, holder = NULL,
         expires = NULL
     WHERE protocol <> $1 AND state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label
-        WHERE label.structure = job.structure AND label.protocol = job.protocol AND standing = 'label')";
+        WHERE label.structure = job.structure AND label.protocol = job.protocol AND standing IN ('label', 'excluded'))";
 
 /// What has no label by an earlier protocol goes over to the one in force, unless that has a job for it which says something else.
 const GO_OVER: &str = "INSERT INTO job (structure, protocol, decision, priority, state, overruled, relabel, relabel_after)
     SELECT structure, CAST($1 AS BIGINT), decision, priority, CASE WHEN EXISTS (SELECT 1 FROM label
-            WHERE label.structure = job.structure AND label.protocol = $1 AND standing = 'label')
+            WHERE label.structure = job.structure AND label.protocol = $1 AND standing IN ('label', 'excluded'))
             THEN 'labelled' ELSE 'queued' END, overruled, relabel, 0
         FROM job WHERE protocol <> $1 AND state IN ('queued', 'leased', 'failed')
     ON CONFLICT (structure, protocol) DO UPDATE SET state = 'queued', failures = 0, overruled = excluded.overruled,
@@ -81,7 +81,7 @@ const END_ATTEMPTS: &str = "UPDATE attempt SET ended = $1, outcome = 'dropped' W
 
 /// Labels that were made or taken in for a job of the structure; others belong to other data sets.
 const SUPERSEDE: &str = "UPDATE label SET standing = 'superseded', superseded = $2, reason = $3
-    WHERE structure = $1 AND standing = 'label' AND EXISTS (SELECT 1 FROM job
+    WHERE structure = $1 AND standing IN ('label', 'excluded') AND EXISTS (SELECT 1 FROM job
         WHERE job.structure = label.structure AND job.protocol = label.protocol)";
 
 const SUPERSEDE_JOBS: &str =
@@ -147,7 +147,7 @@ impl Store {
         let sql = "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed')
                    AND protocol <> coalesce((SELECT number FROM protocol WHERE hash = $1), 0)
                    AND NOT EXISTS (SELECT 1 FROM label WHERE label.structure = job.structure
-                                   AND label.protocol = job.protocol AND standing = 'label')";
+                                   AND label.protocol = job.protocol AND standing IN ('label', 'excluded'))";
         query(sql).bind(protocol.0.to_vec()).fetch_one(&self.database).await
     }
 

@@ -2,7 +2,7 @@
 
 use wire::WalkId;
 
-use super::{budget, job_counts, pace, pauses, processes, relabel};
+use super::{budget, exclude, job_counts, pace, pauses, processes, relabel};
 use crate::Store;
 use crate::budget::{Budget, BudgetStatus};
 use crate::checksum::joined;
@@ -51,6 +51,7 @@ impl Store {
         let fates: Vec<(String, String, u64)> = fates.fetch_all(&mut transaction).await?;
         let states = job_counts::states(&mut transaction).await?;
         let asked = relabel::asked(&mut transaction).await?;
+        let excluded = exclude::count(&mut transaction).await?;
         let oldest_lease = job_counts::oldest_lease(&mut transaction).await?;
         let labels_last_hour = job_counts::made_in_the_last_hour(&mut transaction, now).await?;
         let mut walks: Vec<WalkStatus> = query(walks!("ORDER BY walk")).fetch_all(&mut transaction).await?;
@@ -66,7 +67,7 @@ impl Store {
         let paused = pauses::read(&mut transaction).await?;
         let steps_per_second = pace::of_all(&mut transaction, now).await?;
         transaction.commit().await?;
-        let labels = labels(&states, &asked);
+        let labels = Labels { excluded, ..labels(&states, &asked) };
         let time_used_up = limits.time_used_up(&used);
         name_budget(&mut walks, time_used_up, &limits);
         for walk in &mut walks {
@@ -160,6 +161,7 @@ fn labels(states: &[(String, u64)], asked: &[(String, u64)]) -> Labels {
         again: asked("queued") + asked("leased"),
         again_in_vain: asked("labelled") + asked("failed"),
         failed_again: asked("failed"),
+        excluded: 0,
     }
 }
 

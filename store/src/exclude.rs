@@ -1,0 +1,37 @@
+//! Labels that were taken out of the data set by hand.
+
+use serde::Serialize;
+
+/// How a label was excluded.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Exclusion {
+    /// When, ms since 1970.
+    pub time: i64,
+    /// Why.
+    pub reason: String,
+}
+
+/// What became of a structure that was to be excluded, or included again.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct ExclusionChange {
+    /// Name of the candidate, or `import-N`.
+    pub id: String,
+    /// Protocols of its labels.
+    pub protocols: Vec<String>,
+    /// Whether anything is other than before.
+    pub changed: bool,
+    /// Why its labels are excluded; none if they are not.
+    pub excluded: Option<String>,
+}
+
+/// An excluded label.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct ExcludedLabel {
+    /// Name of the first candidate with that structure, or `import-N`.
+    pub id: String,
+    /// Name of the protocol.
+    pub protocol: String,
+    /// When and why.
+    #[serde(flatten)]
+    pub exclusion: Exclusion,
+}

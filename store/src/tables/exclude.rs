@@ -1,0 +1,205 @@
+//! Labels that people take out of the data set, and in again.
+//!
+//! An excluded label has the standing `excluded`: whatever asks for labels does not see it. Its job stays done, and a further result of the
+//! structure is a check; only a label that was asked for anew comes in its place.
+
+use std::collections::BTreeMap;
+
+use serde_json::json;
+
+use super::logs::insert_operation;
+use crate::Store;
+use crate::database::{Transaction, from_columns, query};
+use crate::error::{Result, StoreError};
+use crate::exclude::{ExcludedLabel, Exclusion, ExclusionChange};
+
+/// The structure of a candidate, if it was accepted.
+const OF_CANDIDATE: &str = "SELECT coalesce(structure, 0) FROM candidate WHERE decision = $1";
+const OF_IMPORT: &str = "SELECT structure FROM import WHERE number = $1";
+
+/// Labels of a structure that count, and those that are excluded.
+pub(crate) const STANDING: &str = "SELECT protocol.name AS protocol, standing, exclusion FROM label
+    CROSS JOIN protocol ON protocol.number = label.protocol
+    WHERE label.structure = $1 AND standing IN ('label', 'excluded') ORDER BY label.number";
+
+const EXCLUDE: &str = "UPDATE label SET standing = 'excluded', excluded = $2, exclusion = $3
+    WHERE structure = $1 AND standing = 'label'";
+
+const INCLUDE: &str = "UPDATE label SET standing = 'label', excluded = NULL, exclusion = NULL
+    WHERE structure = $1 AND standing = 'excluded'";
+
+/// The newest job of a structure, and its state.
+const JOB: &str = "SELECT number, state FROM job WHERE structure = $1 ORDER BY number DESC LIMIT 1";
+
+const ALL: &str = "SELECT coalesce((SELECT id FROM candidate WHERE candidate.structure = label.structure
+            ORDER BY decision LIMIT 1),
+        (SELECT 'import-' || CAST(import.number AS TEXT) FROM import WHERE import.structure = label.structure), '') AS id,
+        protocol.name AS protocol, excluded, exclusion
+    FROM label CROSS JOIN protocol ON protocol.number = label.protocol
+    WHERE standing = 'excluded' ORDER BY excluded, label.number";
+
+/// Why labels of jobs are excluded.
+const OF_JOBS: &str = "SELECT job.number, exclusion FROM label
+    CROSS JOIN job ON job.structure = label.structure AND job.protocol = label.protocol WHERE standing = 'excluded'";
+
+const COUNT: &str = "SELECT count(*) FROM label WHERE standing = 'excluded'";
+
+struct StandingRow {
+    protocol: String,
+    standing: String,
+    exclusion: Option<String>,
+}
+
+struct ExcludedRow {
+    id: String,
+    protocol: String,
+    excluded: i64,
+    exclusion: String,
+}
+
+from_columns!(StandingRow { protocol, standing, exclusion });
+from_columns!(ExcludedRow { id, protocol, excluded, exclusion });
+
+/// A structure that somebody named.
+struct Named {
+    structure: i64,
+    id: String,
+}
+
+impl Store {
+    /// Takes the labels of structures out of the data set, of whatever protocol: nobody who asks for labels sees them until
+    /// [`Store::include`]. All of the structures or none; those whose labels are excluded already keep their reason. Structures are named as
+    /// [`Store::find_candidate`] takes them, or `import-N`. Leaves a line `exclude` in the operations log for each.
+    ///
+    /// # Errors
+    /// [`StoreError::NoLabel`] for a structure without a label, and those of names that fit none or several.
+    pub async fn exclude(&self, ids: &[String], reason: &str, now: i64) -> Result<Vec<ExclusionChange>> {
+        self.change_standing(ids, Some(reason), now).await
+    }
+
+    /// Takes excluded labels in again. Leaves a line `include` in the operations log for each structure.
+    ///
+    /// # Errors
+    /// As [`Store::exclude`].
+    pub async fn include(&self, ids: &[String], now: i64) -> Result<Vec<ExclusionChange>> {
+        self.change_standing(ids, None, now).await
+    }
+
+    /// Every excluded label, in the order in which they were excluded.
+    pub async fn excluded(&self) -> Result<Vec<ExcludedLabel>> {
+        let mut transaction = self.database.begin_to_read().await?;
+        if !is_known(&mut transaction).await? {
+            return Ok(Vec::new());
+        }
+        let rows: Vec<ExcludedRow> = query(ALL).fetch_all(&mut transaction).await?;
+        let excluded = rows.into_iter().map(|ExcludedRow { id, protocol, excluded, exclusion }| {
+            ExcludedLabel { id, protocol, exclusion: Exclusion { time: excluded, reason: exclusion } }
+        });
+        Ok(excluded.collect())
+    }
+
+    async fn change_standing(
+        &self,
+        ids: &[String],
+        reason: Option<&str>,
+        now: i64,
+    ) -> Result<Vec<ExclusionChange>> {
+        let mut named: Vec<Named> = Vec::new();
+        for id in ids {
+            let found = self.named(id).await?;
+            if named.iter().all(|other| other.structure != found.structure) {
+                named.push(found);
+            }
+        }
+        let mut transaction = self.database.begin().await?;
+        let now = transaction.time(now).await?;
+        // Always in this order: two of these commands do not wait for each other.
+        let mut structures: Vec<_> = named.iter().map(|named| named.structure).collect();
+        structures.sort_unstable();
+        for structure in structures {
+            let sql = "SELECT atoms FROM structure WHERE number = $1";
+            let _: Option<i64> = query(sql).bind(structure).locked().fetch_optional(&mut transaction).await?;
+        }
+        let mut changes = Vec::new();
+        for named in named {
+            changes.push(change(&mut transaction, named, reason, now).await?);
+        }
+        transaction.commit().await?;
+        Ok(changes)
+    }
+
+    /// The structure of that name.
+    async fn named(&self, id: &str) -> Result<Named> {
+        if let Some(number) = id.strip_prefix("import-") {
+            let structure = match number.parse::<i64>() {
+                Ok(number) => query(OF_IMPORT).bind(number).fetch_optional(&self.database).await?,
+                Err(_) => None,
+            };
+            let imported = self.imported_structures().await?;
+            let structure = structure.ok_or(StoreError::UnknownImport { id: id.to_owned(), imported })?;
+            return Ok(Named { structure, id: id.to_owned() });
+        }
+        let found = self.find_candidate(id).await?;
+        let structure: i64 = query(OF_CANDIDATE).bind(found.decision).fetch_one(&self.database).await?;
+        if structure == 0 {
+            return Err(StoreError::NoLabel { id: found.candidate, why: "it was declined".to_owned() });
+        }
+        Ok(Named { structure, id: found.candidate })
+    }
+}
+
+/// Excludes the labels of a structure, or includes them without a `reason`.
+async fn change(
+    transaction: &mut Transaction,
+    Named { structure, id }: Named,
+    reason: Option<&str>,
+    now: i64,
+) -> Result<ExclusionChange> {
+    let labels: Vec<StandingRow> = query(STANDING).bind(structure).fetch_all(&mut *transaction).await?;
+    let job = query(JOB).bind(structure).fetch_optional(&mut *transaction).await?;
+    let job: Option<(i64, String)> = job;
+    if labels.is_empty() {
+        let why =
+            job.map_or("it has no label job".to_owned(), |(_, state)| format!("its label job is {state}"));
+        return Err(StoreError::NoLabel { id, why });
+    }
+    let changed = match reason {
+        Some(reason) => query(EXCLUDE).bind(structure).bind(now).bind(reason),
+        None => query(INCLUDE).bind(structure),
+    };
+    let changed = changed.execute(&mut *transaction).await? > 0;
+    let mut protocols: Vec<_> = labels.iter().map(|label| label.protocol.clone()).collect();
+    protocols.dedup();
+    if changed {
+        let kind = if reason.is_some() { "exclude" } else { "include" };
+        let job = job.map(|(number, _)| number);
+        let detail = json!({ "candidate": id, "job": job, "reason": reason, "protocols": protocols });
+        insert_operation(transaction, now, kind, &detail).await?;
+    }
+    let before =
+        labels.into_iter().find(|label| label.standing == "excluded").and_then(|label| label.exclusion);
+    let excluded = reason.map(|reason| before.filter(|_| !changed).unwrap_or(reason.to_owned()));
+    Ok(ExclusionChange { id, protocols, changed, excluded })
+}
+
+/// Whether the tables are not those of an earlier version, in which nothing is excluded.
+async fn is_known(transaction: &mut Transaction) -> Result<bool> {
+    transaction.has_column("label", "exclusion").await
+}
+
+/// Number of excluded labels.
+pub(super) async fn count(transaction: &mut Transaction) -> Result<u64> {
+    match is_known(transaction).await? {
+        true => query(COUNT).fetch_one(transaction).await,
+        false => Ok(0),
+    }
+}
+
+/// Why labels are excluded, by the number of their job.
+pub(super) async fn by_job(transaction: &mut Transaction) -> Result<BTreeMap<i64, String>> {
+    if !is_known(transaction).await? {
+        return Ok(BTreeMap::new());
+    }
+    let rows: Vec<(i64, String)> = query(OF_JOBS).fetch_all(transaction).await?;
+    Ok(rows.into_iter().collect())
+}

@@ -1,0 +1,197 @@
+//! Labels that are taken out of the data set by hand, and in again.
+
+#[path = "common/mod.rs"]
+mod common;
+
+use common::*;
+use serde_json::json;
+use store::{
+    Commit, Completed, ExclusionChange, ExportFilter, Fate, JobState, Lease, Protocol, Relabel, Standing,
+    Store, StoreError, WalkRecord,
+};
+use wire::messages::Decline;
+use wire::{ContentHash, Origin};
+
+async fn lease(store: &Store, now: i64) -> Lease {
+    store.lease(protocol("dft").hash, "host/a", now, 10).await.unwrap().unwrap()
+}
+
+/// Candidates that all have their labels, with energies −1, −2, … Their names.
+async fn labelled(home: &Home, number: u64) -> (Store, Vec<String>) {
+    let store = home.create().await.by_the_callers_clock();
+    let names = accept(&store, number).await;
+    let walk = WalkRecord { accepted: number as u32, ..walk(0, 1) };
+    store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
+    for energy in 1..=number {
+        let lease = lease(&store, 0).await;
+        store.complete(&lease, &label(-(energy as f64)), 1).await.unwrap();
+    }
+    (store, names)
+}
+
+fn names(ids: &[&str]) -> Vec<String> {
+    ids.iter().map(|id| (*id).to_owned()).collect()
+}
+
+fn content(step: u64) -> ContentHash {
+    ContentHash::of(&structure(1e-6 * step as f64))
+}
+
+/// Energies in an export, by protocol.
+async fn exported(store: &Store, protocol: &Protocol) -> Vec<f64> {
+    let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: true };
+    let rows = store.labelled(&filter, None, 100).await.unwrap();
+    rows.iter().map(|row| row.label.energy).collect()
+}
+
+/// Standing, energy, and why it is excluded of every label of a structure.
+async fn history(store: &Store, structure: ContentHash) -> Vec<(Standing, f64, Option<String>)> {
+    let labels = store.labels_of(structure).await.unwrap().into_iter().map(|label| label.record);
+    labels.map(|record| (record.standing, record.label.energy, record.excluded.map(|e| e.reason))).collect()
+}
+
+async fn whole(store: &Store) {
+    let found = store.check(|_, _| {}).await.unwrap();
+    assert_eq!(found.iter().map(|finding| finding.what.clone()).collect::<Vec<_>>(), [""; 0]);
+}
+
+fn change(id: &str, changed: bool, excluded: Option<&str>) -> ExclusionChange {
+    let excluded = excluded.map(str::to_owned);
+    ExclusionChange { id: id.into(), protocols: vec!["dft".into()], changed, excluded }
+}
+
+#[tokio::test]
+async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
+    let home = Home::new();
+    let (store, candidates) = labelled(&home, 3).await;
+    let dft = protocol("dft");
+    let second = candidates[1].as_str();
+    let ids = names(&["0.0.2"]);
+    let expected = [change(second, true, Some("it has a hole"))];
+    assert_eq!(store.exclude(&ids, "it has a hole", 100).await.unwrap(), expected);
+    // Whoever asks twice changes nothing, and the first reason stays.
+    let expected = [change(second, false, Some("it has a hole"))];
+    assert_eq!(store.exclude(&ids, "another", 200).await.unwrap(), expected);
+
+    assert_eq!(exported(&store, &dft).await, [-1.0, -3.0]);
+    let energies = store.labelled_energies(dft.hash, 100).await.unwrap();
+    assert_eq!(energies.iter().map(|e| (e.model, e.label)).collect::<Vec<_>>(), [(-8.5, -1.0), (-8.5, -3.0)]);
+    assert_eq!(store.finished(dft.hash, 0, 9).await.unwrap().len(), 2);
+    let collected = store.collected(Some(dft.hash), 0, 9).await.unwrap();
+    let forces: Vec<_> = collected.iter().map(|row| row.label_forces.is_some()).collect();
+    assert_eq!(forces, [true, false, true]);
+    let labels = store.status().await.unwrap().labels;
+    assert_eq!((labels.labelled, labels.excluded), (3, 1));
+    let shown = store.queue_show(second).await.unwrap();
+    assert_eq!(shown.job.excluded.as_deref(), Some("it has a hole"));
+    assert_eq!(shown.energies, [(Standing::Excluded, -2.0)]);
+    let listed = store.queue_list(Some(JobState::Labelled), 9, 0).await.unwrap();
+    assert_eq!(listed.iter().filter(|job| job.excluded.is_some()).count(), 1);
+    let all = store.excluded().await.unwrap();
+    assert_eq!((all.len(), all[0].id.as_str(), all[0].exclusion.time), (1, second, 100));
+    whole(&store).await;
+    // Its job is done: nobody labels it again by himself.
+    assert!(store.lease(dft.hash, "host/a", 300, 10).await.unwrap().is_none());
+
+    assert_eq!(store.include(&ids, 400).await.unwrap(), [change(second, true, None)]);
+    assert_eq!(store.include(&ids, 500).await.unwrap(), [change(second, false, None)]);
+    assert_eq!(exported(&store, &dft).await, [-1.0, -2.0, -3.0]);
+    assert_eq!(history(&store, content(2)).await, [(Standing::Label, -2.0, None)]);
+    assert_eq!(store.status().await.unwrap().labels.excluded, 0);
+    let operations = store.done_by_hand(shown.job.job).await.unwrap();
+    let kinds: Vec<_> =
+        operations.iter().map(|done| (done.kind.as_str(), done.time, &done.detail["reason"])).collect();
+    assert_eq!(kinds, [("exclude", 100, &json!("it has a hole")), ("include", 400, &json!(null))]);
+    whole(&store).await;
+}
+
+#[tokio::test]
+async fn all_that_are_named_are_excluded_or_none() {
+    let home = Home::new();
+    let (store, candidates) = labelled(&home, 2).await;
+    let covered = candidate(0, 7, Origin::Biased, Fate::Declined(Decline::Covered));
+    let waiting = candidate(0, 8, Origin::Biased, Fate::Accepted);
+    store.commit(&commit_of(vec![covered.clone(), waiting.clone()])).await.unwrap();
+    for (wrong, why) in
+        [(name_of(&covered), "it was declined"), (name_of(&waiting), "its label job is queued")]
+    {
+        let ids = [candidates[0].clone(), wrong.clone()];
+        let error = store.exclude(&ids, "bad", 1).await.unwrap_err().to_string();
+        assert_eq!(error, format!("{wrong} has no label to exclude: {why}"));
+    }
+    for wrong in ["99.0.1", "import-1", "nonsense"] {
+        let ids = [candidates[0].clone(), wrong.to_owned()];
+        let error = store.exclude(&ids, "bad", 1).await.unwrap_err();
+        assert!(
+            matches!(error, StoreError::UnknownCandidate { .. } | StoreError::UnknownImport { .. }),
+            "{error}"
+        );
+    }
+    assert_eq!(store.status().await.unwrap().labels.excluded, 0);
+    // One that is named twice is one.
+    let ids = [candidates[0].clone(), "0.0.1".to_owned(), "0.0.2".to_owned()];
+    let changes = store.exclude(&ids, "bad", 1).await.unwrap();
+    assert_eq!(
+        changes.iter().map(|change| &change.id).collect::<Vec<_>>(),
+        candidates.iter().collect::<Vec<_>>()
+    );
+    assert_eq!(exported(&store, &protocol("dft")).await, [0.0; 0]);
+}
+
+#[tokio::test]
+async fn only_a_label_that_was_asked_for_comes_in_its_place() {
+    let home = Home::new();
+    let store = home.create().await.by_the_callers_clock();
+    let (names, dft) = (accept(&store, 1).await, protocol("dft"));
+    let walk = WalkRecord { accepted: 1, ..walk(0, 1) };
+    store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
+    let late = lease(&store, 0).await;
+    let first = lease(&store, 20_000).await;
+    store.complete(&first, &label(-1.0), 20_001).await.unwrap();
+    store.exclude(&names, "bad", 20_002).await.unwrap();
+    assert_eq!(store.complete(&late, &label(-9.0), 20_003).await.unwrap(), Completed::KeptAsCheck);
+    let frames = [(0, structure(1e-6), label(-8.0))];
+    assert_eq!(store.import(dft.hash, "x", &frames, 20_004).await.unwrap().checks, 1);
+    assert_eq!(exported(&store, &dft).await, [0.0; 0]);
+    whole(&store).await;
+
+    let order = Relabel { structures: &[content(1)], again: true, reason: "better", protocol: None };
+    assert_eq!(store.relabel(&order, 20_005).await.unwrap().again, 1);
+    whole(&store).await;
+    // Until it comes, the other stays excluded; in vain, it stays so as well.
+    let failing = lease(&store, 20_006).await;
+    store.fail(&failing, "crashed", "", 1, 20_007).await.unwrap();
+    assert_eq!(store.queue_show(&names[0]).await.unwrap().job.state, JobState::Labelled);
+    assert_eq!(store.status().await.unwrap().labels.excluded, 1);
+    store.relabel(&order, 20_008).await.unwrap();
+    let again = lease(&store, 20_009).await;
+    assert_eq!(store.complete(&again, &label(-1.5), 20_010).await.unwrap(), Completed::Label);
+    assert_eq!(exported(&store, &dft).await, [-1.5]);
+    let bad = Some("bad".to_owned());
+    let (superseded, check) = ((Standing::Superseded, -1.0, bad), |energy| (Standing::Check, energy, None));
+    let expected = [superseded, check(-9.0), check(-8.0), (Standing::Label, -1.5, None)];
+    assert_eq!(history(&store, content(1)).await, expected);
+    // There is nothing to take in again.
+    assert_eq!(store.include(&names, 20_011).await.unwrap(), [change(&names[0], false, None)]);
+    assert_eq!(exported(&store, &dft).await, [-1.5]);
+    whole(&store).await;
+}
+
+#[tokio::test]
+async fn imported_structures_have_labels_to_exclude() {
+    let home = Home::new();
+    let (store, _) = labelled(&home, 1).await;
+    let dft = protocol("dft");
+    let frames = [(0, structure(0.1), label(-5.0)), (1, structure(0.2), label(-6.0))];
+    store.import(dft.hash, "known.extxyz", &frames, 10).await.unwrap();
+    let ids = names(&["import-2"]);
+    assert_eq!(store.exclude(&ids, "bad", 20).await.unwrap(), [change("import-2", true, Some("bad"))]);
+    assert_eq!(exported(&store, &dft).await, [-1.0, -5.0]);
+    assert_eq!(store.excluded().await.unwrap()[0].id, "import-2");
+    // The same numbers once more change nothing.
+    assert_eq!(store.import(dft.hash, "known.extxyz", &frames, 30).await.unwrap().known, 2);
+    assert_eq!(exported(&store, &dft).await, [-1.0, -5.0]);
+    store.include(&ids, 40).await.unwrap();
+    assert_eq!(exported(&store, &dft).await, [-1.0, -5.0, -6.0]);
+    whole(&store).await;
+}
