@@ -7,6 +7,8 @@ use serde::Serialize;
 use store::{LabelCost, Protocol, Store, StoreError, Waiting};
 use wire::ContentHash;
 
+use crate::output::count;
+
 /// Labels that are learned from: the newest.
 const LEARNED_FROM: u32 = 1_000;
 
@@ -138,7 +140,8 @@ impl std::fmt::Display for Again {
         let Self { hours, measured, protocol } = self;
         match hours {
             Some(hours) => {
-                write!(f, "about {hours}, if they take as long as {measured} labels by '{protocol}' did")
+                let measured = count(*measured, "label");
+                write!(f, "about {hours}, if they take as long as {measured} by '{protocol}' did")
             }
             None => write!(f, "unknown, since that of no label was measured"),
         }

@@ -95,7 +95,9 @@ fn a_finished_campaign_is_shown() {
     let walks = status["walks"].as_array().unwrap();
     assert!(walks.len() == 4 && walks.iter().all(|walk| walk["state"] == "collected"));
 
+    assert_eq!((&status["disk"]["at_the_end"], &status["led"]), (&Json::Null, &false.into()));
     let shown = succeed(here, ["status", "small"]);
+    assert!(!shown.contains("when all is collected"), "{shown}");
     assert!(
         shown.contains("state       finished") && shown.contains("T (K)") && shown.contains("slab-111"),
         "{shown}"
@@ -124,7 +126,7 @@ fn a_finished_campaign_is_shown() {
     );
     assert!(refuse(here, ["queue", "small", "drop", id]).contains("its label job is labelled"));
     assert!(refuse(here, ["queue", "small", "show", "0."]).contains("give more of it"));
-    assert!(refuse(here, ["status", "."]).contains("there is no campaign"));
+    assert!(refuse(here, ["status", "nowhere"]).contains("there is no campaign"));
 }
 
 #[test]
@@ -279,7 +281,8 @@ fn labelled_structures_are_imported_once() {
     assert_eq!(json(here, ["status", "small"])["imported"], 0);
 
     let counts = |labels, checks, known, protocol| {
-        format!("{labels} labels, {checks} checks, {known} known already, by protocol '{protocol}'\n")
+        let checks = if checks == 1 { "1 check".to_owned() } else { format!("{checks} checks") };
+        format!("{labels} labels, {checks}, {known} known already, by protocol '{protocol}'\n")
     };
     assert_eq!(succeed(here, ["import", "small", "new.extxyz"]), counts(3, 0, 0, "reference"));
     assert_eq!(succeed(here, ["import", "small", "new.extxyz", "own.extxyz"]), counts(0, 0, 7, "reference"));
@@ -353,7 +356,7 @@ fn status_works_while_a_campaign_runs_and_after_it_was_killed() {
     let message = refuse(here, ["import", "small", "l.extxyz"]);
     assert!(message.contains("only one process may run a campaign"), "{message}");
     drop(run);
-    assert!(succeed(here, ["import", "small", "l.extxyz"]).starts_with("1 labels"));
+    assert!(succeed(here, ["import", "small", "l.extxyz"]).starts_with("1 label, "));
     let killed = json(here, ["status", "small"]);
     assert_eq!(killed["processes"][0]["state"], "gone");
     let not_running = "not running; the same calmwalk run goes on with it";

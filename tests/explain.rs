@@ -118,11 +118,19 @@ fn every_candidate_has_its_story() {
         );
         let (trials, logged) = (&decided["update"]["trials"], &decision.detail["update"]["trials"]);
         assert_eq!(trials, logged);
+        if let Some(components) = decided["update"]["components"].as_array() {
+            let symbols = vec![Value::from("Al"); components.len()];
+            assert_eq!(decided["update"]["component_elements"], Value::from(symbols));
+            let text = succeed(here, ["explain", "here", name]);
+            assert!(text.contains("components changed: component 0 of Al"), "{text}");
+        }
         match decision.kind.as_str() {
             "accepted" => check_accepted(&story, decision, stored, &contents),
             "declined" => check_declined(&story, decision, stored, &contents),
             _ => {
                 check_label(&story, stored);
+                let text = succeed(here, ["explain", "here", name]);
+                assert!(text.contains("a control: unbiased") && !text.contains("its own guard"), "{text}");
                 let partner = story["found"]["partner"]["candidate"].as_str().unwrap();
                 let place = format!("-{}.0.{}-", story["found"]["control_of"], stored.block.view().id().step);
                 assert!(partner.contains(&place), "{partner} {place}");

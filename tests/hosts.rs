@@ -30,13 +30,13 @@ fn a_campaign_on_three_hosts_comes_to_the_same() {
     let held = hold_walkers(hosts.home.path(), 1);
     let mut second = hosts.agent(1);
     for host in 0..2 {
-        wait_until("it has joined", || hosts.said(host).contains("joined: 1 walkers"));
+        wait_until("it has joined", || hosts.said(host).contains("joined: 1 walker,"));
     }
     go_on(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
     assert_eq!((first.0.wait().unwrap().code(), second.0.wait().unwrap().code()), (Some(0), Some(0)));
     for host in 0..2 {
-        assert!(hosts.said(host).contains("joined: 1 walkers, mixture version "), "{}", hosts.said(host));
+        assert!(hosts.said(host).contains("joined: 1 walker, mixture version "), "{}", hosts.said(host));
     }
     assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
     hosts.are_empty();
@@ -60,9 +60,9 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     hosts.are_empty();
     let mut orchestrator = hosts.lead();
     let held = hold_walkers(hosts.home.path(), 1);
-    let joined = hosts.said(0).matches("joined: 1 walkers").count();
+    let joined = hosts.said(0).matches("joined: 1 walker,").count();
     let mut agent = hosts.agent(0);
-    wait_until("it has joined", || hosts.said(0).matches("joined: 1 walkers").count() > joined);
+    wait_until("it has joined", || hosts.said(0).matches("joined: 1 walker,").count() > joined);
     go_on(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
@@ -82,12 +82,12 @@ fn a_slow_line_changes_nothing() {
     let mut orchestrator = hosts.lead();
     // On an idle machine the orchestrator's own walker would be through before the agent has joined.
     let held = hold_walkers(hosts.home.path(), 1);
-    wait_until("the agent has joined", || hosts.said(0).contains("joined: 1 walkers"));
+    wait_until("the agent has joined", || hosts.said(0).contains("joined: 1 walker,"));
     go_on(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
     assert!(!hosts.head_said().contains("gives no sign of life"), "{}", hosts.head_said());
-    assert!(hosts.said(0).contains("joined: 1 walkers"), "{}", hosts.said(0));
+    assert!(hosts.said(0).contains("joined: 1 walker,"), "{}", hosts.said(0));
     assert!(line.carried() > 1_000_000, "candidates came over the line: {} bytes", line.carried());
     assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
     hosts.are_empty();

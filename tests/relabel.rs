@@ -75,7 +75,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
         "label.protocol is now \"fine\" (was \"reference\")".to_owned(),
         "protocol 'fine' would come in force".to_owned(),
         format!(
-            "{labels} structures would be labelled again by protocol 'fine', in the place of {labels} labels by 'reference'"
+            "{labels} structures would be queued to be labelled again by protocol 'fine', in the place of {labels} labels by 'reference'"
         ),
         format!("if they take as long as {labels} labels by 'reference' did"),
         "nothing was changed".to_owned(),
@@ -84,7 +84,12 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     }
     assert_eq!((place.jobs("again"), place.jobs("labelled")), (0, labels));
 
-    assert!(relabel(&place, &with).contains(&format!("{labels} structures are labelled again")));
+    let asked = relabel(&place, &with);
+    assert!(asked.contains(&format!("{labels} structures are queued to be labelled again")), "{asked}");
+    assert!(
+        asked.contains("next: calmwalk run fine.toml") && asked.contains("calmwalk label --store"),
+        "{asked}"
+    );
     let twice: Value = serde_json::from_str(&relabel(&place, &[&with[..], &["--json"]].concat())).unwrap();
     assert_eq!((&twice["again"], &twice["waiting_already"]), (&0.into(), &labels.into()));
     assert_eq!((place.jobs("again"), place.jobs("queued")), (labels, labels));
@@ -112,8 +117,11 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     }
     check(&place);
     let nothing = relabel(&place, &["--all"]);
-    assert!(nothing.contains("0 structures are labelled again"), "{nothing}");
-    assert!(nothing.contains(&format!("{labels} structures are left alone")), "{nothing}");
+    assert!(nothing.contains("0 structures are queued to be labelled again"), "{nothing}");
+    assert!(
+        nothing.contains(&format!("{labels} structures left alone")) && !nothing.contains("next: "),
+        "{nothing}"
+    );
 }
 
 #[test]
@@ -141,7 +149,8 @@ fn doubtful_labels_are_made_again_by_the_same_protocol() {
     let (doubtful, bytes) = (&before[1].1, place.export());
     let all = relabel(&place, &["--where", "max_force >= 0"]);
     assert!(
-        all.contains("0 structures are labelled again") && all.contains("--again asks for others"),
+        all.contains("0 structures are queued to be labelled again")
+            && all.contains("--again asks for others"),
         "{all}"
     );
     assert!(

@@ -23,7 +23,7 @@ use super::crew::all_given_up;
 use super::{CHANNEL, STOPPING, asked_to_stop};
 use crate::log;
 use crate::outcome::{Ended, Failure};
-use crate::output::{say, warn};
+use crate::output::{count, say, warn};
 use crate::setup::{self, AgentSetup, WalkerSetup};
 use crate::web::agent::Watched;
 
@@ -55,7 +55,11 @@ pub async fn work(
             return Err(Failure::Failed(format!("no orchestrator has answered at {address} for {minutes:.1} min")));
         }
     };
-    say(format_args!("joined: {walkers} walkers, mixture version {}", joined.newest().await.version()));
+    say(format_args!(
+        "joined: {}, mixture version {}",
+        count(walkers, "walker"),
+        joined.newest().await.version()
+    ));
     let place = Place::of(directory).map_err(Failure::failed)?;
     let mixture = joined.newest().await;
     let (flag, asked) = (Arc::clone(&stopping), Arc::clone(&stop));

@@ -16,7 +16,7 @@ use workers::labeller::SIGN_OF_LIFE;
 
 use super::Run;
 use crate::outcome::Failure;
-use crate::output::{say, warn};
+use crate::output::{count, say, warn};
 use crate::setup::{self, AgentSetup};
 
 /// Where they join, if they may.
@@ -138,7 +138,8 @@ async fn keep_record(
             return store.log_operation(now, "messages_dropped", &json!({ "remark": why })).await;
         }
     };
-    say(format_args!("agent {} (process {}, {} walkers): {what}", agent.host, agent.pid, agent.walkers));
+    let walkers = count(agent.walkers, "walker");
+    say(format_args!("agent {} (process {}, {walkers}): {what}", agent.host, agent.pid));
     let record = records.entry(agent.id.clone()).or_insert_with(|| ProcessRecord {
         id: agent.id.clone(),
         host: agent.host.clone(),
@@ -147,7 +148,7 @@ async fn keep_record(
         ..ProcessRecord::new(ProcessRecord::AGENT, None, agent.pid, now)
     });
     (record.last_seen, record.state) = (now, state.to_owned());
-    record.remark = format!("{} walkers", agent.walkers);
+    record.remark = walkers;
     if state == "left" {
         records.remove(&agent.id);
         store.remove_process(&agent.id).await?;

@@ -6,7 +6,7 @@ use store::CampaignLock;
 use wire::place::{Place, PlaceError, Removed};
 
 use super::{Ended, Failure};
-use crate::output::print;
+use crate::output::{count, print};
 
 /// Remove what killed processes of a campaign left in shared memory
 ///
@@ -55,6 +55,11 @@ fn report(directory: &Path, removed: Removed) -> Result<(), Failure> {
     let Removed { files, bytes } = removed;
     let megabytes = bytes as f64 / 1e6;
     print(|out| {
-        writeln!(out, "{}: {files} files removed from shared memory, {megabytes:.1} MB", directory.display())
+        writeln!(
+            out,
+            "{}: {} removed from shared memory, {megabytes:.1} MB",
+            directory.display(),
+            count(files, "file")
+        )
     })
 }

@@ -10,7 +10,7 @@ use wire::ContentHash;
 
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::frames::Frames;
-use crate::output::print;
+use crate::output::{count, print};
 
 /// Take in labelled structures that exist already
 ///
@@ -45,7 +45,8 @@ impl Import {
         let Imported { labels, checks, known } = imported;
         print(|out| {
             let name = &protocol.name;
-            writeln!(out, "{labels} labels, {checks} checks, {known} known already, by protocol '{name}'")
+            let (labels, checks) = (count(labels, "label"), count(checks, "check"));
+            writeln!(out, "{labels}, {checks}, {known} known already, by protocol '{name}'")
         })?;
         Ok(Ended::Done)
     }

@@ -15,7 +15,7 @@ use self::order::Order;
 use super::{Ended, Failure, block_on, place};
 use crate::campaign::Campaign;
 use crate::config::Config;
-use crate::output::{print, say};
+use crate::output::{count, print, say};
 
 /// Slurm's commands wait for a busy slurmctld themselves; longer than this is of no use.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -195,7 +195,7 @@ impl Launch {
         let own = std::env::var("SLURM_JOB_ID").ok().and_then(|id| id.parse().ok());
         let ended = if self.waiting { slurm.withdraw(names).await } else { slurm.stop(names, own).await };
         let ended = ended.map_err(Failure::failed)?;
-        print(|out| writeln!(out, "{ended} jobs cancelled"))
+        print(|out| writeln!(out, "{} cancelled", count(ended, "job")))
     }
 }
 

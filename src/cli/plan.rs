@@ -11,7 +11,7 @@ use super::{Ended, Failure, block_on, place};
 use crate::bill::{CoreHours, Costs, digits, size_of};
 use crate::campaign::Campaign;
 use crate::forecast::Forecast;
-use crate::output::{Table, print, print_json};
+use crate::output::{Table, count, print, print_json};
 
 /// Seed structures shown unless all are asked for.
 const SHOWN: usize = 20;
@@ -122,7 +122,11 @@ impl Plan {
         };
         let location = place::location(like)?;
         let costs = block_on(learn(&location))??;
-        let shown = format!("the {} newest labels of {}", costs.measured(), location);
+        let shown = format!(
+            "the {} newest {} of {location}",
+            costs.measured(),
+            if costs.measured() == 1 { "label" } else { "labels" }
+        );
         Ok((Some(costs), shown))
     }
 }
@@ -139,7 +143,7 @@ async fn learn(location: &Location) -> Result<Costs, Failure> {
 fn write(out: &mut dyn Write, path: &Path, planned: &Planned, all: bool) -> io::Result<()> {
     let Planned { parts, labels, limited_by, all: total, measured, disk } = planned;
     let limit = limited_by.as_ref().map_or(String::new(), |key| format!(", limited by {key}"));
-    writeln!(out, "{}: at most {labels} labels{limit}", path.display())?;
+    writeln!(out, "{}: at most {}{limit}", path.display(), count(*labels, "label"))?;
     match total {
         Some(hours) => {
             writeln!(out, "  labels   about {hours} if all of them are made, as {measured}")?;

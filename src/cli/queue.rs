@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use store::{Attempt, Job, JobDetails, JobState, Location, Store, unix_milliseconds};
 
 use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::output::{Table, decimals, print, print_json};
+use crate::output::{Table, count, decimals, print, print_json};
 
 /// List, show, drop, retry or prioritise the structures in the label queue
 ///
@@ -28,7 +28,7 @@ pub struct Queue {
 
 #[derive(Clone, Debug, PartialEq, clap::Subcommand)]
 pub enum Action {
-    /// List jobs: those in one state in the order in which they would be labelled, or all as they came
+    /// List jobs in the order in which they would be labelled: those in one state, or all, in work and waiting ones first
     List(List),
     /// Show everything about one, with its attempts and the logs of those that failed
     Show {
@@ -281,7 +281,7 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
         writeln!(out, "       calculation {calculation}")?;
     }
     if let (Some(seconds), Some(cores)) = (core_seconds, made.cores) {
-        writeln!(out, "       took {seconds:.1} core-seconds on {cores} cores")?;
+        writeln!(out, "       took {seconds:.1} core-seconds on {}", count(cores, "core"))?;
     }
     if let Some(remedies) = &made.remedies {
         writeln!(out, "       changed after failures: {}", remedies.replace(',', ", "))?;

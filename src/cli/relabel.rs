@@ -7,14 +7,16 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 
 use serde_json::{Value, json};
-use store::{CampaignLock, NewProtocol, Protocol, Requeued, Store, unix_milliseconds};
+use store::{CampaignLock, Location, NewProtocol, Protocol, Requeued, Store, unix_milliseconds};
 
 use self::choice::Choice;
 use self::protocol::NewLabels;
+use super::place::shown;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::bill::{self, Again};
 use crate::condition::Condition;
-use crate::output::{print, print_json, say_if_unprotected};
+use crate::origin::Origin;
+use crate::output::{count, print, print_json, say_if_unprotected};
 
 /// Label structures again, and change the protocol by which a campaign labels
 ///
@@ -67,6 +69,8 @@ struct Order {
     bill: Again,
     /// `moved` is known before.
     done: Requeued,
+    /// How the labels come to be made.
+    next: String,
 }
 
 impl Relabel {
@@ -95,20 +99,39 @@ impl Relabel {
         };
         // Labellers by two protocols at once would not know of each other.
         let _lock = match new.is_some() && !self.dry_run {
-            true => Some(CampaignLock::acquire_at(location, "calmwalk relabel").await?),
+            true => Some(CampaignLock::acquire_at(&location, "calmwalk relabel").await?),
             false => None,
         };
         let protocol = new.as_ref().map_or(&in_force, |new| &new.protocol).clone();
         let choice = self.choose(&store, &protocol).await?;
         let moved = if new.is_some() { store.unlabelled_by_others(protocol.hash).await? } else { 0 };
         let bill = bill::again(&store, &in_force, &choice.sizes()).await?;
+        let next = self.next(&store, &location).await?;
         let mut done = Requeued { again: choice.structures().len() as u64, moved };
         if !self.dry_run {
             done = self.carry_out(&store, new.as_ref(), &choice).await?;
         }
         store.close().await;
         let changes = new.map_or(Vec::new(), |new| new.changes_in_words());
-        Ok(Order { protocol, changes, choice, bill, done })
+        Ok(Order { protocol, changes, choice, bill, done, next })
+    }
+
+    /// What has to be done for the labels to be made.
+    async fn next(&self, store: &Store, location: &Location) -> Result<String, Failure> {
+        if store.status().await?.led {
+            return Ok("the campaign runs: its labellers take them".to_owned());
+        }
+        let origin = Origin::of(store).await?;
+        let given = self.config.as_ref().map(|path| path.display().to_string());
+        let config = given.or(origin.map(|origin| origin.file.path)).unwrap_or("CONFIG".to_owned());
+        let directory = match location {
+            Location::Directory(directory) => format!(" --directory {}", directory.display()),
+            Location::Server(_) => String::new(),
+        };
+        Ok(format!(
+            "next: calmwalk run {config}{directory} makes the labels, or calmwalk label --store {}",
+            shown(location)
+        ))
     }
 
     async fn choose(&self, store: &Store, protocol: &Protocol) -> Result<Choice, Failure> {
@@ -144,30 +167,32 @@ impl Relabel {
 
 impl Order {
     fn write(&self, out: &mut dyn Write, dry_run: bool, is_given: bool) -> io::Result<()> {
-        let Self { protocol: Protocol { name, .. }, changes, choice, bill, done } = self;
+        let Self { protocol: Protocol { name, .. }, changes, choice, bill, done, next } = self;
         let will = |is: &'static str, was: &'static str| if dry_run { is } else { was };
         changes.iter().try_for_each(|change| writeln!(out, "{change}"))?;
         if !changes.is_empty() {
             let (comes, goes) = (will("would come", "is"), will("would go", "went"));
             writeln!(out, "protocol '{name}' {comes} in force")?;
-            writeln!(out, "{} structures without a label {goes} over to it", done.moved)?;
+            writeln!(out, "{} without a label {goes} over to it", count(done.moved, "structure"))?;
         } else if is_given {
             writeln!(out, "protocol '{name}' is in force already")?;
         }
-        let are = will("would be", "are");
-        writeln!(out, "{} structures {are} labelled again by protocol '{name}'{}", done.again, choice.by())?;
+        let are = will("would be", if done.again == 1 { "is" } else { "are" });
+        let structures = count(done.again, "structure");
+        writeln!(out, "{structures} {are} queued to be labelled again by protocol '{name}'{}", choice.by())?;
         choice.left_alone(name).iter().try_for_each(|line| writeln!(out, "{line}"))?;
         if done.again > 0 {
             writeln!(out, "cost: {bill}")?;
         }
-        if dry_run {
-            writeln!(out, "nothing was changed")?;
+        match dry_run {
+            true => writeln!(out, "nothing was changed"),
+            false if done.again + done.moved > 0 => writeln!(out, "{next}"),
+            false => Ok(()),
         }
-        Ok(())
     }
 
     fn as_json(&self, dry_run: bool) -> Value {
-        let Self { protocol, changes, choice, bill, done } = self;
+        let Self { protocol, changes, choice, bill, done, .. } = self;
         json!({
             "dry_run": dry_run, "protocol": protocol.name, "protocol_hash": protocol.hash.to_string(),
             "changes": changes, "again": done.again, "without_a_label": done.moved,

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use store::Store;
 
 use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::output::{Table, decimals, print, print_json};
+use crate::output::{Table, count, decimals, print, print_json};
 use crate::replay::{self, Change, Moved, Report, Setting, Stop, Tally};
 
 /// Changed decisions shown; JSON has all.
@@ -83,7 +83,8 @@ fn write_report(out: &mut dyn Write, report: &Report) -> io::Result<()> {
         let walks = report.walks_cut_short;
         writeln!(
             out,
-            "            {walks} walks that ended with what they had collected would go on: to where is not known"
+            "            {} that ended with what they had collected would go on: to where is not known",
+            count(walks, "walk")
         )?;
     }
     writeln!(

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use store::Store;
 
 use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::output::print;
+use crate::output::{count, print};
 use crate::report::{self, File, PAGE};
 use crate::whole_file::{WholeFile, cannot_create};
 
@@ -45,7 +45,7 @@ impl Report {
             file.finish()?;
         }
         let page = self.output.join(PAGE);
-        print(|out| writeln!(out, "{} and {} files beside it", page.display(), files.len() - 1))?;
+        print(|out| writeln!(out, "{} and {} beside it", page.display(), count(files.len() - 1, "file")))?;
         Ok(Ended::Done)
     }
 }

@@ -8,7 +8,7 @@ use calm::Artifact;
 use super::{Ended, Failure};
 use crate::campaign::Campaign;
 use crate::forecast::Forecast;
-use crate::output::print;
+use crate::output::{count, print};
 
 /// Check a configuration and every file that it names
 ///
@@ -39,7 +39,8 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()
     writeln!(out, "{} is a valid campaign", path.display())?;
     writeln!(out, "  potential        {architecture}, {}, cutoff {} Å", elements.join(" "), model.cutoff())?;
     let (components, features) = (mixture.iter().count(), mixture.dimension());
-    writeln!(out, "  mixture          {components} components, {features} features an atom")?;
+    let (components, features) = (count(components, "component"), count(features, "feature"));
+    writeln!(out, "  mixture          {components}, {features} an atom")?;
     if !mixture.can_be_updated() {
         writeln!(
             out,

@@ -9,6 +9,9 @@ use store::{LoggedDecision, Store, StoreError, StoredCandidate};
 
 use super::{Covered, Named};
 
+/// Under which name the leader of a campaign leaves the symbols of the model's elements.
+pub const ELEMENTS: &str = "elements";
+
 /// The decision.
 #[derive(Clone, Debug, Serialize)]
 pub struct Decided {
@@ -42,6 +45,8 @@ pub struct Update {
     /// What was found.
     #[serde(flatten)]
     pub found: FoundUpdate,
+    /// Symbol of the element of each of `components`; none in campaigns that began before elements were recorded.
+    pub component_elements: Vec<Option<String>>,
     /// γ of the potential's training frames under the mixture afterwards.
     pub training_frames: Option<GradeDistribution>,
     /// Whether that raised the alarm over forgetting.
@@ -85,7 +90,7 @@ impl Decided {
         rules: &Value,
     ) -> Result<Self, StoreError> {
         let detail = &logged.detail;
-        let update = Update::of(detail, rules)?;
+        let update = Update::of(detail, rules, &elements(store).await?)?;
         let mut coverage = Coverage::default();
         let reason = detail["reason"].as_str().map(str::to_owned);
         if reason.as_deref() == Some("covered") {
@@ -111,18 +116,27 @@ impl Decided {
 }
 
 impl Update {
-    fn of(detail: &Value, rules: &Value) -> Result<Option<Self>, StoreError> {
+    fn of(detail: &Value, rules: &Value, elements: &[String]) -> Result<Option<Self>, StoreError> {
         let damaged = |error| StoreError::damaged("the decision log", error);
         let Some(found) = detail.get("update") else { return Ok(None) };
+        let found: FoundUpdate = serde_json::from_value(found.clone()).map_err(damaged)?;
+        let symbol = |(element, _): &(u32, u32)| elements.get(*element as usize).cloned();
         let training_frames = detail.get("training_frames").cloned().map(serde_json::from_value);
         Ok(Some(Self {
             rule: serde_json::from_value(rules["collect"]["until"].clone()).ok(),
             combination: rules["calm"]["combination"].as_str().map(str::to_owned),
-            found: serde_json::from_value(found.clone()).map_err(damaged)?,
+            component_elements: found.components.iter().map(symbol).collect(),
+            found,
             training_frames: training_frames.transpose().map_err(damaged)?,
             forgetting_alarm: detail["forgetting_alarm"].as_bool(),
         }))
     }
+}
+
+/// Symbols of the model's elements, in its order; none in campaigns of earlier versions.
+async fn elements(store: &Store) -> Result<Vec<String>, StoreError> {
+    let note = store.note(ELEMENTS).await?;
+    Ok(note.and_then(|note| serde_json::from_str(&note).ok()).unwrap_or_default())
 }
 
 /// By how many versions the mixture of a walker was ever older than the selector's; none in campaigns of earlier versions.

@@ -17,7 +17,7 @@ use serde_json::Value;
 use store::{Covered, Named, Store, StoreError, StoredCandidate};
 use wire::ContentHash;
 
-pub use decision::{Coverage, Decided, Update};
+pub use decision::{Coverage, Decided, ELEMENTS, Update};
 pub use grades::{Atom, Grades, Trigger};
 pub use labels::{ForceError, LabelJob, StoryLabel};
 pub use walk::{Distances, Found};

@@ -206,6 +206,31 @@ async fn jobs_are_found_by_name_or_a_beginning_of_it() {
 }
 
 #[tokio::test]
+async fn all_jobs_are_listed_by_state_and_priority() {
+    let home = Home::new();
+    let store = home.create().await;
+    let names = accept(&store, 6).await;
+    store.drop_job(&names[0], 1).await.unwrap();
+    store.prioritise_job(&names[4], 50, 1).await.unwrap();
+    lease(&store, "a", 0).await.unwrap();
+    store.prioritise_job(&names[5], 99, 1).await.unwrap();
+    let expected = [4, 5, 1, 2, 3, 0].map(|k: usize| names[k].clone());
+    let listed = async |limit, offset| -> Vec<String> {
+        let jobs = store.queue_list(None, limit, offset).await.unwrap();
+        jobs.into_iter().map(|job| job.candidate).collect()
+    };
+    assert_eq!(listed(u32::MAX, 0).await, expected);
+    // Pages have the same order, wherever one ends.
+    for limit in 1..=6_u32 {
+        let mut pages = Vec::new();
+        for offset in (0..8).step_by(limit as usize) {
+            pages.extend(listed(limit, offset).await);
+        }
+        assert_eq!(pages, expected, "{limit}");
+    }
+}
+
+#[tokio::test]
 async fn a_dropped_job_stays_dropped_until_it_is_wanted_again() {
     let home = Home::new();
     let store = home.create().await;

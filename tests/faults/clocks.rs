@@ -121,7 +121,7 @@ fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
         set.push(clock);
     }
     for host in 0..2 {
-        wait_until("it has joined", || hosts.said(host).contains("joined: 1 walkers"));
+        wait_until("it has joined", || hosts.said(host).contains("joined: 1 walker,"));
     }
     go_on(&held);
     for jump in 0.. {

@@ -41,7 +41,7 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     wait_until("its walker is gone", || carrying_out(hosts.home.path(), "walker").is_empty());
     let mut orchestrator = hosts.lead();
     let held = hold();
-    wait_until("the agent has joined it", || hosts.said(0).contains("joined: 1 walkers"));
+    wait_until("the agent has joined it", || hosts.said(0).contains("joined: 1 walker,"));
     go_on(&held);
     assert!(hosts.said(0).contains("joining anew"), "{}", hosts.said(0));
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());

@@ -102,7 +102,9 @@ fn range(scale: Scale, low: f64, high: f64) -> (f64, f64) {
     match (is_usable(low), is_usable(high)) {
         (true, true) if low < high => (low, high),
         (true, true) if low == high && scale == Scale::Logarithmic => (low / 2.0, low * 2.0),
-        (true, true) if low == high => (low - 0.5, low + 0.5),
+        // A single value: where it is zero, nothing says on which side others would be, and quantities are rarely negative.
+        (true, true) if low == 0.0 && high == 0.0 => (0.0, 1.0),
+        (true, true) if low == high => (low - 0.1 * low.abs(), low + 0.1 * low.abs()),
         _ if scale == Scale::Logarithmic => (0.1, 10.0),
         _ => (0.0, 1.0),
     }
@@ -119,6 +121,16 @@ mod tests {
         let axis = Axis::new("x", Scale::Logarithmic, 0.01, 100.0);
         assert!((axis.place(1.0) - 0.5).abs() < 1e-12 && (axis.place(0.1) - 0.25).abs() < 1e-12);
         assert_eq!([0.0, -1.0, f64::NAN, f64::INFINITY].map(|x| axis.place(x)), [-FAR, -FAR, -FAR, FAR]);
+    }
+
+    #[test]
+    fn a_single_value_has_its_own_sign_on_its_axis() {
+        for (value, low, high) in
+            [(0.0, 0.0, 1.0), (2.0, 1.8, 2.2), (-2.0, -2.2, -1.8), (1e-6, 0.9e-6, 1.1e-6)]
+        {
+            let axis = Axis::new("x", Scale::Linear, value, value);
+            assert!((axis.low - low).abs() < 1e-12 && (axis.high - high).abs() < 1e-12, "{axis:?}");
+        }
     }
 
     #[test]

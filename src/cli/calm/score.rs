@@ -14,7 +14,7 @@ use super::scorer::Scorer;
 use crate::campaign::check_sound;
 use crate::cli::{Ended, Failure};
 use crate::frames::Frames;
-use crate::output::{Bar, print};
+use crate::output::{self, Bar, print};
 use crate::whole_file::{WholeFile, cannot_write};
 
 /// What a calculation says of a frame, by the names that other programs read.
@@ -75,7 +75,7 @@ impl Score {
                 matrix.extend(scorer.features().iter().copied()).map_err(cannot)?;
             }
             count += 1;
-            bar.set(frames.position(), || format!("{count} frames"));
+            bar.set(frames.position(), || output::count(count, "frame"));
         }
         if count == 0 {
             return Err(Failure::input(FileError::Empty(self.input)));
@@ -84,7 +84,9 @@ impl Score {
         feature_file.map_or(Ok(()), WholeFile::finish)?;
         output.finish()?;
         drop(bar);
-        print(|out| writeln!(out, "graded {count} structures into {}", self.output.display()))?;
+        print(|out| {
+            writeln!(out, "graded {} into {}", output::count(count, "structure"), self.output.display())
+        })?;
         Ok(Ended::Done)
     }
 

@@ -87,8 +87,12 @@ fn write_update(out: &mut dyn Write, update: &Update, atoms: usize) -> io::Resul
         "",
         &format!("α = {} taken{inflated}: {}; γ_max {after} afterwards", found.alpha, end(found.ended_by)),
     )?;
-    let components = found.components.iter();
-    let components = components.map(|(element, slot)| format!("{slot} of the model's element {element}"));
+    let components = found.components.iter().zip(&update.component_elements);
+    let components = components.map(|((element, component), symbol)| match symbol {
+        Some(symbol) => format!("component {component} of {symbol}"),
+        // Of a campaign that was begun before elements were recorded.
+        None => format!("component {component} of element {element} of the model (counted from 0)"),
+    });
     line(out, "", &format!("components changed: {}", first(components)))?;
     let Some(training) = &update.training_frames else { return Ok(()) };
     let alarm = if update.forgetting_alarm == Some(true) { ": ALARM, the mixture forgets them" } else { "" };

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use calm::CollectionRule;
 
 use super::{INDENT, SHOWN, line};
-use crate::output::{Table, decimals};
+use crate::output::{Table, count, decimals};
 use crate::story::{Atom, Grades, Trigger};
 
 pub fn write(out: &mut dyn Write, grades: &Grades) -> io::Result<()> {
@@ -24,7 +24,7 @@ pub fn write(out: &mut dyn Write, grades: &Grades) -> io::Result<()> {
     block(out, "grades", &table)?;
     let age = match grades.staleness {
         0 => "the walker's mixture was the newest at the decision".to_owned(),
-        age => format!("the selector's mixture was {age} versions newer than the walker's"),
+        age => format!("the selector's mixture was {} newer than the walker's", count(age, "version")),
     };
     line(out, "", &age)?;
     match &grades.trigger {
@@ -47,7 +47,10 @@ fn write_trigger(out: &mut dyn Write, trigger: &Trigger, grades: &Grades) -> io:
     line(
         out,
         "",
-        &format!("{above_walker} atoms under the walker's mixture, {above_selector} under the selector's"),
+        &format!(
+            "{} under the walker's mixture, {above_selector} under the selector's",
+            count(*above_walker, "atom")
+        ),
     )?;
     let triggered = grades.triggered();
     if triggered.is_empty() {

@@ -5,6 +5,7 @@ use std::io::{self, Write};
 use store::{Attempt, Exclusion, Job, Superseded, unix_milliseconds};
 
 use super::line;
+use crate::output::count;
 use crate::story::{ForceError, LabelJob, Story, StoryLabel};
 
 /// Lines of a log that are shown, the last ones.
@@ -57,7 +58,7 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
         None => format!("for {}", since(*started)),
     };
     let cost = core_seconds.map_or(String::new(), |seconds| {
-        format!(", {seconds:.1} core-seconds on {} cores", made.cores.unwrap_or(1))
+        format!(", {seconds:.1} core-seconds on {}", count(made.cores.unwrap_or(1), "core"))
     });
     line(out, "", &format!("attempt {number}: {outcome}{class} {lasted}, by {holder}{cost}"))?;
     if let Some(remedies) = &made.remedies {
@@ -94,7 +95,8 @@ fn write_label(out: &mut dyn Write, label: &StoryLabel, atoms: usize) -> io::Res
         out,
         "potential",
         &format!(
-            "|F_model − F_label|: mean {mean:.4} eV/Å over {atoms} atoms, largest {largest:.4} eV/Å (atom {atom})"
+            "|F_model − F_label|: mean {mean:.4} eV/Å over {}, largest {largest:.4} eV/Å (atom {atom})",
+            count(atoms, "atom"),
         ),
     )?;
     match model.energy_error_per_atom {

@@ -9,7 +9,7 @@ use std::io::{self, Write};
 use store::{Location, Store};
 
 use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::output::{decimals, print, print_json};
+use crate::output::{count, decimals, print, print_json};
 use crate::story::{self, Description, Distances, Found, Story};
 
 /// Columns of a line before its text.
@@ -105,7 +105,7 @@ fn write_structure(out: &mut dyn Write, structure: &Description) -> io::Result<(
     let volume = volume.map_or(String::new(), |volume| {
         format!(", {volume:.2} Å³ ({:.3} Å³ an atom)", volume / *atoms as f64)
     });
-    line(out, "structure", &format!("{formula}, {atoms} atoms{volume}; content {}", &hash[..16]))
+    line(out, "structure", &format!("{formula}, {}{volume}; content {}", count(*atoms, "atom"), &hash[..16]))
 }
 
 fn write_found(out: &mut dyn Write, found: &Found) -> io::Result<()> {
@@ -127,14 +127,17 @@ fn write_found(out: &mut dyn Write, found: &Found) -> io::Result<()> {
     }
     let Some(walk) = &found.walk_now else { return Ok(()) };
     let reason = if walk.reason.is_empty() { String::new() } else { format!(" ({})", walk.reason) };
-    line(
-        out,
-        "",
-        &format!(
-            "the walk by now: {}{reason}, step {}, {} accepted; its own guard refused {} structures, it went back {} times",
-            walk.state, walk.step, walk.accepted, walk.refused, walk.returns
+    // A control gives frames of steps that are wanted: no guard refuses them, and it never goes back.
+    let guard = match found.control_of {
+        Some(_) => String::new(),
+        None => format!(
+            "; its own guard refused {}, it went back {}",
+            count(walk.refused, "structure"),
+            count(walk.returns, "time")
         ),
-    )
+    };
+    let (state, step, accepted) = (walk.state.replace('_', " "), walk.step, walk.accepted);
+    line(out, "", &format!("the walk by now: {state}{reason}, step {step}, {accepted} accepted{guard}"))
 }
 
 fn write_distances(out: &mut dyn Write, distances: &Distances, control: bool) -> io::Result<()> {

@@ -14,7 +14,7 @@ use store::{DATABASE, ExportFilter, ExportPlace, ExportRow, ExportSource, JobSta
 use self::split::Shares;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::condition::Condition;
-use crate::output::{Bar, print};
+use crate::output::{self, Bar, print};
 use crate::whole_file::{WholeFile, cannot_write, refuse_to_replace};
 
 /// Structures read at a time.
@@ -153,12 +153,13 @@ impl Export {
                         count.seed_structures.len()
                     )
                 };
-                writeln!(out, "{} structures in {}{from}", count.frames, path.display())?;
+                writeln!(out, "{} in {}{from}", output::count(count.frames, "structure"), path.display())?;
             }
             if others > 0 {
+                let others = output::count(others, "structure");
                 writeln!(
                     out,
-                    "{others} structures have their labels by other protocols, which --protocol chooses"
+                    "left out for their labels by other protocols, which --protocol chooses: {others}"
                 )?;
             }
             let store::Labels { queued, leased, failed, dropped, again, failed_again, excluded, .. } = labels;

@@ -15,7 +15,7 @@ use self::config::{DynamicsSection, MdConfig, OutputSection};
 use self::trajectory::{Trajectory, time};
 use super::{Ended, Failure};
 use crate::interrupt;
-use crate::output::{Bar, decimals, print};
+use crate::output::{Bar, count, decimals, print};
 use crate::whole_file::refuse_to_replace;
 
 const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
@@ -71,7 +71,8 @@ impl Md {
         print(|out| {
             let (steps, seconds) = (dynamics.state().step, begun.elapsed().as_secs_f64());
             let (frames, atoms) = (trajectory.frames, dynamics.structure().len());
-            writeln!(out, "{steps} steps of {atoms} atoms in {seconds:.1} s, {frames} frames in {shown}")
+            let (steps, atoms, frames) = (count(steps, "step"), count(atoms, "atom"), count(frames, "frame"));
+            writeln!(out, "{steps} of {atoms} in {seconds:.1} s, {frames} in {shown}")
         })?;
         let interrupted = dynamics.state().step < config.dynamics.steps;
         Ok(if interrupted { Ended::Interrupted } else { Ended::Done })

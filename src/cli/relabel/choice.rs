@@ -8,6 +8,7 @@ use wire::ContentHash;
 use super::Failure;
 use crate::cli::export::frame::facts;
 use crate::condition::Condition;
+use crate::output;
 
 /// Structures read at a time.
 const PAGE: u32 = 200;
@@ -82,20 +83,23 @@ impl Choice {
         for one in &self.again {
             *protocols.entry(&one.protocol).or_default() += 1;
         }
-        let counts: Vec<_> =
-            protocols.iter().map(|(name, count)| format!("{count} labels by '{name}'")).collect();
+        let counts: Vec<_> = protocols
+            .iter()
+            .map(|(name, count)| format!("{} by '{name}'", output::count(*count, "label")))
+            .collect();
         if counts.is_empty() { String::new() } else { format!(", in the place of {}", counts.join(", ")) }
     }
 
     /// What is said of the others.
     pub fn left_alone(&self, protocol: &str) -> Vec<String> {
         let lines = [
-            (self.waiting, "wait for it already".to_owned()),
-            (self.labelled, format!("have their labels by '{protocol}' (--again asks for others)")),
-            (self.dropped, "were dropped".to_owned()),
+            (self.waiting, "waiting for it already".to_owned()),
+            (self.labelled, format!("labelled by '{protocol}' already; --again asks for others")),
+            (self.dropped, "dropped".to_owned()),
         ];
         let said = lines.into_iter().filter(|(count, _)| *count > 0);
-        said.map(|(count, what)| format!("{count} structures are left alone: they {what}")).collect()
+        said.map(|(count, what)| format!("{} left alone: {what}", output::count(count, "structure")))
+            .collect()
     }
 }
 

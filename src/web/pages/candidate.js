@@ -38,10 +38,10 @@ export async function show(content, address, signal) {
 
 function head({ id, kind, decision, jobs }) {
   const fate = decision && (decision.reason ?? decision.kind);
-  return element("p", { class: "head" }, state(kind), fate && state(fate), jobs.map((job) => state(job.state)), element("code", {}, id));
+  return element("p", { class: "head" }, state(kind), fate && fate !== kind && state(fate), jobs.map((job) => state(job.state)), element("code", {}, id));
 }
 
-function about({ structure, found, file, frame, same_structure: same, same_import: imported }) {
+function about({ kind, structure, found, file, frame, same_structure: same, same_import: imported }) {
   const { atoms, formula, volume } = structure;
   const near = found?.distances;
   return facts([
@@ -52,7 +52,7 @@ function about({ structure, found, file, frame, same_structure: same, same_impor
     ["energy by the potential", found && `${decimals(found.energy / atoms, 4, "eV")} an atom`],
     ["a control of", found?.control_of != null && element("span", {}, `walk ${found.control_of}`, found.partner && [": ", link(found.partner)])],
     ["shortest distance", near?.shortest && `${decimals(near.shortest, 3, "Å")} (atoms ${near.atoms.join(" and ")})` +
-      (near.least == null ? "" : `; the selector's guard asks for ${decimals(near.least, 3, "Å")}`)],
+      (near.least == null || kind === "control" ? "" : `; the selector's guard asks for ${decimals(near.least, 3, "Å")}`)],
     ["imported from", file && `${file}, frame ${frame}`],
     ["the same structure", (same.length > 0 || imported) && element("span", {}, same.map((named) => [link(named), " "]).flat(),
       imported && element("a", { href: `#candidate/import-${imported}` }, `import-${imported}`))],
@@ -90,7 +90,8 @@ function decided(decision) {
     ["mixture afterwards", `version ${whole(decision.mixture_version)}`],
     ["update", update && `${update.combination ?? ""} with α = ${digits(update.alpha)}; ${ENDS[update.ended_by]}`],
     ["γ_max afterwards", update && decimals(update.gamma_max_after, 3)],
-    ["components changed", update && whole(update.components.length)],
+    ["components changed", update && update.components.map(([index, component], k) =>
+      `${component} of ${update.component_elements[k] ?? `element ${index} of the model`}`).join(", ")],
     ["training atoms with γ > 1", update?.training_frames && percent(update.training_frames.share_above_one)],
   ]);
   if (!update || update.trials.length === 0) return list;

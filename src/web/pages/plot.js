@@ -60,13 +60,20 @@ function axis({ least, most, logarithmic, ticks = tick }, values, from, to) {
   let low = values.reduce((a, b) => Math.min(a, b), least ?? Infinity);
   let high = values.reduce((a, b) => Math.max(a, b), most ?? -Infinity);
   if (logarithmic) [low, high] = [Math.log10(Math.max(low, 1e-12)), Math.log10(Math.max(high, 1e-12))];
-  if (high - low < 1e-9 * Math.max(1, Math.abs(high))) [low, high] = [low - 0.5, high + 0.5];
+  if (high - low < 1e-9 * Math.max(Math.abs(low), Math.abs(high), 1e-300)) [low, high] = around(low, logarithmic);
   const at = (value) => {
     const place = logarithmic ? Math.log10(Math.max(value, 1e-12)) : value;
     return from + ((place - low) / (high - low)) * (to - from);
   };
   const number = Math.abs(to - from) / 55;
   return { at, ticks: logarithmic ? roundPowers(low, high) : roundNumbers(low, high, number), text: ticks };
+}
+
+/** An axis for a single value, which keeps its sign: where it is 0, the axis begins there. */
+function around(value, logarithmic) {
+  if (logarithmic) return [value - 0.5, value + 0.5];
+  const part = 0.1 * Math.abs(value);
+  return value === 0 ? [0, 1] : [value - part, value + part];
 }
 
 function roundNumbers(low, high, number) {

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde_json::{Value, json};
 
 use super::exclude;
+use super::job_counts;
 use super::labels::LabelRow;
 use super::logs::insert_operation;
 use super::queue::end_attempt;
@@ -38,15 +39,15 @@ pub(crate) const LIST: &str = concat!(
     ORDER BY job.priority DESC, job.decision"
 );
 
-const LIST_ALL: &str = concat!(
-    "SELECT job.*, ",
-    columns!(),
-    "
-    FROM job CROSS JOIN candidate ON candidate.decision = job.decision
-    CROSS JOIN protocol ON protocol.number = job.protocol
-    LEFT JOIN seed_structure ON seed = candidate.seed_structure
-    ORDER BY job.number LIMIT $1 OFFSET $2"
-);
+/// Jobs of all states are listed in this order: what is in work, what waits, what needs somebody, what is over.
+const STATES: [JobState; 6] = [
+    JobState::Leased,
+    JobState::Queued,
+    JobState::Failed,
+    JobState::Dropped,
+    JobState::Labelled,
+    JobState::Superseded,
+];
 
 const SHOW: &str = concat!(
     "SELECT job.*, ",
@@ -119,16 +120,27 @@ impl FromRow for Row {
 }
 
 impl Store {
-    /// The jobs in a state, in the order in which they would be leased; or all, in the order in which they came.
+    /// The jobs in a state, in the order in which they would be leased: by priority, and then as they came. Without a state those
+    /// of all, leased ones first, then those that wait, that failed, that were dropped, and those that are over.
     pub async fn queue_list(&self, state: Option<JobState>, limit: u32, offset: u32) -> Result<Vec<Job>> {
-        let query = match state {
-            Some(state) => query(LIST).bind(state.name()),
-            None => query(LIST_ALL),
-        };
         let mut transaction = self.database.begin_to_read().await?;
-        let rows: Vec<Row> = query.bind(limit).bind(offset).fetch_all(&mut transaction).await?;
+        let numbers = job_counts::states(&mut transaction).await?;
         let excluded = exclude::by_job(&mut transaction).await?;
-        rows.into_iter().map(|row| row.into_job(&excluded)).collect()
+        let number =
+            |state: JobState| numbers.iter().find(|(name, _)| name == state.name()).map_or(0, |(_, n)| *n);
+        let (mut jobs, mut skipped) = (Vec::new(), u64::from(offset));
+        for state in STATES.into_iter().filter(|listed| state.is_none_or(|state| state == *listed)) {
+            let (room, there) = (u64::from(limit) - jobs.len() as u64, number(state));
+            if room > 0 && skipped < there {
+                let rows = query(LIST).bind(state.name()).bind(room as i64).bind(skipped as i64);
+                let rows: Vec<Row> = rows.fetch_all(&mut transaction).await?;
+                let rows = rows.into_iter().map(|row| row.into_job(&excluded));
+                jobs.extend(rows.collect::<Result<Vec<_>>>()?);
+            }
+            skipped = skipped.saturating_sub(there);
+        }
+        transaction.commit().await?;
+        Ok(jobs)
     }
 
     /// A job by the name of its candidate or the beginning of it; the campaign's part of the name may be left out.
