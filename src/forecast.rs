@@ -27,6 +27,9 @@ pub struct Forecast {
     pub rest: u64,
     /// Features of declined candidates, at most.
     pub declined: u64,
+    /// How many structures and control frames there may be; 0 in campaigns of early versions.
+    #[serde(default)]
+    pub most_structures: u64,
 }
 
 impl Forecast {
@@ -48,6 +51,16 @@ impl Forecast {
             structures: copies * collected * mean,
             rest: EMPTY + copies * checkpoints + mixture as u64,
             declined: config.collect.declined_features_mb * 1_000_000,
+            most_structures: copies * collected,
+        }
+    }
+
+    /// What is still to come when there are so many structures and control frames, and they and all else take `bytes` now.
+    pub fn still_to_come(&self, structures: u64, bytes: u64) -> u64 {
+        let left = self.most_structures.saturating_sub(structures);
+        match self.most_structures {
+            0 => self.bytes().saturating_sub(bytes),
+            most => (u128::from(self.structures) * u128::from(left) / u128::from(most)) as u64,
         }
     }
 
@@ -77,5 +90,20 @@ impl std::fmt::Display for Forecast {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let (all, declined) = (megabytes(self.bytes()), megabytes(self.declined));
         write!(f, "{all} when all is collected, and up to {declined} of features of declined candidates")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_to_come_is_what_is_not_yet_collected() {
+        let forecast = Forecast { structures: 1_000_000, rest: 500_000, declined: 7, most_structures: 100 };
+        for (structures, expected) in [(0, 1_000_000), (25, 750_000), (100, 0), (120, 0)] {
+            assert_eq!(forecast.still_to_come(structures, 40_000_000), expected, "{structures}");
+        }
+        let early = Forecast { most_structures: 0, ..forecast };
+        assert_eq!((early.still_to_come(3, 400_000), early.still_to_come(3, 9_000_000)), (1_100_000, 0));
     }
 }

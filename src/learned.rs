@@ -31,12 +31,15 @@ pub struct Grades {
 pub struct Learned {
     /// Of all structures.
     pub all: Grades,
-    /// Of those of biased walks.
+    /// Of those of biased walks alone.
     pub biased: Grades,
-    /// Of frames of control walks.
+    /// Of frames of control walks alone.
     pub control: Grades,
     /// Energy errors of all structures.
     pub energies: EnergyErrors,
+    /// Labelled structures that a biased walk and a control both found, as at a step before the bias tells them apart: they stand
+    /// in `all` once, and are no part of the comparison.
+    pub shared: u64,
     /// Which got their labels, by the largest γ; failed ones by their names.
     pub by_gamma: Completion<String>,
     /// The same by V/V₀.
@@ -50,9 +53,11 @@ pub async fn of(store: &Store, protocol: ContentHash) -> Result<Learned, StoreEr
         biased: Grades::new(),
         control: Grades::new(),
         energies: EnergyErrors::new(Zeros::read(store, protocol).await?),
+        shared: 0,
         by_gamma: Completion::new(Bins::of_grades()),
         by_expansion: Completion::new(Bins::of_expansion()),
     };
+    let shared = store.structures_of_both_origins().await?;
     let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
     let mut after = None;
     loop {
@@ -64,7 +69,15 @@ pub async fn of(store: &Store, protocol: ContentHash) -> Result<Learned, StoreEr
             let forces = block.view().forces;
             let errors = forces.iter().zip(&row.label.forces).map(|(model, label)| norm(sub(*model, *label)));
             let errors: Vec<_> = errors.collect();
-            learned.each(*origin, |grades| grades.labelled(original, &errors));
+            match (shared.contains(&block.view().id().content), *origin) {
+                (false, origin) => learned.each(origin, |grades| grades.labelled(original, &errors)),
+                (true, Origin::Biased) => {
+                    learned.shared += 1;
+                    learned.all.labelled(original, &errors);
+                }
+                // It was counted with the other.
+                (true, Origin::Control) => continue,
+            }
             learned.energies.push(&row.structure, block.view().energy(), row.label.energy);
         }
     }

@@ -9,6 +9,7 @@ mod cli;
 mod condition;
 mod config;
 mod energies;
+mod ends;
 mod forecast;
 mod forgetting;
 mod frames;

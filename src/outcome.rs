@@ -10,6 +10,8 @@ use crate::config::ConfigError;
 pub enum Ended {
     /// All done.
     Done,
+    /// A campaign is over, and none of its walks came to its end in order.
+    NoneInOrder,
     /// Stopped by Ctrl-C or SIGTERM, in order.
     Interrupted,
 }
@@ -24,10 +26,11 @@ pub enum Failure {
 }
 
 impl Ended {
-    /// 0 or 130.
+    /// 0, 1 or 130.
     pub fn exit_code(self) -> ExitCode {
         ExitCode::from(match self {
             Self::Done => 0,
+            Self::NoneInOrder => 1,
             Self::Interrupted => 130,
         })
     }

@@ -60,8 +60,9 @@ pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
 }
 
 /// A number of things: `1 label`, `2 labels`.
-pub fn count(number: u64, noun: &str) -> String {
-    if number == 1 { format!("1 {noun}") } else { format!("{number} {noun}s") }
+pub fn count<N: Display + PartialEq + From<u8>>(number: N, noun: &str) -> String {
+    let plural = if number == N::from(1) { "" } else { "s" };
+    format!("{number} {noun}{plural}")
 }
 
 /// `x` with a number of decimals, or a dash where there is none.

@@ -9,8 +9,9 @@ use orchestrator::reactor::Notice;
 use store::Fate;
 use wire::{Origin, WalkId};
 
+use crate::ends::Ends;
 use crate::forgetting::{Alarm, Forgetting};
-use crate::output::show;
+use crate::output::{count, show};
 
 /// Time between two plain lines that only say where the walks stand.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
@@ -26,6 +27,9 @@ pub struct Display {
     /// Whether it was said that walkers wait for labels.
     waiting: bool,
     forgetting: Alarm,
+    ends: Ends,
+    /// Whether it was said that walk after walk ends early.
+    warned: bool,
     last_line: Instant,
 }
 
@@ -37,7 +41,13 @@ struct Bars {
 
 impl Display {
     /// Follows walks of `walk_steps` steps each; `walks` are (walk, seed structure, where it stands).
-    pub fn new(walk_steps: u64, walks: Vec<(WalkId, String, u64)>, forgetting: Forgetting) -> Self {
+    /// `ends` are those of earlier runs.
+    pub fn new(
+        walk_steps: u64,
+        walks: Vec<(WalkId, String, u64)>,
+        ends: Ends,
+        forgetting: Forgetting,
+    ) -> Self {
         let (mut names, mut steps) = (BTreeMap::new(), BTreeMap::new());
         for (walk, name, step) in walks {
             names.insert(walk, name);
@@ -52,6 +62,8 @@ impl Display {
             accepted: 0,
             waiting: false,
             forgetting: Alarm::new(forgetting),
+            warned: ends.are_alarming(),
+            ends,
             last_line: Instant::now(),
         };
         display.draw();
@@ -111,16 +123,24 @@ impl Display {
             if let Some(walk) = decision.walk {
                 // Whatever was left of its steps will not be made.
                 self.steps.insert(walk, self.walk_steps);
-                let end = decision.detail["end"].as_str().unwrap_or_default().replace('_', " ");
+                let text = |key: &str| decision.detail[key].as_str().unwrap_or_default();
+                self.ends.add(walk.0, text("end"), text("reason"));
+                let end = text("end").replace('_', " ");
                 self.show(&format!("{}: ended ({end}) at step {}", self.name(walk), decision.detail["step"]));
             }
+        }
+        if !self.warned && self.ends.are_alarming() {
+            self.warned = true;
+            let warning = format!("WARNING: {}", self.ends.warning());
+            tracing::warn!("{warning}");
+            self.show(&warning);
         }
     }
 
     /// Said once, until a walk goes on.
     fn queue_full(&mut self, jobs: u64) {
         if !std::mem::replace(&mut self.waiting, true) {
-            let line = format!("walkers wait: {jobs} structures are waiting for labels");
+            let line = format!("walkers wait: the label queue is full ({} in it)", count(jobs, "structure"));
             tracing::info!("{line}");
             self.show(&line);
         }

@@ -7,8 +7,9 @@ use store::{Status, Store, StoreError, Unlabelled};
 use wire::ContentHash;
 
 use crate::budget;
+use crate::ends::Ends;
 use crate::learned::{self, Grades, Learned};
-use crate::output::decimals;
+use crate::output::{count, decimals};
 use crate::unlabelled;
 
 /// Seed structures with failed labels that are shown.
@@ -38,14 +39,12 @@ pub async fn of(store: &Store, protocol: ContentHash) -> Result<Summary, StoreEr
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Status { candidates, labels, walks, mixture_version, .. } = &self.status;
-        let count = |origin: &str| walks.iter().filter(|walk| walk.origin == origin).count();
-        writeln!(f, "walks            {} biased, {} control", count("biased"), count("control"))?;
-        let mut ends: Vec<_> = walks.iter().map(|walk| walk.state.as_str()).collect();
-        ends.sort_unstable();
-        let ends: Vec<_> =
-            ends.chunk_by(|a, b| a == b).map(|run| format!("{} {}", run.len(), run[0])).collect();
-        writeln!(f, "                 ended: {}", ends.join(", ").replace('_', " "))?;
+        let Self { status: Status { candidates, labels, walks, mixture_version, .. }, learned, .. } = self;
+        let of = |origin: &str| walks.iter().filter(|walk| walk.origin == origin).count();
+        writeln!(f, "walks            {} biased, {} control", of("biased"), of("control"))?;
+        let ends = Ends::of(walks);
+        writeln!(f, "                 ended: {}", ends.in_words())?;
+        ends.lines().iter().try_for_each(|line| writeln!(f, "                 {line}"))?;
         let declined = &candidates.declined;
         let all = declined.covered + declined.duplicate + declined.guard + declined.budget + declined.backlog;
         writeln!(
@@ -70,8 +69,12 @@ impl fmt::Display for Summary {
         };
         writeln!(
             f,
-            "labels           {} biased and {} control structures labelled, {} failed, {} dropped{superseded}{excluded}",
-            self.learned.biased.structures, self.learned.control.structures, labels.failed, labels.dropped
+            "labels           {} biased and {} control structures labelled{}, {} failed, {} dropped{superseded}{excluded}",
+            learned.biased.structures + learned.shared,
+            learned.control.structures + learned.shared,
+            both(learned),
+            labels.failed,
+            labels.dropped
         )?;
         write!(f, "{}", unlabelled::shown(&self.unlabelled, 17, SHOWN))?;
         if let Some(budget) = budget::shown(&self.status.budget) {
@@ -97,6 +100,16 @@ impl fmt::Display for Summary {
             writeln!(f, "energy error of the potential: {line}")?;
         }
         writeln!(f, "{}", energies.offsets.note)
+    }
+}
+
+/// That structures are counted twice which biased walks and controls both found.
+fn both(learned: &Learned) -> String {
+    match learned.shared {
+        0 => String::new(),
+        shared => {
+            format!(" ({shared} of them both, and not compared: {})", count(learned.all.structures, "label"))
+        }
     }
 }
 

@@ -54,6 +54,7 @@ fn every_page_shows_what_it_should_and_nothing_comes_from_elsewhere() {
         browser.wait("document.querySelector('#connection').dataset.how === 'live'");
         browser.wait("document.querySelectorAll('.tile').length === 5");
         browser.wait("document.querySelectorAll('figure svg[role=img]').length >= 3");
+        same_time(&browser);
         assert_eq!(browser.run("return location.hash"), "", "the token is out of the address");
         browser.wait("document.body.textContent.includes('<b>vacancy</b>')");
         picture(&browser, &format!("overview-{colours}.png"));
@@ -93,6 +94,8 @@ fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
     let address = address.trim_end_matches('/');
     let found = get(address, "/api/candidates?order=gamma&fate=accepted&limit=1").json();
     let id = found["candidates"][0]["id"].as_str().unwrap().to_owned();
+    let found = get(address, "/api/candidates?fate=control&limit=1").json();
+    let control = found["candidates"][0]["id"].as_str().unwrap().to_owned();
     for (dark, colours) in [(false, "light"), (true, "dark")] {
         let browser = Browser::start(dark, (1280, 1600));
         for width in [1280, 800] {
@@ -113,9 +116,57 @@ fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
             browser.run("document.querySelector('#table-seed-structures').scrollIntoView()");
             picture(&browser, &format!("report-{colours}-{width}.png"));
         }
+        narrow(&browser, &page, &id);
+        picture(&browser, &format!("narrow-{colours}.png"));
+        browser.show(&format!("{page}#candidate/{control}"));
+        browser.wait("document.querySelector('.head')");
+        let head = browser.run("return document.querySelector('.head').textContent");
+        let text = browser.run("return document.querySelector('main').textContent");
+        assert_eq!(head.as_str().unwrap().matches("control").count(), 1, "{head}");
+        assert!(!text.as_str().unwrap().contains("guard asks for"), "{text}");
+        // What is over is not live.
+        browser.wait("document.querySelector('#connection').dataset.how === 'finished'");
         let complaints = browser.log("browser");
         assert!(complaints.is_empty(), "{complaints:?}");
     }
+}
+
+/// The plots over time have one axis, whatever they have values for.
+fn same_time(browser: &Browser) {
+    let axes = "[...document.querySelectorAll('figure svg[role=img]')].filter((one) => one.textContent.includes('time before now'))\
+                .map((one) => [...one.querySelectorAll('.grid text[text-anchor=middle]')].map((tick) => tick.textContent).join(' '))";
+    let axes: Vec<String> = serde_json::from_value(browser.run(&format!("return {axes}"))).unwrap();
+    assert!(axes.len() > 1 && axes.windows(2).all(|pair| pair[0] == pair[1]), "{axes:?}");
+}
+
+/// Every page on a narrow screen.
+fn narrow(browser: &Browser, page: &str, id: &str) {
+    browser.resize(400);
+    for (name, is_there) in [
+        ("candidates", "document.querySelectorAll('.candidates tbody tr').length > 2"),
+        ("mixture", "document.querySelector('button.pick[aria-pressed=true]')"),
+        ("errors", "document.querySelectorAll('figure svg[role=img]').length === 2"),
+        ("hosts", "document.querySelector('main p, main table')"),
+        (&format!("candidate/{id}"), "document.querySelectorAll('.atoms tbody tr').length > 20"),
+        ("overview", "document.querySelectorAll('.tile').length === 5"),
+    ] {
+        fits(browser, &format!("{page}#{name}"), is_there);
+    }
+}
+
+/// A page that is as wide as a telephone, and no wider.
+fn fits(browser: &Browser, url: &str, is_there: &str) {
+    browser.show(url);
+    browser.wait(is_there);
+    let width = browser.run("return document.documentElement.scrollWidth").as_u64().unwrap();
+    let shown = browser.run("return document.documentElement.clientWidth").as_u64().unwrap();
+    let wide = "[...document.querySelectorAll('main, main *, header, header *')].filter((one) => !one.closest('.scrolls')\
+                && one.getBoundingClientRect().right > document.documentElement.clientWidth + 1).map((one) => one.outerHTML.slice(0, 80))";
+    assert!(
+        width <= shown && shown <= 400,
+        "{url}: {width} of {shown}: {}",
+        browser.run(&format!("return {wide}"))
+    );
 }
 
 fn errors(browser: &Browser) {

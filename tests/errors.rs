@@ -66,6 +66,35 @@ fn atoms_in(bin: &Json, pairs: &[(f64, f64)]) -> usize {
     pairs.iter().filter(|(gamma, _)| *gamma > above && *gamma <= up_to).count()
 }
 
+/// At the first biased step the bias is silent: the control has the very same structure there.
+#[test]
+fn structures_of_both_walks_are_counted_and_not_compared() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let path = Small { per_seed: 2, ..Small::default() }.write(here);
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(&path, text.replacen("threshold = 1.0, fraction = 0.1", "threshold = 0.01, fraction = 0.1", 1))
+        .unwrap();
+    let summary = succeed(here, ["run", "campaign.toml"]);
+    let words =
+        "4 biased and 4 control structures labelled (2 of them both, and not compared: 6 labels), 0 failed";
+    assert!(summary.contains(words), "{summary}");
+    let status = json(here, ["status", "campaign"]);
+    assert_eq!((&status["labels"]["labelled"], &status["shared_structures"]), (&6.into(), &2.into()));
+    assert_eq!((&status["candidates"]["accepted"], &status["candidates"]["control"]), (&4.into(), &4.into()));
+    let shown = succeed(here, ["status", "campaign"]);
+    assert!(
+        shown.contains("4 control frames (2 of them structures of biased walks too: 6 labels for all)"),
+        "{shown}"
+    );
+    let errors = json(here, ["errors", "campaign"]);
+    let structures = ["all", "biased", "control"].map(|of| errors[of]["structures"].as_u64().unwrap());
+    assert_eq!((structures, &errors["shared_structures"]), ([6, 2, 2], &2.into()));
+    succeed(here, ["report", "campaign", "-o", "report"]);
+    let page = fs::read_to_string(here.join("report/report.html")).unwrap();
+    assert!(page.contains("2 structures that biased walks and their controls have both found are left out"));
+}
+
 #[test]
 fn failed_labels_are_censored_and_the_others_are_measured() {
     let directory = tempfile::tempdir().unwrap();

@@ -58,9 +58,29 @@ fn walks_are_seen_to_advance_and_a_copy_says_the_same() {
     let one = succeed(here, ["status", "campaign", "--walks", "1"]);
     assert!(one.contains("… and 1 more walks") && one.contains("orchestrator"), "{one}");
 
+    succeed(here, ["walks", "campaign", "pause", "0"]);
+    let paused = status("campaign");
+    assert_eq!(
+        (&paused["walks"][0]["paused"], &paused["walks"][0]["steps_per_second"]),
+        (&true.into(), &Value::Null)
+    );
+    assert_eq!(paused["led"], true);
+    assert!(paused["disk"]["at_the_end"].as_u64() >= paused["disk"]["bytes"].as_u64(), "{paused}");
+
     drop(run);
     let killed = status("campaign");
     assert_eq!((&killed["expected_end"]["time"], &killed["finished"]), (&Value::Null, &false.into()));
+    assert_eq!((&killed["led"], &killed["steps_per_second"]), (&false.into(), &Value::Null));
+    assert!(
+        killed["walks"].as_array().unwrap().iter().all(|walk| walk["steps_per_second"].is_null()),
+        "{killed}"
+    );
+    let shown = succeed(here, ["status", "campaign"]);
+    assert!(
+        shown.contains("walks       2 not finished, 0 ended") && !shown.contains(" steps/s\n"),
+        "{shown}"
+    );
+    assert!(shown.contains(" stopped ") && shown.contains(" paused "), "{shown}");
     succeed(here, ["store", "backup", "campaign", "copy"]);
     let copy = status("copy");
     for key in ["version", "campaign", "candidates", "labels", "mixture_version", "budget", "imported"] {

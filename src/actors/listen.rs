@@ -65,7 +65,7 @@ impl Listen {
     pub fn has_ended(&self, ended: Ended) -> Result<(), Failure> {
         match (self.announce.as_deref(), ended) {
             (None, _) => Ok(()),
-            (Some(path), Ended::Done) => write_down(path, &Announcement::Over),
+            (Some(path), Ended::Done | Ended::NoneInOrder) => write_down(path, &Announcement::Over),
             (Some(path), Ended::Interrupted) => remove(path),
         }
     }

@@ -35,6 +35,7 @@ pub use listen::Listen;
 
 use crate::campaign::Campaign;
 use crate::config::QueueFull;
+use crate::ends::Ends;
 use crate::forgetting::Forgetting;
 use crate::outcome::Failure;
 use crate::output::say;
@@ -75,7 +76,10 @@ fn start_reactor(
 ) -> ReactorTask {
     let config = &run.campaign.config;
     let walk_steps = config.walk.equilibration + config.walk.steps.get();
-    let mut display = Display::new(walk_steps, selector.standing(walk_steps), Forgetting::new(&config.calm));
+    let mut ends = Ends::default();
+    selector.ended().for_each(|(walk, end, reason)| ends.add(walk.0, end, reason));
+    let mut display =
+        Display::new(walk_steps, selector.standing(walk_steps), ends, Forgetting::new(&config.calm));
     let queue_limit = u64::from(config.label.queue_limit.get());
     if config.label.queue_full == QueueFull::Raise {
         selector.raise_above(queue_limit);

@@ -8,7 +8,7 @@ use store::{Protocol, Store};
 
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::learned::{self, Grades, LARGE, Learned};
-use crate::output::{Table, decimals, print, print_json, range};
+use crate::output::{Table, count, decimals, print, print_json, range};
 
 /// Names of failed structures that a line shows.
 const NAMES: usize = 3;
@@ -76,6 +76,13 @@ fn write(out: &mut dyn Write, protocol: &Protocol, learned: &Learned) -> io::Res
     if (all.gamma.sampled() as u64) < all.gamma.atoms() {
         let (sampled, atoms) = (all.gamma.sampled(), all.gamma.atoms());
         writeln!(out, "ρ, ROC-AUC and percentiles are those of a sample of {sampled} of the {atoms} atoms")?;
+    }
+    if learned.shared > 0 {
+        let structures = count(learned.shared, "structure");
+        writeln!(
+            out,
+            "{structures} of biased walks that are those of their controls too: in 'all' only, and once"
+        )?;
     }
     if all.gamma.left_out() + all.gamma_nbr.left_out() > 0 {
         let (gamma, gamma_nbr) = (all.gamma.left_out(), all.gamma_nbr.left_out());
@@ -193,6 +200,7 @@ pub fn as_json(protocol: &Protocol, learned: &Learned) -> Value {
         "biased": grades_as_json(&learned.biased),
         "control": grades_as_json(&learned.control),
         "energy": learned.energies.summary(),
+        "shared_structures": learned.shared,
         "completion_by_gamma": completion_as_json(&learned.by_gamma.bins()),
         "completion_by_relative_volume": completion_as_json(&learned.by_expansion.bins()),
     })

@@ -25,6 +25,15 @@ pub fn location(text: &Path) -> Result<Location, Failure> {
     }
 }
 
+/// The location as an argument of a command.
+pub fn shown(location: &Location) -> String {
+    match location {
+        Location::Directory(_) => location.to_string(),
+        // The shell has uses of its own for '?' and '&'.
+        Location::Server(url) => format!("'{url}'"),
+    }
+}
+
 /// The campaign that a directory means: the one in it, else the one whose configuration is in it (as `calmwalk init` leaves it),
 /// else the only one in the directories below it. Where there is none, the directory itself.
 ///

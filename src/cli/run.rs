@@ -18,15 +18,17 @@ use tokio::sync::Notify;
 use wire::net::{Endpoint, Tls};
 use workers::labeller::GUARD;
 
-use super::{Ended, Failure, block_on, place};
+use super::place::{self, shown};
+use super::{Ended, Failure, block_on};
 use crate::actors::notify::{self, Notifier};
 use crate::actors::{self, budget, in_process, processes};
 use crate::campaign::Campaign;
+use crate::ends::Ends;
 use crate::forecast::{self, Forecast, megabytes};
 use crate::labelling::LABEL_METHOD;
 use crate::origin::Origin;
 use crate::output::{print, say, say_if_unprotected, warn};
-use crate::{log, summary, web};
+use crate::{log, story, summary, web};
 
 /// Run a campaign to its end, or go on with one that was interrupted
 ///
@@ -186,7 +188,8 @@ async fn run(
         return Ok(Ended::Interrupted);
     }
     let summary = summary::of(&store, campaign.protocol.hash).await?;
-    let failed = store.status().await?.labels.failed;
+    let status = store.status().await?;
+    let (failed, ends) = (status.labels.failed, Ends::of(&status.walks));
     let (shown, file) = match location {
         Location::Directory(_) => (shown(location), format!("/{DATABASE}")),
         Location::Server(_) => (shown(location), String::new()),
@@ -202,16 +205,11 @@ async fn run(
         writeln!(out, "  calmwalk export {shown} --output dataset.extxyz")
     })?;
     store.close().await;
-    Ok(Ended::Done)
-}
-
-/// The location as an argument of a command.
-fn shown(location: &Location) -> String {
-    match location {
-        Location::Directory(_) => location.to_string(),
-        // The shell has uses of its own for '?' and '&'.
-        Location::Server(url) => format!("'{url}'"),
+    if ends.none_in_order() {
+        warn(format_args!("calmwalk: the campaign has failed: {}", ends.warning()));
+        return Ok(Ended::NoneInOrder);
     }
+    Ok(Ended::Done)
 }
 
 /// Begins the campaign, or opens the one that is there and checks that it is the same.
@@ -251,12 +249,14 @@ async fn open_store(
     Ok(store)
 }
 
-/// Says in the store what others do not know: where files are, and how much disk is needed.
+/// Says in the store what others do not know: how labels are made, which elements the model has, how much disk is needed.
 async fn leave_notes(campaign: &Campaign, store: &Store) -> Result<(), Failure> {
     let text = |note: serde_json::Result<String>| note.map_err(Failure::failed);
     let method = campaign.method()?;
     store.leave_note(LABEL_METHOD, &text(serde_json::to_string(&method))?).await?;
     store.leave_note(GUARD, &text(serde_json::to_string(&campaign.config.label.guard))?).await?;
+    let elements: Vec<_> = campaign.model.elements().iter().map(|species| species.symbol()).collect();
+    store.leave_note(story::ELEMENTS, &text(serde_json::to_string(&elements))?).await?;
     store.leave_note(forecast::NOTE, &text(serde_json::to_string(&Forecast::of(campaign)))?).await?;
     Ok(())
 }

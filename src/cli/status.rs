@@ -23,9 +23,10 @@ use self::page::Page;
 pub use self::values::Values;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::budget;
+use crate::ends::Ends;
 use crate::forecast::{self, Forecast, megabytes};
 use crate::origin::Origin;
-use crate::output::{decimals, print, print_json};
+use crate::output::{count, decimals, print, print_json};
 
 /// Show how a campaign stands
 ///
@@ -153,28 +154,40 @@ impl Snapshot {
         out.write_all(&head)?;
         let lines = head.iter().filter(|byte| **byte == b'\n').count();
         let page = page.fitted(lines, if matches!(jobs, Jobs::Known(_)) { 3 } else { 2 }, walks);
-        walks::write(out, &self.standing.walks, &page)?;
+        walks::write(out, &self.standing.walks, self.standing.led, &page)?;
         processes::write(out, &self.standing.processes, &page)?;
         jobs.write(out, &page)
     }
 
     fn write_head(&self, out: &mut dyn Write, page: &Page) -> io::Result<()> {
         let Self { campaign, origin, standing, values, disk, labels, end } = self;
-        let name = origin.as_ref().map_or(String::new(), |origin| format!("{}, ", origin.name));
-        page.titled(out, "campaign", &format!("{name}{}, {} mode", campaign.id, campaign.mode))?;
+        let (name, mode) = (origin.as_ref().map_or("", |origin| &origin.name), &campaign.mode);
+        let id = campaign.id.to_string();
+        // The names of candidates begin with as much of it.
+        let id = if page.has_all() || name.is_empty() { &id[..] } else { &id[..8] };
+        let separator = if name.is_empty() { "" } else { ", " };
+        page.titled(out, "campaign", &format!("{name}{separator}{id}, {mode} mode"))?;
         if let Some(origin) = origin.as_ref().filter(|_| page.has_all()) {
             page.titled(out, "", &format!("by {}", origin.file.path))?;
         }
         page.titled(out, "state", &processes::state(standing))?;
-        page.titled(out, "walks", &walks_in_words(standing))?;
+        let ends = Ends::of(&standing.walks);
+        page.titled(out, "walks", &walks_in_words(standing, &ends))?;
+        if page.has_all() {
+            ends.lines().iter().try_for_each(|line| page.titled(out, "", line))?;
+        } else {
+            let advice =
+                ends.causes().map(|(cause, _)| format!("{}: try {}", cause.in_words(), cause.advice()));
+            advice.take(page.few).try_for_each(|line| page.titled(out, "", &line))?;
+        }
         page.titled(out, "mixture", &format!("version {}", standing.mixture_version))?;
         values.write(out, page, &campaign.mode)?;
-        write_candidates(out, page, &standing.candidates)?;
+        write_candidates(out, page, &standing.candidates, labels.shared)?;
         labels.write(out, page, standing)?;
         if let Some(budget) = budget::shown(&standing.budget) {
             page.titled(out, "budget", &budget)?;
         }
-        page.titled(out, "disk", &disk.in_words())?;
+        page.titled(out, "disk", &disk.in_words(standing))?;
         match end.shown() {
             Some(end) => page.titled(out, "end", &end),
             None => Ok(()),
@@ -192,24 +205,44 @@ struct Disk {
 }
 
 impl Disk {
-    fn in_words(&self) -> String {
+    /// At the end, bytes; none if it is unknown, or the campaign is over.
+    fn at_the_end(&self, status: &Standing) -> Option<u64> {
+        let Candidates { accepted, control, .. } = status.candidates;
+        let forecast = self.forecast.filter(|_| !status.finished)?;
+        Some(self.bytes + forecast.still_to_come(accepted + control, self.bytes))
+    }
+
+    fn in_words(&self, status: &Standing) -> String {
         let now = megabytes(self.bytes);
-        match &self.forecast {
-            Some(forecast) => format!("{now} now; {forecast}"),
+        match self.forecast.zip(self.at_the_end(status)) {
+            Some((forecast, end)) => format!(
+                "{now} now; about {} when all is collected, besides up to {} of features of declined candidates",
+                megabytes(end),
+                megabytes(forecast.declined)
+            ),
             None => format!("{now} now"),
         }
     }
 }
 
-fn walks_in_words(status: &Standing) -> String {
+fn walks_in_words(status: &Standing, ends: &Ends) -> String {
     let under_way = status.walks.iter().filter(|walk| walk.is_under_way()).count();
-    let ended = status.walks.len() - under_way;
+    let are = if status.led { "under way" } else { "not finished" };
+    let ended = match ends.ended() {
+        0 => "0 ended".to_owned(),
+        ended => format!("{ended} ended ({})", ends.in_words()),
+    };
     let pace = status.steps_per_second.filter(|_| under_way > 0);
     let pace = pace.map_or(String::new(), |pace| format!("; {} steps/s", decimals(Some(pace), 1)));
-    format!("{under_way} under way, {ended} ended; round {}{pace}", status.round)
+    format!("{under_way} {are}, {ended}; round {}{pace}", status.round)
 }
 
-fn write_candidates(out: &mut dyn Write, page: &Page, candidates: &Candidates) -> io::Result<()> {
+fn write_candidates(
+    out: &mut dyn Write,
+    page: &Page,
+    candidates: &Candidates,
+    shared: Option<u64>,
+) -> io::Result<()> {
     let Candidates { seen, accepted, declined, control, refused_by_walkers } = candidates;
     let reasons = [
         ("covered", declined.covered),
@@ -221,9 +254,19 @@ fn write_candidates(out: &mut dyn Write, page: &Page, candidates: &Candidates) -
     let all: u64 = reasons.iter().map(|(_, count)| count).sum();
     let reasons = reasons.map(|(reason, count)| format!("{count} {reason}")).join(", ");
     page.titled(out, "candidates", &format!("{seen} seen, {accepted} accepted, {all} declined ({reasons})"))?;
+    let shared = match shared {
+        None | Some(0) => String::new(),
+        Some(shared) => format!(
+            " ({shared} of them structures of biased walks too: {} for all)",
+            count(accepted + control - shared, "label")
+        ),
+    };
     page.titled(
         out,
         "",
-        &format!("{control} control frames; {refused_by_walkers} refused by walkers' guards"),
+        &format!(
+            "{}{shared}; {refused_by_walkers} refused by walkers' guards",
+            count(*control, "control frame")
+        ),
     )
 }

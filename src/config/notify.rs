@@ -40,12 +40,14 @@ pub enum NotifyEvent {
     FailedLabels,
     /// The mixture forgets its training data, or does so no longer.
     Forgetting,
+    /// Walk after walk ends early.
+    FailingWalks,
 }
 
 impl NotifyEvent {
     /// All of them.
-    pub const ALL: [Self; 6] =
-        [Self::End, Self::Failure, Self::Stall, Self::Budget, Self::FailedLabels, Self::Forgetting];
+    pub const ALL: [Self; 7] =
+        [Self::End, Self::Failure, Self::Stall, Self::Budget, Self::FailedLabels, Self::Forgetting, Self::FailingWalks];
 
     /// As the configuration has it.
     pub fn name(self) -> &'static str {
@@ -56,6 +58,7 @@ impl NotifyEvent {
             Self::Budget => "budget",
             Self::FailedLabels => "failed_labels",
             Self::Forgetting => "forgetting",
+            Self::FailingWalks => "failing_walks",
         }
     }
 }

@@ -7,7 +7,9 @@ use serde::{Deserialize, Serialize};
 use store::Status;
 
 use crate::config::{NotifyEvent, NotifySection};
+use crate::ends::Ends;
 use crate::forgetting::Forgetting;
+use crate::output::count;
 
 const MINUTE: f64 = 60_000.0;
 /// What was told last of forgetting, while the alarm holds.
@@ -55,13 +57,14 @@ impl Watch {
         let candidates = status.candidates.seen + status.candidates.control;
         let labels = status.budget.used.labels + status.labels.failed;
         let mut due = Vec::new();
-        let so_far = format!("{candidates} candidates, {labels} labels");
+        let so_far = format!("{}, {}", count(candidates, "candidate"), count(labels, "label"));
         if let Some(key) = &status.budget.used_up {
             let limits = &status.budget.limits;
             let limit = (key, limits.labels, limits.core_hours, limits.wall_hours);
             due.extend(self.due(NotifyEvent::Budget, format!("{limit:?}"), format!("{key} is used up")));
         }
         due.extend(self.failed_labels(status.labels.failed));
+        due.extend(self.failing_walks(&Ends::of(&status.walks)));
         if status.finished {
             due.extend(self.due(
                 NotifyEvent::End,
@@ -117,8 +120,19 @@ impl Watch {
         if reached <= told.unwrap_or(0) {
             return None;
         }
-        let message = format!("the labels of {failed} structures have finally failed");
+        let message = match failed {
+            1 => "the label of 1 structure has finally failed".to_owned(),
+            failed => format!("the labels of {failed} structures have finally failed"),
+        };
         self.due(NotifyEvent::FailedLabels, reached.to_string(), message)
+    }
+
+    /// Once a campaign.
+    fn failing_walks(&mut self, ends: &Ends) -> Option<Due> {
+        if !ends.are_alarming() {
+            return None;
+        }
+        self.due(NotifyEvent::FailingWalks, "yes".into(), ends.warning())
     }
 
     fn is_wanted(&self, event: NotifyEvent) -> bool {
@@ -178,6 +192,20 @@ mod tests {
         for (failed, expected) in [(9, 0), (10, 1), (11, 0), (3, 0), (12, 0), (39, 1), (40, 1)] {
             status.labels.failed = failed;
             assert_eq!(watch.look(&status, 0).len(), expected, "{failed}");
+        }
+    }
+
+    #[test]
+    fn walks_that_end_early_one_after_the_other_are_told_once() {
+        let (mut watch, mut status) = (watch(), Status::default());
+        let walk = |state: &str| store::WalkStatus { state: state.into(), ..store::WalkStatus::default() };
+        for (state, expected) in
+            [("blew_up", 0), ("collected", 0), ("trapped", 0), ("blew_up", 1), ("blew_up", 0)]
+        {
+            status.walks.push(walk(state));
+            let due = watch.look(&status, 0);
+            assert_eq!(due.len(), expected, "{:?}", status.walks);
+            assert!(due.iter().all(|due| due.event == NotifyEvent::FailingWalks), "{due:?}");
         }
     }
 

@@ -29,6 +29,8 @@ pub struct Sample {
     pub biased: Collection,
     /// Frames of control walks.
     pub control: Collection,
+    /// Structures of both: they tell nothing of the difference, and are left out of all but counts.
+    pub shared: u64,
     /// Features of atoms, by element.
     pub features: Features,
 }
@@ -90,6 +92,7 @@ impl Sample {
         let shortest = seeds.iter().filter_map(|seed| Some((seed.index, nearest(&seed.structure)?)));
         let shortest: HashMap<_, _> = shortest.collect();
         let (mut biased, mut control) = (Collection::new(), Collection::new());
+        let of_both = store.structures_of_both_origins().await?;
         let mut after = 0;
         loop {
             let page = store.collected(protocol, after, PAGE).await?;
@@ -97,7 +100,10 @@ impl Sample {
             after = last.decision;
             for row in &page {
                 let collection = if row.origin == Origin::Biased { &mut biased } else { &mut control };
-                collection.push(row, shortest.get(&row.seed_structure).copied());
+                collection.count(row);
+                if !of_both.contains(&row.block.view().id().content) {
+                    collection.push(row, shortest.get(&row.seed_structure).copied());
+                }
             }
         }
         let elements = Features::most_frequent(&biased.elements, &control.elements);
@@ -111,7 +117,20 @@ impl Sample {
                 }
             }
         }
-        Ok(Self { biased, control, features })
+        Ok(Self { biased, control, shared: of_both.len() as u64, features })
+    }
+
+    /// Says in a caption what is left out; nothing if nothing is.
+    pub fn left_out(&self) -> String {
+        match self.shared {
+            0 => String::new(),
+            1 => " 1 structure that a biased walk and its control have both found is left out.".to_owned(),
+            shared => {
+                format!(
+                    " {shared} structures that biased walks and their controls have both found are left out."
+                )
+            }
+        }
     }
 
     /// The collections and their names, biased walks first.
@@ -131,6 +150,13 @@ impl Collection {
         }
     }
 
+    fn count(&mut self, row: &Collected) {
+        let counts = self.labels.entry(row.seed_structure).or_default();
+        counts.structures += 1;
+        counts.labelled += u64::from(row.label_forces.is_some());
+        counts.failed += u64::from(row.job == Some(JobState::Failed));
+    }
+
     fn push(&mut self, row: &Collected, shortest: Option<f64>) {
         let view = row.block.view();
         let structure = view.structure();
@@ -144,10 +170,6 @@ impl Collection {
             *self.elements.entry(*species).or_default() += 1;
         }
         self.sampled.push(row.decision);
-        let counts = self.labels.entry(row.seed_structure).or_default();
-        counts.structures += 1;
-        counts.labelled += u64::from(row.label_forces.is_some());
-        counts.failed += u64::from(row.job == Some(JobState::Failed));
         self.push_atoms(row, view.forces, &structure, shortest);
     }
 

@@ -39,7 +39,9 @@ async fn begin(directory: &std::path::Path, configuration: &str) -> Store {
 }
 
 async fn offer(store: &Store, step: u64, origin: Origin, fate: Fate, keep_features: bool) {
-    let structure = structure(2.5 + 0.01 * step as f64);
+    // Those of a control are like those of its biased walk, and not the same.
+    let shift = if origin == Origin::Control { 0.001 } else { 0.0 };
+    let structure = structure(2.5 + 0.01 * step as f64 + shift);
     let content = ContentHash::of(&structure);
     // Each atom a little newer than the one before it.
     let grades: Vec<_> = (0..ATOMS).map(|k| 0.2 * (k + 1) as f64).collect();

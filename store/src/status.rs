@@ -22,6 +22,8 @@ pub struct Status {
     pub labels_last_hour: u64,
     /// Structures that came with their labels.
     pub imported: u64,
+    /// Whether a process runs the campaign, as far as can be seen from here.
+    pub led: bool,
     /// Version of the mixture.
     pub mixture_version: u64,
     /// Round (reproducible mode) or 0.
@@ -120,7 +122,8 @@ pub struct WalkStatus {
     pub relative_volume: Option<f64>,
     /// Largest γ of the last graded step.
     pub gamma_max: Option<f64>,
-    /// Steps per second, with the time between its turns; none if it was not heard of within the last minute.
+    /// Steps per second, with the time between its turns; none if it was not heard of within the last minute, is paused, or nobody leads the
+    /// campaign.
     pub steps_per_second: Option<f64>,
     /// Structures accepted.
     pub accepted: u32,

@@ -70,6 +70,15 @@ impl Browser {
         self.tell("/window/rect", &json!({ "width": width, "height": 1600 }));
     }
 
+    /// Gives pages this width, also below the least width of a window.
+    pub fn resize(&self, width: u32) {
+        let parameters = json!({ "width": width, "height": 900, "deviceScaleFactor": 1, "mobile": false });
+        self.tell(
+            "/goog/cdp/execute",
+            &json!({ "cmd": "Emulation.setDeviceMetricsOverride", "params": parameters }),
+        );
+    }
+
     /// What a script returns.
     pub fn run(&self, script: &str) -> Value {
         self.tell("/execute/sync", &json!({ "script": script, "args": [] }))

@@ -214,6 +214,12 @@ impl Selector {
         self.judge.walks.values().map(standing).collect()
     }
 
+    /// The walks that have ended: number, state and reason.
+    pub fn ended(&self) -> impl Iterator<Item = (WalkId, &str, &str)> {
+        let walks = self.judge.walks.values().filter(|walk| walk.has_ended());
+        walks.map(|Walk { record, .. }| (record.walk, record.state.as_str(), record.reason.as_str()))
+    }
+
     /// Makes a walk for every seed structure that has none: at the start of a campaign, or when seed structures were
     /// added to it. Walks that had ended by a budget which has grown since go on. The commit is empty if there was
     /// nothing to do.

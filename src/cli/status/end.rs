@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 use serde_json::Value;
-use store::{ProcessRecord, Status, unix_milliseconds};
+use store::{Status, unix_milliseconds};
 
 use crate::bill::{Bill, SECONDS_PER_HOUR, digits};
 
@@ -22,10 +22,7 @@ pub struct End {
 impl End {
     /// Of a campaign with this configuration in force.
     pub fn of(status: &Status, configuration: &Value, bill: &Bill) -> Self {
-        let is_led = status
-            .processes
-            .iter()
-            .any(|process| process.kind == ProcessRecord::ORCHESTRATOR && process.state == "running");
+        let is_led = status.led;
         if status.finished {
             return Self::default();
         }
@@ -74,15 +71,10 @@ mod tests {
 
     fn campaign() -> (Status, Value, Bill) {
         let walk = |state: &str, step| WalkStatus { state: state.into(), step, ..WalkStatus::default() };
-        let orchestrator = ProcessRecord {
-            kind: ProcessRecord::ORCHESTRATOR.into(),
-            state: "running".into(),
-            ..ProcessRecord::default()
-        };
         let status = Status {
             walks: vec![walk("running", 4_000), walk("waiting", 0), walk("collected", 7)],
             steps_per_second: Some(10.0),
-            processes: vec![orchestrator],
+            led: true,
             ..Status::default()
         };
         (status, json!({ "walk": { "equilibration": 1_000, "steps": 19_000 } }), Bill::default())
@@ -101,7 +93,7 @@ mod tests {
         assert_eq!(End::of(&status, &configuration, &bill).time, None, "nobody makes the labels");
         status.budget.limits = Budget { wall_hours: Some(0.5), ..Budget::default() };
         assert!((hours(&End::of(&status, &configuration, &bill)) - 0.5).abs() < 0.01);
-        status.processes.clear();
+        status.led = false;
         assert_eq!(End::of(&status, &configuration, &bill).time, None, "nobody runs it");
     }
 }

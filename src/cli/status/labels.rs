@@ -8,6 +8,7 @@ use store::{FailureCount, JobState, Labels, Status, Store, StoreError, Unlabelle
 use super::page::{Page, cut};
 use super::processes::since;
 use crate::bill::{self, Bill, digits};
+use crate::output::count;
 use crate::unlabelled;
 
 /// Labelled structures that are looked through for ranges of grades and volumes, at most.
@@ -21,19 +22,27 @@ pub struct LabelsSoFar {
     pub(super) unlabelled: Vec<Unlabelled>,
     /// What became of label jobs by each protocol, in words.
     pub(super) by_protocol: Vec<String>,
+    /// Control frames that are the structures of their biased walks, which have one label each; not counted in large campaigns.
+    pub(super) shared: Option<u64>,
 }
 
 impl LabelsSoFar {
     /// Reads it; nothing without a protocol.
     pub async fn of(store: &Store, status: &Status) -> Result<Self, StoreError> {
-        let Some(protocol) = store.protocol_in_force().await? else { return Ok(Self::default()) };
+        let shared = match status.candidates.control <= LOOKED_THROUGH {
+            true => Some(store.structures_of_both_origins().await?.len() as u64),
+            false => None,
+        };
+        let Some(protocol) = store.protocol_in_force().await? else {
+            return Ok(Self { shared, ..Self::default() });
+        };
         let failures = store.failures(protocol.hash).await?;
         let unlabelled = match (status.labels.failed, status.labels.labelled) {
             (0, _) => Vec::new(),
             (_, labelled) => store.unlabelled(protocol.hash, labelled <= LOOKED_THROUGH).await?,
         };
         let by_protocol = by_protocol(&store.jobs_by_protocol().await?, &protocol.name);
-        Ok(Self { bill: bill::of(store, protocol.hash).await?, failures, unlabelled, by_protocol })
+        Ok(Self { bill: bill::of(store, protocol.hash).await?, failures, unlabelled, by_protocol, shared })
     }
 
     /// What labels have cost and will.
@@ -47,6 +56,7 @@ impl LabelsSoFar {
         json["cost"] = json!({ "core_hours": status.budget.used.core_hours, "queue": self.bill });
         json["failures"] = json!(self.failures);
         json["unlabelled"] = json!(self.unlabelled);
+        json["shared_structures"] = json!(self.shared);
     }
 
     /// The queue, what it costs, failures and what is unlabelled because of them.
@@ -77,7 +87,10 @@ impl LabelsSoFar {
         let Some(remaining) = remaining else {
             return match unfinished {
                 0 => used,
-                _ => format!("{used}; that of {unfinished} labels to come is unknown before a first one"),
+                _ => format!(
+                    "{used}; that of {} to come is unknown before a first one",
+                    count(*unfinished, "label")
+                ),
             };
         };
         let in_vain = match *overhead > 1.005 {
@@ -85,11 +98,13 @@ impl LabelsSoFar {
             false => String::new(),
         };
         let done = match hours_left {
-            Some(hours) => format!("done in {} h on the {cores} cores at work", digits(*hours)),
+            Some(hours) => format!("done in {} h on {} at work", digits(*hours), count(*cores, "core")),
             None => "nobody is at work on them".to_owned(),
         };
         format!(
-            "{used}; {unfinished} labels to come: about {remaining} as {measured} labels so far{in_vain}; {done}"
+            "{used}; {} to come: about {remaining} as {} so far{in_vain}; {done}",
+            count(*unfinished, "label"),
+            count(*measured, "label")
         )
     }
 }
@@ -104,7 +119,8 @@ fn queue(status: &Status) -> String {
     let imported = status.imported;
     format!(
         "{queued} queued, {leased} leased{oldest}, {labelled} labelled, {failed} failed, {dropped} dropped{superseded}{excluded}; \
-         {imported} structures imported"
+         {} imported",
+        count(imported, "structure")
     )
 }
 

@@ -61,13 +61,19 @@ pub fn large() -> Snapshot {
         values: Values(values.map(|(name, value)| (name.to_owned(), value.to_string())).into()),
         disk: Disk {
             bytes: 123_456_789_012,
-            forecast: Some(Forecast { structures: 9 << 33, rest: 1 << 32, declined: 1 << 30 }),
+            forecast: Some(Forecast {
+                structures: 9 << 33,
+                rest: 1 << 32,
+                declined: 1 << 30,
+                most_structures: 200_000,
+            }),
         },
         labels: LabelsSoFar {
             bill,
             failures: ["not_converged", "out_of_memory", "implausible"].map(failure).into(),
             unlabelled: vec![unlabelled],
             by_protocol: Vec::new(),
+            shared: Some(12),
         },
         end: End {
             walks_hours: Some(12.0),
@@ -83,7 +89,15 @@ fn standing() -> Standing {
         walk: number,
         seed_structure: format!("a-long-name-of-a-seed-structure-{number}"),
         origin: if number.is_multiple_of(2) { "biased" } else { "control" }.into(),
-        state: if number < 4 { "running" } else { "collected" }.into(),
+        state: if number < 4 {
+            "running"
+        } else if number == 4 {
+            "blew_up"
+        } else {
+            "collected"
+        }
+        .into(),
+        reason: if number == 4 { "at step 1000000: 23456 K is above the allowed 20000 K" } else { "" }.into(),
         step: 10_000_000,
         tau: Some(0.3),
         temperature: Some(12_345.0),
@@ -120,6 +134,7 @@ fn standing() -> Standing {
         imported: 10_000,
         mixture_version: 80_000,
         round: 1_000_000,
+        led: true,
         steps_per_second: Some(123_456.7),
         walks: (0..1000).map(walk).collect(),
         processes: (0..1000).map(process).collect(),

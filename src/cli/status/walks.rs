@@ -32,7 +32,7 @@ fn shown(walks: &[WalkStatus], most: usize) -> Vec<&WalkStatus> {
 }
 
 /// A line for each.
-pub fn write(out: &mut dyn Write, walks: &[WalkStatus], page: &Page) -> io::Result<()> {
+pub fn write(out: &mut dyn Write, walks: &[WalkStatus], led: bool, page: &Page) -> io::Result<()> {
     let shown = shown(walks, page.walks);
     if shown.is_empty() {
         return Ok(());
@@ -40,16 +40,21 @@ pub fn write(out: &mut dyn Write, walks: &[WalkStatus], page: &Page) -> io::Resu
     let mut table = Table::new(&TITLES);
     let name = if page.walks == usize::MAX { usize::MAX } else { NAME };
     for walk in &shown {
-        table.push(line(walk, name));
+        table.push(line(walk, led, name));
     }
     page.table(out, &table, shown.len(), walks.len(), "walks")
 }
 
-/// One walk below [`TITLES`], with so many characters of the name of its seed structure.
-pub fn line(walk: &WalkStatus, name: usize) -> Vec<String> {
+/// One walk below [`TITLES`], with so many characters of the name of its seed structure; `led`: whether a process runs the
+/// campaign.
+pub fn line(walk: &WalkStatus, led: bool, name: usize) -> Vec<String> {
     let control = if walk.origin == "control" { "c: " } else { "" };
     let name = cut(&format!("{control}{}", walk.seed_structure), name);
-    let state = if walk.paused { "paused".to_owned() } else { walk.state.replace('_', " ") };
+    let state = match walk.state.as_str() {
+        _ if walk.paused => "paused".to_owned(),
+        "running" if !led => "stopped".to_owned(),
+        state => state.replace('_', " "),
+    };
     vec![
         walk.walk.to_string(),
         name,

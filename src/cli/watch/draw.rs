@@ -14,7 +14,7 @@ use super::pane::{Pane, Tone};
 use super::state::{DECISIONS, Message, Mode, QUEUE, State, Text, WALKS, WINDOW, Wanted};
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;
-use crate::output::{Table, decimals};
+use crate::output::{Table, count, decimals};
 
 /// Lines of the head, with the line below it.
 const HEAD: u16 = 5;
@@ -102,6 +102,7 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
     let paused = standing.walks.iter().filter(|walk| walk.paused).count();
     let paused = if paused == 0 { String::new() } else { format!(" ({paused} paused)") };
     let ended = standing.walks.len() - under_way;
+    let are = if standing.led { "under way" } else { "not finished" };
     let speed = standing.steps_per_second.filter(|_| under_way > 0);
     let speed = speed.map_or(String::new(), |speed| format!("; {speed:.1} steps/s"));
     let Candidates { seen, accepted, control, .. } = &standing.candidates;
@@ -111,15 +112,16 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
         (
             "walks",
             format!(
-                "{under_way} under way{paused}, {ended} ended{speed}; mixture version {}",
+                "{under_way} {are}{paused}, {ended} ended{speed}; mixture version {}",
                 standing.mixture_version
             ),
         ),
         (
             "candidates",
             format!(
-                "{seen} seen, {accepted} accepted, {} declined; {control} control frames",
-                seen - accepted
+                "{seen} seen, {accepted} accepted, {} declined; {}",
+                seen - accepted,
+                count(*control, "control frame")
             ),
         ),
         (

@@ -24,19 +24,20 @@ pub const NOT_KNOWN: [&[&str]; 3] = [
     &["energy", "energy_per_atom", "max_force"],
 ];
 
-/// A line for each that meets the condition.
-pub fn of_walks(walks: &[WalkStatus], filter: Option<&Condition>) -> Vec<Entry> {
+/// A line for each that meets the condition; `led`: whether a process runs the campaign.
+pub fn of_walks(walks: &[WalkStatus], led: bool, filter: Option<&Condition>) -> Vec<Entry> {
     let meets = |walk: &&WalkStatus| filter.is_none_or(|filter| filter.is_met(&facts_of_walk(walk)));
     let tone = |walk: &WalkStatus| match walk.state.as_str() {
         _ if walk.paused => Tone::Attention,
-        "running" => Tone::Good,
+        "running" if led => Tone::Good,
+        "running" => Tone::Plain,
         "waiting" => Tone::Plain,
         "trapped" | "blew_up" | "bad_start" => Tone::Attention,
         _ => Tone::Past,
     };
     let entry = |walk: &WalkStatus| Entry {
         key: walk.walk.to_string(),
-        columns: walks::line(walk, walks::NAME),
+        columns: walks::line(walk, led, walks::NAME),
         tone: tone(walk),
         candidate: None,
     };

@@ -181,9 +181,9 @@ impl State {
 
     /// Fills the panes with what there is.
     pub fn arrange(&mut self) {
-        let walks = &self.snapshot.standing().walks;
+        let store::Status { walks, led, .. } = self.snapshot.standing();
         let [of_walks, of_queue, of_decisions] = &mut self.panes;
-        of_walks.show(entries::of_walks(walks, of_walks.filter.as_ref()), walks.len());
+        of_walks.show(entries::of_walks(walks, *led, of_walks.filter.as_ref()), walks.len());
         of_queue.show(entries::of_jobs(&self.jobs, of_queue.filter.as_ref()), self.jobs.len());
         let decisions = entries::of_decisions(self.decisions.iter(), of_decisions.filter.as_ref());
         of_decisions.show(decisions, self.decisions.len());

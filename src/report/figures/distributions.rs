@@ -85,7 +85,8 @@ fn caption(sample: &Sample, shown: &[Origin]) -> String {
     format!(
         "Atoms of all structures that were collected, under the original mixture. a, Grade γ. b, Its average over the \
          neighbourhood, γ_{{nbr}}. c, Force error |F_{{model}} − F_{{label}}| of the atoms whose structures have labels. Dashed, the \
-         calibrated threshold 1. Bins of one width on the logarithmic axis; axes leave out 0.1 % of the atoms at either end. {}.",
-        both.join("; ")
+         calibrated threshold 1. Bins of one width on the logarithmic axis; axes leave out 0.1 % of the atoms at either end. {}.{}",
+        both.join("; "),
+        sample.left_out()
     )
 }

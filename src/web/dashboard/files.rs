@@ -31,6 +31,7 @@ const FILES: &[(&str, &str)] = files![
     "overview.js",
     "plot.js",
     "plots.js",
+    "standing.js",
     "structure.js",
     "style.css",
 ];

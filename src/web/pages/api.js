@@ -45,14 +45,14 @@ export function listen(hear, signal) {
   if (newest) hear(newest);
 }
 
-/** Begins to listen to the program; `tell` hears how the connection is. */
+/** Begins to listen to the program; `tell` hears how the connection is, and with news the campaign's status. */
 export function connect(tell) {
   const source = new EventSource("/api/events");
   source.onopen = () => tell("live");
   source.onerror = () => tell("lost");
   source.onmessage = (event) => {
     const news = JSON.parse(event.data);
-    tell(news.error ? "blind" : "live", news.error);
+    tell(news.error ? "blind" : "live", news.error, news.status);
     if (news.error) return;
     newest = news;
     listeners.forEach((hear) => hear(news));

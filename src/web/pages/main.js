@@ -8,10 +8,11 @@ import * as errors from "./errors.js";
 import * as hosts from "./hosts.js";
 import * as mixture from "./mixture.js";
 import * as overview from "./overview.js";
+import { standing } from "./standing.js";
 
 /** Pages in the order of the menu, by the first word of their address. */
 const PAGES = { overview, candidates, mixture, errors, hosts };
-const CONNECTIONS = { live: "● live", lost: "○ no connection: trying again", blind: "○ the database does not answer" };
+const CONNECTIONS = { live: "● live", finished: "✓ finished", stopped: "○ stopped: nobody runs the campaign", lost: "○ no connection: trying again", blind: "○ the database does not answer" };
 
 let shown = new AbortController();
 
@@ -59,8 +60,11 @@ function theme() {
   use();
 }
 
-function connection(how, why = "") {
+/** A campaign that nobody runs is not live, however well the connection is. */
+function connection(link, why = "", status = null) {
   const line = document.getElementById("connection");
+  const what = status ? standing(status) : "running";
+  const how = link === "live" && what !== "running" ? what : link;
   if (line.dataset.how !== how) line.textContent = CONNECTIONS[how];
   line.dataset.how = how;
   line.title = why;
@@ -69,8 +73,9 @@ function connection(how, why = "") {
 menu();
 theme();
 connect(connection);
-listen((news) => { document.title = document.title.replace(/calmwalk.*$/, `calmwalk ${news.status.campaign.slice(0, 8)}`); },
-  new AbortController().signal);
+listen((news) => {
+  document.title = document.title.replace(/calmwalk.*$/, `calmwalk ${news.status.name ?? news.status.campaign.slice(0, 8)}`);
+}, new AbortController().signal);
 // The address says which page is shown, and stays.
 document.querySelector(".skip").addEventListener("click", (event) => {
   event.preventDefault();

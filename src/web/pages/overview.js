@@ -5,6 +5,7 @@ import { listen } from "./api.js";
 import { element, facts, renew, section, sentence, state, table } from "./dom.js";
 import { bytes, decimals, digits, duration, percent, time, whole } from "./format.js";
 import { overTime } from "./plots.js";
+import { standing } from "./standing.js";
 
 export const TITLE = "Overview";
 
@@ -24,9 +25,10 @@ export function show(content, _, signal) {
   const draw = () => {
     tiles.replaceChildren(...summary(status));
     renew(rest,
+      earlyEnds(status.ends),
       section("Label queue", queue(status)),
       section("Budget and end", budget(status)),
-      section("Walks", walks(status.walks, changes && draw)));
+      section("Walks", walks(status, changes && draw)));
   };
   canPause().then((can) => {
     changes = can;
@@ -46,18 +48,18 @@ function tile(title, value, ...more) {
 function summary(status) {
   const { candidates, labels, walks, mixture_version: version, staleness, training_frames: training } = status;
   const underWay = walks.filter(isUnderWay).length;
-  const led = status.processes.some((process) => process.kind === "orchestrator" && process.state === "running");
   const declined = Object.entries(candidates.declined).filter(([, count]) => count > 0)
     .map(([reason, count]) => `${whole(count)} ${reason}`).join(", ");
-  const how = status.finished ? "finished" : led ? "running" : "stopped";
+  const how = standing(status);
   return [
     tile("Campaign", state(how), `${status.campaign.slice(0, 8)}, ${status.mode} mode`,
       status.round > 0 ? `round ${whole(status.round)}` : "", `${bytes(status.disk.bytes)} on disk`),
-    tile("Walks", `${whole(underWay)} under way`, `${whole(walks.length - underWay)} ended`,
+    tile("Walks", `${whole(underWay)} ${status.led ? "under way" : "not finished"}`, ended(status.ends, walks.length - underWay),
       status.steps_per_second == null ? "" : `${digits(status.steps_per_second)} steps/s in all`),
     tile("Candidates", `${whole(candidates.accepted)} accepted`,
       `of ${whole(candidates.seen)} seen (${percent(share(candidates.accepted, candidates.seen))})`,
-      declined && `declined: ${declined}`, `${whole(candidates.control)} control frames`),
+      declined && `declined: ${declined}`, `${whole(candidates.control)} control frames`,
+      status.shared_structures > 0 && `${whole(status.shared_structures)} of them structures of their biased walks`),
     tile("Labels", `${whole(labels.labelled)} made`, `${whole(labels.queued)} wait, ${whole(labels.leased)} in work`,
       `${whole(labels.failed)} failed, ${whole(labels.dropped)} dropped${labels.superseded > 0 ? `, ${whole(labels.superseded)} superseded` : ""}${
         labels.excluded > 0 ? `, ${whole(labels.excluded)} excluded` : ""}`,
@@ -67,6 +69,20 @@ function summary(status) {
       training?.alarm ? element("span", { class: "wrong" }, "it forgets: more than calm.forgetting_alarm") : "",
       staleness ? `walkers saw the newest in ${percent(staleness.share_of_newest)} of the decisions` : ""),
   ];
+}
+
+/** How walks have ended, early ends with their number. */
+function ended(ends, number) {
+  const early = ends.filter((end) => end.cause != null).reduce((sum, end) => sum + end.walks, 0);
+  const text = `${whole(number)} ended`;
+  return early === 0 ? text : element("span", {}, `${text}, `, element("span", { class: "wrong" }, `${whole(early)} of them early`));
+}
+
+/** Causes of early ends, and what to change. */
+function earlyEnds(ends) {
+  const rows = ends.filter((end) => end.cause != null).map((end) => [whole(end.walks), state(end.end),
+    sentence(`walk ${end.walk}: ${end.reason}`), sentence(end.advice)]);
+  return rows.length === 0 ? "" : section("Walks that ended early", table("By cause", [["walks", true], ["end"], ["such as"], ["what to change"]], rows));
 }
 
 function share(part, all) {
@@ -105,7 +121,7 @@ function budget(status) {
 }
 
 /** `changed` is called when walks were paused here or resumed; false where they cannot be. */
-function walks(all, changed) {
+function walks({ walks: all, led }, changed) {
   const order = [...all].sort((a, b) => isUnderWay(b) - isUnderWay(a) || a.walk - b.walk);
   const change = (some, isPaused) => () => {
     // The next news say so too.
@@ -114,7 +130,7 @@ function walks(all, changed) {
   };
   const button = (walk) => (isUnderWay(walk) || walk.paused) && pauseButton(walk.walk, walk.paused, change([walk], !walk.paused));
   const rows = order.slice(0, WALKS).map((walk) => [
-    whole(walk.walk), walk.seed_structure, walk.origin, sentence(state(walk.paused ? "paused" : walk.state), walk.reason && ` ${walk.reason}`),
+    whole(walk.walk), walk.seed_structure, walk.origin, sentence(state(walk.paused ? "paused" : !led && walk.state === "running" ? "stopped" : walk.state), walk.reason && ` ${walk.reason}`),
     whole(walk.step), decimals(walk.temperature, 0, "K"), decimals(walk.relative_volume, 4), decimals(walk.gamma_max, 2),
     digits(walk.tau), digits(walk.steps_per_second), whole(walk.accepted), whole(walk.refused), ...(changed ? [button(walk) || ""] : [])]);
   const more = all.length - rows.length;

@@ -32,6 +32,7 @@ export function overTime(place, signal) {
 
 function drawn(samples) {
   const last = samples.at(-1).time;
+  // One axis for all, however much of it each plot has values for.
   const x = axisOfTime(last - samples[0].time);
   const at = (sample) => (sample.time - last) / x.unit;
   const line = (read) => samples.map((sample) => [at(sample), read(sample)]);
@@ -58,7 +59,7 @@ function drawn(samples) {
 
 function axisOfTime(span) {
   const [unit, name] = span > 1.5e8 ? [8.64e7, "d"] : span > 5.4e6 ? [3.6e6, "h"] : span > 9e4 ? [6e4, "min"] : [1e3, "s"];
-  return { title: `time before now (${name})`, unit, ticks: (value) => tick(Math.abs(value)) };
+  return { title: `time before now (${name})`, unit, least: -span / unit, most: 0, ticks: (value) => tick(Math.abs(value)) };
 }
 
 function newestCandidates(newest) {

@@ -1,5 +1,7 @@
 //! Labelled structures, page by page.
 
+use std::collections::HashSet;
+
 use wire::ContentHash;
 
 use super::labels::LabelRow;
@@ -7,7 +9,7 @@ use super::restore::{block, grades, origin};
 use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, IMPORT, Names, ORIGINAL_GRADES, SEED_STRUCTURE, joined};
 use crate::database::{FromRow, Row, query};
-use crate::encoding::read_structure;
+use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
 
@@ -48,7 +50,18 @@ pub(crate) const IMPORTS: &str = concat!(
     ORDER BY import.number LIMIT $3"
 );
 
+/// Hashes of structures that were collected of biased walks and of controls.
+const OF_BOTH_ORIGINS: &str = "SELECT DISTINCT content FROM candidate WHERE origin = 'control'
+    AND EXISTS (SELECT 1 FROM candidate other WHERE other.structure = candidate.structure AND other.origin = 'biased')";
+
 impl Store {
+    /// Structures that a biased walk and a control walk have both found: a control has the random numbers of its biased walk, and
+    /// is at the same place until the bias tells them apart. Such a structure has one label.
+    pub async fn structures_of_both_origins(&self) -> Result<HashSet<ContentHash>> {
+        let hashes: Vec<Vec<u8>> = query(OF_BOTH_ORIGINS).fetch_all(&self.database).await?;
+        hashes.iter().map(|hash| decode_hash(hash)).collect()
+    }
+
     /// At most `limit` labelled structures behind `after` (`None`: from the first on): candidates in decision order, then
     /// imports as they came, whatever the order in which the labels came. An empty page is the end. What was dropped by
     /// hand is left out.

@@ -42,7 +42,8 @@ impl Store {
     /// Everything at one instant. Processes are in order of kind and number. A process that is gone has the
     /// state `gone`, whatever was said of it before, unless it was `given up`, or is `pausing` and an orchestrator lives. One
     /// of another host that has said nothing for a minute is `silent`.
-    /// A walk that a limit of time has stopped has the state `budget`.
+    /// A walk that a limit of time has stopped has the state `budget`. While nobody leads the campaign, walks stand at their
+    /// checkpoints and have no pace.
     pub async fn status(&self) -> Result<Status> {
         let now = unix_milliseconds();
         let mut transaction = self.database.begin_to_read().await?;
@@ -62,21 +63,27 @@ impl Store {
         let (mixture_version, round) = last.unwrap_or_default();
         let imported = query("SELECT count(*) FROM import").fetch_one(&mut transaction).await?;
         let processes = processes::all(&mut transaction).await?;
+        let led = processes.iter().any(ProcessRecord::is_leading);
         let (limits, used) = budget::read(&mut transaction, now).await?;
-        advance(&mut walks, &pace::fresh(&mut transaction, now).await?);
         let paused = pauses::read(&mut transaction).await?;
-        let steps_per_second = pace::of_all(&mut transaction, now).await?;
+        let mut steps_per_second = None;
+        if led {
+            advance(&mut walks, &pace::fresh(&mut transaction, now).await?);
+            steps_per_second = pace::of_all(&mut transaction, now).await?;
+        }
         transaction.commit().await?;
         let labels = Labels { excluded, ..labels(&states, &asked) };
         let time_used_up = limits.time_used_up(&used);
         name_budget(&mut walks, time_used_up, &limits);
         for walk in &mut walks {
             walk.paused = walk.is_under_way() && paused.contains(&WalkId(walk.walk));
+            walk.steps_per_second = walk.steps_per_second.filter(|_| !walk.paused);
         }
         let no_more_labels = labels.leased == 0 && (labels.queued == 0 || limits.allows_no_attempt(&used));
         Ok(Status {
             candidates: candidates(&fates, refused),
             imported,
+            led,
             mixture_version,
             round,
             finished: !walks.is_empty() && !walks.iter().any(WalkStatus::is_under_way) && no_more_labels,

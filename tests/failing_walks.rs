@@ -1,0 +1,87 @@
+//! A campaign whose walks diverge is no success: why they ended is said, counted and told, and the exit code is 1.
+
+mod common;
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+
+use common::campaign::Small;
+use common::{calmwalk, stderr, succeed};
+use serde_json::Value;
+
+const SEEDS: &[&str] = &["fcc-100", "vacancy", "fcc-097", "fcc-103"];
+
+/// Walks that are soon hotter than they may be: every one, or none.
+fn write(here: &Path, all_fail: bool) {
+    let small = Small { steps: 40, seeds: SEEDS, walks_per_round: 4, ..Small::default() };
+    let path = small.write(here);
+    let mut text = small.text();
+    if all_fail {
+        // What a displaced atom lets go is more than such walks may have.
+        text = text.replace("temperature = 700.0", "temperature = 1.0");
+        text = text.replace("[guard]", "[guard]\nhighest_temperature = 2.0");
+        let mut frames = atoms::read_extxyz(&here.join("seeds.extxyz")).unwrap();
+        frames.iter_mut().for_each(|frame| frame.structure.positions[0][0] += 0.3);
+        common::write_frames(&here.join("seeds.extxyz"), &frames);
+    }
+    let script = here.join("tell.sh");
+    fs::write(
+        &script,
+        format!("#!/bin/sh\necho \"$CALMWALK_EVENT $CALMWALK_MESSAGE\" >> '{}/events'\n", here.display()),
+    )
+    .unwrap();
+    fs::set_permissions(&script, fs::Permissions::from_mode(0o755)).unwrap();
+    fs::write(path, format!("{text}\n[notify]\ncommand = [\"./tell.sh\"]\n")).unwrap();
+}
+
+#[test]
+fn a_campaign_whose_walks_all_diverge_has_failed() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(here, true);
+    let output = calmwalk(here, ["run", "campaign.toml"]);
+    let (summary, said) = (String::from_utf8_lossy(&output.stdout), stderr(&output));
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(summary.contains("ended: 4 blew up (too hot)"), "{summary}");
+    assert!(
+        summary.contains("4 too hot, as walk ") && summary.contains(" is above the allowed 2 K"),
+        "{summary}"
+    );
+    assert!(summary.contains("what to change: a smaller walk.time_step"), "{summary}");
+    // Of three walks or four: they may end together.
+    assert!(said.contains("WARNING: ") && said.contains(" walks that have ended did so early ("), "{said}");
+    assert!(said.contains("the campaign has failed: 4 of 4 walks"), "{said}");
+
+    let shown = succeed(here, ["status", "campaign"]);
+    assert!(
+        shown.contains("4 ended (4 blew up (too hot))") && shown.contains("too hot: try a smaller"),
+        "{shown}"
+    );
+    let all = succeed(here, ["status", "campaign", "--all"]);
+    assert!(all.contains("4 too hot, as walk ") && all.contains("what to change: "), "{all}");
+    let status: Value = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();
+    let ends = status["ends"].as_array().unwrap();
+    assert_eq!((ends.len(), &ends[0]["end"], &ends[0]["cause"]), (1, &"blew_up".into(), &"too_hot".into()));
+    assert_eq!(ends[0]["walks"], 4);
+
+    // The same command once more comes to the same end, and tells nothing twice.
+    assert_eq!(calmwalk(here, ["run", "campaign.toml"]).status.code(), Some(1));
+    let events = fs::read_to_string(here.join("events")).unwrap();
+    let told: Vec<_> = events.lines().filter(|line| line.starts_with("failing_walks ")).collect();
+    assert!(told.len() == 1 && told[0].contains("walks that have ended did so early"), "{events}");
+}
+
+#[test]
+fn walks_that_find_nothing_are_a_result() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    write(here, false);
+    let path = here.join("campaign.toml");
+    fs::write(&path, fs::read_to_string(&path).unwrap().replace("threshold = 1.0", "threshold = 1e6"))
+        .unwrap();
+    let summary = succeed(here, ["run", "campaign.toml"]);
+    assert!(summary.contains("ended: 4 steps\n") && !summary.contains("what to change"), "{summary}");
+    let events = fs::read_to_string(here.join("events")).unwrap();
+    assert!(!events.contains("failing_walks"), "{events}");
+}
