@@ -1,7 +1,7 @@
 //! A user of the host who has no token opens as many connections to the dashboard as the system lets him. The campaign does not
 //! mind, and its user is answered.
 //!
-//! `CALMWALK_FLOOD=20000 cargo test --test floods` for the long version: so many connections, 300 by default.
+//! `CALMWALK_FLOOD=5000 cargo test --test floods` for the long version: so many connections, 300 by default.
 
 mod common;
 

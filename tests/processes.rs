@@ -200,6 +200,33 @@ fn a_walker_that_the_host_has_no_room_for_is_started_when_there_is() {
     ends_as_undisturbed(running, here, &small);
 }
 
+/// Limits of open files of a process: soft and hard.
+fn descriptors(pid: u32) -> Vec<String> {
+    let limits = fs::read_to_string(format!("/proc/{pid}/limits")).unwrap();
+    let line = limits.lines().find_map(|line| line.strip_prefix("Max open files")).unwrap().to_owned();
+    line.split_whitespace().take(2).map(str::to_owned).collect()
+}
+
+#[test]
+fn a_run_may_have_more_descriptors_than_its_walkers() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    Small::default().write(here);
+    let script =
+        format!("ulimit -n 600; ulimit -Sn 300; exec {} {}", env!("CARGO_BIN_EXE_calmwalk"), RUN.join(" "));
+    let mut command = Command::new("sh");
+    command.args(["-c", &script]).current_dir(here).stdout(Stdio::null()).stderr(Stdio::null());
+    let mut running = Running(command.spawn().unwrap());
+    let held = hold_walkers(here, 2);
+    assert_eq!(descriptors(running.0.id()), ["600", "600"]);
+    for child in held.iter().chain(&carrying_out(here, "labeller")) {
+        assert_eq!(descriptors(*child), ["300", "600"]);
+    }
+    go_on(&held);
+    assert_eq!(wait(&mut running), Some(0));
+    nothing_is_left(here);
+}
+
 #[test]
 fn without_any_walker_the_campaign_fails_and_can_go_on() {
     let small = long();

@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use orchestrator::launcher::raise_descriptor_limit;
 use store::ProcessRecord;
 use wire::net::{self, Address, Tls};
 
@@ -59,6 +60,7 @@ impl Agent {
             let checked = tls.check_for_agent().map_err(Failure::input)?;
             checked.warnings.iter().for_each(|warning| warn(format_args!("WARNING: {warning}")));
         }
+        raise_descriptor_limit();
         scratch::clean();
         let scratch = Scratch::new().map_err(|error| {
             Failure::Failed(format!("cannot make a directory in {}: {error}", std::env::temp_dir().display()))

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use orchestrator::launcher::raise_descriptor_limit;
 use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
 use serde_json::json;
@@ -91,6 +92,9 @@ impl Run {
             host: self.host.unwrap_or_else(store::this_host),
         });
         listen.iter().try_for_each(actors::Listen::check)?;
+        if !self.in_process {
+            raise_descriptor_limit();
+        }
         let patience = Duration::from_secs_f64(60.0 * self.patience);
         let ended = block_on(async {
             let location = campaign.config.location(&directory)?;

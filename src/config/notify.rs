@@ -46,8 +46,15 @@ pub enum NotifyEvent {
 
 impl NotifyEvent {
     /// All of them.
-    pub const ALL: [Self; 7] =
-        [Self::End, Self::Failure, Self::Stall, Self::Budget, Self::FailedLabels, Self::Forgetting, Self::FailingWalks];
+    pub const ALL: [Self; 7] = [
+        Self::End,
+        Self::Failure,
+        Self::Stall,
+        Self::Budget,
+        Self::FailedLabels,
+        Self::Forgetting,
+        Self::FailingWalks,
+    ];
 
     /// As the configuration has it.
     pub fn name(self) -> &'static str {

@@ -10,6 +10,7 @@
 
 mod child_side;
 mod children;
+mod descriptors;
 mod lines;
 mod process;
 mod signs;
@@ -26,6 +27,7 @@ use tokio::process::{Child, Command};
 
 pub use child_side::{ParentGone, be_called, end_with_parent, own_session};
 pub use children::{Children, Event};
+pub use descriptors::raise_descriptor_limit;
 pub use process::{AdoptError, ask_to_end};
 pub use signs::Signs;
 
@@ -93,17 +95,17 @@ fn is_for_databases(name: &OsStr) -> bool {
     name.as_encoded_bytes().starts_with(b"PG")
 }
 
-/// Lets the child inherit nothing but its three standard streams. What is opened for shared memory is not marked to be
-/// closed, and a labeller, which outlives this process, would keep that memory.
+/// Gives the child the user's limit of descriptors, and nothing to inherit but its three standard streams. What is opened for
+/// shared memory is not marked to be closed, and a labeller, which outlives this process, would keep that memory.
 #[allow(unsafe_code)]
 fn keep_to_ourselves(command: &mut Command) {
     let close_the_rest = || {
         // SAFETY: a system call that takes numbers and touches no memory.
         match unsafe { libc::close_range(3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC as libc::c_int) } {
-            0 => Ok(()),
+            0 => descriptors::restore_descriptor_limit(),
             _ => Err(io::Error::last_os_error()),
         }
     };
-    // SAFETY: between fork and exec nothing is done but that system call; it allocates nothing and takes no lock.
+    // SAFETY: between fork and exec nothing is done but two system calls; they allocate nothing and take no lock.
     unsafe { command.pre_exec(close_the_rest) };
 }
