@@ -213,7 +213,7 @@ fn what_cannot_be_graded_is_named_with_its_line() {
         (
             "coincident.extxyz",
             "coincident.extxyz:4:",
-            "atoms 0 and 1 are 0.000 Å apart; expected at least 0.3 Å",
+            "atoms 0 and 1 are 0.000 Å apart; expected at least 0.4 Å",
         ),
         ("near.extxyz", "near.extxyz:4:", "atoms 0 and 1 are 0.200 Å apart"),
         ("missing.extxyz", "missing.extxyz", "cannot be opened"),

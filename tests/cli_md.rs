@@ -189,7 +189,7 @@ fn mistakes_are_named_with_their_line() {
         (
             good.replace("none = {}", "nose_hoover = { relaxation_time = 9, chain_length = 1000000000000 }"),
             "md.toml:9:",
-            "at most 100",
+            "expected 1 to 100",
         ),
         (good.replace("steps = 10", ""), "md.toml:5:1:", "missing key `steps`"),
     ] {

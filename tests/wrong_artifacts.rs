@@ -87,6 +87,19 @@ fn the_grades_of_the_training_frames_tell() {
 }
 
 #[test]
+fn many_training_atoms_outside_are_warned_of() {
+    let desk = Desk::new();
+    desk.write("half.npz", scaled("eff_interp_thresholds", 0.5));
+    desk.write("c.toml", changed(&path(ARTIFACT), "half.npz"));
+    let output = calmwalk(desk.path(), ["validate", "c.toml"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    let at = format!("WARNING: c.toml:{}: calm.training_frames: ", line("training_frames = "));
+    let words = "35 % of the atoms have γ > 1 under the mixture as it begins, where 2 to 9 % are usual";
+    let warning = stderr(&output);
+    assert!(warning.starts_with(&at) && warning.contains(words), "{warning}");
+}
+
+#[test]
 fn without_training_frames_the_seed_structures_tell() {
     let desk = Desk::new();
     // γ × 10⁻³: the export has no scatter that would show it.

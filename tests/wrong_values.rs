@@ -158,6 +158,9 @@ fn missing_keys_are_told_together() {
     for words in ["2 errors in md.toml", "did you mean `temperature`?", "missing key `trajectory`"] {
         assert!(message.contains(words), "{words}: {message}");
     }
+    desk.write("md.toml", md.replace("time_step = 2.0", "time_step = 200.0"));
+    let message = refuse(desk.path(), ["md", "md.toml"]);
+    assert!(message.contains("dynamics.time_step is 200; expected at most 20 fs"), "{message}");
 }
 
 #[test]
@@ -232,6 +235,9 @@ fn urls_of_no_known_kind_are_no_directories() {
     told(desk.refused(changed("[run]", &format!("[run]\nstore = \"{store}\""))));
     told(refuse(desk.path(), ["status", store]));
     told(refuse(desk.path(), ["label", "--store", store]));
+    desk.write("c.toml", common::demo("aluminium.toml"));
+    let message = refuse(desk.path(), ["run", "c.toml", "--directory", store]);
+    assert!(message.contains("--directory is a URL") && !message.contains("secret"), "{message}");
     assert!(!desk.path().join("postgre:").exists());
 }
 

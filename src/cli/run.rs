@@ -117,6 +117,13 @@ impl Run {
 
 /// Makes the campaign's directory, which only this user needs to read.
 fn make(directory: &Path) -> Result<(), Failure> {
+    if directory.to_string_lossy().contains("://") {
+        // A URL may have a password in it.
+        return Err(Failure::Input(
+            "--directory is a URL; expected a directory of this host: the URL of a database is run.store of the configuration"
+                .to_owned(),
+        ));
+    }
     let failed = |source| StoreError::Directory { directory: directory.into(), source };
     let made = DirBuilder::new().recursive(true).mode(0o700).create(directory);
     made.map_err(|source| match source.kind() {

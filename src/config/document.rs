@@ -124,20 +124,19 @@ impl<'a> Document<'a> {
         self.noted.iter().any(|noted| path.starts_with(noted))
     }
 
-    /// Compares the numbers of the file with the ranges of [`ranges`]; what is possible but unusual is a warning.
-    pub fn check_ranges(&mut self) -> Vec<Warning> {
+    /// Compares the numbers of the file with the ranges of [`ranges`]; what is possible but unusual is a warning. `walk` is the
+    /// table that has the keys of `[walk]`.
+    pub fn check_ranges(&mut self, walk: &str) -> Vec<Warning> {
         let mut warnings = Vec::new();
-        for Found { range, value, offset } in ranges::found(self.table.get_ref()) {
-            let path: Vec<_> = range.key.split('.').map(str::to_owned).collect();
+        for Found { range, key, value, offset } in ranges::found(self.table.get_ref(), walk) {
+            let path: Vec<_> = key.split('.').map(str::to_owned).collect();
             if self.is_noted(&path) {
                 continue;
             }
             if !range.is_possible(value) {
-                let expected = range.expected();
-                self.push(range.key, offset, (range.key.to_owned(), value.to_string(), expected));
+                self.push(offset, (key, value.to_string(), range.expected()));
             } else if !range.is_usual(value) {
-                let at = self.at(offset);
-                warnings.push(Warning { at, key: range.key.to_owned(), message: range.unusual(value) });
+                warnings.push(Warning { at: self.at(offset), key, message: range.unusual(value) });
             }
         }
         warnings
@@ -147,17 +146,15 @@ impl<'a> Document<'a> {
     pub fn check_rules(&mut self, rules: impl FnOnce() -> Vec<Wrong>) {
         if self.problems.is_empty() {
             for wrong in rules() {
-                let (key, offset) = (wrong.0.clone(), self.offset_of(&wrong.0));
-                self.push(&key, offset, wrong);
+                self.push(self.offset_of(&wrong.0), wrong);
             }
         }
     }
 
-    fn push(&mut self, key: &str, offset: usize, (name, found, expected): Wrong) {
-        self.noted.push(key.split('.').map(str::to_owned).collect());
+    fn push(&mut self, offset: usize, (key, found, expected): Wrong) {
         let at =
             if self.table.get_ref().is_empty() { self.path.display().to_string() } else { self.at(offset) };
-        self.problems.push((offset, ConfigError::Value { at, key: name, found, expected }));
+        self.problems.push((offset, ConfigError::Value { at, key, found, expected }));
     }
 
     fn at(&self, offset: usize) -> String {

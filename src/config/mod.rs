@@ -361,7 +361,7 @@ impl Config {
         let text = read_text(path)?;
         let mut document = Document::parse(path, &text)?;
         let config: Option<Self> = document.read(STAND_INS, &Self::known_keys());
-        let warnings = document.check_ranges();
+        let warnings = document.check_ranges("walk");
         document.check_rules(|| config.as_ref().map(check::check).unwrap_or_default());
         document.finish()?;
         // What could not be read was noted, and is an error.
@@ -379,7 +379,7 @@ impl Config {
         let text = read_text(path)?;
         let mut document = Document::parse(path, &text)?;
         let labels: Option<Labels> = document.read(STAND_INS, &Self::known_keys());
-        document.check_ranges();
+        document.check_ranges("walk");
         document
             .check_rules(|| labels.as_ref().map(|all| check::check_label(&all.label)).unwrap_or_default());
         document.finish()?;

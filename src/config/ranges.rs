@@ -25,6 +25,8 @@ pub struct Range {
 pub struct Found {
     /// Its range.
     pub range: &'static Range,
+    /// Its dotted key in that file.
+    pub key: String,
     /// The number.
     pub value: f64,
     /// Where it stands, bytes.
@@ -175,11 +177,15 @@ fn with_unit(number: String, unit: &str) -> String {
     if unit.is_empty() { number } else { format!("{number} {unit}") }
 }
 
-/// The numbers of a file that have ranges.
-pub fn found(table: &DeTable<'_>) -> Vec<Found> {
+/// The numbers of a file that have ranges. What the ranges call `walk` is the table `walk` of the file.
+pub fn found(table: &DeTable<'_>, walk: &str) -> Vec<Found> {
     let found = |range: &'static Range| {
-        let (value, offset) = number(table, range.key)?;
-        Some(Found { range, value, offset })
+        let key = match range.key.strip_prefix("walk.") {
+            Some(rest) => format!("{walk}.{rest}"),
+            None => range.key.to_owned(),
+        };
+        let (value, offset) = number(table, &key)?;
+        Some(Found { range, key, value, offset })
     };
     RANGES.iter().filter_map(found).collect()
 }
@@ -187,8 +193,9 @@ pub fn found(table: &DeTable<'_>) -> Vec<Found> {
 /// The numbers of a text that cannot be meant.
 pub fn impossible(text: &str) -> Vec<Wrong> {
     let (table, _) = DeTable::parse_recoverable(text);
-    let wrong = found(table.get_ref()).into_iter().filter(|found| !found.range.is_possible(found.value));
-    wrong.map(|found| (found.range.key.to_owned(), found.value.to_string(), found.range.expected())).collect()
+    let wrong =
+        found(table.get_ref(), "walk").into_iter().filter(|found| !found.range.is_possible(found.value));
+    wrong.map(|found| (found.key, found.value.to_string(), found.range.expected())).collect()
 }
 
 /// A number by its dotted key, and where it stands.
@@ -224,7 +231,7 @@ mod tests {
             "[walk]\ntau = 1_5\n[walk.thermostat]\nlangevin = { friction = 1e1 }\n[run]\nwalkers = 0x10\n";
         let (table, _) = DeTable::parse_recoverable(text);
         let found: Vec<_> =
-            found(table.get_ref()).into_iter().map(|found| (found.range.key, found.value)).collect();
+            found(table.get_ref(), "walk").into_iter().map(|found| (found.range.key, found.value)).collect();
         let expected =
             [("walk.tau", 15.0), ("walk.thermostat.langevin.friction", 10.0), ("run.walkers", 16.0)];
         assert_eq!(found, expected);

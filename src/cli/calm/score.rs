@@ -27,6 +27,7 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 /// Every frame is written with the model's energy (eV), forces (eV/Å) and, if it has a cell that repeats, stress
 /// (eV/Å³, tension positive), and with these columns: gamma (extrapolation grade γ), gamma_nbr (its neighbourhood
 /// average), sigma (Mahalanobis distance σ), component (the nearest one of the atom's element, from 0).
+/// Structures with atoms in one place (nearer than 0.4 Å) are refused, and so are mixtures that no training data can have made.
 ///
 /// All else in the frame is kept. Energy, forces, stress and virial that it came with are kept as REF_energy,
 /// REF_forces … unless it has such reference labels already: then the plain ones, another model's, are replaced.

@@ -7,8 +7,8 @@ use calm::neighbourhood::{Pair, PairError};
 use calm::{GradeError, Grades, Mixture, neighbourhood_average};
 use potentials::grace::{Grace, GraceModel, PullBack};
 
-/// No two nuclei come as near as this, Å: the shortest bond, of H₂, has 0.74.
-const LEAST_DISTANCE: f64 = 0.3;
+/// No two nuclei come as near as this, Å: the shortest bond, of H₂, has 0.74. Programs that make labels refuse the same.
+const LEAST_DISTANCE: f64 = 0.4;
 
 /// A model, a mixture that grades its features, and the work arrays of both.
 pub struct Scorer {

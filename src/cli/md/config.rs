@@ -9,10 +9,8 @@ use md::{Langevin, NoseHooverChain, Thermostat};
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::config::{ConfigError, Document, KnownKeys, PotentialFile, place, place_of_offset, read_text};
-
-/// Longer chains than this are a mistake.
-const LONGEST_CHAIN: usize = 100;
+use crate::config::{ConfigError, Document, KnownKeys, PotentialFile, place_of_offset, read_text};
+use crate::output::warn;
 
 /// Values that stand in for keys that must be there and are wrong, so that the rest can be read.
 const STAND_INS: &str = r#"
@@ -97,19 +95,13 @@ impl MdConfig {
         let mut document = Document::parse(path, &text)?;
         let known = KnownKeys::new().with::<DynamicsSection>("dynamics").with::<OutputSection>("output");
         let config = document.read(STAND_INS, &known);
+        let warnings = document.check_ranges("dynamics");
         document.finish()?;
+        warnings.iter().for_each(warn);
         let mut config: Self = config.ok_or_else(|| ConfigError::unreadable(path))?;
         let directory = path.parent().unwrap_or(Path::new(""));
         for file in [&mut config.structure, &mut config.potential.file] {
             *file.get_mut() = directory.join(file.get_ref());
-        }
-        if let ThermostatSection::NoseHoover { chain_length, .. } = config.dynamics.thermostat
-            && chain_length.get() > LONGEST_CHAIN
-        {
-            let (at, key) = (place(path, &text, "dynamics.thermostat"), "dynamics.thermostat".to_owned());
-            let (found, expected) =
-                (format!("chain_length {chain_length}"), format!("at most {LONGEST_CHAIN}"));
-            return Err(ConfigError::Value { at, key, found, expected });
         }
         let wrong = |key: &str, file: &Spanned<PathBuf>, message: String| ConfigError::File {
             at: place_of_offset(path, &text, file.span().start),
