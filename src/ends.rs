@@ -153,6 +153,19 @@ impl Ends {
         self.0.iter().map(one).collect::<Vec<_>>().join(", ")
     }
 
+    /// The same without causes: `12 collected, 3 blew up`.
+    pub fn without_causes(&self) -> String {
+        let mut numbers: Vec<(&str, u64)> = Vec::new();
+        for EndCount { end, walks, .. } in &self.0 {
+            match numbers.iter_mut().find(|(known, _)| known == end) {
+                Some((_, number)) => *number += walks,
+                None => numbers.push((end, *walks)),
+            }
+        }
+        let one = |(end, number): (&str, u64)| format!("{number} {}", end.replace('_', " "));
+        numbers.into_iter().map(one).collect::<Vec<_>>().join(", ")
+    }
+
     /// Whether walk after walk ends early.
     pub fn are_alarming(&self) -> bool {
         is_pattern(self.ended(), self.early())
@@ -242,6 +255,7 @@ mod tests {
         let ends = Ends::of(&walks);
         assert_eq!((ends.ended(), ends.early(), ends.none_in_order()), (5, 3, false));
         assert_eq!(ends.in_words(), "2 collected, 2 blew up (too hot), 1 trapped");
+        assert_eq!(ends.without_causes(), "2 collected, 2 blew up, 1 trapped");
         let (_, hot) = ends.causes().next().unwrap();
         assert_eq!((hot.walk, hot.reason.as_str()), (2, "at step 5: 9000 K is above the allowed 800 K"));
         assert!(ends.warning().starts_with("3 of 5 walks that have ended did so early (2 too hot, 1 atoms"));

@@ -82,7 +82,7 @@ fn structures_of_both_walks_are_counted_and_not_compared() {
     let status = json(here, ["status", "campaign"]);
     assert_eq!((&status["labels"]["labelled"], &status["shared_structures"]), (&6.into(), &2.into()));
     assert_eq!((&status["candidates"]["accepted"], &status["candidates"]["control"]), (&4.into(), &4.into()));
-    let shown = succeed(here, ["status", "campaign"]);
+    let shown = succeed(here, ["status", "campaign", "--all"]);
     assert!(
         shown.contains("4 control frames (2 of them structures of biased walks too: 6 labels for all)"),
         "{shown}"

@@ -138,7 +138,7 @@ fn a_campaign_in_the_working_directory_is_not_begun_anew() {
     forget_the_configuration(&here.join("campaign"));
     let message = refuse(here, ["run", "first/campaign.toml"]);
     for words in
-        ["is in ./campaign", "with --directory campaign to go on", "--directory first/campaign to begin"]
+        ["is in campaign, and", "with --directory campaign to go on", "--directory first/campaign to begin"]
     {
         assert!(message.contains(words), "{words}: {message}");
     }
@@ -147,7 +147,11 @@ fn a_campaign_in_the_working_directory_is_not_begun_anew() {
     // It has become that of this file, and is in nobody else's way.
     write(&here.join("second"));
     run(here, &["second/campaign.toml"]);
-    assert!(refuse(here, ["run", "first/campaign.toml"]).contains("is in ./campaign"));
+    assert!(refuse(here, ["run", "first/campaign.toml"]).contains("is in campaign, and"));
+    // Nor one that is beside its configuration.
+    run(here, &["second/campaign.toml", "--directory", "second"]);
+    fs::remove_dir_all(here.join("second/campaign")).unwrap();
+    assert!(refuse(here, ["run", "second/campaign.toml"]).contains("--directory ./second to go on"));
 }
 
 fn forget_the_configuration(campaign: &Path) {

@@ -77,36 +77,43 @@ fn holds_campaign(directory: &Path) -> bool {
     directory.join(DATABASE).is_file()
 }
 
-/// Refuses to begin a campaign in its default directory while it is kept where earlier versions kept it: in the working directory.
+/// Refuses to begin a campaign in its default directory while one of this configuration is in the directory of that name below the
+/// working directory, where earlier versions kept it, or beside the configuration itself.
 ///
 /// # Errors
 /// The campaign is there.
 pub async fn refuse_if_kept_elsewhere(campaign: &Campaign, directory: &Path) -> Result<(), Failure> {
-    let Some(earlier) = directory.file_name().map(PathBuf::from) else { return Ok(()) };
-    let is_server = campaign.config.run.store.is_some();
-    if is_server || holds_campaign(directory) || !holds_campaign(&earlier) {
+    if campaign.config.run.store.is_some() || holds_campaign(directory) {
         return Ok(());
     }
-    // What cannot be read is no reason not to begin elsewhere.
-    let Ok(store) = Store::open_read_only(&earlier).await else { return Ok(()) };
-    let in_force: Option<Value> = store
-        .campaign()
-        .await
-        .ok()
-        .and_then(|found| serde_json::from_str(&found.configuration_in_force).ok());
+    let places = [
+        directory.file_name().map(PathBuf::from),
+        directory.parent().map(|parent| Path::new(".").join(parent)),
+    ];
+    for place in places.into_iter().flatten().filter(|place| holds_campaign(place)) {
+        if holds_campaign_of(&place, campaign, directory).await {
+            let (config, place, directory) = (campaign.path.display(), place.display(), directory.display());
+            return Err(Failure::Input(format!(
+                "{config}: a campaign of this configuration is in {place}, and the default directory is {directory}. Run it with \
+                 --directory {place} to go on with that campaign, or with --directory {directory} to begin another"
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// Whether the campaign in a directory is one of this configuration. What cannot be read is none.
+async fn holds_campaign_of(place: &Path, campaign: &Campaign, directory: &Path) -> bool {
+    let Ok(store) = Store::open_read_only(place).await else { return false };
+    let in_force = store.campaign().await.ok().map(|found| found.configuration_in_force);
     let found = Origin::of(&store).await.ok().flatten();
     store.close().await;
-    let is_own = match found {
+    match found {
         Some(found) => found.file.path == Origin::new(&campaign.path, &campaign.text, directory).file.path,
-        None => in_force.is_some_and(|in_force| compare(&in_force, &campaign.resolved()).is_ok()),
-    };
-    if !is_own {
-        return Ok(());
+        // Of an early version: as far as its content says.
+        None => {
+            let in_force = in_force.and_then(|text| serde_json::from_str::<Value>(&text).ok());
+            in_force.is_some_and(|in_force| compare(&in_force, &campaign.resolved()).is_ok())
+        }
     }
-    let (config, earlier, directory) = (campaign.path.display(), earlier.display(), directory.display());
-    Err(Failure::Input(format!(
-        "{config}: a campaign of this configuration is in ./{earlier}, where earlier versions of calmwalk kept it; its default \
-         directory is {directory} now. Run it with --directory {earlier} to go on with that campaign, or with --directory \
-         {directory} to begin another"
-    )))
 }

@@ -166,7 +166,8 @@ impl Snapshot {
         // The names of candidates begin with as much of it.
         let id = if page.has_all() || name.is_empty() { &id[..] } else { &id[..8] };
         let separator = if name.is_empty() { "" } else { ", " };
-        page.titled(out, "campaign", &format!("{name}{separator}{id}, {mode} mode"))?;
+        let round = if standing.round == 0 { String::new() } else { format!(", round {}", standing.round) };
+        page.titled(out, "campaign", &format!("{name}{separator}{id}, {mode} mode{round}"))?;
         if let Some(origin) = origin.as_ref().filter(|_| page.has_all()) {
             page.titled(out, "", &format!("by {}", origin.file.path))?;
         }
@@ -230,11 +231,11 @@ fn walks_in_words(status: &Standing, ends: &Ends) -> String {
     let are = if status.led { "under way" } else { "not finished" };
     let ended = match ends.ended() {
         0 => "0 ended".to_owned(),
-        ended => format!("{ended} ended ({})", ends.in_words()),
+        ended => format!("{ended} ended ({})", ends.without_causes()),
     };
     let pace = status.steps_per_second.filter(|_| under_way > 0);
     let pace = pace.map_or(String::new(), |pace| format!("; {} steps/s", decimals(Some(pace), 1)));
-    format!("{under_way} {are}, {ended}; round {}{pace}", status.round)
+    format!("{under_way} {are}, {ended}{pace}")
 }
 
 fn write_candidates(
@@ -256,17 +257,12 @@ fn write_candidates(
     page.titled(out, "candidates", &format!("{seen} seen, {accepted} accepted, {all} declined ({reasons})"))?;
     let shared = match shared {
         None | Some(0) => String::new(),
-        Some(shared) => format!(
+        Some(shared) if page.has_all() => format!(
             " ({shared} of them structures of biased walks too: {} for all)",
             count(accepted + control - shared, "label")
         ),
+        Some(shared) => format!(" ({shared} also biased)"),
     };
-    page.titled(
-        out,
-        "",
-        &format!(
-            "{}{shared}; {refused_by_walkers} refused by walkers' guards",
-            count(*control, "control frame")
-        ),
-    )
+    let control = count(*control, "control frame");
+    page.titled(out, "", &format!("{control}{shared}; {refused_by_walkers} refused by guards"))
 }
