@@ -154,6 +154,16 @@ impl Labelling {
     }
 }
 
+/// What the campaign believes of labels, as the configuration in force says.
+pub async fn bounds(store: &Store) -> Result<LabelBounds, Failure> {
+    let text = store.campaign().await?.configuration_in_force;
+    let configuration: Value = serde_json::from_str(&text).map_err(unreadable)?;
+    match &configuration["label"] {
+        Value::Null => Ok(LabelBounds::default()),
+        label => LabelBounds::deserialize(label).map_err(unreadable),
+    }
+}
+
 fn unreadable(error: serde_json::Error) -> Failure {
     Failure::Failed(format!(
         "what the store says of labels cannot be read ({error}): the campaign may be one of another version of this \

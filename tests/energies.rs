@@ -25,6 +25,15 @@ awk -v E="$E" '
 mv unfinished label.extxyz
 "#;
 
+/// Two frames, of which the second has the larger energy.
+const IMPORTED: &str = r#"1
+Lattice="9 0 0 0 9 0 0 0 9" Properties=species:S:1:pos:R:3:forces:R:3 pbc="T T T" energy=-40
+Al 0 0 0 0 0 0
+1
+Lattice="8 0 0 0 8 0 0 0 8" Properties=species:S:1:pos:R:3:forces:R:3 pbc="T T T" energy=-60
+Al 0 0 0 0 0 0
+"#;
+
 /// A campaign `here` whose labels have this energy, by an awk expression; `keys` are of `[label]`.
 fn labelled_with(energy: &str, keys: &str) -> TempDir {
     let directory = tempfile::tempdir().unwrap();
@@ -93,6 +102,15 @@ fn bounds_are_those_of_the_configuration() {
         told.contains("no energy errors: ") && told.contains("at least 2 labelled structures; there are 0"),
         "{told}"
     );
+    // Nor is an import believed.
+    fs::write(here.join("known.extxyz"), IMPORTED).unwrap();
+    let message = common::refuse(here, ["import", "here", "known.extxyz"]);
+    assert!(
+        message
+            .contains("known.extxyz:4: an energy of -60 eV/atom, beyond label.largest_energy = 50 eV/atom"),
+        "{message}"
+    );
+    assert_eq!(json(here, ["status", "here"])["imported"], 0);
     let arguments = ["label", "--once", "seeds.extxyz", "--config", "campaign.toml"];
     let output = common::calmwalk(here, arguments);
     assert_eq!(output.status.code(), Some(1));

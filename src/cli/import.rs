@@ -7,15 +7,18 @@ use atoms::{FileError, Structure};
 use store::records::{Label, LabelDetails, Protocol};
 use store::{CampaignLock, Imported, Store, unix_milliseconds};
 use wire::ContentHash;
+use workers::labeller::LabelBounds;
 
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::frames::Frames;
+use crate::labelling;
 use crate::output::{count, print};
 
 /// Take in labelled structures that exist already
 ///
 /// Every frame needs energy and forces, as energy and forces or REF_energy and REF_forces; stress is taken if there is
-/// one. If one frame is not right, nothing is taken from any file. An import may be repeated: what is known is left as
+/// one. If one frame is not right, or beyond the bounds of label.largest_force, largest_stress and largest_energy, nothing is taken from any
+/// file. An import may be repeated: what is known is left as
 /// it is, and other numbers for a structure that has its label are kept as checks beside it.
 ///
 /// Not while the campaign runs: what is known decides what is a duplicate, so it changes between two runs only, and the
@@ -36,6 +39,24 @@ pub struct Import {
 struct File {
     name: String,
     frames: Vec<(u64, Structure, Label)>,
+    /// The line where each frame begins, from 1.
+    lines: Vec<usize>,
+}
+
+impl File {
+    /// Labels beyond the campaign's bounds are no more believed than those that it makes.
+    fn check(&self, bounds: &LabelBounds) -> Result<(), Failure> {
+        for ((_, _, label), line) in self.frames.iter().zip(&self.lines) {
+            if let Some(problem) = bounds.refuses(label.energy, &label.forces, label.stress.as_ref()) {
+                return Err(Failure::Input(format!(
+                    "{}:{line}: {problem}: nothing is imported; correct the label or leave the frame out, or raise the key if it is \
+                     right",
+                    self.name
+                )));
+            }
+        }
+        Ok(())
+    }
 }
 
 impl Import {
@@ -56,12 +77,14 @@ impl Import {
         let store = Store::open(&location).await?;
         // What is known decides what is a duplicate: it changes between two runs, not within one.
         let _lock = CampaignLock::acquire_at(&location, "calmwalk import").await?;
+        let bounds = labelling::bounds(&store).await?;
+        files.iter().try_for_each(|file| file.check(&bounds))?;
         let protocol = match &self.protocol {
             Some(name) => protocol_named(&store, name).await?,
             None => own_protocol(&store).await?,
         };
         let mut all = Imported::default();
-        for File { name, frames } in files {
+        for File { name, frames, .. } in files {
             let imported = store.import(protocol.hash, name, frames, unix_milliseconds()).await?;
             all.labels += imported.labels;
             all.checks += imported.checks;
@@ -74,17 +97,18 @@ impl Import {
 
 fn read(path: &Path) -> Result<File, Failure> {
     let name = path.display().to_string();
-    let mut frames = Vec::new();
+    let (mut frames, mut lines) = (Vec::new(), Vec::new());
     for (number, frame) in Frames::open(path).map_err(Failure::input)?.enumerate() {
         let frame = frame.map_err(Failure::input)?;
         let label =
             label(&frame).map_err(|error| Failure::Input(format!("{name}:{}: {error}", frame.line)))?;
         frames.push((number as u64, frame.structure, label));
+        lines.push(frame.line);
     }
     if frames.is_empty() {
         return Err(Failure::input(FileError::Empty(path.to_owned())));
     }
-    Ok(File { name, frames })
+    Ok(File { name, frames, lines })
 }
 
 fn label(frame: &Frame) -> Result<Label, String> {

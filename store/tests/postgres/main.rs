@@ -15,6 +15,8 @@ mod check;
 #[path = "../common/mod.rs"]
 mod common;
 mod connections;
+#[path = "../exclude.rs"]
+mod exclude;
 #[path = "../history.rs"]
 mod history;
 mod leading;

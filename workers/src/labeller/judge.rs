@@ -1,7 +1,8 @@
 //! Which results are believed.
 
 use analysis::EnergyOffsets;
-use atoms::Structure;
+use atoms::cell::norm;
+use atoms::{Matrix3, Structure, Vec3};
 use dft::{Calculated, Failure, FailureClass};
 use serde::{Deserialize, Serialize};
 
@@ -38,6 +39,39 @@ impl Default for LabelBounds {
     }
 }
 
+impl LabelBounds {
+    /// Which bound finite numbers of a label are beyond, in words: energy, eV; forces, [n], eV/Å; stress, eV/Å³.
+    pub fn refuses(&self, energy: f64, forces: &[Vec3], stress: Option<&Matrix3>) -> Option<String> {
+        let larger = |largest: f64, x: f64| if x.abs() > largest.abs() { x } else { largest };
+        let stress = stress.into_iter().flatten().flatten().copied().fold(0.0, larger);
+        let force = forces.iter().map(|force| norm(*force)).fold(0.0, f64::max);
+        self.refuses_energy(energy, forces.len())
+            .or_else(|| self.refuses_stress(stress))
+            .or_else(|| self.refuses_force(force))
+    }
+
+    fn refuses_energy(&self, energy: f64, atoms: usize) -> Option<String> {
+        let (energy, bound) = (energy / atoms.max(1) as f64, self.largest_energy);
+        let (found, largest) = (number(energy), number(bound));
+        (energy.abs() > bound)
+            .then(|| format!("an energy of {found} eV/atom, beyond label.largest_energy = {largest} eV/atom"))
+    }
+
+    fn refuses_stress(&self, stress: f64) -> Option<String> {
+        let bound = self.largest_stress;
+        let (gpa, found, largest) = (number(stress * GPA), number(stress), number(bound));
+        (stress.abs() > bound).then(|| {
+            format!("a stress component of {found} eV/Å³ ({gpa} GPa), beyond label.largest_stress = {largest} eV/Å³")
+        })
+    }
+
+    fn refuses_force(&self, force: f64) -> Option<String> {
+        let (found, largest) = (number(force), number(self.largest_force));
+        (force > self.largest_force)
+            .then(|| format!("a force of {found} eV/Å, beyond label.largest_force = {largest} eV/Å"))
+    }
+}
+
 /// What the energy of a label is compared with.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Expected<'a> {
@@ -60,7 +94,8 @@ pub(super) fn judge(
 ) -> Result<Calculated, Failure> {
     let problem = wrong_number(&made, structure.len())
         .or_else(|| not_finite(&made))
-        .or_else(|| beyond(&made, bounds))
+        .or_else(|| bounds.refuses(made.energy, &made.forces, made.stress.as_ref()))
+        .or_else(|| bounds.refuses_energy(made.energy_without_smearing?, structure.len()))
         .or_else(|| too_far(&made, structure, bounds, expected?));
     match problem {
         Some(problem) => Err(FailureClass::Implausible.because(problem)),
@@ -86,32 +121,6 @@ fn not_finite(made: &Calculated) -> Option<String> {
         .or_else(|| find("a force", &mut made.forces.iter().flatten().copied()))
         .or_else(|| find("a stress component", &mut made.stress.iter().flatten().flatten().copied()))
         .or_else(|| find("a magnetic moment", &mut moments.copied()))
-}
-
-/// Of numbers that are all finite.
-fn beyond(made: &Calculated, bounds: &LabelBounds) -> Option<String> {
-    let LabelBounds { largest_force, largest_stress, largest_energy, .. } = *bounds;
-    let atoms = made.forces.len().max(1) as f64;
-    let energies = [Some(made.energy), made.energy_without_smearing];
-    let energy =
-        energies.into_iter().flatten().map(|energy| energy / atoms).find(|e| e.abs() > largest_energy);
-    if let Some(energy) = energy {
-        let (energy, bound) = (number(energy), number(largest_energy));
-        return Some(format!("an energy of {energy} eV/atom, beyond label.largest_energy = {bound} eV/atom"));
-    }
-    let components = made.stress.iter().flatten().flatten();
-    let stress =
-        components.copied().fold(0.0, |largest: f64, x| if x.abs() > largest.abs() { x } else { largest });
-    if stress.abs() > largest_stress {
-        let (gpa, stress, bound) = (number(stress * GPA), number(stress), number(largest_stress));
-        return Some(format!(
-            "a stress component of {stress} eV/Å³ ({gpa} GPa), beyond label.largest_stress = {bound} eV/Å³"
-        ));
-    }
-    let force = made.forces.iter().map(|f| atoms::cell::norm(*f)).fold(0.0, f64::max);
-    let (found, bound) = (number(force), number(largest_force));
-    (force > largest_force)
-        .then(|| format!("a force of {found} eV/Å, beyond label.largest_force = {bound} eV/Å"))
 }
 
 fn too_far(
