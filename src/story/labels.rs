@@ -1,6 +1,7 @@
 //! The label jobs of a structure, what became of each attempt, and how far the potential is from the labels.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 
 use atoms::Vec3;
 use atoms::cell::{norm, sub};
@@ -112,11 +113,12 @@ pub(super) async fn labels(
             continue;
         };
         let protocol = label.protocol.hash;
-        if !zeros.contains_key(&protocol.0) {
-            zeros.insert(protocol.0, Zeros::read(store, protocol).await?);
-        }
-        let model =
-            ForceError::of(view, label.record.label.energy, &label.record.label.forces, &zeros[&protocol.0]);
+        let zeros = match zeros.entry(protocol.0) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(new) => new.insert(Zeros::read(store, protocol).await?),
+        };
+        let made = &label.record.label;
+        let model = ForceError::of(view, made.energy, &made.forces, zeros);
         labels.push(StoryLabel::of(label, Some(model)));
     }
     Ok(labels)

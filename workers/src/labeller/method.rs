@@ -10,6 +10,7 @@ use store::{Store, StoreError};
 use tokio::task::spawn_blocking;
 
 use super::code::{CodeMethod, Ended, classes};
+use super::judge::{Expected, LabelBounds, judge};
 use super::{Closing, KeeperCommand, ReferenceMethod, Running};
 
 /// A way to make labels.
@@ -20,11 +21,19 @@ pub enum Method {
     Code(Box<CodeMethod>),
 }
 
-/// A result that is not judged yet.
+/// A result.
 pub(super) struct Made {
     pub result: Result<Calculated, Failure>,
     /// The calculation behind it, if it was a process of its own.
     pub ended: Option<Ended>,
+}
+
+impl Made {
+    /// The same, if it can be believed; otherwise why not.
+    pub fn judged(self, lease: &Lease, bounds: &LabelBounds, expected: Option<Expected<'_>>) -> Self {
+        let result = self.result.and_then(|made| judge(made, &lease.structure, bounds, expected));
+        Self { result, ..self }
+    }
 }
 
 impl Method {

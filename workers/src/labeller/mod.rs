@@ -38,7 +38,6 @@ use tracing::{debug, info, warn};
 use closing::Wanted;
 use code::Ended;
 use energies::Offsets;
-use judge::judge;
 use method::Made;
 use told::Became;
 
@@ -208,8 +207,10 @@ async fn work(
                 return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
             }
         };
+        let expected = offsets.expected(store, &settings.protocol, &lease, &made.result, closing).await?;
+        let made = made.judged(&lease, &settings.bounds, expected);
         let Brought { judged, became, ended } =
-            bring(store, method, &lease, settings, &mut offsets, made, closing, &now).await?;
+            bring(store, method, &lease, settings, made, closing, &now).await?;
         let line = told::line(&lease, &judged, &became, begun.elapsed().as_secs_f64());
         match &judged {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
@@ -231,20 +232,17 @@ struct Brought {
     ended: Option<Ended>,
 }
 
-/// Judges what was made for a job, and brings it to the store with what it has cost.
+/// Brings what was made for a job and judged to the store, with what it has cost.
 async fn bring(
     store: &Store,
     method: &Method,
     lease: &Lease,
     settings: &LabellerSettings,
-    offsets: &mut Offsets,
     made: Made,
     closing: &Closing,
     now: impl Fn() -> i64,
 ) -> Result<Brought, StoreError> {
-    let Made { result, ended } = made;
-    let expected = offsets.expected(store, &settings.protocol, lease, &result, closing).await?;
-    let judged = result.and_then(|made| judge(made, &lease.structure, &settings.bounds, expected));
+    let Made { result: judged, ended } = made;
     let log = ended.as_ref().map_or("", |ended| &ended.log);
     if let Some(ended) = &ended {
         insist(closing, || store.account(lease, ended.core_seconds, log)).await?;
