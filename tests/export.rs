@@ -4,14 +4,17 @@ mod common;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
 
 use atoms::extxyz::Frame;
 use atoms::read_extxyz;
 use common::campaign::Small;
-use common::{deviation, refuse, stderr, succeed};
+use common::{calmwalk, deviation, refuse, stderr, succeed};
 use serde_json::Value;
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{AssertSqlSafe, ConnectOptions, Connection};
 use tempfile::TempDir;
 
 fn campaign() -> TempDir {
@@ -189,4 +192,108 @@ fn training_codes_find_their_names() {
             );
         }
     }
+}
+
+/// Changes the database of the campaign behind the program's back.
+fn change(here: &Path, statements: &[&str]) {
+    let file = SqliteConnectOptions::new().filename(here.join("here/campaign.sqlite")).foreign_keys(false);
+    tokio::runtime::Runtime::new().unwrap().block_on(async {
+        let mut connection = file.connect().await.unwrap();
+        for sql in statements {
+            sqlx::raw_sql(AssertSqlSafe((*sql).to_owned())).execute(&mut connection).await.unwrap();
+        }
+        connection.close().await.unwrap();
+    });
+}
+
+/// What it says on the standard error; nothing is written.
+fn fails(here: &Path) -> String {
+    let output = calmwalk(here, ["export", "here", "--output", "out.extxyz"]);
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    let files: Vec<_> = fs::read_dir(here).unwrap().flatten().map(|file| file.file_name()).collect();
+    assert!(!files.iter().any(|name| name.to_string_lossy().contains("out.extxyz")), "{files:?}");
+    stderr(&output)
+}
+
+/// The sign and a bit of the exponent of a force are flipped, a label is missing in its index, or a candidate in its table.
+#[test]
+fn a_damaged_database_is_refused_with_what_is_damaged() {
+    let directory = campaign();
+    let here = directory.path();
+    let database = here.join("here/campaign.sqlite");
+    let whole = fs::read(&database).unwrap();
+    change(
+        here,
+        &[
+            "UPDATE label SET forces = CAST(substr(forces, 1, 7) || x'7f' || substr(forces, 9) AS BLOB) WHERE number = 2",
+        ],
+    );
+    let message = fails(here);
+    assert!(message.contains("damaged database: label 2: its content has the checksum "), "{message}");
+    assert!(message.contains("restore the campaign from a backup"), "{message}");
+    let check = calmwalk(here, ["store", "check", "here"]);
+    let found = String::from_utf8_lossy(&check.stdout).into_owned();
+    assert!(check.status.code() == Some(1) && found.contains("label 2: "), "{found}");
+
+    fs::write(&database, &whole).unwrap();
+    change(
+        here,
+        &[
+            "PRAGMA writable_schema = ON; CREATE TABLE kept AS SELECT * FROM sqlite_schema WHERE name = 'label_of'",
+            "UPDATE label SET standing = 'superseded' WHERE number = 2",
+            "DELETE FROM sqlite_schema WHERE name = 'label_of'; PRAGMA writable_schema = RESET",
+            "UPDATE label SET standing = 'label' WHERE number = 2",
+            "PRAGMA writable_schema = ON; INSERT INTO sqlite_schema SELECT * FROM kept; DROP TABLE kept;
+             PRAGMA writable_schema = RESET",
+        ],
+    );
+    let message = fails(here);
+    assert!(message.contains("label_of") && message.contains("would be missing in an export"), "{message}");
+
+    fs::write(&database, &whole).unwrap();
+    change(here, &["DELETE FROM candidate WHERE decision = (SELECT max(decision) FROM candidate)"]);
+    let message = fails(here);
+    assert!(message.contains("decisions about candidates that are not there"), "{message}");
+
+    fs::write(&database, &whole).unwrap();
+    export(here, &[]);
+}
+
+/// Nobody else may read the campaign, its log or a backup of it, and a lock that is deleted still holds.
+#[test]
+fn files_of_a_campaign_are_private() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    let path = Small { steps: 60, ..Small::default() }.write(here);
+    let path = path.to_str().unwrap();
+    succeed(here, ["run", path, "--directory", "here", "--log", "run.log"]);
+    succeed(here, ["store", "backup", "here", "copy"]);
+    // While it is open there are files beside it.
+    let open = SqliteConnectOptions::new().filename(here.join("here/campaign.sqlite"));
+    tokio::runtime::Runtime::new().unwrap().block_on(async {
+        let mut connection = open.connect().await.unwrap();
+        sqlx::query("SELECT count(*) FROM label").fetch_one(&mut connection).await.unwrap();
+        let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+        assert_eq!(mode(&here.join("run.log")), 0o600);
+        for campaign in ["here", "copy"] {
+            assert_eq!(mode(&here.join(campaign)), 0o700, "{campaign}");
+            for file in fs::read_dir(here.join(campaign)).unwrap().flatten() {
+                assert_eq!(mode(&file.path()), 0o600, "{}", file.path().display());
+            }
+        }
+        connection.close().await.unwrap();
+    });
+}
+
+#[test]
+fn a_second_run_is_refused_although_the_lock_is_deleted() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    fs::create_dir(here.join("here")).unwrap();
+    let path = Small::default().write(here);
+    let lock = store::CampaignLock::acquire(&here.join("here"), "run").unwrap();
+    fs::remove_file(here.join("here/campaign.lock")).unwrap();
+    let message = refuse(here, ["run", path.to_str().unwrap(), "--directory", "here", "--in-process"]);
+    assert!(message.contains("only one process may run a campaign"), "{message}");
+    drop(lock);
 }

@@ -470,3 +470,31 @@ async fn directories_of_calculations_are_kept_with_their_attempts() {
     assert_eq!(copy.archives(lease.job).await.unwrap(), [archive]);
     assert_eq!(copy.budget(9).await.unwrap(), store.budget(9).await.unwrap());
 }
+
+/// The answer to the commit of a lease was lost: its holder lives, and knows nothing of it.
+#[tokio::test]
+async fn what_a_holder_does_not_state_comes_back() {
+    let home = Home::new();
+    let store = home.create().await;
+    accept(&store, 4).await;
+    let lease = async |holder: &str| {
+        store.lease(protocol("dft").hash, holder, 0, 600).await.unwrap().expect("a job that waits")
+    };
+    let (known, unknown, part, other) =
+        (lease("a").await, lease("a").await, lease("a/0").await, lease("b").await);
+    assert_eq!(store.state_leases("a", &[&known], 1).await.unwrap(), 1);
+    assert_eq!(store.state_leases("a", &[&known], 1).await.unwrap(), 0);
+    for held in [&known, &part, &other] {
+        assert!(store.renew(held, 2, 600).await.unwrap(), "{}", held.holder);
+    }
+    assert!(!store.renew(&unknown, 2, 600).await.unwrap());
+    // It waits again, and nobody has failed.
+    let again = lease("a").await;
+    assert_eq!((again.job, again.attempt, again.failures.len()), (unknown.job, 2, 0));
+    let details = store.queue_show(&again.candidate).await.unwrap();
+    assert_eq!(details.attempts_made[0].outcome.as_deref(), Some("lost"));
+    // One of an earlier attempt is another lease.
+    assert_eq!(store.state_leases("a", &[&known, &unknown], 3).await.unwrap(), 1);
+    assert_eq!(store.state_leases("a", &[], 3).await.unwrap(), 1);
+    assert_eq!((store.state_leases("a/0", &[&part], 3).await.unwrap(), details.job.failures), (0, 0));
+}

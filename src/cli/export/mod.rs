@@ -29,7 +29,8 @@ const BAR: &str = "{spinner} {pos} structures";
 /// mixture_version (after the decision), mixture_version_seen (by the walker), protocol, protocol_hash and
 /// relative_volume (V/V₀), and the columns gamma and gamma_nbr under the ORIGINAL mixture. Imported structures have
 /// source_file and source_frame (from 0) instead. Where the calculation gives them there are energy_without_smearing (eV),
-/// the cell's magnetic moment magmom and the column magmoms (μ_B). See docs/export.md.
+/// the cell's magnetic moment magmom and the column magmoms (μ_B). A damaged database is not exported: everything that is
+/// read has a checksum, and what is missing is found by a second look. See docs/export.md.
 #[derive(Debug, clap::Args)]
 pub struct Export {
     #[command(flatten)]

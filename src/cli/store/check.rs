@@ -13,8 +13,8 @@ const BAR: &str = "checking {bar:32} {pos}/{len} rows  {eta} left";
 ///
 /// The database's own check first, then everything that calmwalk promises of it: a decision log without gaps, the decision
 /// and the job of each accepted candidate, labels that belong to their jobs, contents that have their hashes, components that
-/// can be read, directories of calculations that can be unpacked, no lease of a process that is gone. Only reads, and a
-/// campaign may run meanwhile. Each finding is a line that says what it means and what to do; with any of them the exit code
+/// can be read, directories of calculations that can be unpacked, no lease of a process that is gone; and the checksum of
+/// every row with numbers. Only reads, and a campaign may run meanwhile. Each finding is a line that says what it means and what to do; with any of them the exit code
 /// is 1.
 #[derive(Debug, clap::Args)]
 pub struct Check {

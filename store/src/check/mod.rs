@@ -54,7 +54,7 @@ async fn ours(
     findings: &mut Vec<Finding>,
     tell: &mut dyn FnMut(u64, u64),
 ) -> Result<()> {
-    for rule in &rules::RULES {
+    for rule in rules::all_rules() {
         findings.extend(rule.find(transaction).await?);
     }
     findings.extend(rules::labelled_jobs(transaction).await?);

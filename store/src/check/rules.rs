@@ -28,7 +28,8 @@ const LOST: &str = "something was lost or changed by hand; restore the campaign 
 const QUEUE: &str =
     "the label queue was changed by hand; calmwalk queue shows the jobs, and a backup has them whole";
 
-pub(super) const RULES: [Rule; 17] = [
+/// What lets structures or labels be missing in an export, which does not see them itself.
+const LOSSES: [Rule; 7] = [
     Rule {
         finds: "SELECT count(*), CAST(min(sequence) AS TEXT) FROM decision WHERE sequence > 1
                 AND NOT EXISTS (SELECT 1 FROM decision AS before WHERE before.sequence = decision.sequence - 1)",
@@ -46,6 +47,37 @@ pub(super) const RULES: [Rule; 17] = [
         what: "decisions about candidates that are not there",
         then: LOST,
     },
+    Rule {
+        finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM import
+                WHERE NOT EXISTS (SELECT 1 FROM label WHERE label.structure = import.structure)",
+        what: "imported structures without any label",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM label WHERE file IS NOT NULL
+                AND NOT EXISTS (SELECT 1 FROM import WHERE import.structure = label.structure)",
+        what: "labels that came with structures which are not there",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(label.number) AS TEXT) FROM label
+                LEFT JOIN job ON job.number = label.job
+                LEFT JOIN attempt ON attempt.job = label.job AND attempt.attempt = label.attempt
+                WHERE label.job IS NOT NULL AND (job.number IS NULL OR attempt.attempt IS NULL
+                OR job.structure <> label.structure OR job.protocol <> label.protocol)",
+        what: "labels that do not belong to their job",
+        then: LOST,
+    },
+    Rule {
+        finds: "SELECT count(*), CAST(min(structure) AS TEXT) FROM label WHERE standing = 'superseded' AND NOT EXISTS (
+                SELECT 1 FROM label AS other WHERE other.structure = label.structure AND other.standing IN ('label', 'excluded'))",
+        what: "labels that were superseded by none, of the structure",
+        then: LOST,
+    },
+];
+
+/// Everything else.
+const RULES: [Rule; 10] = [
     Rule {
         finds: "SELECT count(*), min(id) FROM candidate JOIN decision ON sequence = decision
                 WHERE candidate.id IS DISTINCT FROM decision.candidate OR kind <>
@@ -91,34 +123,6 @@ pub(super) const RULES: [Rule; 17] = [
         then: LOST,
     },
     Rule {
-        finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM import
-                WHERE NOT EXISTS (SELECT 1 FROM label WHERE label.structure = import.structure)",
-        what: "imported structures without any label",
-        then: LOST,
-    },
-    Rule {
-        finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM label WHERE file IS NOT NULL
-                AND NOT EXISTS (SELECT 1 FROM import WHERE import.structure = label.structure)",
-        what: "labels that came with structures which are not there",
-        then: LOST,
-    },
-    Rule {
-        finds: "SELECT count(*), CAST(min(label.number) AS TEXT) FROM label
-                LEFT JOIN job ON job.number = label.job
-                LEFT JOIN attempt ON attempt.job = label.job AND attempt.attempt = label.attempt
-                WHERE label.job IS NOT NULL AND (job.number IS NULL OR attempt.attempt IS NULL
-                OR job.structure <> label.structure OR job.protocol <> label.protocol)",
-        what: "labels that do not belong to their job",
-        then: LOST,
-    },
-    Rule {
-        finds: "SELECT count(*), CAST(min(structure) AS TEXT) FROM label WHERE standing = 'superseded' AND NOT EXISTS (
-                SELECT 1 FROM label AS other WHERE other.structure = label.structure
-                AND other.standing IN ('label', 'excluded'))",
-        what: "labels that were superseded by none, of the structure",
-        then: LOST,
-    },
-    Rule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job WHERE state = 'superseded' AND NOT EXISTS (
                 SELECT 1 FROM job AS other WHERE other.structure = job.structure AND other.state <> 'superseded')",
         what: "jobs that were superseded by none",
@@ -139,14 +143,14 @@ pub(super) const RULES: [Rule; 17] = [
     },
 ];
 
-/// What says nothing about structures and labels.
-const OF_WALKS: [&str; 2] =
-    ["walks that count other accepted structures than there are", "candidates of walks that are not there"];
+pub(super) fn all_rules() -> impl Iterator<Item = &'static Rule> {
+    LOSSES.iter().chain(&RULES)
+}
 
-/// What is missing or another than it was, whatever the queue and walks say.
+/// What is missing, whatever the rest of the campaign says.
 pub(super) async fn losses(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let mut findings = Vec::new();
-    for rule in RULES.iter().filter(|rule| rule.then == LOST && !OF_WALKS.contains(&rule.what)) {
+    for rule in &LOSSES {
         findings.extend(rule.find(transaction).await?);
     }
     findings.extend(labelled_jobs(transaction).await?);

@@ -15,6 +15,7 @@ mod check;
 #[path = "../common/mod.rs"]
 mod common;
 mod connections;
+mod earlier;
 #[path = "../exclude.rs"]
 mod exclude;
 #[path = "../history.rs"]
