@@ -18,6 +18,9 @@ use super::warning::Warning;
 /// More errors than this are not what a person made.
 const MOST_ERRORS: usize = 100;
 
+/// Errors of syntax that are told: a quote or a bracket too few makes one of every line behind it.
+const MOST_SYNTAX_ERRORS: usize = 3;
+
 /// A parsed file, and what was found wrong with it.
 pub struct Document<'a> {
     path: &'a Path,
@@ -42,8 +45,9 @@ impl<'a> Document<'a> {
             .map(|error| (offset(error), ConfigError::parse(path, text, error.span(), plain(error), "")))
             .collect();
         problems.sort_by_key(|(offset, _)| *offset);
-        // What follows on the same line follows from the first.
+        // What follows on the same line follows from the first, and so does most of what comes behind.
         problems.dedup_by_key(|(offset, _)| line_and_column(text, *offset).0);
+        problems.truncate(MOST_SYNTAX_ERRORS);
         match ConfigError::all(path, problems) {
             Some(error) => Err(error),
             None => Ok(Self { path, text, table, problems: Vec::new(), noted: Vec::new() }),

@@ -67,8 +67,18 @@ pub enum ConfigError {
     },
 }
 
+/// Errors of a file that are told.
+const MOST_ERRORS: usize = 12;
+
+/// Characters of a line that are shown.
+const MOST_OF_A_LINE: usize = 120;
+
 fn lines(errors: &[ConfigError]) -> String {
-    errors.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n")
+    let mut lines: Vec<_> = errors.iter().take(MOST_ERRORS).map(ToString::to_string).collect();
+    if errors.len() > MOST_ERRORS {
+        lines.push(format!("… and {} more", errors.len() - MOST_ERRORS));
+    }
+    lines.join("\n")
 }
 
 /// The directory that `init` makes is taken for its configuration easily.
@@ -102,7 +112,8 @@ impl ConfigError {
     ) -> Self {
         let (line, column) = span.map_or((1, 1), |span| line_and_column(text, span.start));
         let at = format!("{}:{line}:{column}", path.display());
-        let shown = text.lines().nth(line - 1).unwrap_or_default().trim();
+        let shown: String =
+            text.lines().nth(line - 1).unwrap_or_default().trim().chars().take(MOST_OF_A_LINE).collect();
         let mut message = if key.is_empty() { message } else { format!("{key}: {message}") };
         // What the whole file lacks has no line of its own.
         let of_whole = (line, column) == (1, 1) && message.starts_with("missing");
