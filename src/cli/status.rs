@@ -188,7 +188,7 @@ impl Snapshot {
         if let Some(budget) = budget::shown(&standing.budget) {
             page.titled(out, "budget", &budget)?;
         }
-        page.titled(out, "disk", &disk.in_words(standing))?;
+        page.titled(out, "disk", &disk.in_words(page, standing))?;
         match end.shown() {
             Some(end) => page.titled(out, "end", &end),
             None => Ok(()),
@@ -213,15 +213,18 @@ impl Disk {
         Some(self.bytes + forecast.still_to_come(accepted + control, self.bytes))
     }
 
-    fn in_words(&self, status: &Standing) -> String {
+    fn in_words(&self, page: &Page, status: &Standing) -> String {
         let now = megabytes(self.bytes);
-        match self.forecast.zip(self.at_the_end(status)) {
-            Some((forecast, end)) => format!(
-                "{now} now; about {} when all is collected, besides up to {} of features of declined candidates",
-                megabytes(end),
-                megabytes(forecast.declined)
-            ),
-            None => format!("{now} now"),
+        let Some((forecast, end)) = self.forecast.zip(self.at_the_end(status)) else {
+            return format!("{now} now");
+        };
+        let end = format!("{now} now; about {} when all is collected", megabytes(end));
+        match page.has_all() {
+            true => {
+                let declined = megabytes(forecast.declined);
+                format!("{end}, besides up to {declined} of features of declined candidates")
+            }
+            false => end,
         }
     }
 }
