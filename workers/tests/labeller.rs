@@ -105,8 +105,7 @@ async fn labelled_with(energies: &[f64]) -> Vec<Result<f64, (String, String)>> {
     let candidates = accept(&store, energies.len() as u64).await;
     let closing = Closing::default();
     closing.set_no_more_jobs(true);
-    let method =
-        Method::reference(Box::new(Energies(energies.iter().copied().collect::<Vec<_>>().into_iter())));
+    let method = Method::reference(Box::new(Energies(Vec::from(energies).into_iter())));
     let settings = LabellerSettings { attempts: 1, ..settings("a/0") };
     run(store.clone(), method, settings, &closing, unix_milliseconds, |_| ()).await.unwrap();
     let mut outcomes = Vec::new();
