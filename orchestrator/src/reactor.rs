@@ -139,7 +139,12 @@ impl Reactor {
                     }
                     arrivals.in_force(shell.selector.mixture());
                 }
-                _ = look.tick(), if !shell.waiting.is_empty() => {}
+                _ = look.tick(), if !shell.waiting.is_empty() || shell.at_work.is_empty() => {
+                    // A stop before the first walker asks is followed by no message: agents wait for the end of the reactor.
+                    if shell.waiting.is_empty() && !shell.stopping.load(Ordering::Relaxed) {
+                        continue;
+                    }
+                }
             }
             if !writing.is_empty() {
                 continue;

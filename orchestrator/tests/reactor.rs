@@ -34,6 +34,20 @@ fn scripts() -> Vec<Script> {
     (0..3).map(|walk| (1..=60).map(|step| event(walk, step)).collect()).collect()
 }
 
+#[tokio::test]
+async fn a_stop_before_anybody_asks_is_the_end() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = open(directory.path()).await;
+    let stopping = Arc::new(AtomicBool::new(false));
+    // Those who carry messages of other hosts hold the way to it until it has ended.
+    let (reactor, _to_reactor) = reactor(&store, &stopping).await;
+    let running = tokio::spawn(reactor.run(|_| {}));
+    tokio::time::sleep(Duration::from_millis(50)).await;
+    stopping.store(true, Ordering::Relaxed);
+    let ended = tokio::time::timeout(Duration::from_secs(60), running).await.expect("it ends");
+    assert_eq!(ended.unwrap().unwrap(), Ended::Stopped);
+}
+
 fn rounds() -> Settings {
     Settings { per_seed: 9, control: true, ..settings(Mode::Reproducible) }
 }

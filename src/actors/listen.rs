@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::io::{ErrorKind, Write};
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 use wire::net::{Announcement, CertificateFault, Endpoint, Tls};
@@ -42,10 +43,10 @@ impl Listen {
             let fault = CertificateFault::OtherNames { names, host: host.to_owned() };
             return Err(Failure::input(fault.at(&tls.certificate)));
         }
-        // By which name agents connect is not known here.
-        warn(format_args!(
-            "WARNING: agents have to connect to {names}: the certificate has no other name, as {host}"
-        ));
+        // By which name agents connect is not known here, but hardly by that of another host.
+        if host.parse::<IpAddr>().is_err() {
+            warn(format_args!("WARNING: agents cannot connect to {host}: the certificate is for {names}"));
+        }
         Ok(())
     }
 
