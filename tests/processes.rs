@@ -169,37 +169,6 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
     ends_as_undisturbed(running, here, &small);
 }
 
-/// Sets how many descriptors a process may have; returns how many it might have before.
-fn allow_descriptors(pid: u32, number: Option<u64>) -> Option<u64> {
-    use rustix::process::{Pid, Resource, Rlimit, prlimit};
-    let pid = Pid::from_raw(pid.try_into().unwrap());
-    let limits = rustix::process::getrlimit(Resource::Nofile);
-    prlimit(pid, Resource::Nofile, Rlimit { current: number, maximum: limits.maximum }).unwrap().current
-}
-
-#[test]
-fn a_walker_that_the_host_has_no_room_for_is_started_when_there_is() {
-    let small = long();
-    let directory = tempfile::tempdir().unwrap();
-    let here = directory.path();
-    with_keys(&small.write(here), "restarts = 1");
-    let running = start(here);
-    wait_for_work(here);
-    let held = hold_walkers(here, 2);
-    let orchestrator = running.0.id();
-    // No file that it opens from now on gets a number.
-    let before = allow_descriptors(orchestrator, Some(3));
-    signal(held[0], "KILL");
-    // More often than a walker may fail.
-    wait_until("the start has failed three times", || {
-        endings(here).iter().filter(|ending| ending.contains("could not be started")).count() >= 3
-    });
-    allow_descriptors(orchestrator, before);
-    wait_until("it is started", || carrying_out(here, "walker").len() == 2);
-    go_on(&held);
-    ends_as_undisturbed(running, here, &small);
-}
-
 /// Limits of open files of a process: soft and hard.
 fn descriptors(pid: u32) -> Vec<String> {
     let limits = fs::read_to_string(format!("/proc/{pid}/limits")).unwrap();

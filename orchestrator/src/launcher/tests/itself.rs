@@ -3,7 +3,7 @@
 use std::io::{Read, Write};
 use std::process::Command;
 
-use rustix::process::{getpgid, getpid};
+use rustix::process::{Resource, Rlimit, getpgid, getpid, getrlimit, setrlimit};
 
 use super::*;
 
@@ -28,6 +28,36 @@ fn reads_its_setup() {
     let mut setup = String::new();
     std::io::stdin().read_to_string(&mut setup).unwrap();
     writeln!(std::io::stderr(), "read: {setup}").unwrap();
+}
+
+#[tokio::test]
+async fn a_child_that_the_host_has_no_room_for_is_started_when_there_is() {
+    let mut children =
+        Children::new(1, NO_RESTART, |_, _| Launch::this_program(only("lacks_descriptors"), Vec::new()));
+    let events = rest(&mut children).await;
+    assert_eq!(lines(&events), ["started in the end"], "{events:?}");
+}
+
+/// In a process of its own, since other tests need descriptors. Its child may not fail even once.
+#[tokio::test]
+#[ignore = "runs in a process that another test starts"]
+async fn lacks_descriptors() {
+    let limit = |current| Rlimit { current, maximum: getrlimit(Resource::Nofile).maximum };
+    let before = getrlimit(Resource::Nofile).current;
+    let mut children = children(&["exit 0"], NO_RESTART);
+    // No file that is opened from now on gets a number.
+    setrlimit(Resource::Nofile, limit(Some(3))).unwrap();
+    for _ in 0..10 {
+        let Event::Ended { ended, .. } = next(&mut children).await else { panic!("it cannot be started") };
+        assert!(matches!(ended.ending, Ending::NotStarted { is_shortage: true, .. }), "{ended:?}");
+        assert!(matches!(ended.then, Standing::Pausing { .. }), "{ended:?}");
+    }
+    setrlimit(Resource::Nofile, limit(before)).unwrap();
+    let events = rest(&mut children).await;
+    // One more start may have failed before the limit was raised.
+    let (_, last) = *ends(&events).last().unwrap();
+    assert_eq!((&last.ending, last.then), (&exit(0, None), Standing::GoneHome));
+    writeln!(std::io::stderr(), "started in the end").unwrap();
 }
 
 /// 0 where the session's leader is in another process namespace, as in a container: `getsid` of rustix does not expect that.
