@@ -95,26 +95,20 @@ mod tests {
             "instructions": "avx2", "seeds": ["a 12ab"], "files": { "potential.model": "ff00" },
             "potential": { "model": null }, "later": { "key": [1, 2] }, "collect": {},
         });
-        let expected: [(&str, &[(&str, Option<&str>)]); 4] = [
-            ("campaign", &[("instructions", Some("avx2"))]),
-            ("potential", &[("potential.model", Some("ff00"))]),
-            (
-                "walk",
-                &[
-                    ("walk.temperature", Some("300.0")),
-                    ("walk.thermostat.kind", Some("langevin")),
-                    ("walk.volume_ramp", None),
-                ],
-            ),
-            ("later", &[("later.key", Some("[1,2]"))]),
-        ];
-        let expected: Vec<_> = expected
-            .iter()
-            .map(|(section, pairs)| {
-                let pairs = pairs.iter().map(|(key, value)| ((*key).to_owned(), value.map(str::to_owned)));
-                ((*section).to_owned(), pairs.collect::<Vec<_>>())
+        let found: Vec<_> = sections(&configuration)
+            .into_iter()
+            .flat_map(|(section, pairs)| {
+                pairs.into_iter().map(move |(key, value)| format!("[{section}] {key} {value:?}"))
             })
             .collect();
-        assert_eq!(sections(&configuration), expected);
+        let expected = [
+            "[campaign] instructions Some(\"avx2\")",
+            "[potential] potential.model Some(\"ff00\")",
+            "[walk] walk.temperature Some(\"300.0\")",
+            "[walk] walk.thermostat.kind Some(\"langevin\")",
+            "[walk] walk.volume_ramp None",
+            "[later] later.key Some(\"[1,2]\")",
+        ];
+        assert_eq!(found, expected);
     }
 }
