@@ -120,7 +120,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     assert!(!place.said().contains("pausing"), "{}", place.said());
     assert_eq!(calculating(&scratch), []);
     let left: Vec<_> = fs::read_dir(&scratch).unwrap().map(|entry| entry.unwrap().path()).collect();
-    assert_eq!(left, [trap.clone()]);
+    assert_eq!(left.as_slice(), std::slice::from_ref(&trap));
     assert_eq!(fs::read_dir(&trap).unwrap().count(), 0);
     let modes = fs::read_to_string(home.join("modes")).unwrap();
     let own = format!("700 {}", fs::metadata(&home).unwrap().uid());
