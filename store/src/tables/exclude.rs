@@ -20,7 +20,8 @@ const OF_IMPORT: &str = "SELECT structure FROM import WHERE number = $1";
 /// Labels of a structure that count, and those that are excluded.
 pub(crate) const STANDING: &str = "SELECT protocol.name AS protocol, standing, exclusion FROM label
     CROSS JOIN protocol ON protocol.number = label.protocol
-    WHERE label.structure = $1 AND standing IN ('label', 'excluded') ORDER BY label.number";
+    WHERE label.structure = $1 AND standing IN ('label', 'excluded')
+    ORDER BY label.protocol, label.number";
 
 const EXCLUDE: &str = "UPDATE label SET standing = 'excluded', excluded = $2, exclusion = $3
     WHERE structure = $1 AND standing = 'label'";

@@ -5,14 +5,15 @@ use wire::Origin;
 
 use super::common::*;
 
-/// Makes them tables of version 8.
+/// Makes them tables of version 8: what later versions add goes.
 const WITHOUT_CHECKSUMS: &str = "
     ALTER TABLE campaign DROP COLUMN checksum; ALTER TABLE value DROP COLUMN checksum;
     ALTER TABLE structure DROP COLUMN checksum; ALTER TABLE seed_structure DROP COLUMN checksum;
     ALTER TABLE protocol DROP COLUMN checksum; ALTER TABLE decision DROP COLUMN checksum;
     ALTER TABLE candidate DROP COLUMN checksum, DROP COLUMN features_checksum, DROP COLUMN selector_checksum,
         DROP COLUMN original_checksum;
-    ALTER TABLE component DROP COLUMN checksum; ALTER TABLE label DROP COLUMN checksum;
+    ALTER TABLE component DROP COLUMN checksum; DROP INDEX label_excluded;
+    ALTER TABLE label DROP COLUMN checksum, DROP COLUMN excluded, DROP COLUMN exclusion;
     ALTER TABLE walk DROP COLUMN checksum, DROP COLUMN checkpoint_checksum;
     ALTER TABLE import DROP COLUMN checksum; ALTER TABLE archive DROP COLUMN checksum;
     DELETE FROM _sqlx_migrations WHERE version > 8";
