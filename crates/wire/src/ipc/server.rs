@@ -136,7 +136,15 @@ impl Server {
                         // Lets go of the connection as well.
                         more = take_in(&self.port, &mut desk, &mut heard)?;
                     }
-                    Some(Order::Close) | None => return Ok(()),
+                    Some(Order::Close) | None => {
+                        // The reactor waits for the walkers that are gone, also when others keep its channel open.
+                        for incoming in desk.outbox.drain(..) {
+                            if to_reactor.send(incoming).await.is_err() {
+                                break;
+                            }
+                        }
+                        return Ok(());
+                    }
                 },
                 (walker, work) = poll_fn(|context| desk.poll_decision(context)) => desk.decided(walker, work)?,
                 permit = to_reactor.reserve(), if !desk.outbox.is_empty() => match permit {

@@ -89,6 +89,21 @@ async fn a_killed_walker_is_replaced() {
     desk.close().await;
 }
 
+/// The reactor hears of the last walker's end also if the server is closed at once: others may keep its channel open.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_end_is_told_before_the_server_closes() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut desk = Desk::open(directory.path(), 1, 1 << 16);
+    let mut stuck = desk.start(0, 1, Role::Stuck);
+    desk.offer().await.reply.send(Some(work(0, 1, (3, 4)))).unwrap();
+    assert!(matches!(desk.incoming.recv().await, Some(Incoming::Progress(..))), "it is at work");
+    kill(&mut stuck);
+    desk.handle.gone(0, 1, false);
+    desk.handle.close();
+    assert!(matches!(desk.next().await, Incoming::Gone { walker: 0, fault: false }));
+    desk.close().await;
+}
+
 /// The successor of a dead walker is expected before somebody says that it is dead: nothing of the successor is freed.
 #[tokio::test(flavor = "multi_thread")]
 async fn late_news_of_a_death_does_no_harm_to_the_successor() {
