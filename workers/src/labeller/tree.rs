@@ -159,7 +159,7 @@ mod tests {
         fs::create_dir_all(root.join("closed/in")).unwrap();
         fs::write(root.join("closed/in/file"), "x").unwrap();
         fs::set_permissions(root.join("closed/in"), Permissions::from_mode(0o500)).unwrap();
-        fs::set_permissions(root.join("closed"), Permissions::from_mode(0)).unwrap();
+        fs::set_permissions(root.join("closed"), Permissions::from_mode(0o0)).unwrap();
         let kept = home.path().join("kept");
         fs::create_dir(&kept).unwrap();
         symlink(&kept, root.join("link")).unwrap();
