@@ -224,6 +224,12 @@ fn what_was_changed_behind_its_back_is_found() {
         "UPDATE decision SET detail = json_set(detail, '$.update.alpha', 0.123) WHERE sequence = {first}"
     );
     execute(here, &[&alpha]);
+    fails(&["damaged database: decision ", "its content has the checksum "]);
+    // With a checksum that belongs to it, only the replay can tell.
+    let message = stderr(&calmwalk(here, ["replay", "here"]));
+    let checksum = message.split("its content has the checksum ").nth(1).unwrap().split(',').next().unwrap();
+    let checksum = u32::from_str_radix(checksum, 16).unwrap();
+    execute(here, &[&format!("UPDATE decision SET checksum = {checksum} WHERE sequence = {first}")]);
     fails(&["does not come out as it was recorded", "detail.update.alpha was 0.123, and is "]);
     for (statement, words) in [
         (format!("DELETE FROM decision WHERE sequence = {first}"), &["the database is damaged"][..]),

@@ -128,7 +128,8 @@ async fn check(store: &Store, committed: u64, labelled: &[u64]) -> u64 {
     }
 
     // One job for every accepted candidate; a label for exactly those that are labelled.
-    let jobs = store.queue_list(None, u32::MAX, 0).await.unwrap();
+    let mut jobs = store.queue_list(None, u32::MAX, 0).await.unwrap();
+    jobs.sort_by_key(|job| job.job);
     let accepted = (1..=k).flat_map(|k| {
         let [first, _, second] = numbered_commit(k).candidates.try_into().unwrap();
         [name_of(&first), name_of(&second)]

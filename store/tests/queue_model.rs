@@ -212,7 +212,8 @@ impl Run {
     }
 
     async fn compare(&self) {
-        let jobs = self.store.queue_list(None, 100, 0).await.unwrap();
+        let mut jobs = self.store.queue_list(None, 100, 0).await.unwrap();
+        jobs.sort_by_key(|job| job.job);
         assert_eq!(jobs.len(), self.names.len());
         let mut open = BTreeSet::new();
         for ((place, expected), job) in self.model.0.iter().zip(&jobs) {
