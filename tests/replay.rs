@@ -240,18 +240,18 @@ fn what_was_changed_behind_its_back_is_found() {
         ),
         (
             format!("UPDATE candidate_data SET features = substr(features, 1, 400) WHERE decision = {first}"),
-            &["numbers"],
+            &["the features of candidate ", "its content has the checksum "],
         ),
         (
             "UPDATE candidate_data SET selector_grades = original_grades WHERE decision =
                 (SELECT max(decision) FROM candidate WHERE fate = 'accepted' AND origin = 'biased')"
                 .to_owned(),
-            &["grades of the atoms (selector)"],
+            &["of candidate ", "its content has the checksum "],
         ),
         ("UPDATE component SET bytes = zeroblob(length(bytes)) WHERE slot = (SELECT min(slot) FROM component)".to_owned(),
          &["component"]),
-        (format!("UPDATE decision SET detail = '{{' WHERE sequence = {first}"), &["the decision log"]),
-        (format!("UPDATE decision SET kind = 'tried' WHERE sequence = {first}"), &["does not know"]),
+        (format!("UPDATE decision SET detail = '{{' WHERE sequence = {first}"), &["decision ", "its content has the checksum "]),
+        (format!("UPDATE decision SET kind = 'tried' WHERE sequence = {first}"), &["decision ", "its content has the checksum "]),
     ] {
         fs::write(&database, &whole).unwrap();
         execute(here, &[&statement]);
