@@ -19,6 +19,9 @@ const LONGEST: u32 = 200;
 const WINDOW: u32 = 1000;
 const LOOKED: usize = 10_000;
 
+/// Names of a condition that candidates have no value for.
+const OF_LABELS: [&str; 3] = ["energy", "energy_per_atom", "max_force"];
+
 /// What is asked for.
 #[derive(Debug, Default)]
 struct Asked {
@@ -72,7 +75,7 @@ impl Asked {
                         || Refusal::wrong(format!("state is '{value}', expected one of a label job"));
                     asked.state = Some(JobState::named(&value).ok_or_else(unknown)?);
                 }
-                "where" => asked.condition = Some(value.parse().map_err(Refusal::wrong)?),
+                "where" => asked.condition = Some(condition(&value)?),
                 "after" => asked.after = Some(place(&value)?),
                 "limit" => {
                     let wrong = || Refusal::wrong(format!("limit is '{value}', expected 1 to {LONGEST}"));
@@ -191,6 +194,17 @@ fn facts<'a>(line: &'a ListedCandidate, species: &'a [Species]) -> Facts<'a> {
     }
 }
 
+/// The condition that a text is, if the table has everything that it asks for.
+fn condition(text: &str) -> Result<Condition, Refusal> {
+    let condition: Condition = text.parse().map_err(Refusal::wrong)?;
+    match condition.names().into_iter().find(|name| OF_LABELS.contains(name)) {
+        None => Ok(condition),
+        Some(name) => Err(Refusal::wrong(format!(
+            "{name} is a quantity of labels, which this table does not have: calmwalk export --where knows it"
+        ))),
+    }
+}
+
 impl FromStr for Order {
     type Err = Refusal;
 
@@ -242,6 +256,7 @@ mod tests {
             ("after=NaN:1", "expected what 'next'"),
             ("where=gamma", "expected one of = != <"),
             ("sort=gamma", "no parameter 'sort'"),
+            ("where=gamma+%3E+2+and+max_force+%3E+5", "max_force is a quantity of labels"),
         ] {
             let refused = format!("{:?}", Asked::read(query).unwrap_err());
             assert!(refused.contains(why), "{query}: {refused}");
