@@ -5,6 +5,7 @@ mod common;
 
 use std::collections::BTreeSet;
 use std::fs;
+use std::io::BufReader;
 use std::path::Path;
 use std::process::Stdio;
 
@@ -273,6 +274,48 @@ fn check_mixture(live: &Live) {
         assert!(number("shrunk") <= number("grown") && number("condition_number") >= 1.0, "{found}");
     }
     assert!(found.iter().any(|component| component["moved"] == true));
+}
+
+/// A condition finds in the table what it finds for `calmwalk export`.
+#[test]
+fn the_table_and_exports_speak_one_language() {
+    let directory = tempfile::tempdir().unwrap();
+    let here = directory.path();
+    Small::default().write(here);
+    succeed(here, ["run", "campaign.toml"]);
+    let mut command = program(here);
+    command.args(["dashboard", "campaign", "--at", "127.0.0.1:0"]);
+    let mut shown = Running(command.stderr(Stdio::piped()).spawn().unwrap());
+    let [address] = said(&mut shown.0, ["dashboard at http://"]);
+    let address = address.trim_end_matches('/');
+    let labelled = all_lines(address, "state=labelled", 9);
+    let number = |line: &Value, key: &str| line[key].as_f64().unwrap();
+    let middle = |of: &dyn Fn(&Value) -> f64| {
+        let mut found: Vec<_> = labelled.iter().map(of).collect();
+        found.sort_by(f64::total_cmp);
+        found[found.len() / 2]
+    };
+    let [energy, force, gamma] =
+        ["energy", "max_force", "gamma"].map(|key| middle(&|line| number(line, key)));
+    let per_atom = middle(&|line| number(line, "energy") / number(line, "atoms"));
+    for condition in [
+        format!("max_force > {force}"),
+        format!("energy <= {energy} and max_force > 0"),
+        format!("energy_per_atom < {per_atom}"),
+        format!("not gamma >= {gamma} and mixture_version != 3 and energy < 1e9"),
+        format!("gamma > {gamma} and energy < 1e9 or kind = control and energy < 1e9 and step > 100"),
+    ] {
+        succeed(here, ["export", "campaign", "--output", "set.extxyz", "--control", "--where", &condition]);
+        let frames = fs::File::open(here.join("set.extxyz")).unwrap();
+        let frames = Reader::new(BufReader::new(frames)).map(|frame| frame.unwrap());
+        let exported: BTreeSet<_> =
+            frames.map(|frame| frame.info["candidate_id"].text().unwrap().to_owned()).collect();
+        let query: String = form_urlencoded::byte_serialize(condition.as_bytes()).collect();
+        let found = all_lines(address, &format!("where={query}"), 3);
+        let found: BTreeSet<_> = found.iter().map(|line| line["id"].as_str().unwrap().to_owned()).collect();
+        assert_eq!(found, exported, "{condition}");
+        assert!(!found.is_empty() && found.len() < labelled.len(), "{condition}: {}", found.len());
+    }
 }
 
 #[test]

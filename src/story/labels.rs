@@ -147,7 +147,7 @@ impl StoryLabel {
             excluded,
             energy: label.energy,
             energy_per_atom: label.energy / atoms,
-            largest_force: label.forces.iter().map(|force| norm(*force)).fold(0.0, f64::max),
+            largest_force: label.max_force(),
             pressure: label.stress.map(|stress| -(stress[0][0] + stress[1][1] + stress[2][2]) / 3.0),
             model,
             details: label.details,

@@ -41,7 +41,7 @@ pub struct ListedCandidate {
     pub step: u64,
     /// Name of the seed structure.
     pub seed_structure: String,
-    /// Version of the mixture that its walker saw.
+    /// Version of the mixture after the decision.
     pub mixture_version: u64,
     /// Number of atoms.
     pub atoms: u32,
@@ -63,4 +63,8 @@ pub struct ListedCandidate {
     pub priority: Option<i32>,
     /// Attempts at that job.
     pub attempts: Option<u32>,
+    /// Energy of its structure's label under that job's protocol, eV; none without a label, or if it is excluded.
+    pub energy: Option<f64>,
+    /// Largest force of that label, eV/Å.
+    pub max_force: Option<f64>,
 }

@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
 use serde::{Deserialize, Serialize};
 use wire::messages::{Decline, Progress};
@@ -231,6 +232,13 @@ pub struct Label {
     pub stress: Option<Matrix3>,
     /// What else the calculation says.
     pub details: LabelDetails,
+}
+
+impl Label {
+    /// Largest force on an atom, eV/Å; 0 without atoms.
+    pub fn max_force(&self) -> f64 {
+        self.forces.iter().map(|force| norm(*force)).fold(0.0, f64::max)
+    }
 }
 
 /// What is known of a label besides its numbers.

@@ -6,8 +6,8 @@ mod common;
 use common::*;
 use serde_json::json;
 use store::{
-    Commit, Completed, ExclusionChange, ExportFilter, Fate, JobState, Lease, Protocol, Relabel, Standing,
-    Store, StoreError, WalkRecord,
+    Commit, Completed, ExclusionChange, ExportFilter, Fate, JobState, Lease, ListOrder, ListedCandidate,
+    Protocol, Relabel, Standing, Store, StoreError, WalkRecord,
 };
 use wire::messages::Decline;
 use wire::{ContentHash, Origin};
@@ -87,6 +87,12 @@ async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
     assert_eq!(shown.energies, [(Standing::Excluded, -2.0)]);
     let listed = store.queue_list(Some(JobState::Labelled), 9, 0).await.unwrap();
     assert_eq!(listed.iter().filter(|job| job.excluded.is_some()).count(), 1);
+    let table = store.list_candidates(ListOrder::Decision, false, None, 9).await.unwrap();
+    let energies = |table: &[ListedCandidate]| table.iter().map(|line| line.energy).collect::<Vec<_>>();
+    assert_eq!(energies(&table), [Some(-1.0), None, Some(-3.0)]);
+    let queue = store.list_queue(JobState::Labelled, None, 9).await.unwrap();
+    assert_eq!(energies(&queue), energies(&table));
+    assert_eq!(table[0].max_force, Some(label(-1.0).max_force()));
     let all = store.excluded().await.unwrap();
     assert_eq!((all.len(), all[0].id.as_str(), all[0].exclusion.time), (1, second, 100));
     whole(&store).await;

@@ -1,6 +1,5 @@
 //! A labelled structure as a frame, with where it came from, and as a condition sees it.
 
-use atoms::cell::norm;
 use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, Value};
 use store::{ExportRow, ExportSource};
 
@@ -9,10 +8,9 @@ use crate::condition::Facts;
 /// What a condition is put to.
 pub fn facts(row: &ExportRow) -> Facts<'_> {
     let largest = |grades: &[f64]| grades.iter().copied().reduce(f64::max);
-    let forces = row.label.forces.iter().map(|force| norm(*force));
     let of_label = Facts {
         energy: Some(row.label.energy),
-        max_force: Some(forces.fold(0.0, f64::max)),
+        max_force: Some(row.label.max_force()),
         species: &row.structure.species,
         kind: "imported",
         ..Facts::default()

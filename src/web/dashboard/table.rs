@@ -19,9 +19,6 @@ const LONGEST: u32 = 200;
 const WINDOW: u32 = 1000;
 const LOOKED: usize = 10_000;
 
-/// Names of a condition that candidates have no value for.
-const OF_LABELS: [&str; 3] = ["energy", "energy_per_atom", "max_force"];
-
 /// What is asked for.
 #[derive(Debug, Default)]
 struct Asked {
@@ -75,7 +72,7 @@ impl Asked {
                         || Refusal::wrong(format!("state is '{value}', expected one of a label job"));
                     asked.state = Some(JobState::named(&value).ok_or_else(unknown)?);
                 }
-                "where" => asked.condition = Some(condition(&value)?),
+                "where" => asked.condition = Some(value.parse().map_err(Refusal::wrong)?),
                 "after" => asked.after = Some(place(&value)?),
                 "limit" => {
                     let wrong = || Refusal::wrong(format!("limit is '{value}', expected 1 to {LONGEST}"));
@@ -176,7 +173,7 @@ impl Asked {
     }
 }
 
-/// What is known of a candidate before it has a label.
+/// What a condition sees of a candidate: the same as that of `calmwalk export`.
 fn facts<'a>(line: &'a ListedCandidate, species: &'a [Species]) -> Facts<'a> {
     Facts {
         gamma: line.gamma,
@@ -186,22 +183,11 @@ fn facts<'a>(line: &'a ListedCandidate, species: &'a [Species]) -> Facts<'a> {
         walk: Some(line.walk),
         step: Some(line.step),
         mixture_version: Some(line.mixture_version),
-        energy: None,
-        max_force: None,
+        energy: line.energy,
+        max_force: line.max_force,
         species,
         kind: &line.origin,
         seed: Some(&line.seed_structure),
-    }
-}
-
-/// The condition that a text is, if the table has everything that it asks for.
-fn condition(text: &str) -> Result<Condition, Refusal> {
-    let condition: Condition = text.parse().map_err(Refusal::wrong)?;
-    match condition.names().into_iter().find(|name| OF_LABELS.contains(name)) {
-        None => Ok(condition),
-        Some(name) => Err(Refusal::wrong(format!(
-            "{name} is a quantity of labels, which this table does not have: calmwalk export --where knows it"
-        ))),
     }
 }
 
@@ -256,7 +242,6 @@ mod tests {
             ("after=NaN:1", "expected what 'next'"),
             ("where=gamma", "expected one of = != <"),
             ("sort=gamma", "no parameter 'sort'"),
-            ("where=gamma+%3E+2+and+max_force+%3E+5", "max_force is a quantity of labels"),
         ] {
             let refused = format!("{:?}", Asked::read(query).unwrap_err());
             assert!(refused.contains(why), "{query}: {refused}");

@@ -77,8 +77,10 @@ function filters(asked, change) {
   return element("form", { class: "filters", role: "search", onsubmit: submit }, choice("fate", "fate", Object.keys(FATES)),
     choice("label", "state", STATES), element("label", {}, "where", where), element("button", {}, "Show"),
     element("details", {}, element("summary", {}, "What may stand there"), element("p", {},
-      "gamma, gamma_nbr (original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version, atoms with = != < <= > >=; " +
-      "element, kind, seed with = and !=; and, or, not and parentheses.")));
+      "gamma, gamma_nbr (original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version (after the decision), atoms, " +
+      "energy (eV), energy_per_atom and max_force (eV/Å) of the label, with = != < <= > >=; " +
+      "element, kind (biased or control), seed with = and !=; and, or, not and parentheses. " +
+      "What a candidate does not have, as an energy without a label, meets no comparison.")));
 }
 
 function lines({ candidates, next }, asked, change, pages, after, load) {

@@ -1,16 +1,21 @@
 //! Pages of the table of candidates. Each goes through an index from its first row on, however many rows there are.
 
+use super::labels::LabelRow;
 use crate::Store;
-use crate::checksum::{CANDIDATE, Names, joined};
+use crate::checksum::{CANDIDATE, DECISION, Names, joined};
 use crate::database::{FromRow, Row, query};
 use crate::error::Result;
 use crate::listing::{ListOrder, ListPlace, ListedCandidate};
-use crate::records::JobState;
+use crate::records::{JobState, Label};
 
 impl FromRow for ListedCandidate {
     fn from_row(row: &Row) -> Result<Self> {
         CANDIDATE.verify(row, Names::Joined)?;
+        DECISION.verify(row, Names::Joined)?;
         let reason: Option<String> = row.get("candidate__reason")?;
+        let has_label = row.get::<Option<String>>("standing")?.is_some();
+        let label =
+            has_label.then(|| LabelRow::from_row(row)?.into_record()).transpose()?.map(|found| found.label);
         Ok(Self {
             decision: row.get("candidate__decision")?,
             id: row.get("candidate__id")?,
@@ -20,7 +25,7 @@ impl FromRow for ListedCandidate {
             segment: row.get("candidate__segment")?,
             step: row.get("candidate__step")?,
             seed_structure: row.get("seed_name")?,
-            mixture_version: row.get("candidate__mixture_version")?,
+            mixture_version: row.get("decision__mixture_version")?,
             atoms: row.get("candidate__atoms")?,
             formula: row.get("candidate__formula")?,
             temperature: row.get("candidate__temperature")?,
@@ -31,6 +36,8 @@ impl FromRow for ListedCandidate {
             job_state: row.get("job_state")?,
             priority: row.get("priority")?,
             attempts: row.get("attempts")?,
+            energy: label.as_ref().map(|label| label.energy),
+            max_force: label.as_ref().map(Label::max_force),
         })
     }
 }
@@ -40,7 +47,9 @@ macro_rules! lines {
         concat!(
             "SELECT ",
             joined!(candidate),
-            ", coalesce(name, '') AS seed_name, job.state AS job_state, priority, attempts ",
+            ", ",
+            joined!(decision),
+            ", coalesce(name, '') AS seed_name, job.state AS job_state, priority, attempts, label.* ",
             $($rest),*
         )
     };
@@ -52,6 +61,9 @@ macro_rules! page {
             "FROM candidate
             LEFT JOIN job ON job.number = (SELECT max(newest.number) FROM job AS newest
                                            WHERE newest.structure = candidate.structure)
+            LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = job.protocol
+                AND standing = 'label'
+            CROSS JOIN decision ON sequence = candidate.decision
             LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
             WHERE ",
             $which,
@@ -102,6 +114,9 @@ pub(crate) const QUEUE: &str = lines!(
               AND (priority < $2 OR decision > $3) ORDER BY priority DESC, decision LIMIT $4) AS page
         CROSS JOIN job ON job.number = place
         CROSS JOIN candidate ON candidate.decision = job.decision
+        CROSS JOIN decision ON sequence = candidate.decision
+        LEFT JOIN label ON label.structure = candidate.structure AND label.protocol = job.protocol
+            AND standing = 'label'
         LEFT JOIN seed_structure ON seed_structure.seed = candidate.seed_structure
         ORDER BY job.priority DESC, job.decision"
 );
