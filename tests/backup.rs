@@ -1,18 +1,18 @@
 //! `calmwalk store`: copies of a campaign that is run, whole or not there. The same tests on PostgreSQL are in
 //! `postgres_whole.rs`.
 
-mod common;
-
 use std::fs;
 use std::path::Path;
 use std::time::Instant;
 
-use common::campaign::{Small, outcome, outcome_at};
-use common::place::{Place, on_store};
-use common::processes::{processes_in, wait_until};
-use common::{calmwalk, kills, random, refuse, stderr, succeed};
 use serde_json::Value;
 use store::Location;
+
+use crate::common;
+use crate::common::campaign::{Small, outcome, outcome_at};
+use crate::common::place::{Place, on_store};
+use crate::common::processes::{processes_in, wait_until};
+use crate::common::{calmwalk, kills, random, refuse, stderr, succeed};
 
 fn ended(running: &mut common::Running) -> Option<i32> {
     running.0.wait().expect("a child").code()

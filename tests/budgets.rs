@@ -1,17 +1,16 @@
 //! Budgets end a campaign in order, and a larger one lets it go on; what a long label queue does.
 
-mod common;
-
 use std::fs;
 use std::path::Path;
 use std::process::Stdio;
 
-use common::campaign::{Outcome, Small, outcome};
-use common::desk::Desk;
-use common::processes::{carrying_out, hold, signal, wait_until};
-use common::{Running, program, succeed};
 use serde_json::Value;
 use tempfile::TempDir;
+
+use crate::common::campaign::{Outcome, Small, outcome};
+use crate::common::desk::Desk;
+use crate::common::processes::{carrying_out, hold, signal, wait_until};
+use crate::common::{Running, program, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
 

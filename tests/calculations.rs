@@ -1,16 +1,14 @@
 //! Labels by another program in a real campaign, while everybody who works on them is killed.
 
-mod common;
-
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use common::campaign::{Small, outcome_at};
-use common::place::{LEAVE_LABEL, Place, are_single, on_store};
-use common::processes::{calculating, carrying_out, processes_in, signal, wait_until};
+use crate::common::campaign::{Small, outcome_at};
+use crate::common::place::{LEAVE_LABEL, Place, are_single, on_store};
+use crate::common::processes::{calculating, carrying_out, processes_in, signal, wait_until};
 
 /// Takes half a second, and starts what never ends by itself.
 const SCRIPT: &str = r#"

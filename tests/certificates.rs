@@ -1,17 +1,16 @@
 //! Hosts with wrong certificates: whoever can tell says at once which file is wrong, and nobody waits for ever.
 
-mod common;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, SystemTime};
 
-use common::campaign::Small;
-use common::hosts::Hosts;
-use common::processes::{signal, wait_until};
-use common::{Running, program, refuse};
 use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair};
+
+use crate::common::campaign::Small;
+use crate::common::hosts::Hosts;
+use crate::common::processes::{signal, wait_until};
+use crate::common::{Running, program, refuse};
 
 struct Authority {
     pem: String,

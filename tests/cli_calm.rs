@@ -1,7 +1,5 @@
 //! `calmwalk calm score` against the values of gracemaker, and `calmwalk calm info`.
 
-mod common;
-
 use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
@@ -9,9 +7,10 @@ use std::path::Path;
 use atoms::extxyz::{Frame, Value};
 use atoms::{Cell, NeighbourList, Species, Structure, read_extxyz};
 use calm::{Artifact, Grades};
-use common::{calmwalk, config, deviation, refuse, succeed, write_frames};
 use npyz::NpyFile;
 use npyz::npz::NpzArchive;
+
+use crate::common::{calmwalk, config, deviation, refuse, succeed, write_frames};
 
 /// gracemaker's numbers are in double precision; the radial functions here come from a table (error 10⁻¹²).
 const TOLERANCE: f64 = 1e-9;

@@ -1,7 +1,5 @@
 //! What can be done with a campaign from outside: status, queue, export, import.
 
-mod common;
-
 use std::fs;
 use std::path::Path;
 use std::process::Stdio;
@@ -9,10 +7,11 @@ use std::time::{Duration, Instant};
 
 use atoms::extxyz::{Frame, Keys, Labels, Value};
 use atoms::{Evaluation, NeighbourList, Potential, read_extxyz};
-use common::processes::{nothing_is_left, wait_until};
-use common::{Running, config, deviation, program, refuse, succeed, write_frames};
 use potentials::{Eam, EamStyle};
 use serde_json::Value as Json;
+
+use crate::common::processes::{nothing_is_left, wait_until};
+use crate::common::{Running, config, deviation, program, refuse, succeed, write_frames};
 
 /// Two seed structures, a few hundred steps, two structures from each and as many of their controls.
 const CONFIGURATION: &str = r#"

@@ -1,7 +1,5 @@
 //! `calmwalk md`: dynamics of a potential, from a configuration to a trajectory.
 
-mod common;
-
 use std::fs;
 use std::path::Path;
 use std::process::Command;
@@ -11,8 +9,9 @@ use atoms::cell::dot;
 use atoms::extxyz::Frame;
 use atoms::units::{ACCELERATION, BOLTZMANN};
 use atoms::{Evaluation, NeighbourList, Potential, read_extxyz};
-use common::{Running, config, deviation, program, refuse, succeed};
 use potentials::{Eam, EamStyle};
+
+use crate::common::{Running, config, deviation, program, refuse, succeed};
 
 /// A configuration for `steps` steps of the first aluminium seed structure.
 fn configuration(steps: u64, rng_seed: u64, thermostat: &str) -> String {

@@ -1,16 +1,15 @@
 //! Every file of `configs/` runs as it stands, and what comes of it can be read.
 
-mod common;
-
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
 use atoms::extxyz::Frame;
 use atoms::{Evaluation, NeighbourList, Potential, read_extxyz, shortest_distance};
-use common::{config, deviation, refuse, stderr, succeed};
 use potentials::{Eam, EamStyle, StillingerWeber};
 use serde_json::Value;
+
+use crate::common::{config, deviation, refuse, stderr, succeed};
 
 /// Runs a demo to its end and checks its books; returns its labelled frames, control walks included.
 fn campaign(directory: &Path, name: &str) -> Vec<Frame> {
@@ -167,7 +166,7 @@ fn the_foundation_expansion_runs_once_its_files_are_there() {
 
 #[test]
 fn every_file_of_configs_is_run_by_a_test() {
-    // silicon-dft.toml with ABINIT: cargo test --test dft
+    // silicon-dft.toml with ABINIT: cargo test --test external dft::
     let run = [
         "aluminium.toml",
         "foundation-expansion.toml",

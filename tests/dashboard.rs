@@ -1,8 +1,6 @@
 //! The dashboard of a campaign that runs, and of one that is only looked at: pages, news, the table, candidates, and actions,
 //! which only who knows the token may do, and no page of another site.
 
-mod common;
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::io::BufReader;
@@ -11,12 +9,13 @@ use std::process::Stdio;
 
 use atoms::extxyz::Reader;
 use atoms::poscar::read_poscar;
-use common::campaign::Small;
-use common::http::{first_event, get, reckoned, request, said};
-use common::processes::wait_until;
-use common::{Running, config, program, refuse, succeed};
 use serde_json::{Value, json};
 use tempfile::TempDir;
+
+use crate::common::campaign::Small;
+use crate::common::http::{first_event, get, reckoned, request, said};
+use crate::common::processes::wait_until;
+use crate::common::{Running, config, program, refuse, succeed};
 
 /// A campaign that waits for labels from elsewhere.
 struct Live {

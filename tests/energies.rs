@@ -1,16 +1,16 @@
 //! Energies of labels: which are believed, and how far the potential is from them when the difference of zeros is taken out.
 
-mod common;
-
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use common::campaign::Small;
-use common::succeed;
 use serde_json::Value as Json;
 use store::{ExportFilter, ExportSource, Store};
 use tempfile::TempDir;
+
+use crate::common;
+use crate::common::campaign::Small;
+use crate::common::succeed;
 
 /// A calculation whose energy is what the awk expression ENERGY gives; N is the number of atoms, X the first coordinate of the second.
 const SCRIPT: &str = r#"

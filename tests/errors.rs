@@ -1,16 +1,16 @@
 //! What labels teach: `calmwalk errors`, `calmwalk report`, and what `status` and the summary say of labels that failed.
 
-mod common;
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
 use atoms::cell::{norm, sub};
-use common::campaign::Small;
-use common::succeed;
 use serde_json::Value as Json;
 use store::{ExportFilter, ExportRow, ExportSource, Store};
+
+use crate::common;
+use crate::common::campaign::Small;
+use crate::common::succeed;
 
 fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
     serde_json::from_str(&succeed(here, arguments.into_iter().chain(["--json"]))).unwrap()

@@ -1,13 +1,12 @@
 //! `calmwalk exclude`: a bad label counts nowhere, and everything says that it was excluded.
 
-mod common;
-
 use std::path::Path;
 
-use common::campaign::Small;
-use common::{refuse, succeed};
 use serde_json::Value as Json;
 use tempfile::TempDir;
+
+use crate::common::campaign::Small;
+use crate::common::{refuse, succeed};
 
 fn campaign() -> TempDir {
     let directory = tempfile::tempdir().unwrap();

@@ -1,16 +1,16 @@
 //! `calmwalk explain`: the story of a candidate is what the store holds, for whatever became of it.
 
-mod common;
-
 use std::fs;
 use std::path::Path;
 
 use atoms::cell::{norm, sub};
-use common::campaign::Small;
-use common::{refuse, succeed};
 use serde_json::Value;
 use store::{LoggedDecision, Store, StoredCandidate};
 use tempfile::TempDir;
+
+use crate::common;
+use crate::common::campaign::Small;
+use crate::common::{refuse, succeed};
 
 /// Walks from alike structures that advance together: what one finds is no news from the others.
 fn campaign(changes: &[(&str, &str)]) -> TempDir {

@@ -1,7 +1,5 @@
 //! `calmwalk export`: choosing structures, dividing them by seed structure, and the names of training codes.
 
-mod common;
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -10,12 +8,13 @@ use std::process::Command;
 
 use atoms::extxyz::Frame;
 use atoms::read_extxyz;
-use common::campaign::Small;
-use common::{calmwalk, deviation, refuse, stderr, succeed};
 use serde_json::Value;
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection};
 use tempfile::TempDir;
+
+use crate::common::campaign::Small;
+use crate::common::{calmwalk, deviation, refuse, stderr, succeed};
 
 fn campaign() -> TempDir {
     let directory = tempfile::tempdir().unwrap();

@@ -1,14 +1,14 @@
 //! A campaign whose walks diverge is no success: why they ended is said, counted and told, and the exit code is 1.
 
-mod common;
-
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-use common::campaign::Small;
-use common::{calmwalk, stderr, succeed};
 use serde_json::Value;
+
+use crate::common;
+use crate::common::campaign::Small;
+use crate::common::{calmwalk, stderr, succeed};
 
 const SEEDS: &[&str] = &["fcc-100", "vacancy", "fcc-097", "fcc-103"];
 

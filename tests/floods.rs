@@ -1,9 +1,7 @@
 //! A user of the host who has no token opens as many connections to the dashboard as the system lets him. The campaign does not
 //! mind, and its user is answered.
 //!
-//! `CALMWALK_FLOOD=5000 cargo test --test floods` for the long version: so many connections, 300 by default.
-
-mod common;
+//! `CALMWALK_FLOOD=5000 cargo test --test integration floods::` for the long version: so many connections, 300 by default.
 
 use std::collections::VecDeque;
 use std::fs;
@@ -15,11 +13,12 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use common::Running;
-use common::campaign::{Small, outcome};
-use common::hosts::undisturbed;
-use common::http::{first_event, request, said};
-use common::processes::{carrying_out, go_on, hold_walkers, nothing_is_left, signal, wait_until};
+use crate::common;
+use crate::common::Running;
+use crate::common::campaign::{Small, outcome};
+use crate::common::hosts::undisturbed;
+use crate::common::http::{first_event, request, said};
+use crate::common::processes::{carrying_out, go_on, hold_walkers, nothing_is_left, signal, wait_until};
 
 /// Descriptors that the campaign's process may have.
 const LIMIT: usize = 256;

@@ -1,15 +1,15 @@
 //! Going on with a campaign under another configuration: what may change is applied and logged, the rest is refused.
 
-mod common;
-
 use std::fs;
 use std::path::Path;
 
-use common::campaign::Small;
-use common::{calmwalk, config, refuse, stderr, succeed};
 use serde_json::{Value, json};
 use store::Store;
 use tempfile::TempDir;
+
+use crate::common;
+use crate::common::campaign::Small;
+use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
 

@@ -1,13 +1,12 @@
 //! What is refused before anything is spent on it, and the bill before a campaign begins.
 
-mod common;
-
 use std::fs;
 use std::path::Path;
 
-use common::campaign::Small;
-use common::{refuse, succeed};
 use serde_json::Value as Json;
+
+use crate::common::campaign::Small;
+use crate::common::{refuse, succeed};
 
 fn json<const N: usize>(here: &Path, arguments: [&str; N]) -> Json {
     serde_json::from_str(&succeed(here, arguments.into_iter().chain(["--json"]))).unwrap()

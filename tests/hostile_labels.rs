@@ -1,8 +1,6 @@
 //! Programs that make labels and leave whatever they like: the labeller survives it, and other users of the host have no part
 //! in it.
 
-mod common;
-
 use std::fs::{self, Permissions};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::Path;
@@ -10,11 +8,13 @@ use std::process::{Command, Output};
 
 use atoms::extxyz::{Frame, write_frame};
 use atoms::{Cell, Structure};
-use common::campaign::Small;
-use common::place::{LEAVE_LABEL, Place, on_store, queue};
-use common::processes::{calculating, go_on, hold_walkers, wait_until};
-use common::{program, stderr};
 use store::JobState;
+
+use crate::common;
+use crate::common::campaign::Small;
+use crate::common::place::{LEAVE_LABEL, Place, on_store, queue};
+use crate::common::processes::{calculating, go_on, hold_walkers, wait_until};
+use crate::common::{program, stderr};
 
 /// What a script leaves, as a script, and what is said of the label then.
 const LEFT: [(&str, &str, &str); 13] = [

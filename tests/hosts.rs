@@ -1,17 +1,15 @@
 //! A campaign on several hosts, as far as one host can show it: agents are processes of their own and speak TCP.
 //!
-//! `CALMWALK_KILLS=200 cargo test --test hosts kills` for the long version.
-
-mod common;
+//! `CALMWALK_KILLS=200 cargo test --test integration hosts::kills` for the long version.
 
 use std::fs;
 use std::time::Duration;
 
-use common::campaign::{Small, outcome};
-use common::hosts::{Hosts, undisturbed};
-use common::line::SlowLine;
-use common::processes::{carrying_out, go_on, hold_walkers, signal, wait_until};
-use common::{Running, kills, random};
+use crate::common::campaign::{Small, outcome};
+use crate::common::hosts::{Hosts, undisturbed};
+use crate::common::line::SlowLine;
+use crate::common::processes::{carrying_out, go_on, hold_walkers, signal, wait_until};
+use crate::common::{Running, kills, random};
 
 /// A silent agent is soon taken for dead.
 fn hosts(small: &Small, others: usize) -> Hosts {

@@ -1,20 +1,19 @@
 //! A campaign outlives whatever happens to its process, and ends as if nothing had happened.
 //!
-//! `CALMWALK_KILLS=200 cargo test --test interruption kills` for a long version, 1000 for a longer one. With `program` behind it, only
-//! campaigns whose labels are made by a program.
-
-mod common;
+//! `CALMWALK_KILLS=200 cargo test --test integration interruption::kills` for a long version, 1000 for a longer one; with
+//! `interruption::kills_of_a_campaign` only campaigns whose labels are made by a program.
 
 use std::path::Path;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use common::campaign::{Counters, Outcome, Small, outcome};
-use common::place::LEAVE_LABEL;
-use common::processes::{
+use crate::common;
+use crate::common::campaign::{Counters, Outcome, Small, outcome};
+use crate::common::place::LEAVE_LABEL;
+use crate::common::processes::{
     calculating, carrying_out, go_on, hold_walkers, nothing_is_left, processes_in, signal, wait_until,
 };
-use common::{Running, kills, program, random};
+use crate::common::{Running, kills, program, random};
 
 fn start(directory: &Path, options: &[&str]) -> Running {
     let mut command = program(directory);

@@ -1,16 +1,15 @@
 //! `calmwalk label`: labellers that nobody's run starts. The same tests on PostgreSQL are in `postgres_whole.rs`.
 
-mod common;
-
 use std::fs;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use common::campaign::{Outcome, Small, outcome, outcome_at};
-use common::place::Place;
-use common::processes::{carrying_out, go_on, nothing_is_left, processes_in, signal, wait_until};
-use common::{Running, calmwalk, config, program, refuse, succeed};
 use store::{JobState, Standing};
+
+use crate::common::campaign::{Outcome, Small, outcome, outcome_at};
+use crate::common::place::Place;
+use crate::common::processes::{carrying_out, go_on, nothing_is_left, processes_in, signal, wait_until};
+use crate::common::{Running, calmwalk, config, program, refuse, succeed};
 
 /// `run` starts no labellers of its own.
 const NO_SLOTS: (&str, &str) = ("[label]", "[label]\nslots = 0");

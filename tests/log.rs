@@ -1,14 +1,13 @@
 //! What a campaign leaves in its log.
 
-mod common;
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
-use common::campaign::Small;
-use common::{calmwalk, refuse, stderr, succeed};
 use serde_json::Value;
+
+use crate::common::campaign::Small;
+use crate::common::{calmwalk, refuse, stderr, succeed};
 
 fn read(path: &Path) -> Vec<Value> {
     let text = fs::read_to_string(path).unwrap();

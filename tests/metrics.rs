@@ -1,17 +1,16 @@
 //! `/metrics` of a campaign that runs, and of an agent: format, numbers, and that docs/metrics.md lists what is there.
 
-mod common;
-
 use std::collections::BTreeMap;
 use std::fs;
 use std::process::Stdio;
 
-use common::campaign::Small;
-use common::hosts::Hosts;
-use common::http::{Answer, get, request, said};
-use common::processes::{one_carrying_out, signal, wait_until};
-use common::{Running, program, refuse, succeed};
 use serde_json::Value;
+
+use crate::common::campaign::Small;
+use crate::common::hosts::Hosts;
+use crate::common::http::{Answer, get, request, said};
+use crate::common::processes::{one_carrying_out, signal, wait_until};
+use crate::common::{Running, program, refuse, succeed};
 
 /// A metric: its type, and its samples by labels as they are written.
 type Metrics = BTreeMap<String, (String, BTreeMap<String, f64>)>;

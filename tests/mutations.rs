@@ -1,9 +1,7 @@
 //! Files of every kind that a campaign reads, damaged at random: each is read, or refused by an error that names it.
 //!
-//! `CALMWALK_MUTATIONS=5000 cargo test --test mutations` for the long version: so many of each kind. A number in the message of
+//! `CALMWALK_MUTATIONS=5000 cargo test --test integration mutations::` for the long version: so many of each kind. A number in the message of
 //! a failure is the one that makes the same file again.
-
-mod common;
 
 use std::fs;
 use std::io::{Cursor, Read, Write};
@@ -13,12 +11,14 @@ use std::sync::Arc;
 
 use atoms::{NeighbourList, Structure};
 use calm::Artifact;
-use common::config;
-use common::mutate::{mutated, mutations};
 use npyz::npz::{NpzArchive, NpzWriter};
 use potentials::grace::{Grace, GraceModel};
 use potentials::{Eam, EamStyle, StillingerWeber};
 use wire::{CandidateBlock, ContentHash};
+
+use crate::common;
+use crate::common::config;
+use crate::common::mutate::{mutated, mutations};
 
 /// Gives damaged files of this name to a reader, which returns what it has to say of one that it refuses.
 fn read_all(

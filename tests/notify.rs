@@ -1,16 +1,16 @@
 //! Whether the owner of a campaign is told what happens to it, once, and whether that can disturb it.
 
-mod common;
-
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Stdio;
 
-use common::campaign::Small;
-use common::processes::{signal, wait_until};
-use common::{Running, program, succeed};
 use serde_json::Value;
+
+use crate::common;
+use crate::common::campaign::Small;
+use crate::common::processes::{signal, wait_until};
+use crate::common::{Running, program, succeed};
 
 const RUN: [&str; 2] = ["run", "campaign.toml"];
 

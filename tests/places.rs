@@ -1,13 +1,12 @@
 //! Where campaigns are kept, and that no campaign is taken for another.
 
-mod common;
-
 use std::fs;
 use std::path::Path;
 
-use common::campaign::Small;
-use common::{calmwalk, refuse, stderr, succeed};
 use serde_json::Value;
+
+use crate::common::campaign::Small;
+use crate::common::{calmwalk, refuse, stderr, succeed};
 
 /// A campaign that is over at once.
 fn write(directory: &Path) {

@@ -1,19 +1,19 @@
 //! Walkers and labellers are processes of their own: whatever happens to one of them, the campaign comes to the same end.
 
-mod common;
-
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use common::campaign::{Outcome, Small, outcome};
-use common::processes::{
+use serde_json::Value;
+use store::Store;
+
+use crate::common;
+use crate::common::campaign::{Outcome, Small, outcome};
+use crate::common::processes::{
     carrying_out, go_on, hold, hold_walkers, nothing_is_left, one_carrying_out, processes_in, signal,
     wait_until,
 };
-use common::{Running, calmwalk, config, program, refuse, succeed};
-use serde_json::Value;
-use store::Store;
+use crate::common::{Running, calmwalk, config, program, refuse, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
 

@@ -1,17 +1,16 @@
 //! `calmwalk relabel`: doubtful labels are made again, and a campaign labels by another protocol. The same tests on PostgreSQL are
 //! in `postgres_whole.rs`.
 
-mod common;
-
 use std::fs;
 use std::time::Duration;
 
-use common::campaign::Small;
-use common::place::Place;
-use common::processes::signal;
-use common::{calmwalk, config, random, refuse, stderr, succeed};
 use serde_json::Value;
 use store::{CampaignLock, JobState};
+
+use crate::common::campaign::Small;
+use crate::common::place::Place;
+use crate::common::processes::signal;
+use crate::common::{calmwalk, config, random, refuse, stderr, succeed};
 
 /// A campaign that is over, and how many labels it has.
 fn labelled() -> (Place, u64) {

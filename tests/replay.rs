@@ -1,17 +1,16 @@
 //! `calmwalk replay`: the same decisions by the same rules, others by others, and plain words where it cannot go on.
 
-mod common;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use common::campaign::Small;
-use common::{calmwalk, config, refuse, stderr, succeed};
 use serde_json::Value;
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection};
 use store::Store;
 use tempfile::TempDir;
+
+use crate::common::campaign::Small;
+use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
 

@@ -1,15 +1,14 @@
 //! `calmwalk status` while a campaign runs, after it was killed, and of a copy.
 
-mod common;
-
 use std::fs;
 use std::process::Stdio;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use common::campaign::Small;
-use common::processes::wait_until;
-use common::{Running, program, refuse, succeed};
 use serde_json::Value;
+
+use crate::common::campaign::Small;
+use crate::common::processes::wait_until;
+use crate::common::{Running, program, refuse, succeed};
 
 /// Two walks that find nothing and are not done for a long time.
 fn endless() -> String {

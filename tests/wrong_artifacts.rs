@@ -1,10 +1,9 @@
 //! Artifacts that load and mean nothing: refused where a campaign would otherwise collect nothing, or everything.
 
-mod common;
-
-use common::arrays::changed as with_arrays;
-use common::desk::{Desk, changed, line};
-use common::{calmwalk, config, refuse, stderr, succeed};
+use crate::common;
+use crate::common::arrays::changed as with_arrays;
+use crate::common::desk::{Desk, changed, line};
+use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
 const ARTIFACT: &str = "data/al_eam_1l/gmm_artifacts.npz";
 

@@ -1,7 +1,5 @@
 //! Directories and databases that a campaign cannot be run in: told, and left as they are.
 
-mod common;
-
 use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::os::unix::ffi::OsStrExt;
@@ -9,9 +7,10 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-use common::campaign::{Small, outcome};
-use common::{Running, calmwalk, program, refuse, stderr, succeed};
 use tempfile::TempDir;
+
+use crate::common::campaign::{Small, outcome};
+use crate::common::{Running, calmwalk, program, refuse, stderr, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
 

@@ -1,14 +1,13 @@
 //! Wrong configurations and wrong files: exit code 2, a message that says where, what was found and what was expected,
 //! and nothing written.
 
-mod common;
-
 use std::fs;
 use std::io::{Cursor, Read, Write};
 
-use common::desk::{Desk, changed, line};
-use common::{calmwalk, config, refuse, stderr, succeed};
 use npyz::npz::{NpzArchive, NpzWriter, file_name_from_array_name};
+
+use crate::common::desk::{Desk, changed, line};
+use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
 const MODEL: &str = "data/al_eam_1l/kokkos.npz";
 const ARTIFACT: &str = "data/al_eam_1l/gmm_artifacts.npz";

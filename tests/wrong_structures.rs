@@ -1,11 +1,9 @@
 //! Wrong seed structures: refused with file and line before any walk begins.
 
-mod common;
-
 use std::fmt::Write;
 
-use common::desk::{Desk, changed, line};
-use common::{calmwalk, config, stderr, succeed};
+use crate::common::desk::{Desk, changed, line};
+use crate::common::{calmwalk, config, stderr, succeed};
 
 const CELL: &str = "Lattice=\"8.4 0 0 0 8.4 0 0 0 8.4\"";
 

@@ -1,11 +1,10 @@
 //! Values that cannot be meant, names that are nearly right, and everything that is wrong with a file at once.
 
-mod common;
-
 use std::fs;
 
-use common::desk::{Desk, changed, line};
-use common::{calmwalk, config, refuse, stderr, succeed};
+use crate::common;
+use crate::common::desk::{Desk, changed, line};
+use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
 /// The warnings of `validate` about the demo with other values, which are also those of `run`; it must be valid.
 fn warnings(desk: &Desk, text: &str) -> Vec<String> {

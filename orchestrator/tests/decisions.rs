@@ -1,17 +1,17 @@
 //! What becomes of candidates: every reason to decline, updates of the mixture, budgets, and what is logged.
 
-mod common;
-
 use std::sync::Arc;
 
 use calm::grade::maximum;
-use common::{
-    SHORTEST, begin, decided, ended, features, gamma_max, kinds, mixture, offer, positive, settings,
-    structure, try_restore, turn, value,
-};
 use orchestrator::selector::{Mode, Selector, Settings, Snapshot, TrainingFrames, UpdateProtocol};
 use store::records::{Commit, Fate};
 use wire::messages::{Decline, End, Verdict};
+
+use crate::common;
+use crate::common::{
+    SHORTEST, begin, decided, ended, features, gamma_max, kinds, mixture, offer, positive, settings,
+    structure, try_restore, turn, value,
+};
 
 /// γ = 3 in the first component.
 const NEW: [f64; 3] = [0.0, 3.0, 0.0];

@@ -1,13 +1,9 @@
 //! Reports that arrive together are decided one after the other, committed as one, and answered after that.
 
-mod common;
-
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use common::memory::MemoryStore;
-use common::*;
 use orchestrator::reactor::{Ended, Reactor, ReactorError, group};
 use orchestrator::selector::{Mode, Next, Selector, Settings, UpdateProtocol};
 use proptest::prelude::*;
@@ -20,6 +16,9 @@ use tempfile::TempDir;
 use tokio::sync::{mpsc, oneshot};
 use wire::messages::{End, Outcome, Report};
 use wire::transport::{Incoming, Work};
+
+use crate::common::memory::MemoryStore;
+use crate::common::*;
 
 const WALKS: usize = 3;
 

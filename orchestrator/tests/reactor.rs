@@ -1,15 +1,11 @@
 //! The reactor with a real database and walkers on threads of their own: nothing is lost, and nothing hangs.
 
-mod common;
-
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use common::scripted::{Event, Script, advance};
-use common::{CAMPAIGN, restore, seed, settings};
 use orchestrator::reactor::{Ended, Notice, Reactor};
 use orchestrator::selector::{Mode, Settings, Snapshot};
 use store::{Campaign, JobState, Protocol, SeedStructure, Store};
@@ -17,6 +13,9 @@ use tokio::sync::mpsc;
 use wire::messages::{Progress, Report};
 use wire::transport::{InProcess, Incoming, Transport, Work};
 use wire::{ContentHash, WalkId};
+
+use crate::common::scripted::{Event, Script, advance};
+use crate::common::{CAMPAIGN, restore, seed, settings};
 
 const PROTOCOL: ContentHash = ContentHash([7; 32]);
 

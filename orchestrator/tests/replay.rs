@@ -1,19 +1,18 @@
 //! What a campaign decided is decided again from its log, exactly; and other rules decide otherwise.
 
-mod common;
-
 use std::collections::{BTreeMap, HashSet};
 
 use calm::CollectionRule;
-use common::eventful::{Campaign, acts, any_settings, scripts};
-use common::scripted::Script;
-use common::{SHORTEST, grader, kinds, mixture, positive, seed, structure};
 use orchestrator::selector::{Mode, Replay, Replayed, Settings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
 use store::records::{CandidateRecord, ComponentRecord, Fate, LoggedDecision};
 use wire::ContentHash;
+
+use crate::common::eventful::{Campaign, acts, any_settings, scripts};
+use crate::common::scripted::Script;
+use crate::common::{SHORTEST, grader, kinds, mixture, positive, seed, structure};
 
 /// The decisions of a campaign as a store gives them back, each with its candidate.
 fn log<'a>(campaign: &'a Campaign<'_>) -> Vec<(LoggedDecision, Option<&'a CandidateRecord>)> {

@@ -1,18 +1,17 @@
 //! Rule 6: decision log, mixture and data set are the same bytes for any number of walkers, any order of their reports,
 //! any interruption, any loss, and any crash after any commit.
 
-mod common;
-
 use std::collections::BTreeSet;
 
-use common::eventful::{Campaign, acts, any_settings, scripts};
-use common::kinds;
-use common::scripted::Script;
 use orchestrator::selector::{Mode, Settings, UpdateProtocol};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree;
 use proptest::test_runner::TestRunner;
 use wire::Origin;
+
+use crate::common::eventful::{Campaign, acts, any_settings, scripts};
+use crate::common::kinds;
+use crate::common::scripted::Script;
 
 /// One walker and no incidents.
 fn calm_run<'a>(settings: &'a Settings, scripts: &'a [Script]) -> Campaign<'a> {

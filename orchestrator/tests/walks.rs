@@ -1,15 +1,15 @@
 //! Walks in turns and rounds: beginning, waiting, control walks, returns, losses, ends.
 
-mod common;
-
-use common::memory::MemoryStore;
-use common::{
-    SHORTEST, at, begin, decided, ended, kinds, offer, restore, settings, structure, try_restore, turn, value,
-};
 use orchestrator::selector::{Mode, Next, Selector, Settings, Snapshot, UpdateProtocol};
 use store::records::{ComponentRecord, Fate};
 use wire::messages::{End, Outcome, Progress};
 use wire::{Origin, WalkId};
+
+use crate::common;
+use crate::common::memory::MemoryStore;
+use crate::common::{
+    SHORTEST, at, begin, decided, ended, kinds, offer, restore, settings, structure, try_restore, turn, value,
+};
 
 const NEW: [f64; 3] = [0.0, 3.0, 0.0];
 

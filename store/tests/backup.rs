@@ -1,18 +1,16 @@
 //! Copies of campaigns, made while they go on.
 
-#[path = "common/mod.rs"]
-mod common;
-
 use std::fs;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use common::*;
 use store::{Commit, ComponentRecord, ExportFilter, Fate, JobState, ProcessRecord, Store, StoreError};
 use wire::Origin;
 use wire::messages::Decline;
+
+use crate::common::*;
 
 /// The commit with number `k`, from 1, of walk `k`.
 fn numbered(k: u32) -> Commit {

@@ -1,10 +1,8 @@
 //! Budgets: what was used, and that no attempt begins where nothing is left.
 
-#[path = "common/mod.rs"]
-mod common;
-
-use common::*;
 use store::{Budget, Store};
+
+use crate::common::*;
 
 /// An hour in ms.
 const HOUR: i64 = 3_600_000;

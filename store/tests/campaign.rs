@@ -1,14 +1,12 @@
 //! Beginning and opening campaigns; what is committed is what comes back.
 
-#[path = "common/mod.rs"]
-mod common;
-
-use common::*;
 use store::{
     CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
 };
 use wire::messages::{Decline, Progress};
 use wire::{Origin, WalkId};
+
+use crate::common::*;
 
 #[tokio::test]
 async fn a_campaign_is_begun_once_and_opened_often() {

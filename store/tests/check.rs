@@ -1,12 +1,10 @@
 //! What `Store::check` finds, each in a campaign that is damaged in one way.
 
-#[path = "common/mod.rs"]
-mod common;
-
-use common::*;
 use store::{Commit, Decision, Fate, Finding, Store};
 use wire::Origin;
 use wire::messages::Decline;
+
+use crate::common::*;
 
 /// Two walks with a structure each, one of them labelled, a declined candidate and a decision about none.
 pub async fn whole(home: &Home) -> Store {

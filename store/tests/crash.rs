@@ -1,9 +1,6 @@
 //! A process that commits and labels without end is killed at random instants: whatever it was told to be safe is there,
 //! and everything else is there as a whole or not at all.
 
-#[path = "common/mod.rs"]
-mod common;
-
 use std::env;
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
@@ -11,12 +8,13 @@ use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::Duration;
 
-use common::*;
 use store::{
     CampaignLock, Commit, Completed, ComponentRecord, ExportFilter, Fate, JobState, Store, StoreError,
 };
 use wire::Origin;
 use wire::messages::Decline;
+
+use crate::common::*;
 
 const KILLS: u64 = 20;
 const DIRECTORY: &str = "STORE_CRASH_TEST_DIRECTORY";
@@ -75,7 +73,7 @@ fn tell(what: &str, number: u64) {
 
 fn start(directory: &Path) -> Child {
     Command::new(env::current_exe().unwrap())
-        .args(["--exact", "a_killed_process_leaves_whole_commits", "--nocapture"])
+        .args(["--exact", "crash::a_killed_process_leaves_whole_commits", "--nocapture"])
         .env(DIRECTORY, directory)
         .stdout(Stdio::piped())
         .spawn()

@@ -1,20 +1,18 @@
 //! Damage that nobody has announced: flipped bits in stored numbers, and bytes of the file that are others.
 //!
-//! `CALMWALK_FLIPS=1000 CALMWALK_DAMAGES=200 cargo test -p store --test damage` tries more.
-
-#[path = "common/mod.rs"]
-mod common;
+//! `CALMWALK_FLIPS=1000 CALMWALK_DAMAGES=200 cargo test -p store --test store damage::` tries more.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use common::*;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection, Row};
 use store::{Commit, ComponentRecord, DATABASE, ExportFilter, Fate, Store, StoreError};
 use wire::Origin;
 use wire::messages::Decline;
+
+use crate::common::*;
 
 /// Columns whose bits are flipped: numbers of labels, structures, features, grades, decisions, the mixture, walks, archives, seed
 /// structures and imports. Keys are left alone: with foreign keys and the other rows they are checked by SQLite.

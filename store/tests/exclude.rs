@@ -1,9 +1,5 @@
 //! Labels that are taken out of the data set by hand, and in again.
 
-#[path = "common/mod.rs"]
-mod common;
-
-use common::*;
 use serde_json::json;
 use store::{
     Commit, Completed, ExclusionChange, ExportFilter, Fate, JobState, Lease, ListOrder, ListedCandidate,
@@ -11,6 +7,8 @@ use store::{
 };
 use wire::messages::Decline;
 use wire::{ContentHash, Origin};
+
+use crate::common::*;
 
 async fn lease(store: &Store, now: i64) -> Lease {
     store.lease(protocol("dft").hash, "host/a", now, 10).await.unwrap().unwrap()

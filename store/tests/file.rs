@@ -1,12 +1,10 @@
 //! What is peculiar to a database that is a file.
 
-#[path = "common/mod.rs"]
-mod common;
-
 use std::fs;
 
-use common::*;
 use store::{CampaignLock, DATABASE, ProcessRecord, Store, StoreError};
+
+use crate::common::*;
 
 #[tokio::test]
 async fn a_database_is_there_as_a_whole_or_not_at_all() {

@@ -1,12 +1,10 @@
 //! What is told of one candidate: found by number, name or the beginning of it, with what stands around it.
 
-#[path = "common/mod.rs"]
-mod common;
-
-use common::*;
 use store::{Commit, Covered, Fate, JobState, Named, Standing, StoreError};
 use wire::messages::Decline;
 use wire::{Origin, WalkId};
+
+use crate::common::*;
 
 #[tokio::test]
 async fn a_candidate_is_found_with_what_stands_around_it() {

@@ -1,16 +1,14 @@
 //! Campaigns that earlier versions of the program began.
 
-#[path = "common/mod.rs"]
-mod common;
-
 use std::fs;
 use std::path::Path;
 
-use common::*;
 use sqlx::migrate::Migrator;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection};
 use store::{DATABASE, JobState, ProcessRecord, Store};
+
+use crate::common::*;
 
 const FIRST: &str = "0001_campaign.sql";
 

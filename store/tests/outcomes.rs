@@ -1,11 +1,9 @@
 //! What became of label jobs, as the cost model, `status` and the table of force errors read it.
 
-#[path = "common/mod.rs"]
-mod common;
-
-use common::*;
 use store::{FailureCount, Fate, FateCount, JobState, Lease, Range, Store, Unlabelled, Waiting, Work};
 use wire::{Candidate, CandidateBlock, ContentHash, Origin};
+
+use crate::common::*;
 
 async fn lease(store: &Store, now: i64) -> Lease {
     store.lease(protocol("dft").hash, "a", now, 1000).await.unwrap().unwrap()

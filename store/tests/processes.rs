@@ -1,10 +1,8 @@
 //! Who works for a campaign, and what comes back of those who are gone.
 
-#[path = "common/mod.rs"]
-mod common;
-
-use common::*;
 use store::{JobState, Lease, ProcessRecord, Store, process_birth};
+
+use crate::common::*;
 
 /// A living process (this one).
 fn living(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {

@@ -1,16 +1,14 @@
 //! The label queue step by step, imports and exports.
 
-#[path = "common/mod.rs"]
-mod common;
-
 use std::collections::BTreeSet;
 
-use common::*;
 use store::{
     Archive, CalculationRecord, Completed, ExportFilter, ExportPlace, ExportSource, Failed, Fate, Imported,
     JobState, Label, LabelDetails, LabelSource, Lease, Standing, Store, StoreError, Whereabouts,
 };
 use wire::{ContentHash, Origin};
+
+use crate::common::*;
 
 const LIMIT: u32 = 2;
 

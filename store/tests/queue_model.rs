@@ -1,14 +1,12 @@
 //! The queue against a model of a few lines, under random operations and a clock of its own.
 
-#[path = "common/mod.rs"]
-mod common;
-
 use std::collections::{BTreeMap, BTreeSet};
 
-use common::*;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use store::{Completed, ExportFilter, Failed, JobState, Lease, Store, StoreError};
+
+use crate::common::*;
 
 const JOBS: u64 = 4;
 const LIMIT: u32 = 2;

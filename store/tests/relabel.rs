@@ -1,15 +1,13 @@
 //! Labels that are made anew, by the same protocol and by another.
 
-#[path = "common/mod.rs"]
-mod common;
-
-use common::*;
 use serde_json::json;
 use store::{
     Commit, Completed, ExportFilter, Failed, JobState, LabelSource, Lease, NewProtocol, Protocol, Relabel,
     Requeued, Standing, Store, StoreError, WalkRecord, Whereabouts,
 };
 use wire::ContentHash;
+
+use crate::common::*;
 
 const AGAIN: Requeued = Requeued { again: 1, moved: 0 };
 

@@ -3,8 +3,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::config;
 use store::{ComponentRecord, ExportFilter, Location, Store};
+
+use super::config;
 
 /// Keys that tests vary.
 #[derive(Clone, Debug)]

@@ -1,4 +1,4 @@
-//! Where a test keeps a campaign that others label: its directory; in the test targets `postgres…` a schema of a server.
+//! Where a test keeps a campaign that others label: its directory, or a schema of the server that `CALMWALK_POSTGRES` names.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -35,12 +35,19 @@ impl Place {
             assert!(text.contains(from), "no {from}");
             text = text.replacen(from, to, 1);
         }
-        let url = env!("CARGO_CRATE_NAME").starts_with("postgres").then(new_schema);
+        let url = std::env::var("CALMWALK_POSTGRES").ok().map(|server| new_schema(&server));
         if let Some(url) = &url {
             text = text.replacen("[run]\n", &format!("[run]\nstore = \"{url}\"\n"), 1);
         }
         fs::write(path, text).unwrap();
         Self { directory, url }
+    }
+
+    /// The same, on a server.
+    pub fn on_server(small: &Small, changes: &[(&str, &str)]) -> Self {
+        let place = Self::new(small, changes);
+        assert!(place.url.is_some(), "CALMWALK_POSTGRES must name a server; '.ci/postgres start' makes one");
+        place
     }
 
     pub fn path(&self) -> &Path {
@@ -239,10 +246,8 @@ fn collected(step: u64, structure: Structure, features: Vec<f64>) -> Candidate {
 }
 
 /// The URL of a schema of its own; the server of the tests is thrown away with it.
-fn new_schema() -> String {
+fn new_schema(server: &str) -> String {
     static NUMBER: AtomicU64 = AtomicU64::new(0);
     let number = NUMBER.fetch_add(1, Ordering::Relaxed);
-    let server = std::env::var("CALMWALK_POSTGRES")
-        .expect("CALMWALK_POSTGRES must be the URL of a PostgreSQL server; '.ci/postgres start' makes one");
     format!("{server}?schema=whole_{}_{}_{number}", std::process::id(), unix_milliseconds())
 }

@@ -1,8 +1,5 @@
 //! Labellers: leases that last as long as the label takes, and processes that outlive their orchestrator.
 
-#[path = "../../store/tests/common/mod.rs"]
-mod common;
-
 use std::fs;
 use std::path::Path;
 use std::sync::Arc;
@@ -10,7 +7,6 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
-use common::*;
 use sqlx::ConnectOptions;
 use sqlx::sqlite::SqliteConnectOptions;
 use store::{
@@ -18,6 +14,8 @@ use store::{
 };
 use tokio::task::JoinHandle;
 use workers::labeller::{Closing, LabelBounds, LabellerSettings, Method, Stay, Timing, run, serve};
+
+use crate::common::*;
 
 /// A method that begins labels at once and ends them only while it is open.
 #[derive(Clone, Default)]

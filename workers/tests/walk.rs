@@ -13,8 +13,7 @@ use workers::bias::BiasedPotential;
 use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
-#[path = "../../tests/common/mutate.rs"]
-mod mutate;
+use crate::mutate;
 
 fn data(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/data").join(path)

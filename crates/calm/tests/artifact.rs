@@ -1,13 +1,12 @@
 //! Loading artifacts and exports, and what is wrong with broken ones.
 
-mod common;
-
 use std::path::Path;
 
 use calm::{Artifact, ArtifactError};
-use common::{data, model, niobium};
 use npyz::WriterBuilder;
 use npyz::npz::NpzWriter;
+
+use crate::common::{data, model, niobium};
 
 #[test]
 fn artifact_and_export_of_a_model_agree() {

@@ -1,12 +1,11 @@
 //! σ, γ, component and γ_nbr against gracemaker; the gradient against finite differences.
 
-mod common;
-
 use std::path::Path;
 use std::sync::Arc;
 
 use calm::{Artifact, Component, ComponentError, Grades, Mixture, Pair, neighbourhood_average};
-use common::{assert_close, data, indices, niobium, numbers, optional, peer};
+
+use crate::common::{assert_close, data, indices, niobium, numbers, optional, peer};
 
 /// Both sides compute in f64 from the same f32 inverse; only the order of summation differs.
 const TOLERANCE: f64 = 1e-9;

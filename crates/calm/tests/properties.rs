@@ -1,16 +1,16 @@
 //! Properties over random mixtures and batches.
 
-mod common;
-
 use std::sync::Arc;
 
 use calm::{
     Batch, Combination, Component, CovarianceUpdate, Grades, Mixture, Statistics, TrialLadder,
     regularised_inverse,
 };
-use common::Random;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
+
+use crate::common;
+use crate::common::Random;
 
 /// A mixture of one component whose covariance has the given widths along random directions, and a batch.
 fn case(seed: u64, dimension: usize, atoms: usize, distance: f64) -> (Mixture, Vec<f64>) {

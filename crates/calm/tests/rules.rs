@@ -1,7 +1,5 @@
 //! Collection rules, stop rules, and their configuration.
 
-mod common;
-
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
@@ -10,7 +8,9 @@ use calm::{
     CollectionRule, Combination, Component, Mixture, Statistics, UpdateEnd, UpdateRule, UpdateSettings,
     update,
 };
-use common::assert_close;
+
+use crate::common;
+use crate::common::assert_close;
 
 fn collection(text: &str) -> CollectionRule {
     toml::from_str(text).unwrap()

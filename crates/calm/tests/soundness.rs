@@ -1,11 +1,10 @@
 //! Mixtures that no training data can have made are told from real ones.
 
-mod common;
-
 use std::sync::Arc;
 
 use calm::{Artifact, Component, Mixture, Statistics};
-use common::{model, niobium, peer};
+
+use crate::common::{model, niobium, peer};
 
 /// Numbers of a component, to be spoilt.
 #[derive(Clone)]

@@ -1,7 +1,5 @@
 //! Updates and trial ladders against gracemaker and against the definition.
 
-mod common;
-
 use std::path::Path;
 use std::sync::Arc;
 
@@ -11,7 +9,9 @@ use calm::{
     Artifact, Batch, ChangedComponent, Combination, Component, CovarianceUpdate, Grades, Mixture, Statistics,
     TrialLadder, UpdateError, pseudo_inverse, regularised_inverse, update,
 };
-use common::{Random, assert_close, data, indices, niobium, numbers, peer};
+
+use crate::common;
+use crate::common::{Random, assert_close, data, indices, niobium, numbers, peer};
 
 /// Inverses are eigen-decompositions of matrices with condition numbers up to 10⁵ in both programs: their elements
 /// agree to about 10⁵ roundings.

@@ -1,12 +1,11 @@
 //! Measures of forgetting.
 
-mod common;
-
 use std::sync::Arc;
 
 use calm::watch::{ForgettingAlarm, GradeDistribution, WatchError, forgetting_factors, grade_distribution};
 use calm::{Artifact, Batch, Component, CovarianceUpdate, Grades, Mixture, Statistics};
-use common::{Random, assert_close, indices, model, niobium, numbers, peer};
+
+use crate::common::{Random, assert_close, indices, model, niobium, numbers, peer};
 
 #[test]
 fn the_distribution_is_made_of_order_statistics() {

@@ -1,11 +1,10 @@
 //! A run that stops and goes on is the run that never stopped, bit for bit.
 
-mod common;
-
-use common::{LennardJones, argon_crystal, settings};
 use md::{
     Checkpoint, Dynamics, DynamicsError, Langevin, NoseHooverChain, Settings, State, Thermostat, VolumeRamp,
 };
+
+use crate::common::{LennardJones, argon_crystal, settings};
 
 fn thermostats() -> [Thermostat; 3] {
     [

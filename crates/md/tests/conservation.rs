@@ -1,9 +1,8 @@
 //! What an integrator must keep: energy to second order, momentum, and the way back.
 
-mod common;
-
-use common::{LennardJones, settings, warm_argon};
 use md::{Checkpoint, Dynamics, NoseHooverChain, Thermostat, VolumeRamp};
+
+use crate::common::{LennardJones, settings, warm_argon};
 
 /// Root mean square fluctuation of the conserved energy over 1.6 ps from one starting point.
 fn fluctuation(start: &Checkpoint, time_step: f64) -> f64 {

@@ -1,10 +1,9 @@
 //! Thermostats against the canonical distribution: mean and width, within five standard errors.
 
-mod common;
-
 use atoms::units::{ACCELERATION, BOLTZMANN};
-use common::{Springs, argon_crystal, mean_and_variance, settings, warm_argon};
 use md::{Dynamics, Langevin, NoseHooverChain, State, Thermostat};
+
+use crate::common::{Springs, argon_crystal, mean_and_variance, settings, warm_argon};
 
 fn within_five_errors(what: &str, [found, error]: [f64; 2], expected: f64) {
     assert!(error < 0.1 * expected, "{what}: too few samples, {found} ± {error}");

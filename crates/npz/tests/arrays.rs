@@ -1,12 +1,11 @@
 //! Reading sound archives, and what is said when an array is not the one that was hoped for.
 
-mod common;
-
 use std::path::Path;
 
-use common::{archive, array, file};
 use npz::{Archive, Error};
 use proptest::prelude::*;
+
+use crate::common::{archive, array, file};
 
 /// Reads an archive whose only array is `a`.
 fn read<T>(bytes: Vec<u8>, read: impl FnOnce(&Archive<std::io::Cursor<&[u8]>>) -> T) -> T {

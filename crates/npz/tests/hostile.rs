@@ -1,10 +1,9 @@
 //! Archives with sound checksums and hostile headers give errors: no panic, no memory for what is not there.
 
-mod common;
-
-use common::{archive, array, file};
 use npz::{Archive, Error};
 use proptest::prelude::*;
+
+use crate::common::{archive, array, file};
 
 /// What is said of a file that neither numbers nor texts can be read from.
 fn refused(bytes: Vec<u8>) -> Option<String> {

@@ -1,11 +1,11 @@
 //! What EAM, Stillinger–Weber and ZBL must obey, whatever their numbers are.
 
-mod common;
-
 use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
 use potentials::{Eam, EamStyle, StillingerWeber, Zbl};
 use proptest::prelude::Rng;
 use proptest::test_runner::{RngAlgorithm, TestRng};
+
+use crate::common;
 
 const HERE: &str = env!("CARGO_MANIFEST_DIR");
 

@@ -1,10 +1,8 @@
 //! Files of models of two and three layers that are damaged, or that mean another graph, are refused.
 
-#[path = "common/model_file.rs"]
-mod model_file;
-
-use model_file::{array, changed_of, deep, floats_of, integers_of, length, names, strings};
 use proptest::prelude::*;
+
+use crate::common::model_file::{array, changed_of, deep, floats_of, integers_of, length, names, strings};
 
 const FILES: [&str; 2] = ["two_layers.npz", "three_layers.npz"];
 

@@ -1,17 +1,15 @@
 //! GRACE derivatives against finite differences, and that results depend on nothing but the structure.
 
-mod common;
-#[path = "common/golden.rs"]
-mod golden;
-
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use atoms::{Cell, Evaluation, Matrix3, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
-use common::{assert_close, check_forces, check_virial, position_gradient, strain_gradient};
-use golden::committed;
 use potentials::grace::{Architecture, Grace, GraceModel, Instructions, PullBack, RadialPath, Threads};
+
+use crate::common;
+use crate::common::golden::committed;
+use crate::common::{assert_close, check_forces, check_virial, position_gradient, strain_gradient};
 
 fn model(name: &str, path: RadialPath) -> Arc<GraceModel> {
     let file = match name {
@@ -130,7 +128,7 @@ fn an_atom_without_neighbours_has_a_finite_feature_and_no_gradient() {
 
 #[test]
 fn equal_structures_give_equal_bits() {
-    let golden = golden::golden(&committed("al_eam_1l"));
+    let golden = common::golden::golden(&committed("al_eam_1l"));
     check_bits(model("al_eam_1l", RadialPath::Table), &golden[2].structure, &golden[3].structure);
     for name in ["two_layers", "three_layers"] {
         check_bits(model(name, RadialPath::Table), &alloy([true; 3]), &small("Mo", 6.0, [false; 3]));

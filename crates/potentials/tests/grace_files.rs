@@ -1,13 +1,11 @@
 //! Model files that are damaged, or that claim what is not supported, give errors and never a panic.
 
-#[path = "common/model_file.rs"]
-mod model_file;
-
 use std::path::Path;
 
-use model_file::{BYTES, array, changed, load};
 use potentials::grace::GraceModel;
 use proptest::prelude::*;
+
+use crate::common::model_file::{BYTES, array, changed, load};
 
 #[test]
 fn the_file_itself_is_fine() {

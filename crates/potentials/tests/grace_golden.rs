@@ -1,14 +1,12 @@
 //! GRACE against the framework that trained the models: energy, forces, virial, features, Σγ and its gradient.
 
-#[path = "common/golden.rs"]
-mod golden;
-
 use std::path::Path;
 use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList};
-use golden::{Golden, Mixture, committed, golden, peer, six};
 use potentials::grace::{Grace, GraceModel, PullBack, RadialPath};
+
+use crate::common::golden::{Golden, Mixture, committed, golden, peer, six};
 
 /// The largest deviations met in a model; relative ones to the largest value of a structure.
 #[derive(Debug, Default)]

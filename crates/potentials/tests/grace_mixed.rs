@@ -1,15 +1,13 @@
 //! GRACE in mixed precision against double precision: energies, forces, features, γ and the conservation of energy.
 
-mod common;
-#[path = "common/golden.rs"]
-mod golden;
-
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, NeighbourList, Potential, Structure, Vec3};
-use golden::{Mixture, committed, golden, peer};
 use potentials::grace::{Grace, GraceModel, Instructions, Precision, PullBack, RadialPath, Threads};
+
+use crate::common;
+use crate::common::golden::{Mixture, committed, golden, peer};
 
 fn model(file: &Path, precision: Precision) -> Arc<GraceModel> {
     let model = GraceModel::load_in(file, precision, RadialPath::default()).unwrap();

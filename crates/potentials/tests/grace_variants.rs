@@ -1,16 +1,14 @@
 //! Variants of the model format that no model at hand uses, each made to mean the same as one that is tested
 //! against the framework, or compared with its definition.
 
-mod common;
-#[path = "common/model_file.rs"]
-mod model_file;
-
 use std::sync::Arc;
 
 use atoms::{Cell, Evaluation, NeighbourList, Structure};
-use common::{check_forces, check_virial};
-use model_file::{BYTES, array, changed, changed_of, deep, floats, strings};
 use potentials::grace::{Grace, GraceModel, PullBack};
+
+use crate::common;
+use crate::common::model_file::{BYTES, array, changed, changed_of, deep, floats, strings};
+use crate::common::{check_forces, check_virial};
 
 type Changes<'a> = Vec<(&'a str, Option<Vec<u8>>)>;
 

@@ -1,14 +1,14 @@
 //! EAM, Stillinger–Weber and ZBL against LAMMPS (see `data/lammps_reference.py`).
 
-mod common;
-
 use std::path::{Path, PathBuf};
 
 use atoms::units::COULOMB;
 use atoms::{Cell, Matrix3, Potential, Structure, Vec3};
-use common::assert_close;
 use potentials::{Eam, StillingerWeber, Zbl};
 use serde_json::Value;
+
+use crate::common;
+use crate::common::assert_close;
 
 const HERE: &str = env!("CARGO_MANIFEST_DIR");
 

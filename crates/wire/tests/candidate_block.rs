@@ -1,11 +1,10 @@
 //! A block gives back every bit that went in, and refuses every byte that did not.
 
-mod common;
-
-use common::{bits, candidate};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use wire::{BlockError, Candidate, CandidateBlock, CandidateView};
+
+use crate::common::{bits, candidate};
 
 /// Places in the header.
 const LENGTH: usize = 16;

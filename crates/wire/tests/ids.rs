@@ -1,10 +1,9 @@
 //! Identifiers as text.
 
-mod common;
-
-use common::usable_structure;
 use proptest::prelude::*;
 use wire::{CampaignId, CandidateId, ContentHash, Origin, WalkId};
+
+use crate::common::usable_structure;
 
 proptest! {
     #[test]

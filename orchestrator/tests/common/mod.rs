@@ -1,6 +1,4 @@
 //! A campaign without a potential: a mixture made up, structures made up, and features as a test wants them.
-#![allow(dead_code, reason = "each test file uses its part")]
-
 pub mod eventful;
 pub mod memory;
 pub mod scripted;

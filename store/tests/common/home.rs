@@ -8,7 +8,7 @@ use sqlx::{AssertSqlSafe, ConnectOptions, Executor};
 use store::{Location, Store};
 use tempfile::TempDir;
 
-/// A directory; in the test targets `postgres…` a schema of its own.
+/// A directory; a schema of its own on the server that `CALMWALK_POSTGRES` names, which the test target `postgres` asks for.
 pub struct Home {
     directory: TempDir,
     schema: Option<String>,
@@ -24,8 +24,10 @@ impl Home {
     pub fn new() -> Self {
         static NUMBER: AtomicU64 = AtomicU64::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
-        let schema = (env!("CARGO_CRATE_NAME").starts_with("postgres"))
-            .then(|| format!("test_{}_{}_{number}", std::process::id(), store::unix_milliseconds()));
+        let on_server =
+            env!("CARGO_CRATE_NAME") == "postgres" || std::env::var_os("CALMWALK_POSTGRES").is_some();
+        let schema =
+            on_server.then(|| format!("test_{}_{}_{number}", std::process::id(), store::unix_milliseconds()));
         Self { directory: tempfile::tempdir().unwrap(), schema }
     }
 

@@ -1,10 +1,5 @@
-//! The server is restarted, as after a crash, while work goes on: nothing is lost, and nothing is there twice. A test target
-//! of its own, since no other test can go on meanwhile.
-//!
-//! `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres_restart`
-
-#[path = "../common/mod.rs"]
-mod common;
+//! The server is restarted, as after a crash, while work goes on: nothing is lost, and nothing is there twice. By itself, since no
+//! other test can go on meanwhile: `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres restart::`.
 
 use std::process::Command;
 use std::sync::Arc;
@@ -15,7 +10,7 @@ use store::{CampaignLock, Commit, Completed, ComponentRecord, Fate, JobState, St
 use wire::Origin;
 use wire::messages::Decline;
 
-use common::*;
+use crate::common::*;
 
 const RESTARTS: u64 = 4;
 const LABELLERS: usize = 3;

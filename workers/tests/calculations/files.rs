@@ -6,8 +6,8 @@ use dft::Original;
 use store::JobState;
 use workers::labeller::{Keep, LabelBounds, label_once};
 
-use super::common::structure;
 use super::place::*;
+use crate::common::structure;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn directories_of_failures_are_kept_in_the_store() {

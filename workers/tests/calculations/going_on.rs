@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use store::{JobState, unix_milliseconds};
 
-use super::common::{label, protocol};
 use super::place::*;
+use crate::common::{label, protocol};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_killed_labeller_began_is_finished_once() {

@@ -18,11 +18,11 @@ use workers::labeller::{
     Closing, KeeperCommand, LabelBounds, LabellerSettings, Method, Running, Stay, Timing, serve,
 };
 
-use super::common::*;
+use crate::common::*;
 
 pub fn keeper_command() -> KeeperCommand {
     // With one thread the name of the test would stand before what the code says.
-    let arguments = ["keeper", "--exact", "--ignored", "--nocapture", "--test-threads=2"];
+    let arguments = ["calculations::keeper", "--exact", "--ignored", "--nocapture", "--test-threads=2"];
     let arguments = arguments.map(str::to_owned).to_vec();
     KeeperCommand { program: std::env::current_exe().unwrap(), arguments }
 }

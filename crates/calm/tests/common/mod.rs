@@ -1,6 +1,4 @@
 //! Helpers that the tests of this crate share.
-#![allow(dead_code, reason = "each test file uses some of them")]
-
 use std::path::{Path, PathBuf};
 
 use calm::Artifact;

@@ -2,9 +2,10 @@
 //! its moment, and a limit on electronic steps that is too low is judged so and climbed over.
 //!
 //! Needs Debian's packages gpaw, gpaw-data, abinit, abinit-data, cp2k and cp2k-data, and fails without them:
-//! `cargo test -p dft --test codes`.
+//! `CALMWALK_PYTHON=/usr/bin/python3 cargo test -p dft --test codes`.
 
 mod abinit;
+mod ase;
 mod checks;
 mod copies;
 mod cp2k;

@@ -1,6 +1,4 @@
 //! Two potentials simple enough to know everything about them, and statistics of time series.
-#![allow(dead_code)]
-
 use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
 use md::{Dynamics, Settings, State, Stream, Thermostat};
 

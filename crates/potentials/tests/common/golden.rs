@@ -1,7 +1,5 @@
 //! Reference values of the framework that made the models.
 
-#![allow(dead_code)] // each test binary uses a part of this module
-
 use std::path::{Path, PathBuf};
 
 use atoms::{Cell, Matrix3, Species, Structure};

@@ -1,7 +1,5 @@
 //! Variants of a model file of this project.
 
-#![allow(dead_code)] // each test binary uses a part of this module
-
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
 use std::sync::LazyLock;

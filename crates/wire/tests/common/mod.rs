@@ -1,6 +1,4 @@
 //! Candidates of any content.
-#![allow(dead_code, reason = "each test file uses its part")]
-
 use atoms::{Cell, Species, Structure, Vec3};
 use proptest::array::{uniform3, uniform9, uniform16};
 use proptest::collection::vec;

@@ -17,7 +17,7 @@ use wire::place::{Place, Prepared};
 use wire::transport::{Incoming, Work};
 use wire::{CandidateBlock, WalkId};
 
-use crate::process::{Role, assignment, candidate, start};
+use super::process::{Role, assignment, candidate, start};
 
 /// Nothing here takes nearly as long.
 const LIMIT: Duration = Duration::from_secs(60);

@@ -1,7 +1,7 @@
 //! Turns and reports come and go.
 
-use crate::desk::{Desk, check, work};
-use crate::process::Role;
+use super::desk::{Desk, check, work};
+use super::process::Role;
 
 /// From 1 kB to 4 MB, in memory that was laid out for less.
 #[tokio::test(flavor = "multi_thread")]

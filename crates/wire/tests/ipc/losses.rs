@@ -6,8 +6,8 @@ use std::time::Duration;
 use wire::place::Place;
 use wire::transport::Incoming;
 
-use crate::desk::{Desk, check, files_of, work};
-use crate::process::{AT_WORK, Role, start};
+use super::desk::{Desk, check, files_of, work};
+use super::process::{AT_WORK, Role, start};
 
 fn kill(child: &mut Child) {
     child.kill().unwrap();

@@ -7,8 +7,8 @@ use std::path::Path;
 use wire::ipc::{Sizes, space_needed};
 use wire::place::{Place, PlaceError};
 
-use crate::desk::{Desk, files_of};
-use crate::process::Role;
+use super::desk::{Desk, files_of};
+use super::process::Role;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn two_campaigns_do_not_see_each_other() {

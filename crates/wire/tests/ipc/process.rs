@@ -15,7 +15,7 @@ use wire::messages::{Assignment, Outcome, Report};
 use wire::transport::Transport;
 use wire::{CampaignId, Candidate, CandidateId, ContentHash, Origin, WalkId};
 
-use crate::desk::Desk;
+use super::desk::Desk;
 
 const ROLE: &str = "CALMWALK_TEST_ROLE";
 /// What [`Role::Orchestrator`] makes in its directory when a turn is done.
@@ -35,7 +35,7 @@ pub enum Role {
 /// Begins a process.
 pub fn start(role: &Role) -> Child {
     Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "process::child", "--ignored", "--nocapture"])
+        .args(["--exact", "ipc::process::child", "--ignored", "--nocapture"])
         .env(ROLE, serde_json::to_string(role).unwrap())
         .stdout(Stdio::null())
         .spawn()

@@ -10,8 +10,8 @@ use iceoryx2::prelude::{FileName, Path, SemanticString, ServiceName, ipc_threads
 use serde_json::Value;
 use wire::{Candidate, CandidateBlock};
 
-use crate::desk::Desk;
-use crate::process::{Role, assignment, candidate};
+use super::desk::Desk;
+use super::process::{Role, assignment, candidate};
 
 type Service = ipc_threadsafe::Service;
 

@@ -8,7 +8,7 @@ use std::process::Command;
 use tempfile::tempdir_in;
 use wire::{MixtureReader, SharedMixture, SharedMixtureError};
 
-use crate::helpers::{check, first, next};
+use super::helpers::{check, first, next};
 
 #[test]
 fn the_file_is_the_users_alone_and_as_large_as_announced() {
@@ -93,7 +93,7 @@ fn no_damage_leads_beyond_the_file() {
 fn a_full_file_system_is_an_error() {
     let folder = tempdir_in("/dev/shm").unwrap();
     let script = r#"mount -t tmpfs -o size=512k none "$1" || exit 77
-                    exec "$0" --exact files::in_a_small_file_system --ignored --nocapture"#;
+                    exec "$0" --exact mixture::files::in_a_small_file_system --ignored --nocapture"#;
     let namespace = ["--user", "--map-root-user", "--mount", "--propagation", "private"];
     let mut command = Command::new("unshare");
     command.args(namespace).args(["sh", "-c", script]).arg(std::env::current_exe().unwrap());

@@ -7,7 +7,7 @@ use calm::{Component, Grades, Mixture};
 use tempfile::TempDir;
 use wire::{MixtureReader, SharedMixture, SharedMixtureError};
 
-use crate::helpers::{DIMENSION, check, first, next, stamped};
+use super::helpers::{DIMENSION, check, first, next, stamped};
 
 fn place() -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir_in("/dev/shm").unwrap();
@@ -34,7 +34,7 @@ fn what_is_published_is_read() {
 #[test]
 fn grades_have_the_same_bits() {
     let (_folder, path) = place();
-    let mut random = crate::helpers::Random(7);
+    let mut random = super::helpers::Random(7);
     let mut number = || random.next() as f64 / u64::MAX as f64 - 0.5;
     let mut take = |count: usize| (0..count).map(|_| number()).collect::<Vec<f64>>();
     let dimension = 131;
@@ -165,7 +165,7 @@ fn the_same_version_is_the_same_mixture_and_unchanged_components_are_shared() {
     shared.publish(&next(&mixture)).unwrap();
     let new = reader.pin(1).unwrap();
     for (place, ((.., old), (.., new))) in old.iter().zip(new.iter()).enumerate() {
-        assert_eq!(Arc::ptr_eq(old, new), !crate::helpers::changes(1, place), "component {place}");
+        assert_eq!(Arc::ptr_eq(old, new), !super::helpers::changes(1, place), "component {place}");
     }
 }
 

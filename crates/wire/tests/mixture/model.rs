@@ -12,7 +12,7 @@ use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use wire::{MixtureReader, SharedMixture, SharedMixtureError};
 
-use crate::helpers::{DIMENSION, check, first, next, stamp};
+use super::helpers::{DIMENSION, check, first, next, stamp};
 
 const READERS: u32 = 3;
 const COMPONENTS: usize = 6;

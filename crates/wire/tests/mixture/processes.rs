@@ -11,7 +11,7 @@ use std::time::Duration;
 use calm::Mixture;
 use wire::{MixtureReader, SharedMixture, SharedMixtureError};
 
-use crate::helpers::{Random, check, first, next};
+use super::helpers::{Random, check, first, next};
 
 const READERS: u32 = 6;
 const VERSIONS: u64 = 3000;
@@ -27,7 +27,7 @@ struct Peer {
 impl Peer {
     fn start(path: &Path, number: u32) -> Self {
         let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "processes::reader_process", "--ignored", "--nocapture"])
+            .args(["--exact", "mixture::processes::reader_process", "--ignored", "--nocapture"])
             .env("SHARED_MIXTURE", path)
             .env("READER", number.to_string())
             .stdin(Stdio::piped())

@@ -7,8 +7,8 @@ use tokio::time::{sleep, timeout};
 use wire::net::{AgentEvent, Parted, Told};
 use wire::transport::Incoming;
 
-use crate::head::{Head, LIMIT, Wanted, agent, join, mixture, next_version, report, work};
-use crate::link::{Link, State};
+use super::head::{Head, LIMIT, Wanted, agent, join, mixture, next_version, report, work};
+use super::link::{Link, State};
 
 /// The link is cut, or dead without a word, before the offer, while it is being decided, and at the answer.
 #[tokio::test(flavor = "multi_thread")]

@@ -9,7 +9,7 @@ use wire::messages::Progress;
 use wire::net::{AgentEvent, Parted, Told};
 use wire::transport::Incoming;
 
-use crate::head::{Head, Wanted, agent, join, mixture, next_version, report, work};
+use super::head::{Head, Wanted, agent, join, mixture, next_version, report, work};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn turns_and_reports_come_as_they_were() {

@@ -7,7 +7,7 @@ use std::time::Duration;
 use tokio::time::timeout;
 use wire::net::{Address, Announcement, NetError, Parted, Told, Uplink};
 
-use crate::head::{Head, LIMIT, Wanted, agent, endpoint, report, work};
+use super::head::{Head, LIMIT, Wanted, agent, endpoint, report, work};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_follows_the_orchestrator_to_another_endpoint() {

@@ -8,7 +8,7 @@ use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, 
 use tokio::time::timeout;
 use wire::net::{AgentEvent, Hub, NetError, Tls, Uplink, Welcome};
 
-use crate::head::{Head, LIMIT, PATIENCE, Wanted, agent, endpoint, join};
+use super::head::{Head, LIMIT, PATIENCE, Wanted, agent, endpoint, join};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn nothing_listens_or_connects_off_loopback_without_certificates() {

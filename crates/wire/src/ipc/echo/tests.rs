@@ -16,6 +16,7 @@ use common::candidate;
 
 mod any;
 #[path = "../../../tests/common/mod.rs"]
+#[allow(dead_code, reason = "the tests of the package use the rest")]
 mod common;
 
 /// The length of the control message, and its own fixed part.

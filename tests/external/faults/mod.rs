@@ -1,10 +1,7 @@
 //! What goes wrong on real machines: links between hosts, full disks, wrong clocks, labellers that sleep.
 //!
-//! `cargo test --test faults`, as root, where namespaces may be made (a container needs the capabilities `SYS_ADMIN` and
+//! `cargo test --test external faults::`, as root, where namespaces may be made (a container needs the capabilities `SYS_ADMIN` and
 //! `NET_ADMIN`), with iproute2, nftables, libfaketime, openssl and util-linux. A test fails that lacks what it needs.
-
-#[path = "../common/mod.rs"]
-mod common;
 
 mod cable;
 mod clocks;

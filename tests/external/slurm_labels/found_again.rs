@@ -5,10 +5,10 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use super::jobs::{Jobs, once_each};
 use crate::common::processes::wait_until;
 use crate::common::program;
 use crate::common::slurm::ci;
-use crate::jobs::{Jobs, once_each};
 
 #[test]
 fn a_labeller_that_is_killed_is_followed_by_one_that_finds_its_job() {

@@ -1,6 +1,4 @@
-//! ASE calculators, run for real: EMT, which comes with ASE, and GPAW.
-//!
-//! `cargo test -p dft --test ase`, with the Python that `CALMWALK_PYTHON` names, or Debian's (packages `gpaw`, `gpaw-data`).
+//! ASE calculators, run for real: EMT, which comes with ASE, and GPAW; with the Python that `CALMWALK_PYTHON` names, or Debian's.
 
 use std::collections::BTreeSet;
 use std::os::unix::process::ExitStatusExt;

@@ -5,12 +5,12 @@ use std::path::Path;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use crate::cable::{Cable, HEAD, NODE};
+use super::cable::{Cable, HEAD, NODE};
+use super::must;
 use crate::common::Running;
 use crate::common::campaign::{Counters, Outcome, Small, outcome};
 use crate::common::hosts::{Hosts, undisturbed};
 use crate::common::processes::{carrying_out, go_on, hold_walkers, wait_until};
-use crate::must;
 
 /// Three walks side by side: one for the orchestrator's own walker, two for the agent.
 fn small() -> Small {

@@ -1,9 +1,7 @@
 //! A campaign whose labels are made by a real DFT code: `configs/silicon-dft.toml` with ABINIT, of Debian's packages abinit and
 //! abinit-data.
 //!
-//! cargo test --test dft
-
-mod common;
+//! cargo test --test external dft::
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,10 +10,12 @@ use std::time::{Duration, Instant};
 
 use atoms::extxyz::Frame;
 use atoms::{Cell, Structure, Vec3, read_extxyz};
-use common::place::queue;
-use common::processes::{calculating, carrying_out, signal, wait_until};
-use common::{config, demo, deviation, program, random, stderr, succeed};
 use serde_json::Value;
+
+use crate::common;
+use crate::common::place::queue;
+use crate::common::processes::{calculating, carrying_out, signal, wait_until};
+use crate::common::{config, demo, deviation, program, random, stderr, succeed};
 
 /// Directories of calculations: a campaign has a directory in `scratch`, and each calculation one in it.
 fn directories(scratch: &Path) -> Vec<PathBuf> {

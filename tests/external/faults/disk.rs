@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use tempfile::TempDir;
 
+use super::must;
 use crate::common::campaign::{Counters, Small, outcome};
 use crate::common::hosts::{started, undisturbed};
 use crate::common::processes::{go_on, hold_walkers, nothing_is_left, processes_in, signal, wait_until};
 use crate::common::{Running, program, random, through};
-use crate::must;
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
 

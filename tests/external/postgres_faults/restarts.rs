@@ -3,11 +3,11 @@
 use std::thread::sleep;
 use std::time::Duration;
 
+use super::server::{Campaign, control};
 use crate::common::campaign::Small;
 use crate::common::hosts::undisturbed;
 use crate::common::processes::{carrying_out, one_carrying_out, signal, wait_until};
 use crate::common::random;
-use crate::server::{Campaign, control};
 
 /// Some 20 s of work for two walkers.
 fn long() -> Small {

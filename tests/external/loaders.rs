@@ -1,14 +1,13 @@
 //! What `calmwalk export` writes for gracemaker and MACE, read back by their own loaders. Needs two Pythons, named by
 //! `CALMWALK_GRACEMAKER_PYTHON` (of PyPI: tensorpotential) and `CALMWALK_MACE_PYTHON` (mace-torch); `.ci/loaders` makes both.
 
-mod common;
-
 use std::path::Path;
 use std::process::Command;
 
 use atoms::read_extxyz;
-use common::campaign::Small;
-use common::{deviation, stderr, succeed};
+
+use crate::common::campaign::Small;
+use crate::common::{deviation, stderr, succeed};
 
 /// Energy (eV), forces (eV/Å) and stress (eV/Å³) of a frame, as a loader has them.
 type Loaded = (f64, Vec<f64>, Vec<f64>);

@@ -1,7 +1,5 @@
 //! Campaigns on a real Slurm, one of them kept on a PostgreSQL server:
-//! `SLURM_CONF=$(.ci/slurm start) CALMWALK_POSTGRES=$(.ci/postgres start) cargo test --test slurm`.
-
-mod common;
+//! `SLURM_CONF=$(.ci/slurm start) CALMWALK_POSTGRES=$(.ci/postgres start) cargo test --test external slurm::`.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -10,13 +8,15 @@ use std::process::{Command, Output, Stdio};
 use std::sync::MutexGuard;
 use std::time::{Duration, Instant};
 
-use common::campaign::{Outcome, Small, outcome_at};
-use common::hosts::undisturbed;
-use common::processes::{carrying_out, nothing_is_left, wait_until};
-use common::slurm::{ci, hold, slurm};
-use common::{Running, calmwalk, program, stderr, succeed};
 use serde_json::Value;
 use tempfile::TempDir;
+
+use crate::common;
+use crate::common::campaign::{Outcome, Small, outcome_at};
+use crate::common::hosts::undisturbed;
+use crate::common::processes::{carrying_out, nothing_is_left, wait_until};
+use crate::common::slurm::{ci, hold, slurm};
+use crate::common::{Running, calmwalk, program, stderr, succeed};
 
 /// A campaign that is launched on Slurm.
 struct OnSlurm {
@@ -320,7 +320,7 @@ fn before_its_time_is_over_a_job_is_told_and_requeued() {
     campaign.nobody_failed();
 }
 
-/// `SLURM_CONF=$(.ci/slurm start) CALMWALK_POSTGRES=$(.ci/postgres start) cargo test --test slurm server`
+/// `SLURM_CONF=$(.ci/slurm start) CALMWALK_POSTGRES=$(.ci/postgres start) cargo test --test external slurm:: server`
 #[test]
 fn on_a_server_jobs_make_the_labels() {
     let small = long();

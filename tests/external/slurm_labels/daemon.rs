@@ -3,9 +3,9 @@
 use std::fs;
 use std::path::Path;
 
+use super::jobs::{Jobs, only};
 use crate::common::processes::{calculating, signal, wait_until};
 use crate::common::slurm::ci;
-use crate::jobs::{Jobs, only};
 
 /// Every process of the node that belongs to this job of Slurm: the daemon's own for the job, and what works in `scratch`.
 fn of_job(id: &str, scratch: &Path) -> Vec<u32> {

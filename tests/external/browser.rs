@@ -1,19 +1,18 @@
 //! The dashboard in a real browser, Chromium without a screen, which is driven over HTTP by `chromedriver`:
 //! every page shows what it should, nothing is fetched from elsewhere, nothing is complained of, and an action does what it says. Needs
-//! Debian's packages chromium and chromium-driver; `cargo test --test browser`. Pictures are left in `target/dashboard`.
-
-mod common;
+//! Debian's packages chromium and chromium-driver; `cargo test --test external browser::`. Pictures are left in `target/dashboard`.
 
 use std::fs;
 use std::path::Path;
 use std::process::Stdio;
 
-use common::browser::{Browser, ENTER, ESCAPE, RIGHT, TAB};
-use common::campaign::Small;
-use common::http::{get, said};
-use common::processes::wait_until;
-use common::{Running, program, succeed};
 use serde_json::Value;
+
+use crate::common::browser::{Browser, ENTER, ESCAPE, RIGHT, TAB};
+use crate::common::campaign::Small;
+use crate::common::http::{get, said};
+use crate::common::processes::wait_until;
+use crate::common::{Running, program, succeed};
 
 /// Leaves a picture for people to look at.
 fn picture(browser: &Browser, name: &str) {

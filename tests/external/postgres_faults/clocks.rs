@@ -36,7 +36,7 @@ fn clocks(place: &Place) -> [Clock; 2] {
 #[test]
 fn labellers_with_wrong_clocks_label_everything_once() {
     let small = Small { steps: 1600, per_seed: 12, ..Small::default() };
-    let place = Place::new(&small, &[("[label]", "[label]\nslots = 0\nlease = 2")]);
+    let place = Place::on_server(&small, &[("[label]", "[label]\nslots = 0\nlease = 2")]);
     let mut run = place.run();
     wait_until("there is a campaign", || place.jobs("queued") > 0);
     let clocks = clocks(&place);
@@ -65,7 +65,7 @@ fn labellers_with_wrong_clocks_label_everything_once() {
 #[test]
 fn a_lease_lasts_however_late_others_think_it_is() {
     let small = Small { steps: 60, ..Small::default() };
-    let place = Place::new(&small, &[("[label]", "[label]\nlease = 60")]);
+    let place = Place::on_server(&small, &[("[label]", "[label]\nlease = 60")]);
     assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
     let name = place.queue_large();
     let [ahead, behind] = clocks(&place);

@@ -1,17 +1,18 @@
 //! `calmwalk watch` in a real terminal: keys are sent, and the screen is looked at. Needs tmux (Debian: `tmux`):
-//! `cargo test --test watch`. The same on PostgreSQL is in `postgres_whole.rs`.
-
-mod common;
+//! `cargo test --test external watch::`. With `CALMWALK_POSTGRES=$(.ci/postgres start)`
+//! its campaigns are on that server.
 
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use common::campaign::Small;
-use common::place::Place;
-use common::processes::{carrying_out, signal, wait_until};
-use common::{Running, succeed};
 use serde_json::Value;
+
+use crate::common;
+use crate::common::campaign::Small;
+use crate::common::place::Place;
+use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::common::{Running, succeed};
 
 /// A terminal with the program in it; when that has ended, its exit code is on the screen.
 struct Terminal {

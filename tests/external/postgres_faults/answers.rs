@@ -122,7 +122,7 @@ fn small(number: u64) -> Structure {
 #[test]
 fn answers_to_commits_get_lost_and_no_job_does() {
     const JOBS: u64 = 47;
-    let place = Place::new(&Small { steps: 60, ..Small::default() }, &[]);
+    let place = Place::on_server(&Small { steps: 60, ..Small::default() }, &[]);
     assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
     let structures: Vec<_> = (0..JOBS).map(small).collect();
     for (structure, step) in structures.iter().zip(1..) {

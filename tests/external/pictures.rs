@@ -1,17 +1,15 @@
 //! The pictures of the README, from the campaign of `configs/aluminium.toml`, and a longer one like it: they are written anew into `docs/pictures`. Needs
-//! Debian's packages chromium, chromium-driver, tmux and fonts-dejavu; `cargo test --test pictures`.
-
-mod common;
+//! Debian's packages chromium, chromium-driver, tmux and fonts-dejavu; `cargo test --test external pictures:: -- --ignored`.
 
 use std::fmt::Write;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use common::browser::Browser;
-use common::http::{get, said};
-use common::processes::signal;
-use common::{Running, demo, program, stderr, succeed};
+use crate::common::browser::Browser;
+use crate::common::http::{get, said};
+use crate::common::processes::signal;
+use crate::common::{Running, demo, program, stderr, succeed};
 
 /// Bytes of a picture, at most.
 const LARGEST: u64 = 200_000;
@@ -20,6 +18,7 @@ const LARGEST: u64 = 200_000;
 const TERMINAL: (u32, u32) = (150, 38);
 
 #[test]
+#[ignore = "it writes the pictures of the README anew"]
 fn the_readme_shows_a_campaign() {
     let directory = tempfile::tempdir().unwrap();
     let here = directory.path();

@@ -2,9 +2,9 @@
 
 use std::fs;
 
+use super::jobs::{Jobs, once_each, only};
 use crate::common::processes::wait_until;
 use crate::common::slurm::{ci, slurm};
-use crate::jobs::{Jobs, once_each, only};
 
 /// Slurm looks at time limits every half minute.
 fn end_its_time(id: &str) {

@@ -1,8 +1,5 @@
 //! Calculations by another program, here a shell script: kept, found again, ended, put away.
 
-#[path = "../../../store/tests/common/mod.rs"]
-mod common;
-
 mod failures;
 mod files;
 mod going_on;
@@ -10,11 +7,12 @@ mod place;
 
 use std::fs;
 
-use common::{ATOMS, structure};
 use dft::FailureClass;
 use place::*;
 use store::{Standing, unix_milliseconds};
 use workers::labeller::{LabelBounds, keep, label_once};
+
+use crate::common::{ATOMS, structure};
 
 /// Not a test: what the others start as the keepers of their calculations.
 #[test]

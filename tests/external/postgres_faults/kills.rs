@@ -3,11 +3,11 @@
 use std::thread::sleep;
 use std::time::Duration;
 
+use super::server::Campaign;
 use crate::common::campaign::{Outcome, Small};
 use crate::common::hosts::undisturbed;
 use crate::common::processes::{carrying_out, signal};
 use crate::common::{Running, kills, random};
-use crate::server::Campaign;
 
 /// A campaign with two agents, in which everybody is killed sooner or later and started again.
 struct Killed {

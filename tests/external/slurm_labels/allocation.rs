@@ -2,10 +2,10 @@
 
 use std::fs;
 
+use super::jobs::Jobs;
 use crate::common::processes::{calculating, carrying_out, signal, wait_until};
 use crate::common::program;
 use crate::common::slurm::slurm;
-use crate::jobs::Jobs;
 
 /// Submits a job in which labels are made, and which lasts until calculations may end.
 fn submit(jobs: &Jobs) {

@@ -4,9 +4,9 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
+use super::must;
 use crate::common::Running;
 use crate::common::processes::wait_until;
-use crate::must;
 
 /// The address of the first host.
 pub const HEAD: &str = "10.77.0.1";

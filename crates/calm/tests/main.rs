@@ -1,0 +1,11 @@
+//! Tests of the grade, its rules and the mixture.
+
+mod common;
+
+mod artifact;
+mod grade;
+mod properties;
+mod rules;
+mod soundness;
+mod update;
+mod watch;

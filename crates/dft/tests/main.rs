@@ -1,0 +1,4 @@
+//! Tests of DFT codes that need none of them.
+
+mod command;
+mod vasp;

@@ -1,0 +1,7 @@
+//! Tests of the dynamics.
+
+mod common;
+
+mod checkpoint;
+mod conservation;
+mod ensembles;

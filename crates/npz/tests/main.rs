@@ -1,0 +1,6 @@
+//! Tests of arrays in files.
+
+mod common;
+
+mod arrays;
+mod hostile;

@@ -1,0 +1,12 @@
+//! Tests of the selector, the reactor and the supervisor.
+
+mod common;
+
+mod decisions;
+mod group;
+mod reactor;
+mod replay;
+mod reproducible;
+mod slurm_plan;
+mod supervisor;
+mod walks;

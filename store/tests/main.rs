@@ -1,0 +1,19 @@
+//! Tests of the store. With `CALMWALK_POSTGRES=$(.ci/postgres start)` their campaigns are on that server.
+
+mod common;
+
+mod backup;
+mod budget;
+mod campaign;
+mod check;
+mod crash;
+mod damage;
+mod exclude;
+mod file;
+mod history;
+mod migration;
+mod outcomes;
+mod processes;
+mod queue;
+mod queue_model;
+mod relabel;

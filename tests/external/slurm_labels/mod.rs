@@ -1,0 +1,7 @@
+//! Labels as jobs of their own on a real Slurm: `SLURM_CONF=$(.ci/slurm start) cargo test --test external slurm_labels::`.
+
+mod allocation;
+mod daemon;
+mod ends;
+mod found_again;
+mod jobs;

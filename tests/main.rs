@@ -1,0 +1,44 @@
+//! Tests of the whole program that need nothing else.
+//!
+//! `cargo test --test integration dashboard::` runs those of one module. With `CALMWALK_POSTGRES=$(.ci/postgres start)` the
+//! campaigns of `backup`, `label` and `relabel` are on that server.
+
+mod common;
+
+mod backup;
+mod budgets;
+mod calculations;
+mod certificates;
+mod cli_calm;
+mod cli_campaign;
+mod cli_md;
+mod configs;
+mod dashboard;
+mod energies;
+mod errors;
+mod exclude;
+mod explain;
+mod export;
+mod failing_walks;
+mod floods;
+mod going_on;
+mod guards;
+mod hostile_labels;
+mod hosts;
+mod house;
+mod interruption;
+mod label;
+mod log;
+mod metrics;
+mod mutations;
+mod notify;
+mod places;
+mod processes;
+mod relabel;
+mod replay;
+mod status;
+mod wrong_artifacts;
+mod wrong_campaign;
+mod wrong_input;
+mod wrong_structures;
+mod wrong_values;

@@ -1,0 +1,11 @@
+//! Tests of walks and labellers.
+
+#[path = "../../store/tests/common/mod.rs"]
+mod common;
+#[path = "../../tests/common/mutate.rs"]
+mod mutate;
+
+mod calculations;
+mod deep_models;
+mod labeller;
+mod walk;
