@@ -8,6 +8,7 @@ mod campaign;
 mod cli;
 mod condition;
 mod config;
+mod duration;
 mod ends;
 mod energies;
 mod forecast;
