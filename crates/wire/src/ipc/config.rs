@@ -2,6 +2,7 @@
 //! beyond the campaign's place: the creator of a service sets every limit.
 
 use std::path::Path;
+use std::sync::Mutex;
 
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::config::Config;
@@ -208,6 +209,10 @@ fn create_bell(node: &Node<Service>, bell: &str, processes: usize) -> Result<Lis
         .disable_notifier_dead_event()
         .create()
         .map_err(|e| IpcError::new("create the events", e))?;
+    // iceoryx2 sets the umask of the process while it binds a listener's socket. Two threads that do so at once would leave
+    // it set for good: directories that are made later could not be entered.
+    static UMASK: Mutex<()> = Mutex::new(());
+    let _one_at_a_time = UMASK.lock();
     events.listener_builder().create().map_err(|e| IpcError::new("listen to events", e))
 }
 

@@ -1,8 +1,8 @@
 //! Directories of this user alone.
 
-use std::fs::{DirBuilder, Metadata};
+use std::fs::{self, DirBuilder, Metadata, Permissions};
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::Path;
 
 use super::error::{PlaceError, io_error};
@@ -15,7 +15,9 @@ pub(super) fn user() -> u32 {
 pub(super) fn make_private(path: &Path, uid: u32) -> Result<(), PlaceError> {
     match DirBuilder::new().mode(0o700).create(path) {
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
-        made => made.map_err(io_error("make", path))?,
+        // Whatever the umask is: iceoryx2 changes that of the process for a moment.
+        Ok(()) => fs::set_permissions(path, Permissions::from_mode(0o700)).map_err(io_error("make", path))?,
+        Err(error) => return Err(io_error("make", path)(error)),
     }
     check_private(path, uid)
 }
@@ -36,8 +38,7 @@ fn describe(found: &Metadata) -> String {
 
 #[cfg(test)]
 mod tests {
-    use std::fs::{self, Permissions};
-    use std::os::unix::fs::{PermissionsExt, symlink};
+    use std::os::unix::fs::symlink;
 
     use super::*;
 

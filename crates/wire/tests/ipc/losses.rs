@@ -137,6 +137,7 @@ async fn a_killed_orchestrator_leaves_nothing_that_matters() {
     for _ in 0..2 {
         let mut dead = start(&Role::Orchestrator(directory.path().to_str().unwrap().to_owned()));
         while !directory.path().join(AT_WORK).exists() {
+            assert!(dead.try_wait().unwrap().is_none(), "it ended before it was at work");
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
         kill(&mut dead);
