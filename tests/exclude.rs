@@ -33,7 +33,7 @@ fn a_bad_label_is_left_out_until_it_is_taken_in_again() {
     let (before, _) = exported(here);
     assert!(before.len() > 2);
     let bad = before[1].as_str();
-    let (errors, report) = (json(here, ["errors", "here"]), "the SCF loop had two solutions");
+    let (errors, report) = (json(here, ["force-errors", "here"]), "the SCF loop had two solutions");
     // The campaign's part of the name may be left out.
     let short = bad.split_once('-').unwrap().1;
     let said = succeed(here, ["exclude", "here", short, "--reason", report]);
@@ -47,7 +47,7 @@ fn a_bad_label_is_left_out_until_it_is_taken_in_again() {
     let (left, said) = exported(here);
     assert!(!left.contains(&bad.to_owned()) && left.len() == before.len() - 1, "{left:?}");
     assert!(said.contains("excluded by hand and left out: 1"), "{said}");
-    let now = json(here, ["errors", "here"]);
+    let now = json(here, ["force-errors", "here"]);
     let structures = |errors: &Json, key: &str| errors[key]["structures"].as_u64().unwrap();
     assert_eq!(structures(&now, "biased"), structures(&errors, "biased") - 1);
     let used = |errors: &Json| errors["energy"]["offsets"]["structures"].as_u64().unwrap();
@@ -85,7 +85,7 @@ fn a_bad_label_is_left_out_until_it_is_taken_in_again() {
     let said = succeed(here, ["exclude", "here", bad, "--undo"]);
     assert_eq!(said, format!("{bad}: its label by 'reference' counts again\n"));
     assert_eq!(exported(here).0, before);
-    assert_eq!(json(here, ["errors", "here"]), errors);
+    assert_eq!(json(here, ["force-errors", "here"]), errors);
     let story = succeed(here, ["explain", "here", bad]);
     assert!(story.contains("by hand: include") && !story.contains("excluded from exports"), "{story}");
     assert_eq!(succeed(here, ["exclude", "here", "--list"]), "no label is excluded\n");

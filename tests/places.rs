@@ -46,7 +46,7 @@ fn campaigns_of_init_do_not_meet() {
 
     // Every command takes the directory that `init` made.
     for command in
-        [&["status"][..], &["errors"], &["report", "--output", "page"], &["walks"], &["store", "check"]]
+        [&["status"][..], &["force-errors"], &["report", "--output", "page"], &["walks"], &["store", "check"]]
     {
         let arguments = command.iter().copied();
         let last = if command == ["walks"] { &["resume", "--all"][..] } else { &[] };
@@ -54,7 +54,7 @@ fn campaigns_of_init_do_not_meet() {
             arguments.partition(|word| !word.starts_with("--") && *word != "page");
         succeed(here, words.into_iter().chain(["second"]).chain(options).chain(last.iter().copied()));
     }
-    assert!(succeed(here, ["plan", "first/campaign.toml", "--like", "second"]).contains("newest label"));
+    assert!(succeed(here, ["estimate", "first/campaign.toml", "--cost-from", "second"]).contains("newest label"));
     succeed(here, ["label", "--store", "second", "--until-empty"]);
 }
 

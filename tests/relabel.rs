@@ -149,7 +149,7 @@ fn doubtful_labels_are_made_again_by_the_same_protocol() {
     let all = relabel(&place, &["--where", "max_force >= 0"]);
     assert!(
         all.contains("0 structures are queued to be labelled again")
-            && all.contains("--again asks for others"),
+            && all.contains("(use --include-current to relabel)"),
         "{all}"
     );
     assert!(
@@ -176,13 +176,13 @@ fn killed_at_any_instant_all_or_nothing_is_asked_for() {
     let (place, labels) = labelled();
     let before = exported(&place);
     for kill in 0..8 {
-        let mut running = place.start(&["relabel", place.argument(), "--all", "--again"]);
+        let mut running = place.start(&["relabel", place.argument(), "--all", "--include-current"]);
         std::thread::sleep(Duration::from_millis(random(kill) % 60));
         signal(running.0.id(), "KILL");
         running.0.wait().unwrap();
         assert!([0, labels].contains(&place.jobs("again")), "{}", place.status());
     }
-    relabel(&place, &["--all", "--again"]);
+    relabel(&place, &["--all", "--include-current"]);
     assert_eq!(place.jobs("again"), labels);
     // Labellers that are killed leave nothing undone either.
     for kill in 0..4 {

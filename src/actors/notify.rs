@@ -77,7 +77,7 @@ impl<'a> Notifier<'a> {
 
     async fn look(&mut self) -> Result<(), Failure> {
         let mut due = self.watch.look(&self.store.status().await?, unix_milliseconds());
-        let values = status::Values(self.store.values().await?);
+        let values = status::MixtureSummary(self.store.values().await?);
         if let Some((share, raised)) = values.forgetting() {
             due.extend(self.watch.look_at_training(&self.forgetting, share, raised));
         }

@@ -1,26 +1,26 @@
 //! `calmwalk status`
 
-mod end;
-mod jobs;
+mod batch_jobs;
+mod expected_end;
 mod json;
-mod labels;
+mod label_summary;
+mod mixture_summary;
 pub mod page;
 mod processes;
 #[cfg(test)]
 pub mod tests;
-mod values;
 pub mod walks;
 
 use std::io::{self, Write};
 
 use serde_json::Value;
-use store::{Candidates, Location, Status as Standing, Store};
+use store::{Candidates, Location, Status as CampaignStatus, Store};
 
-pub use self::end::End;
-use self::jobs::Jobs;
-use self::labels::LabelsSoFar;
+use self::batch_jobs::BatchJobs;
+pub use self::expected_end::ExpectedEnd;
+use self::label_summary::LabelSummary;
+pub use self::mixture_summary::MixtureSummary;
 use self::page::Page;
-pub use self::values::Values;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::budget;
 use crate::ends::Ends;
@@ -50,7 +50,7 @@ impl Status {
     pub fn run(self) -> Result<Ended, Failure> {
         let location = self.location.get()?;
         let snapshot = block_on(Snapshot::at(&location))??;
-        let jobs = block_on(Jobs::of(&location))?;
+        let jobs = block_on(BatchJobs::of(&location))?;
         if self.json {
             print_json(&json::of(&snapshot, &jobs).map_err(Failure::failed)?)?;
         } else {
@@ -67,11 +67,11 @@ pub struct Snapshot {
     campaign: store::Campaign,
     /// None of a campaign of an early version.
     origin: Option<Origin>,
-    standing: Standing,
-    values: Values,
+    status: CampaignStatus,
+    mixture: MixtureSummary,
     disk: Disk,
-    labels: LabelsSoFar,
-    end: End,
+    labels: LabelSummary,
+    end: ExpectedEnd,
 }
 
 impl Snapshot {
@@ -86,36 +86,36 @@ impl Snapshot {
     pub async fn of(store: &Store) -> Result<Self, Failure> {
         let forecast = store.note(forecast::NOTE).await?;
         let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
-        let (campaign, standing) = (store.campaign().await?, store.status().await?);
-        let labels = LabelsSoFar::of(store, &standing).await?;
+        let (campaign, status) = (store.campaign().await?, store.status().await?);
+        let labels = LabelSummary::of(store, &status).await?;
         let configuration: Value = serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default();
         Ok(Self {
-            end: End::of(&standing, &configuration, labels.bill()),
+            end: ExpectedEnd::of(&status, &configuration, labels.bill()),
             origin: Origin::of(store).await?,
-            values: Values(store.values().await?),
+            mixture: MixtureSummary(store.values().await?),
             disk: Disk { bytes: store.size().await?, forecast },
             campaign,
-            standing,
+            status,
             labels,
         })
     }
 
     /// What it does, in words.
     pub fn state(&self) -> String {
-        processes::state(&self.standing)
+        processes::state(&self.status)
     }
 
     /// All that the command prints with `--all`, in lines of at most `width` columns; without jobs of a batch system.
     pub fn text(&self, width: usize) -> String {
         let (mut text, page) = (Vec::new(), Page { width, ..Page::of_all() });
         // Memory takes everything.
-        let _ = self.write(&mut text, &Jobs::None, page, None);
+        let _ = self.write(&mut text, &BatchJobs::None, page, None);
         String::from_utf8_lossy(&text).into_owned()
     }
 
     /// As docs/status.md has it, without jobs of a batch system.
     pub fn to_json(&self) -> serde_json::Result<Value> {
-        json::of(self, &Jobs::None)
+        json::of(self, &BatchJobs::None)
     }
 
     /// The campaign.
@@ -124,8 +124,8 @@ impl Snapshot {
     }
 
     /// How it stands.
-    pub fn standing(&self) -> &Standing {
-        &self.standing
+    pub fn status(&self) -> &CampaignStatus {
+        &self.status
     }
 
     /// Failures of labels by class.
@@ -135,7 +135,7 @@ impl Snapshot {
 
     /// Share of the training atoms with γ > 1 under the newest mixture, if they are watched.
     pub fn share_above_one(&self) -> Option<f64> {
-        self.values.training_frames()["share_above_one"].as_f64()
+        self.mixture.training_frames()["share_above_one"].as_f64()
     }
 
     /// Size of the store, bytes.
@@ -144,36 +144,36 @@ impl Snapshot {
     }
 
     /// When it is expected to end.
-    pub fn end(&self) -> &End {
+    pub fn end(&self) -> &ExpectedEnd {
         &self.end
     }
 
-    fn write(&self, out: &mut dyn Write, jobs: &Jobs, page: Page, walks: Option<usize>) -> io::Result<()> {
+    fn write(&self, out: &mut dyn Write, jobs: &BatchJobs, page: Page, walks: Option<usize>) -> io::Result<()> {
         let mut head = Vec::new();
         self.write_head(&mut head, &page)?;
         out.write_all(&head)?;
         let lines = head.iter().filter(|byte| **byte == b'\n').count();
-        let page = page.fitted(lines, if matches!(jobs, Jobs::Known(_)) { 3 } else { 2 }, walks);
-        walks::write(out, &self.standing.walks, self.standing.led, &page)?;
-        processes::write(out, &self.standing.processes, &page)?;
+        let page = page.fitted(lines, if matches!(jobs, BatchJobs::Known(_)) { 3 } else { 2 }, walks);
+        walks::write(out, &self.status.walks, self.status.led, &page)?;
+        processes::write(out, &self.status.processes, &page)?;
         jobs.write(out, &page)
     }
 
     fn write_head(&self, out: &mut dyn Write, page: &Page) -> io::Result<()> {
-        let Self { campaign, origin, standing, values, disk, labels, end } = self;
+        let Self { campaign, origin, status, mixture, disk, labels, end } = self;
         let (name, mode) = (origin.as_ref().map_or("", |origin| &origin.name), &campaign.mode);
         let id = campaign.id.to_string();
         // The names of candidates begin with as much of it.
         let id = if page.has_all() || name.is_empty() { &id[..] } else { &id[..8] };
         let separator = if name.is_empty() { "" } else { ", " };
-        let round = if standing.round == 0 { String::new() } else { format!(", round {}", standing.round) };
+        let round = if status.round == 0 { String::new() } else { format!(", round {}", status.round) };
         page.titled(out, "campaign", &format!("{name}{separator}{id}, {mode} mode{round}"))?;
         if let Some(origin) = origin.as_ref().filter(|_| page.has_all()) {
             page.titled(out, "", &format!("by {}", origin.file.path))?;
         }
-        page.titled(out, "state", &processes::state(standing))?;
-        let ends = Ends::of(&standing.walks);
-        page.titled(out, "walks", &walks_in_words(standing, &ends))?;
+        page.titled(out, "state", &processes::state(status))?;
+        let ends = Ends::of(&status.walks);
+        page.titled(out, "walks", &walks_in_words(status, &ends))?;
         if page.has_all() {
             ends.lines().iter().try_for_each(|line| page.titled(out, "", line))?;
         } else {
@@ -181,14 +181,14 @@ impl Snapshot {
                 ends.causes().map(|(cause, _)| format!("{}: try {}", cause.in_words(), cause.advice()));
             advice.take(page.few).try_for_each(|line| page.titled(out, "", &line))?;
         }
-        page.titled(out, "mixture", &format!("version {}", standing.mixture_version))?;
-        values.write(out, page, &campaign.mode)?;
-        write_candidates(out, page, &standing.candidates, labels.shared)?;
-        labels.write(out, page, standing)?;
-        if let Some(budget) = budget::shown(&standing.budget) {
+        page.titled(out, "mixture", &format!("version {}", status.mixture_version))?;
+        mixture.write(out, page, &campaign.mode)?;
+        write_candidates(out, page, &status.candidates, labels.shared)?;
+        labels.write(out, page, status)?;
+        if let Some(budget) = budget::shown(&status.budget) {
             page.titled(out, "budget", &budget)?;
         }
-        page.titled(out, "disk", &disk.in_words(page, standing))?;
+        page.titled(out, "disk", &disk.in_words(page, status))?;
         match end.shown() {
             Some(end) => page.titled(out, "end", &end),
             None => Ok(()),
@@ -207,13 +207,13 @@ struct Disk {
 
 impl Disk {
     /// At the end, bytes; none if it is unknown, or the campaign is over.
-    fn at_the_end(&self, status: &Standing) -> Option<u64> {
+    fn at_the_end(&self, status: &CampaignStatus) -> Option<u64> {
         let Candidates { accepted, control, .. } = status.candidates;
         let forecast = self.forecast.filter(|_| !status.finished)?;
         Some(self.bytes + forecast.still_to_come(accepted + control, self.bytes))
     }
 
-    fn in_words(&self, page: &Page, status: &Standing) -> String {
+    fn in_words(&self, page: &Page, status: &CampaignStatus) -> String {
         let now = megabytes(self.bytes);
         let Some((forecast, end)) = self.forecast.zip(self.at_the_end(status)) else {
             return format!("{now} now");
@@ -229,7 +229,7 @@ impl Disk {
     }
 }
 
-fn walks_in_words(status: &Standing, ends: &Ends) -> String {
+fn walks_in_words(status: &CampaignStatus, ends: &Ends) -> String {
     let under_way = status.walks.iter().filter(|walk| walk.is_under_way()).count();
     let are = if status.led { "under way" } else { "not finished" };
     let ended = match ends.ended() {

@@ -28,7 +28,7 @@ async fn metrics(State(store): State<Store>) -> Response {
 
 /// Everything. Labels have few values each: kinds, states, reasons and classes, never walks or structures.
 pub fn text(snapshot: &Snapshot) -> String {
-    let (campaign, status) = (snapshot.campaign(), snapshot.standing());
+    let (campaign, status) = (snapshot.campaign(), snapshot.status());
     let mut text = Text::default();
     let id = campaign.id.to_string();
     let labels =

@@ -29,7 +29,7 @@ impl Terminal {
         let (width, height) = (size.0.to_string(), size.1.to_string());
         let program = env!("CARGO_BIN_EXE_calmwalk");
         let command =
-            format!("{environment} {program} watch '{campaign}' --every 0.2; echo code $?; exec cat");
+            format!("{environment} {program} watch '{campaign}' --every 200ms; echo code $?; exec cat");
         let here = here.display().to_string();
         let arguments = ["-f", "/dev/null", "new-session", "-d", "-c", &here, "-x", &width, "-y", &height];
         terminal.tmux(&[&arguments[..], &[&command]].concat());

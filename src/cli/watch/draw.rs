@@ -97,23 +97,23 @@ fn draw_panes(frame: &mut Frame<'_>, area: Rect, state: &mut State, theme: &Them
 }
 
 fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
-    let (campaign, standing) = (state.snapshot.campaign(), state.snapshot.standing());
-    let under_way = standing.walks.iter().filter(|walk| walk.is_under_way()).count();
-    let paused = standing.walks.iter().filter(|walk| walk.paused).count();
+    let (campaign, status) = (state.snapshot.campaign(), state.snapshot.status());
+    let under_way = status.walks.iter().filter(|walk| walk.is_under_way()).count();
+    let paused = status.walks.iter().filter(|walk| walk.paused).count();
     let paused = if paused == 0 { String::new() } else { format!(" ({paused} paused)") };
-    let ended = standing.walks.len() - under_way;
-    let are = if standing.led { "under way" } else { "not finished" };
-    let speed = standing.steps_per_second.filter(|_| under_way > 0);
+    let ended = status.walks.len() - under_way;
+    let are = if status.led { "under way" } else { "not finished" };
+    let speed = status.steps_per_second.filter(|_| under_way > 0);
     let speed = speed.map_or(String::new(), |speed| format!("; {speed:.1} steps/s"));
-    let Candidates { seen, accepted, control, .. } = &standing.candidates;
-    let Labels { queued, leased, labelled, failed, .. } = &standing.labels;
+    let Candidates { seen, accepted, control, .. } = &status.candidates;
+    let Labels { queued, leased, labelled, failed, .. } = &status.labels;
     let lines = [
         ("campaign", format!("{}, {} mode: {}", campaign.id, campaign.mode, state.snapshot.state())),
         (
             "walks",
             format!(
                 "{under_way} {are}{paused}, {ended} ended{speed}; mixture version {}",
-                standing.mixture_version
+                status.mixture_version
             ),
         ),
         (
@@ -128,7 +128,7 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
             "labels",
             format!(
                 "{queued} queued, {leased} leased, {labelled} labelled, {failed} failed; {} in the last hour",
-                standing.labels_last_hour
+                status.labels_last_hour
             ),
         ),
         ("end", state.snapshot.end().shown().unwrap_or_else(|| "–".into())),

@@ -13,7 +13,6 @@ mod tests;
 
 use std::io::{self, IsTerminal};
 use std::thread;
-use std::time::Duration;
 
 use ratatui::crossterm::event::{self, Event};
 use store::Location;
@@ -26,21 +25,22 @@ use self::keys::Request;
 use self::reader::{Looks, Reader};
 use self::screen::Screen;
 use self::state::State;
-use super::{CampaignLocation, Ended, Failure, block_on, explain, queue, walks};
+use super::{CampaignLocation, Ended, Failure, block_on, duration_between, explain, queue, walks};
+use crate::duration::Duration;
 
-/// Watch a campaign live in the terminal
+/// Monitor and control a campaign in the terminal
 ///
-/// Walks, label queue and recent decisions, which can be filtered, with the distribution of γ and the share of candidates that are
-/// accepted. Enter tells the story of a candidate; structures in the queue are dropped, tried again and given other
-/// priorities, walks are paused and resumed. F1 or ? shows the keys (docs/watch.md). Works while the campaign runs and after it ended,
-/// also on a copy, and disturbs nobody. No colours where NO_COLOR is set.
+/// Shows walks, label queue and recent decisions with filters, the distribution of γ and the acceptance rate of candidates. Press
+/// Enter for the history of a candidate. Keys drop, retry and prioritise structures in the queue, and pause and resume walks; F1 or ?
+/// lists them (docs/watch.md). Works on running and finished campaigns and on backups, and does not slow a run down. Set NO_COLOR for
+/// output without colours.
 #[derive(Debug, clap::Args)]
 pub struct Watch {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Time between two looks, s
-    #[arg(long, value_name = "SECONDS", default_value_t = 2.0, value_parser = seconds)]
-    every: f64,
+    /// Refresh interval, such as 500ms
+    #[arg(long, value_name = "TIME", default_value_t = Duration::from_seconds(2), value_parser = duration_between("200ms", "1h"))]
+    every: Duration,
 }
 
 impl Watch {
@@ -48,17 +48,16 @@ impl Watch {
         let location = self.location.get()?;
         if !io::stdout().is_terminal() {
             return Err(Failure::Input(
-                "watch draws on a terminal, and the standard output is none: calmwalk status shows a campaign once, \
-                 calmwalk status --json for other programs"
+                "standard output is not a terminal: use calmwalk status, or calmwalk status --json for other programs"
                     .into(),
             ));
         }
-        block_on(watch(location, Duration::from_secs_f64(self.every)))?
+        block_on(watch(location, self.every.get()))?
     }
 }
 
 /// Looks, draws and obeys until somebody leaves.
-async fn watch(location: Location, every: Duration) -> Result<Ended, Failure> {
+async fn watch(location: Location, every: std::time::Duration) -> Result<Ended, Failure> {
     let mut reader = Reader::new(location.clone());
     // What is wrong with it is said on the terminal as it was.
     let mut state = State::new(reader.look(state::Jobs::default()).await?);
@@ -143,9 +142,4 @@ fn events() -> mpsc::Receiver<Event> {
         }
     });
     events
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    let seconds = text.parse().ok().filter(|seconds| (0.2..=3600.0).contains(seconds));
-    seconds.ok_or_else(|| "expected 0.2 to 3600".to_owned())
 }

@@ -181,7 +181,7 @@ impl State {
 
     /// Fills the panes with what there is.
     pub fn arrange(&mut self) {
-        let store::Status { walks, led, .. } = self.snapshot.standing();
+        let store::Status { walks, led, .. } = self.snapshot.status();
         let [of_walks, of_queue, of_decisions] = &mut self.panes;
         of_walks.show(entries::of_walks(walks, *led, of_walks.filter.as_ref()), walks.len());
         of_queue.show(entries::of_jobs(&self.jobs, of_queue.filter.as_ref()), self.jobs.len());

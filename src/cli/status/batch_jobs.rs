@@ -18,7 +18,7 @@ const PATIENCE: Duration = Duration::from_secs(4);
 
 /// What is known of jobs.
 #[derive(Debug)]
-pub enum Jobs {
+pub enum BatchJobs {
     /// There is no batch system, or it has no job of this campaign.
     None,
     /// These, with the exit codes of those that ended.
@@ -27,7 +27,7 @@ pub enum Jobs {
     Unknown(String),
 }
 
-impl Jobs {
+impl BatchJobs {
     /// Asks the batch system about the campaign that is kept here.
     pub async fn of(location: &Location) -> Self {
         let location = match location {
@@ -158,7 +158,7 @@ mod tests {
         (waiting.nodes, waiting.start) = (String::new(), "N/A".into());
         waiting.reason = Some("Resources".into());
         let failed = job(9, Role::Agent(1), "FAILED");
-        let jobs = Jobs::Known(vec![
+        let jobs = BatchJobs::Known(vec![
             (job(12, Role::Orchestrator, "RUNNING"), None),
             (waiting, None),
             (failed, Some("1:0".into())),
@@ -181,9 +181,9 @@ mod tests {
     #[test]
     fn nothing_is_said_of_what_was_never_launched() {
         let mut value = json!({});
-        Jobs::None.add_to(&mut value);
+        BatchJobs::None.add_to(&mut value);
         let mut text = Vec::new();
-        Jobs::None.write(&mut text, &PAGE).unwrap();
+        BatchJobs::None.write(&mut text, &PAGE).unwrap();
         assert_eq!((value, text.len()), (json!({}), 0));
     }
 }

@@ -8,7 +8,7 @@ use crate::bill::{Bill, SECONDS_PER_HOUR, digits};
 
 /// As things are now: walks that there are, at their speed, and labels that wait, on the cores at work.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct End {
+pub struct ExpectedEnd {
     /// Until the walks have made all their steps, h. They end sooner if they have collected all they may.
     pub walks_hours: Option<f64>,
     /// Until the labels that wait are made, h.
@@ -19,7 +19,7 @@ pub struct End {
     pub time: Option<i64>,
 }
 
-impl End {
+impl ExpectedEnd {
     /// Of a campaign with this configuration in force.
     pub fn of(status: &Status, configuration: &Value, bill: &Bill) -> Self {
         let is_led = status.led;
@@ -83,17 +83,17 @@ mod tests {
     #[test]
     fn the_end_is_that_of_the_slowest() {
         let (mut status, configuration, mut bill) = campaign();
-        let end = End::of(&status, &configuration, &bill);
+        let end = ExpectedEnd::of(&status, &configuration, &bill);
         assert_eq!((end.walks_hours, end.labels_hours, end.budget_hours), (Some(1.0), Some(0.0), None));
-        let hours = |end: &End| (end.time.unwrap() - unix_milliseconds()) as f64 / 3.6e6;
+        let hours = |end: &ExpectedEnd| (end.time.unwrap() - unix_milliseconds()) as f64 / 3.6e6;
         assert!((hours(&end) - 1.0).abs() < 0.01);
         (bill.unfinished, bill.hours_left) = (3, Some(2.5));
-        assert!((hours(&End::of(&status, &configuration, &bill)) - 2.5).abs() < 0.01);
+        assert!((hours(&ExpectedEnd::of(&status, &configuration, &bill)) - 2.5).abs() < 0.01);
         bill.hours_left = None;
-        assert_eq!(End::of(&status, &configuration, &bill).time, None, "nobody makes the labels");
+        assert_eq!(ExpectedEnd::of(&status, &configuration, &bill).time, None, "nobody makes the labels");
         status.budget.limits = Budget { wall_hours: Some(0.5), ..Budget::default() };
-        assert!((hours(&End::of(&status, &configuration, &bill)) - 0.5).abs() < 0.01);
+        assert!((hours(&ExpectedEnd::of(&status, &configuration, &bill)) - 0.5).abs() < 0.01);
         status.led = false;
-        assert_eq!(End::of(&status, &configuration, &bill).time, None, "nobody runs it");
+        assert_eq!(ExpectedEnd::of(&status, &configuration, &bill).time, None, "nobody runs it");
     }
 }

@@ -9,9 +9,9 @@ use super::page::Page;
 
 /// The values of past commits, by name.
 #[derive(Debug)]
-pub struct Values(pub Vec<(String, String)>);
+pub struct MixtureSummary(pub Vec<(String, String)>);
 
-impl Values {
+impl MixtureSummary {
     /// The grades of the training frames under the newest mixture; null if they are not watched.
     pub fn training_frames(&self) -> Value {
         self.read("training_frames").unwrap_or_default()
@@ -76,7 +76,7 @@ impl Values {
 mod tests {
     use super::*;
 
-    fn text(values: &Values, mode: &str) -> String {
+    fn text(values: &MixtureSummary, mode: &str) -> String {
         let mut out = Vec::new();
         let page = Page { walks: 8, others: 8, few: 8, width: 120 };
         values.write(&mut out, &page, mode).unwrap();
@@ -87,7 +87,7 @@ mod tests {
     fn the_age_of_what_walkers_saw_is_shown_where_it_says_something() {
         let mut staleness = Staleness::default();
         [0, 0, 0].iter().for_each(|age| staleness.add(*age));
-        let of = |staleness: &Staleness| Values(vec![(STALENESS.into(), json!(staleness).to_string())]);
+        let of = |staleness: &Staleness| MixtureSummary(vec![(STALENESS.into(), json!(staleness).to_string())]);
         assert_eq!(text(&of(&staleness), "reproducible"), "");
         assert!(text(&of(&staleness), "live").contains("at 100.0 % of decisions"));
         [1, 2, 7].iter().for_each(|age| staleness.add(*age));
@@ -102,7 +102,7 @@ mod tests {
             "median": 0, "quantile_90": 7,
         });
         assert_eq!(json, expected);
-        let none = Values(Vec::new());
+        let none = MixtureSummary(Vec::new());
         assert_eq!((text(&none, "live").as_str(), none.staleness()), ("", Value::Null));
     }
 }

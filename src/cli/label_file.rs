@@ -1,7 +1,7 @@
-//! `calmwalk label --once`: tries a method and its settings out.
+//! `calmwalk label-file`
 
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::PathBuf;
 
 use atoms::cell::{Matrix3, Vec3, norm};
 use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, write_frame};
@@ -11,30 +11,44 @@ use store::Protocol;
 use tokio::sync::Notify;
 use workers::labeller::{Once, label_once};
 
-use super::{Ended, Failure};
+use super::{Ended, Failure, block_on};
+use crate::actors::asked_to_stop;
 use crate::config::Config;
 use crate::labelling;
+use crate::log::Options;
 use crate::output::{print, print_json};
 use crate::setup::MethodSetup;
 use crate::whole_file::{WholeFile, cannot_write};
 
-/// What is to be labelled, how, and what becomes of it.
-pub struct Task<'a> {
-    /// Extended XYZ or POSCAR.
-    pub structures: &'a Path,
-    /// The configuration whose `[label]` section counts.
-    pub config: &'a Path,
-    /// Where the labelled structures go.
-    pub output: Option<&'a Path>,
-    /// As JSON.
-    pub json: bool,
+/// Label the structures of a file, to test a label protocol without a campaign
+///
+/// Computes energy, forces and stress of one structure after the other by the [label] section of --config, and prints them with
+/// the cost. Stops at the first failure. Pass the printed core-seconds to `calmwalk estimate --core-seconds` to estimate the cost
+/// of a campaign.
+#[derive(Debug, clap::Args)]
+pub struct LabelFile {
+    /// Structures to label: extended XYZ or POSCAR
+    #[arg(value_name = "STRUCTURES")]
+    structures: PathBuf,
+    /// Configuration; only its [label] section is used
+    #[arg(long, value_name = "FILE")]
+    config: PathBuf,
+    /// Also write the labelled structures to this file, extended XYZ; an existing file is replaced [default: print only]
+    #[arg(long, short, value_name = "FILE.extxyz")]
+    output: Option<PathBuf>,
+    /// Print JSON, one object per structure
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    log: Options,
 }
 
 /// A labelled structure, as it is printed.
 #[derive(Serialize)]
 struct Labelled {
     /// `file:line`
-    place: String,
+    #[serde(rename = "place")]
+    source: String,
     formula: String,
     atoms: usize,
     protocol: String,
@@ -55,67 +69,77 @@ struct Labelled {
     core_seconds: f64,
 }
 
-/// Labels each structure of the file, one after the other. The first failure ends it.
-pub async fn label(task: Task<'_>, stop: &Notify) -> Result<Ended, Failure> {
-    let section = Config::load_label(task.config)?;
-    let frames = read_structures(task.structures).map_err(Failure::input)?;
+impl LabelFile {
+    pub fn run(self) -> Result<Ended, Failure> {
+        self.log.begin("label-file")?;
+        block_on(async {
+            let (_, stop) = asked_to_stop("stopping …")?;
+            self.label(&stop).await
+        })?
+    }
+
+    /// Labels the structures one after the other, up to the first failure.
+    async fn label(&self, stop: &Notify) -> Result<Ended, Failure> {
+    let section = Config::load_label(&self.config)?;
+    let frames = read_structures(&self.structures).map_err(Failure::input)?;
     let setup = MethodSetup::of(&section)?;
     let protocol = labelling::protocol(section.protocol_name(), setup.identity()?);
     let method = setup.load(&protocol)?;
     let bounds = section.bounds();
-    let mut output = task.output.map(WholeFile::create).transpose()?;
+    let mut output = self.output.as_deref().map(WholeFile::create).transpose()?;
     for frame in frames {
-        let place = format!("{}:{}", task.structures.display(), frame.line);
+        let source = format!("{}:{}", self.structures.display(), frame.line);
         let structure = frame.structure;
-        structure.validate().map_err(|error| Failure::Input(format!("{place}: {error}")))?;
-        let once = tokio::select! {
-            once = label_once(&method, &structure, &bounds) => once?,
+        structure.validate().map_err(|error| Failure::Input(format!("{source}: {error}")))?;
+        let attempt = tokio::select! {
+            attempt = label_once(&method, &structure, &bounds) => attempt?,
             () = stop.notified() => {
                 method.stop().await?;
                 return Ok(Ended::Interrupted);
             }
         };
-        let labelled = Labelled::from(&place, &structure, &protocol, once)?;
-        if task.json {
+        let labelled = Labelled::new(source, &structure, &protocol, attempt)?;
+        if self.json {
             print_json(&labelled)?;
         } else {
             print(|out| labelled.write(out))?;
         }
-        if let (Some(file), Some(path)) = (&mut output, task.output) {
+        if let (Some(file), Some(path)) = (&mut output, &self.output) {
             write_frame(file, &labelled.frame(structure)).map_err(|error| cannot_write(path, error))?;
         }
     }
     output.map_or(Ok(()), WholeFile::finish)?;
     Ok(Ended::Done)
 }
+}
 
 impl Labelled {
-    fn from(place: &str, structure: &Structure, protocol: &Protocol, once: Once) -> Result<Self, Failure> {
-        let Once { result, log, core_seconds } = once;
-        let made = result.map_err(|failure| {
+    fn new(source: String, structure: &Structure, protocol: &Protocol, attempt: Once) -> Result<Self, Failure> {
+        let Once { result, log, core_seconds } = attempt;
+        let label = result.map_err(|failure| {
             let log = log.trim_end();
-            let end = if log.is_empty() { String::new() } else { format!("; it said last\n{log}") };
-            Failure::Failed(format!("{place}: no label: {failure}{end}"))
+            let log = if log.is_empty() { String::new() } else { format!("; end of its log:\n{log}") };
+            Failure::Failed(format!("{source}: no label: {failure}{log}"))
         })?;
         Ok(Self {
-            place: place.to_owned(),
+            source,
             formula: structure.formula(),
             atoms: structure.len(),
             protocol: protocol.name.clone(),
             protocol_hash: protocol.hash.to_string(),
-            energy: made.energy,
-            energy_without_smearing: made.energy_without_smearing,
-            forces: made.forces,
-            stress: made.stress,
-            magnetic_moments: made.magnetic_moments,
-            magnetisation: made.magnetisation,
-            electronic_steps: made.electronic_steps,
+            energy: label.energy,
+            energy_without_smearing: label.energy_without_smearing,
+            forces: label.forces,
+            stress: label.stress,
+            magnetic_moments: label.magnetic_moments,
+            magnetisation: label.magnetisation,
+            electronic_steps: label.electronic_steps,
             core_seconds,
         })
     }
 
     fn write(&self, out: &mut dyn Write) -> io::Result<()> {
-        writeln!(out, "{}: {}, {} atoms", self.place, self.formula, self.atoms)?;
+        writeln!(out, "{}: {}, {} atoms", self.source, self.formula, self.atoms)?;
         writeln!(out, "  protocol                '{}', {:.16}", self.protocol, self.protocol_hash)?;
         writeln!(out, "  energy                  {:.6} eV", self.energy)?;
         if let Some(energy) = self.energy_without_smearing {

@@ -16,7 +16,7 @@ const LOOKED_THROUGH: u64 = 20_000;
 
 /// What is known of the labels of the protocol in force.
 #[derive(Clone, Debug, Default)]
-pub struct LabelsSoFar {
+pub struct LabelSummary {
     pub(super) bill: Bill,
     pub(super) failures: Vec<FailureCount>,
     pub(super) unlabelled: Vec<Unlabelled>,
@@ -26,7 +26,7 @@ pub struct LabelsSoFar {
     pub(super) shared: Option<u64>,
 }
 
-impl LabelsSoFar {
+impl LabelSummary {
     /// Reads it; nothing without a protocol.
     pub async fn of(store: &Store, status: &Status) -> Result<Self, StoreError> {
         let shared = match status.candidates.control <= LOOKED_THROUGH {
