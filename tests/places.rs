@@ -54,7 +54,9 @@ fn campaigns_of_init_do_not_meet() {
             arguments.partition(|word| !word.starts_with("--") && *word != "page");
         succeed(here, words.into_iter().chain(["second"]).chain(options).chain(last.iter().copied()));
     }
-    assert!(succeed(here, ["estimate", "first/campaign.toml", "--cost-from", "second"]).contains("newest label"));
+    assert!(
+        succeed(here, ["estimate", "first/campaign.toml", "--cost-from", "second"]).contains("newest label")
+    );
     succeed(here, ["label", "--store", "second", "--until-empty"]);
 }
 

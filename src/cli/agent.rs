@@ -62,12 +62,15 @@ impl Agent {
         raise_descriptor_limit();
         scratch::clean();
         let scratch = Scratch::new().map_err(|error| {
-            Failure::Failed(format!("cannot create a directory in {}: {error}", std::env::temp_dir().display()))
+            Failure::Failed(format!(
+                "cannot create a directory in {}: {error}",
+                std::env::temp_dir().display()
+            ))
         })?;
         let process =
             ProcessRecord::new(ProcessRecord::AGENT, None, std::process::id(), store::unix_milliseconds());
         let agent = net::Agent {
-                // The directory tells cloned hosts apart, which have the same name, process ids and clock.
+            // The directory tells cloned hosts apart, which have the same name, process ids and clock.
             id: blake3::hash(format!("{process:?} {}", scratch.path().display()).as_bytes()).to_hex()[..32]
                 .to_owned(),
             host: process.host,

@@ -92,7 +92,8 @@ pub async fn check_former_locations(campaign: &Campaign, directory: &Path) -> Re
     ];
     for former in candidates.into_iter().flatten().filter(|former| has_campaign(former)) {
         if is_campaign_of(&former, campaign, directory).await {
-            let (config, former, directory) = (campaign.path.display(), former.display(), directory.display());
+            let (config, former, directory) =
+                (campaign.path.display(), former.display(), directory.display());
             return Err(Failure::Input(format!(
                 "{config}: {former} already contains a campaign of this configuration, but the default directory is {directory}. Use \
                  --directory {former} to continue that campaign, or --directory {directory} to start a new one"

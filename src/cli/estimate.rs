@@ -99,8 +99,8 @@ impl Estimate {
             .collect();
         let sum = labels * seed_structures.len() as u64;
         let limit = config.most_structures().map(|limit| u64::from(copies) * u64::from(limit));
-        let cost =
-            costs.and_then(|costs| costs.predict(seed_structures.iter().map(|seed| (seed.size, seed.labels))));
+        let cost = costs
+            .and_then(|costs| costs.predict(seed_structures.iter().map(|seed| (seed.size, seed.labels))));
         // It is not known in advance which seed structures reach fewer labels: scale all costs alike.
         let limit = limit.filter(|limit| *limit < sum);
         let fraction = limit.unwrap_or(sum) as f64 / sum.max(1) as f64;
@@ -159,8 +159,14 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
         )?,
     }
     writeln!(out, "  disk     {disk}")?;
-    let mut table =
-        Table::new(&["seed structure", ">labels", ">atoms", ">electrons", ">k-points", ">core-hours per label"]);
+    let mut table = Table::new(&[
+        "seed structure",
+        ">labels",
+        ">atoms",
+        ">electrons",
+        ">k-points",
+        ">core-hours per label",
+    ]);
     let shown = if all { seed_structures.len() } else { SHOWN.min(seed_structures.len()) };
     for SeedEstimate { name, size, labels, cost_per_label } in &seed_structures[..shown] {
         table.push(vec![

@@ -74,7 +74,9 @@ impl Label {
             let location = match campaign_location::parse(&self.store)? {
                 Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
                 // The text of the argument still has the password.
-                Location::Server(_) if self.store.to_str().is_some_and(Location::is_server) => self.store.clone(),
+                Location::Server(_) if self.store.to_str().is_some_and(Location::is_server) => {
+                    self.store.clone()
+                }
                 Location::Server(url) => url.as_str().into(),
             };
             let protocol = labelling.protocol.clone();

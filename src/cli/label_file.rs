@@ -80,41 +80,46 @@ impl LabelFile {
 
     /// Labels the structures one after the other, up to the first failure.
     async fn label(&self, stop: &Notify) -> Result<Ended, Failure> {
-    let section = Config::load_label(&self.config)?;
-    let frames = read_structures(&self.structures).map_err(Failure::input)?;
-    let setup = MethodSetup::of(&section)?;
-    let protocol = labelling::protocol(section.protocol_name(), setup.identity()?);
-    let method = setup.load(&protocol)?;
-    let bounds = section.bounds();
-    let mut output = self.output.as_deref().map(WholeFile::create).transpose()?;
-    for frame in frames {
-        let source = format!("{}:{}", self.structures.display(), frame.line);
-        let structure = frame.structure;
-        structure.validate().map_err(|error| Failure::Input(format!("{source}: {error}")))?;
-        let attempt = tokio::select! {
-            attempt = label_once(&method, &structure, &bounds) => attempt?,
-            () = stop.notified() => {
-                method.stop().await?;
-                return Ok(Ended::Interrupted);
+        let section = Config::load_label(&self.config)?;
+        let frames = read_structures(&self.structures).map_err(Failure::input)?;
+        let setup = MethodSetup::of(&section)?;
+        let protocol = labelling::protocol(section.protocol_name(), setup.identity()?);
+        let method = setup.load(&protocol)?;
+        let bounds = section.bounds();
+        let mut output = self.output.as_deref().map(WholeFile::create).transpose()?;
+        for frame in frames {
+            let source = format!("{}:{}", self.structures.display(), frame.line);
+            let structure = frame.structure;
+            structure.validate().map_err(|error| Failure::Input(format!("{source}: {error}")))?;
+            let attempt = tokio::select! {
+                attempt = label_once(&method, &structure, &bounds) => attempt?,
+                () = stop.notified() => {
+                    method.stop().await?;
+                    return Ok(Ended::Interrupted);
+                }
+            };
+            let labelled = Labelled::new(source, &structure, &protocol, attempt)?;
+            if self.json {
+                print_json(&labelled)?;
+            } else {
+                print(|out| labelled.write(out))?;
             }
-        };
-        let labelled = Labelled::new(source, &structure, &protocol, attempt)?;
-        if self.json {
-            print_json(&labelled)?;
-        } else {
-            print(|out| labelled.write(out))?;
+            if let (Some(file), Some(path)) = (&mut output, &self.output) {
+                write_frame(file, &labelled.frame(structure)).map_err(|error| cannot_write(path, error))?;
+            }
         }
-        if let (Some(file), Some(path)) = (&mut output, &self.output) {
-            write_frame(file, &labelled.frame(structure)).map_err(|error| cannot_write(path, error))?;
-        }
+        output.map_or(Ok(()), WholeFile::finish)?;
+        Ok(Ended::Done)
     }
-    output.map_or(Ok(()), WholeFile::finish)?;
-    Ok(Ended::Done)
-}
 }
 
 impl Labelled {
-    fn new(source: String, structure: &Structure, protocol: &Protocol, attempt: Once) -> Result<Self, Failure> {
+    fn new(
+        source: String,
+        structure: &Structure,
+        protocol: &Protocol,
+        attempt: Once,
+    ) -> Result<Self, Failure> {
         let Once { result, log, core_seconds } = attempt;
         let label = result.map_err(|failure| {
             let log = log.trim_end();

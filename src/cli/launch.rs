@@ -131,7 +131,8 @@ impl Launch {
 
     /// The canonical path of the campaign's directory, from which the names of its jobs follow.
     fn directory(&self) -> Result<PathBuf, Failure> {
-        let directory = self.directory.clone().unwrap_or_else(|| campaign_location::default_directory(&self.config));
+        let directory =
+            self.directory.clone().unwrap_or_else(|| campaign_location::default_directory(&self.config));
         let created = DirBuilder::new().recursive(true).mode(0o700).create(&directory);
         let canonical = created.and_then(|()| directory.canonicalize());
         canonical.map_err(|error| {

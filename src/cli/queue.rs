@@ -110,7 +110,7 @@ impl Queue {
         if self.json {
             print_json(&changed)?;
         } else {
-            print(|out| changed.iter().try_for_each(|job| writeln!(out, "{}", outcome(action, job))))?;
+            print(|out| changed.iter().try_for_each(|job| writeln!(out, "{}", message(action, job))))?;
         }
         result
     }
@@ -149,7 +149,7 @@ pub async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>
 }
 
 /// The message for a changed job.
-pub fn outcome(action: &Action, job: &Job) -> String {
+pub fn message(action: &Action, job: &Job) -> String {
     let Job { candidate, state, priority, .. } = job;
     match action {
         Action::Drop { .. } => format!("{candidate} is dropped: it will not be labelled or exported"),
@@ -238,9 +238,9 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
     }
     writeln!(out, "  atoms     {atoms}, {formula}")?;
     writeln!(out, "  γ_max     {} (original mixture)", decimals(*original_gamma, 3))?;
-    for (standing, energy) in &details.energies {
-        let standing = format!("{standing:?}").to_lowercase();
-        writeln!(out, "  {standing:<9} energy {energy:.6} eV, {:.6} eV/atom", energy / f64::from(*atoms))?;
+    for (status, energy) in &details.energies {
+        let status = format!("{status:?}").to_lowercase();
+        writeln!(out, "  {status:<9} energy {energy:.6} eV, {:.6} eV/atom", energy / f64::from(*atoms))?;
     }
     writeln!(
         out,

@@ -89,7 +89,11 @@ impl Relabel {
             true => Store::open_read_only(&location).await?,
             false => Store::open(&location).await?,
         };
-        let none = || Failure::Input("the campaign has no label protocol yet: start it with calmwalk run first".to_owned());
+        let none = || {
+            Failure::Input(
+                "the campaign has no label protocol yet: start it with calmwalk run first".to_owned(),
+            )
+        };
         let in_force = store.protocol_in_force().await?.ok_or_else(none)?;
         let new = match &self.config {
             Some(path) => ProtocolChange::read(&store, path, &in_force).await?,

@@ -274,7 +274,11 @@ async fn write_metadata(campaign: &Campaign, store: &Store) -> Result<(), Failur
 }
 
 /// Warns if the disk is too small for the campaign.
-async fn warn_if_disk_is_too_small(campaign: &Campaign, directory: &Path, store: &Store) -> Result<(), Failure> {
+async fn warn_if_disk_is_too_small(
+    campaign: &Campaign,
+    directory: &Path,
+    store: &Store,
+) -> Result<(), Failure> {
     let forecast = Forecast::of(campaign);
     let needed = (forecast.bytes() + forecast::LOG).saturating_sub(store.size().await?);
     let free = store::free_space(directory)?;

@@ -203,8 +203,17 @@ impl<'a> Commands<'a> {
     }
 
     fn labeller(&self) -> String {
-        let (store, concurrency) = (self.store.unwrap_or(&self.directory), self.launch.concurrency.to_string());
-        self.command(["label", "--store", store, "--concurrency", &concurrency, WAIT_TIMEOUT, "--grace-period=60s"])
+        let (store, concurrency) =
+            (self.store.unwrap_or(&self.directory), self.launch.concurrency.to_string());
+        self.command([
+            "label",
+            "--store",
+            store,
+            "--concurrency",
+            &concurrency,
+            WAIT_TIMEOUT,
+            "--grace-period=60s",
+        ])
     }
 
     fn stop(&self) -> String {
@@ -243,6 +252,9 @@ impl<'a> Commands<'a> {
 fn text(path: &Path) -> Result<String, Failure> {
     let text = path.to_str().filter(|text| !text.contains('\n'));
     text.map(str::to_owned).ok_or_else(|| {
-        Failure::Input(format!("{}: a path in a job script must be UTF-8 without line breaks", path.display()))
+        Failure::Input(format!(
+            "{}: a path in a job script must be UTF-8 without line breaks",
+            path.display()
+        ))
     })
 }

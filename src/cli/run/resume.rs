@@ -35,9 +35,7 @@ pub async fn resume(
         .map_err(|refused| changed_content(campaign, location, other, &refused))?;
     match other {
         Some(known) if !adopt => return Err(other_file(campaign, location, known)),
-        Some(known) => {
-            say(format_args!("configuration: {} replaces {}", origin.file.path, known.file.path))
-        }
+        Some(known) => say(format_args!("configuration: {} replaces {}", origin.file.path, known.file.path)),
         None => {}
     }
     record(store, &known.map_or_else(|| origin.clone(), |known| known.continued(origin))).await?;

@@ -1,4 +1,4 @@
-//! The state of a campaign as JSON: see docs/status.md.
+//! The JSON output of `calmwalk status` (docs/status.md).
 
 use serde_json::{Value, json};
 
@@ -6,11 +6,11 @@ use super::Snapshot;
 use super::batch_jobs::BatchJobs;
 use crate::ends::Ends;
 
-/// Goes up when a key is taken away or comes to mean something else.
+/// Incremented when a key is removed or changes its meaning.
 pub const VERSION: u32 = 1;
 
-/// One object.
-pub fn of(snapshot: &Snapshot, jobs: &BatchJobs) -> serde_json::Result<Value> {
+/// The JSON object.
+pub fn to_json(snapshot: &Snapshot, jobs: &BatchJobs) -> serde_json::Result<Value> {
     let Snapshot { campaign, origin, status, mixture, disk, labels, end } = snapshot;
     let mut json = serde_json::to_value(status)?;
     json["version"] = VERSION.into();

@@ -169,7 +169,7 @@ fn job() -> (Job, Option<String>) {
 #[test]
 fn a_large_campaign_has_room_on_a_screen() {
     for (jobs, lines) in [(BatchJobs::None, 40), (BatchJobs::Known(vec![job(); 100]), 45)] {
-        let page = Page { width: 80, ..Page::of_all().screen() };
+        let page = Page { width: 80, ..Page::unlimited().screen() };
         let mut text = Vec::new();
         large().write(&mut text, &jobs, page, None).unwrap();
         let text = String::from_utf8(text).unwrap();
@@ -184,7 +184,7 @@ fn a_large_campaign_has_room_on_a_screen() {
 #[test]
 fn all_walks_are_shown_to_who_asks_for_them() {
     let mut text = Vec::new();
-    large().write(&mut text, &BatchJobs::None, Page::of_all().screen(), Some(usize::MAX)).unwrap();
+    large().write(&mut text, &BatchJobs::None, Page::unlimited().screen(), Some(usize::MAX)).unwrap();
     let text = String::from_utf8(text).unwrap();
     assert!(text.contains("a-long-name-of-a-seed-structure-999") && !text.contains("more walks"));
     assert!(text.contains("more processes"));
@@ -209,7 +209,7 @@ fn keys(value: &Value, name: &str, keys: &mut BTreeSet<String>) {
 fn every_key_is_documented_and_every_documented_key_is_there() {
     let mut found = BTreeSet::new();
     for jobs in [BatchJobs::Known(vec![job()]), BatchJobs::Unknown("no answer".into())] {
-        let json = json::of(&large(), &jobs).unwrap();
+        let json = json::to_json(&large(), &jobs).unwrap();
         assert_eq!(json["version"], json::VERSION);
         keys(&json, "", &mut found);
     }

@@ -7,8 +7,8 @@ use wire::Origin;
 
 use super::draw::{Theme, draw};
 use super::keys::Request;
-use super::reader::Seen;
-use super::state::{DECISIONS, Jobs, Message, Mode, QUEUE, State, WALKS};
+use super::reader::Reading;
+use super::state::{DECISIONS, JobView, Message, Mode, QUEUE, State, WALKS};
 use super::*;
 use crate::cli::queue::Action;
 use crate::cli::status;
@@ -68,10 +68,10 @@ fn decision(sequence: i64) -> RecentDecision {
     }
 }
 
-fn seen(jobs: Vec<Job>, decisions: std::ops::Range<i64>) -> Seen {
-    Seen {
+fn seen(jobs: Vec<Job>, decisions: std::ops::Range<i64>) -> Reading {
+    Reading {
         snapshot: status::tests::large(),
-        which: Jobs::Waiting,
+        view: JobView::Waiting,
         jobs,
         decisions: decisions.rev().map(decision).collect(),
     }
@@ -172,14 +172,14 @@ fn a_condition_chooses_what_a_pane_shows_and_what_is_wrong_in_it_is_said() {
     assert_eq!((state.panes[QUEUE].entries.len(), state.panes[QUEUE].all), (1, 3));
     assert!(shown(&mut state, 80, 24).contains("2 queue: 1 of 3  where"), "{}", shown(&mut state, 80, 24));
     // It holds for what comes later, and for this pane alone.
-    state.take_in(Ok(seen(vec![job(4, JobState::Queued), job(5, JobState::Queued)], 101..103)));
+    state.apply(Ok(seen(vec![job(4, JobState::Queued), job(5, JobState::Queued)], 101..103)));
     assert_eq!((state.panes[QUEUE].entries.len(), state.panes[DECISIONS].entries.len()), (1, 102));
     press(&mut state, "Esc");
     assert_eq!(state.panes[QUEUE].entries.len(), 2);
     press(&mut state, "/");
     write(&mut state, "gamma >");
     press(&mut state, "Enter");
-    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("expected a number")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("expected a number")));
     write(&mut state, " 1.45");
     press(&mut state, "Enter");
     assert_eq!((state.panes[QUEUE].entries.len(), &state.message), (1, &None));
@@ -188,7 +188,7 @@ fn a_condition_chooses_what_a_pane_shows_and_what_is_wrong_in_it_is_said() {
     write(&mut state, "max_force > 5");
     press(&mut state, "Enter");
     assert!(
-        matches!(&state.message, Some(Message::Failed(why)) if why.contains("max_force is not known of label jobs")),
+        matches!(&state.message, Some(Message::Error(why)) if why.contains("max_force is not known of label jobs")),
         "{:?}",
         state.message
     );
@@ -196,10 +196,10 @@ fn a_condition_chooses_what_a_pane_shows_and_what_is_wrong_in_it_is_said() {
     press(&mut state, "Esc");
     // Other jobs are shown when they are read, and no others until then.
     press(&mut state, "Esc");
-    assert_eq!((press(&mut state, "s"), state.panes[QUEUE].all), (Some(Request::Look), 0));
-    state.take_in(Ok(seen(vec![job(4, JobState::Queued)], 103..103)));
+    assert_eq!((press(&mut state, "s"), state.panes[QUEUE].all), (Some(Request::Refresh), 0));
+    state.apply(Ok(seen(vec![job(4, JobState::Queued)], 103..103)));
     assert_eq!(state.panes[QUEUE].all, 0);
-    state.take_in(Ok(Seen { which: Jobs::Failed, ..seen(vec![job(4, JobState::Failed)], 103..103) }));
+    state.apply(Ok(Reading { view: JobView::Failed, ..seen(vec![job(4, JobState::Failed)], 103..103) }));
     assert!(shown(&mut state, 80, 24).contains("2 failed labels: 1"));
     press(&mut state, "s s s");
     // Of a walk its decisions.
@@ -218,22 +218,22 @@ fn what_cannot_be_undone_is_asked_about_first() {
     let text = shown(&mut state, 100, 24);
     assert!(text.contains("drop 3.0.2-0123456789abcdef (queued)?") && text.contains("y: yes"), "{text}");
     // What comes meanwhile does not change what was asked.
-    state.take_in(Ok(seen(vec![job(9, JobState::Leased), job(8, JobState::Queued)], 101..101)));
+    state.apply(Ok(seen(vec![job(9, JobState::Leased), job(8, JobState::Queued)], 101..101)));
     let id = |number| job(number, JobState::Queued).candidate;
     assert_eq!(press(&mut state, "y"), Some(Request::Queue(Action::Drop { ids: vec![id(2)] })));
     assert_eq!(press(&mut state, "d n"), None);
-    assert_eq!(state.message, Some(Message::Done("nothing was changed".into())));
+    assert_eq!(state.message, Some(Message::Success("nothing was changed".into())));
     assert_eq!(press(&mut state, "t"), None);
-    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("only what failed")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("only what failed")));
 
     press(&mut state, "g =");
     write(&mut state, "x");
     assert_eq!(press(&mut state, "Enter"), None);
-    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("'10x' is no priority")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("'10x' is no priority")));
     let request = press(&mut state, "Back Back Back - 5 Enter");
     assert_eq!(request, Some(Request::Queue(Action::Prioritise { id: id(9), priority: -5 })));
 
-    let walks = |walks: &[u32], all| walks::Which { walks: walks.to_vec(), all };
+    let walks = |walks: &[u32], all| walks::WalkSelection { walks: walks.to_vec(), all };
     assert_eq!(press(&mut state, "d"), None);
     press(&mut state, "n");
     let request = press(&mut state, "1 Down p");
@@ -241,18 +241,18 @@ fn what_cannot_be_undone_is_asked_about_first() {
     assert_eq!(press(&mut state, "R"), None);
     assert_eq!(press(&mut state, "y"), Some(Request::Walks(walks::Action::Resume(walks(&[], true)))));
     assert_eq!(press(&mut state, "3 p"), None);
-    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("for the walks")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("for the walks")));
 }
 
 #[test]
 fn a_story_is_shown_when_it_comes_unless_nobody_waits_for_it() {
     let mut state = state();
     let id = job(2, JobState::Queued).candidate;
-    assert_eq!(press(&mut state, "2 Down Enter"), Some(Request::Story(id.clone())));
+    assert_eq!(press(&mut state, "2 Down Enter"), Some(Request::Explain(id.clone())));
     assert!(shown(&mut state, 80, 24).contains("reading …"));
-    state.done(Done::Story("another".into(), Ok("wrong".into())));
+    state.complete(Completed::Explain("another".into(), Ok("wrong".into())));
     let lines: Vec<_> = (1..=50).map(|k| format!("line {k}.")).collect();
-    state.done(Done::Story(id.clone(), Ok(lines.join("\n"))));
+    state.complete(Completed::Explain(id.clone(), Ok(lines.join("\n"))));
     let text = shown(&mut state, 80, 24);
     assert!(text.contains("line 1.") && text.contains(&id) && text.contains("lines 1 to 21 of 50"), "{text}");
     press(&mut state, "End");
@@ -261,22 +261,22 @@ fn a_story_is_shown_when_it_comes_unless_nobody_waits_for_it() {
     press(&mut state, "k");
     assert!(shown(&mut state, 80, 24).contains("line 29."), "one line up from the end");
     press(&mut state, "q");
-    state.done(Done::Story(id, Ok("late".into())));
+    state.complete(Completed::Explain(id, Ok("late".into())));
     assert!(matches!(state.mode, Mode::Panes));
-    assert_eq!(press(&mut state, "q"), Some(Request::Leave(Ended::Done)));
+    assert_eq!(press(&mut state, "q"), Some(Request::Quit(Ended::Done)));
 }
 
 #[test]
 fn what_was_seen_stays_while_the_campaign_cannot_be_read() {
     let mut state = state();
-    state.take_in(Err(Failure::Failed("the server is away".into())));
+    state.apply(Err(Failure::Failed("the server is away".into())));
     let text = shown(&mut state, 80, 24);
     assert!(text.contains("what you see is old: the server is away") && text.contains("1 walks: 1000"));
-    state.take_in(Ok(seen(Vec::new(), 101..102)));
+    state.apply(Ok(seen(Vec::new(), 101..102)));
     assert!(!shown(&mut state, 80, 24).contains("old"));
     assert_eq!((state.focus, state.panes[QUEUE].entries.len()), (WALKS, 0));
     let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
-    assert_eq!(state.key(control_c), Some(Request::Leave(Ended::Interrupted)));
+    assert_eq!(state.key(control_c), Some(Request::Quit(Ended::Interrupted)));
 }
 
 #[test]
