@@ -84,7 +84,7 @@ fn structures_of_both_walks_are_counted_and_not_compared() {
     assert_eq!((&status["candidates"]["accepted"], &status["candidates"]["control"]), (&4.into(), &4.into()));
     let shown = succeed(here, ["status", "campaign", "--all"]);
     assert!(
-        shown.contains("4 control frames (2 of them structures of biased walks too: 6 labels for all)"),
+        shown.contains("4 control frames (2 of them also found by biased walks: 6 labels in total)"),
         "{shown}"
     );
     let errors = json(here, ["force-errors", "campaign"]);
@@ -175,7 +175,7 @@ fn labels_that_wait_have_a_price_as_soon_as_one_was_made() {
     });
     let before = json(here, ["status", "campaign"]);
     assert_eq!(before["cost"]["queue"]["remaining"], Json::Null, "{before}");
-    assert!(succeed(here, ["status", "campaign"]).contains("unknown before a first one"));
+    assert!(succeed(here, ["status", "campaign"]).contains("unknown before the first one"));
     // Labels from elsewhere.
     let mut labeller = common::Running(
         common::program(here).args(["label", "--store", "campaign", "--until-empty"]).spawn().unwrap(),

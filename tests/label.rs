@@ -52,7 +52,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     assert_eq!(ended(&mut run), Some(0), "{}", place.said());
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
     let said = place.said();
-    assert!(said.contains("label.slots = 0: labels come from calmwalk label --store "), "{said}");
+    assert!(said.contains("label.slots = 0: start labellers with calmwalk label --store "), "{said}");
     let labels = place.jobs("labelled") as usize;
     assert!(labels > 0 && said.matches(": labelled ").count() == labels, "{labels} in {said}");
     assert_eq!(outcome_at(place.argument(), place.path()), expected(&small));

@@ -153,10 +153,10 @@ mod tests {
         assert_eq!(address("127.0.0.1:8080"), Ok(([127, 0, 0, 1], 8080).into()));
         assert_eq!(address("localhost:8080"), address("127.0.0.1:8080"));
         for text in ["9464", ":9464"] {
-            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, as 127.0.0.1:9464");
+            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, such as 127.0.0.1:9464");
         }
         for text in ["", "host", "host:8080", "127.0.0.1", "127.0.0.1:99999"] {
-            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, as 127.0.0.1:8080", "{text}");
+            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, such as 127.0.0.1:8080", "{text}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Whether everything has room on a screen, and whether docs/status.md says what is so.
+//! Checks that the output fits a screen, and that docs/status.md describes the JSON output.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -14,7 +14,7 @@ use wire::CampaignId;
 use super::*;
 use crate::bill::{Bill, CoreHours};
 
-/// A campaign in which there is something of everything, and much of what there may be much of.
+/// A large campaign with a value for every field.
 pub fn large() -> Snapshot {
     let staleness = json!({ "counts": { "0": 900_000, "3": 100_000 }, "largest": 3 });
     let training = json!({
@@ -167,7 +167,7 @@ fn job() -> (Job, Option<String>) {
 }
 
 #[test]
-fn a_large_campaign_has_room_on_a_screen() {
+fn the_status_of_a_large_campaign_fits_a_screen() {
     for (jobs, lines) in [(BatchJobs::None, 40), (BatchJobs::Known(vec![job(); 100]), 45)] {
         let page = Page { width: 80, ..Page::unlimited().screen() };
         let mut text = Vec::new();
@@ -175,14 +175,16 @@ fn a_large_campaign_has_room_on_a_screen() {
         let text = String::from_utf8(text).unwrap();
         let widest = text.lines().map(|line| line.chars().count()).max();
         assert!(text.lines().count() <= lines && widest <= Some(80), "{text}");
-        for words in ["the oldest for", "512 made in the last hour", "123456.7 steps/s", "expected in 30 h"] {
+        for words in
+            ["oldest for", "512 computed in the last hour", "123456.7 steps/s", "expected within 30 h"]
+        {
             assert!(text.contains(words), "{words}: {text}");
         }
     }
 }
 
 #[test]
-fn all_walks_are_shown_to_who_asks_for_them() {
+fn all_walks_are_shown_on_request() {
     let mut text = Vec::new();
     large().write(&mut text, &BatchJobs::None, Page::unlimited().screen(), Some(usize::MAX)).unwrap();
     let text = String::from_utf8(text).unwrap();
@@ -190,7 +192,7 @@ fn all_walks_are_shown_to_who_asks_for_them() {
     assert!(text.contains("more processes"));
 }
 
-/// Names of everything in it that is no object and no list, as docs/status.md writes them.
+/// Paths of all scalar values, as docs/status.md writes them.
 fn keys(value: &Value, name: &str, keys: &mut BTreeSet<String>) {
     match value {
         Value::Object(object) => {

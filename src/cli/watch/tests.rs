@@ -125,9 +125,9 @@ fn every_pane_has_its_place_on_a_small_terminal() {
         "3.0.1-0123456789abcdef",
         "accepted",
         "declined: covered",
-        "γ_max of 100: median 1.51, most 2.0",
+        "γ_max of 100: median 1.51, max 2.0",
         "accepted: 25 % of the last 100",
-        "expected in 30 h",
+        "expected within 30 h",
         "p pause",
     ] {
         assert!(text.contains(words), "{words}:\n{text}");
@@ -188,7 +188,7 @@ fn a_condition_chooses_what_a_pane_shows_and_what_is_wrong_in_it_is_said() {
     write(&mut state, "max_force > 5");
     press(&mut state, "Enter");
     assert!(
-        matches!(&state.message, Some(Message::Error(why)) if why.contains("max_force is not known of label jobs")),
+        matches!(&state.message, Some(Message::Error(why)) if why.contains("max_force is not available for label jobs")),
         "{:?}",
         state.message
     );
@@ -222,14 +222,14 @@ fn what_cannot_be_undone_is_asked_about_first() {
     let id = |number| job(number, JobState::Queued).candidate;
     assert_eq!(press(&mut state, "y"), Some(Request::Queue(Action::Drop { ids: vec![id(2)] })));
     assert_eq!(press(&mut state, "d n"), None);
-    assert_eq!(state.message, Some(Message::Success("nothing was changed".into())));
+    assert_eq!(state.message, Some(Message::Success("cancelled".into())));
     assert_eq!(press(&mut state, "t"), None);
-    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("only what failed")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("only failed or dropped")));
 
     press(&mut state, "g =");
     write(&mut state, "x");
     assert_eq!(press(&mut state, "Enter"), None);
-    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("'10x' is no priority")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("'10x' is not a priority")));
     let request = press(&mut state, "Back Back Back - 5 Enter");
     assert_eq!(request, Some(Request::Queue(Action::Prioritise { id: id(9), priority: -5 })));
 
@@ -241,7 +241,7 @@ fn what_cannot_be_undone_is_asked_about_first() {
     assert_eq!(press(&mut state, "R"), None);
     assert_eq!(press(&mut state, "y"), Some(Request::Walks(walks::Action::Resume(walks(&[], true)))));
     assert_eq!(press(&mut state, "3 p"), None);
-    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("for the walks")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("the pane of the walks")));
 }
 
 #[test]
@@ -271,9 +271,12 @@ fn what_was_seen_stays_while_the_campaign_cannot_be_read() {
     let mut state = state();
     state.apply(Err(Failure::Failed("the server is away".into())));
     let text = shown(&mut state, 80, 24);
-    assert!(text.contains("what you see is old: the server is away") && text.contains("1 walks: 1000"));
+    assert!(
+        text.contains("outdated, cannot read the campaign: the server is away")
+            && text.contains("1 walks: 1000")
+    );
     state.apply(Ok(seen(Vec::new(), 101..102)));
-    assert!(!shown(&mut state, 80, 24).contains("old"));
+    assert!(!shown(&mut state, 80, 24).contains("outdated"));
     assert_eq!((state.focus, state.panes[QUEUE].entries.len()), (WALKS, 0));
     let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
     assert_eq!(state.key(control_c), Some(Request::Quit(Ended::Interrupted)));
