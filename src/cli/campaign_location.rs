@@ -77,8 +77,8 @@ fn has_campaign(directory: &Path) -> bool {
     directory.join(DATABASE).is_file()
 }
 
-/// Checks, before a campaign starts in its default directory, that there is no campaign of this configuration where earlier versions
-/// kept it: in the directory of that name below the working directory, or beside the configuration itself.
+/// Checks, before a campaign starts in its default directory, that there is no campaign of this configuration where earlier
+/// versions kept it: in the directory of that name below the working directory, or beside the configuration itself.
 ///
 /// # Errors
 /// There is such a campaign.

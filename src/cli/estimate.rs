@@ -18,16 +18,16 @@ const SHOWN: usize = 20;
 
 /// Estimate the cost of a campaign before it starts
 ///
-/// Shows the largest number of labels that the configuration allows, their expected cost and the disk use. The cost of a label is
-/// extrapolated from the labels of another campaign (--cost-from) or from one test label (--core-seconds, see `calmwalk
+/// Shows the largest number of labels that the configuration allows, their expected cost and the disk use. The cost of a label
+/// is extrapolated from the labels of another campaign (--cost-from) or from one test label (--core-seconds, see `calmwalk
 /// label-file`).
 #[derive(Debug, clap::Args)]
 pub struct Estimate {
     /// Configuration of the campaign (TOML)
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
-    /// Campaign with labels computed in the same way, from which to estimate costs: its directory, or the postgres:// URL of its
-    /// store
+    /// Campaign with labels computed in the same way, from which to estimate costs: its directory, or the postgres:// URL of
+    /// its store
     #[arg(long, value_name = "DIR", conflicts_with = "core_seconds")]
     cost_from: Option<PathBuf>,
     /// Cost of one label of the first seed structure, in core-seconds

@@ -9,9 +9,9 @@ use crate::output::{Table, print, print_json, say_if_unprotected};
 
 /// Exclude bad labels from exports and statistics, or include them again
 ///
-/// An excluded label stays in the store with its history, but exports, force and energy errors, the energy offsets of the elements,
-/// summaries, reports and the dashboard's statistics ignore it. Its cost still counts. To replace it, use `calmwalk relabel`: the new
-/// label is included.
+/// An excluded label stays in the store with its history, but exports, force and energy errors, the energy offsets of the
+/// elements, summaries, reports and the dashboard's statistics ignore it. Its cost still counts. Another result for the
+/// structure does not replace it, unless requested with `calmwalk relabel`.
 ///
 /// Works while the campaign runs. Changes either all given structures or none.
 #[derive(Debug, clap::Args)]
@@ -87,7 +87,7 @@ impl Exclude {
         let protocols = protocols.iter().map(|name| format!("'{name}'")).collect::<Vec<_>>().join(", ");
         match (excluded, changed) {
             (Some(_), true) => format!(
-                "{id}: label of {protocols} excluded from exports and statistics (to include it again, use --undo; to replace it, calmwalk \
+                "{id}: label of {protocols} excluded from exports and statistics (undo with --undo, replace with calmwalk \
                  relabel)"
             ),
             (Some(reason), false) => format!("{id}: label of {protocols} was already excluded: {reason}"),

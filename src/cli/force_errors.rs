@@ -13,13 +13,13 @@ use crate::output::{Table, count, decimals, print, print_json, range};
 /// Failed structures listed per line.
 const NAMES: usize = 3;
 
-/// Compare the potential's forces and energies with the labels, by extrapolation grade
+/// Show the errors of the potential: force errors by extrapolation grade, energy errors, and structures without labels
 ///
-/// Relates the force error |F_model − F_label| of each labelled atom to its grades γ and γ_nbr under the original mixture: median and
-/// percentiles in bins of the grade, Spearman's ρ, and the area under the receiver operating characteristic (ROC-AUC) of the grade as
-/// a test for errors above 1 eV/Å. The errors of structures whose labels failed are unknown: these structures are counted as
-/// censored and listed in their bins. Energy errors exclude a fitted offset per element, because labels and potential have different
-/// zeros of energy. Works while the campaign runs.
+/// Relates the force error |F_model − F_label| of each labelled atom to its grades γ and γ_nbr under the original mixture:
+/// median and percentiles in bins of the grade, Spearman's ρ, and the area under the receiver operating characteristic
+/// (ROC-AUC) of the grade as a test for errors above 1 eV/Å. The errors of structures whose labels failed are unknown: these
+/// structures are counted as censored and listed in their bins. Energy errors exclude a fitted offset per element, because
+/// labels and potential have different zeros of energy. Works while the campaign runs.
 #[derive(Debug, clap::Args)]
 pub struct ForceErrors {
     #[command(flatten)]
@@ -81,7 +81,7 @@ fn write(out: &mut dyn Write, protocol: &Protocol, learned: &Learned) -> io::Res
         let structures = count(learned.shared, "structure");
         writeln!(
             out,
-            "{structures} found by both a biased walk and its control: counted once in 'all', and not in 'biased' or 'control'"
+            "{structures} found by both biased and control walks: counted once in 'all', and not in 'biased' or 'control'"
         )?;
     }
     if all.gamma.left_out() + all.gamma_nbr.left_out() > 0 {

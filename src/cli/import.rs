@@ -16,11 +16,13 @@ use crate::output::{count, print};
 
 /// Import labelled structures
 ///
-/// Each frame needs energy and forces, named energy and forces or REF_energy and REF_forces; stress is optional. If one frame is
-/// invalid or exceeds label.largest_force, largest_stress or largest_energy, nothing is imported from any file. Importing again is
-/// safe: known structures are not changed, and a different label for a labelled structure is stored as a check beside it.
+/// Each frame needs energy and forces, named energy and forces or REF_energy and REF_forces; stress is optional. If one frame
+/// is invalid or exceeds label.largest_force, largest_stress or largest_energy, nothing is imported from any file. Importing
+/// again is safe: known structures are not changed, and a different label for a labelled structure is stored as a check beside
+/// it.
 ///
-/// The campaign must not be running: imported structures change which candidates are duplicates, and the decision log records when.
+/// The campaign must not be running: imported structures change which candidates are duplicates, and the decision log records
+/// when.
 #[derive(Debug, clap::Args)]
 pub struct Import {
     #[command(flatten)]
@@ -47,8 +49,8 @@ impl File {
         for ((_, _, label), line) in self.frames.iter().zip(&self.lines) {
             if let Some(problem) = bounds.refuses(label.energy, &label.forces, label.stress.as_ref()) {
                 return Err(Failure::Input(format!(
-                    "{}:{line}: {problem}: nothing was imported; correct the label, remove the frame, or raise the limit if the label \
-                     is correct",
+                    "{}:{line}: {problem}: nothing was imported; correct the label, remove the frame, or raise the limit if it is \
+                     correct",
                     self.name
                 )));
             }

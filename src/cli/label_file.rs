@@ -23,8 +23,8 @@ use crate::whole_file::{WholeFile, cannot_write};
 /// Label the structures of a file, to test a label protocol without a campaign
 ///
 /// Computes energy, forces and stress of one structure after the other by the [label] section of --config, and prints them with
-/// the cost. Stops at the first failure. Pass the printed core-seconds to `calmwalk estimate --core-seconds` to estimate the cost
-/// of a campaign.
+/// the cost. Stops at the first failure. Pass the printed core-seconds to `calmwalk estimate --core-seconds` to estimate the
+/// cost of a campaign.
 #[derive(Debug, clap::Args)]
 pub struct LabelFile {
     /// Structures to label: extended XYZ or POSCAR

@@ -23,8 +23,8 @@ const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
 /// Submit a campaign to a batch system, as jobs for orchestrator, agents and labellers
 ///
 /// Safe to repeat: keeps the existing jobs, submits missing ones, and cancels agents and labellers that exceed the requested
-/// numbers. Each job checkpoints and exits before its time limit, and is requeued until the campaign is finished. `calmwalk status`
-/// shows the jobs. See docs/slurm.md.
+/// numbers. Each job checkpoints and exits before its time limit, and is requeued until the campaign is finished. `calmwalk
+/// status` shows the jobs. See docs/slurm.md.
 #[derive(Debug, clap::Args)]
 pub struct Launch {
     /// Configuration of the campaign (TOML), on a file system that all nodes share
@@ -33,7 +33,8 @@ pub struct Launch {
     /// Batch system
     #[arg(long, value_name = "SYSTEM", value_enum)]
     on: System,
-    /// Directory of the campaign, on a file system that all nodes share [default: path of the configuration without its extension]
+    /// Directory of the campaign, on a file system that all nodes share [default: path of the configuration without its
+    /// extension]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
     /// Resume a campaign that was started with another configuration file, and use CONFIG from now on
@@ -63,8 +64,8 @@ pub struct Launch {
     /// Account to charge [default: that of the user]
     #[arg(long, value_name = "NAME")]
     account: Option<String>,
-    /// Directory with the certificates of the orchestrator in orchestrator/ and of the agents in agent/; required for jobs on more
-    /// than one node
+    /// Directory with the certificates of the orchestrator in orchestrator/ and of the agents in agent/; required for jobs on
+    /// more than one node
     #[arg(long, value_name = "DIR")]
     tls: Option<PathBuf>,
     /// Directory with your own job templates, adapted from configs/slurm [default: built-in templates]

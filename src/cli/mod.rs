@@ -136,17 +136,16 @@ impl CampaignLocation {
 }
 
 /// Parser of an argument that is a wall-clock time between `min` and `max`, limits included.
-fn duration_between(min: &str, max: &str) -> impl Fn(&str) -> Result<Duration, String> + Clone + use<> {
-    let (min, max) = (limit(min), limit(max));
+fn duration_between(
+    min: &'static str,
+    max: &'static str,
+) -> impl Fn(&str) -> Result<Duration, String> + Clone {
+    let parse_limit = |text: &str| text.parse::<Duration>().expect("a time with its unit");
+    let limits = parse_limit(min)..=parse_limit(max);
     move |text| {
-        let duration: Duration = text.parse()?;
-        let is_valid = (min..=max).contains(&duration);
-        is_valid.then_some(duration).ok_or_else(|| format!("expected {min} to {max}"))
+        let duration = text.parse()?;
+        limits.contains(&duration).then_some(duration).ok_or_else(|| format!("expected {min} to {max}"))
     }
-}
-
-fn limit(text: &str) -> Duration {
-    text.parse().expect("a time with its unit")
 }
 
 /// Runs a future that uses the database to its end.

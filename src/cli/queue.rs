@@ -31,12 +31,12 @@ pub enum Action {
     List(List),
     /// Show a label job with its attempts and the logs of failed ones
     Show {
-        /// Candidate
+        /// Id of the candidate
         id: String,
     },
     /// Write the archived calculation directories of a candidate to files (label.keep selects what is archived)
     Files {
-        /// Candidate
+        /// Id of the candidate
         id: String,
         /// Directory for the files CANDIDATE-ATTEMPT.tar.zst, one per attempt; created if it does not exist
         #[arg(long, short, value_name = "DIR", default_value = ".")]
@@ -44,19 +44,19 @@ pub enum Action {
     },
     /// Remove queued structures from the queue and from exports (to remove existing labels, use calmwalk exclude)
     Drop {
-        /// Candidates
+        /// Ids of the candidates
         #[arg(value_name = "ID", required = true)]
         ids: Vec<String>,
     },
     /// Queue failed or dropped structures again
     Retry {
-        /// Candidates
+        /// Ids of the candidates
         #[arg(value_name = "ID", required = true)]
         ids: Vec<String>,
     },
     /// Change the priority of a queued structure
     Prioritise {
-        /// Candidate
+        /// Id of the candidate
         id: String,
         /// Larger values are labelled first. Default: 10 for structures of biased walks, 0 for frames of control walks
         #[arg(allow_negative_numbers = true)]

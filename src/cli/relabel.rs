@@ -20,9 +20,9 @@ use crate::output::{count, print, print_json, say_if_unprotected};
 
 /// Compute labels again, or switch the campaign to another label protocol
 ///
-/// Use it for doubtful or inaccurate labels. Queues the structures again, bypassing the guard. The old label stays valid until the new
-/// one exists; then it is kept as superseded, with date and reason. If the new label fails, the old one stays. Structures that already
-/// wait for a new label are not queued twice.
+/// Use it for doubtful or inaccurate labels. Queues the structures again, bypassing the guard. The old label stays valid until
+/// the new one exists; then it is kept as superseded, with date and reason. If the new label fails, the old one stays.
+/// Structures that already wait for a new label are not queued twice.
 ///
 /// With --config, the campaign switches to the label protocol of that file: structures without a label move to it, and running
 /// calculations are cancelled. The campaign must not be running, and the next `calmwalk run` needs that configuration.

@@ -13,12 +13,12 @@ const SHOWN: usize = 20;
 
 /// Replay a campaign's decisions, to verify them or to test other selection rules
 ///
-/// Passes the recorded candidates to the selector again, without dynamics or labels, and changes nothing. Without --set, every decision
-/// and the mixture must be reproduced bit by bit; otherwise the first difference is printed and the exit code is 1.
+/// Passes the recorded candidates to the selector again, without dynamics or labels, and changes nothing. Without --set, every
+/// decision and the mixture must be reproduced bit by bit; otherwise the first difference is printed and the exit code is 1.
 ///
-/// With --set, shows which candidates other rules would accept. The walks stay as recorded, which limits the result: structures that
-/// walkers never offered do not appear under a looser rule, walks that would have continued are not continued, and trajectories do not
-/// react to the changed mixture.
+/// With --set, shows which candidates other rules would accept. The walks stay as recorded, which limits the result: structures
+/// that walkers never offered do not appear under a looser rule, walks that would have continued are not continued, and
+/// trajectories do not react to the changed mixture.
 #[derive(Debug, clap::Args)]
 pub struct Replay {
     #[command(flatten)]

@@ -13,10 +13,10 @@ use crate::whole_file::{WholeFile, cannot_create};
 
 /// Write a report of a campaign: figures, tables, settings and provenance
 ///
-/// Writes a self-contained HTML page for browser and print: the collected structures, biased walks compared with their controls, force
-/// errors by grade, cost, failures and the structures without labels. Also writes each figure as SVG, PNG and CSV, and each table as
-/// CSV. Works on running and finished campaigns and on backups; the same campaign gives the same bytes. docs/report.md describes the
-/// figures.
+/// Writes a self-contained HTML page for browser and print: the collected structures, biased walks compared with their
+/// controls, force errors by grade, cost, failures and the structures without labels. Also writes each figure as SVG, PNG and
+/// CSV, and each table as CSV. Works on running and finished campaigns and on backups; the same campaign gives the same bytes.
+/// docs/report.md describes the figures.
 #[derive(Debug, clap::Args)]
 pub struct Report {
     #[command(flatten)]

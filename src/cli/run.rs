@@ -55,8 +55,8 @@ pub struct Run {
     /// Directory with authority.pem, certificate.pem and key.pem; required unless the endpoint is a loopback address
     #[arg(long, value_name = "DIR", requires = "listen")]
     tls: Option<PathBuf>,
-    /// Write the endpoint of this process to FILE, where agents read it (calmwalk agent --join @FILE). At the end the file tells
-    /// them that the campaign is finished
+    /// Write the endpoint of this process to FILE, where agents read it (calmwalk agent --join @FILE). At the end the file
+    /// tells them that the campaign is finished
     #[arg(long, value_name = "FILE", requires = "listen")]
     announce: Option<PathBuf>,
     /// Host name or address to announce to agents [default: host name of this host]

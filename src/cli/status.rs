@@ -30,8 +30,8 @@ use crate::output::{count, decimals, print, print_json};
 
 /// Show the progress of a campaign
 ///
-/// Shows walks, mixture, label queue, costs, processes and the expected end. Works on running and finished campaigns and on backups.
-/// docs/status.md describes the JSON output.
+/// Shows walks, mixture, label queue, costs, processes and the expected end. Works on running and finished campaigns and on
+/// backups. docs/status.md describes the JSON output.
 #[derive(Debug, clap::Args)]
 pub struct Status {
     #[command(flatten)]
@@ -83,7 +83,7 @@ impl Snapshot {
         Ok(snapshot)
     }
 
-    /// Reads it.
+    /// Reads the state of a campaign.
     pub async fn of(store: &Store) -> Result<Self, Failure> {
         let forecast = store.note(forecast::NOTE).await?;
         let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
@@ -119,7 +119,7 @@ impl Snapshot {
         json::to_json(self, &BatchJobs::None)
     }
 
-    /// The campaign.
+    /// Identity and configuration.
     pub fn campaign(&self) -> &store::Campaign {
         &self.campaign
     }
@@ -144,7 +144,7 @@ impl Snapshot {
         self.disk.bytes
     }
 
-    /// When it is expected to end.
+    /// The expected end.
     pub fn end(&self) -> &ExpectedEnd {
         &self.end
     }

@@ -12,8 +12,8 @@ use crate::output::{count, print};
 
 /// Check a configuration and all files that it refers to
 ///
-/// Reports all errors with file, line and key (exit code 2). Valid but suspicious values are warnings on standard error and do not
-/// change the exit code.
+/// Reports all errors with file, line and key (exit code 2). Valid but suspicious values are warnings on standard error and do
+/// not change the exit code.
 #[derive(Debug, clap::Args)]
 pub struct Validate {
     /// Configuration of a campaign (TOML)

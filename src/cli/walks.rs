@@ -8,9 +8,9 @@ use crate::output::print;
 
 /// Pause or resume walks
 ///
-/// A walk pauses at the end of its current assignment (run.turn_steps), and resumes from there. It stays paused when the campaign is
-/// stopped and resumed. In reproducible mode, the other walks of the same round wait for it, because decisions must not depend on when
-/// a walk was paused.
+/// A walk pauses at the end of its current assignment (run.turn_steps), and resumes from there. It stays paused when the
+/// campaign is stopped and resumed. In reproducible mode, the other walks of the same round wait for it, because decisions must
+/// not depend on when a walk was paused.
 #[derive(Debug, clap::Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
 pub struct Walks {

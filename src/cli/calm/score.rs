@@ -24,13 +24,13 @@ const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
 /// Grade structures: energy, forces, stress, and extrapolation grades of every atom
 ///
-/// Writes every frame with the model's energy (eV), forces (eV/Å) and, for periodic cells, stress (eV/Å³, tension positive), and per
-/// atom gamma (extrapolation grade γ), gamma_nbr (its neighbourhood average), sigma (Mahalanobis distance σ) and component (nearest
-/// component of the atom's element, from 0). Rejects structures with atoms closer than 0.4 Å, and mixtures that cannot come from
-/// training data.
+/// Writes every frame with the model's energy (eV), forces (eV/Å) and, for periodic cells, stress (eV/Å³, tension positive),
+/// and per atom gamma (extrapolation grade γ), gamma_nbr (its neighbourhood average), sigma (Mahalanobis distance σ) and
+/// component (nearest component of the atom's element, from 0). Rejects structures with atoms closer than 0.4 Å, and mixtures
+/// that cannot come from training data.
 ///
-/// Keeps all other data of the frame. Renames its energy, forces, stress and virial to REF_energy, REF_forces and so on, unless it
-/// already has reference labels; then it replaces the plain ones, which come from another model.
+/// Keeps all other data of the frame. Renames its energy, forces, stress and virial to REF_energy, REF_forces and so on, unless
+/// it already has reference labels; then it replaces the plain ones, which come from another model.
 #[derive(Debug, clap::Args)]
 pub struct Score {
     /// GRACE model (kokkos.npz)

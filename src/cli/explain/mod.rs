@@ -19,16 +19,16 @@ const SHOWN: usize = 20;
 
 /// Show the full history of one candidate
 ///
-/// Shows the atoms that triggered it, its grades under the walker's, the selector's and the original mixture, the decision with its
-/// rule and numbers, every value of α that was tried, the attempts at its label with their costs, the error of the potential, and the
-/// later candidates that it covered. Shows the available part of this for control frames and imported structures. Works while the
-/// campaign runs and on backups.
+/// Shows the atoms that triggered it, its grades under the walker's, the selector's and the original mixture, the decision with
+/// its rule and numbers, every value of α that was tried, the attempts at its label with their costs, the error of the
+/// potential, and the later candidates that it covered. Shows the available part of this for control frames and imported
+/// structures. Works while the campaign runs and on backups.
 #[derive(Debug, clap::Args)]
 pub struct Explain {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Candidate: its id or a unique prefix of it (the campaign part can be omitted), or the number of its decision; or import-N
-    /// for an imported structure
+    /// Candidate: its id or a unique prefix of it (the campaign part can be omitted), or the number of its decision; or
+    /// import-N for an imported structure
     id: String,
     /// Print JSON, with the grades of every atom (docs/explain.md)
     #[arg(long)]

@@ -24,12 +24,13 @@ const BAR: &str = "{spinner} {pos} structures";
 
 /// Write the labelled structures to an extended XYZ file
 ///
-/// Structures are in the order of the decisions, whenever their labels were computed: the same campaign gives the same bytes. In
-/// addition to the label, each frame has campaign, candidate_id, seed_structure, walk, segment, step, origin, mixture_version (after
-/// the decision), mixture_version_seen (by the walker), protocol, protocol_hash and relative_volume (V/V₀), and per atom gamma and
-/// gamma_nbr under the original mixture. Imported structures have source_file and source_frame (from 0) instead. If the calculation
-/// provides them, there are also energy_without_smearing (eV), magmom (magnetic moment of the cell, μ_B) and per atom magmoms (μ_B).
-/// Fails without writing a file if the database is damaged or incomplete. See docs/export.md.
+/// Structures are in the order of the decisions, whenever their labels were computed: the same campaign gives the same bytes.
+/// In addition to the label, each frame has campaign, candidate_id, seed_structure, walk, segment, step, origin,
+/// mixture_version (after the decision), mixture_version_seen (by the walker), protocol, protocol_hash and relative_volume
+/// (V/V₀), and per atom gamma and gamma_nbr under the original mixture. Imported structures have source_file and source_frame
+/// (from 0) instead. If the calculation provides them, there are also energy_without_smearing (eV), magmom (magnetic moment of
+/// the cell, μ_B) and per atom magmoms (μ_B). Fails without writing a file if the database is damaged or incomplete. See
+/// docs/export.md.
 #[derive(Debug, clap::Args)]
 pub struct Export {
     #[command(flatten)]
@@ -48,16 +49,16 @@ pub struct Export {
     imported: bool,
     /// Export only structures that match a filter, such as 'gamma > 2 and element = Mo'
     ///
-    /// Combine comparisons with and, or, not and parentheses. Numbers (= != < <= > >=): gamma, gamma_nbr (largest of the structure,
-    /// original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version, atoms, energy (eV, label), energy_per_atom
-    /// (eV, label), max_force (eV/Å, label). Texts (= !=): element (any atom of the structure), kind (biased, control or imported),
-    /// seed (name of the seed structure, in quotes if it contains spaces).
+    /// Combine comparisons with and, or, not and parentheses. Numbers (= != < <= > >=): gamma, gamma_nbr (largest of the
+    /// structure, original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version, atoms, energy (eV, label),
+    /// energy_per_atom (eV, label), max_force (eV/Å, label). Texts (= !=): element (any atom of the structure), kind (biased,
+    /// control or imported), seed (name of the seed structure, in quotes if it contains spaces).
     #[arg(long = "where", value_name = "FILTER")]
     condition: Option<Condition>,
     /// Split into several files, such as train=0.9,test=0.1 for FILE-train and FILE-test
     ///
-    /// Assigns the seed structures at random to the files in these proportions. All structures found from one seed structure go to the
-    /// same file, which keeps training and test sets independent. Imported structures go to the first file.
+    /// Assigns the seed structures at random to the files in these proportions. All structures found from one seed structure go
+    /// to the same file, which keeps training and test sets independent. Imported structures go to the first file.
     #[arg(long, value_name = "NAME=SHARE,…")]
     split: Option<Shares>,
     /// Random seed of the split

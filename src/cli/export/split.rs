@@ -49,8 +49,8 @@ impl Shares {
         self.0.iter().map(|(name, _)| name.as_str())
     }
 
-    /// Assigns each seed structure to a part, by index. Shuffles the seed structures with a hash of `random_seed` and their names, and
-    /// divides the sequence by the shares. Each part gets at least one.
+    /// Assigns each seed structure to a part, by index. Shuffles the seed structures with a hash of `random_seed` and their
+    /// names, and divides the sequence by the shares. Each part gets at least one.
     ///
     /// # Errors
     /// There are fewer seed structures than parts.

@@ -22,9 +22,9 @@ const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
 
 /// Run unbiased molecular dynamics with any supported potential
 ///
-/// Writes an extended XYZ trajectory with energy (eV), forces (eV/Å), stress (eV/Å³, tension positive, without the kinetic part),
-/// momenta (in the units of ASE), step, time_fs and temperature (K; 3n − 3 degrees of freedom if the momentum is conserved, 3n with
-/// Langevin). On Ctrl-C or SIGTERM, writes the last step and exits.
+/// Writes an extended XYZ trajectory with energy (eV), forces (eV/Å), stress (eV/Å³, tension positive, without the kinetic
+/// part), momenta (in the units of ASE), step, time_fs and temperature (K; 3n − 3 degrees of freedom if the momentum is
+/// conserved, 3n with Langevin). On Ctrl-C or SIGTERM, writes the last step and exits.
 #[derive(Debug, clap::Args)]
 pub struct Md {
     /// Configuration (TOML): structure, [potential], [dynamics], [output]; see configs/md-aluminium.toml

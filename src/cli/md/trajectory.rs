@@ -46,8 +46,8 @@ fn frame(dynamics: &Dynamics) -> Frame {
         forces: Some(evaluation.forces.clone()),
         stress: evaluation.stress(&state.structure),
     };
-    // The unit of momentum of ASE is u Å per Å √(u/eV); 1 fs is √ACCELERATION of this unit of time, with the acceleration of 1 u by
-    // 1 eV/Å.
+    // The unit of momentum of ASE is u Å per Å √(u/eV); 1 fs is √ACCELERATION of this unit of time, with the acceleration of 1
+    // u by 1 eV/Å.
     let unit = ACCELERATION.sqrt();
     let momenta = state.velocities.iter().zip(dynamics.masses());
     let momenta: Vec<_> = momenta.map(|(v, mass)| v.map(|v| mass * v / unit)).collect();

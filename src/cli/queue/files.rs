@@ -7,8 +7,8 @@ use store::{Location, Store};
 
 use crate::outcome::Failure;
 
-/// Writes the archived calculation directories of a candidate to `output`, one file per attempt. Returns the paths, each with the
-/// names of the files that were too large to archive.
+/// Writes the archived calculation directories of a candidate to `output`, one file per attempt. Returns the paths, each with
+/// the names of the files that were too large to archive.
 pub async fn write(location: &Location, id: &str, output: &Path) -> Result<Vec<(PathBuf, String)>, Failure> {
     let store = Store::open_read_only(location).await?;
     let job = store.queue_show(id).await?.job;

@@ -22,7 +22,7 @@ pub struct LabelSummary {
     pub(super) unlabelled: Vec<Unlabelled>,
     /// The states of label jobs by protocol, as text.
     pub(super) by_protocol: Vec<String>,
-    /// Structures found by both a biased walk and its control, with one label each; not counted in large campaigns.
+    /// Structures found by both biased and control walks, with one label each; not counted in large campaigns.
     pub(super) shared: Option<u64>,
 }
 

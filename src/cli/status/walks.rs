@@ -15,7 +15,8 @@ pub const NAME: usize = 14;
 pub const TITLES: [&str; 9] =
     [">walk", "seed structure", "state", ">step", ">steps/s", ">T (K)", ">V/V₀", ">γ_max", ">taken"];
 
-/// Selects at most `most` walks, in order of their numbers: running walks with the largest γ first, then those that started last.
+/// Selects at most `most` walks, in order of their numbers: running walks with the largest γ first, then those that started
+/// last.
 fn select(walks: &[WalkStatus], most: usize) -> Vec<&WalkStatus> {
     let mut shown: Vec<_> = walks.iter().collect();
     if shown.len() > most {

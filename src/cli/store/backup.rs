@@ -13,9 +13,9 @@ const BAR: &str = "copying {bar:32} {percent} %  {eta} left";
 
 /// Copy a campaign to a new directory, also while it runs
 ///
-/// The backup is a campaign directory with a SQLite database, also if the store of the campaign is PostgreSQL. status, export and other
-/// commands read it, and run can resume it (remove run.store from the configuration). It is a consistent snapshot, and appears only
-/// when it is complete and on disk.
+/// The backup is a campaign directory with a SQLite database, also if the store of the campaign is PostgreSQL. status, export
+/// and other commands read it, and run can resume it (remove run.store from the configuration). It is a consistent snapshot,
+/// and appears only when it is complete and on disk.
 #[derive(Debug, clap::Args)]
 pub struct Backup {
     #[command(flatten)]

@@ -41,7 +41,8 @@ impl Charts {
         Some((self.gamma.get(self.gamma.len() / 2).copied()?, self.gamma.last().copied()?))
     }
 
-    /// A histogram of γ with `bins` equal bins on [0, end), and `end`. The last bin includes larger values, at most one in fifty.
+    /// A histogram of γ with `bins` equal bins on [0, end), and `end`. The last bin includes larger values, at most one in
+    /// fifty.
     pub fn histogram(&self, bins: usize) -> (Vec<u64>, f64) {
         let high = self.gamma.get(self.gamma.len() * 49 / 50);
         let end = high.map_or(2.0, |gamma| gamma.ceil().max(2.0));

@@ -256,8 +256,8 @@ fn draw_text(frame: &mut Frame<'_>, area: Rect, text: &mut Text) {
     frame.render_widget(Paragraph::new(seen.collect::<Vec<_>>()), rows);
 }
 
-/// Wraps a line at `width` columns, between words if possible. Continuation lines are indented like the line, or like the text after
-/// its title.
+/// Wraps a line at `width` columns, between words if possible. Continuation lines are indented like the line, or like the text
+/// after its title.
 fn wrap(line: &str, width: usize) -> Vec<String> {
     let mut rest: Vec<char> = line.chars().collect();
     let blanks = |from: usize| rest[from..].iter().take_while(|c| **c == ' ').count();

@@ -30,10 +30,10 @@ use crate::duration::Duration;
 
 /// Monitor and control a campaign in the terminal
 ///
-/// Shows walks, label queue and recent decisions with filters, the distribution of γ and the acceptance rate of candidates. Press
-/// Enter for the history of a candidate. Keys drop, retry and prioritise structures in the queue, and pause and resume walks; F1 or ?
-/// lists them (docs/watch.md). Works on running and finished campaigns and on backups, and does not slow a run down. Set NO_COLOR for
-/// output without colours.
+/// Shows walks, label queue and recent decisions with filters, the distribution of γ and the acceptance rate of candidates.
+/// Press Enter for the history of a candidate. Keys drop, retry and prioritise structures in the queue, and pause and resume
+/// walks; F1 or ? lists them (docs/watch.md). Works on running and finished campaigns and on backups, and does not block a run.
+/// Set NO_COLOR for output without colours.
 #[derive(Debug, clap::Args)]
 pub struct Watch {
     #[command(flatten)]

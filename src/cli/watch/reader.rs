@@ -18,7 +18,7 @@ const MAX_JOBS: u32 = 300;
 pub struct Reading {
     /// The campaign, as in `calmwalk status`.
     pub snapshot: Snapshot,
-    /// WalkSelection jobs were asked for.
+    /// The requested view of jobs.
     pub view: JobView,
     /// The first jobs of the view, in the order in which labellers take them.
     pub jobs: Vec<Job>,
@@ -29,7 +29,8 @@ pub struct Reading {
 /// Reads a campaign.
 pub struct Reader {
     location: Location,
-    /// Connections to a server stay open. A file is opened for each poll, because it may have been replaced, or a run may have started.
+    /// Connections to a server stay open. A file is opened for each poll, because it may have been replaced, or a run may have
+    /// started.
     server: Option<Store>,
     last: i64,
 }

@@ -23,7 +23,7 @@ pub const QUEUE: usize = 1;
 /// Index of the pane of decisions.
 pub const DECISIONS: usize = 2;
 
-/// WalkSelection label jobs are shown.
+/// Which label jobs are shown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum JobView {
     /// Leased, then queued jobs.
