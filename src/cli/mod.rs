@@ -152,8 +152,8 @@ fn duration_between(
 fn block_on<T>(future: impl Future<Output = T>) -> Result<T, Failure> {
     let runtime =
         tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(Failure::failed)?;
-    let done = runtime.block_on(future);
+    let output = runtime.block_on(future);
     // A thread may still compute a label that was already returned to the queue: do not wait for it.
     runtime.shutdown_background();
-    Ok(done)
+    Ok(output)
 }

@@ -27,7 +27,7 @@ use crate::output::{count, print, print_json, say_if_unprotected};
 /// With --config, the campaign switches to the label protocol of that file: structures without a label move to it, and running
 /// calculations are cancelled. The campaign must not be running, and the next `calmwalk run` needs that configuration.
 #[derive(Debug, clap::Args)]
-#[command(group = clap::ArgGroup::new("which").required(true).args(["ids", "all", "condition"]))]
+#[command(group = clap::ArgGroup::new("target").required(true).args(["ids", "all", "condition"]))]
 pub struct Relabel {
     #[command(flatten)]
     location: CampaignLocation,

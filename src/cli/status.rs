@@ -50,7 +50,7 @@ pub struct Status {
 impl Status {
     pub fn run(self) -> Result<Ended, Failure> {
         let location = self.location.get()?;
-        let snapshot = block_on(Snapshot::at(&location))??;
+        let snapshot = block_on(Snapshot::read_location(&location))??;
         let jobs = block_on(BatchJobs::query(&location))?;
         if self.json {
             print_json(&json::to_json(&snapshot, &jobs).map_err(Failure::failed)?)?;
@@ -76,15 +76,15 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
-    async fn at(location: &Location) -> Result<Self, Failure> {
+    async fn read_location(location: &Location) -> Result<Self, Failure> {
         let store = Store::open_read_only(location).await?;
-        let snapshot = Self::of(&store).await?;
+        let snapshot = Self::read(&store).await?;
         store.close().await;
         Ok(snapshot)
     }
 
     /// Reads the state of a campaign.
-    pub async fn of(store: &Store) -> Result<Self, Failure> {
+    pub async fn read(store: &Store) -> Result<Self, Failure> {
         let forecast = store.note(forecast::NOTE).await?;
         let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
         let (campaign, status) = (store.campaign().await?, store.status().await?);

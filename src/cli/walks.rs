@@ -41,8 +41,8 @@ pub struct WalkSelection {
 impl Walks {
     pub fn run(self) -> Result<Ended, Failure> {
         let location = self.location.get()?;
-        let done = block_on(change(&location, &self.action))??;
-        print(|out| done.iter().try_for_each(|line| writeln!(out, "{line}")))?;
+        let messages = block_on(change(&location, &self.action))??;
+        print(|out| messages.iter().try_for_each(|line| writeln!(out, "{line}")))?;
         Ok(Ended::Done)
     }
 }

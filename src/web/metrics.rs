@@ -20,7 +20,7 @@ pub fn router(store: Store) -> Router {
 }
 
 async fn metrics(State(store): State<Store>) -> Response {
-    match Snapshot::of(&store).await {
+    match Snapshot::read(&store).await {
         Ok(snapshot) => ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&snapshot)).into_response(),
         Err(failure) => (StatusCode::SERVICE_UNAVAILABLE, failure.to_string()).into_response(),
     }

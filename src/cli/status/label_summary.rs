@@ -139,8 +139,8 @@ fn by_protocol(jobs: &[(String, JobState, u64)], in_force: &str) -> Vec<String> 
     let of_one = |jobs: &[(String, JobState, u64)]| {
         let name = &jobs[0].0;
         let counts: Vec<_> = jobs.iter().map(|(_, state, count)| format!("{count} {state}")).collect();
-        let which = if name == in_force { " (current)" } else { "" };
-        format!("'{name}'{which}: {}", counts.join(", "))
+        let current = if name == in_force { " (current)" } else { "" };
+        format!("'{name}'{current}: {}", counts.join(", "))
     };
     jobs.chunk_by(|a, b| a.0 == b.0).map(of_one).collect()
 }

@@ -141,21 +141,21 @@ fn draw_head(frame: &mut Frame<'_>, area: Rect, state: &State) {
     frame.render_widget(Paragraph::new(lines.to_vec()), area);
 }
 
-fn draw_pane(frame: &mut Frame<'_>, area: Rect, state: &mut State, place: usize, theme: &Theme) {
-    let (name, titles): (_, &[&str]) = match place {
+fn draw_pane(frame: &mut Frame<'_>, area: Rect, state: &mut State, index: usize, theme: &Theme) {
+    let (name, titles): (_, &[&str]) = match index {
         WALKS => ("walks", &walks::TITLES),
         QUEUE => (state.view.name(), &entries::JOBS),
         _ => ("decisions", &entries::DECISIONS),
     };
-    let has_focus = place == state.focus;
-    let pane = &mut state.panes[place];
+    let has_focus = index == state.focus;
+    let pane = &mut state.panes[index];
     // In small panes, rows are more useful than column titles.
     let titled = u16::from(has_focus || area.height > 4);
     let [title, head, rows] =
         Layout::vertical([Constraint::Length(1), Constraint::Length(titled), Constraint::Fill(1)])
             .areas(area);
     let width = usize::from(area.width);
-    let text = cut(&pane_title(pane, place, name), width);
+    let text = cut(&pane_title(pane, index, name), width);
     let style = if has_focus { Modifier::REVERSED | Modifier::BOLD } else { Modifier::UNDERLINED };
     frame.render_widget(Paragraph::new(Line::styled(format!("{text:<width$}"), style)), title);
     let (visible, selected) = (pane.visible(rows.height.into()), pane.index());
@@ -178,12 +178,12 @@ fn draw_pane(frame: &mut Frame<'_>, area: Rect, state: &mut State, place: usize,
 }
 
 /// The title of a pane, with the numbers of shown and existing entries.
-fn pane_title(pane: &Pane, place: usize, name: &str) -> String {
+fn pane_title(pane: &Pane, index: usize, name: &str) -> String {
     let shown = pane.entries.len();
     let number = if pane.all == shown { shown.to_string() } else { format!("{shown} of {}", pane.all) };
-    let last = if place == DECISIONS && pane.all == WINDOW { "last " } else { "" };
+    let last = if index == DECISIONS && pane.all == WINDOW { "last " } else { "" };
     let filter = pane.filter.as_ref().map_or(String::new(), |filter| format!("  where {filter}"));
-    format!(" {} {name}: {last}{number}{filter}", place + 1)
+    format!(" {} {name}: {last}{number}{filter}", index + 1)
 }
 
 fn draw_charts(frame: &mut Frame<'_>, area: Rect, state: &State, theme: &Theme) {

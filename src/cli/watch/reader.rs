@@ -56,7 +56,7 @@ impl Reader {
     }
 
     async fn read(&mut self, store: &Store, view: JobView) -> Result<Reading, Failure> {
-        let snapshot = Snapshot::of(store).await?;
+        let snapshot = Snapshot::read(store).await?;
         let mut jobs = Vec::new();
         for state in view.states() {
             jobs.extend(store.queue_list(Some(*state), MAX_JOBS, 0).await?);
