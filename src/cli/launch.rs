@@ -122,7 +122,7 @@ impl Launch {
             }
             let (names, wanted) = (job_names(&location), self.wanted(&location));
             if wanted.labellers == 0 && campaign.config.label.slots == 0 {
-                say("label.slots = 0 and --labellers 0: start labellers with calmwalk label");
+                say("label.slots = 0 and no labeller jobs: start labellers with calmwalk label");
             }
             let specs = JobSpecs::new(&self, &campaign, &directory, wanted)?;
             block_on(self.launch(&slurm, &names, &specs, wanted))??;

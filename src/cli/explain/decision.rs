@@ -7,7 +7,7 @@ use calm::{UpdateEnd, UpdateRule};
 
 use super::grades::block;
 use super::{SHOWN, line, shortened_list};
-use crate::output::{Table, decimals};
+use crate::output::{self, Table, decimals};
 use crate::story::{Coverage, Decided, Update};
 
 pub fn write(out: &mut dyn Write, decision: &Decided, atoms: usize) -> io::Result<()> {
@@ -145,7 +145,10 @@ fn write_coverage(out: &mut dyn Write, decision: &Decided, coverage: &Coverage) 
     line(
         out,
         "covered",
-        &format!("{count} later candidates of walkers that had not seen this update were declined{searched}"),
+        &format!(
+            "{} whose walkers had not seen this update{searched}",
+            output::count(count, "later candidate")
+        ),
     )?;
     for covered in coverage.later.iter().take(SHOWN) {
         let by = match covered.decided - covered.seen {

@@ -308,9 +308,9 @@ fn key_hints(state: &State) -> String {
             "Tab pane  / filter  Enter decisions  p pause  r resume  i all  ? keys  q quit".into()
         }
         (Mode::Panes, QUEUE) => {
-            "Tab pane  ↑↓  / filter  Enter history  = priority  d drop  t retry  s view  ? keys".into()
+            "Tab pane  ↑↓  / filter  Enter open  = priority  d drop  t retry  s view  ? keys".into()
         }
-        (Mode::Panes, _) => "Tab pane  ↑↓  / filter  Enter history  i all  ? keys  q quit".into(),
+        (Mode::Panes, _) => "Tab pane  ↑↓  / filter  Enter open  i all  ? keys  q quit".into(),
     }
 }
 
