@@ -248,6 +248,12 @@ fn arguments_that_are_nearly_right_get_a_hint() {
         (vec!["run", "c.toml", "--dashboard", "8080"], "expected ADDRESS:PORT, such as 127.0.0.1:8080"),
         (vec!["run", "c.toml", "--metrics", ":9464"], "expected ADDRESS:PORT, such as 127.0.0.1:9464"),
         (vec!["dashboard", "c", "--address", "here"], "expected ADDRESS:PORT, such as 127.0.0.1:8080"),
+        (vec!["run", "c.toml", "--wait-timeout", "10"], "found '10', expected a time with its unit, such as"),
+        (
+            vec!["label", "--store", "c", "--grace-period", "soon"],
+            "found 'soon', expected a time with its unit",
+        ),
+        (vec!["watch", "c", "--every", "1ms"], "expected 200ms to 1h"),
         (vec!["walks", "c", "pause", "all"], "to select all walks, use --all"),
         (vec!["walks", "c", "pause", "x"], "expected the number of a walk"),
         (vec!["export", "c", "--output", "o", "--where", "gama > 1"], "did you mean 'gamma'?"),

@@ -157,3 +157,26 @@ fn block_on<T>(future: impl Future<Output = T>) -> Result<T, Failure> {
     runtime.shutdown_background();
     Ok(output)
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_definition_of_the_command_line_is_consistent() {
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn durations_are_checked_against_their_limits() {
+        let parse = duration_between("200ms", "1h");
+        assert_eq!(
+            (parse("2s"), parse("1h")),
+            (Ok(Duration::from_seconds(2)), Ok(Duration::from_seconds(3600)))
+        );
+        assert_eq!(parse("100ms").unwrap_err(), "expected 200ms to 1h");
+        assert!(parse("2").unwrap_err().contains("such as"));
+    }
+}
