@@ -40,7 +40,7 @@ pub struct Labelling {
 
 /// What the user says of the host on which labels are made.
 #[derive(Debug, Default)]
-pub struct Here<'a> {
+pub struct HostOptions<'a> {
     /// The method that the campaign must have.
     pub method: Option<&'a str>,
     /// Files that are not where the leader has them.
@@ -129,7 +129,7 @@ pub fn supports(label: &LabelSection, species: &BTreeSet<Species>) -> Result<(),
 
 impl Labelling {
     /// Reads it, and finds what the method needs here. `protocol` is the one in force.
-    pub async fn of(store: &Store, protocol: Protocol, here: Here<'_>) -> Result<Self, Failure> {
+    pub async fn of(store: &Store, protocol: Protocol, here: HostOptions<'_>) -> Result<Self, Failure> {
         let text = store.campaign().await?.configuration_in_force;
         let InForce { label: Limits { attempts, bounds, lease } } =
             serde_json::from_str(&text).map_err(unreadable)?;
@@ -212,7 +212,7 @@ impl MethodSetup {
     }
 
     /// The same with what is on this host, if it makes labels of that protocol.
-    fn for_this_host(self, protocol: &Protocol, here: Here<'_>) -> Result<Self, Failure> {
+    fn for_this_host(self, protocol: &Protocol, here: HostOptions<'_>) -> Result<Self, Failure> {
         let given = here.label.as_ref().map(Self::of).transpose()?;
         match (self, given) {
             (Self::Reference { kind, file, .. }, None) => {

@@ -27,13 +27,13 @@ static SETUP: OnceLock<Setup> = OnceLock::new();
 /// Arguments of commands that run for long.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Options {
-    /// Write down what happens at the end of this file, also that of the processes that this one starts (docs/log.md)
+    /// Append the log of this process and its children to this file (docs/log.md)
     #[arg(long = "log", value_name = "FILE")]
     file: Option<PathBuf>,
-    /// How much is written down
+    /// Log level: log events of this and higher severity
     #[arg(long = "log-level", value_name = "LEVEL", requires = "file", default_value = "info")]
     level: LogLevel,
-    /// How
+    /// Log format
     #[arg(long = "log-format", value_name = "FORMAT", requires = "file", default_value = "text")]
     format: Format,
 }
@@ -42,13 +42,13 @@ pub struct Options {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LogLevel {
-    /// What ends a process.
+    /// Errors that end a process
     Error,
-    /// What should not be, and is dealt with.
+    /// Problems that were handled
     Warn,
-    /// What happens to the campaign.
+    /// Events of the campaign
     Info,
-    /// Every turn, commit and lease.
+    /// Every assignment, commit and lease
     Debug,
 }
 
@@ -56,9 +56,9 @@ pub enum LogLevel {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Format {
-    /// For people.
+    /// One line of text per event
     Text,
-    /// One JSON object a line.
+    /// One JSON object per line
     Json,
 }
 

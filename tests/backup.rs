@@ -38,14 +38,14 @@ fn a_copy_of_a_running_campaign_can_be_run_on() {
         place.status()["mixture_version"].as_u64().is_some_and(|version| version > 0)
     });
     let said = succeed(place.path(), ["store", "backup", place.argument(), &copy]);
-    assert!(said.contains("the campaign is copied to "), "{said}");
+    assert!(said.contains("backed up to "), "{said}");
     assert_eq!(visible(elsewhere.path()), ["copy"]);
     let message = refuse(place.path(), ["store", "backup", place.argument(), &copy]);
     assert!(message.contains("exists already: a backup is a new directory"), "{message}");
     let message = refuse(place.path(), ["store", "compact", place.argument()]);
     assert!(message.contains("is being run by process"), "{message}");
     let said = succeed(place.path(), ["store", "check", &copy]);
-    assert!(said.contains("nothing found: "), "{said}");
+    assert!(said.contains("no problems found in "), "{said}");
     let status: Value = serde_json::from_str(&succeed(place.path(), ["status", &copy, "--json"])).unwrap();
     assert_eq!((&status["processes"], &status["finished"]), (&serde_json::json!([]), &false.into()));
     assert_eq!(ended(&mut run), Some(0), "{}", place.said());
@@ -110,11 +110,11 @@ fn check_and_compact_tell_what_they_find() {
     let place = Place::new(&small, &[]);
     assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
     let said = succeed(place.path(), ["store", "check", place.argument()]);
-    assert!(said.starts_with("nothing found: "), "{said}");
+    assert!(said.starts_with("no problems found in "), "{said}");
     let said = succeed(place.path(), ["store", "compact", place.argument()]);
     assert!(said.contains(" MB before, ") && said.contains(" MB after"), "{said}");
     let output = calmwalk(place.path(), ["store", "compact", place.argument(), "--drop-declined-features"]);
-    assert!(stderr(&output).contains("a replay with other rules ends at the first of them"));
+    assert!(stderr(&output).contains("calmwalk replay --set stops at the first of them"));
     succeed(place.path(), ["store", "check", place.argument()]);
     wait_until("nobody is left", || processes_in(place.path()).is_empty());
     on_store(place.location(), async |store| {

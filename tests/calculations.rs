@@ -72,7 +72,7 @@ fn victims(place: &Place, scratch: &Path, who: Victim) -> Vec<u32> {
     match who {
         Label => carrying_out(place.path(), "label"),
         Labeller => carrying_out(place.path(), "labeller"),
-        Keeper => carrying_out(place.path(), "keep"),
+        Keeper => carrying_out(place.path(), "calculation-runner"),
         Program => started("sh label.sh"),
         Child => started("sleep 1000"),
     }
@@ -84,7 +84,7 @@ fn each_label_comes_once_whoever_is_killed() {
     let (scratch, mut random) = (scratch.path().canonicalize().unwrap(), Random(11));
     let place = place(&scratch);
     let mut run = place.run();
-    let slots = ["--slots", "2", "--wait", "2"];
+    let slots = ["--concurrency", "2", "--wait-timeout", "2m"];
     let mut label = place.label(&slots);
     let (mut killed, begun) = (BTreeMap::<Victim, usize>::new(), Instant::now());
     while run.0.try_wait().unwrap().is_none() {
@@ -171,7 +171,7 @@ fn a_setup_that_is_replaced_between_two_labels_makes_none() {
     let home = tempfile::tempdir().unwrap();
     let place = with_setup(&home.path().canonicalize().unwrap());
     let mut run = place.run();
-    let mut label = place.label(&["--wait", "2"]);
+    let mut label = place.label(&["--wait-timeout", "2m"]);
     assert_eq!(label.0.wait().unwrap().code(), Some(1), "{}", place.said());
     let (said, setup) = (place.said(), home.path().canonicalize().unwrap().join("Al.PBE"));
     assert!(
@@ -183,7 +183,7 @@ fn a_setup_that_is_replaced_between_two_labels_makes_none() {
     assert!(said.contains("settings.pseudopotentials.Al"), "{said}");
     assert_eq!((place.jobs("labelled"), place.jobs("failed")), (1, 0), "{said}");
     fs::write(&setup, SETUP).unwrap();
-    let mut label = place.label(&["--wait", "2"]);
+    let mut label = place.label(&["--wait-timeout", "2m"]);
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
     outcome_at(place.argument(), place.path());

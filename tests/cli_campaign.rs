@@ -135,7 +135,7 @@ fn an_export_holds_labels_and_grades_in_decision_order() {
     write_campaign(here, &[]);
     succeed(here, ["run", "small.toml"]);
     let printed = succeed(here, ["export", "small", "--output", "ase.extxyz"]);
-    assert_eq!(printed, "4 structures in ase.extxyz\nevery accepted structure is labelled\n");
+    assert_eq!(printed, "4 structures in ase.extxyz\nall accepted structures are labelled\n");
     let frames = read_extxyz(&here.join("ase.extxyz")).unwrap();
     check_labels(&frames);
     let versions: Vec<_> = frames.iter().map(|frame| number(frame, "mixture_version")).collect();
@@ -236,7 +236,7 @@ fn failed_labels_are_shown_retried_and_dropped() {
     let retried = json(here, ["queue", "small", "retry", id(0), id(1), id(2)]);
     assert!(retried.as_array().unwrap().iter().all(|job| job["state"] == "queued" && job["failures"] == 0));
     let prioritised = succeed(here, ["queue", "small", "prioritise", id(2), "-5"]);
-    assert_eq!(prioritised, format!("{} has priority -5 now\n", id(2)));
+    assert_eq!(prioritised, format!("{} now has priority -5\n", id(2)));
     succeed(here, ["queue", "small", "prioritise", id(1), "99"]);
     let queued = json(here, ["queue", "small", "list", "--state", "queued"]);
     let order: Vec<_> =
@@ -252,8 +252,10 @@ fn failed_labels_are_shown_retried_and_dropped() {
         .unwrap();
     succeed(here, ["run", "small.toml"]);
     let printed = succeed(here, ["export", "small", "--output", "out.extxyz"]);
-    let expected =
-        format!("accepted without a label: 0 not labelled yet, {} failed, 1 dropped\n", failed.len() - 3);
+    let expected = format!(
+        "accepted structures without a label: 0 not labelled yet, {} failed, 1 dropped\n",
+        failed.len() - 3
+    );
     assert!(printed.starts_with("2 structures") && printed.ends_with(&expected), "{printed}");
     let exported = read_extxyz(&here.join("out.extxyz")).unwrap();
     assert_eq!(exported.iter().map(|frame| text(frame, "candidate_id")).collect::<Vec<_>>(), [id(0), id(1)]);
@@ -281,7 +283,7 @@ fn labelled_structures_are_imported_once() {
 
     let counts = |labels, checks, known, protocol| {
         let checks = if checks == 1 { "1 check".to_owned() } else { format!("{checks} checks") };
-        format!("{labels} labels, {checks}, {known} known already, by protocol '{protocol}'\n")
+        format!("imported {labels} labels and {checks} of protocol '{protocol}'; {known} already known\n")
     };
     assert_eq!(succeed(here, ["import", "small", "new.extxyz"]), counts(3, 0, 0, "reference"));
     assert_eq!(succeed(here, ["import", "small", "new.extxyz", "own.extxyz"]), counts(0, 0, 7, "reference"));
@@ -355,11 +357,11 @@ fn status_works_while_a_campaign_runs_and_after_it_was_killed() {
     let message = refuse(here, ["import", "small", "l.extxyz"]);
     assert!(message.contains("only one process may run a campaign"), "{message}");
     drop(run);
-    assert!(succeed(here, ["import", "small", "l.extxyz"]).starts_with("1 label, "));
+    assert!(succeed(here, ["import", "small", "l.extxyz"]).starts_with("imported 1 label and "));
     let killed = json(here, ["status", "small"]);
     assert_eq!(killed["processes"][0]["state"], "gone");
-    let not_running = "not running; the same calmwalk run goes on with it";
+    let not_running = "not running (resume with calmwalk run)";
     wait_until("the labeller has left", || succeed(here, ["status", "small"]).contains(not_running));
-    assert!(succeed(here, ["clean", "small"]).contains("files removed"));
+    assert!(succeed(here, ["clean", "small"]).contains("files from shared memory"));
     nothing_is_left(&here.join("small"));
 }

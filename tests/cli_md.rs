@@ -183,7 +183,7 @@ fn mistakes_are_named_with_their_line() {
         (
             good.replace(aluminium.to_str().unwrap(), silicon.to_str().unwrap()),
             "md.toml:1: structure:",
-            "silicon_seeds.extxyz:1: atom 0 is Si; the potential knows Al",
+            "silicon_seeds.extxyz:1: atom 0 is Si; the potential supports Al",
         ),
         (
             good.replace("none = {}", "nose_hoover = { relaxation_time = 9, chain_length = 1000000000000 }"),

@@ -283,7 +283,7 @@ fn the_table_and_exports_speak_one_language() {
     Small::default().write(here);
     succeed(here, ["run", "campaign.toml"]);
     let mut command = program(here);
-    command.args(["dashboard", "campaign", "--at", "127.0.0.1:0"]);
+    command.args(["dashboard", "campaign", "--address", "127.0.0.1:0"]);
     let mut shown = Running(command.stderr(Stdio::piped()).spawn().unwrap());
     let [address] = said(&mut shown.0, ["dashboard at http://"]);
     let address = address.trim_end_matches('/');
@@ -361,7 +361,7 @@ fn check_copy(live: &Live, id: &str) {
     let here = live.here();
     succeed(here, ["store", "backup", "campaign", "copy"]);
     let mut command = program(here);
-    command.args(["dashboard", "copy", "--at", "127.0.0.1:0"]);
+    command.args(["dashboard", "copy", "--address", "127.0.0.1:0"]);
     let mut shown = Running(command.stderr(Stdio::piped()).spawn().unwrap());
     let [address] = said(&mut shown.0, ["dashboard at http://"]);
     let address = address.trim_end_matches('/');
@@ -371,6 +371,6 @@ fn check_copy(live: &Live, id: &str) {
     let token = [("x-calmwalk-token", live.token.as_str())];
     assert_eq!(request(address, "POST", &format!("/api/candidates/{id}/drop"), &token, "{}").status, 403);
     assert_eq!(request(address, "POST", "/api/walks/0/pause", &token, "{}").status, 403);
-    let open = refuse(here, ["dashboard", "copy", "--at", "0.0.0.0:0"]);
+    let open = refuse(here, ["dashboard", "copy", "--address", "0.0.0.0:0"]);
     assert!(open.contains("ssh -L"), "{open}");
 }

@@ -92,12 +92,12 @@ fn bounds_are_those_of_the_configuration() {
     }
     let here = directory.path();
     // Without labels there are no energy errors, and it is said why.
-    let errors = json(here, ["errors", "here"]);
+    let errors = json(here, ["force-errors", "here"]);
     assert_eq!(
         (&errors["energy"]["mean"], &errors["energy"]["offsets"]["structures"]),
         (&Json::Null, &0.into())
     );
-    let told = succeed(here, ["errors", "here"]);
+    let told = succeed(here, ["force-errors", "here"]);
     assert!(
         told.contains("no energy errors: ") && told.contains("at least 2 labelled structures; there are 0"),
         "{told}"
@@ -111,7 +111,7 @@ fn bounds_are_those_of_the_configuration() {
         "{message}"
     );
     assert_eq!(json(here, ["status", "here"])["imported"], 0);
-    let arguments = ["label", "--once", "seeds.extxyz", "--config", "campaign.toml"];
+    let arguments = ["label-file", "seeds.extxyz", "--config", "campaign.toml"];
     let output = common::calmwalk(here, arguments);
     assert_eq!(output.status.code(), Some(1));
     let said = common::stderr(&output);
@@ -161,7 +161,7 @@ fn energy_errors_are_without_the_difference_of_zeros() {
     let of_structures: BTreeMap<_, _> =
         energies.values().map(|(model, label, content)| (content, model - label + offset)).collect();
 
-    let shown = json(here, ["errors", "here"])["energy"].clone();
+    let shown = json(here, ["force-errors", "here"])["energy"].clone();
     near(&shown["offsets"]["elements"][0]["offset"], offset);
     assert_eq!(
         (&shown["offsets"]["elements"][0]["element"], shown["structures"].as_u64()),
@@ -184,7 +184,7 @@ fn energy_errors_are_without_the_difference_of_zeros() {
     }
     // Nowhere is the difference of zeros called an error.
     let summary = succeed(here, ["run", "campaign.toml", "--directory", "here"]);
-    let told = succeed(here, ["errors", "here"]);
+    let told = succeed(here, ["force-errors", "here"]);
     succeed(here, ["report", "here", "--output", "report"]);
     let table = fs::read_to_string(here.join("report/tables/energy-offsets.csv")).unwrap();
     assert!(table.contains(&format!("Al,{offset}")[..12]), "{table}");

@@ -1,4 +1,4 @@
-//! What labels teach: `calmwalk errors`, `calmwalk report`, and what `status` and the summary say of labels that failed.
+//! What labels teach: `calmwalk force-errors`, `calmwalk report`, and what `status` and the summary say of labels that failed.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -84,10 +84,10 @@ fn structures_of_both_walks_are_counted_and_not_compared() {
     assert_eq!((&status["candidates"]["accepted"], &status["candidates"]["control"]), (&4.into(), &4.into()));
     let shown = succeed(here, ["status", "campaign", "--all"]);
     assert!(
-        shown.contains("4 control frames (2 of them structures of biased walks too: 6 labels for all)"),
+        shown.contains("4 control frames (2 of them also found by biased walks: 6 labels in total)"),
         "{shown}"
     );
-    let errors = json(here, ["errors", "campaign"]);
+    let errors = json(here, ["force-errors", "campaign"]);
     let structures = ["all", "biased", "control"].map(|of| errors[of]["structures"].as_u64().unwrap());
     assert_eq!((structures, &errors["shared_structures"]), ([6, 2, 2], &2.into()));
     succeed(here, ["report", "campaign", "-o", "report"]);
@@ -113,7 +113,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     let (kept, lost): (Vec<_>, Vec<_>) = rows.iter().partition(|row| largest_force(row) <= limit);
     assert!(lost.len() > 1 && kept.len() > 1, "{forces:?}");
 
-    let errors = json(here, ["errors", "strict"]);
+    let errors = json(here, ["force-errors", "strict"]);
     let (measured, unknown) = (pairs(&kept), pairs(&lost));
     let all = &errors["all"];
     assert_eq!(
@@ -134,7 +134,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     };
     assert_eq!(of_bin("completion_by_gamma", "failed"), lost.len());
     assert_eq!(of_bin("completion_by_relative_volume", "failed"), lost.len());
-    let text = succeed(here, ["errors", "strict"]);
+    let text = succeed(here, ["force-errors", "strict"]);
     assert!(
         text.contains("ROC-AUC(γ_nbr)") && text.contains("above 1 eV/Å (%)") && text.contains("censored"),
         "{text}"
@@ -157,7 +157,7 @@ fn failed_labels_are_censored_and_the_others_are_measured() {
     assert!(!succeed(here, ["status", "whole"]).contains("unlabelled"));
     common::report::check(here, "strict", &status, &errors);
     // Another protocol than there is.
-    let wrong = common::refuse(here, ["errors", "whole", "--protocol", "nothing"]);
+    let wrong = common::refuse(here, ["force-errors", "whole", "--protocol", "nothing"]);
     assert!(wrong.contains("no protocol 'nothing'; it has 'reference'"), "{wrong}");
 }
 
@@ -175,7 +175,7 @@ fn labels_that_wait_have_a_price_as_soon_as_one_was_made() {
     });
     let before = json(here, ["status", "campaign"]);
     assert_eq!(before["cost"]["queue"]["remaining"], Json::Null, "{before}");
-    assert!(succeed(here, ["status", "campaign"]).contains("unknown before a first one"));
+    assert!(succeed(here, ["status", "campaign"]).contains("unknown before the first one"));
     // Labels from elsewhere.
     let mut labeller = common::Running(
         common::program(here).args(["label", "--store", "campaign", "--until-empty"]).spawn().unwrap(),

@@ -130,7 +130,7 @@ fn every_candidate_has_its_story() {
             _ => {
                 check_label(&story, stored);
                 let text = succeed(here, ["explain", "here", name]);
-                assert!(text.contains("a control: unbiased") && !text.contains("its own guard"), "{text}");
+                assert!(text.contains("a control walk: unbiased") && !text.contains("its guard"), "{text}");
                 let partner = story["found"]["partner"]["candidate"].as_str().unwrap();
                 let place = format!("-{}.0.{}-", story["found"]["control_of"], stored.block.view().id().step);
                 assert!(partner.contains(&place), "{partner} {place}");
@@ -205,11 +205,11 @@ fn a_story_is_told_in_words_also_of_a_copy_and_of_what_failed() {
         for part in [
             accepted.as_str(),
             "atom_count: at least",
-            "α = 0.05 taken",
+            "α = 0.05 applied",
             "queued, priority 77",
-            "by hand: prioritise, to 77",
-            "by hand: drop",
-            "lets it pass",
+            "by the user: prioritise, to 77",
+            "by the user: drop",
+            "bypasses the labellers' guard",
             "attempt 1: failed (",
             "not recorded",
         ] {
@@ -220,7 +220,10 @@ fn a_story_is_told_in_words_also_of_a_copy_and_of_what_failed() {
     let declined = succeed(here, ["explain", "here", &of_kind("declined")]);
     assert!(declined.contains("declined: ") && declined.contains("no label job"), "{declined}");
     let control = succeed(here, ["explain", "here", &of_kind("control")]);
-    assert!(control.contains("random numbers of walk") && control.contains("held to no limit"), "{control}");
+    assert!(
+        control.contains("random numbers of walk") && control.contains("no limit for control frames"),
+        "{control}"
+    );
 }
 
 #[test]

@@ -78,7 +78,7 @@ fn conditions_choose_what_they_say() {
     for (condition, problem) in [
         ("gamma > 2 elment = Mo", "at character 11: found 'elment', expected 'and', 'or' or the end"),
         ("gamma >", "at character 8: found the end, expected a number"),
-        ("element = Mo", "no labelled structure meets --where"),
+        ("element = Mo", "no labelled structure matches --where"),
     ] {
         let message = refuse(here, ["export", "here", "--output", "none.extxyz", "--where", condition]);
         assert!(message.contains(problem), "{message}");

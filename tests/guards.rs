@@ -85,10 +85,10 @@ fn a_campaign_has_a_bill_before_it_begins() {
     let here = directory.path();
     Small::default().write(here);
     // Two seed structures, four structures each, and a control frame of each of those.
-    let plan = json(here, ["plan", "campaign.toml"]);
+    let plan = json(here, ["estimate", "campaign.toml"]);
     assert_eq!((&plan["labels"], &plan["core_hours"]), (&16.into(), &Json::Null));
-    assert!(succeed(here, ["plan", "campaign.toml"]).contains("cost is unknown"));
-    let priced = json(here, ["plan", "campaign.toml", "--core-seconds", "3600"]);
+    assert!(succeed(here, ["estimate", "campaign.toml"]).contains("cost unknown"));
+    let priced = json(here, ["estimate", "campaign.toml", "--core-seconds", "3600"]);
     let hours = |plan: &Json| plan["core_hours"]["expected"].as_f64().unwrap();
     let first = priced["seed_structures"][0]["core_hours_each"]["expected"].as_f64().unwrap();
     // An hour, and what labels take on average above the middle.
@@ -99,12 +99,12 @@ fn a_campaign_has_a_bill_before_it_begins() {
     // A key that limits structures limits the bill.
     let text = fs::read_to_string(here.join("campaign.toml")).unwrap();
     fs::write(here.join("less.toml"), text.replace("per_seed = 4", "per_seed = 4\ntotal = 2")).unwrap();
-    let less = json(here, ["plan", "less.toml", "--core-seconds", "3600"]);
+    let less = json(here, ["estimate", "less.toml", "--core-seconds", "3600"]);
     assert_eq!((&less["labels"], &less["limited_by"]), (&4.into(), &"collect.total".into()));
     assert!((hours(&less) / hours(&priced) - 0.25).abs() < 1e-9);
 
-    assert!(refuse(here, ["plan", "campaign.toml", "--like", "less"]).contains("less"));
+    assert!(refuse(here, ["estimate", "campaign.toml", "--cost-from", "less"]).contains("less"));
     succeed(here, ["run", "less.toml"]);
-    let like = json(here, ["plan", "campaign.toml", "--like", "less"]);
+    let like = json(here, ["estimate", "campaign.toml", "--cost-from", "less"]);
     assert!(hours(&like) > 0.0 && hours(&like) < 1.0, "{like}");
 }

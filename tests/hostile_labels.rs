@@ -96,7 +96,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     let queued: Vec<_> =
         (0..LEFT.len()).map(|k| queue(place.location(), k as u64, pair(k), Vec::new())).collect();
     LEFT.iter().for_each(|(kind, ..)| fs::create_dir(home.join("kinds").join(kind)).unwrap());
-    let mut label = place.label(&["--wait", "2"]);
+    let mut label = place.label(&["--wait-timeout", "2m"]);
     wait_until("all have come and gone", || fs::read_dir(home.join("kinds")).unwrap().count() == 0);
     go_on(&walkers);
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
@@ -155,7 +155,7 @@ impl Once {
 
     fn command(&self) -> Command {
         let mut command = program(self.home.path());
-        command.args(["label", "--once", "pair.extxyz", "--config", "label.toml"]);
+        command.args(["label-file", "pair.extxyz", "--config", "label.toml"]);
         command
     }
 

@@ -75,7 +75,7 @@ fn a_slow_line_changes_nothing() {
     let mut hosts = Hosts::new(&small, 1, "agent_silence_limit = 30.0");
     let line = SlowLine::to(hosts.endpoints[0].trim_start_matches("tcp/"), Duration::from_millis(200));
     hosts.endpoints[1] = format!("tcp/{}", line.here);
-    hosts.options[1] = vec!["--ahead=1".into()];
+    hosts.options[1] = vec!["--prefetch=1".into()];
     let mut agent = hosts.agent(0);
     let mut orchestrator = hosts.lead();
     // On an idle machine the orchestrator's own walker would be through before the agent has joined.

@@ -60,7 +60,7 @@ fn kill(directory: &Path, running: &Running, choice: u64, programs_too: bool) ->
         1 => carrying_out(directory, "walker"),
         2 => carrying_out(directory, "labeller"),
         ALL => processes_in(directory).iter().map(|process| process.pid).collect(),
-        4 => carrying_out(directory, "keep"),
+        4 => carrying_out(directory, "calculation-runner"),
         _ if programs_too => {
             let scratch = directory.canonicalize().unwrap().join("scratch");
             calculating(&scratch)

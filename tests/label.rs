@@ -39,7 +39,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     let small = Small::default();
     let place = Place::new(&small, &[NO_SLOTS]);
     // It may be there before the campaign.
-    let mut label = place.label(&["--slots", "2", "--method", "reference", "--wait", "2"]);
+    let mut label = place.label(&["--concurrency", "2", "--method", "reference", "--wait-timeout", "2m"]);
     wait_until("it waits", || place.said().contains("waiting for the campaign: there is no campaign in"));
     let mut run = place.run();
     wait_until("both slots show in status", || {
@@ -52,7 +52,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     assert_eq!(ended(&mut run), Some(0), "{}", place.said());
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
     let said = place.said();
-    assert!(said.contains("label.slots = 0: labels come from calmwalk label --store "), "{said}");
+    assert!(said.contains("label.slots = 0: start labellers with calmwalk label --store "), "{said}");
     let labels = place.jobs("labelled") as usize;
     assert!(labels > 0 && said.matches(": labelled ").count() == labels, "{labels} in {said}");
     assert_eq!(outcome_at(place.argument(), place.path()), expected(&small));
@@ -97,7 +97,7 @@ fn what_it_is_killed_over_is_labelled_by_the_next() {
 #[test]
 fn a_slot_that_is_killed_is_replaced_and_the_others_go_on() {
     let (place, name) = with_large_structure(&[]);
-    let mut label = place.label(&["--slots", "2", "--until-empty"]);
+    let mut label = place.label(&["--concurrency", "2", "--until-empty"]);
     place.wait_for_lease();
     let slots = carrying_out(place.path(), "labeller");
     // The label is not made before its slot is found.
@@ -116,14 +116,14 @@ fn a_slot_that_is_killed_is_replaced_and_the_others_go_on() {
 #[test]
 fn a_stop_finishes_the_label_in_hand_or_gives_it_back() {
     let (place, name) = with_large_structure(&[]);
-    let mut label = place.label(&["--grace", "0"]);
+    let mut label = place.label(&["--grace-period", "0s"]);
     place.wait_for_lease();
     signal(label.0.id(), "TERM");
     assert_eq!(ended(&mut label), Some(130), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Queued);
     assert_eq!(place.job(&name).attempts_made[0].outcome.as_deref(), Some("released"));
     assert!(place.said().contains("is given back"), "{}", place.said());
-    let mut label = place.label(&["--grace", "100"]);
+    let mut label = place.label(&["--grace-period", "100s"]);
     place.wait_for_lease();
     signal(label.0.id(), "INT");
     assert_eq!(ended(&mut label), Some(130), "{}", place.said());

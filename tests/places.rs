@@ -35,18 +35,18 @@ fn campaigns_of_init_do_not_meet() {
         // Their content is the same, as that of `init` is: only where they are tells them apart.
         write(&here.join(name));
         let said = run(here, &[&format!("{name}/campaign.toml")]);
-        assert!(said.contains(&format!("campaign '{name}' begins in {name}/campaign, with /")), "{said}");
+        assert!(said.contains(&format!("starting campaign '{name}' in {name}/campaign with /")), "{said}");
         assert!(here.join(name).join("campaign/campaign.sqlite").is_file());
         assert_eq!(status(here, name)["name"], name);
     }
     let said = run(here, &["first/campaign.toml"]);
-    assert!(said.contains("campaign 'first' in first/campaign is finished; after decision "), "{said}");
+    assert!(said.contains("campaign 'first' in first/campaign is finished: "), "{said}");
     let entries = fs::read_dir(here).unwrap().count();
     assert_eq!(entries, 2, "nothing was left in the working directory");
 
     // Every command takes the directory that `init` made.
     for command in
-        [&["status"][..], &["errors"], &["report", "--output", "page"], &["walks"], &["store", "check"]]
+        [&["status"][..], &["force-errors"], &["report", "--output", "page"], &["walks"], &["store", "check"]]
     {
         let arguments = command.iter().copied();
         let last = if command == ["walks"] { &["resume", "--all"][..] } else { &[] };
@@ -54,7 +54,9 @@ fn campaigns_of_init_do_not_meet() {
             arguments.partition(|word| !word.starts_with("--") && *word != "page");
         succeed(here, words.into_iter().chain(["second"]).chain(options).chain(last.iter().copied()));
     }
-    assert!(succeed(here, ["plan", "first/campaign.toml", "--like", "second"]).contains("newest label"));
+    assert!(
+        succeed(here, ["estimate", "first/campaign.toml", "--cost-from", "second"]).contains("newest label")
+    );
     succeed(here, ["label", "--store", "second", "--until-empty"]);
 }
 
@@ -70,7 +72,7 @@ fn a_directory_with_several_campaigns_is_not_enough() {
     assert_eq!(status(here, ".")["name"], here.file_name().unwrap().to_str().unwrap());
     run(here, &["other.toml"]);
     let message = refuse(here, ["status", "."]);
-    assert!(message.contains(". holds 2 campaigns: name one of ./campaign, ./other"), "{message}");
+    assert!(message.contains(". contains 2 campaigns: name one of ./campaign, ./other"), "{message}");
     assert_eq!(status(here, "other")["name"], "other");
 }
 
@@ -87,7 +89,7 @@ fn a_campaign_refuses_the_configuration_of_another() {
     let message = refuse(here, both("second/campaign.toml"));
     let first = here.canonicalize().unwrap().join("first/campaign.toml");
     let expected = format!("is 'first', which belongs to another configuration, {}", first.display());
-    for words in ["second/campaign.toml: ", &expected, "with --directory", "--adopt goes on with it"] {
+    for words in ["second/campaign.toml: ", &expected, "with --directory", "by --adopt"] {
         assert!(message.contains(words), "{words}: {message}");
     }
     // Nor does it lead to changing the file.
@@ -99,7 +101,7 @@ fn a_campaign_refuses_the_configuration_of_another() {
     assert_eq!(fs::read(here.join("shared/campaign.sqlite")).unwrap(), database);
 
     let said = run(here, &["second/campaign.toml", "--directory", "shared", "--adopt"]);
-    assert!(said.contains("second/campaign.toml takes the place of "), "{said}");
+    assert!(said.contains("second/campaign.toml replaces "), "{said}");
     run(here, &["second/campaign.toml", "--directory", "shared"]);
     assert!(refuse(here, both("first/campaign.toml")).contains("is 'second', which belongs to another"));
     let found = status(here, "shared");
@@ -136,9 +138,11 @@ fn a_campaign_in_the_working_directory_is_not_begun_anew() {
     run(here, &["first/campaign.toml", "--directory", "campaign"]);
     forget_the_configuration(&here.join("campaign"));
     let message = refuse(here, ["run", "first/campaign.toml"]);
-    for words in
-        ["is in campaign, and", "with --directory campaign to go on", "--directory first/campaign to begin"]
-    {
+    for words in [
+        "campaign already contains",
+        "--directory campaign to continue",
+        "--directory first/campaign to start",
+    ] {
         assert!(message.contains(words), "{words}: {message}");
     }
     assert!(!here.join("first/campaign").exists());
@@ -150,7 +154,7 @@ fn a_campaign_in_the_working_directory_is_not_begun_anew() {
     // Nor one that is beside its configuration.
     run(here, &["second/campaign.toml", "--directory", "second"]);
     fs::remove_dir_all(here.join("second/campaign")).unwrap();
-    assert!(refuse(here, ["run", "second/campaign.toml"]).contains("--directory ./second to go on"));
+    assert!(refuse(here, ["run", "second/campaign.toml"]).contains("--directory ./second to continue"));
 }
 
 fn forget_the_configuration(campaign: &Path) {

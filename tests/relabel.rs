@@ -72,9 +72,9 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     let planned = relabel(&place, &[&with[..], &["--dry-run"]].concat());
     for words in [
         "label.protocol is now \"fine\" (was \"reference\")".to_owned(),
-        "protocol 'fine' would come in force".to_owned(),
+        "protocol 'fine' would become the current label protocol".to_owned(),
         format!(
-            "{labels} structures would be queued to be labelled again by protocol 'fine', in the place of {labels} labels by 'reference'"
+            "{labels} structures would be queued again for protocol 'fine', to replace {labels} labels of 'reference'"
         ),
         format!("if they take as long as {labels} labels by 'reference' did"),
         "nothing was changed".to_owned(),
@@ -84,9 +84,10 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     assert_eq!((place.jobs("again"), place.jobs("labelled")), (0, labels));
 
     let asked = relabel(&place, &with);
-    assert!(asked.contains(&format!("{labels} structures are queued to be labelled again")), "{asked}");
+    assert!(asked.contains(&format!("{labels} structures are queued again")), "{asked}");
     assert!(
-        asked.contains("next: calmwalk run fine.toml") && asked.contains("calmwalk label --store"),
+        asked.contains("next: compute the labels with calmwalk run fine.toml")
+            && asked.contains("calmwalk label --store"),
         "{asked}"
     );
     let twice: Value = serde_json::from_str(&relabel(&place, &[&with[..], &["--json"]].concat())).unwrap();
@@ -116,9 +117,9 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
     }
     check(&place);
     let nothing = relabel(&place, &["--all"]);
-    assert!(nothing.contains("0 structures are queued to be labelled again"), "{nothing}");
+    assert!(nothing.contains("0 structures are queued again"), "{nothing}");
     assert!(
-        nothing.contains(&format!("{labels} structures left alone")) && !nothing.contains("next: "),
+        nothing.contains(&format!("{labels} structures skipped")) && !nothing.contains("next: "),
         "{nothing}"
     );
 }
@@ -129,7 +130,7 @@ fn a_protocol_needs_a_name_of_its_own_and_a_campaign_that_nobody_runs() {
     another_protocol(&place, "reference");
     let with = ["relabel", place.argument(), "--config", "fine.toml", "--all"];
     let refused = refuse(place.path(), with);
-    assert!(refused.contains("give this one a name of its own"), "{refused}");
+    assert!(refused.contains("choose a new name"), "{refused}");
     another_protocol(&place, "fine");
     let lock = CampaignLock::acquire(place.path(), "somebody");
     if place.argument() == "." {
@@ -148,8 +149,7 @@ fn doubtful_labels_are_made_again_by_the_same_protocol() {
     let (doubtful, bytes) = (&before[1].1, place.export());
     let all = relabel(&place, &["--where", "max_force >= 0"]);
     assert!(
-        all.contains("0 structures are queued to be labelled again")
-            && all.contains("--again asks for others"),
+        all.contains("0 structures are queued again") && all.contains("(use --include-current to relabel)"),
         "{all}"
     );
     assert!(
@@ -160,7 +160,7 @@ fn doubtful_labels_are_made_again_by_the_same_protocol() {
     let listed = succeed(place.path(), ["queue", place.argument(), "list", "--state", "queued"]);
     assert!(listed.contains(doubtful) && listed.contains("queued again"), "{listed}");
     let shown = succeed(place.path(), ["queue", place.argument(), "show", doubtful]);
-    assert!(shown.contains("another label was asked for: a sick node"), "{shown}");
+    assert!(shown.contains("relabel   requested: a sick node"), "{shown}");
     assert_eq!(place.export(), bytes, "the label stays");
     check(&place);
     assert_eq!(place.label(&["--until-empty"]).0.wait().unwrap().code(), Some(0), "{}", place.said());
@@ -176,13 +176,13 @@ fn killed_at_any_instant_all_or_nothing_is_asked_for() {
     let (place, labels) = labelled();
     let before = exported(&place);
     for kill in 0..8 {
-        let mut running = place.start(&["relabel", place.argument(), "--all", "--again"]);
+        let mut running = place.start(&["relabel", place.argument(), "--all", "--include-current"]);
         std::thread::sleep(Duration::from_millis(random(kill) % 60));
         signal(running.0.id(), "KILL");
         running.0.wait().unwrap();
         assert!([0, labels].contains(&place.jobs("again")), "{}", place.status());
     }
-    relabel(&place, &["--all", "--again"]);
+    relabel(&place, &["--all", "--include-current"]);
     assert_eq!(place.jobs("again"), labels);
     // Labellers that are killed leave nothing undone either.
     for kill in 0..4 {
@@ -207,7 +207,7 @@ fn labellers_go_on_with_the_new_protocol() {
     relabel(&place, &["--config", "fine.toml", "--all"]);
     signal(slot, "CONT");
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
-    assert!(place.said().contains("by another protocol than 'reference' now"), "{}", place.said());
+    assert!(place.said().contains("the campaign replaced label protocol 'reference'"), "{}", place.said());
     let job = place.job(&name).job;
     assert_eq!((job.protocol.as_str(), job.state), ("fine", JobState::Labelled));
     assert_eq!((place.jobs("labelled"), place.jobs("again")), (labels + 1, 0));

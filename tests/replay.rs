@@ -87,8 +87,8 @@ fn a_reproducible_campaign_comes_out_as_it_was_and_other_rules_decide_otherwise(
     let report = check_exact(here);
     assert!(!report["now"]["declined"].as_object().unwrap().is_empty(), "a campaign with declines: {report}");
     let shown = succeed(here, ["replay", "here"]);
-    assert!(shown.contains("every one as it was recorded, to the last digit"), "{shown}");
-    assert!(shown.contains("is the stored one, byte for byte"), "{shown}");
+    assert!(shown.contains("all reproduced bit by bit"), "{shown}");
+    assert!(shown.contains("is identical to the stored one"), "{shown}");
 
     let strict = replayed(here, &["collect.when={ rule = \"atom_count\", threshold = 1.2, fraction = 0.1 }"]);
     let accepted = |report: &Value, when: &str| report[when]["accepted"].as_u64().unwrap();
@@ -162,7 +162,7 @@ fn it_says_from_where_on_features_are_missing() {
     let shown = succeed(here, ["replay", "here"]);
     let (walk, step) = (&stopped["walk"], &stopped["step"]);
     let words = format!("(decision {}, walk {walk},", stopped["decision"]);
-    assert!(shown.contains(&words) && shown.contains(&format!("step {step}) were not kept")), "{shown}");
+    assert!(shown.contains(&words) && shown.contains(&format!("step {step}) were not stored")), "{shown}");
 }
 
 #[test]
@@ -229,7 +229,7 @@ fn what_was_changed_behind_its_back_is_found() {
     let checksum = message.split("its content has the checksum ").nth(1).unwrap().split(',').next().unwrap();
     let checksum = u32::from_str_radix(checksum, 16).unwrap();
     execute(here, &[&format!("UPDATE decision SET checksum = {checksum} WHERE sequence = {first}")]);
-    fails(&["does not come out as it was recorded", "detail.update.alpha was 0.123, and is "]);
+    fails(&["is not reproduced", "detail.update.alpha was 0.123, and is now "]);
     for (statement, words) in [
         (format!("DELETE FROM decision WHERE sequence = {first}"), &["the database is damaged"][..]),
         (format!("DELETE FROM candidate_data WHERE decision = {first}"), &["its candidate is missing"]),

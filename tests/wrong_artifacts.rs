@@ -116,7 +116,7 @@ fn without_training_frames_the_seed_structures_tell() {
     let at = format!("WARNING: c.toml:{}: potential.model: ", line("model = "));
     let warning = stderr(&output);
     assert!(warning.contains(&at) && warning.contains("nothing is ever collected"), "{warning}");
-    assert!(String::from_utf8_lossy(&output.stdout).contains("  warnings         1: see above\n"));
+    assert!(String::from_utf8_lossy(&output.stdout).contains("  warnings         1, see above\n"));
 }
 
 #[test]

@@ -112,7 +112,7 @@ fn names_need_not_be_text_but_for_sqlite() {
     };
     let message = refuse(above.path(), run(directory.as_os_str()));
     assert!(message.contains("(its name is not UTF-8, as SQLite needs it)"), "{message}");
-    assert!(succeed(above.path(), run(OsStr::new("here"))).contains("look further with"));
+    assert!(succeed(above.path(), run(OsStr::new("here"))).contains("; next:"));
 }
 
 /// The program as a user without any rights, if we may become one; `None` if that cannot be tried here.

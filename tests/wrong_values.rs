@@ -15,7 +15,7 @@ fn warnings(desk: &Desk, text: &str) -> Vec<String> {
     let shown = String::from_utf8(output.stdout).unwrap();
     let count = match warnings.len() {
         0 => "none".to_owned(),
-        count => format!("{count}: see above"),
+        count => format!("{count}, see above"),
     };
     assert!(shown.ends_with(&format!("  warnings         {count}\n")), "{shown}{warnings:?}");
     warnings
@@ -245,10 +245,16 @@ fn arguments_that_are_nearly_right_get_a_hint() {
     let desk = Desk::new();
     desk.write("c.toml", common::demo("aluminium.toml"));
     for (arguments, expected) in [
-        (vec!["run", "c.toml", "--dashboard", "8080"], "expected ADDRESS:PORT, as 127.0.0.1:8080"),
-        (vec!["run", "c.toml", "--metrics", ":9464"], "expected ADDRESS:PORT, as 127.0.0.1:9464"),
-        (vec!["dashboard", "c", "--at", "here"], "expected ADDRESS:PORT, as 127.0.0.1:8080"),
-        (vec!["walks", "c", "pause", "all"], "every walk is named by --all"),
+        (vec!["run", "c.toml", "--dashboard", "8080"], "expected ADDRESS:PORT, such as 127.0.0.1:8080"),
+        (vec!["run", "c.toml", "--metrics", ":9464"], "expected ADDRESS:PORT, such as 127.0.0.1:9464"),
+        (vec!["dashboard", "c", "--address", "here"], "expected ADDRESS:PORT, such as 127.0.0.1:8080"),
+        (vec!["run", "c.toml", "--wait-timeout", "10"], "found '10', expected a time with its unit, such as"),
+        (
+            vec!["label", "--store", "c", "--grace-period", "soon"],
+            "found 'soon', expected a time with its unit",
+        ),
+        (vec!["watch", "c", "--every", "1ms"], "expected 200ms to 1h"),
+        (vec!["walks", "c", "pause", "all"], "to select all walks, use --all"),
         (vec!["walks", "c", "pause", "x"], "expected the number of a walk"),
         (vec!["export", "c", "--output", "o", "--where", "gama > 1"], "did you mean 'gamma'?"),
         (vec!["export", "c", "--output", "o", "--where", "forces > 1"], "did you mean 'max_force'?"),

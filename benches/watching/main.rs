@@ -54,7 +54,7 @@ fn main() {
     row("`status`", || drop(succeed(here, ["status", "campaign"])));
     row("`status --json`", || drop(succeed(here, ["status", "campaign", "--json"])));
     let mut command = program(here);
-    command.args(["dashboard", "campaign", "--at", "127.0.0.1:0"]).stderr(Stdio::piped());
+    command.args(["dashboard", "campaign", "--address", "127.0.0.1:0"]).stderr(Stdio::piped());
     let mut server = Running(command.spawn().expect("the program starts"));
     let [address] = said(&mut server.0, ["dashboard at http://"]);
     let address = address.trim_end_matches('/');

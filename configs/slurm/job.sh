@@ -1,13 +1,13 @@
-# What the jobs of a campaign have in common; their scripts source it.
+# Shell functions that the job scripts of a campaign source.
 
-tries=5  # of a command that fails
-pause=20 # s between two of them
+tries=5  # attempts of a failing command
+pause=20 # time between attempts, s
 
-# work COMMAND …: runs it, hands on the batch system's notice, and ends with its exit code:
+# work COMMAND …: runs the command, forwards the SIGTERM of the batch system, and returns the exit code of the command:
 #   0    done
-#   2    wrong input or configuration: no use in trying again
-#   130  stopped in order: the job is requeued and goes on when it is its turn again, unless it was cancelled
-#   any other: failed, and tried again; after a notice requeued
+#   2    invalid input or configuration: not retried
+#   130  stopped: the job is requeued, unless it was cancelled, and resumes when it is scheduled again
+#   other: failure; retried, or requeued after a SIGTERM
 work() {
     local try code=130
     told= child=
@@ -34,7 +34,7 @@ work() {
 
 note() { echo "$(date '+%F %T') job $SLURM_JOB_ID: $*"; }
 
-# Waits for the child, also when the notice comes meanwhile, and gives its exit code.
+# Waits for the child, also if SIGTERM interrupts the wait, and returns its exit code.
 await() {
     local code before
     while :; do
@@ -45,13 +45,14 @@ await() {
     done
 }
 
-# A pause that a notice ends.
+# Sleeps; SIGTERM ends the sleep.
 doze() {
     sleep "$1" &
     wait $!
 }
 
-# Only while the job runs: one that was cancelled, or whose time is over, is not to come back. Slurm ends this script then.
+# Requeues the job only while Slurm reports it as running, so that a cancelled or timed-out job does not return. Slurm then ends this
+# script.
 requeue() {
     local try
     for ((try = 1; try <= 12; try++)); do

@@ -77,7 +77,7 @@ impl<'a> Notifier<'a> {
 
     async fn look(&mut self) -> Result<(), Failure> {
         let mut due = self.watch.look(&self.store.status().await?, unix_milliseconds());
-        let values = status::Values(self.store.values().await?);
+        let values = status::MixtureSummary(self.store.values().await?);
         if let Some((share, raised)) = values.forgetting() {
             due.extend(self.watch.look_at_training(&self.forgetting, share, raised));
         }
@@ -87,7 +87,7 @@ impl<'a> Notifier<'a> {
         // First, so that it is not told twice whatever happens now.
         let told = serde_json::to_string(self.watch.told()).map_err(Failure::failed)?;
         self.store.leave_note(NOTE, &told).await?;
-        let snapshot = status::Snapshot::of(self.store).await?;
+        let snapshot = status::Snapshot::read(self.store).await?;
         let state = snapshot.to_json().map_err(Failure::failed)?;
         due.into_iter().for_each(|due| self.tell(due, &state));
         Ok(())

@@ -8,13 +8,13 @@ use wire::place::{Place, PlaceError, Removed};
 use super::{Ended, Failure};
 use crate::output::{count, print};
 
-/// Remove what killed processes of a campaign left in shared memory
+/// Remove shared-memory files left behind by killed processes
 ///
-/// A run removes it at its start and at its end; this is for campaigns that were killed and will not go on. What belongs
-/// to a campaign that is running is left alone, and no campaign loses anything that it needs to go on.
+/// Each run does this at its start and end; use the command for killed campaigns that you do not resume. Skips running
+/// campaigns, and removes nothing that a campaign needs to resume.
 #[derive(Debug, clap::Args)]
 pub struct Clean {
-    /// Directories of campaigns [default: every campaign of this user on this host]
+    /// Directories of campaigns [default: all campaigns of this user on this host]
     #[arg(value_name = "DIR")]
     directories: Vec<PathBuf>,
 }
@@ -22,30 +22,30 @@ pub struct Clean {
 impl Clean {
     pub fn run(self) -> Result<Ended, Failure> {
         if self.directories.is_empty() {
-            for place in Place::all().map_err(Failure::failed)? {
-                let campaign = place.campaign_directory();
-                match clean(&place, campaign) {
-                    Ok(removed) => report(campaign.unwrap_or(place.directory()), removed)?,
-                    Err(Failure::Input(message)) => print(|out| writeln!(out, "left alone: {message}"))?,
+            for shared in Place::all().map_err(Failure::failed)? {
+                let campaign = shared.campaign_directory();
+                match clean(&shared, campaign) {
+                    Ok(removed) => report(campaign.unwrap_or(shared.directory()), removed)?,
+                    Err(Failure::Input(message)) => print(|out| writeln!(out, "skipped: {message}"))?,
                     Err(failure) => return Err(failure),
                 }
             }
         }
         for directory in &self.directories {
-            let place = Place::of(directory).map_err(Failure::input)?;
-            report(directory, clean(&place, Some(directory))?)?;
+            let shared = Place::of(directory).map_err(Failure::input)?;
+            report(directory, clean(&shared, Some(directory))?)?;
         }
         Ok(Ended::Done)
     }
 }
 
-/// Removes a place while nobody can begin to run its campaign.
-fn clean(place: &Place, campaign: Option<&Path>) -> Result<Removed, Failure> {
-    // Where the directory is gone there is no campaign left to run.
+/// Removes the shared-memory files of a campaign, under the lock that keeps it from starting meanwhile.
+fn clean(shared: &Place, campaign: Option<&Path>) -> Result<Removed, Failure> {
+    // A campaign whose directory was deleted cannot start.
     let campaign = campaign.filter(|directory| directory.is_dir());
     let _lock = campaign.map(|directory| CampaignLock::acquire(directory, "calmwalk clean")).transpose()?;
-    place.remove().map_err(|error| match error {
-        // Its directory may not be visible here, or may have been renamed.
+    shared.remove().map_err(|error| match error {
+        // In use although the directory is not locked: it may be invisible here, or renamed.
         PlaceError::InUse { .. } => Failure::input(error),
         error => Failure::failed(error),
     })
@@ -57,7 +57,7 @@ fn report(directory: &Path, removed: Removed) -> Result<(), Failure> {
     print(|out| {
         writeln!(
             out,
-            "{}: {} removed from shared memory, {megabytes:.1} MB",
+            "{}: removed {} from shared memory, {megabytes:.1} MB",
             directory.display(),
             count(files, "file")
         )

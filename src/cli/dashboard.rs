@@ -9,17 +9,17 @@ use crate::log::Options;
 use crate::output::say;
 use crate::web::{self, dashboard};
 
-/// Show a campaign in a browser, to look at it only
+/// Serve a read-only dashboard of a campaign to a web browser
 ///
-/// Of a campaign that runs elsewhere, has ended, or is a copy; `calmwalk run --dashboard` shows the one that it runs. Ends with
-/// Ctrl-C. docs/dashboard.md says what there is to see.
+/// For a campaign that runs elsewhere, has ended or is a backup; use `calmwalk run --dashboard` for the campaign that it runs.
+/// Stop with Ctrl-C. docs/dashboard.md describes the pages.
 #[derive(Debug, clap::Args)]
 pub struct Dashboard {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Address of this host; port 0: any that is free
+    /// Address and port to listen on; port 0 selects a free port
     #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:8080", value_parser = web::address)]
-    at: SocketAddr,
+    address: SocketAddr,
     #[command(flatten)]
     log: Options,
 }
@@ -28,7 +28,7 @@ impl Dashboard {
     pub fn run(self) -> Result<Ended, Failure> {
         self.log.begin("dashboard")?;
         block_on(async {
-            let listener = web::listen(self.at).await?;
+            let listener = web::listen(self.address).await?;
             let store = Store::open_read_only(&self.location.get()?).await?;
             let address = listener.local_addr().map_err(Failure::failed)?;
             let serving = web::Server::start(listener, dashboard::Dashboard::new(store, None, None).router());

@@ -7,27 +7,27 @@ use store::{ExcludedLabel, ExclusionChange, Store, unix_milliseconds};
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::output::{Table, print, print_json, say_if_unprotected};
 
-/// Take labels that turn out to be bad out of the data set, and take them in again
+/// Exclude bad labels from exports and statistics, or include them again
 ///
-/// An excluded label stays in the store with its history, and counts nowhere: it is left out of exports, of force and energy errors, of
-/// the offsets of the elements, and of summaries, reports and the dashboard's statistics. What it cost stays in the bill. A further result for
-/// the structure does not take its place; `calmwalk relabel` asks for another label, which does, and counts.
+/// An excluded label stays in the store with its history, but exports, force and energy errors, the energy offsets of the
+/// elements, summaries, reports and the dashboard's statistics ignore it. Its cost still counts. Another result for the
+/// structure does not replace it, unless requested with `calmwalk relabel`.
 ///
-/// Works while the campaign runs. All structures that are named are changed, or none.
+/// Works while the campaign runs. Changes either all given structures or none.
 #[derive(Debug, clap::Args)]
 pub struct Exclude {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Candidates, by their ids, the beginning of these or the number of the decision; or imported structures, as import-3
+    /// Candidates: ids, unique prefixes of ids, or decision numbers; or imported structures, such as import-3
     #[arg(value_name = "ID", required_unless_present = "list")]
     ids: Vec<String>,
-    /// Why, for those who look at the labels later
+    /// Reason, stored with the labels
     #[arg(long, value_name = "TEXT", required_unless_present_any = ["undo", "list"], value_parser = parse_reason)]
     reason: Option<String>,
-    /// Take them in again
+    /// Include the labels again
     #[arg(long, conflicts_with = "reason")]
     undo: bool,
-    /// Only list what is excluded
+    /// List the excluded labels
     #[arg(long, conflicts_with_all = ["ids", "reason", "undo"])]
     list: bool,
     /// Print JSON
@@ -37,7 +37,7 @@ pub struct Exclude {
 
 fn parse_reason(text: &str) -> Result<String, String> {
     match text.trim() {
-        "" => Err("expected some words that say why".to_owned()),
+        "" => Err("expected a reason".to_owned()),
         text => Ok(text.to_owned()),
     }
 }
@@ -57,7 +57,7 @@ impl Exclude {
         if self.json {
             print_json(&changes)?;
         } else {
-            print(|out| changes.iter().try_for_each(|change| writeln!(out, "{}", self.outcome(change))))?;
+            print(|out| changes.iter().try_for_each(|change| writeln!(out, "{}", self.message(change))))?;
         }
         Ok(Ended::Done)
     }
@@ -82,25 +82,24 @@ impl Exclude {
         Ok(changes)
     }
 
-    /// What was done, in words.
-    fn outcome(&self, change: &ExclusionChange) -> String {
+    fn message(&self, change: &ExclusionChange) -> String {
         let ExclusionChange { id, protocols, changed, excluded } = change;
-        let by = protocols.iter().map(|name| format!("'{name}'")).collect::<Vec<_>>().join(", ");
+        let protocols = protocols.iter().map(|name| format!("'{name}'")).collect::<Vec<_>>().join(", ");
         match (excluded, changed) {
             (Some(_), true) => format!(
-                "{id}: its label by {by} is excluded from exports and statistics (--undo takes it in again, calmwalk relabel asks for \
-                 another)"
+                "{id}: label of {protocols} excluded from exports and statistics (undo with --undo, replace with calmwalk \
+                 relabel)"
             ),
-            (Some(reason), false) => format!("{id}: its label by {by} is excluded already: {reason}"),
-            (None, true) => format!("{id}: its label by {by} counts again"),
-            (None, false) => format!("{id}: its label by {by} was not excluded"),
+            (Some(reason), false) => format!("{id}: label of {protocols} was already excluded: {reason}"),
+            (None, true) => format!("{id}: label of {protocols} included again"),
+            (None, false) => format!("{id}: label of {protocols} was not excluded"),
         }
     }
 }
 
 fn write_list(out: &mut dyn Write, excluded: &[ExcludedLabel]) -> io::Result<()> {
     if excluded.is_empty() {
-        return writeln!(out, "no label is excluded");
+        return writeln!(out, "no excluded labels");
     }
     let mut table = Table::new(&["id", "protocol", "reason"]);
     for ExcludedLabel { id, protocol, exclusion } in excluded {

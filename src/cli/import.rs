@@ -14,43 +14,43 @@ use crate::frames::Frames;
 use crate::labelling;
 use crate::output::{count, print};
 
-/// Take in labelled structures that exist already
+/// Import labelled structures
 ///
-/// Every frame needs energy and forces, as energy and forces or REF_energy and REF_forces; stress is taken if there is
-/// one. If one frame is not right, or beyond the bounds of label.largest_force, largest_stress and largest_energy, nothing is taken from any
-/// file. An import may be repeated: what is known is left as
-/// it is, and other numbers for a structure that has its label are kept as checks beside it.
+/// Each frame needs energy and forces, named energy and forces or REF_energy and REF_forces; stress is optional. If one frame
+/// is invalid or exceeds label.largest_force, largest_stress or largest_energy, nothing is imported from any file. Importing
+/// again is safe: known structures are not changed, and a different label for a labelled structure is stored as a check beside
+/// it.
 ///
-/// Not while the campaign runs: what is known decides what is a duplicate, so it changes between two runs only, and the
-/// decision log says when.
+/// The campaign must not be running: imported structures change which candidates are duplicates, and the decision log records
+/// when.
 #[derive(Debug, clap::Args)]
 pub struct Import {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Extended XYZ
+    /// Extended XYZ files
     #[arg(value_name = "FILES", required = true)]
     files: Vec<PathBuf>,
-    /// Protocol by which they were labelled; a new name makes a new protocol [default: that of the campaign]
+    /// Label protocol of the structures; a new name creates a protocol [default: current protocol of the campaign]
     #[arg(long, value_name = "NAME")]
     protocol: Option<String>,
 }
 
-/// Frames of one file, each with its number in it.
+/// The frames of one file with their numbers in it.
 struct File {
     name: String,
     frames: Vec<(u64, Structure, Label)>,
-    /// The line where each frame begins, from 1.
+    /// First line of each frame, from 1.
     lines: Vec<usize>,
 }
 
 impl File {
-    /// Labels beyond the campaign's bounds are no more believed than those that it makes.
+    /// Applies the campaign's bounds for its own labels.
     fn check(&self, bounds: &LabelBounds) -> Result<(), Failure> {
         for ((_, _, label), line) in self.frames.iter().zip(&self.lines) {
             if let Some(problem) = bounds.refuses(label.energy, &label.forces, label.stress.as_ref()) {
                 return Err(Failure::Input(format!(
-                    "{}:{line}: {problem}: nothing is imported; correct the label or leave the frame out, or raise the key if it is \
-                     right",
+                    "{}:{line}: {problem}: nothing was imported; correct the label, remove the frame, or raise the limit if it is \
+                     correct",
                     self.name
                 )));
             }
@@ -67,7 +67,7 @@ impl Import {
         print(|out| {
             let name = &protocol.name;
             let (labels, checks) = (count(labels, "label"), count(checks, "check"));
-            writeln!(out, "{labels}, {checks}, {known} known already, by protocol '{name}'")
+            writeln!(out, "imported {labels} and {checks} of protocol '{name}'; {known} already known")
         })?;
         Ok(Ended::Done)
     }
@@ -75,13 +75,13 @@ impl Import {
     async fn import(&self, files: &[File]) -> Result<(Protocol, Imported), Failure> {
         let location = self.location.get()?;
         let store = Store::open(&location).await?;
-        // What is known decides what is a duplicate: it changes between two runs, not within one.
+        // Imported structures change which candidates are duplicates: exclude a run.
         let _lock = CampaignLock::acquire_at(&location, "calmwalk import").await?;
         let bounds = labelling::bounds(&store).await?;
         files.iter().try_for_each(|file| file.check(&bounds))?;
         let protocol = match &self.protocol {
             Some(name) => protocol_named(&store, name).await?,
-            None => own_protocol(&store).await?,
+            None => current_protocol(&store).await?,
         };
         let mut all = Imported::default();
         for File { name, frames, .. } in files {
@@ -126,16 +126,17 @@ fn label(frame: &Frame) -> Result<Label, String> {
     }
 }
 
-/// The protocol by which the campaign itself labels.
-async fn own_protocol(store: &Store) -> Result<Protocol, Failure> {
+/// The current protocol of the campaign.
+async fn current_protocol(store: &Store) -> Result<Protocol, Failure> {
     store.protocol_in_force().await?.ok_or_else(|| {
         Failure::Input(
-            "the campaign has no label protocol yet: run it first, or name one with --protocol".to_owned(),
+            "the campaign has no label protocol yet: start it with calmwalk run first, or use --protocol"
+                .to_owned(),
         )
     })
 }
 
-/// The protocol of that name, made if the campaign has none so named.
+/// The protocol of this name, created if it does not exist.
 async fn protocol_named(store: &Store, name: &str) -> Result<Protocol, Failure> {
     if let Some(known) = store.protocols().await?.into_iter().find(|protocol| protocol.name == name) {
         return Ok(known);

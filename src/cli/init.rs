@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use super::{Ended, Failure};
 use crate::output::print;
 
-/// Write a commented campaign.toml and a small example that runs
+/// Create a small runnable example with a commented campaign.toml
 #[derive(Debug, clap::Args)]
 pub struct Init {
-    /// Directory to write into; made if it does not exist
+    /// Directory for the files; created if it does not exist
     #[arg(value_name = "DIR")]
     directory: PathBuf,
 }
@@ -20,7 +20,7 @@ macro_rules! example {
     };
 }
 
-/// The example campaign and its files, as they stand in `configs/`.
+/// The example campaign and its files, from `configs/`.
 const CAMPAIGN: &[u8] = include_bytes!("../../configs/aluminium.toml");
 const FILES: [(&str, &[u8]); 5] = [
     example!("data/al_eam_1l/kokkos.npz"),
@@ -38,16 +38,16 @@ impl Init {
         if let Some((existing, _)) = files.iter().find(|(path, _)| path.exists()) {
             let existing = existing.display();
             return Err(Failure::Input(format!(
-                "{existing} exists already: name another directory, or remove it"
+                "{existing} already exists: choose another directory or remove the file"
             )));
         }
         for (path, content) in &files {
             write(path, content)?;
         }
         print(|out| {
-            writeln!(out, "wrote {} and the files it names", config.display())?;
-            writeln!(out, "run it with:     calmwalk run {}", config.display())?;
-            writeln!(out, "look at it with: calmwalk status {}", self.directory.display())
+            writeln!(out, "created {} and the files it refers to; next:", config.display())?;
+            writeln!(out, "  calmwalk run {}", config.display())?;
+            writeln!(out, "  calmwalk status {}", self.directory.display())
         })?;
         Ok(Ended::Done)
     }

@@ -1,70 +1,59 @@
 //! `calmwalk label`
 
-mod once;
-
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use store::{Location, Store, StoreError};
 use tokio::sync::Notify;
 
-use super::{Ended, Failure, block_on, place};
+use super::{Ended, Failure, block_on, campaign_location, duration_between};
 use crate::actors::asked_to_stop;
 use crate::actors::slots::{self, Slots};
 use crate::config::Config;
-use crate::labelling::{Here, Labelling};
+use crate::duration::Duration;
+use crate::labelling::{HostOptions, Labelling};
 use crate::log::Options;
 use crate::output::{say, say_if_unprotected};
 
-/// Between two looks whether the campaign is there.
-const PAUSE: Duration = Duration::from_secs(2);
+/// Between two attempts to open a campaign that does not exist yet.
+const RETRY_INTERVAL: std::time::Duration = std::time::Duration::from_secs(2);
 
-/// Label what a campaign collects, anywhere that reaches its store
+/// Start labellers for a campaign on any host that reaches its store
 ///
-/// Method, protocol and limits are those of the campaign's [label] section. Labels as many structures side by side as there
-/// are slots, each in a process of its own. Waits for work while the campaign is run or may be run again, and ends when it
-/// is finished (exit code 0), or on Ctrl-C or SIGTERM (130): labels in hand are finished then, or given back if they take
-/// longer than --grace.
+/// Uses the method, protocol and limits of the campaign's [label] section. Each of the --concurrency labellers is a separate
+/// process. Waits for label jobs until the campaign is finished (exit code 0), also while no run is active. On Ctrl-C or
+/// SIGTERM, labels in progress that do not finish within --grace-period return to the queue (exit code 130).
 #[derive(Debug, clap::Args)]
 pub struct Label {
-    /// Directory of the campaign (on its host), or the postgres:// URL of its store
-    #[arg(long, value_name = "LOCATION", required_unless_present = "once")]
-    store: Option<PathBuf>,
-    /// Instead: label every structure of a file (extended XYZ or POSCAR) by the [label] section of --config, print the results
-    /// and end. No campaign is needed, and none changes
-    #[arg(long, value_name = "STRUCTURES", requires = "config", conflicts_with = "store")]
-    once: Option<PathBuf>,
-    /// With --once: where the labelled structures go, extended XYZ
-    #[arg(long, value_name = "FILE", requires = "once")]
-    output: Option<PathBuf>,
-    /// With --once: print JSON
-    #[arg(long, requires = "once")]
-    json: bool,
-    /// Labels to make side by side
+    /// Store of the campaign: its directory (on the host that runs it), or the postgres:// URL
+    #[arg(long, value_name = "LOCATION")]
+    store: PathBuf,
+    /// Number of labels to compute at the same time
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
-    slots: u32,
-    /// The method that the campaign must have, to be sure [default: whatever its configuration says]
+    concurrency: u32,
+    /// Exit with an error unless the campaign uses this label method, such as vasp [default: accept any method]
     #[arg(long, value_name = "NAME")]
     method: Option<String>,
-    /// A configuration whose [label] section says how the method's program is called on this host, and where its files are;
-    /// its protocol must be the campaign's [default: as on the host of `calmwalk run`]
+    /// Configuration whose [label] section says how to call the method's program on this host and where its files are. Its
+    /// label protocol must be the campaign's [default: as on the host of `calmwalk run`]
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// A file that the method needs and that is not where the campaign's leader has it; known by its content. May be given
-    /// several times
+    /// File that the method needs, if its path differs from that on the host of `calmwalk run`; identified by its content. May
+    /// be repeated
     #[arg(long = "file", value_name = "PATH")]
     files: Vec<PathBuf>,
-    /// End when no label is waited for and nobody runs the campaign
+    /// Exit when the queue is empty and no run is active
     #[arg(long)]
     until_empty: bool,
-    /// After a stop, labels in hand have so long to be finished, s: less than a batch system leaves between SIGTERM and SIGKILL
-    #[arg(long, value_name = "SECONDS", default_value_t = 20.0, value_parser = seconds)]
-    grace: f64,
-    /// Wait so long for a campaign that has not begun yet, or whose store cannot be reached yet, min
-    #[arg(long, value_name = "MINUTES", default_value_t = 0.0, value_parser = seconds)]
-    wait: f64,
+    /// After Ctrl-C or SIGTERM, let labels in progress finish for this time. Choose less than the time between SIGTERM and
+    /// SIGKILL of your batch system
+    #[arg(long, value_name = "TIME", default_value_t = Duration::from_seconds(20), value_parser = duration_between("0s", "10000h"))]
+    grace_period: Duration,
+    /// How long to wait for a campaign that has not started or whose store cannot be reached, such as 15m
+    #[arg(long, value_name = "TIME", default_value_t = Duration::from_seconds(0), value_parser = duration_between("0s", "10000h"))]
+    wait_timeout: Duration,
     #[command(flatten)]
     log: Options,
 }
@@ -76,30 +65,27 @@ impl Label {
     }
 
     async fn label(self) -> Result<Ended, Failure> {
-        let (stopping, stop) = asked_to_stop("stopping: labels in hand are finished or given back …")?;
-        if let (Some(structures), Some(config)) = (&self.once, &self.config) {
-            let (output, json) = (self.output.as_deref(), self.json);
-            return once::label(once::Task { structures, config, output, json }, &stop).await;
-        }
-        let store = self.store.clone().unwrap_or_default();
-        say_if_unprotected(&place::location(&store)?);
+        let (stopping, stop) = asked_to_stop("stopping: labels in progress finish or return to the queue …")?;
+        say_if_unprotected(&campaign_location::parse(&self.store)?);
         loop {
-            let Some((opened, labelling)) = self.begin(&store, &stopping, &stop).await? else {
+            let Some((opened, labelling)) = self.wait_for_campaign(&stopping, &stop).await? else {
                 return Ok(Ended::Interrupted);
             };
-            let place = match place::location(&store)? {
+            let location = match campaign_location::parse(&self.store)? {
                 Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
-                // With its password, if it has one.
-                Location::Server(_) if store.to_str().is_some_and(Location::is_server) => store.clone(),
+                // The text of the argument still has the password.
+                Location::Server(_) if self.store.to_str().is_some_and(Location::is_server) => {
+                    self.store.clone()
+                }
                 Location::Server(url) => url.as_str().into(),
             };
             let protocol = labelling.protocol.clone();
             let slots = Slots {
-                number: self.slots,
-                location: place,
+                number: self.concurrency,
+                location,
                 labelling,
                 until_empty: self.until_empty,
-                grace: Duration::from_secs_f64(self.grace),
+                grace: self.grace_period.get(),
             };
             let ended = slots::work(&opened, slots, &stopping, &stop).await?;
             let is_in_force = opened.is_in_force(protocol.hash).await?;
@@ -109,67 +95,62 @@ impl Label {
             }
             let name = protocol.name;
             say(format_args!(
-                "the campaign labels by another protocol than '{name}' now: going on with that"
+                "the campaign replaced label protocol '{name}': continuing with the new protocol"
             ));
         }
     }
 
-    /// Opens the store, as soon as there is a campaign in it; `None` if somebody asked to stop first.
-    async fn begin(
+    /// Opens the store once it contains a campaign. `None` if this process was asked to stop first.
+    async fn wait_for_campaign(
         &self,
-        store: &Path,
         stopping: &Arc<AtomicBool>,
         stop: &Notify,
     ) -> Result<Option<(Store, Labelling)>, Failure> {
-        let (begun, mut told) = (Instant::now(), false);
+        let (started, mut reported) = (Instant::now(), false);
         while !stopping.load(Ordering::Relaxed) {
-            // A campaign that begins meanwhile may be below the directory.
-            let error = match self.open(&place::location(store)?).await {
+            // Parsed at each attempt: the campaign may appear in a subdirectory.
+            let error = match self.open(&campaign_location::parse(&self.store)?).await {
                 Ok(opened) => return Ok(Some(opened)),
-                Err(Early::NotYet(error)) if begun.elapsed().as_secs_f64() < 60.0 * self.wait => error,
-                Err(Early::NotYet(error)) => return Err(error.into()),
-                Err(Early::Never(failure)) => return Err(failure),
+                Err(OpenError::NotReady(error)) if started.elapsed() < self.wait_timeout.get() => error,
+                Err(OpenError::NotReady(error)) => return Err(error.into()),
+                Err(OpenError::Fatal(failure)) => return Err(failure),
             };
-            if !std::mem::replace(&mut told, true) {
+            if !std::mem::replace(&mut reported, true) {
                 say(format_args!("waiting for the campaign: {error}"));
             }
-            tokio::select! { () = tokio::time::sleep(PAUSE) => {}, () = stop.notified() => {} }
+            tokio::select! { () = tokio::time::sleep(RETRY_INTERVAL) => {}, () = stop.notified() => {} }
         }
         Ok(None)
     }
 
-    async fn open(&self, location: &Location) -> Result<(Store, Labelling), Early> {
+    async fn open(&self, location: &Location) -> Result<(Store, Labelling), OpenError> {
         let store = Store::open(location).await?;
         let Some(protocol) = store.protocol_in_force().await? else {
             let lacks = "label protocol yet";
-            return Err(Early::NotYet(StoreError::Missing { location: location.to_string(), lacks }));
+            return Err(OpenError::NotReady(StoreError::Missing { location: location.to_string(), lacks }));
         };
         let label = self.config.as_deref().map(Config::load_label).transpose();
-        let label = label.map_err(|error| Early::Never(error.into()))?;
-        let here = Here { method: self.method.as_deref(), files: &self.files, label };
-        match Labelling::of(&store, protocol, here).await {
+        let label = label.map_err(|error| OpenError::Fatal(error.into()))?;
+        let options = HostOptions { method: self.method.as_deref(), files: &self.files, label };
+        match Labelling::of(&store, protocol, options).await {
             Ok(labelling) => Ok((store, labelling)),
-            Err(failure) => Err(Early::Never(failure)),
+            Err(failure) => Err(OpenError::Fatal(failure)),
         }
     }
 }
 
-/// Why there is nothing to label yet.
-enum Early {
-    NotYet(StoreError),
-    Never(Failure),
+/// Why the campaign could not be opened.
+enum OpenError {
+    /// It may be possible later.
+    NotReady(StoreError),
+    Fatal(Failure),
 }
 
-impl From<StoreError> for Early {
+impl From<StoreError> for OpenError {
     fn from(error: StoreError) -> Self {
         match error {
-            StoreError::Missing { .. } | StoreError::Unreachable(_) => Self::NotYet(error),
-            error => Self::Never(error.into()),
+            StoreError::Missing { .. } | StoreError::Unreachable(_) => Self::NotReady(error),
+            error => Self::Fatal(error.into()),
         }
     }
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    let number = text.parse().ok().filter(|number| (0.0..=1e6).contains(number));
-    number.ok_or_else(|| "expected 0 to 1e6".to_owned())
 }

@@ -13,11 +13,11 @@ use crate::log;
 use crate::output::show;
 use crate::setup::{self, LabellerSetup};
 
-/// A labeller's process; `calmwalk run` and `calmwalk label` start it
+/// Internal: a labeller process, started by `calmwalk run` and `calmwalk label`
 ///
-/// It reads what to do from standard input. If the run that started it is killed it goes on until the queue is empty, or
-/// until the next run takes it over; with `calmwalk label` it ends. SIGTERM ends it after the label in hand;
-/// a calculation of another program that takes longer than some seconds goes on and is left to the next labeller.
+/// Reads what to do from standard input. If the `calmwalk run` that started it is killed, it continues until the queue is empty
+/// or the next run takes it over; if `calmwalk label` is killed, it exits. On SIGTERM it exits after the current label. A
+/// calculation of an external program that needs more than a few seconds keeps running and is left to the next labeller.
 #[derive(Debug, clap::Args)]
 pub struct Labeller {}
 
@@ -50,7 +50,7 @@ async fn label(setup: LabellerSetup, method: Method, closing: &Arc<Closing>) -> 
     let store = insist(closing, || Store::open(&location)).await?;
     let (pid, now) = (std::process::id(), unix_milliseconds());
     let record = ProcessRecord::new(ProcessRecord::LABELLER, setup.number, pid, now);
-    // Nobody adopts a slot.
+    // Only labellers of `calmwalk run` are taken over by the next run.
     let hash = setup.slot.is_none().then(|| setup.hash());
     let record = ProcessRecord { setup: hash, restarts: setup.restarts, ..record };
     let slot = setup.slot.as_ref();
@@ -66,13 +66,13 @@ async fn label(setup: LabellerSetup, method: Method, closing: &Arc<Closing>) -> 
             ..Timing::default()
         },
     };
-    let tells = slot.is_some();
-    let tell = |line: &str| {
-        if tells {
+    let reports = slot.is_some();
+    let report = |line: &str| {
+        if reports {
             show(line);
         }
     };
-    serve(store.clone(), method, settings, record, closing, unix_milliseconds, tell).await?;
+    serve(store.clone(), method, settings, record, closing, unix_milliseconds, report).await?;
     store.close().await;
     Ok(())
 }

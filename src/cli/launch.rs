@@ -1,7 +1,7 @@
 //! `calmwalk launch`
 
-mod order;
-mod scripts;
+mod job_specs;
+mod templates;
 
 use std::fs::DirBuilder;
 use std::os::unix::fs::DirBuilderExt;
@@ -11,74 +11,76 @@ use std::time::Duration;
 use orchestrator::slurm::{JobNames, Phase, Plan, Slurm, SlurmError, Wanted, plan};
 use store::Location;
 
-use self::order::Order;
-use super::{Ended, Failure, block_on, place};
+use self::job_specs::JobSpecs;
+use super::{Ended, Failure, block_on, campaign_location};
 use crate::campaign::Campaign;
 use crate::config::Config;
 use crate::output::{count, print, say};
 
-/// Slurm's commands wait for a busy slurmctld themselves; longer than this is of no use.
-const PATIENCE: Duration = Duration::from_secs(60);
+/// How long to wait for one command of Slurm, which itself waits for a busy slurmctld.
+const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Submit a whole campaign to a batch system: orchestrator, agents, labellers
+/// Submit a campaign to a batch system, as jobs for orchestrator, agents and labellers
 ///
-/// Safe to repeat: what is there already stays, what is missing is submitted, agents and labellers that are not asked for any
-/// more are cancelled. Jobs leave in order before their time is over and are requeued, until the campaign is done.
-/// docs/slurm.md has it all; calmwalk status shows the jobs.
+/// Safe to repeat: keeps the existing jobs, submits missing ones, and cancels agents and labellers that exceed the requested
+/// numbers. Each job checkpoints and exits before its time limit, and is requeued until the campaign is finished. `calmwalk
+/// status` shows the jobs. See docs/slurm.md.
 #[derive(Debug, clap::Args)]
 pub struct Launch {
-    /// Configuration of the campaign, on a file system that all nodes see
+    /// Configuration of the campaign (TOML), on a file system that all nodes share
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
-    /// The batch system
+    /// Batch system
     #[arg(long, value_name = "SYSTEM", value_enum)]
     on: System,
-    /// Directory of the campaign, also seen by all nodes [default: beside the configuration, with its name but no extension]
+    /// Directory of the campaign, on a file system that all nodes share [default: path of the configuration without its
+    /// extension]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
-    /// Go on with a campaign that belongs to another configuration file: this one takes its place
+    /// Resume a campaign that was started with another configuration file, and use CONFIG from now on
     #[arg(long)]
     adopt: bool,
-    /// Jobs with an agent
+    /// Number of agents, one per job
     #[arg(long, value_name = "N", required_unless_present = "stop", value_parser = clap::value_parser!(u32).range(0..=10_000))]
     agents: Option<u32>,
-    /// Walkers of each agent
+    /// Number of walkers per agent
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=4096))]
     walkers: u32,
-    /// Threads of each walker
+    /// Number of threads per walker
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
     threads: u32,
-    /// Jobs with labellers, for a campaign whose store is PostgreSQL
+    /// Number of jobs that compute labels; only for campaigns with a PostgreSQL store
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=10_000))]
     labellers: u32,
-    /// Labels that each of them makes side by side
+    /// Number of labels that each of these jobs computes at the same time
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
-    slots: u32,
-    /// Time limit of a job, as sbatch takes it: 24:00:00
+    concurrency: u32,
+    /// Time limit of each job in the format of sbatch, such as 24:00:00 [default: that of the partition]
     #[arg(long, value_name = "TIME")]
     time: Option<String>,
-    /// Partition to submit to
+    /// Partition of the jobs [default: that of the batch system]
     #[arg(long, value_name = "NAME")]
     partition: Option<String>,
-    /// Account to charge
+    /// Account to charge [default: that of the user]
     #[arg(long, value_name = "NAME")]
     account: Option<String>,
-    /// Directory with the certificates of orchestrator and agents, in orchestrator/ and agent/: needed for more than one node
+    /// Directory with the certificates of the orchestrator in orchestrator/ and of the agents in agent/; required for jobs on
+    /// more than one node
     #[arg(long, value_name = "DIR")]
     tls: Option<PathBuf>,
-    /// A copy of configs/slurm with what your site needs
+    /// Directory with your own job templates, adapted from configs/slurm [default: built-in templates]
     #[arg(long, value_name = "DIR")]
     template: Option<PathBuf>,
-    /// Print what would be written and submitted, and do nothing
+    /// Print the job scripts and the commands of the batch system without running them
     #[arg(long)]
     dry_run: bool,
-    /// End the campaign's jobs in order instead; the same launch goes on with it
+    /// Cancel the campaign's jobs instead, so that they checkpoint and exit; launch it again to resume
     #[arg(long)]
     stop: bool,
-    /// With --stop: only jobs that have not begun
+    /// With --stop: cancel only pending jobs
     #[arg(long, requires = "stop")]
-    waiting: bool,
-    /// Further options of sbatch, for every job
+    pending: bool,
+    /// Additional options of sbatch for every job, after --
     #[arg(last = true, value_name = "OPTION")]
     options: Vec<String>,
 }
@@ -88,23 +90,23 @@ enum System {
     Slurm,
 }
 
-/// Scripts and logs of a campaign's jobs, in its directory.
+/// Subdirectory of the campaign with the scripts and logs of its jobs.
 pub const FOLDER: &str = "slurm";
 
-/// How the jobs of a campaign are called: after the place where it is kept, which is there before it begins.
+/// The names of a campaign's jobs. They follow from its location, which is known before it starts.
 pub fn job_names(location: &Location) -> JobNames {
-    let place = match location {
+    let location = match location {
         Location::Directory(directory) => directory.display().to_string(),
         Location::Server(url) => url.place(),
     };
-    JobNames::new(&blake3::hash(place.as_bytes()).to_hex()[..12])
+    JobNames::new(&blake3::hash(location.as_bytes()).to_hex()[..12])
 }
 
 impl Launch {
     pub fn run(self) -> Result<Ended, Failure> {
         let System::Slurm = self.on;
         let directory = self.directory()?;
-        let slurm = Slurm::with_patience(PATIENCE);
+        let slurm = Slurm::with_patience(COMMAND_TIMEOUT);
         if self.stop {
             let config = Config::load(&self.config)?.config;
             let names = job_names(&config.location(&directory)?);
@@ -112,7 +114,7 @@ impl Launch {
         } else {
             let campaign = Campaign::load(&self.config)?;
             if self.directory.is_none() {
-                block_on(place::refuse_if_kept_elsewhere(&campaign, &directory))??;
+                block_on(campaign_location::check_former_locations(&campaign, &directory))??;
             }
             let location = campaign.config.location(&directory)?;
             if let Location::Directory(directory) = &location {
@@ -120,21 +122,22 @@ impl Launch {
             }
             let (names, wanted) = (job_names(&location), self.wanted(&location));
             if wanted.labellers == 0 && campaign.config.label.slots == 0 {
-                say("label.slots = 0 and no job for labellers: labels have to come from calmwalk label");
+                say("label.slots = 0 and no labeller jobs: start labellers with calmwalk label");
             }
-            let order = Order::new(&self, &campaign, &directory, wanted)?;
-            block_on(self.launch(&slurm, &names, &order, wanted))??;
+            let specs = JobSpecs::new(&self, &campaign, &directory, wanted)?;
+            block_on(self.launch(&slurm, &names, &specs, wanted))??;
         }
         Ok(Ended::Done)
     }
 
-    /// The campaign's directory, by its one true name, since jobs are known by it.
+    /// The canonical path of the campaign's directory, from which the names of its jobs follow.
     fn directory(&self) -> Result<PathBuf, Failure> {
-        let directory = self.directory.clone().unwrap_or_else(|| place::default_directory(&self.config));
-        let made = DirBuilder::new().recursive(true).mode(0o700).create(&directory);
-        let made = made.and_then(|()| directory.canonicalize());
-        made.map_err(|error| {
-            Failure::Input(format!("cannot make the directory {}: {error}", directory.display()))
+        let directory =
+            self.directory.clone().unwrap_or_else(|| campaign_location::default_directory(&self.config));
+        let created = DirBuilder::new().recursive(true).mode(0o700).create(&directory);
+        let canonical = created.and_then(|()| directory.canonicalize());
+        canonical.map_err(|error| {
+            Failure::Input(format!("cannot create the directory {}: {error}", directory.display()))
         })
     }
 
@@ -144,9 +147,8 @@ impl Launch {
             && labellers > 0
         {
             say(
-                "the campaign is kept in SQLite, which serves one node: labels are made beside the orchestrator \
-                 (label.slots of them side by side), and no job for labellers is submitted; PostgreSQL (run.store) \
-                 serves many",
+                "--labellers is ignored: the SQLite store of the campaign is limited to one node, where the orchestrator starts \
+                 label.slots labellers; set run.store to a PostgreSQL database for labellers on other nodes",
             );
             labellers = 0;
         }
@@ -157,7 +159,7 @@ impl Launch {
         &self,
         slurm: &Slurm,
         names: &JobNames,
-        order: &Order,
+        specs: &JobSpecs,
         wanted: Wanted,
     ) -> Result<(), Failure> {
         let jobs = |error: SlurmError| match self.dry_run && error.is_missing() {
@@ -166,40 +168,40 @@ impl Launch {
         };
         if self.dry_run {
             let jobs = slurm.jobs(names).await.or_else(jobs)?;
-            return print(|out| order.show(out, names, &plan(&wanted, &jobs), &jobs));
+            return print(|out| specs.print(out, names, &plan(&wanted, &jobs), &jobs));
         }
-        let _lock = order.lock()?;
-        order.write()?;
+        let _lock = specs.lock()?;
+        specs.write()?;
         let jobs = slurm.jobs(names).await.or_else(jobs)?;
         let Plan { cancel, submit } = plan(&wanted, &jobs);
         for job in jobs.iter().filter(|job| job.phase() != Phase::Over) {
-            let becomes = if cancel.contains(&job.id) { "is cancelled" } else { "is there" };
-            print(|out| writeln!(out, "{}: job {} ({}) {becomes}", job.role, job.id, job.state))?;
+            let action = if cancel.contains(&job.id) { "cancelled" } else { "kept" };
+            print(|out| writeln!(out, "{}: job {} ({}) {action}", job.role, job.id, job.state))?;
         }
         slurm.cancel(&cancel).await.map_err(Failure::failed)?;
-        let mut leader = order.leader(&jobs, &cancel);
+        let mut orchestrator = specs.orchestrator_job(&jobs, &cancel);
         for submission in &submit {
-            if leader.is_none() {
-                order.forget_the_end()?;
+            if orchestrator.is_none() {
+                specs.remove_endpoint()?;
             }
-            let request = order.request(submission.role, leader);
+            let request = specs.request(submission.role, orchestrator);
             let id = slurm.submit(names, submission, &request).await.map_err(Failure::failed)?;
-            leader = leader.or(Some(id));
+            orchestrator = orchestrator.or(Some(id));
             print(|out| writeln!(out, "{}: job {id} submitted", submission.role))?;
         }
         Ok(())
     }
 
     async fn stop(&self, slurm: &Slurm, names: &JobNames) -> Result<(), Failure> {
-        // Called from a job of the campaign it does not wait for its own end.
+        // A job of the campaign that runs this command must not wait for its own end.
         let own = std::env::var("SLURM_JOB_ID").ok().and_then(|id| id.parse().ok());
-        let ended = if self.waiting { slurm.withdraw(names).await } else { slurm.stop(names, own).await };
-        let ended = ended.map_err(Failure::failed)?;
-        print(|out| writeln!(out, "{} cancelled", count(ended, "job")))
+        let cancelled = if self.pending { slurm.withdraw(names).await } else { slurm.stop(names, own).await };
+        let cancelled = cancelled.map_err(Failure::failed)?;
+        print(|out| writeln!(out, "{} cancelled", count(cancelled, "job")))
     }
 }
 
-/// A path that holds for jobs, wherever they begin.
+/// An absolute path, valid in any working directory of a job.
 fn absolute(path: &Path) -> Result<PathBuf, Failure> {
     std::path::absolute(path).map_err(Failure::failed)
 }

@@ -1,22 +1,23 @@
-//! The command line: one file a command.
+//! The command line: one module per command, with its arguments, what it does and what it prints.
 
 mod agent;
+mod calculation_runner;
 mod calm;
+mod campaign_location;
 mod clean;
 mod dashboard;
-pub mod errors;
+mod estimate;
 mod exclude;
 mod explain;
 mod export;
+pub mod force_errors;
 mod import;
 mod init;
-mod keep;
 mod label;
+mod label_file;
 mod labeller;
 mod launch;
 mod md;
-mod place;
-mod plan;
 mod queue;
 mod relabel;
 mod replay;
@@ -35,11 +36,12 @@ use std::path::PathBuf;
 use ::store::Location;
 use clap::{Parser, Subcommand};
 
+use crate::duration::Duration;
 use crate::outcome::{Ended, Failure};
 
-/// Expands the training set of an interatomic potential by molecular dynamics biased towards what it does not know.
+/// Grow the training set of an interatomic potential by molecular dynamics biased towards structures it does not know.
 ///
-/// Exit codes: 0 done, 1 failed, 2 wrong input or configuration, 130 interrupted.
+/// Exit codes: 0 success, 1 failure, 2 invalid input or configuration, 130 interrupted.
 #[derive(Debug, Parser)]
 #[command(name = "calmwalk", version, max_term_width = 100)]
 pub struct Arguments {
@@ -47,20 +49,21 @@ pub struct Arguments {
     command: Command,
 }
 
-// The commands' own documentation is their help.
+// The help text of a command is the documentation of its type.
 #[derive(Debug, Subcommand)]
 enum Command {
     Init(init::Init),
     Validate(validate::Validate),
-    Plan(plan::Plan),
+    Estimate(estimate::Estimate),
     Run(run::Run),
     Agent(agent::Agent),
     Label(label::Label),
+    LabelFile(label_file::LabelFile),
     Launch(launch::Launch),
     Status(status::Status),
     Dashboard(dashboard::Dashboard),
     Watch(watch::Watch),
-    Errors(errors::Errors),
+    ForceErrors(force_errors::ForceErrors),
     Queue(queue::Queue),
     Relabel(relabel::Relabel),
     Exclude(exclude::Exclude),
@@ -80,23 +83,24 @@ enum Command {
     #[command(hide = true)]
     Labeller(labeller::Labeller),
     #[command(hide = true)]
-    Keep(keep::Keep),
+    CalculationRunner(calculation_runner::CalculationRunner),
 }
 
-/// Carries out a command.
+/// Runs the command.
 pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
     match arguments.command {
         Command::Init(command) => command.run(),
         Command::Validate(command) => command.run(),
-        Command::Plan(command) => command.run(),
+        Command::Estimate(command) => command.run(),
         Command::Run(command) => command.run(),
         Command::Agent(command) => command.run(),
         Command::Label(command) => command.run(),
+        Command::LabelFile(command) => command.run(),
         Command::Launch(command) => command.run(),
         Command::Status(command) => command.run(),
         Command::Dashboard(command) => command.run(),
         Command::Watch(command) => command.run(),
-        Command::Errors(command) => command.run(),
+        Command::ForceErrors(command) => command.run(),
         Command::Queue(command) => command.run(),
         Command::Relabel(command) => command.run(),
         Command::Exclude(command) => command.run(),
@@ -112,31 +116,67 @@ pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
         Command::Clean(command) => command.run(),
         Command::Walker(command) => command.run(),
         Command::Labeller(command) => command.run(),
-        Command::Keep(command) => command.run(),
+        Command::CalculationRunner(command) => command.run(),
     }
 }
 
-/// Where a campaign is kept, as an argument.
+/// The argument that names a campaign.
 #[derive(Debug, clap::Args)]
 struct CampaignLocation {
-    /// Directory of the campaign or of its configuration, or the postgres:// URL of its store
+    /// Campaign: its directory, the directory of its configuration, or the postgres:// URL of its store
     #[arg(value_name = "DIR")]
     location: PathBuf,
 }
 
 impl CampaignLocation {
-    /// Not a type of the argument: what is shown of a wrong argument would show its password.
+    /// The location is parsed here and not by clap, whose error message would print the password of a URL.
     fn get(&self) -> Result<Location, Failure> {
-        place::location(&self.location)
+        campaign_location::parse(&self.location)
     }
 }
 
-/// Runs what waits on the database.
+/// Parser of an argument that is a wall-clock time between `min` and `max`, limits included.
+fn duration_between(
+    min: &'static str,
+    max: &'static str,
+) -> impl Fn(&str) -> Result<Duration, String> + Clone {
+    let parse_limit = |text: &str| text.parse::<Duration>().expect("a time with its unit");
+    let limits = parse_limit(min)..=parse_limit(max);
+    move |text| {
+        let duration = text.parse()?;
+        limits.contains(&duration).then_some(duration).ok_or_else(|| format!("expected {min} to {max}"))
+    }
+}
+
+/// Runs a future that uses the database to its end.
 fn block_on<T>(future: impl Future<Output = T>) -> Result<T, Failure> {
     let runtime =
         tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(Failure::failed)?;
-    let done = runtime.block_on(future);
-    // A label that was given back goes on in its thread; nobody waits for it.
+    let output = runtime.block_on(future);
+    // A thread may still compute a label that was already returned to the queue: do not wait for it.
     runtime.shutdown_background();
-    Ok(done)
+    Ok(output)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_definition_of_the_command_line_is_consistent() {
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn durations_are_checked_against_their_limits() {
+        let parse = duration_between("200ms", "1h");
+        assert_eq!(
+            (parse("2s"), parse("1h")),
+            (Ok(Duration::from_seconds(2)), Ok(Duration::from_seconds(3600)))
+        );
+        assert_eq!(parse("100ms").unwrap_err(), "expected 200ms to 1h");
+        assert!(parse("2").unwrap_err().contains("such as"));
+    }
 }

@@ -10,10 +10,9 @@ use store::{Attempt, Job, JobDetails, JobState, Location, Store, unix_millisecon
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::output::{Table, count, decimals, print, print_json};
 
-/// List, show, drop, retry or prioritise the structures in the label queue
+/// List, show, drop, retry or prioritise structures in the label queue
 ///
-/// A structure is named by its candidate's id, or by the beginning of it if no other begins so; the campaign's part of
-/// the id may be left out.
+/// ID is the id of a candidate or a unique prefix of it; its campaign part can be omitted.
 #[derive(Debug, clap::Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
 pub struct Queue {
@@ -28,38 +27,38 @@ pub struct Queue {
 
 #[derive(Clone, Debug, PartialEq, clap::Subcommand)]
 pub enum Action {
-    /// List jobs in the order in which they would be labelled: those in one state, or all, in work and waiting ones first
+    /// List label jobs: running jobs first, then queued ones in the order in which labellers take them, then the rest
     List(List),
-    /// Show everything about one, with its attempts and the logs of those that failed
+    /// Show a label job with its attempts and the logs of failed ones
     Show {
-        /// Candidate
+        /// Id of the candidate
         id: String,
     },
-    /// Write the packed directories of its calculations, as label.keep has them kept
+    /// Write the archived calculation directories of a candidate to files (label.keep selects what is archived)
     Files {
-        /// Candidate
+        /// Id of the candidate
         id: String,
-        /// Directory to write into, a file CANDIDATE-ATTEMPT.tar.zst each; made if it does not exist
-        #[arg(long, value_name = "DIR", default_value = ".")]
-        into: PathBuf,
+        /// Directory for the files CANDIDATE-ATTEMPT.tar.zst, one per attempt; created if it does not exist
+        #[arg(long, short, value_name = "DIR", default_value = ".")]
+        output: PathBuf,
     },
-    /// Take structures that wait for a label out of the queue and out of exports (calmwalk exclude takes labels out)
+    /// Remove queued structures from the queue and from exports (to remove existing labels, use calmwalk exclude)
     Drop {
-        /// Candidates
+        /// Ids of the candidates
         #[arg(value_name = "ID", required = true)]
         ids: Vec<String>,
     },
-    /// Put failed or dropped structures back into the queue
+    /// Queue failed or dropped structures again
     Retry {
-        /// Candidates
+        /// Ids of the candidates
         #[arg(value_name = "ID", required = true)]
         ids: Vec<String>,
     },
-    /// Give a structure that waits another priority
+    /// Change the priority of a queued structure
     Prioritise {
-        /// Candidate
+        /// Id of the candidate
         id: String,
-        /// Higher first; structures begin with 10, frames of control walks with 0
+        /// Larger values are labelled first. Default: 10 for structures of biased walks, 0 for frames of control walks
         #[arg(allow_negative_numbers = true)]
         priority: i32,
     },
@@ -67,13 +66,13 @@ pub enum Action {
 
 #[derive(Clone, Debug, PartialEq, clap::Args)]
 pub struct List {
-    /// Only those in this state
+    /// List only jobs in this state: queued, leased, labelled, failed, dropped or superseded [default: all]
     #[arg(long, value_parser = parse_state)]
     state: Option<JobState>,
-    /// Show at most this many
+    /// Maximum number of jobs to list
     #[arg(long, default_value_t = 50)]
     limit: u32,
-    /// Leave out this many first
+    /// Number of jobs to skip
     #[arg(long, default_value_t = 0)]
     offset: u32,
 }
@@ -95,8 +94,8 @@ impl Queue {
                 let details = block_on(read_details(location, id))??;
                 if self.json { print_json(&details)? } else { print(|out| write_details(out, &details))? }
             }
-            Action::Files { id, into } => {
-                let written = block_on(files::write(location, id, into))??;
+            Action::Files { id, output } => {
+                let written = block_on(files::write(location, id, output))??;
                 if self.json { print_json(&written)? } else { print(|out| write_files(out, &written))? }
             }
             action => self.change(location, action)?,
@@ -104,16 +103,16 @@ impl Queue {
         Ok(Ended::Done)
     }
 
-    /// Changes one job after the other, and tells of each how it stands then.
+    /// Changes one job after the other, and prints the new state of each.
     fn change(&self, location: &Location, action: &Action) -> Result<(), Failure> {
         let mut changed = Vec::new();
-        let ended = block_on(change(location, action, &mut changed))?;
+        let result = block_on(change(location, action, &mut changed))?;
         if self.json {
             print_json(&changed)?;
         } else {
-            print(|out| changed.iter().try_for_each(|job| writeln!(out, "{}", outcome(action, job))))?;
+            print(|out| changed.iter().try_for_each(|job| writeln!(out, "{}", message(action, job))))?;
         }
-        ended
+        result
     }
 }
 
@@ -127,7 +126,7 @@ async fn read_details(location: &Location, id: &str) -> Result<JobDetails, Failu
     Ok(store.queue_show(id).await?)
 }
 
-/// Changes what it names; `changed` has the jobs as they stand then, also before a failure.
+/// Changes the jobs that `action` names. Appends their new states to `changed`, also those before a failure.
 pub async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>) -> Result<(), Failure> {
     let store = Store::open(location).await?;
     let ids = match action {
@@ -149,17 +148,17 @@ pub async fn change(location: &Location, action: &Action, changed: &mut Vec<Job>
     Ok(())
 }
 
-/// What was done, in words.
-pub fn outcome(action: &Action, job: &Job) -> String {
+/// The message for a changed job.
+pub fn message(action: &Action, job: &Job) -> String {
     let Job { candidate, state, priority, .. } = job;
     match action {
-        Action::Drop { .. } => format!("{candidate} is dropped: it will not be labelled, and not exported"),
-        Action::Prioritise { .. } => format!("{candidate} has priority {priority} now"),
+        Action::Drop { .. } => format!("{candidate} is dropped: it will not be labelled or exported"),
+        Action::Prioritise { .. } => format!("{candidate} now has priority {priority}"),
         _ => format!("{candidate} is {state} again"),
     }
 }
 
-/// Its state, whether there is a label while it waits for another, and whether that is excluded.
+/// The state of a job; "again" if it already has a label that another one will replace; "excluded" if that label is excluded.
 fn state_of(job: &Job) -> String {
     let excluded = if job.excluded.is_some() { ", excluded" } else { "" };
     match (&job.relabel, job.state) {
@@ -170,8 +169,11 @@ fn state_of(job: &Job) -> String {
 
 fn write_list(out: &mut dyn Write, jobs: &[Job], list: &List) -> io::Result<()> {
     if jobs.is_empty() {
-        let state = list.state.map_or(String::new(), |state| format!(" that are {state}"));
-        return writeln!(out, "no jobs{state} beyond the first {}", list.offset);
+        let state = list.state.map_or(String::new(), |state| format!("{state} "));
+        return match list.offset {
+            0 => writeln!(out, "no {state}jobs"),
+            offset => writeln!(out, "no {state}jobs after the first {offset}"),
+        };
     }
     let mut table = Table::new(&[
         "id",
@@ -200,7 +202,7 @@ fn write_list(out: &mut dyn Write, jobs: &[Job], list: &List) -> io::Result<()> 
     table.write(out)?;
     if jobs.len() as u64 == u64::from(list.limit) {
         let next = u64::from(list.offset) + u64::from(list.limit);
-        writeln!(out, "… there may be more: --offset {next} goes on, --limit changes the number")?;
+        writeln!(out, "… there may be more: continue with --offset {next}, or raise --limit")?;
     }
     Ok(())
 }
@@ -225,24 +227,24 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
     writeln!(out, "  job       {job}, protocol '{protocol}'")?;
     writeln!(out, "  state     {state}, priority {priority}")?;
     if let Some(reason) = relabel {
-        writeln!(out, "  again     another label was asked for: {reason}")?;
+        writeln!(out, "  relabel   requested: {reason}")?;
     }
     if let Some(reason) = excluded {
-        writeln!(out, "  excluded  its label is left out of exports and statistics: {reason}")?;
+        writeln!(out, "  excluded  from exports and statistics: {reason}")?;
     }
     if let (Some(holder), Some(expires)) = (holder, expires) {
         let left = (expires - unix_milliseconds()) / 1000;
-        writeln!(out, "  held by   {holder}, for {left} s more")?;
+        writeln!(out, "  leased by {holder}, lease expires in {left} s")?;
     }
     writeln!(out, "  atoms     {atoms}, {formula}")?;
     writeln!(out, "  γ_max     {} (original mixture)", decimals(*original_gamma, 3))?;
-    for (standing, energy) in &details.energies {
-        let standing = format!("{standing:?}").to_lowercase();
-        writeln!(out, "  {standing:<9} energy {energy:.6} eV, {:.6} eV/atom", energy / f64::from(*atoms))?;
+    for (status, energy) in &details.energies {
+        let status = format!("{status:?}").to_lowercase();
+        writeln!(out, "  {status:<9} energy {energy:.6} eV, {:.6} eV/atom", energy / f64::from(*atoms))?;
     }
     writeln!(
         out,
-        "  attempts  {}, {} failed since it was queued",
+        "  attempts  {}, {} failed since it was last queued",
         details.job.attempts, details.job.failures
     )?;
     details.attempts_made.iter().try_for_each(|attempt| write_attempt(out, attempt))
@@ -250,11 +252,11 @@ fn write_details(out: &mut dyn Write, details: &JobDetails) -> io::Result<()> {
 
 fn write_files(out: &mut dyn Write, written: &[(PathBuf, String)]) -> io::Result<()> {
     if written.is_empty() {
-        writeln!(out, "no directory of a calculation is kept (label.keep says which are)")?;
+        writeln!(out, "no calculation directories are archived (see label.keep)")?;
     }
     for (path, left_out) in written {
         writeln!(out, "{}", path.display())?;
-        left_out.lines().try_for_each(|line| writeln!(out, "  without {line}: too large"))?;
+        left_out.lines().try_for_each(|line| writeln!(out, "  too large to archive: {line}"))?;
     }
     Ok(())
 }
@@ -272,7 +274,7 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
         made,
         core_seconds,
     } = attempt;
-    let outcome = outcome.as_deref().unwrap_or("under way");
+    let outcome = outcome.as_deref().unwrap_or("running");
     let lasted = ended.map(|ended| (ended - started) as f64 / 1000.0);
     let lasted = lasted.map_or(String::new(), |seconds| format!(" after {seconds:.1} s"));
     let class = class.as_ref().map_or(String::new(), |class| format!(" ({class})"));
@@ -281,10 +283,10 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
         writeln!(out, "       calculation {calculation}")?;
     }
     if let (Some(seconds), Some(cores)) = (core_seconds, made.cores) {
-        writeln!(out, "       took {seconds:.1} core-seconds on {}", count(cores, "core"))?;
+        writeln!(out, "       cost {seconds:.1} core-seconds on {}", count(cores, "core"))?;
     }
     if let Some(remedies) = &made.remedies {
-        writeln!(out, "       changed after failures: {}", remedies.replace(',', ", "))?;
+        writeln!(out, "       retry adjustments: {}", remedies.replace(',', ", "))?;
     }
     let difference = made.difference.as_deref().unwrap_or_default();
     difference.lines().try_for_each(|line| writeln!(out, "       {line}"))?;

@@ -1,7 +1,7 @@
 //! `calmwalk relabel`
 
-mod choice;
-mod protocol;
+mod protocol_change;
+mod selection;
 
 use std::io::{self, Write};
 use std::path::PathBuf;
@@ -9,49 +9,47 @@ use std::path::PathBuf;
 use serde_json::{Value, json};
 use store::{CampaignLock, Location, NewProtocol, Protocol, Requeued, Store, unix_milliseconds};
 
-use self::choice::Choice;
-use self::protocol::NewLabels;
-use super::place::shown;
+use self::protocol_change::ProtocolChange;
+use self::selection::Selection;
+use super::campaign_location::shell_argument;
 use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::bill::{self, Again};
 use crate::condition::Condition;
 use crate::origin::Origin;
 use crate::output::{count, print, print_json, say_if_unprotected};
 
-/// Label structures again, and change the protocol by which a campaign labels
+/// Compute labels again, or switch the campaign to another label protocol
 ///
-/// For labels that turned out doubtful, or not good enough. The structures are put into the queue again, past any guard; a label
-/// stays the label until the new one has come, and is kept beside it then as superseded, with date and reason. Where the new one
-/// cannot be made, nothing has changed. What waits already is not asked for twice.
+/// Use it for doubtful or inaccurate labels. Queues the structures again, bypassing the guard. The old label stays valid until
+/// the new one exists; then it is kept as superseded, with date and reason. If the new label fails, the old one stays.
+/// Structures that already wait for a new label are not queued twice.
 ///
-/// With --config they are labelled by the protocol of that file's [label] section, which is the campaign's from then on: what has no
-/// label yet goes over to it, and calculations under way are given up. Not while the campaign runs; the next calmwalk run has to be
-/// given that configuration.
+/// With --config, the campaign switches to the label protocol of that file: structures without a label move to it, and running
+/// calculations are cancelled. The campaign must not be running, and the next `calmwalk run` needs that configuration.
 #[derive(Debug, clap::Args)]
-#[command(group = clap::ArgGroup::new("which").required(true).args(["ids", "all", "condition"]))]
+#[command(group = clap::ArgGroup::new("target").required(true).args(["ids", "all", "condition"]))]
 pub struct Relabel {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Candidates, by their ids, the beginning of these or the number of the decision; also if they have their labels by the
-    /// protocol in force
+    /// Candidates to relabel, also those labelled by the current protocol: ids, unique prefixes of ids, or decision numbers
     #[arg(value_name = "ID")]
     ids: Vec<String>,
-    /// Every structure that has its label by another protocol than the one in force
+    /// Relabel every structure whose label comes from another protocol than the current one
     #[arg(long)]
     all: bool,
-    /// Of these, the ones that meet a condition as export has them, such as 'max_force > 20'
-    #[arg(long = "where", value_name = "CONDITION")]
+    /// As --all, but only structures that match a filter, such as 'max_force > 20'; see `calmwalk export --help` for its syntax
+    #[arg(long = "where", value_name = "FILTER")]
     condition: Option<Condition>,
-    /// With --all or --where: also those that have their labels by the protocol in force
+    /// With --all or --where: also relabel structures labelled by the current protocol
     #[arg(long)]
-    again: bool,
-    /// A configuration whose [label] section has another protocol, with a name of its own (label.protocol)
+    include_current: bool,
+    /// Configuration with the new label protocol in its [label] section; it needs a new name (label.protocol)
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Why, for those who look at the labels later
+    /// Reason, stored with the labels
     #[arg(long, value_name = "TEXT", default_value = "none given")]
     reason: String,
-    /// Only say how many there are, and what they may cost
+    /// Print the number of structures and the expected cost without changing anything
     #[arg(long)]
     dry_run: bool,
     /// Print JSON
@@ -59,67 +57,71 @@ pub struct Relabel {
     json: bool,
 }
 
-/// What was asked for, and what came of it.
-struct Order {
-    /// By which they are labelled.
+/// What was changed, or would be in a dry run.
+struct RelabelReport {
+    /// The protocol of the new labels.
     protocol: Protocol,
-    /// What makes it another than the one in force, a line each.
+    /// Its differences from the current protocol, one line each.
     changes: Vec<String>,
-    choice: Choice,
-    bill: Again,
-    /// `moved` is known before.
-    done: Requeued,
-    /// How the labels come to be made.
+    selection: Selection,
+    cost: Again,
+    /// Numbers of structures.
+    requeued: Requeued,
+    /// What the user does next.
     next: String,
 }
 
 impl Relabel {
     pub fn run(self) -> Result<Ended, Failure> {
-        let order = block_on(self.relabel())??;
+        let report = block_on(self.relabel())??;
         if self.json {
-            print_json(&order.as_json(self.dry_run))?;
+            print_json(&report.as_json(self.dry_run))?;
         } else {
-            print(|out| order.write(out, self.dry_run, self.config.is_some()))?;
+            print(|out| report.write(out, self.dry_run, self.config.is_some()))?;
         }
         Ok(Ended::Done)
     }
 
-    async fn relabel(&self) -> Result<Order, Failure> {
+    async fn relabel(&self) -> Result<RelabelReport, Failure> {
         let location = self.location.get()?;
         say_if_unprotected(&location);
         let store = match self.dry_run {
             true => Store::open_read_only(&location).await?,
             false => Store::open(&location).await?,
         };
-        let none = || Failure::Input("the campaign has no label protocol yet: run it first".to_owned());
+        let none = || {
+            Failure::Input(
+                "the campaign has no label protocol yet: start it with calmwalk run first".to_owned(),
+            )
+        };
         let in_force = store.protocol_in_force().await?.ok_or_else(none)?;
         let new = match &self.config {
-            Some(path) => NewLabels::of(&store, path, &in_force).await?,
+            Some(path) => ProtocolChange::read(&store, path, &in_force).await?,
             None => None,
         };
-        // Labellers by two protocols at once would not know of each other.
+        // Excludes a run: its labellers would keep the old protocol.
         let _lock = match new.is_some() && !self.dry_run {
             true => Some(CampaignLock::acquire_at(&location, "calmwalk relabel").await?),
             false => None,
         };
         let protocol = new.as_ref().map_or(&in_force, |new| &new.protocol).clone();
-        let choice = self.choose(&store, &protocol).await?;
+        let selection = self.select(&store, &protocol).await?;
         let moved = if new.is_some() { store.unlabelled_by_others(protocol.hash).await? } else { 0 };
-        let bill = bill::again(&store, &in_force, &choice.sizes()).await?;
+        let cost = bill::again(&store, &in_force, &selection.sizes()).await?;
         let next = self.next(&store, &location).await?;
-        let mut done = Requeued { again: choice.structures().len() as u64, moved };
+        let mut requeued = Requeued { again: selection.structures().len() as u64, moved };
         if !self.dry_run {
-            done = self.carry_out(&store, new.as_ref(), &choice).await?;
+            requeued = self.apply(&store, new.as_ref(), &selection).await?;
         }
         store.close().await;
-        let changes = new.map_or(Vec::new(), |new| new.changes_in_words());
-        Ok(Order { protocol, changes, choice, bill, done, next })
+        let changes = new.map_or(Vec::new(), |new| new.describe_changes());
+        Ok(RelabelReport { protocol, changes, selection, cost, requeued, next })
     }
 
-    /// What has to be done for the labels to be made.
+    /// How the labels will be computed.
     async fn next(&self, store: &Store, location: &Location) -> Result<String, Failure> {
         if store.status().await?.led {
-            return Ok("the campaign runs: its labellers take them".to_owned());
+            return Ok("the campaign is running: its labellers compute the labels".to_owned());
         }
         let origin = Origin::of(store).await?;
         let given = self.config.as_ref().map(|path| path.display().to_string());
@@ -129,28 +131,28 @@ impl Relabel {
             Location::Server(_) => String::new(),
         };
         Ok(format!(
-            "next: calmwalk run {config}{directory} makes the labels, or calmwalk label --store {}",
-            shown(location)
+            "next: compute the labels with calmwalk run {config}{directory}, or with calmwalk label --store {}",
+            shell_argument(location)
         ))
     }
 
-    async fn choose(&self, store: &Store, protocol: &Protocol) -> Result<Choice, Failure> {
+    async fn select(&self, store: &Store, protocol: &Protocol) -> Result<Selection, Failure> {
         let all = store.relabellable(protocol.hash).await?;
         if !self.ids.is_empty() {
-            return Choice::named(store, all, &self.ids).await;
+            return Selection::from_ids(store, all, &self.ids).await;
         }
         let all = match &self.condition {
-            Some(condition) => choice::meeting(store, all, condition).await?,
+            Some(condition) => selection::matching(store, all, condition).await?,
             None => all,
         };
-        Ok(Choice::of(all, self.again))
+        Ok(Selection::new(all, self.include_current))
     }
 
-    async fn carry_out(
+    async fn apply(
         &self,
         store: &Store,
-        new: Option<&NewLabels>,
-        choice: &Choice,
+        new: Option<&ProtocolChange>,
+        selection: &Selection,
     ) -> Result<Requeued, Failure> {
         let changes: Vec<_> = new.iter().flat_map(|new| &new.changes).map(|change| change.detail()).collect();
         let protocol = new.map(|new| NewProtocol {
@@ -159,45 +161,49 @@ impl Relabel {
             changes: &changes,
             notes: &new.notes,
         });
-        let (structures, again) = (choice.structures(), self.again || !self.ids.is_empty());
-        let order = store::Relabel { structures: &structures, again, reason: &self.reason, protocol };
-        Ok(store.relabel(&order, unix_milliseconds()).await?)
+        let (structures, again) = (selection.structures(), self.include_current || !self.ids.is_empty());
+        let request = store::Relabel { structures: &structures, again, reason: &self.reason, protocol };
+        Ok(store.relabel(&request, unix_milliseconds()).await?)
     }
 }
 
-impl Order {
-    fn write(&self, out: &mut dyn Write, dry_run: bool, is_given: bool) -> io::Result<()> {
-        let Self { protocol: Protocol { name, .. }, changes, choice, bill, done, next } = self;
-        let will = |is: &'static str, was: &'static str| if dry_run { is } else { was };
+impl RelabelReport {
+    /// `has_config`: whether --config was given.
+    fn write(&self, out: &mut dyn Write, dry_run: bool, has_config: bool) -> io::Result<()> {
+        let Self { protocol: Protocol { name, .. }, changes, selection, cost, requeued, next } = self;
+        let verb = |conditional: &'static str, indicative: &'static str| match dry_run {
+            true => conditional,
+            false => indicative,
+        };
         changes.iter().try_for_each(|change| writeln!(out, "{change}"))?;
         if !changes.is_empty() {
-            let (comes, goes) = (will("would come", "is"), will("would go", "went"));
-            writeln!(out, "protocol '{name}' {comes} in force")?;
-            writeln!(out, "{} without a label {goes} over to it", count(done.moved, "structure"))?;
-        } else if is_given {
-            writeln!(out, "protocol '{name}' is in force already")?;
+            let (becomes, moved) = (verb("would become", "is now"), verb("would move", "moved"));
+            writeln!(out, "protocol '{name}' {becomes} the current label protocol")?;
+            writeln!(out, "{} without a label {moved} to it", count(requeued.moved, "structure"))?;
+        } else if has_config {
+            writeln!(out, "protocol '{name}' is already the current label protocol")?;
         }
-        let are = will("would be", if done.again == 1 { "is" } else { "are" });
-        let structures = count(done.again, "structure");
-        writeln!(out, "{structures} {are} queued to be labelled again by protocol '{name}'{}", choice.by())?;
-        choice.left_alone(name).iter().try_for_each(|line| writeln!(out, "{line}"))?;
-        if done.again > 0 {
-            writeln!(out, "cost: {bill}")?;
+        let are = verb("would be", if requeued.again == 1 { "is" } else { "are" });
+        let structures = count(requeued.again, "structure");
+        writeln!(out, "{structures} {are} queued again for protocol '{name}'{}", selection.replaced())?;
+        selection.skipped(name).iter().try_for_each(|line| writeln!(out, "{line}"))?;
+        if requeued.again > 0 {
+            writeln!(out, "cost: {cost}")?;
         }
         match dry_run {
-            true => writeln!(out, "nothing was changed"),
-            false if done.again + done.moved > 0 => writeln!(out, "{next}"),
+            true => writeln!(out, "dry run: nothing was changed"),
+            false if requeued.again + requeued.moved > 0 => writeln!(out, "{next}"),
             false => Ok(()),
         }
     }
 
     fn as_json(&self, dry_run: bool) -> Value {
-        let Self { protocol, changes, choice, bill, done, .. } = self;
+        let Self { protocol, changes, selection, cost, requeued, .. } = self;
         json!({
             "dry_run": dry_run, "protocol": protocol.name, "protocol_hash": protocol.hash.to_string(),
-            "changes": changes, "again": done.again, "without_a_label": done.moved,
-            "waiting_already": choice.waiting, "labelled_already": choice.labelled, "dropped": choice.dropped,
-            "core_hours": bill.hours, "measured": bill.measured,
+            "changes": changes, "again": requeued.again, "without_a_label": requeued.moved,
+            "waiting_already": selection.waiting, "labelled_already": selection.labelled, "dropped": selection.dropped,
+            "core_hours": cost.hours, "measured": cost.measured,
         })
     }
 }

@@ -8,27 +8,27 @@ use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::output::{Table, count, decimals, print, print_json};
 use crate::replay::{self, Change, Moved, Report, Setting, Stop, Tally};
 
-/// Changed decisions shown; JSON has all.
+/// Changed decisions printed without --json.
 const SHOWN: usize = 20;
 
-/// Put a campaign's recorded candidates before its selector again, by its own rules or by others
+/// Replay a campaign's decisions, to verify them or to test other selection rules
 ///
-/// No dynamics and no labels, and nothing is written. With nothing set every decision must come out as it was recorded,
-/// to the last digit, and so must the mixture; otherwise the first difference is shown, and the exit code is 1.
+/// Passes the recorded candidates to the selector again, without dynamics or labels, and changes nothing. Without --set, every
+/// decision and the mixture must be reproduced bit by bit; otherwise the first difference is printed and the exit code is 1.
 ///
-/// With other rules: walks are as they were recorded. What cannot be known is which structures walkers would have
-/// offered under them: a looser rule shows no structure that was never offered, a walk that would have gone on is not
-/// continued, and one that would have been steered by another mixture went where it went.
+/// With --set, shows which candidates other rules would accept. The walks stay as recorded, which limits the result: structures
+/// that walkers never offered do not appear under a looser rule, walks that would have continued are not continued, and
+/// trajectories do not react to the changed mixture.
 #[derive(Debug, clap::Args)]
 pub struct Replay {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Another value (TOML) for a key that acts on the selector, as collect.when.threshold=2.0; may be repeated
+    /// Change a configuration key of the selector to a value (TOML), such as collect.when.threshold=2.0; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<Setting>,
     #[command(flatten)]
     moved: Moved,
-    /// Print JSON, with all decisions that changed
+    /// Print JSON, with all changed decisions
     #[arg(long)]
     json: bool,
 }
@@ -44,7 +44,7 @@ impl Replay {
         match report.difference {
             None => Ok(Ended::Done),
             Some(difference) => Err(Failure::Failed(format!(
-                "decision {} does not come out as it was recorded: {} was {}, and is {} now",
+                "decision {} is not reproduced: {} was {}, and is now {}",
                 difference.decision, difference.what, difference.recorded, difference.now
             ))),
         }
@@ -67,15 +67,12 @@ fn write_report(out: &mut dyn Write, report: &Report) -> io::Result<()> {
     if let Some(Stop { decision, candidate, walk, step }) = &report.stopped {
         writeln!(
             out,
-            "            no further: the features of candidate {candidate} (decision {decision}, walk {walk},"
+            "            stopped: the features of candidate {candidate} (decision {decision}, walk {walk},"
         )?;
-        writeln!(
-            out,
-            "            step {step}) were not kept; collect.declined_features_mb says how many are"
-        )?;
+        writeln!(out, "            step {step}) were not stored (limit: collect.declined_features_mb)")?;
     }
     if report.set.is_empty() {
-        return write_sameness(out, report);
+        return write_verification(out, report);
     }
     write_tally(out, "before", before)?;
     write_tally(out, "now", now)?;
@@ -83,38 +80,29 @@ fn write_report(out: &mut dyn Write, report: &Report) -> io::Result<()> {
         let walks = report.walks_cut_short;
         writeln!(
             out,
-            "            {} that ended with what they had collected would go on: to where is not known",
+            "            {} that reached a limit of collected structures would continue; their further path is unknown",
             count(walks, "walk")
         )?;
     }
-    writeln!(
-        out,
-        "            only structures that walkers offered are known, and they walked under the rules before"
-    )?;
-    write_changes(out, "accepted before, and not now", &report.no_longer_accepted)?;
-    write_changes(out, "accepted now, and not before", &report.newly_accepted)
+    writeln!(out, "            limited to structures that walkers offered under the recorded rules")?;
+    write_changes(out, "no longer accepted", &report.no_longer_accepted)?;
+    write_changes(out, "newly accepted", &report.newly_accepted)
 }
 
-fn write_sameness(out: &mut dyn Write, report: &Report) -> io::Result<()> {
+fn write_verification(out: &mut dyn Write, report: &Report) -> io::Result<()> {
     if report.difference.is_some() {
         if report.other_processor {
             writeln!(
                 out,
-                "            the campaign began on another kind of processor, which has other last digits"
+                "            the campaign was started on another type of processor, whose floating-point results differ"
             )?;
         }
         return Ok(());
     }
     let Tally { candidates, accepted, mixture_version, .. } = report.now;
-    writeln!(
-        out,
-        "            every one as it was recorded, to the last digit: {accepted} of {candidates} accepted"
-    )?;
+    writeln!(out, "            all reproduced bit by bit: {accepted} of {candidates} candidates accepted")?;
     if report.same_mixture == Some(true) {
-        writeln!(
-            out,
-            "            and the mixture, version {mixture_version}, is the stored one, byte for byte"
-        )?;
+        writeln!(out, "            mixture version {mixture_version} is identical to the stored one")?;
     }
     Ok(())
 }
@@ -137,7 +125,7 @@ fn write_changes(out: &mut dyn Write, title: &str, changes: &[Change]) -> io::Re
     }
     writeln!(out, "\n{title}:")?;
     let mut table =
-        Table::new(&[">decision", "candidate", ">walk", ">step", ">γ_max before", ">now", "declined for"]);
+        Table::new(&[">decision", "candidate", ">walk", ">step", ">γ_max before", ">now", "decline reason"]);
     for change in changes.iter().take(SHOWN) {
         table.push(vec![
             change.decision.to_string(),
@@ -151,5 +139,5 @@ fn write_changes(out: &mut dyn Write, title: &str, changes: &[Change]) -> io::Re
     }
     table.write(out)?;
     let more = changes.len().saturating_sub(SHOWN);
-    if more > 0 { writeln!(out, "… and {more} more: --json has all") } else { Ok(()) }
+    if more > 0 { writeln!(out, "… and {more} more (use --json)") } else { Ok(()) }
 }

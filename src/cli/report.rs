@@ -11,17 +11,17 @@ use crate::output::{count, print};
 use crate::report::{self, File, PAGE};
 use crate::whole_file::{WholeFile, cannot_create};
 
-/// Write what came of a campaign as a document: figures, tables, settings, provenance
+/// Write a report of a campaign: figures, tables, settings and provenance
 ///
-/// One HTML file that needs nothing else, in a browser and on paper: what was collected and why, biased walks against their
-/// controls, force errors by grade, cost, failures and what has no label because of them. Beside it each figure as SVG, PNG and
-/// CSV, and each table as CSV. Works while the campaign runs, after it ended, and of a copy, and changes nothing. The same campaign
-/// gives the same bytes. docs/report.md says what each figure shows.
+/// Writes a self-contained HTML page for browser and print: the collected structures, biased walks compared with their
+/// controls, force errors by grade, cost, failures and the structures without labels. Also writes each figure as SVG, PNG and
+/// CSV, and each table as CSV. Works on running and finished campaigns and on backups; the same campaign gives the same bytes.
+/// docs/report.md describes the figures.
 #[derive(Debug, clap::Args)]
 pub struct Report {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Directory to write to, made if it is not there; files of an earlier report in it are replaced
+    /// Directory for the files, created if it does not exist; files of an earlier report are replaced
     #[arg(long, short, value_name = "DIR", default_value = "report")]
     output: PathBuf,
 }
@@ -29,8 +29,8 @@ pub struct Report {
 impl Report {
     pub fn run(self) -> Result<Ended, Failure> {
         let location = self.location.get()?;
-        // Before the long work.
-        make(&self.output)?;
+        // Fail before the long computation.
+        create_directory(&self.output)?;
         let files = block_on(async {
             let store = Store::open_read_only(&location).await?;
             let files = report::of(&store).await;
@@ -39,17 +39,24 @@ impl Report {
         })??;
         for File { path, bytes } in &files {
             let path = self.output.join(path);
-            path.parent().map_or(Ok(()), make)?;
+            path.parent().map_or(Ok(()), create_directory)?;
             let mut file = WholeFile::create(&path)?;
             file.write_all(bytes).map_err(|error| crate::whole_file::cannot_write(&path, error))?;
             file.finish()?;
         }
         let page = self.output.join(PAGE);
-        print(|out| writeln!(out, "{} and {} beside it", page.display(), count(files.len() - 1, "file")))?;
+        print(|out| {
+            writeln!(
+                out,
+                "wrote {} and {} in the same directory",
+                page.display(),
+                count(files.len() - 1, "file")
+            )
+        })?;
         Ok(Ended::Done)
     }
 }
 
-fn make(directory: &Path) -> Result<(), Failure> {
+fn create_directory(directory: &Path) -> Result<(), Failure> {
     fs::create_dir_all(directory).map_err(|error| cannot_create(directory, error))
 }

@@ -1,14 +1,13 @@
 //! `calmwalk run`
 
-mod begin;
 mod lock;
+mod resume;
 
 use std::fs::DirBuilder;
 use std::io::ErrorKind;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
 use orchestrator::launcher::raise_descriptor_limit;
 use orchestrator::reactor;
@@ -19,11 +18,12 @@ use tokio::sync::Notify;
 use wire::net::{Endpoint, Tls};
 use workers::labeller::GUARD;
 
-use super::place::{self, shown};
-use super::{Ended, Failure, block_on};
+use super::campaign_location::{self, shell_argument};
+use super::{Ended, Failure, block_on, duration_between};
 use crate::actors::notify::{self, Notifier};
 use crate::actors::{self, budget, in_process, processes};
 use crate::campaign::Campaign;
+use crate::duration::Duration;
 use crate::ends::Ends;
 use crate::forecast::{self, Forecast, megabytes};
 use crate::labelling::LABEL_METHOD;
@@ -31,44 +31,44 @@ use crate::origin::Origin;
 use crate::output::{print, say, say_if_unprotected, warn};
 use crate::{log, story, summary, web};
 
-/// Run a campaign to its end, or go on with one that was interrupted
+/// Run a campaign until it is finished, or resume it
 ///
-/// The same command starts a campaign and continues it, whatever stopped it. Ctrl-C or SIGTERM stops in order within
-/// seconds; a second one at once.
+/// The same command starts a campaign and resumes it after any interruption. Ctrl-C or SIGTERM checkpoints the walks and exits
+/// within seconds (exit code 130); a second signal exits at once.
 #[derive(Debug, clap::Args)]
 pub struct Run {
-    /// Configuration of the campaign
+    /// Configuration of the campaign (TOML)
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
-    /// Directory of the campaign [default: beside the configuration, with its name but no extension]
+    /// Directory of the campaign, created if it does not exist [default: path of the configuration without its extension]
     #[arg(long, value_name = "DIR")]
     directory: Option<PathBuf>,
-    /// Go on with a campaign that belongs to another configuration file: this one takes its place
+    /// Resume a campaign that was started with another configuration file, and use CONFIG from now on
     #[arg(long)]
     adopt: bool,
-    /// Walkers and labellers as threads of this process, not as processes of their own; needs no shared memory
+    /// Run walkers and labellers as threads of this process instead of as separate processes; uses no shared memory
     #[arg(long)]
     in_process: bool,
-    /// Let agents of other hosts take part (calmwalk agent --join), as tcp/0.0.0.0:7447
+    /// Accept agents of other hosts (calmwalk agent --join) at this endpoint, such as tcp/0.0.0.0:7447
     #[arg(long, value_name = "ENDPOINT", conflicts_with = "in_process")]
     listen: Option<Endpoint>,
-    /// Directory with authority.pem, certificate.pem and key.pem: needed for everything but loopback
+    /// Directory with authority.pem, certificate.pem and key.pem; required unless the endpoint is a loopback address
     #[arg(long, value_name = "DIR", requires = "listen")]
     tls: Option<PathBuf>,
-    /// Write into this file where agents find this process (calmwalk agent --join @FILE), and in the end that there is no
-    /// more work
+    /// Write the endpoint of this process to FILE, where agents read it (calmwalk agent --join @FILE). At the end the file
+    /// tells them that the campaign is finished
     #[arg(long, value_name = "FILE", requires = "listen")]
     announce: Option<PathBuf>,
-    /// Name by which other hosts know this one, to be announced [default: its host name]
+    /// Host name or address to announce to agents [default: host name of this host]
     #[arg(long, value_name = "NAME", requires = "announce")]
     host: Option<String>,
     #[command(flatten)]
-    shown_at: web::Addresses,
+    web: web::Addresses,
     #[command(flatten)]
     log: log::Options,
-    /// Wait so long for another process that runs this campaign, which may be about to end, min
-    #[arg(long, value_name = "MINUTES", default_value_t = 0.0, value_parser = minutes)]
-    patience: f64,
+    /// How long to wait for another run to release the campaign, such as 15m
+    #[arg(long, value_name = "TIME", default_value_t = Duration::from_seconds(0), value_parser = duration_between("0s", "10000h"))]
+    wait_timeout: Duration,
 }
 
 impl Run {
@@ -79,12 +79,12 @@ impl Run {
         let directory = match self.directory {
             Some(directory) => directory,
             None => {
-                let directory = place::default_directory(&self.config);
-                block_on(place::refuse_if_kept_elsewhere(&campaign, &directory))??;
+                let directory = campaign_location::default_directory(&self.config);
+                block_on(campaign_location::check_former_locations(&campaign, &directory))??;
                 directory
             }
         };
-        make(&directory)?;
+        create_directory(&directory)?;
         let listen = self.listen.map(|endpoint| actors::Listen {
             endpoint,
             tls: self.tls.as_deref().map(Tls::in_directory),
@@ -95,82 +95,82 @@ impl Run {
         if !self.in_process {
             raise_descriptor_limit();
         }
-        let patience = Duration::from_secs_f64(60.0 * self.patience);
+        let wait_timeout = self.wait_timeout.get();
         let ended = block_on(async {
             let location = campaign.config.location(&directory)?;
             say_if_unprotected(&location);
-            let web = self.shown_at.listen().await?;
-            let _lock = lock::directory(&directory, &location, patience).await?;
+            let web = self.web.listen().await?;
+            let _lock = lock::directory(&directory, &location, wait_timeout).await?;
             listen.iter().try_for_each(actors::Listen::begins)?;
             let (in_process, adopt) = (self.in_process, self.adopt);
-            let how = How { in_process, adopt, listen: listen.as_ref(), web, patience };
-            run(&campaign, &directory, &location, how).await
+            let options = RunOptions { in_process, adopt, listen: listen.as_ref(), web, wait_timeout };
+            run(&campaign, &directory, &location, options).await
         })?
         .map_err(|failure| failure.in_campaign(&directory))?;
         listen.iter().try_for_each(|listen| listen.has_ended(ended))?;
         if ended == Ended::Interrupted {
-            say("stopped in order; the same command goes on with the campaign");
+            say("stopped; run the same command again to resume the campaign");
         }
         Ok(ended)
     }
 }
 
-/// Makes the campaign's directory, which only this user needs to read.
-fn make(directory: &Path) -> Result<(), Failure> {
+/// Creates the directory of the campaign, readable by this user only.
+fn create_directory(directory: &Path) -> Result<(), Failure> {
     if directory.to_string_lossy().contains("://") {
         // A URL may have a password in it.
         return Err(Failure::Input(
-            "--directory is a URL; expected a directory of this host: the URL of a database is run.store of the configuration"
+            "--directory is a URL; expected a directory of this host. Set the URL of a database with run.store in the configuration"
                 .to_owned(),
         ));
     }
     let failed = |source| StoreError::Directory { directory: directory.into(), source };
-    let made = DirBuilder::new().recursive(true).mode(0o700).create(directory);
-    made.map_err(|source| match source.kind() {
+    let created = DirBuilder::new().recursive(true).mode(0o700).create(directory);
+    created.map_err(|source| match source.kind() {
         ErrorKind::StorageFull => StoreError::DiskFull.into(),
         ErrorKind::AlreadyExists => {
             failed(std::io::Error::new(ErrorKind::NotADirectory, "it is a file")).into()
         }
-        _ => Failure::Input(format!("{}; --directory names another one", failed(source))),
+        _ => Failure::Input(format!("{}; choose another one with --directory", failed(source))),
     })
 }
 
-/// What the command line says besides the configuration.
-struct How<'a> {
+/// Options of the command line, without the configuration.
+struct RunOptions<'a> {
     in_process: bool,
-    /// Whether the campaign may belong to another configuration file.
+    /// Whether the campaign may have been started with another configuration file.
     adopt: bool,
     listen: Option<&'a actors::Listen>,
     web: web::Listening,
-    patience: Duration,
+    wait_timeout: std::time::Duration,
 }
 
 async fn run(
     campaign: &Campaign,
     directory: &Path,
     location: &Location,
-    how: How<'_>,
+    options: RunOptions<'_>,
 ) -> Result<Ended, Failure> {
-    let How { in_process, adopt, listen, web, patience } = how;
-    let lock = lock::server(location, patience).await?;
+    let RunOptions { in_process, adopt, listen, web, wait_timeout } = options;
+    let lock = lock::server(location, wait_timeout).await?;
     let origin = Origin::new(&campaign.path, &campaign.text, directory);
     let store = open_store(campaign, location, &origin, adopt).await?;
     let store = lock.iter().fold(store, Store::led_by);
     if let Location::Directory(directory) = &location {
-        warn_of_the_disk(campaign, directory, &store).await?;
+        warn_if_disk_is_too_small(campaign, directory, &store).await?;
     }
     let process = register(&store).await?;
     let selector = restore_selector(campaign, &store).await?;
     if campaign.config.label.slots == 0 {
-        let shown = shown(location);
-        say(format_args!("label.slots = 0: labels come from calmwalk label --store {shown}"));
+        let store = shell_argument(location);
+        say(format_args!("label.slots = 0: start labellers with calmwalk label --store {store}"));
     }
     let over = Arc::new(Notify::new());
     let run = actors::Run { campaign, store: &store, process: &process, directory, listen, over: &over };
     let (limits, used_up) = (campaign.config.budget(), budget::time_used_up(&store).await?);
     let work = async {
         if used_up.is_some() {
-            // Nothing may be begun.
+            // The budget allows no further work.
             return Ok(reactor::Ended::Stopped);
         }
         if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
@@ -186,12 +186,12 @@ async fn run(
     notify::finish(notifier, worked.as_ref().err()).await;
     serving.end().await;
     let ended = worked?;
-    // Hours of work do not end as a failure because a server is away in the last second.
+    // Do not fail after hours of work because the server is unreachable in the last second.
     let store = store.patient(SERVER_AWAY);
     loop {
-        match leave(&store, &process, ended).await {
+        match unregister(&store, &process, ended).await {
             Err(StoreError::Unreachable(_)) => {}
-            left => break left?,
+            result => break result?,
         }
     }
     if !store.status().await?.finished {
@@ -201,19 +201,20 @@ async fn run(
     let summary = summary::of(&store, campaign.protocol.hash).await?;
     let status = store.status().await?;
     let (failed, ends) = (status.labels.failed, Ends::of(&status.walks));
-    let (shown, file) = match location {
-        Location::Directory(_) => (shown(location), format!("/{DATABASE}")),
-        Location::Server(_) => (shown(location), String::new()),
+    let argument = shell_argument(location);
+    let file = match location {
+        Location::Directory(_) => format!("/{DATABASE}"),
+        Location::Server(_) => String::new(),
     };
     print(|out| {
         writeln!(out, "{summary}")?;
-        writeln!(out, "the campaign is in {shown}{file}; look further with")?;
-        writeln!(out, "  calmwalk status {shown}")?;
-        writeln!(out, "  calmwalk queue {shown} list")?;
+        writeln!(out, "the campaign is in {argument}{file}; next:")?;
+        writeln!(out, "  calmwalk status {argument}")?;
+        writeln!(out, "  calmwalk queue {argument} list")?;
         if failed > 0 {
-            writeln!(out, "  calmwalk queue {shown} list --state failed")?;
+            writeln!(out, "  calmwalk queue {argument} list --state failed")?;
         }
-        writeln!(out, "  calmwalk export {shown} --output dataset.extxyz")
+        writeln!(out, "  calmwalk export {argument} --output dataset.extxyz")
     })?;
     store.close().await;
     if ends.none_in_order() {
@@ -223,7 +224,7 @@ async fn run(
     Ok(Ended::Done)
 }
 
-/// Begins the campaign, or opens the one that is there and checks that it is the same.
+/// Creates the campaign, or opens an existing one and checks that it belongs to this configuration.
 async fn open_store(
     campaign: &Campaign,
     location: &Location,
@@ -243,26 +244,26 @@ async fn open_store(
                 configuration_in_force: resolved.to_string(),
             };
             let store = Store::create(location, &record, &campaign.stored_seeds(), now).await?;
-            begin::begun(&store, origin, location).await?;
+            resume::record_start(&store, origin, location).await?;
             store
         }
         opened => {
             let store = opened?;
-            begin::go_on(campaign, &store, location, origin, adopt).await?;
+            resume::resume(campaign, &store, location, origin, adopt).await?;
             store
         }
     };
     store.set_budget(&campaign.config.budget()).await?;
     store.set_grade_files(&campaign.grade_files()).await?;
-    leave_notes(campaign, &store).await?;
-    // Labellers that wait for the campaign begin with its protocol.
+    write_metadata(campaign, &store).await?;
+    // Last: labellers that wait for the campaign start as soon as it has a protocol.
     store.add_protocol(&campaign.protocol, now).await?;
     Ok(store)
 }
 
-/// Says in the store what others do not know: how labels are made, which elements the model has, how much disk is needed.
-async fn leave_notes(campaign: &Campaign, store: &Store) -> Result<(), Failure> {
-    let text = |note: serde_json::Result<String>| note.map_err(Failure::failed);
+/// Stores what other processes need to know: the label method, the guard, the elements of the model and the disk forecast.
+async fn write_metadata(campaign: &Campaign, store: &Store) -> Result<(), Failure> {
+    let text = |json: serde_json::Result<String>| json.map_err(Failure::failed);
     let method = campaign.method()?;
     store.leave_note(LABEL_METHOD, &text(serde_json::to_string(&method))?).await?;
     store.leave_note(GUARD, &text(serde_json::to_string(&campaign.config.label.guard))?).await?;
@@ -272,14 +273,18 @@ async fn leave_notes(campaign: &Campaign, store: &Store) -> Result<(), Failure> 
     Ok(())
 }
 
-/// A campaign that will not have room on its disk is better stopped now.
-async fn warn_of_the_disk(campaign: &Campaign, directory: &Path, store: &Store) -> Result<(), Failure> {
+/// Warns if the disk is too small for the campaign.
+async fn warn_if_disk_is_too_small(
+    campaign: &Campaign,
+    directory: &Path,
+    store: &Store,
+) -> Result<(), Failure> {
     let forecast = Forecast::of(campaign);
     let needed = (forecast.bytes() + forecast::LOG).saturating_sub(store.size().await?);
     let free = store::free_space(directory)?;
     if free < needed {
         warn(format_args!(
-            "WARNING: the campaign will take {} more on the disk of {}, where {} are free (forecast: {forecast})",
+            "WARNING: the campaign needs {} more on the disk of {}, but only {} are free (forecast: {forecast})",
             megabytes(needed),
             directory.display(),
             megabytes(free)
@@ -288,7 +293,7 @@ async fn warn_of_the_disk(campaign: &Campaign, directory: &Path, store: &Store) 
     Ok(())
 }
 
-/// Makes this process known, and takes back what dead ones held: the lock says that there is no other.
+/// Registers this process, and reclaims the leases of dead ones. The caller holds the lock, so there is no other orchestrator.
 async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
     let now = unix_milliseconds();
     store.take_over(now).await?;
@@ -299,8 +304,8 @@ async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
     Ok(record)
 }
 
-/// Gives back what is held, at an end in order.
-async fn leave(store: &Store, process: &ProcessRecord, ended: reactor::Ended) -> Result<(), StoreError> {
+/// Releases what this process holds, and removes its registration.
+async fn unregister(store: &Store, process: &ProcessRecord, ended: reactor::Ended) -> Result<(), StoreError> {
     let now = unix_milliseconds();
     store.release_all(&process.id, now).await?;
     store.remove_process(&process.id).await?;
@@ -329,14 +334,9 @@ async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector
         snapshot,
     )
     .map_err(Failure::failed)?;
-    let begun = selector.begin_walks();
-    if !begun.decisions.is_empty() {
-        store.commit(&begun).await?;
+    let started = selector.begin_walks();
+    if !started.decisions.is_empty() {
+        store.commit(&started).await?;
     }
     Ok(selector)
-}
-
-fn minutes(text: &str) -> Result<f64, String> {
-    let minutes = text.parse().ok().filter(|minutes| (0.0..=1e6).contains(minutes));
-    minutes.ok_or_else(|| "expected 0 to 1e6".to_owned())
 }

@@ -10,13 +10,13 @@ use crate::campaign::Campaign;
 use crate::forecast::Forecast;
 use crate::output::{count, print};
 
-/// Check a configuration and every file that it names
+/// Check a configuration and all files that it refers to
 ///
-/// Everything that is wrong is told at once, with file, line and key: exit code 2. What is possible but hardly meant is a warning on
-/// the standard error, which changes nothing about the exit code.
+/// Reports all errors with file, line and key (exit code 2). Valid but suspicious values are warnings on standard error and do
+/// not change the exit code.
 #[derive(Debug, clap::Args)]
 pub struct Validate {
-    /// Configuration of a campaign
+    /// Configuration of a campaign (TOML)
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
 }
@@ -35,23 +35,23 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()
     let elements: Vec<_> = model.elements().iter().map(|species| species.symbol()).collect();
     let architecture = model.description().architecture;
     let atoms = || seeds.iter().map(|named| named.seed.structure.len());
-    let (least, most) = (atoms().min().unwrap_or(0), atoms().max().unwrap_or(0));
+    let (min, max) = (atoms().min().unwrap_or(0), atoms().max().unwrap_or(0));
     writeln!(out, "{} is a valid campaign", path.display())?;
     writeln!(out, "  potential        {architecture}, {}, cutoff {} Å", elements.join(" "), model.cutoff())?;
     let (components, features) = (mixture.iter().count(), mixture.dimension());
     let (components, features) = (count(components, "component"), count(features, "feature"));
-    writeln!(out, "  mixture          {components}, {features} an atom")?;
+    writeln!(out, "  mixture          {components}, {features} per atom")?;
     if !mixture.can_be_updated() {
         writeln!(
             out,
-            "                   without scatter and counts: it can be scored with but not updated"
+            "                   without scatter matrices and counts: it can grade structures but not be updated"
         )?;
     }
-    writeln!(out, "  seed structures  {}, of {least} to {most} atoms", seeds.len())?;
+    writeln!(out, "  seed structures  {}, with {min} to {max} atoms", seeds.len())?;
     writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)?;
     writeln!(out, "  disk             {}", Forecast::of(campaign))?;
     match campaign.warnings.len() {
         0 => writeln!(out, "  warnings         none"),
-        count => writeln!(out, "  warnings         {count}: see above"),
+        count => writeln!(out, "  warnings         {count}, see above"),
     }
 }

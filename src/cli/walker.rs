@@ -12,9 +12,9 @@ use super::{Ended, Failure};
 use crate::setup::{self, WalkerSetup};
 use crate::{interrupt, log};
 
-/// A walker's process; `calmwalk run` starts it
+/// Internal: a walker process, started by `calmwalk run` and `calmwalk agent`
 ///
-/// It reads what to do from standard input, ends with the process that started it, and on SIGTERM after the step in hand.
+/// Reads what to do from standard input. Exits with the process that started it, and on SIGTERM after the current step.
 #[derive(Debug, clap::Args)]
 pub struct Walker {}
 

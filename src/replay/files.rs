@@ -10,13 +10,13 @@ use crate::outcome::Failure;
 /// Files that are elsewhere than where the campaign last found them.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct Moved {
-    /// The model, if it is not any more where the campaign last found it
+    /// Path of the model, if the file has moved since the last run
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// The artifact, the same
+    /// Path of the CALM artifact, if the file has moved since the last run
     #[arg(long, value_name = "FILE")]
     artifact: Option<PathBuf>,
-    /// The training frames, the same
+    /// Path of the training frames, if the file has moved since the last run
     #[arg(long, value_name = "FILE")]
     training_frames: Option<PathBuf>,
 }

@@ -20,7 +20,7 @@ pub fn router(store: Store) -> Router {
 }
 
 async fn metrics(State(store): State<Store>) -> Response {
-    match Snapshot::of(&store).await {
+    match Snapshot::read(&store).await {
         Ok(snapshot) => ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&snapshot)).into_response(),
         Err(failure) => (StatusCode::SERVICE_UNAVAILABLE, failure.to_string()).into_response(),
     }
@@ -28,7 +28,7 @@ async fn metrics(State(store): State<Store>) -> Response {
 
 /// Everything. Labels have few values each: kinds, states, reasons and classes, never walks or structures.
 pub fn text(snapshot: &Snapshot) -> String {
-    let (campaign, status) = (snapshot.campaign(), snapshot.standing());
+    let (campaign, status) = (snapshot.campaign(), snapshot.status());
     let mut text = Text::default();
     let id = campaign.id.to_string();
     let labels =

@@ -24,10 +24,10 @@ use crate::output::{say, show};
 /// Where a campaign is shown, as arguments.
 #[derive(Debug, clap::Args)]
 pub struct Addresses {
-    /// Show the campaign in a browser at this address of this host, as 127.0.0.1:8080 (docs/dashboard.md)
+    /// Serve the dashboard to web browsers at this address, such as 127.0.0.1:8080 (docs/dashboard.md)
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = address)]
     dashboard: Option<SocketAddr>,
-    /// Serve metrics for Prometheus at this address of this host, as 127.0.0.1:9464 (docs/metrics.md)
+    /// Serve metrics to Prometheus at this address, such as 127.0.0.1:9464 (docs/metrics.md)
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = address)]
     metrics: Option<SocketAddr>,
 }
@@ -40,7 +40,7 @@ pub fn address(text: &str) -> Result<SocketAddr, String> {
             Ok(port) => format!("127.0.0.1:{port}"),
             Err(_) => "127.0.0.1:8080".to_owned(),
         };
-        format!("expected ADDRESS:PORT, as {example}")
+        format!("expected ADDRESS:PORT, such as {example}")
     })
 }
 
@@ -153,10 +153,10 @@ mod tests {
         assert_eq!(address("127.0.0.1:8080"), Ok(([127, 0, 0, 1], 8080).into()));
         assert_eq!(address("localhost:8080"), address("127.0.0.1:8080"));
         for text in ["9464", ":9464"] {
-            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, as 127.0.0.1:9464");
+            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, such as 127.0.0.1:9464");
         }
         for text in ["", "host", "host:8080", "127.0.0.1", "127.0.0.1:99999"] {
-            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, as 127.0.0.1:8080", "{text}");
+            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, such as 127.0.0.1:8080", "{text}");
         }
     }
 }

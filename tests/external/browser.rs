@@ -86,7 +86,7 @@ fn nothing_is_cut_off_and_errors_are_shown_by_grade() {
     succeed(here, ["report", "campaign", "--output", "report"]);
     let report = format!("file://{}", here.join("report/report.html").display());
     let mut command = program(here);
-    command.args(["dashboard", "campaign", "--at", "127.0.0.1:0"]);
+    command.args(["dashboard", "campaign", "--address", "127.0.0.1:0"]);
     let mut shown = Running(command.stderr(Stdio::piped()).spawn().unwrap());
     let [address] = said(&mut shown.0, ["dashboard at http://"]);
     let page = format!("http://{address}");

@@ -44,7 +44,7 @@ fn the_demo_makes_at_least_ten_dft_labels() {
     let mut bare = Frame::from(last.structure.clone());
     bare.info.insert("name".to_owned(), "last".to_owned().into());
     common::write_frames(&here.join("last.extxyz"), &[bare]);
-    succeed(here, ["label", "--once", "last.extxyz", "--config", &demo, "--output", "again.extxyz"]);
+    succeed(here, ["label-file", "last.extxyz", "--config", &demo, "--output", "again.extxyz"]);
     let again = &read_extxyz(&here.join("again.extxyz")).unwrap()[0];
     let (found, expected) = (again.labels().unwrap(), last.labels().unwrap());
     assert!((found.energy.unwrap() - expected.energy.unwrap()).abs() < 1e-6);
@@ -91,7 +91,7 @@ fn labels_survive_kills_of_labeller_keeper_and_code() {
                 calculating(&scratch).into_iter().find(|(_, command)| is_abinit(command)).map(|(pid, _)| pid)
             }
             1 => carrying_out(here, "labeller").first().copied(),
-            _ => carrying_out(here, "keep").first().copied(),
+            _ => carrying_out(here, "calculation-runner").first().copied(),
         };
         victim.into_iter().for_each(|pid| signal(pid, "KILL"));
         assert!(begun.elapsed() < Duration::from_secs(300));
@@ -230,7 +230,7 @@ fn a_pseudopotential_that_is_replaced_between_two_labels_makes_none() {
     let bare: Vec<_> = frames.iter().map(|frame| Frame::from(frame.structure.clone())).collect();
     common::write_frames(&here.join("bare.extxyz"), &bare);
     let demo = config("silicon-dft.toml").display().to_string();
-    succeed(&here, ["label", "--once", "bare.extxyz", "--config", &demo, "--output", "again.extxyz"]);
+    succeed(&here, ["label-file", "bare.extxyz", "--config", &demo, "--output", "again.extxyz"]);
     for (frame, again) in frames.iter().zip(read_extxyz(&here.join("again.extxyz")).unwrap()) {
         let energy = |frame: &Frame| frame.labels().unwrap().energy.unwrap();
         assert!((energy(frame) - energy(&again)).abs() < 1e-6);

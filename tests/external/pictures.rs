@@ -76,7 +76,7 @@ impl Terminal {
     fn open(here: &Path) -> Self {
         let terminal = Self(format!("calmwalk-picture-{}", std::process::id()));
         let (width, height) = (TERMINAL.0.to_string(), TERMINAL.1.to_string());
-        let command = format!("{} watch aluminium --every 0.5", env!("CARGO_BIN_EXE_calmwalk"));
+        let command = format!("{} watch aluminium --every 500ms", env!("CARGO_BIN_EXE_calmwalk"));
         let here = here.display().to_string();
         terminal.tmux(&[
             "-f",

@@ -29,7 +29,7 @@ impl Terminal {
         let (width, height) = (size.0.to_string(), size.1.to_string());
         let program = env!("CARGO_BIN_EXE_calmwalk");
         let command =
-            format!("{environment} {program} watch '{campaign}' --every 0.2; echo code $?; exec cat");
+            format!("{environment} {program} watch '{campaign}' --every 200ms; echo code $?; exec cat");
         let here = here.display().to_string();
         let arguments = ["-f", "/dev/null", "new-session", "-d", "-c", &here, "-x", &width, "-y", &height];
         terminal.tmux(&[&arguments[..], &[&command]].concat());
@@ -155,8 +155,8 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
 
     // The second walk stands still; in reproducible mode the first waits for it.
     terminal.press("Down p");
-    terminal.wait_for("walk 1 is paused");
-    terminal.wait_for("2 under way (1 paused)");
+    terminal.wait_for("walk 1 paused");
+    terminal.wait_for("2 active (1 paused)");
     let paused = |of: Value| {
         of["walks"].as_array().unwrap().iter().map(|walk| walk["paused"] == true).collect::<Vec<_>>()
     };
@@ -170,7 +170,7 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
     });
     terminal.wait_for("paused");
     terminal.press("r");
-    terminal.wait_for("walk 1 goes on");
+    terminal.wait_for("walk 1 resumed");
     wait_until("both go on", || {
         let now: Value =
             place.status()["walks"].as_array().unwrap().iter().map(|walk| walk["step"].clone()).collect();
@@ -179,9 +179,9 @@ fn a_campaign_that_runs_is_watched_and_its_walks_are_paused() {
 
     // All of them, but only if that is meant.
     terminal.press("P");
-    terminal.wait_for("pause every walk that has more steps to make?");
+    terminal.wait_for("pause all walks that have not ended?");
     terminal.press("n");
-    terminal.wait_for("nothing was changed");
+    terminal.wait_for("cancelled");
     assert_eq!(paused(place.status()), [false, false]);
 
     for (width, height) in [(160, 50), (60, 12), (20, 5), (80, 24)] {
@@ -215,14 +215,14 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
     terminal.press("2 Down Down = C-u");
     terminal.write("99");
     terminal.press("Enter");
-    terminal.wait_for("has priority 99 now");
+    terminal.wait_for("now has priority 99");
     let now = queue(&place, "queued");
     assert_eq!((short(&now[0]), &now[0]["priority"]), (short(&queued[2]), &99.into()));
     // It is still the chosen one.
     terminal.press("d");
     terminal.wait_for(&format!("drop {} (queued)?", short(&queued[2])));
     terminal.press("n");
-    terminal.wait_for("nothing was changed");
+    terminal.wait_for("cancelled");
     terminal.press("d y");
     terminal.wait_for("is dropped");
     assert_eq!(short(&queue(&place, "dropped")[0]), short(&queued[2]));
@@ -287,9 +287,9 @@ fn a_copy_is_watched_through_its_absence() {
     terminal.wait_for("1 walks: 4");
     // A campaign that is away for a moment is no end of watching it.
     fs::rename(here.join("copy"), here.join("away")).unwrap();
-    terminal.wait_for("what you see is old:");
+    terminal.wait_for("outdated, cannot read the campaign:");
     fs::rename(here.join("away"), here.join("copy")).unwrap();
-    wait_until("it is seen again", || !terminal.screen().contains("what you see is old"));
+    wait_until("it is seen again", || !terminal.screen().contains("outdated, cannot read the campaign"));
     terminal.press("q");
     terminal.is_given_back("code 0");
     // What cannot be watched is said on the terminal as it is.

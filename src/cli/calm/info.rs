@@ -12,12 +12,12 @@ use serde::Serialize;
 use crate::cli::{Ended, Failure};
 use crate::output::{Table, decimals, print, print_json};
 
-/// Components shown; JSON has them all.
+/// Components printed without --json.
 const SHOWN: usize = 40;
 
-/// Show what a model or an artifact is made of
+/// Show the contents of a GRACE model or CALM artifact
 ///
-/// Which of the two a file is, is seen from what it holds.
+/// Detects the type of the file from its contents.
 #[derive(Debug, clap::Args)]
 pub struct Info {
     /// GRACE model (kokkos.npz) or CALM artifact (gmm_artifacts.npz)
@@ -28,7 +28,7 @@ pub struct Info {
     json: bool,
 }
 
-/// What a file is made of.
+/// The contents of a file.
 #[derive(Debug, Serialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 enum Content {
@@ -42,7 +42,7 @@ struct Model {
     elements: Vec<Species>,
     /// Å
     cutoff: f64,
-    /// Å, of the pairs of elements whose cutoff is another.
+    /// Pairs of elements with their own cutoff.
     pair_cutoffs: Vec<PairCutoff>,
     lmax: usize,
     radial_basis_size: usize,
@@ -66,7 +66,7 @@ struct PairCutoff {
 #[derive(Debug, Serialize)]
 struct RadialTable {
     intervals: usize,
-    /// The larger of those of values and of derivatives, each relative to the largest.
+    /// The larger of the errors of values and derivatives, each relative to the largest value.
     error: f64,
 }
 
@@ -82,7 +82,7 @@ struct MixtureInfo {
     density_channels: bool,
     threshold_mode: Option<String>,
     can_be_updated: bool,
-    /// Components that no training data can have made, and why.
+    /// Components that cannot come from training data, and why.
     faults: Vec<String>,
     components: Vec<ComponentInfo>,
 }
@@ -93,11 +93,11 @@ struct ComponentInfo {
     component: usize,
     /// Calibrated threshold θ of σ.
     threshold: f64,
-    /// Environments.
+    /// Number of atomic environments.
     count: Option<f64>,
-    /// Sum of their weights.
+    /// Sum of the weights of the environments.
     effective_count: Option<f64>,
-    /// Of the covariance, as the build found it.
+    /// Condition number of the covariance matrix when the mixture was built.
     condition_number: Option<f64>,
 }
 
@@ -192,13 +192,13 @@ impl Model {
             line(
                 out,
                 "radial table",
-                format!("{intervals} intervals, error of values and slopes below {error:.1e} of the largest"),
+                format!("{intervals} intervals, relative error of values and derivatives below {error:.1e}"),
             )?;
         }
         match &self.mixture {
             Some(mixture) => mixture.write(out),
             None => {
-                line(out, "mixture", "none: exported without CALM arrays (uq_*), so nothing can be graded")
+                line(out, "mixture", "none: exported without CALM arrays (uq_*), cannot grade structures")
             }
         }
     }
@@ -229,7 +229,7 @@ impl MixtureInfo {
         line(
             out,
             "features",
-            format!("{}, of them {} projected from {} invariants", sizes.0, sizes.1, sizes.2),
+            format!("{}, {} of them projected from {} invariants", sizes.0, sizes.1, sizes.2),
         )?;
         let flags = [
             (self.normalised, "normalised basis"),
@@ -241,8 +241,7 @@ impl MixtureInfo {
         if let Some(mode) = &self.threshold_mode {
             line(out, "thresholds", mode)?;
         }
-        let updates =
-            if self.can_be_updated { "yes" } else { "no: without scatter matrices it can only grade" };
+        let updates = if self.can_be_updated { "yes" } else { "no: without scatter matrices" };
         line(out, "can be updated", updates)?;
         line(out, "components", format!("{} for {}", self.components.len(), self.elements.join(" ")))?;
         for fault in self.faults.iter().take(SHOWN) {
@@ -264,12 +263,12 @@ impl MixtureInfo {
         table.write(out)?;
         match self.components.len().saturating_sub(SHOWN) {
             0 => Ok(()),
-            more => writeln!(out, "… and {more} more: --json shows all"),
+            more => writeln!(out, "… and {more} more (use --json)"),
         }
     }
 }
 
-/// A single text; none if it is absent or cannot be read.
+/// A single text, if the array exists and is readable.
 fn text(archive: &Archive, key: &str) -> Option<String> {
     archive.strings(key).ok().filter(|texts| texts.len() == 1).map(|texts| texts.concat())
 }
@@ -305,7 +304,7 @@ impl Content {
     }
 }
 
-/// A name and its value.
+/// Prints a name and its value.
 fn line(out: &mut dyn Write, name: &str, value: impl std::fmt::Display) -> io::Result<()> {
     writeln!(out, "  {name:<16}{value}")
 }

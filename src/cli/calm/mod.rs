@@ -1,4 +1,4 @@
-//! `calmwalk calm`: what has to do with a mixture and needs no campaign.
+//! `calmwalk calm`: commands for CALM mixtures, without a campaign.
 
 mod info;
 mod score;
@@ -6,7 +6,7 @@ mod scorer;
 
 use super::{Ended, Failure};
 
-/// Look at a CALM mixture, or grade structures with it
+/// Inspect a CALM mixture, or grade structures with it
 #[derive(Debug, clap::Subcommand)]
 pub enum Calm {
     Info(info::Info),

@@ -17,38 +17,38 @@ use crate::frames::Frames;
 use crate::output::{self, Bar, print};
 use crate::whole_file::{WholeFile, cannot_write};
 
-/// What a calculation says of a frame, by the names that other programs read.
+/// Keys of labels in a frame.
 const LABELS: [&str; 5] = ["energy", "free_energy", "forces", "stress", "virial"];
 
 const BAR: &str = "{bar:32} {percent} %  {eta} left  {msg}";
 
-/// Grade structures: energy, forces, stress and extrapolation grades of every atom
+/// Grade structures: energy, forces, stress, and extrapolation grades of every atom
 ///
-/// Every frame is written with the model's energy (eV), forces (eV/Å) and, if it has a cell that repeats, stress
-/// (eV/Å³, tension positive), and with these columns: gamma (extrapolation grade γ), gamma_nbr (its neighbourhood
-/// average), sigma (Mahalanobis distance σ), component (the nearest one of the atom's element, from 0).
-/// Structures with atoms in one place (nearer than 0.4 Å) are refused, and so are mixtures that no training data can have made.
+/// Writes every frame with the model's energy (eV), forces (eV/Å) and, for periodic cells, stress (eV/Å³, tension positive),
+/// and per atom gamma (extrapolation grade γ), gamma_nbr (its neighbourhood average), sigma (Mahalanobis distance σ) and
+/// component (nearest component of the atom's element, from 0). Rejects structures with atoms closer than 0.4 Å, and mixtures
+/// that cannot come from training data.
 ///
-/// All else in the frame is kept. Energy, forces, stress and virial that it came with are kept as REF_energy,
-/// REF_forces … unless it has such reference labels already: then the plain ones, another model's, are replaced.
+/// Keeps all other data of the frame. Renames its energy, forces, stress and virial to REF_energy, REF_forces and so on, unless
+/// it already has reference labels; then it replaces the plain ones, which come from another model.
 #[derive(Debug, clap::Args)]
 pub struct Score {
     /// GRACE model (kokkos.npz)
     #[arg(long, value_name = "MODEL.npz")]
     model: PathBuf,
-    /// CALM artifact (gmm_artifacts.npz) [default: the mixture that the model was exported with]
+    /// CALM artifact (gmm_artifacts.npz) [default: mixture in the model file]
     #[arg(long, value_name = "CALM.npz")]
     artifact: Option<PathBuf>,
     /// Structures to grade, extended XYZ
     #[arg(value_name = "IN.extxyz")]
     input: PathBuf,
-    /// Graded structures; an existing file is replaced when all are done
+    /// File for the graded structures; an existing file is replaced once all are graded
     #[arg(long, short, value_name = "OUT.extxyz")]
     output: PathBuf,
-    /// Write the column gamma_gradient too: the gradient of the sum of all γ, 1/Å
+    /// Also write gamma_gradient per atom: gradient of the sum of all γ, 1/Å
     #[arg(long)]
     gradient: bool,
-    /// Write the features z of all atoms, [atoms × D] in the order of the file, f64
+    /// Also write the features z of all atoms to this file: array of shape [atoms, D] in the order of the input, float64
     #[arg(long, value_name = "FILE.npy")]
     features: Option<PathBuf>,
 }
@@ -86,7 +86,12 @@ impl Score {
         output.finish()?;
         drop(bar);
         print(|out| {
-            writeln!(out, "graded {} into {}", output::count(count, "structure"), self.output.display())
+            writeln!(
+                out,
+                "wrote {} with grades to {}",
+                output::count(count, "structure"),
+                self.output.display()
+            )
         })?;
         Ok(Ended::Done)
     }
@@ -117,9 +122,9 @@ fn load(model: &Path, artifact: Option<&Path>) -> Result<(GraceModel, Artifact),
     Ok((model, artifact))
 }
 
-/// Puts what was computed into the frame, and its own labels out of the way.
+/// Adds the results to the frame, after moving its own labels.
 fn write_scores(frame: &mut Frame, scorer: &Scorer, gradient: bool) {
-    keep_labels(frame);
+    move_labels_to_reference(frame);
     let evaluation = &scorer.evaluation;
     frame.info.insert("energy".into(), evaluation.energy().into());
     if let Some(stress) = evaluation.stress(&frame.structure) {
@@ -138,8 +143,8 @@ fn write_scores(frame: &mut Frame, scorer: &Scorer, gradient: bool) {
     }
 }
 
-/// Renames the plain labels to `REF_`, or removes them where there are such.
-fn keep_labels(frame: &mut Frame) {
+/// Renames the plain labels to `REF_…`, or removes them if the frame has reference labels.
+fn move_labels_to_reference(frame: &mut Frame) {
     let reference = LABELS.map(|label| format!("REF_{label}"));
     let kept = reference.iter().any(|key| frame.info.contains_key(key) || frame.arrays.contains_key(key));
     for (label, reference) in LABELS.into_iter().zip(reference) {
@@ -151,14 +156,14 @@ fn keep_labels(frame: &mut Frame) {
             frame.arrays.insert(reference.clone(), column);
         }
         if let Some(value) = info {
-            // Nine numbers in a row are what MACE reads as REF_stress.
+            // MACE reads REF_stress as nine numbers in a row.
             let flat = value.numbers().filter(|numbers| numbers.len() > 1).map(Value::from);
             frame.info.insert(reference, flat.unwrap_or(value));
         }
     }
 }
 
-/// Begins the matrix of all features in NumPy's format; the number of rows is written at the end.
+/// Starts the array of features in NumPy's format; the number of rows is written at the end.
 fn feature_matrix(file: &mut WholeFile, dimension: usize) -> io::Result<NpyWriter<f64, &mut WholeFile>> {
     npyz::WriteOptions::new().default_dtype().writer(file).begin_2d(dimension as u64)
 }

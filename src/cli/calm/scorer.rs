@@ -1,4 +1,4 @@
-//! Energy, grades and their gradient for one structure after another.
+//! Computes energy, grades and their gradient for one structure after another.
 
 use std::sync::Arc;
 
@@ -7,46 +7,46 @@ use calm::neighbourhood::{Pair, PairError};
 use calm::{GradeError, Grades, Mixture, neighbourhood_average};
 use potentials::grace::{Grace, GraceModel, PullBack};
 
-/// No two nuclei come as near as this, Å: the shortest bond, of H₂, has 0.74. Programs that make labels refuse the same.
-const LEAST_DISTANCE: f64 = 0.4;
+/// Shortest accepted distance, Å; the shortest bond, that of H₂, is 0.74 Å. Label programs apply the same limit.
+const MIN_DISTANCE: f64 = 0.4;
 
-/// A model, a mixture that grades its features, and the work arrays of both.
+/// A model, a mixture that grades its features, and work arrays.
 pub struct Scorer {
     grace: Grace,
     mixture: Arc<Mixture>,
     neighbours: NeighbourList,
     cotangent: Vec<f64>,
-    /// σ, γ and component at the last structure.
+    /// σ, γ and component of the last structure.
     pub grades: Grades,
-    /// γ_nbr at the last structure, [n].
+    /// γ_nbr of the last structure, [n].
     pub gamma_nbr: Vec<f64>,
-    /// Energy and forces at the last structure.
+    /// Energy and forces of the last structure.
     pub evaluation: Evaluation,
-    /// ∂Σγ/∂r at the last structure, if it was asked for; zero otherwise.
+    /// ∂Σγ/∂r of the last structure, if requested; otherwise zero.
     pub pull_back: PullBack,
 }
 
 /// Why a structure cannot be graded.
 #[derive(Debug, thiserror::Error)]
 pub enum ScoreError {
-    /// A structure that is none.
+    /// An invalid structure.
     #[error(transparent)]
     Structure(#[from] StructureError),
-    /// An element that the model does not know.
+    /// An element that the model does not support.
     #[error(transparent)]
     Potential(#[from] PotentialError),
     /// Features that cannot be graded.
     #[error(transparent)]
     Grade(#[from] GradeError),
-    /// Bonds that do not fit the grades.
+    /// Bonds that do not match the grades.
     #[error(transparent)]
     Pair(#[from] PairError),
     /// Overlapping atoms.
     #[error("the energy is {0} eV: do atoms overlap?")]
     NotFinite(f64),
-    /// Atoms in one place, of which a model may give any energy and any grade.
+    /// Atoms so close that energy and grades of a model are arbitrary.
     #[error(
-        "atoms {0} and {1} are {2:.3} Å apart; expected at least {LEAST_DISTANCE} Å: no grade means anything here"
+        "atoms {0} and {1} are {2:.3} Å apart; expected at least {MIN_DISTANCE} Å: grades are meaningless"
     )]
     Coincident(usize, usize, f64),
 }
@@ -66,17 +66,17 @@ impl Scorer {
         }
     }
 
-    /// Features z at the last structure, [n × D].
+    /// Features z of the last structure, [n × D].
     pub fn features(&self) -> &[f64] {
         self.grace.features()
     }
 
-    /// Evaluates and grades `structure`; with `gradient` the gradient of Σγ too.
+    /// Evaluates and grades `structure`; with `gradient`, also computes the gradient of Σγ.
     pub fn score(&mut self, structure: &Structure, gradient: bool) -> Result<(), ScoreError> {
         let elements = self.grace.model().element_indices(&structure.species)?;
         self.neighbours.update(structure)?;
         let shortest = shortest_distance(structure, &self.neighbours);
-        if let Some((i, j, distance)) = shortest.filter(|(_, _, distance)| *distance < LEAST_DISTANCE) {
+        if let Some((i, j, distance)) = shortest.filter(|(_, _, distance)| *distance < MIN_DISTANCE) {
             return Err(ScoreError::Coincident(i, j, distance));
         }
         self.grace.forward(structure, &self.neighbours)?;
@@ -95,7 +95,7 @@ impl Scorer {
         Ok(())
     }
 
-    /// The directed bonds within their pair cutoffs.
+    /// Directed bonds within the pair cutoffs.
     fn pairs(&self, structure: &Structure, elements: &[usize]) -> Vec<Pair> {
         let (model, mut bonds, mut pairs) = (self.grace.model(), Vec::new(), Vec::new());
         for (i, centre) in elements.iter().enumerate() {

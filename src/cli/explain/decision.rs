@@ -1,4 +1,4 @@
-//! The decision in words.
+//! Prints the decision about a candidate.
 
 use std::io::{self, Write};
 
@@ -6,16 +6,16 @@ use calm::rules::atom_limit;
 use calm::{UpdateEnd, UpdateRule};
 
 use super::grades::block;
-use super::{SHOWN, first, line};
-use crate::output::{Table, decimals};
+use super::{SHOWN, line, shortened_list};
+use crate::output::{self, Table, decimals};
 use crate::story::{Coverage, Decided, Update};
 
 pub fn write(out: &mut dyn Write, decision: &Decided, atoms: usize) -> io::Result<()> {
     let Decided { number, round, kind, mixture_version, .. } = decision;
     let round = if *round == 0 { String::new() } else { format!(", round {round}") };
     let what = match (kind.as_str(), decision.reason.as_deref()) {
-        ("control", _) => "a frame of a control: labelled, and no mixture learns from it".to_owned(),
-        ("declined", Some(reason)) => format!("declined: {reason}, {}", why(reason)),
+        ("control", _) => "control frame: labelled, but does not update the mixture".to_owned(),
+        ("declined", Some(reason)) => format!("declined: {reason} ({})", describe(reason)),
         (kind, _) => kind.to_owned(),
     };
     line(
@@ -24,11 +24,7 @@ pub fn write(out: &mut dyn Write, decision: &Decided, atoms: usize) -> io::Resul
         &format!("number {number}{round}: {what}; mixture version {mixture_version} afterwards"),
     )?;
     if let (Some(factor), Some(threshold)) = (decision.raised_by, decision.raised_threshold) {
-        line(
-            out,
-            "",
-            &format!("many structures waited for labels: threshold raised by {factor:.3} to {threshold:.3}"),
-        )?;
+        line(out, "", &format!("long label queue: threshold multiplied by {factor:.3}, to {threshold:.3}"))?;
     }
     if let Some(update) = &decision.update {
         write_update(out, update, atoms)?;
@@ -36,13 +32,13 @@ pub fn write(out: &mut dyn Write, decision: &Decided, atoms: usize) -> io::Resul
     write_coverage(out, decision, &decision.coverage)
 }
 
-fn why(reason: &str) -> &'static str {
+fn describe(reason: &str) -> &'static str {
     match reason {
-        "covered" => "the selector's mixture does not find it new any more",
-        "duplicate" => "the very same structure was known",
-        "guard" => "atoms are too near each other",
-        "budget" => "its seed structure or the campaign had as many as it may have",
-        "backlog" => "new, but not above the raised threshold",
+        "covered" => "no longer new under the selector's mixture",
+        "duplicate" => "the same structure is already known",
+        "guard" => "atoms are too close to each other",
+        "budget" => "its seed structure or the campaign has reached its limit",
+        "backlog" => "new, but below the raised threshold",
         _ => "",
     }
 }
@@ -85,15 +81,19 @@ fn write_update(out: &mut dyn Write, update: &Update, atoms: usize) -> io::Resul
     line(
         out,
         "",
-        &format!("α = {} taken{inflated}: {}; γ_max {after} afterwards", found.alpha, end(found.ended_by)),
+        &format!(
+            "α = {} applied{inflated}: {}; γ_max {after} afterwards",
+            found.alpha,
+            describe_end(found.ended_by)
+        ),
     )?;
     let components = found.components.iter().zip(&update.component_elements);
     let components = components.map(|((element, component), symbol)| match symbol {
         Some(symbol) => format!("component {component} of {symbol}"),
-        // Of a campaign that was begun before elements were recorded.
+        // The campaign was started before elements were recorded.
         None => format!("component {component} of element {element} of the model (counted from 0)"),
     });
-    line(out, "", &format!("components changed: {}", first(components)))?;
+    line(out, "", &format!("components changed: {}", shortened_list(components)))?;
     let Some(training) = &update.training_frames else { return Ok(()) };
     let alarm = if update.forgetting_alarm == Some(true) { ": ALARM, the mixture forgets them" } else { "" };
     line(
@@ -108,26 +108,26 @@ fn write_update(out: &mut dyn Write, update: &Update, atoms: usize) -> io::Resul
     )
 }
 
-fn end(end: UpdateEnd) -> &'static str {
+fn describe_end(end: UpdateEnd) -> &'static str {
     match end {
-        UpdateEnd::MaximumBelowTarget => "it brought γ_max below the target",
-        UpdateEnd::Inflated => "no α sufficed, the inflation did",
-        UpdateEnd::InflationExhausted => "no α sufficed, and the bounded inflation did not either",
-        UpdateEnd::CountBelowLimit => "it left few enough atoms above",
+        UpdateEnd::MaximumBelowTarget => "γ_max fell below the target",
+        UpdateEnd::Inflated => "no α was sufficient, the inflation was",
+        UpdateEnd::InflationExhausted => "neither any α nor the bounded inflation was sufficient",
+        UpdateEnd::CountBelowLimit => "the number of atoms above the threshold fell below the limit",
         UpdateEnd::FallbackMaximum => {
-            "no α left few enough atoms above, this one brought γ_max below the target"
+            "no α brought the number of atoms above the threshold below the limit; this one brought γ_max below the target"
         }
-        UpdateEnd::FallbackLast => "no α sufficed, the last was taken",
+        UpdateEnd::FallbackLast => "no α was sufficient; the last one was applied",
     }
 }
 
 fn write_coverage(out: &mut dyn Write, decision: &Decided, coverage: &Coverage) -> io::Result<()> {
     if decision.reason.as_deref() == Some("covered") {
         let by = match coverage.by.as_slice() {
-            [] => "no update that its walker had not seen is near in the log".to_owned(),
+            [] => "no update unseen by its walker is near in the log".to_owned(),
             updates => format!(
-                "updates that its walker had not seen, by {}",
-                first(updates.iter().map(|named| &named.candidate))
+                "updates unseen by its walker, from {}",
+                shortened_list(updates.iter().map(|named| &named.candidate))
             ),
         };
         line(out, "covered by", &by)?;
@@ -135,24 +135,28 @@ fn write_coverage(out: &mut dyn Write, decision: &Decided, coverage: &Coverage) 
     if decision.update.is_none() {
         return Ok(());
     }
-    let looked = coverage.looked_until.map_or(String::new(), |last| format!(" (as far as decision {last})"));
+    let searched =
+        coverage.looked_until.map_or(String::new(), |last| format!(" (searched up to decision {last})"));
     if coverage.later.is_empty() {
-        let none = "no later candidate was declined as covered whose walker had not seen this update";
-        return line(out, "covered", &format!("{none}{looked}"));
+        let none = "no later candidate of a walker that had not seen this update was declined as covered";
+        return line(out, "covered", &format!("{none}{searched}"));
     }
     let count = coverage.later.len();
     line(
         out,
         "covered",
-        &format!("later candidates declined whose walkers had not seen this update: {count}{looked}"),
+        &format!(
+            "{} whose walkers had not seen this update{searched}",
+            output::count(count, "later candidate")
+        ),
     )?;
     for covered in coverage.later.iter().take(SHOWN) {
         let by = match covered.decided - covered.seen {
             1 => "by this update alone".to_owned(),
-            updates => format!("by this or others of {updates} updates"),
+            updates => format!("by one or more of {updates} updates"),
         };
         line(out, "", &format!("{} (decision {}), {by}", covered.named.candidate, covered.named.decision))?;
     }
     let more = count.saturating_sub(SHOWN);
-    if more > 0 { line(out, "", &format!("… and {more} more (--json has all)")) } else { Ok(()) }
+    if more > 0 { line(out, "", &format!("… and {more} more (use --json)")) } else { Ok(()) }
 }

@@ -1,4 +1,4 @@
-//! Grades in words: which atoms, under which mixture.
+//! Prints the grades of a candidate: which atoms, under which mixture.
 
 use std::io::{self, Write};
 
@@ -69,7 +69,7 @@ fn write_trigger(out: &mut dyn Write, trigger: &Trigger, grades: &Grades) -> io:
     triggered.iter().take(SHOWN).for_each(|atom| table.push(row(atom)));
     block(out, "", &table)?;
     let more = triggered.len().saturating_sub(SHOWN);
-    if more > 0 { line(out, "", &format!("… and {more} more atoms (--json has all)")) } else { Ok(()) }
+    if more > 0 { line(out, "", &format!("… and {more} more atoms (use --json)")) } else { Ok(()) }
 }
 
 fn row(atom: &Atom) -> Vec<String> {
@@ -86,7 +86,7 @@ fn row(atom: &Atom) -> Vec<String> {
     ]
 }
 
-/// A table with its title before the first line.
+/// A table with a title before its first line.
 pub fn block(out: &mut dyn Write, title: &str, table: &Table) -> io::Result<()> {
     let mut text = Vec::new();
     table.write(&mut text)?;

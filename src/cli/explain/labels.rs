@@ -1,4 +1,4 @@
-//! The label queue in words: what happened to each job, and what its label says.
+//! Prints the label jobs of a candidate with their attempts, and its labels.
 
 use std::io::{self, Write};
 
@@ -8,12 +8,12 @@ use super::line;
 use crate::output::count;
 use crate::story::{ForceError, LabelJob, Story, StoryLabel};
 
-/// Lines of a log that are shown, the last ones.
-const LOG: usize = 10;
+/// Lines printed from the end of a log.
+const LOG_LINES: usize = 10;
 
 pub fn write(out: &mut dyn Write, story: &Story) -> io::Result<()> {
     if story.jobs.is_empty() && story.labels.is_empty() {
-        return line(out, "label", "no label job: only what is accepted gets one");
+        return line(out, "label", "no label job: only accepted candidates and control frames get one");
     }
     story.jobs.iter().try_for_each(|job| write_job(out, job))?;
     story.labels.iter().try_for_each(|label| write_label(out, label, story.structure.atoms))
@@ -32,18 +32,18 @@ fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
     )?;
     if let (Some(holder), Some(expires)) = (holder, expires) {
         let left = (expires - unix_milliseconds()) / 1000;
-        line(out, "", &format!("held by {holder}, for {left} s more"))?;
+        line(out, "", &format!("leased by {holder}, lease expires in {left} s"))?;
     }
     if let Some(reason) = relabel {
-        line(out, "", &format!("another label was asked for: {reason}"))?;
+        line(out, "", &format!("relabelling requested: {reason}"))?;
     }
     if *overruled {
-        line(out, "", "put into the queue by hand: the labellers' guard lets it pass")?;
+        line(out, "", "queued by the user: bypasses the labellers' guard")?;
     }
     for done in &job.by_hand {
         let to = done.priority.map_or(String::new(), |priority| format!(", to {priority}"));
         let why = done.reason.as_ref().map_or(String::new(), |reason| format!(" ({reason})"));
-        line(out, "", &format!("by hand: {}{to}{why}, {} ago", done.action, since(done.time)))?;
+        line(out, "", &format!("by the user: {}{to}{why}, {} ago", done.action, elapsed_since(done.time)))?;
     }
     job.details.attempts_made.iter().try_for_each(|attempt| write_attempt(out, attempt))
 }
@@ -51,32 +51,32 @@ fn write_job(out: &mut dyn Write, job: &LabelJob) -> io::Result<()> {
 fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
     let Attempt { attempt: number, holder, started, ended, outcome, class, log, made, core_seconds, .. } =
         attempt;
-    let outcome = outcome.as_deref().unwrap_or("under way");
+    let outcome = outcome.as_deref().unwrap_or("running");
     let class = class.as_ref().map_or(String::new(), |class| format!(" ({class})"));
     let lasted = match ended {
         Some(ended) => format!("after {:.1} s", (ended - started) as f64 / 1000.0),
-        None => format!("for {}", since(*started)),
+        None => format!("for {}", elapsed_since(*started)),
     };
     let cost = core_seconds.map_or(String::new(), |seconds| {
         format!(", {seconds:.1} core-seconds on {}", count(made.cores.unwrap_or(1), "core"))
     });
     line(out, "", &format!("attempt {number}: {outcome}{class} {lasted}, by {holder}{cost}"))?;
     if let Some(remedies) = &made.remedies {
-        line(out, "", &format!("  changed after failures: {}", remedies.replace(',', ", ")))?;
+        line(out, "", &format!("  retry adjustments: {}", remedies.replace(',', ", ")))?;
     }
     let difference = made.difference.as_deref().unwrap_or_default();
     difference.lines().try_for_each(|changed| line(out, "", &format!("  {changed}")))?;
     let log: Vec<_> = log.as_deref().unwrap_or_default().lines().collect();
-    let tail = &log[log.len().saturating_sub(LOG)..];
+    let tail = &log[log.len().saturating_sub(LOG_LINES)..];
     tail.iter().try_for_each(|text| line(out, "", &format!("  | {text}")))
 }
 
 fn write_label(out: &mut dyn Write, label: &StoryLabel, atoms: usize) -> io::Result<()> {
     let StoryLabel { protocol, protocol_hash, standing, source, energy, energy_per_atom, .. } = label;
-    let standing = format!("{standing:?}").to_lowercase();
+    let status = format!("{standing:?}").to_lowercase();
     line(
         out,
-        &standing,
+        &status,
         &format!(
             "energy {energy:.6} eV ({energy_per_atom:.6} eV/atom), largest force {:.4} eV/Å",
             label.largest_force
@@ -84,10 +84,14 @@ fn write_label(out: &mut dyn Write, label: &StoryLabel, atoms: usize) -> io::Res
     )?;
     line(out, "", &format!("protocol '{protocol}' ({}), from {source}", &protocol_hash[..16]))?;
     if let Some(Exclusion { time, reason }) = &label.excluded {
-        line(out, "", &format!("excluded from exports and statistics {} ago: {reason}", since(*time)))?;
+        line(
+            out,
+            "",
+            &format!("excluded from exports and statistics {} ago: {reason}", elapsed_since(*time)),
+        )?;
     }
     if let Some(Superseded { time, reason }) = &label.superseded {
-        line(out, "", &format!("superseded {} ago: {reason}", since(*time)))?;
+        line(out, "", &format!("superseded {} ago: {reason}", elapsed_since(*time)))?;
     }
     let Some(model) = &label.model else { return Ok(()) };
     let ForceError { mean, largest, atom, .. } = model;
@@ -102,15 +106,13 @@ fn write_label(out: &mut dyn Write, label: &StoryLabel, atoms: usize) -> io::Res
     match model.energy_error_per_atom {
         Some(error) => line(out, "", &format!("E_model − E_label: {:.1} meV/atom", 1000.0 * error))?,
         None if model.energy_offsets.structures == 0 => {}
-        None => {
-            line(out, "", "E_model − E_label: not shown, since too few labels speak for this composition")?
-        }
+        None => line(out, "", "E_model − E_label: not shown, too few labels for this composition")?,
     }
     line(out, "", &model.energy_offsets.note)
 }
 
-/// How long ago it was.
-fn since(time: i64) -> String {
+/// The time since then.
+fn elapsed_since(time: i64) -> String {
     let seconds = (unix_milliseconds() - time).max(0) / 1000;
     match seconds {
         0..120 => format!("{seconds} s"),

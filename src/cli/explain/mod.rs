@@ -12,25 +12,25 @@ use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::output::{count, decimals, print, print_json};
 use crate::story::{self, Description, Distances, Found, Story};
 
-/// Columns of a line before its text.
+/// Indent of lines without a title.
 const INDENT: &str = "             ";
-/// Entries of a list that are shown.
+/// Entries of a list that are printed.
 const SHOWN: usize = 20;
 
-/// Tell the whole story of one candidate
+/// Show the full history of one candidate
 ///
-/// Which atoms made it a candidate, its grades under the walker's, the selector's and the original mixture, the decision
-/// with its rule and numbers, every α that was tried, what became of its label and what each attempt cost, how far the
-/// potential is from the label, and which later candidates it covered. Of controls and imported structures what there is.
-/// Works while the campaign runs, and on a copy.
+/// Shows the atoms that triggered it, its grades under the walker's, the selector's and the original mixture, the decision with
+/// its rule and numbers, every value of α that was tried, the attempts at its label with their costs, the error of the
+/// potential, and the later candidates that it covered. Shows the available part of this for control frames and imported
+/// structures. Works while the campaign runs and on backups.
 #[derive(Debug, clap::Args)]
 pub struct Explain {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Candidate: its name or the beginning of it (the campaign's part may be left out), the number of the decision about it,
-    /// or import-N for an imported structure
+    /// Candidate: its id or a unique prefix of it (the campaign part can be omitted), or the number of its decision; or
+    /// import-N for an imported structure
     id: String,
-    /// Print JSON (docs/explain.md), with every atom
+    /// Print JSON, with the grades of every atom (docs/explain.md)
     #[arg(long)]
     json: bool,
 }
@@ -47,7 +47,7 @@ impl Explain {
     }
 }
 
-/// All that the command prints.
+/// The output of the command.
 pub async fn text(location: Location, id: &str) -> Result<String, Failure> {
     let (mut text, story) = (Vec::new(), read(location, id).await?);
     write(&mut text, &story).map_err(Failure::failed)?;
@@ -85,26 +85,25 @@ fn write(out: &mut dyn Write, story: &Story) -> io::Result<()> {
     Ok(())
 }
 
-/// A line with its title.
+/// A line with a title.
 fn line(out: &mut dyn Write, title: &str, text: &str) -> io::Result<()> {
     writeln!(out, "{title:<12} {text}")
 }
 
-/// A list, of which only the beginning is shown.
-fn first<T: AsRef<str>>(names: impl ExactSizeIterator<Item = T>) -> String {
+/// A comma-separated list of at most [`SHOWN`] names.
+fn shortened_list<T: AsRef<str>>(names: impl ExactSizeIterator<Item = T>) -> String {
     let more = names.len().saturating_sub(SHOWN);
     let mut shown: Vec<_> = names.take(SHOWN).map(|name| name.as_ref().to_owned()).collect();
     if more > 0 {
-        shown.push(format!("… and {more} more (--json has all)"));
+        shown.push(format!("… and {more} more (use --json)"));
     }
     shown.join(", ")
 }
 
 fn write_structure(out: &mut dyn Write, structure: &Description) -> io::Result<()> {
     let Description { formula, atoms, volume, hash, .. } = structure;
-    let volume = volume.map_or(String::new(), |volume| {
-        format!(", {volume:.2} Å³ ({:.3} Å³ an atom)", volume / *atoms as f64)
-    });
+    let volume = volume
+        .map_or(String::new(), |volume| format!(", {volume:.2} Å³ ({:.3} Å³/atom)", volume / *atoms as f64));
     line(out, "structure", &format!("{formula}, {}{volume}; content {}", count(*atoms, "atom"), &hash[..16]))
 }
 
@@ -120,46 +119,54 @@ fn write_found(out: &mut dyn Write, found: &Found) -> io::Result<()> {
     )?;
     if let Some(biased) = found.control_of {
         let partner = found.partner.as_ref().map_or_else(
-            || "nothing of it was accepted at this step".to_owned(),
-            |named| format!("its candidate at this step is {}", named.candidate),
+            || "which had no accepted candidate at this step".to_owned(),
+            |named| format!("whose candidate at this step is {}", named.candidate),
         );
-        line(out, "", &format!("a control: unbiased, with the random numbers of walk {biased}; {partner}"))?;
+        line(
+            out,
+            "",
+            &format!("a control walk: unbiased, with the random numbers of walk {biased}, {partner}"),
+        )?;
     }
     let Some(walk) = &found.walk_now else { return Ok(()) };
     let reason = if walk.reason.is_empty() { String::new() } else { format!(" ({})", walk.reason) };
-    // A control gives frames of steps that are wanted: no guard refuses them, and it never goes back.
+    // Control walks report frames at requested steps: no guard rejects them, and they never roll back.
     let guard = match found.control_of {
         Some(_) => String::new(),
         None => format!(
-            "; its own guard refused {}, it went back {}",
+            "; its guard rejected {}, it rolled back {}",
             count(walk.refused, "structure"),
             count(walk.returns, "time")
         ),
     };
     let (state, step, accepted) = (walk.state.replace('_', " "), walk.step, walk.accepted);
-    line(out, "", &format!("the walk by now: {state}{reason}, step {step}, {accepted} accepted{guard}"))
+    line(
+        out,
+        "",
+        &format!("current state of the walk: {state}{reason}, step {step}, {accepted} accepted{guard}"),
+    )
 }
 
 fn write_distances(out: &mut dyn Write, distances: &Distances, control: bool) -> io::Result<()> {
     let Distances { shortest, atoms, seed_structure, least } = distances;
     let pair = atoms.map_or(String::new(), |[i, j]| format!(" (atoms {i} and {j})"));
     let found = format!("shortest distance {} Å{pair}", decimals(*shortest, 3));
-    let judged = match (control, shortest, least) {
-        (true, ..) => "; frames of controls are held to no limit".to_owned(),
+    let limit = match (control, shortest, least) {
+        (true, ..) => "; no limit for control frames".to_owned(),
         (false, Some(shortest), Some(least)) => format!(
-            ", {} {least:.3} Å, the selector's limit (seed structure {} Å)",
+            ", {} the selector's limit of {least:.3} Å (seed structure: {} Å)",
             if shortest < least { "below" } else { "at least" },
             decimals(*seed_structure, 3)
         ),
         _ => String::new(),
     };
-    line(out, "guard", &(found + &judged))
+    line(out, "guard", &(found + &limit))
 }
 
 fn write_same(out: &mut dyn Write, story: &Story) -> io::Result<()> {
     if !story.same_structure.is_empty() {
         let names = story.same_structure.iter().map(|named| &named.candidate);
-        line(out, "the same as", &first(names))?;
+        line(out, "the same as", &shortened_list(names))?;
     }
     match story.same_import {
         Some(import) => line(out, "the same as", &format!("import-{import}")),

@@ -1,11 +1,11 @@
-//! A labelled structure as a frame, with where it came from, and as a condition sees it.
+//! A labelled structure as a frame with its origin, and its quantities for filters.
 
 use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, Value};
 use store::{ExportRow, ExportSource};
 
 use crate::condition::Facts;
 
-/// What a condition is put to.
+/// The quantities of a structure for a filter.
 pub fn facts(row: &ExportRow) -> Facts<'_> {
     let largest = |grades: &[f64]| grades.iter().copied().reduce(f64::max);
     let of_label = Facts {
@@ -36,7 +36,7 @@ pub fn facts(row: &ExportRow) -> Facts<'_> {
     }
 }
 
-/// The frame of a structure of a campaign.
+/// The frame of a labelled structure.
 pub fn frame(row: ExportRow, keys: Keys, campaign: &str) -> Frame {
     let mut frame = Frame::from(row.structure);
     let label = row.label;
@@ -73,10 +73,10 @@ pub fn frame(row: ExportRow, keys: Keys, campaign: &str) -> Frame {
             info("seed_structure", seed_structure_name.into());
             info("walk", i64::from(view.id().walk.0).into());
             info("segment", i64::from(view.id().segment).into());
-            info("step", whole(view.id().step));
+            info("step", integer(view.id().step));
             info("origin", origin.name().into());
-            info("mixture_version", whole(mixture_version_after));
-            info("mixture_version_seen", whole(view.mixture_version()));
+            info("mixture_version", integer(mixture_version_after));
+            info("mixture_version_seen", integer(view.mixture_version()));
             info("relative_volume", view.relative_volume().into());
             frame.arrays.insert("gamma".to_owned(), scalars(original.gamma));
             frame.arrays.insert("gamma_nbr".to_owned(), scalars(original.gamma_nbr));
@@ -84,12 +84,12 @@ pub fn frame(row: ExportRow, keys: Keys, campaign: &str) -> Frame {
         ExportSource::Import { file, frame } => {
             info("origin", "imported".into());
             info("source_file", file.into());
-            info("source_frame", whole(frame));
+            info("source_frame", integer(frame));
         }
     }
     frame
 }
 
-fn whole(number: u64) -> Value {
+fn integer(number: u64) -> Value {
     Value::Int(i64::try_from(number).unwrap_or(i64::MAX))
 }

@@ -17,99 +17,99 @@ use crate::condition::Condition;
 use crate::output::{self, Bar, print};
 use crate::whole_file::{WholeFile, cannot_write, refuse_to_replace};
 
-/// Structures read at a time.
+/// Structures per read.
 const PAGE: u32 = 200;
 
 const BAR: &str = "{spinner} {pos} structures";
 
-/// Write the labelled structures as extended XYZ
+/// Write the labelled structures to an extended XYZ file
 ///
-/// Structures stand in the order of the decisions, whatever the order in which their labels came: the same campaign
-/// gives the same bytes. Beside the label each has campaign, candidate_id, seed_structure, walk, segment, step, origin,
-/// mixture_version (after the decision), mixture_version_seen (by the walker), protocol, protocol_hash and
-/// relative_volume (V/V₀), and the columns gamma and gamma_nbr under the ORIGINAL mixture. Imported structures have
-/// source_file and source_frame (from 0) instead. Where the calculation gives them there are energy_without_smearing (eV),
-/// the cell's magnetic moment magmom and the column magmoms (μ_B). A damaged database is not exported: everything that is
-/// read has a checksum, and what is missing is found by a second look. See docs/export.md.
+/// Structures are in the order of the decisions, whenever their labels were computed: the same campaign gives the same bytes.
+/// In addition to the label, each frame has campaign, candidate_id, seed_structure, walk, segment, step, origin,
+/// mixture_version (after the decision), mixture_version_seen (by the walker), protocol, protocol_hash and relative_volume
+/// (V/V₀), and per atom gamma and gamma_nbr under the original mixture. Imported structures have source_file and source_frame
+/// (from 0) instead. If the calculation provides them, there are also energy_without_smearing (eV), magmom (magnetic moment of
+/// the cell, μ_B) and per atom magmoms (μ_B). Fails without writing a file if the database is damaged or incomplete. See
+/// docs/export.md.
 #[derive(Debug, clap::Args)]
 pub struct Export {
     #[command(flatten)]
     location: CampaignLocation,
-    /// File to write; an existing one is replaced when all is written
+    /// File to write; an existing file is replaced once the export is complete
     #[arg(long, short, value_name = "FILE.extxyz")]
     output: PathBuf,
-    /// Names of energy, forces and stress
+    /// Names for energy, forces and stress, as the training program expects them
     #[arg(long, value_enum, default_value_t = KeyNames::Ase)]
     keys: KeyNames,
-    /// Add the frames of control walks
+    /// Include the frames of control walks
     #[arg(long)]
     control: bool,
-    /// Add the structures that were imported, behind the others
+    /// Include imported structures, after the others
     #[arg(long)]
     imported: bool,
-    /// Only structures that meet this condition, as 'gamma > 2 and element = Mo'
+    /// Export only structures that match a filter, such as 'gamma > 2 and element = Mo'
     ///
-    /// Numbers (= != < <= > >=): gamma, gamma_nbr (the largest, original mixture), volume (V/V₀), temperature (K), walk, step,
-    /// mixture_version, atoms, energy (eV, of the label), energy_per_atom, max_force (eV/Å, of the label). Texts (= !=): element (one of
-    /// the atoms is it), kind (biased, control, imported), seed (name of the seed structure, in quotes if it has spaces). With and,
-    /// or, not and parentheses.
-    #[arg(long = "where", value_name = "CONDITION")]
+    /// Combine comparisons with and, or, not and parentheses. Numbers (= != < <= > >=): gamma, gamma_nbr (largest of the
+    /// structure, original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version, atoms, energy (eV, label),
+    /// energy_per_atom (eV, label), max_force (eV/Å, label). Texts (= !=): element (any atom of the structure), kind (biased,
+    /// control or imported), seed (name of the seed structure, in quotes if it contains spaces).
+    #[arg(long = "where", value_name = "FILTER")]
     condition: Option<Condition>,
-    /// Divide into several files by seed structure, as train=0.9,test=0.1: FILE-train and FILE-test
+    /// Split into several files, such as train=0.9,test=0.1 for FILE-train and FILE-test
     ///
-    /// Everything that was found from a seed structure goes to the same file, so that no test set has its like in training;
-    /// shares are those of the seed structures. Imported structures go to the first file.
+    /// Assigns the seed structures at random to the files in these proportions. All structures found from one seed structure go
+    /// to the same file, which keeps training and test sets independent. Imported structures go to the first file.
     #[arg(long, value_name = "NAME=SHARE,…")]
     split: Option<Shares>,
-    /// Another number deals the seed structures otherwise
+    /// Random seed of the split
     #[arg(long, value_name = "NUMBER", default_value_t = 0, requires = "split")]
     split_seed: u64,
-    /// Labels of this protocol; needed if there are labels of several
+    /// Export the labels of this protocol; required if there are labels of several protocols
     #[arg(long, value_name = "NAME")]
     protocol: Option<String>,
 }
 
 #[derive(Clone, Copy, Debug, clap::ValueEnum)]
 enum KeyNames {
-    /// energy, forces, stress
+    /// ASE: energy, forces, stress
     Ase,
-    /// REF_energy, REF_forces, REF_stress
+    /// MACE: REF_energy, REF_forces, REF_stress
     Mace,
-    /// as ase, with the energy also as free_energy
+    /// gracemaker: as ase, with the energy also as free_energy
     Grace,
-    /// energy, force, virial
+    /// GAP: energy, force, virial
     Gap,
 }
 
-/// What an export came to.
+/// What a file contains.
 #[derive(Default)]
 struct Count {
     frames: u64,
     without_stress: u64,
-    /// Seed structures that they come from.
+    /// Seed structures of the frames.
     seed_structures: BTreeSet<u32>,
 }
 
-/// An export, and what is not in it.
+/// The result of an export.
 struct Exported {
-    /// Files, what they hold, and how many seed structures go there.
+    /// Files with their contents and the number of seed structures assigned to each.
     counts: Vec<(PathBuf, Count, usize)>,
     labels: store::Labels,
-    /// Structures whose labels are by other protocols.
+    /// Structures with labels of other protocols, which are not exported.
     others: u64,
 }
 
-/// A file to write, and what goes there.
+/// A file to write.
 struct Part {
     path: PathBuf,
     file: WholeFile,
     count: Count,
-    /// Seed structures that go there, whether anything was found from them or not.
-    dealt: usize,
+    /// Seed structures assigned to this file, also those without labelled structures.
+    assigned: usize,
 }
 
-/// Refuses an export that lacks structures which have their labels.
-async fn refuse_to_miss(
+/// Checks that no labelled structure is missing from the export.
+async fn check_completeness(
     store: &Store,
     filter: &ExportFilter,
     mut missing: BTreeSet<ExportPlace>,
@@ -117,7 +117,7 @@ async fn refuse_to_miss(
     if missing.is_empty() {
         return Ok(());
     }
-    // What was dropped, or labelled again, since it was counted is not missing.
+    // Structures that were dropped or relabelled since the first count are not missing.
     let now = store.labelled_places(filter).await?;
     missing.retain(|place| now.contains(place));
     let place = match missing.first() {
@@ -126,8 +126,8 @@ async fn refuse_to_miss(
         Some(ExportPlace::Import(number)) => format!("import-{number}"),
     };
     Err(Failure::Failed(format!(
-        "damaged database: {} of {} labelled structures cannot be found where they should be, the first is {place}; nothing was \
-         written: calmwalk store check says what is damaged; restore the campaign from a backup",
+        "damaged database: {} of {} labelled structures are missing, the first is {place}; nothing was written. calmwalk store \
+         check shows the damage; restore the campaign from a backup",
         missing.len(),
         now.len()
     )))
@@ -139,18 +139,18 @@ impl Export {
         for (path, count, _) in &counts {
             if matches!(self.keys, KeyNames::Grace) && (1..count.frames).contains(&count.without_stress) {
                 let (without, frames, path) = (count.without_stress, count.frames, path.display());
-                let warning = "have no stress: gracemaker will then use none of the file";
+                let warning = "have no stress: gracemaker will ignore the stress of the whole file";
                 let _ =
                     writeln!(std::io::stderr(), "{without} of the {frames} structures in {path} {warning}");
             }
         }
         print(|out| {
-            for (path, count, dealt) in &counts {
+            for (path, count, assigned) in &counts {
                 let from = if self.split.is_none() {
                     String::new()
                 } else {
                     format!(
-                        ", found from {} of the {dealt} seed structures that go there",
+                        ", from {} of the {assigned} seed structures assigned to it",
                         count.seed_structures.len()
                     )
                 };
@@ -160,22 +160,22 @@ impl Export {
                 let others = output::count(others, "structure");
                 writeln!(
                     out,
-                    "left out for their labels by other protocols, which --protocol chooses: {others}"
+                    "not exported: {others} with labels of other protocols (select with --protocol)"
                 )?;
             }
             let store::Labels { queued, leased, failed, dropped, again, failed_again, excluded, .. } = labels;
             if excluded > 0 {
-                writeln!(out, "excluded by hand and left out: {excluded} (calmwalk exclude --list)")?;
+                writeln!(out, "not exported: {excluded} with excluded labels (see calmwalk exclude --list)")?;
             }
-            // Those that are labelled again have labels.
+            // Structures that wait for a replacement label have a label.
             let (waiting, failed) =
                 ((queued + leased).saturating_sub(again), failed.saturating_sub(failed_again));
             if waiting + failed + dropped == 0 {
-                return writeln!(out, "every accepted structure is labelled");
+                return writeln!(out, "all accepted structures are labelled");
             }
             writeln!(
                 out,
-                "accepted without a label: {waiting} not labelled yet, {failed} failed, {dropped} dropped"
+                "accepted structures without a label: {waiting} not labelled yet, {failed} failed, {dropped} dropped"
             )
         })?;
         Ok(Ended::Done)
@@ -184,9 +184,9 @@ impl Export {
     async fn export(&self) -> Result<Exported, Failure> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         store.check_for_export().await?;
-        let protocol = self.choose_protocol(&store).await?;
+        let protocol = self.select_protocol(&store).await?;
         let (filter, campaign) = (self.filter(&protocol), store.campaign().await?.id.to_string());
-        let (mut parts, dealt) = self.parts(&store).await?;
+        let (mut parts, assigned) = self.parts(&store).await?;
         let mut missing = store.labelled_places(&filter).await?;
         let (mut frames, mut last, bar) = (0, None, Bar::new(None, BAR));
         loop {
@@ -203,19 +203,19 @@ impl Export {
                     ExportSource::Candidate { seed_structure, .. } => Some(*seed_structure),
                     ExportSource::Import { .. } => None,
                 };
-                let part = seed.and_then(|seed| dealt.get(&seed)).copied().unwrap_or_default();
+                let part = seed.and_then(|seed| assigned.get(&seed)).copied().unwrap_or_default();
                 parts[part].write(row, seed, self.keys.into(), &campaign)?;
             }
             bar.set(frames, String::new);
         }
-        refuse_to_miss(&store, &filter, missing).await?;
+        check_completeness(&store, &filter, missing).await?;
         if let (0, Some(condition)) = (frames, &self.condition) {
-            return Err(Failure::Input(format!("no labelled structure meets --where '{condition}'")));
+            return Err(Failure::Input(format!("no labelled structure matches --where '{condition}'")));
         }
         let mut counts = Vec::new();
-        for Part { path, file, count, dealt } in parts {
+        for Part { path, file, count, assigned } in parts {
             file.finish()?;
-            counts.push((path, count, dealt));
+            counts.push((path, count, assigned));
         }
         let labels = store.status().await?.labels;
         let jobs = store.jobs_by_protocol().await?.into_iter();
@@ -226,30 +226,30 @@ impl Export {
         Ok(Exported { counts, labels, others })
     }
 
-    /// The files to write, and which of them each seed structure goes to.
+    /// The files to write, and the index of the file of each seed structure.
     async fn parts(&self, store: &Store) -> Result<(Vec<Part>, BTreeMap<u32, usize>), Failure> {
         let Some(shares) = &self.split else {
             return Ok((vec![self.part(self.output.clone(), 0)?], BTreeMap::new()));
         };
         let seeds = store.seed_structures().await?.into_iter();
         let seeds: Vec<_> = seeds.map(|seed| (seed.index, seed.name)).collect();
-        let dealt = shares
-            .deal(&seeds, self.split_seed)
+        let assigned = shares
+            .assign(&seeds, self.split_seed)
             .map_err(|error| Failure::Input(format!("--split: {error}")))?;
         let mut parts = Vec::new();
         for (number, name) in shares.names().enumerate() {
-            let seeds = dealt.values().filter(|part| **part == number).count();
+            let seeds = assigned.values().filter(|part| **part == number).count();
             parts.push(self.part(split::path(&self.output, name), seeds)?);
         }
-        Ok((parts, dealt))
+        Ok((parts, assigned))
     }
 
-    fn part(&self, path: PathBuf, dealt: usize) -> Result<Part, Failure> {
+    fn part(&self, path: PathBuf, assigned: usize) -> Result<Part, Failure> {
         let files = [DATABASE.to_owned(), format!("{DATABASE}-wal"), LOCK.to_owned()];
         let [database, log, lock] = files.map(|name| self.location.location.join(name));
         let own = [&database, &log, &lock].map(|file| (file.as_path(), "a file of the campaign itself"));
         refuse_to_replace(&path, own)?;
-        Ok(Part { file: WholeFile::create(&path)?, path, count: Count::default(), dealt })
+        Ok(Part { file: WholeFile::create(&path)?, path, count: Count::default(), assigned })
     }
 
     fn filter(&self, protocol: &Protocol) -> ExportFilter {
@@ -257,8 +257,8 @@ impl Export {
         ExportFilter { protocol: protocol.hash, biased: true, control, imported }
     }
 
-    /// The protocol asked for, or the only one that has labels of what is exported.
-    async fn choose_protocol(&self, store: &Store) -> Result<Protocol, Failure> {
+    /// The requested protocol, or the only one with labels to export.
+    async fn select_protocol(&self, store: &Store) -> Result<Protocol, Failure> {
         let protocols = store.protocols().await?;
         let names = |protocols: &[Protocol]| {
             let names: Vec<_> = protocols.iter().map(|protocol| format!("'{}'", protocol.name)).collect();
@@ -281,7 +281,7 @@ impl Export {
             }
             ([], _) => Err(Failure::Input(self.nothing_to_export(&store.status().await?))),
             (several, _) => Err(Failure::Input(format!(
-                "there are labels of several protocols, which do not belong in one file: choose one with --protocol \
+                "there are labels of several protocols, which must not be mixed in one file: select one with --protocol \
                  ({})",
                 names(several)
             ))),
@@ -290,8 +290,11 @@ impl Export {
 
     fn nothing_to_export(&self, status: &store::Status) -> String {
         let store::Labels { queued, leased, failed, dropped, excluded, .. } = status.labels;
-        let imported =
-            if self.imported || status.imported == 0 { "" } else { "; --imported adds what was imported" };
+        let imported = if self.imported || status.imported == 0 {
+            ""
+        } else {
+            "; use --imported to export imported structures"
+        };
         format!(
             "nothing to export: no structure has a label ({} not labelled yet, {failed} failed, {dropped} \
              dropped, {excluded} excluded){imported}",

@@ -1,12 +1,12 @@
-//! Which seed structures go to which part of a data set: all structures of a seed structure, and of the controls of its walks, to
-//! one, so that nothing of a test set has been seen in training.
+//! Splits a data set by seed structure: all structures found from one, including control frames, go to the same part, so that
+//! training and test sets are independent.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-/// Sums of shares are one within this.
-const ROUNDING: f64 = 1e-9;
+/// Allowed deviation of the sum of the shares from 1.
+const TOLERANCE: f64 = 1e-9;
 
 /// `train=0.9,test=0.1`: names with their shares of the seed structures.
 #[derive(Clone, Debug, PartialEq)]
@@ -18,7 +18,7 @@ impl FromStr for Shares {
     fn from_str(text: &str) -> Result<Self, String> {
         let mut shares: Vec<(String, f64)> = Vec::new();
         for part in text.split(',') {
-            let wrong = || format!("found '{part}', expected NAME=SHARE, as train=0.9,test=0.1");
+            let wrong = || format!("found '{part}', expected NAME=SHARE, such as train=0.9,test=0.1");
             let (name, share) = part.split_once('=').ok_or_else(wrong)?;
             let (name, share) = (name.trim(), share.trim().parse::<f64>().map_err(|_| wrong())?);
             let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
@@ -26,15 +26,17 @@ impl FromStr for Shares {
                 return Err(format!("found the name '{name}', expected letters, digits, '_' and '-'"));
             }
             if !(share > 0.0 && share < 1.0) {
-                return Err(format!("found the share {share} of '{name}', expected one between 0 and 1"));
+                return Err(format!(
+                    "found the share {share} for '{name}', expected a number between 0 and 1"
+                ));
             }
             if shares.iter().any(|(other, _)| other == name) {
-                return Err(format!("'{name}' stands there twice"));
+                return Err(format!("found '{name}' twice"));
             }
             shares.push((name.to_owned(), share));
         }
         let sum: f64 = shares.iter().map(|(_, share)| share).sum();
-        if (sum - 1.0).abs() > ROUNDING {
+        if (sum - 1.0).abs() > TOLERANCE {
             return Err(format!("the shares add up to {sum}, expected 1"));
         }
         Ok(Self(shares))
@@ -47,40 +49,44 @@ impl Shares {
         self.0.iter().map(|(name, _)| name.as_str())
     }
 
-    /// The part of each seed structure. They are put into an order that follows from `seed` and their names, and cut by the
-    /// shares; each part gets one at least.
+    /// Assigns each seed structure to a part, by index. Shuffles the seed structures with a hash of `random_seed` and their
+    /// names, and divides the sequence by the shares. Each part gets at least one.
     ///
     /// # Errors
-    /// Fewer seed structures than parts.
-    pub fn deal(&self, structures: &[(u32, String)], seed: u64) -> Result<BTreeMap<u32, usize>, String> {
+    /// There are fewer seed structures than parts.
+    pub fn assign(
+        &self,
+        structures: &[(u32, String)],
+        random_seed: u64,
+    ) -> Result<BTreeMap<u32, usize>, String> {
         let (count, parts) = (structures.len(), self.0.len());
         if count < parts {
             return Err(format!(
-                "there are {parts} parts and {count} seed structures, which are not divided: a part would be empty"
+                "cannot split {count} seed structures into {parts} parts: a part would be empty"
             ));
         }
         let mut order: Vec<_> =
-            structures.iter().map(|(index, name)| (key(seed, *index, name), *index)).collect();
+            structures.iter().map(|(index, name)| (key(random_seed, *index, name), *index)).collect();
         order.sort_unstable();
-        let mut dealt = BTreeMap::new();
+        let mut assigned = BTreeMap::new();
         let (mut begin, mut share) = (0, 0.0);
         for (part, (_, own)) in self.0.iter().enumerate() {
             share += own;
             let end = (share * count as f64).round() as usize;
-            // One at least here, and for each part behind.
+            // At least one for this part and for each of the following ones.
             let end = end.clamp(begin + 1, count - (parts - part - 1));
             let end = if part + 1 == parts { count } else { end };
-            dealt.extend(order[begin..end].iter().map(|(_, index)| (*index, part)));
+            assigned.extend(order[begin..end].iter().map(|(_, index)| (*index, part)));
             begin = end;
         }
-        Ok(dealt)
+        Ok(assigned)
     }
 }
 
-fn key(seed: u64, index: u32, name: &str) -> [u8; 32] {
+fn key(random_seed: u64, index: u32, name: &str) -> [u8; 32] {
     let mut hasher = blake3::Hasher::new();
     hasher.update(b"calmwalk split 1");
-    hasher.update(&seed.to_le_bytes());
+    hasher.update(&random_seed.to_le_bytes());
     hasher.update(&index.to_le_bytes());
     hasher.update(name.as_bytes());
     *hasher.finalize().as_bytes()
@@ -107,7 +113,7 @@ mod tests {
             ("train=0.9,test=x", "found 'test=x'"),
             ("train=0.9,test=0.2", "add up to 1.1"),
             ("train=1.0", "between 0 and 1"),
-            ("a=0.5,a=0.5", "'a' stands there twice"),
+            ("a=0.5,a=0.5", "found 'a' twice"),
             ("a/b=0.5,c=0.5", "expected letters"),
         ] {
             let error = text.parse::<Shares>().unwrap_err();
@@ -122,15 +128,15 @@ mod tests {
         fn every_seed_structure_goes_to_one_part_and_no_part_is_empty(count in 3_u32..200, seed: u64) {
             let shares: Shares = "train=0.8,valid=0.15,test=0.05".parse().unwrap();
             let structures: Vec<_> = (0..count).map(|index| (index, format!("seed {index}"))).collect();
-            let dealt = shares.deal(&structures, seed).unwrap();
-            prop_assert_eq!(dealt.len(), count as usize);
+            let assigned = shares.assign(&structures, seed).unwrap();
+            prop_assert_eq!(assigned.len(), count as usize);
             for (part, share) in [0.8, 0.15, 0.05].into_iter().enumerate() {
-                let number = dealt.values().filter(|own| **own == part).count();
+                let number = assigned.values().filter(|own| **own == part).count();
                 prop_assert!(number >= 1 && (number as f64 - share * f64::from(count)).abs() <= 2.0, "{} of {}", number, count);
             }
             let mut other = structures.clone();
             other.reverse();
-            prop_assert_eq!(&shares.deal(&other, seed).unwrap(), &dealt, "whatever their order");
+            prop_assert_eq!(&shares.assign(&other, seed).unwrap(), &assigned, "independent of their order");
         }
     }
 }

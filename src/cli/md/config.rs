@@ -1,4 +1,4 @@
-//! The configuration of `calmwalk md`: one TOML file that denies unknown keys.
+//! The configuration of `calmwalk md`: a TOML file; unknown keys are errors.
 
 use std::num::{NonZeroU64, NonZeroUsize};
 use std::path::{Path, PathBuf};
@@ -12,25 +12,25 @@ use toml::Spanned;
 use crate::config::{ConfigError, Document, KnownKeys, PotentialFile, place_of_offset, read_text};
 use crate::output::warn;
 
-/// Values that stand in for keys that must be there and are wrong, so that the rest can be read.
-const STAND_INS: &str = r#"
+/// Placeholder values for invalid required keys, so that the other keys can be checked too.
+const PLACEHOLDERS: &str = r#"
 structure = "-"
 potential = { kind = "grace", file = "-" }
 dynamics = { steps = 0, temperature = 300.0, thermostat = { none = {} } }
 output = { trajectory = "-" }
 "#;
 
-/// Everything in the file. Paths to read are relative to its own directory, those to write to the working directory.
+/// The file. Input paths are relative to its directory, output paths to the working directory.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MdConfig {
-    /// Where it starts: the first frame of this file.
+    /// The dynamics starts from the first frame of this file.
     pub structure: Spanned<PathBuf>,
-    /// What drives it.
+    /// The potential.
     pub potential: PotentialFile,
-    /// How it moves.
+    /// Integration.
     pub dynamics: DynamicsSection,
-    /// What is kept of it.
+    /// Output files.
     pub output: OutputSection,
 }
 
@@ -40,16 +40,16 @@ pub struct MdConfig {
 pub struct DynamicsSection {
     /// Number of steps.
     pub steps: u64,
-    /// Of the initial velocities and of the thermostat, K.
+    /// Temperature of the initial velocities and of the thermostat, K.
     pub temperature: Positive,
-    /// fs; left out, 2 fs, or 0.5 fs with H, He, Li or Be.
+    /// Time step, fs. Default: 2 fs, or 0.5 fs with H, He, Li or Be.
     pub time_step: Option<Positive>,
-    /// Random seed of initial velocities and Langevin forces.
+    /// Random seed of the initial velocities and Langevin forces.
     #[serde(default = "one")]
     pub rng_seed: u64,
-    /// What keeps the temperature.
+    /// Thermostat.
     pub thermostat: ThermostatSection,
-    /// Skin of the neighbour list, Å; has no influence on the numbers.
+    /// Skin of the neighbour list, Å; does not affect results.
     #[serde(default = "skin")]
     pub skin: Positive,
 }
@@ -62,14 +62,14 @@ pub enum ThermostatSection {
     None {},
     /// Langevin dynamics, BAOAB.
     Langevin {
-        /// 1/fs.
+        /// Friction coefficient, 1/fs.
         friction: Positive,
     },
     /// Nosé–Hoover chain.
     NoseHoover {
-        /// fs.
+        /// Relaxation time, fs.
         relaxation_time: Positive,
-        /// Thermostats in the chain.
+        /// Number of thermostats in the chain.
         #[serde(default = "chain_length")]
         chain_length: NonZeroUsize,
     },
@@ -81,10 +81,10 @@ pub enum ThermostatSection {
 pub struct OutputSection {
     /// Extended XYZ; an existing file is overwritten.
     pub trajectory: PathBuf,
-    /// Steps from frame to frame.
+    /// Steps between frames.
     #[serde(default = "hundred")]
     pub every: NonZeroU64,
-    /// Steps from line to line on the standard error; left out, as `every`.
+    /// Steps between lines on standard error. Default: `every`.
     pub log_every: Option<NonZeroU64>,
 }
 
@@ -94,7 +94,7 @@ impl MdConfig {
         let text = read_text(path)?;
         let mut document = Document::parse(path, &text)?;
         let known = KnownKeys::new().with::<DynamicsSection>("dynamics").with::<OutputSection>("output");
-        let config = document.read(STAND_INS, &known);
+        let config = document.read(PLACEHOLDERS, &known);
         let warnings = document.check_ranges("dynamics");
         document.finish()?;
         warnings.iter().for_each(warn);
@@ -116,7 +116,7 @@ impl MdConfig {
         Ok((config, start, potential))
     }
 
-    /// The first frame of the structure file, of elements that the potential knows.
+    /// The first frame of the structure file, after a check of its elements.
     fn start(&self, potential: &dyn Potential) -> Result<Frame, String> {
         let path = self.structure.get_ref();
         let frames = read_structures(path).map_err(|error| error.to_string())?;
@@ -128,14 +128,17 @@ impl MdConfig {
             start.structure.species.iter().enumerate().find(|(_, s)| !known.contains(s))
         {
             let known: Vec<_> = known.iter().map(|species| species.symbol()).collect();
-            return Err(format!("{at}: atom {atom} is {species}; the potential knows {}", known.join(", ")));
+            return Err(format!(
+                "{at}: atom {atom} is {species}; the potential supports {}",
+                known.join(", ")
+            ));
         }
         Ok(start)
     }
 }
 
 impl DynamicsSection {
-    /// The thermostat at rest.
+    /// The thermostat in its initial state.
     pub fn thermostat(&self) -> Thermostat {
         let temperature = self.temperature.get();
         match self.thermostat {

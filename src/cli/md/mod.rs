@@ -1,4 +1,4 @@
-//! `calmwalk md`: unbiased dynamics of any supported potential.
+//! `calmwalk md`
 
 mod config;
 mod trajectory;
@@ -20,17 +20,17 @@ use crate::whole_file::refuse_to_replace;
 
 const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
 
-/// Unbiased molecular dynamics of any supported potential
+/// Run unbiased molecular dynamics with any supported potential
 ///
-/// Writes an extended XYZ trajectory with energy (eV), forces (eV/Å), stress (eV/Å³, tension positive, without its
-/// kinetic part), momenta (as ASE reads them), step, time_fs and temperature (K; 3n − 3 degrees of freedom where the
-/// momentum is conserved, 3n with Langevin). Ctrl-C or SIGTERM ends it in order, with the last step in the trajectory.
+/// Writes an extended XYZ trajectory with energy (eV), forces (eV/Å), stress (eV/Å³, tension positive, without the kinetic
+/// part), momenta (in the units of ASE), step, time_fs and temperature (K; 3n − 3 degrees of freedom if the momentum is
+/// conserved, 3n with Langevin). On Ctrl-C or SIGTERM, writes the last step and exits.
 #[derive(Debug, clap::Args)]
 pub struct Md {
     /// Configuration (TOML): structure, [potential], [dynamics], [output]; see configs/md-aluminium.toml
     #[arg(value_name = "CONFIG")]
     config: PathBuf,
-    /// Trajectory, instead of output.trajectory
+    /// Trajectory file [default: output.trajectory of the configuration]
     #[arg(long, short, value_name = "FILE.extxyz")]
     output: Option<PathBuf>,
 }
@@ -52,27 +52,27 @@ impl Md {
         })?;
         let stopping = interrupt::flag()?;
         let mut trajectory = Trajectory::create(&path)?;
-        let begun = Instant::now();
-        let watch = Watch::new(&config);
-        let followed = follow(&mut dynamics, &mut *potential, config.dynamics.steps, |dynamics| {
-            watch.see(dynamics);
+        let started = Instant::now();
+        let progress = Progress::new(&config);
+        let outcome = integrate(&mut dynamics, &mut *potential, config.dynamics.steps, |dynamics| {
+            progress.update(dynamics);
             if dynamics.state().step.is_multiple_of(config.output.every.get()) {
                 trajectory.push(dynamics)?;
             }
             Ok(!stopping.load(Ordering::Relaxed))
         });
-        drop(watch);
-        let (frames, shown) = (trajectory.frames, path.display());
-        followed.map_err(|failure| match failure {
-            Failure::Failed(message) => Failure::Failed(format!("{message}; {frames} frames are in {shown}")),
+        drop(progress);
+        let (frames, file) = (trajectory.frames, path.display());
+        outcome.map_err(|failure| match failure {
+            Failure::Failed(message) => Failure::Failed(format!("{message}; {frames} frames are in {file}")),
             other => other,
         })?;
         trajectory.push(&dynamics)?;
         print(|out| {
-            let (steps, seconds) = (dynamics.state().step, begun.elapsed().as_secs_f64());
+            let (steps, seconds) = (dynamics.state().step, started.elapsed().as_secs_f64());
             let (frames, atoms) = (trajectory.frames, dynamics.structure().len());
             let (steps, atoms, frames) = (count(steps, "step"), count(atoms, "atom"), count(frames, "frame"));
-            writeln!(out, "{steps} of {atoms} in {seconds:.1} s, {frames} in {shown}")
+            writeln!(out, "{steps} of {atoms} in {seconds:.1} s, {frames} in {file}")
         })?;
         let interrupted = dynamics.state().step < config.dynamics.steps;
         Ok(if interrupted { Ended::Interrupted } else { Ended::Done })
@@ -85,9 +85,9 @@ fn initial_state(dynamics: &DynamicsSection, structure: atoms::Structure) -> Sta
 }
 
 fn settings(dynamics: &DynamicsSection, state: &State) -> Settings {
-    let usual = default_time_step(&state.structure.species);
+    let default = default_time_step(&state.structure.species);
     Settings {
-        time_step: dynamics.time_step.map_or(usual, |time_step| time_step.get()),
+        time_step: dynamics.time_step.map_or(default, |time_step| time_step.get()),
         thermostat: dynamics.thermostat(),
         ramp: None,
         stream: Stream::new(dynamics.rng_seed, 0, 0),
@@ -95,42 +95,44 @@ fn settings(dynamics: &DynamicsSection, state: &State) -> Settings {
     }
 }
 
-/// Makes `steps` steps, or fewer if `see`, which is shown every one of them and the start, says to stop.
-fn follow(
+/// Makes `steps` steps. Calls `observe` before the first and after every step, and stops early if it returns false.
+fn integrate(
     dynamics: &mut Dynamics,
     potential: &mut dyn Potential,
     steps: u64,
-    mut see: impl FnMut(&Dynamics) -> Result<bool, Failure>,
+    mut observe: impl FnMut(&Dynamics) -> Result<bool, Failure>,
 ) -> Result<(), Failure> {
-    while see(dynamics)? && dynamics.state().step < steps {
+    while observe(dynamics)? && dynamics.state().step < steps {
         let step = dynamics.state().step + 1;
         dynamics.step(potential).map_err(|error| Failure::Failed(format!("step {step}: {error}")))?;
     }
     Ok(())
 }
 
-/// Shows how the run goes: a bar on a terminal, lines otherwise.
-struct Watch {
+/// Reports progress: with a bar on a terminal, otherwise with lines.
+struct Progress {
     every: u64,
     bar: Option<Bar>,
 }
 
-impl Watch {
+impl Progress {
     fn new(config: &MdConfig) -> Self {
         let OutputSection { every, log_every, .. } = config.output;
         let bar = std::io::stderr().is_terminal().then(|| Bar::new(Some(config.dynamics.steps), BAR));
         if bar.is_none() {
-            say(["step", "time (ps)", "energy (eV)", "temperature (K)", "conserved (eV)"].map(str::to_owned));
+            print_row(
+                ["step", "time (ps)", "energy (eV)", "temperature (K)", "conserved (eV)"].map(str::to_owned),
+            );
         }
         Self { every: log_every.unwrap_or(every).get(), bar }
     }
 
-    fn see(&self, dynamics: &Dynamics) {
+    fn update(&self, dynamics: &Dynamics) {
         let step = dynamics.state().step;
         if let Some(bar) = &self.bar {
             bar.set(step, || format!("{:.0} K", dynamics.temperature()));
         } else if step.is_multiple_of(self.every) {
-            say([
+            print_row([
                 step.to_string(),
                 format!("{:.3}", time(dynamics) / 1000.0),
                 format!("{:.6}", dynamics.evaluation().energy()),
@@ -141,8 +143,8 @@ impl Watch {
     }
 }
 
-/// A line on the standard error; nobody has to read it.
-fn say([step, time, energy, temperature, conserved]: [String; 5]) {
+/// Prints a row to standard error, ignoring errors.
+fn print_row([step, time, energy, temperature, conserved]: [String; 5]) {
     let mut out = std::io::stderr().lock();
     let _ = writeln!(out, "{step:>10}  {time:>10}  {energy:>16}  {temperature:>15}  {conserved:>16}");
 }

@@ -10,23 +10,23 @@ use md::Dynamics;
 use crate::cli::Failure;
 use crate::whole_file::{cannot_create, cannot_write};
 
-/// A trajectory that is being written: after every frame it is a valid file.
+/// A trajectory file, valid after every frame.
 pub struct Trajectory {
     path: PathBuf,
     file: File,
-    /// Frames so far.
+    /// Number of frames written.
     pub frames: u64,
     last_step: Option<u64>,
 }
 
 impl Trajectory {
-    /// Begins it, in the place of a file that may be there.
+    /// Creates the file; an existing one is replaced.
     pub fn create(path: &Path) -> Result<Self, Failure> {
         let file = File::create(path).map_err(|error| cannot_create(path, error))?;
         Ok(Self { path: path.to_owned(), file, frames: 0, last_step: None })
     }
 
-    /// Adds where the dynamics stand, unless that is the last frame already.
+    /// Appends the current step, unless it is already the last frame.
     pub fn push(&mut self, dynamics: &Dynamics) -> Result<(), Failure> {
         let step = dynamics.state().step;
         if self.last_step != Some(step) {
@@ -46,7 +46,8 @@ fn frame(dynamics: &Dynamics) -> Frame {
         forces: Some(evaluation.forces.clone()),
         stress: evaluation.stress(&state.structure),
     };
-    // ASE has momenta in u Å per its own unit of time, Å √(u/eV): one fs is √(acceleration of 1 u by 1 eV/Å) of it.
+    // The unit of momentum of ASE is u Å per Å √(u/eV); 1 fs is √ACCELERATION of this unit of time, with the acceleration of 1
+    // u by 1 eV/Å.
     let unit = ACCELERATION.sqrt();
     let momenta = state.velocities.iter().zip(dynamics.masses());
     let momenta: Vec<_> = momenta.map(|(v, mass)| v.map(|v| mass * v / unit)).collect();

@@ -7,16 +7,16 @@ use store::{Location, Store};
 
 use crate::outcome::Failure;
 
-/// Writes the packed directories of a candidate's calculations into a directory, one file an attempt. Returns what was
-/// written, each with the names of the files that were too large to be kept.
-pub async fn write(location: &Location, id: &str, into: &Path) -> Result<Vec<(PathBuf, String)>, Failure> {
+/// Writes the archived calculation directories of a candidate to `output`, one file per attempt. Returns the paths, each with
+/// the names of the files that were too large to archive.
+pub async fn write(location: &Location, id: &str, output: &Path) -> Result<Vec<(PathBuf, String)>, Failure> {
     let store = Store::open_read_only(location).await?;
     let job = store.queue_show(id).await?.job;
     let failed = |path: &Path, error| Failure::Failed(format!("cannot write {}: {error}", path.display()));
-    fs::create_dir_all(into).map_err(|error| failed(into, error))?;
+    fs::create_dir_all(output).map_err(|error| failed(output, error))?;
     let mut written = Vec::new();
     for archive in store.archives(job.job).await? {
-        let path = into.join(format!("{}-{}.tar.zst", job.candidate, archive.attempt));
+        let path = output.join(format!("{}-{}.tar.zst", job.candidate, archive.attempt));
         fs::write(&path, &archive.bytes).map_err(|error| failed(&path, error))?;
         written.push((path, archive.left_out));
     }

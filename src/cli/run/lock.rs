@@ -1,4 +1,4 @@
-//! The right to run a campaign: locks that another process may have for a while yet.
+//! The locks of a campaign, which ensure that one process runs it. Waits while another process holds them.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -7,62 +7,62 @@ use store::{CampaignLock, Location, StoreError};
 
 use crate::output::say;
 
-/// Who takes the locks, as others are told.
-const WHO: &str = "calmwalk run";
-/// Between two tries to take a lock that another process has.
-const NEXT_TRY: Duration = Duration::from_secs(1);
+/// The name of the lock holder in messages of other processes.
+const HOLDER: &str = "calmwalk run";
+/// Between two attempts to acquire a lock.
+const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Takes the directory's lock. A campaign that is on a server may have its directory on a network file system, some of
-/// which lock nothing: the server's lock is what counts there.
+/// Acquires the lock of the directory. With the store on a server, the directory may be on a network file system without locks;
+/// the lock of the server decides there.
 pub async fn directory(
     directory: &Path,
     location: &Location,
-    patience: Duration,
+    timeout: Duration,
 ) -> Result<Option<CampaignLock>, StoreError> {
-    let acquire = async || CampaignLock::acquire(directory, WHO);
+    let acquire = async || CampaignLock::acquire(directory, HOLDER);
     match location {
         Location::Directory(_) => {
             store::check_directory(directory)?;
-            patiently(patience, acquire).await.map(Some)
+            retry_until(timeout, acquire).await.map(Some)
         }
-        Location::Server(_) => match patiently(patience, acquire).await {
+        Location::Server(_) => match retry_until(timeout, acquire).await {
             Err(StoreError::File { .. }) => Ok(None),
             acquired => acquired.map(Some),
         },
     }
 }
 
-/// On a server the directory's lock is not enough: the campaign may be run from another host.
-pub async fn server(location: &Location, patience: Duration) -> Result<Option<CampaignLock>, StoreError> {
+/// Acquires the lock on the server: the lock of the directory does not exclude runs on other hosts.
+pub async fn server(location: &Location, timeout: Duration) -> Result<Option<CampaignLock>, StoreError> {
     match location {
         Location::Server(_) => {
-            patiently(patience, async || CampaignLock::acquire_at(location, WHO).await).await.map(Some)
+            retry_until(timeout, async || CampaignLock::acquire_at(location, HOLDER).await).await.map(Some)
         }
         Location::Directory(_) => Ok(None),
     }
 }
 
-/// Tries to take a lock until it is free, or for so long.
-async fn patiently(
-    patience: Duration,
+/// Tries to acquire a lock until it is free, for at most `timeout`.
+async fn retry_until(
+    timeout: Duration,
     mut acquire: impl AsyncFnMut() -> Result<CampaignLock, StoreError>,
 ) -> Result<CampaignLock, StoreError> {
-    let begun = Instant::now();
+    let started = Instant::now();
     let mut waiting = false;
     loop {
         match acquire().await {
-            Err(error @ StoreError::Locked { .. }) if begun.elapsed() < patience => {
+            Err(error @ StoreError::Locked { .. }) if started.elapsed() < timeout => {
                 if !std::mem::replace(&mut waiting, true) {
                     say(format_args!("waiting: {error}"));
                 }
-                tokio::time::sleep(NEXT_TRY).await;
+                tokio::time::sleep(RETRY_INTERVAL).await;
             }
             acquired => return acquired,
         }
     }
 }
 
-/// Waits until another process has the lock.
+/// Returns when the lock is lost to another process.
 pub async fn lost(lock: Option<&CampaignLock>) -> StoreError {
     match lock {
         Some(lock) => lock.lost().await,

@@ -1,18 +1,18 @@
-//! The state of a campaign as JSON: see docs/status.md.
+//! The JSON output of `calmwalk status` (docs/status.md).
 
 use serde_json::{Value, json};
 
 use super::Snapshot;
-use super::jobs::Jobs;
+use super::batch_jobs::BatchJobs;
 use crate::ends::Ends;
 
-/// Goes up when a key is taken away or comes to mean something else.
+/// Incremented when a key is removed or changes its meaning.
 pub const VERSION: u32 = 1;
 
-/// One object.
-pub fn of(snapshot: &Snapshot, jobs: &Jobs) -> serde_json::Result<Value> {
-    let Snapshot { campaign, origin, standing, values, disk, labels, end } = snapshot;
-    let mut json = serde_json::to_value(standing)?;
+/// The JSON object.
+pub fn to_json(snapshot: &Snapshot, jobs: &BatchJobs) -> serde_json::Result<Value> {
+    let Snapshot { campaign, origin, status, mixture, disk, labels, end } = snapshot;
+    let mut json = serde_json::to_value(status)?;
     json["version"] = VERSION.into();
     json["campaign"] = campaign.id.to_string().into();
     json["name"] = json!(origin.as_ref().map(|origin| &origin.name));
@@ -20,13 +20,13 @@ pub fn of(snapshot: &Snapshot, jobs: &Jobs) -> serde_json::Result<Value> {
         json!({ "path": origin.file.path, "blake3": origin.file.blake3, "began_with": origin.began_with })
     }));
     json["mode"] = campaign.mode.clone().into();
-    json["training_frames"] = values.training_frames();
-    json["staleness"] = values.staleness();
+    json["training_frames"] = mixture.training_frames();
+    json["staleness"] = mixture.staleness();
     json["disk"] = serde_json::to_value(disk)?;
-    json["disk"]["at_the_end"] = json!(disk.at_the_end(standing));
-    json["ends"] = json!(Ends::of(&standing.walks));
+    json["disk"]["at_the_end"] = json!(disk.at_the_end(status));
+    json["ends"] = json!(Ends::of(&status.walks));
     json["expected_end"] = json!(end);
-    labels.add_to(&mut json, standing);
+    labels.add_to(&mut json, status);
     jobs.add_to(&mut json);
     Ok(json)
 }

@@ -1,58 +1,58 @@
-//! How much of a campaign is shown, and how it is laid out.
+//! Layout of `calmwalk status`: how much is shown, and how wide.
 
 use std::io::{self, IsTerminal, Write};
 
 use crate::output::Table;
 
-/// Columns of titles.
+/// Width of titles, columns.
 const TITLE: usize = 12;
-/// Columns of a terminal, and of what other programs read.
+/// Width of the output on a terminal, and otherwise.
 const WIDTHS: [usize; 2] = [80, usize::MAX];
-/// Lines of a screen.
+/// Height of a screen, lines.
 const HEIGHT: usize = 40;
-/// Lines of a table besides its rows.
+/// Lines of a table without its rows.
 const FRAME: usize = 3;
-/// Classes of failures, and parts of the collected space without labels, that are shown on a screen.
+/// Failure classes, and groups of structures without labels, shown on a screen.
 const FEW: usize = 2;
 
-/// What is shown.
+/// Limits of the output.
 #[derive(Clone, Copy, Debug)]
 pub struct Page {
-    /// Most walks.
+    /// Maximum number of walks.
     pub walks: usize,
-    /// Most processes, or jobs.
+    /// Maximum number of processes, and of jobs.
     pub others: usize,
-    /// Most of what stands above them in lines of its own.
+    /// Maximum number of lines of each list above the tables.
     pub few: usize,
-    /// Longer lines are broken, or cut if they are those of a table.
+    /// Longer lines are wrapped; rows of a table are cut.
     pub width: usize,
 }
 
 impl Page {
-    /// Everything; as wide as a terminal if the standard output is one.
-    pub fn of_all() -> Self {
+    /// No limits, except for the width of a terminal.
+    pub fn unlimited() -> Self {
         let (is_screen, all) = (io::stdout().is_terminal(), usize::MAX);
         Self { walks: all, others: all, few: all, width: WIDTHS[usize::from(!is_screen)] }
     }
 
-    /// Few things of a kind.
+    /// Limits for the lists above the tables; [`Page::fitted`] sets those of the tables.
     pub fn screen(self) -> Self {
         Self { walks: 0, others: 0, few: FEW, ..self }
     }
 
-    /// Whether nothing is left out.
-    pub fn has_all(&self) -> bool {
+    /// Whether everything is shown.
+    pub fn is_unlimited(&self) -> bool {
         self.few == usize::MAX
     }
 
-    /// With as many rows as have room below so many lines, in so many tables; `walks` if that many were asked for.
+    /// Limits that let `tables` tables fit on the screen below `lines` lines. `walks` overrides the number of walks.
     pub fn fitted(self, lines: usize, tables: usize, walks: Option<usize>) -> Self {
         let rows = HEIGHT.saturating_sub(lines + tables * FRAME) / tables;
-        let rows = if self.has_all() { usize::MAX } else { rows.max(FEW) };
+        let rows = if self.is_unlimited() { usize::MAX } else { rows.max(FEW) };
         Self { walks: walks.unwrap_or(rows), others: rows, ..self }
     }
 
-    /// Words behind a title, and below each other where one line does not hold them.
+    /// Writes a title and a text, wrapped to the width.
     pub fn titled(&self, out: &mut dyn Write, title: &str, text: &str) -> io::Result<()> {
         let mut line = format!("{title:<TITLE$}");
         let mut is_empty = true;
@@ -69,7 +69,7 @@ impl Page {
         writeln!(out, "{}", line.trim_end())
     }
 
-    /// A table of `shown` of so many things, behind an empty line.
+    /// Writes a table with `shown` of `of` rows, after an empty line.
     pub fn table(
         &self,
         out: &mut dyn Write,
@@ -85,13 +85,13 @@ impl Page {
             writeln!(out, "{}", cut(line, self.width))?;
         }
         if shown < of {
-            writeln!(out, "… and {} more {what}: --all shows them", of - shown)?;
+            writeln!(out, "… and {} more {what} (use --all)", of - shown)?;
         }
         Ok(())
     }
 }
 
-/// At most so many characters.
+/// Cuts a text to at most `width` characters.
 pub fn cut(text: &str, width: usize) -> String {
     if text.chars().count() <= width {
         return text.to_owned();
@@ -99,8 +99,8 @@ pub fn cut(text: &str, width: usize) -> String {
     text.chars().take(width.saturating_sub(1)).chain(['…']).collect()
 }
 
-/// A number of walks to show: `all`, or how many.
-pub fn number(text: &str) -> Result<usize, String> {
+/// Parses the number of walks to show: a number, or `all`.
+pub fn parse_walks(text: &str) -> Result<usize, String> {
     match text {
         "all" => Ok(usize::MAX),
         _ => text.parse().map_err(|_| "expected a number, or all".to_owned()),
@@ -112,15 +112,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn long_lines_go_on_below() {
-        let page = Page { width: 24, ..Page::of_all() };
+    fn long_lines_are_wrapped() {
+        let page = Page { width: 24, ..Page::unlimited() };
         let mut text = Vec::new();
         page.titled(&mut text, "labels", "1 queued, 2 leased, extraordinarily long").unwrap();
         let expected =
             "labels      1 queued, 2\n            leased,\n            extraordinarily\n            long\n";
         assert_eq!(String::from_utf8(text).unwrap(), expected);
         assert_eq!((cut("γγγγ", 3), cut("γγγ", 3)), ("γγ…".into(), "γγγ".into()));
-        assert_eq!((number("all"), number("12")), (Ok(usize::MAX), Ok(12)));
-        assert!(number("few").is_err());
+        assert_eq!((parse_walks("all"), parse_walks("12")), (Ok(usize::MAX), Ok(12)));
+        assert!(parse_walks("few").is_err());
     }
 }

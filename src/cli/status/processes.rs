@@ -5,30 +5,31 @@ use std::io::{self, Write};
 use store::{ProcessRecord, Status, this_host, unix_milliseconds};
 
 use super::page::Page;
-use crate::output::Table;
+use crate::output::{Table, count};
 
-/// What the campaign does, in words.
+/// A description of what the campaign does.
 pub fn state(status: &Status) -> String {
     let number = |kind, holds: fn(&str) -> bool| {
         let processes = status.processes.iter().filter(|process| process.kind == kind);
         processes.filter(|process| holds(&process.state)).count()
     };
-    let living = |kind| number(kind, |state| state != "gone" && !is_given_up(state));
+    let alive = |kind| number(kind, |state| state != "gone" && !is_given_up(state));
     let given_up = number(ProcessRecord::WALKER, is_given_up);
-    match (status.finished, living(ProcessRecord::ORCHESTRATOR), living(ProcessRecord::LABELLER)) {
+    match (status.finished, alive(ProcessRecord::ORCHESTRATOR), alive(ProcessRecord::LABELLER)) {
         (true, ..) => match &status.budget.used_up {
-            Some(key) => format!("finished, since {key} is used up; raised, it lets calmwalk run go on"),
+            Some(key) => format!("finished: {key} is used up (raise it and resume with calmwalk run)"),
             None => "finished".to_owned(),
         },
-        (false, 0, 0) => "not running; the same calmwalk run goes on with it".to_owned(),
+        (false, 0, 0) => "not running (resume with calmwalk run)".to_owned(),
         (false, 0, labellers) => {
-            let who =
-                if labellers == 1 { "1 labeller empties" } else { &format!("{labellers} labellers empty") };
-            format!("not running, but {who} the queue; the same calmwalk run goes on with it")
+            format!(
+                "not running, but {} at work on the queue (resume with calmwalk run)",
+                count(labellers, "labeller")
+            )
         }
         _ if given_up > 0 => {
             let all = number(ProcessRecord::WALKER, |_| true);
-            format!("running, but {given_up} of {all} walkers were given up")
+            format!("running, but {given_up} of {all} walkers failed")
         }
         _ => "running".to_owned(),
     }
@@ -38,7 +39,7 @@ fn is_given_up(state: &str) -> bool {
     state.starts_with("given up")
 }
 
-/// A line for each process; where there are many, those first that do not simply run.
+/// Writes a table of the processes; if they do not fit, those that are not running have priority.
 pub fn write(out: &mut dyn Write, processes: &[ProcessRecord], page: &Page) -> io::Result<()> {
     if processes.is_empty() {
         return Ok(());
@@ -71,30 +72,30 @@ fn line(process: &ProcessRecord, now: i64) -> Vec<String> {
     ]
 }
 
-/// Its number, which is of use on its host only.
+/// The process id, with the host if it is another one.
 fn pid(process: &ProcessRecord) -> String {
     let ProcessRecord { pid, host, .. } = process;
     if host.is_empty() || *host == this_host() { pid.to_string() } else { format!("{pid}@{host}") }
 }
 
-/// What a process said may have many lines, and bytes that a terminal obeys.
+/// The first line without control characters, which a terminal would interpret.
 fn first_line(text: &str) -> String {
     let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
     let first: String = lines.next().unwrap_or_default().chars().filter(|c| !c.is_control()).collect();
     if lines.next().is_some() { format!("{first} …") } else { first }
 }
 
-/// A time that has passed, given in ms.
+/// A past time, given by its age in ms.
 fn ago(milliseconds: i64) -> String {
-    format!("{} ago", lasting(milliseconds))
+    format!("{} ago", format_time(milliseconds))
 }
 
-/// The time since then, ms since 1970.
+/// The time since `time`, ms since 1970.
 pub fn since(time: i64) -> String {
-    lasting(unix_milliseconds() - time)
+    format_time(unix_milliseconds() - time)
 }
 
-fn lasting(milliseconds: i64) -> String {
+fn format_time(milliseconds: i64) -> String {
     let seconds = milliseconds.max(0) / 1000;
     match (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60, seconds % 60) {
         (0, 0, 0, s) => format!("{s} s"),
@@ -133,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn failures_stand_beside_those_who_failed() {
+    fn remarks_are_shown_beside_processes() {
         let mut failed = process("walker", 3, "given up");
         failed.restarts = 5;
         failed.remark = "exit code 2: cannot read\x1b[2J the mixture\n\nsecond line\n".into();
@@ -147,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn of_many_processes_those_in_trouble_are_shown() {
+    fn processes_in_trouble_have_priority() {
         let mut processes = vec![process("orchestrator", None, "running")];
         processes.extend((0..100).map(|number| process("walker", number, "running")));
         processes[90].state = "pausing".into();
@@ -156,28 +157,28 @@ mod tests {
             short.contains("walker 89  ") && short.contains("walker 17 ") && !short.contains("walker 18 ")
         );
         assert!(short.starts_with("\nprocess") && short.contains("orchestrator"), "{short}");
-        assert!(short.ends_with("… and 81 more processes: --all shows them\n"), "{short}");
+        assert!(short.ends_with("… and 81 more processes (use --all)\n"), "{short}");
         assert_eq!(text(&processes, true).lines().count(), 103);
     }
 
     #[test]
-    fn the_state_of_a_campaign_is_told_in_words() {
-        let told = |processes: &[ProcessRecord], finished| {
+    fn the_state_of_a_campaign_is_described() {
+        let describe = |processes: &[ProcessRecord], finished| {
             state(&Status { processes: processes.to_vec(), finished, ..Status::default() })
         };
         let run = process("orchestrator", None, "running");
         let lost = process("orchestrator", None, "gone");
         let (walker, labeller) = (process("walker", 0, "running"), process("labeller", 0, "running"));
         let given_up = process("walker", 1, "given up");
-        assert_eq!(told(&[run.clone(), walker.clone(), labeller.clone()], false), "running");
-        let some = told(&[run.clone(), walker, given_up.clone()], false);
-        assert_eq!(some, "running, but 1 of 2 walkers were given up");
-        assert_eq!(told(&[lost.clone(), given_up.clone()], false), told(&[], false));
-        assert!(told(&[], false).starts_with("not running; the same"));
+        assert_eq!(describe(&[run.clone(), walker.clone(), labeller.clone()], false), "running");
+        let some = describe(&[run.clone(), walker, given_up.clone()], false);
+        assert_eq!(some, "running, but 1 of 2 walkers failed");
+        assert_eq!(describe(&[lost.clone(), given_up.clone()], false), describe(&[], false));
+        assert_eq!(describe(&[], false), "not running (resume with calmwalk run)");
         assert!(
-            told(&[lost, given_up, labeller], false)
-                .starts_with("not running, but 1 labeller empties the queue;")
+            describe(&[lost, given_up, labeller], false)
+                .starts_with("not running, but 1 labeller at work on the queue")
         );
-        assert_eq!(told(&[run], true), "finished");
+        assert_eq!(describe(&[run], true), "finished");
     }
 }

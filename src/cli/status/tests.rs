@@ -1,4 +1,4 @@
-//! Whether everything has room on a screen, and whether docs/status.md says what is so.
+//! Checks that the output fits a screen, and that docs/status.md describes the JSON output.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -14,7 +14,7 @@ use wire::CampaignId;
 use super::*;
 use crate::bill::{Bill, CoreHours};
 
-/// A campaign in which there is something of everything, and much of what there may be much of.
+/// A large campaign with a value for every field.
 pub fn large() -> Snapshot {
     let staleness = json!({ "counts": { "0": 900_000, "3": 100_000 }, "largest": 3 });
     let training = json!({
@@ -57,8 +57,8 @@ pub fn large() -> Snapshot {
             "",
             Path::new("/scratch"),
         )),
-        standing: standing(),
-        values: Values(values.map(|(name, value)| (name.to_owned(), value.to_string())).into()),
+        status: status(),
+        mixture: MixtureSummary(values.map(|(name, value)| (name.to_owned(), value.to_string())).into()),
         disk: Disk {
             bytes: 123_456_789_012,
             forecast: Some(Forecast {
@@ -68,14 +68,14 @@ pub fn large() -> Snapshot {
                 most_structures: 200_000,
             }),
         },
-        labels: LabelsSoFar {
+        labels: LabelSummary {
             bill,
             failures: ["not_converged", "out_of_memory", "implausible"].map(failure).into(),
             unlabelled: vec![unlabelled],
             by_protocol: Vec::new(),
             shared: Some(12),
         },
-        end: End {
+        end: ExpectedEnd {
             walks_hours: Some(12.0),
             labels_hours: Some(30.1),
             budget_hours: Some(100.0),
@@ -84,7 +84,7 @@ pub fn large() -> Snapshot {
     }
 }
 
-fn standing() -> Standing {
+fn status() -> CampaignStatus {
     let walk = |number: u32| WalkStatus {
         walk: number,
         seed_structure: format!("a-long-name-of-a-seed-structure-{number}"),
@@ -113,7 +113,7 @@ fn standing() -> Standing {
     };
     let declined =
         Declined { covered: 900_000, duplicate: 10_000, guard: 1_000, budget: 100, backlog: 10_000 };
-    Standing {
+    CampaignStatus {
         candidates: Candidates {
             seen: 1_000_000,
             accepted: 80_000,
@@ -167,30 +167,32 @@ fn job() -> (Job, Option<String>) {
 }
 
 #[test]
-fn a_large_campaign_has_room_on_a_screen() {
-    for (jobs, lines) in [(Jobs::None, 40), (Jobs::Known(vec![job(); 100]), 45)] {
-        let page = Page { width: 80, ..Page::of_all().screen() };
+fn the_status_of_a_large_campaign_fits_a_screen() {
+    for (jobs, lines) in [(BatchJobs::None, 40), (BatchJobs::Known(vec![job(); 100]), 45)] {
+        let page = Page { width: 80, ..Page::unlimited().screen() };
         let mut text = Vec::new();
         large().write(&mut text, &jobs, page, None).unwrap();
         let text = String::from_utf8(text).unwrap();
         let widest = text.lines().map(|line| line.chars().count()).max();
         assert!(text.lines().count() <= lines && widest <= Some(80), "{text}");
-        for words in ["the oldest for", "512 made in the last hour", "123456.7 steps/s", "expected in 30 h"] {
+        for words in
+            ["oldest for", "512 computed in the last hour", "123456.7 steps/s", "expected within 30 h"]
+        {
             assert!(text.contains(words), "{words}: {text}");
         }
     }
 }
 
 #[test]
-fn all_walks_are_shown_to_who_asks_for_them() {
+fn all_walks_are_shown_on_request() {
     let mut text = Vec::new();
-    large().write(&mut text, &Jobs::None, Page::of_all().screen(), Some(usize::MAX)).unwrap();
+    large().write(&mut text, &BatchJobs::None, Page::unlimited().screen(), Some(usize::MAX)).unwrap();
     let text = String::from_utf8(text).unwrap();
     assert!(text.contains("a-long-name-of-a-seed-structure-999") && !text.contains("more walks"));
     assert!(text.contains("more processes"));
 }
 
-/// Names of everything in it that is no object and no list, as docs/status.md writes them.
+/// Paths of all scalar values, as docs/status.md writes them.
 fn keys(value: &Value, name: &str, keys: &mut BTreeSet<String>) {
     match value {
         Value::Object(object) => {
@@ -208,8 +210,8 @@ fn keys(value: &Value, name: &str, keys: &mut BTreeSet<String>) {
 #[test]
 fn every_key_is_documented_and_every_documented_key_is_there() {
     let mut found = BTreeSet::new();
-    for jobs in [Jobs::Known(vec![job()]), Jobs::Unknown("no answer".into())] {
-        let json = json::of(&large(), &jobs).unwrap();
+    for jobs in [BatchJobs::Known(vec![job()]), BatchJobs::Unknown("no answer".into())] {
+        let json = json::to_json(&large(), &jobs).unwrap();
         assert_eq!(json["version"], json::VERSION);
         keys(&json, "", &mut found);
     }

@@ -8,16 +8,16 @@ use store::WalkStatus;
 use super::page::{Page, cut};
 use crate::output::{Table, decimals};
 
-/// Columns of the name of a seed structure, unless everything is shown.
+/// Width of the name of a seed structure, unless everything is shown.
 pub const NAME: usize = 14;
 
-/// Titles of the columns, as [`Table::new`] has them.
+/// Titles of the columns in the format of [`Table::new`].
 pub const TITLES: [&str; 9] =
     [">walk", "seed structure", "state", ">step", ">steps/s", ">T (K)", ">V/V₀", ">γ_max", ">taken"];
 
-/// Those that advance first, the newest structures before the others; then those that began last. In order of their
-/// numbers.
-fn shown(walks: &[WalkStatus], most: usize) -> Vec<&WalkStatus> {
+/// Selects at most `most` walks, in order of their numbers: running walks with the largest γ first, then those that started
+/// last.
+fn select(walks: &[WalkStatus], most: usize) -> Vec<&WalkStatus> {
     let mut shown: Vec<_> = walks.iter().collect();
     if shown.len() > most {
         let gamma = |walk: &WalkStatus| (1e6 * walk.gamma_max.unwrap_or_default().clamp(0.0, 1e9)) as u64;
@@ -31,9 +31,9 @@ fn shown(walks: &[WalkStatus], most: usize) -> Vec<&WalkStatus> {
     shown
 }
 
-/// A line for each.
+/// Writes a table of the walks.
 pub fn write(out: &mut dyn Write, walks: &[WalkStatus], led: bool, page: &Page) -> io::Result<()> {
-    let shown = shown(walks, page.walks);
+    let shown = select(walks, page.walks);
     if shown.is_empty() {
         return Ok(());
     }
@@ -45,8 +45,8 @@ pub fn write(out: &mut dyn Write, walks: &[WalkStatus], led: bool, page: &Page) 
     page.table(out, &table, shown.len(), walks.len(), "walks")
 }
 
-/// One walk below [`TITLES`], with so many characters of the name of its seed structure; `led`: whether a process runs the
-/// campaign.
+/// The row of a walk below [`TITLES`], with at most `name` characters of the name of its seed structure. `led`: whether an
+/// orchestrator runs.
 pub fn line(walk: &WalkStatus, led: bool, name: usize) -> Vec<String> {
     let control = if walk.origin == "control" { "c: " } else { "" };
     let name = cut(&format!("{control}{}", walk.seed_structure), name);
@@ -72,23 +72,23 @@ pub fn line(walk: &WalkStatus, led: bool, name: usize) -> Vec<String> {
 mod tests {
     use super::*;
 
-    fn walk(number: u32, state: &str, gamma: f64, pace: Option<f64>) -> WalkStatus {
+    fn walk(number: u32, state: &str, gamma: f64, speed: Option<f64>) -> WalkStatus {
         WalkStatus {
             walk: number,
             state: state.into(),
             gamma_max: Some(gamma),
-            steps_per_second: pace,
+            steps_per_second: speed,
             ..WalkStatus::default()
         }
     }
 
     #[test]
-    fn of_many_walks_those_that_find_something_are_shown() {
+    fn running_walks_with_large_grades_have_priority() {
         let mut walks: Vec<_> = (0..50).map(|number| walk(number, "collected", 9.0, None)).collect();
         walks[3] = walk(3, "running", 1.2, Some(10.0));
         walks[4] = walk(4, "running", 2.5, Some(10.0));
         walks[5] = walk(5, "waiting", 3.5, None);
-        let numbers = |most| shown(&walks, most).iter().map(|walk| walk.walk).collect::<Vec<_>>();
+        let numbers = |most| select(&walks, most).iter().map(|walk| walk.walk).collect::<Vec<_>>();
         assert_eq!((numbers(1), numbers(2), numbers(3)), (vec![4], vec![3, 4], vec![3, 4, 5]));
         assert_eq!((numbers(5), numbers(usize::MAX).len()), (vec![3, 4, 5, 48, 49], 50));
     }

@@ -9,13 +9,13 @@ use crate::output::{Bar, print};
 
 const BAR: &str = "checking {bar:32} {pos}/{len} rows  {eta} left";
 
-/// Check that a campaign's store is whole
+/// Check the integrity of a campaign's store
 ///
-/// The database's own check first, then everything that calmwalk promises of it: a decision log without gaps, the decision
-/// and the job of each accepted candidate, labels that belong to their jobs, contents that have their hashes, components that
-/// can be read, directories of calculations that can be unpacked, no lease of a process that is gone; and the checksum of
-/// every row with numbers. Only reads, and a campaign may run meanwhile. Each finding is a line that says what it means and what to do; with any of them the exit code
-/// is 1.
+/// Runs the integrity check of the database, then verifies that the decision log has no gaps, each accepted candidate has a
+/// decision and a label job, labels belong to their jobs, contents match their hashes, components are readable, archived
+/// calculation directories can be unpacked, no dead process holds a lease, and every row with numbers matches its checksum.
+/// Only reads, also while the campaign runs. Prints each finding with its meaning and remedy; the exit code is 1 if there are
+/// any.
 #[derive(Debug, clap::Args)]
 pub struct Check {
     #[command(flatten)]
@@ -27,11 +27,7 @@ impl Check {
         let (findings, rows) = block_on(self.check())??;
         print(|out| {
             findings.iter().try_for_each(|finding| writeln!(out, "{finding}"))?;
-            if findings.is_empty() {
-                writeln!(out, "nothing found: {rows} rows are as they should be")
-            } else {
-                Ok(())
-            }
+            if findings.is_empty() { writeln!(out, "no problems found in {rows} rows") } else { Ok(()) }
         })?;
         match findings.len() {
             0 => Ok(Ended::Done),
@@ -49,8 +45,8 @@ impl Check {
             })
             .await?;
         match store.load_components().await {
-            Ok(components) => findings.extend(components.iter().filter_map(of_component)),
-            // That was found already.
+            Ok(components) => findings.extend(components.iter().filter_map(check_component)),
+            // Reported by the check above.
             Err(StoreError::Damaged { .. }) => {}
             Err(error) => return Err(error.into()),
         }
@@ -59,7 +55,7 @@ impl Check {
     }
 }
 
-fn of_component(record: &ComponentRecord) -> Option<Finding> {
+fn check_component(record: &ComponentRecord) -> Option<Finding> {
     let ComponentRecord { element, slot, bytes } = record;
     let error = Component::from_bytes(bytes).err()?;
     let what = format!("component {slot} of element {element} cannot be read ({error})");

@@ -7,14 +7,14 @@ use crate::cli::block_on;
 use crate::forecast::megabytes;
 use crate::output::{print, say};
 
-/// Give back the space that a campaign's store does not need
+/// Free unused space in a campaign's store
 ///
-/// The campaign must not run meanwhile. The database is written anew, which takes room for a copy of it on the disk.
+/// The campaign must not be running. Rewrites the database, which temporarily needs disk space for a copy of it.
 #[derive(Debug, clap::Args)]
 pub struct Compact {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Drop the feature vectors of declined candidates: a replay of the campaign with other rules ends where they are missing
+    /// Also delete the feature vectors of declined candidates; `calmwalk replay --set` then stops at the first of them
     #[arg(long)]
     drop_declined_features: bool,
 }
@@ -28,7 +28,7 @@ impl Compact {
 
     async fn compact(&self) -> Result<(u64, u64), Failure> {
         let location = self.location.get()?;
-        // What is not there must not be made by its lock.
+        // Fails if there is no campaign, before the lock creates files.
         Store::open_read_only(&location).await?.close().await;
         let lock = CampaignLock::acquire_at(&location, "calmwalk store compact").await?;
         let store = Store::open(&location).await?.led_by(&lock);
@@ -36,7 +36,7 @@ impl Compact {
         if self.drop_declined_features {
             let dropped = store.drop_declined_features(unix_milliseconds()).await?;
             say(format_args!(
-                "features of {dropped} declined candidates dropped: a replay with other rules ends at the first of them"
+                "deleted the features of {dropped} declined candidates: calmwalk replay --set stops at the first of them"
             ));
         }
         store.compact().await?;

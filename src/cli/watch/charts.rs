@@ -1,12 +1,12 @@
-//! Numbers behind the two small charts: how γ is distributed, and how many candidates are accepted.
+//! Data of the two charts: distribution of γ, and acceptance rate of candidates.
 
 use store::RecentDecision;
 use wire::Origin;
 
-/// Candidates over which the share that is accepted is told in numbers.
+/// Number of newest candidates for the acceptance rate.
 const LAST: usize = 100;
 
-/// What the charts show of the last candidates of biased walks.
+/// Data of the newest candidates of biased walks.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Charts {
     /// Largest γ under the original mixture, sorted.
@@ -16,8 +16,8 @@ pub struct Charts {
 }
 
 impl Charts {
-    /// Of decisions, newest first.
-    pub fn of<'a>(decisions: impl DoubleEndedIterator<Item = &'a RecentDecision>) -> Self {
+    /// Computes the data from decisions, newest first.
+    pub fn from_decisions<'a>(decisions: impl DoubleEndedIterator<Item = &'a RecentDecision>) -> Self {
         let mut charts = Self::default();
         for decision in decisions.rev() {
             let Some(found) = decision.candidate.as_ref().filter(|found| found.origin == Origin::Biased)
@@ -31,7 +31,7 @@ impl Charts {
         charts
     }
 
-    /// Candidates that it is about.
+    /// Number of candidates.
     pub fn candidates(&self) -> usize {
         self.accepted.len()
     }
@@ -41,29 +41,29 @@ impl Charts {
         Some((self.gamma.get(self.gamma.len() / 2).copied()?, self.gamma.last().copied()?))
     }
 
-    /// How many candidates have their γ in each of so many equal parts of [0, end), and the end; the last part has those beyond,
-    /// which are one in fifty at most.
-    pub fn histogram(&self, parts: usize) -> (Vec<u64>, f64) {
+    /// A histogram of γ with `bins` equal bins on [0, end), and `end`. The last bin includes larger values, at most one in
+    /// fifty.
+    pub fn histogram(&self, bins: usize) -> (Vec<u64>, f64) {
         let high = self.gamma.get(self.gamma.len() * 49 / 50);
         let end = high.map_or(2.0, |gamma| gamma.ceil().max(2.0));
-        let mut counts = vec![0; parts];
+        let mut counts = vec![0; bins];
         for gamma in &self.gamma {
-            let part = (gamma / end * parts as f64) as usize;
-            if let Some(count) = counts.get_mut(part.min(parts.saturating_sub(1))) {
+            let bin = (gamma / end * bins as f64) as usize;
+            if let Some(count) = counts.get_mut(bin.min(bins.saturating_sub(1))) {
                 *count += 1;
             }
         }
         (counts, end)
     }
 
-    /// Share that was accepted of the last hundred, or of all if there are fewer, %, and of how many.
+    /// Acceptance rate of the last hundred candidates, or of all if there are fewer, in %, and their number.
     pub fn acceptance(&self) -> Option<(f64, usize)> {
         let last = &self.accepted[self.accepted.len().saturating_sub(LAST)..];
         (!last.is_empty()).then(|| (percent(last), last.len()))
     }
 
-    /// The same of each group of so many candidates, %, oldest first, in at most `columns` groups; and the size of a group.
-    pub fn acceptances(&self, columns: usize) -> (Vec<u64>, usize) {
+    /// Acceptance rates of groups of candidates in %, oldest first, in at most `columns` groups; and the size of a group.
+    pub fn acceptance_history(&self, columns: usize) -> (Vec<u64>, usize) {
         let group = self.accepted.len().div_ceil(columns.max(1)).max(1);
         (self.accepted.chunks(group).map(|group| percent(group).round() as u64).collect(), group)
     }
@@ -105,11 +105,11 @@ mod tests {
     }
 
     #[test]
-    fn grades_are_counted_in_equal_parts_and_the_last_has_the_rest() {
+    fn grades_are_counted_in_equal_bins_and_the_last_has_the_rest() {
         let of = |gammas: &[f64]| {
             let decisions: Vec<_> =
                 gammas.iter().map(|g| decision(1, Some(*g), true, Origin::Biased)).collect();
-            Charts::of(decisions.iter())
+            Charts::from_decisions(decisions.iter())
         };
         let mut gammas = vec![0.1; 60];
         gammas.extend([1.2; 38]);
@@ -127,15 +127,18 @@ mod tests {
         let mut decisions: Vec<_> =
             (0..150).rev().map(|k| decision(k, None, k < 60 || k % 2 == 0, Origin::Biased)).collect();
         decisions.insert(0, decision(200, Some(9.0), true, Origin::Control));
-        let charts = Charts::of(decisions.iter());
+        let charts = Charts::from_decisions(decisions.iter());
         assert_eq!((charts.candidates(), charts.gamma()), (150, None));
         // Of candidates 50 to 149, ten before the change and half of ninety behind it.
         assert_eq!(charts.acceptance(), Some((55.0, 100)));
         assert_eq!(
-            charts.acceptances(15),
+            charts.acceptance_history(15),
             (vec![100, 100, 100, 100, 100, 100, 50, 50, 50, 50, 50, 50, 50, 50, 50], 10)
         );
-        assert_eq!(charts.acceptances(4).1, 38);
-        assert_eq!((Charts::default().acceptance(), Charts::default().acceptances(7)), (None, (vec![], 1)));
+        assert_eq!(charts.acceptance_history(4).1, 38);
+        assert_eq!(
+            (Charts::default().acceptance(), Charts::default().acceptance_history(7)),
+            (None, (vec![], 1))
+        );
     }
 }

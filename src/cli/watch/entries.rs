@@ -1,4 +1,4 @@
-//! Walks, label jobs and decisions as lines of their lists, and as a condition sees them.
+//! Walks, label jobs and decisions as entries of the panes, and their quantities for filters.
 
 use atoms::Species;
 use store::{DecidedCandidate, Job, JobState, RecentDecision, WalkStatus};
@@ -9,7 +9,7 @@ use crate::cli::status::walks;
 use crate::condition::{self, Condition, Facts};
 use crate::output::decimals;
 
-/// Columns of the queue; those of numbers begin with `>`, and blanks are room for what may come.
+/// Columns of the queue: `>` marks numbers, trailing blanks reserve width.
 pub const JOBS: [&str; 7] =
     ["candidate                 ", "state   ", ">priority", ">atoms", "formula  ", ">γ_max", ">tries"];
 
@@ -17,23 +17,23 @@ pub const JOBS: [&str; 7] =
 pub const DECISIONS: [&str; 8] =
     [">number", "what               ", ">walk", "seed structure", ">   step", ">T (K)", ">V/V₀", ">γ_max"];
 
-/// Names of a condition that mean nothing in a pane, by its place: of walks, of label jobs, of decisions.
-pub const NOT_KNOWN: [&[&str]; 3] = [
+/// Quantities that are not available in a pane: of walks, of label jobs, of decisions.
+pub const UNKNOWN_QUANTITIES: [&[&str]; 3] = [
     &["gamma_nbr", "mixture_version", "atoms", "energy", "energy_per_atom", "max_force", "element"],
     &["mixture_version", "energy", "energy_per_atom", "max_force"],
     &["energy", "energy_per_atom", "max_force"],
 ];
 
-/// A line for each that meets the condition; `led`: whether a process runs the campaign.
-pub fn of_walks(walks: &[WalkStatus], led: bool, filter: Option<&Condition>) -> Vec<Entry> {
-    let meets = |walk: &&WalkStatus| filter.is_none_or(|filter| filter.is_met(&facts_of_walk(walk)));
+/// The entries of walks that match the filter. `led`: whether an orchestrator runs.
+pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Condition>) -> Vec<Entry> {
+    let matches = |walk: &&WalkStatus| filter.is_none_or(|filter| filter.is_met(&facts_of_walk(walk)));
     let tone = |walk: &WalkStatus| match walk.state.as_str() {
         _ if walk.paused => Tone::Attention,
-        "running" if led => Tone::Good,
+        "running" if led => Tone::Active,
         "running" => Tone::Plain,
         "waiting" => Tone::Plain,
         "trapped" | "blew_up" | "bad_start" => Tone::Attention,
-        _ => Tone::Past,
+        _ => Tone::Ended,
     };
     let entry = |walk: &WalkStatus| Entry {
         key: walk.walk.to_string(),
@@ -41,20 +41,20 @@ pub fn of_walks(walks: &[WalkStatus], led: bool, filter: Option<&Condition>) -> 
         tone: tone(walk),
         candidate: None,
     };
-    walks.iter().filter(meets).map(entry).collect()
+    walks.iter().filter(matches).map(entry).collect()
 }
 
-/// The same of label jobs.
-pub fn of_jobs(jobs: &[Job], filter: Option<&Condition>) -> Vec<Entry> {
-    let meets = |job: &&Job| {
+/// The entries of label jobs that match the filter.
+pub fn job_entries(jobs: &[Job], filter: Option<&Condition>) -> Vec<Entry> {
+    let matches = |job: &&Job| {
         let species = condition::species(&job.formula);
         filter.is_none_or(|filter| filter.is_met(&facts_of_job(job, &species)))
     };
     let tone = |state: JobState| match state {
-        JobState::Leased | JobState::Labelled => Tone::Good,
+        JobState::Leased | JobState::Labelled => Tone::Active,
         JobState::Queued => Tone::Plain,
         JobState::Failed => Tone::Attention,
-        JobState::Dropped | JobState::Superseded => Tone::Past,
+        JobState::Dropped | JobState::Superseded => Tone::Ended,
     };
     let entry = |job: &Job| Entry {
         key: job.job.to_string(),
@@ -70,23 +70,23 @@ pub fn of_jobs(jobs: &[Job], filter: Option<&Condition>) -> Vec<Entry> {
         tone: tone(job.state),
         candidate: Some(job.candidate.clone()),
     };
-    jobs.iter().filter(meets).map(entry).collect()
+    jobs.iter().filter(matches).map(entry).collect()
 }
 
-/// The same of decisions.
-pub fn of_decisions<'a>(
+/// The entries of decisions that match the filter.
+pub fn decision_entries<'a>(
     decisions: impl Iterator<Item = &'a RecentDecision>,
     filter: Option<&Condition>,
 ) -> Vec<Entry> {
-    let meets = |decision: &&RecentDecision| {
+    let matches = |decision: &&RecentDecision| {
         let formula = decision.candidate.as_ref().map_or("", |found| &found.formula);
         let species = condition::species(formula);
         filter.is_none_or(|filter| filter.is_met(&facts_of_decision(decision, &species)))
     };
-    decisions.filter(meets).map(of_decision).collect()
+    decisions.filter(matches).map(decision_entry).collect()
 }
 
-fn of_decision(decision: &RecentDecision) -> Entry {
+fn decision_entry(decision: &RecentDecision) -> Entry {
     let RecentDecision { sequence, kind, walk, detail, candidate, .. } = decision;
     let found = candidate.as_ref();
     let number = |of: fn(&DecidedCandidate) -> Option<f64>, digits| match found {
@@ -113,15 +113,15 @@ fn of_decision(decision: &RecentDecision) -> Entry {
             number(|found| found.original_gamma, 2),
         ],
         tone: match kind.as_str() {
-            "accepted" => Tone::Good,
+            "accepted" => Tone::Active,
             "declined" | "control" => Tone::Plain,
-            _ => Tone::Past,
+            _ => Tone::Ended,
         },
         candidate: found.map(|found| found.candidate.clone()),
     }
 }
 
-/// The name of a candidate behind its campaign's part, which is the same in all.
+/// The id of a candidate without the campaign part, which is the same for all.
 pub fn without_campaign(candidate: &str) -> &str {
     candidate.split_once('-').map_or(candidate, |(_, rest)| rest)
 }

@@ -1,77 +1,77 @@
-//! What keys do.
+//! Key bindings.
 
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use store::JobState;
 
 use super::super::Ended;
-use super::entries::{NOT_KNOWN, without_campaign};
-use super::state::{Ask, DECISIONS, Message, Mode, QUEUE, State, Text, WALKS, Wanted};
+use super::entries::{UNKNOWN_QUANTITIES, without_campaign};
+use super::state::{DECISIONS, Message, Mode, Prompt, PromptKind, QUEUE, State, Text, WALKS};
 use crate::cli::queue::Action as QueueAction;
-use crate::cli::walks::{Action as WalksAction, Which};
+use crate::cli::walks::{Action as WalksAction, WalkSelection};
 use crate::condition::Condition;
 
-/// What is to be done outside.
+/// An action outside the state.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Request {
-    /// Stop watching.
-    Leave(Ended),
-    /// Look at once: something else is to be seen.
-    Look,
-    /// Read the story of a candidate.
-    Story(String),
+    /// Exit.
+    Quit(Ended),
+    /// Poll at once, because another view was selected.
+    Refresh,
+    /// Read the history of a candidate.
+    Explain(String),
     /// Change label jobs.
     Queue(QueueAction),
     /// Pause or resume walks.
     Walks(WalksAction),
 }
 
-/// The keys, as they are shown by F1.
+/// The text of F1.
 pub const HELP: &str = "\
-Tab, 1 2 3       the next pane; walks, queue, decisions
-↑ ↓, j k         choose a line; PgUp PgDn, Home End (g G)
-/                filter the pane: gamma > 2 and element = Mo (docs/export.md has the language); Esc shows all again
-Enter            the story of the candidate, as calmwalk explain tells it; of a walk: its decisions
-i                all that calmwalk status --all shows
+Tab, 1 2 3       next pane; walks, queue, decisions
+↑ ↓, j k         select a line; also PgUp PgDn, Home End (g G)
+/                filter the pane, e.g. gamma > 2 and element = Mo (syntax: docs/export.md); Esc removes the filter
+Enter            history of the candidate (calmwalk explain); of a walk: its decisions
+i                output of calmwalk status --all
 
-p, r             pause, resume the chosen walk;  P, R  all walks
-s                the queue: what waits, then what failed, what was dropped, what is labelled
-=                give the chosen structure another priority
-d                drop it;  t  try it again, if it failed or was dropped
+p, r             pause, resume the selected walk;  P, R  all walks
+s                view of the queue: waiting, failed, dropped, labelled
+=                change the priority of the selected structure
+d                drop it;  t  retry it, if it failed or was dropped
 
-q                leave, or back from a text; Ctrl-C leaves at once
+q                quit, or close a text; Ctrl-C quits at once
 
-γ_max of walks is that of their last graded step; that of the queue, of decisions and of the distribution is under the
-original mixture. What is changed here stands in the operations log, as what is changed by commands. In reproducible mode a paused
-walk holds back the others of its round.";
+γ_max of a walk is that of its last graded step; in the queue, decisions and distribution it is under the original mixture.
+Changes are recorded in the operations log, as those by commands. In reproducible mode the other walks of the same round wait for a
+paused walk.";
 
 impl State {
-    /// Obeys a key.
+    /// Handles a key.
     pub fn key(&mut self, key: KeyEvent) -> Option<Request> {
         if key.kind == KeyEventKind::Release {
             return None;
         }
         let control = key.modifiers.contains(KeyModifiers::CONTROL);
         if control && key.code == KeyCode::Char('c') {
-            return Some(Request::Leave(Ended::Interrupted));
+            return Some(Request::Quit(Ended::Interrupted));
         }
         self.message = None;
         match std::mem::take(&mut self.mode) {
-            Mode::Panes => self.in_panes(key.code),
-            Mode::Text(text) => self.in_text(text, key.code),
-            Mode::Ask(ask) => self.in_line(ask, key.code, control),
+            Mode::Panes => self.key_in_panes(key.code),
+            Mode::Text(text) => self.key_in_text(text, key.code),
+            Mode::Prompt(prompt) => self.key_in_prompt(prompt, key.code, control),
             Mode::Confirm(_, request) => match key.code {
                 KeyCode::Char('y' | 'Y') => Some(request),
                 _ => {
-                    self.message = Some(Message::Done("nothing was changed".into()));
+                    self.message = Some(Message::Success("cancelled".into()));
                     None
                 }
             },
         }
     }
 
-    fn in_panes(&mut self, code: KeyCode) -> Option<Request> {
+    fn key_in_panes(&mut self, code: KeyCode) -> Option<Request> {
         match code {
-            KeyCode::Char('q') => return Some(Request::Leave(Ended::Done)),
+            KeyCode::Char('q') => return Some(Request::Quit(Ended::Done)),
             KeyCode::Tab => self.focus = (self.focus + 1) % self.panes.len(),
             KeyCode::BackTab => self.focus = (self.focus + self.panes.len() - 1) % self.panes.len(),
             KeyCode::Char('1') => self.focus = WALKS,
@@ -81,31 +81,32 @@ impl State {
             KeyCode::Char('i') => self.show("calmwalk status --all", self.snapshot.text(usize::MAX)),
             KeyCode::Char('/') => {
                 let text = self.pane().filter.as_ref().map_or(String::new(), ToString::to_string);
-                self.mode = Mode::Ask(Ask { what: Wanted::Filter, text });
+                self.mode = Mode::Prompt(Prompt { kind: PromptKind::Filter, text });
             }
             KeyCode::Esc => self.filter(None),
             KeyCode::Enter => return self.open(),
             KeyCode::Char('p' | 'r' | 'P' | 'R') if self.focus == WALKS => return self.pause(code),
             KeyCode::Char('s') => {
                 self.focus = QUEUE;
-                self.next_jobs();
-                return Some(Request::Look);
+                self.next_view();
+                return Some(Request::Refresh);
             }
             KeyCode::Char('d' | 't' | '=') if self.focus == QUEUE => self.change(code),
-            KeyCode::Char('p' | 'r' | 'P' | 'R') => self.only_in("walks", '1'),
-            KeyCode::Char('d' | 't' | '=') => self.only_in("queue", '2'),
+            KeyCode::Char('p' | 'r' | 'P' | 'R') => self.report_wrong_pane("walks", '1'),
+            KeyCode::Char('d' | 't' | '=') => self.report_wrong_pane("queue", '2'),
             code => {
                 let page = self.pane().page();
                 if let Some(lines) = lines(code, page) {
-                    self.pane().go(lines);
+                    self.pane().move_by(lines);
                 }
             }
         }
         None
     }
 
-    fn only_in(&mut self, pane: &str, key: char) {
-        self.message = Some(Message::Failed(format!("that is for the {pane}: {key} goes there")));
+    fn report_wrong_pane(&mut self, pane: &str, key: char) {
+        self.message =
+            Some(Message::Error(format!("this key works only in the pane of the {pane}: press {key} first")));
     }
 
     fn show(&mut self, title: &str, text: String) {
@@ -114,23 +115,23 @@ impl State {
 
     fn filter(&mut self, filter: Option<Condition>) {
         self.pane().filter = filter;
-        self.arrange();
+        self.update_panes();
     }
 
-    /// Of a candidate the story, of a walk its decisions.
+    /// Opens the history of a candidate, or the decisions of a walk.
     fn open(&mut self) -> Option<Request> {
         if let Some(walk) = self.walk().filter(|_| self.focus == WALKS) {
             self.focus = DECISIONS;
-            // As somebody would write it.
+            // The same filter as if typed.
             self.filter(format!("walk = {walk}").parse().ok());
             return None;
         }
-        let Some(id) = self.pane().chosen().and_then(|entry| entry.candidate.clone()) else {
-            self.message = Some(Message::Failed("no candidate is chosen here".into()));
+        let Some(id) = self.pane().selected().and_then(|entry| entry.candidate.clone()) else {
+            self.message = Some(Message::Error("no candidate is selected".into()));
             return None;
         };
         self.mode = Mode::Text(Text { title: id.clone(), ..Text::default() });
-        Some(Request::Story(id))
+        Some(Request::Explain(id))
     }
 
     fn pause(&mut self, code: KeyCode) -> Option<Request> {
@@ -138,23 +139,23 @@ impl State {
         let pauses = matches!(code, KeyCode::Char('p' | 'P'));
         let walks: Vec<u32> = self.walk().filter(|_| !all).into_iter().collect();
         if !all && walks.is_empty() {
-            self.message = Some(Message::Failed("no walk is chosen".into()));
+            self.message = Some(Message::Error("no walk is selected".into()));
             return None;
         }
-        let which = Which { walks, all };
-        let action = if pauses { WalksAction::Pause(which) } else { WalksAction::Resume(which) };
+        let selection = WalkSelection { walks, all };
+        let action = if pauses { WalksAction::Pause(selection) } else { WalksAction::Resume(selection) };
         let request = Request::Walks(action);
         if !all {
             return Some(request);
         }
         let what = if pauses { "pause" } else { "resume" };
-        self.mode = Mode::Confirm(format!("{what} every walk that has more steps to make?"), request);
+        self.mode = Mode::Confirm(format!("{what} all walks that have not ended?"), request);
         None
     }
 
     fn change(&mut self, code: KeyCode) {
         let Some(job) = self.job() else {
-            self.message = Some(Message::Failed("no structure is chosen".into()));
+            self.message = Some(Message::Error("no structure is selected".into()));
             return;
         };
         let (id, state, priority) = (job.candidate.clone(), job.state, job.priority);
@@ -162,96 +163,98 @@ impl State {
         let is_over = matches!(state, JobState::Failed | JobState::Dropped);
         self.mode = match code {
             KeyCode::Char('d') => Mode::Confirm(
-                format!("drop {short} ({state})? It will not be labelled, and not exported"),
+                format!("drop {short} ({state})? It will not be labelled or exported"),
                 Request::Queue(QueueAction::Drop { ids: vec![id] }),
             ),
-            KeyCode::Char('=') => Mode::Ask(Ask { what: Wanted::Priority(id), text: priority.to_string() }),
+            KeyCode::Char('=') => {
+                Mode::Prompt(Prompt { kind: PromptKind::Priority(id), text: priority.to_string() })
+            }
             _ if is_over => Mode::Confirm(
-                format!("put {short} ({state}) back into the queue?"),
+                format!("queue {short} ({state}) again?"),
                 Request::Queue(QueueAction::Retry { ids: vec![id] }),
             ),
             _ => {
                 let message = format!(
-                    "{short} is {state}: only what failed or was dropped is tried again (s shows it)"
+                    "{short} is {state}: only failed or dropped structures can be retried (press s to show them)"
                 );
-                self.message = Some(Message::Failed(message));
+                self.message = Some(Message::Error(message));
                 Mode::Panes
             }
         };
     }
 
-    fn in_text(&mut self, mut text: Text, code: KeyCode) -> Option<Request> {
+    fn key_in_text(&mut self, mut text: Text, code: KeyCode) -> Option<Request> {
         if matches!(code, KeyCode::Char('q') | KeyCode::Esc | KeyCode::Enter) {
             return None;
         }
         if let Some(lines) = lines(code, text.rows.max(1) as isize) {
-            // Drawing sees to it that the last lines stay at the bottom.
+            // Limited to the end of the text when drawn.
             text.top = text.top.saturating_add_signed(lines);
         }
         self.mode = Mode::Text(text);
         None
     }
 
-    fn in_line(&mut self, mut ask: Ask, code: KeyCode, control: bool) -> Option<Request> {
+    fn key_in_prompt(&mut self, mut prompt: Prompt, code: KeyCode, control: bool) -> Option<Request> {
         match code {
             KeyCode::Esc => return None,
-            KeyCode::Enter => return self.written(ask),
-            KeyCode::Backspace => drop(ask.text.pop()),
-            KeyCode::Char('u') if control => ask.text.clear(),
+            KeyCode::Enter => return self.submit(prompt),
+            KeyCode::Backspace => drop(prompt.text.pop()),
+            KeyCode::Char('u') if control => prompt.text.clear(),
             KeyCode::Char(_) if control => {}
-            KeyCode::Char(character) => ask.text.push(character),
+            KeyCode::Char(character) => prompt.text.push(character),
             _ => {}
         }
-        self.mode = Mode::Ask(ask);
+        self.mode = Mode::Prompt(prompt);
         None
     }
 
-    /// Takes in a line that is written; what is wrong with it is said, and it can be mended.
-    fn written(&mut self, ask: Ask) -> Option<Request> {
-        let text = ask.text.trim();
-        let wrong = match &ask.what {
-            Wanted::Filter if text.is_empty() => {
+    /// Applies a line of input. If it is invalid, shows the error and lets the user correct it.
+    fn submit(&mut self, prompt: Prompt) -> Option<Request> {
+        let text = prompt.text.trim();
+        let error = match &prompt.kind {
+            PromptKind::Filter if text.is_empty() => {
                 self.filter(None);
                 return None;
             }
-            Wanted::Filter => match self.condition(text) {
+            PromptKind::Filter => match self.parse_filter(text) {
                 Ok(condition) => {
                     self.filter(Some(condition));
                     return None;
                 }
-                Err(why) => why,
+                Err(error) => error,
             },
-            Wanted::Priority(id) => match text.parse() {
+            PromptKind::Priority(id) => match text.parse() {
                 Ok(priority) => {
                     return Some(Request::Queue(QueueAction::Prioritise { id: id.clone(), priority }));
                 }
-                Err(_) => format!("'{text}' is no priority: expected a whole number, higher first"),
+                Err(_) => format!("'{text}' is not a priority: expected an integer (larger values first)"),
             },
         };
-        self.message = Some(Message::Failed(wrong));
-        self.mode = Mode::Ask(ask);
+        self.message = Some(Message::Error(error));
+        self.mode = Mode::Prompt(prompt);
         None
     }
 }
 
 impl State {
-    /// The condition that a text is, if this pane knows everything that it asks for.
-    fn condition(&self, text: &str) -> Result<Condition, String> {
-        let condition: Condition = text.parse().map_err(|error| format!("no condition: {error}"))?;
-        let is_not_known = |name: &&str| NOT_KNOWN[self.focus].contains(name);
+    /// Parses a filter, and checks that the pane has its quantities.
+    fn parse_filter(&self, text: &str) -> Result<Condition, String> {
+        let condition: Condition = text.parse().map_err(|error| format!("invalid filter: {error}"))?;
+        let is_not_known = |name: &&str| UNKNOWN_QUANTITIES[self.focus].contains(name);
         match condition.names().into_iter().find(is_not_known) {
             None => Ok(condition),
             Some(name) => {
                 let pane = ["walks", "label jobs", "decisions"][self.focus];
                 Err(format!(
-                    "{name} is not known of {pane} here: use the dashboard's table, or export --where"
+                    "{name} is not available for {pane} here: use the dashboard's table or calmwalk export --where"
                 ))
             }
         }
     }
 }
 
-/// How far a key goes.
+/// The number of lines by which a key moves.
 fn lines(code: KeyCode, page: isize) -> Option<isize> {
     Some(match code {
         KeyCode::Up | KeyCode::Char('k') => -1,

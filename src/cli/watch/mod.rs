@@ -13,7 +13,6 @@ mod tests;
 
 use std::io::{self, IsTerminal};
 use std::thread;
-use std::time::Duration;
 
 use ratatui::crossterm::event::{self, Event};
 use store::Location;
@@ -23,24 +22,25 @@ use tokio::task::JoinSet;
 
 use self::draw::Theme;
 use self::keys::Request;
-use self::reader::{Looks, Reader};
+use self::reader::{Poller, Reader};
 use self::screen::Screen;
 use self::state::State;
-use super::{CampaignLocation, Ended, Failure, block_on, explain, queue, walks};
+use super::{CampaignLocation, Ended, Failure, block_on, duration_between, explain, queue, walks};
+use crate::duration::Duration;
 
-/// Watch a campaign live in the terminal
+/// Monitor and control a campaign in the terminal
 ///
-/// Walks, label queue and recent decisions, which can be filtered, with the distribution of γ and the share of candidates that are
-/// accepted. Enter tells the story of a candidate; structures in the queue are dropped, tried again and given other
-/// priorities, walks are paused and resumed. F1 or ? shows the keys (docs/watch.md). Works while the campaign runs and after it ended,
-/// also on a copy, and disturbs nobody. No colours where NO_COLOR is set.
+/// Shows walks, label queue and recent decisions with filters, the distribution of γ and the acceptance rate of candidates.
+/// Press Enter for the history of a candidate. Keys drop, retry and prioritise structures in the queue, and pause and resume
+/// walks; F1 or ? lists them (docs/watch.md). Works on running and finished campaigns and on backups, and does not block a run.
+/// Set NO_COLOR for output without colours.
 #[derive(Debug, clap::Args)]
 pub struct Watch {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Time between two looks, s
-    #[arg(long, value_name = "SECONDS", default_value_t = 2.0, value_parser = seconds)]
-    every: f64,
+    /// Refresh interval, such as 500ms
+    #[arg(long, value_name = "TIME", default_value_t = Duration::from_seconds(2), value_parser = duration_between("200ms", "1h"))]
+    every: Duration,
 }
 
 impl Watch {
@@ -48,44 +48,44 @@ impl Watch {
         let location = self.location.get()?;
         if !io::stdout().is_terminal() {
             return Err(Failure::Input(
-                "watch draws on a terminal, and the standard output is none: calmwalk status shows a campaign once, \
-                 calmwalk status --json for other programs"
+                "standard output is not a terminal: use calmwalk status, or calmwalk status --json for other programs"
                     .into(),
             ));
         }
-        block_on(watch(location, Duration::from_secs_f64(self.every)))?
+        block_on(watch(location, self.every.get()))?
     }
 }
 
-/// Looks, draws and obeys until somebody leaves.
-async fn watch(location: Location, every: Duration) -> Result<Ended, Failure> {
+/// Polls, draws and handles keys until the user quits.
+async fn watch(location: Location, interval: std::time::Duration) -> Result<Ended, Failure> {
     let mut reader = Reader::new(location.clone());
-    // What is wrong with it is said on the terminal as it was.
-    let mut state = State::new(reader.look(state::Jobs::default()).await?);
+    // Before the screen opens, so that an error is printed normally.
+    let mut state = State::new(reader.poll(state::JobView::default()).await?);
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
     let mut hangup = signal(SignalKind::hangup()).map_err(Failure::failed)?;
-    let theme = Theme::of_environment();
+    let theme = Theme::from_environment();
     let mut screen = Screen::open()?;
-    let (mut looks, mut events, mut orders) = (Looks::begin(reader, every), events(), JoinSet::new());
+    let (mut poller, mut events, mut requests) =
+        (Poller::start(reader, interval), terminal_events(), JoinSet::new());
     loop {
         screen.draw(|frame| draw::draw(frame, &mut state, &theme))?;
         let request = tokio::select! {
             event = events.recv() => match event {
                 Some(Event::Key(key)) => state.key(key),
                 Some(_) => None,
-                None => return Err(Failure::Failed("the terminal is gone".into())),
+                None => return Err(Failure::Failed("the terminal was closed".into())),
             },
-            seen = looks.next() => match seen {
-                Some(seen) => {
-                    state.take_in(seen);
+            reading = poller.next() => match reading {
+                Some(reading) => {
+                    state.apply(reading);
                     None
                 }
-                None => return Err(Failure::Failed("reading the campaign has ended unexpectedly".into())),
+                None => return Err(Failure::Failed("the task that reads the campaign ended unexpectedly".into())),
             },
-            Some(done) = orders.join_next() => {
-                state.done(done.map_err(Failure::failed)?);
-                looks.now(state.which);
+            Some(completed) = requests.join_next() => {
+                state.complete(completed.map_err(Failure::failed)?);
+                poller.poll_now(state.view);
                 None
             }
             _ = interrupt.recv() => return Ok(Ended::Interrupted),
@@ -94,58 +94,53 @@ async fn watch(location: Location, every: Duration) -> Result<Ended, Failure> {
         };
         match request {
             None => {}
-            Some(Request::Leave(ended)) => return Ok(ended),
-            Some(Request::Look) => looks.now(state.which),
-            Some(request) => drop(orders.spawn(carry_out(location.clone(), request))),
+            Some(Request::Quit(ended)) => return Ok(ended),
+            Some(Request::Refresh) => poller.poll_now(state.view),
+            Some(request) => drop(requests.spawn(perform(location.clone(), request))),
         }
     }
 }
 
-/// What came of something that was asked for.
+/// The result of a request, as text.
 #[derive(Debug, PartialEq)]
-pub enum Done {
-    /// The story of a candidate, or why there is none.
-    Story(String, Result<String, String>),
-    /// What was changed, in words, or why it was not.
+pub enum Completed {
+    /// The id of a candidate, and its history or an error.
+    Explain(String, Result<String, String>),
+    /// What was changed, or an error.
     Change(Result<String, String>),
 }
 
-/// Does as the commands of the same names do.
-async fn carry_out(location: Location, request: Request) -> Done {
-    let said = |failure: Failure| failure.to_string();
+/// Does what the commands of the same names do.
+async fn perform(location: Location, request: Request) -> Completed {
+    let message = |failure: Failure| failure.to_string();
     match request {
-        Request::Story(id) => {
-            let story = explain::text(location, &id).await.map_err(said);
-            Done::Story(id, story)
+        Request::Explain(id) => {
+            let history = explain::text(location, &id).await.map_err(message);
+            Completed::Explain(id, history)
         }
         Request::Queue(action) => {
             let mut changed = Vec::new();
-            let ended = queue::change(&location, &action, &mut changed).await.map_err(said);
-            let outcomes = changed.iter().map(|job| queue::outcome(&action, job));
-            Done::Change(ended.map(|()| outcomes.collect::<Vec<_>>().join("; ")))
+            let result = queue::change(&location, &action, &mut changed).await.map_err(message);
+            let messages = changed.iter().map(|job| queue::message(&action, job));
+            Completed::Change(result.map(|()| messages.collect::<Vec<_>>().join("; ")))
         }
         Request::Walks(action) => {
-            let done = walks::change(&location, &action).await.map_err(said);
-            Done::Change(done.map(|lines| lines.join("; ")))
+            let messages = walks::change(&location, &action).await.map_err(message);
+            Completed::Change(messages.map(|lines| lines.join("; ")))
         }
-        Request::Leave(_) | Request::Look => Done::Change(Ok(String::new())),
+        Request::Quit(_) | Request::Refresh => Completed::Change(Ok(String::new())),
     }
 }
 
-/// What happens at the terminal, from a thread that waits for it; it ends with the process.
-fn events() -> mpsc::Receiver<Event> {
-    let (send, events) = mpsc::channel(64);
+/// Events of the terminal, read by a thread that ends with the process.
+fn terminal_events() -> mpsc::Receiver<Event> {
+    let (sender, events) = mpsc::channel(64);
     thread::spawn(move || {
         while let Ok(event) = event::read() {
-            if send.blocking_send(event).is_err() {
+            if sender.blocking_send(event).is_err() {
                 return;
             }
         }
     });
     events
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    let seconds = text.parse().ok().filter(|seconds| (0.2..=3600.0).contains(seconds));
-    seconds.ok_or_else(|| "expected 0.2 to 3600".to_owned())
 }

@@ -1,91 +1,90 @@
-//! A list of which a part is seen, and one entry is chosen.
+//! A scrollable list with a selected entry.
 
 use std::ops::Range;
 
 use crate::condition::Condition;
 
-/// How a line is shown where there are colours. Its words say the same.
+/// The colour of a line. Its text carries the same information.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Tone {
-    /// Nothing special.
+    /// Default.
     #[default]
     Plain,
-    /// Accepted, at work.
-    Good,
-    /// Failed, paused.
+    /// Accepted or running.
+    Active,
+    /// Failed or paused.
     Attention,
-    /// Over.
-    Past,
+    /// Ended.
+    Ended,
 }
 
 /// A line of a list.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Entry {
-    /// Tells it from all others of its list, also at later looks.
+    /// Identifies the entry in its list, also after later polls.
     pub key: String,
-    /// Its columns.
+    /// Columns.
     pub columns: Vec<String>,
-    /// How it is shown.
+    /// Colour.
     pub tone: Tone,
-    /// Name of the candidate that it is about.
+    /// Id of the candidate, if the entry is about one.
     pub candidate: Option<String>,
 }
 
 /// The list.
 #[derive(Debug, Default)]
 pub struct Pane {
-    /// Those that meet the condition.
+    /// Entries that match the filter.
     pub entries: Vec<Entry>,
-    /// How many there are with those that do not.
+    /// Number of entries without the filter.
     pub all: usize,
-    /// Only those that meet it are shown.
+    /// Filter.
     pub filter: Option<Condition>,
-    /// The chosen entry and where it was seen last; none: the first, whichever that is.
-    chosen: Option<(String, usize)>,
-    /// First line that is seen.
+    /// Key and last index of the selected entry. `None` selects the first, whichever that is.
+    selected: Option<(String, usize)>,
+    /// First visible line.
     top: usize,
-    /// Lines that are seen.
+    /// Number of visible lines.
     rows: usize,
 }
 
 impl Pane {
-    /// Shows these, out of `all`.
-    pub fn show(&mut self, entries: Vec<Entry>, all: usize) {
+    /// Replaces the entries; `all` is their number without the filter.
+    pub fn set_entries(&mut self, entries: Vec<Entry>, all: usize) {
         (self.entries, self.all) = (entries, all);
-        if let Some((key, at)) = &mut self.chosen
+        if let Some((key, at)) = &mut self.selected
             && let Some(found) = self.entries.iter().position(|entry| entry.key == *key)
         {
             *at = found;
         }
     }
 
-    /// Place of the chosen entry.
-    pub fn at(&self) -> usize {
-        let at = self.chosen.as_ref().map_or(0, |(_, at)| *at);
+    /// Index of the selected entry.
+    pub fn index(&self) -> usize {
+        let at = self.selected.as_ref().map_or(0, |(_, at)| *at);
         at.min(self.entries.len().saturating_sub(1))
     }
 
-    /// The chosen entry.
-    pub fn chosen(&self) -> Option<&Entry> {
-        self.entries.get(self.at())
+    /// The selected entry.
+    pub fn selected(&self) -> Option<&Entry> {
+        self.entries.get(self.index())
     }
 
-    /// Chooses the entry so many lines below; where there is none, the last or the first. Whoever chooses the first sees what
-    /// comes before it.
-    pub fn go(&mut self, lines: isize) {
-        let at = self.at().saturating_add_signed(lines).min(self.entries.len().saturating_sub(1));
-        self.chosen = self.entries.get(at).filter(|_| at > 0).map(|entry| (entry.key.clone(), at));
+    /// Moves the selection down by `lines`, within the list. On the first entry, the selection follows new first entries.
+    pub fn move_by(&mut self, lines: isize) {
+        let at = self.index().saturating_add_signed(lines).min(self.entries.len().saturating_sub(1));
+        self.selected = self.entries.get(at).filter(|_| at > 0).map(|entry| (entry.key.clone(), at));
     }
 
-    /// So many lines are seen at once.
+    /// Height of a page, lines.
     pub fn page(&self) -> isize {
         self.rows.max(1) as isize
     }
 
-    /// The lines that are seen where there is room for so many: the chosen one is among them.
-    pub fn seen(&mut self, rows: usize) -> Range<usize> {
+    /// The range of visible entries for this number of rows; it contains the selected one.
+    pub fn visible(&mut self, rows: usize) -> Range<usize> {
         self.rows = rows;
-        let at = self.at();
+        let at = self.index();
         self.top = self.top.min(at).max((at + 1).saturating_sub(rows));
         self.top = self.top.min(self.entries.len().saturating_sub(rows));
         self.top..self.entries.len().min(self.top + rows)
@@ -100,38 +99,38 @@ mod tests {
         keys.into_iter().map(|key| Entry { key: key.to_string(), ..Entry::default() }).collect()
     }
 
-    /// What is chosen, and what is seen.
-    fn looked(pane: &mut Pane, rows: usize) -> (Option<u32>, Range<usize>) {
-        let chosen = pane.chosen().and_then(|entry| entry.key.parse().ok());
-        (chosen, pane.seen(rows))
+    /// The selected entry and the visible range.
+    fn view(pane: &mut Pane, rows: usize) -> (Option<u32>, Range<usize>) {
+        let selected = pane.selected().and_then(|entry| entry.key.parse().ok());
+        (selected, pane.visible(rows))
     }
 
     #[test]
-    fn a_chosen_entry_stays_chosen_when_others_come_before_it() {
+    fn a_selected_entry_stays_selected_when_others_come_before_it() {
         let mut pane = Pane::default();
-        assert_eq!(looked(&mut pane, 3), (None, 0..0));
-        pane.go(5);
-        pane.show(entries((0..10).rev()), 10);
-        assert_eq!(looked(&mut pane, 4), (Some(9), 0..4));
-        // Whoever looks at the newest sees the newest.
-        pane.show(entries((0..12).rev()), 12);
-        assert_eq!(looked(&mut pane, 4).0, Some(11));
-        pane.go(2);
-        assert_eq!(looked(&mut pane, 4), (Some(9), 0..4));
-        pane.show(entries((0..20).rev()), 20);
-        assert_eq!((looked(&mut pane, 4), pane.at()), ((Some(9), 7..11), 10));
-        pane.go(isize::MIN);
-        assert_eq!(looked(&mut pane, 4), (Some(19), 0..4));
-        pane.go(isize::MAX);
-        assert_eq!(looked(&mut pane, 4), (Some(0), 16..20));
-        // One that is gone leaves its place to the next.
-        pane.go(-10);
-        pane.show(entries((0..20).rev().filter(|key| *key != 10)), 19);
-        assert_eq!(looked(&mut pane, 4).0, Some(9));
-        // A larger terminal is filled.
-        pane.go(isize::MAX);
-        assert_eq!(pane.seen(4), 15..19);
-        assert_eq!(pane.seen(40), 0..19);
+        assert_eq!(view(&mut pane, 3), (None, 0..0));
+        pane.move_by(5);
+        pane.set_entries(entries((0..10).rev()), 10);
+        assert_eq!(view(&mut pane, 4), (Some(9), 0..4));
+        // On the first entry, the selection follows the newest.
+        pane.set_entries(entries((0..12).rev()), 12);
+        assert_eq!(view(&mut pane, 4).0, Some(11));
+        pane.move_by(2);
+        assert_eq!(view(&mut pane, 4), (Some(9), 0..4));
+        pane.set_entries(entries((0..20).rev()), 20);
+        assert_eq!((view(&mut pane, 4), pane.index()), ((Some(9), 7..11), 10));
+        pane.move_by(isize::MIN);
+        assert_eq!(view(&mut pane, 4), (Some(19), 0..4));
+        pane.move_by(isize::MAX);
+        assert_eq!(view(&mut pane, 4), (Some(0), 16..20));
+        // If the selected entry disappears, the next one is selected.
+        pane.move_by(-10);
+        pane.set_entries(entries((0..20).rev().filter(|key| *key != 10)), 19);
+        assert_eq!(view(&mut pane, 4).0, Some(9));
+        // A larger terminal shows more entries.
+        pane.move_by(isize::MAX);
+        assert_eq!(pane.visible(4), 15..19);
+        assert_eq!(pane.visible(40), 0..19);
         assert_eq!(pane.page(), 40);
     }
 }

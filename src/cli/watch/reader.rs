@@ -1,5 +1,4 @@
-//! What is read of a campaign at each look: by the same code as `calmwalk status` and `queue` read it, in short transactions that
-//! keep nobody waiting.
+//! Polls a campaign with the code of `calmwalk status` and `queue`, in short transactions that do not block a run.
 
 use std::time::Duration;
 
@@ -7,69 +6,69 @@ use store::{Job, JobState, Location, RecentDecision, Store};
 use tokio::sync::{mpsc, watch};
 use tokio::time::timeout;
 
-use super::state::{Jobs, WINDOW};
+use super::state::{JobView, WINDOW};
 use crate::cli::status::Snapshot;
 use crate::outcome::Failure;
 
-/// Jobs of a state that are read, at most.
-const JOBS: u32 = 300;
+/// Maximum number of jobs read per state.
+const MAX_JOBS: u32 = 300;
 
-/// What was seen at one look.
+/// The result of a poll.
 #[derive(Debug)]
-pub struct Seen {
-    /// As `calmwalk status` shows it.
+pub struct Reading {
+    /// The campaign, as in `calmwalk status`.
     pub snapshot: Snapshot,
-    /// Which jobs were asked for.
-    pub which: Jobs,
-    /// The first of them, in the order in which they will be labelled.
+    /// The requested view of jobs.
+    pub view: JobView,
+    /// The first jobs of the view, in the order in which labellers take them.
     pub jobs: Vec<Job>,
-    /// Decisions since the look before, newest first.
+    /// Decisions since the last poll, newest first.
     pub decisions: Vec<RecentDecision>,
 }
 
-/// Looks at a campaign.
+/// Reads a campaign.
 pub struct Reader {
     location: Location,
-    /// A server's connections are kept. A file is opened at each look: it may be that of another campaign by then, or be written to
-    /// by a campaign that did not run before.
+    /// Connections to a server stay open. A file is opened for each poll, because it may have been replaced, or a run may have
+    /// started.
     server: Option<Store>,
     last: i64,
 }
 
 impl Reader {
-    /// Nothing is read yet.
+    /// Reads nothing yet.
     pub fn new(location: Location) -> Self {
         Self { location, server: None, last: 0 }
     }
 
-    /// Looks once.
-    pub async fn look(&mut self, which: Jobs) -> Result<Seen, Failure> {
+    /// Polls once.
+    pub async fn poll(&mut self, view: JobView) -> Result<Reading, Failure> {
         let store = match &self.server {
             Some(store) => store.clone(),
             None => Store::open_read_only(&self.location).await?,
         };
-        let seen = self.read(&store, which).await;
+        let reading = self.read(&store, view).await;
         match &self.location {
             Location::Directory(_) => store.close().await,
             Location::Server(_) => self.server = Some(store),
         }
-        seen
+        reading
     }
 
-    async fn read(&mut self, store: &Store, which: Jobs) -> Result<Seen, Failure> {
-        let snapshot = Snapshot::of(store).await?;
+    async fn read(&mut self, store: &Store, view: JobView) -> Result<Reading, Failure> {
+        let snapshot = Snapshot::read(store).await?;
         let mut jobs = Vec::new();
-        for state in which.states() {
-            jobs.extend(store.queue_list(Some(*state), JOBS, 0).await?);
+        for state in view.states() {
+            jobs.extend(store.queue_list(Some(*state), MAX_JOBS, 0).await?);
         }
         let decisions = store.newest_decisions(self.last, WINDOW as u32).await?;
         self.last = decisions.first().map_or(self.last, |newest| newest.sequence);
-        Ok(Seen { snapshot, which, jobs, decisions })
+        Ok(Reading { snapshot, view, jobs, decisions })
     }
 }
 
-impl Jobs {
-    /// Those that the pane shows together.
+impl JobView {
+    /// The states of the jobs in a view.
     fn states(self) -> &'static [JobState] {
         match self {
             Self::Waiting => &[JobState::Leased, JobState::Queued],
@@ -80,44 +79,44 @@ impl Jobs {
     }
 }
 
-/// Looks without end, from a task.
-pub struct Looks {
-    seen: mpsc::Receiver<Result<Seen, Failure>>,
-    wishes: watch::Sender<Jobs>,
+/// A task that polls at an interval.
+pub struct Poller {
+    readings: mpsc::Receiver<Result<Reading, Failure>>,
+    view: watch::Sender<JobView>,
 }
 
-impl Looks {
-    /// Begins.
-    pub fn begin(reader: Reader, every: Duration) -> Self {
-        let (wishes, wished) = watch::channel(Jobs::default());
-        let (send, seen) = mpsc::channel(1);
-        tokio::spawn(keep(reader, every, wished, send));
-        Self { seen, wishes }
+impl Poller {
+    /// Starts the task.
+    pub fn start(reader: Reader, interval: Duration) -> Self {
+        let (view, requested) = watch::channel(JobView::default());
+        let (sender, readings) = mpsc::channel(1);
+        tokio::spawn(poll_repeatedly(reader, interval, requested, sender));
+        Self { readings, view }
     }
 
-    /// What was seen at the next look; `None` if there will be no more.
-    pub async fn next(&mut self) -> Option<Result<Seen, Failure>> {
-        self.seen.recv().await
+    /// The result of the next poll; `None` if the task has ended.
+    pub async fn next(&mut self) -> Option<Result<Reading, Failure>> {
+        self.readings.recv().await
     }
 
-    /// Looks at once, and at these jobs from now on.
-    pub fn now(&self, jobs: Jobs) {
-        self.wishes.send_replace(jobs);
+    /// Polls at once, with this view from now on.
+    pub fn poll_now(&self, view: JobView) {
+        self.view.send_replace(view);
     }
 }
 
-async fn keep(
+async fn poll_repeatedly(
     mut reader: Reader,
-    every: Duration,
-    mut wished: watch::Receiver<Jobs>,
-    send: mpsc::Sender<Result<Seen, Failure>>,
+    interval: Duration,
+    mut requested: watch::Receiver<JobView>,
+    sender: mpsc::Sender<Result<Reading, Failure>>,
 ) {
     loop {
-        if let Ok(Err(_)) = timeout(every, wished.changed()).await {
+        if let Ok(Err(_)) = timeout(interval, requested.changed()).await {
             return;
         }
-        let jobs = *wished.borrow_and_update();
-        if send.send(reader.look(jobs).await).await.is_err() {
+        let view = *requested.borrow_and_update();
+        if sender.send(reader.poll(view).await).await.is_err() {
             return;
         }
     }

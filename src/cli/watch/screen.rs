@@ -1,4 +1,4 @@
-//! The terminal: taken when watching begins, and given back as it was however it ends.
+//! The terminal in raw mode on the alternate screen; restored however the program ends.
 
 use std::io::{self, Stdout, Write, stdout};
 use std::panic;
@@ -13,32 +13,32 @@ use ratatui::{Frame, Terminal};
 
 use crate::outcome::Failure;
 
-/// The terminal while something is drawn on it.
+/// The terminal while it is drawn on.
 pub struct Screen {
     terminal: Terminal<CrosstermBackend<Stdout>>,
 }
 
 impl Screen {
-    /// Takes it. Also a panic gives it back, before it says what happened.
+    /// Switches the terminal to raw mode. A panic restores it before its message is printed.
     pub fn open() -> Result<Self, Failure> {
         let report = panic::take_hook();
         panic::set_hook(Box::new(move |panic| {
-            give_back();
+            restore();
             report(panic);
         }));
-        Self::take().map_err(|error| {
-            give_back();
+        Self::enter().map_err(|error| {
+            restore();
             Failure::Failed(format!("cannot draw on this terminal: {error}"))
         })
     }
 
-    fn take() -> io::Result<Self> {
+    fn enter() -> io::Result<Self> {
         enable_raw_mode()?;
         execute!(stdout(), EnterAlternateScreen)?;
         Ok(Self { terminal: Terminal::new(CrosstermBackend::new(stdout()))? })
     }
 
-    /// Draws; only what has changed goes to the terminal.
+    /// Draws; only changes are sent to the terminal.
     pub fn draw(&mut self, draw: impl FnOnce(&mut Frame<'_>)) -> Result<(), Failure> {
         let drawn = self.terminal.draw(draw);
         drawn.map(drop).map_err(|error| Failure::Failed(format!("cannot draw on this terminal: {error}")))
@@ -47,12 +47,12 @@ impl Screen {
 
 impl Drop for Screen {
     fn drop(&mut self) {
-        give_back();
+        restore();
     }
 }
 
-/// As far as it can be: it may be gone.
-fn give_back() {
+/// Restores the terminal; ignores errors, as it may be closed.
+fn restore() {
     let _ = disable_raw_mode();
     let _ = execute!(stdout(), LeaveAlternateScreen, Show);
     let _ = stdout().flush();

@@ -1,113 +1,113 @@
-//! What there is to draw, and how it changes; knows neither terminal nor store.
+//! The state that is drawn, and how it changes; independent of terminal and store.
 
 use std::collections::VecDeque;
 
 use store::{Job, RecentDecision};
 
-use super::Done;
+use super::Completed;
 use super::charts::Charts;
 use super::entries;
 use super::keys::Request;
 use super::pane::Pane;
-use super::reader::Seen;
+use super::reader::Reading;
 use crate::cli::status::Snapshot;
 use crate::outcome::Failure;
 
-/// Decisions that are kept, the newest: charts and filters are about these.
+/// Number of newest decisions kept, for charts and filters.
 pub const WINDOW: usize = 2000;
 
-/// Places of the panes.
+/// Index of the pane of walks.
 pub const WALKS: usize = 0;
-/// See [`WALKS`].
+/// Index of the pane of label jobs.
 pub const QUEUE: usize = 1;
-/// See [`WALKS`].
+/// Index of the pane of decisions.
 pub const DECISIONS: usize = 2;
 
 /// Which label jobs are shown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Jobs {
-    /// In work, then those that wait.
+pub enum JobView {
+    /// Leased, then queued jobs.
     #[default]
     Waiting,
-    /// Given up.
+    /// Failed jobs.
     Failed,
-    /// Taken out by hand.
+    /// Jobs dropped by the user.
     Dropped,
-    /// Done.
+    /// Jobs with a label.
     Labelled,
 }
 
-/// What has the keys.
+/// What receives the keys.
 #[derive(Debug, Default)]
 pub enum Mode {
     /// The panes.
     #[default]
     Panes,
-    /// A text over all the screen.
+    /// A full-screen text.
     Text(Text),
-    /// A line that is being written.
-    Ask(Ask),
-    /// A question with yes or no.
+    /// A line of input.
+    Prompt(Prompt),
+    /// A yes-no question, and the request to send on yes.
     Confirm(String, Request),
 }
 
-/// A text that can be scrolled.
+/// A scrollable text.
 #[derive(Debug, Default)]
 pub struct Text {
-    /// What it is.
+    /// Title.
     pub title: String,
-    /// Its lines; `None` while it is read.
+    /// Content; `None` until it is read.
     pub text: Option<String>,
-    /// First line that is seen.
+    /// First visible line.
     pub top: usize,
-    /// Lines that are seen.
+    /// Number of visible lines.
     pub rows: usize,
 }
 
-/// A line that is being written.
+/// A line of input.
 #[derive(Debug)]
-pub struct Ask {
-    /// For what.
-    pub what: Wanted,
-    /// What was written so far.
+pub struct Prompt {
+    /// What the input is for.
+    pub kind: PromptKind,
+    /// The input so far.
     pub text: String,
 }
 
-/// What a line is written for.
+/// What a line of input is for.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Wanted {
-    /// A condition for the pane.
+pub enum PromptKind {
+    /// A filter of the pane.
     Filter,
-    /// A priority for the candidate.
+    /// A new priority of the candidate.
     Priority(String),
 }
 
-/// What is said in a line, until the next key.
+/// A message, shown until the next key.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Message {
-    /// That something was done.
-    Done(String),
-    /// That something could not be done.
-    Failed(String),
+    /// The result of a request.
+    Success(String),
+    /// Why a request failed.
+    Error(String),
 }
 
 /// Everything that is drawn.
 pub struct State {
-    /// As `calmwalk status` shows it.
+    /// The campaign, as in `calmwalk status`.
     pub snapshot: Snapshot,
-    /// See [`Jobs`].
-    pub which: Jobs,
+    /// Which label jobs are shown.
+    pub view: JobView,
     /// Walks, queue, decisions.
     pub panes: [Pane; 3],
-    /// The pane that has the keys.
+    /// The pane that receives the keys.
     pub focus: usize,
-    /// What has the keys.
+    /// What receives the keys.
     pub mode: Mode,
-    /// What there is to say.
+    /// The current message.
     pub message: Option<Message>,
-    /// Why the last look failed, if it did.
-    pub blind: Option<String>,
-    /// Of the decisions.
+    /// Why the last poll failed, if it did.
+    pub read_error: Option<String>,
+    /// Charts of the decisions.
     pub charts: Charts,
     jobs: Vec<Job>,
     /// Newest first.
@@ -115,100 +115,100 @@ pub struct State {
 }
 
 impl State {
-    /// After the first look.
-    pub fn new(seen: Seen) -> Self {
-        let Seen { snapshot, which, jobs, decisions } = seen;
+    /// The state after the first poll.
+    pub fn new(reading: Reading) -> Self {
+        let Reading { snapshot, view, jobs, decisions } = reading;
         let mut state = Self {
             snapshot,
-            which,
+            view,
             panes: Default::default(),
             focus: WALKS,
             mode: Mode::default(),
             message: None,
-            blind: None,
+            read_error: None,
             charts: Charts::default(),
             jobs,
             decisions: decisions.into(),
         };
-        state.arrange();
+        state.update_panes();
         state
     }
 
-    /// Takes in what was seen, or why nothing was: what was seen before stays.
-    pub fn take_in(&mut self, seen: Result<Seen, Failure>) {
-        let Seen { snapshot, which, jobs, decisions } = match seen {
-            Ok(seen) => seen,
+    /// Applies the result of a poll. On an error, the former state stays.
+    pub fn apply(&mut self, reading: Result<Reading, Failure>) {
+        let Reading { snapshot, view, jobs, decisions } = match reading {
+            Ok(reading) => reading,
             Err(failure) => {
-                self.blind = Some(failure.to_string());
+                self.read_error = Some(failure.to_string());
                 return;
             }
         };
-        self.blind = None;
+        self.read_error = None;
         self.snapshot = snapshot;
-        // Others may be wanted by now.
-        if which == self.which {
+        // The user may have selected another view meanwhile.
+        if view == self.view {
             self.jobs = jobs;
         }
         for decision in decisions.into_iter().rev() {
             self.decisions.push_front(decision);
         }
         self.decisions.truncate(WINDOW);
-        self.arrange();
+        self.update_panes();
     }
 
-    /// Takes in what came of a request.
-    pub fn done(&mut self, done: Done) {
-        match done {
-            Done::Story(id, story) => {
+    /// Applies the result of a request.
+    pub fn complete(&mut self, completed: Completed) {
+        match completed {
+            Completed::Explain(id, history) => {
                 if let Mode::Text(text) = &mut self.mode
                     && text.text.is_none()
                     && text.title == id
                 {
-                    text.text = Some(story.unwrap_or_else(|why| why));
+                    text.text = Some(history.unwrap_or_else(|error| error));
                 }
             }
-            Done::Change(Ok(done)) => self.message = Some(Message::Done(done)),
-            Done::Change(Err(why)) => self.message = Some(Message::Failed(why)),
+            Completed::Change(Ok(message)) => self.message = Some(Message::Success(message)),
+            Completed::Change(Err(error)) => self.message = Some(Message::Error(error)),
         }
     }
 
-    /// Shows the next kind of jobs, as soon as they are read.
-    pub fn next_jobs(&mut self) {
-        self.which = self.which.next();
+    /// Switches to the next view of jobs; they appear with the next poll.
+    pub fn next_view(&mut self) {
+        self.view = self.view.next();
         self.jobs.clear();
-        self.arrange();
+        self.update_panes();
     }
 
-    /// Fills the panes with what there is.
-    pub fn arrange(&mut self) {
-        let store::Status { walks, led, .. } = self.snapshot.standing();
+    /// Updates the panes and charts.
+    pub fn update_panes(&mut self) {
+        let store::Status { walks, led, .. } = self.snapshot.status();
         let [of_walks, of_queue, of_decisions] = &mut self.panes;
-        of_walks.show(entries::of_walks(walks, *led, of_walks.filter.as_ref()), walks.len());
-        of_queue.show(entries::of_jobs(&self.jobs, of_queue.filter.as_ref()), self.jobs.len());
-        let decisions = entries::of_decisions(self.decisions.iter(), of_decisions.filter.as_ref());
-        of_decisions.show(decisions, self.decisions.len());
-        self.charts = Charts::of(self.decisions.iter());
+        of_walks.set_entries(entries::walk_entries(walks, *led, of_walks.filter.as_ref()), walks.len());
+        of_queue.set_entries(entries::job_entries(&self.jobs, of_queue.filter.as_ref()), self.jobs.len());
+        let decisions = entries::decision_entries(self.decisions.iter(), of_decisions.filter.as_ref());
+        of_decisions.set_entries(decisions, self.decisions.len());
+        self.charts = Charts::from_decisions(self.decisions.iter());
     }
 
-    /// The pane that has the keys.
+    /// The pane that receives the keys.
     pub fn pane(&mut self) -> &mut Pane {
         &mut self.panes[self.focus]
     }
 
-    /// The job of the chosen line of the queue.
+    /// The selected label job.
     pub fn job(&self) -> Option<&Job> {
-        let key = &self.panes[QUEUE].chosen()?.key;
+        let key = &self.panes[QUEUE].selected()?.key;
         self.jobs.iter().find(|job| job.job.to_string() == *key)
     }
 
-    /// The number of the chosen walk.
+    /// The number of the selected walk.
     pub fn walk(&self) -> Option<u32> {
-        self.panes[WALKS].chosen()?.key.parse().ok()
+        self.panes[WALKS].selected()?.key.parse().ok()
     }
 }
 
-impl Jobs {
-    /// The next kind.
+impl JobView {
+    /// The next view.
     pub fn next(self) -> Self {
         match self {
             Self::Waiting => Self::Failed,
@@ -218,7 +218,7 @@ impl Jobs {
         }
     }
 
-    /// What they are called.
+    /// The title of the view.
     pub fn name(self) -> &'static str {
         match self {
             Self::Waiting => "queue",

@@ -7,8 +7,8 @@ use wire::Origin;
 
 use super::draw::{Theme, draw};
 use super::keys::Request;
-use super::reader::Seen;
-use super::state::{DECISIONS, Jobs, Message, Mode, QUEUE, State, WALKS};
+use super::reader::Reading;
+use super::state::{DECISIONS, JobView, Message, Mode, QUEUE, State, WALKS};
 use super::*;
 use crate::cli::queue::Action;
 use crate::cli::status;
@@ -68,10 +68,10 @@ fn decision(sequence: i64) -> RecentDecision {
     }
 }
 
-fn seen(jobs: Vec<Job>, decisions: std::ops::Range<i64>) -> Seen {
-    Seen {
+fn reading(jobs: Vec<Job>, decisions: std::ops::Range<i64>) -> Reading {
+    Reading {
         snapshot: status::tests::large(),
-        which: Jobs::Waiting,
+        view: JobView::Waiting,
         jobs,
         decisions: decisions.rev().map(decision).collect(),
     }
@@ -79,7 +79,7 @@ fn seen(jobs: Vec<Job>, decisions: std::ops::Range<i64>) -> Seen {
 
 fn state() -> State {
     let jobs = vec![job(1, JobState::Leased), job(2, JobState::Queued), job(3, JobState::Queued)];
-    State::new(seen(jobs, 1..101))
+    State::new(reading(jobs, 1..101))
 }
 
 fn press(state: &mut State, keys: &str) -> Option<Request> {
@@ -108,14 +108,14 @@ fn terminal(state: &mut State, width: u16, height: u16, theme: Theme) -> Termina
     terminal
 }
 
-fn shown(state: &mut State, width: u16, height: u16) -> String {
+fn screen(state: &mut State, width: u16, height: u16) -> String {
     terminal(state, width, height, PLAIN).backend().to_string()
 }
 
 #[test]
-fn every_pane_has_its_place_on_a_small_terminal() {
+fn all_panes_fit_a_small_terminal() {
     let mut state = state();
-    let text = shown(&mut state, 80, 24);
+    let text = screen(&mut state, 80, 24);
     for words in [
         "07070707070707070707070707070707, reproducible mode",
         "1 walks: 1000",
@@ -125,9 +125,9 @@ fn every_pane_has_its_place_on_a_small_terminal() {
         "3.0.1-0123456789abcdef",
         "accepted",
         "declined: covered",
-        "γ_max of 100: median 1.51, most 2.0",
+        "γ_max of 100: median 1.51, max 2.0",
         "accepted: 25 % of the last 100",
-        "expected in 30 h",
+        "expected within 30 h",
         "p pause",
     ] {
         assert!(text.contains(words), "{words}:\n{text}");
@@ -135,24 +135,24 @@ fn every_pane_has_its_place_on_a_small_terminal() {
 }
 
 #[test]
-fn terminals_of_every_size_are_drawn_on() {
+fn terminals_of_every_size_are_supported() {
     for width in [1, 2, 10, 40, 79, 150, 300] {
         for height in [1, 2, 3, 7, 13, 14, 16, 20, 22, 70] {
             let mut state = state();
             for keys in ["1", "G", "2", "3", "i", "q", "?", "q", "2", "d", "n", "/"] {
                 press(&mut state, keys);
-                shown(&mut state, width, height);
+                screen(&mut state, width, height);
             }
         }
     }
-    let text = shown(&mut state(), 200, 40);
+    let text = screen(&mut state(), 200, 40);
     assert!(text.lines().any(|line| line.contains("1 walks") && line.contains("2 queue")), "{text}");
-    let flat = shown(&mut state(), 60, 12);
+    let flat = screen(&mut state(), 60, 12);
     assert!(flat.contains("1 walks") && !flat.contains("queue:"), "{flat}");
 }
 
 #[test]
-fn there_are_no_colours_where_none_are_wanted() {
+fn no_color_removes_all_colours() {
     let colours = |theme| {
         let terminal = terminal(&mut state(), 80, 24, theme);
         let cells = terminal.backend().buffer().content.clone();
@@ -163,46 +163,46 @@ fn there_are_no_colours_where_none_are_wanted() {
 }
 
 #[test]
-fn a_condition_chooses_what_a_pane_shows_and_what_is_wrong_in_it_is_said() {
+fn filters_apply_to_their_pane_and_errors_are_shown() {
     let mut state = state();
     press(&mut state, "2 /");
     write(&mut state, "gamma > 1.1 and element = C");
-    assert!(shown(&mut state, 80, 24).contains("filter: gamma > 1.1 and element = C"));
+    assert!(screen(&mut state, 80, 24).contains("filter: gamma > 1.1 and element = C"));
     press(&mut state, "Enter");
     assert_eq!((state.panes[QUEUE].entries.len(), state.panes[QUEUE].all), (1, 3));
-    assert!(shown(&mut state, 80, 24).contains("2 queue: 1 of 3  where"), "{}", shown(&mut state, 80, 24));
-    // It holds for what comes later, and for this pane alone.
-    state.take_in(Ok(seen(vec![job(4, JobState::Queued), job(5, JobState::Queued)], 101..103)));
+    assert!(screen(&mut state, 80, 24).contains("2 queue: 1 of 3  where"), "{}", screen(&mut state, 80, 24));
+    // The filter also applies to new entries, and only to this pane.
+    state.apply(Ok(reading(vec![job(4, JobState::Queued), job(5, JobState::Queued)], 101..103)));
     assert_eq!((state.panes[QUEUE].entries.len(), state.panes[DECISIONS].entries.len()), (1, 102));
     press(&mut state, "Esc");
     assert_eq!(state.panes[QUEUE].entries.len(), 2);
     press(&mut state, "/");
     write(&mut state, "gamma >");
     press(&mut state, "Enter");
-    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("expected a number")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("expected a number")));
     write(&mut state, " 1.45");
     press(&mut state, "Enter");
     assert_eq!((state.panes[QUEUE].entries.len(), &state.message), (1, &None));
-    // A quantity that the pane does not have is refused by name, instead of showing nothing.
+    // A quantity that the pane does not have is an error.
     press(&mut state, "Esc /");
     write(&mut state, "max_force > 5");
     press(&mut state, "Enter");
     assert!(
-        matches!(&state.message, Some(Message::Failed(why)) if why.contains("max_force is not known of label jobs")),
+        matches!(&state.message, Some(Message::Error(why)) if why.contains("max_force is not available for label jobs")),
         "{:?}",
         state.message
     );
     assert_eq!(state.panes[QUEUE].entries.len(), 2);
     press(&mut state, "Esc");
-    // Other jobs are shown when they are read, and no others until then.
+    // Another view is empty until its jobs are read.
     press(&mut state, "Esc");
-    assert_eq!((press(&mut state, "s"), state.panes[QUEUE].all), (Some(Request::Look), 0));
-    state.take_in(Ok(seen(vec![job(4, JobState::Queued)], 103..103)));
+    assert_eq!((press(&mut state, "s"), state.panes[QUEUE].all), (Some(Request::Refresh), 0));
+    state.apply(Ok(reading(vec![job(4, JobState::Queued)], 103..103)));
     assert_eq!(state.panes[QUEUE].all, 0);
-    state.take_in(Ok(Seen { which: Jobs::Failed, ..seen(vec![job(4, JobState::Failed)], 103..103) }));
-    assert!(shown(&mut state, 80, 24).contains("2 failed labels: 1"));
+    state.apply(Ok(Reading { view: JobView::Failed, ..reading(vec![job(4, JobState::Failed)], 103..103) }));
+    assert!(screen(&mut state, 80, 24).contains("2 failed labels: 1"));
     press(&mut state, "s s s");
-    // Of a walk its decisions.
+    // Enter on a walk shows its decisions.
     press(&mut state, "1 Down Down Down Enter");
     assert_eq!(state.focus, DECISIONS);
     assert_eq!(state.panes[DECISIONS].entries.len(), 102);
@@ -211,29 +211,29 @@ fn a_condition_chooses_what_a_pane_shows_and_what_is_wrong_in_it_is_said() {
 }
 
 #[test]
-fn what_cannot_be_undone_is_asked_about_first() {
+fn irreversible_changes_need_confirmation() {
     let mut state = state();
     press(&mut state, "2 Down");
     assert_eq!(press(&mut state, "d"), None);
-    let text = shown(&mut state, 100, 24);
+    let text = screen(&mut state, 100, 24);
     assert!(text.contains("drop 3.0.2-0123456789abcdef (queued)?") && text.contains("y: yes"), "{text}");
-    // What comes meanwhile does not change what was asked.
-    state.take_in(Ok(seen(vec![job(9, JobState::Leased), job(8, JobState::Queued)], 101..101)));
+    // New jobs do not change the pending request.
+    state.apply(Ok(reading(vec![job(9, JobState::Leased), job(8, JobState::Queued)], 101..101)));
     let id = |number| job(number, JobState::Queued).candidate;
     assert_eq!(press(&mut state, "y"), Some(Request::Queue(Action::Drop { ids: vec![id(2)] })));
     assert_eq!(press(&mut state, "d n"), None);
-    assert_eq!(state.message, Some(Message::Done("nothing was changed".into())));
+    assert_eq!(state.message, Some(Message::Success("cancelled".into())));
     assert_eq!(press(&mut state, "t"), None);
-    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("only what failed")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("only failed or dropped")));
 
     press(&mut state, "g =");
     write(&mut state, "x");
     assert_eq!(press(&mut state, "Enter"), None);
-    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("'10x' is no priority")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("'10x' is not a priority")));
     let request = press(&mut state, "Back Back Back - 5 Enter");
     assert_eq!(request, Some(Request::Queue(Action::Prioritise { id: id(9), priority: -5 })));
 
-    let walks = |walks: &[u32], all| walks::Which { walks: walks.to_vec(), all };
+    let walks = |walks: &[u32], all| walks::WalkSelection { walks: walks.to_vec(), all };
     assert_eq!(press(&mut state, "d"), None);
     press(&mut state, "n");
     let request = press(&mut state, "1 Down p");
@@ -241,48 +241,51 @@ fn what_cannot_be_undone_is_asked_about_first() {
     assert_eq!(press(&mut state, "R"), None);
     assert_eq!(press(&mut state, "y"), Some(Request::Walks(walks::Action::Resume(walks(&[], true)))));
     assert_eq!(press(&mut state, "3 p"), None);
-    assert!(matches!(&state.message, Some(Message::Failed(why)) if why.contains("for the walks")));
+    assert!(matches!(&state.message, Some(Message::Error(why)) if why.contains("the pane of the walks")));
 }
 
 #[test]
-fn a_story_is_shown_when_it_comes_unless_nobody_waits_for_it() {
+fn a_history_is_shown_if_its_text_view_is_still_open() {
     let mut state = state();
     let id = job(2, JobState::Queued).candidate;
-    assert_eq!(press(&mut state, "2 Down Enter"), Some(Request::Story(id.clone())));
-    assert!(shown(&mut state, 80, 24).contains("reading …"));
-    state.done(Done::Story("another".into(), Ok("wrong".into())));
+    assert_eq!(press(&mut state, "2 Down Enter"), Some(Request::Explain(id.clone())));
+    assert!(screen(&mut state, 80, 24).contains("reading …"));
+    state.complete(Completed::Explain("another".into(), Ok("wrong".into())));
     let lines: Vec<_> = (1..=50).map(|k| format!("line {k}.")).collect();
-    state.done(Done::Story(id.clone(), Ok(lines.join("\n"))));
-    let text = shown(&mut state, 80, 24);
+    state.complete(Completed::Explain(id.clone(), Ok(lines.join("\n"))));
+    let text = screen(&mut state, 80, 24);
     assert!(text.contains("line 1.") && text.contains(&id) && text.contains("lines 1 to 21 of 50"), "{text}");
     press(&mut state, "End");
-    let text = shown(&mut state, 80, 24);
+    let text = screen(&mut state, 80, 24);
     assert!(text.contains("line 50.") && !text.contains("line 29."), "{text}");
     press(&mut state, "k");
-    assert!(shown(&mut state, 80, 24).contains("line 29."), "one line up from the end");
+    assert!(screen(&mut state, 80, 24).contains("line 29."), "one line up from the end");
     press(&mut state, "q");
-    state.done(Done::Story(id, Ok("late".into())));
+    state.complete(Completed::Explain(id, Ok("late".into())));
     assert!(matches!(state.mode, Mode::Panes));
-    assert_eq!(press(&mut state, "q"), Some(Request::Leave(Ended::Done)));
+    assert_eq!(press(&mut state, "q"), Some(Request::Quit(Ended::Done)));
 }
 
 #[test]
-fn what_was_seen_stays_while_the_campaign_cannot_be_read() {
+fn the_last_state_stays_while_the_campaign_cannot_be_read() {
     let mut state = state();
-    state.take_in(Err(Failure::Failed("the server is away".into())));
-    let text = shown(&mut state, 80, 24);
-    assert!(text.contains("what you see is old: the server is away") && text.contains("1 walks: 1000"));
-    state.take_in(Ok(seen(Vec::new(), 101..102)));
-    assert!(!shown(&mut state, 80, 24).contains("old"));
+    state.apply(Err(Failure::Failed("the server is away".into())));
+    let text = screen(&mut state, 80, 24);
+    assert!(
+        text.contains("outdated, cannot read the campaign: the server is away")
+            && text.contains("1 walks: 1000")
+    );
+    state.apply(Ok(reading(Vec::new(), 101..102)));
+    assert!(!screen(&mut state, 80, 24).contains("outdated"));
     assert_eq!((state.focus, state.panes[QUEUE].entries.len()), (WALKS, 0));
     let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
-    assert_eq!(state.key(control_c), Some(Request::Leave(Ended::Interrupted)));
+    assert_eq!(state.key(control_c), Some(Request::Quit(Ended::Interrupted)));
 }
 
 #[test]
-fn the_chosen_line_is_seen_without_colours() {
+fn the_selected_line_is_visible_without_colours() {
     let terminal = terminal(&mut state(), 80, 24, PLAIN);
     let reversed =
         terminal.backend().buffer().content.iter().filter(|cell| cell.modifier.contains(Modifier::REVERSED));
-    assert_eq!(reversed.count(), 160, "the title of the pane that has the keys, and its first line");
+    assert_eq!(reversed.count(), 160, "title and first line of the focused pane");
 }

@@ -6,7 +6,7 @@ use store::Store;
 
 use super::Dashboard;
 use super::answer::{Answer, Refusal};
-use crate::cli::errors::as_json;
+use crate::cli::force_errors::as_json;
 use crate::learned;
 
 /// `GET /api/errors`: what `calmwalk errors --json` prints.

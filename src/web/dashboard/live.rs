@@ -58,9 +58,9 @@ async fn look(store: Store, tell: watch::Sender<Option<Arc<str>>>, samples: Arc<
     let is_watched = || tell.receiver_count() > 1;
     loop {
         let begun = Instant::now();
-        let text = match Snapshot::of(&store).await {
+        let text = match Snapshot::read(&store).await {
             Ok(snapshot) => {
-                let sample = Sample::of(snapshot.standing(), unix_milliseconds());
+                let sample = Sample::of(snapshot.status(), unix_milliseconds());
                 let status = snapshot.to_json().unwrap_or_default();
                 let text = json!({ "status": status, "sample": sample }).to_string();
                 samples.lock().unwrap_or_else(PoisonError::into_inner).push(sample);

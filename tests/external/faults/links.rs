@@ -46,8 +46,9 @@ impl Linked {
         let certificates = hosts.home.path().join("certificates");
         certify(&certificates);
         let tls = |name: &str| ["--tls".to_owned(), certificates.join(name).display().to_string()];
-        let [ahead, limit] = ["--ahead=1".to_owned(), format!("--patience={patience}")];
-        hosts.options = [tls(HEAD).into(), tls(NODE).into_iter().chain([ahead, limit]).collect()];
+        let [prefetch, timeout] =
+            ["--prefetch=1".to_owned(), format!("--wait-timeout={}s", (60.0 * patience) as u64)];
+        hosts.options = [tls(HEAD).into(), tls(NODE).into_iter().chain([prefetch, timeout]).collect()];
         let (orchestrator, agent) = (hosts.lead(), hosts.agent(0));
         Self { hosts, cable, orchestrator, agent }
     }

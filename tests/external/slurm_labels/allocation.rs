@@ -13,7 +13,7 @@ fn submit(jobs: &Jobs) {
     let label = program(&here).get_program().display().to_string();
     let script = here.join("labeller.sh");
     let text = format!(
-        "#!/bin/sh\n{label} label --store . --wait 2 2>> said\nwhile [ -d {home} ] && [ ! -e {home}/go ]; do sleep 0.2; done\n"
+        "#!/bin/sh\n{label} label --store . --wait-timeout 2m 2>> said\nwhile [ -d {home} ] && [ ! -e {home}/go ]; do sleep 0.2; done\n"
     );
     fs::write(&script, text).unwrap();
     let (directory, output) = (format!("--chdir={}", here.display()), format!("--output={home}/job.log"));
@@ -29,11 +29,11 @@ fn a_step_ends_with_its_keeper_and_its_label_is_made_again() {
     submit(&jobs);
     wait_until("a step is at work", || jobs.begun().len() == 1);
     // Nobody is left who might tidy up.
-    for who in ["label", "labeller", "keep"] {
+    for who in ["label", "labeller", "calculation-runner"] {
         carrying_out(jobs.place.path(), who).into_iter().for_each(|pid| signal(pid, "KILL"));
     }
     wait_until("the step has ended", || calculating(&scratch).is_empty());
-    let label = jobs.place.label(&["--wait", "2"]);
+    let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("it is begun again", || jobs.begun().len() == 2);
     jobs.go();
     let labels = jobs.finish(run, label);

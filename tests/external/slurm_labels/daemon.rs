@@ -33,7 +33,7 @@ fn a_label_outlives_the_daemon_of_its_node() {
     let jobs = Jobs::new();
     let scratch = jobs.home.path().canonicalize().unwrap().join("scratch");
     let run = jobs.place.run();
-    let label = jobs.place.label(&["--wait", "2"]);
+    let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     ci("kill-node");
     ci("revive");
@@ -60,7 +60,7 @@ fn a_label_whose_node_dies_is_made_again_once() {
     let jobs = Jobs::new();
     let scratch = jobs.home.path().canonicalize().unwrap().join("scratch");
     let run = jobs.place.run();
-    let label = jobs.place.label(&["--wait", "2"]);
+    let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     let id = jobs.jobs()[0][0].clone();
     ci("kill-node");

@@ -20,7 +20,7 @@ fn lose_node(name: &str) {
 fn a_job_that_is_cancelled_is_lost_and_tried_again() {
     let jobs = Jobs::new();
     let run = jobs.place.run();
-    let label = jobs.place.label(&["--wait", "2"]);
+    let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     slurm(&["scancel", &jobs.jobs()[0][0]]);
     wait_until("it is begun again", || jobs.begun().len() == 2);
@@ -37,7 +37,7 @@ fn a_job_that_is_cancelled_is_lost_and_tried_again() {
 fn a_job_whose_time_is_over_gets_twice_as_much() {
     let jobs = Jobs::with("time_limit = 600.0", "--comment=label");
     let run = jobs.place.run();
-    let label = jobs.place.label(&["--wait", "2"]);
+    let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     end_its_time(&jobs.jobs()[0][0]);
     wait_until("it is begun again", || jobs.begun().len() == 2);
@@ -60,7 +60,7 @@ fn a_job_that_slurm_kills_for_its_memory_was_out_of_memory() {
     let eat = jobs.home.path().join("eat");
     fs::write(&eat, "").unwrap();
     let run = jobs.place.run();
-    let label = jobs.place.label(&["--wait", "2"]);
+    let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     fs::remove_file(eat).unwrap();
     wait_until("it is begun again", || jobs.begun().len() == 2);
@@ -75,7 +75,7 @@ fn a_job_that_slurm_kills_for_its_memory_was_out_of_memory() {
 fn a_job_whose_node_is_lost_goes_to_another() {
     let jobs = Jobs::with("", "--partition=pair");
     let run = jobs.place.run();
-    let label = jobs.place.label(&["--wait", "2"]);
+    let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     let lost = jobs.told("%i|%T|%N")[0][2].clone();
     lose_node(&lost);
@@ -93,7 +93,7 @@ fn a_job_whose_node_is_lost_goes_to_another() {
 fn where_there_is_no_other_node_it_goes_to_the_same() {
     let jobs = Jobs::new();
     let run = jobs.place.run();
-    let label = jobs.place.label(&["--wait", "2"]);
+    let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     lose_node(&jobs.told("%i|%T|%N")[0][2]);
     wait_until("it is begun again", || jobs.begun().len() == 2);
@@ -109,7 +109,7 @@ fn where_there_is_no_other_node_it_goes_to_the_same() {
 fn what_slurm_has_forgotten_stands_in_the_log_of_the_job() {
     let jobs = Jobs::new();
     let run = jobs.place.run();
-    let mut label = jobs.place.label(&["--wait", "2"]);
+    let mut label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     jobs.kill(&mut label);
     end_its_time(&jobs.jobs()[0][0]);
@@ -132,7 +132,7 @@ fn what_slurm_has_forgotten_stands_in_the_log_of_the_job() {
 fn a_job_that_slurm_loses_in_its_midst_is_made_again_once() {
     let jobs = Jobs::new();
     let run = jobs.place.run();
-    let label = jobs.place.label(&["--wait", "2"]);
+    let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     ci("forget");
     wait_until("it is begun again", || jobs.begun().len() == 2);

@@ -14,12 +14,12 @@ use crate::common::slurm::ci;
 fn a_labeller_that_is_killed_is_followed_by_one_that_finds_its_job() {
     let jobs = Jobs::new();
     let run = jobs.place.run();
-    let mut label = jobs.place.label(&["--wait", "2"]);
+    let mut label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     let name = jobs.jobs()[0][2].clone();
     jobs.kill(&mut label);
     // As many as there are structures: none of them ends before it may.
-    let label = jobs.place.label(&["--slots", "20"]);
+    let label = jobs.place.label(&["--concurrency", "20"]);
     let waits = || {
         jobs.attempts()
             .iter()
@@ -55,11 +55,11 @@ fn a_job_that_is_submitted_twice_calculates_once() {
     );
     let mut slowly = program(jobs.place.path());
     slowly.env("PATH", path.unwrap());
-    let mut label = jobs.place.spawn(slowly, &["label", "--store", ".", "--wait", "2"]);
+    let mut label = jobs.place.spawn(slowly, &["label", "--store", ".", "--wait-timeout", "2m"]);
     wait_until("a job is being submitted", || jobs.home.path().join("asked").exists());
     jobs.kill(&mut label);
     assert!(jobs.jobs().is_empty() && jobs.begun().is_empty());
-    let label = jobs.place.label(&["--slots", "2"]);
+    let label = jobs.place.label(&["--concurrency", "2"]);
     wait_until("it is submitted by another", || !jobs.begun().is_empty());
     let first = PathBuf::from(&jobs.begun()[0]);
     jobs.go();
@@ -76,7 +76,7 @@ fn a_job_that_is_submitted_twice_calculates_once() {
 fn while_slurm_does_not_answer_nothing_is_concluded() {
     let jobs = Jobs::new();
     let run = jobs.place.run();
-    let label = jobs.place.label(&["--wait", "2"]);
+    let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("a job is at work", || jobs.begun().len() == 1);
     // Slurm has to have written down that it runs.
     let state = PathBuf::from(std::env::var_os("SLURM_CONF").unwrap()).with_file_name("state/job_state");

@@ -94,7 +94,7 @@ impl Jobs {
     pub fn finish(&self, mut run: Running, mut label: Running) -> usize {
         wait_until("the campaign is over", || {
             if label.0.try_wait().unwrap().is_some() {
-                label = self.place.label(&["--slots", "2"]);
+                label = self.place.label(&["--concurrency", "2"]);
             }
             run.0.try_wait().unwrap().is_some()
         });

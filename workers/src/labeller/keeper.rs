@@ -76,9 +76,9 @@ pub struct KeeperCommand {
 }
 
 impl Default for KeeperCommand {
-    /// `calmwalk keep`, of this very program, also when its file was replaced meanwhile.
+    /// `calmwalk calculation-runner`, of this very program, also when its file was replaced meanwhile.
     fn default() -> Self {
-        Self { program: "/proc/self/exe".into(), arguments: vec!["keep".to_owned()] }
+        Self { program: "/proc/self/exe".into(), arguments: vec!["calculation-runner".to_owned()] }
     }
 }
 

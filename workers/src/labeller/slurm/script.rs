@@ -119,7 +119,7 @@ mod tests {
             memory_limit: Some(2_000_000_000),
             keeper: KeeperCommand {
                 program: "/opt/it's/calmwalk".into(),
-                arguments: vec!["keep".to_owned()],
+                arguments: vec!["calculation-runner".to_owned()],
             },
         }
     }
@@ -135,7 +135,7 @@ mod tests {
         let expected =
             ["--nodes=1", "--ntasks=4", "--time=61", "--mem=1908M", "--partition=long", "--exclude=n1,n2"];
         assert_eq!(directives, expected);
-        assert!(text.contains(r"'/opt/it'\''s/calmwalk' 'keep' < order.json"), "{text}");
+        assert!(text.contains(r"'/opt/it'\''s/calmwalk' 'calculation-runner' < order.json"), "{text}");
         let order = fs::read_to_string(home.path().join(ORDER)).unwrap();
         assert!(order.starts_with("{\"Keep\"") && order.ends_with("}\n"), "{order}");
         assert!(avoid_none(home.path()).unwrap());

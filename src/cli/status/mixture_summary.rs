@@ -1,4 +1,4 @@
-//! What the selector keeps about its mixture for those who watch.
+//! The state of the mixture in `calmwalk status`: forgetting and staleness.
 
 use std::io::{self, Write};
 
@@ -7,23 +7,23 @@ use serde_json::{Value, json};
 
 use super::page::Page;
 
-/// The values of past commits, by name.
+/// Values that the selector stores with its commits, by name.
 #[derive(Debug)]
-pub struct Values(pub Vec<(String, String)>);
+pub struct MixtureSummary(pub Vec<(String, String)>);
 
-impl Values {
-    /// The grades of the training frames under the newest mixture; null if they are not watched.
+impl MixtureSummary {
+    /// The grades of the training frames under the newest mixture; null if they are not monitored.
     pub fn training_frames(&self) -> Value {
         self.read("training_frames").unwrap_or_default()
     }
 
-    /// The share of the training atoms with γ > 1, and whether that is an alarm; none before the first update.
+    /// The fraction of the training atoms with γ > 1, and whether it raises an alarm. `None` before the first update.
     pub fn forgetting(&self) -> Option<(f64, bool)> {
         let training = self.training_frames();
         training["share_above_one"].as_f64().zip(training["alarm"].as_bool())
     }
 
-    /// By how many versions the mixture was newer at decisions than what walkers had seen; null before the first.
+    /// By how many versions walkers' mixtures were behind the newest at decisions; null before the first decision.
     pub fn staleness(&self) -> Value {
         let Some(staleness) = self.read::<Staleness>(STALENESS) else { return Value::Null };
         let mut json = json!(staleness);
@@ -39,7 +39,7 @@ impl Values {
         serde_json::from_str(text).ok()
     }
 
-    /// Writes the lines that stand below the version of the mixture.
+    /// Writes the lines below the version of the mixture.
     pub fn write(&self, out: &mut dyn Write, page: &Page, mode: &str) -> io::Result<()> {
         let training = self.training_frames();
         let number = |key: &str| training[key].as_f64();
@@ -52,14 +52,14 @@ impl Values {
                 &format!("training atoms under it: median γ {median:.2}, {share:.1} % above 1{alarm}"),
             )?;
         }
-        // Where walks follow one another each sees the newest, by construction.
+        // Walks that run one after the other have the newest version by construction.
         let staleness = self.read::<Staleness>(STALENESS);
         match staleness.filter(|staleness| mode == "live" || staleness.largest() > 0) {
             Some(staleness) => page.titled(
                 out,
                 "",
                 &format!(
-                    "walkers had seen the newest at {:.1} % of decisions; versions behind: median {}, 90 % {}, \
+                    "walkers had the newest version at {:.1} % of decisions; versions behind: median {}, 90 % {}, \
                      largest {}",
                     100.0 * staleness.share_of_newest(),
                     staleness.quantile(0.5),
@@ -76,7 +76,7 @@ impl Values {
 mod tests {
     use super::*;
 
-    fn text(values: &Values, mode: &str) -> String {
+    fn text(values: &MixtureSummary, mode: &str) -> String {
         let mut out = Vec::new();
         let page = Page { walks: 8, others: 8, few: 8, width: 120 };
         values.write(&mut out, &page, mode).unwrap();
@@ -84,10 +84,11 @@ mod tests {
     }
 
     #[test]
-    fn the_age_of_what_walkers_saw_is_shown_where_it_says_something() {
+    fn staleness_is_shown_where_it_matters() {
         let mut staleness = Staleness::default();
         [0, 0, 0].iter().for_each(|age| staleness.add(*age));
-        let of = |staleness: &Staleness| Values(vec![(STALENESS.into(), json!(staleness).to_string())]);
+        let of =
+            |staleness: &Staleness| MixtureSummary(vec![(STALENESS.into(), json!(staleness).to_string())]);
         assert_eq!(text(&of(&staleness), "reproducible"), "");
         assert!(text(&of(&staleness), "live").contains("at 100.0 % of decisions"));
         [1, 2, 7].iter().for_each(|age| staleness.add(*age));
@@ -102,7 +103,7 @@ mod tests {
             "median": 0, "quantile_90": 7,
         });
         assert_eq!(json, expected);
-        let none = Values(Vec::new());
+        let none = MixtureSummary(Vec::new());
         assert_eq!((text(&none, "live").as_str(), none.staleness()), ("", Value::Null));
     }
 }

@@ -1,4 +1,4 @@
-//! The protocol of another configuration, in the place of the one in force.
+//! The switch to the label protocol of another configuration.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -12,21 +12,21 @@ use crate::labelling::{self, LABEL_METHOD};
 use crate::origin::{self, Origin};
 use crate::setup::MethodSetup;
 
-/// How labels are made from now on.
-pub struct NewLabels {
-    /// By which protocol.
+/// The new label protocol, and what changes with it.
+pub struct ProtocolChange {
+    /// The new protocol.
     pub protocol: Protocol,
-    /// The configuration by which the campaign runs, JSON.
+    /// The new configuration of the campaign, JSON.
     pub configuration: String,
-    /// How it differs from the one by which it ran.
+    /// Its differences from the current configuration.
     pub changes: Vec<Change>,
-    /// What labellers on other hosts need to know.
+    /// Metadata for labellers on other hosts.
     pub notes: Vec<(&'static str, String)>,
 }
 
-impl NewLabels {
-    /// Reads the file's section, and finds what its method needs here; nothing if its protocol is the one in force.
-    pub async fn of(store: &Store, path: &Path, in_force: &Protocol) -> Result<Option<Self>, Failure> {
+impl ProtocolChange {
+    /// Reads the [label] section of a file and loads its method on this host. `None` if its protocol is the current one.
+    pub async fn read(store: &Store, path: &Path, in_force: &Protocol) -> Result<Option<Self>, Failure> {
         let section = Config::load_label(path)?;
         let method = MethodSetup::of(&section)?;
         let protocol = labelling::protocol(section.protocol_name(), method.identity()?);
@@ -47,13 +47,13 @@ impl NewLabels {
         Ok(Some(Self { protocol, configuration: after.to_string(), changes, notes }))
     }
 
-    /// A line for each change.
-    pub fn changes_in_words(&self) -> Vec<String> {
+    /// One line per change.
+    pub fn describe_changes(&self) -> Vec<String> {
         self.changes.iter().map(ToString::to_string).collect()
     }
 }
 
-/// That the campaign may go on by this file.
+/// The record that lets the campaign resume with this file.
 async fn origin_note(store: &Store, path: &Path) -> Result<Option<(&'static str, String)>, Failure> {
     let Some(known) = Origin::of(store).await? else { return Ok(None) };
     let text = std::fs::read_to_string(path)
@@ -62,27 +62,27 @@ async fn origin_note(store: &Store, path: &Path) -> Result<Option<(&'static str,
     Ok(Some((origin::NOTE, note)))
 }
 
-/// A protocol has one name in a campaign, and a name means one protocol.
+/// Checks that names and protocols correspond one to one in the campaign.
 async fn check_name(store: &Store, protocol: &Protocol, path: &Path) -> Result<(), Failure> {
     let (path, name) = (path.display(), &protocol.name);
     for known in store.protocols().await? {
         if known.hash == protocol.hash && known.name != *name {
             return Err(Failure::Input(format!(
-                "{path}: label.protocol is '{name}', but the campaign knows this protocol as '{}': give it that name",
+                "{path}: label.protocol is '{name}', but in this campaign the same protocol is named '{}': use that name",
                 known.name
             )));
         }
         if known.hash != protocol.hash && known.name == *name {
             return Err(Failure::Input(format!(
-                "{path}: label.protocol is '{name}', by which the campaign knows a protocol with other settings: give this one a \
-                 name of its own, such as protocol = \"{name}-2\""
+                "{path}: label.protocol is '{name}', but in this campaign '{name}' is a protocol with other settings: choose a new \
+                 name, such as protocol = \"{name}-2\""
             )));
         }
     }
     Ok(())
 }
 
-/// Labels of every seed structure can be made by it.
+/// Checks that the method supports the elements of all seed structures.
 async fn check_elements(store: &Store, section: &LabelSection, path: &Path) -> Result<(), Failure> {
     let seeds = store.seed_structures().await?;
     let species: BTreeSet<Species> =

@@ -1,4 +1,4 @@
-//! `calmwalk errors`
+//! `calmwalk force-errors`
 
 use std::io::{self, Write};
 
@@ -10,21 +10,21 @@ use super::{CampaignLocation, Ended, Failure, block_on};
 use crate::learned::{self, Grades, LARGE, Learned};
 use crate::output::{Table, count, decimals, print, print_json, range};
 
-/// Names of failed structures that a line shows.
+/// Failed structures listed per line.
 const NAMES: usize = 3;
 
-/// Show the potential's errors, the forces' by grade, and which structures got no label
+/// Show the errors of the potential: force errors by extrapolation grade, energy errors, and structures without labels
 ///
-/// Compares |F_model − F_label| of every labelled atom with its γ and γ_nbr under the ORIGINAL mixture: median and
-/// percentiles in bins of the grade, Spearman's ρ, and the area under the receiver operating characteristic (ROC-AUC) of the
-/// grade as a test for errors above 1 eV/Å. Structures whose labels finally failed have errors too, which nobody
-/// knows: they are counted as censored, and named in their bins. Energy errors are without the offsets of the elements: labels and the
-/// potential have other zeros of energy. Works while the campaign runs.
+/// Relates the force error |F_model − F_label| of each labelled atom to its grades γ and γ_nbr under the original mixture:
+/// median and percentiles in bins of the grade, Spearman's ρ, and the area under the receiver operating characteristic
+/// (ROC-AUC) of the grade as a test for errors above 1 eV/Å. The errors of structures whose labels failed are unknown: these
+/// structures are counted as censored and listed in their bins. Energy errors exclude a fitted offset per element, because
+/// labels and potential have different zeros of energy. Works while the campaign runs.
 #[derive(Debug, clap::Args)]
-pub struct Errors {
+pub struct ForceErrors {
     #[command(flatten)]
     location: CampaignLocation,
-    /// Labels of this protocol; left out, of the one in force
+    /// Use the labels of this protocol [default: the current protocol]
     #[arg(long, value_name = "NAME")]
     protocol: Option<String>,
     /// Print JSON
@@ -32,7 +32,7 @@ pub struct Errors {
     json: bool,
 }
 
-impl Errors {
+impl ForceErrors {
     pub fn run(self) -> Result<Ended, Failure> {
         let (protocol, learned) = block_on(self.read())??;
         if self.json {
@@ -45,15 +45,15 @@ impl Errors {
 
     async fn read(&self) -> Result<(Protocol, Learned), Failure> {
         let store = Store::open_read_only(&self.location.get()?).await?;
-        let protocol = self.choose(&store).await?;
+        let protocol = self.select_protocol(&store).await?;
         let learned = learned::of(&store, protocol.hash).await?;
         store.close().await;
         Ok((protocol, learned))
     }
 
-    async fn choose(&self, store: &Store) -> Result<Protocol, Failure> {
+    async fn select_protocol(&self, store: &Store) -> Result<Protocol, Failure> {
         let Some(name) = &self.protocol else {
-            let none = || Failure::Input("the campaign has no label protocol, and so no labels".into());
+            let none = || Failure::Input("the campaign has no labels: it has no label protocol yet".into());
             return store.protocol_in_force().await?.ok_or_else(none);
         };
         let protocols = store.protocols().await?;
@@ -69,24 +69,24 @@ fn write(out: &mut dyn Write, protocol: &Protocol, learned: &Learned) -> io::Res
     let Learned { all, .. } = learned;
     writeln!(
         out,
-        "force error |F_model − F_label| by the grade of the original mixture, protocol '{}'",
+        "force error |F_model − F_label| by grade under the original mixture, protocol '{}'",
         protocol.name
     )?;
     write_correlations(out, learned)?;
     if (all.gamma.sampled() as u64) < all.gamma.atoms() {
         let (sampled, atoms) = (all.gamma.sampled(), all.gamma.atoms());
-        writeln!(out, "ρ, ROC-AUC and percentiles are those of a sample of {sampled} of the {atoms} atoms")?;
+        writeln!(out, "ρ, ROC-AUC and percentiles are from a sample of {sampled} of {atoms} atoms")?;
     }
     if learned.shared > 0 {
         let structures = count(learned.shared, "structure");
         writeln!(
             out,
-            "{structures} of biased walks that are those of their controls too: in 'all' only, and once"
+            "{structures} found by both biased and control walks: counted once in 'all', and not in 'biased' or 'control'"
         )?;
     }
     if all.gamma.left_out() + all.gamma_nbr.left_out() > 0 {
         let (gamma, gamma_nbr) = (all.gamma.left_out(), all.gamma_nbr.left_out());
-        writeln!(out, "left out: {gamma} atoms without a finite γ, {gamma_nbr} without a finite γ_nbr")?;
+        writeln!(out, "excluded: {gamma} atoms without a finite γ, {gamma_nbr} without a finite γ_nbr")?;
     }
     write_energies(out, learned)?;
     for (name, errors) in [("γ", &all.gamma), ("γ_nbr", &all.gamma_nbr)] {
@@ -168,14 +168,14 @@ fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<
 
 fn write_completion(out: &mut dyn Write, name: &str, bins: &[CompletionBin<String>]) -> io::Result<()> {
     let mut table =
-        Table::new(&[name, ">attempted", ">labelled", ">share (%)", ">95 %", "failed, and so censored"]);
+        Table::new(&[name, ">attempted", ">labelled", ">share (%)", ">95 %", "failed (censored)"]);
     for bin in bins {
         let percent = |share: f64| format!("{:.0}", 100.0 * share);
         let interval = bin.interval.map(|(low, high)| format!("{} to {}", percent(low), percent(high)));
         let more = bin.failed.len().saturating_sub(NAMES);
         let mut names = bin.failed[..bin.failed.len() - more].join(" ");
         if more > 0 {
-            names = format!("{names} … and {more} more (--json has all)");
+            names = format!("{names} … and {more} more (use --json)");
         }
         table.push(vec![
             range(bin.above, bin.up_to),
@@ -190,7 +190,7 @@ fn write_completion(out: &mut dyn Write, name: &str, bins: &[CompletionBin<Strin
     table.write(out)
 }
 
-/// What `--json` prints.
+/// The output of `--json`.
 pub fn as_json(protocol: &Protocol, learned: &Learned) -> Value {
     json!({
         "protocol": protocol.name,

@@ -1,4 +1,4 @@
-//! What is ordered from the batch system: scripts and options of each kind of job.
+//! Scripts and `sbatch` options of each kind of job.
 
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Write};
@@ -7,19 +7,19 @@ use std::path::{Path, PathBuf};
 use orchestrator::slurm::{Job, JobNames, Phase, Plan, Request, Role, Wanted};
 use wire::net::Tls;
 
-use super::scripts::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
+use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
 use super::{FOLDER, Launch, absolute};
 use crate::campaign::Campaign;
 use crate::outcome::Failure;
 use crate::whole_file::cannot_write;
 
-/// Where the orchestrator writes down where it is, in the campaign's directory.
+/// The file in the campaign's directory to which the orchestrator announces its endpoint.
 const ENDPOINT: &str = "endpoint";
-/// How long an agent waits for an orchestrator, and the orchestrator for its predecessor, min. The job is tried again then.
-const PATIENCE: &str = "--patience=15";
+/// How long an agent or labeller waits for the campaign, and an orchestrator for its predecessor. The job then tries again.
+const WAIT_TIMEOUT: &str = "--wait-timeout=15m";
 
-/// All that jobs are made of.
-pub struct Order {
+/// Everything needed to submit the jobs of a campaign.
+pub struct JobSpecs {
     directory: PathBuf,
     folder: PathBuf,
     /// Names and texts of the scripts.
@@ -28,7 +28,7 @@ pub struct Order {
     walkers: u32,
 }
 
-impl Order {
+impl JobSpecs {
     pub fn new(
         launch: &Launch,
         campaign: &Campaign,
@@ -39,8 +39,8 @@ impl Order {
         let commands = Commands::new(launch, campaign, directory)?;
         let job = quoted(&text(&folder.join(COMMON))?);
         let config = &campaign.config;
-        // "One a core" is as many as the job is given.
-        let leading = match config.run.walkers {
+        // run.walkers = 0 is one walker per core, that is, as many as the job has cores.
+        let cores = match config.run.walkers {
             0 => config.run.threads.get().max(2),
             walkers => walkers * config.run.threads.get() + config.label.slots,
         };
@@ -56,14 +56,13 @@ impl Order {
         let script = |name: &'static str, values: &Values<'_>| {
             template(site, name).and_then(|template| fill(name, &template, values)).map(|text| (name, text))
         };
-        let leading = values(leading, commands.orchestrator(wanted)?);
-        let mut scripts = vec![script(ORCHESTRATOR, &leading)?];
+        let mut scripts = vec![script(ORCHESTRATOR, &values(cores, commands.orchestrator(wanted)?))?];
         if wanted.agents > 0 {
             scripts
                 .push(script(AGENT, &values((launch.walkers * launch.threads) as usize, commands.agent()?))?);
         }
         if wanted.labellers > 0 {
-            scripts.push(script(LABELLER, &values(launch.slots as usize, commands.labeller()))?);
+            scripts.push(script(LABELLER, &values(launch.concurrency as usize, commands.labeller()))?);
         }
         scripts.push((COMMON, template(site, COMMON)?));
         Ok(Self {
@@ -75,8 +74,8 @@ impl Order {
         })
     }
 
-    /// One who launches at a time, where the file system can lock. Where it cannot, Slurm itself sees to it that of two
-    /// jobs of one name one waits.
+    /// Excludes concurrent launches, if the file system supports locks. Otherwise Slurm runs only one of two jobs with the same
+    /// name at a time.
     pub fn lock(&self) -> Result<Option<File>, Failure> {
         fs::create_dir_all(&self.folder).map_err(|error| cannot_write(&self.folder, error))?;
         let path = self.folder.join("launch.lock");
@@ -87,11 +86,12 @@ impl Order {
 
     /// Writes the scripts.
     pub fn write(&self) -> Result<(), Failure> {
-        self.scripts.iter().try_for_each(|(name, text)| scripts::write(&self.folder.join(name), text))
+        self.scripts.iter().try_for_each(|(name, text)| templates::write(&self.folder.join(name), text))
     }
 
-    /// Before a new orchestrator begins: agents would take the end of the last one for that of the campaign.
-    pub fn forget_the_end(&self) -> Result<(), Failure> {
+    /// Removes the endpoint file before a new orchestrator starts. It may still say that the campaign is finished, and agents
+    /// would exit.
+    pub fn remove_endpoint(&self) -> Result<(), Failure> {
         let path = self.directory.join(ENDPOINT);
         match fs::remove_file(&path) {
             Err(error) if error.kind() != ErrorKind::NotFound => Err(cannot_write(&path, error)),
@@ -99,14 +99,14 @@ impl Order {
         }
     }
 
-    /// The orchestrator's job that stays, if there is one.
-    pub fn leader(&self, jobs: &[Job], cancelled: &[u64]) -> Option<u64> {
-        let stays = |job: &&Job| matches!(job.phase(), Phase::Pending | Phase::Running);
-        let mut leaders = jobs.iter().filter(|job| job.role == Role::Orchestrator).filter(stays);
-        leaders.find(|job| !cancelled.contains(&job.id)).map(|job| job.id)
+    /// The existing job of the orchestrator that is not cancelled, if there is one.
+    pub fn orchestrator_job(&self, jobs: &[Job], cancelled: &[u64]) -> Option<u64> {
+        let is_active = |job: &&Job| matches!(job.phase(), Phase::Pending | Phase::Running);
+        let mut active = jobs.iter().filter(|job| job.role == Role::Orchestrator).filter(is_active);
+        active.find(|job| !cancelled.contains(&job.id)).map(|job| job.id)
     }
 
-    /// How a job is submitted.
+    /// The `sbatch` request of a job.
     pub fn request(&self, role: Role, orchestrator: Option<u64>) -> Request<'_> {
         let (script, name) = match role {
             Role::Orchestrator => (ORCHESTRATOR, role.name()),
@@ -123,8 +123,8 @@ impl Order {
         }
     }
 
-    /// Says what would be written and submitted.
-    pub fn show(&self, out: &mut dyn Write, names: &JobNames, plan: &Plan, jobs: &[Job]) -> io::Result<()> {
+    /// Prints what would be written and submitted.
+    pub fn print(&self, out: &mut dyn Write, names: &JobNames, plan: &Plan, jobs: &[Job]) -> io::Result<()> {
         for (name, text) in &self.scripts {
             writeln!(out, "==> {}\n{text}", self.folder.join(name).display())?;
         }
@@ -132,27 +132,27 @@ impl Order {
             let ids: Vec<_> = plan.cancel.iter().map(u64::to_string).collect();
             writeln!(out, "scancel {}", ids.join(" "))?;
         }
-        let leader = self.leader(jobs, &plan.cancel);
+        let orchestrator = self.orchestrator_job(jobs, &plan.cancel);
         for submission in &plan.submit {
-            let arguments = self.request(submission.role, leader).arguments(names, submission);
+            let arguments = self.request(submission.role, orchestrator).arguments(names, submission);
             let words: Vec<_> = arguments.iter().map(|word| quoted(&word.to_string_lossy())).collect();
             writeln!(out, "sbatch {}", words.join(" "))?;
         }
         if plan.cancel.is_empty() && plan.submit.is_empty() {
-            writeln!(out, "every job is there already")?;
+            writeln!(out, "all jobs exist already")?;
         }
         Ok(())
     }
 }
 
-/// Options of `sbatch` that hold for every job.
+/// Options of `sbatch` for every job.
 fn options(launch: &Launch) -> Vec<String> {
     let named = [("time", &launch.time), ("partition", &launch.partition), ("account", &launch.account)];
     let named = named.iter().filter_map(|(name, value)| Some(format!("--{name}={}", value.as_ref()?)));
     named.chain(launch.options.iter().cloned()).collect()
 }
 
-/// The commands of the jobs, for a shell.
+/// The commands that the jobs run, quoted for a shell.
 struct Commands<'a> {
     launch: &'a Launch,
     program: String,
@@ -180,14 +180,14 @@ impl<'a> Commands<'a> {
     }
 
     fn orchestrator(&self, wanted: Wanted) -> Result<String, Failure> {
-        let mut words = vec!["run", &self.config, "--directory", &self.directory, PATIENCE];
+        let mut words = vec!["run", &self.config, "--directory", &self.directory, WAIT_TIMEOUT];
         if self.launch.adopt {
             words.push("--adopt");
         }
         let tls = self.certificates("orchestrator")?;
         if wanted.agents > 0 {
-            let everywhere = if tls.is_some() { "tcp/0.0.0.0:0" } else { "tcp/127.0.0.1:0" };
-            words.extend(["--listen", everywhere, "--announce", &self.endpoint]);
+            let endpoint = if tls.is_some() { "tcp/0.0.0.0:0" } else { "tcp/127.0.0.1:0" };
+            words.extend(["--listen", endpoint, "--announce", &self.endpoint]);
             words.extend(tls.iter().flat_map(|directory| ["--tls", directory]));
         }
         Ok(self.command(words))
@@ -197,14 +197,23 @@ impl<'a> Commands<'a> {
         let join = format!("@{}", self.endpoint);
         let (walkers, threads) = (self.launch.walkers.to_string(), self.launch.threads.to_string());
         let tls = self.certificates("agent")?;
-        self.check_reach(tls.is_some())?;
-        let words = ["agent", "--join", &join, "--walkers", &walkers, "--threads", &threads, PATIENCE];
+        self.check_reachable(tls.is_some())?;
+        let words = ["agent", "--join", &join, "--walkers", &walkers, "--threads", &threads, WAIT_TIMEOUT];
         Ok(self.command(words.into_iter().chain(tls.iter().flat_map(|directory| ["--tls", directory]))))
     }
 
     fn labeller(&self) -> String {
-        let (store, slots) = (self.store.unwrap_or(&self.directory), self.launch.slots.to_string());
-        self.command(["label", "--store", store, "--slots", &slots, "--wait=15", "--grace=60"])
+        let (store, concurrency) =
+            (self.store.unwrap_or(&self.directory), self.launch.concurrency.to_string());
+        self.command([
+            "label",
+            "--store",
+            store,
+            "--concurrency",
+            &concurrency,
+            WAIT_TIMEOUT,
+            "--grace-period=60s",
+        ])
     }
 
     fn stop(&self) -> String {
@@ -212,12 +221,12 @@ impl<'a> Commands<'a> {
         self.command(words)
     }
 
-    /// Where the certificate of the orchestrator, or that of agents, is.
-    fn certificates(&self, of: &str) -> Result<Option<String>, Failure> {
+    /// The directory with the certificate of `role`, "orchestrator" or "agent", after a check of its files.
+    fn certificates(&self, role: &str) -> Result<Option<String>, Failure> {
         let Some(tls) = &self.launch.tls else { return Ok(None) };
-        let directory = absolute(&tls.join(of))?;
+        let directory = absolute(&tls.join(role))?;
         let certificates = Tls::in_directory(&directory);
-        let checked = match of {
+        let checked = match role {
             "orchestrator" => certificates.check_for_orchestrator(),
             _ => certificates.check_for_agent(),
         };
@@ -225,24 +234,27 @@ impl<'a> Commands<'a> {
         text(&directory).map(Some)
     }
 
-    /// Without certificates only agents beside the orchestrator reach it.
-    fn check_reach(&self, tls: bool) -> Result<(), Failure> {
+    /// Without certificates, all jobs must run on the orchestrator's node.
+    fn check_reachable(&self, tls: bool) -> Result<(), Failure> {
         let is_node = |option: &String| option.starts_with("--nodelist") || option.starts_with("-w");
         if tls || self.launch.options.iter().any(is_node) {
             return Ok(());
         }
         Err(Failure::Input(
-            "agents on other nodes than the orchestrator's need certificates: make them and name them with --tls \
-             (docs/slurm.md), or keep everything on one node with '-- --nodelist=NODE'"
+            "agents on other nodes than the orchestrator's need certificates: create them and pass their directory with --tls \
+             (docs/slurm.md), or run all jobs on one node with '-- --nodelist=NODE'"
                 .to_owned(),
         ))
     }
 }
 
-/// A path that a script can have in it.
+/// A path as text for a script.
 fn text(path: &Path) -> Result<String, Failure> {
     let text = path.to_str().filter(|text| !text.contains('\n'));
     text.map(str::to_owned).ok_or_else(|| {
-        Failure::Input(format!("{}: the name of a path in a job's script must be plain text", path.display()))
+        Failure::Input(format!(
+            "{}: a path in a job script must be UTF-8 without line breaks",
+            path.display()
+        ))
     })
 }

@@ -1,4 +1,4 @@
-//! The start of a run: which campaign it is, whether it is the one that the configuration means, and where it goes on.
+//! The start of a run: checks that the campaign belongs to the configuration, and reports where it resumes.
 
 use std::path::Path;
 
@@ -11,15 +11,15 @@ use crate::origin::{self, Match, Origin};
 use crate::outcome::Failure;
 use crate::output::{count, say};
 
-/// Records of a new campaign what it began with.
-pub async fn begun(store: &Store, origin: &Origin, location: &Location) -> Result<(), Failure> {
+/// Records the configuration of a new campaign.
+pub async fn record_start(store: &Store, origin: &Origin, location: &Location) -> Result<(), Failure> {
     record(store, origin).await?;
-    say(format_args!("campaign '{}' begins in {location}, with {}", origin.name, origin.file.path));
+    say(format_args!("starting campaign '{}' in {location} with {}", origin.name, origin.file.path));
     Ok(())
 }
 
-/// Checks that the campaign in the store is the one of this configuration, and applies what may have changed.
-pub async fn go_on(
+/// Checks that the campaign in the store belongs to this configuration, and applies the permitted changes of the configuration.
+pub async fn resume(
     campaign: &Campaign,
     store: &Store,
     location: &Location,
@@ -27,21 +27,19 @@ pub async fn go_on(
     adopt: bool,
 ) -> Result<(), Failure> {
     let known = Origin::of(store).await?;
-    let holds_campaign = matches!(location, Location::Directory(_));
-    let how = known.as_ref().map(|known| known.compare(origin, holds_campaign, Path::exists));
-    let other = known.as_ref().filter(|_| how == Some(Match::Other));
+    let has_campaign = matches!(location, Location::Directory(_));
+    let matched = known.as_ref().map(|known| known.compare(origin, has_campaign, Path::exists));
+    let other = known.as_ref().filter(|_| matched == Some(Match::Other));
     let resolved = campaign.resolved();
     let changes = compare(&in_force(store).await?, &resolved)
-        .map_err(|refused| other_content(campaign, location, other, &refused))?;
+        .map_err(|refused| changed_content(campaign, location, other, &refused))?;
     match other {
         Some(known) if !adopt => return Err(other_file(campaign, location, known)),
-        Some(known) => {
-            say(format_args!("configuration: {} takes the place of {}", origin.file.path, known.file.path))
-        }
+        Some(known) => say(format_args!("configuration: {} replaces {}", origin.file.path, known.file.path)),
         None => {}
     }
     record(store, &known.map_or_else(|| origin.clone(), |known| known.continued(origin))).await?;
-    tell_where(store, origin, location).await?;
+    report_progress(store, origin, location).await?;
     if changes.is_empty() {
         return Ok(());
     }
@@ -61,33 +59,37 @@ async fn in_force(store: &Store) -> Result<Value, Failure> {
 }
 
 async fn record(store: &Store, origin: &Origin) -> Result<(), Failure> {
-    let note = serde_json::to_string(origin).map_err(Failure::failed)?;
-    Ok(store.leave_note(origin::NOTE, &note).await?)
+    let text = serde_json::to_string(origin).map_err(Failure::failed)?;
+    Ok(store.leave_note(origin::NOTE, &text).await?)
 }
 
-/// Says where the campaign goes on.
-async fn tell_where(store: &Store, origin: &Origin, location: &Location) -> Result<(), Failure> {
+/// Reports where the campaign resumes.
+async fn report_progress(store: &Store, origin: &Origin, location: &Location) -> Result<(), Failure> {
     let status = store.status().await?;
     let decisions = store.newest_mixture().await?.decision;
     let steps: u64 = status.walks.iter().map(|walk| walk.step).sum();
-    let over = status.walks.iter().filter(|walk| !walk.is_under_way()).count() as u64;
-    let from = if decisions == 0 {
-        "nothing was decided yet".to_owned()
+    let ended = status.walks.iter().filter(|walk| !walk.is_under_way()).count() as u64;
+    let progress = if decisions == 0 {
+        "no decisions yet".to_owned()
     } else {
         format!(
-            "after decision {decisions}: {}, {over} of them over, {}, {}",
+            "{}, {} ({ended} ended), {}, {}",
+            count(decisions as u64, "decision"),
             count(status.walks.len() as u64, "walk"),
             count(steps, "step"),
             count(status.labels.labelled, "label")
         )
     };
-    let goes_on = if status.finished { "is finished" } else { "goes on" };
-    say(format_args!("campaign '{}' in {location} {goes_on}; {from}", origin.name));
+    let name = &origin.name;
+    match status.finished {
+        true => say(format_args!("campaign '{name}' in {location} is finished: {progress}")),
+        false => say(format_args!("resuming campaign '{name}' in {location}: {progress}")),
+    }
     Ok(())
 }
 
-/// The configuration has another content than the campaign, perhaps since it is another campaign's.
-fn other_content(
+/// The configuration differs from that of the campaign in a key that may not change; it may belong to another campaign.
+fn changed_content(
     campaign: &Campaign,
     location: &Location,
     other: Option<&Origin>,
@@ -96,24 +98,24 @@ fn other_content(
     let at = place(&campaign.path, &campaign.text, refused.key());
     let elsewhere = elsewhere(location);
     let hint = other.map_or(String::new(), |known| {
-        format!(" (the campaign in {location} is '{}', by {})", known.name, known.file.path)
+        format!(" (the campaign in {location} is '{}', configured by {})", known.name, known.file.path)
     });
     Failure::Input(format!("{at}: {refused}, or start another campaign {elsewhere}{hint}"))
 }
 
-/// The configuration would do, and is not the campaign's.
+/// The configuration is compatible, but the campaign was started with another file.
 fn other_file(campaign: &Campaign, location: &Location, known: &Origin) -> Failure {
     let (given, name, file) = (campaign.path.display(), &known.name, &known.file.path);
     let elsewhere = elsewhere(location);
     Failure::Input(format!(
-        "{given}: the campaign in {location} is '{name}', which belongs to another configuration, {file}. Go on with it by that \
-         file, or start another campaign {elsewhere}; --adopt goes on with it by {given}"
+        "{given}: the campaign in {location} is '{name}', which belongs to another configuration, {file}. Resume it with that \
+         file, start another campaign {elsewhere}, or resume it with {given} by --adopt"
     ))
 }
 
 fn elsewhere(location: &Location) -> &'static str {
     match location {
         Location::Directory(_) => "with --directory",
-        Location::Server(_) => "in another schema, which ?schema=… in run.store names",
+        Location::Server(_) => "in another schema, set with ?schema=… in run.store",
     }
 }

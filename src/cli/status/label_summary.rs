@@ -1,4 +1,4 @@
-//! What labels cost and which of them failed, in `calmwalk status`.
+//! The label queue, costs and failures in `calmwalk status`.
 
 use std::io::{self, Write};
 
@@ -11,25 +11,25 @@ use crate::bill::{self, Bill, digits};
 use crate::output::count;
 use crate::unlabelled;
 
-/// Labelled structures that are looked through for ranges of grades and volumes, at most.
-const LOOKED_THROUGH: u64 = 20_000;
+/// Largest number of labelled structures for which ranges of grades and volumes are computed.
+const MAX_STRUCTURES: u64 = 20_000;
 
-/// What is known of the labels of the protocol in force.
+/// Costs and failures of the labels of the current protocol.
 #[derive(Clone, Debug, Default)]
-pub struct LabelsSoFar {
+pub struct LabelSummary {
     pub(super) bill: Bill,
     pub(super) failures: Vec<FailureCount>,
     pub(super) unlabelled: Vec<Unlabelled>,
-    /// What became of label jobs by each protocol, in words.
+    /// The states of label jobs by protocol, as text.
     pub(super) by_protocol: Vec<String>,
-    /// Control frames that are the structures of their biased walks, which have one label each; not counted in large campaigns.
+    /// Structures found by both biased and control walks, with one label each; not counted in large campaigns.
     pub(super) shared: Option<u64>,
 }
 
-impl LabelsSoFar {
-    /// Reads it; nothing without a protocol.
-    pub async fn of(store: &Store, status: &Status) -> Result<Self, StoreError> {
-        let shared = match status.candidates.control <= LOOKED_THROUGH {
+impl LabelSummary {
+    /// Reads the store. Empty if there is no protocol yet.
+    pub async fn read(store: &Store, status: &Status) -> Result<Self, StoreError> {
+        let shared = match status.candidates.control <= MAX_STRUCTURES {
             true => Some(store.structures_of_both_origins().await?.len() as u64),
             false => None,
         };
@@ -39,18 +39,18 @@ impl LabelsSoFar {
         let failures = store.failures(protocol.hash).await?;
         let unlabelled = match (status.labels.failed, status.labels.labelled) {
             (0, _) => Vec::new(),
-            (_, labelled) => store.unlabelled(protocol.hash, labelled <= LOOKED_THROUGH).await?,
+            (_, labelled) => store.unlabelled(protocol.hash, labelled <= MAX_STRUCTURES).await?,
         };
         let by_protocol = by_protocol(&store.jobs_by_protocol().await?, &protocol.name);
         Ok(Self { bill: bill::of(store, protocol.hash).await?, failures, unlabelled, by_protocol, shared })
     }
 
-    /// What labels have cost and will.
+    /// Costs of the labels so far, and of the queued ones.
     pub fn bill(&self) -> &Bill {
         &self.bill
     }
 
-    /// Adds it to the state of a campaign.
+    /// Adds the summary to the JSON output.
     pub fn add_to(&self, json: &mut Value, status: &Status) {
         json["labels_per_hour"] = json!(per_hour(status));
         json["cost"] = json!({ "core_hours": status.budget.used.core_hours, "queue": self.bill });
@@ -59,19 +59,19 @@ impl LabelsSoFar {
         json["shared_structures"] = json!(self.shared);
     }
 
-    /// The queue, what it costs, failures and what is unlabelled because of them.
+    /// Writes the state of the queue, costs, failures and the structures without labels.
     pub fn write(&self, out: &mut dyn Write, page: &Page, status: &Status) -> io::Result<()> {
-        page.titled(out, "labels", &queue(status))?;
-        if let Some(again) = again(&status.labels) {
-            page.titled(out, "", &again)?;
+        page.titled(out, "labels", &describe_queue(status))?;
+        if let Some(relabelling) = describe_relabelling(&status.labels) {
+            page.titled(out, "", &relabelling)?;
         }
         if self.by_protocol.len() > 1 {
             page.titled(out, "protocols", &self.by_protocol.join("; "))?;
         }
-        page.titled(out, "", &made(status))?;
+        page.titled(out, "", &describe_rate(status))?;
         page.titled(out, "cost", &self.cost(status.budget.used.core_hours))?;
         for (k, failure) in self.failures.iter().take(page.few).enumerate() {
-            page.titled(out, if k == 0 { "failures" } else { "" }, &in_words(failure))?;
+            page.titled(out, if k == 0 { "failures" } else { "" }, &describe_failure(failure))?;
         }
         if self.failures.len() > page.few {
             page.titled(out, "", &format!("… and {} more classes", self.failures.len() - page.few))?;
@@ -88,34 +88,33 @@ impl LabelsSoFar {
             return match unfinished {
                 0 => used,
                 _ => format!(
-                    "{used}; that of {} to come is unknown before a first one",
+                    "{used}; cost of {} to come unknown before the first one",
                     count(*unfinished, "label")
                 ),
             };
         };
-        let in_vain = match *overhead > 1.005 {
-            true => format!(", attempts in vain add {:.0} %", 100.0 * (overhead - 1.0)),
+        let failures = match *overhead > 1.005 {
+            true => format!(", failed attempts add {:.0} %", 100.0 * (overhead - 1.0)),
             false => String::new(),
         };
         let done = match hours_left {
-            Some(hours) => format!("done in {} h on {} at work", digits(*hours), count(*cores, "core")),
-            None => "nobody is at work on them".to_owned(),
+            Some(hours) => format!("done in {} h on {}", digits(*hours), count(*cores, "core")),
+            None => "no active labellers".to_owned(),
         };
         format!(
-            "{used}; {} to come: about {remaining} as {} so far{in_vain}; {done}",
+            "{used}; {} to come: about {remaining}, from {} so far{failures}; {done}",
             count(*unfinished, "label"),
             count(*measured, "label")
         )
     }
 }
 
-fn queue(status: &Status) -> String {
+fn describe_queue(status: &Status) -> String {
     let Labels { queued, leased, labelled, failed, dropped, superseded, excluded, .. } = &status.labels;
     let oldest = status.oldest_lease.as_ref();
-    let oldest = oldest.map_or(String::new(), |lease| format!(" (the oldest for {})", since(lease.started)));
+    let oldest = oldest.map_or(String::new(), |lease| format!(" (oldest for {})", since(lease.started)));
     let superseded = if *superseded > 0 { format!(", {superseded} superseded") } else { String::new() };
-    let excluded =
-        if *excluded > 0 { format!(", {excluded} labels excluded by hand") } else { String::new() };
+    let excluded = if *excluded > 0 { format!(", {excluded} labels excluded") } else { String::new() };
     let imported = status.imported;
     format!(
         "{queued} queued, {leased} leased{oldest}, {labelled} labelled, {failed} failed, {dropped} dropped{superseded}{excluded}; \
@@ -124,42 +123,42 @@ fn queue(status: &Status) -> String {
     )
 }
 
-/// What is labelled again, and what could not be.
-fn again(labels: &Labels) -> Option<String> {
-    let said = [
-        (labels.again, "of those that wait keep their labels until the new ones come"),
-        (labels.again_in_vain, "could not be labelled again and keep their labels"),
+/// Structures that are relabelled, and failed attempts at it.
+fn describe_relabelling(labels: &Labels) -> Option<String> {
+    let parts = [
+        (labels.again, "being relabelled keep their labels until then"),
+        (labels.again_in_vain, "failed to be relabelled and keep their labels"),
     ];
-    let said: Vec<_> = said.iter().filter(|(count, _)| *count > 0).collect();
-    let said: Vec<_> = said.iter().map(|(count, what)| format!("{count} {what}")).collect();
-    (!said.is_empty()).then(|| said.join("; "))
+    let parts = parts.iter().filter(|(count, _)| *count > 0);
+    let parts: Vec<_> = parts.map(|(count, what)| format!("{count} {what}")).collect();
+    (!parts.is_empty()).then(|| parts.join("; "))
 }
 
-/// A text for each protocol.
+/// One text per protocol.
 fn by_protocol(jobs: &[(String, JobState, u64)], in_force: &str) -> Vec<String> {
     let of_one = |jobs: &[(String, JobState, u64)]| {
         let name = &jobs[0].0;
         let counts: Vec<_> = jobs.iter().map(|(_, state, count)| format!("{count} {state}")).collect();
-        let which = if name == in_force { " (in force)" } else { "" };
-        format!("'{name}'{which}: {}", counts.join(", "))
+        let current = if name == in_force { " (current)" } else { "" };
+        format!("'{name}'{current}: {}", counts.join(", "))
     };
     jobs.chunk_by(|a, b| a.0 == b.0).map(of_one).collect()
 }
 
-fn made(status: &Status) -> String {
-    let average =
-        per_hour(status).map_or(String::new(), |average| format!("; {} an hour on average", digits(average)));
-    format!("{} made in the last hour{average}", status.labels_last_hour)
+fn describe_rate(status: &Status) -> String {
+    let average = per_hour(status)
+        .map_or(String::new(), |average| format!("; {} per hour on average", digits(average)));
+    format!("{} computed in the last hour{average}", status.labels_last_hour)
 }
 
-/// Labels that were made by the time for which the campaign was under way.
+/// Average number of labels per hour of running time.
 fn per_hour(status: &Status) -> Option<f64> {
     let used = &status.budget.used;
     (used.wall_hours > 0.0).then(|| used.labels as f64 / used.wall_hours)
 }
 
-fn in_words(failure: &FailureCount) -> String {
+fn describe_failure(failure: &FailureCount) -> String {
     let FailureCount { class, labelled, given_up, unfinished } = failure;
     let (class, jobs) = (class.replace('_', " "), labelled + given_up + unfinished);
-    format!("{class} in {jobs}: {labelled} labelled later, {given_up} given up, {unfinished} open")
+    format!("{class} in {jobs}: {labelled} labelled later, {given_up} failed, {unfinished} open")
 }

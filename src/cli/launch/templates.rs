@@ -1,4 +1,4 @@
-//! The scripts of a campaign's jobs: templates with what belongs to the campaign put in.
+//! Templates of the job scripts, and how they are filled.
 
 use std::fs;
 use std::io::Write;
@@ -7,7 +7,7 @@ use std::path::Path;
 use crate::outcome::Failure;
 use crate::whole_file::{WholeFile, cannot_write};
 
-/// The templates, as they stand in `configs/slurm`.
+/// The built-in templates, from `configs/slurm`.
 const TEMPLATES: [(&str, &str); 4] = [
     (ORCHESTRATOR, include_str!("../../../configs/slurm/orchestrator.sbatch")),
     (AGENT, include_str!("../../../configs/slurm/agent.sbatch")),
@@ -17,20 +17,20 @@ const TEMPLATES: [(&str, &str); 4] = [
 pub const ORCHESTRATOR: &str = "orchestrator.sbatch";
 pub const AGENT: &str = "agent.sbatch";
 pub const LABELLER: &str = "labeller.sbatch";
-/// What the others source.
+/// Shell functions that the other scripts source.
 pub const COMMON: &str = "job.sh";
 
-/// Names and values that are put into a template.
+/// Placeholders of a template with their values.
 pub type Values<'a> = [(&'a str, String)];
 
-/// The template of this name: the site's, if it has its own, or that of this program.
+/// The template of this name: from the site's directory if given, else the built-in one.
 pub fn template(site: Option<&Path>, name: &str) -> Result<String, Failure> {
     match site {
         Some(directory) => {
             let path = directory.join(name);
             let failed = |error| {
                 Failure::Input(format!(
-                    "cannot read {}: {error}; --template names a copy of configs/slurm with its four files",
+                    "cannot read {}: {error}; --template needs a directory with the four files of configs/slurm",
                     path.display()
                 ))
             };
@@ -43,10 +43,10 @@ pub fn template(site: Option<&Path>, name: &str) -> Result<String, Failure> {
     }
 }
 
-/// The template with each `{name}` replaced by its value. `${name}` is the shell's and stays.
+/// Replaces each `{name}` in the template by its value. `${name}` belongs to the shell and is kept.
 ///
 /// # Errors
-/// A name that has no value.
+/// A name has no value.
 pub fn fill(name: &str, template: &str, values: &Values<'_>) -> Result<String, Failure> {
     let mut text = String::with_capacity(template.len());
     let mut rest = template;
@@ -63,7 +63,7 @@ pub fn fill(name: &str, template: &str, values: &Values<'_>) -> Result<String, F
             let line = 1 + template[..template.len() - from.len()].matches('\n').count();
             let known: Vec<_> = values.iter().map(|(name, _)| format!("{{{name}}}")).collect();
             return Err(Failure::Input(format!(
-                "{name}:{line}: {{{word}}} means nothing here; known are {}",
+                "{name}:{line}: unknown placeholder {{{word}}}; expected one of {}",
                 known.join(", ")
             )));
         };
@@ -73,21 +73,21 @@ pub fn fill(name: &str, template: &str, values: &Values<'_>) -> Result<String, F
     Ok(text + rest)
 }
 
-/// The name in `{name}`, if the text begins with one.
+/// The name in `{name}`, if the text starts with one.
 fn placeholder(text: &str) -> Option<&str> {
     let (word, _) = text.strip_prefix('{')?.split_once('}')?;
     let plain = !word.is_empty() && word.chars().all(|c| c.is_ascii_lowercase() || c == '_');
     plain.then_some(word)
 }
 
-/// A script as a whole or, where it cannot be written, not at all: a job may read it now.
+/// Writes a script atomically: a job may read it at this moment.
 pub fn write(path: &Path, text: &str) -> Result<(), Failure> {
     let mut file = WholeFile::create(path)?;
     file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
     file.finish()
 }
 
-/// A word as the shell reads it.
+/// Quotes a word for the shell.
 pub fn quoted(word: &str) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_=./:,@%+".contains(c);
     if !word.is_empty() && word.chars().all(plain) {
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_the_shells_stays() {
+    fn shell_expansions_are_kept() {
         for text in ["${cpus} $x {a,b} { work; } {} {Cpus}", "work() {\n}\n", "a {", "x{", "${a:-0}{", ""] {
             assert_eq!(filled(text).unwrap(), text);
         }
@@ -116,13 +116,13 @@ mod tests {
     }
 
     #[test]
-    fn what_means_nothing_is_refused_with_its_line() {
+    fn unknown_placeholders_are_rejected_with_their_line() {
         let Err(Failure::Input(message)) = filled("{cpus}\n\nx {cpu} {command}") else { panic!() };
-        assert_eq!(message, "agent.sbatch:3: {cpu} means nothing here; known are {cpus}, {command}");
+        assert_eq!(message, "agent.sbatch:3: unknown placeholder {cpu}; expected one of {cpus}, {command}");
     }
 
     #[test]
-    fn templates_are_bash_once_they_are_filled() {
+    fn filled_templates_are_valid_bash() {
         for (name, template) in TEMPLATES {
             let values = ["cpus", "command", "stop", "job"].map(|name| (name, format!("/a/{name}")));
             let text = fill(name, template, &values).unwrap();
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn words_reach_a_command_as_they_are() {
+    fn quoted_words_reach_a_command_unchanged() {
         for word in ["", "a b", "it's", "$HOME", "`x`", "a\\b", "x\ny", "postgres://u@h/d?schema=s&x=1"] {
             let text = format!("printf %s {}", quoted(word));
             let output = Command::new("bash").args(["-c", &text]).output().unwrap();

@@ -1,4 +1,4 @@
-//! The jobs of a campaign in `calmwalk status`, as the batch system gives them.
+//! The batch jobs of a campaign in `calmwalk status`.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -13,41 +13,41 @@ use super::page::Page;
 use crate::cli::launch::{FOLDER, job_names};
 use crate::output::Table;
 
-/// Whoever looks at a campaign does not wait for a batch system for longer than this.
-const PATIENCE: Duration = Duration::from_secs(4);
+/// How long `calmwalk status` waits for the batch system.
+const TIMEOUT: Duration = Duration::from_secs(4);
 
-/// What is known of jobs.
+/// The jobs of a campaign.
 #[derive(Debug)]
-pub enum Jobs {
-    /// There is no batch system, or it has no job of this campaign.
+pub enum BatchJobs {
+    /// There is no batch system, or it has no jobs of this campaign.
     None,
-    /// These, with the exit codes of those that ended.
+    /// Jobs with the exit codes of failed ones.
     Known(Vec<(Job, Option<String>)>),
-    /// It does not say.
+    /// The batch system gives no answer, for this reason.
     Unknown(String),
 }
 
-impl Jobs {
-    /// Asks the batch system about the campaign that is kept here.
-    pub async fn of(location: &Location) -> Self {
+impl BatchJobs {
+    /// Queries the batch system.
+    pub async fn query(location: &Location) -> Self {
         let location = match location {
-            // Nothing was ever launched from a directory without scripts.
+            // Without job scripts, the campaign was never launched.
             Location::Directory(directory) if !directory.join(FOLDER).is_dir() => return Self::None,
             Location::Directory(directory) => {
                 Location::Directory(directory.canonicalize().unwrap_or_else(|_| directory.clone()))
             }
             Location::Server(url) => Location::Server(url.clone()),
         };
-        match timeout(PATIENCE, ask(&location)).await {
+        match timeout(TIMEOUT, query_slurm(&location)).await {
             Ok(Ok(jobs)) if jobs.is_empty() => Self::None,
             Ok(Ok(jobs)) => Self::Known(jobs),
             Ok(Err(error)) if error.is_missing() => Self::None,
             Ok(Err(error)) => Self::Unknown(error.to_string()),
-            Err(_) => Self::Unknown(format!("no answer within {} s", PATIENCE.as_secs())),
+            Err(_) => Self::Unknown(format!("no answer within {} s", TIMEOUT.as_secs())),
         }
     }
 
-    /// Adds them to the state of a campaign.
+    /// Adds the jobs to the JSON output.
     pub fn add_to(&self, json: &mut Value) {
         match self {
             Self::None => {}
@@ -56,11 +56,11 @@ impl Jobs {
         }
     }
 
-    /// A line for each; where there are many, those first that do not simply run.
+    /// Writes a table of the jobs; if they do not fit, jobs that are not running have priority.
     pub fn write(&self, out: &mut dyn Write, page: &Page) -> io::Result<()> {
         let jobs = match self {
             Self::None => return Ok(()),
-            Self::Unknown(why) => return writeln!(out, "\njobs        Slurm does not say: {why}"),
+            Self::Unknown(why) => return writeln!(out, "\njobs        no answer from Slurm: {why}"),
             Self::Known(jobs) => jobs,
         };
         let runs = |job: &Job| job.role != Role::Orchestrator && job.phase() == Phase::Running;
@@ -78,9 +78,9 @@ impl Jobs {
     }
 }
 
-/// Jobs that live, and of each kind the last that has ended if none does.
-async fn ask(location: &Location) -> Result<Vec<(Job, Option<String>)>, SlurmError> {
-    let slurm = Slurm::with_patience(PATIENCE);
+/// Active jobs, and for each role without an active job the last one that ended.
+async fn query_slurm(location: &Location) -> Result<Vec<(Job, Option<String>)>, SlurmError> {
+    let slurm = Slurm::with_patience(TIMEOUT);
     let mut jobs = slurm.jobs(&job_names(location)).await?;
     let mut last: BTreeMap<Role, (bool, u64)> = BTreeMap::new();
     for job in &jobs {
@@ -93,7 +93,7 @@ async fn ask(location: &Location) -> Result<Vec<(Job, Option<String>)>, SlurmErr
     let mut known = Vec::new();
     for job in jobs {
         let failed = job.phase() == Phase::Over && job.state != "COMPLETED";
-        // It may be forgotten by now.
+        // Slurm may no longer know the job.
         let code = if failed { slurm.exit_code(job.id).await.ok().flatten() } else { None };
         known.push((job, code));
     }
@@ -101,10 +101,10 @@ async fn ask(location: &Location) -> Result<Vec<(Job, Option<String>)>, SlurmErr
 }
 
 fn line(job: &Job, code: Option<&str>) -> Vec<String> {
-    let begun = job.phase() != Phase::Pending;
+    let has_started = job.phase() != Phase::Pending;
     let reason = job.reason.clone().unwrap_or_default();
     let remark = match (job.phase(), code) {
-        (Phase::Pending, _) if job.start != "N/A" => format!("{reason}; expected to begin {}", job.start),
+        (Phase::Pending, _) if job.start != "N/A" => format!("{reason}; expected start {}", job.start),
         (_, Some(code)) if reason.is_empty() => format!("exit code {code}"),
         (_, Some(code)) => format!("exit code {code}, {reason}"),
         _ => reason,
@@ -114,7 +114,7 @@ fn line(job: &Job, code: Option<&str>) -> Vec<String> {
         job.id.to_string(),
         job.state.to_lowercase(),
         job.nodes.clone(),
-        if begun { job.start.clone() } else { String::new() },
+        if has_started { job.start.clone() } else { String::new() },
         if job.phase() == Phase::Over { String::new() } else { job.time_left.clone() },
         remark,
     ]
@@ -153,12 +153,12 @@ mod tests {
     }
 
     #[test]
-    fn jobs_are_shown_as_the_batch_system_gives_them() {
+    fn jobs_are_shown_with_state_and_remark() {
         let mut waiting = job(13, Role::Agent(0), "PENDING");
         (waiting.nodes, waiting.start) = (String::new(), "N/A".into());
         waiting.reason = Some("Resources".into());
         let failed = job(9, Role::Agent(1), "FAILED");
-        let jobs = Jobs::Known(vec![
+        let jobs = BatchJobs::Known(vec![
             (job(12, Role::Orchestrator, "RUNNING"), None),
             (waiting, None),
             (failed, Some("1:0".into())),
@@ -179,11 +179,11 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_said_of_what_was_never_launched() {
+    fn nothing_is_shown_without_jobs() {
         let mut value = json!({});
-        Jobs::None.add_to(&mut value);
+        BatchJobs::None.add_to(&mut value);
         let mut text = Vec::new();
-        Jobs::None.write(&mut text, &PAGE).unwrap();
+        BatchJobs::None.write(&mut text, &PAGE).unwrap();
         assert_eq!((value, text.len()), (json!({}), 0));
     }
 }

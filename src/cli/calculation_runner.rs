@@ -1,17 +1,17 @@
-//! `calmwalk keep`
+//! `calmwalk calculation-runner`
 
 use orchestrator::launcher;
 use workers::labeller::keep;
 
 use super::{Ended, Failure};
 
-/// Keeps a calculation; labellers start it
+/// Internal: run one calculation for a labeller
 ///
-/// It reads what to do from standard input, and outlives the labeller that started it.
+/// Reads what to do from standard input, and outlives the labeller that started it.
 #[derive(Debug, clap::Args)]
-pub struct Keep {}
+pub struct CalculationRunner {}
 
-impl Keep {
+impl CalculationRunner {
     pub fn run(self) -> Result<Ended, Failure> {
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
         keep().map_err(Failure::failed)?;

@@ -1,4 +1,4 @@
-//! When a campaign is expected to end, in `calmwalk status`.
+//! The expected end of a campaign in `calmwalk status`.
 
 use serde::Serialize;
 use serde_json::Value;
@@ -6,40 +6,39 @@ use store::{Status, unix_milliseconds};
 
 use crate::bill::{Bill, SECONDS_PER_HOUR, digits};
 
-/// As things are now: walks that there are, at their speed, and labels that wait, on the cores at work.
+/// An extrapolation from the current state: existing walks at their current speed, and queued labels on the cores in use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct End {
-    /// Until the walks have made all their steps, h. They end sooner if they have collected all they may.
+pub struct ExpectedEnd {
+    /// Time until the walks have made all their steps, h. They end earlier if they reach a limit of collected structures.
     pub walks_hours: Option<f64>,
-    /// Until the labels that wait are made, h.
+    /// Time until the queued labels are computed, h.
     pub labels_hours: Option<f64>,
-    /// Until `budget.wall_hours` is used up, h.
+    /// Time until `budget.wall_hours` is used up, h.
     pub budget_hours: Option<f64>,
-    /// When it is over, ms since 1970; none if that cannot be told, or it is over.
+    /// Expected end, ms since 1970. `None` if it is unknown or the campaign is finished.
     pub time: Option<i64>,
 }
 
-impl End {
-    /// Of a campaign with this configuration in force.
-    pub fn of(status: &Status, configuration: &Value, bill: &Bill) -> Self {
-        let is_led = status.led;
+impl ExpectedEnd {
+    /// Extrapolates from the status of a campaign with this configuration.
+    pub fn extrapolate(status: &Status, configuration: &Value, bill: &Bill) -> Self {
         if status.finished {
             return Self::default();
         }
         let steps = |key: &str| configuration["walk"][key].as_u64().unwrap_or_default();
-        let of_a_walk = steps("equilibration") + steps("steps");
+        let steps_per_walk = steps("equilibration") + steps("steps");
         let under_way = status.walks.iter().filter(|walk| walk.is_under_way());
-        let left: u64 = under_way.map(|walk| of_a_walk.saturating_sub(walk.step)).sum();
-        let pace = status.steps_per_second.filter(|pace| is_led && *pace > 0.0);
+        let left: u64 = under_way.map(|walk| steps_per_walk.saturating_sub(walk.step)).sum();
+        let speed = status.steps_per_second.filter(|speed| status.led && *speed > 0.0);
         let walks_hours = match left {
             0 => Some(0.0),
-            left => pace.map(|pace| left as f64 / pace / SECONDS_PER_HOUR),
+            left => speed.map(|speed| left as f64 / speed / SECONDS_PER_HOUR),
         };
         let labels_hours = if bill.unfinished == 0 { Some(0.0) } else { bill.hours_left };
         let budget = &status.budget;
         let budget_hours = budget.limits.wall_hours.map(|limit| (limit - budget.used.wall_hours).max(0.0));
         let hours = walks_hours.zip(labels_hours).map(|(walks, labels)| walks.max(labels));
-        let hours = match (hours, budget_hours.filter(|_| is_led)) {
+        let hours = match (hours, budget_hours.filter(|_| status.led)) {
             (Some(hours), Some(budget)) => Some(hours.min(budget)),
             (hours, budget) => hours.or(budget),
         };
@@ -47,8 +46,8 @@ impl End {
         Self { walks_hours, labels_hours, budget_hours, time }
     }
 
-    /// In words; none where nothing can be told.
-    pub fn shown(&self) -> Option<String> {
+    /// A description; `None` if the end is unknown.
+    pub fn describe(&self) -> Option<String> {
         let milliseconds = self.time? - unix_milliseconds();
         let hours = digits(milliseconds.max(0) as f64 / 1000.0 / SECONDS_PER_HOUR);
         let part = |what: &str, hours: Option<f64>| hours.map(|hours| format!("{what} {} h", digits(hours)));
@@ -58,7 +57,7 @@ impl End {
             part("budget", self.budget_hours),
         ];
         let parts: Vec<_> = parts.into_iter().flatten().collect();
-        Some(format!("expected in {hours} h at the latest, as things are now ({})", parts.join(", ")))
+        Some(format!("expected within {hours} h at the current rate ({})", parts.join(", ")))
     }
 }
 
@@ -81,19 +80,19 @@ mod tests {
     }
 
     #[test]
-    fn the_end_is_that_of_the_slowest() {
+    fn the_slowest_part_determines_the_end() {
         let (mut status, configuration, mut bill) = campaign();
-        let end = End::of(&status, &configuration, &bill);
+        let end = ExpectedEnd::extrapolate(&status, &configuration, &bill);
         assert_eq!((end.walks_hours, end.labels_hours, end.budget_hours), (Some(1.0), Some(0.0), None));
-        let hours = |end: &End| (end.time.unwrap() - unix_milliseconds()) as f64 / 3.6e6;
+        let hours = |end: &ExpectedEnd| (end.time.unwrap() - unix_milliseconds()) as f64 / 3.6e6;
         assert!((hours(&end) - 1.0).abs() < 0.01);
         (bill.unfinished, bill.hours_left) = (3, Some(2.5));
-        assert!((hours(&End::of(&status, &configuration, &bill)) - 2.5).abs() < 0.01);
+        assert!((hours(&ExpectedEnd::extrapolate(&status, &configuration, &bill)) - 2.5).abs() < 0.01);
         bill.hours_left = None;
-        assert_eq!(End::of(&status, &configuration, &bill).time, None, "nobody makes the labels");
+        assert_eq!(ExpectedEnd::extrapolate(&status, &configuration, &bill).time, None, "no labellers");
         status.budget.limits = Budget { wall_hours: Some(0.5), ..Budget::default() };
-        assert!((hours(&End::of(&status, &configuration, &bill)) - 0.5).abs() < 0.01);
+        assert!((hours(&ExpectedEnd::extrapolate(&status, &configuration, &bill)) - 0.5).abs() < 0.01);
         status.led = false;
-        assert_eq!(End::of(&status, &configuration, &bill).time, None, "nobody runs it");
+        assert_eq!(ExpectedEnd::extrapolate(&status, &configuration, &bill).time, None, "no orchestrator");
     }
 }

@@ -1,0 +1,201 @@
+//! `calmwalk estimate`
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use analysis::{CostModel, Measured, Size};
+use serde_json::json;
+use store::{Location, Store};
+
+use super::{Ended, Failure, block_on, campaign_location};
+use crate::bill::{CoreHours, Costs, digits, size_of};
+use crate::campaign::Campaign;
+use crate::forecast::Forecast;
+use crate::output::{Table, count, print, print_json};
+
+/// Seed structures shown without --all.
+const SHOWN: usize = 20;
+
+/// Estimate the cost of a campaign before it starts
+///
+/// Shows the largest number of labels that the configuration allows, their expected cost and the disk use. The cost of a label
+/// is extrapolated from the labels of another campaign (--cost-from) or from one test label (--core-seconds, see `calmwalk
+/// label-file`).
+#[derive(Debug, clap::Args)]
+pub struct Estimate {
+    /// Configuration of the campaign (TOML)
+    #[arg(value_name = "CONFIG")]
+    config: PathBuf,
+    /// Campaign with labels computed in the same way, from which to estimate costs: its directory, or the postgres:// URL of
+    /// its store
+    #[arg(long, value_name = "DIR", conflicts_with = "core_seconds")]
+    cost_from: Option<PathBuf>,
+    /// Cost of one label of the first seed structure, in core-seconds
+    #[arg(long, value_name = "CORE_SECONDS", value_parser = core_seconds)]
+    core_seconds: Option<f64>,
+    /// List every seed structure instead of the first 20 (JSON always lists all)
+    #[arg(long)]
+    all: bool,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+fn core_seconds(text: &str) -> Result<f64, String> {
+    let seconds = text.parse().ok().filter(|seconds: &f64| seconds.is_finite() && *seconds > 0.0);
+    seconds.ok_or_else(|| "expected a number of core-seconds above 0".to_owned())
+}
+
+/// The labels of one seed structure.
+struct SeedEstimate {
+    name: String,
+    size: Size,
+    /// Upper limit.
+    labels: u64,
+    /// Cost of one label.
+    cost_per_label: Option<CoreHours>,
+}
+
+/// The estimate for the campaign.
+struct CampaignEstimate {
+    seed_structures: Vec<SeedEstimate>,
+    /// Upper limit. Smaller than the sum over the seed structures if a key of the configuration limits the total.
+    labels: u64,
+    limited_by: Option<String>,
+    cost: Option<CoreHours>,
+    /// Where the costs come from.
+    cost_source: String,
+    disk: Forecast,
+}
+
+impl Estimate {
+    pub fn run(self) -> Result<Ended, Failure> {
+        let campaign = Campaign::load(&self.config)?;
+        let estimate = self.estimate(&campaign)?;
+        if self.json {
+            print_json(&as_json(&estimate))?;
+        } else {
+            print(|out| write(out, &self.config, &estimate, self.all))?;
+        }
+        Ok(Ended::Done)
+    }
+
+    fn estimate(&self, campaign: &Campaign) -> Result<CampaignEstimate, Failure> {
+        let sizes: Vec<_> = campaign.label_sizes()?.iter().map(size_of).collect();
+        let (costs, cost_source) = self.costs(sizes.first())?;
+        let config = &campaign.config;
+        let (copies, per_seed) = (config.labels_of_each(), config.collect.per_seed.get());
+        let labels = u64::from(copies) * u64::from(per_seed);
+        let seed_structures: Vec<_> = campaign
+            .seeds
+            .iter()
+            .zip(sizes)
+            .map(|(seed, size)| SeedEstimate {
+                name: seed.seed.name.clone(),
+                size,
+                labels,
+                cost_per_label: costs.as_ref().and_then(|costs| costs.predict([(size, 1)])),
+            })
+            .collect();
+        let sum = labels * seed_structures.len() as u64;
+        let limit = config.most_structures().map(|limit| u64::from(copies) * u64::from(limit));
+        let cost = costs
+            .and_then(|costs| costs.predict(seed_structures.iter().map(|seed| (seed.size, seed.labels))));
+        // It is not known in advance which seed structures reach fewer labels: scale all costs alike.
+        let limit = limit.filter(|limit| *limit < sum);
+        let fraction = limit.unwrap_or(sum) as f64 / sum.max(1) as f64;
+        Ok(CampaignEstimate {
+            seed_structures,
+            labels: limit.unwrap_or(sum),
+            limited_by: limit.and(config.budget().structures_by),
+            cost: cost.map(|cost| cost.times(fraction)),
+            cost_source,
+            disk: Forecast::of(campaign),
+        })
+    }
+
+    /// The cost model, and a description of its source.
+    fn costs(&self, first: Option<&Size>) -> Result<(Option<Costs>, String), Failure> {
+        if let (Some(core_seconds), Some(size)) = (self.core_seconds, first) {
+            let measured = Measured { size: *size, core_seconds };
+            let costs = Costs::by(CostModel::fit(&[measured], None));
+            return Ok((Some(costs), "--core-seconds".into()));
+        }
+        let Some(campaign) = &self.cost_from else {
+            return Ok((None, String::new()));
+        };
+        let location = campaign_location::parse(campaign)?;
+        let costs = block_on(fit_costs(&location))??;
+        let source = format!("the {} of {location}", newest_labels(costs.measured()));
+        Ok((Some(costs), source))
+    }
+}
+
+fn newest_labels(count: usize) -> String {
+    if count == 1 { "newest label".to_owned() } else { format!("{count} newest labels") }
+}
+
+async fn fit_costs(location: &Location) -> Result<Costs, Failure> {
+    let store = Store::open_read_only(location).await?;
+    let none = || Failure::Input("--cost-from: that campaign has no labels".into());
+    let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
+    let costs = Costs::of(&store, protocol.hash).await?;
+    store.close().await;
+    if costs.measured() == 0 { Err(none()) } else { Ok(costs) }
+}
+
+fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: bool) -> io::Result<()> {
+    let CampaignEstimate { seed_structures, labels, limited_by, cost, cost_source, disk } = estimate;
+    let limit = limited_by.as_ref().map_or(String::new(), |key| format!(", limited by {key}"));
+    writeln!(out, "{}: at most {}{limit}", path.display(), count(*labels, "label"))?;
+    match cost {
+        Some(hours) => {
+            writeln!(out, "  labels   about {hours} for all of them, estimated from {cost_source}")?;
+        }
+        None => writeln!(
+            out,
+            "  labels   cost unknown: pass a similar campaign with --cost-from, or compute one label with calmwalk label-file \
+             and pass its cost with --core-seconds"
+        )?,
+    }
+    writeln!(out, "  disk     {disk}")?;
+    let mut table = Table::new(&[
+        "seed structure",
+        ">labels",
+        ">atoms",
+        ">electrons",
+        ">k-points",
+        ">core-hours per label",
+    ]);
+    let shown = if all { seed_structures.len() } else { SHOWN.min(seed_structures.len()) };
+    for SeedEstimate { name, size, labels, cost_per_label } in &seed_structures[..shown] {
+        table.push(vec![
+            name.clone(),
+            labels.to_string(),
+            size.atoms.to_string(),
+            size.electrons.map_or("–".into(), |electrons| electrons.to_string()),
+            size.k_points.to_string(),
+            cost_per_label.map_or("–".into(), |hours| digits(hours.expected)),
+        ]);
+    }
+    table.write(out)?;
+    match seed_structures.len() - shown {
+        0 => Ok(()),
+        more => writeln!(out, "… and {more} more (use --all)"),
+    }
+}
+
+fn as_json(estimate: &CampaignEstimate) -> serde_json::Value {
+    let of_seed = |seed: &SeedEstimate| {
+        let Size { atoms, electrons, k_points } = seed.size;
+        json!({
+            "seed_structure": seed.name, "labels": seed.labels, "atoms": atoms, "electrons": electrons,
+            "k_points": k_points, "core_hours_each": seed.cost_per_label,
+        })
+    };
+    json!({
+        "labels": estimate.labels, "limited_by": estimate.limited_by, "core_hours": estimate.cost,
+        "disk": estimate.disk,
+        "seed_structures": estimate.seed_structures.iter().map(of_seed).collect::<Vec<_>>(),
+    })
+}

@@ -1,0 +1,130 @@
+//! Selects the structures to relabel.
+
+use std::collections::{BTreeMap, HashSet};
+
+use store::{ExportFilter, JobState, Relabellable, Store, Waiting};
+use wire::ContentHash;
+
+use super::Failure;
+use crate::cli::export::frame::facts;
+use crate::condition::Condition;
+use crate::output;
+
+/// Structures per read.
+const PAGE: u32 = 200;
+
+/// Labelled structures: those to relabel, and the numbers of those that are skipped.
+#[derive(Default)]
+pub struct Selection {
+    selected: Vec<Relabellable>,
+    /// Already waiting for a new label.
+    pub waiting: u64,
+    /// Already labelled by the protocol.
+    pub labelled: u64,
+    /// Dropped from the queue of the protocol.
+    pub dropped: u64,
+}
+
+impl Selection {
+    /// `include_current`: also structures labelled by the protocol.
+    pub fn new(all: Vec<Relabellable>, include_current: bool) -> Self {
+        let mut selection = Self::default();
+        for structure in all {
+            match structure.job {
+                Some(JobState::Queued | JobState::Leased) => selection.waiting += 1,
+                Some(JobState::Dropped) => selection.dropped += 1,
+                Some(JobState::Labelled) if !include_current => selection.labelled += 1,
+                _ => selection.selected.push(structure),
+            }
+        }
+        selection
+    }
+
+    /// The structures of these candidates, whatever the protocol of their labels.
+    pub async fn from_ids(store: &Store, all: Vec<Relabellable>, ids: &[String]) -> Result<Self, Failure> {
+        let mut wanted = HashSet::new();
+        for id in ids {
+            let candidate = store.find_candidate(id).await?.candidate;
+            let content = match store.candidate(&candidate).await? {
+                Some(stored) => stored.block.view().id().content,
+                None => return Err(Failure::Input(format!("there is no candidate {candidate}"))),
+            };
+            if !all.iter().any(|structure| structure.content == content) {
+                return Err(Failure::Input(format!(
+                    "{candidate} has no label to replace: see calmwalk explain (to queue a failed or dropped candidate again, \
+                     use calmwalk queue … retry)"
+                )));
+            }
+            wanted.insert(content.0);
+        }
+        let selected = all.into_iter().filter(|structure| wanted.contains(&structure.content.0)).collect();
+        Ok(Self::new(selected, true))
+    }
+
+    /// Hashes of the selected structures.
+    pub fn structures(&self) -> Vec<ContentHash> {
+        self.selected.iter().map(|structure| structure.content).collect()
+    }
+
+    /// Numbers of selected structures by size.
+    pub fn sizes(&self) -> Vec<Waiting> {
+        let mut sizes: BTreeMap<_, u64> = BTreeMap::new();
+        for Relabellable { seed_structure, formula, atoms, .. } in &self.selected {
+            *sizes.entry((*seed_structure, formula.clone(), *atoms)).or_default() += 1;
+        }
+        let waiting =
+            |((seed_structure, formula, atoms), jobs)| Waiting { seed_structure, formula, atoms, jobs };
+        sizes.into_iter().map(waiting).collect()
+    }
+
+    /// The labels to replace, by protocol, as the end of a sentence.
+    pub fn replaced(&self) -> String {
+        let mut protocols: BTreeMap<&str, u64> = BTreeMap::new();
+        for structure in &self.selected {
+            *protocols.entry(&structure.protocol).or_default() += 1;
+        }
+        let counts: Vec<_> = protocols
+            .iter()
+            .map(|(name, count)| format!("{} of '{name}'", output::count(*count, "label")))
+            .collect();
+        if counts.is_empty() { String::new() } else { format!(", to replace {}", counts.join(", ")) }
+    }
+
+    /// Lines about the structures that are not relabelled.
+    pub fn skipped(&self, protocol: &str) -> Vec<String> {
+        let lines = [
+            (self.waiting, "already queued".to_owned()),
+            (self.labelled, format!("already labelled by '{protocol}' (use --include-current to relabel)")),
+            (self.dropped, "dropped".to_owned()),
+        ];
+        let lines = lines.into_iter().filter(|(count, _)| *count > 0);
+        lines
+            .map(|(count, reason)| format!("{} skipped: {reason}", output::count(count, "structure")))
+            .collect()
+    }
+}
+
+/// The structures whose labels match the filter.
+pub async fn matching(
+    store: &Store,
+    all: Vec<Relabellable>,
+    condition: &Condition,
+) -> Result<Vec<Relabellable>, Failure> {
+    let mut matching = HashSet::new();
+    for protocol in store.protocols().await? {
+        let filter = ExportFilter { protocol: protocol.hash, biased: true, control: true, imported: false };
+        let mut last = None;
+        loop {
+            let page = store.labelled(&filter, last, PAGE).await?;
+            let Some(row) = page.last() else { break };
+            last = Some(row.place);
+            let rows = page.iter().filter(|row| condition.is_met(&facts(row)));
+            matching.extend(rows.map(|row| ContentHash::of(&row.structure).0));
+        }
+    }
+    let all: Vec<_> = all.into_iter().filter(|structure| matching.contains(&structure.content.0)).collect();
+    if all.is_empty() {
+        return Err(Failure::Input(format!("no labelled structure matches --where '{condition}'")));
+    }
+    Ok(all)
+}
