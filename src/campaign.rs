@@ -17,10 +17,10 @@ use wire::{CampaignId, ContentHash};
 use workers::settings::{GuardSettings, WalkSettings};
 
 use crate::config::{Config, ConfigError, LabelMethod, Loaded, Warning, without_changeable};
-use crate::labelling::resolved_method;
-use crate::outcome::Failure;
-use crate::output::warn;
-use crate::setup::MethodSetup;
+use crate::exit_status::Failure;
+use crate::label_setup::resolved_method;
+use crate::output::log_and_warn;
+use crate::process_config::MethodConfig;
 use load::Loader;
 pub use load::check_sound;
 
@@ -94,12 +94,12 @@ impl Campaign {
 
     /// Prints the warnings on the standard error and in the log.
     pub fn print_warnings(&self) {
-        self.warnings.iter().for_each(warn);
+        self.warnings.iter().for_each(log_and_warn);
     }
 
     /// How labels are made.
-    pub fn method(&self) -> Result<MethodSetup, Failure> {
-        MethodSetup::of(&self.config.label)
+    pub fn method(&self) -> Result<MethodConfig, Failure> {
+        MethodConfig::from_section(&self.config.label)
     }
 
     /// What the label of each seed structure depends on in its cost. A program must be there.

@@ -5,11 +5,11 @@ use calm::rules::Combination;
 use crate::config::CalmSection;
 
 /// The alarm ends when the share has fallen below so much of the limit, so that it does not come and go with every decision.
-const CLEARLY_BELOW: f64 = 0.9;
+const HYSTERESIS: f64 = 0.9;
 
 /// What is looked at.
 #[derive(Clone, Copy, Debug)]
-pub struct Forgetting {
+pub struct ForgettingRule {
     /// Share of the training atoms above which there is an alarm.
     limit: f64,
     combination: Combination,
@@ -17,12 +17,12 @@ pub struct Forgetting {
 
 /// Follows the alarm through a run.
 #[derive(Clone, Debug)]
-pub struct Alarm {
-    forgetting: Forgetting,
+pub struct ForgettingAlarm {
+    forgetting: ForgettingRule,
     raised: bool,
 }
 
-impl Forgetting {
+impl ForgettingRule {
     /// By the section `[calm]`.
     pub fn new(calm: &CalmSection) -> Self {
         Self { limit: calm.forgetting_alarm.get(), combination: calm.combination }
@@ -30,12 +30,12 @@ impl Forgetting {
 
     /// Whether the alarm holds for this share of the training atoms with γ > 1; `raised` is what the selector found. `None`
     /// where it is as it was before.
-    pub fn holds(&self, share: f64, raised: bool) -> Option<bool> {
-        (raised || share < CLEARLY_BELOW * self.limit).then_some(raised)
+    pub fn evaluate(&self, share: f64, raised: bool) -> Option<bool> {
+        (raised || share < HYSTERESIS * self.limit).then_some(raised)
     }
 
     /// The alarm, with what can be done about it.
-    pub fn begun(&self, share: f64) -> String {
+    pub fn raised_message(&self, share: f64) -> String {
         let other = match self.combination {
             Combination::Convex => {
                 "combination = \"additive\", which forgets nothing, or with smaller values of ladder"
@@ -52,7 +52,7 @@ impl Forgetting {
     }
 
     /// That the alarm is over.
-    pub fn over(&self, share: f64) -> String {
+    pub fn cleared_message(&self, share: f64) -> String {
         format!(
             "the mixture covers its training data again: {:.1} % of the training atoms have γ > 1",
             100.0 * share
@@ -60,18 +60,18 @@ impl Forgetting {
     }
 }
 
-impl Alarm {
+impl ForgettingAlarm {
     /// Nothing has been said yet.
-    pub fn new(forgetting: Forgetting) -> Self {
+    pub fn new(forgetting: ForgettingRule) -> Self {
         Self { forgetting, raised: false }
     }
 
     /// Takes in a decision; what there is to say when the alarm begins or ends.
-    pub fn decided(&mut self, share: f64, raised: bool) -> Option<String> {
-        let holds = self.forgetting.holds(share, raised)?;
+    pub fn update(&mut self, share: f64, raised: bool) -> Option<String> {
+        let holds = self.forgetting.evaluate(share, raised)?;
         match (std::mem::replace(&mut self.raised, holds), holds) {
-            (false, true) => Some(format!("ALARM: {}", self.forgetting.begun(share))),
-            (true, false) => Some(self.forgetting.over(share)),
+            (false, true) => Some(format!("ALARM: {}", self.forgetting.raised_message(share))),
+            (true, false) => Some(self.forgetting.cleared_message(share)),
             _ => None,
         }
     }
@@ -83,11 +83,11 @@ mod tests {
 
     #[test]
     fn an_alarm_is_said_when_it_begins_and_when_it_ends() {
-        let forgetting = Forgetting { limit: 0.2, combination: Combination::Convex };
-        let mut alarm = Alarm::new(forgetting);
+        let forgetting = ForgettingRule { limit: 0.2, combination: Combination::Convex };
+        let mut alarm = ForgettingAlarm::new(forgetting);
         let said: Vec<_> = [0.1, 0.21, 0.3, 0.19, 0.21, 0.17, 0.1, 0.25]
             .into_iter()
-            .map(|share| alarm.decided(share, share > 0.2))
+            .map(|share| alarm.update(share, share > 0.2))
             .collect();
         let begins = [1, 7].map(|index: usize| said[index].clone().unwrap());
         assert!(begins[0].starts_with("ALARM: ") && begins[0].contains("additive"), "{begins:?}");

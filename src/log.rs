@@ -15,14 +15,14 @@ use serde::{Deserialize, Serialize};
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Level, Metadata, Subscriber};
 
-use self::format::{Fields, Line};
-use crate::outcome::Failure;
+use self::format::{Fields, LogLine};
+use crate::exit_status::Failure;
 
 /// The packages of this program. Of what libraries have to say, only warnings and errors are kept.
-const OURS: [&str; 5] = ["calmwalk", "orchestrator", "store", "wire", "workers"];
+const WORKSPACE_CRATES: [&str; 5] = ["calmwalk", "orchestrator", "store", "wire", "workers"];
 
 /// What children are told.
-static SETUP: OnceLock<Setup> = OnceLock::new();
+static CONFIG: OnceLock<LogConfig> = OnceLock::new();
 
 /// Arguments of commands that run for long.
 #[derive(Clone, Debug, clap::Args)]
@@ -65,7 +65,7 @@ pub enum Format {
 /// What the log of a process is.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
-pub struct Setup {
+pub struct LogConfig {
     /// The file, wherever a process works.
     file: PathBuf,
     level: LogLevel,
@@ -77,20 +77,20 @@ impl Options {
     ///
     /// # Errors
     /// A file that cannot be written.
-    pub fn begin(&self, process: &'static str) -> Result<(), Failure> {
+    pub fn init(&self, process: &'static str) -> Result<(), Failure> {
         let Some(file) = &self.file else { return Ok(()) };
         let file = std::path::absolute(file).map_err(|error| cannot_write(file, &error))?;
-        begin(Some(Setup { file, level: self.level, format: self.format }), process, None)
+        init(Some(LogConfig { file, level: self.level, format: self.format }), process, None)
     }
 }
 
 /// What a process that this one starts is to log.
-pub fn for_children() -> Option<Setup> {
-    SETUP.get().cloned()
+pub fn child_config() -> Option<LogConfig> {
+    CONFIG.get().cloned()
 }
 
 /// Begins the log of a process that others have started: what it is called, and its number among its like.
-pub fn begin(setup: Option<Setup>, process: &'static str, number: Option<u32>) -> Result<(), Failure> {
+pub fn init(setup: Option<LogConfig>, process: &'static str, number: Option<u32>) -> Result<(), Failure> {
     let Some(setup) = setup else { return Ok(()) };
     let opened = OpenOptions::new().append(true).create(true).mode(0o600).open(&setup.file);
     let file = opened.map_err(|error| cannot_write(&setup.file, &error))?;
@@ -98,7 +98,7 @@ pub fn begin(setup: Option<Setup>, process: &'static str, number: Option<u32>) -
     let log = Log { file, level: setup.level.into(), format: setup.format, name };
     // A process has one log, which begins with its command.
     if tracing::subscriber::set_global_default(log).is_ok() {
-        let _ = SETUP.set(setup);
+        let _ = CONFIG.set(setup);
     }
     Ok(())
 }
@@ -119,15 +119,16 @@ struct Log {
 impl Subscriber for Log {
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
         let package = metadata.target().split("::").next().unwrap_or_default();
-        let level = if OURS.contains(&package) { self.level } else { self.level.min(Level::WARN) };
+        let level =
+            if WORKSPACE_CRATES.contains(&package) { self.level } else { self.level.min(Level::WARN) };
         metadata.is_event() && *metadata.level() <= level
     }
 
     fn event(&self, event: &Event<'_>) {
         let mut fields = Fields::default();
         event.record(&mut fields);
-        fields.correct();
-        let line = Line {
+        fields.remove_wrong_hint();
+        let line = LogLine {
             time: store::unix_milliseconds(),
             level: *event.metadata().level(),
             process: &self.name,

@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use store::Location;
 
-use crate::outcome::Failure;
+use crate::exit_status::Failure;
 
 /// Work that ends sooner than this shows no bar.
 const BAR_AFTER: Duration = Duration::from_secs(1);
@@ -25,28 +25,28 @@ pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(),
 }
 
 /// Writes a line to the standard error, and nowhere else. That nobody reads it, or that it cannot be kept, stops no work.
-pub fn show(line: impl Display) {
+pub fn print_stderr(line: impl Display) {
     let _ = writeln!(io::stderr().lock(), "{line}");
 }
 
 /// The same, and in the log.
-pub fn say(line: impl Display) {
+pub fn log_and_print(line: impl Display) {
     tracing::info!("{line}");
-    show(line);
+    print_stderr(line);
 }
 
 /// The same of what should not be.
-pub fn warn(line: impl Display) {
+pub fn log_and_warn(line: impl Display) {
     tracing::warn!("{line}");
-    show(line);
+    print_stderr(line);
 }
 
 /// Says that what goes to the store may be read by others, if its URL allows that.
-pub fn say_if_unprotected(location: &Location) {
+pub fn warn_if_unencrypted(location: &Location) {
     if let Location::Server(url) = location
         && url.is_unprotected()
     {
-        warn(format_args!(
+        log_and_warn(format_args!(
             "WARNING: what goes to and from {url} is not encrypted (sslmode=disable): whoever is on the network can read and \
              change it"
         ));

@@ -9,9 +9,9 @@ use orchestrator::reactor::Notice;
 use store::Fate;
 use wire::{Origin, WalkId};
 
-use crate::ends::Ends;
-use crate::forgetting::{Alarm, Forgetting};
-use crate::output::{count, show};
+use crate::forgetting::{ForgettingAlarm, ForgettingRule};
+use crate::output::{count, print_stderr};
+use crate::walk_ends::WalkEnds;
 
 /// Time between two plain lines that only say where the walks stand.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
@@ -26,8 +26,8 @@ pub struct Display {
     accepted: u64,
     /// Whether it was said that walkers wait for labels.
     waiting: bool,
-    forgetting: Alarm,
-    ends: Ends,
+    forgetting: ForgettingAlarm,
+    ends: WalkEnds,
     /// Whether it was said that walk after walk ends early.
     warned: bool,
     last_line: Instant,
@@ -45,8 +45,8 @@ impl Display {
     pub fn new(
         walk_steps: u64,
         walks: Vec<(WalkId, String, u64)>,
-        ends: Ends,
-        forgetting: Forgetting,
+        ends: WalkEnds,
+        forgetting: ForgettingRule,
     ) -> Self {
         let (mut names, mut steps) = (BTreeMap::new(), BTreeMap::new());
         for (walk, name, step) in walks {
@@ -61,8 +61,8 @@ impl Display {
             walk_steps,
             accepted: 0,
             waiting: false,
-            forgetting: Alarm::new(forgetting),
-            warned: ends.are_alarming(),
+            forgetting: ForgettingAlarm::new(forgetting),
+            warned: ends.is_alarming(),
             ends,
             last_line: Instant::now(),
         };
@@ -113,7 +113,7 @@ impl Display {
         for decision in &commit.decisions {
             let share = decision.detail["training_frames"]["share_above_one"].as_f64();
             let raised = decision.detail["forgetting_alarm"].as_bool();
-            let alarm = share.zip(raised).and_then(|(share, raised)| self.forgetting.decided(share, raised));
+            let alarm = share.zip(raised).and_then(|(share, raised)| self.forgetting.update(share, raised));
             if let Some(alarm) = alarm {
                 tracing::warn!("{alarm}");
                 self.show_lasting(&alarm);
@@ -129,7 +129,7 @@ impl Display {
                 self.show(&format!("{}: ended ({end}) at step {}", self.name(walk), decision.detail["step"]));
             }
         }
-        if !self.warned && self.ends.are_alarming() {
+        if !self.warned && self.ends.is_alarming() {
             self.warned = true;
             let warning = format!("WARNING: {}", self.ends.warning());
             tracing::warn!("{warning}");
@@ -153,7 +153,7 @@ impl Display {
     fn show(&self, line: &str) {
         match &self.bars {
             Some(bars) => bars.message.set_message(line.to_owned()),
-            None => show(line),
+            None => print_stderr(line),
         }
     }
 
@@ -162,7 +162,7 @@ impl Display {
         match &self.bars {
             // A terminal that is gone needs no line.
             Some(bars) => drop(bars.all.println(line)),
-            None => show(line),
+            None => print_stderr(line),
         }
     }
 
@@ -174,7 +174,7 @@ impl Display {
             bars.steps.set_message(format!("{} accepted", self.accepted));
         } else if self.last_line.elapsed() > LINE_INTERVAL {
             self.last_line = Instant::now();
-            show(format_args!("{done} of {all} steps, {} accepted in this run", self.accepted));
+            print_stderr(format_args!("{done} of {all} steps, {} accepted in this run", self.accepted));
         }
     }
 }

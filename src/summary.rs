@@ -6,11 +6,11 @@ use calm::watch::GradeDistribution;
 use store::{Status, Store, StoreError, Unlabelled};
 use wire::ContentHash;
 
-use crate::budget;
-use crate::ends::Ends;
-use crate::learned::{self, Grades, Learned};
+use crate::budget_usage;
+use crate::label_statistics::{self, ErrorsByGrade, LabelStatistics};
 use crate::output::{count, decimals};
 use crate::unlabelled;
+use crate::walk_ends::WalkEnds;
 
 /// Seed structures with failed labels that are shown.
 const SHOWN: usize = 8;
@@ -19,7 +19,7 @@ const SHOWN: usize = 8;
 #[derive(Clone, Debug)]
 pub struct Summary {
     status: Status,
-    learned: Learned,
+    learned: LabelStatistics,
     /// Where labels finally failed.
     unlabelled: Vec<Unlabelled>,
     /// Grades of the training frames under the newest mixture, if they are watched.
@@ -27,9 +27,9 @@ pub struct Summary {
 }
 
 /// Gathers the summary of a campaign, with the labels of one protocol.
-pub async fn of(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
+pub async fn read(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
     let status = store.status().await?;
-    let learned = learned::of(store, protocol).await?;
+    let learned = label_statistics::read(store, protocol).await?;
     let unlabelled = store.unlabelled(protocol, true).await?;
     let values = store.values().await?;
     let watched = values.iter().find(|(name, _)| name == "training_frames");
@@ -42,7 +42,7 @@ impl fmt::Display for Summary {
         let Self { status: Status { candidates, labels, walks, mixture_version, .. }, learned, .. } = self;
         let of = |origin: &str| walks.iter().filter(|walk| walk.origin == origin).count();
         writeln!(f, "walks            {} biased, {} control", of("biased"), of("control"))?;
-        let ends = Ends::of(walks);
+        let ends = WalkEnds::from_walks(walks);
         writeln!(f, "                 ended: {}", ends.in_words())?;
         ends.lines().iter().try_for_each(|line| writeln!(f, "                 {line}"))?;
         let declined = &candidates.declined;
@@ -76,8 +76,8 @@ impl fmt::Display for Summary {
             labels.failed,
             labels.dropped
         )?;
-        write!(f, "{}", unlabelled::shown(&self.unlabelled, 17, SHOWN))?;
-        if let Some(budget) = budget::shown(&self.status.budget) {
+        write!(f, "{}", unlabelled::describe(&self.unlabelled, 17, SHOWN))?;
+        if let Some(budget) = budget_usage::describe(&self.status.budget) {
             writeln!(f, "budget           {budget}")?;
         }
         writeln!(f, "mixture          version {mixture_version}")?;
@@ -104,7 +104,7 @@ impl fmt::Display for Summary {
 }
 
 /// That structures are counted twice which biased walks and controls both found.
-fn both(learned: &Learned) -> String {
+fn both(learned: &LabelStatistics) -> String {
     match learned.shared {
         0 => String::new(),
         shared => {
@@ -114,8 +114,8 @@ fn both(learned: &Learned) -> String {
 }
 
 /// A line of numbers.
-fn line(grades: &Grades) -> String {
-    let Grades { gamma, gamma_nbr, .. } = grades;
+fn line(grades: &ErrorsByGrade) -> String {
+    let ErrorsByGrade { gamma, gamma_nbr, .. } = grades;
     if gamma.atoms() == 0 {
         return "no labelled structures".to_owned();
     }

@@ -6,7 +6,7 @@ use crate::output::Table;
 
 /// A line behind a title of `width` characters, and one for each seed structure and formula, `most` of these; nothing if
 /// no label failed.
-pub fn shown(unlabelled: &[Unlabelled], width: usize, most: usize) -> String {
+pub fn describe(unlabelled: &[Unlabelled], width: usize, most: usize) -> String {
     if unlabelled.is_empty() {
         return String::new();
     }
@@ -74,12 +74,12 @@ mod tests {
             relative_volume: range(1.4, 1.4),
             relative_volume_labelled: Range::default(),
         };
-        let text = shown(&[part.clone(), part], 12, 1);
+        let text = describe(&[part.clone(), part], 12, 1);
         let lines: Vec<_> = text.lines().collect();
         assert!(lines[0].starts_with("unlabelled  the labels of 4 structures failed"), "{text}");
         let cells: Vec<_> = lines[2].split("  ").map(str::trim).filter(|cell| !cell.is_empty()).collect();
         assert_eq!(cells, ["fcc", "Al32", "2", "9", "3.00 to 4.00", "1.50 to 2.25", "1.400", "–"]);
         assert!(lines[3].contains("1 more") && lines.len() == 4, "{text}");
-        assert_eq!(shown(&[], 12, 8), "");
+        assert_eq!(describe(&[], 12, 8), "");
     }
 }

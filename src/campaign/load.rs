@@ -14,7 +14,7 @@ use toml::Spanned;
 
 use super::NamedSeed;
 use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
-use crate::labelling::{self, REFERENCE_FILE};
+use crate::label_setup::{self, REFERENCE_FILE};
 
 /// Atoms of training frames whose grades are watched, at most: enough for the share above 1 to a percent.
 const WATCHED_ATOMS: usize = 4000;
@@ -103,7 +103,7 @@ impl Loader<'_> {
         let frames = read_structures(file.get_ref()).map_err(|error| wrong(error.to_string()))?;
         let atoms: usize = frames.iter().map(|frame| frame.structure.len()).sum();
         let every = atoms.div_ceil(WATCHED_ATOMS);
-        let mut features = Features::of(model);
+        let mut features = Features::new(model);
         for frame in frames.iter().step_by(every) {
             let place = || format!("{}:{}", file.get_ref().display(), frame.line);
             features.add(&frame.structure).map_err(|error| wrong(format!("{}: {error}", place())))?;
@@ -143,7 +143,7 @@ impl Loader<'_> {
         let file = self.config.calm.artifact.as_ref().unwrap_or(&self.config.potential.model);
         let key = if self.config.calm.artifact.is_some() { "calm.artifact" } else { "potential.model" };
         let wrong = |message: String| self.wrong(key, file, message);
-        let mut features = Features::of(model);
+        let mut features = Features::new(model);
         for named in seeds {
             let of_seed =
                 |error| wrong(format!("seed structure '{}' ({}): {error}", named.seed.name, named.source));
@@ -170,7 +170,7 @@ impl Loader<'_> {
             LabelMethod::Reference(reference) => self.reference(reference, seeds)?,
             LabelMethod::Code(settings) => (self.code(settings, seeds)?, Vec::new()),
         };
-        Ok((labelling::protocol(self.config.label.protocol_name(), settings), hashes))
+        Ok((label_setup::protocol(self.config.label.protocol_name(), settings), hashes))
     }
 
     fn reference(
@@ -194,7 +194,7 @@ impl Loader<'_> {
             }
         }
         let hash = self.hash(REFERENCE_FILE, &reference.file)?;
-        Ok((labelling::reference_identity(reference.kind, &hash.1), vec![hash]))
+        Ok((label_setup::reference_identity(reference.kind, &hash.1), vec![hash]))
     }
 
     /// Settings of a program's protocol; the program must be there, with what it needs for every seed structure.
@@ -210,7 +210,7 @@ impl Loader<'_> {
             let of_seed = |error| format!("{error} (seed structure '{}', {})", named.seed.name, named.source);
             supported.map_err(|error| wrong(of_seed(error)))?;
         }
-        Ok(labelling::identity(settings.name(), &*code))
+        Ok(label_setup::code_identity(settings.name(), &*code))
     }
 
     /// A key and the hash of the file that it names.
@@ -242,7 +242,7 @@ struct Features {
 }
 
 impl Features {
-    fn of(model: &Arc<GraceModel>) -> Self {
+    fn new(model: &Arc<GraceModel>) -> Self {
         let (grace, neighbours) = (Grace::new(Arc::clone(model)), NeighbourList::new(model.cutoff(), 0.0));
         Self { grace, neighbours, elements: Vec::new(), values: Vec::new() }
     }

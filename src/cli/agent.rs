@@ -8,12 +8,12 @@ use orchestrator::launcher::raise_descriptor_limit;
 use store::ProcessRecord;
 use wire::net::{self, Address, Tls};
 
-use super::{Ended, Failure, block_on};
-use crate::actors::scratch::{self, Scratch};
-use crate::actors::{agent, cores};
+use super::{ExitStatus, Failure, block_on};
 use crate::log::Options;
-use crate::output::warn;
-use crate::web::{self, agent::Watched};
+use crate::output::log_and_warn;
+use crate::runtime::scratch_dir::{self, ScratchDir};
+use crate::runtime::{agent_host, cores};
+use crate::web::{self, agent_metrics::AgentState};
 
 /// Let this host take part in a campaign that `calmwalk run --listen` leads on another
 ///
@@ -51,18 +51,18 @@ pub struct Agent {
 }
 
 impl Agent {
-    pub fn run(self) -> Result<Ended, Failure> {
-        self.log.begin("agent")?;
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        self.log.init("agent")?;
         let walkers = self.walkers.unwrap_or_else(|| (cores() / self.threads).max(1));
         let patience = Duration::from_secs_f64(60.0 * self.patience);
         let tls = self.tls.as_deref().map(Tls::in_directory);
         if let Some(tls) = &tls {
             let checked = tls.check_for_agent().map_err(Failure::input)?;
-            checked.warnings.iter().for_each(|warning| warn(format_args!("WARNING: {warning}")));
+            checked.warnings.iter().for_each(|warning| log_and_warn(format_args!("WARNING: {warning}")));
         }
         raise_descriptor_limit();
-        scratch::clean();
-        let scratch = Scratch::new().map_err(|error| {
+        scratch_dir::clean();
+        let scratch = ScratchDir::new().map_err(|error| {
             Failure::Failed(format!("cannot make a directory in {}: {error}", std::env::temp_dir().display()))
         })?;
         let process =
@@ -77,13 +77,13 @@ impl Agent {
             walkers,
             ahead: self.ahead,
         };
-        let watched = Watched::default();
+        let watched = AgentState::default();
         block_on(async {
             if let Some(address) = self.metrics {
-                web::serve_metrics(web::listen(address).await?, web::agent::router(watched.clone()))?;
+                web::serve_metrics(web::listen(address).await?, web::agent_metrics::router(watched.clone()))?;
             }
             let (tls, threads) = (tls.as_ref(), self.threads as usize);
-            agent::work(&self.join, tls, agent, threads, patience, scratch.path(), &watched).await
+            agent_host::run(&self.join, tls, agent, threads, patience, scratch.path(), &watched).await
         })?
     }
 }

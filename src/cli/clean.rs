@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use store::CampaignLock;
 use wire::place::{Place, PlaceError, Removed};
 
-use super::{Ended, Failure};
+use super::{ExitStatus, Failure};
 use crate::output::{count, print};
 
 /// Remove what killed processes of a campaign left in shared memory
@@ -20,7 +20,7 @@ pub struct Clean {
 }
 
 impl Clean {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         if self.directories.is_empty() {
             for place in Place::all().map_err(Failure::failed)? {
                 let campaign = place.campaign_directory();
@@ -35,7 +35,7 @@ impl Clean {
             let place = Place::of(directory).map_err(Failure::input)?;
             report(directory, clean(&place, Some(directory))?)?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 

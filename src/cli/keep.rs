@@ -3,7 +3,7 @@
 use orchestrator::launcher;
 use workers::labeller::keep;
 
-use super::{Ended, Failure};
+use super::{ExitStatus, Failure};
 
 /// Keeps a calculation; labellers start it
 ///
@@ -12,9 +12,9 @@ use super::{Ended, Failure};
 pub struct Keep {}
 
 impl Keep {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
         keep().map_err(Failure::failed)?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }

@@ -10,13 +10,13 @@ use std::time::{Duration, Instant};
 use store::{Location, Store, StoreError};
 use tokio::sync::Notify;
 
-use super::{Ended, Failure, block_on, place};
-use crate::actors::asked_to_stop;
-use crate::actors::slots::{self, Slots};
+use super::{ExitStatus, Failure, block_on, place};
 use crate::config::Config;
-use crate::labelling::{Here, Labelling};
+use crate::label_setup::{HostOptions, LabelSetup};
 use crate::log::Options;
-use crate::output::{say, say_if_unprotected};
+use crate::output::{log_and_print, warn_if_unencrypted};
+use crate::runtime::label_pool::{self, LabelPool};
+use crate::runtime::stop_signal;
 
 /// Between two looks whether the campaign is there.
 const PAUSE: Duration = Duration::from_secs(2);
@@ -70,22 +70,22 @@ pub struct Label {
 }
 
 impl Label {
-    pub fn run(self) -> Result<Ended, Failure> {
-        self.log.begin("label")?;
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        self.log.init("label")?;
         block_on(self.label())?
     }
 
-    async fn label(self) -> Result<Ended, Failure> {
-        let (stopping, stop) = asked_to_stop("stopping: labels in hand are finished or given back …")?;
+    async fn label(self) -> Result<ExitStatus, Failure> {
+        let (stopping, stop) = stop_signal("stopping: labels in hand are finished or given back …")?;
         if let (Some(structures), Some(config)) = (&self.once, &self.config) {
             let (output, json) = (self.output.as_deref(), self.json);
             return once::label(once::Task { structures, config, output, json }, &stop).await;
         }
         let store = self.store.clone().unwrap_or_default();
-        say_if_unprotected(&place::location(&store)?);
+        warn_if_unencrypted(&place::location(&store)?);
         loop {
             let Some((opened, labelling)) = self.begin(&store, &stopping, &stop).await? else {
-                return Ok(Ended::Interrupted);
+                return Ok(ExitStatus::Interrupted);
             };
             let place = match place::location(&store)? {
                 Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
@@ -94,21 +94,21 @@ impl Label {
                 Location::Server(url) => url.as_str().into(),
             };
             let protocol = labelling.protocol.clone();
-            let slots = Slots {
+            let slots = LabelPool {
                 number: self.slots,
                 location: place,
                 labelling,
                 until_empty: self.until_empty,
                 grace: Duration::from_secs_f64(self.grace),
             };
-            let ended = slots::work(&opened, slots, &stopping, &stop).await?;
+            let ended = label_pool::run(&opened, slots, &stopping, &stop).await?;
             let is_in_force = opened.is_in_force(protocol.hash).await?;
             opened.close().await;
-            if ended == Ended::Interrupted || is_in_force {
+            if ended == ExitStatus::Interrupted || is_in_force {
                 return Ok(ended);
             }
             let name = protocol.name;
-            say(format_args!(
+            log_and_print(format_args!(
                 "the campaign labels by another protocol than '{name}' now: going on with that"
             ));
         }
@@ -120,7 +120,7 @@ impl Label {
         store: &Path,
         stopping: &Arc<AtomicBool>,
         stop: &Notify,
-    ) -> Result<Option<(Store, Labelling)>, Failure> {
+    ) -> Result<Option<(Store, LabelSetup)>, Failure> {
         let (begun, mut told) = (Instant::now(), false);
         while !stopping.load(Ordering::Relaxed) {
             // A campaign that begins meanwhile may be below the directory.
@@ -131,14 +131,14 @@ impl Label {
                 Err(Early::Never(failure)) => return Err(failure),
             };
             if !std::mem::replace(&mut told, true) {
-                say(format_args!("waiting for the campaign: {error}"));
+                log_and_print(format_args!("waiting for the campaign: {error}"));
             }
             tokio::select! { () = tokio::time::sleep(PAUSE) => {}, () = stop.notified() => {} }
         }
         Ok(None)
     }
 
-    async fn open(&self, location: &Location) -> Result<(Store, Labelling), Early> {
+    async fn open(&self, location: &Location) -> Result<(Store, LabelSetup), Early> {
         let store = Store::open(location).await?;
         let Some(protocol) = store.protocol_in_force().await? else {
             let lacks = "label protocol yet";
@@ -146,8 +146,8 @@ impl Label {
         };
         let label = self.config.as_deref().map(Config::load_label).transpose();
         let label = label.map_err(|error| Early::Never(error.into()))?;
-        let here = Here { method: self.method.as_deref(), files: &self.files, label };
-        match Labelling::of(&store, protocol, here).await {
+        let here = HostOptions { method: self.method.as_deref(), files: &self.files, label };
+        match LabelSetup::read(&store, protocol, here).await {
             Ok(labelling) => Ok((store, labelling)),
             Err(failure) => Err(Early::Never(failure)),
         }

@@ -12,10 +12,10 @@ use orchestrator::slurm::{JobNames, Phase, Plan, Slurm, SlurmError, Wanted, plan
 use store::Location;
 
 use self::order::Order;
-use super::{Ended, Failure, block_on, place};
+use super::{ExitStatus, Failure, block_on, place};
 use crate::campaign::Campaign;
 use crate::config::Config;
-use crate::output::{count, print, say};
+use crate::output::{count, log_and_print, print};
 
 /// Slurm's commands wait for a busy slurmctld themselves; longer than this is of no use.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -101,7 +101,7 @@ pub fn job_names(location: &Location) -> JobNames {
 }
 
 impl Launch {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let System::Slurm = self.on;
         let directory = self.directory()?;
         let slurm = Slurm::with_patience(PATIENCE);
@@ -120,12 +120,14 @@ impl Launch {
             }
             let (names, wanted) = (job_names(&location), self.wanted(&location));
             if wanted.labellers == 0 && campaign.config.label.slots == 0 {
-                say("label.slots = 0 and no job for labellers: labels have to come from calmwalk label");
+                log_and_print(
+                    "label.slots = 0 and no job for labellers: labels have to come from calmwalk label",
+                );
             }
             let order = Order::new(&self, &campaign, &directory, wanted)?;
             block_on(self.launch(&slurm, &names, &order, wanted))??;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     /// The campaign's directory, by its one true name, since jobs are known by it.
@@ -143,7 +145,7 @@ impl Launch {
         if let Location::Directory(_) = location
             && labellers > 0
         {
-            say(
+            log_and_print(
                 "the campaign is kept in SQLite, which serves one node: labels are made beside the orchestrator \
                  (label.slots of them side by side), and no job for labellers is submitted; PostgreSQL (run.store) \
                  serves many",

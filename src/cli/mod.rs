@@ -35,7 +35,7 @@ use std::path::PathBuf;
 use ::store::Location;
 use clap::{Parser, Subcommand};
 
-use crate::outcome::{Ended, Failure};
+use crate::exit_status::{ExitStatus, Failure};
 
 /// Expands the training set of an interatomic potential by molecular dynamics biased towards what it does not know.
 ///
@@ -84,7 +84,7 @@ enum Command {
 }
 
 /// Carries out a command.
-pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
+pub fn run(arguments: Arguments) -> Result<ExitStatus, Failure> {
     match arguments.command {
         Command::Init(command) => command.run(),
         Command::Validate(command) => command.run(),

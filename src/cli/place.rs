@@ -9,7 +9,7 @@ use store::{DATABASE, Location, Store};
 use super::Failure;
 use crate::campaign::Campaign;
 use crate::config::compare;
-use crate::origin::Origin;
+use crate::provenance::Provenance;
 
 /// The directory of a campaign if none is named: beside its configuration, called as that is without its extension.
 pub fn default_directory(config: &Path) -> PathBuf {
@@ -106,10 +106,12 @@ pub async fn refuse_if_kept_elsewhere(campaign: &Campaign, directory: &Path) -> 
 async fn holds_campaign_of(place: &Path, campaign: &Campaign, directory: &Path) -> bool {
     let Ok(store) = Store::open_read_only(place).await else { return false };
     let in_force = store.campaign().await.ok().map(|found| found.configuration_in_force);
-    let found = Origin::of(&store).await.ok().flatten();
+    let found = Provenance::read(&store).await.ok().flatten();
     store.close().await;
     match found {
-        Some(found) => found.file.path == Origin::new(&campaign.path, &campaign.text, directory).file.path,
+        Some(found) => {
+            found.file.path == Provenance::new(&campaign.path, &campaign.text, directory).file.path
+        }
         // Of an early version: as far as its content says.
         None => {
             let in_force = in_force.and_then(|text| serde_json::from_str::<Value>(&text).ok());

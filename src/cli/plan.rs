@@ -7,10 +7,10 @@ use analysis::{CostModel, Measured, Size};
 use serde_json::json;
 use store::{Location, Store};
 
-use super::{Ended, Failure, block_on, place};
-use crate::bill::{CoreHours, Costs, digits, size_of};
+use super::{ExitStatus, Failure, block_on, place};
 use crate::campaign::Campaign;
-use crate::forecast::Forecast;
+use crate::disk_forecast::DiskForecast;
+use crate::label_cost::{CoreHours, CostEstimator, cost_size, two_digits};
 use crate::output::{Table, count, print, print_json};
 
 /// Seed structures shown unless all are asked for.
@@ -62,11 +62,11 @@ struct Planned {
     limited_by: Option<String>,
     all: Option<CoreHours>,
     measured: String,
-    disk: Forecast,
+    disk: DiskForecast,
 }
 
 impl Plan {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let campaign = Campaign::load(&self.config)?;
         let planned = self.plan(&campaign)?;
         if self.json {
@@ -74,11 +74,11 @@ impl Plan {
         } else {
             print(|out| write(out, &self.config, &planned, self.all))?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     fn plan(&self, campaign: &Campaign) -> Result<Planned, Failure> {
-        let sizes: Vec<_> = campaign.label_sizes()?.iter().map(size_of).collect();
+        let sizes: Vec<_> = campaign.label_sizes()?.iter().map(cost_size).collect();
         let (costs, measured) = self.costs(sizes.first())?;
         let config = &campaign.config;
         let (copies, per_seed) = (config.labels_of_each(), config.collect.per_seed.get());
@@ -104,17 +104,17 @@ impl Plan {
             parts,
             labels: limited.unwrap_or(by_seeds),
             limited_by: limited.and(config.budget().structures_by),
-            all: all.map(|all| all.times(share)),
+            all: all.map(|all| all.scaled(share)),
             measured,
-            disk: Forecast::of(campaign),
+            disk: DiskForecast::from_campaign(campaign),
         })
     }
 
     /// What is known of costs, and from where.
-    fn costs(&self, first: Option<&Size>) -> Result<(Option<Costs>, String), Failure> {
+    fn costs(&self, first: Option<&Size>) -> Result<(Option<CostEstimator>, String), Failure> {
         if let (Some(core_seconds), Some(size)) = (self.core_seconds, first) {
             let one = Measured { size: *size, core_seconds };
-            let costs = Costs::by(CostModel::fit(&[one], None));
+            let costs = CostEstimator::from_model(CostModel::fit(&[one], None));
             return Ok((Some(costs), "one label, as you say".into()));
         }
         let Some(like) = &self.like else {
@@ -131,11 +131,11 @@ impl Plan {
     }
 }
 
-async fn learn(location: &Location) -> Result<Costs, Failure> {
+async fn learn(location: &Location) -> Result<CostEstimator, Failure> {
     let store = Store::open_read_only(location).await?;
     let none = || Failure::Input("--like: that campaign has no labels to learn from".into());
     let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
-    let costs = Costs::of(&store, protocol.hash).await?;
+    let costs = CostEstimator::from_store(&store, protocol.hash).await?;
     store.close().await;
     if costs.measured() == 0 { Err(none()) } else { Ok(costs) }
 }
@@ -147,7 +147,11 @@ fn write(out: &mut dyn Write, path: &Path, planned: &Planned, all: bool) -> io::
     match total {
         Some(hours) => {
             writeln!(out, "  labels   about {hours} if all of them are made, as {measured}")?;
-            writeln!(out, "           one after the other on one core that is {} h", digits(hours.expected))?;
+            writeln!(
+                out,
+                "           one after the other on one core that is {} h",
+                two_digits(hours.expected)
+            )?;
         }
         None => writeln!(
             out,
@@ -166,7 +170,7 @@ fn write(out: &mut dyn Write, path: &Path, planned: &Planned, all: bool) -> io::
             size.atoms.to_string(),
             size.electrons.map_or("–".into(), |electrons| electrons.to_string()),
             size.k_points.to_string(),
-            each.map_or("–".into(), |hours| digits(hours.expected)),
+            each.map_or("–".into(), |hours| two_digits(hours.expected)),
         ]);
     }
     table.write(out)?;

@@ -12,11 +12,11 @@ use store::{CampaignLock, Location, NewProtocol, Protocol, Requeued, Store, unix
 use self::choice::Choice;
 use self::protocol::NewLabels;
 use super::place::shown;
-use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::bill::{self, Again};
-use crate::condition::Condition;
-use crate::origin::Origin;
-use crate::output::{count, print, print_json, say_if_unprotected};
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::filter::Filter;
+use crate::label_cost::{self, RelabelCost};
+use crate::output::{count, print, print_json, warn_if_unencrypted};
+use crate::provenance::Provenance;
 
 /// Label structures again, and change the protocol by which a campaign labels
 ///
@@ -41,7 +41,7 @@ pub struct Relabel {
     all: bool,
     /// Of these, the ones that meet a condition as export has them, such as 'max_force > 20'
     #[arg(long = "where", value_name = "CONDITION")]
-    condition: Option<Condition>,
+    condition: Option<Filter>,
     /// With --all or --where: also those that have their labels by the protocol in force
     #[arg(long)]
     again: bool,
@@ -66,7 +66,7 @@ struct Order {
     /// What makes it another than the one in force, a line each.
     changes: Vec<String>,
     choice: Choice,
-    bill: Again,
+    bill: RelabelCost,
     /// `moved` is known before.
     done: Requeued,
     /// How the labels come to be made.
@@ -74,19 +74,19 @@ struct Order {
 }
 
 impl Relabel {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let order = block_on(self.relabel())??;
         if self.json {
             print_json(&order.as_json(self.dry_run))?;
         } else {
             print(|out| order.write(out, self.dry_run, self.config.is_some()))?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     async fn relabel(&self) -> Result<Order, Failure> {
         let location = self.location.get()?;
-        say_if_unprotected(&location);
+        warn_if_unencrypted(&location);
         let store = match self.dry_run {
             true => Store::open_read_only(&location).await?,
             false => Store::open(&location).await?,
@@ -105,7 +105,7 @@ impl Relabel {
         let protocol = new.as_ref().map_or(&in_force, |new| &new.protocol).clone();
         let choice = self.choose(&store, &protocol).await?;
         let moved = if new.is_some() { store.unlabelled_by_others(protocol.hash).await? } else { 0 };
-        let bill = bill::again(&store, &in_force, &choice.sizes()).await?;
+        let bill = label_cost::relabel_cost(&store, &in_force, &choice.sizes()).await?;
         let next = self.next(&store, &location).await?;
         let mut done = Requeued { again: choice.structures().len() as u64, moved };
         if !self.dry_run {
@@ -121,7 +121,7 @@ impl Relabel {
         if store.status().await?.led {
             return Ok("the campaign runs: its labellers take them".to_owned());
         }
-        let origin = Origin::of(store).await?;
+        let origin = Provenance::read(store).await?;
         let given = self.config.as_ref().map(|path| path.display().to_string());
         let config = given.or(origin.map(|origin| origin.file.path)).unwrap_or("CONFIG".to_owned());
         let directory = match location {

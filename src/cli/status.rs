@@ -21,12 +21,12 @@ use self::jobs::Jobs;
 use self::labels::LabelsSoFar;
 use self::page::Page;
 pub use self::values::Values;
-use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::budget;
-use crate::ends::Ends;
-use crate::forecast::{self, Forecast, megabytes};
-use crate::origin::Origin;
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::budget_usage;
+use crate::disk_forecast::{self, DiskForecast, megabytes};
 use crate::output::{count, decimals, print, print_json};
+use crate::provenance::Provenance;
+use crate::walk_ends::WalkEnds;
 
 /// Show how a campaign stands
 ///
@@ -47,7 +47,7 @@ pub struct Status {
 }
 
 impl Status {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
         let snapshot = block_on(Snapshot::at(&location))??;
         let jobs = block_on(Jobs::of(&location))?;
@@ -57,7 +57,7 @@ impl Status {
             let page = if self.all { Page::of_all() } else { Page::of_all().screen() };
             print(|out| snapshot.write(out, &jobs, page, self.walks))?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 
@@ -66,7 +66,7 @@ impl Status {
 pub struct Snapshot {
     campaign: store::Campaign,
     /// None of a campaign of an early version.
-    origin: Option<Origin>,
+    origin: Option<Provenance>,
     standing: Standing,
     values: Values,
     disk: Disk,
@@ -84,14 +84,14 @@ impl Snapshot {
 
     /// Reads it.
     pub async fn of(store: &Store) -> Result<Self, Failure> {
-        let forecast = store.note(forecast::NOTE).await?;
+        let forecast = store.note(disk_forecast::METADATA_KEY).await?;
         let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
         let (campaign, standing) = (store.campaign().await?, store.status().await?);
         let labels = LabelsSoFar::of(store, &standing).await?;
         let configuration: Value = serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default();
         Ok(Self {
             end: End::of(&standing, &configuration, labels.bill()),
-            origin: Origin::of(store).await?,
+            origin: Provenance::read(store).await?,
             values: Values(store.values().await?),
             disk: Disk { bytes: store.size().await?, forecast },
             campaign,
@@ -172,7 +172,7 @@ impl Snapshot {
             page.titled(out, "", &format!("by {}", origin.file.path))?;
         }
         page.titled(out, "state", &processes::state(standing))?;
-        let ends = Ends::of(&standing.walks);
+        let ends = WalkEnds::from_walks(&standing.walks);
         page.titled(out, "walks", &walks_in_words(standing, &ends))?;
         if page.has_all() {
             ends.lines().iter().try_for_each(|line| page.titled(out, "", line))?;
@@ -185,7 +185,7 @@ impl Snapshot {
         values.write(out, page, &campaign.mode)?;
         write_candidates(out, page, &standing.candidates, labels.shared)?;
         labels.write(out, page, standing)?;
-        if let Some(budget) = budget::shown(&standing.budget) {
+        if let Some(budget) = budget_usage::describe(&standing.budget) {
             page.titled(out, "budget", &budget)?;
         }
         page.titled(out, "disk", &disk.in_words(page, standing))?;
@@ -202,7 +202,7 @@ struct Disk {
     /// Now.
     bytes: u64,
     /// At the end, as the leader of the campaign last reckoned.
-    forecast: Option<Forecast>,
+    forecast: Option<DiskForecast>,
 }
 
 impl Disk {
@@ -210,7 +210,7 @@ impl Disk {
     fn at_the_end(&self, status: &Standing) -> Option<u64> {
         let Candidates { accepted, control, .. } = status.candidates;
         let forecast = self.forecast.filter(|_| !status.finished)?;
-        Some(self.bytes + forecast.still_to_come(accepted + control, self.bytes))
+        Some(self.bytes + forecast.remaining_bytes(accepted + control, self.bytes))
     }
 
     fn in_words(&self, page: &Page, status: &Standing) -> String {
@@ -229,12 +229,12 @@ impl Disk {
     }
 }
 
-fn walks_in_words(status: &Standing, ends: &Ends) -> String {
+fn walks_in_words(status: &Standing, ends: &WalkEnds) -> String {
     let under_way = status.walks.iter().filter(|walk| walk.is_under_way()).count();
     let are = if status.led { "under way" } else { "not finished" };
     let ended = match ends.ended() {
         0 => "0 ended".to_owned(),
-        ended => format!("{ended} ended ({})", ends.without_causes()),
+        ended => format!("{ended} ended ({})", ends.counts_by_end()),
     };
     let pace = status.steps_per_second.filter(|_| under_way > 0);
     let pace = pace.map_or(String::new(), |pace| format!("; {} steps/s", decimals(Some(pace), 1)));

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use calm::Artifact;
 
-use super::{Ended, Failure};
+use super::{ExitStatus, Failure};
 use crate::campaign::Campaign;
-use crate::forecast::Forecast;
+use crate::disk_forecast::DiskForecast;
 use crate::output::{count, print};
 
 /// Check a configuration and every file that it names
@@ -22,11 +22,11 @@ pub struct Validate {
 }
 
 impl Validate {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();
         print(|out| write(out, &self.config, &campaign))?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 
@@ -49,7 +49,7 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()
     }
     writeln!(out, "  seed structures  {}, of {least} to {most} atoms", seeds.len())?;
     writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)?;
-    writeln!(out, "  disk             {}", Forecast::of(campaign))?;
+    writeln!(out, "  disk             {}", DiskForecast::from_campaign(campaign))?;
     match campaign.warnings.len() {
         0 => writeln!(out, "  warnings         none"),
         count => writeln!(out, "  warnings         {count}: see above"),

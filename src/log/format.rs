@@ -17,7 +17,7 @@ pub struct Fields {
 
 /// An event and where it comes from.
 #[derive(Debug)]
-pub struct Line<'a> {
+pub struct LogLine<'a> {
     /// ms since 1970.
     pub time: i64,
     pub level: Level,
@@ -34,7 +34,7 @@ const FILE_LIMIT_HINT: &str = ". Hint: increase the system open file limit.";
 
 impl Fields {
     /// Takes out a hint that is wrong.
-    pub fn correct(&mut self) {
+    pub fn remove_wrong_hint(&mut self) {
         let is_right = |why: &str| why.contains("(os error 23)") || why.contains("(os error 24)");
         if let Some(why) = self.message.strip_suffix(FILE_LIMIT_HINT)
             && !is_right(why)
@@ -44,7 +44,7 @@ impl Fields {
     }
 }
 
-impl Line<'_> {
+impl LogLine<'_> {
     /// For people. Whatever is said is one line.
     pub fn text(&self) -> String {
         let Self { time, level, process, pid, fields, .. } = self;

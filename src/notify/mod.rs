@@ -7,25 +7,25 @@ use serde::{Deserialize, Serialize};
 use store::Status;
 
 use crate::config::{NotifyEvent, NotifySection};
-use crate::ends::Ends;
-use crate::forgetting::Forgetting;
+use crate::forgetting::ForgettingRule;
 use crate::output::count;
+use crate::walk_ends::WalkEnds;
 
 const MINUTE: f64 = 60_000.0;
 /// What was told last of forgetting, while the alarm holds.
-const HOLDS: &str = "holds";
+const ALARM_RAISED: &str = "holds";
 
 /// Under which name it is kept in the store what was told.
-pub const NOTE: &str = "notified";
+pub const METADATA_KEY: &str = "notified";
 
 /// What was told last, by the name of the event: also by earlier runs.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(transparent)]
-pub struct Told(BTreeMap<String, String>);
+pub struct SentNotifications(BTreeMap<String, String>);
 
 /// Something that has happened.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Due {
+pub struct Notification {
     /// What.
     pub event: NotifyEvent,
     /// In words.
@@ -34,26 +34,26 @@ pub struct Due {
 
 /// Looks at a campaign again and again.
 #[derive(Debug)]
-pub struct Watch {
+pub struct NotificationTracker {
     settings: NotifySection,
-    told: Told,
+    sent: SentNotifications,
     /// Candidates and labels so far, and since when there are no more, ms.
-    still: Option<((u64, u64), i64)>,
+    idle_since: Option<((u64, u64), i64)>,
 }
 
-impl Watch {
+impl NotificationTracker {
     /// Goes on where others left off.
-    pub fn new(settings: NotifySection, told: Told) -> Self {
-        Self { settings, told, still: None }
+    pub fn new(settings: NotifySection, sent: SentNotifications) -> Self {
+        Self { settings, sent, idle_since: None }
     }
 
     /// What was told, with what is due.
-    pub fn told(&self) -> &Told {
-        &self.told
+    pub fn sent(&self) -> &SentNotifications {
+        &self.sent
     }
 
     /// What there is to tell of a campaign that stands so at the time `now`, ms since 1970.
-    pub fn look(&mut self, status: &Status, now: i64) -> Vec<Due> {
+    pub fn check(&mut self, status: &Status, now: i64) -> Vec<Notification> {
         let candidates = status.candidates.seen + status.candidates.control;
         let labels = status.budget.used.labels + status.labels.failed;
         let mut due = Vec::new();
@@ -64,7 +64,7 @@ impl Watch {
             due.extend(self.due(NotifyEvent::Budget, format!("{limit:?}"), format!("{key} is used up")));
         }
         due.extend(self.failed_labels(status.labels.failed));
-        due.extend(self.failing_walks(&Ends::of(&status.walks)));
+        due.extend(self.failing_walks(&WalkEnds::from_walks(&status.walks)));
         if status.finished {
             due.extend(self.due(
                 NotifyEvent::End,
@@ -79,28 +79,34 @@ impl Watch {
 
     /// What there is to tell of a mixture of which this share of the training atoms has γ > 1; `raised` is whether the selector
     /// found that to be an alarm.
-    pub fn look_at_training(&mut self, forgetting: &Forgetting, share: f64, raised: bool) -> Option<Due> {
+    pub fn check_training(
+        &mut self,
+        forgetting: &ForgettingRule,
+        share: f64,
+        raised: bool,
+    ) -> Option<Notification> {
         let event = NotifyEvent::Forgetting;
-        let (holds, was) = (forgetting.holds(share, raised)?, self.told.0.get(event.name()));
+        let (holds, was) = (forgetting.evaluate(share, raised)?, self.sent.0.get(event.name()));
         match holds {
-            true => self.due(event, HOLDS.to_owned(), forgetting.begun(share)),
-            false if was.is_some_and(|was| was == HOLDS) => {
-                self.due(event, "over".to_owned(), forgetting.over(share))
+            true => self.due(event, ALARM_RAISED.to_owned(), forgetting.raised_message(share)),
+            false if was.is_some_and(|was| was == ALARM_RAISED) => {
+                self.due(event, "over".to_owned(), forgetting.cleared_message(share))
             }
             false => None,
         }
     }
 
     /// A run could not go on. That is news each time.
-    pub fn failed(&mut self, why: &str) -> Option<Due> {
+    pub fn failed(&mut self, why: &str) -> Option<Notification> {
         let event = NotifyEvent::Failure;
-        self.is_wanted(event).then(|| Due { event, message: format!("calmwalk run cannot go on: {why}") })
+        self.is_wanted(event)
+            .then(|| Notification { event, message: format!("calmwalk run cannot go on: {why}") })
     }
 
-    fn stall(&mut self, so_far: (u64, u64), shown: String, now: i64) -> Option<Due> {
-        let (before, since) = *self.still.get_or_insert((so_far, now));
+    fn stall(&mut self, so_far: (u64, u64), shown: String, now: i64) -> Option<Notification> {
+        let (before, since) = *self.idle_since.get_or_insert((so_far, now));
         if before != so_far {
-            self.still = Some((so_far, now));
+            self.idle_since = Some((so_far, now));
             return None;
         }
         let minutes = (now - since) as f64 / MINUTE;
@@ -113,11 +119,11 @@ impl Watch {
     }
 
     /// Every so many.
-    fn failed_labels(&mut self, failed: u64) -> Option<Due> {
+    fn failed_labels(&mut self, failed: u64) -> Option<Notification> {
         let each = u64::from(self.settings.failed_labels.get());
         let reached = failed / each * each;
-        let told = self.told.0.get(NotifyEvent::FailedLabels.name()).and_then(|told| told.parse().ok());
-        if reached <= told.unwrap_or(0) {
+        let sent = self.sent.0.get(NotifyEvent::FailedLabels.name()).and_then(|sent| sent.parse().ok());
+        if reached <= sent.unwrap_or(0) {
             return None;
         }
         let message = match failed {
@@ -128,8 +134,8 @@ impl Watch {
     }
 
     /// Once a campaign.
-    fn failing_walks(&mut self, ends: &Ends) -> Option<Due> {
-        if !ends.are_alarming() {
+    fn failing_walks(&mut self, ends: &WalkEnds) -> Option<Notification> {
+        if !ends.is_alarming() {
             return None;
         }
         self.due(NotifyEvent::FailingWalks, "yes".into(), ends.warning())
@@ -140,12 +146,12 @@ impl Watch {
     }
 
     /// An event that was not told yet: `identity` tells it from others of its kind.
-    fn due(&mut self, event: NotifyEvent, identity: String, message: String) -> Option<Due> {
-        if !self.is_wanted(event) || self.told.0.get(event.name()) == Some(&identity) {
+    fn due(&mut self, event: NotifyEvent, identity: String, message: String) -> Option<Notification> {
+        if !self.is_wanted(event) || self.sent.0.get(event.name()) == Some(&identity) {
             return None;
         }
-        self.told.0.insert(event.name().to_owned(), identity);
-        Some(Due { event, message })
+        self.sent.0.insert(event.name().to_owned(), identity);
+        Some(Notification { event, message })
     }
 }
 
@@ -155,11 +161,11 @@ mod tests {
 
     const MINUTES: i64 = 60_000;
 
-    fn watch() -> Watch {
-        Watch::new(NotifySection::default(), Told::default())
+    fn watch() -> NotificationTracker {
+        NotificationTracker::new(NotifySection::default(), SentNotifications::default())
     }
 
-    fn events(due: &[Due]) -> Vec<NotifyEvent> {
+    fn events(due: &[Notification]) -> Vec<NotifyEvent> {
         due.iter().map(|due| due.event).collect()
     }
 
@@ -177,12 +183,12 @@ mod tests {
             (999, 6, 0),
         ] {
             status.candidates.seen = seen;
-            assert_eq!(watch.look(&status, minute * MINUTES).len(), expected, "{minute}");
+            assert_eq!(watch.check(&status, minute * MINUTES).len(), expected, "{minute}");
         }
         // Also over a restart.
-        let mut next = Watch::new(NotifySection::default(), watch.told().clone());
+        let mut next = NotificationTracker::new(NotifySection::default(), watch.sent().clone());
         for minute in [1000, 2000] {
-            assert_eq!(next.look(&status, minute * MINUTES), []);
+            assert_eq!(next.check(&status, minute * MINUTES), []);
         }
     }
 
@@ -191,7 +197,7 @@ mod tests {
         let (mut watch, mut status) = (watch(), Status::default());
         for (failed, expected) in [(9, 0), (10, 1), (11, 0), (3, 0), (12, 0), (39, 1), (40, 1)] {
             status.labels.failed = failed;
-            assert_eq!(watch.look(&status, 0).len(), expected, "{failed}");
+            assert_eq!(watch.check(&status, 0).len(), expected, "{failed}");
         }
     }
 
@@ -203,7 +209,7 @@ mod tests {
             [("blew_up", 0), ("collected", 0), ("trapped", 0), ("blew_up", 1), ("blew_up", 0)]
         {
             status.walks.push(walk(state));
-            let due = watch.look(&status, 0);
+            let due = watch.check(&status, 0);
             assert_eq!(due.len(), expected, "{:?}", status.walks);
             assert!(due.iter().all(|due| due.event == NotifyEvent::FailingWalks), "{due:?}");
         }
@@ -215,13 +221,13 @@ mod tests {
         let (mut watch, mut status) = (watch(), Status { finished: true, ..Status::default() });
         status.budget.used_up = Some("budget.labels".into());
         status.budget.limits.labels = Some(5);
-        assert_eq!(events(&watch.look(&status, 0)), [Budget, End]);
-        assert_eq!(watch.look(&status, 0), []);
+        assert_eq!(events(&watch.check(&status, 0)), [Budget, End]);
+        assert_eq!(watch.check(&status, 0), []);
         status.budget.limits.labels = Some(6);
         status.candidates.seen = 1;
-        assert_eq!(events(&watch.look(&status, 0)), [Budget, End]);
+        assert_eq!(events(&watch.check(&status, 0)), [Budget, End]);
         let only = NotifySection { on: vec![End], ..NotifySection::default() };
-        let mut only = Watch::new(only, Told::default());
-        assert_eq!((events(&only.look(&status, 0)), only.failed("x")), (vec![End], None));
+        let mut only = NotificationTracker::new(only, SentNotifications::default());
+        assert_eq!((events(&only.check(&status, 0)), only.failed("x")), (vec![End], None));
     }
 }

@@ -7,7 +7,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 use store::{AtomGrades, LoggedDecision, NewestMixture, StoredCandidate};
 
-use super::Setting;
+use super::RuleOverride;
 
 /// What a replay came to.
 #[derive(Clone, Debug, Serialize)]
@@ -21,17 +21,17 @@ pub struct Report {
     /// Those that were replayed.
     pub replayed: i64,
     /// Candidates of biased walks among them, as they were decided.
-    pub before: Tally,
+    pub before: FateCounts,
     /// The same now.
-    pub now: Tally,
+    pub now: FateCounts,
     /// Accepted before, and not now.
-    pub no_longer_accepted: Vec<Change>,
+    pub no_longer_accepted: Vec<FateChange>,
     /// Accepted now, and not before.
-    pub newly_accepted: Vec<Change>,
+    pub newly_accepted: Vec<FateChange>,
     /// Walks that ended for what was collected and that would go on now; what they would find is not known.
     pub walks_cut_short: u64,
     /// Where the replay had to stop, if it had.
-    pub stopped: Option<Stop>,
+    pub stopped: Option<MissingFeatures>,
     /// By the same rules: the first thing that is not as it was recorded.
     pub difference: Option<Difference>,
     /// By the same rules, to the end: the mixture at the end is the stored one, byte for byte.
@@ -44,7 +44,7 @@ pub struct Report {
 
 /// Numbers of candidates by what became of them.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Tally {
+pub struct FateCounts {
     /// All of them.
     pub candidates: u64,
     /// Accepted.
@@ -57,7 +57,7 @@ pub struct Tally {
 
 /// A candidate with another fate than before.
 #[derive(Clone, Debug, Serialize)]
-pub struct Change {
+pub struct FateChange {
     /// Number of the decision.
     pub decision: i64,
     /// Name of the candidate.
@@ -74,7 +74,7 @@ pub struct Change {
 
 /// Where a replay stops: the features of that candidate were not kept.
 #[derive(Clone, Debug, Serialize)]
-pub struct Stop {
+pub struct MissingFeatures {
     /// Number of the decision.
     pub decision: i64,
     /// Name of the candidate.
@@ -99,7 +99,7 @@ pub struct Difference {
 }
 
 /// A place of the log.
-pub struct Recorded<'a> {
+pub struct LogEntry<'a> {
     /// The decision.
     pub decision: &'a LoggedDecision,
     /// The candidate that it is about.
@@ -110,7 +110,7 @@ impl Report {
     /// One of nothing yet.
     pub fn new(
         campaign: &store::Campaign,
-        settings: &[Setting],
+        settings: &[RuleOverride],
         other_processor: bool,
         recorded: i64,
     ) -> Self {
@@ -120,8 +120,8 @@ impl Report {
             set: set.collect(),
             recorded,
             replayed: 0,
-            before: Tally::default(),
-            now: Tally::default(),
+            before: FateCounts::default(),
+            now: FateCounts::default(),
             no_longer_accepted: Vec::new(),
             newly_accepted: Vec::new(),
             walks_cut_short: 0,
@@ -134,7 +134,7 @@ impl Report {
     }
 
     /// Takes in a place of the log and what came of it now.
-    pub fn take(&mut self, recorded: Recorded<'_>, now: Option<Replayed>, exact: bool) {
+    pub fn add(&mut self, recorded: LogEntry<'_>, now: Option<Replayed>, exact: bool) {
         let decision = recorded.decision;
         self.replayed = decision.sequence;
         self.before.mixture_version = decision.mixture_version;
@@ -153,7 +153,7 @@ impl Report {
         self.before.count(before_reason.as_deref());
         self.now.count(now_reason.as_deref());
         let gamma_max = |detail: &Value| detail["selector"]["gamma_max"].as_f64();
-        let change = |reason| Change {
+        let change = |reason| FateChange {
             decision: decision.sequence,
             candidate: decision.candidate.clone().unwrap_or_default(),
             walk: decision.walk.unwrap_or_default(),
@@ -170,7 +170,7 @@ impl Report {
 
     /// The replay cannot go on with this decision.
     pub fn stop(&mut self, decision: &LoggedDecision) {
-        self.stopped = Some(Stop {
+        self.stopped = Some(MissingFeatures {
             decision: decision.sequence,
             candidate: decision.candidate.clone().unwrap_or_default(),
             walk: decision.walk.unwrap_or_default(),
@@ -197,7 +197,7 @@ impl Report {
     }
 }
 
-impl Tally {
+impl FateCounts {
     fn count(&mut self, reason: Option<&str>) {
         self.candidates += 1;
         match reason {
@@ -219,7 +219,7 @@ fn step(decision: &LoggedDecision) -> u64 {
 }
 
 /// The first thing in which a decision is not the recorded one.
-fn difference(recorded: &Recorded<'_>, now: Option<&Replayed>) -> Option<Difference> {
+fn difference(recorded: &LogEntry<'_>, now: Option<&Replayed>) -> Option<Difference> {
     let before = recorded.decision;
     let as_json = |kind: &str, walk: Option<u32>, candidate: Option<String>, version: u64, detail: &Value| {
         json!({

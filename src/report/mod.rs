@@ -1,12 +1,12 @@
-//! What came of a campaign, as a document: read from the store (`gathered`), drawn (`figures`), told (`page`). The same campaign
+//! What came of a campaign, as a document: read from the store (`data`), drawn (`figures`), told (`page`). The same campaign
 //! gives the same bytes: nothing of the clock or of where it is made is in it.
 
+mod collections;
 mod csv;
 mod features;
 mod figures;
-mod gathered;
 mod page;
-mod sample;
+mod report_data;
 mod style;
 mod tables;
 #[cfg(test)]
@@ -16,8 +16,8 @@ use ::figures::{to_png, to_svg};
 use store::Store;
 
 use self::csv::Csv;
-use self::gathered::Gathered;
-use crate::outcome::Failure;
+use self::report_data::ReportData;
+use crate::exit_status::Failure;
 
 /// Dots an inch of the images.
 const RESOLUTION: f64 = 300.0;
@@ -49,11 +49,11 @@ pub struct File {
 }
 
 /// Reads the campaign and makes all files of its report, the page first.
-pub async fn of(store: &Store) -> Result<Vec<File>, Failure> {
-    let gathered = Gathered::of(store).await?;
-    let parts = figures::all(&gathered);
-    let tables = tables::all(&gathered);
-    let page = page::write(&gathered, &parts, &tables);
+pub async fn build(store: &Store) -> Result<Vec<File>, Failure> {
+    let data = ReportData::read(store).await?;
+    let parts = figures::all(&data);
+    let tables = tables::all(&data);
+    let page = page::write(&data, &parts, &tables);
     let mut files = vec![File { path: PAGE.to_owned(), bytes: page.into_bytes() }];
     for part in parts {
         let Ok(drawn) = part.drawn else { continue };

@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use figures::{BOLD, REGULAR, escape, to_html, to_svg};
 
-use super::gathered::Gathered;
+use super::report_data::ReportData;
 use super::style::grouped;
 use super::tables::{Cell, Table, collection_rule};
 use super::{Drawn, Part};
@@ -19,8 +19,8 @@ enum Block<'a> {
 }
 
 /// The page.
-pub fn write(gathered: &Gathered, parts: &[Part], tables: &[Table]) -> String {
-    let title = format!("Campaign {}", gathered.campaign.id);
+pub fn write(data: &ReportData, parts: &[Part], tables: &[Table]) -> String {
+    let title = format!("Campaign {}", data.campaign.id);
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n<title>{}</title>\n<style>\n{}{}{STYLE}</style>\n\
@@ -29,9 +29,9 @@ pub fn write(gathered: &Gathered, parts: &[Part], tables: &[Table]) -> String {
         face(REGULAR, "normal"),
         face(BOLD, "bold"),
         escape(&title),
-        to_html(&lead(gathered))
+        to_html(&lead(data))
     );
-    for (heading, blocks) in sections(gathered, parts, tables) {
+    for (heading, blocks) in sections(data, parts, tables) {
         if blocks.is_empty() {
             continue;
         }
@@ -52,7 +52,7 @@ pub fn write(gathered: &Gathered, parts: &[Part], tables: &[Table]) -> String {
 }
 
 fn sections<'a>(
-    gathered: &Gathered,
+    data: &ReportData,
     parts: &'a [Part],
     tables: &'a [Table],
 ) -> Vec<(&'static str, Vec<Block<'a>>)> {
@@ -67,7 +67,7 @@ fn sections<'a>(
         Some(Block::Table(&tables[place], place + 1))
     };
     let blocks = |blocks: Vec<Option<Block<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
-    let why = collection_rule(&gathered.configuration).map(|rule| {
+    let why = collection_rule(&data.configuration).map(|rule| {
         Block::Paragraph(format!(
             "A structure of a biased walk becomes a candidate when {rule}, under the mixture that the walker sees; the selector \
              decides with the newest."
@@ -103,9 +103,9 @@ fn sections<'a>(
     ]
 }
 
-fn lead(gathered: &Gathered) -> String {
-    let candidates = &gathered.standing.candidates;
-    let (biased, control) = (&gathered.sample.biased, &gathered.sample.control);
+fn lead(data: &ReportData) -> String {
+    let candidates = &data.standing.candidates;
+    let (biased, control) = (&data.sample.biased, &data.sample.control);
     format!(
         "{} structures were accepted of {} candidates of biased walks, and {} frames were kept of control walks; {} of all these have \
          labels. Grades are those of the original mixture, with which the campaign began, unless it is said otherwise.",

@@ -6,7 +6,7 @@ mod seeds;
 mod settings;
 
 use super::csv::{self, Csv};
-use super::gathered::Gathered;
+use super::report_data::ReportData;
 
 pub use facts::collection_rule;
 
@@ -84,9 +84,9 @@ fn percent(share: Option<f64>) -> Cell {
 }
 
 /// All that have rows, in the order of the page.
-pub fn all(gathered: &Gathered) -> Vec<Table> {
-    let mut tables = vec![facts::summary(gathered), seeds::of(gathered)];
-    if let Some(found) = &gathered.labels {
+pub fn all(data: &ReportData) -> Vec<Table> {
+    let mut tables = vec![facts::summary(data), seeds::of(data)];
+    if let Some(found) = &data.labels {
         tables.extend([
             labels::correlations(&found.learned),
             labels::quantiles("quantiles-gamma", "γ", &found.learned.all.gamma),
@@ -96,7 +96,7 @@ pub fn all(gathered: &Gathered) -> Vec<Table> {
             labels::unlabelled(&found.unlabelled),
         ]);
     }
-    tables.extend([settings::settings(gathered), facts::provenance(gathered)]);
+    tables.extend([settings::settings(data), facts::provenance(data)]);
     tables.retain(|table| !table.rows.is_empty());
     tables
 }

@@ -124,7 +124,7 @@ async fn every_setting_is_on_the_page() {
     let keys: serde_json::Map<_, _> = (0..80).map(|k| (format!("key{k:02}"), json!(k))).collect();
     let configuration = json!({ "guard": keys, "walk": { "temperature": 417.0, "volume_ramp": null } });
     let store = begin(directory.path(), &configuration.to_string()).await;
-    let files = of(&store).await.unwrap();
+    let files = build(&store).await.unwrap();
     let page = words(file(&files, PAGE));
     for expected in ["[guard]", "key79", "[walk]", "temperature", "417.0", "volume_ramp", "not set"] {
         assert!(page.contains(expected), "{expected}: {page}");
@@ -140,7 +140,7 @@ async fn every_setting_is_on_the_page() {
 async fn what_is_missing_is_said() {
     let directory = tempfile::tempdir().unwrap();
     let store = begin(directory.path(), "{}").await;
-    let files = of(&store).await.unwrap();
+    let files = build(&store).await.unwrap();
     assert!(!files.iter().any(|file| file.path.starts_with("figures/")), "nothing to draw");
     let page = words(file(&files, PAGE));
     for expected in [
@@ -157,7 +157,7 @@ async fn what_is_missing_is_said() {
         offer(&store, step, Origin::Biased, Fate::Accepted, false).await;
     }
     offer(&store, 99, Origin::Biased, Fate::Declined(Decline::Covered), false).await;
-    let files = of(&store).await.unwrap();
+    let files = build(&store).await.unwrap();
     let page = words(file(&files, PAGE));
     for expected in ["no force error is known", "The store has no features", "n = 31", "240 atoms"] {
         assert!(page.replace('\u{a0}', "").contains(expected), "{expected}: {page}");
@@ -178,7 +178,7 @@ async fn figures_have_the_numbers_of_the_store() {
         offer(&store, 1000 + step, Origin::Biased, Fate::Declined(Decline::Duplicate), true).await;
     }
     label_all(&store).await;
-    let files = of(&store).await.unwrap();
+    let files = build(&store).await.unwrap();
     assert_eq!(files.iter().filter(|file| file.path.ends_with(".png")).count(), 8);
     for svg in files.iter().filter(|file| file.path.ends_with(".svg")) {
         words(std::str::from_utf8(&svg.bytes).unwrap());
@@ -222,6 +222,6 @@ async fn figures_have_the_numbers_of_the_store() {
     let seeds = file(&files, "tables/seed-structures.csv");
     assert!(seeds.contains("\"a<b>&\"\"row\"\"\",Al8,0,,80,40,0,40,0,0,0,40,80,0"), "{seeds}");
 
-    let again = of(&store).await.unwrap();
+    let again = build(&store).await.unwrap();
     assert!(files.iter().zip(&again).all(|(a, b)| a.path == b.path && a.bytes == b.bytes), "the same bytes");
 }

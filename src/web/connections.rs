@@ -13,11 +13,11 @@ use tokio::net::TcpStream;
 use tokio::task::JoinHandle;
 
 /// Connections of one listener at most.
-const MOST: usize = 64;
+const MAX_CONNECTIONS: usize = 64;
 /// A connection is idle for so long before it makes room for another: whoever has connected gets so much time to ask.
-const LEAST_IDLE: Duration = Duration::from_millis(200);
+const MIN_IDLE_TIME: Duration = Duration::from_millis(200);
 /// Descriptors that connections leave free at least, where the limit allows it: to start a process takes up to ten.
-const RESERVE: u64 = 64;
+const MIN_RESERVED_DESCRIPTORS: u64 = 64;
 
 /// The connections that are open. Clones share them.
 #[derive(Clone, Debug, Default)]
@@ -43,14 +43,14 @@ pub enum State {
     /// It waits for a request to be complete, or for the client to take an answer.
     Idle,
     /// It is told events until the client leaves.
-    Events,
+    Streaming,
     /// A request is being answered.
-    Answering,
+    Responding,
 }
 
 /// A place among the connections, given back when this is dropped.
 #[derive(Debug)]
-pub struct Place {
+pub struct ConnectionGuard {
     connections: Connections,
     number: u64,
 }
@@ -61,25 +61,25 @@ pub enum Admission {
     /// Yes.
     Now,
     /// Yes, when this one has gone.
-    After(JoinHandle<()>),
+    AfterClosing(JoinHandle<()>),
     /// Not before so long.
     Later(Duration),
     /// No: all others are at work.
-    Never,
+    Refuse,
 }
 
 impl Connections {
     /// Whether a new connection may be served, and which one goes for it.
     pub fn admit(&self, stream: &TcpStream) -> Admission {
         let mut open = self.open();
-        if open.by_number.len() < MOST && leaves_reserve(stream) {
+        if open.by_number.len() < MAX_CONNECTIONS && leaves_reserve(stream) {
             return Admission::Now;
         }
-        open.make_room(Instant::now())
+        open.evict(Instant::now())
     }
 
     /// Takes a place for a connection that `serve` begins to serve.
-    pub fn add(&self, serve: impl FnOnce(Place) -> JoinHandle<()>) {
+    pub fn add(&self, serve: impl FnOnce(ConnectionGuard) -> JoinHandle<()>) {
         let number = {
             let mut open = self.open();
             open.next_number += 1;
@@ -88,7 +88,7 @@ impl Connections {
             open.by_number.insert(number, connection);
             number
         };
-        let task = serve(Place { connections: self.clone(), number });
+        let task = serve(ConnectionGuard { connections: self.clone(), number });
         // It may be over already.
         if let Some(connection) = self.open().by_number.get_mut(&number) {
             connection.task = Some(task);
@@ -107,14 +107,14 @@ impl Connections {
 
 impl Open {
     /// Closes the connection that has been idle for longest, or else the one that was told events for longest.
-    fn make_room(&mut self, now: Instant) -> Admission {
+    fn evict(&mut self, now: Instant) -> Admission {
         // One that has no task yet has only just come.
         let others = self.by_number.iter().filter(|(_, open)| open.task.is_some());
         let first = others.min_by_key(|(_, open)| (open.state, open.since));
-        let Some((number, open)) = first.filter(|(_, open)| open.state != State::Answering) else {
-            return Admission::Never;
+        let Some((number, open)) = first.filter(|(_, open)| open.state != State::Responding) else {
+            return Admission::Refuse;
         };
-        let left = LEAST_IDLE.saturating_sub(now.saturating_duration_since(open.since));
+        let left = MIN_IDLE_TIME.saturating_sub(now.saturating_duration_since(open.since));
         if !left.is_zero() {
             return Admission::Later(left);
         }
@@ -122,14 +122,14 @@ impl Open {
         match self.by_number.remove(&number).and_then(|open| open.task) {
             Some(task) => {
                 task.abort();
-                Admission::After(task)
+                Admission::AfterClosing(task)
             }
-            None => Admission::Never,
+            None => Admission::Refuse,
         }
     }
 }
 
-impl Place {
+impl ConnectionGuard {
     /// The connection does something else from now on.
     pub fn enter(&self, state: State) {
         if let Some(open) = self.connections.open().by_number.get_mut(&self.number) {
@@ -145,7 +145,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for ConnectionGuard {
     fn drop(&mut self) {
         self.connections.open().by_number.remove(&self.number);
     }
@@ -158,9 +158,9 @@ fn leaves_reserve(stream: &TcpStream) -> bool {
     getrlimit(Resource::Nofile).current.is_none_or(|limit| number < limit - reserve(limit))
 }
 
-/// Descriptors in reserve under this limit: a quarter of it, [`RESERVE`] at least, and never more than half.
+/// Descriptors in reserve under this limit: a quarter of it, [`MIN_RESERVED_DESCRIPTORS`] at least, and never more than half.
 fn reserve(limit: u64) -> u64 {
-    RESERVE.max(limit / 4).min(limit / 2)
+    MIN_RESERVED_DESCRIPTORS.max(limit / 4).min(limit / 2)
 }
 
 #[cfg(test)]
@@ -183,19 +183,19 @@ mod tests {
         let now = Instant::now() + Duration::from_secs(3600);
         let mut open = open(
             &[
-                (State::Answering, 100),
-                (State::Events, 90),
+                (State::Responding, 100),
+                (State::Streaming, 90),
                 (State::Idle, 10),
                 (State::Idle, 20),
-                (State::Events, 80),
+                (State::Streaming, 80),
             ],
             now,
         );
         for gone in [4, 3, 2, 5] {
-            assert!(matches!(open.make_room(now), Admission::After(_)));
+            assert!(matches!(open.evict(now), Admission::AfterClosing(_)));
             assert!(!open.by_number.contains_key(&gone), "{gone} goes: {open:?}");
         }
-        assert!(matches!(open.make_room(now), Admission::Never));
+        assert!(matches!(open.evict(now), Admission::Refuse));
         assert_eq!(open.by_number.len(), 1);
     }
 
@@ -203,8 +203,8 @@ mod tests {
     async fn who_has_just_connected_has_time_to_ask() {
         let now = Instant::now() + Duration::from_secs(3600);
         let mut open = open(&[(State::Idle, 0)], now);
-        let Admission::Later(left) = open.make_room(now) else { panic!("it is new") };
-        assert!(matches!(open.make_room(now + left), Admission::After(_)));
+        let Admission::Later(left) = open.evict(now) else { panic!("it is new") };
+        assert!(matches!(open.evict(now + left), Admission::AfterClosing(_)));
     }
 
     #[test]

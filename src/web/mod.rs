@@ -1,12 +1,12 @@
 //! What a campaign shows over HTTP, to this host only.
 
-pub mod agent;
+pub mod agent_metrics;
 mod connections;
 pub mod dashboard;
 pub mod exposition;
-mod guard;
 pub mod metrics;
-mod serve;
+mod security;
+mod server;
 
 use std::net::SocketAddr;
 
@@ -15,15 +15,15 @@ use calm::Artifact;
 use store::{Location, Store};
 use tokio::net::TcpListener;
 
-use self::dashboard::{Acting, Dashboard};
-pub use self::serve::Server;
-use crate::mixture::Original;
-use crate::outcome::Failure;
-use crate::output::{say, show};
+use self::dashboard::{Dashboard, Mutations};
+pub use self::server::Server;
+use crate::exit_status::Failure;
+use crate::mixture_status::InitialMixture;
+use crate::output::{log_and_print, print_stderr};
 
 /// Where a campaign is shown, as arguments.
 #[derive(Debug, clap::Args)]
-pub struct Addresses {
+pub struct ListenAddresses {
     /// Show the campaign in a browser at this address of this host, as 127.0.0.1:8080 (docs/dashboard.md)
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = address)]
     dashboard: Option<SocketAddr>,
@@ -46,37 +46,37 @@ pub fn address(text: &str) -> Result<SocketAddr, String> {
 
 /// The same, held.
 #[derive(Debug)]
-pub struct Listening {
+pub struct BoundListeners {
     dashboard: Option<TcpListener>,
     metrics: Option<TcpListener>,
 }
 
 /// What is served, until this is dropped.
 #[derive(Debug, Default)]
-pub struct Serving {
+pub struct RunningServers {
     servers: Vec<Server>,
-    shown: Option<Store>,
+    read_store: Option<Store>,
 }
 
-impl Serving {
+impl RunningServers {
     /// Serves no more, and closes what was read from: whoever closes a database last tidies it up.
     pub async fn end(self) {
         self.servers.iter().for_each(Server::end);
-        if let Some(shown) = &self.shown {
-            shown.close().await;
+        if let Some(read_store) = &self.read_store {
+            read_store.close().await;
         }
     }
 }
 
-impl Drop for Serving {
+impl Drop for RunningServers {
     fn drop(&mut self) {
         self.servers.iter().for_each(Server::end);
     }
 }
 
-impl Addresses {
+impl ListenAddresses {
     /// Takes the addresses, before any work begins that would be in vain.
-    pub async fn listen(&self) -> Result<Listening, Failure> {
+    pub async fn listen(&self) -> Result<BoundListeners, Failure> {
         let (mut dashboard, mut metrics) = (None, None);
         if let Some(address) = self.dashboard {
             dashboard = Some(listen(address).await?);
@@ -84,11 +84,11 @@ impl Addresses {
         if let Some(address) = self.metrics {
             metrics = Some(listen(address).await?);
         }
-        Ok(Listening { dashboard, metrics })
+        Ok(BoundListeners { dashboard, metrics })
     }
 }
 
-impl Listening {
+impl BoundListeners {
     /// Begins to serve. What is shown is read through connections of its own: whoever asks often does not keep the campaign
     /// waiting. What is changed goes through `store`.
     pub async fn serve(
@@ -96,24 +96,25 @@ impl Listening {
         location: &Location,
         store: &Store,
         artifact: &Artifact,
-    ) -> Result<Serving, Failure> {
-        let mut serving = Serving::default();
+    ) -> Result<RunningServers, Failure> {
+        let mut serving = RunningServers::default();
         if self.dashboard.is_none() && self.metrics.is_none() {
             return Ok(serving);
         }
-        let shown = Store::open_read_only(location).await?;
-        serving.shown = Some(shown.clone());
+        let read_store = Store::open_read_only(location).await?;
+        serving.read_store = Some(read_store.clone());
         if let Some(listener) = self.metrics {
-            serving.servers.push(serve_metrics(listener, metrics::router(shown.clone()))?);
+            serving.servers.push(serve_metrics(listener, metrics::router(read_store.clone()))?);
         }
         if let Some(listener) = self.dashboard {
-            let original = Original { symbols: artifact.symbols.clone(), mixture: artifact.mixture.clone() };
-            let acting = Acting::new(store.clone())?;
+            let original =
+                InitialMixture { symbols: artifact.symbols.clone(), mixture: artifact.mixture.clone() };
+            let mutations = Mutations::new(store.clone())?;
             let address = listener.local_addr().map_err(Failure::failed)?;
             tracing::info!("dashboard at http://{address}/");
             // The token is for whoever reads this, and for no file.
-            show(format_args!("dashboard at http://{address}/#token={}", acting.token()));
-            let router = Dashboard::new(shown, Some(acting), Some(original)).router();
+            print_stderr(format_args!("dashboard at http://{address}/#token={}", mutations.token()));
+            let router = Dashboard::new(read_store, Some(mutations), Some(original)).router();
             serving.servers.push(Server::start(listener, router));
         }
         Ok(serving)
@@ -140,7 +141,7 @@ pub async fn listen(address: SocketAddr) -> Result<TcpListener, Failure> {
 /// Says where metrics are served, and serves them.
 pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<Server, Failure> {
     let address = listener.local_addr().map_err(Failure::failed)?;
-    say(format_args!("metrics at http://{address}/metrics"));
+    log_and_print(format_args!("metrics at http://{address}/metrics"));
     Ok(Server::start(listener, router))
 }
 

@@ -11,12 +11,12 @@ use store::Protocol;
 use tokio::sync::Notify;
 use workers::labeller::{Once, label_once};
 
-use super::{Ended, Failure};
+use super::{ExitStatus, Failure};
+use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::config::Config;
-use crate::labelling;
+use crate::label_setup;
 use crate::output::{print, print_json};
-use crate::setup::MethodSetup;
-use crate::whole_file::{WholeFile, cannot_write};
+use crate::process_config::MethodConfig;
 
 /// What is to be labelled, how, and what becomes of it.
 pub struct Task<'a> {
@@ -56,14 +56,14 @@ struct Labelled {
 }
 
 /// Labels each structure of the file, one after the other. The first failure ends it.
-pub async fn label(task: Task<'_>, stop: &Notify) -> Result<Ended, Failure> {
+pub async fn label(task: Task<'_>, stop: &Notify) -> Result<ExitStatus, Failure> {
     let section = Config::load_label(task.config)?;
     let frames = read_structures(task.structures).map_err(Failure::input)?;
-    let setup = MethodSetup::of(&section)?;
-    let protocol = labelling::protocol(section.protocol_name(), setup.identity()?);
+    let setup = MethodConfig::from_section(&section)?;
+    let protocol = label_setup::protocol(section.protocol_name(), setup.identity()?);
     let method = setup.load(&protocol)?;
     let bounds = section.bounds();
-    let mut output = task.output.map(WholeFile::create).transpose()?;
+    let mut output = task.output.map(AtomicFile::create).transpose()?;
     for frame in frames {
         let place = format!("{}:{}", task.structures.display(), frame.line);
         let structure = frame.structure;
@@ -72,7 +72,7 @@ pub async fn label(task: Task<'_>, stop: &Notify) -> Result<Ended, Failure> {
             once = label_once(&method, &structure, &bounds) => once?,
             () = stop.notified() => {
                 method.stop().await?;
-                return Ok(Ended::Interrupted);
+                return Ok(ExitStatus::Interrupted);
             }
         };
         let labelled = Labelled::from(&place, &structure, &protocol, once)?;
@@ -85,8 +85,8 @@ pub async fn label(task: Task<'_>, stop: &Notify) -> Result<Ended, Failure> {
             write_frame(file, &labelled.frame(structure)).map_err(|error| cannot_write(path, error))?;
         }
     }
-    output.map_or(Ok(()), WholeFile::finish)?;
-    Ok(Ended::Done)
+    output.map_or(Ok(()), AtomicFile::finish)?;
+    Ok(ExitStatus::Done)
 }
 
 impl Labelled {

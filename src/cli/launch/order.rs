@@ -9,9 +9,9 @@ use wire::net::Tls;
 
 use super::scripts::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
 use super::{FOLDER, Launch, absolute};
+use crate::atomic_file::cannot_write;
 use crate::campaign::Campaign;
-use crate::outcome::Failure;
-use crate::whole_file::cannot_write;
+use crate::exit_status::Failure;
 
 /// Where the orchestrator writes down where it is, in the campaign's directory.
 const ENDPOINT: &str = "endpoint";

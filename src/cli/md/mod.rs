@@ -13,10 +13,10 @@ use md::{Dynamics, Settings, State, Stream, default_time_step};
 
 use self::config::{DynamicsSection, MdConfig, OutputSection};
 use self::trajectory::{Trajectory, time};
-use super::{Ended, Failure};
-use crate::interrupt;
+use super::{ExitStatus, Failure};
+use crate::atomic_file::refuse_to_replace;
 use crate::output::{Bar, count, decimals, print};
-use crate::whole_file::refuse_to_replace;
+use crate::signals;
 
 const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
 
@@ -36,7 +36,7 @@ pub struct Md {
 }
 
 impl Md {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let (config, start, mut potential) = MdConfig::load(&self.config)?;
         let path = self.output.unwrap_or_else(|| config.output.trajectory.clone());
         let inputs = [
@@ -50,7 +50,7 @@ impl Md {
         let mut dynamics = Dynamics::new(state, settings, &mut *potential).map_err(|error| {
             Failure::Input(format!("{}:{}: {error}", config.structure.get_ref().display(), start.line))
         })?;
-        let stopping = interrupt::flag()?;
+        let stopping = signals::stop_flag()?;
         let mut trajectory = Trajectory::create(&path)?;
         let begun = Instant::now();
         let watch = Watch::new(&config);
@@ -75,7 +75,7 @@ impl Md {
             writeln!(out, "{steps} of {atoms} in {seconds:.1} s, {frames} in {shown}")
         })?;
         let interrupted = dynamics.state().step < config.dynamics.steps;
-        Ok(if interrupted { Ended::Interrupted } else { Ended::Done })
+        Ok(if interrupted { ExitStatus::Interrupted } else { ExitStatus::Done })
     }
 }
 
@@ -120,7 +120,9 @@ impl Watch {
         let OutputSection { every, log_every, .. } = config.output;
         let bar = std::io::stderr().is_terminal().then(|| Bar::new(Some(config.dynamics.steps), BAR));
         if bar.is_none() {
-            say(["step", "time (ps)", "energy (eV)", "temperature (K)", "conserved (eV)"].map(str::to_owned));
+            print_row(
+                ["step", "time (ps)", "energy (eV)", "temperature (K)", "conserved (eV)"].map(str::to_owned),
+            );
         }
         Self { every: log_every.unwrap_or(every).get(), bar }
     }
@@ -130,7 +132,7 @@ impl Watch {
         if let Some(bar) = &self.bar {
             bar.set(step, || format!("{:.0} K", dynamics.temperature()));
         } else if step.is_multiple_of(self.every) {
-            say([
+            print_row([
                 step.to_string(),
                 format!("{:.3}", time(dynamics) / 1000.0),
                 format!("{:.6}", dynamics.evaluation().energy()),
@@ -142,7 +144,7 @@ impl Watch {
 }
 
 /// A line on the standard error; nobody has to read it.
-fn say([step, time, energy, temperature, conserved]: [String; 5]) {
+fn print_row([step, time, energy, temperature, conserved]: [String; 5]) {
     let mut out = std::io::stderr().lock();
     let _ = writeln!(out, "{step:>10}  {time:>10}  {energy:>16}  {temperature:>15}  {conserved:>16}");
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use store::{Location, Store};
 
-use crate::outcome::Failure;
+use crate::exit_status::Failure;
 
 /// Writes the packed directories of a candidate's calculations into a directory, one file an attempt. Returns what was
 /// written, each with the names of the files that were too large to be kept.

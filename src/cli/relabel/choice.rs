@@ -7,7 +7,7 @@ use wire::ContentHash;
 
 use super::Failure;
 use crate::cli::export::frame::facts;
-use crate::condition::Condition;
+use crate::filter::Filter;
 use crate::output;
 
 /// Structures read at a time.
@@ -107,7 +107,7 @@ impl Choice {
 pub async fn meeting(
     store: &Store,
     all: Vec<Relabellable>,
-    condition: &Condition,
+    condition: &Filter,
 ) -> Result<Vec<Relabellable>, Failure> {
     let mut meeting = HashSet::new();
     for protocol in store.protocols().await? {
@@ -117,7 +117,7 @@ pub async fn meeting(
             let page = store.labelled(&filter, last, PAGE).await?;
             let Some(row) = page.last() else { break };
             last = Some(row.place);
-            let met = page.iter().filter(|row| condition.is_met(&facts(row)));
+            let met = page.iter().filter(|row| condition.matches(&facts(row)));
             meeting.extend(met.map(|row| ContentHash::of(&row.structure).0));
         }
     }

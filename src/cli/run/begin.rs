@@ -7,14 +7,14 @@ use store::{Location, Store, unix_milliseconds};
 
 use crate::campaign::Campaign;
 use crate::config::{Change, Refused, compare, place};
-use crate::origin::{self, Match, Origin};
-use crate::outcome::Failure;
-use crate::output::{count, say};
+use crate::exit_status::Failure;
+use crate::output::{count, log_and_print};
+use crate::provenance::{self, ConfigMatch, Provenance};
 
 /// Records of a new campaign what it began with.
-pub async fn begun(store: &Store, origin: &Origin, location: &Location) -> Result<(), Failure> {
+pub async fn begun(store: &Store, origin: &Provenance, location: &Location) -> Result<(), Failure> {
     record(store, origin).await?;
-    say(format_args!("campaign '{}' begins in {location}, with {}", origin.name, origin.file.path));
+    log_and_print(format_args!("campaign '{}' begins in {location}, with {}", origin.name, origin.file.path));
     Ok(())
 }
 
@@ -23,21 +23,22 @@ pub async fn go_on(
     campaign: &Campaign,
     store: &Store,
     location: &Location,
-    origin: &Origin,
+    origin: &Provenance,
     adopt: bool,
 ) -> Result<(), Failure> {
-    let known = Origin::of(store).await?;
+    let known = Provenance::read(store).await?;
     let holds_campaign = matches!(location, Location::Directory(_));
     let how = known.as_ref().map(|known| known.compare(origin, holds_campaign, Path::exists));
-    let other = known.as_ref().filter(|_| how == Some(Match::Other));
+    let other = known.as_ref().filter(|_| how == Some(ConfigMatch::Other));
     let resolved = campaign.resolved();
     let changes = compare(&in_force(store).await?, &resolved)
         .map_err(|refused| other_content(campaign, location, other, &refused))?;
     match other {
         Some(known) if !adopt => return Err(other_file(campaign, location, known)),
-        Some(known) => {
-            say(format_args!("configuration: {} takes the place of {}", origin.file.path, known.file.path))
-        }
+        Some(known) => log_and_print(format_args!(
+            "configuration: {} takes the place of {}",
+            origin.file.path, known.file.path
+        )),
         None => {}
     }
     record(store, &known.map_or_else(|| origin.clone(), |known| known.continued(origin))).await?;
@@ -45,7 +46,7 @@ pub async fn go_on(
     if changes.is_empty() {
         return Ok(());
     }
-    changes.iter().for_each(|change| say(format_args!("configuration: {change}")));
+    changes.iter().for_each(|change| log_and_print(format_args!("configuration: {change}")));
     store.add_seed_structures(&campaign.stored_seeds()).await?;
     let details: Vec<_> = changes.iter().map(Change::detail).collect();
     Ok(store.set_configuration_in_force(&resolved.to_string(), &details, unix_milliseconds()).await?)
@@ -60,13 +61,13 @@ async fn in_force(store: &Store) -> Result<Value, Failure> {
     })
 }
 
-async fn record(store: &Store, origin: &Origin) -> Result<(), Failure> {
+async fn record(store: &Store, origin: &Provenance) -> Result<(), Failure> {
     let note = serde_json::to_string(origin).map_err(Failure::failed)?;
-    Ok(store.leave_note(origin::NOTE, &note).await?)
+    Ok(store.leave_note(provenance::METADATA_KEY, &note).await?)
 }
 
 /// Says where the campaign goes on.
-async fn tell_where(store: &Store, origin: &Origin, location: &Location) -> Result<(), Failure> {
+async fn tell_where(store: &Store, origin: &Provenance, location: &Location) -> Result<(), Failure> {
     let status = store.status().await?;
     let decisions = store.newest_mixture().await?.decision;
     let steps: u64 = status.walks.iter().map(|walk| walk.step).sum();
@@ -82,7 +83,7 @@ async fn tell_where(store: &Store, origin: &Origin, location: &Location) -> Resu
         )
     };
     let goes_on = if status.finished { "is finished" } else { "goes on" };
-    say(format_args!("campaign '{}' in {location} {goes_on}; {from}", origin.name));
+    log_and_print(format_args!("campaign '{}' in {location} {goes_on}; {from}", origin.name));
     Ok(())
 }
 
@@ -90,7 +91,7 @@ async fn tell_where(store: &Store, origin: &Origin, location: &Location) -> Resu
 fn other_content(
     campaign: &Campaign,
     location: &Location,
-    other: Option<&Origin>,
+    other: Option<&Provenance>,
     refused: &Refused,
 ) -> Failure {
     let at = place(&campaign.path, &campaign.text, refused.key());
@@ -102,7 +103,7 @@ fn other_content(
 }
 
 /// The configuration would do, and is not the campaign's.
-fn other_file(campaign: &Campaign, location: &Location, known: &Origin) -> Failure {
+fn other_file(campaign: &Campaign, location: &Location, known: &Provenance) -> Failure {
     let (given, name, file) = (campaign.path.display(), &known.name, &known.file.path);
     let elsewhere = elsewhere(location);
     Failure::Input(format!(

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use store::{CampaignLock, Location, StoreError};
 
-use crate::output::say;
+use crate::output::log_and_print;
 
 /// Who takes the locks, as others are told.
 const WHO: &str = "calmwalk run";
@@ -53,7 +53,7 @@ async fn patiently(
         match acquire().await {
             Err(error @ StoreError::Locked { .. }) if begun.elapsed() < patience => {
                 if !std::mem::replace(&mut waiting, true) {
-                    say(format_args!("waiting: {error}"));
+                    log_and_print(format_args!("waiting: {error}"));
                 }
                 tokio::time::sleep(NEXT_TRY).await;
             }

@@ -4,7 +4,7 @@ use serde::Serialize;
 use serde_json::Value;
 use store::{Status, unix_milliseconds};
 
-use crate::bill::{Bill, SECONDS_PER_HOUR, digits};
+use crate::label_cost::{QueueCost, SECONDS_PER_HOUR, two_digits};
 
 /// As things are now: walks that there are, at their speed, and labels that wait, on the cores at work.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
@@ -21,7 +21,7 @@ pub struct End {
 
 impl End {
     /// Of a campaign with this configuration in force.
-    pub fn of(status: &Status, configuration: &Value, bill: &Bill) -> Self {
+    pub fn of(status: &Status, configuration: &Value, bill: &QueueCost) -> Self {
         let is_led = status.led;
         if status.finished {
             return Self::default();
@@ -50,8 +50,9 @@ impl End {
     /// In words; none where nothing can be told.
     pub fn shown(&self) -> Option<String> {
         let milliseconds = self.time? - unix_milliseconds();
-        let hours = digits(milliseconds.max(0) as f64 / 1000.0 / SECONDS_PER_HOUR);
-        let part = |what: &str, hours: Option<f64>| hours.map(|hours| format!("{what} {} h", digits(hours)));
+        let hours = two_digits(milliseconds.max(0) as f64 / 1000.0 / SECONDS_PER_HOUR);
+        let part =
+            |what: &str, hours: Option<f64>| hours.map(|hours| format!("{what} {} h", two_digits(hours)));
         let parts = [
             part("walks", self.walks_hours),
             part("labels", self.labels_hours),
@@ -69,7 +70,7 @@ mod tests {
 
     use super::*;
 
-    fn campaign() -> (Status, Value, Bill) {
+    fn campaign() -> (Status, Value, QueueCost) {
         let walk = |state: &str, step| WalkStatus { state: state.into(), step, ..WalkStatus::default() };
         let status = Status {
             walks: vec![walk("running", 4_000), walk("waiting", 0), walk("collected", 7)],
@@ -77,7 +78,7 @@ mod tests {
             led: true,
             ..Status::default()
         };
-        (status, json!({ "walk": { "equilibration": 1_000, "steps": 19_000 } }), Bill::default())
+        (status, json!({ "walk": { "equilibration": 1_000, "steps": 19_000 } }), QueueCost::default())
     }
 
     #[test]

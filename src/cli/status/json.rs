@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 
 use super::Snapshot;
 use super::jobs::Jobs;
-use crate::ends::Ends;
+use crate::walk_ends::WalkEnds;
 
 /// Goes up when a key is taken away or comes to mean something else.
 pub const VERSION: u32 = 1;
@@ -24,7 +24,7 @@ pub fn of(snapshot: &Snapshot, jobs: &Jobs) -> serde_json::Result<Value> {
     json["staleness"] = values.staleness();
     json["disk"] = serde_json::to_value(disk)?;
     json["disk"]["at_the_end"] = json!(disk.at_the_end(standing));
-    json["ends"] = json!(Ends::of(&standing.walks));
+    json["ends"] = json!(WalkEnds::from_walks(&standing.walks));
     json["expected_end"] = json!(end);
     labels.add_to(&mut json, standing);
     jobs.add_to(&mut json);

@@ -7,7 +7,7 @@ use store::{FailureCount, JobState, Labels, Status, Store, StoreError, Unlabelle
 
 use super::page::{Page, cut};
 use super::processes::since;
-use crate::bill::{self, Bill, digits};
+use crate::label_cost::{self, QueueCost, two_digits};
 use crate::output::count;
 use crate::unlabelled;
 
@@ -17,7 +17,7 @@ const LOOKED_THROUGH: u64 = 20_000;
 /// What is known of the labels of the protocol in force.
 #[derive(Clone, Debug, Default)]
 pub struct LabelsSoFar {
-    pub(super) bill: Bill,
+    pub(super) bill: QueueCost,
     pub(super) failures: Vec<FailureCount>,
     pub(super) unlabelled: Vec<Unlabelled>,
     /// What became of label jobs by each protocol, in words.
@@ -42,11 +42,17 @@ impl LabelsSoFar {
             (_, labelled) => store.unlabelled(protocol.hash, labelled <= LOOKED_THROUGH).await?,
         };
         let by_protocol = by_protocol(&store.jobs_by_protocol().await?, &protocol.name);
-        Ok(Self { bill: bill::of(store, protocol.hash).await?, failures, unlabelled, by_protocol, shared })
+        Ok(Self {
+            bill: label_cost::queue_cost(store, protocol.hash).await?,
+            failures,
+            unlabelled,
+            by_protocol,
+            shared,
+        })
     }
 
     /// What labels have cost and will.
-    pub fn bill(&self) -> &Bill {
+    pub fn bill(&self) -> &QueueCost {
         &self.bill
     }
 
@@ -76,14 +82,14 @@ impl LabelsSoFar {
         if self.failures.len() > page.few {
             page.titled(out, "", &format!("… and {} more classes", self.failures.len() - page.few))?;
         }
-        unlabelled::shown(&self.unlabelled, 12, page.few)
+        unlabelled::describe(&self.unlabelled, 12, page.few)
             .lines()
             .try_for_each(|line| writeln!(out, "{}", cut(line, page.width)))
     }
 
     fn cost(&self, used: f64) -> String {
-        let Bill { unfinished, remaining, hours_left, cores, measured, overhead } = &self.bill;
-        let used = format!("{} core-hours so far", digits(used));
+        let QueueCost { unfinished, remaining, hours_left, cores, measured, overhead } = &self.bill;
+        let used = format!("{} core-hours so far", two_digits(used));
         let Some(remaining) = remaining else {
             return match unfinished {
                 0 => used,
@@ -98,7 +104,7 @@ impl LabelsSoFar {
             false => String::new(),
         };
         let done = match hours_left {
-            Some(hours) => format!("done in {} h on {} at work", digits(*hours), count(*cores, "core")),
+            Some(hours) => format!("done in {} h on {} at work", two_digits(*hours), count(*cores, "core")),
             None => "nobody is at work on them".to_owned(),
         };
         format!(
@@ -147,8 +153,8 @@ fn by_protocol(jobs: &[(String, JobState, u64)], in_force: &str) -> Vec<String> 
 }
 
 fn made(status: &Status) -> String {
-    let average =
-        per_hour(status).map_or(String::new(), |average| format!("; {} an hour on average", digits(average)));
+    let average = per_hour(status)
+        .map_or(String::new(), |average| format!("; {} an hour on average", two_digits(average)));
     format!("{} made in the last hour{average}", status.labels_last_hour)
 }
 

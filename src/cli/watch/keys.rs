@@ -3,18 +3,18 @@
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use store::JobState;
 
-use super::super::Ended;
+use super::super::ExitStatus;
 use super::entries::{NOT_KNOWN, without_campaign};
 use super::state::{Ask, DECISIONS, Message, Mode, QUEUE, State, Text, WALKS, Wanted};
 use crate::cli::queue::Action as QueueAction;
 use crate::cli::walks::{Action as WalksAction, Which};
-use crate::condition::Condition;
+use crate::filter::Filter;
 
 /// What is to be done outside.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Request {
     /// Stop watching.
-    Leave(Ended),
+    Leave(ExitStatus),
     /// Look at once: something else is to be seen.
     Look,
     /// Read the story of a candidate.
@@ -52,7 +52,7 @@ impl State {
         }
         let control = key.modifiers.contains(KeyModifiers::CONTROL);
         if control && key.code == KeyCode::Char('c') {
-            return Some(Request::Leave(Ended::Interrupted));
+            return Some(Request::Leave(ExitStatus::Interrupted));
         }
         self.message = None;
         match std::mem::take(&mut self.mode) {
@@ -71,7 +71,7 @@ impl State {
 
     fn in_panes(&mut self, code: KeyCode) -> Option<Request> {
         match code {
-            KeyCode::Char('q') => return Some(Request::Leave(Ended::Done)),
+            KeyCode::Char('q') => return Some(Request::Leave(ExitStatus::Done)),
             KeyCode::Tab => self.focus = (self.focus + 1) % self.panes.len(),
             KeyCode::BackTab => self.focus = (self.focus + self.panes.len() - 1) % self.panes.len(),
             KeyCode::Char('1') => self.focus = WALKS,
@@ -112,7 +112,7 @@ impl State {
         self.mode = Mode::Text(Text { title: title.to_owned(), text: Some(text), ..Text::default() });
     }
 
-    fn filter(&mut self, filter: Option<Condition>) {
+    fn filter(&mut self, filter: Option<Filter>) {
         self.pane().filter = filter;
         self.arrange();
     }
@@ -236,8 +236,8 @@ impl State {
 
 impl State {
     /// The condition that a text is, if this pane knows everything that it asks for.
-    fn condition(&self, text: &str) -> Result<Condition, String> {
-        let condition: Condition = text.parse().map_err(|error| format!("no condition: {error}"))?;
+    fn condition(&self, text: &str) -> Result<Filter, String> {
+        let condition: Filter = text.parse().map_err(|error| format!("no condition: {error}"))?;
         let is_not_known = |name: &&str| NOT_KNOWN[self.focus].contains(name);
         match condition.names().into_iter().find(is_not_known) {
             None => Ok(condition),

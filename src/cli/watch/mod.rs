@@ -26,7 +26,7 @@ use self::keys::Request;
 use self::reader::{Looks, Reader};
 use self::screen::Screen;
 use self::state::State;
-use super::{CampaignLocation, Ended, Failure, block_on, explain, queue, walks};
+use super::{CampaignLocation, ExitStatus, Failure, block_on, explain, queue, walks};
 
 /// Watch a campaign live in the terminal
 ///
@@ -44,7 +44,7 @@ pub struct Watch {
 }
 
 impl Watch {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
         if !io::stdout().is_terminal() {
             return Err(Failure::Input(
@@ -58,7 +58,7 @@ impl Watch {
 }
 
 /// Looks, draws and obeys until somebody leaves.
-async fn watch(location: Location, every: Duration) -> Result<Ended, Failure> {
+async fn watch(location: Location, every: Duration) -> Result<ExitStatus, Failure> {
     let mut reader = Reader::new(location.clone());
     // What is wrong with it is said on the terminal as it was.
     let mut state = State::new(reader.look(state::Jobs::default()).await?);
@@ -88,9 +88,9 @@ async fn watch(location: Location, every: Duration) -> Result<Ended, Failure> {
                 looks.now(state.which);
                 None
             }
-            _ = interrupt.recv() => return Ok(Ended::Interrupted),
-            _ = terminate.recv() => return Ok(Ended::Interrupted),
-            _ = hangup.recv() => return Ok(Ended::Interrupted),
+            _ = interrupt.recv() => return Ok(ExitStatus::Interrupted),
+            _ = terminate.recv() => return Ok(ExitStatus::Interrupted),
+            _ = hangup.recv() => return Ok(ExitStatus::Interrupted),
         };
         match request {
             None => {}

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use crate::condition::Condition;
+use crate::filter::Filter;
 
 /// How a line is shown where there are colours. Its words say the same.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -39,7 +39,7 @@ pub struct Pane {
     /// How many there are with those that do not.
     pub all: usize,
     /// Only those that meet it are shown.
-    pub filter: Option<Condition>,
+    pub filter: Option<Filter>,
     /// The chosen entry and where it was seen last; none: the first, whichever that is.
     chosen: Option<(String, usize)>,
     /// First line that is seen.

@@ -9,7 +9,7 @@ use tokio::time::timeout;
 
 use super::state::{Jobs, WINDOW};
 use crate::cli::status::Snapshot;
-use crate::outcome::Failure;
+use crate::exit_status::Failure;
 
 /// Jobs of a state that are read, at most.
 const JOBS: u32 = 300;

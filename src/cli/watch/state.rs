@@ -11,7 +11,7 @@ use super::keys::Request;
 use super::pane::Pane;
 use super::reader::Seen;
 use crate::cli::status::Snapshot;
-use crate::outcome::Failure;
+use crate::exit_status::Failure;
 
 /// Decisions that are kept, the newest: charts and filters are about these.
 pub const WINDOW: usize = 2000;

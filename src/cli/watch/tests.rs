@@ -263,7 +263,7 @@ fn a_story_is_shown_when_it_comes_unless_nobody_waits_for_it() {
     press(&mut state, "q");
     state.done(Done::Story(id, Ok("late".into())));
     assert!(matches!(state.mode, Mode::Panes));
-    assert_eq!(press(&mut state, "q"), Some(Request::Leave(Ended::Done)));
+    assert_eq!(press(&mut state, "q"), Some(Request::Leave(ExitStatus::Done)));
 }
 
 #[test]
@@ -276,7 +276,7 @@ fn what_was_seen_stays_while_the_campaign_cannot_be_read() {
     assert!(!shown(&mut state, 80, 24).contains("old"));
     assert_eq!((state.focus, state.panes[QUEUE].entries.len()), (WALKS, 0));
     let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
-    assert_eq!(state.key(control_c), Some(Request::Leave(Ended::Interrupted)));
+    assert_eq!(state.key(control_c), Some(Request::Leave(ExitStatus::Interrupted)));
 }
 
 #[test]

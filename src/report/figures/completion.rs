@@ -3,14 +3,14 @@
 use ::figures::{Axis, Colour, Figure, Marker, Panel, Rectangle, Scale};
 use analysis::CompletionBin;
 
-use super::super::gathered::Gathered;
+use super::super::report_data::ReportData;
 use super::super::style::{WIDTH, grouped};
 use super::super::{Csv, Drawn, csv};
 use super::row;
 
-pub fn draw(gathered: &Gathered) -> Result<Drawn, String> {
+pub fn draw(data: &ReportData) -> Result<Drawn, String> {
     let none = "No label has been made, and none has finally failed.";
-    let labels = gathered.labels.as_ref().ok_or(none)?;
+    let labels = data.labels.as_ref().ok_or(none)?;
     let (by_gamma, by_expansion) = (labels.learned.by_gamma.bins(), labels.learned.by_expansion.bins());
     let (labelled, failed) = counts(&by_gamma);
     if labelled + failed == 0 {

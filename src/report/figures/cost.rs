@@ -4,7 +4,7 @@ use ::figures::{Axis, Colour, Figure, Marker, Panel, Scale};
 use analysis::{Histogram, logarithmic_edges, quantile};
 use store::LabelCost;
 
-use super::super::gathered::Gathered;
+use super::super::report_data::ReportData;
 use super::super::style::{WIDTH, axis, grouped};
 use super::super::{Csv, Drawn, csv};
 use super::row;
@@ -14,8 +14,8 @@ const BINS: usize = 24;
 /// Labels that have marks.
 const DRAWN: usize = 3000;
 
-pub fn draw(gathered: &Gathered) -> Result<Drawn, String> {
-    let costs = gathered.labels.as_ref().map_or(&[][..], |labels| &labels.costs);
+pub fn draw(data: &ReportData) -> Result<Drawn, String> {
+    let costs = data.labels.as_ref().map_or(&[][..], |labels| &labels.costs);
     if costs.is_empty() {
         return Err("No label was made in this campaign, so none has a cost.".into());
     }
@@ -48,7 +48,7 @@ pub fn draw(gathered: &Gathered) -> Result<Drawn, String> {
     panel.dots(points, Marker::Disc, 1.8, Colour::BLUE.faint(0.45), None);
     panel.letter('b');
     panel.draw(&mut figure);
-    Ok(Drawn { figure, caption: caption(gathered, seconds), numbers })
+    Ok(Drawn { figure, caption: caption(data, seconds), numbers })
 }
 
 /// What the cost depends on: electrons, where every label has some.
@@ -59,7 +59,7 @@ fn size(costs: &[LabelCost]) -> (&'static str, fn(&LabelCost) -> f64) {
     }
 }
 
-fn caption(gathered: &Gathered, mut seconds: Vec<f64>) -> String {
+fn caption(data: &ReportData, mut seconds: Vec<f64>) -> String {
     seconds.sort_by(f64::total_cmp);
     let of = |share| quantile(&seconds, share).map_or(String::new(), |x| format!("{x:.3}"));
     format!(
@@ -68,6 +68,6 @@ fn caption(gathered: &Gathered, mut seconds: Vec<f64>) -> String {
         grouped(seconds.len() as u64),
         of(0.5),
         of(0.9),
-        gathered.standing.budget.used.core_hours
+        data.standing.budget.used.core_hours
     )
 }

@@ -4,7 +4,7 @@ use ::figures::{Figure, Panel, Scale};
 use analysis::{Histogram, logarithmic_edges, quantile};
 use wire::Origin;
 
-use super::super::sample::{Atom, Sample};
+use super::super::collections::{Atom, Collections};
 use super::super::style::{WIDTH, axis, grouped, origins};
 use super::super::{Csv, Drawn};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};
@@ -15,7 +15,7 @@ type OfAtom = fn(&Atom) -> Option<f64>;
 /// Bins of a panel.
 const BINS: usize = 40;
 
-pub fn draw(sample: &Sample) -> Result<Drawn, String> {
+pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let shown = origins_of(sample);
     if shown.is_empty() {
         return Err(NOTHING_COLLECTED.into());
@@ -57,7 +57,7 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
     Ok(Drawn { figure, caption: caption(sample, &shown), numbers })
 }
 
-fn caption(sample: &Sample, shown: &[Origin]) -> String {
+fn caption(sample: &Collections, shown: &[Origin]) -> String {
     let of = |origin: &Origin| {
         let (_, collection) = sample.both()[usize::from(*origin == Origin::Control)];
         let atoms = &collection.atoms;

@@ -4,7 +4,7 @@ use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale, Side};
 use analysis::{Band, bands, density, even_edges, quantile};
 use wire::Origin;
 
-use super::super::sample::{Atom, Sample};
+use super::super::collections::{Atom, Collections};
 use super::super::style::{WIDTH, axis, grouped, look, origins};
 use super::super::{Csv, Drawn, csv};
 use super::NO_LABELS;
@@ -29,7 +29,7 @@ const AGAINST: [Against; 2] = [
     Against { letter: 'b', title: "d_{nn} / d_{nn}^{0}", scale: Scale::Linear, of: |atom| atom.stretch },
 ];
 
-pub fn draw(sample: &Sample) -> Result<Drawn, String> {
+pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let has_labels = |of: &(Origin, _)| !pairs(sample, of.0, |_| Some(1.0)).is_empty();
     let shown: Vec<_> = sample.both().into_iter().filter(has_labels).map(|(origin, _)| origin).collect();
     if shown.is_empty() {
@@ -51,7 +51,7 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
 fn draw_panel(
     figure: &mut Figure,
     numbers: &mut Csv,
-    sample: &Sample,
+    sample: &Collections,
     shown: &[Origin],
     against: &Against,
     place: Rectangle,
@@ -162,7 +162,7 @@ fn draw_density(panel: &mut Panel, origin: Origin, line: &[(f64, f64)], at: fn(f
 }
 
 /// (what is plotted, error) of the labelled atoms.
-fn pairs(sample: &Sample, origin: Origin, of: fn(&Atom) -> Option<f64>) -> Vec<[f64; 2]> {
+fn pairs(sample: &Collections, origin: Origin, of: fn(&Atom) -> Option<f64>) -> Vec<[f64; 2]> {
     let (_, collection) = sample.both()[usize::from(origin == Origin::Control)];
     let pair = |atom: &Atom| Some([of(atom)?, atom.error?]).filter(|[x, y]| x.is_finite() && y.is_finite());
     collection.atoms.kept().filter_map(pair).collect()
@@ -179,7 +179,7 @@ pub fn push_bands(numbers: &mut Csv, panel: &str, origin: &str, bands: &[Band]) 
     }
 }
 
-fn caption(sample: &Sample, shown: &[Origin]) -> String {
+fn caption(sample: &Collections, shown: &[Origin]) -> String {
     let medians = |origin: &Origin| {
         let stretched = pairs(sample, *origin, |atom| atom.stretch);
         let mut errors: Vec<_> = stretched.iter().filter(|[x, _]| *x > 1.15).map(|[_, y]| *y).collect();

@@ -4,7 +4,7 @@ use ::figures::{Colour, Figure, Key, Panel, Scale, legend};
 use analysis::{bands, logarithmic_edges, spearman};
 use wire::Origin;
 
-use super::super::sample::{Atom, Sample};
+use super::super::collections::{Atom, Collections};
 use super::super::style::{WIDTH, axis, grouped};
 use super::super::{Csv, Drawn, csv};
 use super::errors::{LEAST, middle, ribbons};
@@ -16,7 +16,7 @@ type OfAtom = fn(&Atom) -> f64;
 /// Bins of a panel.
 const BINS: usize = 18;
 
-pub fn draw(sample: &Sample) -> Result<Drawn, String> {
+pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let atoms = |origin: Origin| sample.both()[usize::from(origin == Origin::Control)].1.atoms.kept();
     let labelled = atoms(Origin::Biased).chain(atoms(Origin::Control)).filter(|atom| atom.error.is_some());
     let labelled: Vec<Atom> = labelled.copied().collect();

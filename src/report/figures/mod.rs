@@ -13,27 +13,27 @@ use ::figures::{Axis, Panel, Rectangle, Scale};
 use analysis::Histogram;
 use wire::Origin;
 
-use super::gathered::Gathered;
-use super::sample::Sample;
+use super::collections::Collections;
+use super::report_data::ReportData;
 use super::style::look;
 use super::{Csv, Part, csv};
 
 /// All of them, in the order of the page.
-pub fn all(gathered: &Gathered) -> Vec<Part> {
+pub fn all(data: &ReportData) -> Vec<Part> {
     let part = |name, title, drawn| Part { name, title, drawn };
     vec![
-        part("collection", "What was collected", collection::draw(gathered)),
-        part("distributions", "Grades and force errors", distributions::draw(&gathered.sample)),
+        part("collection", "What was collected", collection::draw(data)),
+        part("distributions", "Grades and force errors", distributions::draw(&data.sample)),
         part(
             "errors",
             "Force errors where structures are new, and where they are stretched",
-            errors::draw(&gathered.sample),
+            errors::draw(&data.sample),
         ),
-        part("space", "Volumes and composition", space::draw(&gathered.sample)),
-        part("features", "Feature space", projection::draw(&gathered.sample)),
-        part("grades", "Force errors by grade", grades::draw(&gathered.sample)),
-        part("cost", "What labels cost", cost::draw(gathered)),
-        part("completion", "Structures that got their labels", completion::draw(gathered)),
+        part("space", "Volumes and composition", space::draw(&data.sample)),
+        part("features", "Feature space", projection::draw(&data.sample)),
+        part("grades", "Force errors by grade", grades::draw(&data.sample)),
+        part("cost", "What labels cost", cost::draw(data)),
+        part("completion", "Structures that got their labels", completion::draw(data)),
     ]
 }
 
@@ -70,7 +70,7 @@ fn push_histograms(numbers: &mut Csv, panel: &str, histograms: &[(Origin, Histog
 }
 
 /// The origins of which something was collected.
-fn origins_of(sample: &Sample) -> Vec<Origin> {
+fn origins_of(sample: &Collections) -> Vec<Origin> {
     let both = sample.both().into_iter();
     both.filter(|(_, of)| of.structures.seen() > 0).map(|(origin, _)| origin).collect()
 }

@@ -4,8 +4,8 @@ use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale};
 use analysis::{PlaneDensity, contours};
 use wire::Origin;
 
-use super::super::features::{ELEMENTS, Plane, Points};
-use super::super::sample::Sample;
+use super::super::collections::Collections;
+use super::super::features::{MAX_ELEMENTS, Plane, Points};
 use super::super::style::{WIDTH, grouped, look, origins};
 use super::super::{Csv, Drawn, csv};
 use super::NOTHING_COLLECTED;
@@ -19,7 +19,7 @@ const DRAWN: usize = 1500;
 /// Fewer atoms have no contour.
 const LEAST: usize = 50;
 
-pub fn draw(sample: &Sample) -> Result<Drawn, String> {
+pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     if sample.both().iter().all(|(_, of)| of.structures.seen() == 0) {
         return Err(NOTHING_COLLECTED.into());
     }
@@ -128,7 +128,7 @@ fn push(
     }
 }
 
-fn caption(sample: &Sample, planes: &[Plane]) -> String {
+fn caption(sample: &Collections, planes: &[Plane]) -> String {
     let of = |plane: &Plane| {
         let one = |origin: Origin| {
             let points = plane.points(origin);
@@ -140,8 +140,8 @@ fn caption(sample: &Sample, planes: &[Plane]) -> String {
     };
     let all: Vec<_> = planes.iter().map(of).collect();
     let elements = sample.biased.elements.len().max(sample.control.elements.len());
-    let chosen = match elements > ELEMENTS {
-        true => format!(" of the {ELEMENTS} elements with the most atoms"),
+    let chosen = match elements > MAX_ELEMENTS {
+        true => format!(" of the {MAX_ELEMENTS} elements with the most atoms"),
         false => String::new(),
     };
     format!(

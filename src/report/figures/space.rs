@@ -4,20 +4,20 @@ use ::figures::{Axis, Figure, Panel, Rectangle, Scale};
 use analysis::{Histogram, even_edges};
 use wire::Origin;
 
-use super::super::sample::{Sample, Shape};
+use super::super::collections::{Collections, StructureSize};
 use super::super::style::{WIDTH, axis, grouped, look, origins};
 use super::super::{Csv, Drawn};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};
 
 /// What is shown of a structure.
-type OfShape = fn(&Shape) -> Option<f64>;
+type OfShape = fn(&StructureSize) -> Option<f64>;
 
 /// Bins of a histogram.
 const BINS: usize = 24;
 /// Elements that have bars of their own: those with the most atoms.
 const ELEMENTS: usize = 12;
 
-pub fn draw(sample: &Sample) -> Result<Drawn, String> {
+pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let shown = origins_of(sample);
     if shown.is_empty() {
         return Err(NOTHING_COLLECTED.into());
@@ -57,7 +57,7 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
 fn draw_volumes(
     figure: &mut Figure,
     numbers: &mut Csv,
-    sample: &Sample,
+    sample: &Collections,
     shown: &[Origin],
     (letter, title, of): (char, &str, OfShape),
     place: Rectangle,
@@ -86,7 +86,7 @@ fn draw_volumes(
 fn draw_elements(
     figure: &mut Figure,
     numbers: &mut Csv,
-    sample: &Sample,
+    sample: &Collections,
     shown: &[Origin],
     place: Rectangle,
 ) {

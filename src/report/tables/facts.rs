@@ -5,17 +5,17 @@ use std::collections::BTreeSet;
 use calm::CollectionRule;
 use serde_json::Value;
 
-use super::super::gathered::Gathered;
+use super::super::report_data::ReportData;
 use super::super::style::grouped;
 use super::settings::flatten;
 use super::{Table, text};
 
 /// The campaign in a few lines.
-pub fn summary(gathered: &Gathered) -> Table {
+pub fn summary(data: &ReportData) -> Table {
     let mut table = Table::new("summary", "The campaign in numbers.", &["", "value"]);
-    let status = &gathered.standing;
+    let status = &data.standing;
     let mut row = |name: &str, value: String| table.rows.push(vec![text(name), text(value)]);
-    row("campaign", format!("{}, {} mode", gathered.campaign.id, gathered.campaign.mode));
+    row("campaign", format!("{}, {} mode", data.campaign.id, data.campaign.mode));
     let walks = |origin: &str| status.walks.iter().filter(|walk| walk.origin == origin).count() as u64;
     let state = if status.finished { "has ended" } else { "is not over: numbers are those of the moment" };
     row("state", state.into());
@@ -40,14 +40,14 @@ pub fn summary(gathered: &Gathered) -> Table {
             grouped(labels.excluded)
         ),
     );
-    if let Some(found) = &gathered.labels {
+    if let Some(found) = &data.labels {
         let energies = found.learned.energies.summary();
         row("energy error", energies.line().unwrap_or_else(|| energies.offsets.note.clone()));
     }
     row("imported structures", grouped(status.imported));
     row("cost of labels", format!("{:.4} core-hours", status.budget.used.core_hours));
     let mut mixture = format!("version {}", status.mixture_version);
-    let training = gathered.values.get("training_frames");
+    let training = data.values.get("training_frames");
     let number = |key: &str| training.and_then(|training| training[key].as_f64());
     if let Some((median, share)) = number("median").zip(number("share_above_one")) {
         mixture +=
@@ -76,17 +76,17 @@ pub fn collection_rule(configuration: &Value) -> Option<String> {
 }
 
 /// Versions, hashes, and where everything comes from.
-pub fn provenance(gathered: &Gathered) -> Table {
+pub fn provenance(data: &ReportData) -> Table {
     let mut table = Table::new("provenance", "Where it comes from.", &["", "value"]).whole();
     let mut row = |name: String, value: String| table.rows.push(vec![text(name), text(value)]);
-    let campaign = &gathered.campaign;
+    let campaign = &data.campaign;
     row("campaign".into(), campaign.id.to_string());
-    if let Some(begun) = gathered.begun {
+    if let Some(begun) = data.begun {
         row("begun".into(), date(begun));
     }
     row("begun by".into(), format!("calmwalk {}", campaign.program_version));
     row("report by".into(), format!("calmwalk {}", env!("CARGO_PKG_VERSION")));
-    if let Some(labels) = &gathered.labels {
+    if let Some(labels) = &data.labels {
         row("label protocol".into(), labels.protocol.name.clone());
         row("protocol hash (BLAKE3)".into(), labels.protocol.hash.to_string());
         let mut pairs = Vec::new();
@@ -95,19 +95,18 @@ pub fn provenance(gathered: &Gathered) -> Table {
             .into_iter()
             .for_each(|(key, value)| value.into_iter().for_each(|value| row(key.clone(), value)));
     }
-    if let Some(files) = gathered.configuration["files"].as_object() {
+    if let Some(files) = data.configuration["files"].as_object() {
         for (key, hash) in files {
             row(format!("file {key} (BLAKE3)"), hash.as_str().unwrap_or_default().to_owned());
         }
     }
-    let sources: BTreeSet<_> = gathered.seeds.iter().map(|seed| seed.source.as_str()).collect();
-    let seeds = gathered.seeds.len() as u64;
+    let sources: BTreeSet<_> = data.seeds.iter().map(|seed| seed.source.as_str()).collect();
+    let seeds = data.seeds.len() as u64;
     row(
         "seed structures".into(),
         format!("{} of {}", grouped(seeds), sources.into_iter().collect::<Vec<_>>().join(", ")),
     );
-    let hosts: BTreeSet<_> =
-        gathered.standing.processes.iter().map(|process| process.host.as_str()).collect();
+    let hosts: BTreeSet<_> = data.standing.processes.iter().map(|process| process.host.as_str()).collect();
     if !hosts.is_empty() {
         row("hosts".into(), hosts.into_iter().collect::<Vec<_>>().join(", "));
     }

@@ -4,14 +4,14 @@ use analysis::ForceErrors;
 use store::{FailureCount, Range, Unlabelled};
 
 use super::{Cell, Table, count, percent, real, text};
-use crate::learned::{LARGE, Learned};
+use crate::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
 use crate::output::range;
 
 /// How grades and errors go together.
-pub fn correlations(learned: &Learned) -> Table {
+pub fn correlations(learned: &LabelStatistics) -> Table {
     let caption = format!(
         "Force error |F_{{model}} − F_{{label}}| and the grades under the original mixture: mean error, Spearman’s ρ between grade and \
-         error, and ROC-AUC of the grade as a test for errors above {LARGE} eV Å^{{−1}}."
+         error, and ROC-AUC of the grade as a test for errors above {LARGE_FORCE_ERROR} eV Å^{{−1}}."
     );
     let titles = [
         "",
@@ -53,7 +53,7 @@ pub fn correlations(learned: &Learned) -> Table {
 pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) -> Table {
     let caption = format!(
         "Force errors of all labelled atoms (n = {}) by {grade} under the original mixture: percentiles in eV Å^{{−1}}, the share of atoms \
-         in each bin, and the share with an error above {LARGE} eV Å^{{−1}}. Without label, atoms of structures whose labels finally \
+         in each bin, and the share with an error above {LARGE_FORCE_ERROR} eV Å^{{−1}}. Without label, atoms of structures whose labels finally \
          failed; possible, that share if every one of them were below or above.",
         super::super::style::grouped(errors.atoms())
     );
@@ -89,7 +89,7 @@ pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) 
 }
 
 /// What was taken out of energies before errors are shown.
-pub fn energy_offsets(learned: &Learned) -> Table {
+pub fn energy_offsets(learned: &LabelStatistics) -> Table {
     let offsets = learned.energies.summary().offsets;
     let caption = format!(
         "Labels and the potential have other zeros of energy: E_{{label}} − E_{{model}} of an atom of each element, by least squares over {} \

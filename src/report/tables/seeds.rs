@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use super::super::gathered::Gathered;
+use super::super::report_data::ReportData;
 use super::{Table, count, text};
 
 /// By seed structure: walks, candidates by fate, labels.
-pub fn of(gathered: &Gathered) -> Table {
+pub fn of(data: &ReportData) -> Table {
     let caption = "What came of each seed structure: biased walks and how they ended, candidates by what the selector decided, frames of \
                    its control walks, and labels of both.";
     let titles = [
@@ -27,15 +27,15 @@ pub fn of(gathered: &Gathered) -> Table {
     ];
     let mut table = Table::new("seed-structures", caption, &titles);
     let mut fates: BTreeMap<u64, BTreeMap<&str, u64>> = BTreeMap::new();
-    for fate in &gathered.fates_by_seed {
+    for fate in &data.fates_by_seed {
         fates.entry(fate.part).or_default().insert(&fate.fate, fate.number);
     }
-    for seed in &gathered.seeds {
+    for seed in &data.seeds {
         let fate =
             |name: &str| fates.get(&seed.index.into()).and_then(|of| of.get(name)).copied().unwrap_or(0);
-        let biased = gathered.sample.biased.labels.get(&seed.index).copied().unwrap_or_default();
-        let control = gathered.sample.control.labels.get(&seed.index).copied().unwrap_or_default();
-        let (walks, ended) = walks(gathered, &seed.name);
+        let biased = data.sample.biased.labels.get(&seed.index).copied().unwrap_or_default();
+        let control = data.sample.control.labels.get(&seed.index).copied().unwrap_or_default();
+        let (walks, ended) = walks(data, &seed.name);
         let names = ["accepted", "covered", "duplicate", "guard", "budget", "backlog"];
         let mut row = vec![text(&seed.name), text(seed.structure.formula()), count(walks), text(ended)];
         row.push(count(names.iter().map(|name| fate(name)).sum()));
@@ -48,8 +48,8 @@ pub fn of(gathered: &Gathered) -> Table {
 }
 
 /// Biased walks from a seed structure, and how many of them ended in which way.
-fn walks(gathered: &Gathered, seed: &str) -> (u64, String) {
-    let walks = gathered.standing.walks.iter();
+fn walks(data: &ReportData, seed: &str) -> (u64, String) {
+    let walks = data.standing.walks.iter();
     let walks = walks.filter(|walk| walk.seed_structure == seed && walk.origin == "biased");
     let mut states: BTreeMap<&str, u64> = BTreeMap::new();
     for walk in walks {

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use super::super::gathered::Gathered;
+use super::super::report_data::ReportData;
 use super::{Cell, Table, text};
 
 /// Sections in the order of the configuration file; the table puts any other section behind them.
@@ -23,11 +23,11 @@ const SECTIONS: [&str; 11] = [
 const ELSEWHERE: [&str; 2] = ["files", "seeds"];
 
 /// The table: a heading a section, then its keys. A key without a value is shown as not set.
-pub fn settings(gathered: &Gathered) -> Table {
+pub fn settings(data: &ReportData) -> Table {
     let caption = "The configuration in force, with every default filled in. Units are those of the documentation: eV, Å, fs, K. \
                    Files are named by their BLAKE3 hashes under Versions and provenance.";
     let mut table = Table::new("settings", caption, &["key", "value"]).whole();
-    for (section, pairs) in sections(&gathered.configuration) {
+    for (section, pairs) in sections(&data.configuration) {
         table.rows.push(vec![text(format!("[{section}]"))]);
         table.rows.extend(pairs.into_iter().map(|(key, value)| {
             let name = key.strip_prefix(&format!("{section}.")).unwrap_or(&key).to_owned();

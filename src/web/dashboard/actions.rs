@@ -12,20 +12,20 @@ use store::{Store, unix_milliseconds};
 use wire::WalkId;
 
 use super::Dashboard;
-use super::answer::{self, Answer, Refusal};
-use crate::outcome::Failure;
-use crate::web::guard;
+use super::response::{self, ApiError, ApiResult};
+use crate::exit_status::Failure;
+use crate::web::security;
 
 const HEADER: &str = "x-calmwalk-token";
 
 /// A store that may be changed, and what has to be known for that.
 #[derive(Clone, Debug)]
-pub struct Acting {
+pub struct Mutations {
     store: Store,
     token: String,
 }
 
-impl Acting {
+impl Mutations {
     /// With a new token, which nobody can guess.
     pub fn new(store: Store) -> Result<Self, Failure> {
         let mut bytes = [0; 16];
@@ -48,10 +48,10 @@ impl Acting {
 }
 
 /// `GET /api/actions`: whether there are any, and whether this token is the one.
-pub async fn allowed(State(dashboard): State<Dashboard>, headers: HeaderMap) -> Answer {
-    let acting = &dashboard.acting;
-    let knows = acting.as_ref().is_some_and(|acting| acting.knows(&headers));
-    answer::json(&json!({ "possible": acting.is_some(), "token_is_right": knows }))
+pub async fn allowed(State(dashboard): State<Dashboard>, headers: HeaderMap) -> ApiResult {
+    let mutations = &dashboard.mutations;
+    let knows = mutations.as_ref().is_some_and(|mutations| mutations.knows(&headers));
+    response::json(&json!({ "possible": mutations.is_some(), "token_is_right": knows }))
 }
 
 /// `POST /api/candidates/ID/drop`, `retry` or `prioritise` with `{"priority": …}`: returns the job as it is then.
@@ -60,15 +60,15 @@ pub async fn act(
     Path((id, action)): Path<(String, String)>,
     headers: HeaderMap,
     body: Bytes,
-) -> Answer {
+) -> ApiResult {
     let (store, now) = (may_change(&dashboard, &headers)?, unix_milliseconds());
     let candidate = match action.as_str() {
         "drop" => store.drop_job(&id, now).await?,
         "retry" => store.retry_job(&id, now).await?,
         "prioritise" => store.prioritise_job(&id, priority(&body)?, now).await?,
-        _ => return Err(Refusal::new(StatusCode::NOT_FOUND, "there is drop, retry and prioritise")),
+        _ => return Err(ApiError::new(StatusCode::NOT_FOUND, "there is drop, retry and prioritise")),
     };
-    answer::json(&store.queue_show(&candidate).await?.job)
+    response::json(&store.queue_show(&candidate).await?.job)
 }
 
 /// `POST /api/walks/N/pause` or `resume`, `all` for N being every walk that has more steps to make: returns the walks that were
@@ -77,44 +77,46 @@ pub async fn act_on_walks(
     State(dashboard): State<Dashboard>,
     Path((walk, action)): Path<(String, String)>,
     headers: HeaderMap,
-) -> Answer {
+) -> ApiResult {
     let store = may_change(&dashboard, &headers)?;
     let paused = match action.as_str() {
         "pause" => true,
         "resume" => false,
-        _ => return Err(Refusal::new(StatusCode::NOT_FOUND, "there is pause and resume")),
+        _ => return Err(ApiError::new(StatusCode::NOT_FOUND, "there is pause and resume")),
     };
     let walks = match walk.as_str() {
         "all" => store.walks_under_way().await?,
         number => {
-            vec![WalkId(number.parse().map_err(|_| Refusal::wrong("expected the number of a walk, or all"))?)]
+            vec![WalkId(
+                number.parse().map_err(|_| ApiError::wrong("expected the number of a walk, or all"))?,
+            )]
         }
     };
     let changed = store.pause_walks(&walks, paused, unix_milliseconds()).await?;
-    answer::json(&json!({ "changed": changed, "paused": paused }))
+    response::json(&json!({ "changed": changed, "paused": paused }))
 }
 
 /// What may be changed, if whoever asks may do so.
-fn may_change<'a>(dashboard: &'a Dashboard, headers: &HeaderMap) -> Result<&'a Store, Refusal> {
-    let refused = Refusal::new;
-    let Some(acting) = &dashboard.acting else {
+fn may_change<'a>(dashboard: &'a Dashboard, headers: &HeaderMap) -> Result<&'a Store, ApiError> {
+    let refused = ApiError::new;
+    let Some(mutations) = &dashboard.mutations else {
         return Err(refused(
             StatusCode::FORBIDDEN,
             "this campaign is only looked at: nothing can be changed here",
         ));
     };
-    if !guard::is_of_this_site(headers) {
+    if !security::is_same_origin(headers) {
         return Err(refused(StatusCode::FORBIDDEN, "only pages of this dashboard may change something"));
     }
-    if !acting.knows(headers) {
+    if !mutations.knows(headers) {
         let why = "that takes the token which calmwalk run has printed behind the address";
         return Err(refused(StatusCode::UNAUTHORIZED, why));
     }
-    Ok(&acting.store)
+    Ok(&mutations.store)
 }
 
-fn priority(body: &[u8]) -> Result<i32, Refusal> {
+fn priority(body: &[u8]) -> Result<i32, ApiError> {
     let asked: Value = serde_json::from_slice(body).unwrap_or_default();
     let priority = asked["priority"].as_i64().and_then(|priority| priority.try_into().ok());
-    priority.ok_or_else(|| Refusal::wrong("expected {\"priority\": …} with a whole number of 32 bits"))
+    priority.ok_or_else(|| ApiError::wrong("expected {\"priority\": …} with a whole number of 32 bits"))
 }

@@ -1,0 +1,187 @@
+//! The labellers of `calmwalk label`: processes that end with it, and that no run of the campaign takes over.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use orchestrator::launcher::{Children, Event, Launch};
+use orchestrator::supervisor::{Limits, Standing};
+use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
+use tokio::sync::Notify;
+use tokio::time::{MissedTickBehavior, interval};
+use workers::labeller::SIGN_OF_LIFE;
+
+use super::labellers::Labellers;
+use super::multi_process::LABELLER_TIMEOUT;
+use super::process_manager::{PROVEN_AFTER, all_failed_message};
+use super::process_records;
+use crate::exit_status::{ExitStatus, Failure};
+use crate::label_setup::LabelSetup;
+use crate::output::{Bar, log_and_print, print_stderr};
+use crate::process_config::{self, LabellerConfig, PoolConfig};
+
+/// A slot that was asked to stop needs some time beyond its grace to give its label back.
+const RELEASE_TIME: Duration = Duration::from_secs(10);
+
+const BAR: &str = "{spinner} {pos} labels made  {wide_msg}";
+
+/// What is to be done.
+pub struct LabelPool {
+    /// Labels side by side.
+    pub number: u32,
+    /// Directory of the campaign, or URL of its store.
+    pub location: PathBuf,
+    /// How labels are made.
+    pub labelling: LabelSetup,
+    /// Whether they leave when the queue is empty and nobody runs the campaign.
+    pub until_empty: bool,
+    /// How long labels in hand may take after a stop.
+    pub grace: Duration,
+}
+
+/// Labels until there is nothing more to do or `stop` is notified. To be awaited on the main thread: the slots end with the
+/// thread that starts them.
+pub async fn run(
+    store: &Store,
+    pool: LabelPool,
+    stopping: &Arc<AtomicBool>,
+    stop: &Notify,
+) -> Result<ExitStatus, Failure> {
+    let attempts = pool.labelling.attempts;
+    let mut manager = PoolManager {
+        store,
+        labellers: Labellers::new(children(pool), Default::default(), attempts),
+        display: Display { bar: Bar::new(None, BAR), labels: 0, queue: String::new() },
+        unreachable: false,
+    };
+    let mut ticks = interval(SIGN_OF_LIFE);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut given_up = None;
+    loop {
+        let done = tokio::select! {
+            event = manager.labellers.children.next() => match event {
+                Event::AllGone => break,
+                event => manager.handle(event).await,
+            },
+            _ = ticks.tick() => manager.update().await,
+            () = stop.notified() => {
+                manager.labellers.children.stop();
+                Ok(())
+            }
+        };
+        if let Err(error) = manager.check(done) {
+            given_up.get_or_insert(error.to_string());
+            manager.labellers.children.stop();
+        }
+    }
+    let given_up = given_up.or_else(|| all_failed_message(&mut manager.labellers.children));
+    match given_up.filter(|_| !stopping.load(Ordering::Relaxed)) {
+        Some(why) => Err(Failure::Failed(format!("no slot is left: {why}"))),
+        None if stopping.load(Ordering::Relaxed) => Ok(ExitStatus::Interrupted),
+        None => Ok(ExitStatus::Done),
+    }
+}
+
+fn children(pool: LabelPool) -> Children {
+    let limits = Limits { silence: LABELLER_TIMEOUT, grace: pool.grace + RELEASE_TIME, ..Limits::default() };
+    let LabelPool { number, location, labelling, until_empty, grace } = pool;
+    let slot = PoolConfig { parent: std::process::id(), until_empty, grace: grace.as_secs_f64() };
+    let setup = LabellerConfig::new(location, labelling);
+    Children::new(number, limits, move |_, incarnation| {
+        let restarts = incarnation.saturating_sub(1);
+        let setup = LabellerConfig { restarts, slot: Some(slot.clone()), ..setup.clone() };
+        Launch::this_program(["labeller"], process_config::to_bytes(&setup))
+    })
+}
+
+/// The slots at work.
+struct PoolManager<'a> {
+    store: &'a Store,
+    labellers: Labellers,
+    display: Display,
+    /// Whether the database could not be asked at the last try.
+    unreachable: bool,
+}
+
+impl PoolManager<'_> {
+    async fn handle(&mut self, event: Event) -> Result<(), StoreError> {
+        match event {
+            Event::Started { number, pid, .. } => self.labellers.started(number, pid),
+            Event::Said { number, line } => self.display.child_line(number, &line),
+            Event::Ended { number, ended } => {
+                if !matches!(ended.then, Standing::GoneHome) {
+                    self.display.line(&format!("slot {number}: {}; {}", ended.ending, ended.then));
+                }
+                let record = self.labellers.ended(self.store, number, &ended).await?;
+                if let Some(record) = record {
+                    process_records::write_end(self.store, record, &ended).await?;
+                }
+            }
+            Event::AllGone => {}
+        }
+        Ok(())
+    }
+
+    /// Takes in the slots' signs of life, and says what the queue does.
+    async fn update(&mut self) -> Result<(), StoreError> {
+        self.labellers.read_heartbeats(self.store, PROVEN_AFTER).await?;
+        let jobs = self.store.awaits_labels(unix_milliseconds()).await?;
+        let leaders = self.store.processes(Some(ProcessRecord::ORCHESTRATOR)).await?;
+        self.display.queue(jobs, leaders.iter().any(ProcessRecord::is_leading));
+        Ok(())
+    }
+
+    /// What may pass is said once; anything else is returned.
+    fn check(&mut self, done: Result<(), StoreError>) -> Result<(), StoreError> {
+        match done {
+            Ok(()) => self.unreachable = false,
+            Err(error) if error.is_transient() => {
+                if !std::mem::replace(&mut self.unreachable, true) {
+                    self.display.line(&format!("the store cannot be asked: {error}"));
+                }
+                // They cannot be seen to be alive now.
+                self.labellers.assume_all_alive();
+            }
+            Err(error) => return Err(error),
+        }
+        Ok(())
+    }
+}
+
+/// A bar on a terminal, otherwise a line for each label.
+struct Display {
+    bar: Bar,
+    labels: u64,
+    /// What was said of the queue last.
+    queue: String,
+}
+
+impl Display {
+    fn child_line(&mut self, slot: u32, line: &str) {
+        if line.starts_with("labelled ") {
+            self.labels += 1;
+            if self.bar.is_shown() {
+                return self.bar.set(self.labels, || line.to_owned());
+            }
+        }
+        // It stands in the log already, as that of the slot.
+        self.bar.suspend(|| print_stderr(format_args!("slot {slot}: {line}")));
+    }
+
+    fn queue(&mut self, jobs: bool, led: bool) {
+        let queue = match (jobs, led) {
+            (false, true) => "the queue is empty: waiting for structures",
+            (false, false) => "the queue is empty, and nobody runs the campaign",
+            _ => "",
+        };
+        if queue != self.queue && !queue.is_empty() {
+            self.line(queue);
+        }
+        queue.clone_into(&mut self.queue);
+    }
+
+    fn line(&self, line: &str) {
+        self.bar.suspend(|| log_and_print(line));
+    }
+}

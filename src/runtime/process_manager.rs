@@ -1,0 +1,237 @@
+//! The processes of a campaign: what happens to them, and what is done about it.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use orchestrator::launcher::{self, Children};
+use orchestrator::supervisor::Standing;
+use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
+use tokio::time::{Interval, MissedTickBehavior, interval};
+use wire::ipc::Handle;
+use workers::labeller::SIGN_OF_LIFE;
+
+use super::db_status::DbStatus;
+use super::labellers::Labellers;
+use super::process_records::ProcessRecords;
+use crate::exit_status::Failure;
+use crate::output::log_and_print;
+
+/// Between two looks whether labels are still to be made, once no more structures will come.
+pub const LAST_LABELS_POLL_INTERVAL: Duration = Duration::from_millis(100);
+/// A labeller that has lived for so long is of use: what it was started with is in order.
+pub const PROVEN_AFTER: Duration = Duration::from_secs(10);
+
+/// Walkers and labellers at work.
+pub struct ProcessManager<'a> {
+    store: &'a Store,
+    records: ProcessRecords<'a>,
+    line: Handle,
+    walkers: Children,
+    labellers: Labellers,
+    heartbeats: Interval,
+    last_labels: Option<Interval>,
+    /// Whether every walker is gone, every labeller.
+    ended: [bool; 2],
+    /// Tells the reactor to send walkers home.
+    stopping: Arc<AtomicBool>,
+    failure: Option<String>,
+    /// Whether the database does.
+    db_status: DbStatus,
+}
+
+/// What there is to react to.
+pub enum Event {
+    /// A walker.
+    Walker(launcher::Event),
+    /// A labeller.
+    Labeller(launcher::Event),
+    /// It is time for signs of life.
+    Heartbeat,
+    /// It is time to look whether every label is made.
+    LastLabels,
+}
+
+impl<'a> ProcessManager<'a> {
+    /// The crew of the orchestrator `process`; [`ProcessManager::event`] starts it.
+    pub fn new(
+        store: &'a Store,
+        process: ProcessRecord,
+        line: Handle,
+        mut walkers: Children,
+        labellers: Labellers,
+        stopping: Arc<AtomicBool>,
+    ) -> Self {
+        let mut heartbeats = interval(SIGN_OF_LIFE);
+        heartbeats.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let records = ProcessRecords::new(store, process, walkers.status().len());
+        Self {
+            store,
+            records,
+            line,
+            walkers,
+            labellers,
+            heartbeats,
+            last_labels: None,
+            ended: [false; 2],
+            stopping,
+            failure: None,
+            db_status: DbStatus::default(),
+        }
+    }
+
+    /// To be told which walker was heard, and whether it delivered something.
+    pub fn listener(&self) -> impl FnMut(u32, bool) + Send + 'static {
+        let (signs, heard) = (self.walkers.signs(), self.records.listener());
+        move |walker, useful| {
+            heard(walker);
+            if useful { signs.useful(walker) } else { signs.heard(walker) }
+        }
+    }
+
+    /// The next thing that happens. Dropped while it waits, it has lost nothing.
+    pub async fn next_event(&mut self) -> Event {
+        let last_labels = async {
+            match &mut self.last_labels {
+                Some(interval) => interval.tick().await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            event = self.walkers.next() => Event::Walker(event),
+            event = self.labellers.children.next() => Event::Labeller(event),
+            _ = self.heartbeats.tick() => Event::Heartbeat,
+            _ = last_labels => Event::LastLabels,
+        }
+    }
+
+    /// Does what is to be done about it. A database that is busy or full for a moment is no reason to leave: what could
+    /// not be said is said at the next look.
+    pub async fn handle(&mut self, event: Event) {
+        let done = match event {
+            Event::Walker(event) => self.walker(event).await,
+            Event::Labeller(event) => self.labeller(event).await,
+            Event::Heartbeat => {
+                let looked = self.send_heartbeats().await;
+                self.db_status.observe(&looked);
+                looked
+            }
+            Event::LastLabels => self.check_last_labels().await,
+        };
+        match done {
+            Ok(()) => {}
+            // They cannot be seen to be alive now.
+            Err(error) if error.is_transient() => self.labellers.assume_all_alive(),
+            Err(error) => self.fail(error.to_string()),
+        }
+    }
+
+    /// Asks everybody to end in order.
+    pub fn stop(&mut self) {
+        self.last_labels = None;
+        self.stopping.store(true, Ordering::Relaxed);
+        self.walkers.stop();
+        self.labellers.children.stop();
+    }
+
+    /// No more structures will come: the labellers end when those that are there have their labels.
+    pub fn wait_for_labels(&mut self) {
+        if !self.is_stopping() {
+            self.last_labels = Some(interval(LAST_LABELS_POLL_INTERVAL));
+        }
+    }
+
+    /// Whether nobody is left, and no label of others is waited for.
+    pub fn has_ended(&self) -> bool {
+        self.ended == [true; 2] && self.last_labels.is_none()
+    }
+
+    /// Why the campaign cannot go on, if it cannot.
+    pub fn failure(&self) -> Result<(), Failure> {
+        self.failure.clone().map_or(Ok(()), |failure| Err(Failure::Failed(failure)))
+    }
+
+    fn is_stopping(&self) -> bool {
+        self.stopping.load(Ordering::Relaxed)
+    }
+
+    fn fail(&mut self, why: String) {
+        self.failure.get_or_insert(why);
+        self.stop();
+    }
+
+    async fn walker(&mut self, event: launcher::Event) -> Result<(), StoreError> {
+        match event {
+            launcher::Event::Started { number, incarnation, pid } => {
+                self.records.walker_started(number, incarnation, pid).await?;
+            }
+            launcher::Event::Said { number, line } => log_and_print(format_args!("walker {number}: {line}")),
+            launcher::Event::Ended { number, ended } => {
+                self.line.gone(number, ended.incarnation, ended.ending.is_own_fault());
+                if ended.then == Standing::GoneHome {
+                    // There is no more work for the others either.
+                    self.walkers.close();
+                }
+                self.records.walker_ended(number, &ended).await?;
+            }
+            launcher::Event::AllGone => {
+                self.ended[0] = true;
+                self.line.close();
+                let given_up = all_failed_message(&mut self.walkers);
+                self.check_any_left("walker", given_up);
+            }
+        }
+        Ok(())
+    }
+
+    async fn labeller(&mut self, event: launcher::Event) -> Result<(), StoreError> {
+        match event {
+            launcher::Event::Started { number, pid, .. } => self.labellers.started(number, pid),
+            launcher::Event::Said { number, line } => {
+                log_and_print(format_args!("labeller {number}: {line}"))
+            }
+            launcher::Event::Ended { number, ended } => {
+                let record = self.labellers.ended(self.store, number, &ended).await?;
+                self.records.labeller_ended(number, record, &ended).await?;
+            }
+            launcher::Event::AllGone => {
+                self.ended[1] = true;
+                let given_up = all_failed_message(&mut self.labellers.children);
+                self.check_any_left("labeller", given_up);
+            }
+        }
+        Ok(())
+    }
+
+    /// Nobody of a kind is left to do the work.
+    fn check_any_left(&mut self, kind: &str, given_up: Option<String>) {
+        if let Some(given_up) = given_up.filter(|_| !self.is_stopping()) {
+            self.fail(format!("no {kind} is left: {given_up}"));
+        }
+    }
+
+    /// Signs of life: this process and its walkers give them in the database, labellers by themselves.
+    async fn send_heartbeats(&mut self) -> Result<(), StoreError> {
+        self.records.write_heartbeats(self.line.traffic()).await?;
+        // Also of those whose end could not be written down at once.
+        self.store.release_leases_of_gone_processes(unix_milliseconds()).await?;
+        self.labellers.read_heartbeats(self.store, PROVEN_AFTER).await
+    }
+
+    async fn check_last_labels(&mut self) -> Result<(), StoreError> {
+        if !self.store.awaits_labels(unix_milliseconds()).await? {
+            self.last_labels = None;
+            self.labellers.children.stop();
+        }
+        Ok(())
+    }
+}
+
+/// How the last of them failed, if all were given up.
+pub fn all_failed_message(children: &mut Children) -> Option<String> {
+    let status = children.status();
+    let given_up = status.iter().all(|child| child.standing == Standing::GivenUp);
+    let last = status.last().filter(|_| given_up)?;
+    let how = last.last_failure.as_ref().map(ToString::to_string).unwrap_or_default();
+    Some(format!("each was given up after {} restarts, number {} with {how}", last.restarts, last.number))
+}

@@ -1,0 +1,33 @@
+//! Ctrl-C and SIGTERM for commands that work on one thread.
+
+use std::process;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+
+use tokio::signal::unix::{SignalKind, signal};
+
+use crate::exit_status::Failure;
+
+/// A flag that the first signal sets, so that work can stop in order; the second signal ends the process at once.
+pub fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
+    let runtime =
+        tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(Failure::failed)?;
+    let guard = runtime.enter();
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;
+    drop(guard);
+    let flag = Arc::new(AtomicBool::new(false));
+    let set = Arc::clone(&flag);
+    thread::spawn(move || {
+        runtime.block_on(async {
+            loop {
+                tokio::select! { _ = interrupt.recv() => (), _ = terminate.recv() => () };
+                if set.swap(true, Ordering::Relaxed) {
+                    process::exit(130);
+                }
+            }
+        });
+    });
+    Ok(flag)
+}

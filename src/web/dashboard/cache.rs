@@ -1,0 +1,125 @@
+//! Answers that take long: reckoned when somebody asks, and kept for the others who ask. Nobody waits for them long: who asks too early gets
+//! what was reckoned before, or is told to ask again.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use axum::http::StatusCode;
+use axum::response::IntoResponse;
+use tokio::sync::watch;
+use tokio::time::timeout;
+
+use super::response::{ApiError, ApiResult, json_text};
+
+/// What was reckoned is given out again for so many times as long as it took …
+const VALIDITY_FACTOR: u32 = 50;
+/// … and for so long at least.
+const MIN_VALIDITY: Duration = Duration::from_secs(2);
+/// Who asks waits for so long at most.
+const WAIT_TIMEOUT: Duration = Duration::from_millis(500);
+
+/// What was reckoned last, and what is being reckoned.
+#[derive(Clone, Debug, Default)]
+pub struct CachedResponse(Arc<Mutex<State>>);
+
+#[derive(Debug, Default)]
+struct State {
+    computed: Option<Computed>,
+    /// Closed when it is done, however it ends.
+    in_progress: Option<watch::Receiver<()>>,
+}
+
+#[derive(Clone, Debug)]
+struct Computed {
+    found: Result<String, ApiError>,
+    valid_until: Instant,
+}
+
+impl CachedResponse {
+    /// The JSON that is kept, or what `compute` comes to. 202 if there is nothing yet.
+    pub async fn answer(
+        &self,
+        compute: impl Future<Output = Result<String, ApiError>> + Send + 'static,
+    ) -> ApiResult {
+        if let Some(mut in_progress) = self.begin(compute) {
+            // Nothing is ever sent: it ends with the task.
+            let _ = timeout(WAIT_TIMEOUT, in_progress.changed()).await;
+        }
+        match &self.state().computed {
+            Some(computed) => computed.found.clone().map(json_text),
+            None => Ok((StatusCode::ACCEPTED, json_text(r#"{"reckoning":true}"#)).into_response()),
+        }
+    }
+
+    /// Begins to reckon unless that is under way, or what is kept is new enough.
+    fn begin(
+        &self,
+        compute: impl Future<Output = Result<String, ApiError>> + Send + 'static,
+    ) -> Option<watch::Receiver<()>> {
+        let mut state = self.state();
+        if state.computed.as_ref().is_some_and(|computed| Instant::now() < computed.valid_until) {
+            return None;
+        }
+        if let Some(in_progress) =
+            state.in_progress.as_ref().filter(|in_progress| in_progress.has_changed().is_ok())
+        {
+            return Some(in_progress.clone());
+        }
+        let (done, in_progress) = watch::channel(());
+        state.in_progress = Some(in_progress.clone());
+        let cache = self.clone();
+        tokio::spawn(async move {
+            let begun = Instant::now();
+            let found = compute.await;
+            let valid_until = Instant::now() + (begun.elapsed() * VALIDITY_FACTOR).max(MIN_VALIDITY);
+            cache.state().computed = Some(Computed { found, valid_until });
+            drop(done);
+        });
+        Some(in_progress)
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axum::body::to_bytes;
+    use tokio::sync::oneshot;
+
+    use super::*;
+
+    async fn body(answer: ApiResult) -> (StatusCode, String) {
+        let response = answer.into_response();
+        let (status, body) = (response.status(), response.into_body());
+        (status, String::from_utf8(to_bytes(body, 1000).await.unwrap().to_vec()).unwrap())
+    }
+
+    #[tokio::test]
+    async fn nobody_waits_long_and_nothing_is_reckoned_twice() {
+        let cache = CachedResponse::default();
+        let (send, wait) = oneshot::channel();
+        let slow = async move { Ok(wait.await.unwrap_or_default()) };
+        assert_eq!(body(cache.answer(slow).await).await.0, StatusCode::ACCEPTED);
+        let other = async { panic!("it is under way") };
+        assert_eq!(body(cache.answer(other).await).await.0, StatusCode::ACCEPTED);
+        send.send("{}".to_owned()).unwrap();
+        let mut found = (StatusCode::ACCEPTED, String::new());
+        while found.0 == StatusCode::ACCEPTED {
+            found = body(cache.answer(async { panic!("it is under way, or kept") }).await).await;
+        }
+        assert_eq!(found, (StatusCode::OK, "{}".to_owned()));
+    }
+
+    #[tokio::test]
+    async fn why_there_is_none_is_told_and_a_failure_is_not_for_ever() {
+        let cache = CachedResponse::default();
+        let none = async { Err(ApiError::new(StatusCode::NOT_FOUND, "no labels")) };
+        let (status, why) = body(cache.answer(none).await).await;
+        assert!(status == StatusCode::NOT_FOUND && why.contains("no labels"), "{why}");
+        let cache = CachedResponse::default();
+        assert_eq!(body(cache.answer(async { panic!("lost") }).await).await.0, StatusCode::ACCEPTED);
+        assert_eq!(body(cache.answer(async { Ok("{}".to_owned()) }).await).await.0, StatusCode::OK);
+    }
+}

@@ -1,0 +1,101 @@
+//! Who may ask. An address of this host is also reached by every page that a browser here shows, under whatever name its
+//! server gives that address: such requests bear that name.
+
+use std::net::IpAddr;
+
+use axum::extract::Request;
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+
+/// Answers requests that name this host as itself, and refuses all others.
+pub async fn require_local_host(request: Request, next: Next) -> Response {
+    match host(request.headers()) {
+        Some(host) if is_local_host(host) => next.run(request).await,
+        _ => (StatusCode::FORBIDDEN, "ask for localhost or 127.0.0.1: other names are refused\n")
+            .into_response(),
+    }
+}
+
+/// What a page may do, said with every answer: load what comes from here, and nothing else; show nothing of it inside
+/// pages of others.
+const ALLOWED: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; \
+                       base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+
+/// Keeps what is served from pages of others, and the pages from others' scripts.
+pub async fn add_security_headers(mut answer: Response) -> Response {
+    let said = [
+        (header::CONTENT_SECURITY_POLICY, ALLOWED),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+        (HeaderName::from_static("cross-origin-opener-policy"), "same-origin"),
+    ];
+    for (name, value) in said {
+        answer.headers_mut().insert(name, HeaderValue::from_static(value));
+    }
+    // Files say how long they hold; numbers do not.
+    let hold = answer.headers_mut().entry(header::CACHE_CONTROL);
+    hold.or_insert(HeaderValue::from_static("no-store"));
+    answer
+}
+
+/// Whether the request comes from a page of ours, or from no page at all: browsers say where from.
+pub fn is_same_origin(headers: &HeaderMap) -> bool {
+    let text = |name: HeaderName| headers.get(name).map(|value| value.to_str().unwrap_or_default());
+    let site = text(HeaderName::from_static("sec-fetch-site"));
+    let origin = text(header::ORIGIN);
+    let ours = host(headers).map(|host| format!("http://{host}"));
+    site.is_none_or(|site| site == "same-origin")
+        && origin.is_none_or(|origin| Some(origin) == ours.as_deref())
+}
+
+/// What the request calls this host, with the port.
+pub fn host(headers: &HeaderMap) -> Option<&str> {
+    headers.get(header::HOST)?.to_str().ok()
+}
+
+/// The port may be any: ssh forwards others.
+fn is_local_host(host: &str) -> bool {
+    let name = match host.rsplit_once(':') {
+        Some((name, port)) if port.parse::<u16>().is_ok() => name,
+        _ => host,
+    };
+    let address = name.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')).unwrap_or(name);
+    address.eq_ignore_ascii_case("localhost") || address.parse().is_ok_and(|ip: IpAddr| ip.is_loopback())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pages_of_others_are_told_from_ours() {
+        let of_this_site = |said: &[(&'static str, &'static str)]| {
+            let headers = said
+                .iter()
+                .map(|(name, value)| (HeaderName::from_static(name), HeaderValue::from_static(value)));
+            is_same_origin(&headers.collect())
+        };
+        let host = ("host", "localhost:80");
+        assert!(of_this_site(&[host]));
+        assert!(of_this_site(&[host, ("origin", "http://localhost:80"), ("sec-fetch-site", "same-origin")]));
+        assert!(!of_this_site(&[host, ("origin", "http://example.org")]));
+        assert!(!of_this_site(&[host, ("origin", "http://localhost:81")]));
+        assert!(!of_this_site(&[host, ("origin", "null")]));
+        assert!(!of_this_site(&[host, ("sec-fetch-site", "cross-site")]));
+        assert!(!of_this_site(&[("origin", "http://localhost:80")]));
+    }
+
+    #[test]
+    fn this_host_has_few_names() {
+        for host in ["localhost", "LocalHost:80", "127.0.0.1:9464", "127.3.2.1", "[::1]:9464", "[::1]"] {
+            assert!(is_local_host(host), "{host}");
+        }
+        for host in
+            ["", "example.org", "127.0.0.1.example.org", "localhost.example.org:80", "10.0.0.1", "[fe80::1]"]
+        {
+            assert!(!is_local_host(host), "{host}");
+        }
+    }
+}
