@@ -8,7 +8,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::common::campaign::{Outcome, Small, outcome};
-use crate::common::desk::Desk;
+use crate::common::config_tester::ConfigTester;
 use crate::common::processes::{carrying_out, hold, signal, wait_until};
 use crate::common::{Running, program, succeed};
 
@@ -177,16 +177,16 @@ fn a_long_queue_raises_the_threshold_and_the_log_can_be_replayed() {
 
 #[test]
 fn wrong_budgets_and_queues_are_refused() {
-    let desk = Desk::new();
-    desk.refused_with(
+    let tester = ConfigTester::new();
+    tester.refused_with(
         "# labels = 1000",
         "labels = 1",
         &["budget.labels is 1; expected at least 2: a structure and its control"],
     );
-    desk.refused_with("# labels = 1000", "labels = 0", &["expected a whole number above 0"]);
-    desk.refused_with("# wall_hours = 24.0", "wall_hours = -1.0", &["expected a finite number above 0"]);
-    desk.refused_with("# core_hours = 100.0", "core_hour = 100.0", &["did you mean `core_hours`?"]);
-    desk.refused_with(
+    tester.refused_with("# labels = 1000", "labels = 0", &["expected a whole number above 0"]);
+    tester.refused_with("# wall_hours = 24.0", "wall_hours = -1.0", &["expected a finite number above 0"]);
+    tester.refused_with("# core_hours = 100.0", "core_hour = 100.0", &["did you mean `core_hours`?"]);
+    tester.refused_with(
         "# queue_full = \"wait\"",
         "queue_full = \"raise\"",
         &["label.queue_full is \"raise\"; expected \"wait\", or mode = \"live\"", "how fast labels are made"],

@@ -7,7 +7,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::common::campaign::{Small, outcome_at};
-use crate::common::place::{LEAVE_LABEL, Place, are_single, on_store};
+use crate::common::label_campaign::{LEAVE_LABEL, LabelCampaign, are_single, on_store};
 use crate::common::processes::{calculating, carrying_out, processes_in, signal, wait_until};
 
 /// Takes half a second, and starts what never ends by itself.
@@ -43,14 +43,14 @@ impl Random {
 }
 
 /// A campaign whose labels are made by [`SCRIPT`], below `scratch`.
-fn place(scratch: &Path) -> Place {
+fn place(scratch: &Path) -> LabelCampaign {
     let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
     let keys = format!(
         "[label]\nslots = 0\nattempts = 20\nscratch = {:?}\nmethod = {command} # ",
         scratch.display().to_string()
     );
     let small = Small { walkers: 1, steps: 120, ..Small::default() };
-    let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
+    let place = LabelCampaign::new(&small, &[("[label]\nmethod", &keys)]);
     fs::write(place.path().join("label.sh"), SCRIPT.to_owned() + LEAVE_LABEL).unwrap();
     place
 }
@@ -64,7 +64,7 @@ fn directories(scratch: &Path) -> Vec<PathBuf> {
 }
 
 /// Those who can be killed now.
-fn victims(place: &Place, scratch: &Path, who: Victim) -> Vec<u32> {
+fn victims(place: &LabelCampaign, scratch: &Path, who: Victim) -> Vec<u32> {
     let started = |what: &str| {
         let all = calculating(scratch).into_iter();
         all.filter(|(_, command)| command.starts_with(what)).map(|(pid, _)| pid).collect()
@@ -154,7 +154,7 @@ const SETUP: &str = "<atom symbol=\"Al\" Z=\"13\" core=\"10\" valence=\"3\"/>\n<
                      <!-- energy -1.5 -->\n";
 
 /// A campaign whose labels are made by [`GPAW`].
-fn with_setup(home: &Path) -> Place {
+fn with_setup(home: &Path) -> LabelCampaign {
     fs::write(home.join("Al.PBE"), SETUP).unwrap();
     fs::write(home.join("gpaw.sh"), GPAW).unwrap();
     let command = ["sh".to_owned(), home.join("gpaw.sh").display().to_string()];
@@ -163,7 +163,7 @@ fn with_setup(home: &Path) -> Place {
          pseudopotentials = {scratch:?}, spin = false }} }} # ",
         scratch = home.display().to_string()
     );
-    Place::new(&Small { walkers: 1, steps: 120, ..Small::default() }, &[("[label]\nmethod", &keys)])
+    LabelCampaign::new(&Small { walkers: 1, steps: 120, ..Small::default() }, &[("[label]\nmethod", &keys)])
 }
 
 #[test]

@@ -12,7 +12,7 @@ use store::JobState;
 
 use crate::common;
 use crate::common::campaign::Small;
-use crate::common::place::{LEAVE_LABEL, Place, on_store, queue};
+use crate::common::label_campaign::{LEAVE_LABEL, LabelCampaign, on_store, queue};
 use crate::common::processes::{calculating, go_on, hold_walkers, wait_until};
 use crate::common::{program, stderr};
 
@@ -84,7 +84,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     let keys =
         format!("[label]\nslots = 0\nscratch = {:?}\nmethod = {command} # ", scratch.display().to_string());
     let small = Small { walkers: 1, steps: 60, ..Small::default() };
-    let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
+    let place = LabelCampaign::new(&small, &[("[label]\nmethod", &keys)]);
     fs::write(place.path().join("label.sh"), script(&home)).unwrap();
     let mut run = place.run();
     let walkers = hold_walkers(place.path(), 1);

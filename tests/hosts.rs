@@ -6,8 +6,8 @@ use std::fs;
 use std::time::Duration;
 
 use crate::common::campaign::{Small, outcome};
+use crate::common::delay_proxy::DelayProxy;
 use crate::common::hosts::{Hosts, undisturbed};
-use crate::common::line::SlowLine;
 use crate::common::processes::{carrying_out, go_on, hold_walkers, signal, wait_until};
 use crate::common::{Running, kills, random};
 
@@ -73,8 +73,8 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
 fn a_slow_line_changes_nothing() {
     let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
     let mut hosts = Hosts::new(&small, 1, "agent_silence_limit = 30.0");
-    let line = SlowLine::to(hosts.endpoints[0].trim_start_matches("tcp/"), Duration::from_millis(200));
-    hosts.endpoints[1] = format!("tcp/{}", line.here);
+    let proxy = DelayProxy::to(hosts.endpoints[0].trim_start_matches("tcp/"), Duration::from_millis(200));
+    hosts.endpoints[1] = format!("tcp/{}", proxy.address);
     hosts.options[1] = vec!["--ahead=1".into()];
     let mut agent = hosts.agent(0);
     let mut orchestrator = hosts.lead();
@@ -86,7 +86,11 @@ fn a_slow_line_changes_nothing() {
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
     assert!(!hosts.head_said().contains("gives no sign of life"), "{}", hosts.head_said());
     assert!(hosts.said(0).contains("joined: 1 walker,"), "{}", hosts.said(0));
-    assert!(line.carried() > 1_000_000, "candidates came over the line: {} bytes", line.carried());
+    assert!(
+        proxy.bytes_forwarded() > 1_000_000,
+        "candidates came over the line: {} bytes",
+        proxy.bytes_forwarded()
+    );
     assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
     hosts.are_empty();
 }

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use crate::common;
 use crate::common::campaign::{Counters, Outcome, Small, outcome};
-use crate::common::place::LEAVE_LABEL;
+use crate::common::label_campaign::LEAVE_LABEL;
 use crate::common::processes::{
     calculating, carrying_out, go_on, hold_walkers, nothing_is_left, processes_in, signal, wait_until,
 };

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use store::{JobState, Standing};
 
 use crate::common::campaign::{Outcome, Small, outcome, outcome_at};
-use crate::common::place::Place;
+use crate::common::label_campaign::LabelCampaign;
 use crate::common::processes::{carrying_out, go_on, nothing_is_left, processes_in, signal, wait_until};
 use crate::common::{Running, calmwalk, config, program, refuse, succeed};
 
@@ -27,8 +27,8 @@ fn expected(small: &Small) -> Outcome {
 }
 
 /// A campaign that is over, and in whose queue is one structure that takes its time. Returns its name as well.
-fn with_large_structure(changes: &[(&str, &str)]) -> (Place, String) {
-    let place = Place::new(&Small { steps: 60, ..Small::default() }, changes);
+fn with_large_structure(changes: &[(&str, &str)]) -> (LabelCampaign, String) {
+    let place = LabelCampaign::new(&Small { steps: 60, ..Small::default() }, changes);
     assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
     let name = place.queue_large();
     (place, name)
@@ -37,7 +37,7 @@ fn with_large_structure(changes: &[(&str, &str)]) -> (Place, String) {
 #[test]
 fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     let small = Small::default();
-    let place = Place::new(&small, &[NO_SLOTS]);
+    let place = LabelCampaign::new(&small, &[NO_SLOTS]);
     // It may be there before the campaign.
     let mut label = place.label(&["--slots", "2", "--method", "reference", "--wait", "2"]);
     wait_until("it waits", || place.said().contains("waiting for the campaign: there is no campaign in"));
@@ -63,7 +63,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
 #[test]
 fn everything_in_one_process_waits_for_labels_of_others() {
     let small = Small { steps: 60, ..Small::default() };
-    let place = Place::new(&small, &[NO_SLOTS]);
+    let place = LabelCampaign::new(&small, &[NO_SLOTS]);
     let mut run = place.start(&["run", "campaign.toml", "--directory", ".", "--in-process"]);
     wait_until("walks are over", || {
         let status = place.status();
@@ -135,7 +135,7 @@ fn a_stop_finishes_the_label_in_hand_or_gives_it_back() {
 #[test]
 fn wrong_files_methods_and_stores_are_refused() {
     let label = config("data/Al_mm.eam.fs");
-    let place = Place::new(
+    let place = LabelCampaign::new(
         &Small { steps: 60, ..Small::default() },
         &[(&label.display().to_string(), "label.eam.fs"), NO_SLOTS],
     );
@@ -184,7 +184,7 @@ fn wrong_files_methods_and_stores_are_refused() {
 
 /// The program on another host, as far as one can show it: with process numbers of its own, and another boot.
 /// `None` where this is not permitted.
-fn elsewhere(place: &Place) -> Option<Command> {
+fn elsewhere(place: &LabelCampaign) -> Option<Command> {
     let boot = place.path().join("boot_id");
     fs::write(&boot, "11111111-2222-3333-4444-555555555555\n").unwrap();
     let flags = ["--user", "--map-root-user", "--pid", "--fork", "--kill-child", "--mount-proc"];

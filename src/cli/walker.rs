@@ -10,7 +10,7 @@ use workers::walker;
 
 use super::{ExitStatus, Failure};
 use crate::process_config::{self, WalkerConfig};
-use crate::{signals, log};
+use crate::{log, signals};
 
 /// A walker's process; `calmwalk run` starts it
 ///

@@ -47,7 +47,7 @@ pub fn get(address: &str, path: &str) -> Answer {
 }
 
 /// The answer to a question that takes time to be reckoned, when it is.
-pub fn reckoned(address: &str, path: &str) -> Value {
+pub fn get_computed(address: &str, path: &str) -> Value {
     let mut answer = get(address, path);
     while answer.status == 202 {
         std::thread::sleep(Duration::from_millis(20));

@@ -1,16 +1,16 @@
 //! Running the program as its users do.
 #![allow(dead_code)] // Each test program uses a part.
 
-pub mod arrays;
 pub mod browser;
 pub mod campaign;
 pub mod clock;
-pub mod desk;
+pub mod config_tester;
+pub mod delay_proxy;
 pub mod hosts;
 pub mod http;
-pub mod line;
+pub mod label_campaign;
 pub mod mutate;
-pub mod place;
+pub mod npz;
 pub mod processes;
 pub mod report;
 pub mod slurm;

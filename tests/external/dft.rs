@@ -13,7 +13,7 @@ use atoms::{Cell, Structure, Vec3, read_extxyz};
 use serde_json::Value;
 
 use crate::common;
-use crate::common::place::queue;
+use crate::common::label_campaign::queue;
 use crate::common::processes::{calculating, carrying_out, signal, wait_until};
 use crate::common::{config, demo, deviation, program, random, stderr, succeed};
 

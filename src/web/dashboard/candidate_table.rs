@@ -75,7 +75,8 @@ impl Query {
                 "where" => query.filter = Some(value.parse().map_err(ApiError::wrong)?),
                 "after" => query.after = Some(parse_cursor(&value)?),
                 "limit" => {
-                    let wrong = || ApiError::wrong(format!("limit is '{value}', expected 1 to {MAX_PAGE_ROWS}"));
+                    let wrong =
+                        || ApiError::wrong(format!("limit is '{value}', expected 1 to {MAX_PAGE_ROWS}"));
                     let limit = value.parse().ok().filter(|limit| (1..=MAX_PAGE_ROWS).contains(limit));
                     query.limit = Some(limit.ok_or_else(wrong)?);
                 }

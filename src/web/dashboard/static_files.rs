@@ -18,6 +18,7 @@ const INDEX: &str = include_str!("../pages/index.html");
 const FILES: &[(&str, &str)] = files![
     "actions.js",
     "api.js",
+    "campaign_state.js",
     "candidate.js",
     "candidates.js",
     "colours.js",
@@ -31,7 +32,6 @@ const FILES: &[(&str, &str)] = files![
     "overview.js",
     "plot.js",
     "plots.js",
-    "standing.js",
     "structure.js",
     "style.css",
 ];

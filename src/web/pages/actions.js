@@ -1,6 +1,6 @@
 // What may be changed from here: asked again before it is done, and with the token that `calmwalk run` has printed.
 
-import { act, ask, ofCandidate } from "./api.js";
+import { act, ask, candidatePath } from "./api.js";
 import { element } from "./dom.js";
 import { shortName } from "./format.js";
 
@@ -28,7 +28,7 @@ export function buttons(job, done) {
     if (!isPossible) return;
     const allowed = Object.entries(ACTIONS).filter(([, action]) => action.states.includes(job.state));
     place.append(...allowed.map(([name, { title, question, isGrave }]) => {
-      const asked = { title, question, isGrave, about: shortName(job.candidate), path: ofCandidate(job.candidate, `/${name}`),
+      const asked = { title, question, isGrave, about: shortName(job.candidate), path: candidatePath(job.candidate, `/${name}`),
         priority: name === "prioritise" ? job.priority : null };
       return element("button", { type: "button", class: isGrave && "grave", onclick: () => confirm(asked, done) }, title);
     }));

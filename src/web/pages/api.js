@@ -9,7 +9,7 @@ export async function ask(path, signal) {
 }
 
 /** The same of what takes long to be reckoned: asks until it is there. */
-export async function askUntilReckoned(path, signal) {
+export async function fetchComputed(path, signal) {
   for (;;) {
     const found = await ask(path, signal);
     if (!found.reckoning) return found;
@@ -31,7 +31,7 @@ async function answered(response) {
 }
 
 /** The path of a candidate's own things. */
-export function ofCandidate(id, what = "") {
+export function candidatePath(id, what = "") {
   return `/api/candidates/${encodeURIComponent(id)}${what}`;
 }
 

@@ -1,7 +1,7 @@
 // The story of one candidate: what `calmwalk explain` tells, with its atoms in space.
 
 import { buttons } from "./actions.js";
-import { ask, ofCandidate } from "./api.js";
+import { ask, candidatePath } from "./api.js";
 import { DASHES, LINES } from "./colours.js";
 import { element, facts, section, state, table } from "./dom.js";
 import { decimals, digits, duration, percent, shortName, time, whole } from "./format.js";
@@ -22,7 +22,7 @@ const ENDS = {
 
 export async function show(content, address, signal) {
   const id = decodeURIComponent(address);
-  const [story, structure] = await Promise.all([ask(ofCandidate(id), signal), ask(ofCandidate(id, "/structure"), signal)]);
+  const [story, structure] = await Promise.all([ask(candidatePath(id), signal), ask(candidatePath(id, "/structure"), signal)]);
   content.replaceChildren(element("h1", {}, shortName(story.id)), head(story));
   const { found, grades, decision } = story;
   // The button that was pressed is gone.
@@ -64,7 +64,7 @@ function link({ candidate, decision }) {
 }
 
 function downloads({ id }) {
-  const file = (kind, name) => element("a", { href: ofCandidate(id, `/structure.${kind}`), download: "" }, name);
+  const file = (kind, name) => element("a", { href: candidatePath(id, `/structure.${kind}`), download: "" }, name);
   return element("p", { class: "downloads" }, file("extxyz", "extended XYZ"), " ", file("poscar", "POSCAR"));
 }
 

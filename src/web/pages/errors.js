@@ -1,6 +1,6 @@
 // Whether the grade told where the potential errs: force errors of the labels by grade.
 
-import { askUntilReckoned, listen } from "./api.js";
+import { fetchComputed, listen } from "./api.js";
 import { LINES } from "./colours.js";
 import { element, section, table } from "./dom.js";
 import { decimals, percent, tick, whole } from "./format.js";
@@ -17,7 +17,7 @@ export async function show(content, _, signal) {
   const load = async () => {
     place.setAttribute("aria-busy", "true");
     try {
-      place.replaceChildren(...shown(await askUntilReckoned("/api/errors", signal)));
+      place.replaceChildren(...shown(await fetchComputed("/api/errors", signal)));
     } finally {
       place.removeAttribute("aria-busy");
     }

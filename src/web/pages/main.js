@@ -8,7 +8,7 @@ import * as errors from "./errors.js";
 import * as hosts from "./hosts.js";
 import * as mixture from "./mixture.js";
 import * as overview from "./overview.js";
-import { standing } from "./standing.js";
+import { campaignState } from "./campaign_state.js";
 
 /** Pages in the order of the menu, by the first word of their address. */
 const PAGES = { overview, candidates, mixture, errors, hosts };
@@ -63,7 +63,7 @@ function theme() {
 /** A campaign that nobody runs is not live, however well the connection is. */
 function connection(link, why = "", status = null) {
   const line = document.getElementById("connection");
-  const what = status ? standing(status) : "running";
+  const what = status ? campaignState(status) : "running";
   const how = link === "live" && what !== "running" ? what : link;
   if (line.dataset.how !== how) line.textContent = CONNECTIONS[how];
   line.dataset.how = how;

@@ -1,6 +1,6 @@
 // The mixture in force: its components by element, and how far each has moved since the campaign began.
 
-import { askUntilReckoned } from "./api.js";
+import { fetchComputed } from "./api.js";
 import { LINES } from "./colours.js";
 import { drawing, element, facts, section, table } from "./dom.js";
 import { decimals, digits, whole } from "./format.js";
@@ -23,7 +23,7 @@ export async function show(content, chosen, signal) {
   const load = async () => {
     place.setAttribute("aria-busy", "true");
     try {
-      const mixture = await askUntilReckoned("/api/mixture", signal);
+      const mixture = await fetchComputed("/api/mixture", signal);
       place.removeAttribute("role");
       place.replaceChildren(...shown(mixture, decodeURIComponent(chosen)));
     } finally {

@@ -5,7 +5,7 @@ import { listen } from "./api.js";
 import { element, facts, renew, section, sentence, state, table } from "./dom.js";
 import { bytes, decimals, digits, duration, percent, time, whole } from "./format.js";
 import { overTime } from "./plots.js";
-import { standing } from "./standing.js";
+import { campaignState } from "./campaign_state.js";
 
 export const TITLE = "Overview";
 
@@ -50,7 +50,7 @@ function summary(status) {
   const underWay = walks.filter(isUnderWay).length;
   const declined = Object.entries(candidates.declined).filter(([, count]) => count > 0)
     .map(([reason, count]) => `${whole(count)} ${reason}`).join(", ");
-  const how = standing(status);
+  const how = campaignState(status);
   return [
     tile("Campaign", state(how), `${status.campaign.slice(0, 8)}, ${status.mode} mode`,
       status.round > 0 ? `round ${whole(status.round)}` : "", `${bytes(status.disk.bytes)} on disk`),

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use crate::common::campaign::{Small, outcome};
 use crate::common::config;
+use crate::common::delay_proxy::DelayProxy;
 use crate::common::hosts::{Hosts, undisturbed};
-use crate::common::line::SlowLine;
 use crate::common::processes::{carrying_out, go_on, hold_walkers, signal, wait_until};
 
 /// Long enough to kill somebody while a question is on its way.
@@ -27,8 +27,8 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     let elsewhere = ["unshare", "--mount", "sh", "-c", "mount -t tmpfs none \"$0\" && exec \"$@\""];
     hosts.through[1] =
         elsewhere.map(str::to_owned).into_iter().chain([models.display().to_string()]).collect();
-    let line = SlowLine::to(hosts.endpoints[0].trim_start_matches("tcp/"), DELAY);
-    hosts.endpoints[1] = format!("tcp/{}", line.here);
+    let proxy = DelayProxy::to(hosts.endpoints[0].trim_start_matches("tcp/"), DELAY);
+    hosts.endpoints[1] = format!("tcp/{}", proxy.address);
 
     // So that there is something left to do for the host that comes, and comes back.
     let hold = || hold_walkers(hosts.home.path(), 1);

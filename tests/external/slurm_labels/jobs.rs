@@ -8,7 +8,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::common::campaign::{Small, outcome_at};
-use crate::common::place::{LEAVE_LABEL, Place, are_single, on_store};
+use crate::common::label_campaign::{LEAVE_LABEL, LabelCampaign, are_single, on_store};
 use crate::common::processes::{carrying_out, processes_in, signal, wait_until};
 use crate::common::slurm::{ci, hold, slurm};
 use crate::common::{Running, succeed};
@@ -24,7 +24,7 @@ while [ ! -e $HERE/go ]; do sleep 0.1; done
 
 /// A campaign whose labels are jobs of their own.
 pub struct Jobs {
-    pub place: Place,
+    pub place: LabelCampaign,
     /// Its scratch directory is there, and what tells the script what to do.
     pub home: TempDir,
     _node: MutexGuard<'static, ()>,
@@ -54,7 +54,7 @@ impl Jobs {
             scratch.display().to_string()
         );
         let small = Small { walkers: 1, steps: 120, ..Small::default() };
-        let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
+        let place = LabelCampaign::new(&small, &[("[label]\nmethod", &keys)]);
         let script = SCRIPT.replace("$HERE", &home.path().display().to_string());
         fs::write(place.path().join("label.sh"), script + LEAVE_LABEL).unwrap();
         Self { place, home, _node }

@@ -6,7 +6,7 @@ use std::path::Path;
 use npyz::npz::{NpzArchive, NpzWriter, array_name_from_file_name};
 
 /// The bytes of an npz file whose arrays of floating-point numbers are as `change` leaves them.
-pub fn changed(file: &Path, change: impl Fn(&str, &mut Vec<f64>)) -> Vec<u8> {
+pub fn with_changed_arrays(file: &Path, change: impl Fn(&str, &mut Vec<f64>)) -> Vec<u8> {
     let mut source = NpzArchive::open(file).unwrap();
     let zip = source.zip_archive();
     let mut names: Vec<_> = zip.file_names().map(str::to_owned).collect();

@@ -8,9 +8,9 @@ use tempfile::TempDir;
 use super::{demo, refuse};
 
 /// A directory in which configurations are tried.
-pub struct Desk(TempDir);
+pub struct ConfigTester(TempDir);
 
-impl Desk {
+impl ConfigTester {
     /// An empty one.
     pub fn new() -> Self {
         Self(tempfile::tempdir().unwrap())

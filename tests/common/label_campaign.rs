@@ -20,12 +20,12 @@ use super::processes::{hold, one_carrying_out, wait_until};
 use super::{Running, calmwalk, program, succeed};
 
 /// A directory with `campaign.toml`, and the URL of the store if that is on a server.
-pub struct Place {
+pub struct LabelCampaign {
     directory: TempDir,
     url: Option<String>,
 }
 
-impl Place {
+impl LabelCampaign {
     /// With this configuration; `changes` are replaced in its text.
     pub fn new(small: &Small, changes: &[(&str, &str)]) -> Self {
         let directory = tempfile::tempdir().unwrap();

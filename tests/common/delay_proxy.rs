@@ -9,34 +9,35 @@ use std::thread::{self, sleep};
 use std::time::{Duration, Instant};
 
 /// Where it begins, as `127.0.0.1:port`, and how many bytes have come through.
-pub struct SlowLine {
-    pub here: String,
-    carried: Arc<AtomicUsize>,
+pub struct DelayProxy {
+    pub address: String,
+    bytes_forwarded: Arc<AtomicUsize>,
 }
 
-impl SlowLine {
-    /// Listens for connections to `there`; what goes over them, either way, arrives by so much later.
-    pub fn to(there: &str, delay: Duration) -> Self {
+impl DelayProxy {
+    /// Listens for connections to `target`; what goes over them, either way, arrives by so much later.
+    pub fn to(target: &str, delay: Duration) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let (here, carried) = (listener.local_addr().unwrap().to_string(), Arc::new(AtomicUsize::new(0)));
-        let (there, count) = (there.to_owned(), Arc::clone(&carried));
+        let (address, bytes_forwarded) =
+            (listener.local_addr().unwrap().to_string(), Arc::new(AtomicUsize::new(0)));
+        let (target, count) = (target.to_owned(), Arc::clone(&bytes_forwarded));
         thread::spawn(move || {
             for near in listener.incoming().flatten() {
                 // If nobody is there yet, whoever calls tries again.
-                let Ok(far) = TcpStream::connect(&there) else { continue };
-                carry(near.try_clone().unwrap(), far.try_clone().unwrap(), delay, Arc::clone(&count));
-                carry(far, near, delay, Arc::clone(&count));
+                let Ok(far) = TcpStream::connect(&target) else { continue };
+                forward(near.try_clone().unwrap(), far.try_clone().unwrap(), delay, Arc::clone(&count));
+                forward(far, near, delay, Arc::clone(&count));
             }
         });
-        Self { here, carried }
+        Self { address, bytes_forwarded }
     }
 
-    pub fn carried(&self) -> usize {
-        self.carried.load(Ordering::Relaxed)
+    pub fn bytes_forwarded(&self) -> usize {
+        self.bytes_forwarded.load(Ordering::Relaxed)
     }
 }
 
-fn carry(mut from: TcpStream, mut to: TcpStream, delay: Duration, count: Arc<AtomicUsize>) {
+fn forward(mut from: TcpStream, mut to: TcpStream, delay: Duration, count: Arc<AtomicUsize>) {
     let (sender, receiver) = mpsc::channel::<(Instant, Vec<u8>)>();
     thread::spawn(move || {
         let mut buffer = vec![0; 1 << 16];
