@@ -1,4 +1,4 @@
-//! Output files that are there as a whole or not at all.
+//! Output files that appear complete or not at all.
 
 use std::fs::{self, File, Permissions};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
@@ -9,20 +9,20 @@ use tempfile::{Builder, TempPath};
 
 use crate::exit_status::Failure;
 
-/// A file written beside its place and put there when it is complete: whoever is killed leaves no half file, and what
-/// was there before stays until then.
+/// A file that is written to a temporary file beside its target and renamed when it is complete. A killed process
+/// leaves the old file unchanged.
 pub struct AtomicFile {
     target: PathBuf,
     file: BufWriter<File>,
-    /// None for a device or a pipe, which is written to as it is.
+    /// `None` for a device or a pipe, which is written to directly.
     temporary: Option<TempPath>,
 }
 
 impl AtomicFile {
-    /// Begins a file that will stand at `target`.
+    /// Creates the temporary file for `target`.
     pub fn create(target: &Path) -> Result<Self, Failure> {
         let cannot = |error| cannot_create(target, error);
-        // Through a symbolic link the file it leads to is replaced, not the link.
+        // Replaces the target of a symbolic link, not the link.
         let target = target.canonicalize().unwrap_or_else(|_| target.to_owned());
         if fs::metadata(&target).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
             let file = File::options().write(true).open(&target).map_err(cannot)?;
@@ -41,7 +41,7 @@ impl AtomicFile {
         Ok(Self { target, file: BufWriter::new(file), temporary: Some(temporary) })
     }
 
-    /// Puts the complete file in its place.
+    /// Renames the complete file to its target.
     pub fn finish(self) -> Result<(), Failure> {
         let Self { target, file, temporary } = self;
         let cannot = |error| cannot_write(&target, error);
@@ -57,7 +57,7 @@ pub fn cannot_write(path: &Path, error: impl std::fmt::Display) -> Failure {
     Failure::Failed(format!("cannot write {}: {error}", path.display()))
 }
 
-/// The failure to begin an output file: a wrong path is wrong input.
+/// The failure to create an output file. A wrong path is wrong input.
 pub fn cannot_create(path: &Path, error: io::Error) -> Failure {
     use io::ErrorKind as Kind;
     let message = format!("cannot write {}: {error}", path.display());
@@ -69,7 +69,7 @@ pub fn cannot_create(path: &Path, error: io::Error) -> Failure {
     }
 }
 
-/// Refuses an output that would take the place of one of these files; each comes with what it is.
+/// Refuses an output that would overwrite one of these files. Each comes with a description.
 pub fn refuse_to_replace<'a>(
     output: &Path,
     files: impl IntoIterator<Item = (&'a Path, &'a str)>,

@@ -1,8 +1,8 @@
-//! Budgets in words.
+//! Describes how much of a budget is used.
 
 use store::{Budget, BudgetStatus};
 
-/// How much of each limit is used; none without limits.
+/// Usage of each limit. `None` without limits.
 pub fn describe(budget: &BudgetStatus) -> Option<String> {
     let BudgetStatus { limits, used, used_up } = budget;
     let Budget { labels, core_hours, wall_hours, .. } = limits;

@@ -1,39 +1,40 @@
-//! How much disk a campaign will take, from what bounds it.
+//! Estimates the disk space of a campaign from its limits.
 
 use serde::{Deserialize, Serialize};
 
 use crate::campaign::Campaign;
 
-/// Under which name the leader keeps it in the store.
+/// Metadata key of the forecast in the store.
 pub const METADATA_KEY: &str = "forecast";
 
-/// Decision, candidate, job, attempt and label without what counts with the atoms, and their indexes, bytes.
+/// Decision, candidate, job, attempt and label with their indexes, without what scales with the number of atoms,
+/// bytes.
 const ROW_BYTES: u64 = 4_000;
-/// Rows that are longer than a page end in one that is half empty, bytes.
+/// Half a page, which a row longer than a page wastes on average, bytes.
 const HALF_PAGE_BYTES: u64 = 8_192;
-/// An empty campaign: every table and index has a page, bytes.
+/// An empty database: every table and index takes a page, bytes.
 const EMPTY_DATABASE_BYTES: u64 = 500_000;
-/// A walk's checkpoints, bytes an atom.
+/// A walk's checkpoints, bytes per atom.
 const CHECKPOINT_BYTES_PER_ATOM: u64 = 450;
-/// What waits in SQLite's log until it is copied into the database, at most, bytes.
+/// Largest size of SQLite's write-ahead log, bytes.
 pub const WAL_BYTES: u64 = 70_000_000;
 
-/// What a campaign takes when it has collected all that it may, bytes.
+/// Disk space of a campaign that has collected all that it may, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DiskForecast {
     /// Accepted structures and control frames with their labels.
     pub structures: u64,
-    /// Walks, the mixture, and what is there in any case.
+    /// Walks, the mixture and the fixed overhead.
     pub rest: u64,
-    /// Features of declined candidates, at most.
+    /// Upper limit of the features of declined candidates.
     pub declined: u64,
-    /// How many structures and control frames there may be; 0 in campaigns of early versions.
+    /// Largest number of structures and control frames. 0 in campaigns of early versions.
     #[serde(default)]
     pub most_structures: u64,
 }
 
 impl DiskForecast {
-    /// That of a configuration.
+    /// Estimates it from a configuration.
     pub fn from_campaign(campaign: &Campaign) -> Self {
         let config = &campaign.config;
         let features = campaign.artifact.mixture.dimension() as u64;
@@ -56,7 +57,8 @@ impl DiskForecast {
         }
     }
 
-    /// What is still to come when there are so many structures and control frames, and they and all else take `bytes` now.
+    /// What will be added to `structures` structures and control frames, which take `bytes` together with everything
+    /// else.
     pub fn remaining_bytes(&self, structures: u64, bytes: u64) -> u64 {
         let left = self.most_structures.saturating_sub(structures);
         match self.most_structures {
@@ -65,7 +67,7 @@ impl DiskForecast {
         }
     }
 
-    /// Without features of declined candidates, of which nobody knows how many there will be.
+    /// Total without the features of declined candidates, whose number is unknown.
     pub fn bytes(&self) -> u64 {
         self.structures + self.rest
     }
@@ -79,7 +81,7 @@ fn structure_bytes(atoms: u64, features: u64) -> u64 {
     block + features + grades + positions + forces + ROW_BYTES + HALF_PAGE_BYTES
 }
 
-/// Bytes for people.
+/// Formats a number of bytes.
 pub fn megabytes(bytes: u64) -> String {
     match bytes {
         0..1_000_000_000 => format!("{:.1} MB", bytes as f64 / 1e6),

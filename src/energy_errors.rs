@@ -1,4 +1,4 @@
-//! How far the potential's energies are from those of labels, without the difference of their zeros.
+//! Errors of the potential's energies against labels, after removing element offsets.
 
 use analysis::{EnergyOffsets, Thinned, TooFewLabels, quantile};
 use atoms::{Species, Structure};
@@ -7,36 +7,38 @@ use store::{Store, StoreError};
 use wire::ContentHash;
 use workers::labeller::{energy_offsets, labelled_energy};
 
-/// So many labelled structures speak for a composition whose energy errors are shown: one alone would have none.
+/// Least number of labelled structures that must support a composition before its energy error is shown. One alone
+/// would have no error.
 const MIN_SUPPORT: f64 = 2.0;
-/// Structures that quantiles come from, at most; of more a sample.
+/// Largest number of errors kept for quantiles. Beyond it a systematic sample is kept.
 const MAX_SAMPLES: usize = 1 << 20;
 
-/// The zeros of the labels of one protocol, against that of the potential.
+/// Element offsets between the energies of one label protocol and those of the potential.
 #[derive(Clone, Debug)]
 pub struct EnergyReference(Result<EnergyOffsets, TooFewLabels>);
 
-/// They, for people and for programs.
+/// The fitted offsets, for display and JSON.
 #[derive(Clone, Debug, Serialize)]
 pub struct OffsetSummary {
-    /// Labelled structures that the fit used; 0 without one.
+    /// Labelled structures used in the fit. 0 without a fit.
     pub structures: usize,
-    /// Those that it left out because they are too far from the others.
+    /// Outliers that the fit excludes.
     pub left_out: usize,
-    /// The elements' offsets; none without a fit.
+    /// The offset of each element. Empty without a fit.
     pub elements: Vec<OffsetEntry>,
-    /// All of it in words; why there is no fit.
+    /// Summary as text, or why there is no fit.
     pub note: String,
 }
 
 /// The offset of an element.
 #[derive(Clone, Debug, Serialize)]
 pub struct OffsetEntry {
-    /// Symbol.
+    /// Chemical symbol.
     pub element: &'static str,
-    /// E_label − E_model of an atom, eV.
+    /// E_label − E_model per atom, eV.
     pub offset: f64,
-    /// Whether the labelled compositions tell the element apart from others; if not, only sums over compositions count.
+    /// Whether the labelled compositions determine the offset of this element. If not, only sums over compositions
+    /// are meaningful.
     pub separate: bool,
 }
 
@@ -44,45 +46,46 @@ pub struct OffsetEntry {
 #[derive(Clone, Debug)]
 pub struct EnergyErrors {
     reference: EnergyReference,
-    /// Absolute values, eV an atom.
+    /// Absolute errors, eV/atom.
     errors: Thinned<f64>,
     sum: f64,
     largest: f64,
     left_out: u64,
 }
 
-/// What they come to.
+/// Summary of the errors.
 #[derive(Clone, Debug, Serialize)]
 pub struct EnergySummary {
     /// Labelled structures with an error.
     pub structures: u64,
-    /// Those without: too few labels speak for their compositions.
+    /// Labelled structures without an error, since too few labels support their compositions.
     pub left_out: u64,
-    /// Mean of |E_model − E_label| without the offsets, eV an atom; `None` without any structure, as are those that follow.
+    /// Mean of |E_model − E_label| after removing the offsets, eV/atom. `None` without structures, like the following
+    /// fields.
     pub mean: Option<f64>,
-    /// Median, eV an atom.
+    /// Median, eV/atom.
     pub median: Option<f64>,
-    /// 90 % are smaller, eV an atom.
+    /// 90 % quantile, eV/atom.
     pub p90: Option<f64>,
-    /// The largest, eV an atom.
+    /// Maximum, eV/atom.
     pub largest: Option<f64>,
-    /// What was taken out.
+    /// The offsets that were removed.
     pub offsets: OffsetSummary,
 }
 
 impl EnergyReference {
-    /// Fits the offsets of the elements to labels of this protocol.
+    /// Fits the element offsets to the labels of this protocol.
     pub async fn fit(store: &Store, protocol: ContentHash) -> Result<Self, StoreError> {
         energy_offsets(store, protocol).await.map(Self)
     }
 
-    /// (E_model − E_label) an atom without the offsets, eV; `None` if too few labels speak for the composition.
+    /// E_model − E_label per atom after removing the offsets, eV. `None` if too few labels support the composition.
     pub fn error_per_atom(&self, structure: &Structure, model: f64, label: f64) -> Option<f64> {
         let found = labelled_energy(structure, model, label);
         self.0.as_ref().ok()?.error_per_atom(&found, MIN_SUPPORT).filter(|error| error.is_finite())
     }
 
-    /// What is shown of them.
+    /// The fit for display and JSON.
     pub fn summary(&self) -> OffsetSummary {
         let note = self.note();
         let Ok(fit) = &self.0 else {
@@ -142,12 +145,12 @@ impl EnergyReference {
 }
 
 impl EnergyErrors {
-    /// Of no structure yet.
+    /// Starts without errors.
     pub fn new(reference: EnergyReference) -> Self {
         Self { reference, errors: Thinned::new(MAX_SAMPLES), sum: 0.0, largest: 0.0, left_out: 0 }
     }
 
-    /// A labelled structure with its energies, eV.
+    /// Adds a labelled structure with its energies, eV.
     pub fn add(&mut self, structure: &Structure, model: f64, label: f64) {
         match self.reference.error_per_atom(structure, model, label) {
             Some(error) => {
@@ -159,7 +162,7 @@ impl EnergyErrors {
         }
     }
 
-    /// What they come to.
+    /// Summarizes the errors.
     pub fn summary(&self) -> EnergySummary {
         let mut sorted: Vec<f64> = self.errors.kept().copied().collect();
         sorted.sort_by(f64::total_cmp);
@@ -178,7 +181,7 @@ impl EnergyErrors {
 }
 
 impl EnergySummary {
-    /// Without the note: in one line, meV an atom; `None` if there is no error to show.
+    /// One line of text in meV/atom, without the note. `None` without errors.
     pub fn line(&self) -> Option<String> {
         let milli = |x: Option<f64>| crate::output::decimals(x.map(|x| 1000.0 * x), 1);
         self.mean?;

@@ -1,18 +1,18 @@
-//! How the program ends: its exit codes.
+//! Exit codes of the program.
 
 use std::path::Path;
 use std::process::ExitCode;
 
 use crate::config::ConfigError;
 
-/// How a command ended that did not fail.
+/// How a command ended without a failure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExitStatus {
-    /// All done.
+    /// Finished.
     Done,
-    /// A campaign is over, and none of its walks came to its end in order.
+    /// A campaign is over, but every walk ended early.
     NoWalkCompleted,
-    /// Stopped by Ctrl-C or SIGTERM, in order.
+    /// Stopped in order by Ctrl-C or SIGTERM.
     Interrupted,
 }
 
@@ -21,7 +21,7 @@ pub enum ExitStatus {
 pub enum Failure {
     /// Wrong input or configuration: exit code 2.
     Input(String),
-    /// Anything else: exit code 1.
+    /// Any other failure: exit code 1.
     Failed(String),
 }
 
@@ -47,7 +47,7 @@ impl Failure {
         Self::Failed(error.to_string())
     }
 
-    /// What failed for no fault of the user says in which campaign it did.
+    /// Names the campaign in the message, unless the input was wrong.
     pub fn in_campaign(self, directory: &Path) -> Self {
         match self {
             Self::Failed(message) => Self::Failed(format!("campaign in {}: {message}", directory.display())),

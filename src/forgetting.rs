@@ -1,21 +1,21 @@
-//! The alarm over a mixture that forgets its training data: when it begins, when it ends, and what can be done about it.
+//! The alarm for a mixture that forgets its training data.
 
 use calm::rules::Combination;
 
 use crate::config::CalmSection;
 
-/// The alarm ends when the share has fallen below so much of the limit, so that it does not come and go with every decision.
+/// The alarm is cleared below this fraction of the limit, so that it does not toggle with every decision.
 const HYSTERESIS: f64 = 0.9;
 
-/// What is looked at.
+/// Limit and texts of the alarm.
 #[derive(Clone, Copy, Debug)]
 pub struct ForgettingRule {
-    /// Share of the training atoms above which there is an alarm.
+    /// Share of the training atoms above which the alarm is raised.
     limit: f64,
     combination: Combination,
 }
 
-/// Follows the alarm through a run.
+/// State of the alarm in a run.
 #[derive(Clone, Debug)]
 pub struct ForgettingAlarm {
     forgetting: ForgettingRule,
@@ -23,18 +23,18 @@ pub struct ForgettingAlarm {
 }
 
 impl ForgettingRule {
-    /// By the section `[calm]`.
+    /// Reads the section `[calm]`.
     pub fn new(calm: &CalmSection) -> Self {
         Self { limit: calm.forgetting_alarm.get(), combination: calm.combination }
     }
 
-    /// Whether the alarm holds for this share of the training atoms with γ > 1; `raised` is what the selector found. `None`
-    /// where it is as it was before.
+    /// Whether the alarm holds for this share of training atoms with γ > 1. `raised` is the selector's own check.
+    /// `None` if the alarm stays as it was.
     pub fn evaluate(&self, share: f64, raised: bool) -> Option<bool> {
         (raised || share < HYSTERESIS * self.limit).then_some(raised)
     }
 
-    /// The alarm, with what can be done about it.
+    /// Message when the alarm is raised, with advice.
     pub fn raised_message(&self, share: f64) -> String {
         let other = match self.combination {
             Combination::Convex => {
@@ -51,7 +51,7 @@ impl ForgettingRule {
         )
     }
 
-    /// That the alarm is over.
+    /// Message when the alarm is cleared.
     pub fn cleared_message(&self, share: f64) -> String {
         format!(
             "the mixture covers its training data again: {:.1} % of the training atoms have γ > 1",
@@ -61,12 +61,12 @@ impl ForgettingRule {
 }
 
 impl ForgettingAlarm {
-    /// Nothing has been said yet.
+    /// Starts without an alarm.
     pub fn new(forgetting: ForgettingRule) -> Self {
         Self { forgetting, raised: false }
     }
 
-    /// Takes in a decision; what there is to say when the alarm begins or ends.
+    /// Takes the values of a decision. Returns a message if the alarm is raised or cleared.
     pub fn update(&mut self, share: f64, raised: bool) -> Option<String> {
         let holds = self.forgetting.evaluate(share, raised)?;
         match (std::mem::replace(&mut self.raised, holds), holds) {

@@ -1,4 +1,4 @@
-//! What the labels of a campaign have cost, and what those that wait will cost.
+//! Cost of the labels of a campaign, so far and expected.
 
 use std::collections::HashMap;
 
@@ -9,50 +9,50 @@ use wire::ContentHash;
 
 use crate::output::count;
 
-/// Labels that are learned from: the newest.
+/// Number of labels that the cost model is fitted to: the newest.
 const MAX_SAMPLES: u32 = 1_000;
 
 pub const SECONDS_PER_HOUR: f64 = 3600.0;
 
-/// Hours on one core: on average, and between what they are with 90 %.
+/// Core-hours: the expected value and a 90 % interval.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct CoreHours {
-    /// On average.
+    /// Expected value.
     pub expected: f64,
-    /// With 90 % it is more than this …
+    /// Lower end of the 90 % interval.
     pub low: f64,
-    /// … and less than this.
+    /// Upper end of the 90 % interval.
     pub high: f64,
 }
 
-/// The label queue, as far as it costs something.
+/// Cost of the label queue.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct QueueCost {
-    /// Labels that wait or are being made.
+    /// Jobs that are queued or leased.
     pub unfinished: u64,
     /// Labels whose cost was measured.
     pub measured: usize,
-    /// What all attempts took by what those took that brought labels.
+    /// Total cost ÷ cost of the successful attempts.
     pub overhead: f64,
-    /// What the unfinished ones will take, with attempts in vain; none before a first label.
+    /// Expected cost of the unfinished jobs, failed attempts included. `None` before the first label.
     pub remaining: Option<CoreHours>,
-    /// Cores of the attempts under way.
+    /// Cores of the running attempts.
     pub cores: u64,
-    /// Hours until the queue is empty at that rate, if nothing is added to it.
+    /// Hours until the queue is empty at the current rate, if nothing is added.
     pub hours_left: Option<f64>,
 }
 
-/// What is known of the cost of labels by one protocol.
+/// Predicts the cost of labels of one protocol.
 pub struct CostEstimator {
     model: Option<CostModel>,
-    /// What labels of one seed structure and formula were like, as the newest of them said.
+    /// Size of the newest label of each seed structure and formula.
     sizes: HashMap<(u32, String), Size>,
     /// See [`QueueCost::overhead`].
     overhead: f64,
 }
 
 impl CostEstimator {
-    /// Learns from the labels that were made by `protocol`.
+    /// Fits a model to the labels of `protocol`.
     pub async fn from_store(store: &Store, protocol: ContentHash) -> Result<Self, StoreError> {
         let costs = store.label_costs(protocol, MAX_SAMPLES).await?;
         let measured: Vec<_> = costs.iter().map(measured).collect();
@@ -66,36 +66,38 @@ impl CostEstimator {
         Ok(Self { model: CostModel::fit(&measured, None), sizes, overhead })
     }
 
-    /// From a model that is there.
+    /// Uses an existing model.
     pub fn from_model(model: Option<CostModel>) -> Self {
         Self { model, sizes: HashMap::new(), overhead: 1.0 }
     }
 
-    /// Labels that it learned from.
+    /// Number of labels that the model was fitted to.
     pub fn measured(&self) -> usize {
         self.model.as_ref().map_or(0, CostModel::labels)
     }
 
-    /// What labels of these sizes take together, so many of each.
+    /// Expected total cost of labels of these sizes, each with its number.
     pub fn predict(&self, sizes: impl IntoIterator<Item = (Size, u64)>) -> Option<CoreHours> {
         let predicted = self.model.as_ref()?.predict_all(sizes)?;
         Some(CoreHours::from_core_seconds(predicted, self.overhead))
     }
 
-    /// A label of that seed structure and formula is like the last; of others, only the number of atoms is known.
+    /// A job has the size of the newest label of its seed structure and formula. Otherwise only the number of atoms
+    /// is known.
     fn size_of(&self, waiting: &Waiting) -> Size {
         let known = self.sizes.get(&(waiting.seed_structure, waiting.formula.clone()));
         let other = self.sizes.values().next();
         known.copied().unwrap_or_else(|| {
             let atoms = f64::from(waiting.atoms);
-            // Methods without electrons have no mesh either; with them the size is not known, and the model says so.
+            // Methods without electrons have no k-point mesh either. For the others the size is unknown, which NaN
+            // tells the model.
             let electrons = other.and_then(|other| other.electrons).map(|_| f64::NAN);
             Size { atoms, electrons, k_points: 1.0 }
         })
     }
 }
 
-/// The bill of the jobs that have no label of `protocol` yet.
+/// Cost of the jobs that have no label of `protocol` yet.
 pub async fn queue_cost(store: &Store, protocol: ContentHash) -> Result<QueueCost, StoreError> {
     let waiting = store.waiting_jobs(protocol).await?;
     let (costs, work) = (CostEstimator::from_store(store, protocol).await?, store.label_work().await?);
@@ -111,17 +113,18 @@ pub async fn queue_cost(store: &Store, protocol: ContentHash) -> Result<QueueCos
     })
 }
 
-/// What labels that are made again may cost.
+/// Expected cost of making labels again.
 pub struct RelabelCost {
-    /// None before a first label.
+    /// `None` before the first label.
     pub hours: Option<CoreHours>,
     /// Labels whose cost was measured.
     pub measured: usize,
-    /// Name of their protocol.
+    /// Name of the protocol of the measured labels.
     pub protocol: String,
 }
 
-/// What these will cost, as labels of the protocol in force did; before it has any, as those of the last one that has.
+/// Expected cost of labelling these structures, from labels of the protocol in force or, before it has any, of the
+/// newest protocol that has.
 pub async fn relabel_cost(
     store: &Store,
     in_force: &Protocol,
@@ -153,12 +156,12 @@ impl std::fmt::Display for RelabelCost {
 }
 
 impl CoreHours {
-    /// So many times as much.
+    /// The cost times a factor.
     pub fn scaled(self, factor: f64) -> Self {
         Self { expected: factor * self.expected, low: factor * self.low, high: factor * self.high }
     }
 
-    /// From core-seconds, times a factor.
+    /// Converts core-seconds, times a factor.
     pub fn from_core_seconds(predicted: Predicted, factor: f64) -> Self {
         let hours = |seconds: f64| factor * seconds / SECONDS_PER_HOUR;
         Self {
@@ -176,7 +179,7 @@ impl std::fmt::Display for CoreHours {
     }
 }
 
-/// Two digits that count, and whole numbers from ten on.
+/// Formats with two significant digits, and as a whole number from ten on.
 pub fn two_digits(x: f64) -> String {
     if !(x.is_finite() && x > 0.0) {
         return format!("{x}");
@@ -185,7 +188,7 @@ pub fn two_digits(x: f64) -> String {
     format!("{x:.decimals$}")
 }
 
-/// What the cost of a label depends on, as its method says.
+/// The quantities that the cost of a label depends on, from its method.
 pub fn cost_size(size: &dft::Size) -> Size {
     let electrons = Some(size.electrons).filter(|electrons| *electrons > 0.0);
     Size { atoms: size.atoms as f64, electrons, k_points: size.k_points as f64 }

@@ -1,4 +1,4 @@
-//! How the labels of a campaign are made, as its store says: for labellers that have no configuration at hand.
+//! How the labels of a campaign are made, as read from its store. Labellers without the configuration file use it.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -17,39 +17,39 @@ use crate::config::{LabelMethod, LabelSection, PotentialFile, PotentialKind, cha
 use crate::exit_status::Failure;
 use crate::process_config::MethodConfig;
 
-/// The key of the configuration that names the file of a reference potential.
+/// Configuration key of a reference potential's file.
 pub const REFERENCE_FILE: &str = "label.method.reference.file";
 
-/// Under which name the leader says in the store how it makes labels: a [`MethodConfig`] with paths of its host.
+/// Metadata key under which the leader stores its [`MethodConfig`], with the paths of its host.
 pub const LABEL_METHOD_KEY: &str = "label_method";
 
-/// What a labeller needs to know of the campaign.
+/// What a labeller needs to know about the campaign.
 #[derive(Clone, Debug)]
 pub struct LabelSetup {
-    /// How labels are made, with files that are here.
+    /// How to make labels, with files on this host.
     pub method: MethodConfig,
     /// The protocol of new jobs.
     pub protocol: Protocol,
     /// Attempts before a label counts as failed.
     pub attempts: u32,
-    /// What is believed of a label.
+    /// Limits of plausible labels.
     pub bounds: LabelBounds,
     /// How long a job is leased.
     pub lease: Duration,
 }
 
-/// What the user says of the host on which labels are made.
+/// Options for the host on which labels are made.
 #[derive(Debug, Default)]
 pub struct HostOptions<'a> {
     /// The method that the campaign must have.
     pub method: Option<&'a str>,
     /// Files that are not where the leader has them.
     pub files: &'a [PathBuf],
-    /// How its program is called here: another command, other paths, the same protocol.
+    /// How to call the program on this host: another command or other paths, but the same protocol.
     pub label: Option<LabelSection>,
 }
 
-/// Of the configuration in force, what concerns labels.
+/// The `[label]` section of the configuration in force.
 #[derive(Deserialize)]
 struct EffectiveConfig {
     label: LabelLimits,
@@ -60,7 +60,7 @@ struct LabelLimits {
     attempts: u32,
     #[serde(flatten)]
     bounds: LabelBounds,
-    /// Campaigns of earlier versions have none.
+    /// Campaigns of earlier versions have no lease.
     #[serde(default = "default_lease")]
     lease: u32,
 }
@@ -69,24 +69,24 @@ fn default_lease() -> u32 {
     600
 }
 
-/// The protocol with these settings: its hash is theirs.
+/// The protocol with these settings. Its hash is that of the settings.
 pub fn protocol(name: &str, settings: Value) -> Protocol {
     let hash = ContentHash(*blake3::hash(settings.to_string().as_bytes()).as_bytes());
     Protocol { hash, name: name.to_owned(), settings }
 }
 
-/// Settings of the protocol of a program's labels.
+/// Protocol settings of a program's labels.
 pub fn code_identity(method: &str, code: &dyn Code) -> Value {
     json!({ "method": method, "settings": code.identity() })
 }
 
-/// The same of a reference potential.
+/// Protocol settings of a reference potential.
 pub fn reference_identity(kind: PotentialKind, file_hash: &str) -> Value {
     json!({ "method": "reference", "kind": kind, "file_hash": file_hash })
 }
 
-/// What of the method stands in the configuration of a campaign: what makes a label what it is. How its program is called may
-/// change, and so may the places of files.
+/// The part of the label method that a campaign's configuration records: what determines the labels. The command and
+/// the paths of files may change.
 pub fn resolved_method(label: &LabelSection, protocol: &Protocol) -> Value {
     match &label.method {
         LabelMethod::Reference(PotentialFile { kind, .. }) => {
@@ -96,7 +96,7 @@ pub fn resolved_method(label: &LabelSection, protocol: &Protocol) -> Value {
     }
 }
 
-/// The configuration of a campaign with another protocol of labels.
+/// The configuration of a campaign with another label protocol.
 pub fn with_protocol(configuration: &Value, label: &LabelSection, protocol: &Protocol) -> Value {
     let mut configuration = configuration.clone();
     configuration["label"]["protocol"] = json!(protocol.name);
@@ -110,7 +110,7 @@ pub fn with_protocol(configuration: &Value, label: &LabelSection, protocol: &Pro
     configuration
 }
 
-/// Whether labels of these elements can be made; why not.
+/// Checks that labels can be made for these elements.
 pub fn supports(label: &LabelSection, species: &BTreeSet<Species>) -> Result<(), String> {
     match &label.method {
         LabelMethod::Reference(reference) => {
@@ -128,7 +128,7 @@ pub fn supports(label: &LabelSection, species: &BTreeSet<Species>) -> Result<(),
 }
 
 impl LabelSetup {
-    /// Reads it, and finds what the method needs here. `protocol` is the one in force.
+    /// Reads the setup of `protocol`, which is in force, and locates on this host what the method needs.
     pub async fn read(store: &Store, protocol: Protocol, here: HostOptions<'_>) -> Result<Self, Failure> {
         let text = store.campaign().await?.configuration_in_force;
         let EffectiveConfig { label: LabelLimits { attempts, bounds, lease } } =
@@ -154,7 +154,7 @@ impl LabelSetup {
     }
 }
 
-/// What the campaign believes of labels, as the configuration in force says.
+/// Limits of plausible labels, from the configuration in force.
 pub async fn read_bounds(store: &Store) -> Result<LabelBounds, Failure> {
     let text = store.campaign().await?.configuration_in_force;
     let configuration: Value = serde_json::from_str(&text).map_err(unreadable)?;
@@ -192,7 +192,7 @@ impl MethodConfig {
         }
     }
 
-    /// Settings of the protocol of its labels. A program must be there.
+    /// Protocol settings of the labels. A program must be installed.
     pub fn identity(&self) -> Result<Value, Failure> {
         match self {
             Self::Reference { kind, file_hash, .. } => Ok(reference_identity(*kind, file_hash)),
@@ -203,7 +203,7 @@ impl MethodConfig {
         }
     }
 
-    /// As the configuration calls it.
+    /// Name of the method in the configuration.
     fn name(&self) -> &'static str {
         match self {
             Self::Reference { .. } => "reference",
@@ -211,7 +211,7 @@ impl MethodConfig {
         }
     }
 
-    /// The same with what is on this host, if it makes labels of that protocol.
+    /// Replaces files and commands by those of this host. Fails if they would make labels of another protocol.
     fn for_this_host(self, protocol: &Protocol, here: HostOptions<'_>) -> Result<Self, Failure> {
         let given = here.label.as_ref().map(Self::from_section).transpose()?;
         match (self, given) {
@@ -244,7 +244,7 @@ impl MethodConfig {
     }
 }
 
-/// Whether labels of that identity are labels of the protocol.
+/// Checks that labels with these settings belong to the protocol.
 pub fn check_protocol(identity: &Value, protocol: &Protocol) -> Result<(), Failure> {
     match changed_keys(&protocol.settings, identity).first() {
         None => Ok(()),
@@ -267,7 +267,7 @@ fn method_mismatch(found: &str, expected: &str) -> Failure {
     })
 }
 
-/// The file with which labels of that protocol are made, and its BLAKE3: one of those given, or where the leader has it.
+/// The file with which labels of the protocol are made, and its BLAKE3 hash: one of `given`, or the leader's file.
 fn find_file(noted: &Path, protocol: &Protocol, given: &[PathBuf]) -> Result<(PathBuf, String), Failure> {
     let expected = protocol.settings["file_hash"].as_str().unwrap_or_default();
     let mut found = None;
@@ -276,7 +276,7 @@ fn find_file(noted: &Path, protocol: &Protocol, given: &[PathBuf]) -> Result<(Pa
             Failure::Input(format!("--file {}: cannot be read ({error})", path.display()))
         })?;
         if hash != expected {
-            // A file that nobody needs is most likely a wrong one.
+            // A file that is not needed is most likely a mistake.
             return Err(Failure::Input(format!(
                 "--file {}: its content (BLAKE3 {hash}) is not that of the file with which the labels of this campaign \
                  are made",

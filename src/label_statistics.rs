@@ -1,4 +1,5 @@
-//! What the labels of a campaign teach: how far the potential errs, whether the grade told where, and which structures got no label.
+//! Statistics of the labels of a campaign: the potential's errors, whether the grade predicted them, and which
+//! structures have no label.
 
 use analysis::{Bins, Completion, ForceErrors};
 use atoms::cell::{norm, sub};
@@ -7,15 +8,15 @@ use wire::{ContentHash, Origin};
 
 use crate::energy_errors::{EnergyErrors, EnergyReference};
 
-/// Force errors above this are large, eV/Å, as in the paper.
+/// Force errors above this count as large, eV/Å, as in the paper.
 pub const LARGE_FORCE_ERROR: f64 = 1.0;
 
 /// Rows read from the store at a time.
 const PAGE_ROWS: u32 = 256;
-/// Atoms that ranks and quantiles come from, at most; of more a sample.
+/// Largest number of atoms kept for ranks and quantiles. Beyond it a systematic sample is kept.
 const MAX_SAMPLES: usize = 1 << 20;
 
-/// Force errors by either grade of the original mixture.
+/// Force errors by both grades of the original mixture.
 #[derive(Clone, Debug)]
 pub struct ErrorsByGrade {
     /// Labelled structures.
@@ -26,27 +27,27 @@ pub struct ErrorsByGrade {
     pub gamma_nbr: ForceErrors,
 }
 
-/// All of it.
+/// Statistics of the labels of one protocol.
 #[derive(Clone, Debug)]
 pub struct LabelStatistics {
     /// Of all structures.
     pub all: ErrorsByGrade,
-    /// Of those of biased walks alone.
+    /// Of structures from biased walks.
     pub biased: ErrorsByGrade,
-    /// Of frames of control walks alone.
+    /// Of frames from control walks.
     pub control: ErrorsByGrade,
     /// Energy errors of all structures.
     pub energies: EnergyErrors,
-    /// Labelled structures that a biased walk and a control both found, as at a step before the bias tells them apart: they stand
-    /// in `all` once, and are no part of the comparison.
+    /// Labelled structures that both a biased walk and a control walk found, for example before the bias separates
+    /// them. `all` counts them once, and the comparison excludes them.
     pub shared: u64,
-    /// Which got their labels, by the largest γ; failed ones by their names.
+    /// Labelled and failed structures by their largest γ, with the names of the failed ones.
     pub by_gamma: Completion<String>,
     /// The same by V/V₀.
     pub by_expansion: Completion<String>,
 }
 
-/// Reads it page by page, for the labels of one protocol.
+/// Reads the labels of one protocol page by page.
 pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistics, StoreError> {
     let mut learned = LabelStatistics {
         all: ErrorsByGrade::new(),
@@ -75,7 +76,7 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
                     learned.shared += 1;
                     learned.all.labelled(original, &errors);
                 }
-                // It was counted with the other.
+                // Counted with the biased walk.
                 (true, Origin::Control) => continue,
             }
             learned.energies.add(&row.structure, block.view().energy(), row.label.energy);

@@ -1,5 +1,6 @@
-//! calmwalk expands the training set of an interatomic potential: walkers run molecular dynamics biased along the
-//! gradient of the CALM extrapolation grade, a selector decides what is new, and what is new is labelled.
+//! calmwalk expands the training set of an interatomic potential. Walkers run molecular dynamics biased along the
+//! gradient of the CALM extrapolation grade, a selector accepts the structures that are new, and labellers label
+//! them.
 
 mod atomic_file;
 mod budget_usage;

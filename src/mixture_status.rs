@@ -1,4 +1,4 @@
-//! How the components of the mixture in force stand, beside those that the campaign began with.
+//! State of the mixture's components, compared with those at the start of the campaign.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use store::{NewestMixture, Store};
 use crate::exit_status::Failure;
 use crate::process_config::verify_hash;
 
-/// What a campaign began with.
+/// The mixture at the start of a campaign.
 #[derive(Clone, Debug)]
 pub struct InitialMixture {
     /// Chemical symbols by element index.
@@ -28,40 +28,40 @@ pub struct MixtureStatus {
     version: u64,
     /// Number of the newest decision.
     decision: i64,
-    /// Dimension of features.
+    /// Dimension of the features.
     feature_dimension: usize,
     /// By element and slot.
     components: Vec<ComponentStatus>,
 }
 
-/// One component of it.
+/// One component of the mixture.
 #[derive(Debug, Serialize)]
 struct ComponentStatus {
     element: String,
     component: usize,
     /// Calibrated threshold θ of σ.
     threshold: f64,
-    /// Environments in the beginning, and now; none if the campaign began with an export alone.
+    /// Environments at the start and now. `None` if the campaign started from an export alone.
     environments_before: Option<f64>,
     environments: Option<f64>,
-    /// Sum of their weights now.
+    /// Current sum of their weights.
     weighted: Option<f64>,
-    /// Of the covariance now.
+    /// Current condition number of the covariance.
     condition_number: Option<f64>,
-    /// Whether a collection ever changed it.
+    /// Whether an update has ever changed the component.
     moved: bool,
-    /// Factor by which the width has grown in the direction in which it grew most, and the least.
+    /// Factors on the width in the directions of the largest growth and the largest shrinkage.
     grown: Option<f64>,
     shrunk: Option<f64>,
-    /// Of the covariances, √Σ ln²λ.
+    /// Distance of the covariances, √Σ ln²λ.
     distance: Option<f64>,
 }
 
 impl InitialMixture {
-    /// That of the artifact, from where the campaign last found it.
+    /// Reads the artifact from the path that the campaign last used.
     ///
     /// # Errors
-    /// A file that is not there, or is another.
+    /// Fails if the file is missing or has another content.
     pub async fn read(store: &Store) -> Result<Self, Failure> {
         let campaign = store.campaign().await?;
         let resolved: Value = serde_json::from_str(&campaign.resolved_configuration)
@@ -81,10 +81,10 @@ impl InitialMixture {
     }
 }
 
-/// How each component stands.
+/// Compares each component with its start.
 ///
 /// # Errors
-/// A damaged database, a mixture that did not grow from this one.
+/// Fails on a damaged database, or if the mixture did not grow from `original`.
 pub fn mixture_status(original: &InitialMixture, newest: &NewestMixture) -> Result<MixtureStatus, Failure> {
     let damaged = |error: &dyn ToString| Failure::Failed(format!("the mixture: {}", error.to_string()));
     let now = orchestrator::selector::restored_mixture(&original.mixture, newest.version, &newest.components)

@@ -1,5 +1,5 @@
-//! What the processes of a campaign are started with: they read it from standard input, as JSON, and nothing else of the
-//! configuration, so a file that is edited meanwhile changes nothing.
+//! Configuration of the child processes. They read it as JSON from standard input and nothing else of the campaign's
+//! configuration, so editing the file during a run has no effect.
 
 use std::io::{self, Read};
 use std::path::PathBuf;
@@ -19,19 +19,19 @@ use crate::exit_status::Failure;
 use crate::label_setup::{self, LabelSetup};
 use crate::log;
 
-/// What a walker's process needs to know.
+/// Configuration of a walker process.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct WalkerConfig {
-    /// The process that it works for, and with which it ends.
+    /// Parent process. The walker ends with it.
     pub parent: u32,
-    /// Its way to the orchestrator.
+    /// How to connect to the orchestrator.
     pub door: Door,
     /// The exported model.
     pub model: PathBuf,
-    /// BLAKE3 of that file.
+    /// BLAKE3 hash of that file.
     pub model_hash: String,
-    /// In which it is evaluated.
+    /// Precision of the model's evaluation.
     pub precision: Precision,
     /// Threads that evaluate it.
     pub threads: usize,
@@ -41,35 +41,35 @@ pub struct WalkerConfig {
     pub log: Option<log::LogConfig>,
 }
 
-/// What an agent needs to know.
+/// Configuration of an agent.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AgentConfig {
-    /// The exported model, where the orchestrator finds it.
+    /// The exported model, at its path on the orchestrator's host.
     pub model: PathBuf,
-    /// BLAKE3 of that file.
+    /// BLAKE3 hash of that file.
     pub model_hash: String,
-    /// In which it is evaluated.
+    /// Precision of the model's evaluation.
     pub precision: Precision,
     /// Dynamics, bias and guards.
     pub settings: WalkSettings,
-    /// Bytes of the largest message of a walker.
+    /// Largest message of a walker, bytes.
     pub message_bytes: usize,
-    /// A walker without a sign of life for so long (s) is replaced …
+    /// Heartbeat timeout of a walker, s.
     pub silence_limit: f64,
-    /// … so many times.
+    /// Largest number of restarts.
     pub restarts: u32,
 }
 
-/// What a labeller's process needs to know.
+/// Configuration of a labeller process.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct LabellerConfig {
-    /// Its number among those of a run, which the next run adopts.
+    /// Number among the labellers of a run, by which the next run adopts it.
     pub number: Option<u32>,
-    /// How often one in its place was started again.
+    /// Number of restarts so far.
     pub restarts: u32,
-    /// What it is if `calmwalk label` started it.
+    /// Settings of a labeller that `calmwalk label` started.
     pub slot: Option<PoolConfig>,
     /// Directory of the campaign, or URL of its store.
     pub location: PathBuf,
@@ -79,23 +79,23 @@ pub struct LabellerConfig {
     pub protocol: Protocol,
     /// Attempts before a label counts as failed.
     pub attempts: u32,
-    /// What is believed of a label.
+    /// Limits of plausible labels.
     pub bounds: LabelBounds,
     /// How long a job is leased.
     pub lease: Duration,
-    /// Its log. One that is adopted keeps the log that it began with.
+    /// Its log. An adopted labeller keeps its original log.
     pub log: Option<log::LogConfig>,
 }
 
-/// What tells a slot of `calmwalk label` from a labeller of a run.
+/// Settings of a labeller of `calmwalk label`, as opposed to one of a run.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct PoolConfig {
-    /// The process with which it ends.
+    /// Parent process. The labeller ends with it.
     pub parent: u32,
-    /// Whether it leaves when the queue is empty and nobody runs the campaign, also if some walks are not over.
+    /// Whether to exit when the queue is empty and no run is active, even if walks are unfinished.
     pub until_empty: bool,
-    /// How long a label in hand may take after a stop, s.
+    /// Time that a label in progress may take after a stop, s.
     pub grace: f64,
 }
 
@@ -103,18 +103,18 @@ pub struct PoolConfig {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum MethodConfig {
-    /// By a potential that calmwalk evaluates.
+    /// With a potential that calmwalk evaluates.
     Reference {
-        /// What the potential's file holds.
+        /// Format of the potential's file.
         kind: PotentialKind,
         /// The potential.
         file: PathBuf,
-        /// BLAKE3 of that file.
+        /// BLAKE3 hash of that file.
         file_hash: String,
     },
-    /// By a program.
+    /// With an external program.
     Code {
-        /// Which one, and by which protocol.
+        /// The program and the protocol.
         settings: Box<dft::Settings>,
         /// How its calculations run.
         running: Running,
@@ -122,13 +122,13 @@ pub enum MethodConfig {
 }
 
 impl MethodConfig {
-    /// The method, ready to label by that protocol: a file or a program may have been replaced meanwhile.
+    /// Prepares the method to label by `protocol`. Fails if a file or program has been replaced.
     pub fn load(&self, protocol: &Protocol) -> Result<Method, Failure> {
         match self {
             Self::Reference { kind, file, file_hash } => {
                 verify_hash(file, file_hash)?;
                 let potential = kind.load(file).map_err(Failure::Input)?;
-                // It may have been replaced while it was read.
+                // Detects a file that was replaced while it was read.
                 verify_hash(file, file_hash)?;
                 Ok(Method::reference(potential))
             }
@@ -141,7 +141,7 @@ impl MethodConfig {
     }
 }
 
-/// Reads the setup of this process.
+/// Reads the configuration of this process.
 pub fn from_stdin<T: DeserializeOwned>() -> Result<T, Failure> {
     let mut text = String::new();
     io::stdin().read_to_string(&mut text).map_err(Failure::failed)?;
@@ -150,28 +150,27 @@ pub fn from_stdin<T: DeserializeOwned>() -> Result<T, Failure> {
     })
 }
 
-/// A setup as the bytes that are written to the process.
+/// The configuration as bytes for the child's standard input.
 pub fn to_bytes(setup: &impl Serialize) -> Vec<u8> {
     serde_json::to_vec(setup).expect("plain data becomes JSON")
 }
 
 impl LabellerConfig {
-    /// That of a labeller without a number.
+    /// Configuration of a labeller without a number.
     pub fn new(location: PathBuf, labelling: LabelSetup) -> Self {
         let LabelSetup { method, protocol, attempts, bounds, lease } = labelling;
         let (number, restarts, slot, log) = (None, 0, None, log::child_config());
         Self { number, restarts, slot, location, method, protocol, attempts, bounds, lease, log }
     }
 
-    /// What tells two setups of labellers apart, whatever their numbers and logs: one that was started with another must be
-    /// replaced.
+    /// Hash of everything but number and log. A running labeller with another hash must be replaced.
     pub fn hash(&self) -> String {
         blake3::hash(&to_bytes(&Self { number: None, restarts: 0, log: None, ..self.clone() })).to_string()
     }
 }
 
 impl WalkerConfig {
-    /// Reads the model, which must be the one that the campaign's run began with.
+    /// Loads the model and checks that it is the one of the run.
     pub fn load_model(&self) -> Result<Arc<GraceModel>, Failure> {
         verify_hash(&self.model, &self.model_hash)?;
         let model = GraceModel::load_in(&self.model, self.precision, RadialPath::default());
@@ -179,7 +178,7 @@ impl WalkerConfig {
     }
 }
 
-/// Checks that a file is the one that the orchestrator read.
+/// Checks that a file has this BLAKE3 hash.
 pub fn verify_hash(path: &std::path::Path, expected: &str) -> Result<(), Failure> {
     let bytes = std::fs::read(path)
         .map_err(|error| Failure::Input(format!("cannot read {}: {error}", path.display())))?;

@@ -1,4 +1,4 @@
-//! Which configuration file a campaign belongs to. The store records it, so that a run with another file does not go on with the
+//! Records which configuration file a campaign belongs to, so that a run with another file does not continue the
 //! campaign by mistake.
 
 use std::path::{Component, Path, PathBuf};
@@ -6,10 +6,10 @@ use std::path::{Component, Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use store::{Store, StoreError};
 
-/// Under which name the store has it.
+/// Metadata key in the store.
 pub const METADATA_KEY: &str = "configuration_file";
 
-/// A configuration that many campaigns have: its directory names the campaign.
+/// A common name of configuration files. The directory then names the campaign.
 const GENERIC_STEM: &str = "campaign";
 
 /// A configuration file at the time of a run.
@@ -17,34 +17,34 @@ const GENERIC_STEM: &str = "campaign";
 pub struct ConfigFile {
     /// Absolute path without symbolic links.
     pub path: String,
-    /// BLAKE3 of its content.
+    /// BLAKE3 hash of its content.
     pub blake3: String,
 }
 
-/// Name of a campaign, and its configuration.
+/// Name of a campaign and its configuration files.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Provenance {
-    /// Name of the campaign: that of its configuration, or of the directory of a `campaign.toml`.
+    /// Name of the campaign: that of its configuration file, or of the directory of a `campaign.toml`.
     pub name: String,
-    /// The file with which the campaign began.
+    /// The file with which the campaign started.
     pub began_with: ConfigFile,
     /// The file of the last run.
     pub file: ConfigFile,
-    /// A file whose `[label]` section `calmwalk relabel` has brought into force since: it may become the campaign's.
+    /// A file whose `[label]` section `calmwalk relabel` has put into force since. It may become the campaign's file.
     #[serde(default)]
     pub relabelled_by: Option<ConfigFile>,
     /// Directory of the campaign in the last run, absolute and without symbolic links.
     pub directory: String,
 }
 
-/// Why a file is taken for the configuration of a campaign.
+/// How a file relates to the configuration of a campaign.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ConfigMatch {
-    /// It is the file of the last run, or of the last `calmwalk relabel`.
+    /// It is the file of the last run or of the last `calmwalk relabel`.
     Same,
     /// Campaign and configuration were moved together.
     MovedTogether,
-    /// The file of the last run is gone, and this one has its content.
+    /// The file of the last run is gone, and this one has the same content.
     Renamed,
     /// It is another file.
     Other,
@@ -58,7 +58,7 @@ impl ConfigFile {
 }
 
 impl Provenance {
-    /// The origin of a campaign in `directory` that begins with the configuration at `path`, which holds `text`.
+    /// For a campaign in `directory` that starts with the configuration at `path`, whose content is `text`.
     pub fn new(path: &Path, text: &str, directory: &Path) -> Self {
         let path = canonical(path);
         let file = ConfigFile::new(&path, text);
@@ -66,14 +66,15 @@ impl Provenance {
         Self { name: name(&path), began_with: file.clone(), file, relabelled_by: None, directory }
     }
 
-    /// That of a campaign; none of one that began with an early version.
+    /// Reads it from the store. `None` for campaigns of early versions.
     pub async fn read(store: &Store) -> Result<Option<Self>, StoreError> {
         let note = store.note(METADATA_KEY).await?;
         Ok(note.and_then(|note| serde_json::from_str(&note).ok()))
     }
 
-    /// How the configuration of a run (`now`) stands to that of the campaign. `holds_campaign`: the campaign's directory has its
-    /// database, so that a copy of both is a campaign of its own. `file_exists` tells whether a file is there.
+    /// Compares the configuration of a run (`now`) with that of the campaign. `holds_campaign` says whether the
+    /// directory contains the database, so that copying both makes a separate campaign. `file_exists` checks for a
+    /// file.
     pub fn compare(
         &self,
         now: &Self,
@@ -92,17 +93,17 @@ impl Provenance {
         }
     }
 
-    /// The origin after a run with the configuration of `now`.
+    /// The provenance after a run with the configuration of `now`.
     pub fn continued(&self, now: &Self) -> Self {
         Self { began_with: self.began_with.clone(), ..now.clone() }
     }
 
-    /// The origin after the `[label]` section of the configuration at `path`, which holds `text`, came into force.
+    /// The provenance after the `[label]` section of the file at `path`, whose content is `text`, came into force.
     pub fn relabelled(self, path: &Path, text: &str) -> Self {
         Self { relabelled_by: Some(ConfigFile::new(&canonical(path), text)), ..self }
     }
 
-    /// The configuration's path as seen from the campaign's directory: steps up, and the way down from there.
+    /// The configuration's path relative to the campaign's directory: levels up, then the path down.
     fn relative(&self) -> (usize, PathBuf) {
         let (file, directory) = (Path::new(&self.file.path), Path::new(&self.directory));
         let common = file.components().zip(directory.components()).take_while(|(a, b)| a == b).count();

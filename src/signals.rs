@@ -1,4 +1,4 @@
-//! Ctrl-C and SIGTERM for commands that work on one thread.
+//! Handles Ctrl-C and SIGTERM in single-threaded commands.
 
 use std::process;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use crate::exit_status::Failure;
 
-/// A flag that the first signal sets, so that work can stop in order; the second signal ends the process at once.
+/// Returns a flag that the first signal sets, so that work can stop in order. The second signal exits at once.
 pub fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
     let runtime =
         tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(Failure::failed)?;

@@ -1,4 +1,4 @@
-//! What came of a campaign, in numbers, and whether the grade told where the potential errs.
+//! Summary of a finished campaign: its numbers, and whether the grade predicted the potential's errors.
 
 use std::fmt;
 
@@ -12,21 +12,21 @@ use crate::output::{count, decimals};
 use crate::unlabelled;
 use crate::walk_ends::WalkEnds;
 
-/// Seed structures with failed labels that are shown.
+/// Largest number of seed structures with failed labels to show.
 const SHOWN: usize = 8;
 
-/// A finished campaign.
+/// Summary of a campaign.
 #[derive(Clone, Debug)]
 pub struct Summary {
     status: Status,
     learned: LabelStatistics,
-    /// Where labels finally failed.
+    /// Structures whose labels failed for good.
     unlabelled: Vec<Unlabelled>,
-    /// Grades of the training frames under the newest mixture, if they are watched.
+    /// Grades of the training frames under the newest mixture, if they are monitored.
     training: Option<GradeDistribution>,
 }
 
-/// Gathers the summary of a campaign, with the labels of one protocol.
+/// Reads the summary of a campaign with the labels of one protocol.
 pub async fn read(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
     let status = store.status().await?;
     let learned = label_statistics::read(store, protocol).await?;
@@ -103,7 +103,7 @@ impl fmt::Display for Summary {
     }
 }
 
-/// That structures are counted twice which biased walks and controls both found.
+/// Says that structures found by both biased and control walks are counted twice.
 fn both(learned: &LabelStatistics) -> String {
     match learned.shared {
         0 => String::new(),
@@ -113,7 +113,7 @@ fn both(learned: &LabelStatistics) -> String {
     }
 }
 
-/// A line of numbers.
+/// A line of the comparison.
 fn line(grades: &ErrorsByGrade) -> String {
     let ErrorsByGrade { gamma, gamma_nbr, .. } = grades;
     if gamma.atoms() == 0 {

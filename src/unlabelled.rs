@@ -1,11 +1,11 @@
-//! What part of the collected space has no label because labels finally failed, in words.
+//! Describes the collected structures whose labels failed for good.
 
 use store::{Range, Unlabelled};
 
 use crate::output::Table;
 
-/// A line behind a title of `width` characters, and one for each seed structure and formula, `most` of these; nothing if
-/// no label failed.
+/// A line with a title of `width` characters, then one line for each seed structure and formula, at most `most`.
+/// Empty if no label failed.
 pub fn describe(unlabelled: &[Unlabelled], width: usize, most: usize) -> String {
     if unlabelled.is_empty() {
         return String::new();
@@ -23,7 +23,7 @@ pub fn describe(unlabelled: &[Unlabelled], width: usize, most: usize) -> String 
     ]);
     unlabelled.iter().take(most).for_each(|part| table.push(line(part)));
     let mut text = Vec::new();
-    // Nothing prevents writing to memory.
+    // Writing to memory cannot fail.
     let _ = table.write(&mut text);
     let table = String::from_utf8_lossy(&text).into_owned();
     let more = match unlabelled.len().saturating_sub(most) {

@@ -1,55 +1,56 @@
-//! How walks have ended, why, and what to change where they ended too early: pure, for all who show it.
+//! Counts how walks ended and why, and gives advice on early ends. Pure functions, shared by everything that shows
+//! them.
 
 use serde::Serialize;
 use store::WalkStatus;
 
-/// So few early ends are no pattern yet.
+/// Fewer early ends are not a pattern yet.
 const MIN_EARLY_ENDS: u64 = 3;
 
-/// Why a walk ended before it had made its steps or collected its structures.
+/// Why a walk ended before it made all its steps or collected all its structures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EarlyEndCause {
-    /// Hotter than `guard.highest_temperature`.
+    /// The temperature exceeded `guard.highest_temperature`.
     TooHot,
-    /// An energy or force that is no number.
+    /// An energy or force is not finite.
     NotFinite,
-    /// An atom without a neighbour.
+    /// An atom has no neighbour.
     LostAtom,
-    /// It cost several walkers.
+    /// The walk crashed several walkers.
     Crashed,
-    /// The guard against short bonds refused it again and again.
+    /// The shortest-bond guard refused its structures repeatedly.
     Trapped,
-    /// The seed structure cannot be walked from.
+    /// No walk can start from the seed structure.
     BadStart,
-    /// Any other.
+    /// Any other cause.
     Other,
 }
 
-/// Walks that ended in one way.
+/// The walks that ended in one way.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct EndCount {
-    /// As the store has it: `steps`, `collected`, `budget`, `trapped`, `blew_up`, `bad_start`.
+    /// As stored: `steps`, `collected`, `budget`, `trapped`, `blew_up` or `bad_start`.
     pub end: String,
-    /// None of an end in order.
+    /// `None` if the walks did not end early.
     pub cause: Option<EarlyEndCause>,
-    /// How many.
+    /// Number of walks.
     pub walks: u64,
-    /// Number of the first of them.
+    /// Number of the first of these walks.
     pub walk: u32,
-    /// Why that one ended, in words.
+    /// Why that walk ended, as text.
     pub reason: String,
     /// What to change.
     pub advice: Option<&'static str>,
 }
 
-/// How the walks of a campaign have ended.
+/// How the walks of a campaign ended.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 #[serde(transparent)]
 pub struct WalkEnds(Vec<EndCount>);
 
-/// Why a walk with this state and reason ended early; none of one that is under way, or ended in order: it made all its steps,
-/// collected all it may, or a budget was used up.
+/// Why a walk with this state and reason ended early. `None` for a walk that is running, made all its steps,
+/// collected all it may, or ended with a budget.
 pub fn early_end_cause(state: &str, reason: &str) -> Option<EarlyEndCause> {
     let has = |words: &str| reason.contains(words);
     match state {
@@ -64,13 +65,13 @@ pub fn early_end_cause(state: &str, reason: &str) -> Option<EarlyEndCause> {
     }
 }
 
-/// Whether walk after walk ends early: of `ended` walks so many that it is no accident.
+/// Whether `early` of `ended` walks are too many to be accidents.
 fn is_pattern(ended: u64, early: u64) -> bool {
     early >= MIN_EARLY_ENDS && 2 * early >= ended
 }
 
 impl EarlyEndCause {
-    /// In a few words.
+    /// Short description.
     pub fn in_words(self) -> &'static str {
         match self {
             Self::TooHot => "too hot",
@@ -100,7 +101,7 @@ impl EarlyEndCause {
 }
 
 impl WalkEnds {
-    /// Of these walks; those that are under way are not counted.
+    /// Counts these walks, except those that are running.
     pub fn from_walks(walks: &[WalkStatus]) -> Self {
         let mut ends = Self::default();
         for walk in walks.iter().filter(|walk| !walk.is_under_way()) {
@@ -121,17 +122,17 @@ impl WalkEnds {
         self.0.sort_by(|a, b| (a.cause, &a.end).cmp(&(b.cause, &b.end)));
     }
 
-    /// Walks that have ended.
+    /// Number of walks that have ended.
     pub fn ended(&self) -> u64 {
         self.0.iter().map(|count| count.walks).sum()
     }
 
-    /// Walks that have ended early.
+    /// Number of walks that ended early.
     pub fn early(&self) -> u64 {
         self.causes().map(|(_, count)| count.walks).sum()
     }
 
-    /// Whether walks have ended, and every one of them early.
+    /// Whether walks have ended, and all of them early.
     pub fn all_early(&self) -> bool {
         self.ended() > 0 && self.early() == self.ended()
     }
@@ -141,7 +142,7 @@ impl WalkEnds {
         self.0.iter().filter_map(|count| Some((count.cause?, count)))
     }
 
-    /// All of them in one line: `12 collected, 3 blew up (too hot)`.
+    /// All ends in one line: `12 collected, 3 blew up (too hot)`.
     pub fn in_words(&self) -> String {
         let one = |EndCount { end, cause, walks, .. }: &EndCount| {
             let end = end.replace('_', " ");
@@ -155,7 +156,7 @@ impl WalkEnds {
         self.0.iter().map(one).collect::<Vec<_>>().join(", ")
     }
 
-    /// The same without causes: `12 collected, 3 blew up`.
+    /// All ends in one line without causes: `12 collected, 3 blew up`.
     pub fn counts_by_end(&self) -> String {
         let mut numbers: Vec<(&str, u64)> = Vec::new();
         for EndCount { end, walks, .. } in &self.0 {
@@ -168,12 +169,12 @@ impl WalkEnds {
         numbers.into_iter().map(one).collect::<Vec<_>>().join(", ")
     }
 
-    /// Whether walk after walk ends early.
+    /// Whether many walks ended early.
     pub fn is_alarming(&self) -> bool {
         is_pattern(self.ended(), self.early())
     }
 
-    /// The early ends and what to change, two lines a cause.
+    /// The early ends and what to change, two lines for each cause.
     pub fn lines(&self) -> Vec<String> {
         let two = |(cause, EndCount { walks, walk, reason, .. }): (EarlyEndCause, &EndCount)| {
             let what = format!("{walks} {}, as walk {walk}: {reason}", cause.in_words());
@@ -182,7 +183,7 @@ impl WalkEnds {
         self.causes().flat_map(two).collect()
     }
 
-    /// What a warning says of the early ends.
+    /// Text of the warning about early ends.
     pub fn warning(&self) -> String {
         let causes: Vec<_> =
             self.causes().map(|(cause, count)| format!("{} {}", count.walks, cause.in_words())).collect();

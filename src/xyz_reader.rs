@@ -1,4 +1,4 @@
-//! The frames of a file one at a time, with errors that name it.
+//! Reads the frames of a file one at a time. Errors name the file.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -12,13 +12,13 @@ use atoms::{FileError, open_extxyz};
 /// Reads an extended XYZ file frame by frame.
 pub struct XyzReader {
     path: PathBuf,
-    /// Length of the file, bytes; none for a pipe.
+    /// Length of the file, bytes. `None` for a pipe.
     pub length: Option<u64>,
     read: Arc<AtomicU64>,
     reader: Reader<Box<dyn BufRead>>,
 }
 
-/// Counts the bytes that pass.
+/// Counts the bytes read.
 struct Counting(File, Arc<AtomicU64>);
 
 impl XyzReader {

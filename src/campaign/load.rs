@@ -1,4 +1,4 @@
-//! Reading the files that a configuration names.
+//! Reads the files that a configuration names.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -16,16 +16,16 @@ use super::NamedSeed;
 use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
 use crate::label_setup::{self, REFERENCE_FILE};
 
-/// Atoms of training frames whose grades are watched, at most: enough for the share above 1 to a percent.
+/// Largest number of training atoms whose grades are monitored: enough for the share above 1 to a percent.
 const WATCHED_ATOMS: usize = 4000;
 
-/// Atoms of seed structures whose grades are looked at.
+/// Largest number of seed-structure atoms that are graded.
 const GRADED_ATOMS: usize = 256;
 
-/// A mixture under which γ is less than this everywhere knows everything, and so nothing.
+/// A mixture with γ below this everywhere cannot distinguish new structures.
 const NO_GRADE: f64 = 1e-3;
 
-/// Fresh mixtures leave 2 to 9 % of their training atoms above 1.
+/// Above the usual share: fresh mixtures have 2 to 9 % of their training atoms above 1.
 const DOUBTFUL_SHARE: f64 = 0.25;
 
 const TRAINING_FRAMES: &str = "calm.training_frames";
@@ -35,18 +35,18 @@ const NO_UPDATES: &str = "no scatter matrices and counts, so its mixture can be 
                           gmm_artifacts.npz of the build, or leave calm.artifact out and set update = \"never\" to \
                           take the mixture of the export as it is";
 
-/// Reads files with errors that name the line of the configuration which names the file.
+/// Reads files. Errors name the line of the configuration that names the file.
 pub(super) struct Loader<'a> {
-    /// The configuration's file.
+    /// Path of the configuration file.
     pub path: &'a Path,
-    /// What is in it.
+    /// Its text.
     pub text: &'a str,
-    /// What it says.
+    /// The parsed configuration.
     pub config: &'a Config,
 }
 
 impl Loader<'_> {
-    /// The model, which must have a feature map, and cover what the configuration asks of it.
+    /// Loads the model, which must have a feature projection and support the configured settings.
     pub fn model(&self) -> Result<Arc<GraceModel>, ConfigError> {
         let file = &self.config.potential.model;
         let wrong = |message: String| self.wrong("potential.model", file, message);
@@ -71,7 +71,7 @@ impl Loader<'_> {
         Ok(Arc::new(model))
     }
 
-    /// The mixture at the start: that of the artifact, or without one that of the export.
+    /// Loads the initial mixture: that of the artifact, or else that of the export.
     pub fn artifact(&self, model: &GraceModel) -> Result<Artifact, ConfigError> {
         let model_file = &self.config.potential.model;
         let export = Artifact::load_export(model_file.get_ref())
@@ -92,7 +92,8 @@ impl Loader<'_> {
         Ok(artifact)
     }
 
-    /// Features of the training frames, evenly thinned to [`WATCHED_ATOMS`]. Most of them must have 0.001 < γ < 1.
+    /// Computes features of the training frames, evenly sampled to [`WATCHED_ATOMS`]. The median of γ must be between
+    /// 0.001 and 1.
     pub fn training_frames(
         &self,
         model: &Arc<GraceModel>,
@@ -121,7 +122,7 @@ impl Loader<'_> {
         Ok(Some(training))
     }
 
-    /// What is doubtful about the grades at the start.
+    /// Warns of suspicious initial grades.
     pub fn doubtful_grades(
         &self,
         model: &Arc<GraceModel>,
@@ -164,7 +165,7 @@ impl Loader<'_> {
         }))
     }
 
-    /// How labels are made, and the hashes of files by which they are made.
+    /// The label protocol and the hashes of its files.
     pub fn protocol(&self, seeds: &[NamedSeed]) -> Result<(Protocol, Vec<(String, String)>), ConfigError> {
         let (settings, hashes) = match &self.config.label.method {
             LabelMethod::Reference(reference) => self.reference(reference, seeds)?,
@@ -197,7 +198,7 @@ impl Loader<'_> {
         Ok((label_setup::reference_identity(reference.kind, &hash.1), vec![hash]))
     }
 
-    /// Settings of a program's protocol; the program must be there, with what it needs for every seed structure.
+    /// Protocol settings of a program, which must be installed with all it needs for every seed structure.
     fn code(&self, settings: &dft::Settings, seeds: &[NamedSeed]) -> Result<Value, ConfigError> {
         let key = format!("label.method.{}", settings.name());
         let at = || place(self.path, self.text, &key);
@@ -231,7 +232,7 @@ impl Loader<'_> {
     }
 }
 
-/// Features of one structure after another.
+/// Computes features of structures one after another.
 struct Features {
     grace: Grace,
     neighbours: NeighbourList,
@@ -257,7 +258,7 @@ impl Features {
     }
 }
 
-/// Refuses an artifact whose numbers no training data can have made.
+/// Refuses an artifact whose numbers cannot come from training data.
 pub fn check_sound(artifact: &Artifact, path: &Path) -> Result<(), String> {
     let faults = artifact.unsound_components();
     let Some(first) = faults.first() else { return Ok(()) };
@@ -271,7 +272,7 @@ pub fn check_sound(artifact: &Artifact, path: &Path) -> Result<(), String> {
     ))
 }
 
-/// What is wrong with an artifact; an export, and an artifact stripped of its statistics, are mistaken for one easily.
+/// Explains why an artifact is invalid. Users easily confuse it with an export or an artifact without statistics.
 fn why_no_artifact(path: &Path, error: &ArtifactError) -> String {
     let stripped = matches!(error, ArtifactError::Missing { key, .. } if key.starts_with("scatter_") || key.starts_with("counts_"));
     if stripped || Artifact::load_export(path).is_ok() {

@@ -1,4 +1,4 @@
-//! Reading seed structures, and looking whether walks can begin there and find something.
+//! Reads the seed structures and checks that walks can start from them.
 
 use std::collections::HashMap;
 
@@ -14,12 +14,12 @@ use crate::config::{ConfigError, Warning, place};
 
 const FILES: &str = "seeds.files";
 
-/// Nearest neighbours of solids and molecules are 0.79 to 1.48 times the sum of their radii (U, H₂) apart; the same numbers taken
-/// for Bohr, or Bohr taken for Å, are a factor of 1.89 off.
+/// Nearest neighbours of solids and molecules are 0.79 to 1.48 times the sum of their radii (U, H₂) apart. Confusing
+/// Bohr and Å changes distances by a factor of 1.89.
 const USUAL_BONDS: std::ops::RangeInclusive<f64> = 0.65..=1.5;
 
 impl Loader<'_> {
-    /// Every frame of every file, by a name of its own.
+    /// Reads every frame of every file. Names must be unique.
     pub fn seeds(&self, model: &GraceModel) -> Result<Vec<NamedSeed>, ConfigError> {
         let mut seeds: Vec<NamedSeed> = Vec::new();
         for file in &self.config.seeds.files {
@@ -46,8 +46,8 @@ impl Loader<'_> {
         Ok(seeds)
     }
 
-    /// A walk must be able to start and to find something: elements that the model knows, no atom on top of another,
-    /// none out of reach of all others, as many as the collection rule asks for, a cell for the volume ramp.
+    /// Checks that a walk can start and collect: the model knows the elements, no atoms overlap, each atom has a
+    /// neighbour, there are as many atoms as the collection rule requires, and a volume ramp has a cell.
     fn check_seed(&self, structure: &Structure, model: &GraceModel) -> Result<(), String> {
         structure.validate().map_err(|error| error.to_string())?;
         model.element_indices(&structure.species).map_err(|error| error.to_string())?;
@@ -91,7 +91,7 @@ impl Loader<'_> {
         Ok(())
     }
 
-    /// What is possible and hardly meant: the same structure twice, and distances that no elements have.
+    /// Warns of likely mistakes: duplicate structures and distances that do not match the elements.
     pub fn doubtful_seeds(&self, seeds: &[NamedSeed], model: &GraceModel) -> Vec<Warning> {
         let mut first = HashMap::new();
         let mut warnings = Vec::new();
@@ -116,22 +116,22 @@ impl Loader<'_> {
     }
 }
 
-/// The structure with its lengths rounded to what files print, Å.
+/// The structure with lengths rounded to the precision of files, Å.
 fn rounded(structure: &Structure) -> Structure {
     const DIGIT: f64 = 1e-4;
     let mut structure = structure.clone();
     let lengths = structure.cell.0.iter_mut().chain(&mut structure.positions).flatten();
-    // −0 is 0.
+    // Turns −0 into 0.
     lengths.for_each(|x| *x = (*x / DIGIT).round() * DIGIT + 0.0);
     structure
 }
 
-/// What is strange about the distances of nearest neighbours, if they are not those of the elements.
+/// Describes nearest-neighbour distances that do not match the elements.
 fn strange_distances(structure: &Structure, cutoff: f64) -> Option<String> {
     let mut neighbours = NeighbourList::new(cutoff, 0.0);
     neighbours.update(structure).ok()?;
     let mut bonds = Vec::new();
-    // Of each atom the neighbour that is nearest for its size: distance, and the same by the sum of radii.
+    // For each atom, the nearest neighbour relative to the radii: distance, and distance divided by the sum of radii.
     let mut nearest: Vec<(f64, f64)> = (0..structure.len())
         .filter_map(|i| {
             neighbours.bonds_within(structure, i, cutoff, &mut bonds);

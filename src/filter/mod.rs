@@ -1,4 +1,4 @@
-//! Conditions on structures, as `gamma > 2 and element = Mo`: a small language, described in docs/export.md.
+//! Filters on structures, such as `gamma > 2 and element = Mo`. docs/export.md describes the language.
 
 mod parse;
 #[cfg(test)]
@@ -11,7 +11,7 @@ use atoms::Species;
 
 pub use parse::FilterError;
 
-/// What is known of a structure that a condition is put to. What is not there meets no comparison.
+/// Properties of a structure. A comparison with a missing property is false.
 #[derive(Clone, Debug, Default)]
 pub struct StructureProperties<'a> {
     /// Largest γ under the original mixture.
@@ -32,7 +32,7 @@ pub struct StructureProperties<'a> {
     pub energy: Option<f64>,
     /// Largest force of the label, eV/Å.
     pub max_force: Option<f64>,
-    /// The elements of its atoms, an entry an atom; none if they are not known.
+    /// The element of each atom. Empty if unknown.
     pub species: &'a [Species],
     /// `biased`, `control` or `imported`.
     pub kind: &'a str,
@@ -40,22 +40,22 @@ pub struct StructureProperties<'a> {
     pub seed: Option<&'a str>,
 }
 
-/// A condition.
+/// A filter expression.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Filter {
-    /// A number beside another.
-    NumberField(NumberField, Comparison, f64),
-    /// A text that is, or is not, another.
-    TextField(TextField, bool, String),
-    /// Not that.
+    /// Compares a number.
+    Number(NumberField, Comparison, f64),
+    /// Whether a text equals (`true`) or differs from (`false`) a value.
+    Text(TextField, bool, String),
+    /// Negation.
     Not(Box<Filter>),
-    /// Both.
+    /// Conjunction.
     And(Box<Filter>, Box<Filter>),
-    /// One or both.
+    /// Disjunction.
     Or(Box<Filter>, Box<Filter>),
 }
 
-/// How numbers are compared.
+/// Comparison operators for numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Comparison {
     /// `=`
@@ -80,7 +80,7 @@ macro_rules! names {
         pub enum $type { $($variant),* }
 
         impl $type {
-            /// Each with its name.
+            /// Every variant with its name.
             pub const ALL: &[(Self, &str)] = &[$((Self::$variant, $name)),*];
 
             fn name(self) -> &'static str {
@@ -91,7 +91,7 @@ macro_rules! names {
 }
 
 names! {
-    /// What is a number.
+    /// Numeric properties.
     NumberField {
         Gamma "gamma", GammaNbr "gamma_nbr", Volume "volume", Temperature "temperature", Walk "walk", Step "step",
         MixtureVersion "mixture_version", Atoms "atoms", Energy "energy", EnergyPerAtom "energy_per_atom",
@@ -100,18 +100,18 @@ names! {
 }
 
 names! {
-    /// What is a text.
+    /// Text properties.
     TextField { Element "element", Kind "kind", Seed "seed" }
 }
 
 impl Filter {
-    /// Whether a structure meets it.
+    /// Whether a structure passes the filter.
     pub fn matches(&self, facts: &StructureProperties<'_>) -> bool {
         match self {
-            Self::NumberField(column, comparison, value) => {
+            Self::Number(column, comparison, value) => {
                 facts.number(*column).is_some_and(|number| comparison.holds(number, *value))
             }
-            Self::TextField(column, wanted, value) => {
+            Self::Text(column, wanted, value) => {
                 facts.is_text(*column, value).is_some_and(|found| found == *wanted)
             }
             Self::Not(condition) => !condition.matches(facts),
@@ -122,11 +122,11 @@ impl Filter {
 }
 
 impl Filter {
-    /// The names that stand in it, as they are written.
+    /// The property names in the expression, in order.
     pub fn names(&self) -> Vec<&'static str> {
         match self {
-            Self::NumberField(column, ..) => vec![column.name()],
-            Self::TextField(column, ..) => vec![column.name()],
+            Self::Number(column, ..) => vec![column.name()],
+            Self::Text(column, ..) => vec![column.name()],
             Self::Not(condition) => condition.names(),
             Self::And(left, right) | Self::Or(left, right) => [left.names(), right.names()].concat(),
         }
@@ -175,7 +175,7 @@ impl StructureProperties<'_> {
         }
     }
 
-    /// Whether the text is this one; of elements, whether one of the atoms is it.
+    /// Whether the text equals `value`. An element matches if any atom has it.
     fn is_text(&self, column: TextField, value: &str) -> Option<bool> {
         match column {
             TextField::Element if self.species.is_empty() => None,
@@ -186,7 +186,7 @@ impl StructureProperties<'_> {
     }
 }
 
-/// The atoms of a formula as `Al31Mo`, an entry an atom.
+/// The species of each atom of a formula such as `Al31Mo`.
 pub fn species(formula: &str) -> Vec<Species> {
     let mut species = Vec::new();
     let mut rest = formula;
@@ -212,14 +212,14 @@ impl FromStr for Filter {
     }
 }
 
-/// As it can be read again.
+/// Writes the expression so that it can be parsed again.
 impl fmt::Display for Filter {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::NumberField(column, comparison, value) => {
+            Self::Number(column, comparison, value) => {
                 write!(f, "{} {} {value:?}", column.name(), comparison.sign())
             }
-            Self::TextField(column, wanted, value) => {
+            Self::Text(column, wanted, value) => {
                 let quote = if value.contains('\'') { '"' } else { '\'' };
                 let sign = if *wanted { "=" } else { "!=" };
                 write!(f, "{} {sign} {quote}{value}{quote}", column.name())

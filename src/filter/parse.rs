@@ -1,16 +1,16 @@
-//! Reading a condition, by recursive descent: `or` of `and`s of comparisons, `not` and parentheses.
+//! Parses filters by recursive descent: `or` of `and`s of comparisons, `not` and parentheses.
 
 use atoms::Species;
 
 use super::{Comparison, Filter, NumberField, TextField};
 use crate::config::nearest;
 
-/// Parentheses and `not` inside each other, at most: each takes some of the stack.
+/// Maximum nesting of parentheses and `not`, which limits recursion.
 const MAX_DEPTH: usize = 100;
 
 const KINDS: [&str; 3] = ["biased", "control", "imported"];
 
-/// What else a quantity may be called.
+/// Synonyms of property names, for hints.
 const SYNONYMS: [(&str, &str); 12] = [
     ("gamma_max", "gamma"),
     ("grade", "gamma"),
@@ -26,19 +26,19 @@ const SYNONYMS: [(&str, &str); 12] = [
     ("version", "mixture_version"),
 ];
 
-/// A text that is no condition.
+/// A text that is no filter expression.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("at character {position}: found {found}, expected {expected}")]
 pub struct FilterError {
-    /// Where, from 1.
+    /// Position of the character, from 1.
     pub position: usize,
-    /// What stands there.
+    /// What is there.
     pub found: String,
-    /// What should.
+    /// What should be there.
     pub expected: String,
 }
 
-/// A word, a number, a sign or a text in quotes.
+/// A word or number, a quoted text, or an operator.
 #[derive(Clone, Debug, PartialEq)]
 enum Token {
     Word(String),
@@ -48,8 +48,8 @@ enum Token {
 }
 
 struct Parser {
-    /// With their places, the end last.
-    tokenize: Vec<(usize, Token)>,
+    /// With their positions. The last one is the end.
+    tokens: Vec<(usize, Token)>,
     next: usize,
     depth: usize,
 }
@@ -58,24 +58,24 @@ struct Parser {
 const SYMBOLS: [&str; 8] = ["!=", "<=", ">=", "=", "<", ">", "(", ")"];
 
 pub(super) fn parse(text: &str) -> Result<Filter, FilterError> {
-    let mut parser = Parser { tokenize: tokenize(text)?, next: 0, depth: 0 };
-    let condition = parser.any()?;
+    let mut parser = Parser { tokens: tokenize(text)?, next: 0, depth: 0 };
+    let condition = parser.disjunction()?;
     match parser.peek() {
         Token::End => Ok(condition),
-        _ => Err(parser.wrong("'and', 'or' or the end")),
+        _ => Err(parser.error("'and', 'or' or the end")),
     }
 }
 
 fn tokenize(text: &str) -> Result<Vec<(usize, Token)>, FilterError> {
     let characters: Vec<char> = text.chars().collect();
-    let (mut tokenize, mut at) = (Vec::new(), 0);
+    let (mut tokens, mut at) = (Vec::new(), 0);
     while let Some(&character) = characters.get(at) {
         let rest = &characters[at..];
         let begins = |sign: &&&str| sign.chars().zip(rest).filter(|(a, b)| a == *b).count() == sign.len();
         if character.is_whitespace() {
             at += 1;
         } else if let Some(sign) = SYMBOLS.iter().find(begins) {
-            tokenize.push((at, Token::Symbol(sign)));
+            tokens.push((at, Token::Symbol(sign)));
             at += sign.len();
         } else if matches!(character, '\'' | '"') {
             let Some(length) = rest[1..].iter().position(|c| *c == character) else {
@@ -86,7 +86,7 @@ fn tokenize(text: &str) -> Result<Vec<(usize, Token)>, FilterError> {
                     expected: format!("another {character} behind it"),
                 });
             };
-            tokenize.push((at, Token::Quoted(rest[1..=length].iter().collect())));
+            tokens.push((at, Token::Quoted(rest[1..=length].iter().collect())));
             at += length + 2;
         } else {
             let is_word_character = |c: &&char| c.is_alphanumeric() || matches!(c, '_' | '.' | '-' | '+');
@@ -103,28 +103,28 @@ fn tokenize(text: &str) -> Result<Vec<(usize, Token)>, FilterError> {
                 return Err(FilterError { position: at + 1, found, expected });
             }
             let length = word.chars().count();
-            tokenize.push((at, Token::Word(word)));
+            tokens.push((at, Token::Word(word)));
             at += length;
         }
     }
-    tokenize.push((characters.len(), Token::End));
-    Ok(tokenize)
+    tokens.push((characters.len(), Token::End));
+    Ok(tokens)
 }
 
 impl Parser {
     fn peek(&self) -> &Token {
-        // The end is never passed.
-        &self.tokenize[self.next.min(self.tokenize.len() - 1)].1
+        // The parser never passes the end.
+        &self.tokens[self.next.min(self.tokens.len() - 1)].1
     }
 
     fn take(&mut self) -> Token {
         let token = self.peek().clone();
-        self.next = (self.next + 1).min(self.tokenize.len() - 1);
+        self.next = (self.next + 1).min(self.tokens.len() - 1);
         token
     }
 
-    fn wrong(&self, expected: impl Into<String>) -> FilterError {
-        let (position, token) = &self.tokenize[self.next];
+    fn error(&self, expected: impl Into<String>) -> FilterError {
+        let (position, token) = &self.tokens[self.next];
         let found = match token {
             Token::Word(word) | Token::Quoted(word) => format!("'{word}'"),
             Token::Symbol(sign) => format!("'{sign}'"),
@@ -133,7 +133,7 @@ impl Parser {
         FilterError { position: position + 1, found, expected: expected.into() }
     }
 
-    /// Takes the keyword, if it is next.
+    /// Consumes the keyword if it is next.
     fn keyword(&mut self, keyword: &str) -> bool {
         let is_next = matches!(self.peek(), Token::Word(word) if word.eq_ignore_ascii_case(keyword));
         if is_next {
@@ -142,34 +142,34 @@ impl Parser {
         is_next
     }
 
-    fn any(&mut self) -> Result<Filter, FilterError> {
-        let mut left = self.all()?;
+    fn disjunction(&mut self) -> Result<Filter, FilterError> {
+        let mut left = self.conjunction()?;
         while self.keyword("or") {
-            left = Filter::Or(Box::new(left), Box::new(self.all()?));
+            left = Filter::Or(Box::new(left), Box::new(self.conjunction()?));
         }
         Ok(left)
     }
 
-    fn all(&mut self) -> Result<Filter, FilterError> {
-        let mut left = self.one()?;
+    fn conjunction(&mut self) -> Result<Filter, FilterError> {
+        let mut left = self.operand()?;
         while self.keyword("and") {
-            left = Filter::And(Box::new(left), Box::new(self.one()?));
+            left = Filter::And(Box::new(left), Box::new(self.operand()?));
         }
         Ok(left)
     }
 
-    fn one(&mut self) -> Result<Filter, FilterError> {
+    fn operand(&mut self) -> Result<Filter, FilterError> {
         if self.depth == MAX_DEPTH {
-            return Err(self.wrong(format!("at most {MAX_DEPTH} parentheses and 'not' inside each other")));
+            return Err(self.error(format!("at most {MAX_DEPTH} parentheses and 'not' inside each other")));
         }
         self.depth += 1;
         let condition = if self.keyword("not") {
-            Filter::Not(Box::new(self.one()?))
+            Filter::Not(Box::new(self.operand()?))
         } else if *self.peek() == Token::Symbol("(") {
             self.take();
-            let inside = self.any()?;
+            let inside = self.disjunction()?;
             if *self.peek() != Token::Symbol(")") {
-                return Err(self.wrong("'and', 'or' or ')'"));
+                return Err(self.error("'and', 'or' or ')'"));
             }
             self.take();
             inside
@@ -183,24 +183,24 @@ impl Parser {
     fn comparison(&mut self) -> Result<Filter, FilterError> {
         let name = match self.peek() {
             Token::Word(name) => name.clone(),
-            _ => return Err(self.wrong(names())),
+            _ => return Err(self.error(names())),
         };
         if let Some((column, _)) = NumberField::ALL.iter().find(|(_, known)| *known == name) {
             self.take();
             let comparison = self.comparison_sign()?;
-            return Ok(Filter::NumberField(*column, comparison, self.number()?));
+            return Ok(Filter::Number(*column, comparison, self.number()?));
         }
         let Some((column, _)) = TextField::ALL.iter().find(|(_, known)| *known == name) else {
-            return Err(self.wrong(format!("{}{}", names(), hint(&name, all_names()))));
+            return Err(self.error(format!("{}{}", names(), hint(&name, all_names()))));
         };
         self.take();
         let wanted = match self.peek() {
             Token::Symbol("=") => true,
             Token::Symbol("!=") => false,
-            _ => return Err(self.wrong(format!("= or != behind {name}"))),
+            _ => return Err(self.error(format!("= or != behind {name}"))),
         };
         self.take();
-        Ok(Filter::TextField(*column, wanted, self.text(*column)?))
+        Ok(Filter::Text(*column, wanted, self.text(*column)?))
     }
 
     fn comparison_sign(&mut self) -> Result<Comparison, FilterError> {
@@ -211,7 +211,7 @@ impl Parser {
             Token::Symbol("<=") => Comparison::AtMost,
             Token::Symbol(">") => Comparison::Above,
             Token::Symbol(">=") => Comparison::AtLeast,
-            _ => return Err(self.wrong("one of = != < <= > >=")),
+            _ => return Err(self.error("one of = != < <= > >=")),
         };
         self.take();
         Ok(comparison)
@@ -222,22 +222,22 @@ impl Parser {
             Token::Word(word) => word.parse().ok().filter(|number: &f64| number.is_finite()),
             _ => None,
         };
-        let number = number.ok_or_else(|| self.wrong("a number"))?;
+        let number = number.ok_or_else(|| self.error("a number"))?;
         self.take();
         Ok(number)
     }
 
     fn text(&mut self, column: TextField) -> Result<String, FilterError> {
         let (Token::Word(text) | Token::Quoted(text)) = self.peek().clone() else {
-            return Err(self.wrong("a word, or a text in quotes"));
+            return Err(self.error("a word, or a text in quotes"));
         };
         match column {
             TextField::Element if text.parse::<Species>().is_err() => {
-                return Err(self.wrong("the symbol of an element, as Mo"));
+                return Err(self.error("the symbol of an element, as Mo"));
             }
             TextField::Kind if !KINDS.contains(&text.as_str()) => {
                 let kinds = KINDS.join(", ").replace(", imported", " or imported");
-                return Err(self.wrong(format!("{kinds}{}", hint(&text, KINDS.into_iter()))));
+                return Err(self.error(format!("{kinds}{}", hint(&text, KINDS.into_iter()))));
             }
             _ => {}
         }
@@ -254,7 +254,7 @@ fn names() -> String {
     format!("'not', '(' or one of {}", all_names().collect::<Vec<_>>().join(", "))
 }
 
-/// The name that was meant, if one is near.
+/// Suggests the name that was likely meant.
 fn hint<'a>(found: &str, names: impl Iterator<Item = &'a str> + Clone) -> String {
     let synonym =
         SYNONYMS.iter().find(|(other, _)| *other == found.to_ascii_lowercase()).map(|(_, name)| *name);

@@ -85,11 +85,11 @@ fn conditions() -> impl Strategy<Value = Filter> {
         proptest::sample::select(NumberField::ALL.iter().map(|(column, _)| *column).collect::<Vec<_>>());
     let comparison = proptest::sample::select(vec![Equal, Different, Below, AtMost, Above, AtLeast]);
     let finite = any::<f64>().prop_filter("finite", |x| x.is_finite());
-    let numbers = (number, comparison, finite).prop_map(|(a, b, c)| Filter::NumberField(a, b, c));
+    let numbers = (number, comparison, finite).prop_map(|(a, b, c)| Filter::Number(a, b, c));
     let seed = ("[a-zé' ()=0-9]{0,12}", any::<bool>())
-        .prop_map(|(name, equal)| Filter::TextField(TextField::Seed, equal, name));
+        .prop_map(|(name, equal)| Filter::Text(TextField::Seed, equal, name));
     let element = proptest::sample::select(vec!["Al", "Mo"]);
-    let element = element.prop_map(|symbol| Filter::TextField(TextField::Element, true, symbol.to_owned()));
+    let element = element.prop_map(|symbol| Filter::Text(TextField::Element, true, symbol.to_owned()));
     prop_oneof![numbers, seed, element].prop_recursive(5, 40, 2, |inner| {
         let pair = (inner.clone(), inner.clone());
         prop_oneof![

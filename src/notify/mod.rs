@@ -1,5 +1,5 @@
-//! What the owner of a campaign is told of, each thing once: the core, which knows neither clock nor store. `actors/notify` is its
-//! shell.
+//! Decides which events to report to the owner of a campaign, each once. This core knows neither clock nor store;
+//! `runtime/notify` runs it.
 
 use std::collections::BTreeMap;
 
@@ -12,47 +12,47 @@ use crate::output::count;
 use crate::walk_ends::WalkEnds;
 
 const MINUTE: f64 = 60_000.0;
-/// What was told last of forgetting, while the alarm holds.
+/// Stored for the event `forgetting` while the alarm is raised.
 const ALARM_RAISED: &str = "holds";
 
-/// Under which name it is kept in the store what was told.
+/// Metadata key under which the store keeps what was reported.
 pub const METADATA_KEY: &str = "notified";
 
-/// What was told last, by the name of the event: also by earlier runs.
+/// What was last reported of each event, by this run or earlier ones.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(transparent)]
 pub struct SentNotifications(BTreeMap<String, String>);
 
-/// Something that has happened.
+/// An event to report.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Notification {
-    /// What.
+    /// Kind of the event.
     pub event: NotifyEvent,
-    /// In words.
+    /// Text of the message.
     pub message: String,
 }
 
-/// Looks at a campaign again and again.
+/// Tracks the state of a campaign and finds new events.
 #[derive(Debug)]
 pub struct NotificationTracker {
     settings: NotifySection,
     sent: SentNotifications,
-    /// Candidates and labels so far, and since when there are no more, ms.
+    /// Number of candidates and labels, and since when it has not changed, ms.
     idle_since: Option<((u64, u64), i64)>,
 }
 
 impl NotificationTracker {
-    /// Goes on where others left off.
+    /// Continues from the events that earlier runs reported.
     pub fn new(settings: NotifySection, sent: SentNotifications) -> Self {
         Self { settings, sent, idle_since: None }
     }
 
-    /// What was told, with what is due.
+    /// All reported events, including those returned last.
     pub fn sent(&self) -> &SentNotifications {
         &self.sent
     }
 
-    /// What there is to tell of a campaign that stands so at the time `now`, ms since 1970.
+    /// Returns the events of a campaign with this status at the time `now`, ms since 1970.
     pub fn check(&mut self, status: &Status, now: i64) -> Vec<Notification> {
         let candidates = status.candidates.seen + status.candidates.control;
         let labels = status.budget.used.labels + status.labels.failed;
@@ -77,8 +77,8 @@ impl NotificationTracker {
         due
     }
 
-    /// What there is to tell of a mixture of which this share of the training atoms has γ > 1; `raised` is whether the selector
-    /// found that to be an alarm.
+    /// Returns an event if the forgetting alarm is raised or cleared. `share` is that of training atoms with γ > 1,
+    /// `raised` the selector's check.
     pub fn check_training(
         &mut self,
         forgetting: &ForgettingRule,
@@ -96,7 +96,7 @@ impl NotificationTracker {
         }
     }
 
-    /// A run could not go on. That is news each time.
+    /// Reports that a run cannot go on, every time.
     pub fn failed(&mut self, why: &str) -> Option<Notification> {
         let event = NotifyEvent::Failure;
         self.is_wanted(event)
@@ -118,7 +118,7 @@ impl NotificationTracker {
         self.due(NotifyEvent::Stall, shown, message)
     }
 
-    /// Every so many.
+    /// Reports every `notify.failed_labels` failures.
     fn failed_labels(&mut self, failed: u64) -> Option<Notification> {
         let each = u64::from(self.settings.failed_labels.get());
         let reached = failed / each * each;
@@ -133,7 +133,7 @@ impl NotificationTracker {
         self.due(NotifyEvent::FailedLabels, reached.to_string(), message)
     }
 
-    /// Once a campaign.
+    /// Reports once per campaign.
     fn failing_walks(&mut self, ends: &WalkEnds) -> Option<Notification> {
         if !ends.is_alarming() {
             return None;
@@ -145,7 +145,7 @@ impl NotificationTracker {
         self.settings.on.contains(&event)
     }
 
-    /// An event that was not told yet: `identity` tells it from others of its kind.
+    /// Returns an event unless it was reported already. `identity` distinguishes events of one kind.
     fn due(&mut self, event: NotifyEvent, identity: String, message: String) -> Option<Notification> {
         if !self.is_wanted(event) || self.sent.0.get(event.name()) == Some(&identity) {
             return None;
@@ -185,7 +185,7 @@ mod tests {
             status.candidates.seen = seen;
             assert_eq!(watch.check(&status, minute * MINUTES).len(), expected, "{minute}");
         }
-        // Also over a restart.
+        // A restart does not repeat it.
         let mut next = NotificationTracker::new(NotifySection::default(), watch.sent().clone());
         for minute in [1000, 2000] {
             assert_eq!(next.check(&status, minute * MINUTES), []);

@@ -1,4 +1,4 @@
-//! Decisions and candidates from the store through the replay, a few at a time.
+//! Feeds decisions and candidates from the store to the replay.
 
 use std::collections::VecDeque;
 use std::panic::resume_unwind;
@@ -17,11 +17,11 @@ use crate::runtime::cores;
 
 /// Decisions read at a time.
 const PAGE_ROWS: i64 = 500;
-/// Candidates that are examined by a core one after the other: the more, the likelier under a mixture that is not any
-/// more in force when they are decided.
+/// Candidates that each core grades per batch. With more of them, the mixture is more often outdated when they are
+/// decided.
 const CANDIDATES_PER_CORE: u32 = 8;
 
-/// Follows the log as far as decision `last`, or until something differs or is missing.
+/// Follows the log up to decision `last`, or until something differs or is missing.
 pub async fn follow(
     store: &Store,
     replay: &mut Replay,
@@ -66,15 +66,15 @@ fn damaged(decision: i64, problem: &str) -> Failure {
     ))
 }
 
-/// A candidate as it was stored, without its arrays, and examined; not, if its features were not kept.
+/// A stored candidate without its arrays, and graded unless its features were not kept.
 struct PrefetchedCandidate {
     stored: StoredCandidate,
     examined: Option<Result<Examined, SelectorError>>,
 }
 
-/// Candidates behind a place of the log.
+/// Candidates after a position in the log.
 struct Prefetch {
-    /// Whether those of control walks are needed too.
+    /// Whether candidates of control walks are needed.
     control: bool,
     ready: VecDeque<PrefetchedCandidate>,
 }
@@ -84,7 +84,7 @@ impl Prefetch {
         Self { control, ready: VecDeque::new() }
     }
 
-    /// The candidate of a decision; those between the last one and it were not needed.
+    /// The candidate of a decision. Skips candidates that were not needed.
     async fn take(
         &mut self,
         store: &Store,
@@ -102,7 +102,7 @@ impl Prefetch {
     }
 }
 
-/// Examines candidates on every core.
+/// Grades candidates on every core.
 fn examine(
     stored: Vec<StoredCandidate>,
     examiner: &Examiner,

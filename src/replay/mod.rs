@@ -1,5 +1,5 @@
-//! The recorded candidates of a campaign once more before its selector, by its own rules or by others: no dynamics, no
-//! labels.
+//! Replays the recorded candidates of a campaign through its selector, by its own rules or others. Runs no dynamics
+//! and makes no labels.
 
 mod follow;
 mod overrides;
@@ -25,7 +25,7 @@ pub use report::{FateChange, FateCounts, MissingFeatures, Report};
 
 const BAR: &str = "{bar:32} {pos}/{len} decisions  {eta} left";
 
-/// Replays the campaign in a store to where it stands now.
+/// Replays the campaign in a store up to its current state.
 pub async fn replay(
     store: &Store,
     settings: &[RuleOverride],
@@ -47,7 +47,7 @@ pub async fn replay(
     Ok(report)
 }
 
-/// The selector's judge before the first decision.
+/// The selector's state before the first decision.
 async fn open(store: &Store, config: &Config, settings: &[RuleOverride]) -> Result<Replay, Failure> {
     let (model, artifact, training) = campaign::load_for_grades(config, Path::new("(the campaign)"))?;
     let seeds = store.seed_structures().await?.into_iter();
@@ -65,7 +65,7 @@ async fn open(store: &Store, config: &Config, settings: &[RuleOverride]) -> Resu
     replay.map_err(failure)
 }
 
-/// Whether the campaign began on another kind of processor than this one.
+/// Whether the campaign began on a processor with other instruction sets.
 fn is_other_processor(resolved: &Value) -> bool {
     resolved["instructions"].as_str().is_some_and(|then| then != campaign::instructions())
 }

@@ -1,4 +1,4 @@
-//! The configuration that a campaign began with, some of its rules replaced.
+//! Overrides rules of the configuration that a campaign began with.
 
 use std::str::FromStr;
 
@@ -7,7 +7,7 @@ use toml::{Table, Value};
 use crate::config::{Config, impossible, in_plain_words};
 use crate::exit_status::Failure;
 
-/// Keys that act on what the selector decides. What they do to walks has been done: those are as they were recorded.
+/// Keys that affect the selector's decisions. Their effect on walks is recorded and does not change.
 const KEYS: [&str; 11] = [
     "budget.labels",
     "calm.combination",
@@ -22,10 +22,10 @@ const KEYS: [&str; 11] = [
     "guard.least_distance_fraction",
 ];
 
-/// Another value for a key, as `key=value`.
+/// A key with another value, as `key=value`.
 #[derive(Clone, Debug)]
 pub struct RuleOverride {
-    /// Dotted key, of one of the [`KEYS`] or of something in it.
+    /// Dotted key: one of [`KEYS`] or a key below it.
     pub key: String,
     /// Its value.
     pub value: Value,
@@ -48,16 +48,16 @@ impl FromStr for RuleOverride {
 }
 
 impl RuleOverride {
-    /// Which of the [`KEYS`] it is, or lies in.
+    /// Which of the [`KEYS`] it is or belongs to.
     pub fn base_key(&self) -> &'static str {
         find_key(&self.key).unwrap_or_default()
     }
 }
 
 impl RuleOverride {
-    /// The key by which the log speaks of it.
+    /// Name of the key in the decision log.
     pub fn rule(&self) -> &'static str {
-        // One limit of structures, whoever sets it.
+        // Both keys limit the number of structures, and the log records one limit.
         if self.base_key() == "budget.labels" { "collect.total" } else { self.base_key() }
     }
 }
@@ -67,7 +67,7 @@ fn find_key(key: &str) -> Option<&'static str> {
     KEYS.into_iter().find(is_in)
 }
 
-/// A value in TOML; the quotes of a single word may be left out, since the shell takes them away.
+/// Parses a TOML value. A single word needs no quotes, since the shell removes them.
 fn parse(value: &str) -> Result<Value, String> {
     let is_word = value.starts_with(|c: char| c.is_ascii_lowercase())
         && value.chars().all(|c| c.is_ascii_lowercase() || c == '_')
@@ -79,7 +79,7 @@ fn parse(value: &str) -> Result<Value, String> {
     table.remove("value").ok_or_else(|| "expected a value".to_owned())
 }
 
-/// The configuration of the text `stored`, with these settings.
+/// Parses the configuration `stored` and applies these overrides.
 pub fn configuration(stored: &str, settings: &[RuleOverride]) -> Result<Config, Failure> {
     let unreadable = |error: String| {
         Failure::Input(format!(

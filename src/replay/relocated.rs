@@ -1,4 +1,4 @@
-//! Where the files are that grades depend on.
+//! Locates the files that determine grades.
 
 use std::path::{Path, PathBuf};
 
@@ -7,22 +7,22 @@ use serde_json::Value;
 use crate::config::Config;
 use crate::exit_status::Failure;
 
-/// Files that are elsewhere than where the campaign last found them.
+/// Files that are not where the campaign last found them.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct RelocatedFiles {
-    /// The model, if it is not any more where the campaign last found it
+    /// Path of the model, if it has moved since the last run
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// The artifact, the same
+    /// Path of the artifact, if it has moved
     #[arg(long, value_name = "FILE")]
     artifact: Option<PathBuf>,
-    /// The training frames, the same
+    /// Path of the training frames, if they have moved
     #[arg(long, value_name = "FILE")]
     training_frames: Option<PathBuf>,
 }
 
-/// Puts into `config` where the files are: as said, or as the campaign last found them (`found`, paths by key), and checks
-/// that they are those that it began with.
+/// Sets the paths in `config`, from the options or from where the campaign last found them (`found`, paths by key).
+/// Checks that the contents are those that the campaign began with.
 pub fn find(
     config: &mut Config,
     resolved: &Value,

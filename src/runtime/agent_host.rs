@@ -1,4 +1,4 @@
-//! An agent at work: walkers in processes of their own on this host, and a line to the orchestrator on another.
+//! Runs an agent: starts walkers as processes on this host and connects them to the orchestrator on another.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -27,11 +27,12 @@ use crate::output::{count, log_and_print, log_and_warn};
 use crate::process_config::{self, AgentConfig, WalkerConfig};
 use crate::web::agent_metrics::AgentState;
 
-/// Between two looks at the walkers, for those who watch.
+/// Interval at which the walkers' states are published for the agent's metrics.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Works for a campaign until it is over or this process is asked to stop. What is needed in the meantime lies in
-/// `directory`. To be awaited on the main thread: the walkers end with the thread that starts them.
+/// Works for a campaign until it is over or this process is asked to stop. Temporary files are kept in `directory`.
+///
+/// Await this on the main thread: the walkers end with the thread that starts them.
 pub async fn run(
     address: &Address,
     tls: Option<&Tls>,
@@ -83,7 +84,7 @@ pub async fn run(
     Ok(ended)
 }
 
-/// Waits until there is an orchestrator, a place with it, and what its walkers need.
+/// Waits until the orchestrator admits this agent, and loads what the walkers need.
 async fn join(
     address: &Address,
     tls: Option<&Tls>,
@@ -105,8 +106,8 @@ async fn join(
     }
 }
 
-/// The model's file: the orchestrator's own where this host sees it, else a copy; `None` if the place was lost before it was
-/// here.
+/// Path of the model: the orchestrator's file if this host can read it, otherwise a downloaded copy. `None` if this
+/// agent lost its membership before the download finished.
 async fn model(joined: &Joined, setup: &AgentConfig, directory: &Path) -> Result<Option<PathBuf>, Failure> {
     let hash = &setup.model_hash;
     if process_config::verify_hash(&setup.model, hash).is_ok() {
@@ -124,14 +125,14 @@ async fn model(joined: &Joined, setup: &AgentConfig, directory: &Path) -> Result
     Ok(Some(path))
 }
 
-/// The walkers of this host, and the task that deals turns to them.
+/// The walkers of this host and the task that dispatches assignments to them.
 struct AgentHost {
     walkers: Children,
     state: AgentState,
     line: ipc::Handle,
     dispatching: DispatchTask,
     serving: JoinHandle<Result<(), IpcError>>,
-    /// How the last of them failed, if all were given up.
+    /// How the last walker failed, if all have failed for good.
     given_up: Option<String>,
 }
 
@@ -169,7 +170,7 @@ async fn run_in(
         .await
 }
 
-/// How walkers are started.
+/// Returns the function that launches a walker.
 fn launch(
     setup: &AgentConfig,
     threads: usize,
@@ -193,7 +194,7 @@ fn launch(
 }
 
 impl AgentHost {
-    /// Until every walker is gone and everything is told.
+    /// Runs until every walker has ended and every report is delivered.
     async fn supervise(mut self, stop: &Notify) -> Result<ExitStatus, Failure> {
         let (mut dispatched, mut gone) = (None, false);
         let mut ticks = interval(STATUS_INTERVAL);
@@ -226,7 +227,7 @@ impl AgentHost {
         }
     }
 
-    /// Whether nobody is left.
+    /// Handles an event of a walker process. Returns whether all walkers have ended.
     fn handle(&mut self, event: launcher::Event) -> bool {
         match event {
             launcher::Event::Started { .. } => {}

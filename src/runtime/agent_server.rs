@@ -1,4 +1,4 @@
-//! Agents of other hosts, as the orchestrator sees them.
+//! Serves the agents of other hosts on the orchestrator's side.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,27 +19,27 @@ use crate::exit_status::Failure;
 use crate::output::{count, log_and_print, log_and_warn};
 use crate::process_config::{self, AgentConfig};
 
-/// Where they join, if they may.
+/// Lets agents join if this run listens.
 pub struct AgentServer {
     hub: Option<Hub>,
     store: Store,
     mixture: Arc<Mixture>,
 }
 
-/// Ends it.
+/// Closes the server.
 pub struct Handle(Option<net::Handle>);
 
 impl Handle {
-    /// There is no more work.
+    /// Tells agents that there is no more work.
     pub fn close(&self) {
         self.0.iter().for_each(net::Handle::close);
     }
 }
 
 impl AgentServer {
-    /// Listens where this run is to.
+    /// Starts to listen if the run is configured to.
     pub async fn open(run: RunContext<'_>, session: u64, mixture: &Arc<Mixture>) -> Result<Self, Failure> {
-        // What is to be written down waits here while the database is away.
+        // Writes wait here while the database is unreachable.
         let (store, mixture) = (run.store.clone().patient(SERVER_AWAY), Arc::clone(mixture));
         let Some(listen) = run.listen else { return Ok(Self { hub: None, store, mixture }) };
         let config = &run.campaign.config;
@@ -71,7 +71,7 @@ impl AgentServer {
         Handle(self.hub.as_ref().map(Hub::handle))
     }
 
-    /// Listens to them until there is no more work and the last has left.
+    /// Serves agents until there is no more work and the last agent has left.
     pub async fn run(
         self,
         stopping: Arc<AtomicBool>,
@@ -88,8 +88,8 @@ impl AgentServer {
     }
 }
 
-/// Says what happens to agents: here, in `status`, in the operations log. A database that is busy for a moment can do
-/// without.
+/// Reports the agents' events: on standard error, in `status` and in the operations log. Skips what a busy database
+/// cannot take.
 async fn record_events(store: &Store, mut events: mpsc::UnboundedReceiver<AgentEvent>) {
     let mut records = BTreeMap::new();
     let mut heartbeats = interval(SIGN_OF_LIFE);
@@ -144,7 +144,7 @@ async fn record_event(
     let record = records.entry(agent.id.clone()).or_insert_with(|| ProcessRecord {
         id: agent.id.clone(),
         host: agent.host.clone(),
-        // Not one that this host could see.
+        // This host cannot check whether the process lives.
         birth: String::new(),
         ..ProcessRecord::new(ProcessRecord::AGENT, None, agent.pid, now)
     });

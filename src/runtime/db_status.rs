@@ -1,17 +1,17 @@
-//! Whether the database answers: said once when it does not, and once when it does again.
+//! Reports once when the database becomes unreachable, and once when it answers again.
 
 use store::StoreError;
 
 use crate::output::{log_and_print, log_and_warn};
 
-/// What is known of it.
+/// Whether the database was reachable at the last attempt.
 #[derive(Debug, Default)]
 pub struct DbStatus {
     unreachable: bool,
 }
 
 impl DbStatus {
-    /// Somebody has tried to write to it.
+    /// Takes the result of a write.
     pub fn observe(&mut self, written: &Result<(), StoreError>) {
         match written {
             Err(error) if error.is_transient() => {

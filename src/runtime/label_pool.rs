@@ -1,4 +1,4 @@
-//! The labellers of `calmwalk label`: processes that end with it, and that no run of the campaign takes over.
+//! The labellers of `calmwalk label`. They end with the command, and no run of the campaign adopts them.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -21,27 +21,28 @@ use crate::label_setup::LabelSetup;
 use crate::output::{Bar, log_and_print, print_stderr};
 use crate::process_config::{self, LabellerConfig, PoolConfig};
 
-/// A slot that was asked to stop needs some time beyond its grace to give its label back.
+/// Time beyond its grace period that a stopping labeller has to release its lease.
 const RELEASE_TIME: Duration = Duration::from_secs(10);
 
 const BAR: &str = "{spinner} {pos} labels made  {wide_msg}";
 
-/// What is to be done.
+/// Settings of the pool.
 pub struct LabelPool {
-    /// Labels side by side.
+    /// Number of labellers.
     pub number: u32,
     /// Directory of the campaign, or URL of its store.
     pub location: PathBuf,
-    /// How labels are made.
+    /// How to make labels.
     pub labelling: LabelSetup,
-    /// Whether they leave when the queue is empty and nobody runs the campaign.
+    /// Whether the labellers exit when the queue is empty and no run is active.
     pub until_empty: bool,
-    /// How long labels in hand may take after a stop.
+    /// Time that labels in progress may take after a stop.
     pub grace: Duration,
 }
 
-/// Labels until there is nothing more to do or `stop` is notified. To be awaited on the main thread: the slots end with the
-/// thread that starts them.
+/// Makes labels until there is nothing left to do or `stop` is notified.
+///
+/// Await this on the main thread: the labellers end with the thread that starts them.
 pub async fn run(
     store: &Store,
     pool: LabelPool,
@@ -95,12 +96,12 @@ fn children(pool: LabelPool) -> Children {
     })
 }
 
-/// The slots at work.
+/// The running labellers.
 struct PoolManager<'a> {
     store: &'a Store,
     labellers: Labellers,
     display: Display,
-    /// Whether the database could not be asked at the last try.
+    /// Whether the last attempt to reach the database failed.
     unreachable: bool,
 }
 
@@ -123,7 +124,7 @@ impl PoolManager<'_> {
         Ok(())
     }
 
-    /// Takes in the slots' signs of life, and says what the queue does.
+    /// Reads the labellers' heartbeats and displays the state of the queue.
     async fn update(&mut self) -> Result<(), StoreError> {
         self.labellers.read_heartbeats(self.store, PROVEN_AFTER).await?;
         let jobs = self.store.awaits_labels(unix_milliseconds()).await?;
@@ -132,7 +133,7 @@ impl PoolManager<'_> {
         Ok(())
     }
 
-    /// What may pass is said once; anything else is returned.
+    /// Reports a transient error once and returns any other.
     fn check(&mut self, done: Result<(), StoreError>) -> Result<(), StoreError> {
         match done {
             Ok(()) => self.unreachable = false,
@@ -140,7 +141,7 @@ impl PoolManager<'_> {
                 if !std::mem::replace(&mut self.unreachable, true) {
                     self.display.line(&format!("the store cannot be asked: {error}"));
                 }
-                // They cannot be seen to be alive now.
+                // Their heartbeats cannot be read now.
                 self.labellers.assume_all_alive();
             }
             Err(error) => return Err(error),
@@ -149,11 +150,11 @@ impl PoolManager<'_> {
     }
 }
 
-/// A bar on a terminal, otherwise a line for each label.
+/// Shows a bar on a terminal, otherwise a line for each label.
 struct Display {
     bar: Bar,
     labels: u64,
-    /// What was said of the queue last.
+    /// The last message about the queue.
     queue: String,
 }
 
@@ -165,7 +166,7 @@ impl Display {
                 return self.bar.set(self.labels, || line.to_owned());
             }
         }
-        // It stands in the log already, as that of the slot.
+        // The labeller has logged it already.
         self.bar.suspend(|| print_stderr(format_args!("slot {slot}: {line}")));
     }
 

@@ -1,4 +1,5 @@
-//! The labellers of a campaign: processes that outlive their orchestrator and speak to it through the database only.
+//! The labeller processes of a campaign. They outlive the orchestrator and communicate with it through the database
+//! only.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -7,32 +8,32 @@ use orchestrator::launcher::Children;
 use orchestrator::supervisor::Ended;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 
-/// Labellers at work.
+/// The labeller processes.
 pub struct Labellers {
-    /// Their processes.
+    /// Their child processes.
     pub children: Children,
-    /// The process of each number: others of that number may still be making their last label.
+    /// Current pid of each labeller number. An earlier process of the same number may still be making its last label.
     pids: BTreeMap<u32, u32>,
-    /// The last sign of life of each, and since when it gives them. Its clock may be put right, so it says nothing but that
-    /// there is another.
+    /// The last heartbeat of each labeller, and since when it sends them. The labeller's clock may be adjusted, so a
+    /// heartbeat only counts as different from the one before.
     seen: BTreeMap<u32, (i64, Instant)>,
     /// Attempts before a label counts as failed.
     attempts: u32,
 }
 
 impl Labellers {
-    /// Labellers, of which those in `adopted` (number and process number) are at work.
+    /// Manages `children`, of which those in `adopted` (number and pid) run already.
     pub fn new(children: Children, adopted: BTreeMap<u32, u32>, attempts: u32) -> Self {
         Self { children, pids: adopted, seen: BTreeMap::new(), attempts }
     }
 
-    /// A process was started.
+    /// Records the start of a process.
     pub fn started(&mut self, number: u32, pid: u32) {
         self.pids.insert(number, pid);
         self.seen.remove(&number);
     }
 
-    /// A process ended: what it had leased comes back. Returns its record, if it has one.
+    /// Releases the leases of a process that ended. Returns its record, if it has one.
     pub async fn ended(
         &mut self,
         store: &Store,
@@ -44,7 +45,7 @@ impl Labellers {
         let record = labellers.into_iter().rfind(|record| is_process(record, pid));
         let now = unix_milliseconds();
         if let Some(record) = record.as_ref().filter(|_| ended.ending.is_own_fault()) {
-            // A structure that kills labellers must not do so for ever.
+            // Count the attempt as failed: a structure that kills labellers must not do so for ever.
             let log = ended.ending.to_string();
             store.fail_leases_of(&record.id, "crashed", &log, self.attempts, now).await?;
         }
@@ -52,7 +53,7 @@ impl Labellers {
         Ok(record)
     }
 
-    /// Takes in their signs of life. Those that have given them for longer than `proven` have shown that they are of use.
+    /// Reads their heartbeats. A labeller that has sent them for longer than `proven` counts as working.
     pub async fn read_heartbeats(&mut self, store: &Store, proven: Duration) -> Result<(), StoreError> {
         let signs = self.children.signs();
         let records = store.processes(Some(ProcessRecord::LABELLER)).await?;
@@ -75,14 +76,14 @@ impl Labellers {
         Ok(())
     }
 
-    /// Takes all of them for alive: their signs of life cannot be read.
+    /// Treats all labellers as alive while their heartbeats cannot be read.
     pub fn assume_all_alive(&self) {
         let signs = self.children.signs();
         self.pids.keys().for_each(|number| signs.heard(*number));
     }
 }
 
-/// Of several records with one process number the last is that of the process that had it last.
+/// Pids are reused: among records with the same pid, the last one belongs to the current process.
 fn is_process(record: &ProcessRecord, pid: Option<u32>) -> bool {
     Some(record.pid) == pid && record.is_local()
 }

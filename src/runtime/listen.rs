@@ -1,4 +1,4 @@
-//! Where agents of other hosts find a run.
+//! The endpoint where agents of other hosts reach a run.
 
 use std::fs;
 use std::io::{ErrorKind, Write};
@@ -16,19 +16,19 @@ use crate::output::log_and_warn;
 pub struct Listen {
     /// The address.
     pub endpoint: Endpoint,
-    /// Needed for everything but loopback.
+    /// Certificates. Required unless the address is loopback.
     pub tls: Option<Tls>,
-    /// The file in which agents find it.
+    /// File to announce the endpoint in.
     pub announce: Option<PathBuf>,
-    /// By which name others reach this host.
+    /// Name by which other hosts reach this one.
     pub host: String,
 }
 
 impl Listen {
-    /// Checks the certificates before any work begins, and says what will be wrong with them before long.
+    /// Checks the certificates before any work begins and warns about those that will soon be invalid.
     ///
     /// # Errors
-    /// With these certificates no agent could join.
+    /// Fails if no agent could join with these certificates.
     pub fn check(&self) -> Result<(), Failure> {
         let Some(tls) = &self.tls else { return Ok(()) };
         let checked = tls.check_for_orchestrator().map_err(Failure::input)?;
@@ -43,7 +43,7 @@ impl Listen {
             let fault = CertificateFault::OtherNames { names, host: host.to_owned() };
             return Err(Failure::input(fault.at(&tls.certificate)));
         }
-        // By which name agents connect is not known here, but hardly by that of another host.
+        // The name that agents use is unknown here, but it is hardly that of another host.
         if host.parse::<IpAddr>().is_err() {
             log_and_warn(format_args!(
                 "WARNING: agents cannot connect to {host}: the certificate is for {names}"
@@ -52,19 +52,19 @@ impl Listen {
         Ok(())
     }
 
-    /// Writes down where agents find this run.
+    /// Announces the endpoint in the file.
     pub fn announce(&self, endpoint: &Endpoint) -> Result<(), Failure> {
         let Some(path) = &self.announce else { return Ok(()) };
         let endpoint = endpoint.of_host(&self.host).map_err(Failure::input)?;
         write_announcement(path, &Announcement::At(endpoint))
     }
 
-    /// What an earlier run wrote down does not hold any more.
+    /// Removes the announcement of an earlier run.
     pub fn clear_announcement(&self) -> Result<(), Failure> {
         self.announce.as_deref().map_or(Ok(()), remove)
     }
 
-    /// Writes down that there is no more work, or that nobody is there for the time being.
+    /// Announces that there is no more work, or removes the announcement if the run was interrupted.
     pub fn announce_end(&self, ended: ExitStatus) -> Result<(), Failure> {
         match (self.announce.as_deref(), ended) {
             (None, _) => Ok(()),

@@ -1,4 +1,4 @@
-//! The actors of a campaign at work: in processes of their own, or all in one.
+//! Runs a campaign: walkers and labellers in separate processes, or everything in one process.
 
 pub mod agent_host;
 mod agent_server;
@@ -41,33 +41,33 @@ use crate::output::log_and_print;
 use crate::progress::Display;
 use crate::walk_ends::WalkEnds;
 
-/// Reports under way between walkers and reactor.
+/// Capacity of the channel of reports from walkers to the reactor.
 const CHANNEL: usize = 64;
 
-/// A run of a campaign.
+/// What a run of a campaign needs.
 #[derive(Clone, Copy)]
 pub struct RunContext<'a> {
-    /// All that its configuration names.
+    /// The configuration and the files that it names, loaded.
     pub campaign: &'a Campaign,
-    /// Its database.
+    /// The campaign's database.
     pub store: &'a Store,
-    /// The record of this process.
+    /// The database record of this process.
     pub process: &'a ProcessRecord,
-    /// Its directory.
+    /// The campaign's directory.
     pub directory: &'a Path,
     /// Where agents of other hosts may join.
     pub listen: Option<&'a Listen>,
-    /// Told when a limit of time is reached.
+    /// Notified when a time limit is reached.
     pub over: &'a Arc<Notify>,
 }
 
-/// What is said when a campaign is asked to stop.
+/// Printed when a campaign is asked to stop.
 const STOP_MESSAGE: &str = "stopping: walks are checkpointed …";
 
-/// The reactor at work.
+/// The task that runs the reactor.
 type ReactorTask = tokio::task::JoinHandle<Result<reactor::Ended, reactor::ReactorError>>;
 
-/// Starts the reactor, with a display of what it does.
+/// Starts the reactor and displays its progress.
 fn start_reactor(
     run: RunContext<'_>,
     mut selector: Selector,
@@ -106,7 +106,7 @@ fn start_reactor(
     })
 }
 
-/// Walkers side by side, as the configuration has it.
+/// Number of walkers to run in parallel, from the configuration.
 fn wanted_walkers(campaign: &Campaign) -> u32 {
     match campaign.config.run.walkers {
         0 => (cores() / campaign.config.run.threads.get() as u32).max(1),
@@ -114,15 +114,15 @@ fn wanted_walkers(campaign: &Campaign) -> u32 {
     }
 }
 
-/// Processor cores that this process may use.
+/// Number of processor cores that this process may use.
 pub fn cores() -> u32 {
     let there = thread::available_parallelism().map_or(1, |cores| cores.get()) as u32;
-    // Not every batch system keeps a job to the processors that it was given.
+    // Not every batch system confines a job to its allocated cores.
     let given = std::env::var("SLURM_CPUS_PER_TASK").ok().and_then(|text| text.parse().ok());
     given.map_or(there, |given: u32| given.clamp(1, there))
 }
 
-/// Whether somebody has asked this process to stop, and what wakes whoever waits for that; `message` is said then.
+/// Returns a flag that the first stop signal sets and a notification that it sends. Prints `message` then.
 pub fn stop_signal(message: &'static str) -> Result<(Arc<AtomicBool>, Arc<Notify>), Failure> {
     let (stopping, stop) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
     let asked = (Arc::clone(&stopping), Arc::clone(&stop));
@@ -133,7 +133,7 @@ pub fn stop_signal(message: &'static str) -> Result<(Arc<AtomicBool>, Arc<Notify
     Ok((stopping, stop))
 }
 
-/// Stops in order, as on a signal, when a limit of time is reached.
+/// Calls `stop` when a time limit is reached, as a stop signal would.
 fn stop_when_over(over: &Arc<Notify>, stop: impl FnOnce() + Send + 'static) {
     let over = Arc::clone(over);
     tokio::spawn(async move {
@@ -142,11 +142,12 @@ fn stop_when_over(over: &Arc<Notify>, stop: impl FnOnce() + Send + 'static) {
     });
 }
 
-/// A batch system tells every process of a job to end, and the job's script hands on what it is told: that is one request.
+/// A batch system signals every process of a job, and the job script forwards the signal it receives. Signals within
+/// this time count as one request.
 const SIGNAL_MERGE_WINDOW: Duration = Duration::from_secs(5);
 
-/// Ctrl-C, SIGTERM and a closed terminal: the first calls `stop`, which stops in order, the second ends at once (which is
-/// safe too), but for a SIGTERM that comes together with the first.
+/// Calls `stop` on the first Ctrl-C, SIGTERM or hang-up. A second signal exits at once, which is safe too, unless it
+/// is a SIGTERM within [`SIGNAL_MERGE_WINDOW`] of the first.
 fn on_stop_signal(message: &'static str, stop: impl Fn() + Send + 'static) -> Result<(), Failure> {
     let mut interrupt = signal(SignalKind::interrupt()).map_err(Failure::failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(Failure::failed)?;

@@ -1,6 +1,6 @@
-//! Walkers and labellers in processes of their own: started, listened to, replaced.
+//! Runs a campaign with walkers and labellers in separate processes, and restarts them when they fail.
 //!
-//! Walkers end with this process; labellers go on without it, and the next run adopts them.
+//! Walkers end with this process. Labellers outlive it, and the next run adopts them.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -27,17 +27,18 @@ use super::{
 };
 use crate::exit_status::Failure;
 
-/// What is on its way to the database when everybody is gone may take so long.
+/// Time that the last writes to the database may take after all processes have ended.
 const DATABASE_TIMEOUT: Duration = Duration::from_secs(60);
-/// Labellers give their signs of life in the database, which may be busy for a while.
+/// Heartbeat timeout of labellers: they write heartbeats to the database, which may be busy for a while.
 pub const LABELLER_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Runs the campaign until it is done or stopped. To be awaited on the main thread: the walkers end with the thread that
-/// starts them.
+/// Runs the campaign until it is finished or stopped.
+///
+/// Await this on the main thread: the walkers end with the thread that starts them.
 pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
     let place = Place::of(run.directory).map_err(Failure::failed)?;
     let ended = run_in(&place, run, selector).await;
-    // Nobody is left who could need it. What cannot be removed now is at the next start.
+    // No process needs the shared memory any more. The next start removes what cannot be removed now.
     let removed = place.remove().map_err(Failure::failed);
     let ended = ended?;
     removed?;
@@ -86,18 +87,18 @@ async fn run_in(place: &Place, run: RunContext<'_>, selector: Selector) -> Resul
     supervise(manager, reactor, agents_line, serving, &stop).await
 }
 
-/// Tells the walkers of this run from those of any other.
+/// Distinguishes the walkers of this run from those of any other.
 fn session(process: &ProcessRecord) -> u64 {
     let hash = blake3::hash(process.id.as_bytes());
     let [a, b, c, d, e, f, g, h, ..] = *hash.as_bytes();
     u64::from_le_bytes([a, b, c, d, e, f, g, h])
 }
 
-/// What the leader of a crew has to answer.
+/// An event of the main loop.
 enum ManagerEvent {
-    /// To a process.
+    /// From a child process.
     Process(process_manager::Event),
-    /// Somebody asked to stop.
+    /// A stop was requested.
     StopRequested,
     /// The reactor has ended.
     ReactorEnded(Result<reactor::Ended, Failure>),
@@ -105,8 +106,8 @@ enum ManagerEvent {
     TransportEnded(Result<(), Failure>),
 }
 
-/// Leads the crew until all walks are over and every structure has its label, or until somebody asks to stop; then until
-/// everybody is gone.
+/// Supervises the processes until all walks are over and every structure has its label, or until a stop is requested.
+/// Then waits until all processes have ended.
 async fn supervise(
     mut manager: ProcessManager<'_>,
     mut reactor: ReactorTask,
@@ -158,7 +159,7 @@ async fn supervise(
     }
 }
 
-/// The end of a time, if it has begun.
+/// Waits until the deadline, if there is one.
 async fn expired(time: &mut Option<Pin<Box<Sleep>>>) {
     match time {
         Some(time) => time.await,
@@ -173,7 +174,7 @@ fn database_unreachable() -> Failure {
     ))
 }
 
-/// A task's own result; a crash is one too.
+/// The result of a task. A panic is a failure too.
 fn flatten<T>(ended: Result<Result<T, impl ToString>, JoinError>) -> Result<T, Failure> {
     ended.map_err(Failure::failed)?.map_err(Failure::failed)
 }

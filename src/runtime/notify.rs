@@ -1,5 +1,5 @@
-//! Runs the user's command when something has happened to the campaign (`[notify]`). Nothing waits for it but the end of a run, and
-//! that for `notify.time_limit`; that it fails is a line in the operations log.
+//! Runs the user's command when an event of `[notify]` happens. Only the end of a run waits for the command, for at
+//! most `notify.time_limit`. A command that fails is recorded in the operations log.
 
 use std::convert::Infallible;
 use std::process::Stdio;
@@ -19,12 +19,12 @@ use crate::forgetting::ForgettingRule;
 use crate::notify::{METADATA_KEY, Notification, NotificationTracker};
 use crate::output::log_and_warn;
 
-/// Longest time between two looks.
+/// Longest interval between checks.
 const MAX_CHECK_INTERVAL: Duration = Duration::from_secs(15);
-/// As much is kept of what a command says that fails, bytes.
+/// Length of the standard error of a failed command that is kept, bytes.
 const MAX_STDERR_BYTES: usize = 1000;
 
-/// Tells the owner of a campaign.
+/// Notifies the owner of a campaign.
 pub struct Notifier<'a> {
     store: &'a Store,
     location: String,
@@ -37,7 +37,7 @@ pub struct Notifier<'a> {
 }
 
 impl<'a> Notifier<'a> {
-    /// None if nobody is to be told.
+    /// `None` if no command is configured.
     pub async fn new(
         config: &Config,
         store: &'a Store,
@@ -60,14 +60,14 @@ impl<'a> Notifier<'a> {
         }))
     }
 
-    /// Looks and tells without end.
+    /// Checks for events and notifies, for ever.
     async fn run(&mut self) -> Infallible {
         let mut ticks = interval(self.interval);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
                 _ = ticks.tick() => {
-                    // Whoever has more to do with the database finds out what is wrong with it.
+                    // Other parts of the run report a broken database.
                     let _ = self.check().await;
                 }
                 Some(done) = self.commands.join_next() => self.log(done.ok()).await,
@@ -84,7 +84,7 @@ impl<'a> Notifier<'a> {
         if due.is_empty() {
             return Ok(());
         }
-        // First, so that it is not told twice whatever happens now.
+        // Store this first, so that no event is reported twice.
         let told = serde_json::to_string(self.tracker.sent()).map_err(Failure::failed)?;
         self.store.leave_note(METADATA_KEY, &told).await?;
         let snapshot = status::Snapshot::of(self.store).await?;
@@ -120,7 +120,7 @@ impl<'a> Notifier<'a> {
     }
 }
 
-/// Looks and tells without end, if somebody is to be told.
+/// Checks for events and notifies, for ever, if a command is configured.
 pub async fn run(notifier: &mut Option<Notifier<'_>>) -> Infallible {
     match notifier {
         Some(notifier) => notifier.run().await,
@@ -128,7 +128,7 @@ pub async fn run(notifier: &mut Option<Notifier<'_>>) -> Infallible {
     }
 }
 
-/// The last look at a run, which may have failed; waits until all is told.
+/// Checks a last time at the end of a run, which may have failed, and waits for all commands.
 pub async fn finish(notifier: Option<Notifier<'_>>, failure: Option<&Failure>) {
     let Some(mut notifier) = notifier else { return };
     if let Some(due) = failure.and_then(|failure| notifier.tracker.failed(&failure.to_string())) {
@@ -142,7 +142,7 @@ pub async fn finish(notifier: Option<Notifier<'_>>, failure: Option<&Failure>) {
     }
 }
 
-/// Runs a command with this on its standard input, for so long at most; how it failed.
+/// Runs a command with `input` on its standard input, for at most `limit`. Returns how it failed.
 async fn run_command(mut command: Command, input: String, limit: Duration) -> Result<(), String> {
     command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
     // Ctrl-C in a terminal is meant for the campaign.
@@ -151,7 +151,7 @@ async fn run_command(mut command: Command, input: String, limit: Duration) -> Re
     let stdin = child.stdin.take();
     let work = async {
         if let Some(mut stdin) = stdin {
-            // It may not want to know.
+            // The command need not read its input.
             let _ = stdin.write_all(input.as_bytes()).await;
         }
         child.wait_with_output().await

@@ -1,4 +1,4 @@
-//! The processes of a campaign: what happens to them, and what is done about it.
+//! Manages the walker and labeller processes of a run.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,12 +17,12 @@ use super::process_records::ProcessRecords;
 use crate::exit_status::Failure;
 use crate::output::log_and_print;
 
-/// Between two looks whether labels are still to be made, once no more structures will come.
+/// Interval between checks for unfinished labels after the last walk has ended.
 pub const LAST_LABELS_POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// A labeller that has lived for so long is of use: what it was started with is in order.
+/// A labeller that has run this long counts as working: its configuration is valid.
 pub const PROVEN_AFTER: Duration = Duration::from_secs(10);
 
-/// Walkers and labellers at work.
+/// The walkers and labellers of a run.
 pub struct ProcessManager<'a> {
     store: &'a Store,
     records: ProcessRecords<'a>,
@@ -31,29 +31,29 @@ pub struct ProcessManager<'a> {
     labellers: Labellers,
     heartbeats: Interval,
     last_labels: Option<Interval>,
-    /// Whether every walker is gone, every labeller.
+    /// Whether all walkers, and all labellers, have ended.
     ended: [bool; 2],
-    /// Tells the reactor to send walkers home.
+    /// Tells the reactor to dismiss the walkers.
     stopping: Arc<AtomicBool>,
     failure: Option<String>,
-    /// Whether the database does.
+    /// Whether the database is reachable.
     db_status: DbStatus,
 }
 
-/// What there is to react to.
+/// An event to handle.
 pub enum Event {
-    /// A walker.
+    /// From a walker.
     Walker(launcher::Event),
-    /// A labeller.
+    /// From a labeller.
     Labeller(launcher::Event),
-    /// It is time for signs of life.
+    /// Heartbeats are due.
     Heartbeat,
-    /// It is time to look whether every label is made.
+    /// A check for unfinished labels is due.
     LastLabels,
 }
 
 impl<'a> ProcessManager<'a> {
-    /// The crew of the orchestrator `process`; [`ProcessManager::event`] starts it.
+    /// Manages the processes of the orchestrator `process`. [`ProcessManager::next_event`] starts them.
     pub fn new(
         store: &'a Store,
         process: ProcessRecord,
@@ -80,7 +80,7 @@ impl<'a> ProcessManager<'a> {
         }
     }
 
-    /// To be told which walker was heard, and whether it delivered something.
+    /// A callback for messages of walkers: takes the walker's number and whether the message delivered something.
     pub fn listener(&self) -> impl FnMut(u32, bool) + Send + 'static {
         let (signs, heard) = (self.walkers.signs(), self.records.listener());
         move |walker, useful| {
@@ -89,7 +89,7 @@ impl<'a> ProcessManager<'a> {
         }
     }
 
-    /// The next thing that happens. Dropped while it waits, it has lost nothing.
+    /// Waits for the next event. Cancel-safe.
     pub async fn next_event(&mut self) -> Event {
         let last_labels = async {
             match &mut self.last_labels {
@@ -105,8 +105,8 @@ impl<'a> ProcessManager<'a> {
         }
     }
 
-    /// Does what is to be done about it. A database that is busy or full for a moment is no reason to leave: what could
-    /// not be said is said at the next look.
+    /// Handles an event. A database that is busy or full for a moment is not fatal: the next heartbeat writes what is
+    /// missing.
     pub async fn handle(&mut self, event: Event) {
         let done = match event {
             Event::Walker(event) => self.walker(event).await,
@@ -120,13 +120,13 @@ impl<'a> ProcessManager<'a> {
         };
         match done {
             Ok(()) => {}
-            // They cannot be seen to be alive now.
+            // Their heartbeats cannot be read now.
             Err(error) if error.is_transient() => self.labellers.assume_all_alive(),
             Err(error) => self.fail(error.to_string()),
         }
     }
 
-    /// Asks everybody to end in order.
+    /// Asks all processes to end in order.
     pub fn stop(&mut self) {
         self.last_labels = None;
         self.stopping.store(true, Ordering::Relaxed);
@@ -134,19 +134,19 @@ impl<'a> ProcessManager<'a> {
         self.labellers.children.stop();
     }
 
-    /// No more structures will come: the labellers end when those that are there have their labels.
+    /// Lets the labellers finish the queue, since no more structures will come.
     pub fn wait_for_labels(&mut self) {
         if !self.is_stopping() {
             self.last_labels = Some(interval(LAST_LABELS_POLL_INTERVAL));
         }
     }
 
-    /// Whether nobody is left, and no label of others is waited for.
+    /// Whether all processes have ended and no external label is awaited.
     pub fn has_ended(&self) -> bool {
         self.ended == [true; 2] && self.last_labels.is_none()
     }
 
-    /// Why the campaign cannot go on, if it cannot.
+    /// Fails if the campaign cannot go on.
     pub fn failure(&self) -> Result<(), Failure> {
         self.failure.clone().map_or(Ok(()), |failure| Err(Failure::Failed(failure)))
     }
@@ -169,7 +169,7 @@ impl<'a> ProcessManager<'a> {
             launcher::Event::Ended { number, ended } => {
                 self.line.gone(number, ended.incarnation, ended.ending.is_own_fault());
                 if ended.then == Standing::GoneHome {
-                    // There is no more work for the others either.
+                    // There is no more work for the other walkers either.
                     self.walkers.close();
                 }
                 self.records.walker_ended(number, &ended).await?;
@@ -203,17 +203,17 @@ impl<'a> ProcessManager<'a> {
         Ok(())
     }
 
-    /// Nobody of a kind is left to do the work.
+    /// Fails the run if no process of this kind is left to do the work.
     fn check_any_left(&mut self, kind: &str, given_up: Option<String>) {
         if let Some(given_up) = given_up.filter(|_| !self.is_stopping()) {
             self.fail(format!("no {kind} is left: {given_up}"));
         }
     }
 
-    /// Signs of life: this process and its walkers give them in the database, labellers by themselves.
+    /// Writes the heartbeats of this process and its walkers. Labellers write their own.
     async fn send_heartbeats(&mut self) -> Result<(), StoreError> {
         self.records.write_heartbeats(self.line.traffic()).await?;
-        // Also of those whose end could not be written down at once.
+        // This includes processes whose end could not be recorded at once.
         self.store.release_leases_of_gone_processes(unix_milliseconds()).await?;
         self.labellers.read_heartbeats(self.store, PROVEN_AFTER).await
     }
@@ -227,7 +227,7 @@ impl<'a> ProcessManager<'a> {
     }
 }
 
-/// How the last of them failed, if all were given up.
+/// How the last process failed, if all of them have failed for good.
 pub fn all_failed_message(children: &mut Children) -> Option<String> {
     let status = children.status();
     let given_up = status.iter().all(|child| child.standing == Standing::GivenUp);

@@ -1,4 +1,4 @@
-//! What is said of the processes of a campaign: in `status`, in the operations log.
+//! Records the processes of a campaign in the database: in `status` and in the operations log.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,27 +11,27 @@ use wire::ipc::Traffic;
 
 use crate::output::log_and_warn;
 
-/// The records of a crew. Labellers keep their own while they live.
+/// The records of this process and its children. A running labeller keeps its own.
 pub struct ProcessRecords<'a> {
     store: &'a Store,
-    /// Of this process.
+    /// The record of this process.
     process: ProcessRecord,
-    /// Of walkers, as `status` shows them.
+    /// The records of the walkers, as `status` shows them.
     walkers: BTreeMap<u32, ProcessRecord>,
-    /// When each walker was last heard, ms since 1970.
+    /// When the last message of each walker arrived, ms since 1970.
     heard: Arc<[AtomicI64]>,
-    /// Messages dropped that were spoken of.
+    /// Number of rejected messages reported so far.
     dropped: u64,
 }
 
 impl<'a> ProcessRecords<'a> {
-    /// Those of the orchestrator `process` and of its walkers, of which there are so many.
+    /// The records of the orchestrator `process` and of `walkers` walkers.
     pub fn new(store: &'a Store, process: ProcessRecord, walkers: usize) -> Self {
         let heard = (0..walkers).map(|_| AtomicI64::default()).collect();
         Self { store, process, walkers: BTreeMap::new(), heard, dropped: 0 }
     }
 
-    /// To be told which walker was heard.
+    /// A callback for the number of a walker that sent a message.
     pub fn listener(&self) -> impl Fn(u32) + Send + 'static {
         let heard = Arc::clone(&self.heard);
         move |walker| {
@@ -41,7 +41,7 @@ impl<'a> ProcessRecords<'a> {
         }
     }
 
-    /// A walker's process was started.
+    /// Records the start of a walker process.
     pub async fn walker_started(
         &mut self,
         number: u32,
@@ -54,10 +54,10 @@ impl<'a> ProcessRecords<'a> {
         self.store.upsert_process(&record).await
     }
 
-    /// A walker's process ended.
+    /// Records the end of a walker process.
     pub async fn walker_ended(&mut self, number: u32, ended: &Ended) -> Result<(), StoreError> {
         let record = self.walkers.remove(&number);
-        // One that could not even be started has none.
+        // A process that could not be started has no record.
         let record = record.unwrap_or_else(|| new_record(ProcessRecord::WALKER, number, 0));
         if ended.then != Standing::GoneHome {
             self.walkers.insert(number, with_end(record.clone(), ended));
@@ -66,7 +66,7 @@ impl<'a> ProcessRecords<'a> {
         write_end(self.store, record, ended).await
     }
 
-    /// A labeller's process ended, and left this record if it had one.
+    /// Records the end of a labeller process, which left `record` if it had one.
     pub async fn labeller_ended(
         &self,
         number: u32,
@@ -78,7 +78,7 @@ impl<'a> ProcessRecords<'a> {
         write_end(self.store, record, ended).await
     }
 
-    /// Gives the signs of life of this process and of its walkers, and says which messages were dropped.
+    /// Writes the heartbeats of this process and its walkers, and reports rejected messages.
     pub async fn write_heartbeats(&mut self, traffic: Traffic) -> Result<(), StoreError> {
         let now = unix_milliseconds();
         self.process.last_seen = now;
@@ -105,7 +105,7 @@ impl<'a> ProcessRecords<'a> {
     }
 }
 
-/// Writes down how a process ended that has this record.
+/// Records how a process ended.
 pub async fn write_end(store: &Store, record: ProcessRecord, ended: &Ended) -> Result<(), StoreError> {
     if ended.then == Standing::GoneHome {
         return store.remove_process(&record.id).await;
@@ -129,7 +129,7 @@ fn new_record(kind: &str, number: u32, pid: u32) -> ProcessRecord {
     ProcessRecord::new(kind, Some(number), pid, unix_milliseconds())
 }
 
-/// The record of a process that ended.
+/// The record of a process with its end.
 fn with_end(mut record: ProcessRecord, ended: &Ended) -> ProcessRecord {
     record.state = match ended.then {
         Standing::Pausing { .. } => "pausing".to_owned(),

@@ -1,5 +1,4 @@
-//! The directory in which an agent keeps what it needs in the meantime. It is locked: one that nobody holds is of an agent that
-//! was killed.
+//! The directory for an agent's temporary files. The agent locks it, so an unlocked one was left by a killed agent.
 
 use std::fs::{self, File, TryLockError};
 use std::io::{ErrorKind, Result};
@@ -8,23 +7,23 @@ use std::path::Path;
 use tempfile::{Builder, TempDir};
 use wire::place::Place;
 
-/// Their names begin with this.
+/// Prefix of the directories' names.
 const PREFIX: &str = "calmwalk-agent-";
 
-/// Removed when it is dropped.
+/// A directory that is removed on drop.
 pub struct ScratchDir {
     directory: TempDir,
-    /// Closed, it is free.
+    /// Closing it releases the lock.
     _held: File,
 }
 
 impl ScratchDir {
-    /// A new one among the system's temporary files.
+    /// Creates one in the system's temporary directory.
     pub fn new() -> Result<Self> {
         loop {
             let directory = Builder::new().prefix(PREFIX).tempdir()?;
             let _held = match File::open(directory.path()) {
-                // Somebody who cleans up was faster.
+                // Another process removed it as abandoned.
                 Err(error) if error.kind() == ErrorKind::NotFound => continue,
                 opened => opened?,
             };
@@ -35,17 +34,17 @@ impl ScratchDir {
         }
     }
 
-    /// Where it is.
+    /// Path of the directory.
     pub fn path(&self) -> &Path {
         self.directory.path()
     }
 }
 
-/// Removes what agents left that were killed on this host, as far as it may be removed.
+/// Removes what killed agents left on this host, as far as permissions allow.
 pub fn clean() {
     for place in Place::all().unwrap_or_default() {
         let Some(directory) = place.campaign_directory() else { continue };
-        // Those of the living are in use and stay.
+        // Those of running agents are locked and stay.
         if is_scratch(directory) && place.remove().is_ok() {
             remove_if_free(directory);
         }
@@ -57,7 +56,7 @@ pub fn clean() {
     }
 }
 
-/// What has such a name may be somebody else's: a pipe would hold this up.
+/// Another user may have created something of that name. A pipe would block.
 fn remove_if_free(directory: &Path) {
     if !directory.symlink_metadata().is_ok_and(|found| found.is_dir()) {
         return;

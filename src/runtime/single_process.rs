@@ -1,4 +1,4 @@
-//! Everything in one process: walkers as threads, reactor and labellers as tasks.
+//! Runs a campaign in one process: walkers as threads, reactor and labellers as tasks.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -27,10 +27,10 @@ use super::{
 use crate::campaign::Campaign;
 use crate::exit_status::Failure;
 
-/// Runs the campaign until it is done or stopped.
+/// Runs the campaign until it is finished or stopped.
 pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
     if let Ok(place) = Place::of(run.directory) {
-        // What a killed run left; this one needs nothing there.
+        // Removes what a killed run left in shared memory. This run needs nothing there.
         let _ = place.remove();
     }
     no_labellers(run.store).await?;
@@ -41,30 +41,30 @@ pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::End
     ended
 }
 
-/// Keeps the sign of life in `status` fresh.
+/// Keeps the heartbeat in `status` fresh.
 async fn write_heartbeats(store: Store, mut process: ProcessRecord) {
     let mut db_status = DbStatus::default();
     loop {
         tokio::time::sleep(SIGN_OF_LIFE).await;
         process.last_seen = unix_milliseconds();
-        // A busy database can do without this one.
+        // A busy database may miss a heartbeat.
         db_status.observe(&store.upsert_process(&process).await);
     }
 }
 
-/// Walkers, reactor and labellers at work.
+/// Walkers, reactor and labellers.
 struct Tasks {
     walkers: Vec<JoinHandle<walker::Ended>>,
     labellers: JoinSet<Result<(), StoreError>>,
     reactor: ReactorTask,
-    /// Where labels of others are waited for, if nobody makes any here.
+    /// The store to poll for labels that other processes make, if this one makes none.
     labels_of_others: Option<Store>,
     closing: Arc<Closing>,
     stopping: Arc<AtomicBool>,
 }
 
 impl Tasks {
-    /// Starts them all.
+    /// Starts all of them.
     fn start(run: RunContext<'_>, selector: Selector) -> Result<Self, Failure> {
         let stopping = Arc::new(AtomicBool::new(false));
         let closing = Arc::new(Closing::default());
@@ -83,7 +83,7 @@ impl Tasks {
         Ok(Self { walkers, labellers, reactor, labels_of_others, closing, stopping })
     }
 
-    /// Waits for all of them. A labeller that cannot go on stops the campaign: without labels its queue only grows.
+    /// Waits for all of them. A labeller that cannot go on stops the campaign, because its queue could only grow.
     async fn finish(mut self) -> Result<reactor::Ended, Failure> {
         let mut failure = None;
         let ended = loop {
@@ -120,7 +120,7 @@ impl Tasks {
     }
 }
 
-/// Waits until no structure waits for a label, or somebody asks to stop.
+/// Waits until no structure lacks a label or a stop is requested.
 async fn wait_for_labels(store: &Store, closing: &Closing) -> Result<(), StoreError> {
     while !closing.is_stopping() {
         match store.awaits_labels(unix_milliseconds()).await {
@@ -132,7 +132,7 @@ async fn wait_for_labels(store: &Store, closing: &Closing) -> Result<(), StoreEr
     Ok(())
 }
 
-/// Why a labeller ended, if it could not go on.
+/// Why a labeller failed, if it did.
 fn failure_of(labeller: Result<Result<(), StoreError>, JoinError>) -> Option<Failure> {
     match labeller {
         Ok(ended) => ended.err().map(Failure::from),

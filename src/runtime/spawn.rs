@@ -1,4 +1,4 @@
-//! What the processes of a campaign are started with, and which of those that live are taken over.
+//! Launches the processes of a campaign and adopts running labellers.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -17,7 +17,7 @@ use crate::label_setup::LabelSetup;
 use crate::log;
 use crate::process_config::{self, LabellerConfig, WalkerConfig};
 
-/// How walkers are started.
+/// Returns the function that launches a walker.
 pub fn walker(
     campaign: &Campaign,
     line: Handle,
@@ -43,7 +43,7 @@ pub fn walker(
     })
 }
 
-/// The labellers: those that an earlier run left and that work as this one wants it, and new ones in the other places.
+/// Adopts the labellers that an earlier run left with the same configuration, and launches the missing ones.
 pub async fn labellers(run: RunContext<'_>, limits: Limits) -> Result<Labellers, Failure> {
     let RunContext { campaign, store, directory, .. } = run;
     let location = match &campaign.config.run.store {
@@ -70,14 +70,14 @@ pub async fn labellers(run: RunContext<'_>, limits: Limits) -> Result<Labellers,
         let wanted = found.number.filter(|_| found.setup.as_ref() == Some(&hash) && found.state == "running");
         match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.birth).is_ok()) {
             Some(number) => drop(adopted.insert(number, found.pid)),
-            // One that ended meanwhile needs no asking.
+            // Ignore a labeller that has ended meanwhile.
             None => drop(ask_to_end(found.pid, &found.birth)),
         }
     }
     Ok(Labellers::new(labellers, adopted, campaign.config.label.attempts.get()))
 }
 
-/// Asks the labellers that an earlier run left to end: this run makes its labels itself.
+/// Asks the labellers of an earlier run to end, because this run makes labels itself.
 pub async fn no_labellers(store: &Store) -> Result<(), Failure> {
     for found in left_by_runs(store).await? {
         let _ = ask_to_end(found.pid, &found.birth);
@@ -85,7 +85,8 @@ pub async fn no_labellers(store: &Store) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The labellers here that an earlier run started. Those of `calmwalk label` have no number, and are their own masters.
+/// Running labellers on this host that an earlier run started. Those of `calmwalk label` have no number and are left
+/// alone.
 async fn left_by_runs(store: &Store) -> Result<Vec<ProcessRecord>, StoreError> {
     let mut labellers = store.processes(Some(ProcessRecord::LABELLER)).await?;
     labellers.retain(|found| found.number.is_some() && found.is_local() && !found.is_gone());

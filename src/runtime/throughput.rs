@@ -1,4 +1,5 @@
-//! How fast walks advance: heard from the reactor, and written down every few seconds for those who watch. Decides nothing.
+//! Measures how fast walks advance, from the reactor's notices, and stores it every few seconds for display. It
+//! affects no decision.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
@@ -11,18 +12,18 @@ use tokio::time::{MissedTickBehavior, interval};
 use wire::WalkId;
 use wire::messages::Progress;
 
-/// Between two times that it is written down.
+/// Interval between writes.
 const WRITE_INTERVAL: Duration = Duration::from_secs(3);
-/// A speed is told of no less time than this, s.
+/// Shortest time over which a speed is measured, s.
 const MIN_INTERVAL: f64 = 1.0;
-/// Time over which speeds are averaged, s.
+/// Time constant of the moving average, s.
 const AVERAGING_TIME: f64 = 30.0;
 
-/// How the walks of a run advance.
+/// Throughput of the walks of a run.
 #[derive(Debug, Default)]
 pub struct Throughput {
     walks: BTreeMap<u32, Walk>,
-    /// Those that were heard of since it was last written down.
+    /// Walks with changes since the last write.
     changed: BTreeSet<u32>,
     all: Speed,
     /// Steps of all walks in this run.
@@ -33,14 +34,14 @@ pub struct Throughput {
 struct Walk {
     pace: Pace,
     speed: Speed,
-    /// Steps in this run, also those that were made twice.
+    /// Steps in this run, including repeated ones.
     steps: u64,
 }
 
-/// Steps per second, the latest counting most.
+/// Exponential moving average of steps per second.
 #[derive(Debug, Default)]
 struct Speed {
-    /// Steps at a time (ms) from which on they are counted.
+    /// Number of steps and time (ms) of the last update.
     from: Option<(u64, i64)>,
     average: Option<f64>,
 }
@@ -60,7 +61,7 @@ impl Speed {
 }
 
 impl Throughput {
-    /// Takes in what the reactor tells at the time `now`, ms since 1970.
+    /// Takes a notice of the reactor at the time `now`, ms since 1970.
     pub fn notice(&mut self, notice: &Notice<'_>, now: i64) {
         match notice {
             Notice::Progress(walk, progress) => self.update(*walk, progress, now),
@@ -75,7 +76,7 @@ impl Throughput {
     fn update(&mut self, walk: WalkId, progress: &Progress, now: i64) {
         let known = self.walks.contains_key(&walk.0);
         let entry = self.walks.entry(walk.0).or_default();
-        // Where it stood when this run began is no step of this run; nor is a return to a checkpoint.
+        // The steps of earlier runs do not count, and neither does a rollback to a checkpoint.
         if known && entry.pace.segment == progress.segment {
             let made = progress.step.saturating_sub(entry.pace.step);
             entry.steps += made;
@@ -96,7 +97,7 @@ impl Throughput {
         self.changed.insert(walk.0);
     }
 
-    /// Those to be written down, and steps of all walks per second.
+    /// The changed walks, and steps per second of all walks.
     fn take(&mut self, now: i64) -> (Vec<Pace>, Option<f64>) {
         self.all.at(self.steps, now);
         let changed = std::mem::take(&mut self.changed);
@@ -104,7 +105,7 @@ impl Throughput {
     }
 }
 
-/// Writes it down without end. Nobody is told if that fails: whoever has more to write finds out.
+/// Writes the throughput periodically, for ever. Ignores errors: other writers report a broken database.
 pub async fn record(store: &Store, throughput: &Mutex<Throughput>) -> Infallible {
     let mut write = interval(WRITE_INTERVAL);
     write.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -128,7 +129,7 @@ mod tests {
     fn a_walk_is_as_fast_as_its_steps_over_all_its_time() {
         let mut throughput = Throughput::default();
         let walk = WalkId(3);
-        // Goes on at step 1000 with 50 steps a second, of which it waits every other second.
+        // Continues at step 1000 with 50 steps per second on average: it waits every other second.
         for second in 0..200_i64 {
             let step = 1000 + 100 * (second as u64 / 2);
             throughput.notice(&Notice::Progress(walk, at(0, step)), 1000 * second);

@@ -1,4 +1,4 @@
-//! Keeps count of the time that a campaign is under way, and stops it when a limit of time is reached.
+//! Counts how long a campaign has been running and stops it at a time limit.
 
 use std::time::Duration;
 
@@ -8,17 +8,17 @@ use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use crate::output::log_and_print;
 
-/// Between two looks.
+/// Interval between updates of the count.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
 
-/// The limit of time that is reached.
+/// The key of the time limit that is exhausted, if any.
 pub async fn exhausted_time_limit(store: &Store) -> Result<Option<&'static str>, StoreError> {
     let (limits, used) = store.budget(unix_milliseconds()).await?;
     Ok(limits.time_used_up(&used))
 }
 
-/// Counts the time until it is dropped, and says so to `limit_reached` when a limit is reached: once, as somebody who asks to stop.
-/// A database that is busy is told later.
+/// Counts the time until the future is dropped. Notifies `limit_reached` once when a limit is reached, which stops
+/// the run in order. Retries while the database is busy.
 pub async fn track(store: &Store, limits: &Budget, limit_reached: &Notify) -> StoreError {
     let limited = limits.wall_hours.is_some() || limits.core_hours.is_some();
     let mut ticks = interval(POLL_INTERVAL);
@@ -42,7 +42,7 @@ pub async fn track(store: &Store, limits: &Budget, limit_reached: &Notify) -> St
     }
 }
 
-/// Adds the time, and looks whether a limit is reached if there is one.
+/// Adds to the count. Checks the limits if there are any.
 async fn add_time(store: &Store, time: Duration, limited: bool) -> Result<Option<&'static str>, StoreError> {
     store.add_time_under_way(time.as_millis() as u64).await?;
     if limited { exhausted_time_limit(store).await } else { Ok(None) }
