@@ -137,7 +137,7 @@ impl Campaign {
     }
 
     /// Size of the largest message between walker and selector, bytes: a candidate of the largest seed structure with
-    /// the checkpoints of its walk (three states with velocities and forces, and their averages).
+    /// the checkpoints of its walk (three states with velocities and forces).
     pub fn largest_message(&self) -> usize {
         let atoms = self.seeds.iter().map(|named| named.seed.structure.len()).max().unwrap_or(0);
         let features = self.artifact.mixture.dimension();

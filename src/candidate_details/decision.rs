@@ -1,4 +1,4 @@
-//! What was decided, by which numbers, and what followed from it for others.
+//! The decision about a candidate: its numbers and its consequences for other candidates.
 
 use calm::watch::GradeDistribution;
 use calm::{Trial, UpdateEnd, UpdateRule};
@@ -9,7 +9,7 @@ use store::{LoggedDecision, Store, StoreError, StoredCandidate};
 
 use super::{Covered, Named};
 
-/// Under which name the leader of a campaign leaves the symbols of the model's elements.
+/// Metadata key under which the leader stores the symbols of the model's elements.
 pub const ELEMENTS_KEY: &str = "elements";
 
 /// The decision.
@@ -17,68 +17,69 @@ pub const ELEMENTS_KEY: &str = "elements";
 pub struct DecisionDetails {
     /// Its number.
     pub number: i64,
-    /// Round (reproducible mode) or 0.
+    /// Round in reproducible mode, otherwise 0.
     pub round: u64,
     /// `accepted`, `declined` or `control`.
     pub kind: String,
-    /// Why it was declined: `covered`, `duplicate`, `guard`, `budget`, `backlog`.
+    /// Why it was declined: `covered`, `duplicate`, `guard`, `budget` or `backlog`.
     pub reason: Option<String>,
-    /// Factor by which the threshold was raised, since many structures waited for labels.
+    /// Factor by which a long label queue had raised the threshold.
     pub raised_by: Option<f64>,
-    /// The threshold with it.
+    /// The raised threshold.
     pub raised_threshold: Option<f64>,
     /// Version of the mixture afterwards.
     pub mixture_version: u64,
-    /// How the mixture was made to cover it.
+    /// The update that made the mixture cover the candidate.
     pub update: Option<Update>,
-    /// What came of that.
+    /// Relations to other candidates by coverage.
     pub coverage: Coverage,
 }
 
 /// An update of the mixture.
 #[derive(Clone, Debug, Serialize)]
 pub struct Update {
-    /// The rule by which α is chosen, as configured.
+    /// The configured rule that chooses α.
     pub rule: Option<UpdateRule>,
     /// Convex or additive.
     pub combination: Option<String>,
-    /// What was found.
+    /// The recorded result.
     #[serde(flatten)]
     pub found: LoggedUpdate,
-    /// Symbol of the element of each of `components`; none in campaigns that began before elements were recorded.
+    /// Element symbol of each of `components`. `None` in campaigns that began before elements were recorded.
     pub component_elements: Vec<Option<String>>,
-    /// γ of the potential's training frames under the mixture afterwards.
+    /// γ of the potential's training frames under the updated mixture.
     pub training_frames: Option<GradeDistribution>,
-    /// Whether that raised the alarm over forgetting.
+    /// Whether this raised the forgetting alarm.
     pub forgetting_alarm: Option<bool>,
 }
 
-/// As the decision log has it.
+/// An update as the decision log records it.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 pub struct LoggedUpdate {
-    /// The α that was taken.
+    /// The chosen α.
     pub alpha: f64,
-    /// Every α that was tried, and what it reached.
+    /// Every α that was tried, with its result.
     pub trials: Vec<Trial>,
     /// What ended the search.
     pub ended_by: UpdateEnd,
-    /// Factors of the scatter in rounds of inflation.
+    /// Factors on the scatter matrix in each round of inflation.
     pub inflations: Vec<f64>,
-    /// Largest γ of the structure afterwards.
+    /// Largest γ of the structure after the update.
     pub gamma_max_after: Option<f64>,
-    /// The components that it changed: index of the element in the model, and number of the component.
+    /// The changed components: index of the element in the model, and number of the component.
     pub components: Vec<(u32, u32)>,
 }
 
-/// Who covered whom.
+/// Which candidates covered which.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Coverage {
-    /// Of a candidate that was declined as covered: whose updates its walker had not seen, newest first.
+    /// For a candidate declined as covered: the candidates whose updates its walker had not seen, newest first.
     pub by: Vec<Named>,
-    /// Of one that updated the mixture: later candidates that were declined as covered, and whose walkers had not seen
-    /// that update. If `decided` − `seen` is 1 it was this update alone, otherwise this and others of those versions.
+    /// For a candidate that updated the mixture: later candidates that were declined as covered while their walkers
+    /// had not seen the update. If `decided` − `seen` is 1, this update alone covered them, otherwise the updates of
+    /// those versions together.
     pub later: Vec<Covered>,
-    /// The last decision that was looked at for that, if there are more.
+    /// The last decision that was checked for that, if there are more.
     pub looked_until: Option<i64>,
 }
 
@@ -133,13 +134,14 @@ impl Update {
     }
 }
 
-/// Symbols of the model's elements, in its order; none in campaigns of earlier versions.
+/// Symbols of the model's elements, in the model's order. Empty in campaigns of earlier versions.
 async fn elements(store: &Store) -> Result<Vec<String>, StoreError> {
     let note = store.note(ELEMENTS_KEY).await?;
     Ok(note.and_then(|note| serde_json::from_str(&note).ok()).unwrap_or_default())
 }
 
-/// By how many versions the mixture of a walker was ever older than the selector's; none in campaigns of earlier versions.
+/// Largest number of versions by which a walker's mixture was older than the selector's. `None` in campaigns of
+/// earlier versions.
 async fn largest_staleness(store: &Store) -> Result<Option<u64>, StoreError> {
     let values = store.values().await?;
     let found = values.iter().find(|(name, _)| name == STALENESS);

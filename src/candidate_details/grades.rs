@@ -1,4 +1,4 @@
-//! The grades of a candidate under three mixtures, and which of its atoms made it one.
+//! Grades of a candidate under three mixtures, and the atoms that triggered it.
 
 use calm::CollectionRule;
 use calm::rules::{atom_limit, count_above};
@@ -7,18 +7,18 @@ use serde_json::Value;
 use store::{LoggedDecision, StoredCandidate};
 use wire::Origin;
 
-/// What was known of it under each mixture.
+/// Grades of a candidate under three mixtures.
 #[derive(Clone, Debug, Serialize)]
 pub struct CandidateGrades {
-    /// Under the mixture that the walker saw.
+    /// Under the walker's mixture.
     pub walker: Grade,
-    /// Under the selector's, before the update; that of a control's frame decides nothing.
+    /// Under the selector's mixture before the update. For a control frame it decides nothing.
     pub selector: Grade,
-    /// Under the original one: what errors are compared with.
+    /// Under the original mixture, with which errors are compared.
     pub original: Grade,
-    /// By how many versions the selector's was newer than the walker's.
+    /// Number of versions by which the selector's mixture was newer than the walker's.
     pub staleness: u64,
-    /// By which rule it became a candidate; none of a control's frame, which was wanted for its step.
+    /// The rule that made it a candidate. `None` for a control frame, which is collected for its step.
     pub trigger: Option<Trigger>,
     /// Every atom, in the order of the structure.
     pub atoms: Vec<Atom>,
@@ -37,18 +37,18 @@ pub struct Grade {
     pub atoms_above_1: usize,
 }
 
-/// A collection rule and what it found.
+/// A collection rule and its result.
 #[derive(Clone, Debug, Serialize)]
 pub struct Trigger {
-    /// The rule, as configured.
+    /// The configured rule.
     pub rule: CollectionRule,
     /// Grade above which an atom counts.
     pub threshold: f64,
-    /// As many atoms as must lie above it.
+    /// Number of atoms that must be above it.
     pub needed: usize,
-    /// As many did under the walker's mixture.
+    /// Number of atoms above it under the walker's mixture.
     pub above_walker: usize,
-    /// And under the selector's.
+    /// The same under the selector's mixture.
     pub above_selector: usize,
 }
 
@@ -59,19 +59,19 @@ pub struct Atom {
     pub atom: usize,
     /// Its element.
     pub element: &'static str,
-    /// Whether it lay above the threshold under the walker's mixture.
+    /// Whether it was above the threshold under the walker's mixture.
     pub triggered: bool,
     /// γ under the walker's mixture.
     pub gamma_walker: f64,
-    /// γ under the selector's, before the update.
+    /// γ under the selector's mixture before the update.
     pub gamma_selector: Option<f64>,
-    /// γ under the original one.
+    /// γ under the original mixture.
     pub gamma_original: Option<f64>,
     /// γ_nbr under the walker's mixture.
     pub gamma_nbr_walker: f64,
-    /// γ_nbr under the selector's.
+    /// γ_nbr under the selector's mixture.
     pub gamma_nbr_selector: Option<f64>,
-    /// γ_nbr under the original one.
+    /// γ_nbr under the original mixture.
     pub gamma_nbr_original: Option<f64>,
 }
 
@@ -79,7 +79,7 @@ impl CandidateGrades {
     pub(super) fn new(stored: &StoredCandidate, rules: &Value, decision: &LoggedDecision) -> Self {
         let view = stored.block.view();
         let (selector, original) = (&stored.selector, &stored.original);
-        // The update that an accepted candidate causes comes after its grade.
+        // An accepted candidate is graded before it updates the mixture.
         let decided = &decision.detail["selector"]["mixture_version"];
         let decided = decided.as_u64().unwrap_or(decision.mixture_version);
         let rule = serde_json::from_value::<CollectionRule>(rules["collect"]["when"].clone()).ok();
@@ -108,7 +108,7 @@ impl CandidateGrades {
         }
     }
 
-    /// The atoms that triggered, the largest γ under the walker's mixture first.
+    /// The atoms that triggered, by decreasing γ under the walker's mixture.
     pub fn triggered(&self) -> Vec<&Atom> {
         let mut atoms: Vec<_> = self.atoms.iter().filter(|atom| atom.triggered).collect();
         atoms.sort_by(|a, b| b.gamma_walker.total_cmp(&a.gamma_walker));

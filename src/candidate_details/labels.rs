@@ -1,4 +1,4 @@
-//! The label jobs of a structure, what became of each attempt, and how far the potential is from the labels.
+//! The label jobs of a structure, their attempts, and the potential's errors against the labels.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -14,76 +14,76 @@ use wire::{CandidateView, ContentHash};
 
 use crate::energy_errors::{EnergyReference, OffsetSummary};
 
-/// A label job with everything that happened to it.
+/// A label job and its history.
 #[derive(Clone, Debug, Serialize)]
 pub struct LabelJob {
     /// The job with its attempts.
     #[serde(flatten)]
     pub details: JobDetails,
-    /// Core-seconds of all its attempts, as far as they are known; none if of none.
+    /// Known core-seconds of all its attempts. `None` if none are known.
     pub core_seconds: Option<f64>,
-    /// What people did to it and its labels: `drop`, `retry`, `prioritise`, `exclude`, `include`.
+    /// Manual actions on the job and its labels: `drop`, `retry`, `prioritise`, `exclude`, `include`.
     pub by_hand: Vec<ManualAction>,
 }
 
-/// What somebody did to a job.
+/// A manual action on a job.
 #[derive(Clone, Debug, Serialize)]
 pub struct ManualAction {
     /// ms since 1970.
     pub time: i64,
     /// `drop`, `retry`, `prioritise`, `exclude` or `include`.
     pub action: String,
-    /// The priority that it was given.
+    /// The new priority.
     pub priority: Option<i64>,
     /// Why its label was excluded.
     pub reason: Option<String>,
 }
 
-/// A label, a check, a superseded or an excluded label.
+/// A label of any status: in use, a check, superseded or excluded.
 #[derive(Clone, Debug, Serialize)]
 pub struct CandidateLabel {
     /// Name of the protocol.
     pub protocol: String,
     /// Its hash.
     pub protocol_hash: String,
-    /// What it is now.
+    /// Its current status.
     pub standing: Standing,
-    /// Where it came from, in words.
+    /// Its source, as text.
     pub source: String,
-    /// When it came, ms since 1970.
+    /// When it was stored, ms since 1970.
     pub received: i64,
-    /// When and why another came in its place.
+    /// When and why another label replaced it.
     pub superseded: Option<Superseded>,
-    /// When and why it was taken out of the data set.
+    /// When and why it was excluded from the data set.
     pub excluded: Option<Exclusion>,
     /// Energy, eV.
     pub energy: f64,
-    /// Energy an atom, eV.
+    /// Energy per atom, eV.
     pub energy_per_atom: f64,
     /// Largest force, eV/Å.
     pub largest_force: f64,
-    /// Pressure −tr(stress)/3, eV/Å³; none without a stress.
+    /// Pressure −tr(stress)/3, eV/Å³. `None` without a stress.
     pub pressure: Option<f64>,
-    /// What else the calculation says.
+    /// Further results of the calculation.
     pub details: LabelDetails,
-    /// How far the potential is from it; none of imported structures, whose model forces are not kept.
+    /// The potential's errors. `None` for imported structures, whose model forces are not stored.
     pub model: Option<ForceError>,
 }
 
-/// The potential beside a label.
+/// Errors of the potential against a label.
 #[derive(Clone, Debug, Serialize)]
 pub struct ForceError {
-    /// E_model − E_label an atom, eV: mostly the difference of their zeros.
+    /// E_model − E_label per atom, eV. Mostly the difference of the energy references.
     pub energy_per_atom: f64,
-    /// The same without the offsets of the elements, eV; none if too few labels speak for the composition.
+    /// The same without the element offsets, eV. `None` if too few labels support the composition.
     pub energy_error_per_atom: Option<f64>,
-    /// The offsets, from labels of the same protocol.
+    /// The offsets, fitted to labels of the same protocol.
     pub energy_offsets: OffsetSummary,
     /// Mean of |F_model − F_label| over the atoms, eV/Å.
     pub mean: f64,
-    /// The largest, eV/Å.
+    /// The largest of them, eV/Å.
     pub largest: f64,
-    /// The atom that has it.
+    /// The atom with the largest error.
     pub atom: usize,
     /// |F_model − F_label| of each atom, eV/Å.
     pub atoms: Vec<f64>,
@@ -104,7 +104,7 @@ pub(super) async fn jobs(store: &Store, content: ContentHash) -> Result<Vec<Labe
     Ok(jobs)
 }
 
-/// `model`: the candidate, with the potential's energy and forces.
+/// `model` is the candidate with the potential's energy and forces.
 pub(super) async fn labels(
     store: &Store,
     content: ContentHash,

@@ -1,8 +1,8 @@
-//! The whole story of one candidate, as far as the store records it: who found it, under which grades, what was decided by
-//! which rule, what became of its label, and what it covered later.
+//! Everything that the store records about one candidate: its walk, grades, decision and labels, and which candidates
+//! it covered later.
 //!
-//! Reading is here, and printing is up to whoever shows it: `calmwalk explain` in words, others as they like. What it gives as
-//! JSON is described in docs/explain.md; [`FORMAT`] changes with it.
+//! This module reads the details; `calmwalk explain` and the dashboard show them. docs/explain.md describes the JSON
+//! form, whose version is [`FORMAT`].
 
 mod decision;
 mod grades;
@@ -22,13 +22,13 @@ pub use grades::{Atom, CandidateGrades, Trigger};
 pub use labels::{CandidateLabel, ForceError, LabelJob};
 pub use walk::{Discovery, Distances};
 
-/// Version of the JSON form: fields may be added to it under one number, and none taken away or changed.
+/// Version of the JSON form. Adding fields keeps the version; removing or changing them increments it.
 pub const FORMAT: u32 = 1;
 
-/// How imported structures are named: `import-1` is the first.
+/// Prefix of the names of imported structures, which start with `import-1`.
 pub const IMPORT_PREFIX: &str = "import-";
 
-/// The story of one structure.
+/// Details of one structure.
 #[derive(Clone, Debug, Serialize)]
 pub struct CandidateDetails {
     /// [`FORMAT`].
@@ -39,34 +39,34 @@ pub struct CandidateDetails {
     pub id: String,
     /// `biased`, `control` or `imported`.
     pub kind: &'static str,
-    /// What it is.
+    /// Summary of the structure.
     pub structure: StructureSummary,
-    /// The file that an imported structure came from.
+    /// Source file of an imported structure.
     pub file: Option<String>,
-    /// The frame in it, from 0.
+    /// Frame in that file, from 0.
     pub frame: Option<u64>,
-    /// The walk that found it.
+    /// Where the walk found it.
     pub found: Option<Discovery>,
     /// Its grades under three mixtures.
     pub grades: Option<CandidateGrades>,
-    /// What was decided.
+    /// The decision about it.
     pub decision: Option<DecisionDetails>,
-    /// Other candidates with the very same structure.
+    /// Other candidates with an identical structure.
     pub same_structure: Vec<Named>,
-    /// The import with the very same structure.
+    /// The import with an identical structure.
     pub same_import: Option<i64>,
-    /// Its label jobs, one a protocol at most.
+    /// Its label jobs, at most one per protocol.
     pub jobs: Vec<LabelJob>,
-    /// Its labels, checks and superseded labels.
+    /// Its labels of any status.
     pub labels: Vec<CandidateLabel>,
-    /// What one may ask, and the store cannot answer.
+    /// Questions that the store cannot answer.
     pub not_recorded: Vec<&'static str>,
 }
 
-/// A structure in a few words.
+/// Summary of a structure.
 #[derive(Clone, Debug, Serialize)]
 pub struct StructureSummary {
-    /// Formula.
+    /// Chemical formula.
     pub formula: String,
     /// Number of atoms.
     pub atoms: usize,
@@ -74,14 +74,14 @@ pub struct StructureSummary {
     pub elements: BTreeMap<&'static str, usize>,
     /// Periodic along each lattice vector.
     pub periodic: [bool; 3],
-    /// Å³; none without a cell.
+    /// Å³. `None` without a cell.
     pub volume: Option<f64>,
-    /// BLAKE3 of species, positions, cell and periodicity.
+    /// BLAKE3 hash of species, positions, cell and periodicity.
     pub hash: String,
 }
 
-/// Reads the story of the candidate or imported structure that is called so: the number of the decision about it, its name or the
-/// beginning of that, or `import-N`.
+/// Reads the details of a candidate or an imported structure. `id` is the number of its decision, its name or a
+/// prefix of it, or `import-N`.
 pub async fn read(store: &Store, id: &str) -> Result<CandidateDetails, StoreError> {
     match id.strip_prefix(IMPORT_PREFIX) {
         Some(number) => read_import(store, id, number).await,
@@ -132,7 +132,7 @@ async fn read_candidate(store: &Store, named: Named) -> Result<CandidateDetails,
 }
 
 impl CandidateDetails {
-    /// What candidates and imported structures have in common.
+    /// The fields that candidates and imported structures share.
     async fn new(
         store: &Store,
         id: &str,
@@ -178,13 +178,13 @@ impl StructureSummary {
     }
 }
 
-/// The configuration with which the campaign began: what its rules for collecting, updating and guarding are, they stay.
+/// The configuration with which the campaign began. Its rules for collection, updates and guards are fixed.
 async fn rules(store: &Store) -> Result<Value, StoreError> {
     let text = store.campaign().await?.resolved_configuration;
     serde_json::from_str(&text).map_err(|error| StoreError::damaged("the configuration", error))
 }
 
-/// What somebody might look for in vain.
+/// What the store does not record.
 fn not_recorded(stored: &StoredCandidate) -> Vec<&'static str> {
     let view = stored.block.view();
     let mut missing = vec!["what other walks would have offered without it: only what was offered is known"];

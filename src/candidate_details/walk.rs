@@ -1,19 +1,19 @@
-//! Where a candidate was found, and how near its atoms are.
+//! Where a candidate was found, and the distances of its atoms.
 
 use atoms::{NeighbourList, Structure, shortest_distance};
 use serde::Serialize;
 use serde_json::Value;
 use store::{Named, Store, StoreError, StoredCandidate, WalkStatus};
 
-/// How far neighbours are looked for, Å: beyond it nothing is too near.
+/// Cutoff of the neighbour search, Å. No larger distance matters to the guards.
 const NEIGHBOUR_CUTOFF: f64 = 8.0;
 
-/// Where it was found.
+/// Where the candidate was found.
 #[derive(Clone, Debug, Serialize)]
 pub struct Discovery {
     /// Number of the walk.
     pub walk: u32,
-    /// Piece of the walk between two returns to a checkpoint, from 0.
+    /// Segment of the walk, from 0. Each rollback to a checkpoint starts a new one.
     pub segment: u32,
     /// Step, equilibration included.
     pub step: u64,
@@ -25,29 +25,29 @@ pub struct Discovery {
     pub temperature: f64,
     /// V/V₀.
     pub relative_volume: f64,
-    /// Energy by the potential, without bias and ZBL, eV.
+    /// The potential's energy without bias and ZBL, eV.
     pub energy: f64,
-    /// The biased walk that this one controls, if it is a control.
+    /// The biased walk that this control walk matches. `None` for biased walks.
     pub control_of: Option<u32>,
-    /// The accepted candidate of that walk at the same step, if it is still of the same segment's steps.
+    /// The accepted candidate of that walk at the same step, if it belongs to the steps of the same segment.
     pub partner: Option<Named>,
-    /// What the guards look at.
+    /// Distances that the guards check.
     pub distances: Distances,
-    /// Where the walk stands now, with the refusals of its own guard.
+    /// Current state of the walk, with the refusals of its guard.
     pub walk_now: Option<WalkStatus>,
 }
 
-/// The shortest distance, and what the selector's guard asks for.
+/// Shortest distance, and the limit of the selector's guard.
 #[derive(Clone, Debug, Serialize)]
 pub struct Distances {
-    /// Å; none without two atoms within 8 Å.
+    /// Å. `None` if no two atoms are within 8 Å.
     pub shortest: Option<f64>,
-    /// The pair that has it.
+    /// The pair of atoms at this distance.
     pub atoms: Option<[usize; 2]>,
-    /// That of the seed structure, Å.
+    /// Shortest distance of the seed structure, Å.
     pub seed_structure: Option<f64>,
-    /// Below this the selector declines, Å: max(`guard.least_distance`, `guard.least_distance_fraction` × that of the seed
-    /// structure). Control frames are not held to it.
+    /// The selector declines below this distance, Å: max(`guard.least_distance`, `guard.least_distance_fraction` ×
+    /// that of the seed structure). Control frames are exempt.
     pub least: Option<f64>,
 }
 

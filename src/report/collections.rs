@@ -1,4 +1,4 @@
-//! What was collected, as numbers of atoms and structures: all of it, or a sample if there is more than there is room for.
+//! Statistics of the collected structures and their atoms, sampled if there are too many.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -12,78 +12,78 @@ use super::features::Features;
 
 /// Rows read at a time.
 const PAGE_ROWS: u32 = 256;
-/// Atoms that are kept of either origin, 64 bytes each.
+/// Largest number of atoms kept of each origin, 64 bytes each.
 const MAX_ATOMS: usize = 1 << 18;
-/// Structures that are kept of either origin.
+/// Largest number of structures kept of each origin.
 const MAX_STRUCTURES: usize = 1 << 17;
-/// Structures of either origin whose features are read.
+/// Largest number of structures of each origin whose features are read.
 const MAX_WITH_FEATURES: usize = 256;
-/// Seed structures are looked through for neighbours as far as this, Å.
+/// Largest cutoff of the neighbour search in seed structures, Å.
 const MAX_NEIGHBOUR_CUTOFF: f64 = 16.0;
-/// An atom without a neighbour within so many of the seed structure's distances has none.
+/// Cutoff of the nearest neighbour, in units of the seed structure's shortest distance.
 const MAX_STRETCH: f64 = 2.0;
 
-/// Either origin.
+/// The collected structures of both origins.
 pub struct Collections {
-    /// Structures that biased walks found.
+    /// Structures from biased walks.
     pub biased: OriginCollection,
     /// Frames of control walks.
     pub control: OriginCollection,
-    /// Structures of both: they tell nothing of the difference, and are left out of all but counts.
+    /// Structures of both origins. They say nothing about the difference, so everything but the counts excludes them.
     pub shared: u64,
     /// Features of atoms, by element.
     pub features: Features,
 }
 
-/// What was collected from walks of one kind.
+/// The collected structures of one origin.
 pub struct OriginCollection {
-    /// Every structure.
+    /// Sizes of structures.
     pub structures: Thinned<StructureSize>,
-    /// Every atom.
+    /// Grades and errors of atoms.
     pub atoms: Thinned<Atom>,
-    /// How many atoms of each element.
+    /// Number of atoms of each element.
     pub elements: BTreeMap<Species, u64>,
-    /// How many structures by seed structure and what became of their labels.
+    /// Numbers of structures by seed structure and status of their labels.
     pub labels: BTreeMap<u32, Counts>,
-    /// Decisions about structures whose features are looked at.
+    /// Decisions about the structures whose features are read.
     sampled: Thinned<i64>,
 }
 
-/// What became of the labels of some structures.
+/// Numbers of structures by status of their labels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Structures.
+    /// All structures.
     pub structures: u64,
     /// With a label.
     pub labelled: u64,
-    /// Given up.
+    /// Failed for good.
     pub failed: u64,
 }
 
-/// Of a structure.
+/// Size of a structure.
 #[derive(Clone, Copy, Debug)]
 pub struct StructureSize {
     /// V/V₀.
     pub relative_volume: f64,
-    /// Volume by atoms, Å³; none if a direction does not repeat.
+    /// Volume per atom, Å³. `None` unless it is periodic in three directions.
     pub volume_per_atom: Option<f64>,
 }
 
-/// Of an atom.
+/// Grades and error of an atom.
 #[derive(Clone, Copy, Debug)]
 pub struct Atom {
     /// γ under the original mixture.
     pub gamma: f64,
-    /// γ_nbr under it.
+    /// γ_nbr under the original mixture.
     pub gamma_nbr: f64,
     /// |F_model − F_label|, eV/Å, if there is a label.
     pub error: Option<f64>,
-    /// Distance to its nearest neighbour by the shortest of the seed structure; only of labelled atoms.
+    /// Distance to the nearest neighbour in units of the seed structure's shortest distance. Only of labelled atoms.
     pub stretch: Option<f64>,
 }
 
 impl Collections {
-    /// Reads it, page by page; features afterwards, structure by structure.
+    /// Reads the structures page by page, then the features one structure at a time.
     pub async fn read(
         store: &Store,
         protocol: Option<ContentHash>,
@@ -120,7 +120,7 @@ impl Collections {
         Ok(Self { biased, control, shared: of_both.len() as u64, features })
     }
 
-    /// Says in a caption what is left out; nothing if nothing is.
+    /// Sentence of a caption about excluded structures. Empty if there are none.
     pub fn left_out(&self) -> String {
         match self.shared {
             0 => String::new(),
@@ -133,7 +133,7 @@ impl Collections {
         }
     }
 
-    /// The collections and their names, biased walks first.
+    /// Both collections, biased walks first.
     pub fn both(&self) -> [(Origin, &OriginCollection); 2] {
         [(Origin::Biased, &self.biased), (Origin::Control, &self.control)]
     }
@@ -193,7 +193,7 @@ impl OriginCollection {
         }
     }
 
-    /// Numbers of labelled structures.
+    /// Number of labelled structures.
     pub fn labelled(&self) -> u64 {
         self.labels.values().map(|counts| counts.labelled).sum()
     }
@@ -213,7 +213,7 @@ fn nearest(structure: &Structure) -> Option<f64> {
     None
 }
 
-/// Distance of each atom to its nearest neighbour by `shortest`.
+/// Distance of each atom to its nearest neighbour, in units of `shortest`.
 fn stretches(structure: &Structure, shortest: f64) -> Vec<Option<f64>> {
     let reach = MAX_STRETCH * shortest;
     let mut neighbours = NeighbourList::new(reach, 0.0);

@@ -1,4 +1,4 @@
-//! Features of a sample of atoms, element by element.
+//! Features of sampled atoms, by element.
 
 use std::collections::BTreeMap;
 
@@ -6,26 +6,26 @@ use analysis::{PrincipalAxes, Thinned};
 use atoms::Species;
 use wire::Origin;
 
-/// Elements that are looked at: those with the most atoms.
+/// Largest number of elements. Those with the most atoms are kept.
 pub const MAX_ELEMENTS: usize = 6;
-/// Atoms of one element and origin that are kept.
+/// Largest number of atoms kept of each element and origin.
 const MAX_ATOMS: usize = 4096;
 
-/// Features of atoms of several elements.
+/// Features of atoms, by element.
 pub struct Features(BTreeMap<Species, [FeatureSample; 2]>);
 
-/// Those of one element and origin.
+/// Features of one element and origin.
 pub struct FeatureSample {
     atoms: Thinned<Vec<f64>>,
-    /// The mean over the atoms of each structure.
+    /// Mean over the atoms of each structure.
     centroids: Vec<Vec<f64>>,
 }
 
-/// Both origins of one element in the plane of the first two principal components of all of its atoms.
+/// Atoms of one element, projected onto the first two principal components of both origins together.
 pub struct Plane {
     /// The element.
     pub element: Species,
-    /// Of the whole variance, the share along each.
+    /// Share of the variance along each component.
     pub shares: [f64; 2],
     /// Biased walks.
     pub biased: Points,
@@ -33,10 +33,10 @@ pub struct Plane {
     pub control: Points,
 }
 
-/// Points in that plane.
+/// Projected points.
 #[derive(Default)]
 pub struct Points {
-    /// Atoms of which there were.
+    /// Number of atoms before sampling.
     pub seen: u64,
     /// Atoms.
     pub atoms: Vec<[f64; 2]>,
@@ -45,13 +45,13 @@ pub struct Points {
 }
 
 impl Features {
-    /// None yet, of these elements.
+    /// Starts empty, for these elements.
     pub fn new(elements: &[Species]) -> Self {
         let sample = || FeatureSample { atoms: Thinned::new(MAX_ATOMS), centroids: Vec::new() };
         Self(elements.iter().map(|element| (*element, [sample(), sample()])).collect())
     }
 
-    /// The elements with the most atoms of either origin.
+    /// The elements with the most atoms, of both origins together.
     pub fn most_frequent(biased: &BTreeMap<Species, u64>, control: &BTreeMap<Species, u64>) -> Vec<Species> {
         let mut counts = biased.clone();
         for (element, number) in control {
@@ -62,7 +62,7 @@ impl Features {
         elements.into_iter().take(MAX_ELEMENTS).map(|(element, _)| element).collect()
     }
 
-    /// Those of the atoms of a structure, [n × D].
+    /// Adds the features of a structure's atoms, [n × D].
     pub fn add(&mut self, origin: Origin, species: &[Species], features: &[f64]) {
         let dimension = features.len().checked_div(species.len()).unwrap_or(0);
         if dimension == 0 {
@@ -79,7 +79,7 @@ impl Features {
         }
     }
 
-    /// A plane for each element that has atoms enough.
+    /// The projection of each element that has enough atoms.
     pub fn planes(&self) -> Vec<Plane> {
         self.0.iter().filter_map(|(element, samples)| Plane::fit(*element, samples)).collect()
     }

@@ -1,5 +1,6 @@
-//! What came of a campaign, as a document: read from the store (`data`), drawn (`figures`), told (`page`). The same campaign
-//! gives the same bytes: nothing of the clock or of where it is made is in it.
+//! Builds the report of a campaign: reads the store (`report_data`), draws the figures (`figures`) and writes the
+//! page (`page`). The same campaign always gives the same bytes, since the report contains neither the date nor the
+//! place of its making.
 
 mod collections;
 mod csv;
@@ -19,10 +20,10 @@ use self::csv::Csv;
 use self::report_data::ReportData;
 use crate::exit_status::Failure;
 
-/// Dots an inch of the images.
+/// Resolution of the images, dots per inch.
 const RESOLUTION: f64 = 300.0;
 
-/// A figure with what is said of it, or why there is none.
+/// A figure of the page, or the reason why it is missing.
 struct Part {
     /// Name of its files.
     name: &'static str,
@@ -32,10 +33,10 @@ struct Part {
     drawn: Result<Drawn, String>,
 }
 
-/// A figure, its caption, and the numbers in it.
+/// A figure with its caption and data.
 struct Drawn {
     figure: ::figures::Figure,
-    /// With `_{…}` and `^{…}`.
+    /// Supports `_{…}` and `^{…}`.
     caption: String,
     numbers: Csv,
 }
@@ -44,11 +45,11 @@ struct Drawn {
 pub struct File {
     /// Its path in the report's directory.
     pub path: String,
-    /// What is in it.
+    /// Its content.
     pub bytes: Vec<u8>,
 }
 
-/// Reads the campaign and makes all files of its report, the page first.
+/// Reads the campaign and builds all files of its report, the page first.
 pub async fn build(store: &Store) -> Result<Vec<File>, Failure> {
     let data = ReportData::read(store).await?;
     let parts = figures::all(&data);
@@ -71,5 +72,5 @@ pub async fn build(store: &Store) -> Result<Vec<File>, Failure> {
     Ok(files)
 }
 
-/// The page's file.
+/// File name of the page.
 pub const PAGE: &str = "report.html";

@@ -1,4 +1,4 @@
-//! The page: one HTML file with its font and figures in it, which asks nobody for anything.
+//! The page: one self-contained HTML file with fonts and figures.
 
 use std::fmt::Write;
 
@@ -11,14 +11,14 @@ use super::{Drawn, Part};
 
 const STYLE: &str = include_str!("page.css");
 
-/// What stands below a heading.
+/// Content of a section.
 enum Block<'a> {
     Paragraph(String),
     Figure(&'a Part, usize),
     Table(&'a Table, usize),
 }
 
-/// The page.
+/// Writes the page.
 pub fn write(data: &ReportData, parts: &[Part], tables: &[Table]) -> String {
     let title = format!("Campaign {}", data.campaign.id);
     let mut html = format!(
@@ -56,7 +56,7 @@ fn sections<'a>(
     parts: &'a [Part],
     tables: &'a [Table],
 ) -> Vec<(&'static str, Vec<Block<'a>>)> {
-    // Figures are numbered as far as they are there, tables likewise.
+    // Numbers the figures and tables that exist.
     let numbered = |name: &str| {
         let place = parts.iter().position(|part| part.name == name)?;
         let before = parts[..place].iter().filter(|part| part.drawn.is_ok()).count();
@@ -181,7 +181,7 @@ fn write_cell(column: usize, cell: &Cell) -> String {
     }
 }
 
-/// The font in the page, so that it looks the same everywhere.
+/// Embeds a font, so that the page looks the same everywhere.
 fn face(font: &[u8], weight: &str) -> String {
     format!(
         "@font-face {{ font-family: 'Report Sans'; font-weight: {weight}; \
@@ -190,7 +190,7 @@ fn face(font: &[u8], weight: &str) -> String {
     )
 }
 
-/// Base 64 (RFC 4648).
+/// Base64 (RFC 4648).
 fn base64(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);

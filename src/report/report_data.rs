@@ -1,4 +1,4 @@
-//! Everything that a report says, read from the store.
+//! Reads the data of a report from the store.
 
 use std::collections::BTreeMap;
 
@@ -11,32 +11,32 @@ use store::{
 use super::collections::Collections;
 use crate::label_statistics::{self, LabelStatistics};
 
-/// Labels whose cost is shown: the newest.
+/// Largest number of labels in the cost figure: the newest.
 const COSTS: u32 = 100_000;
-/// Parts into which the decision log is cut.
+/// Number of parts into which the decision log is divided.
 const PARTS: u64 = 200;
 
-/// A campaign as it stands.
+/// Data of a campaign.
 pub struct ReportData {
-    /// What it is.
+    /// Id and configuration.
     pub campaign: Campaign,
     /// Counts, walks, budget.
     pub standing: Status,
-    /// The configuration in force, every default filled in.
+    /// The configuration in force with every default filled in.
     pub configuration: Value,
-    /// What the selector keeps of its mixture, by name.
+    /// Values that the selector stores about its mixture, by name.
     pub values: BTreeMap<String, Value>,
     /// Seed structures.
     pub seeds: Vec<SeedStructure>,
-    /// What became of candidates, along the decision log.
+    /// Fates of candidates along the decision log.
     pub fates: Vec<FateCount>,
-    /// The same by seed structure.
+    /// Fates by seed structure.
     pub fates_by_seed: Vec<FateCount>,
-    /// What was collected.
+    /// The collected structures.
     pub sample: Collections,
-    /// What is there if labels are made at all.
+    /// `None` without a label protocol.
     pub labels: Option<Labels>,
-    /// When the campaign was begun, ms since 1970.
+    /// Start of the campaign, ms since 1970.
     pub begun: Option<i64>,
 }
 
@@ -44,18 +44,18 @@ pub struct ReportData {
 pub struct Labels {
     /// The protocol.
     pub protocol: Protocol,
-    /// Force errors by grade, and which structures got their labels.
+    /// Statistics of force errors and completion.
     pub learned: LabelStatistics,
-    /// What each label took, newest first.
+    /// Cost of each label, newest first.
     pub costs: Vec<LabelCost>,
-    /// Failures that attempts met.
+    /// Failures of attempts.
     pub failures: Vec<FailureCount>,
-    /// Where labels finally failed.
+    /// Structures whose labels failed for good.
     pub unlabelled: Vec<Unlabelled>,
 }
 
 impl ReportData {
-    /// Reads it, page by page.
+    /// Reads the data page by page.
     pub async fn read(store: &Store) -> Result<Self, StoreError> {
         let campaign = store.campaign().await?;
         let seeds = store.seed_structures().await?;

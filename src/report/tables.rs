@@ -1,4 +1,4 @@
-//! The tables of a report: what people read, and every digit of it for a file.
+//! The tables of a report, rounded for the page and with full precision for a file.
 
 mod facts;
 mod labels;
@@ -10,31 +10,31 @@ use super::report_data::ReportData;
 
 pub use facts::collection_rule;
 
-/// Rows of a table on the page, where it grows with the campaign.
+/// Largest number of rows on the page, for tables that grow with the campaign.
 const ROWS: usize = 60;
 
-/// Rows below titles.
+/// A table.
 pub struct Table {
-    /// Name of its file, and the place on the page.
+    /// Name of its file and its anchor on the page.
     pub name: &'static str,
-    /// What it shows; with `_{…}` and `^{…}`, as the titles.
+    /// Caption. Supports `_{…}` and `^{…}`, as the titles do.
     pub caption: String,
-    /// Titles of columns.
+    /// Column titles.
     pub titles: Vec<&'static str>,
-    /// Rows. One of a single cell is a heading of those below it, and is not in the file.
+    /// Rows. A row of a single cell is a heading and is not written to the file.
     pub rows: Vec<Vec<Cell>>,
-    /// Rows on the page, at most; the file has all.
+    /// Largest number of rows on the page. The file has all.
     pub shown: usize,
 }
 
 /// A cell.
 #[derive(Clone, Debug)]
 pub struct Cell {
-    /// As people read it.
+    /// Rounded, for the page.
     pub shown: String,
-    /// With every digit.
+    /// Full precision, for the file.
     pub exact: String,
-    /// Numbers stand to the right.
+    /// Numbers are right-aligned.
     pub is_number: bool,
 }
 
@@ -43,12 +43,12 @@ impl Table {
         Self { name, caption: caption.into(), titles: titles.to_vec(), rows: Vec::new(), shown: ROWS }
     }
 
-    /// The same with every row on the page.
+    /// Shows every row on the page.
     fn whole(self) -> Self {
         Self { shown: usize::MAX, ..self }
     }
 
-    /// Its file.
+    /// The content of its file.
     pub fn csv(&self) -> Csv {
         let titles: Vec<_> = self.titles.iter().map(|title| figures::plain(title)).collect();
         let titles: Vec<_> = titles.iter().map(String::as_str).collect();
@@ -61,7 +61,7 @@ impl Table {
     }
 }
 
-/// Words.
+/// A text.
 fn text(words: impl Into<String>) -> Cell {
     let words = words.into();
     Cell { shown: words.clone(), exact: words, is_number: false }
@@ -72,18 +72,18 @@ fn count(number: u64) -> Cell {
     Cell { shown: super::style::grouped(number), exact: number.to_string(), is_number: true }
 }
 
-/// A number with so many decimals for people, a dash where there is none.
+/// A number with a fixed number of decimals, or a dash.
 fn real(x: impl Into<Option<f64>>, decimals: usize) -> Cell {
     let x = x.into();
     Cell { shown: crate::output::decimals(x, decimals), exact: csv::number(x), is_number: true }
 }
 
-/// A share, shown in percent; its file has the same.
+/// A share, in percent on the page and in the file.
 fn percent(share: Option<f64>) -> Cell {
     real(share.map(|share| 100.0 * share), 1)
 }
 
-/// All that have rows, in the order of the page.
+/// All tables with rows, in the order of the page.
 pub fn all(data: &ReportData) -> Vec<Table> {
     let mut tables = vec![facts::summary(data), seeds::of(data)];
     if let Some(found) = &data.labels {

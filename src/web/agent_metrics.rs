@@ -1,4 +1,5 @@
-//! `/metrics` of an agent: what it knows of its walkers, of their turns and of the line to the orchestrator. docs/metrics.md lists it.
+//! `/metrics` of an agent: its walkers, their assignments and the connection to the orchestrator. docs/metrics.md
+//! lists them.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -13,16 +14,16 @@ use workers::agent::Numbers;
 
 use super::exposition::{CONTENT_TYPE, Text};
 
-/// What is known of an agent. Clones share it.
+/// State of an agent. Clones share it.
 #[derive(Clone, Debug, Default)]
 pub struct AgentState {
-    /// Its work and its line.
+    /// Its assignments and its connection.
     pub numbers: Arc<Mutex<Numbers>>,
     /// Its walkers.
     pub walkers: Arc<Mutex<Vec<ChildStatus>>>,
 }
 
-/// The metrics of an agent.
+/// Serves the metrics of an agent.
 pub fn router(state: AgentState) -> Router {
     Router::new().route("/metrics", get(metrics)).with_state(state)
 }
@@ -118,7 +119,7 @@ fn link_metrics(text: &mut Text, numbers: &Numbers) {
     );
 }
 
-/// Nothing where there is no value.
+/// Omits the gauge if there is no value.
 fn optional_gauge(text: &mut Text, name: &str, help: &str, value: Option<f64>) {
     if let Some(value) = value {
         text.gauge(name, help, &[(&[], value)]);

@@ -1,7 +1,7 @@
-//! The connections of a listener: how many there may be, how long each may be idle, and which one goes when there is no room.
+//! Limits the connections of a listener: their number, their idle time, and which one is closed for a new one.
 //!
-//! Every user of this host can connect. Connections therefore have bounds, and the process keeps descriptors in reserve for
-//! the processes that it starts: at a bound the connection that has been idle for longest makes room for the newest.
+//! Every user of this host can connect, so connections are limited, and the process reserves file descriptors for its
+//! children. At the limit, the connection that has been idle longest is closed for the newest.
 
 use std::collections::BTreeMap;
 use std::os::fd::AsRawFd;
@@ -12,14 +12,14 @@ use rustix::process::{Resource, getrlimit};
 use tokio::net::TcpStream;
 use tokio::task::JoinHandle;
 
-/// Connections of one listener at most.
+/// Largest number of connections of one listener.
 const MAX_CONNECTIONS: usize = 64;
-/// A connection is idle for so long before it makes room for another: whoever has connected gets so much time to ask.
+/// Time for which a new connection may be idle before it can be closed for another: long enough to send a request.
 const MIN_IDLE_TIME: Duration = Duration::from_millis(200);
-/// Descriptors that connections leave free at least, where the limit allows it: to start a process takes up to ten.
+/// File descriptors reserved for other purposes, where the limit allows. Starting a process takes up to ten.
 const MIN_RESERVED_DESCRIPTORS: u64 = 64;
 
-/// The connections that are open. Clones share them.
+/// The open connections. Clones share them.
 #[derive(Clone, Debug, Default)]
 pub struct Connections(Arc<Mutex<Open>>);
 
@@ -37,39 +37,39 @@ struct Connection {
     task: Option<JoinHandle<()>>,
 }
 
-/// What a connection does.
+/// What a connection is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum State {
-    /// It waits for a request to be complete, or for the client to take an answer.
+    /// Waiting for a complete request, or for the client to read a response.
     Idle,
-    /// It is told events until the client leaves.
+    /// Streaming events until the client leaves.
     Streaming,
-    /// A request is being answered.
+    /// Responding to a request.
     Responding,
 }
 
-/// A place among the connections, given back when this is dropped.
+/// Registration of a connection, removed on drop.
 #[derive(Debug)]
 pub struct ConnectionGuard {
     connections: Connections,
     number: u64,
 }
 
-/// Whether a connection may be served.
+/// Whether a new connection may be served.
 #[derive(Debug)]
 pub enum Admission {
-    /// Yes.
+    /// At once.
     Now,
-    /// Yes, when this one has gone.
+    /// After this connection has closed.
     AfterClosing(JoinHandle<()>),
-    /// Not before so long.
+    /// Try again after this time.
     Later(Duration),
-    /// No: all others are at work.
+    /// Refuse it: all others are responding.
     Refuse,
 }
 
 impl Connections {
-    /// Whether a new connection may be served, and which one goes for it.
+    /// Decides whether to serve a new connection, and which one to close for it.
     pub fn admit(&self, stream: &TcpStream) -> Admission {
         let mut open = self.open();
         if open.by_number.len() < MAX_CONNECTIONS && leaves_reserve(stream) {
@@ -78,7 +78,7 @@ impl Connections {
         open.evict(Instant::now())
     }
 
-    /// Takes a place for a connection that `serve` begins to serve.
+    /// Registers a connection and serves it with `serve`.
     pub fn add(&self, serve: impl FnOnce(ConnectionGuard) -> JoinHandle<()>) {
         let number = {
             let mut open = self.open();
@@ -89,13 +89,13 @@ impl Connections {
             number
         };
         let task = serve(ConnectionGuard { connections: self.clone(), number });
-        // It may be over already.
+        // It may have ended already.
         if let Some(connection) = self.open().by_number.get_mut(&number) {
             connection.task = Some(task);
         }
     }
 
-    /// Closes all of them.
+    /// Closes all connections.
     pub fn close(&self) {
         self.open().by_number.values().filter_map(|open| open.task.as_ref()).for_each(JoinHandle::abort);
     }
@@ -106,9 +106,9 @@ impl Connections {
 }
 
 impl Open {
-    /// Closes the connection that has been idle for longest, or else the one that was told events for longest.
+    /// Closes the connection that has been idle longest, or else the one that has streamed events longest.
     fn evict(&mut self, now: Instant) -> Admission {
-        // One that has no task yet has only just come.
+        // A connection without a task has only just been accepted.
         let others = self.by_number.iter().filter(|(_, open)| open.task.is_some());
         let first = others.min_by_key(|(_, open)| (open.state, open.since));
         let Some((number, open)) = first.filter(|(_, open)| open.state != State::Responding) else {
@@ -130,14 +130,14 @@ impl Open {
 }
 
 impl ConnectionGuard {
-    /// The connection does something else from now on.
+    /// Sets the state of the connection.
     pub fn enter(&self, state: State) {
         if let Some(open) = self.connections.open().by_number.get_mut(&self.number) {
             (open.state, open.since) = (state, Instant::now());
         }
     }
 
-    /// How long the connection has been idle; zero while it is not.
+    /// How long the connection has been idle. Zero unless it is idle.
     pub fn idle(&self) -> Duration {
         let open = self.connections.open();
         let idle = open.by_number.get(&self.number).filter(|open| open.state == State::Idle);
@@ -151,14 +151,14 @@ impl Drop for ConnectionGuard {
     }
 }
 
-/// Whether enough descriptors are left for others. The system gives each file the lowest free number, so the number tells how
-/// many are taken.
+/// Whether enough descriptors remain. A new file gets the lowest free number, so the number tells how many are in
+/// use.
 fn leaves_reserve(stream: &TcpStream) -> bool {
     let number = u64::try_from(stream.as_raw_fd()).unwrap_or(u64::MAX);
     getrlimit(Resource::Nofile).current.is_none_or(|limit| number < limit - reserve(limit))
 }
 
-/// Descriptors in reserve under this limit: a quarter of it, [`MIN_RESERVED_DESCRIPTORS`] at least, and never more than half.
+/// Descriptors to reserve under this limit: a quarter of it, at least [`MIN_RESERVED_DESCRIPTORS`], at most half.
 fn reserve(limit: u64) -> u64 {
     MIN_RESERVED_DESCRIPTORS.max(limit / 4).min(limit / 2)
 }

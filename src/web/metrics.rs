@@ -1,4 +1,4 @@
-//! `/metrics` for Prometheus: what `calmwalk status` reads, read when it is asked for. docs/metrics.md lists it.
+//! `/metrics` for Prometheus: the values of `calmwalk status`, read on request. docs/metrics.md lists them.
 
 use std::collections::BTreeMap;
 
@@ -14,7 +14,7 @@ use crate::cli::status::Snapshot;
 
 const SECONDS_PER_HOUR: f64 = 3600.0;
 
-/// The metrics of a campaign.
+/// Serves the metrics of a campaign.
 pub fn router(store: Store) -> Router {
     Router::new().route("/metrics", get(metrics)).with_state(store)
 }
@@ -26,7 +26,7 @@ async fn metrics(State(store): State<Store>) -> Response {
     }
 }
 
-/// Everything. Labels have few values each: kinds, states, reasons and classes, never walks or structures.
+/// All metrics. Labels have few values: kinds, states, reasons and classes, never walks or structures.
 pub fn text(snapshot: &Snapshot) -> String {
     let (campaign, status) = (snapshot.campaign(), snapshot.standing());
     let mut text = Text::default();
@@ -146,7 +146,7 @@ fn label_queue(text: &mut Text, status: &Status) {
     let made = used.labels as f64;
     text.counter("calmwalk_labels_made_total", "Labels made, also those kept beside others.", &[(&[], made)]);
     let core_seconds = used.core_hours * SECONDS_PER_HOUR;
-    // What an attempt took is only known when it has ended: until then it is reckoned, and so the sum may fall.
+    // The cost of an attempt is known only at its end and estimated before, so the sum may decrease.
     text.gauge(
         "calmwalk_label_core_seconds",
         "Core-seconds of label attempts, those under way so far.",
@@ -163,7 +163,7 @@ fn label_queue(text: &mut Text, status: &Status) {
 fn processes(text: &mut Text, status: &Status) {
     let mut kinds: BTreeMap<(&str, &str), u64> = BTreeMap::new();
     for process in &status.processes {
-        // What else is said of a process may be anything.
+        // Other states contain free text.
         let known = ["running", "stopping", "pausing", "silent", "gone"];
         let state = known.into_iter().find(|state| process.state == *state).unwrap_or("given_up");
         *kinds.entry((&process.kind, state)).or_default() += 1;

@@ -1,4 +1,4 @@
-//! What a campaign shows over HTTP, to this host only.
+//! Serves a campaign over HTTP, to this host only.
 
 pub mod agent_metrics;
 mod connections;
@@ -21,18 +21,18 @@ use crate::exit_status::Failure;
 use crate::mixture_status::InitialMixture;
 use crate::output::{log_and_print, print_stderr};
 
-/// Where a campaign is shown, as arguments.
+/// Options for the addresses to serve on.
 #[derive(Debug, clap::Args)]
 pub struct ListenAddresses {
-    /// Show the campaign in a browser at this address of this host, as 127.0.0.1:8080 (docs/dashboard.md)
+    /// Serve the dashboard at this address of this host, such as 127.0.0.1:8080 (docs/dashboard.md)
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = address)]
     dashboard: Option<SocketAddr>,
-    /// Serve metrics for Prometheus at this address of this host, as 127.0.0.1:9464 (docs/metrics.md)
+    /// Serve Prometheus metrics at this address of this host, such as 127.0.0.1:9464 (docs/metrics.md)
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = address)]
     metrics: Option<SocketAddr>,
 }
 
-/// An address to serve on, as an argument.
+/// Parses an address to serve on.
 pub fn address(text: &str) -> Result<SocketAddr, String> {
     let of_this_host = text.strip_prefix("localhost:").map(|port| format!("127.0.0.1:{port}"));
     of_this_host.as_deref().unwrap_or(text).parse().map_err(|_| {
@@ -44,14 +44,14 @@ pub fn address(text: &str) -> Result<SocketAddr, String> {
     })
 }
 
-/// The same, held.
+/// The bound listeners.
 #[derive(Debug)]
 pub struct BoundListeners {
     dashboard: Option<TcpListener>,
     metrics: Option<TcpListener>,
 }
 
-/// What is served, until this is dropped.
+/// The running servers. They stop on drop.
 #[derive(Debug, Default)]
 pub struct RunningServers {
     servers: Vec<Server>,
@@ -59,7 +59,7 @@ pub struct RunningServers {
 }
 
 impl RunningServers {
-    /// Serves no more, and closes what was read from: whoever closes a database last tidies it up.
+    /// Stops the servers and closes their store. The last process that closes a database cleans it up.
     pub async fn end(self) {
         self.servers.iter().for_each(Server::end);
         if let Some(read_store) = &self.read_store {
@@ -75,7 +75,7 @@ impl Drop for RunningServers {
 }
 
 impl ListenAddresses {
-    /// Takes the addresses, before any work begins that would be in vain.
+    /// Binds the addresses before any work begins.
     pub async fn listen(&self) -> Result<BoundListeners, Failure> {
         let (mut dashboard, mut metrics) = (None, None);
         if let Some(address) = self.dashboard {
@@ -89,8 +89,8 @@ impl ListenAddresses {
 }
 
 impl BoundListeners {
-    /// Begins to serve. What is shown is read through connections of its own: whoever asks often does not keep the campaign
-    /// waiting. What is changed goes through `store`.
+    /// Starts the servers. They read through separate connections, so that frequent requests do not slow the
+    /// campaign. Mutations go through `store`.
     pub async fn serve(
         self,
         location: &Location,
@@ -112,7 +112,7 @@ impl BoundListeners {
             let mutations = Mutations::new(store.clone())?;
             let address = listener.local_addr().map_err(Failure::failed)?;
             tracing::info!("dashboard at http://{address}/");
-            // The token is for whoever reads this, and for no file.
+            // Print the token, but do not log it.
             print_stderr(format_args!("dashboard at http://{address}/#token={}", mutations.token()));
             let router = Dashboard::new(read_store, Some(mutations), Some(original)).router();
             serving.servers.push(Server::start(listener, router));
@@ -121,8 +121,7 @@ impl BoundListeners {
     }
 }
 
-/// An address to serve on, before any work begins that would be in vain. What is served asks nobody who he is, so it is
-/// one of this host.
+/// Binds an address before any work begins. Requests are not authenticated, so the address must be loopback.
 pub async fn listen(address: SocketAddr) -> Result<TcpListener, Failure> {
     if !address.ip().is_loopback() {
         return Err(Failure::Input(format!(
@@ -138,7 +137,7 @@ pub async fn listen(address: SocketAddr) -> Result<TcpListener, Failure> {
     })
 }
 
-/// Says where metrics are served, and serves them.
+/// Prints the address of the metrics and serves them.
 pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<Server, Failure> {
     let address = listener.local_addr().map_err(Failure::failed)?;
     log_and_print(format_args!("metrics at http://{address}/metrics"));

@@ -1,5 +1,5 @@
-//! Who may ask. An address of this host is also reached by every page that a browser here shows, under whatever name its
-//! server gives that address: such requests bear that name.
+//! Checks requests. Any web page in a browser on this host can reach a loopback address, under whatever name DNS
+//! resolves to it. Such requests carry that name, so other names are refused.
 
 use std::net::IpAddr;
 
@@ -8,7 +8,7 @@ use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
-/// Answers requests that name this host as itself, and refuses all others.
+/// Passes requests that name this host as itself, and refuses others.
 pub async fn require_local_host(request: Request, next: Next) -> Response {
     match host(request.headers()) {
         Some(host) if is_local_host(host) => next.run(request).await,
@@ -17,12 +17,11 @@ pub async fn require_local_host(request: Request, next: Next) -> Response {
     }
 }
 
-/// What a page may do, said with every answer: load what comes from here, and nothing else; show nothing of it inside
-/// pages of others.
+/// Content security policy of every response: load from this origin only, and forbid embedding.
 const ALLOWED: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; \
                        base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// Keeps what is served from pages of others, and the pages from others' scripts.
+/// Adds headers that isolate the responses from other sites.
 pub async fn add_security_headers(mut answer: Response) -> Response {
     let said = [
         (header::CONTENT_SECURITY_POLICY, ALLOWED),
@@ -34,13 +33,13 @@ pub async fn add_security_headers(mut answer: Response) -> Response {
     for (name, value) in said {
         answer.headers_mut().insert(name, HeaderValue::from_static(value));
     }
-    // Files say how long they hold; numbers do not.
+    // Static files set their own cache policy; data is not cached.
     let hold = answer.headers_mut().entry(header::CACHE_CONTROL);
     hold.or_insert(HeaderValue::from_static("no-store"));
     answer
 }
 
-/// Whether the request comes from a page of ours, or from no page at all: browsers say where from.
+/// Whether the request comes from our own page or from no page, according to the browser's headers.
 pub fn is_same_origin(headers: &HeaderMap) -> bool {
     let text = |name: HeaderName| headers.get(name).map(|value| value.to_str().unwrap_or_default());
     let site = text(HeaderName::from_static("sec-fetch-site"));
@@ -50,12 +49,12 @@ pub fn is_same_origin(headers: &HeaderMap) -> bool {
         && origin.is_none_or(|origin| Some(origin) == ours.as_deref())
 }
 
-/// What the request calls this host, with the port.
+/// Host name in the request, with the port.
 pub fn host(headers: &HeaderMap) -> Option<&str> {
     headers.get(header::HOST)?.to_str().ok()
 }
 
-/// The port may be any: ssh forwards others.
+/// Any port is allowed, since ssh may forward another one.
 fn is_local_host(host: &str) -> bool {
     let name = match host.rsplit_once(':') {
         Some((name, port)) if port.parse::<u16>().is_ok() => name,

@@ -1,5 +1,5 @@
-//! Serving a listener within bounds: of connections ([`Connections`]), of the time and length of a request, and of the time in
-//! which the client takes an answer.
+//! Serves a listener with limits on the number of connections ([`Connections`]), on the time and length of requests,
+//! and on the time to send responses.
 
 use std::convert::Infallible;
 use std::io;
@@ -21,11 +21,11 @@ use tokio::time::{sleep, timeout};
 use super::connections::{Admission, ConnectionGuard, Connections, State};
 use super::security;
 
-/// Time in which a request's headers have to be there, from the connection or the last answer on.
+/// Time to receive the headers of a request, from the connection or the previous response.
 const HEADER_TIMEOUT: Duration = Duration::from_secs(5);
-/// Time in which a request's body has to be there.
+/// Time to receive the body of a request.
 const BODY_TIMEOUT: Duration = Duration::from_secs(5);
-/// Time in which the client has to take an answer.
+/// Time for the client to receive a response.
 const RESPONSE_TIMEOUT: Duration = Duration::from_secs(60);
 /// Request line and headers, bytes.
 const MAX_HEADER_BYTES: usize = 16 << 10;
@@ -35,7 +35,7 @@ const MAX_BODY_BYTES: usize = 16 << 10;
 /// Pause after the system has refused to accept a connection.
 const ACCEPT_RETRY_INTERVAL: Duration = Duration::from_millis(200);
 
-/// What serves a listener, with its connections.
+/// A server with its connections.
 #[derive(Debug)]
 pub struct Server {
     listening: AbortHandle,
@@ -43,7 +43,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// Serves in a task of its own, until [`Self::end`].
+    /// Serves in a background task until [`Self::end`].
     pub fn start(listener: TcpListener, router: Router) -> Self {
         let router = router.layer(middleware::from_fn(security::require_local_host));
         let connections = Connections::default();
@@ -51,7 +51,7 @@ impl Server {
         Self { listening, connections }
     }
 
-    /// Listens no more, and closes all connections.
+    /// Stops listening and closes all connections.
     pub fn end(&self) {
         self.listening.abort();
         self.connections.close();
@@ -67,7 +67,7 @@ async fn accept(listener: TcpListener, router: Router, connections: Connections)
                     connections.add(|guard| tokio::spawn(serve(stream, router, guard)));
                 }
             }
-            // The client has gone, or the system lacks something.
+            // The client has gone, or a resource is exhausted.
             Err(error) if error.kind() == io::ErrorKind::ConnectionAborted => {}
             Err(error) => {
                 tracing::debug!("cannot accept a connection: {error}");
@@ -77,13 +77,13 @@ async fn accept(listener: TcpListener, router: Router, connections: Connections)
     }
 }
 
-/// The connection as soon as there is room for it; `None` if there is none.
+/// Waits until the connection may be served. `None` if it is refused.
 async fn admit(stream: TcpStream, connections: &Connections) -> Option<TcpStream> {
     loop {
         match connections.admit(&stream) {
             Admission::Now => return Some(stream),
             Admission::AfterClosing(gone) => {
-                // It is cancelled: its connection is closed when it has ended.
+                // The task is aborted, and its connection is closed when it has ended.
                 let _ = gone.await;
                 return Some(stream);
             }
@@ -117,13 +117,14 @@ async fn serve(stream: TcpStream, router: Router, guard: ConnectionGuard) {
         .max_buf_size(MAX_HEADER_BYTES)
         .max_headers(MAX_HEADERS);
     tokio::select! {
-        // What is wrong with a connection is its client's affair.
+        // Errors of a connection concern its client only.
         _ = protocol.serve_connection(TokioIo::new(stream), answer) => {}
         () = wait_until_stalled(guard) => {}
     }
 }
 
-/// Waits until the client has taken nothing of an answer for too long. One that only waits for requests ends before.
+/// Waits until the client has read nothing of a response for too long. A connection that only waits for requests
+/// times out before.
 async fn wait_until_stalled(guard: &ConnectionGuard) {
     loop {
         let idle = guard.idle();

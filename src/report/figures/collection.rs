@@ -1,4 +1,4 @@
-//! What became of candidates, and how fast new structures were found.
+//! Fates of candidates, and the rate at which new structures were found.
 
 use ::figures::{Anchor, Axis, Colour, Figure, Panel, Scale};
 use store::Candidates;

@@ -1,4 +1,4 @@
-//! Which structures got their labels, by how new and how stretched they are.
+//! Share of structures that were labelled, by grade and by volume.
 
 use ::figures::{Axis, Colour, Figure, Marker, Panel, Rectangle, Scale};
 use analysis::CompletionBin;
@@ -48,7 +48,7 @@ fn draw_bins(
     bins: &[CompletionBin<String>],
     place: Rectangle,
 ) {
-    // Ends of bins stand where bins end; behind the last, what has no value.
+    // Ticks are at the edges of bins. Structures without a value come after the last bin.
     let ends = bins.iter().enumerate().filter_map(|(k, bin)| match (bin.above, bin.up_to) {
         (_, Some(end)) => Some((k as f64 + 1.0, end.to_string())),
         (None, None) => Some((k as f64 + 0.5, "unknown".to_owned())),

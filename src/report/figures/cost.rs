@@ -1,4 +1,4 @@
-//! What labels cost.
+//! Cost of labels.
 
 use ::figures::{Axis, Colour, Figure, Marker, Panel, Scale};
 use analysis::{Histogram, logarithmic_edges, quantile};
@@ -11,7 +11,7 @@ use super::row;
 
 /// Bins of the histogram.
 const BINS: usize = 24;
-/// Labels that have marks.
+/// Largest number of labels drawn as points.
 const DRAWN: usize = 3000;
 
 pub fn draw(data: &ReportData) -> Result<Drawn, String> {
@@ -51,7 +51,7 @@ pub fn draw(data: &ReportData) -> Result<Drawn, String> {
     Ok(Drawn { figure, caption: caption(data, seconds), numbers })
 }
 
-/// What the cost depends on: electrons, where every label has some.
+/// The size that the cost depends on: electrons if every label has them, otherwise atoms.
 fn size(costs: &[LabelCost]) -> (&'static str, fn(&LabelCost) -> f64) {
     match costs.iter().all(|cost| cost.electrons.is_some_and(|electrons| electrons > 0.0)) {
         true => ("electrons", |cost| cost.electrons.unwrap_or(f64::NAN)),

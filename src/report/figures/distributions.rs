@@ -9,10 +9,10 @@ use super::super::style::{WIDTH, axis, grouped, origins};
 use super::super::{Csv, Drawn};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};
 
-/// What is shown of an atom.
+/// A quantity of an atom.
 type OfAtom = fn(&Atom) -> Option<f64>;
 
-/// Bins of a panel.
+/// Number of bins of a panel.
 const BINS: usize = 40;
 
 pub fn draw(sample: &Collections) -> Result<Drawn, String> {

@@ -9,14 +9,14 @@ use super::super::style::{WIDTH, axis, grouped, look, origins};
 use super::super::{Csv, Drawn, csv};
 use super::NO_LABELS;
 
-/// Bins of a panel.
+/// Number of bins of a panel.
 const BINS: usize = 16;
-/// A bin with fewer atoms is not drawn.
+/// Bins with fewer atoms are not drawn.
 pub const LEAST: u64 = 20;
-/// Places of a marginal density.
+/// Grid points of a marginal density.
 const PLACES: usize = 160;
 
-/// What is plotted against the error.
+/// A quantity to plot the error against.
 struct Against {
     letter: char,
     title: &'static str,
@@ -80,7 +80,7 @@ fn draw_panel(
     draw_margins(figure, &of, place, &x, &y);
 }
 
-/// Edges of the bins of a panel: of one width on its axis.
+/// Edges of the bins of a panel, equally wide on its axis.
 fn edges(x: &Axis) -> Vec<f64> {
     match x.scale {
         Scale::Linear => even_edges(x.low, x.high, BINS),
@@ -88,7 +88,7 @@ fn edges(x: &Axis) -> Vec<f64> {
     }
 }
 
-/// Middle of a bin on the axis of a panel.
+/// Midpoint of a bin on the axis of a panel.
 pub fn middle(panel: &Panel, band: &Band) -> f64 {
     match panel.x.scale {
         Scale::Linear => 0.5 * (band.low + band.high),
@@ -96,7 +96,7 @@ pub fn middle(panel: &Panel, band: &Band) -> f64 {
     }
 }
 
-/// What is between two of the quantiles of bins that have atoms enough, one behind the other.
+/// Draws the band between two quantiles over runs of bins with enough atoms.
 pub fn ribbons(panel: &mut Panel, bands: &[Band], [low, high]: [usize; 2], paint: ::figures::Paint) {
     for run in bands.split(|band| band.number < LEAST) {
         let points: Vec<_> = run
@@ -123,7 +123,7 @@ fn draw_medians(panel: &mut Panel, origin: Origin, bands: &[Band]) {
     }
 }
 
-/// Densities of what is on either axis, above and at the right.
+/// Draws the marginal densities above and to the right.
 fn draw_margins(figure: &mut Figure, of: &[(Origin, Vec<[f64; 2]>)], place: Rectangle, x: &Axis, y: &Axis) {
     let above = Rectangle { y: place.y - 31.0, height: 28.0, ..place };
     let right = Rectangle { x: place.right() + 3.0, width: 30.0, ..place };
@@ -161,14 +161,14 @@ fn draw_density(panel: &mut Panel, origin: Origin, line: &[(f64, f64)], at: fn(f
     panel.line(points, ::figures::Stroke { width: 1.0, ..look.line });
 }
 
-/// (what is plotted, error) of the labelled atoms.
+/// Pairs of quantity and error of the labelled atoms.
 fn pairs(sample: &Collections, origin: Origin, of: fn(&Atom) -> Option<f64>) -> Vec<[f64; 2]> {
     let (_, collection) = sample.both()[usize::from(origin == Origin::Control)];
     let pair = |atom: &Atom| Some([of(atom)?, atom.error?]).filter(|[x, y]| x.is_finite() && y.is_finite());
     collection.atoms.kept().filter_map(pair).collect()
 }
 
-/// Adds bins to the numbers of a figure: panel, origin, edges, atoms and five of the quantiles.
+/// Writes the bins to the figure's data: panel, origin, edges, number of atoms and five quantiles.
 pub fn push_bands(numbers: &mut Csv, panel: &str, origin: &str, bands: &[Band]) {
     for band in bands {
         let mut cells =

@@ -1,4 +1,4 @@
-//! Force error against either grade, all labelled atoms together, with nested percentile bands (as the paper's Fig. 2).
+//! Force error against either grade, for all labelled atoms, with nested percentile bands (as the paper's Fig. 2).
 
 use ::figures::{Colour, Figure, Key, Panel, Scale, legend};
 use analysis::{bands, logarithmic_edges, spearman};
@@ -10,10 +10,10 @@ use super::super::{Csv, Drawn, csv};
 use super::errors::{LEAST, middle, ribbons};
 use super::{NO_LABELS, row};
 
-/// What is shown of an atom.
+/// A quantity of an atom.
 type OfAtom = fn(&Atom) -> f64;
 
-/// Bins of a panel.
+/// Number of bins of a panel.
 const BINS: usize = 18;
 
 pub fn draw(sample: &Collections) -> Result<Drawn, String> {

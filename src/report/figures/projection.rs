@@ -1,4 +1,4 @@
-//! Features in the plane of their first two principal components, with 95 % contours (the paper's Fig. 7a).
+//! Features projected onto their first two principal components, with 95 % contours (the paper's Fig. 7a).
 
 use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale};
 use analysis::{PlaneDensity, contours};
@@ -10,13 +10,13 @@ use super::super::style::{WIDTH, grouped, look, origins};
 use super::super::{Csv, Drawn, csv};
 use super::NOTHING_COLLECTED;
 
-/// Of the atoms, so many are inside of a contour.
+/// Share of the atoms inside a contour.
 const INSIDE: f64 = 0.95;
-/// Places of the grid of a density, along either side.
+/// Grid points of a density along each side.
 const GRID: usize = 128;
-/// Atoms that are drawn of either origin.
+/// Largest number of atoms drawn of each origin.
 const DRAWN: usize = 1500;
-/// Fewer atoms have no contour.
+/// Least number of atoms for a contour.
 const LEAST: usize = 50;
 
 pub fn draw(sample: &Collections) -> Result<Drawn, String> {

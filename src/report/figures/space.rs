@@ -1,4 +1,4 @@
-//! Volumes and composition of what was collected.
+//! Volumes and composition of the collected structures.
 
 use ::figures::{Axis, Figure, Panel, Rectangle, Scale};
 use analysis::{Histogram, even_edges};
@@ -9,12 +9,12 @@ use super::super::style::{WIDTH, axis, grouped, look, origins};
 use super::super::{Csv, Drawn};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};
 
-/// What is shown of a structure.
+/// A quantity of a structure.
 type OfShape = fn(&StructureSize) -> Option<f64>;
 
-/// Bins of a histogram.
+/// Number of bins of a histogram.
 const BINS: usize = 24;
-/// Elements that have bars of their own: those with the most atoms.
+/// Largest number of elements with bars. Those with the most atoms are shown.
 const ELEMENTS: usize = 12;
 
 pub fn draw(sample: &Collections) -> Result<Drawn, String> {

@@ -1,4 +1,4 @@
-//! What the campaign is: in numbers, by its settings, and where it comes from.
+//! Summary and provenance of the campaign.
 
 use std::collections::BTreeSet;
 
@@ -60,7 +60,7 @@ pub fn summary(data: &ReportData) -> Table {
     table
 }
 
-/// When a structure becomes a candidate, in words; `None` where the configuration does not say.
+/// The collection rule as text. `None` if the configuration has none.
 pub fn collection_rule(configuration: &Value) -> Option<String> {
     let rule = serde_json::from_value(configuration["collect"]["when"].clone()).ok()?;
     Some(match rule {
@@ -75,7 +75,7 @@ pub fn collection_rule(configuration: &Value) -> Option<String> {
     })
 }
 
-/// Versions, hashes, and where everything comes from.
+/// Versions, hashes and sources.
 pub fn provenance(data: &ReportData) -> Table {
     let mut table = Table::new("provenance", "Where it comes from.", &["", "value"]).whole();
     let mut row = |name: String, value: String| table.rows.push(vec![text(name), text(value)]);
@@ -113,7 +113,7 @@ pub fn provenance(data: &ReportData) -> Table {
     table
 }
 
-/// ms since 1970 as a date, UTC (the calendar of Howard Hinnant's `civil_from_days`).
+/// Formats ms since 1970 as a date, UTC (with Howard Hinnant's `civil_from_days`).
 fn date(milliseconds: i64) -> String {
     let minutes = milliseconds.div_euclid(60_000);
     let (days, minute) = (minutes.div_euclid(1440), minutes.rem_euclid(1440));

@@ -1,4 +1,4 @@
-//! Force errors by grade, failures, and what has no label because of them.
+//! Force errors by grade, failures, and unlabelled structures.
 
 use analysis::ForceErrors;
 use store::{FailureCount, Range, Unlabelled};
@@ -7,7 +7,7 @@ use super::{Cell, Table, count, percent, real, text};
 use crate::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
 use crate::output::range;
 
-/// How grades and errors go together.
+/// Correlation of grades and errors.
 pub fn correlations(learned: &LabelStatistics) -> Table {
     let caption = format!(
         "Force error |F_{{model}} − F_{{label}}| and the grades under the original mixture: mean error, Spearman’s ρ between grade and \
@@ -49,7 +49,7 @@ pub fn correlations(learned: &LabelStatistics) -> Table {
     table
 }
 
-/// The table of quantiles by one of the grades, as the paper's.
+/// The table of quantiles by one of the grades, as in the paper.
 pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) -> Table {
     let caption = format!(
         "Force errors of all labelled atoms (n = {}) by {grade} under the original mixture: percentiles in eV Å^{{−1}}, the share of atoms \
@@ -88,7 +88,7 @@ pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) 
     table
 }
 
-/// What was taken out of energies before errors are shown.
+/// Element offsets that are removed from energies before errors are shown.
 pub fn energy_offsets(learned: &LabelStatistics) -> Table {
     let offsets = learned.energies.summary().offsets;
     let caption = format!(
@@ -119,7 +119,7 @@ pub fn failures(failures: &[FailureCount]) -> Table {
     table
 }
 
-/// What part of the collected space has no label because labels failed.
+/// The part of the collected space without labels because of failures.
 pub fn unlabelled(unlabelled: &[Unlabelled]) -> Table {
     let caption = "The part of what was collected that has no label because all attempts failed, by seed structure: ranges of the largest \
                    γ under the original mixture and of V/V_{0}, beside those of what is labelled.";

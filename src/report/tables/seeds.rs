@@ -1,11 +1,11 @@
-//! What came of each seed structure.
+//! Results by seed structure.
 
 use std::collections::BTreeMap;
 
 use super::super::report_data::ReportData;
 use super::{Table, count, text};
 
-/// By seed structure: walks, candidates by fate, labels.
+/// Walks, candidates by fate and labels of each seed structure.
 pub fn of(data: &ReportData) -> Table {
     let caption = "What came of each seed structure: biased walks and how they ended, candidates by what the selector decided, frames of \
                    its control walks, and labels of both.";
@@ -47,7 +47,7 @@ pub fn of(data: &ReportData) -> Table {
     table
 }
 
-/// Biased walks from a seed structure, and how many of them ended in which way.
+/// Number of biased walks from a seed structure, and their states.
 fn walks(data: &ReportData, seed: &str) -> (u64, String) {
     let walks = data.standing.walks.iter();
     let walks = walks.filter(|walk| walk.seed_structure == seed && walk.origin == "biased");

@@ -1,5 +1,5 @@
-//! What may be done from a page: what `calmwalk queue` and `calmwalk walks` do. It takes the token that is said when the campaign starts, in a header
-//! that no page of another site can send.
+//! Actions of the dashboard, as in `calmwalk queue` and `calmwalk walks`. They require the token that is printed when
+//! the campaign starts, in a header that pages of other sites cannot send.
 
 use std::fs::File;
 use std::io::Read;
@@ -18,7 +18,7 @@ use crate::web::security;
 
 const HEADER: &str = "x-calmwalk-token";
 
-/// A store that may be changed, and what has to be known for that.
+/// The store for mutations, and the token that authorizes them.
 #[derive(Clone, Debug)]
 pub struct Mutations {
     store: Store,
@@ -26,7 +26,7 @@ pub struct Mutations {
 }
 
 impl Mutations {
-    /// With a new token, which nobody can guess.
+    /// Generates a random token.
     pub fn new(store: Store) -> Result<Self, Failure> {
         let mut bytes = [0; 16];
         let read = File::open("/dev/urandom").and_then(|mut source| source.read_exact(&mut bytes));
@@ -34,12 +34,12 @@ impl Mutations {
         Ok(Self { store, token: bytes.iter().map(|byte| format!("{byte:02x}")).collect() })
     }
 
-    /// What the owner of the campaign is told.
+    /// The token, to be printed for the owner of the campaign.
     pub fn token(&self) -> &str {
         &self.token
     }
 
-    /// Takes as long for any token of that length.
+    /// Checks the token in constant time.
     fn knows(&self, headers: &HeaderMap) -> bool {
         let given = headers.get(HEADER).map_or(&b""[..], |value| value.as_bytes());
         let differing = given.iter().zip(self.token.bytes()).fold(0, |all, (a, b)| all | (a ^ b));
@@ -47,14 +47,14 @@ impl Mutations {
     }
 }
 
-/// `GET /api/actions`: whether there are any, and whether this token is the one.
+/// `GET /api/actions`: whether actions are possible, and whether the token is right.
 pub async fn allowed(State(dashboard): State<Dashboard>, headers: HeaderMap) -> ApiResult {
     let mutations = &dashboard.mutations;
     let knows = mutations.as_ref().is_some_and(|mutations| mutations.knows(&headers));
     response::json(&json!({ "possible": mutations.is_some(), "token_is_right": knows }))
 }
 
-/// `POST /api/candidates/ID/drop`, `retry` or `prioritise` with `{"priority": …}`: returns the job as it is then.
+/// `POST /api/candidates/ID/drop`, `retry` or `prioritise` with `{"priority": …}`: returns the changed job.
 pub async fn act(
     State(dashboard): State<Dashboard>,
     Path((id, action)): Path<(String, String)>,
@@ -71,8 +71,7 @@ pub async fn act(
     response::json(&store.queue_show(&candidate).await?.job)
 }
 
-/// `POST /api/walks/N/pause` or `resume`, `all` for N being every walk that has more steps to make: returns the walks that were
-/// changed.
+/// `POST /api/walks/N/pause` or `resume`: returns the changed walks. `all` for N stands for every unfinished walk.
 pub async fn act_on_walks(
     State(dashboard): State<Dashboard>,
     Path((walk, action)): Path<(String, String)>,
@@ -96,7 +95,7 @@ pub async fn act_on_walks(
     response::json(&json!({ "changed": changed, "paused": paused }))
 }
 
-/// What may be changed, if whoever asks may do so.
+/// Returns the store if the request is authorized.
 fn may_change<'a>(dashboard: &'a Dashboard, headers: &HeaderMap) -> Result<&'a Store, ApiError> {
     let refused = ApiError::new;
     let Some(mutations) = &dashboard.mutations else {

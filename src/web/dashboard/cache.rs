@@ -1,5 +1,4 @@
-//! Answers that take long: reckoned when somebody asks, and kept for the others who ask. Nobody waits for them long: who asks too early gets
-//! what was reckoned before, or is told to ask again.
+//! Caches responses that take long to compute. A request that comes too early gets the previous result, or 202.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -11,21 +10,21 @@ use tokio::time::timeout;
 
 use super::response::{ApiError, ApiResult, json_text};
 
-/// What was reckoned is given out again for so many times as long as it took …
+/// A result stays valid for this multiple of the time it took …
 const VALIDITY_FACTOR: u32 = 50;
-/// … and for so long at least.
+/// … and at least for this long.
 const MIN_VALIDITY: Duration = Duration::from_secs(2);
-/// Who asks waits for so long at most.
+/// Longest time that a request waits.
 const WAIT_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// What was reckoned last, and what is being reckoned.
+/// The last result and the computation in progress. Clones share them.
 #[derive(Clone, Debug, Default)]
 pub struct CachedResponse(Arc<Mutex<State>>);
 
 #[derive(Debug, Default)]
 struct State {
     computed: Option<Computed>,
-    /// Closed when it is done, however it ends.
+    /// Closed at the end of the computation, whether it succeeds or fails.
     in_progress: Option<watch::Receiver<()>>,
 }
 
@@ -36,13 +35,13 @@ struct Computed {
 }
 
 impl CachedResponse {
-    /// The JSON that is kept, or what `compute` comes to. 202 if there is nothing yet.
+    /// Returns the cached JSON or the result of `compute`. Returns 202 if there is none yet.
     pub async fn answer(
         &self,
         compute: impl Future<Output = Result<String, ApiError>> + Send + 'static,
     ) -> ApiResult {
         if let Some(mut in_progress) = self.begin(compute) {
-            // Nothing is ever sent: it ends with the task.
+            // The channel carries no value; it closes with the task.
             let _ = timeout(WAIT_TIMEOUT, in_progress.changed()).await;
         }
         match &self.state().computed {
@@ -51,7 +50,7 @@ impl CachedResponse {
         }
     }
 
-    /// Begins to reckon unless that is under way, or what is kept is new enough.
+    /// Starts `compute` unless it is in progress or the cached result is still valid.
     fn begin(
         &self,
         compute: impl Future<Output = Result<String, ApiError>> + Send + 'static,

@@ -1,4 +1,4 @@
-//! One candidate or imported structure: its story, its atoms, and files of them.
+//! One candidate or imported structure: its details, its atoms, and files to download.
 
 use atoms::Structure;
 use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, write_frame};
@@ -14,13 +14,13 @@ use super::Dashboard;
 use super::response::{ApiError, ApiResult, json};
 use crate::candidate_details;
 
-/// What may be shown of it.
+/// A structure with its candidate.
 struct StructureRecord {
     /// Its name.
     id: String,
     structure: Structure,
     content: ContentHash,
-    /// None of imported structures.
+    /// `None` for imported structures.
     candidate: Option<StoredCandidate>,
 }
 
@@ -39,7 +39,8 @@ pub async fn structure(State(dashboard): State<Dashboard>, Path(id): Path<String
     }))
 }
 
-/// `GET /api/candidates/ID/structure.extxyz`: with γ and γ_nbr of the original mixture, and the label if there is one.
+/// `GET /api/candidates/ID/structure.extxyz`: with γ and γ_nbr of the original mixture, and the label if there is
+/// one.
 pub async fn extxyz(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> ApiResult {
     let store = &dashboard.store;
     let found = find(store, &id).await?;
@@ -98,7 +99,7 @@ async fn frame(store: &Store, found: StructureRecord) -> Result<Frame, StoreErro
     Ok(frame)
 }
 
-/// To be kept under this name, which is that of a candidate: no quotes, no line breaks.
+/// A file to download. Names of candidates have no quotes or line breaks.
 fn attachment(name: &str, bytes: Vec<u8>) -> axum::response::Response {
     let disposition = format!("attachment; filename=\"{name}\"");
     let kind = "text/plain; charset=utf-8".to_owned();

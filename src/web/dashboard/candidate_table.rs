@@ -1,5 +1,5 @@
-//! The table of candidates, a page at a time. However many there are, an answer looks at a bounded number of them: where
-//! a condition finds few, it says how far it came, and from where to go on.
+//! The table of candidates, one page at a time. A request scans a limited number of candidates. If a filter matches
+//! few of them, the response says how many were scanned and where to continue.
 
 use std::collections::HashMap;
 use std::str::FromStr;
@@ -13,13 +13,13 @@ use super::Dashboard;
 use super::response::{ApiError, ApiResult, json};
 use crate::filter::{Filter, StructureProperties, species};
 
-/// Lines of a page, at most.
+/// Largest number of rows of a page.
 const MAX_PAGE_ROWS: u32 = 200;
-/// Candidates read at a time where some are left out, and looked at for an answer.
+/// Candidates read at a time when rows are filtered, and the largest number scanned for a response.
 const SCAN_ROWS: u32 = 1000;
 const MAX_SCANNED: usize = 10_000;
 
-/// What is asked for.
+/// Parameters of a request.
 #[derive(Debug, Default)]
 struct Query {
     order: Order,
@@ -31,14 +31,14 @@ struct Query {
     limit: Option<u32>,
 }
 
-/// By what the lines are in order.
+/// Order of the rows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum Order {
     #[default]
     Decision,
     Gamma,
     Volume,
-    /// In which the jobs of one state would be labelled.
+    /// Order in which the jobs of one state would be labelled.
     Queue,
 }
 
@@ -46,7 +46,7 @@ enum Order {
 #[derive(Debug, Default)]
 struct Page {
     rows: Vec<ListedCandidate>,
-    /// Where the next page begins; none at the end.
+    /// Cursor of the next page. `None` at the end.
     next: Option<ListPlace>,
     scanned: usize,
 }
@@ -114,7 +114,7 @@ impl Query {
         }
     }
 
-    /// Whether what is read holds more than what is wanted.
+    /// Whether rows that are read may be filtered out.
     fn filters_rows(&self) -> bool {
         let by_fate = self.fate.is_some() && self.order != Order::Decision;
         let by_state = self.state.is_some() && self.order != Order::Queue;
@@ -159,7 +159,7 @@ impl Query {
         ListPlace { value: value.unwrap_or_default(), decision: row.decision }
     }
 
-    /// `elements`: those of formulas that were met before.
+    /// `elements` caches the species of formulas.
     fn matches(&self, row: &ListedCandidate, elements: &mut HashMap<String, Vec<Species>>) -> bool {
         let fate = if row.origin == "control" { "control" } else { &row.fate };
         if self.fate.as_deref().is_some_and(|wanted| wanted != fate) {
@@ -174,7 +174,7 @@ impl Query {
     }
 }
 
-/// What a condition sees of a candidate: the same as that of `calmwalk export`.
+/// Properties for the filter, the same as in `calmwalk export`.
 fn properties<'a>(row: &'a ListedCandidate, species: &'a [Species]) -> StructureProperties<'a> {
     StructureProperties {
         gamma: row.gamma,

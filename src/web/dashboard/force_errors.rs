@@ -1,4 +1,4 @@
-//! Force errors by grade, which take a walk through all labels.
+//! Force errors by grade, computed from all labels.
 
 use axum::extract::State;
 use axum::http::StatusCode;

@@ -21,7 +21,7 @@ async fn compute(store: Store, initial: Option<InitialMixture>) -> Result<String
         None => InitialMixture::read(&store).await.map_err(|failure| not_found(&failure))?,
     };
     let newest = store.newest_mixture().await?;
-    // Eigenvalues of every component may take seconds.
+    // Computing the eigenvalues of every component may take seconds.
     let status = tokio::task::spawn_blocking(move || mixture_status::mixture_status(&initial, &newest)).await;
     let internal = |error: &dyn ToString| ApiError::new(StatusCode::INTERNAL_SERVER_ERROR, error.to_string());
     let status = status.map_err(|error| internal(&error))?.map_err(|failure| internal(&failure))?;

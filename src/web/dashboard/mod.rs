@@ -1,4 +1,4 @@
-//! The dashboard: pages for a browser, and the numbers that they show as JSON. docs/dashboard.md describes it.
+//! The dashboard: pages for a browser, and a JSON API. docs/dashboard.md describes it.
 
 mod actions;
 mod cache;
@@ -24,31 +24,31 @@ use self::sse::StatusFeed;
 use super::security;
 use crate::mixture_status::InitialMixture;
 
-/// Candidates of a walk that are shown as its trace, at most.
+/// Largest number of candidates in the trace of a walk.
 const MAX_TRACE_POINTS: u32 = 2000;
 
-/// What every request may need. Clones share it.
+/// State of the request handlers. Clones share it.
 #[derive(Clone, Debug)]
 pub struct Dashboard {
-    /// To be read only, through connections of its own.
+    /// Read-only, with separate connections.
     store: Store,
     feed: StatusFeed,
     errors: CachedResponse,
     mixture: CachedResponse,
-    /// Where the campaign is run here, the mixture that it began with.
+    /// The initial mixture, if this process runs the campaign.
     initial: Option<InitialMixture>,
-    /// None where nothing may be changed.
+    /// `None` if nothing may be changed.
     mutations: Option<Mutations>,
 }
 
 impl Dashboard {
-    /// Shows what this store has, and begins to look at it every few seconds.
+    /// Shows the content of `store` and polls it every few seconds.
     pub fn new(store: Store, mutations: Option<Mutations>, initial: Option<InitialMixture>) -> Self {
         let (errors, mixture) = (CachedResponse::default(), CachedResponse::default());
         Self { feed: StatusFeed::start(store.clone()), errors, mixture, initial, store, mutations }
     }
 
-    /// Its pages.
+    /// Routes of the dashboard.
     pub fn router(self) -> Router {
         Router::new()
             .route("/", get(static_files::index))

@@ -1,4 +1,4 @@
-//! What is answered: JSON, or why there is none.
+//! Responses of the API: JSON or an error.
 
 use axum::body::Body;
 use axum::http::{StatusCode, header};
@@ -6,10 +6,10 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use store::StoreError;
 
-/// An answer, or a refusal.
+/// A response or an error.
 pub type ApiResult = Result<Response, ApiError>;
 
-/// Why there is no answer, in words.
+/// An error with its message.
 #[derive(Clone, Debug)]
 pub struct ApiError {
     status: StatusCode,
@@ -17,30 +17,30 @@ pub struct ApiError {
 }
 
 impl ApiError {
-    /// What was asked is wrong.
+    /// The request is wrong.
     pub fn wrong(why: impl ToString) -> Self {
         Self { status: StatusCode::BAD_REQUEST, why: why.to_string() }
     }
 
-    /// Something else.
+    /// Any other error.
     pub fn new(status: StatusCode, why: impl ToString) -> Self {
         Self { status, why: why.to_string() }
     }
 }
 
-/// Any value as JSON.
+/// A value as JSON.
 pub fn json(value: &impl Serialize) -> ApiResult {
     let text = serde_json::to_string(value)
         .map_err(|error| ApiError::new(StatusCode::INTERNAL_SERVER_ERROR, error))?;
     Ok(json_text(text))
 }
 
-/// A text that is JSON.
+/// A text that is JSON already.
 pub fn json_text(text: impl Into<Body>) -> Response {
     ([(header::CONTENT_TYPE, "application/json")], text.into()).into_response()
 }
 
-/// To whatever else is asked for.
+/// For unknown paths.
 pub async fn not_found() -> ApiError {
     ApiError::new(StatusCode::NOT_FOUND, "there is no such page")
 }

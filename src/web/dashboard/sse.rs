@@ -1,4 +1,4 @@
-//! What changes while a page is open: read once for all who look, and told by server-sent events.
+//! Streams status updates as server-sent events. The store is polled once for all clients.
 
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,23 +17,23 @@ use super::response::{self, ApiResult};
 use super::time_series::{Sample, TimeSeries};
 use crate::cli::status::Snapshot;
 
-/// Between two looks at the store while somebody is told of them, at least.
+/// Shortest interval between polls while a client listens.
 const POLL_INTERVAL: Duration = Duration::from_secs(2);
-/// The same while nobody is, and at most in any case.
+/// Interval while no client listens, and the longest in any case.
 const IDLE_POLL_INTERVAL: Duration = Duration::from_secs(10);
-/// Up to that, so many times as long as a look takes: to look costs less than one part in so many of a core.
+/// In between, the pause is this multiple of the time of a poll, so that polling takes less than 1/200 of a core.
 const PAUSE_FACTOR: u32 = 200;
 
-/// The newest news, as JSON, and the samples so far.
+/// The latest update as JSON, and the samples so far.
 #[derive(Clone, Debug)]
 pub struct StatusFeed {
-    /// One for all clones, so that those who are told can be counted.
+    /// Shared by all clones, so that the number of listening clients is known.
     latest: Arc<watch::Receiver<Option<Arc<str>>>>,
     samples: Arc<Mutex<TimeSeries>>,
     _task: Arc<PollTask>,
 }
 
-/// The task that looks ends with the last of those who could be told.
+/// The polling task, which ends with the last clone.
 #[derive(Debug)]
 struct PollTask(JoinHandle<()>);
 
@@ -44,7 +44,7 @@ impl Drop for PollTask {
 }
 
 impl StatusFeed {
-    /// Looks at this store again and again.
+    /// Starts to poll this store.
     pub fn start(store: Store) -> Self {
         let (publish, latest) = watch::channel(None);
         let samples = Arc::new(Mutex::new(TimeSeries::default()));
@@ -54,7 +54,7 @@ impl StatusFeed {
 }
 
 async fn poll(store: Store, publish: watch::Sender<Option<Arc<str>>>, samples: Arc<Mutex<TimeSeries>>) {
-    // The dashboard has a receiver of its own.
+    // The dashboard itself holds one receiver.
     let is_watched = || publish.receiver_count() > 1;
     loop {
         let begun = Instant::now();
@@ -66,7 +66,7 @@ async fn poll(store: Store, publish: watch::Sender<Option<Arc<str>>>, samples: A
                 samples.lock().unwrap_or_else(PoisonError::into_inner).add(sample);
                 text
             }
-            // A server may be away for a while.
+            // A server may be unreachable for a while.
             Err(failure) => json!({ "error": failure.to_string() }).to_string(),
         };
         publish.send_replace(Some(text.into()));
@@ -80,7 +80,7 @@ async fn poll(store: Store, publish: watch::Sender<Option<Arc<str>>>, samples: A
     }
 }
 
-/// `GET /api/events`: the newest news, and all that come.
+/// `GET /api/events`: the latest update and all that follow.
 pub async fn events(
     State(dashboard): State<Dashboard>,
 ) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
@@ -95,7 +95,7 @@ pub async fn events(
     Sse::new(events).keep_alive(KeepAlive::default())
 }
 
-/// `GET /api/samples`: what the plots over time begin with.
+/// `GET /api/samples`: the initial data of the plots over time.
 pub async fn samples(State(dashboard): State<Dashboard>) -> ApiResult {
     response::json(&dashboard.feed.samples.lock().unwrap_or_else(PoisonError::into_inner).samples())
 }

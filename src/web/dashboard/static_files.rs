@@ -1,4 +1,4 @@
-//! The files of the pages, which are in the program.
+//! The files of the pages, embedded in the program.
 
 use axum::extract::Path;
 use axum::http::{StatusCode, header};
@@ -14,7 +14,7 @@ macro_rules! files {
 
 const INDEX: &str = include_str!("../pages/index.html");
 
-/// Everything that `index.html` and its modules name.
+/// Every file that `index.html` and its modules name.
 const FILES: &[(&str, &str)] = files![
     "actions.js",
     "api.js",
@@ -54,7 +54,7 @@ pub async fn file(Path(name): Path<String>) -> ApiResult {
 }
 
 fn answer(kind: &'static str, text: &'static str) -> Response {
-    // Another version of the program may be there tomorrow.
+    // Tomorrow another version of the program may serve this address.
     ([(header::CONTENT_TYPE, kind), (header::CACHE_CONTROL, "no-cache")], text).into_response()
 }
 
@@ -62,7 +62,7 @@ fn answer(kind: &'static str, text: &'static str) -> Response {
 mod tests {
     use super::*;
 
-    /// What stands in quotes behind a word.
+    /// The quoted texts that follow a word.
     fn named<'a>(text: &'a str, before: &str) -> Vec<&'a str> {
         let parts = text.split(before).skip(1);
         parts.filter_map(|part| part.split('"').next()).collect()

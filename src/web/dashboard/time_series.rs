@@ -1,47 +1,47 @@
-//! How a campaign stood at instants since somebody began to look: what the plots over time are drawn from.
+//! Samples of a campaign's state for the plots over time.
 
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 use store::Status;
 
-/// Samples that are kept. Of more every second one goes, so that they reach back to the first however long it is looked at.
+/// Largest number of samples. Beyond it every second one is dropped, so that they always reach back to the first.
 const MAX_SAMPLES: usize = 600;
-/// Walks whose γ is kept, each with a line of its own.
+/// Largest number of walks whose γ is sampled. Each has its own line.
 const MAX_WALKS: usize = 12;
 
-/// How it stood at an instant.
+/// State of a campaign at one time.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Sample {
     /// ms since 1970.
     pub time: i64,
     /// Candidates of biased walks so far.
     pub seen: u64,
-    /// Accepted of them.
+    /// Accepted candidates.
     pub accepted: u64,
     /// Labels made.
     pub labels: u64,
-    /// Label jobs that wait.
+    /// Queued label jobs.
     pub queued: u64,
-    /// Label jobs in work.
+    /// Leased label jobs.
     pub leased: u64,
-    /// Steps of all walks a second.
+    /// Steps of all walks per second.
     pub steps_per_second: Option<f64>,
-    /// Largest γ of the last graded step of walks under way, by walk.
+    /// Largest γ of the last graded step of each running walk, by walk.
     pub gamma: BTreeMap<u32, f64>,
 }
 
-/// Samples in the order of their times, thinned out.
+/// Samples by time, thinned out.
 #[derive(Clone, Debug, Default)]
 pub struct TimeSeries {
     samples: Vec<Sample>,
-    /// So many of those that come make one that is kept.
+    /// One of this many samples is kept.
     every: usize,
     passed: usize,
 }
 
 impl Sample {
-    /// Of a campaign that stands so now.
+    /// The current state of a campaign.
     pub fn new(status: &Status, time: i64) -> Self {
         let under_way =
             status.walks.iter().filter(|walk| matches!(walk.state.as_str(), "waiting" | "running"));
@@ -60,7 +60,7 @@ impl Sample {
 }
 
 impl TimeSeries {
-    /// Adds the newest.
+    /// Adds the newest sample.
     pub fn add(&mut self, sample: Sample) {
         let every = self.every.max(1);
         if self.passed == 0 {
@@ -77,7 +77,7 @@ impl TimeSeries {
         }
     }
 
-    /// Those that are kept, oldest first.
+    /// The samples, oldest first.
     pub fn samples(&self) -> &[Sample] {
         &self.samples
     }
