@@ -92,7 +92,10 @@ pub fn megabytes(bytes: u64) -> String {
 impl std::fmt::Display for DiskForecast {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let (all, declined) = (megabytes(self.bytes()), megabytes(self.declined));
-        write!(f, "{all} when all is collected, and up to {declined} of features of declined candidates")
+        write!(
+            f,
+            "{all} at the end of the campaign, and up to {declined} for features of declined candidates"
+        )
     }
 }
 

@@ -109,8 +109,8 @@ impl EnergyReference {
             Ok(fit) => fit,
             Err(TooFewLabels { structures, needed }) => {
                 return format!(
-                    "no energy errors: labels and the potential have other reference of energy, and the offsets of the elements take \
-                     at least {needed} labelled structures; there {}",
+                    "no energy errors: fitting the element offsets between labels and the potential takes at least {needed} \
+                     labelled structures; there {}",
                     match structures {
                         1 => "is 1".to_owned(),
                         n => format!("are {n}"),
@@ -124,19 +124,19 @@ impl EnergyReference {
             |found: &analysis::ElementOffset| format!("{} {:.4}", symbol(found.element), found.offset);
         let offsets: Vec<_> = elements.iter().map(offset).collect();
         let mut note = format!(
-            "energy errors are without the offsets of the elements (eV an atom, E_label − E_model): {}; least squares over {} labelled \
+            "energy errors exclude the element offsets (eV/atom, E_label − E_model): {}; least squares over {} labelled \
              structures",
             offsets.join(", "),
             fit.structures()
         );
         if fit.left_out() > 0 {
-            note += &format!(", without {} that are too far from the others", fit.left_out());
+            note += &format!(", without {} outliers", fit.left_out());
         }
         let together: Vec<_> = elements.iter().filter(|found| !found.is_separate).collect();
         if !together.is_empty() {
             let symbols: Vec<_> = together.iter().map(|found| symbol(found.element)).collect();
             note += &format!(
-                "; the labelled compositions do not tell {} apart, and only sums of their offsets count",
+                "; the labelled compositions do not determine the offsets of {} separately, only sums",
                 symbols.join(", ")
             );
         }
@@ -194,7 +194,7 @@ impl EnergySummary {
             self.structures
         );
         if self.left_out > 0 {
-            line += &format!(" ({} more have compositions for which too few labels speak)", self.left_out);
+            line += &format!(" ({} more have compositions with too few labels)", self.left_out);
         }
         Some(line)
     }

@@ -44,8 +44,8 @@ impl ForgettingRule {
         };
         format!(
             "the mixture forgets its training data: {:.1} % of the training atoms have γ > 1 (calm.forgetting_alarm: {:.1} %), \
-             so that walks may collect what the potential knows. The campaign goes on. To change it, begin another one with \
-             {other} in [calm]; to accept it, raise calm.forgetting_alarm (docs/configuration.md)",
+             so that walks may collect structures that the potential knows. The campaign continues. To avoid this, start another \
+             one with {other} in [calm]; to accept it, raise calm.forgetting_alarm (docs/configuration.md)",
             100.0 * share,
             100.0 * self.limit
         )

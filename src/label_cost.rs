@@ -148,9 +148,9 @@ impl std::fmt::Display for RelabelCost {
         match hours {
             Some(hours) => {
                 let measured = count(*measured, "label");
-                write!(f, "about {hours}, if they take as long as {measured} by '{protocol}' did")
+                write!(f, "about {hours}, estimated from {measured} by '{protocol}'")
             }
-            None => write!(f, "unknown, since that of no label was measured"),
+            None => write!(f, "unknown: no label has a measured cost"),
         }
     }
 }

@@ -135,8 +135,8 @@ impl LabelSetup {
             serde_json::from_str(&text).map_err(unreadable)?;
         let noted = store.note(LABEL_METHOD_KEY).await?.ok_or_else(|| {
             Failure::Failed(
-                "the store does not say how labels are made: the campaign was last run by an earlier version of this \
-                 program; run it once with this one"
+                "the store has no label settings: an earlier version of this program last ran the campaign; run it once \
+                 with this one"
                     .to_owned(),
             )
         })?;
@@ -145,7 +145,7 @@ impl LabelSetup {
         if let Some(wanted) = here.method.filter(|wanted| *wanted != found) {
             return Err(Failure::Input(format!(
                 "--method {wanted}, but the labels of this campaign are made by the method '{found}': leave --method out, \
-                 or name the campaign that you mean"
+                 or name the intended campaign"
             )));
         }
         let method = noted.for_this_host(&protocol, here)?;
@@ -166,8 +166,8 @@ pub async fn read_bounds(store: &Store) -> Result<LabelBounds, Failure> {
 
 fn unreadable(error: serde_json::Error) -> Failure {
     Failure::Failed(format!(
-        "what the store says of labels cannot be read ({error}): the campaign may be one of another version of this \
-         program, or its database is damaged; calmwalk store check tells"
+        "cannot read the label settings in the store ({error}): another version of this program may have written them, \
+         or the database is damaged; run calmwalk store check"
     ))
 }
 
@@ -223,7 +223,7 @@ impl MethodConfig {
                 let (name, method) = (noted.name(), given.unwrap_or(noted));
                 if let Some(file) = here.files.first() {
                     return Err(Failure::Input(format!(
-                        "--file {}: where files of the method '{name}' are on this host is said in a --config",
+                        "--file {}: give the files of the method '{name}' in a --config",
                         file.display()
                     )));
                 }
@@ -232,8 +232,8 @@ impl MethodConfig {
                 }
                 let identity = method.identity().map_err(|failure| {
                     Failure::Input(format!(
-                        "labels cannot be made here: {failure}; if what is missing is elsewhere on this host, say so in a \
-                         --config"
+                        "cannot make labels on this host: {failure}; if the missing file or program has another path here, \
+                         give it in a --config"
                     ))
                 })?;
                 check_protocol(&identity, protocol)?;
@@ -249,8 +249,8 @@ pub fn check_protocol(identity: &Value, protocol: &Protocol) -> Result<(), Failu
     match changed_keys(&protocol.settings, identity).first() {
         None => Ok(()),
         Some((key, before, after)) => Err(Failure::Input(format!(
-            "labels made here would be of another protocol than '{}' of the campaign: {key} is {after} here, {before} \
-             there",
+            "labels made here would not belong to the campaign's protocol '{}': {key} is {after} here, but {before} \
+             in the protocol",
             protocol.name
         ))),
     }
@@ -259,7 +259,7 @@ pub fn check_protocol(identity: &Value, protocol: &Protocol) -> Result<(), Failu
 fn method_mismatch(found: &str, expected: &str) -> Failure {
     Failure::Input(match (found, expected) {
         ("reference", "reference") => {
-            "--config: the file of a reference potential is named with --file".to_owned()
+            "--config: give the file of a reference potential with --file".to_owned()
         }
         _ => format!(
             "--config has the label method '{found}', but the labels of this campaign are made by '{expected}'"
@@ -278,8 +278,8 @@ fn find_file(noted: &Path, protocol: &Protocol, given: &[PathBuf]) -> Result<(Pa
         if hash != expected {
             // A file that is not needed is most likely a mistake.
             return Err(Failure::Input(format!(
-                "--file {}: its content (BLAKE3 {hash}) is not that of the file with which the labels of this campaign \
-                 are made",
+                "--file {}: its content (BLAKE3 {hash}) differs from that of the file that makes this campaign's \
+                 labels",
                 path.display()
             )));
         }
@@ -294,8 +294,8 @@ fn find_file(noted: &Path, protocol: &Protocol, given: &[PathBuf]) -> Result<(Pa
         Err(error) => format!("{} cannot be read here ({error})", noted.display()),
     };
     Err(Failure::Input(format!(
-        "{REFERENCE_FILE}: labels of this campaign are made with the file of BLAKE3 {expected}, but {why}; copy it to this \
-         host and name it with --file"
+        "{REFERENCE_FILE}: this campaign's labels need the file with BLAKE3 {expected}, but {why}; copy it to this \
+         host and pass it with --file"
     )))
 }
 

@@ -72,7 +72,7 @@ impl InitialMixture {
             _ => ("potential.model", |path| Artifact::load_export(path)),
         };
         let path = files[key].as_str().ok_or_else(|| {
-            Failure::Input(format!("the campaign does not say where its {key} is, which it began with"))
+            Failure::Input(format!("the store has no path of {key}, with which the campaign began"))
         })?;
         let path = Path::new(path);
         verify_hash(path, resolved["files"][key].as_str().unwrap_or_default())?;

@@ -47,8 +47,8 @@ pub fn warn_if_unencrypted(location: &Location) {
         && url.is_unprotected()
     {
         log_and_warn(format_args!(
-            "WARNING: what goes to and from {url} is not encrypted (sslmode=disable): whoever is on the network can read and \
-             change it"
+            "WARNING: the connection to {url} is not encrypted (sslmode=disable): anyone on the network can read and change \
+             the data"
         ));
     }
 }

@@ -146,7 +146,7 @@ pub fn from_stdin<T: DeserializeOwned>() -> Result<T, Failure> {
     let mut text = String::new();
     io::stdin().read_to_string(&mut text).map_err(Failure::failed)?;
     serde_json::from_str(&text).map_err(|error| {
-        Failure::Input(format!("standard input: {error}; calmwalk run starts this command, not people"))
+        Failure::Input(format!("standard input: {error}; this command is internal, calmwalk run starts it"))
     })
 }
 
@@ -187,7 +187,7 @@ pub fn verify_hash(path: &std::path::Path, expected: &str) -> Result<(), Failure
         return Ok(());
     }
     Err(Failure::Input(format!(
-        "{}: the file has another content (BLAKE3 {found}) than when this run began ({expected}); put the old file back",
+        "{}: the file has another content (BLAKE3 {found}) than when this run began ({expected}); restore the old file",
         path.display()
     )))
 }
@@ -213,7 +213,8 @@ mod tests {
         fs::write(&script, "exit 1").unwrap();
         let message = method.load(&protocol).map(drop).unwrap_err().to_string();
         assert!(
-            message.contains("of another protocol than 'script'") && message.contains("label.sh"),
+            message.contains("not belong to the campaign's protocol 'script'")
+                && message.contains("label.sh"),
             "{message}"
         );
     }

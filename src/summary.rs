@@ -58,7 +58,7 @@ impl fmt::Display for Summary {
             declined.budget,
             declined.backlog
         )?;
-        writeln!(f, "                 {} refused by walkers' own guards", candidates.refused_by_walkers)?;
+        writeln!(f, "                 {} refused by walkers' guards", candidates.refused_by_walkers)?;
         let superseded = match labels.superseded {
             0 => String::new(),
             jobs => format!(", {jobs} superseded"),
@@ -108,7 +108,10 @@ fn both(learned: &LabelStatistics) -> String {
     match learned.shared {
         0 => String::new(),
         shared => {
-            format!(" ({shared} of them both, and not compared: {})", count(learned.all.structures, "label"))
+            format!(
+                " ({shared} of them by both and not compared: {})",
+                count(learned.all.structures, "label")
+            )
         }
     }
 }

@@ -32,7 +32,7 @@ pub fn describe(unlabelled: &[Unlabelled], width: usize, most: usize) -> String 
     };
     let title = "unlabelled";
     format!(
-        "{title:<width$}the labels of {failed} structures failed, and this part of what was collected has none:\n{table}{more}"
+        "{title:<width$}the labels of {failed} structures failed, which leaves these ranges without labels:\n{table}{more}"
     )
 }
 

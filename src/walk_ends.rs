@@ -75,11 +75,11 @@ impl EarlyEndCause {
     pub fn in_words(self) -> &'static str {
         match self {
             Self::TooHot => "too hot",
-            Self::NotFinite => "forces are no numbers",
-            Self::LostAtom => "an atom left the others",
+            Self::NotFinite => "forces not finite",
+            Self::LostAtom => "an atom left the structure",
             Self::Crashed => "walkers crashed",
-            Self::Trapped => "atoms too close again and again",
-            Self::BadStart => "no walk can start there",
+            Self::Trapped => "atoms repeatedly too close",
+            Self::BadStart => "invalid start",
             Self::Other => "diverged",
         }
     }
@@ -91,7 +91,7 @@ impl EarlyEndCause {
             Self::NotFinite => "guard.zbl, a smaller walk.time_step or walk.tau",
             Self::LostAtom => "a smaller walk.tau, a narrower walk.volume_ramp or a lower walk.temperature",
             Self::Crashed => {
-                "nothing in the configuration: see the walkers' last words in the log, and whether there is enough memory"
+                "nothing in the configuration: check the walkers' last output in the log, and the free memory"
             }
             Self::Trapped => "a smaller walk.tau, or guard.zbl; guard.least_distance says what is too close",
             Self::BadStart => "the seed structure: the reason says what is wrong with it",
@@ -177,7 +177,7 @@ impl WalkEnds {
     /// The early ends and what to change, two lines for each cause.
     pub fn lines(&self) -> Vec<String> {
         let two = |(cause, EndCount { walks, walk, reason, .. }): (EarlyEndCause, &EndCount)| {
-            let what = format!("{walks} {}, as walk {walk}: {reason}", cause.in_words());
+            let what = format!("{walks} {}, such as walk {walk}: {reason}", cause.in_words());
             [what, format!("  what to change: {}", cause.advice())]
         };
         self.causes().flat_map(two).collect()
@@ -191,7 +191,7 @@ impl WalkEnds {
             self.causes().max_by_key(|(_, count)| count.walks).map_or("", |(cause, _)| cause.advice());
         let (early, ended) = (self.early(), self.ended());
         format!(
-            "{early} of {ended} walks that have ended did so early ({}); what to change: {advice}",
+            "{early} of {ended} finished walks ended early ({}); what to change: {advice}",
             causes.join(", ")
         )
     }
@@ -271,7 +271,7 @@ mod tests {
         assert_eq!(ends.counts_by_end(), "2 collected, 2 blew up, 1 trapped");
         let (_, hot) = ends.causes().next().unwrap();
         assert_eq!((hot.walk, hot.reason.as_str()), (2, "at step 5: 9000 K is above the allowed 800 K"));
-        assert!(ends.warning().starts_with("3 of 5 walks that have ended did so early (2 too hot, 1 atoms"));
+        assert!(ends.warning().starts_with("3 of 5 finished walks ended early (2 too hot, 1 atoms"));
         assert!(
             WalkEnds::from_walks(&walks[2..5]).all_early() && !WalkEnds::from_walks(&walks[1..2]).all_early()
         );

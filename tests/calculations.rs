@@ -179,7 +179,7 @@ fn a_setup_that_is_replaced_between_two_labels_makes_none() {
         "{said}"
     );
     // Who begins now is refused.
-    assert!(said.contains("labels made here would be of another protocol than 'gpaw'"), "{said}");
+    assert!(said.contains("labels made here would not belong to the campaign's protocol 'gpaw'"), "{said}");
     assert!(said.contains("settings.pseudopotentials.Al"), "{said}");
     assert_eq!((place.jobs("labelled"), place.jobs("failed")), (1, 0), "{said}");
     fs::write(&setup, SETUP).unwrap();

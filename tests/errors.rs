@@ -77,7 +77,7 @@ fn structures_of_both_walks_are_counted_and_not_compared() {
         .unwrap();
     let summary = succeed(here, ["run", "campaign.toml"]);
     let words =
-        "4 biased and 4 control structures labelled (2 of them both, and not compared: 6 labels), 0 failed";
+        "4 biased and 4 control structures labelled (2 of them by both and not compared: 6 labels), 0 failed";
     assert!(summary.contains(words), "{summary}");
     let status = json(here, ["status", "campaign"]);
     assert_eq!((&status["labels"]["labelled"], &status["shared_structures"]), (&6.into(), &2.into()));

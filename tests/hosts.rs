@@ -84,7 +84,7 @@ fn a_slow_line_changes_nothing() {
     go_on(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
-    assert!(!hosts.head_said().contains("gives no sign of life"), "{}", hosts.head_said());
+    assert!(!hosts.head_said().contains("sends no heartbeat"), "{}", hosts.head_said());
     assert!(hosts.said(0).contains("joined: 1 walker,"), "{}", hosts.said(0));
     assert!(
         proxy.bytes_forwarded() > 1_000_000,

@@ -76,7 +76,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
         format!(
             "{labels} structures would be queued to be labelled again by protocol 'fine', in the place of {labels} labels by 'reference'"
         ),
-        format!("if they take as long as {labels} labels by 'reference' did"),
+        format!("estimated from {labels} labels by 'reference'"),
         "nothing was changed".to_owned(),
     ] {
         assert!(planned.contains(&words), "{words} in {planned}");

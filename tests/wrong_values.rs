@@ -245,9 +245,9 @@ fn arguments_that_are_nearly_right_get_a_hint() {
     let tester = ConfigTester::new();
     tester.write("c.toml", common::demo("aluminium.toml"));
     for (arguments, expected) in [
-        (vec!["run", "c.toml", "--dashboard", "8080"], "expected ADDRESS:PORT, as 127.0.0.1:8080"),
-        (vec!["run", "c.toml", "--metrics", ":9464"], "expected ADDRESS:PORT, as 127.0.0.1:9464"),
-        (vec!["dashboard", "c", "--at", "here"], "expected ADDRESS:PORT, as 127.0.0.1:8080"),
+        (vec!["run", "c.toml", "--dashboard", "8080"], "expected ADDRESS:PORT, such as 127.0.0.1:8080"),
+        (vec!["run", "c.toml", "--metrics", ":9464"], "expected ADDRESS:PORT, such as 127.0.0.1:9464"),
+        (vec!["dashboard", "c", "--at", "here"], "expected ADDRESS:PORT, such as 127.0.0.1:8080"),
         (vec!["walks", "c", "pause", "all"], "every walk is named by --all"),
         (vec!["walks", "c", "pause", "x"], "expected the number of a walk"),
         (vec!["export", "c", "--output", "o", "--where", "gama > 1"], "did you mean 'gamma'?"),

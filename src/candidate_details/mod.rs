@@ -108,7 +108,7 @@ async fn read_import(store: &Store, id: &str, number: &str) -> Result<CandidateD
     story.labels = labels::labels(store, found.content, None).await?;
     story
         .not_recorded
-        .push("grades: the store has none of imported structures (calmwalk calm score gives them)");
+        .push("grades: the store has none of imported structures (calmwalk calm score computes them)");
     Ok(story)
 }
 
@@ -187,9 +187,12 @@ async fn rules(store: &Store) -> Result<Value, StoreError> {
 /// What the store does not record.
 fn not_recorded(stored: &StoredCandidate) -> Vec<&'static str> {
     let view = stored.block.view();
-    let mut missing = vec!["what other walks would have offered without it: only what was offered is known"];
+    let mut missing =
+        vec!["what other walks would have offered without it: the store has only what they did offer"];
     if view.origin() == wire::Origin::Biased {
-        missing.push("components as they were before: the store keeps the newest of each (calmwalk replay makes the others again)");
+        missing.push(
+            "earlier components: the store keeps the newest of each (calmwalk replay recomputes the others)",
+        );
     }
     if stored.features.is_none() {
         missing.push("features: not kept (collect.declined_features_mb), so other grades cannot be computed from the store");

@@ -79,11 +79,11 @@ fn tokenize(text: &str) -> Result<Vec<(usize, Token)>, FilterError> {
             at += sign.len();
         } else if matches!(character, '\'' | '"') {
             let Some(length) = rest[1..].iter().position(|c| *c == character) else {
-                let found = "a text without an end".to_owned();
+                let found = "an unterminated text".to_owned();
                 return Err(FilterError {
                     position: at + 1,
                     found,
-                    expected: format!("another {character} behind it"),
+                    expected: format!("a closing {character}"),
                 });
             };
             tokens.push((at, Token::Quoted(rest[1..=length].iter().collect())));
@@ -96,7 +96,7 @@ fn tokenize(text: &str) -> Result<Vec<(usize, Token)>, FilterError> {
                 let word = match character {
                     '&' => "; conditions are joined by the word 'and'",
                     '|' => "; conditions are joined by the word 'or'",
-                    '!' | '~' => "; the opposite is said by the word 'not'",
+                    '!' | '~' => "; negation is the word 'not'",
                     _ => "",
                 };
                 let expected = format!("a name, a number, a comparison or a parenthesis{word}");
@@ -160,7 +160,7 @@ impl Parser {
 
     fn operand(&mut self) -> Result<Filter, FilterError> {
         if self.depth == MAX_DEPTH {
-            return Err(self.error(format!("at most {MAX_DEPTH} parentheses and 'not' inside each other")));
+            return Err(self.error(format!("at most {MAX_DEPTH} nested parentheses and 'not'")));
         }
         self.depth += 1;
         let condition = if self.keyword("not") {
@@ -197,7 +197,7 @@ impl Parser {
         let wanted = match self.peek() {
             Token::Symbol("=") => true,
             Token::Symbol("!=") => false,
-            _ => return Err(self.error(format!("= or != behind {name}"))),
+            _ => return Err(self.error(format!("= or != after {name}"))),
         };
         self.take();
         Ok(Filter::Text(*column, wanted, self.text(*column)?))
@@ -229,11 +229,11 @@ impl Parser {
 
     fn text(&mut self, column: TextField) -> Result<String, FilterError> {
         let (Token::Word(text) | Token::Quoted(text)) = self.peek().clone() else {
-            return Err(self.error("a word, or a text in quotes"));
+            return Err(self.error("a word, or a quoted text"));
         };
         match column {
             TextField::Element if text.parse::<Species>().is_err() => {
-                return Err(self.error("the symbol of an element, as Mo"));
+                return Err(self.error("the symbol of an element, such as Mo"));
             }
             TextField::Kind if !KINDS.contains(&text.as_str()) => {
                 let kinds = KINDS.join(", ").replace(", imported", " or imported");

@@ -64,10 +64,10 @@ fn what_is_wrong_is_said_with_its_place() {
         ("gamma > inf", 9, "'inf'", "a number"),
         ("gamma > 2 element = Mo", 11, "'element'", "'and', 'or' or the end"),
         ("(gamma > 2", 11, "the end", "')'"),
-        ("element > Mo", 9, "'>'", "= or != behind element"),
+        ("element > Mo", 9, "'>'", "= or != after element"),
         ("element = Xx", 11, "'Xx'", "the symbol of an element"),
         ("kind = biassed", 8, "'biassed'", "biased, control or imported"),
-        ("seed = 'fcc", 8, "a text without an end", "another '"),
+        ("seed = 'fcc", 8, "an unterminated text", "a closing '"),
         ("γ > 2", 1, "'γ'", "one of gamma,"),
         ("gamma > 2 && step = 1", 11, "'&'", "a name"),
     ] {

@@ -127,8 +127,8 @@ impl NotificationTracker {
             return None;
         }
         let message = match failed {
-            1 => "the label of 1 structure has finally failed".to_owned(),
-            failed => format!("the labels of {failed} structures have finally failed"),
+            1 => "the label of 1 structure has failed for good".to_owned(),
+            failed => format!("the labels of {failed} structures have failed for good"),
         };
         self.due(NotifyEvent::FailedLabels, reached.to_string(), message)
     }

@@ -39,11 +39,11 @@ pub fn find(
         let Some(place) = place else { continue };
         let path = moved.clone().or_else(|| found[key].as_str().map(PathBuf::from));
         let path = path.ok_or_else(|| {
-            Failure::Input(format!("the campaign does not say where its {key} is; say so with {option} FILE"))
+            Failure::Input(format!("the store has no path of {key}; give it with {option} FILE"))
         })?;
         let expected = resolved["files"][key].as_str().unwrap_or_default();
         check(&path, expected)
-            .map_err(|error| Failure::Input(format!("{key}: {error}; say with {option} FILE where it is")))?;
+            .map_err(|error| Failure::Input(format!("{key}: {error}; give its path with {option} FILE")))?;
         *place.get_mut() = path;
     }
     Ok(())

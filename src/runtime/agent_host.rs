@@ -72,7 +72,7 @@ pub async fn run(
                 asked.notify_one();
             }
             News::Silent { untold, idle } => log_and_warn(format_args!(
-                "the orchestrator does not answer: {untold} reports are kept for it, {idle} of {walkers} walkers wait"
+                "the orchestrator does not answer: {untold} unsent reports, {idle} of {walkers} walkers idle"
             )),
             News::Back => log_and_print("the orchestrator answers again"),
         }))
@@ -101,7 +101,7 @@ async fn join(
         })?;
         match model(&joined, &setup, directory).await? {
             Some(model) => return Ok((uplink, joined, AgentConfig { model, ..setup })),
-            None => log_and_print("the orchestrator was started again meanwhile: joining anew"),
+            None => log_and_print("the orchestrator has restarted: joining again"),
         }
     }
 }
@@ -113,7 +113,7 @@ async fn model(joined: &Joined, setup: &AgentConfig, directory: &Path) -> Result
     if process_config::verify_hash(&setup.model, hash).is_ok() {
         return Ok(Some(setup.model.clone()));
     }
-    log_and_print("this host does not see the orchestrator's model: fetching the model …");
+    log_and_print("the orchestrator's model file is not on this host: downloading the model …");
     let path = directory.join("kokkos.npz");
     let bytes = match joined.file(hash).await {
         Err(Parted::Stranger(_)) => return Ok(None),

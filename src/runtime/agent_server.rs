@@ -103,7 +103,7 @@ async fn record_events(store: &Store, mut events: mpsc::UnboundedReceiver<AgentE
             _ = heartbeats.tick() => write_heartbeats(store, &mut records).await,
         };
         if let Err(error) = written {
-            log_and_warn(format_args!("cannot write down how agents are: {error}"));
+            log_and_warn(format_args!("cannot record the state of agents: {error}"));
         }
     }
 }
@@ -130,12 +130,12 @@ async fn record_event(
     let now = unix_milliseconds();
     let (agent, what, state) = match event {
         AgentEvent::Joined(agent) => (agent, "joined", "running"),
-        AgentEvent::Silent(agent) => (agent, "gives no sign of life", "silent"),
+        AgentEvent::Silent(agent) => (agent, "sends no heartbeat", "silent"),
         AgentEvent::Back(agent) => (agent, "is back", "running"),
-        AgentEvent::Lost(agent) => (agent, "was silent for too long: others get its walks", "lost"),
+        AgentEvent::Lost(agent) => (agent, "timed out: its walks go to other walkers", "lost"),
         AgentEvent::Left(agent) => (agent, "left", "left"),
         AgentEvent::Dropped(why) => {
-            log_and_warn(format_args!("a message from another host was dropped: {why}"));
+            log_and_warn(format_args!("rejected a message from another host: {why}"));
             return store.log_operation(now, "messages_dropped", &json!({ "remark": why })).await;
         }
     };

@@ -139,7 +139,7 @@ impl PoolManager<'_> {
             Ok(()) => self.unreachable = false,
             Err(error) if error.is_transient() => {
                 if !std::mem::replace(&mut self.unreachable, true) {
-                    self.display.line(&format!("the store cannot be asked: {error}"));
+                    self.display.line(&format!("cannot read the store: {error}"));
                 }
                 // Their heartbeats cannot be read now.
                 self.labellers.assume_all_alive();
@@ -173,7 +173,7 @@ impl Display {
     fn queue(&mut self, jobs: bool, led: bool) {
         let queue = match (jobs, led) {
             (false, true) => "the queue is empty: waiting for structures",
-            (false, false) => "the queue is empty, and nobody runs the campaign",
+            (false, false) => "the queue is empty, and no run is active",
             _ => "",
         };
         if queue != self.queue && !queue.is_empty() {

@@ -169,7 +169,7 @@ async fn expired(time: &mut Option<Pin<Box<Sleep>>>) {
 
 fn database_unreachable() -> Failure {
     Failure::Failed(format!(
-        "asked to stop, but the database has not answered for {} s: walks are where they were checkpointed last; the same command goes on with the campaign",
+        "stopping, but the database has not answered for {} s: walks stand at their last checkpoints; run the same command to continue the campaign",
         DATABASE_TIMEOUT.as_secs()
     ))
 }

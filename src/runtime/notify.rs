@@ -147,7 +147,7 @@ async fn run_command(mut command: Command, input: String, limit: Duration) -> Re
     command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
     // Ctrl-C in a terminal is meant for the campaign.
     command.process_group(0).kill_on_drop(true);
-    let mut child = command.spawn().map_err(|error| format!("cannot be started: {error}"))?;
+    let mut child = command.spawn().map_err(|error| format!("cannot start: {error}"))?;
     let stdin = child.stdin.take();
     let work = async {
         if let Some(mut stdin) = stdin {
@@ -157,7 +157,7 @@ async fn run_command(mut command: Command, input: String, limit: Duration) -> Re
         child.wait_with_output().await
     };
     match timeout(limit, work).await {
-        Err(_) => Err(format!("not done after {} s, and killed", limit.as_secs_f64())),
+        Err(_) => Err(format!("killed after {} s", limit.as_secs_f64())),
         Ok(Err(error)) => Err(error.to_string()),
         Ok(Ok(output)) if output.status.success() => Ok(()),
         Ok(Ok(output)) => {

@@ -233,5 +233,5 @@ pub fn all_failed_message(children: &mut Children) -> Option<String> {
     let given_up = status.iter().all(|child| child.standing == Standing::GivenUp);
     let last = status.last().filter(|_| given_up)?;
     let how = last.last_failure.as_ref().map(ToString::to_string).unwrap_or_default();
-    Some(format!("each was given up after {} restarts, number {} with {how}", last.restarts, last.number))
+    Some(format!("each failed after {} restarts, number {} with {how}", last.restarts, last.number))
 }

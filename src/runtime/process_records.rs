@@ -88,7 +88,7 @@ impl<'a> ProcessRecords<'a> {
         }
         let rejected = (traffic.dropped > self.dropped).then(|| {
             let last = traffic.last_dropped.unwrap_or_default();
-            format!("{} messages dropped; the last: {last}", traffic.dropped)
+            format!("{} messages rejected; the last: {last}", traffic.dropped)
         });
         if let Some(rejected) = &rejected {
             self.process.remark.clone_from(rejected);

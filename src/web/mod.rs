@@ -40,7 +40,7 @@ pub fn address(text: &str) -> Result<SocketAddr, String> {
             Ok(port) => format!("127.0.0.1:{port}"),
             Err(_) => "127.0.0.1:8080".to_owned(),
         };
-        format!("expected ADDRESS:PORT, as {example}")
+        format!("expected ADDRESS:PORT, such as {example}")
     })
 }
 
@@ -125,14 +125,14 @@ impl BoundListeners {
 pub async fn listen(address: SocketAddr) -> Result<TcpListener, Failure> {
     if !address.ip().is_loopback() {
         return Err(Failure::Input(format!(
-            "will not listen on {address}: whoever reaches it could read the campaign; name an address of this host, as \
-             127.0.0.1:{port}, and reach it from elsewhere with ssh -L {port}:127.0.0.1:{port}",
+            "will not listen on {address}: anyone who reaches it could read the campaign; use a loopback address such as \
+             127.0.0.1:{port}, and reach it from other hosts with ssh -L {port}:127.0.0.1:{port}",
             port = address.port()
         )));
     }
     TcpListener::bind(address).await.map_err(|error| {
         Failure::Input(format!(
-            "cannot listen on {address}: {error}; name another port, or port 0 for any that is free"
+            "cannot listen on {address}: {error}; use another port, or port 0 for any free one"
         ))
     })
 }
@@ -153,10 +153,10 @@ mod tests {
         assert_eq!(address("127.0.0.1:8080"), Ok(([127, 0, 0, 1], 8080).into()));
         assert_eq!(address("localhost:8080"), address("127.0.0.1:8080"));
         for text in ["9464", ":9464"] {
-            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, as 127.0.0.1:9464");
+            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, such as 127.0.0.1:9464");
         }
         for text in ["", "host", "host:8080", "127.0.0.1", "127.0.0.1:99999"] {
-            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, as 127.0.0.1:8080", "{text}");
+            assert_eq!(address(text).unwrap_err(), "expected ADDRESS:PORT, such as 127.0.0.1:8080", "{text}");
         }
     }
 }

@@ -12,7 +12,7 @@ use axum::response::{IntoResponse, Response};
 pub async fn require_local_host(request: Request, next: Next) -> Response {
     match host(request.headers()) {
         Some(host) if is_local_host(host) => next.run(request).await,
-        _ => (StatusCode::FORBIDDEN, "ask for localhost or 127.0.0.1: other names are refused\n")
+        _ => (StatusCode::FORBIDDEN, "use localhost or 127.0.0.1: other host names are refused\n")
             .into_response(),
     }
 }

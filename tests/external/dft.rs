@@ -215,7 +215,7 @@ fn a_pseudopotential_that_is_replaced_between_two_labels_makes_none() {
     let output = program(&here).args(["run", "campaign.toml"]).output().unwrap();
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("labels made here would be of another protocol than 'abinit'"), "{said}");
+    assert!(said.contains("labels made here would not belong to the campaign's protocol 'abinit'"), "{said}");
     let status: Value = serde_json::from_str(&succeed(&here, ["status", "campaign", "--json"])).unwrap();
     assert_eq!(
         (&status["labels"]["labelled"], &status["labels"]["failed"]),

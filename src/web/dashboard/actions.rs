@@ -66,7 +66,12 @@ pub async fn act(
         "drop" => store.drop_job(&id, now).await?,
         "retry" => store.retry_job(&id, now).await?,
         "prioritise" => store.prioritise_job(&id, priority(&body)?, now).await?,
-        _ => return Err(ApiError::new(StatusCode::NOT_FOUND, "there is drop, retry and prioritise")),
+        _ => {
+            return Err(ApiError::new(
+                StatusCode::NOT_FOUND,
+                "unknown action; expected drop, retry or prioritise",
+            ));
+        }
     };
     response::json(&store.queue_show(&candidate).await?.job)
 }
@@ -81,7 +86,7 @@ pub async fn act_on_walks(
     let paused = match action.as_str() {
         "pause" => true,
         "resume" => false,
-        _ => return Err(ApiError::new(StatusCode::NOT_FOUND, "there is pause and resume")),
+        _ => return Err(ApiError::new(StatusCode::NOT_FOUND, "unknown action; expected pause or resume")),
     };
     let walks = match walk.as_str() {
         "all" => store.walks_under_way().await?,
@@ -99,16 +104,13 @@ pub async fn act_on_walks(
 fn may_change<'a>(dashboard: &'a Dashboard, headers: &HeaderMap) -> Result<&'a Store, ApiError> {
     let refused = ApiError::new;
     let Some(mutations) = &dashboard.mutations else {
-        return Err(refused(
-            StatusCode::FORBIDDEN,
-            "this campaign is only looked at: nothing can be changed here",
-        ));
+        return Err(refused(StatusCode::FORBIDDEN, "this dashboard is read-only"));
     };
     if !security::is_same_origin(headers) {
-        return Err(refused(StatusCode::FORBIDDEN, "only pages of this dashboard may change something"));
+        return Err(refused(StatusCode::FORBIDDEN, "only pages of this dashboard may change the campaign"));
     }
     if !mutations.knows(headers) {
-        let why = "that takes the token which calmwalk run has printed behind the address";
+        let why = "this needs the token that calmwalk run printed with the address";
         return Err(refused(StatusCode::UNAUTHORIZED, why));
     }
     Ok(&mutations.store)

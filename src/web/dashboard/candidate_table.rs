@@ -69,7 +69,7 @@ impl Query {
                 "fate" => query.fate = Some(value.into_owned()),
                 "state" => {
                     let unknown =
-                        || ApiError::wrong(format!("state is '{value}', expected one of a label job"));
+                        || ApiError::wrong(format!("state is '{value}', expected a state of label jobs"));
                     query.state = Some(JobState::named(&value).ok_or_else(unknown)?);
                 }
                 "where" => query.filter = Some(value.parse().map_err(ApiError::wrong)?),
@@ -80,11 +80,11 @@ impl Query {
                     let limit = value.parse().ok().filter(|limit| (1..=MAX_PAGE_ROWS).contains(limit));
                     query.limit = Some(limit.ok_or_else(wrong)?);
                 }
-                _ => return Err(ApiError::wrong(format!("there is no parameter '{key}'"))),
+                _ => return Err(ApiError::wrong(format!("unknown parameter '{key}'"))),
             }
         }
         if query.order == Order::Queue && query.state.is_none() {
-            return Err(ApiError::wrong("the order of the queue is that of one state: give 'state' too"));
+            return Err(ApiError::wrong("the order 'queue' applies to one state: give 'state' too"));
         }
         Ok(query)
     }
@@ -213,7 +213,7 @@ fn parse_cursor(text: &str) -> Result<ListPlace, ApiError> {
         let value = value.parse().ok().filter(|value: &f64| value.is_finite())?;
         Some(ListPlace { value, decision: decision.parse().ok()? })
     };
-    let wrong = || ApiError::wrong(format!("after is '{text}', expected what 'next' of the page before was"));
+    let wrong = || ApiError::wrong(format!("after is '{text}', expected 'next' of the previous page"));
     text.split_once(':').and_then(read).ok_or_else(wrong)
 }
 
@@ -240,9 +240,9 @@ mod tests {
             ("order=size", "expected one of decision"),
             ("order=queue", "give 'state'"),
             ("limit=0", "expected 1 to 200"),
-            ("after=NaN:1", "expected what 'next'"),
+            ("after=NaN:1", "expected 'next'"),
             ("where=gamma", "expected one of = != <"),
-            ("sort=gamma", "no parameter 'sort'"),
+            ("sort=gamma", "unknown parameter 'sort'"),
         ] {
             let refused = format!("{:?}", Query::parse(query).unwrap_err());
             assert!(refused.contains(why), "{query}: {refused}");

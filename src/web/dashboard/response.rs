@@ -42,7 +42,7 @@ pub fn json_text(text: impl Into<Body>) -> Response {
 
 /// For unknown paths.
 pub async fn not_found() -> ApiError {
-    ApiError::new(StatusCode::NOT_FOUND, "there is no such page")
+    ApiError::new(StatusCode::NOT_FOUND, "no such page")
 }
 
 impl IntoResponse for ApiError {

@@ -44,7 +44,7 @@ pub async fn index() -> Response {
 /// `GET /pages/NAME`
 pub async fn file(Path(name): Path<String>) -> ApiResult {
     let found = FILES.iter().find(|(known, _)| *known == name);
-    let (name, text) = found.ok_or_else(|| ApiError::new(StatusCode::NOT_FOUND, "there is no such file"))?;
+    let (name, text) = found.ok_or_else(|| ApiError::new(StatusCode::NOT_FOUND, "no such file"))?;
     let kind = match name.rsplit('.').next() {
         Some("css") => "text/css; charset=utf-8",
         Some("svg") => "image/svg+xml",

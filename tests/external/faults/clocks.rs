@@ -135,7 +135,7 @@ fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
     for (host, agent) in agents.iter_mut().enumerate() {
         assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(host));
     }
-    assert!(!hosts.head_said().contains("gives no sign of life"), "{}", hosts.head_said());
+    assert!(!hosts.head_said().contains("sends no heartbeat"), "{}", hosts.head_said());
     assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
     hosts.are_empty();
 }

@@ -76,7 +76,7 @@ impl Linked {
 
     /// The agent's walker has nothing to do any more.
     fn walker_waits(&self) {
-        let said = "reports are kept for it, 1 of 1 walkers wait";
+        let said = "unsent reports, 1 of 1 walkers idle";
         wait_until("the agent's walker waits", || self.agent_says(said));
     }
 

@@ -35,7 +35,7 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     let mut orchestrator = hosts.lead();
     hold();
     let mut agent = hosts.agent(0);
-    wait_until("the agent asks for the model", || hosts.said(0).contains("fetching the model"));
+    wait_until("the agent asks for the model", || hosts.said(0).contains("downloading the model"));
     signal(orchestrator.0.id(), "KILL");
     orchestrator.0.wait().unwrap();
     wait_until("its walker is gone", || carrying_out(hosts.home.path(), "walker").is_empty());
@@ -43,7 +43,7 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     let held = hold();
     wait_until("the agent has joined it", || hosts.said(0).contains("joined: 1 walker,"));
     go_on(&held);
-    assert!(hosts.said(0).contains("joining anew"), "{}", hosts.said(0));
+    assert!(hosts.said(0).contains("joining again"), "{}", hosts.said(0));
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
     assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
