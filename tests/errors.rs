@@ -92,7 +92,7 @@ fn structures_of_both_walks_are_counted_and_not_compared() {
     assert_eq!((structures, &errors["shared_structures"]), ([6, 2, 2], &2.into()));
     succeed(here, ["report", "campaign", "-o", "report"]);
     let page = fs::read_to_string(here.join("report/report.html")).unwrap();
-    assert!(page.contains("2 structures that biased walks and their controls have both found are left out"));
+    assert!(page.contains("2 structures found by both biased walks and their controls are excluded"));
 }
 
 #[test]

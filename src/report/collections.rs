@@ -124,11 +124,9 @@ impl Collections {
     pub fn left_out(&self) -> String {
         match self.shared {
             0 => String::new(),
-            1 => " 1 structure that a biased walk and its control have both found is left out.".to_owned(),
+            1 => " 1 structure found by both a biased walk and its control is excluded.".to_owned(),
             shared => {
-                format!(
-                    " {shared} structures that biased walks and their controls have both found are left out."
-                )
+                format!(" {shared} structures found by both biased walks and their controls are excluded.")
             }
         }
     }

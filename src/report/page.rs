@@ -69,13 +69,13 @@ fn sections<'a>(
     let blocks = |blocks: Vec<Option<Block<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
     let why = collection_rule(&data.configuration).map(|rule| {
         Block::Paragraph(format!(
-            "A structure of a biased walk becomes a candidate when {rule}, under the mixture that the walker sees; the selector \
-             decides with the newest."
+            "A structure of a biased walk becomes a candidate when {rule}, under the walker’s mixture. The selector decides with the \
+             newest mixture."
         ))
     });
     vec![
         ("Summary", blocks(vec![table("summary")])),
-        ("What was collected, and why", blocks(vec![why, numbered("collection"), table("seed-structures")])),
+        ("Collected structures", blocks(vec![why, numbered("collection"), table("seed-structures")])),
         (
             "Biased against control walks",
             blocks(vec![
@@ -95,7 +95,7 @@ fn sections<'a>(
             ]),
         ),
         (
-            "Cost, failures, and what has no label",
+            "Cost, failures and unlabelled structures",
             blocks(vec![numbered("cost"), table("failures"), numbered("completion"), table("unlabelled")]),
         ),
         ("Settings", blocks(vec![table("settings")])),
@@ -107,8 +107,8 @@ fn lead(data: &ReportData) -> String {
     let candidates = &data.standing.candidates;
     let (biased, control) = (&data.sample.biased, &data.sample.control);
     format!(
-        "{} structures were accepted of {} candidates of biased walks, and {} frames were kept of control walks; {} of all these have \
-         labels. Grades are those of the original mixture, with which the campaign began, unless it is said otherwise.",
+        "The selector accepted {} structures of {} candidates from biased walks and collected {} frames from control walks; {} of them are \
+         labelled. Unless stated otherwise, grades are those of the original mixture, with which the campaign began.",
         grouped(candidates.accepted),
         grouped(candidates.seen),
         grouped(candidates.control),
@@ -140,7 +140,7 @@ fn write_table(html: &mut String, table: &Table, number: usize) {
     let Table { name, caption, titles, rows, shown } = table;
     let more = match rows.len().saturating_sub(*shown) {
         0 => String::new(),
-        more => format!(" {} more rows are only in its file.", grouped(more as u64)),
+        more => format!(" The file has {} more rows.", grouped(more as u64)),
     };
     let _ = writeln!(
         html,

@@ -38,14 +38,14 @@ fn text(numbers: &Numbers, walkers: &[ChildStatus]) -> String {
     let mut text = Text::default();
     let host = store::this_host();
     let labels = [("host", host.as_str()), ("version", env!("CARGO_PKG_VERSION"))];
-    text.gauge("calmwalk_agent_info", "What runs: always 1.", &[(&labels, 1.0)]);
+    text.gauge("calmwalk_agent_info", "Information about the agent; always 1.", &[(&labels, 1.0)]);
     walker_metrics(&mut text, numbers, walkers);
     assignment_metrics(&mut text, numbers);
     let version = numbers.mixture_version.map(|version| version as f64);
     optional_gauge(
         &mut text,
         "calmwalk_agent_mixture_version",
-        "Newest version of the mixture here.",
+        "Newest mixture version on this host.",
         version,
     );
     link_metrics(&mut text, numbers);
@@ -62,15 +62,23 @@ fn walker_metrics(text: &mut Text, numbers: &Numbers, walkers: &[ChildStatus]) {
     let restarts: u64 = walkers.iter().map(|walker| u64::from(walker.restarts)).sum();
     text.counter(
         "calmwalk_agent_walker_restarts_total",
-        "Starts of walkers that followed a failure.",
+        "Restarts of walkers after a failure.",
         &[(&[], restarts as f64)],
     );
-    text.gauge("calmwalk_agent_idle_walkers", "Walkers without a turn.", &[(&[], numbers.idle as f64)]);
+    text.gauge(
+        "calmwalk_agent_idle_walkers",
+        "Walkers without an assignment.",
+        &[(&[], numbers.idle as f64)],
+    );
 }
 
 fn assignment_metrics(text: &mut Text, numbers: &Numbers) {
     let taken = numbers.turns_taken as f64;
-    text.counter("calmwalk_agent_turns_taken_total", "Turns that the orchestrator gave.", &[(&[], taken)]);
+    text.counter(
+        "calmwalk_agent_turns_taken_total",
+        "Assignments received from the orchestrator.",
+        &[(&[], taken)],
+    );
     let turns = &numbers.turns;
     let outcomes = [
         ("candidate", turns.candidate),
@@ -84,7 +92,7 @@ fn assignment_metrics(text: &mut Text, numbers: &Numbers) {
         labels.iter().zip(outcomes).map(|(labels, (_, count))| (&labels[..], count as f64)).collect();
     text.counter(
         "calmwalk_agent_turns_total",
-        "Turns by what came of them, as far as the orchestrator has taken it.",
+        "Assignments by outcome, as acknowledged by the orchestrator.",
         &samples,
     );
     let steps = numbers.steps as f64;
@@ -97,24 +105,24 @@ fn link_metrics(text: &mut Text, numbers: &Numbers) {
     optional_gauge(
         text,
         "calmwalk_agent_link_silence_seconds",
-        "Time since the orchestrator was last heard.",
+        "Time since the last message from the orchestrator.",
         numbers.heard.map(|heard| heard.elapsed().as_secs_f64()),
     );
     optional_gauge(
         text,
         "calmwalk_agent_link_round_trip_seconds",
-        "Time that the last question to the orchestrator took to be answered.",
+        "Round-trip time of the last request to the orchestrator.",
         numbers.round_trip.map(|took| took.as_secs_f64()),
     );
     let places = numbers.places as f64;
     text.counter(
         "calmwalk_agent_places_total",
-        "Times that the orchestrator has let this agent join.",
+        "Number of times that this agent has joined.",
         &[(&[], places)],
     );
     text.gauge(
         "calmwalk_agent_untold_reports",
-        "Reports that the orchestrator has not taken yet.",
+        "Reports that the orchestrator has not acknowledged yet.",
         &[(&[], numbers.untold as f64)],
     );
 }

@@ -65,7 +65,7 @@ pub fn check(here: &Path, campaign: &str, status: &Value, errors: &Value) {
     let unlabelled = text("tables/unlabelled.csv");
     let parts = status["unlabelled"].as_array().expect("parts");
     assert_eq!(unlabelled.lines().count(), parts.len() + 1, "{unlabelled}");
-    assert_eq!(page.contains("has no label because all attempts failed"), !parts.is_empty());
+    assert_eq!(page.contains("without a label because all attempts failed"), !parts.is_empty());
     for (row, part) in unlabelled.lines().skip(1).zip(parts) {
         let cells: Vec<_> = row.split(',').collect();
         assert_eq!(

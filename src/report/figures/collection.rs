@@ -13,18 +13,18 @@ pub fn draw(data: &ReportData) -> Result<Drawn, String> {
     if candidates.seen == 0 {
         return Err("No candidate has reached the selector yet.".into());
     }
-    let description = "Candidates by what became of them, and accepted structures against candidates";
+    let description = "Candidates by fate, and accepted structures against candidates";
     let mut figure = Figure::new("collection", description, WIDTH, 190.0);
     let mut numbers = Csv::new(&["panel", "fate", "candidates", "accepted"]);
     let places = row(2, [86.0, 74.0, 14.0], 22.0, 128.0);
     draw_fates(&mut figure, &mut numbers, places[0], candidates);
     draw_progress(&mut figure, &mut numbers, places[1], data);
     let caption = format!(
-        "Candidates of biased walks (n = {}). a, By what the selector decided: accepted, or declined because the newest \
-         mixture covered them (another walk had found their like), because they were there already, because atoms were too \
-         close, because there were as many as there may be, or because too many labels were waiting. {} more were refused by the \
-         walkers’ own guards and never became candidates. b, Accepted structures against candidates in the order of the \
-         decisions; dashed, every candidate accepted. The flatter the line, the less that is found is new.",
+        "Candidates of biased walks (n = {}). a, By decision of the selector: accepted, or declined because the newest mixture \
+         covered them (another walk had found a similar structure), as duplicates, because atoms were too close (guard), because \
+         the quota was reached (budget), or because too many labels were queued (backlog). The walkers’ guards refused {} more \
+         structures before they became candidates. b, Accepted structures against candidates in the order of the decisions; \
+         dashed, every candidate accepted. The flatter the line, the fewer new structures the walks find.",
         grouped(candidates.seen),
         grouped(candidates.refused_by_walkers),
     );

@@ -9,14 +9,14 @@ use super::super::{Csv, Drawn, csv};
 use super::row;
 
 pub fn draw(data: &ReportData) -> Result<Drawn, String> {
-    let none = "No label has been made, and none has finally failed.";
+    let none = "No label has been made or has failed for good.";
     let labels = data.labels.as_ref().ok_or(none)?;
     let (by_gamma, by_expansion) = (labels.learned.by_gamma.bins(), labels.learned.by_expansion.bins());
     let (labelled, failed) = counts(&by_gamma);
     if labelled + failed == 0 {
         return Err(none.into());
     }
-    let description = "Share of structures that got their labels, by grade and by volume";
+    let description = "Labelled share of structures, by grade and by volume";
     let mut figure = Figure::new("completion", description, WIDTH, 176.0);
     let mut numbers =
         Csv::new(&["panel", "above", "up_to", "labelled", "failed", "share", "share_low", "share_high"]);
@@ -27,10 +27,10 @@ pub fn draw(data: &ReportData) -> Result<Drawn, String> {
         draw_bins(&mut figure, &mut numbers, (letter, title), &bins, place);
     }
     let caption = format!(
-        "Share of the structures that have their labels among those whose labels were made or finally failed, by (a) their largest γ \
-         under the original mixture and (b) their volume by that of the seed structure. Bars, 95 % intervals (Wilson); above the axis, \
-         how many structures are in the bin. {} structures are labelled and {} failed, frames of control walks included. What failed was \
-         collected and is missing from every statement about force errors.",
+        "Share of labelled structures among those that were labelled or failed for good, by (a) their largest γ under the original \
+         mixture and (b) their volume relative to that of the seed structure. Bars, 95 % intervals (Wilson); above the axis, the number \
+         of structures in the bin. {} structures are labelled and {} failed, frames of control walks included. Force errors do not \
+         include failed structures.",
         grouped(labelled),
         grouped(failed)
     );

@@ -12,7 +12,7 @@ use super::row;
 /// Bins of the histogram.
 const BINS: usize = 24;
 /// Largest number of labels drawn as points.
-const DRAWN: usize = 3000;
+const MAX_DRAWN: usize = 3000;
 
 pub fn draw(data: &ReportData) -> Result<Drawn, String> {
     let costs = data.labels.as_ref().map_or(&[][..], |labels| &labels.costs);
@@ -43,7 +43,7 @@ pub fn draw(data: &ReportData) -> Result<Drawn, String> {
     let x = axis(title, Scale::Logarithmic, &sizes, None);
     let y = axis("core-seconds per label", Scale::Logarithmic, &seconds, None);
     let mut panel = Panel::new(places[1], x, y);
-    let every = costs.len().div_ceil(DRAWN);
+    let every = costs.len().div_ceil(MAX_DRAWN);
     let points = costs.iter().step_by(every).map(|cost| [size(cost), cost.core_seconds]);
     panel.dots(points, Marker::Disc, 1.8, Colour::BLUE.faint(0.45), None);
     panel.letter('b');
@@ -63,8 +63,8 @@ fn caption(data: &ReportData, mut seconds: Vec<f64>) -> String {
     seconds.sort_by(f64::total_cmp);
     let of = |share| quantile(&seconds, share).map_or(String::new(), |x| format!("{x:.3}"));
     format!(
-        "Core-seconds of the attempts that brought labels (n = {}): median {}, 90 % quantile {}. a, How many labels took how long. \
-         b, By their size. Attempts in vain are not in it; with them, all attempts took {:.4} core-hours.",
+        "Core-seconds of successful label attempts (n = {}): median {}, 90 % quantile {}. a, Distribution. b, By size. Failed attempts \
+         are not shown; all attempts together took {:.4} core-hours.",
         grouped(seconds.len() as u64),
         of(0.5),
         of(0.9),

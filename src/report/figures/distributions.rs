@@ -70,7 +70,7 @@ fn caption(sample: &Collections, shown: &[Origin]) -> String {
             n => format!("mean force error {:.3} eV Å^{{−1}}", errors.iter().sum::<f64>() / n as f64),
         };
         let drawn = match (atoms.kept().len() as u64) < atoms.seen() {
-            true => format!(", a sample of {} of them drawn", grouped(atoms.kept().len() as u64)),
+            true => format!(", of which a sample of {} is shown", grouped(atoms.kept().len() as u64)),
             false => String::new(),
         };
         format!(
@@ -83,9 +83,9 @@ fn caption(sample: &Collections, shown: &[Origin]) -> String {
     };
     let both: Vec<_> = shown.iter().map(of).collect();
     format!(
-        "Atoms of all structures that were collected, under the original mixture. a, Grade γ. b, Its average over the \
-         neighbourhood, γ_{{nbr}}. c, Force error |F_{{model}} − F_{{label}}| of the atoms whose structures have labels. Dashed, the \
-         calibrated threshold 1. Bins of one width on the logarithmic axis; axes leave out 0.1 % of the atoms at either end. {}.{}",
+        "Atoms of all collected structures, under the original mixture. a, Grade γ. b, Its average over the neighbourhood, \
+         γ_{{nbr}}. c, Force error |F_{{model}} − F_{{label}}| of the atoms of labelled structures. Dashed, the calibrated \
+         threshold 1. Bins have equal widths on the logarithmic axis; axes omit 0.1 % of the atoms at either end. {}.{}",
         both.join("; "),
         sample.left_out()
     )

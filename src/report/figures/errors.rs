@@ -12,9 +12,9 @@ use super::NO_LABELS;
 /// Number of bins of a panel.
 const BINS: usize = 16;
 /// Bins with fewer atoms are not drawn.
-pub const LEAST: u64 = 20;
+pub const MIN_ATOMS: u64 = 20;
 /// Grid points of a marginal density.
-const PLACES: usize = 160;
+const GRID_POINTS: usize = 160;
 
 /// A quantity to plot the error against.
 struct Against {
@@ -98,7 +98,7 @@ pub fn middle(panel: &Panel, band: &Band) -> f64 {
 
 /// Draws the band between two quantiles over runs of bins with enough atoms.
 pub fn ribbons(panel: &mut Panel, bands: &[Band], [low, high]: [usize; 2], paint: ::figures::Paint) {
-    for run in bands.split(|band| band.number < LEAST) {
+    for run in bands.split(|band| band.number < MIN_ATOMS) {
         let points: Vec<_> = run
             .iter()
             .filter_map(|band| band.quantiles.map(|q| (middle(panel, band), q[low], q[high])))
@@ -115,7 +115,7 @@ fn draw_bands(panel: &mut Panel, origin: Origin, bands: &[Band]) {
 
 fn draw_medians(panel: &mut Panel, origin: Origin, bands: &[Band]) {
     let look = look(origin);
-    for run in bands.split(|band| band.number < LEAST) {
+    for run in bands.split(|band| band.number < MIN_ATOMS) {
         let median = |band: &Band| Some([middle(panel, band), band.quantiles?[3]]);
         let points: Vec<_> = run.iter().filter_map(median).collect();
         panel.line(points.clone(), look.line);
@@ -129,7 +129,7 @@ fn draw_margins(figure: &mut Figure, of: &[(Origin, Vec<[f64; 2]>)], place: Rect
     let right = Rectangle { x: place.right() + 3.0, width: 30.0, ..place };
     let along = |axis: &Axis, k: usize| -> Vec<(Origin, Vec<(f64, f64)>)> {
         let on = |pairs: &Vec<[f64; 2]>| pairs.iter().map(|pair| axis.place(pair[k])).collect::<Vec<_>>();
-        of.iter().map(|(origin, pairs)| (*origin, density(&on(pairs), 0.0, 1.0, PLACES))).collect()
+        of.iter().map(|(origin, pairs)| (*origin, density(&on(pairs), 0.0, 1.0, GRID_POINTS))).collect()
     };
     let (horizontal, vertical) = (along(x, 0), along(y, 1));
     let (places, densities) = (
@@ -199,10 +199,10 @@ fn caption(sample: &Collections, shown: &[Origin]) -> String {
     let both: Vec<_> = shown.iter().map(medians).collect();
     format!(
         "a, Force error |F_{{model}} − F_{{label}}| of labelled atoms against γ_{{nbr}} under the original mixture. b, The same errors \
-         against the distance of an atom to its nearest neighbour by the shortest distance in the seed structure of its walk; atoms \
-         that have no neighbour within twice that distance are left out. Lines, medians; bands, P_{{25}}–P_{{75}} and P_{{10}}–P_{{90}}, in \
-         bins of one width on the axis with at least {LEAST} atoms. Margins, Gaussian kernel densities on the axes as drawn, each with \
-         area 1. Dashed, γ_{{nbr}} = 1 and the distance in the seed structure. {}.",
+         against the distance of an atom to its nearest neighbour relative to the shortest distance in the seed structure of its walk; \
+         atoms without a neighbour within twice that distance are omitted. Lines, medians; bands, P_{{25}}–P_{{75}} and \
+         P_{{10}}–P_{{90}}, in equally wide bins with at least {MIN_ATOMS} atoms. Margins, Gaussian kernel densities on the axes as \
+         drawn, each with area 1. Dashed, γ_{{nbr}} = 1 and the distance in the seed structure. {}.",
         both.join("; ")
     )
 }

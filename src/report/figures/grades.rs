@@ -7,7 +7,7 @@ use wire::Origin;
 use super::super::collections::{Atom, Collections};
 use super::super::style::{WIDTH, axis, grouped};
 use super::super::{Csv, Drawn, csv};
-use super::errors::{LEAST, middle, ribbons};
+use super::errors::{MIN_ATOMS, middle, ribbons};
 use super::{NO_LABELS, row};
 
 /// A quantity of an atom.
@@ -43,7 +43,7 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
         for (ends, opacity) in [([0, 6], 0.13), ([1, 5], 0.2), ([2, 4], 0.3)] {
             ribbons(&mut panel, &found, ends, Colour::BLUE.faint(opacity));
         }
-        for run in found.split(|band| band.number < LEAST) {
+        for run in found.split(|band| band.number < MIN_ATOMS) {
             let median = |band: &analysis::Band| Some([middle(&panel, band), band.quantiles?[3]]);
             let points: Vec<_> = run.iter().filter_map(median).collect();
             panel.line(points, Colour::INK.dashed(1.3));
@@ -70,8 +70,8 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let caption = format!(
         "Force error |F_{{model}} − F_{{label}}| of all labelled atoms, of biased and control walks together, against (a) the grade γ and \
          (b) its average over the neighbourhood, γ_{{nbr}}, both under the original mixture. Black, medians; bands, P_{{25}}–P_{{75}}, \
-         P_{{10}}–P_{{90}} and P_{{5}}–P_{{95}}, in bins of one width on the logarithmic axis with at least {LEAST} atoms. Dashed grey, the \
-         calibrated threshold 1. {}.",
+         P_{{10}}–P_{{90}} and P_{{5}}–P_{{95}}, in bins of equal width on the logarithmic axis with at least {MIN_ATOMS} atoms. Dashed \
+         grey, the calibrated threshold 1. {}.",
         correlations.join("; ")
     );
     Ok(Drawn { figure, caption, numbers })

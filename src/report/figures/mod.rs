@@ -22,18 +22,14 @@ use super::{Csv, Part, csv};
 pub fn all(data: &ReportData) -> Vec<Part> {
     let part = |name, title, drawn| Part { name, title, drawn };
     vec![
-        part("collection", "What was collected", collection::draw(data)),
+        part("collection", "Candidates and accepted structures", collection::draw(data)),
         part("distributions", "Grades and force errors", distributions::draw(&data.sample)),
-        part(
-            "errors",
-            "Force errors where structures are new, and where they are stretched",
-            errors::draw(&data.sample),
-        ),
+        part("errors", "Force errors of new and of stretched structures", errors::draw(&data.sample)),
         part("space", "Volumes and composition", space::draw(&data.sample)),
         part("features", "Feature space", projection::draw(&data.sample)),
         part("grades", "Force errors by grade", grades::draw(&data.sample)),
-        part("cost", "What labels cost", cost::draw(data)),
-        part("completion", "Structures that got their labels", completion::draw(data)),
+        part("cost", "Cost of labels", cost::draw(data)),
+        part("completion", "Labelled share of structures", completion::draw(data)),
     ]
 }
 

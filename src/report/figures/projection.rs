@@ -15,9 +15,9 @@ const INSIDE: f64 = 0.95;
 /// Grid points of a density along each side.
 const GRID: usize = 128;
 /// Largest number of atoms drawn of each origin.
-const DRAWN: usize = 1500;
+const MAX_DRAWN: usize = 1500;
 /// Least number of atoms for a contour.
-const LEAST: usize = 50;
+const MIN_ATOMS: usize = 50;
 
 pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     if sample.both().iter().all(|(_, of)| of.structures.seen() == 0) {
@@ -25,7 +25,7 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     }
     let planes = sample.features.planes();
     if planes.is_empty() {
-        return Err("The store has no features of what was collected, or they do not differ.".into());
+        return Err("The store has no features of the collected structures, or they do not differ.".into());
     }
     let columns = planes.len().min(3);
     let rows = planes.len().div_ceil(columns);
@@ -79,7 +79,7 @@ fn draw_plane(figure: &mut Figure, numbers: &mut Csv, plane: &Plane, place: Rect
     let mut panel = Panel::new(place, axis(0), axis(1));
     for (origin, points) in both {
         let look = look(origin);
-        let every = points.atoms.len().div_ceil(DRAWN).max(1);
+        let every = points.atoms.len().div_ceil(MAX_DRAWN).max(1);
         panel.dots(
             points.atoms.iter().step_by(every).copied(),
             look.marker,
@@ -110,7 +110,7 @@ fn draw_plane(figure: &mut Figure, numbers: &mut Csv, plane: &Plane, place: Rect
 }
 
 fn contours_of(atoms: &[[f64; 2]]) -> Vec<Vec<[f64; 2]>> {
-    let density = Some(atoms).filter(|atoms| atoms.len() >= LEAST);
+    let density = Some(atoms).filter(|atoms| atoms.len() >= MIN_ATOMS);
     let Some(density) = density.and_then(|atoms| PlaneDensity::of(atoms, GRID)) else { return Vec::new() };
     density.level(atoms, INSIDE).map_or(Vec::new(), |level| contours(&density, level))
 }
@@ -145,10 +145,9 @@ fn caption(sample: &Collections, planes: &[Plane]) -> String {
         false => String::new(),
     };
     format!(
-        "Features z of atoms{chosen}, projected onto their first two principal components, which are those of the atoms of both \
-         collections together, one projection for each element; in brackets, the share of the variance. Lines enclose the smallest \
-         regions that hold 95 % of the atoms of either collection, by a Gaussian kernel density of Scott’s width. Large marks are the \
-         means of structures, small ones atoms ({DRAWN} of either collection at most). From {} structures evenly spread over the \
+        "Features z of atoms{chosen}, projected onto the first two principal components of both collections together, one projection for \
+         each element; in brackets, the share of the variance. Lines enclose the smallest regions with 95 % of the atoms of either \
+         collection, by a Gaussian kernel density with Scott’s bandwidth. Large marks are means of structures, small ones atoms ({MAX_DRAWN} of either collection at most). From {} structures evenly spread over the \
          decision log: {}.",
         if planes.is_empty() { "no" } else { "up to 256 biased and 256 control" },
         all.join("; ")

@@ -10,12 +10,12 @@ use super::super::{Csv, Drawn};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};
 
 /// A quantity of a structure.
-type OfShape = fn(&StructureSize) -> Option<f64>;
+type SizeOf = fn(&StructureSize) -> Option<f64>;
 
 /// Number of bins of a histogram.
 const BINS: usize = 24;
 /// Largest number of elements with bars. Those with the most atoms are shown.
-const ELEMENTS: usize = 12;
+const MAX_ELEMENTS: usize = 12;
 
 pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let shown = origins_of(sample);
@@ -26,7 +26,7 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let mut figure = Figure::new("space", description, WIDTH, 168.0);
     let mut numbers = Csv::new(&["panel", "origin", "low", "high", "number"]);
     let places = row(3, [40.0, 44.0, 10.0], 26.0, 106.0);
-    let panels: [(char, &str, OfShape); 2] = [
+    let panels: [(char, &str, SizeOf); 2] = [
         ('a', "V / V_{0}", |shape| Some(shape.relative_volume)),
         ('b', "volume (Å^{3} per atom)", |shape| shape.volume_per_atom),
     ];
@@ -43,10 +43,10 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     };
     let both: Vec<_> = shown.iter().map(of).collect();
     let caption = format!(
-        "All structures that were collected, labelled or not. a, Volume by that of the seed structure. b, Volume by atoms, of \
-         structures that repeat in three directions. c, Share of the atoms by element{}. {}.",
-        match sample.biased.elements.len().max(sample.control.elements.len()) > ELEMENTS {
-            true => format!(", the {ELEMENTS} most frequent of them"),
+        "All collected structures, labelled or not. a, Volume relative to that of the seed structure. b, Volume per atom of \
+         structures that are periodic in three directions. c, Share of the atoms by element{}. {}.",
+        match sample.biased.elements.len().max(sample.control.elements.len()) > MAX_ELEMENTS {
+            true => format!(", the {MAX_ELEMENTS} most frequent of them"),
             false => String::new(),
         },
         both.join("; ")
@@ -59,7 +59,7 @@ fn draw_volumes(
     numbers: &mut Csv,
     sample: &Collections,
     shown: &[Origin],
-    (letter, title, of): (char, &str, OfShape),
+    (letter, title, of): (char, &str, SizeOf),
     place: Rectangle,
 ) {
     let values = |origin: &Origin| -> Vec<f64> {
@@ -108,7 +108,7 @@ fn draw_elements(
     }
     let number = |element: &atoms::Species| of(element, Origin::Biased).0 + of(element, Origin::Control).0;
     elements.sort_by_key(|element| (std::cmp::Reverse(number(element)), **element));
-    elements.truncate(ELEMENTS);
+    elements.truncate(MAX_ELEMENTS);
     let names: Vec<_> = elements.iter().map(|element| element.symbol().to_owned()).collect();
     let shares = elements.iter().flat_map(|element| shown.iter().map(|origin| of(element, *origin).1));
     let y = Axis::new("atoms (%)", Scale::Linear, 0.0, 1.08 * shares.fold(0.0, f64::max));

@@ -17,7 +17,7 @@ pub fn summary(data: &ReportData) -> Table {
     let mut row = |name: &str, value: String| table.rows.push(vec![text(name), text(value)]);
     row("campaign", format!("{}, {} mode", data.campaign.id, data.campaign.mode));
     let walks = |origin: &str| status.walks.iter().filter(|walk| walk.origin == origin).count() as u64;
-    let state = if status.finished { "has ended" } else { "is not over: numbers are those of the moment" };
+    let state = if status.finished { "has ended" } else { "is not over: numbers are current" };
     row("state", state.into());
     row("walks", format!("{} biased, {} control", grouped(walks("biased")), grouped(walks("control"))));
     let candidates = &status.candidates;
@@ -30,7 +30,7 @@ pub fn summary(data: &ReportData) -> Table {
     row(
         "label jobs",
         format!(
-            "{} labelled, {} failed, {} dropped, {} superseded, {} in work, {} waiting; {} labels excluded by hand",
+            "{} labelled, {} failed, {} dropped, {} superseded, {} leased, {} queued; {} labels excluded by hand",
             grouped(labels.labelled),
             grouped(labels.failed),
             grouped(labels.dropped),
@@ -77,7 +77,7 @@ pub fn collection_rule(configuration: &Value) -> Option<String> {
 
 /// Versions, hashes and sources.
 pub fn provenance(data: &ReportData) -> Table {
-    let mut table = Table::new("provenance", "Where it comes from.", &["", "value"]).whole();
+    let mut table = Table::new("provenance", "Provenance of the campaign.", &["", "value"]).whole();
     let mut row = |name: String, value: String| table.rows.push(vec![text(name), text(value)]);
     let campaign = &data.campaign;
     row("campaign".into(), campaign.id.to_string());

@@ -53,8 +53,8 @@ pub fn correlations(learned: &LabelStatistics) -> Table {
 pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) -> Table {
     let caption = format!(
         "Force errors of all labelled atoms (n = {}) by {grade} under the original mixture: percentiles in eV Å^{{−1}}, the share of atoms \
-         in each bin, and the share with an error above {LARGE_FORCE_ERROR} eV Å^{{−1}}. Without label, atoms of structures whose labels finally \
-         failed; possible, that share if every one of them were below or above.",
+         in each bin, and the share with an error above {LARGE_FORCE_ERROR} eV Å^{{−1}}. Without label: atoms of structures whose labels failed \
+         for good. Possible: the range of that share if all of them were below or above.",
         super::super::style::grouped(errors.atoms())
     );
     let titles = [
@@ -92,12 +92,12 @@ pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) 
 pub fn energy_offsets(learned: &LabelStatistics) -> Table {
     let offsets = learned.energies.summary().offsets;
     let caption = format!(
-        "Labels and the potential have other zeros of energy: E_{{label}} − E_{{model}} of an atom of each element, by least squares over {} \
-         labelled structures ({} more are too far from the others). Energy errors are without these offsets. Where elements are not told \
-         apart by the labelled compositions, only sums of their offsets count.",
+        "Offsets between the energy references of labels and potential: E_{{label}} − E_{{model}} per atom of each element, by least squares \
+         over {} labelled structures ({} outliers excluded). Energy errors exclude these offsets. Where the labelled compositions do not \
+         determine the offsets separately, only their sums are meaningful.",
         offsets.structures, offsets.left_out
     );
-    let mut table = Table::new("energy-offsets", &caption, &["element", "offset (eV)", "told apart"]);
+    let mut table = Table::new("energy-offsets", &caption, &["element", "offset (eV)", "separate"]);
     for offset in offsets.elements {
         let separate = if offset.separate { "yes" } else { "no" };
         table.rows.push(vec![text(offset.element), real(offset.offset, 4), text(separate)]);
@@ -107,10 +107,10 @@ pub fn energy_offsets(learned: &LabelStatistics) -> Table {
 
 /// Failures by class.
 pub fn failures(failures: &[FailureCount]) -> Table {
-    let caption = "Label jobs that met a failure, by its class: those that have their labels all the same, those that were given up, and \
-                   those that are not done.";
+    let caption = "Label jobs with a failure, by its class: those labelled later, those that failed for good, and those that are \
+                   unfinished.";
     let mut table =
-        Table::new("failures", caption, &["class", "jobs", "labelled later", "given up", "unfinished"]);
+        Table::new("failures", caption, &["class", "jobs", "labelled later", "failed", "unfinished"]);
     for FailureCount { class, labelled, given_up, unfinished } in failures {
         let all = labelled + given_up + unfinished;
         let counts = [all, *labelled, *given_up, *unfinished].map(count);
@@ -121,8 +121,8 @@ pub fn failures(failures: &[FailureCount]) -> Table {
 
 /// The part of the collected space without labels because of failures.
 pub fn unlabelled(unlabelled: &[Unlabelled]) -> Table {
-    let caption = "The part of what was collected that has no label because all attempts failed, by seed structure: ranges of the largest \
-                   γ under the original mixture and of V/V_{0}, beside those of what is labelled.";
+    let caption = "Collected structures without a label because all attempts failed, by seed structure: ranges of the largest γ under the \
+                   original mixture and of V/V_{0}, compared with those of labelled structures.";
     let titles = [
         "seed structure",
         "formula",

@@ -7,8 +7,8 @@ use super::{Table, count, text};
 
 /// Walks, candidates by fate and labels of each seed structure.
 pub fn of(data: &ReportData) -> Table {
-    let caption = "What came of each seed structure: biased walks and how they ended, candidates by what the selector decided, frames of \
-                   its control walks, and labels of both.";
+    let caption = "Results by seed structure: biased walks and their states, candidates by fate, frames of its control walks, and labels of \
+                   both.";
     let titles = [
         "seed structure",
         "formula",
