@@ -1,4 +1,4 @@
-// The table of candidates: the program sorts, filters and pages; this asks for a page and shows it.
+// The table of candidates. The program sorts, filters and pages; this script shows one page.
 
 import { ask } from "./api.js";
 import { FATES } from "./colours.js";
@@ -9,17 +9,17 @@ export const TITLE = "Candidates";
 
 const LENGTH = 50;
 const STATES = ["queued", "leased", "labelled", "failed", "dropped", "superseded"];
-/** Columns: title, whether it holds numbers, and the order that its title asks for. */
+/** Columns: title, whether it is numeric, and the sort order of its title. */
 const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["γ_max", true, "gamma"],
   ["γ_nbr", true], ["V/V₀", true, "volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["attempts", true]];
 
 export function show(content, rest, signal) {
-  // What is asked for stands in the address, so that it can be kept and sent to others.
+  // The query is part of the address, so that it can be bookmarked and shared.
   const asked = new URLSearchParams(rest);
   const [place, told] = [element("div"), element("p", { role: "status" })];
   const change = (changes) => {
     for (const [key, value] of Object.entries(changes)) value ? asked.set(key, value) : asked.delete(key);
-    // The queue's order is that of one state.
+    // The queue order applies to one state.
     if (asked.get("order") === "queue" && !asked.get("state")) asked.set("state", "queued");
     history.replaceState(null, "", `#candidates/${asked}`);
     pages.length = 0;
@@ -32,7 +32,7 @@ export function show(content, rest, signal) {
     const wait = setTimeout(() => place.setAttribute("aria-busy", "true"), 200);
     try {
       const page = await wholePage(asked, after, signal, (looked) => {
-        if (mine === last) told.textContent = `looked at ${whole(looked)} candidates …`;
+        if (mine === last) told.textContent = `${whole(looked)} candidates searched …`;
       }, () => mine !== last);
       if (mine === last) renew(place, ...lines(page, asked, change, pages, after, load));
     } catch (error) {
@@ -49,7 +49,7 @@ export function show(content, rest, signal) {
   return load(null);
 }
 
-/** A rare kind takes several looks. */
+/** A filter with few matches takes several requests. */
 async function wholePage(asked, after, signal, tell, isOver) {
   let [found, looked, next] = [[], 0, after];
   do {
@@ -76,11 +76,11 @@ function filters(asked, change) {
   };
   return element("form", { class: "filters", role: "search", onsubmit: submit }, choice("fate", "fate", Object.keys(FATES)),
     choice("label", "state", STATES), element("label", {}, "where", where), element("button", {}, "Show"),
-    element("details", {}, element("summary", {}, "What may stand there"), element("p", {},
+    element("details", {}, element("summary", {}, "Syntax"), element("p", {},
       "gamma, gamma_nbr (original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version (after the decision), atoms, " +
       "energy (eV), energy_per_atom and max_force (eV/Å) of the label, with = != < <= > >=; " +
       "element, kind (biased or control), seed with = and !=; and, or, not and parentheses. " +
-      "What a candidate does not have, as an energy without a label, meets no comparison.")));
+      "A comparison with a missing value, such as the energy of an unlabelled candidate, is false.")));
 }
 
 function lines({ candidates, next }, asked, change, pages, after, load) {
@@ -104,9 +104,9 @@ function lines({ candidates, next }, asked, change, pages, after, load) {
   const number = pages.length + 1;
   return [
     element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": "Candidates" }, table),
-    candidates.length === 0 && element("p", {}, "No candidate is so."),
+    candidates.length === 0 && element("p", {}, "No candidate matches."),
     element("p", { class: "turn", role: "status" },
-      element("button", { type: "button", "data-keep": "before", disabled: pages.length === 0, onclick: back }, "← before"),
+      element("button", { type: "button", "data-keep": "before", disabled: pages.length === 0, onclick: back }, "← previous"),
       ` page ${number} `, element("button", { type: "button", "data-keep": "next", disabled: !next, onclick: on }, "next →")),
   ].filter(Boolean);
 }
