@@ -26,7 +26,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn limits_stand_beside_what_was_used() {
+    fn usage_is_shown_with_limits() {
         let limits = Budget { labels: Some(10), wall_hours: Some(2.0), ..Budget::default() };
         let used = BudgetUse { labels: 7, under_way: 1, core_hours: 9.0, wall_hours: 0.25 };
         let mut budget = BudgetStatus { limits, used, used_up: None };

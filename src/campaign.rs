@@ -1,7 +1,7 @@
 //! Loads and checks everything that a configuration names. `validate` stops there, and `run` starts with it.
 
 mod load;
-mod seeds;
+mod seed_structures;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -41,7 +41,7 @@ pub struct Campaign {
     /// The initial mixture.
     pub artifact: Artifact,
     /// Seed structures, in the order of the files.
-    pub seeds: Vec<NamedSeed>,
+    pub seed_structures: Vec<SourcedStructure>,
     /// Features of the training frames, if the configuration names them.
     pub training: Option<TrainingFrames>,
     /// The label protocol.
@@ -53,7 +53,7 @@ pub struct Campaign {
 }
 
 /// A seed structure and its source.
-pub struct NamedSeed {
+pub struct SourcedStructure {
     /// Name and structure.
     pub seed: SeedStructure,
     /// `file:line`
@@ -73,13 +73,14 @@ impl Campaign {
             let training = loader.training_frames(&model, &artifact.mixture)?;
             Ok((artifact, training))
         });
-        let labels = loader.seeds(&model).and_then(|seeds| {
+        let labels = loader.seed_structures(&model).and_then(|seeds| {
             let protocol = loader.protocol(&seeds)?;
             Ok((seeds, protocol))
         });
-        let ((artifact, training), (seeds, (protocol, mut file_hashes))) = both(path, grades, labels)?;
-        warnings.extend(loader.doubtful_grades(&model, &artifact, &seeds, training.as_ref())?);
-        warnings.extend(loader.doubtful_seeds(&seeds, &model));
+        let ((artifact, training), (seeds, (protocol, mut file_hashes))) =
+            combine_errors(path, grades, labels)?;
+        warnings.extend(loader.suspicious_grades(&model, &artifact, &seeds, training.as_ref())?);
+        warnings.extend(loader.suspicious_seed_structures(&seeds, &model));
         file_hashes.insert(0, loader.hash("potential.model", &config.potential.model)?);
         let others = [
             ("calm.artifact", &config.calm.artifact),
@@ -89,7 +90,18 @@ impl Campaign {
             file_hashes.extend(file.as_ref().map(|file| loader.hash(key, file)).transpose()?);
         }
         let path = path.to_owned();
-        Ok(Self { config, path, text, model, artifact, seeds, training, protocol, file_hashes, warnings })
+        Ok(Self {
+            config,
+            path,
+            text,
+            model,
+            artifact,
+            seed_structures: seeds,
+            training,
+            protocol,
+            file_hashes,
+            warnings,
+        })
     }
 
     /// Prints the warnings to standard error and logs them.
@@ -104,7 +116,7 @@ impl Campaign {
 
     /// Size of the label of each seed structure, on which its cost depends. A program must be installed.
     pub fn label_sizes(&self) -> Result<Vec<dft::Size>, Failure> {
-        let structures = self.seeds.iter().map(|seed| &seed.seed.structure);
+        let structures = self.seed_structures.iter().map(|seed| &seed.seed.structure);
         Ok(match &self.config.label.method {
             LabelMethod::Reference(_) => structures
                 .map(|structure| dft::Size { atoms: structure.len(), electrons: 0.0, k_points: 1 })
@@ -139,7 +151,7 @@ impl Campaign {
     /// Size of the largest message between walker and selector, bytes: a candidate of the largest seed structure with
     /// the checkpoints of its walk (three states with velocities and forces).
     pub fn largest_message(&self) -> usize {
-        let atoms = self.seeds.iter().map(|named| named.seed.structure.len()).max().unwrap_or(0);
+        let atoms = self.seed_structures.iter().map(|named| named.seed.structure.len()).max().unwrap_or(0);
         let features = self.artifact.mixture.dimension();
         8 * atoms * (9 + features) + 512 * atoms + 16_384
     }
@@ -166,9 +178,10 @@ impl Campaign {
         if self.config.campaign.mode == Mode::Reproducible {
             value["instructions"] = json!(instructions());
         }
-        let seed =
-            |named: &NamedSeed| format!("{} {}", named.seed.name, ContentHash::of(&named.seed.structure));
-        value["seeds"] = self.seeds.iter().map(seed).collect();
+        let seed = |named: &SourcedStructure| {
+            format!("{} {}", named.seed.name, ContentHash::of(&named.seed.structure))
+        };
+        value["seeds"] = self.seed_structures.iter().map(seed).collect();
         value
     }
 
@@ -178,7 +191,7 @@ impl Campaign {
         let mut hasher = blake3::Hasher::new();
         hasher.update(b"calmwalk campaign 1");
         hasher.update(fixed.to_string().as_bytes());
-        for named in &self.seeds {
+        for named in &self.seed_structures {
             hasher.update(named.seed.name.as_bytes());
             hasher.update(&ContentHash::of(&named.seed.structure).0);
         }
@@ -188,14 +201,14 @@ impl Campaign {
     }
 
     /// The seed structures as stored.
-    pub fn stored_seeds(&self) -> Vec<store::SeedStructure> {
-        let stored = |(index, named): (usize, &NamedSeed)| store::SeedStructure {
+    pub fn stored_seed_structures(&self) -> Vec<store::SeedStructure> {
+        let stored = |(index, named): (usize, &SourcedStructure)| store::SeedStructure {
             index: index as u32,
             name: named.seed.name.clone(),
             source: named.source.clone(),
             structure: named.seed.structure.clone(),
         };
-        self.seeds.iter().enumerate().map(stored).collect()
+        self.seed_structures.iter().enumerate().map(stored).collect()
     }
 
     /// The part of the model that the orchestrator needs.
@@ -240,7 +253,7 @@ impl Campaign {
 }
 
 /// Both values, or the errors of both.
-fn both<A, B>(
+fn combine_errors<A, B>(
     path: &Path,
     a: Result<A, ConfigError>,
     b: Result<B, ConfigError>,

@@ -38,7 +38,7 @@ impl DiskForecast {
     pub fn from_campaign(campaign: &Campaign) -> Self {
         let config = &campaign.config;
         let features = campaign.artifact.mixture.dimension() as u64;
-        let seeds = || campaign.seeds.iter().map(|named| named.seed.structure.len() as u64);
+        let seeds = || campaign.seed_structures.iter().map(|named| named.seed.structure.len() as u64);
         let number = seeds().len() as u64;
         let per_seed = u64::from(config.collect.per_seed.get());
         let collected = per_seed.saturating_mul(number);
@@ -104,7 +104,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_to_come_is_what_is_not_yet_collected() {
+    fn remaining_space_is_that_of_structures_not_yet_collected() {
         let forecast =
             DiskForecast { structures: 1_000_000, rest: 500_000, declined: 7, most_structures: 100 };
         for (structures, expected) in [(0, 1_000_000), (25, 750_000), (100, 0), (120, 0)] {

@@ -82,7 +82,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_alarm_is_said_when_it_begins_and_when_it_ends() {
+    fn an_alarm_is_reported_when_it_begins_and_when_it_ends() {
         let forgetting = ForgettingRule { limit: 0.2, combination: Combination::Convex };
         let mut alarm = ForgettingAlarm::new(forgetting);
         let said: Vec<_> = [0.1, 0.21, 0.3, 0.19, 0.21, 0.17, 0.1, 0.25]

@@ -49,7 +49,7 @@ pub struct LabelStatistics {
 
 /// Reads the labels of one protocol page by page.
 pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistics, StoreError> {
-    let mut learned = LabelStatistics {
+    let mut statistics = LabelStatistics {
         all: ErrorsByGrade::new(),
         biased: ErrorsByGrade::new(),
         control: ErrorsByGrade::new(),
@@ -71,15 +71,15 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
             let errors = forces.iter().zip(&row.label.forces).map(|(model, label)| norm(sub(*model, *label)));
             let errors: Vec<_> = errors.collect();
             match (shared.contains(&block.view().id().content), *origin) {
-                (false, origin) => learned.each(origin, |grades| grades.labelled(original, &errors)),
+                (false, origin) => statistics.for_origin(origin, |grades| grades.labelled(original, &errors)),
                 (true, Origin::Biased) => {
-                    learned.shared += 1;
-                    learned.all.labelled(original, &errors);
+                    statistics.shared += 1;
+                    statistics.all.labelled(original, &errors);
                 }
                 // Counted with the biased walk.
                 (true, Origin::Control) => continue,
             }
-            learned.energies.add(&row.structure, block.view().energy(), row.label.energy);
+            statistics.energies.add(&row.structure, block.view().energy(), row.label.energy);
         }
     }
     let mut after = 0;
@@ -87,13 +87,13 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
         let page = store.finished(protocol, after, PAGE_ROWS).await?;
         let Some(last) = page.last() else { break };
         after = last.decision;
-        page.iter().for_each(|candidate| learned.finished(candidate));
+        page.iter().for_each(|candidate| statistics.finished(candidate));
     }
-    Ok(learned)
+    Ok(statistics)
 }
 
 impl LabelStatistics {
-    fn each(&mut self, origin: Origin, mut change: impl FnMut(&mut ErrorsByGrade)) {
+    fn for_origin(&mut self, origin: Origin, mut change: impl FnMut(&mut ErrorsByGrade)) {
         let of_origin = if origin == Origin::Biased { &mut self.biased } else { &mut self.control };
         [&mut self.all, of_origin].into_iter().for_each(&mut change);
     }
@@ -108,7 +108,7 @@ impl LabelStatistics {
             }
         }
         if let Some(grades) = &candidate.unlabelled {
-            self.each(candidate.origin, |all| all.unlabelled(grades));
+            self.for_origin(candidate.origin, |all| all.unlabelled(grades));
         }
     }
 }

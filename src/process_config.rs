@@ -157,8 +157,8 @@ pub fn to_bytes(setup: &impl Serialize) -> Vec<u8> {
 
 impl LabellerConfig {
     /// Configuration of a labeller without a number.
-    pub fn new(location: PathBuf, labelling: LabelSetup) -> Self {
-        let LabelSetup { method, protocol, attempts, bounds, lease } = labelling;
+    pub fn new(location: PathBuf, label_setup: LabelSetup) -> Self {
+        let LabelSetup { method, protocol, attempts, bounds, lease } = label_setup;
         let (number, restarts, slot, log) = (None, 0, None, log::child_config());
         Self { number, restarts, slot, location, method, protocol, attempts, bounds, lease, log }
     }
@@ -199,7 +199,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_program_that_was_replaced_makes_no_labels_of_the_protocol() {
+    fn a_replaced_program_is_refused() {
         let directory = tempfile::tempdir().unwrap();
         let script = directory.path().join("label.sh");
         fs::write(&script, "exit 0").unwrap();

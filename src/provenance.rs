@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn a_campaign_is_called_after_its_configuration() {
+    fn a_campaign_is_named_after_its_configuration() {
         for (path, expected) in [
             ("/no/such/second/campaign.toml", "second"),
             ("/no/such/second/hot.toml", "hot"),
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn another_file_is_no_configuration_of_the_campaign() {
+    fn another_file_does_not_match() {
         let first = origin("/no/first/campaign.toml", "a", "/no/first/campaign");
         let compare =
             |now: &Provenance, holds_campaign, exists: bool| first.compare(now, holds_campaign, |_| exists);
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_campaign_remembers_with_what_it_began() {
+    fn the_first_configuration_is_kept() {
         let first = origin("/no/first/campaign.toml", "a", "/no/first/campaign");
         let now = first.continued(&origin("/no/second/hot.toml", "b", "/no/second/hot"));
         assert_eq!((now.name.as_str(), &now.began_with), ("hot", &first.file));

@@ -13,13 +13,13 @@ use crate::unlabelled;
 use crate::walk_ends::WalkEnds;
 
 /// Largest number of seed structures with failed labels to show.
-const SHOWN: usize = 8;
+const MAX_SHOWN: usize = 8;
 
 /// Summary of a campaign.
 #[derive(Clone, Debug)]
 pub struct Summary {
     status: Status,
-    learned: LabelStatistics,
+    statistics: LabelStatistics,
     /// Structures whose labels failed for good.
     unlabelled: Vec<Unlabelled>,
     /// Grades of the training frames under the newest mixture, if they are monitored.
@@ -29,17 +29,17 @@ pub struct Summary {
 /// Reads the summary of a campaign with the labels of one protocol.
 pub async fn read(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
     let status = store.status().await?;
-    let learned = label_statistics::read(store, protocol).await?;
+    let statistics = label_statistics::read(store, protocol).await?;
     let unlabelled = store.unlabelled(protocol, true).await?;
     let values = store.values().await?;
     let watched = values.iter().find(|(name, _)| name == "training_frames");
     let watched: Option<GradeDistribution> = watched.and_then(|(_, text)| serde_json::from_str(text).ok());
-    Ok(Summary { status, learned, unlabelled, training: watched })
+    Ok(Summary { status, statistics, unlabelled, training: watched })
 }
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { status: Status { candidates, labels, walks, mixture_version, .. }, learned, .. } = self;
+        let Self { status: Status { candidates, labels, walks, mixture_version, .. }, statistics, .. } = self;
         let of = |origin: &str| walks.iter().filter(|walk| walk.origin == origin).count();
         writeln!(f, "walks            {} biased, {} control", of("biased"), of("control"))?;
         let ends = WalkEnds::from_walks(walks);
@@ -70,13 +70,13 @@ impl fmt::Display for Summary {
         writeln!(
             f,
             "labels           {} biased and {} control structures labelled{}, {} failed, {} dropped{superseded}{excluded}",
-            learned.biased.structures + learned.shared,
-            learned.control.structures + learned.shared,
-            both(learned),
+            statistics.biased.structures + statistics.shared,
+            statistics.control.structures + statistics.shared,
+            shared_note(statistics),
             labels.failed,
             labels.dropped
         )?;
-        write!(f, "{}", unlabelled::describe(&self.unlabelled, 17, SHOWN))?;
+        write!(f, "{}", unlabelled::describe(&self.unlabelled, 17, MAX_SHOWN))?;
         if let Some(budget) = budget_usage::describe(&self.status.budget) {
             writeln!(f, "budget           {budget}")?;
         }
@@ -93,9 +93,9 @@ impl fmt::Display for Summary {
             f,
             "           atoms   mean error   γ > 1   γ_nbr > 1   ρ(γ, error)   ρ(γ_nbr, error)   ROC-AUC(γ)   ROC-AUC(γ_nbr)"
         )?;
-        writeln!(f, "  biased   {}", line(&self.learned.biased))?;
-        writeln!(f, "  control  {}", line(&self.learned.control))?;
-        let energies = self.learned.energies.summary();
+        writeln!(f, "  biased   {}", line(&self.statistics.biased))?;
+        writeln!(f, "  control  {}", line(&self.statistics.control))?;
+        let energies = self.statistics.energies.summary();
         if let Some(line) = energies.line() {
             writeln!(f, "energy error of the potential: {line}")?;
         }
@@ -104,13 +104,13 @@ impl fmt::Display for Summary {
 }
 
 /// Says that structures found by both biased and control walks are counted twice.
-fn both(learned: &LabelStatistics) -> String {
-    match learned.shared {
+fn shared_note(statistics: &LabelStatistics) -> String {
+    match statistics.shared {
         0 => String::new(),
         shared => {
             format!(
                 " ({shared} of them by both and not compared: {})",
-                count(learned.all.structures, "label")
+                count(statistics.all.structures, "label")
             )
         }
     }

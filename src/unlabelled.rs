@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_failed_stands_beside_what_did_not() {
+    fn failed_ranges_are_compared_with_labelled_ones() {
         let range = |low, high| Range { low: Some(low), high: Some(high) };
         let part = Unlabelled {
             seed_structure: "fcc".into(),

@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_guard_says_is_understood() {
+    fn reasons_of_the_guard_have_causes() {
         let settings = GuardSettings {
             least_distance: 1.2,
             least_distance_fraction: 0.75,
@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn walk_after_walk_is_more_than_an_accident() {
+    fn many_early_ends_are_a_pattern() {
         for (ended, early, expected) in
             [(0, 0, false), (2, 2, false), (3, 3, true), (6, 3, true), (7, 3, false), (100, 50, true)]
         {

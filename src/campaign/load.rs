@@ -12,26 +12,26 @@ use serde_json::Value;
 use store::Protocol;
 use toml::Spanned;
 
-use super::NamedSeed;
+use super::SourcedStructure;
 use crate::config::{Config, ConfigError, LabelMethod, PotentialFile, Warning, place, place_of_offset};
 use crate::label_setup::{self, REFERENCE_FILE};
 
 /// Largest number of training atoms whose grades are monitored: enough for the share above 1 to a percent.
-const WATCHED_ATOMS: usize = 4000;
+const MAX_MONITORED_ATOMS: usize = 4000;
 
 /// Largest number of seed-structure atoms that are graded.
-const GRADED_ATOMS: usize = 256;
+const MAX_GRADED_ATOMS: usize = 256;
 
 /// A mixture with γ below this everywhere cannot distinguish new structures.
-const NO_GRADE: f64 = 1e-3;
+const MIN_MEDIAN_GRADE: f64 = 1e-3;
 
 /// Above the usual share: fresh mixtures have 2 to 9 % of their training atoms above 1.
-const DOUBTFUL_SHARE: f64 = 0.25;
+const SUSPICIOUS_SHARE: f64 = 0.25;
 
 const TRAINING_FRAMES: &str = "calm.training_frames";
 
 /// What to do about a mixture without scatter matrices and counts.
-const NO_UPDATES: &str = "no scatter matrices and counts, so its mixture can be scored with but not updated; give the \
+const NO_STATISTICS: &str = "no scatter matrices and counts, so its mixture can be scored with but not updated; give the \
                           gmm_artifacts.npz of the build, or leave calm.artifact out and set update = \"never\" to \
                           take the mixture of the export as it is";
 
@@ -49,7 +49,7 @@ impl Loader<'_> {
     /// Loads the model, which must have a feature projection and support the configured settings.
     pub fn model(&self) -> Result<Arc<GraceModel>, ConfigError> {
         let file = &self.config.potential.model;
-        let wrong = |message: String| self.wrong("potential.model", file, message);
+        let wrong = |message: String| self.file_error("potential.model", file, message);
         let precision = self.config.potential.precision;
         let model = GraceModel::load_in(file.get_ref(), precision, RadialPath::default())
             .map_err(|error| wrong(error.to_string()))?;
@@ -75,15 +75,15 @@ impl Loader<'_> {
     pub fn artifact(&self, model: &GraceModel) -> Result<Artifact, ConfigError> {
         let model_file = &self.config.potential.model;
         let export = Artifact::load_export(model_file.get_ref())
-            .map_err(|error| self.wrong("potential.model", model_file, error))?;
+            .map_err(|error| self.file_error("potential.model", model_file, error))?;
         let Some(file) = &self.config.calm.artifact else {
             check_sound(&export, model_file.get_ref())
-                .map_err(|message| self.wrong("potential.model", model_file, message))?;
+                .map_err(|message| self.file_error("potential.model", model_file, message))?;
             return Ok(export);
         };
         let path = file.get_ref();
-        let wrong = |message: String| self.wrong("calm.artifact", file, message);
-        let artifact = Artifact::load(path).map_err(|error| wrong(why_no_artifact(path, &error)))?;
+        let wrong = |message: String| self.file_error("calm.artifact", file, message);
+        let artifact = Artifact::load(path).map_err(|error| wrong(explain_artifact_error(path, &error)))?;
         let symbols: Vec<_> = model.elements().iter().map(|species| species.symbol().to_owned()).collect();
         artifact.check_belongs_to(&symbols, &export.projection).map_err(|error| {
             wrong(format!("{}: {error} ({})", path.display(), model_file.get_ref().display()))
@@ -92,7 +92,7 @@ impl Loader<'_> {
         Ok(artifact)
     }
 
-    /// Computes features of the training frames, evenly sampled to [`WATCHED_ATOMS`]. The median of γ must be between
+    /// Computes features of the training frames, evenly sampled to [`MAX_MONITORED_ATOMS`]. The median of γ must be between
     /// 0.001 and 1.
     pub fn training_frames(
         &self,
@@ -100,10 +100,10 @@ impl Loader<'_> {
         original: &Mixture,
     ) -> Result<Option<TrainingFrames>, ConfigError> {
         let Some(file) = &self.config.calm.training_frames else { return Ok(None) };
-        let wrong = |message: String| self.wrong(TRAINING_FRAMES, file, message);
+        let wrong = |message: String| self.file_error(TRAINING_FRAMES, file, message);
         let frames = read_structures(file.get_ref()).map_err(|error| wrong(error.to_string()))?;
         let atoms: usize = frames.iter().map(|frame| frame.structure.len()).sum();
-        let every = atoms.div_ceil(WATCHED_ATOMS);
+        let every = atoms.div_ceil(MAX_MONITORED_ATOMS);
         let mut features = Features::new(model);
         for frame in frames.iter().step_by(every) {
             let place = || format!("{}:{}", file.get_ref().display(), frame.line);
@@ -112,9 +112,9 @@ impl Loader<'_> {
         let training = TrainingFrames::new(features.elements, features.values, original)
             .map_err(|error| wrong(error.to_string()))?;
         let median = training.original.median;
-        if !(NO_GRADE..=1.0).contains(&median) {
+        if !(MIN_MEDIAN_GRADE..=1.0).contains(&median) {
             return Err(wrong(format!(
-                "{}: the median of γ is {median:.3e} under the mixture as it begins; expected {NO_GRADE} to 1: either \
+                "{}: the median of γ is {median:.3e} under the mixture as it begins; expected {MIN_MEDIAN_GRADE} to 1: either \
                  these are not the frames that the mixture was built from, or its covariances or thresholds are wrong",
                 file.get_ref().display()
             )));
@@ -123,16 +123,16 @@ impl Loader<'_> {
     }
 
     /// Warns of suspicious initial grades.
-    pub fn doubtful_grades(
+    pub fn suspicious_grades(
         &self,
         model: &Arc<GraceModel>,
         artifact: &Artifact,
-        seeds: &[NamedSeed],
+        seeds: &[SourcedStructure],
         training: Option<&TrainingFrames>,
     ) -> Result<Option<Warning>, ConfigError> {
         if let (Some(training), Some(file)) = (training, &self.config.calm.training_frames) {
             let share = training.original.share_above_one;
-            return Ok((share > DOUBTFUL_SHARE).then(|| {
+            return Ok((share > SUSPICIOUS_SHARE).then(|| {
                 let percent = 100.0 * share;
                 let message = format!(
                     "{percent:.0} % of the atoms have γ > 1 under the mixture as it begins, where 2 to 9 % are usual: \
@@ -143,19 +143,19 @@ impl Loader<'_> {
         }
         let file = self.config.calm.artifact.as_ref().unwrap_or(&self.config.potential.model);
         let key = if self.config.calm.artifact.is_some() { "calm.artifact" } else { "potential.model" };
-        let wrong = |message: String| self.wrong(key, file, message);
+        let wrong = |message: String| self.file_error(key, file, message);
         let mut features = Features::new(model);
         for named in seeds {
             let of_seed =
                 |error| wrong(format!("seed structure '{}' ({}): {error}", named.seed.name, named.source));
             features.add(&named.seed.structure).map_err(of_seed)?;
-            if features.elements.len() >= GRADED_ATOMS {
+            if features.elements.len() >= MAX_GRADED_ATOMS {
                 break;
             }
         }
         let grades = grade_distribution(&artifact.mixture, &features.elements, &features.values)
             .map_err(|error| wrong(error.to_string()))?;
-        Ok((grades.median < NO_GRADE).then(|| {
+        Ok((grades.median < MIN_MEDIAN_GRADE).then(|| {
             let message = format!(
                 "the median of γ over the seed structures is {:.1e}, where 0.1 to 2 is usual: with such a mixture nothing \
                  is ever collected",
@@ -166,7 +166,10 @@ impl Loader<'_> {
     }
 
     /// The label protocol and the hashes of its files.
-    pub fn protocol(&self, seeds: &[NamedSeed]) -> Result<(Protocol, Vec<(String, String)>), ConfigError> {
+    pub fn protocol(
+        &self,
+        seeds: &[SourcedStructure],
+    ) -> Result<(Protocol, Vec<(String, String)>), ConfigError> {
         let (settings, hashes) = match &self.config.label.method {
             LabelMethod::Reference(reference) => self.reference(reference, seeds)?,
             LabelMethod::Code(settings) => (self.code(settings, seeds)?, Vec::new()),
@@ -177,9 +180,9 @@ impl Loader<'_> {
     fn reference(
         &self,
         reference: &PotentialFile,
-        seeds: &[NamedSeed],
+        seeds: &[SourcedStructure],
     ) -> Result<(Value, Vec<(String, String)>), ConfigError> {
-        let wrong = |message: String| self.wrong(REFERENCE_FILE, &reference.file, message);
+        let wrong = |message: String| self.file_error(REFERENCE_FILE, &reference.file, message);
         let potential = reference.load().map_err(wrong)?;
         for named in seeds {
             if let Some(species) =
@@ -199,7 +202,7 @@ impl Loader<'_> {
     }
 
     /// Protocol settings of a program, which must be installed with all it needs for every seed structure.
-    fn code(&self, settings: &dft::Settings, seeds: &[NamedSeed]) -> Result<Value, ConfigError> {
+    fn code(&self, settings: &dft::Settings, seeds: &[SourcedStructure]) -> Result<Value, ConfigError> {
         let key = format!("label.method.{}", settings.name());
         let at = || place(self.path, self.text, &key);
         let wrong = |message: String| ConfigError::File { at: at(), key: key.clone(), message };
@@ -217,12 +220,17 @@ impl Loader<'_> {
     /// A key and the hash of the file that it names.
     pub fn hash(&self, key: &str, file: &Spanned<PathBuf>) -> Result<(String, String), ConfigError> {
         let bytes = std::fs::read(file.get_ref()).map_err(|error| {
-            self.wrong(key, file, format!("cannot read {}: {error}", file.get_ref().display()))
+            self.file_error(key, file, format!("cannot read {}: {error}", file.get_ref().display()))
         })?;
         Ok((key.to_owned(), blake3::hash(&bytes).to_string()))
     }
 
-    pub(super) fn wrong(&self, key: &str, file: &Spanned<PathBuf>, message: impl ToString) -> ConfigError {
+    pub(super) fn file_error(
+        &self,
+        key: &str,
+        file: &Spanned<PathBuf>,
+        message: impl ToString,
+    ) -> ConfigError {
         let at = place_of_offset(self.path, self.text, file.span().start);
         ConfigError::File { at, key: key.to_owned(), message: message.to_string() }
     }
@@ -273,10 +281,10 @@ pub fn check_sound(artifact: &Artifact, path: &Path) -> Result<(), String> {
 }
 
 /// Explains why an artifact is invalid. Users easily confuse it with an export or an artifact without statistics.
-fn why_no_artifact(path: &Path, error: &ArtifactError) -> String {
+fn explain_artifact_error(path: &Path, error: &ArtifactError) -> String {
     let stripped = matches!(error, ArtifactError::Missing { key, .. } if key.starts_with("scatter_") || key.starts_with("counts_"));
     if stripped || Artifact::load_export(path).is_ok() {
-        format!("{}: {NO_UPDATES}", path.display())
+        format!("{}: {NO_STATISTICS}", path.display())
     } else {
         error.to_string()
     }

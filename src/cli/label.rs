@@ -84,7 +84,7 @@ impl Label {
         let store = self.store.clone().unwrap_or_default();
         warn_if_unencrypted(&place::location(&store)?);
         loop {
-            let Some((opened, labelling)) = self.begin(&store, &stopping, &stop).await? else {
+            let Some((opened, label_setup)) = self.begin(&store, &stopping, &stop).await? else {
                 return Ok(ExitStatus::Interrupted);
             };
             let place = match place::location(&store)? {
@@ -93,11 +93,11 @@ impl Label {
                 Location::Server(_) if store.to_str().is_some_and(Location::is_server) => store.clone(),
                 Location::Server(url) => url.as_str().into(),
             };
-            let protocol = labelling.protocol.clone();
+            let protocol = label_setup.protocol.clone();
             let slots = LabelPool {
                 number: self.slots,
                 location: place,
-                labelling,
+                label_setup,
                 until_empty: self.until_empty,
                 grace: Duration::from_secs_f64(self.grace),
             };
@@ -148,7 +148,7 @@ impl Label {
         let label = label.map_err(|error| Early::Never(error.into()))?;
         let here = HostOptions { method: self.method.as_deref(), files: &self.files, label };
         match LabelSetup::read(&store, protocol, here).await {
-            Ok(labelling) => Ok((store, labelling)),
+            Ok(label_setup) => Ok((store, label_setup)),
             Err(failure) => Err(Early::Never(failure)),
         }
     }

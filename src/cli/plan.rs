@@ -84,7 +84,7 @@ impl Plan {
         let (copies, per_seed) = (config.labels_of_each(), config.collect.per_seed.get());
         let labels = u64::from(copies) * u64::from(per_seed);
         let parts: Vec<_> = campaign
-            .seeds
+            .seed_structures
             .iter()
             .zip(sizes)
             .map(|(seed, size)| Part {

@@ -247,7 +247,7 @@ async fn open_store(
                 resolved_configuration: resolved.to_string(),
                 configuration_in_force: resolved.to_string(),
             };
-            let store = Store::create(location, &record, &campaign.stored_seeds(), now).await?;
+            let store = Store::create(location, &record, &campaign.stored_seed_structures(), now).await?;
             begin::begun(&store, origin, location).await?;
             store
         }
@@ -332,7 +332,7 @@ async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector
     let mut selector = Selector::restore(
         campaign.selector_settings(),
         store.campaign().await?.id,
-        campaign.seeds.iter().map(|named| named.seed.clone()).collect(),
+        campaign.seed_structures.iter().map(|named| named.seed.clone()).collect(),
         campaign.grader(),
         Arc::new(campaign.artifact.mixture.clone()),
         campaign.training.clone(),

@@ -31,10 +31,10 @@ impl Validate {
 }
 
 fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()> {
-    let Campaign { model, artifact: Artifact { mixture, .. }, seeds, .. } = campaign;
+    let Campaign { model, artifact: Artifact { mixture, .. }, seed_structures, .. } = campaign;
     let elements: Vec<_> = model.elements().iter().map(|species| species.symbol()).collect();
     let architecture = model.description().architecture;
-    let atoms = || seeds.iter().map(|named| named.seed.structure.len());
+    let atoms = || seed_structures.iter().map(|named| named.seed.structure.len());
     let (least, most) = (atoms().min().unwrap_or(0), atoms().max().unwrap_or(0));
     writeln!(out, "{} is a valid campaign", path.display())?;
     writeln!(out, "  potential        {architecture}, {}, cutoff {} Å", elements.join(" "), model.cutoff())?;
@@ -47,7 +47,7 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()
             "                   without scatter and counts: it can be scored with but not updated"
         )?;
     }
-    writeln!(out, "  seed structures  {}, of {least} to {most} atoms", seeds.len())?;
+    writeln!(out, "  seed structures  {}, of {least} to {most} atoms", seed_structures.len())?;
     writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)?;
     writeln!(out, "  disk             {}", DiskForecast::from_campaign(campaign))?;
     match campaign.warnings.len() {

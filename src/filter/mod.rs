@@ -106,17 +106,17 @@ names! {
 
 impl Filter {
     /// Whether a structure passes the filter.
-    pub fn matches(&self, facts: &StructureProperties<'_>) -> bool {
+    pub fn matches(&self, properties: &StructureProperties<'_>) -> bool {
         match self {
-            Self::Number(column, comparison, value) => {
-                facts.number(*column).is_some_and(|number| comparison.holds(number, *value))
+            Self::Number(field, comparison, value) => {
+                properties.number(*field).is_some_and(|number| comparison.holds(number, *value))
             }
-            Self::Text(column, wanted, value) => {
-                facts.is_text(*column, value).is_some_and(|found| found == *wanted)
+            Self::Text(field, wanted, value) => {
+                properties.is_text(*field, value).is_some_and(|found| found == *wanted)
             }
-            Self::Not(condition) => !condition.matches(facts),
-            Self::And(left, right) => left.matches(facts) && right.matches(facts),
-            Self::Or(left, right) => left.matches(facts) || right.matches(facts),
+            Self::Not(condition) => !condition.matches(properties),
+            Self::And(left, right) => left.matches(properties) && right.matches(properties),
+            Self::Or(left, right) => left.matches(properties) || right.matches(properties),
         }
     }
 }
@@ -125,8 +125,8 @@ impl Filter {
     /// The property names in the expression, in order.
     pub fn names(&self) -> Vec<&'static str> {
         match self {
-            Self::Number(column, ..) => vec![column.name()],
-            Self::Text(column, ..) => vec![column.name()],
+            Self::Number(field, ..) => vec![field.name()],
+            Self::Text(field, ..) => vec![field.name()],
             Self::Not(condition) => condition.names(),
             Self::And(left, right) | Self::Or(left, right) => [left.names(), right.names()].concat(),
         }
@@ -158,9 +158,9 @@ impl Comparison {
 }
 
 impl StructureProperties<'_> {
-    fn number(&self, column: NumberField) -> Option<f64> {
+    fn number(&self, field: NumberField) -> Option<f64> {
         let atoms = (!self.species.is_empty()).then_some(self.species.len() as f64);
-        match column {
+        match field {
             NumberField::Gamma => self.gamma,
             NumberField::GammaNbr => self.gamma_nbr,
             NumberField::Volume => self.volume,
@@ -176,8 +176,8 @@ impl StructureProperties<'_> {
     }
 
     /// Whether the text equals `value`. An element matches if any atom has it.
-    fn is_text(&self, column: TextField, value: &str) -> Option<bool> {
-        match column {
+    fn is_text(&self, field: TextField, value: &str) -> Option<bool> {
+        match field {
             TextField::Element if self.species.is_empty() => None,
             TextField::Element => Some(self.species.iter().any(|species| species.symbol() == value)),
             TextField::Kind => Some(self.kind == value),
@@ -216,13 +216,13 @@ impl FromStr for Filter {
 impl fmt::Display for Filter {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Number(column, comparison, value) => {
-                write!(f, "{} {} {value:?}", column.name(), comparison.sign())
+            Self::Number(field, comparison, value) => {
+                write!(f, "{} {} {value:?}", field.name(), comparison.sign())
             }
-            Self::Text(column, wanted, value) => {
+            Self::Text(field, wanted, value) => {
                 let quote = if value.contains('\'') { '"' } else { '\'' };
                 let sign = if *wanted { "=" } else { "!=" };
-                write!(f, "{} {sign} {quote}{value}{quote}", column.name())
+                write!(f, "{} {sign} {quote}{value}{quote}", field.name())
             }
             Self::Not(condition) => write!(f, "not ({condition})"),
             Self::And(left, right) => write!(f, "({left}) and ({right})"),

@@ -185,12 +185,12 @@ impl Parser {
             Token::Word(name) => name.clone(),
             _ => return Err(self.error(names())),
         };
-        if let Some((column, _)) = NumberField::ALL.iter().find(|(_, known)| *known == name) {
+        if let Some((field, _)) = NumberField::ALL.iter().find(|(_, known)| *known == name) {
             self.take();
             let comparison = self.comparison_sign()?;
-            return Ok(Filter::Number(*column, comparison, self.number()?));
+            return Ok(Filter::Number(*field, comparison, self.number()?));
         }
-        let Some((column, _)) = TextField::ALL.iter().find(|(_, known)| *known == name) else {
+        let Some((field, _)) = TextField::ALL.iter().find(|(_, known)| *known == name) else {
             return Err(self.error(format!("{}{}", names(), hint(&name, all_names()))));
         };
         self.take();
@@ -200,7 +200,7 @@ impl Parser {
             _ => return Err(self.error(format!("= or != after {name}"))),
         };
         self.take();
-        Ok(Filter::Text(*column, wanted, self.text(*column)?))
+        Ok(Filter::Text(*field, wanted, self.text(*field)?))
     }
 
     fn comparison_sign(&mut self) -> Result<Comparison, FilterError> {
@@ -227,11 +227,11 @@ impl Parser {
         Ok(number)
     }
 
-    fn text(&mut self, column: TextField) -> Result<String, FilterError> {
+    fn text(&mut self, field: TextField) -> Result<String, FilterError> {
         let (Token::Word(text) | Token::Quoted(text)) = self.peek().clone() else {
             return Err(self.error("a word, or a quoted text"));
         };
-        match column {
+        match field {
             TextField::Element if text.parse::<Species>().is_err() => {
                 return Err(self.error("the symbol of an element, such as Mo"));
             }

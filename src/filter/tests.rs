@@ -3,7 +3,7 @@ use proptest::test_runner::RngSeed;
 
 use super::*;
 
-fn facts() -> StructureProperties<'static> {
+fn properties() -> StructureProperties<'static> {
     static SPECIES: [Species; 0] = [];
     StructureProperties {
         gamma: Some(2.5),
@@ -20,12 +20,12 @@ fn matches(text: &str) -> bool {
     text.parse::<Filter>().unwrap().matches(&StructureProperties {
         species: &species,
         energy: Some(-6.0),
-        ..facts()
+        ..properties()
     })
 }
 
 #[test]
-fn conditions_mean_what_they_say() {
+fn filters_are_evaluated() {
     for (text, expected) in [
         ("gamma > 2 and element = Mo", true),
         ("gamma > 2 and element = Al", false),
@@ -49,13 +49,13 @@ fn conditions_mean_what_they_say() {
 }
 
 #[test]
-fn names_are_those_that_stand_there() {
+fn names_are_those_in_the_expression() {
     let condition: Filter = "not (gamma > 2 or element = Mo) and max_force < 5".parse().unwrap();
     assert_eq!(condition.names(), ["gamma", "element", "max_force"]);
 }
 
 #[test]
-fn what_is_wrong_is_said_with_its_place() {
+fn errors_have_positions() {
     for (text, position, found, expected) in [
         ("", 1, "the end", "gamma_nbr"),
         ("gama > 2", 1, "'gama'", "one of gamma,"),
@@ -82,7 +82,7 @@ fn what_is_wrong_is_said_with_its_place() {
 fn conditions() -> impl Strategy<Value = Filter> {
     use Comparison::*;
     let number =
-        proptest::sample::select(NumberField::ALL.iter().map(|(column, _)| *column).collect::<Vec<_>>());
+        proptest::sample::select(NumberField::ALL.iter().map(|(field, _)| *field).collect::<Vec<_>>());
     let comparison = proptest::sample::select(vec![Equal, Different, Below, AtMost, Above, AtLeast]);
     let finite = any::<f64>().prop_filter("finite", |x| x.is_finite());
     let numbers = (number, comparison, finite).prop_map(|(a, b, c)| Filter::Number(a, b, c));
@@ -104,12 +104,12 @@ proptest! {
     #![proptest_config(ProptestConfig { rng_seed: RngSeed::Fixed(6), ..ProptestConfig::default() })]
 
     #[test]
-    fn what_is_written_is_read_again(condition in conditions()) {
+    fn displayed_filters_parse_back(condition in conditions()) {
         prop_assert_eq!(condition.to_string().parse::<Filter>(), Ok(condition));
     }
 
     #[test]
-    fn any_text_is_a_condition_or_an_error_inside_it(text in "([a-z_]{1,9}|[ ()<>=!'\"γ.0-9-]|and|or|not|gamma > 1){0,12}") {
+    fn any_text_is_a_filter_or_an_error_inside_it(text in "([a-z_]{1,9}|[ ()<>=!'\"γ.0-9-]|and|or|not|gamma > 1){0,12}") {
         if let Err(error) = text.parse::<Filter>() {
             prop_assert!((1..=text.chars().count() + 1).contains(&error.position), "{error}");
         }

@@ -48,7 +48,7 @@ impl LogLine<'_> {
     /// Text for people, escaped to one line.
     pub fn text(&self) -> String {
         let Self { time, level, process, pid, fields, .. } = self;
-        let mut text = format!("{} {level:<5} {process} [{pid}] ", utc(*time));
+        let mut text = format!("{} {level:<5} {process} [{pid}] ", format_utc(*time));
         for character in fields.message.chars() {
             match character.is_control() {
                 true => text.extend(character.escape_default()),
@@ -67,7 +67,7 @@ impl LogLine<'_> {
     pub fn json(&self) -> String {
         let Self { time, level, process, pid, target, fields } = self;
         let object = serde_json::json!({
-            "time": utc(*time), "level": level.as_str().to_lowercase(), "process": process, "pid": pid,
+            "time": format_utc(*time), "level": level.as_str().to_lowercase(), "process": process, "pid": pid,
             "target": target, "message": fields.message, "fields": fields.named,
         });
         format!("{object}\n")
@@ -109,7 +109,7 @@ impl Visit for Fields {
 }
 
 /// Formats ms since 1970 as 2026-03-01T12:00:00.250Z (RFC 3339).
-pub fn utc(milliseconds: i64) -> String {
+pub fn format_utc(milliseconds: i64) -> String {
     let (year, month, day) = date(milliseconds.div_euclid(DAY));
     let of_day = milliseconds.rem_euclid(DAY);
     let (hour, minute) = (of_day / 3_600_000, of_day / 60_000 % 60);

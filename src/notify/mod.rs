@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stall_is_told_once_and_again_after_the_next_candidate() {
+    fn a_stall_is_reported_once_and_again_after_the_next_candidate() {
         let (mut watch, mut status) = (watch(), Status::default());
         for (minute, seen, expected) in [
             (0, 5, 0),
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn failures_are_told_by_the_dozen() {
+    fn failures_are_reported_in_batches() {
         let (mut watch, mut status) = (watch(), Status::default());
         for (failed, expected) in [(9, 0), (10, 1), (11, 0), (3, 0), (12, 0), (39, 1), (40, 1)] {
             status.labels.failed = failed;
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn walks_that_end_early_one_after_the_other_are_told_once() {
+    fn repeated_early_ends_are_reported_once() {
         let (mut watch, mut status) = (watch(), Status::default());
         let walk = |state: &str| store::WalkStatus { state: state.into(), ..store::WalkStatus::default() };
         for (state, expected) in
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn an_end_by_a_budget_is_both_and_a_larger_budget_is_another() {
+    fn a_budget_and_its_end_are_reported_and_a_larger_budget_again() {
         use NotifyEvent::{Budget, End};
         let (mut watch, mut status) = (watch(), Status { finished: true, ..Status::default() });
         status.budget.used_up = Some("budget.labels".into());

@@ -24,17 +24,17 @@ use crate::exit_status::Failure;
 const RESOLUTION: f64 = 300.0;
 
 /// A figure of the page, or the reason why it is missing.
-struct Part {
+struct FigureEntry {
     /// Name of its files.
     name: &'static str,
     /// Its title.
     title: &'static str,
     /// The figure, or why it is missing.
-    drawn: Result<Drawn, String>,
+    drawn: Result<FigureContent, String>,
 }
 
 /// A figure with its caption and data.
-struct Drawn {
+struct FigureContent {
     figure: ::figures::Figure,
     /// Supports `_{…}` and `^{…}`.
     caption: String,

@@ -7,19 +7,19 @@ use figures::{BOLD, REGULAR, escape, to_html, to_svg};
 use super::report_data::ReportData;
 use super::style::grouped;
 use super::tables::{Cell, Table, collection_rule};
-use super::{Drawn, Part};
+use super::{FigureContent, FigureEntry};
 
 const STYLE: &str = include_str!("page.css");
 
 /// Content of a section.
 enum Block<'a> {
     Paragraph(String),
-    Figure(&'a Part, usize),
+    Figure(&'a FigureEntry, usize),
     Table(&'a Table, usize),
 }
 
 /// Writes the page.
-pub fn write(data: &ReportData, parts: &[Part], tables: &[Table]) -> String {
+pub fn write(data: &ReportData, parts: &[FigureEntry], tables: &[Table]) -> String {
     let title = format!("Campaign {}", data.campaign.id);
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
@@ -53,7 +53,7 @@ pub fn write(data: &ReportData, parts: &[Part], tables: &[Table]) -> String {
 
 fn sections<'a>(
     data: &ReportData,
-    parts: &'a [Part],
+    parts: &'a [FigureEntry],
     tables: &'a [Table],
 ) -> Vec<(&'static str, Vec<Block<'a>>)> {
     // Numbers the figures and tables that exist.
@@ -104,8 +104,8 @@ fn sections<'a>(
 }
 
 fn lead(data: &ReportData) -> String {
-    let candidates = &data.standing.candidates;
-    let (biased, control) = (&data.sample.biased, &data.sample.control);
+    let candidates = &data.status.candidates;
+    let (biased, control) = (&data.collections.biased, &data.collections.control);
     format!(
         "The selector accepted {} structures of {} candidates from biased walks and collected {} frames from control walks; {} of them are \
          labelled. Unless stated otherwise, grades are those of the original mixture, with which the campaign began.",
@@ -116,10 +116,10 @@ fn lead(data: &ReportData) -> String {
     )
 }
 
-fn write_figure(html: &mut String, part: &Part, number: usize) {
-    let Part { name, title, drawn } = part;
+fn write_figure(html: &mut String, part: &FigureEntry, number: usize) {
+    let FigureEntry { name, title, drawn } = part;
     let _ = match drawn {
-        Ok(Drawn { figure, caption, .. }) => writeln!(
+        Ok(FigureContent { figure, caption, .. }) => writeln!(
             html,
             "<figure id=\"figure-{name}\">\n{}<figcaption><strong>Figure {number}. {}.</strong> {} \
              <span class=\"files\">Files: figures/{name}.svg, .png, .csv.</span></figcaption>\n</figure>",

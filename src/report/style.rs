@@ -9,7 +9,7 @@ pub const WIDTH: f64 = 510.0;
 
 /// Style of an origin, distinguishable by colour, dashes and marker shape.
 #[derive(Clone, Copy, Debug)]
-pub struct Look {
+pub struct OriginStyle {
     /// Colour.
     pub colour: Colour,
     /// Line.
@@ -21,15 +21,15 @@ pub struct Look {
 }
 
 /// How an origin looks.
-pub fn look(origin: Origin) -> Look {
+pub fn origin_style(origin: Origin) -> OriginStyle {
     match origin {
-        Origin::Biased => Look {
+        Origin::Biased => OriginStyle {
             colour: Colour::VERMILLION,
             line: Colour::VERMILLION.line(1.3),
             marker: Marker::Disc,
             name: "biased",
         },
-        Origin::Control => Look {
+        Origin::Control => OriginStyle {
             colour: Colour::BLUE,
             line: Stroke { dashes: &[4.0, 1.6], ..Colour::BLUE.line(1.3) },
             marker: Marker::Square,
@@ -40,8 +40,10 @@ pub fn look(origin: Origin) -> Look {
 
 /// Draws the legend of the shown origins at the upper right.
 pub fn origins(figure: &mut Figure, shown: &[Origin]) {
-    let keys: Vec<_> =
-        shown.iter().map(|origin| (Key::Line(look(*origin).line), look(*origin).name)).collect();
+    let keys: Vec<_> = shown
+        .iter()
+        .map(|origin| (Key::Line(origin_style(*origin).line), origin_style(*origin).name))
+        .collect();
     legend(figure, [WIDTH - 8.0, 12.0], &keys);
 }
 

@@ -2,7 +2,7 @@
 
 mod facts;
 mod labels;
-mod seeds;
+mod seed_structures;
 mod settings;
 
 use super::csv::{self, Csv};
@@ -11,7 +11,7 @@ use super::report_data::ReportData;
 pub use facts::collection_rule;
 
 /// Largest number of rows on the page, for tables that grow with the campaign.
-const ROWS: usize = 60;
+const MAX_PAGE_ROWS: usize = 60;
 
 /// A table.
 pub struct Table {
@@ -40,7 +40,13 @@ pub struct Cell {
 
 impl Table {
     fn new(name: &'static str, caption: &str, titles: &[&'static str]) -> Self {
-        Self { name, caption: caption.into(), titles: titles.to_vec(), rows: Vec::new(), shown: ROWS }
+        Self {
+            name,
+            caption: caption.into(),
+            titles: titles.to_vec(),
+            rows: Vec::new(),
+            shown: MAX_PAGE_ROWS,
+        }
     }
 
     /// Shows every row on the page.
@@ -85,13 +91,13 @@ fn percent(share: Option<f64>) -> Cell {
 
 /// All tables with rows, in the order of the page.
 pub fn all(data: &ReportData) -> Vec<Table> {
-    let mut tables = vec![facts::summary(data), seeds::of(data)];
+    let mut tables = vec![facts::summary(data), seed_structures::seed_structures(data)];
     if let Some(found) = &data.labels {
         tables.extend([
-            labels::correlations(&found.learned),
-            labels::quantiles("quantiles-gamma", "γ", &found.learned.all.gamma),
-            labels::quantiles("quantiles-gamma-nbr", "γ_{nbr}", &found.learned.all.gamma_nbr),
-            labels::energy_offsets(&found.learned),
+            labels::correlations(&found.statistics),
+            labels::quantiles("quantiles-gamma", "γ", &found.statistics.all.gamma),
+            labels::quantiles("quantiles-gamma-nbr", "γ_{nbr}", &found.statistics.all.gamma_nbr),
+            labels::energy_offsets(&found.statistics),
             labels::failures(&found.failures),
             labels::unlabelled(&found.unlabelled),
         ]);

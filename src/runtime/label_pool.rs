@@ -33,7 +33,7 @@ pub struct LabelPool {
     /// Directory of the campaign, or URL of its store.
     pub location: PathBuf,
     /// How to make labels.
-    pub labelling: LabelSetup,
+    pub label_setup: LabelSetup,
     /// Whether the labellers exit when the queue is empty and no run is active.
     pub until_empty: bool,
     /// Time that labels in progress may take after a stop.
@@ -49,7 +49,7 @@ pub async fn run(
     stopping: &Arc<AtomicBool>,
     stop: &Notify,
 ) -> Result<ExitStatus, Failure> {
-    let attempts = pool.labelling.attempts;
+    let attempts = pool.label_setup.attempts;
     let mut manager = PoolManager {
         store,
         labellers: Labellers::new(children(pool), Default::default(), attempts),
@@ -86,9 +86,9 @@ pub async fn run(
 
 fn children(pool: LabelPool) -> Children {
     let limits = Limits { silence: LABELLER_TIMEOUT, grace: pool.grace + RELEASE_TIME, ..Limits::default() };
-    let LabelPool { number, location, labelling, until_empty, grace } = pool;
+    let LabelPool { number, location, label_setup, until_empty, grace } = pool;
     let slot = PoolConfig { parent: std::process::id(), until_empty, grace: grace.as_secs_f64() };
-    let setup = LabellerConfig::new(location, labelling);
+    let setup = LabellerConfig::new(location, label_setup);
     Children::new(number, limits, move |_, incarnation| {
         let restarts = incarnation.saturating_sub(1);
         let setup = LabellerConfig { restarts, slot: Some(slot.clone()), ..setup.clone() };

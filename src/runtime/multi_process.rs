@@ -69,9 +69,9 @@ async fn run_in(place: &Place, run: RunContext<'_>, selector: Selector) -> Resul
         ..Limits::default()
     };
     let line = server.handle();
-    let walkers = Children::new(walkers, limits, spawn::walker(campaign, line.clone())?);
+    let walkers = Children::new(walkers, limits, spawn::walker_launcher(campaign, line.clone())?);
     let limits = Limits { silence: limits.silence.max(LABELLER_TIMEOUT), outlives: true, ..limits };
-    let labellers = spawn::labellers(run, limits).await?;
+    let labellers = spawn::start_labellers(run, limits).await?;
     let manager =
         ProcessManager::new(store, process.clone(), line, walkers, labellers, Arc::clone(&stopping));
 

@@ -178,7 +178,7 @@ impl<'a> ProcessManager<'a> {
                 self.ended[0] = true;
                 self.line.close();
                 let given_up = all_failed_message(&mut self.walkers);
-                self.check_any_left("walker", given_up);
+                self.fail_if_none_left("walker", given_up);
             }
         }
         Ok(())
@@ -197,14 +197,14 @@ impl<'a> ProcessManager<'a> {
             launcher::Event::AllGone => {
                 self.ended[1] = true;
                 let given_up = all_failed_message(&mut self.labellers.children);
-                self.check_any_left("labeller", given_up);
+                self.fail_if_none_left("labeller", given_up);
             }
         }
         Ok(())
     }
 
     /// Fails the run if no process of this kind is left to do the work.
-    fn check_any_left(&mut self, kind: &str, given_up: Option<String>) {
+    fn fail_if_none_left(&mut self, kind: &str, given_up: Option<String>) {
         if let Some(given_up) = given_up.filter(|_| !self.is_stopping()) {
             self.fail(format!("no {kind} is left: {given_up}"));
         }

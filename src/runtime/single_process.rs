@@ -19,7 +19,7 @@ use workers::walker;
 
 use super::db_status::DbStatus;
 use super::process_manager::LAST_LABELS_POLL_INTERVAL;
-use super::spawn::no_labellers;
+use super::spawn::stop_labellers;
 use super::{
     CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, on_stop_signal, start_reactor, stop_when_over,
     wanted_walkers,
@@ -33,7 +33,7 @@ pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::End
         // Removes what a killed run left in shared memory. This run needs nothing there.
         let _ = place.remove();
     }
-    no_labellers(run.store).await?;
+    stop_labellers(run.store).await?;
     let actors = Tasks::start(run, selector)?;
     let heartbeats = tokio::spawn(write_heartbeats(run.store.clone(), run.process.clone()));
     let ended = actors.finish().await;

@@ -18,7 +18,7 @@ use crate::log;
 use crate::process_config::{self, LabellerConfig, WalkerConfig};
 
 /// Returns the function that launches a walker.
-pub fn walker(
+pub fn walker_launcher(
     campaign: &Campaign,
     line: Handle,
 ) -> Result<impl FnMut(u32, u32) -> Launch + Send + 'static, Failure> {
@@ -44,21 +44,21 @@ pub fn walker(
 }
 
 /// Adopts the labellers that an earlier run left with the same configuration, and launches the missing ones.
-pub async fn labellers(run: RunContext<'_>, limits: Limits) -> Result<Labellers, Failure> {
+pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labellers, Failure> {
     let RunContext { campaign, store, directory, .. } = run;
     let location = match &campaign.config.run.store {
         Some(url) => PathBuf::from(url),
         None => absolute(directory)?,
     };
     let label = &campaign.config.label;
-    let labelling = LabelSetup {
+    let label_setup = LabelSetup {
         method: campaign.method()?,
         protocol: campaign.protocol.clone(),
         attempts: label.attempts.get(),
         bounds: label.bounds(),
         lease: Duration::from_secs(label.lease.get().into()),
     };
-    let setup = LabellerConfig::new(location, labelling);
+    let setup = LabellerConfig::new(location, label_setup);
     let (hash, slots) = (setup.hash(), label.slots as u32);
     let mut labellers = Children::new(slots, limits, move |number, incarnation| {
         let restarts = incarnation.saturating_sub(1);
@@ -66,7 +66,7 @@ pub async fn labellers(run: RunContext<'_>, limits: Limits) -> Result<Labellers,
         Launch::this_program(["labeller"], process_config::to_bytes(&setup)).for_own_session()
     });
     let mut adopted = BTreeMap::new();
-    for found in left_by_runs(store).await? {
+    for found in running_labellers(store).await? {
         let wanted = found.number.filter(|_| found.setup.as_ref() == Some(&hash) && found.state == "running");
         match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.birth).is_ok()) {
             Some(number) => drop(adopted.insert(number, found.pid)),
@@ -78,8 +78,8 @@ pub async fn labellers(run: RunContext<'_>, limits: Limits) -> Result<Labellers,
 }
 
 /// Asks the labellers of an earlier run to end, because this run makes labels itself.
-pub async fn no_labellers(store: &Store) -> Result<(), Failure> {
-    for found in left_by_runs(store).await? {
+pub async fn stop_labellers(store: &Store) -> Result<(), Failure> {
+    for found in running_labellers(store).await? {
         let _ = ask_to_end(found.pid, &found.birth);
     }
     Ok(())
@@ -87,7 +87,7 @@ pub async fn no_labellers(store: &Store) -> Result<(), Failure> {
 
 /// Running labellers on this host that an earlier run started. Those of `calmwalk label` have no number and are left
 /// alone.
-async fn left_by_runs(store: &Store) -> Result<Vec<ProcessRecord>, StoreError> {
+async fn running_labellers(store: &Store) -> Result<Vec<ProcessRecord>, StoreError> {
     let mut labellers = store.processes(Some(ProcessRecord::LABELLER)).await?;
     labellers.retain(|found| found.number.is_some() && found.is_local() && !found.is_gone());
     Ok(labellers)

@@ -47,7 +47,7 @@ struct Speed {
 }
 
 impl Speed {
-    fn at(&mut self, steps: u64, now: i64) {
+    fn update(&mut self, steps: u64, now: i64) {
         let (before, since) = *self.from.get_or_insert((steps, now));
         let seconds = (now - since) as f64 / 1000.0;
         if seconds < MIN_INTERVAL {
@@ -82,7 +82,7 @@ impl Throughput {
             entry.steps += made;
             self.steps += made;
         }
-        entry.speed.at(entry.steps, now);
+        entry.speed.update(entry.steps, now);
         entry.pace = Pace {
             walk: walk.0,
             seen: now,
@@ -98,8 +98,8 @@ impl Throughput {
     }
 
     /// The changed walks, and steps per second of all walks.
-    fn take(&mut self, now: i64) -> (Vec<Pace>, Option<f64>) {
-        self.all.at(self.steps, now);
+    fn take_changes(&mut self, now: i64) -> (Vec<Pace>, Option<f64>) {
+        self.all.update(self.steps, now);
         let changed = std::mem::take(&mut self.changed);
         (changed.iter().map(|walk| self.walks[walk].pace.clone()).collect(), self.all.average)
     }
@@ -112,7 +112,7 @@ pub async fn record(store: &Store, throughput: &Mutex<Throughput>) -> Infallible
     loop {
         write.tick().await;
         let now = unix_milliseconds();
-        let (changed, all) = throughput.lock().unwrap_or_else(PoisonError::into_inner).take(now);
+        let (changed, all) = throughput.lock().unwrap_or_else(PoisonError::into_inner).take_changes(now);
         let _ = store.set_paces(&changed, all, now).await;
     }
 }
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_walk_is_as_fast_as_its_steps_over_all_its_time() {
+    fn waiting_time_counts_towards_the_speed() {
         let mut throughput = Throughput::default();
         let walk = WalkId(3);
         // Continues at step 1000 with 50 steps per second on average: it waits every other second.
@@ -134,21 +134,21 @@ mod tests {
             let step = 1000 + 100 * (second as u64 / 2);
             throughput.notice(&Notice::Progress(walk, at(0, step)), 1000 * second);
         }
-        let (changed, _) = throughput.take(200_000);
+        let (changed, _) = throughput.take_changes(200_000);
         let pace = changed[0].steps_per_second.unwrap();
         assert!((pace - 50.0).abs() < 2.0, "{pace}");
         assert_eq!((changed[0].walk, changed[0].step, changed[0].seen), (3, 10_900, 199_000));
-        assert_eq!(throughput.take(201_000).0, [], "nothing new was heard");
+        assert_eq!(throughput.take_changes(201_000).0, [], "nothing new was heard");
     }
 
     #[test]
-    fn what_a_return_takes_back_is_no_speed() {
+    fn rollbacks_do_not_count_as_steps() {
         let mut throughput = Throughput::default();
-        throughput.take(0);
+        throughput.take_changes(0);
         for (segment, step, now) in [(0, 500, 0), (0, 600, 1000), (1, 100, 2000), (1, 200, 3000)] {
             throughput.notice(&Notice::Progress(WalkId(0), at(segment, step)), now);
         }
-        let (_, all) = throughput.take(4000);
+        let (_, all) = throughput.take_changes(4000);
         assert_eq!(all, Some(50.0), "200 steps in 4 s");
     }
 }

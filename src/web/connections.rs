@@ -131,7 +131,7 @@ impl Open {
 
 impl ConnectionGuard {
     /// Sets the state of the connection.
-    pub fn enter(&self, state: State) {
+    pub fn set_state(&self, state: State) {
         if let Some(open) = self.connections.open().by_number.get_mut(&self.number) {
             (open.state, open.since) = (state, Instant::now());
         }
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn the_longest_idle_goes_first_and_who_is_answered_stays() {
+    async fn the_longest_idle_is_closed_first_and_responding_ones_stay() {
         let now = Instant::now() + Duration::from_secs(3600);
         let mut open = open(
             &[
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn who_has_just_connected_has_time_to_ask() {
+    async fn new_connections_have_time_to_send_a_request() {
         let now = Instant::now() + Duration::from_secs(3600);
         let mut open = open(&[(State::Idle, 0)], now);
         let Admission::Later(left) = open.evict(now) else { panic!("it is new") };

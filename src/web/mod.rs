@@ -149,7 +149,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn addresses_are_told_from_ports() {
+    fn addresses_need_a_host_and_a_port() {
         assert_eq!(address("127.0.0.1:8080"), Ok(([127, 0, 0, 1], 8080).into()));
         assert_eq!(address("localhost:8080"), address("127.0.0.1:8080"));
         for text in ["9464", ":9464"] {

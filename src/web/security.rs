@@ -69,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pages_of_others_are_told_from_ours() {
+    fn requests_of_other_sites_are_recognized() {
         let of_this_site = |said: &[(&'static str, &'static str)]| {
             let headers = said
                 .iter()

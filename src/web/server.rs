@@ -104,10 +104,10 @@ async fn serve(stream: TcpStream, router: Router, guard: ConnectionGuard) {
             Ok(body) => body,
             Err(refusal) => return Ok::<_, Infallible>(refusal),
         };
-        guard.enter(State::Responding);
+        guard.set_state(State::Responding);
         let answer = router.call(Request::from_parts(head, body)).await;
         let is_events = answer.as_ref().is_ok_and(|answer| is_event_stream(answer.headers()));
-        guard.enter(if is_events { State::Streaming } else { State::Idle });
+        guard.set_state(if is_events { State::Streaming } else { State::Idle });
         answer
     });
     let mut protocol = http1::Builder::new();

@@ -47,7 +47,7 @@ pub async fn go_on(
         return Ok(());
     }
     changes.iter().for_each(|change| log_and_print(format_args!("configuration: {change}")));
-    store.add_seed_structures(&campaign.stored_seeds()).await?;
+    store.add_seed_structures(&campaign.stored_seed_structures()).await?;
     let details: Vec<_> = changes.iter().map(Change::detail).collect();
     Ok(store.set_configuration_in_force(&resolved.to_string(), &details, unix_milliseconds()).await?)
 }

@@ -5,11 +5,11 @@ use store::Candidates;
 
 use super::super::report_data::ReportData;
 use super::super::style::{WIDTH, grouped};
-use super::super::{Csv, Drawn, csv};
+use super::super::{Csv, FigureContent, csv};
 use super::row;
 
-pub fn draw(data: &ReportData) -> Result<Drawn, String> {
-    let candidates = &data.standing.candidates;
+pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
+    let candidates = &data.status.candidates;
     if candidates.seen == 0 {
         return Err("No candidate has reached the selector yet.".into());
     }
@@ -28,7 +28,7 @@ pub fn draw(data: &ReportData) -> Result<Drawn, String> {
         grouped(candidates.seen),
         grouped(candidates.refused_by_walkers),
     );
-    Ok(Drawn { figure, caption, numbers })
+    Ok(FigureContent { figure, caption, numbers })
 }
 
 fn draw_fates(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangle, candidates: &Candidates) {

@@ -5,13 +5,13 @@ use analysis::CompletionBin;
 
 use super::super::report_data::ReportData;
 use super::super::style::{WIDTH, grouped};
-use super::super::{Csv, Drawn, csv};
+use super::super::{Csv, FigureContent, csv};
 use super::row;
 
-pub fn draw(data: &ReportData) -> Result<Drawn, String> {
-    let none = "No label has been made or has failed for good.";
+pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
+    let none = "No label job is finished yet.";
     let labels = data.labels.as_ref().ok_or(none)?;
-    let (by_gamma, by_expansion) = (labels.learned.by_gamma.bins(), labels.learned.by_expansion.bins());
+    let (by_gamma, by_expansion) = (labels.statistics.by_gamma.bins(), labels.statistics.by_expansion.bins());
     let (labelled, failed) = counts(&by_gamma);
     if labelled + failed == 0 {
         return Err(none.into());
@@ -34,7 +34,7 @@ pub fn draw(data: &ReportData) -> Result<Drawn, String> {
         grouped(labelled),
         grouped(failed)
     );
-    Ok(Drawn { figure, caption, numbers })
+    Ok(FigureContent { figure, caption, numbers })
 }
 
 fn counts(bins: &[CompletionBin<String>]) -> (u64, u64) {

@@ -6,7 +6,7 @@ use store::LabelCost;
 
 use super::super::report_data::ReportData;
 use super::super::style::{WIDTH, axis, grouped};
-use super::super::{Csv, Drawn, csv};
+use super::super::{Csv, FigureContent, csv};
 use super::row;
 
 /// Bins of the histogram.
@@ -14,7 +14,7 @@ const BINS: usize = 24;
 /// Largest number of labels drawn as points.
 const MAX_DRAWN: usize = 3000;
 
-pub fn draw(data: &ReportData) -> Result<Drawn, String> {
+pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
     let costs = data.labels.as_ref().map_or(&[][..], |labels| &labels.costs);
     if costs.is_empty() {
         return Err("No label was made in this campaign, so none has a cost.".into());
@@ -48,7 +48,7 @@ pub fn draw(data: &ReportData) -> Result<Drawn, String> {
     panel.dots(points, Marker::Disc, 1.8, Colour::BLUE.faint(0.45), None);
     panel.letter('b');
     panel.draw(&mut figure);
-    Ok(Drawn { figure, caption: caption(data, seconds), numbers })
+    Ok(FigureContent { figure, caption: caption(data, seconds), numbers })
 }
 
 /// The size that the cost depends on: electrons if every label has them, otherwise atoms.
@@ -68,6 +68,6 @@ fn caption(data: &ReportData, mut seconds: Vec<f64>) -> String {
         grouped(seconds.len() as u64),
         of(0.5),
         of(0.9),
-        data.standing.budget.used.core_hours
+        data.status.budget.used.core_hours
     )
 }

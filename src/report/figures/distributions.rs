@@ -6,24 +6,24 @@ use wire::Origin;
 
 use super::super::collections::{Atom, Collections};
 use super::super::style::{WIDTH, axis, grouped, origins};
-use super::super::{Csv, Drawn};
+use super::super::{Csv, FigureContent};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};
 
 /// A quantity of an atom.
-type OfAtom = fn(&Atom) -> Option<f64>;
+type AtomQuantity = fn(&Atom) -> Option<f64>;
 
 /// Number of bins of a panel.
 const BINS: usize = 40;
 
-pub fn draw(sample: &Collections) -> Result<Drawn, String> {
-    let shown = origins_of(sample);
+pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
+    let shown = origins_of(collections);
     if shown.is_empty() {
         return Err(NOTHING_COLLECTED.into());
     }
     let description = "Distributions of grades and force errors of biased and control walks";
     let mut figure = Figure::new("distributions", description, WIDTH, 168.0);
     let mut numbers = Csv::new(&["panel", "origin", "low", "high", "atoms"]);
-    let panels: [(char, &str, OfAtom); 3] = [
+    let panels: [(char, &str, AtomQuantity); 3] = [
         ('a', "γ", |atom| Some(atom.gamma)),
         ('b', "γ_{nbr}", |atom| Some(atom.gamma_nbr)),
         ('c', "force error (eV Å^{−1})", |atom| atom.error),
@@ -31,7 +31,7 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let places = row(3, [40.0, 40.0, 10.0], 26.0, 106.0);
     for ((letter, title, of), place) in panels.into_iter().zip(places) {
         let values = |origin: Origin| -> Vec<f64> {
-            let (_, collection) = sample.both()[usize::from(origin == Origin::Control)];
+            let (_, collection) = collections.both()[usize::from(origin == Origin::Control)];
             collection.atoms.kept().filter_map(of).filter(|x| x.is_finite()).collect()
         };
         let all: Vec<f64> = shown.iter().flat_map(|origin| values(*origin)).collect();
@@ -54,12 +54,12 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
         panel.draw(&mut figure);
     }
     origins(&mut figure, &shown);
-    Ok(Drawn { figure, caption: caption(sample, &shown), numbers })
+    Ok(FigureContent { figure, caption: caption(collections, &shown), numbers })
 }
 
-fn caption(sample: &Collections, shown: &[Origin]) -> String {
+fn caption(collections: &Collections, shown: &[Origin]) -> String {
     let of = |origin: &Origin| {
-        let (_, collection) = sample.both()[usize::from(*origin == Origin::Control)];
+        let (_, collection) = collections.both()[usize::from(*origin == Origin::Control)];
         let atoms = &collection.atoms;
         let mut grades: Vec<_> = atoms.kept().map(|atom| atom.gamma_nbr).filter(|x| x.is_finite()).collect();
         grades.sort_by(f64::total_cmp);
@@ -87,6 +87,6 @@ fn caption(sample: &Collections, shown: &[Origin]) -> String {
          γ_{{nbr}}. c, Force error |F_{{model}} − F_{{label}}| of the atoms of labelled structures. Dashed, the calibrated \
          threshold 1. Bins have equal widths on the logarithmic axis; axes omit 0.1 % of the atoms at either end. {}.{}",
         both.join("; "),
-        sample.left_out()
+        collections.left_out()
     )
 }

@@ -5,8 +5,8 @@ use analysis::{Band, bands, density, even_edges, quantile};
 use wire::Origin;
 
 use super::super::collections::{Atom, Collections};
-use super::super::style::{WIDTH, axis, grouped, look, origins};
-use super::super::{Csv, Drawn, csv};
+use super::super::style::{WIDTH, axis, grouped, origin_style, origins};
+use super::super::{Csv, FigureContent, csv};
 use super::NO_LABELS;
 
 /// Number of bins of a panel.
@@ -17,21 +17,21 @@ pub const MIN_ATOMS: u64 = 20;
 const GRID_POINTS: usize = 160;
 
 /// A quantity to plot the error against.
-struct Against {
+struct Quantity {
     letter: char,
     title: &'static str,
     scale: Scale,
     of: fn(&Atom) -> Option<f64>,
 }
 
-const AGAINST: [Against; 2] = [
-    Against { letter: 'a', title: "γ_{nbr}", scale: Scale::Logarithmic, of: |atom| Some(atom.gamma_nbr) },
-    Against { letter: 'b', title: "d_{nn} / d_{nn}^{0}", scale: Scale::Linear, of: |atom| atom.stretch },
+const QUANTITIES: [Quantity; 2] = [
+    Quantity { letter: 'a', title: "γ_{nbr}", scale: Scale::Logarithmic, of: |atom| Some(atom.gamma_nbr) },
+    Quantity { letter: 'b', title: "d_{nn} / d_{nn}^{0}", scale: Scale::Linear, of: |atom| atom.stretch },
 ];
 
-pub fn draw(sample: &Collections) -> Result<Drawn, String> {
-    let has_labels = |of: &(Origin, _)| !pairs(sample, of.0, |_| Some(1.0)).is_empty();
-    let shown: Vec<_> = sample.both().into_iter().filter(has_labels).map(|(origin, _)| origin).collect();
+pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
+    let has_labels = |of: &(Origin, _)| !pairs(collections, of.0, |_| Some(1.0)).is_empty();
+    let shown: Vec<_> = collections.both().into_iter().filter(has_labels).map(|(origin, _)| origin).collect();
     if shown.is_empty() {
         return Err(NO_LABELS.into());
     }
@@ -40,23 +40,23 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let mut figure = Figure::new("errors", description, WIDTH, 262.0);
     let mut numbers =
         Csv::new(&["panel", "origin", "low", "high", "atoms", "p10", "p25", "median", "p75", "p90"]);
-    for (against, left) in AGAINST.iter().zip([46.0, 302.0]) {
+    for (against, left) in QUANTITIES.iter().zip([46.0, 302.0]) {
         let place = Rectangle { x: left, y: 56.0, width: 162.0, height: 170.0 };
-        draw_panel(&mut figure, &mut numbers, sample, &shown, against, place);
+        draw_panel(&mut figure, &mut numbers, collections, &shown, against, place);
     }
     origins(&mut figure, &shown);
-    Ok(Drawn { figure, caption: caption(sample, &shown), numbers })
+    Ok(FigureContent { figure, caption: caption(collections, &shown), numbers })
 }
 
 fn draw_panel(
     figure: &mut Figure,
     numbers: &mut Csv,
-    sample: &Collections,
+    collections: &Collections,
     shown: &[Origin],
-    against: &Against,
+    against: &Quantity,
     place: Rectangle,
 ) {
-    let of: Vec<_> = shown.iter().map(|origin| (*origin, pairs(sample, *origin, against.of))).collect();
+    let of: Vec<_> = shown.iter().map(|origin| (*origin, pairs(collections, *origin, against.of))).collect();
     let all =
         |k: usize| -> Vec<f64> { of.iter().flat_map(|(_, pairs)| pairs.iter().map(move |p| p[k])).collect() };
     let x = axis(against.title, against.scale, &all(0), Some(1.0));
@@ -108,18 +108,18 @@ pub fn ribbons(panel: &mut Panel, bands: &[Band], [low, high]: [usize; 2], paint
 }
 
 fn draw_bands(panel: &mut Panel, origin: Origin, bands: &[Band]) {
-    let colour = look(origin).colour;
+    let colour = origin_style(origin).colour;
     ribbons(panel, bands, [1, 5], colour.faint(0.14));
     ribbons(panel, bands, [2, 4], colour.faint(0.22));
 }
 
 fn draw_medians(panel: &mut Panel, origin: Origin, bands: &[Band]) {
-    let look = look(origin);
+    let style = origin_style(origin);
     for run in bands.split(|band| band.number < MIN_ATOMS) {
         let median = |band: &Band| Some([middle(panel, band), band.quantiles?[3]]);
         let points: Vec<_> = run.iter().filter_map(median).collect();
-        panel.line(points.clone(), look.line);
-        panel.dots(points, look.marker, 1.9, look.colour, Some(Colour::WHITE.line(0.4)));
+        panel.line(points.clone(), style.line);
+        panel.dots(points, style.marker, 1.9, style.colour, Some(Colour::WHITE.line(0.4)));
     }
 }
 
@@ -154,16 +154,16 @@ fn draw_margins(figure: &mut Figure, of: &[(Origin, Vec<[f64; 2]>)], place: Rect
 
 fn draw_density(panel: &mut Panel, origin: Origin, line: &[(f64, f64)], at: fn(f64, f64) -> [f64; 2]) {
     let (Some(first), Some(last)) = (line.first(), line.last()) else { return };
-    let look = look(origin);
+    let style = origin_style(origin);
     let points: Vec<_> = line.iter().map(|(place, density)| at(*place, *density)).collect();
     let ring = [at(first.0, 0.0)].into_iter().chain(points.clone()).chain([at(last.0, 0.0)]);
-    panel.rings([ring], Some(look.colour.faint(0.15)), None);
-    panel.line(points, ::figures::Stroke { width: 1.0, ..look.line });
+    panel.rings([ring], Some(style.colour.faint(0.15)), None);
+    panel.line(points, ::figures::Stroke { width: 1.0, ..style.line });
 }
 
 /// Pairs of quantity and error of the labelled atoms.
-fn pairs(sample: &Collections, origin: Origin, of: fn(&Atom) -> Option<f64>) -> Vec<[f64; 2]> {
-    let (_, collection) = sample.both()[usize::from(origin == Origin::Control)];
+fn pairs(collections: &Collections, origin: Origin, of: fn(&Atom) -> Option<f64>) -> Vec<[f64; 2]> {
+    let (_, collection) = collections.both()[usize::from(origin == Origin::Control)];
     let pair = |atom: &Atom| Some([of(atom)?, atom.error?]).filter(|[x, y]| x.is_finite() && y.is_finite());
     collection.atoms.kept().filter_map(pair).collect()
 }
@@ -179,16 +179,16 @@ pub fn push_bands(numbers: &mut Csv, panel: &str, origin: &str, bands: &[Band]) 
     }
 }
 
-fn caption(sample: &Collections, shown: &[Origin]) -> String {
+fn caption(collections: &Collections, shown: &[Origin]) -> String {
     let medians = |origin: &Origin| {
-        let stretched = pairs(sample, *origin, |atom| atom.stretch);
+        let stretched = pairs(collections, *origin, |atom| atom.stretch);
         let mut errors: Vec<_> = stretched.iter().filter(|[x, _]| *x > 1.15).map(|[_, y]| *y).collect();
         errors.sort_by(f64::total_cmp);
         let far = match quantile(&errors, 0.5) {
             Some(median) => format!("{median:.3} eV Å^{{−1}} (n = {})", grouped(errors.len() as u64)),
             None => "unknown (n = 0)".to_owned(),
         };
-        let (a, b) = (pairs(sample, *origin, |atom| Some(atom.gamma_nbr)).len(), stretched.len());
+        let (a, b) = (pairs(collections, *origin, |atom| Some(atom.gamma_nbr)).len(), stretched.len());
         format!(
             "{}: n = {} atoms in a and {} in b, median error where d_{{nn}}/d_{{nn}}^{{0}} > 1.15: {far}",
             origin.name(),

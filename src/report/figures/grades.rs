@@ -6,18 +6,18 @@ use wire::Origin;
 
 use super::super::collections::{Atom, Collections};
 use super::super::style::{WIDTH, axis, grouped};
-use super::super::{Csv, Drawn, csv};
+use super::super::{Csv, FigureContent, csv};
 use super::errors::{MIN_ATOMS, middle, ribbons};
 use super::{NO_LABELS, row};
 
 /// A quantity of an atom.
-type OfAtom = fn(&Atom) -> f64;
+type AtomQuantity = fn(&Atom) -> f64;
 
 /// Number of bins of a panel.
 const BINS: usize = 18;
 
-pub fn draw(sample: &Collections) -> Result<Drawn, String> {
-    let atoms = |origin: Origin| sample.both()[usize::from(origin == Origin::Control)].1.atoms.kept();
+pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
+    let atoms = |origin: Origin| collections.both()[usize::from(origin == Origin::Control)].1.atoms.kept();
     let labelled = atoms(Origin::Biased).chain(atoms(Origin::Control)).filter(|atom| atom.error.is_some());
     let labelled: Vec<Atom> = labelled.copied().collect();
     if labelled.is_empty() {
@@ -27,7 +27,7 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let mut figure = Figure::new("grades", description, WIDTH, 226.0);
     let mut numbers =
         Csv::new(&["panel", "low", "high", "atoms", "p5", "p10", "p25", "median", "p75", "p90", "p95"]);
-    let panels: [(char, &str, OfAtom); 2] =
+    let panels: [(char, &str, AtomQuantity); 2] =
         [('a', "γ", |atom| atom.gamma), ('b', "γ_{nbr}", |atom| atom.gamma_nbr)];
     let mut correlations = Vec::new();
     for ((letter, title, of), place) in panels.into_iter().zip(row(2, [46.0, 56.0, 12.0], 28.0, 162.0)) {
@@ -74,5 +74,5 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
          grey, the calibrated threshold 1. {}.",
         correlations.join("; ")
     );
-    Ok(Drawn { figure, caption, numbers })
+    Ok(FigureContent { figure, caption, numbers })
 }

@@ -15,19 +15,19 @@ use wire::Origin;
 
 use super::collections::Collections;
 use super::report_data::ReportData;
-use super::style::look;
-use super::{Csv, Part, csv};
+use super::style::origin_style;
+use super::{Csv, FigureEntry, csv};
 
 /// All figures, in the order of the page.
-pub fn all(data: &ReportData) -> Vec<Part> {
-    let part = |name, title, drawn| Part { name, title, drawn };
+pub fn all(data: &ReportData) -> Vec<FigureEntry> {
+    let part = |name, title, drawn| FigureEntry { name, title, drawn };
     vec![
         part("collection", "Candidates and accepted structures", collection::draw(data)),
-        part("distributions", "Grades and force errors", distributions::draw(&data.sample)),
-        part("errors", "Force errors of new and of stretched structures", errors::draw(&data.sample)),
-        part("space", "Volumes and composition", space::draw(&data.sample)),
-        part("features", "Feature space", projection::draw(&data.sample)),
-        part("grades", "Force errors by grade", grades::draw(&data.sample)),
+        part("distributions", "Grades and force errors", distributions::draw(&data.collections)),
+        part("errors", "Force errors of new and of stretched structures", errors::draw(&data.collections)),
+        part("space", "Volumes and composition", space::draw(&data.collections)),
+        part("features", "Feature space", projection::draw(&data.collections)),
+        part("grades", "Force errors by grade", grades::draw(&data.collections)),
         part("cost", "Cost of labels", cost::draw(data)),
         part("completion", "Labelled share of structures", completion::draw(data)),
     ]
@@ -36,15 +36,15 @@ pub fn all(data: &ReportData) -> Vec<Part> {
 /// Draws histograms of either origin as shares in percent.
 fn draw_histograms(panel: &mut Panel, histograms: &[(Origin, Histogram)]) {
     for (origin, histogram) in histograms {
-        let look = look(*origin);
+        let style = origin_style(*origin);
         let (edges, shares) = (histogram.edges(), histogram.shares());
         let mut outline = vec![[edges[0], 0.0]];
         for (edges, share) in edges.windows(2).zip(&shares) {
             outline.extend([[edges[0], 100.0 * share], [edges[1], 100.0 * share]]);
         }
         outline.push([edges[edges.len() - 1], 0.0]);
-        panel.rings([outline.clone()], Some(look.colour.faint(0.18)), None);
-        panel.line(outline, look.line);
+        panel.rings([outline.clone()], Some(style.colour.faint(0.18)), None);
+        panel.line(outline, style.line);
     }
 }
 
@@ -66,8 +66,8 @@ fn push_histograms(numbers: &mut Csv, panel: &str, histograms: &[(Origin, Histog
 }
 
 /// The origins with collected structures.
-fn origins_of(sample: &Collections) -> Vec<Origin> {
-    let both = sample.both().into_iter();
+fn origins_of(collections: &Collections) -> Vec<Origin> {
+    let both = collections.both().into_iter();
     both.filter(|(_, of)| of.structures.seen() > 0).map(|(origin, _)| origin).collect()
 }
 

@@ -5,20 +5,20 @@ use analysis::{Histogram, even_edges};
 use wire::Origin;
 
 use super::super::collections::{Collections, StructureSize};
-use super::super::style::{WIDTH, axis, grouped, look, origins};
-use super::super::{Csv, Drawn};
+use super::super::style::{WIDTH, axis, grouped, origin_style, origins};
+use super::super::{Csv, FigureContent};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};
 
 /// A quantity of a structure.
-type SizeOf = fn(&StructureSize) -> Option<f64>;
+type SizeQuantity = fn(&StructureSize) -> Option<f64>;
 
 /// Number of bins of a histogram.
 const BINS: usize = 24;
 /// Largest number of elements with bars. Those with the most atoms are shown.
 const MAX_ELEMENTS: usize = 12;
 
-pub fn draw(sample: &Collections) -> Result<Drawn, String> {
-    let shown = origins_of(sample);
+pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
+    let shown = origins_of(collections);
     if shown.is_empty() {
         return Err(NOTHING_COLLECTED.into());
     }
@@ -26,17 +26,17 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let mut figure = Figure::new("space", description, WIDTH, 168.0);
     let mut numbers = Csv::new(&["panel", "origin", "low", "high", "number"]);
     let places = row(3, [40.0, 44.0, 10.0], 26.0, 106.0);
-    let panels: [(char, &str, SizeOf); 2] = [
+    let panels: [(char, &str, SizeQuantity); 2] = [
         ('a', "V / V_{0}", |shape| Some(shape.relative_volume)),
         ('b', "volume (Å^{3} per atom)", |shape| shape.volume_per_atom),
     ];
     for ((letter, title, of), place) in panels.into_iter().zip(&places) {
-        draw_volumes(&mut figure, &mut numbers, sample, &shown, (letter, title, of), *place);
+        draw_volumes(&mut figure, &mut numbers, collections, &shown, (letter, title, of), *place);
     }
-    draw_elements(&mut figure, &mut numbers, sample, &shown, places[2]);
+    draw_elements(&mut figure, &mut numbers, collections, &shown, places[2]);
     origins(&mut figure, &shown);
     let of = |origin: &Origin| {
-        let (_, collection) = sample.both()[usize::from(*origin == Origin::Control)];
+        let (_, collection) = collections.both()[usize::from(*origin == Origin::Control)];
         let atoms: u64 = collection.elements.values().sum();
         let structures = grouped(collection.structures.seen());
         format!("{}: {structures} structures, {} atoms", origin.name(), grouped(atoms))
@@ -45,25 +45,25 @@ pub fn draw(sample: &Collections) -> Result<Drawn, String> {
     let caption = format!(
         "All collected structures, labelled or not. a, Volume relative to that of the seed structure. b, Volume per atom of \
          structures that are periodic in three directions. c, Share of the atoms by element{}. {}.",
-        match sample.biased.elements.len().max(sample.control.elements.len()) > MAX_ELEMENTS {
+        match collections.biased.elements.len().max(collections.control.elements.len()) > MAX_ELEMENTS {
             true => format!(", the {MAX_ELEMENTS} most frequent of them"),
             false => String::new(),
         },
         both.join("; ")
     );
-    Ok(Drawn { figure, caption, numbers })
+    Ok(FigureContent { figure, caption, numbers })
 }
 
 fn draw_volumes(
     figure: &mut Figure,
     numbers: &mut Csv,
-    sample: &Collections,
+    collections: &Collections,
     shown: &[Origin],
-    (letter, title, of): (char, &str, SizeOf),
+    (letter, title, of): (char, &str, SizeQuantity),
     place: Rectangle,
 ) {
     let values = |origin: &Origin| -> Vec<f64> {
-        let (_, collection) = sample.both()[usize::from(*origin == Origin::Control)];
+        let (_, collection) = collections.both()[usize::from(*origin == Origin::Control)];
         collection.structures.kept().filter_map(of).filter(|x| x.is_finite()).collect()
     };
     let all: Vec<_> = shown.iter().flat_map(values).collect();
@@ -86,13 +86,14 @@ fn draw_volumes(
 fn draw_elements(
     figure: &mut Figure,
     numbers: &mut Csv,
-    sample: &Collections,
+    collections: &Collections,
     shown: &[Origin],
     place: Rectangle,
 ) {
-    let mut elements: Vec<_> = sample.biased.elements.keys().chain(sample.control.elements.keys()).collect();
+    let mut elements: Vec<_> =
+        collections.biased.elements.keys().chain(collections.control.elements.keys()).collect();
     let of = |element: &atoms::Species, origin: Origin| {
-        let (_, collection) = sample.both()[usize::from(origin == Origin::Control)];
+        let (_, collection) = collections.both()[usize::from(origin == Origin::Control)];
         let all: u64 = collection.elements.values().sum();
         let number = collection.elements.get(element).copied().unwrap_or_default();
         (number, 100.0 * number as f64 / all.max(1) as f64)
@@ -116,10 +117,10 @@ fn draw_elements(
     let width = 0.7 / shown.len() as f64;
     for (k, element) in elements.iter().enumerate() {
         for (n, origin) in shown.iter().enumerate() {
-            let (left, look) = (k as f64 + 0.15 + width * n as f64, look(*origin));
+            let (left, style) = (k as f64 + 0.15 + width * n as f64, origin_style(*origin));
             let (_, share) = of(element, *origin);
-            panel.bar([left, 0.0], [left + width, share], look.colour.faint(0.3));
-            panel.line([[left, 0.0], [left, share], [left + width, share], [left + width, 0.0]], look.line);
+            panel.bar([left, 0.0], [left + width, share], style.colour.faint(0.3));
+            panel.line([[left, 0.0], [left, share], [left + width, share], [left + width, 0.0]], style.line);
         }
     }
     panel.letter('c');

@@ -13,7 +13,7 @@ use super::{Table, text};
 /// The campaign in a few lines.
 pub fn summary(data: &ReportData) -> Table {
     let mut table = Table::new("summary", "The campaign in numbers.", &["", "value"]);
-    let status = &data.standing;
+    let status = &data.status;
     let mut row = |name: &str, value: String| table.rows.push(vec![text(name), text(value)]);
     row("campaign", format!("{}, {} mode", data.campaign.id, data.campaign.mode));
     let walks = |origin: &str| status.walks.iter().filter(|walk| walk.origin == origin).count() as u64;
@@ -41,7 +41,7 @@ pub fn summary(data: &ReportData) -> Table {
         ),
     );
     if let Some(found) = &data.labels {
-        let energies = found.learned.energies.summary();
+        let energies = found.statistics.energies.summary();
         row("energy error", energies.line().unwrap_or_else(|| energies.offsets.note.clone()));
     }
     row("imported structures", grouped(status.imported));
@@ -81,10 +81,10 @@ pub fn provenance(data: &ReportData) -> Table {
     let mut row = |name: String, value: String| table.rows.push(vec![text(name), text(value)]);
     let campaign = &data.campaign;
     row("campaign".into(), campaign.id.to_string());
-    if let Some(begun) = data.begun {
-        row("begun".into(), date(begun));
+    if let Some(begun) = data.started {
+        row("started".into(), date(begun));
     }
-    row("begun by".into(), format!("calmwalk {}", campaign.program_version));
+    row("started by".into(), format!("calmwalk {}", campaign.program_version));
     row("report by".into(), format!("calmwalk {}", env!("CARGO_PKG_VERSION")));
     if let Some(labels) = &data.labels {
         row("label protocol".into(), labels.protocol.name.clone());
@@ -106,7 +106,7 @@ pub fn provenance(data: &ReportData) -> Table {
         "seed structures".into(),
         format!("{} of {}", grouped(seeds), sources.into_iter().collect::<Vec<_>>().join(", ")),
     );
-    let hosts: BTreeSet<_> = data.standing.processes.iter().map(|process| process.host.as_str()).collect();
+    let hosts: BTreeSet<_> = data.status.processes.iter().map(|process| process.host.as_str()).collect();
     if !hosts.is_empty() {
         row("hosts".into(), hosts.into_iter().collect::<Vec<_>>().join(", "));
     }

@@ -8,7 +8,7 @@ use crate::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
 use crate::output::range;
 
 /// Correlation of grades and errors.
-pub fn correlations(learned: &LabelStatistics) -> Table {
+pub fn correlations(statistics: &LabelStatistics) -> Table {
     let caption = format!(
         "Force error |F_{{model}} − F_{{label}}| and the grades under the original mixture: mean error, Spearman’s ρ between grade and \
          error, and ROC-AUC of the grade as a test for errors above {LARGE_FORCE_ERROR} eV Å^{{−1}}."
@@ -27,7 +27,8 @@ pub fn correlations(learned: &LabelStatistics) -> Table {
         "sampled atoms",
     ];
     let mut table = Table::new("correlations", &caption, &titles);
-    for (name, grades) in [("all", &learned.all), ("biased", &learned.biased), ("control", &learned.control)]
+    for (name, grades) in
+        [("all", &statistics.all), ("biased", &statistics.biased), ("control", &statistics.control)]
     {
         let (gamma, nbr) = (&grades.gamma, &grades.gamma_nbr);
         if gamma.atoms() > 0 {
@@ -89,8 +90,8 @@ pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) 
 }
 
 /// Element offsets that are removed from energies before errors are shown.
-pub fn energy_offsets(learned: &LabelStatistics) -> Table {
-    let offsets = learned.energies.summary().offsets;
+pub fn energy_offsets(statistics: &LabelStatistics) -> Table {
+    let offsets = statistics.energies.summary().offsets;
     let caption = format!(
         "Offsets between the energy references of labels and potential: E_{{label}} − E_{{model}} per atom of each element, by least squares \
          over {} labelled structures ({} outliers excluded). Energy errors exclude these offsets. Where the labelled compositions do not \
@@ -141,15 +142,15 @@ pub fn unlabelled(unlabelled: &[Unlabelled]) -> Table {
     for part in unlabelled {
         let mut row =
             vec![text(&part.seed_structure), text(&part.formula), count(part.failed), count(part.labelled)];
-        row.extend(ends(&part.gamma, 2));
-        row.extend(ends(&part.gamma_labelled, 2));
-        row.extend(ends(&part.relative_volume, 3));
-        row.extend(ends(&part.relative_volume_labelled, 3));
+        row.extend(range_cells(&part.gamma, 2));
+        row.extend(range_cells(&part.gamma_labelled, 2));
+        row.extend(range_cells(&part.relative_volume, 3));
+        row.extend(range_cells(&part.relative_volume_labelled, 3));
         table.rows.push(row);
     }
     table
 }
 
-fn ends(range: &Range, decimals: usize) -> [Cell; 2] {
+fn range_cells(range: &Range, decimals: usize) -> [Cell; 2] {
     [range.low, range.high].map(|end| real(end, decimals))
 }

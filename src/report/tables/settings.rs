@@ -20,7 +20,7 @@ const SECTIONS: [&str; 11] = [
     "notify",
 ];
 /// Hashes of files and the list of seed structures have their own tables.
-const ELSEWHERE: [&str; 2] = ["files", "seeds"];
+const EXCLUDED_SECTIONS: [&str; 2] = ["files", "seeds"];
 
 /// The table: a heading for each section, then its keys. A key without a value is shown as not set.
 pub fn settings(data: &ReportData) -> Table {
@@ -47,7 +47,7 @@ fn sections(configuration: &Value) -> Vec<(String, Vec<Setting>)> {
     let mut found: Vec<(String, Vec<Setting>)> =
         SECTIONS.iter().map(|name| ((*name).to_owned(), Vec::new())).collect();
     for (name, value) in configuration.as_object().into_iter().flatten() {
-        if ELSEWHERE.contains(&name.as_str()) {
+        if EXCLUDED_SECTIONS.contains(&name.as_str()) {
             continue;
         }
         let section = if value.is_object() { name.as_str() } else { "campaign" };

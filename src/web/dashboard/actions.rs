@@ -40,7 +40,7 @@ impl Mutations {
     }
 
     /// Checks the token in constant time.
-    fn knows(&self, headers: &HeaderMap) -> bool {
+    fn is_authorized(&self, headers: &HeaderMap) -> bool {
         let given = headers.get(HEADER).map_or(&b""[..], |value| value.as_bytes());
         let differing = given.iter().zip(self.token.bytes()).fold(0, |all, (a, b)| all | (a ^ b));
         given.len() == self.token.len() && differing == 0
@@ -48,20 +48,20 @@ impl Mutations {
 }
 
 /// `GET /api/actions`: whether actions are possible, and whether the token is right.
-pub async fn allowed(State(dashboard): State<Dashboard>, headers: HeaderMap) -> ApiResult {
+pub async fn action_status(State(dashboard): State<Dashboard>, headers: HeaderMap) -> ApiResult {
     let mutations = &dashboard.mutations;
-    let knows = mutations.as_ref().is_some_and(|mutations| mutations.knows(&headers));
-    response::json(&json!({ "possible": mutations.is_some(), "token_is_right": knows }))
+    let is_authorized = mutations.as_ref().is_some_and(|mutations| mutations.is_authorized(&headers));
+    response::json(&json!({ "possible": mutations.is_some(), "token_is_right": is_authorized }))
 }
 
 /// `POST /api/candidates/ID/drop`, `retry` or `prioritise` with `{"priority": …}`: returns the changed job.
-pub async fn act(
+pub async fn act_on_job(
     State(dashboard): State<Dashboard>,
     Path((id, action)): Path<(String, String)>,
     headers: HeaderMap,
     body: Bytes,
 ) -> ApiResult {
-    let (store, now) = (may_change(&dashboard, &headers)?, unix_milliseconds());
+    let (store, now) = (authorize(&dashboard, &headers)?, unix_milliseconds());
     let candidate = match action.as_str() {
         "drop" => store.drop_job(&id, now).await?,
         "retry" => store.retry_job(&id, now).await?,
@@ -82,7 +82,7 @@ pub async fn act_on_walks(
     Path((walk, action)): Path<(String, String)>,
     headers: HeaderMap,
 ) -> ApiResult {
-    let store = may_change(&dashboard, &headers)?;
+    let store = authorize(&dashboard, &headers)?;
     let paused = match action.as_str() {
         "pause" => true,
         "resume" => false,
@@ -92,7 +92,7 @@ pub async fn act_on_walks(
         "all" => store.walks_under_way().await?,
         number => {
             vec![WalkId(
-                number.parse().map_err(|_| ApiError::wrong("expected the number of a walk, or all"))?,
+                number.parse().map_err(|_| ApiError::bad_request("expected the number of a walk, or all"))?,
             )]
         }
     };
@@ -101,7 +101,7 @@ pub async fn act_on_walks(
 }
 
 /// Returns the store if the request is authorized.
-fn may_change<'a>(dashboard: &'a Dashboard, headers: &HeaderMap) -> Result<&'a Store, ApiError> {
+fn authorize<'a>(dashboard: &'a Dashboard, headers: &HeaderMap) -> Result<&'a Store, ApiError> {
     let refused = ApiError::new;
     let Some(mutations) = &dashboard.mutations else {
         return Err(refused(StatusCode::FORBIDDEN, "this dashboard is read-only"));
@@ -109,7 +109,7 @@ fn may_change<'a>(dashboard: &'a Dashboard, headers: &HeaderMap) -> Result<&'a S
     if !security::is_same_origin(headers) {
         return Err(refused(StatusCode::FORBIDDEN, "only pages of this dashboard may change the campaign"));
     }
-    if !mutations.knows(headers) {
+    if !mutations.is_authorized(headers) {
         let why = "this needs the token that calmwalk run printed with the address";
         return Err(refused(StatusCode::UNAUTHORIZED, why));
     }
@@ -119,5 +119,5 @@ fn may_change<'a>(dashboard: &'a Dashboard, headers: &HeaderMap) -> Result<&'a S
 fn priority(body: &[u8]) -> Result<i32, ApiError> {
     let asked: Value = serde_json::from_slice(body).unwrap_or_default();
     let priority = asked["priority"].as_i64().and_then(|priority| priority.try_into().ok());
-    priority.ok_or_else(|| ApiError::wrong("expected {\"priority\": …} with a whole number of 32 bits"))
+    priority.ok_or_else(|| ApiError::bad_request("expected {\"priority\": …} with a whole number of 32 bits"))
 }

@@ -36,11 +36,11 @@ struct Computed {
 
 impl CachedResponse {
     /// Returns the cached JSON or the result of `compute`. Returns 202 if there is none yet.
-    pub async fn answer(
+    pub async fn get_or_compute(
         &self,
         compute: impl Future<Output = Result<String, ApiError>> + Send + 'static,
     ) -> ApiResult {
-        if let Some(mut in_progress) = self.begin(compute) {
+        if let Some(mut in_progress) = self.start(compute) {
             // The channel carries no value; it closes with the task.
             let _ = timeout(WAIT_TIMEOUT, in_progress.changed()).await;
         }
@@ -51,7 +51,7 @@ impl CachedResponse {
     }
 
     /// Starts `compute` unless it is in progress or the cached result is still valid.
-    fn begin(
+    fn start(
         &self,
         compute: impl Future<Output = Result<String, ApiError>> + Send + 'static,
     ) -> Option<watch::Receiver<()>> {
@@ -96,29 +96,29 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn nobody_waits_long_and_nothing_is_reckoned_twice() {
+    async fn requests_do_not_wait_long_and_nothing_is_computed_twice() {
         let cache = CachedResponse::default();
         let (send, wait) = oneshot::channel();
         let slow = async move { Ok(wait.await.unwrap_or_default()) };
-        assert_eq!(body(cache.answer(slow).await).await.0, StatusCode::ACCEPTED);
+        assert_eq!(body(cache.get_or_compute(slow).await).await.0, StatusCode::ACCEPTED);
         let other = async { panic!("it is under way") };
-        assert_eq!(body(cache.answer(other).await).await.0, StatusCode::ACCEPTED);
+        assert_eq!(body(cache.get_or_compute(other).await).await.0, StatusCode::ACCEPTED);
         send.send("{}".to_owned()).unwrap();
         let mut found = (StatusCode::ACCEPTED, String::new());
         while found.0 == StatusCode::ACCEPTED {
-            found = body(cache.answer(async { panic!("it is under way, or kept") }).await).await;
+            found = body(cache.get_or_compute(async { panic!("it is under way, or kept") }).await).await;
         }
         assert_eq!(found, (StatusCode::OK, "{}".to_owned()));
     }
 
     #[tokio::test]
-    async fn why_there_is_none_is_told_and_a_failure_is_not_for_ever() {
+    async fn errors_are_returned_and_failures_are_retried() {
         let cache = CachedResponse::default();
         let none = async { Err(ApiError::new(StatusCode::NOT_FOUND, "no labels")) };
-        let (status, why) = body(cache.answer(none).await).await;
+        let (status, why) = body(cache.get_or_compute(none).await).await;
         assert!(status == StatusCode::NOT_FOUND && why.contains("no labels"), "{why}");
         let cache = CachedResponse::default();
-        assert_eq!(body(cache.answer(async { panic!("lost") }).await).await.0, StatusCode::ACCEPTED);
-        assert_eq!(body(cache.answer(async { Ok("{}".to_owned()) }).await).await.0, StatusCode::OK);
+        assert_eq!(body(cache.get_or_compute(async { panic!("lost") }).await).await.0, StatusCode::ACCEPTED);
+        assert_eq!(body(cache.get_or_compute(async { Ok("{}".to_owned()) }).await).await.0, StatusCode::OK);
     }
 }

@@ -68,23 +68,25 @@ impl Query {
                 "ascending" => query.ascending = value == "true",
                 "fate" => query.fate = Some(value.into_owned()),
                 "state" => {
-                    let unknown =
-                        || ApiError::wrong(format!("state is '{value}', expected a state of label jobs"));
+                    let unknown = || {
+                        ApiError::bad_request(format!("state is '{value}', expected a state of label jobs"))
+                    };
                     query.state = Some(JobState::named(&value).ok_or_else(unknown)?);
                 }
-                "where" => query.filter = Some(value.parse().map_err(ApiError::wrong)?),
+                "where" => query.filter = Some(value.parse().map_err(ApiError::bad_request)?),
                 "after" => query.after = Some(parse_cursor(&value)?),
                 "limit" => {
-                    let wrong =
-                        || ApiError::wrong(format!("limit is '{value}', expected 1 to {MAX_PAGE_ROWS}"));
+                    let wrong = || {
+                        ApiError::bad_request(format!("limit is '{value}', expected 1 to {MAX_PAGE_ROWS}"))
+                    };
                     let limit = value.parse().ok().filter(|limit| (1..=MAX_PAGE_ROWS).contains(limit));
                     query.limit = Some(limit.ok_or_else(wrong)?);
                 }
-                _ => return Err(ApiError::wrong(format!("unknown parameter '{key}'"))),
+                _ => return Err(ApiError::bad_request(format!("unknown parameter '{key}'"))),
             }
         }
         if query.order == Order::Queue && query.state.is_none() {
-            return Err(ApiError::wrong("the order 'queue' applies to one state: give 'state' too"));
+            return Err(ApiError::bad_request("the order 'queue' applies to one state: give 'state' too"));
         }
         Ok(query)
     }
@@ -201,7 +203,7 @@ impl FromStr for Order {
             "gamma" => Ok(Self::Gamma),
             "volume" => Ok(Self::Volume),
             "queue" => Ok(Self::Queue),
-            _ => Err(ApiError::wrong(format!(
+            _ => Err(ApiError::bad_request(format!(
                 "order is '{name}', expected one of decision, gamma, volume, queue"
             ))),
         }
@@ -213,7 +215,7 @@ fn parse_cursor(text: &str) -> Result<ListPlace, ApiError> {
         let value = value.parse().ok().filter(|value: &f64| value.is_finite())?;
         Some(ListPlace { value, decision: decision.parse().ok()? })
     };
-    let wrong = || ApiError::wrong(format!("after is '{text}', expected 'next' of the previous page"));
+    let wrong = || ApiError::bad_request(format!("after is '{text}', expected 'next' of the previous page"));
     text.split_once(':').and_then(read).ok_or_else(wrong)
 }
 
@@ -231,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_is_read_or_refused_with_a_reason() {
+    fn queries_are_parsed_or_refused_with_a_reason() {
         let query = Query::parse("order=gamma&ascending=true&fate=&where=gamma+%3E+2&after=2.5:17").unwrap();
         assert!(query.order == Order::Gamma && query.ascending && query.fate.is_none());
         assert_eq!(query.filter.unwrap().to_string(), "gamma > 2.0");

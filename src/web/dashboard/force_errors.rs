@@ -11,7 +11,7 @@ use crate::label_statistics;
 
 /// `GET /api/errors`: what `calmwalk errors --json` prints.
 pub async fn force_errors(State(dashboard): State<Dashboard>) -> ApiResult {
-    dashboard.errors.answer(compute(dashboard.store)).await
+    dashboard.errors.get_or_compute(compute(dashboard.store)).await
 }
 
 async fn compute(store: Store) -> Result<String, ApiError> {

@@ -11,7 +11,7 @@ use crate::mixture_status::{self, InitialMixture};
 /// `GET /api/mixture`: each component, and how far its covariance has moved since the campaign began.
 pub async fn mixture(State(dashboard): State<Dashboard>) -> ApiResult {
     let Dashboard { store, mixture, initial, .. } = dashboard;
-    mixture.answer(compute(store, initial)).await
+    mixture.get_or_compute(compute(store, initial)).await
 }
 
 async fn compute(store: Store, initial: Option<InitialMixture>) -> Result<String, ApiError> {

@@ -18,7 +18,7 @@ pub struct ApiError {
 
 impl ApiError {
     /// The request is wrong.
-    pub fn wrong(why: impl ToString) -> Self {
+    pub fn bad_request(why: impl ToString) -> Self {
         Self { status: StatusCode::BAD_REQUEST, why: why.to_string() }
     }
 

@@ -6,7 +6,7 @@ use super::super::report_data::ReportData;
 use super::{Table, count, text};
 
 /// Walks, candidates by fate and labels of each seed structure.
-pub fn of(data: &ReportData) -> Table {
+pub fn seed_structures(data: &ReportData) -> Table {
     let caption = "Results by seed structure: biased walks and their states, candidates by fate, frames of its control walks, and labels of \
                    both.";
     let titles = [
@@ -33,8 +33,8 @@ pub fn of(data: &ReportData) -> Table {
     for seed in &data.seeds {
         let fate =
             |name: &str| fates.get(&seed.index.into()).and_then(|of| of.get(name)).copied().unwrap_or(0);
-        let biased = data.sample.biased.labels.get(&seed.index).copied().unwrap_or_default();
-        let control = data.sample.control.labels.get(&seed.index).copied().unwrap_or_default();
+        let biased = data.collections.biased.labels.get(&seed.index).copied().unwrap_or_default();
+        let control = data.collections.control.labels.get(&seed.index).copied().unwrap_or_default();
         let (walks, ended) = walks(data, &seed.name);
         let names = ["accepted", "covered", "duplicate", "guard", "budget", "backlog"];
         let mut row = vec![text(&seed.name), text(seed.structure.formula()), count(walks), text(ended)];
@@ -49,7 +49,7 @@ pub fn of(data: &ReportData) -> Table {
 
 /// Number of biased walks from a seed structure, and their states.
 fn walks(data: &ReportData, seed: &str) -> (u64, String) {
-    let walks = data.standing.walks.iter();
+    let walks = data.status.walks.iter();
     let walks = walks.filter(|walk| walk.seed_structure == seed && walk.origin == "biased");
     let mut states: BTreeMap<&str, u64> = BTreeMap::new();
     for walk in walks {

@@ -8,7 +8,7 @@ use orchestrator::selector::SeedStructure;
 use potentials::grace::GraceModel;
 use wire::ContentHash;
 
-use super::NamedSeed;
+use super::SourcedStructure;
 use super::load::Loader;
 use crate::config::{ConfigError, Warning, place};
 
@@ -20,18 +20,18 @@ const USUAL_BONDS: std::ops::RangeInclusive<f64> = 0.65..=1.5;
 
 impl Loader<'_> {
     /// Reads every frame of every file. Names must be unique.
-    pub fn seeds(&self, model: &GraceModel) -> Result<Vec<NamedSeed>, ConfigError> {
-        let mut seeds: Vec<NamedSeed> = Vec::new();
+    pub fn seed_structures(&self, model: &GraceModel) -> Result<Vec<SourcedStructure>, ConfigError> {
+        let mut seeds: Vec<SourcedStructure> = Vec::new();
         for file in &self.config.seeds.files {
             let path = file.get_ref();
-            let wrong = |message: String| self.wrong(FILES, file, message);
+            let wrong = |message: String| self.file_error(FILES, file, message);
             let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             let frames = read_structures(path).map_err(|error| wrong(error.to_string()))?;
             for (number, frame) in frames.into_iter().enumerate() {
                 let source = format!("{}:{}", path.display(), frame.line);
                 let named = frame.info.get("name").and_then(extxyz::Value::text).map(str::to_owned);
                 let name = named.unwrap_or_else(|| format!("{stem}-{number}"));
-                self.check_seed(&frame.structure, model)
+                self.check_seed_structure(&frame.structure, model)
                     .map_err(|error| wrong(format!("{source}: {error}")))?;
                 if let Some(first) = seeds.iter().find(|other| other.seed.name == name) {
                     return Err(wrong(format!(
@@ -40,7 +40,10 @@ impl Loader<'_> {
                         first.source
                     )));
                 }
-                seeds.push(NamedSeed { seed: SeedStructure { name, structure: frame.structure }, source });
+                seeds.push(SourcedStructure {
+                    seed: SeedStructure { name, structure: frame.structure },
+                    source,
+                });
             }
         }
         Ok(seeds)
@@ -48,7 +51,7 @@ impl Loader<'_> {
 
     /// Checks that a walk can start and collect: the model knows the elements, no atoms overlap, each atom has a
     /// neighbour, there are as many atoms as the collection rule requires, and a volume ramp has a cell.
-    fn check_seed(&self, structure: &Structure, model: &GraceModel) -> Result<(), String> {
+    fn check_seed_structure(&self, structure: &Structure, model: &GraceModel) -> Result<(), String> {
         structure.validate().map_err(|error| error.to_string())?;
         model.element_indices(&structure.species).map_err(|error| error.to_string())?;
         let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
@@ -92,26 +95,26 @@ impl Loader<'_> {
     }
 
     /// Warns of likely mistakes: duplicate structures and distances that do not match the elements.
-    pub fn doubtful_seeds(&self, seeds: &[NamedSeed], model: &GraceModel) -> Vec<Warning> {
+    pub fn suspicious_seed_structures(&self, seeds: &[SourcedStructure], model: &GraceModel) -> Vec<Warning> {
         let mut first = HashMap::new();
         let mut warnings = Vec::new();
         for named in seeds {
-            let NamedSeed { seed: SeedStructure { name, structure }, source } = named;
+            let SourcedStructure { seed: SeedStructure { name, structure }, source } = named;
             if let Some(other) = first.insert(ContentHash::of(&rounded(structure)), named) {
                 let message = format!(
                     "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find little that is new",
                     other.seed.name, other.source
                 );
-                warnings.push(self.of_seeds(message));
+                warnings.push(self.seeds_warning(message));
             }
-            if let Some(strange) = strange_distances(structure, model.cutoff()) {
-                warnings.push(self.of_seeds(format!("seed structure '{name}' ({source}): {strange}")));
+            if let Some(strange) = suspicious_distances(structure, model.cutoff()) {
+                warnings.push(self.seeds_warning(format!("seed structure '{name}' ({source}): {strange}")));
             }
         }
         warnings
     }
 
-    fn of_seeds(&self, message: String) -> Warning {
+    fn seeds_warning(&self, message: String) -> Warning {
         Warning { at: place(self.path, self.text, FILES), key: FILES.to_owned(), message }
     }
 }
@@ -127,7 +130,7 @@ fn rounded(structure: &Structure) -> Structure {
 }
 
 /// Describes nearest-neighbour distances that do not match the elements.
-fn strange_distances(structure: &Structure, cutoff: f64) -> Option<String> {
+fn suspicious_distances(structure: &Structure, cutoff: f64) -> Option<String> {
     let mut neighbours = NeighbourList::new(cutoff, 0.0);
     neighbours.update(structure).ok()?;
     let mut bonds = Vec::new();
