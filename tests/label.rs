@@ -8,7 +8,9 @@ use store::{JobState, Standing};
 
 use crate::common::campaign::{Outcome, Small, outcome, outcome_at};
 use crate::common::label_campaign::LabelCampaign;
-use crate::common::processes::{carrying_out, go_on, nothing_is_left, processes_in, signal, wait_until};
+use crate::common::processes::{
+    assert_no_leftovers, processes_in, processes_running, resume_processes, signal, wait_until,
+};
 use crate::common::{Running, calmwalk, config, program, refuse, succeed};
 
 /// `run` starts no labellers of its own.
@@ -57,7 +59,7 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     assert!(labels > 0 && said.matches(": labelled ").count() == labels, "{labels} in {said}");
     assert_eq!(outcome_at(place.argument(), place.path()), expected(&small));
     assert_eq!(place.status()["processes"], serde_json::json!([]));
-    nothing_is_left(place.path());
+    assert_no_leftovers(place.path());
 }
 
 #[test]
@@ -82,7 +84,7 @@ fn what_it_is_killed_over_is_labelled_by_the_next() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--until-empty"]);
     // Its slot is held so that the label is not made before it is killed.
-    place.hold_in_mid_label();
+    place.pause_labeller();
     label.0.kill().unwrap();
     label.0.wait().unwrap();
     wait_until("its slot ends with it", || processes_in(place.path()).is_empty());
@@ -99,14 +101,14 @@ fn a_slot_that_is_killed_is_replaced_and_the_others_go_on() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--slots", "2", "--until-empty"]);
     place.wait_for_lease();
-    let slots = carrying_out(place.path(), "labeller");
+    let slots = processes_running(place.path(), "labeller");
     // The label is not made before its slot is found.
     slots.iter().for_each(|slot| place.hold(*slot));
     let holder = place.job(&name).job.holder.unwrap();
     let pid: u32 = holder.rsplit('-').nth(1).unwrap().parse().unwrap();
     assert!(slots.len() == 2 && slots.contains(&pid), "{slots:?} {holder}");
     signal(pid, "KILL");
-    go_on(&slots);
+    resume_processes(&slots);
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
     assert!(place.said().contains("killed by signal 9 (SIGKILL); pausing"), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Labelled);
@@ -212,7 +214,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     let Some(command) = elsewhere(&place) else { return };
     let arguments = ["label", "--until-empty", "--store", place.argument()];
     let mut late = place.spawn(command, &arguments);
-    let slot = place.hold_in_mid_label();
+    let slot = place.pause_labeller();
     let begun = Instant::now();
     let first = place.job(&name).job;
     assert_eq!(
@@ -242,7 +244,7 @@ fn a_labeller_elsewhere_keeps_its_job_when_a_run_starts() {
     let Some(command) = elsewhere(&place) else { return };
     let arguments = ["label", "--until-empty", "--store", place.argument()];
     let mut label = place.spawn(command, &arguments);
-    let slot = place.hold_in_mid_label();
+    let slot = place.pause_labeller();
     let mut run = place.run();
     wait_until("it runs", || {
         let output = calmwalk(place.path(), ["status", place.argument()]);

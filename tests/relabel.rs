@@ -203,7 +203,7 @@ fn labellers_go_on_with_the_new_protocol() {
     another_protocol(&place, "fine");
     let name = place.queue_large();
     let mut label = place.label(&[]);
-    let slot = place.hold_in_mid_label();
+    let slot = place.pause_labeller();
     relabel(&place, &["--config", "fine.toml", "--all"]);
     signal(slot, "CONT");
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());

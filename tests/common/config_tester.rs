@@ -1,4 +1,4 @@
-//! Trying wrong configurations: exit code 2, a message without noise, nothing written.
+//! Tests invalid configurations: exit code 2, a clean message, and nothing written.
 
 use std::fs;
 use std::path::Path;
@@ -7,26 +7,26 @@ use tempfile::TempDir;
 
 use super::{demo, refuse};
 
-/// A directory in which configurations are tried.
+/// A directory for trying configurations.
 pub struct ConfigTester(TempDir);
 
 impl ConfigTester {
-    /// An empty one.
+    /// Creates an empty one.
     pub fn new() -> Self {
         Self(tempfile::tempdir().unwrap())
     }
 
-    /// Where it is.
+    /// Path of the directory.
     pub fn path(&self) -> &Path {
         self.0.path()
     }
 
-    /// Puts a file there.
+    /// Writes a file to it.
     pub fn write(&self, name: &str, content: impl AsRef<[u8]>) {
         fs::write(self.0.path().join(name), content).unwrap();
     }
 
-    /// What `validate` and `run` say of this configuration, which neither of them takes.
+    /// The message with which `validate` and `run` refuse this configuration.
     pub fn refused(&self, text: impl AsRef<[u8]>) -> String {
         self.write("c.toml", text);
         let before = self.files();
@@ -38,7 +38,7 @@ impl ConfigTester {
         message
     }
 
-    /// The demo with something else in the place of `from` is refused, and the message has all these words.
+    /// Replaces `from` in the demo. The configuration must be refused with a message that contains all `words`.
     pub fn refused_with(&self, from: &str, to: &str, words: &[&str]) {
         let message = self.refused(changed(from, to));
         for word in words {
@@ -62,7 +62,7 @@ pub fn changed(from: &str, to: &str) -> String {
     text.replacen(from, to, 1)
 }
 
-/// Line of the demo in which this stands.
+/// Number of the demo's line that contains this text.
 pub fn line(of: &str) -> usize {
     let text = demo("aluminium.toml");
     1 + text.lines().position(|line| line.contains(of)).unwrap_or_else(|| panic!("the demo has no {of}"))

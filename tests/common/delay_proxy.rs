@@ -1,4 +1,4 @@
-//! A line between hosts on which everything takes longer.
+//! A TCP proxy that delays everything.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -8,14 +8,14 @@ use std::sync::mpsc;
 use std::thread::{self, sleep};
 use std::time::{Duration, Instant};
 
-/// Where it begins, as `127.0.0.1:port`, and how many bytes have come through.
+/// Listening address, as `127.0.0.1:port`, and the number of bytes forwarded.
 pub struct DelayProxy {
     pub address: String,
     bytes_forwarded: Arc<AtomicUsize>,
 }
 
 impl DelayProxy {
-    /// Listens for connections to `target`; what goes over them, either way, arrives by so much later.
+    /// Listens for connections to `target` and forwards data in both directions after `delay`.
     pub fn to(target: &str, delay: Duration) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let (address, bytes_forwarded) =
@@ -23,7 +23,7 @@ impl DelayProxy {
         let (target, count) = (target.to_owned(), Arc::clone(&bytes_forwarded));
         thread::spawn(move || {
             for near in listener.incoming().flatten() {
-                // If nobody is there yet, whoever calls tries again.
+                // If nothing listens there yet, the client tries again.
                 let Ok(far) = TcpStream::connect(&target) else { continue };
                 forward(near.try_clone().unwrap(), far.try_clone().unwrap(), delay, Arc::clone(&count));
                 forward(far, near, delay, Arc::clone(&count));

@@ -1,4 +1,4 @@
-//! Where a test keeps a campaign that others label: its directory, or a schema of the server that `CALMWALK_POSTGRES` names.
+//! A campaign for tests of labellers: in a directory, or in a schema of the server that `CALMWALK_POSTGRES` names.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -16,17 +16,17 @@ use tempfile::TempDir;
 use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, Origin, WalkId};
 
 use super::campaign::Small;
-use super::processes::{hold, one_carrying_out, wait_until};
+use super::processes::{hold, wait_for_process, wait_until};
 use super::{Running, calmwalk, program, succeed};
 
-/// A directory with `campaign.toml`, and the URL of the store if that is on a server.
+/// A directory with `campaign.toml`, and the URL of the store if it is on a server.
 pub struct LabelCampaign {
     directory: TempDir,
     url: Option<String>,
 }
 
 impl LabelCampaign {
-    /// With this configuration; `changes` are replaced in its text.
+    /// Writes this configuration, with `changes` replaced in its text.
     pub fn new(small: &Small, changes: &[(&str, &str)]) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let path = small.write(directory.path());
@@ -54,12 +54,12 @@ impl LabelCampaign {
         self.directory.path()
     }
 
-    /// As an argument of commands that run in its directory.
+    /// Argument for commands that run in the directory.
     pub fn argument(&self) -> &str {
         self.url.as_deref().unwrap_or(".")
     }
 
-    /// As `Store::open` takes it.
+    /// Location for `Store::open`.
     pub fn location(&self) -> Location {
         self.url.as_ref().map_or_else(|| self.path().into(), |url| url.parse().unwrap())
     }
@@ -69,7 +69,7 @@ impl LabelCampaign {
         self.spawn(program(self.path()), arguments)
     }
 
-    /// The same with a command that runs the program somehow.
+    /// The same with a given command.
     pub fn spawn(&self, mut command: Command, arguments: &[&str]) -> Running {
         let said = fs::File::options().create(true).append(true).open(self.path().join("said")).unwrap();
         Running(command.args(arguments).stdout(Stdio::null()).stderr(said).spawn().expect("it starts"))
@@ -80,17 +80,17 @@ impl LabelCampaign {
         self.start(&["run", "campaign.toml", "--directory", "."])
     }
 
-    /// `calmwalk label` with these arguments besides.
+    /// `calmwalk label` with these further arguments.
     pub fn label(&self, arguments: &[&str]) -> Running {
         self.start(&[&["label", "--store", self.argument()], arguments].concat())
     }
 
-    /// What commands have said so far.
+    /// Standard error of the commands so far.
     pub fn said(&self) -> String {
         fs::read_to_string(self.path().join("said")).unwrap_or_default()
     }
 
-    /// `calmwalk status`; null while there is no campaign.
+    /// `calmwalk status`. Null while there is no campaign.
     pub fn status(&self) -> Value {
         let output = calmwalk(self.path(), ["status", self.argument(), "--json"]);
         serde_json::from_slice(&output.stdout).unwrap_or_default()
@@ -112,21 +112,22 @@ impl LabelCampaign {
         on_store(self.location(), async |store| store.queue_show(candidate).await.unwrap())
     }
 
-    /// Waits until a job is leased; asks the store itself: to start the program for it may take longer than the label.
+    /// Waits until a job is leased. Reads the store directly, since starting the program may take longer than the
+    /// label.
     pub fn wait_for_lease(&self) {
         let leased =
             async |store: &Store| store.queue_list(Some(JobState::Leased), 1, 0).await.unwrap().len();
         wait_until("a structure is leased", || on_store(self.location(), leased) == 1);
     }
 
-    /// Stops a process where nobody waits for it to write.
+    /// Stops a process with SIGSTOP while it holds no database lock.
     pub fn hold(&self, pid: u32) {
         hold(pid, self.url.as_deref().unwrap_or_else(|| self.path().to_str().unwrap()));
     }
 
-    /// Stops the only labeller when it has something in hand; its process number.
-    pub fn hold_in_mid_label(&self) -> u32 {
-        let labeller = one_carrying_out(self.path(), "labeller");
+    /// Stops the only labeller while it makes a label. Returns its pid.
+    pub fn pause_labeller(&self) -> u32 {
+        let labeller = wait_for_process(self.path(), "labeller");
         self.wait_for_lease();
         self.hold(labeller);
         labeller
@@ -138,8 +139,8 @@ impl LabelCampaign {
     }
 }
 
-/// Queues a structure, as if a walk had collected it at this step, with its features [n × D] if there are any. Returns the
-/// name of its candidate.
+/// Queues a structure as if a walk had collected it at this step, with its features [n × D] if there are any. Returns
+/// the name of its candidate.
 pub fn queue(location: Location, step: u64, structure: Structure, features: Vec<f64>) -> String {
     let candidate = collected(step, structure, features);
     let name = candidate.id.to_string();
@@ -166,7 +167,7 @@ pub fn queue(location: Location, step: u64, structure: Structure, features: Vec<
     name
 }
 
-/// Does something with the store.
+/// Runs `act` with the store.
 pub fn on_store<T>(location: Location, act: impl AsyncFnOnce(&Store) -> T) -> T {
     tokio::runtime::Runtime::new().unwrap().block_on(async {
         let store = Store::open(location).await.unwrap();
@@ -176,8 +177,8 @@ pub fn on_store<T>(location: Location, act: impl AsyncFnOnce(&Store) -> T) -> T 
     })
 }
 
-/// The end of a label script: with these numbers.
-pub const LEAVE_LABEL: &str = r#"
+/// End of a label script that writes fixed numbers.
+pub const WRITE_FIXED_LABEL: &str = r#"
 awk '
     NR == 1 { print; next }
     NR == 2 { sub(/Properties=[^ ]*/, "Properties=species:S:1:pos:R:3:forces:R:3"); print $0 " energy=-1.5"; next }
@@ -186,8 +187,8 @@ awk '
 mv unfinished label.extxyz
 "#;
 
-/// Checks that each structure has one label, which is that of [`LEAVE_LABEL`], and no other result beside it. How many have one.
-pub async fn are_single(store: &Store) -> usize {
+/// Checks that each structure has exactly one result, the label of [`WRITE_FIXED_LABEL`]. Returns the number of structures.
+pub async fn check_single_labels(store: &Store) -> usize {
     let protocol = store.protocols().await.unwrap()[0].hash;
     let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
     let mut structures = BTreeSet::new();
@@ -195,14 +196,14 @@ pub async fn are_single(store: &Store) -> usize {
         let structure = ContentHash::of(&row.structure);
         assert_eq!(store.label_history(structure, protocol).await.unwrap().len(), 1);
         assert_eq!((row.label.energy, row.label.forces[0]), (-1.5, [0.25, 0.0, 0.0]));
-        // Two walks may have come by the same structure.
+        // Two walks may have found the same structure.
         structures.insert(structure.0);
     }
     assert_eq!(store.check(|_, _| ()).await.unwrap(), []);
     structures.len()
 }
 
-/// Aluminium, fcc, of so many atoms that its label takes a while.
+/// An fcc aluminium structure whose label takes a while.
 fn large() -> Structure {
     const CELLS: usize = 28;
     let (a, basis) = (4.05, [[0.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]]);
@@ -245,7 +246,7 @@ fn collected(step: u64, structure: Structure, features: Vec<f64>) -> Candidate {
     }
 }
 
-/// The URL of a schema of its own; the server of the tests is thrown away with it.
+/// URL of a new schema. It is discarded with the test server.
 fn new_schema(server: &str) -> String {
     static NUMBER: AtomicU64 = AtomicU64::new(0);
     let number = NUMBER.fetch_add(1, Ordering::Relaxed);

@@ -1,11 +1,11 @@
-//! npz files with other numbers in them.
+//! Changes the numbers in npz files.
 
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
 
 use npyz::npz::{NpzArchive, NpzWriter, array_name_from_file_name};
 
-/// The bytes of an npz file whose arrays of floating-point numbers are as `change` leaves them.
+/// The bytes of an npz file after applying `change` to its floating-point arrays.
 pub fn with_changed_arrays(file: &Path, change: impl Fn(&str, &mut Vec<f64>)) -> Vec<u8> {
     let mut source = NpzArchive::open(file).unwrap();
     let zip = source.zip_archive();
@@ -22,7 +22,7 @@ pub fn with_changed_arrays(file: &Path, change: impl Fn(&str, &mut Vec<f64>)) ->
     out.zip_writer().finish().unwrap().into_inner()
 }
 
-/// Changes the numbers behind the header of an npy file, version 1.
+/// Changes the data after the header of an npy file, version 1.
 fn change_array(array: &mut [u8], change: impl FnOnce(&mut Vec<f64>)) {
     let begin = 10 + usize::from(u16::from_le_bytes([array[8], array[9]]));
     let (header, data) = array.split_at_mut(begin);

@@ -69,7 +69,7 @@ fn every_page_shows_what_it_should_and_nothing_comes_from_elsewhere() {
             act(&browser, here, &page);
             pause(&browser, here, &page);
         }
-        let asked = browser.asked_for();
+        let asked = browser.requested_urls();
         assert!(asked.len() > 15 && asked.iter().all(|url| url.starts_with(&page)), "{asked:?}");
         let complaints = browser.log("browser");
         assert!(complaints.is_empty(), "{complaints:?}");

@@ -11,7 +11,7 @@ use serde_json::Value;
 use crate::common;
 use crate::common::campaign::Small;
 use crate::common::label_campaign::LabelCampaign;
-use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::common::processes::{processes_running, signal, wait_until};
 use crate::common::{Running, succeed};
 
 /// A terminal with the program in it; when that has ended, its exit code is on the screen.
@@ -263,7 +263,7 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
 fn the_terminal_is_given_back_however_it_ends() {
     let place = waiting();
     let here = place.path();
-    let watching = || carrying_out(here, "watch");
+    let watching = || processes_running(here, "watch");
     for (name, how) in [("terminated", "TERM"), ("interrupted", "INT")] {
         let terminal = Terminal::open(&place, name, (80, 24), "");
         terminal.wait_for("1 walks: 4");

@@ -7,9 +7,9 @@ use std::time::Duration;
 use crate::common::Running;
 use crate::common::campaign::{Small, outcome_at};
 use crate::common::clock::Clock;
-use crate::common::hosts::undisturbed;
+use crate::common::hosts::uninterrupted_outcome;
 use crate::common::label_campaign::LabelCampaign;
-use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::common::processes::{processes_running, signal, wait_until};
 use crate::common::{random, through};
 
 /// `calmwalk label` with this clock on another host, as far as one can show it: with process numbers of its own, and
@@ -58,7 +58,7 @@ fn labellers_with_wrong_clocks_label_everything_once() {
         "{}",
         place.said()
     );
-    assert_eq!(outcome_at(place.argument(), place.path()), undisturbed(&small));
+    assert_eq!(outcome_at(place.argument(), place.path()), uninterrupted_outcome(&small));
 }
 
 /// One an hour behind has a structure in hand, and does not get on for some seconds; one an hour ahead looks for work.
@@ -70,10 +70,10 @@ fn a_lease_lasts_however_late_others_think_it_is() {
     let name = place.queue_large();
     let [ahead, behind] = clocks(&place);
     let mut first = label(&place, &behind);
-    let slot = place.hold_in_mid_label();
+    let slot = place.pause_labeller();
     assert_eq!(place.jobs("leased"), 1, "it was stopped too late: {}", place.said());
     let mut second = label(&place, &ahead);
-    wait_until("another looks", || carrying_out(place.path(), "labeller").len() == 2);
+    wait_until("another looks", || processes_running(place.path(), "labeller").len() == 2);
     // Some looks at the queue.
     sleep(Duration::from_secs(8));
     signal(slot, "CONT");
