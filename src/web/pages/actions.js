@@ -1,6 +1,6 @@
 // Actions on jobs and walks. Each asks for confirmation and for the token that `calmwalk run` has printed.
 
-import { act, ask, candidatePath } from "./api.js";
+import { candidatePath, fetchJson, postAction } from "./api.js";
 import { element } from "./dom.js";
 import { shortName } from "./format.js";
 
@@ -19,7 +19,7 @@ if (given) {
 }
 
 /** Whether this dashboard allows actions. */
-const possible = ask("/api/actions").then((allowed) => allowed.possible, () => false);
+const possible = fetchJson("/api/actions").then((allowed) => allowed.possible, () => false);
 
 /** Buttons for the actions on a job. `done` is called after an action. */
 export function buttons(job, done) {
@@ -28,9 +28,9 @@ export function buttons(job, done) {
     if (!isPossible) return;
     const allowed = Object.entries(ACTIONS).filter(([, action]) => action.states.includes(job.state));
     place.append(...allowed.map(([name, { title, question, isGrave }]) => {
-      const asked = { title, question, isGrave, about: shortName(job.candidate), path: candidatePath(job.candidate, `/${name}`),
+      const action = { title, question, isGrave, about: shortName(job.candidate), path: candidatePath(job.candidate, `/${name}`),
         priority: name === "prioritise" ? job.priority : null };
-      return element("button", { type: "button", class: isGrave && "grave", onclick: () => confirm(asked, done) }, title);
+      return element("button", { type: "button", class: isGrave && "grave", onclick: () => confirm(action, done) }, title);
     }));
   });
   return place;
@@ -45,7 +45,7 @@ export function pauseButton(walk, isPaused, done) {
   const about = walk == null ? "all unfinished walks" : `walk ${walk}`;
   const question = isPaused ? "It gets assignments again."
     : "It finishes its current assignment and gets no other until it is resumed. In reproducible mode the other walks of its round wait for it.";
-  const asked = { title, about, question, path: `/api/walks/${walk ?? "all"}/${isPaused ? "resume" : "pause"}` };
+  const action = { title, about, question, path: `/api/walks/${walk ?? "all"}/${isPaused ? "resume" : "pause"}` };
   const keep = walk == null ? `${title} all` : `walk ${walk}`;
   // Another button has replaced this one.
   const changed = () => {
@@ -53,7 +53,7 @@ export function pauseButton(walk, isPaused, done) {
     document.querySelector(`[data-keep="${keep}"]`)?.focus();
   };
   return element("button", { type: "button", class: "small", "aria-label": `${title} ${about} …`, "data-keep": keep,
-    onclick: () => confirm(asked, changed) }, walk == null ? `${title} all …` : `${title} …`);
+    onclick: () => confirm(action, changed) }, walk == null ? `${title} all …` : `${title} …`);
 }
 
 /** Asks for confirmation and for the token. */
@@ -64,7 +64,7 @@ function confirm({ title, about, question, isGrave, path, priority: before }, do
   const submit = async (event) => {
     event.preventDefault();
     try {
-      await act(path, token.value, priority ? { priority: priority.valueAsNumber } : {});
+      await postAction(path, token.value, priority ? { priority: priority.valueAsNumber } : {});
       sessionStorage.setItem("token", token.value);
       dialog.close();
       done();
@@ -72,8 +72,8 @@ function confirm({ title, about, question, isGrave, path, priority: before }, do
       wrong.textContent = error.message;
     }
   };
-  const dialog = element("dialog", { "aria-labelledby": "asked", onclose: () => dialog.remove() },
-    element("form", { onsubmit: submit }, element("h2", { id: "asked" }, `${title.replace(" …", "")}: ${about}`),
+  const dialog = element("dialog", { "aria-labelledby": "action-title", onclose: () => dialog.remove() },
+    element("form", { onsubmit: submit }, element("h2", { id: "action-title" }, `${title.replace(" …", "")}: ${about}`),
       question && element("p", {}, question),
       priority && element("label", {}, "priority (higher first) ", priority),
       element("label", {}, "token printed by calmwalk run ", token), wrong,

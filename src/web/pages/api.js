@@ -4,14 +4,14 @@
 const POLL_INTERVAL = 500;
 
 /** Returns the response as JSON. Throws an Error with the message of a failure. */
-export async function ask(path, signal) {
-  return answered(await fetch(path, { signal, cache: "no-store" }));
+export async function fetchJson(path, signal) {
+  return parseResponse(await fetch(path, { signal, cache: "no-store" }));
 }
 
 /** Requests a result that takes long to compute, until it is ready. */
 export async function fetchComputed(path, signal) {
   for (;;) {
-    const found = await ask(path, signal);
+    const found = await fetchJson(path, signal);
     if (!found.reckoning) return found;
     await new Promise((resolve) => setTimeout(resolve, POLL_INTERVAL));
     signal?.throwIfAborted();
@@ -19,12 +19,12 @@ export async function fetchComputed(path, signal) {
 }
 
 /** Performs the action at this path. */
-export async function act(path, token, what) {
+export async function postAction(path, token, what) {
   const headers = { "content-type": "application/json", "x-calmwalk-token": token };
-  return answered(await fetch(path, { method: "POST", headers, body: JSON.stringify(what) }));
+  return parseResponse(await fetch(path, { method: "POST", headers, body: JSON.stringify(what) }));
 }
 
-async function answered(response) {
+async function parseResponse(response) {
   const found = await response.json().catch(() => ({}));
   if (!response.ok) throw new Error(found.error ?? `the program responded with status ${response.status}`);
   return found;
@@ -36,25 +36,25 @@ export function candidatePath(id, what = "") {
 }
 
 const listeners = new Set();
-let newest = null;
+let latest = null;
 
-/** Calls `hear` with the latest update and all that follow, until the signal aborts. */
-export function listen(hear, signal) {
-  listeners.add(hear);
-  signal.addEventListener("abort", () => listeners.delete(hear));
-  if (newest) hear(newest);
+/** Calls `listener` with the latest update and all that follow, until the signal aborts. */
+export function listen(listener, signal) {
+  listeners.add(listener);
+  signal.addEventListener("abort", () => listeners.delete(listener));
+  if (latest) listener(latest);
 }
 
-/** Connects to the event stream. `tell` receives the state of the connection and, with updates, the campaign's status. */
-export function connect(tell) {
+/** Connects to the event stream. `onState` receives the state of the connection and, with updates, the campaign's status. */
+export function connect(onState) {
   const source = new EventSource("/api/events");
-  source.onopen = () => tell("live");
-  source.onerror = () => tell("lost");
+  source.onopen = () => onState("live");
+  source.onerror = () => onState("lost");
   source.onmessage = (event) => {
-    const news = JSON.parse(event.data);
-    tell(news.error ? "blind" : "live", news.error, news.status);
-    if (news.error) return;
-    newest = news;
-    listeners.forEach((hear) => hear(news));
+    const update = JSON.parse(event.data);
+    onState(update.error ? "unreachable" : "live", update.error, update.status);
+    if (update.error) return;
+    latest = update;
+    listeners.forEach((listener) => listener(update));
   };
 }

@@ -1,7 +1,7 @@
 // Details of one candidate, as in `calmwalk explain`, with a view of its atoms.
 
 import { buttons } from "./actions.js";
-import { ask, candidatePath } from "./api.js";
+import { candidatePath, fetchJson } from "./api.js";
 import { DASHES, LINES } from "./colours.js";
 import { element, facts, section, state, table } from "./dom.js";
 import { decimals, digits, duration, percent, shortName, time, whole } from "./format.js";
@@ -22,18 +22,18 @@ const ENDS = {
 
 export async function show(content, address, signal) {
   const id = decodeURIComponent(address);
-  const [story, structure] = await Promise.all([ask(candidatePath(id), signal), ask(candidatePath(id, "/structure"), signal)]);
-  content.replaceChildren(element("h1", {}, shortName(story.id)), head(story));
-  const { found, grades, decision } = story;
+  const [details, structure] = await Promise.all([fetchJson(candidatePath(id), signal), fetchJson(candidatePath(id, "/structure"), signal)]);
+  content.replaceChildren(element("h1", {}, shortName(details.id)), head(details));
+  const { found, grades, decision } = details;
   // The pressed button no longer exists.
-  const again = () => show(content, address, signal).then(() => content.focus());
-  content.append(section("Structure", about(story), downloads(story), view(structure, grades?.atoms, story.labels)));
+  const reload = () => show(content, address, signal).then(() => content.focus());
+  content.append(section("Structure", about(details), downloads(details), view(structure, grades?.atoms, details.labels)));
   if (grades) content.append(section("Grades", graded(grades)));
   if (decision) content.append(section("Decision", decided(decision)));
   if (found) content.append(trace(found, grades, signal));
   if (decision) content.append(...covered(decision.coverage));
-  content.append(section("Label", ...labels(story, again, signal)));
-  content.append(section("Not recorded", element("ul", {}, story.not_recorded.map((what) => element("li", {}, what)))));
+  content.append(section("Label", ...labels(details, reload, signal)));
+  content.append(section("Not recorded", element("ul", {}, details.not_recorded.map((what) => element("li", {}, what)))));
 }
 
 function head({ id, kind, decision, jobs }) {
@@ -114,7 +114,7 @@ function trace(found, grades, signal) {
       lines: [{ colour: LINES[0], points: points("gamma") }, { colour: LINES[1], dash: DASHES[1], points: points("walker_gamma") }],
       marks: [marks("gamma", "circle", 0), marks("walker_gamma", "diamond", 1)] }));
   };
-  ask(`/api/walks/${found.walk}/candidates`, signal).then(draw).catch(() => {});
+  fetchJson(`/api/walks/${found.walk}/candidates`, signal).then(draw).catch(() => {});
   return section("Earlier", place);
 }
 
@@ -128,9 +128,9 @@ function covered({ by, later, looked_until: until }) {
   return parts;
 }
 
-function labels({ jobs, labels: made }, again, signal) {
+function labels({ jobs, labels: made }, reload, signal) {
   if (jobs.length + made.length === 0) return [element("p", {}, "No label job.")];
-  return [...jobs.map((found) => element("div", {}, job(found), buttons(found, again))), ...made.map(label)];
+  return [...jobs.map((found) => element("div", {}, job(found), buttons(found, reload))), ...made.map(label)];
 }
 
 function job(found) {

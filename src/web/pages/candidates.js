@@ -1,6 +1,6 @@
 // The table of candidates. The program sorts, filters and pages; this script shows one page.
 
-import { ask } from "./api.js";
+import { fetchJson } from "./api.js";
 import { FATES } from "./colours.js";
 import { element, renew, state } from "./dom.js";
 import { decimals, shortName, whole } from "./format.js";
@@ -15,13 +15,13 @@ const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["labe
 
 export function show(content, rest, signal) {
   // The query is part of the address, so that it can be bookmarked and shared.
-  const asked = new URLSearchParams(rest);
-  const [place, told] = [element("div"), element("p", { role: "status" })];
+  const params = new URLSearchParams(rest);
+  const [place, progress] = [element("div"), element("p", { role: "status" })];
   const change = (changes) => {
-    for (const [key, value] of Object.entries(changes)) value ? asked.set(key, value) : asked.delete(key);
+    for (const [key, value] of Object.entries(changes)) value ? params.set(key, value) : params.delete(key);
     // The queue order applies to one state.
-    if (asked.get("order") === "queue" && !asked.get("state")) asked.set("state", "queued");
-    history.replaceState(null, "", `#candidates/${asked}`);
+    if (params.get("order") === "queue" && !params.get("state")) params.set("state", "queued");
+    history.replaceState(null, "", `#candidates/${params}`);
     pages.length = 0;
     load(null);
   };
@@ -31,44 +31,44 @@ export function show(content, rest, signal) {
     const mine = ++last;
     const wait = setTimeout(() => place.setAttribute("aria-busy", "true"), 200);
     try {
-      const page = await wholePage(asked, after, signal, (looked) => {
-        if (mine === last) told.textContent = `${whole(looked)} candidates searched …`;
+      const page = await fetchPage(params, after, signal, (searched) => {
+        if (mine === last) progress.textContent = `${whole(searched)} candidates searched …`;
       }, () => mine !== last);
-      if (mine === last) renew(place, ...lines(page, asked, change, pages, after, load));
+      if (mine === last) renew(place, ...lines(page, params, change, pages, after, load));
     } catch (error) {
       if (error.name !== "AbortError" && mine === last) place.replaceChildren(element("p", { class: "wrong", role: "alert" }, error.message));
     } finally {
       clearTimeout(wait);
       if (mine === last) {
-        told.textContent = "";
+        progress.textContent = "";
         place.removeAttribute("aria-busy");
       }
     }
   };
-  content.append(filters(asked, change), told, place);
+  content.append(filters(params, change), progress, place);
   return load(null);
 }
 
 /** A filter with few matches takes several requests. */
-async function wholePage(asked, after, signal, tell, isOver) {
-  let [found, looked, next] = [[], 0, after];
+async function fetchPage(params, after, signal, onProgress, isStale) {
+  let [found, searched, next] = [[], 0, after];
   do {
-    const query = new URLSearchParams(asked);
+    const query = new URLSearchParams(params);
     query.set("limit", LENGTH - found.length);
     if (next) query.set("after", next);
-    const page = await ask(`/api/candidates?${query}`, signal);
+    const page = await fetchJson(`/api/candidates?${query}`, signal);
     found = found.concat(page.candidates);
-    looked += page.looked_at;
+    searched += page.looked_at;
     next = page.next;
-    if (next && found.length < LENGTH) tell(looked);
-  } while (next && found.length < LENGTH && !isOver());
+    if (next && found.length < LENGTH) onProgress(searched);
+  } while (next && found.length < LENGTH && !isStale());
   return { candidates: found, next };
 }
 
-function filters(asked, change) {
+function filters(params, change) {
   const choice = (label, key, names) => element("label", {}, label, element("select", { onchange: (event) => change({ [key]: event.target.value }) },
-    element("option", { value: "" }, "all"), names.map((name) => element("option", { value: name, selected: asked.get(key) === name }, name))));
-  const where = element("input", { type: "search", size: 34, value: asked.get("where") ?? "", placeholder: "gamma > 2 and element = Mo",
+    element("option", { value: "" }, "all"), names.map((name) => element("option", { value: name, selected: params.get(key) === name }, name))));
+  const where = element("input", { type: "search", size: 34, value: params.get("where") ?? "", placeholder: "gamma > 2 and element = Mo",
     spellcheck: "false", autocomplete: "off" });
   const submit = (event) => {
     event.preventDefault();
@@ -83,9 +83,9 @@ function filters(asked, change) {
       "A comparison with a missing value, such as the energy of an unlabelled candidate, is false.")));
 }
 
-function lines({ candidates, next }, asked, change, pages, after, load) {
-  const order = asked.get("order") || "decision";
-  const ascending = asked.get("ascending") === "true";
+function lines({ candidates, next }, params, change, pages, after, load) {
+  const order = params.get("order") || "decision";
+  const ascending = params.get("ascending") === "true";
   const head = ([title, isNumber, key]) => {
     if (!key) return element("th", { scope: "col", class: isNumber && "number" }, title);
     const isIt = key === order;

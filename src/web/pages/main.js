@@ -12,7 +12,7 @@ import { campaignState } from "./campaign_state.js";
 
 /** Pages in the order of the menu, by the first word of their address. */
 const PAGES = { overview, candidates, mixture, errors, hosts };
-const CONNECTIONS = { live: "● live", finished: "✓ finished", stopped: "○ stopped: no run is active", lost: "○ no connection: retrying", blind: "○ the database does not answer" };
+const CONNECTIONS = { live: "● live", finished: "✓ finished", stopped: "○ stopped: no run is active", lost: "○ no connection: retrying", unreachable: "○ the database does not answer" };
 
 let shown = new AbortController();
 
@@ -73,8 +73,8 @@ function connection(link, why = "", status = null) {
 menu();
 theme();
 connect(connection);
-listen((news) => {
-  document.title = document.title.replace(/calmwalk.*$/, `calmwalk ${news.status.name ?? news.status.campaign.slice(0, 8)}`);
+listen((update) => {
+  document.title = document.title.replace(/calmwalk.*$/, `calmwalk ${update.status.name ?? update.status.campaign.slice(0, 8)}`);
 }, new AbortController().signal);
 // Keep the address, which names the page.
 document.querySelector(".skip").addEventListener("click", (event) => {

@@ -34,8 +34,8 @@ export function show(content, _, signal) {
     changes = can;
     if (status) draw();
   });
-  listen((news) => {
-    status = news.status;
+  listen((update) => {
+    status = update.status;
     draw();
   }, signal);
 }

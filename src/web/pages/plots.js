@@ -1,6 +1,6 @@
 // The plots of the overview: over time since the dashboard started, and of the newest candidates.
 
-import { ask, listen } from "./api.js";
+import { fetchJson, listen } from "./api.js";
 import { DASHES, FATES, LINES } from "./colours.js";
 import { shortName, tick, whole } from "./format.js";
 import { plot } from "./plot.js";
@@ -15,7 +15,7 @@ export function overTime(place, signal) {
   let newest = [];
   let seen = -1;
   const draw = () => place.replaceChildren(...(samples.length > 1 ? drawn(samples) : []), newestCandidates(newest));
-  const begin = ask("/api/samples", signal).then((found) => { samples = found; }).catch(() => {});
+  const begin = fetchJson("/api/samples", signal).then((found) => { samples = found; }).catch(() => {});
   listen(async ({ status, sample }) => {
     await begin;
     if (samples.at(-1)?.time !== sample.time) samples.push(sample);
@@ -23,7 +23,7 @@ export function overTime(place, signal) {
     const now = status.candidates.seen + status.candidates.control;
     if (now !== seen) {
       seen = now;
-      newest = await ask(`/api/candidates?limit=${NEWEST}`, signal).then((page) => page.candidates).catch(() => newest);
+      newest = await fetchJson(`/api/candidates?limit=${NEWEST}`, signal).then((page) => page.candidates).catch(() => newest);
     }
     // Do not replace what has the focus.
     if (!signal.aborted && !place.contains(document.activeElement)) draw();

@@ -21,7 +21,7 @@ export function view(found, grades, labels) {
   const state = { turned: [[1, 0, 0], [0, 0.2, 0.98], [0, -0.98, 0.2]], zoom: 1, picked: null, by: choices[0] };
   const canvas = element("canvas", { tabindex: "0", role: "application", "aria-describedby": "picked",
     "aria-label": `${atoms.length} atoms. Arrow keys rotate, + and − zoom, comma and full stop select an atom; the table has the same numbers.` });
-  const said = element("p", { id: "picked", role: "status" }, "No atom is selected.");
+  const selection = element("p", { id: "picked", role: "status" }, "No atom is selected.");
   const legend = element("div", { class: "legend" });
   const rows = new Map();
   const draw = () => paint(canvas, structure, atoms, state);
@@ -29,7 +29,7 @@ export function view(found, grades, labels) {
     rows.get(state.picked)?.removeAttribute("aria-selected");
     state.picked = k;
     rows.get(k)?.setAttribute("aria-selected", "true");
-    said.textContent = k == null ? "No atom is selected." : told(atoms[k]);
+    selection.textContent = k == null ? "No atom is selected." : describe(atoms[k]);
     draw();
   };
   const chooser = choices.length > 0 && element("label", {}, "colour by ", element("select", { onchange: (event) => {
@@ -41,11 +41,11 @@ export function view(found, grades, labels) {
   listen(canvas, atoms, state, draw, pick);
   new ResizeObserver(draw).observe(canvas);
   return element("div", { class: "structure" },
-    element("div", {}, canvas, element("div", { class: "below" }, chooser, legend), said),
+    element("div", {}, canvas, element("div", { class: "below" }, chooser, legend), selection),
     tableOf(atoms, choices, rows, pick));
 }
 
-function told(atom) {
+function describe(atom) {
   const numbers = Object.keys(BY).filter((key) => atom[key] != null).map((key) => `${BY[key]} ${decimals(atom[key], 3)}`);
   const place = atom.at.map((x) => decimals(x, 2)).join(", ");
   return [`Atom ${atom.atom}: ${atom.species} at (${place}) Å`, ...numbers, atom.triggered ? "above the collection threshold" : ""].filter(Boolean).join("; ");
