@@ -175,7 +175,7 @@ impl CoreHours {
 impl std::fmt::Display for CoreHours {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let [expected, low, high] = [self.expected, self.low, self.high].map(two_digits);
-        write!(f, "{expected} core-hours ({low} to {high} with 90 %)")
+        write!(f, "{expected} core-hours (90 % interval: {low} to {high})")
     }
 }
 
@@ -224,6 +224,6 @@ mod tests {
         }
         let hours =
             CoreHours::from_core_seconds(Predicted { core_seconds: 3600.0, low: 1800.0, high: 9000.0 }, 2.0);
-        assert_eq!(hours.to_string(), "2.0 core-hours (1.0 to 5.0 with 90 %)");
+        assert_eq!(hours.to_string(), "2.0 core-hours (90 % interval: 1.0 to 5.0)");
     }
 }

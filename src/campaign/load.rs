@@ -114,7 +114,7 @@ impl Loader<'_> {
         let median = training.original.median;
         if !(MIN_MEDIAN_GRADE..=1.0).contains(&median) {
             return Err(wrong(format!(
-                "{}: the median of γ is {median:.3e} under the mixture as it begins; expected {MIN_MEDIAN_GRADE} to 1: either \
+                "{}: the median of γ is {median:.3e} under the initial mixture; expected {MIN_MEDIAN_GRADE} to 1: either \
                  these are not the frames that the mixture was built from, or its covariances or thresholds are wrong",
                 file.get_ref().display()
             )));
@@ -135,7 +135,7 @@ impl Loader<'_> {
             return Ok((share > SUSPICIOUS_SHARE).then(|| {
                 let percent = 100.0 * share;
                 let message = format!(
-                    "{percent:.0} % of the atoms have γ > 1 under the mixture as it begins, where 2 to 9 % are usual: \
+                    "{percent:.0} % of the atoms have γ > 1 under the initial mixture, where 2 to 9 % are usual: \
                      are these the frames that the mixture was built from?"
                 );
                 self.warning(TRAINING_FRAMES, file, message)
@@ -275,7 +275,7 @@ pub fn check_sound(artifact: &Artifact, path: &Path) -> Result<(), String> {
         more => format!(" (and {more} more: calmwalk calm info {})", path.display()),
     };
     Err(format!(
-        "{}: {first}{more}; build the artifact again, or copy it again from where it was built",
+        "{}: {first}{more}; rebuild the artifact, or copy it again from where it was built",
         path.display()
     ))
 }

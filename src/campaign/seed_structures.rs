@@ -35,8 +35,8 @@ impl Loader<'_> {
                     .map_err(|error| wrong(format!("{source}: {error}")))?;
                 if let Some(first) = seeds.iter().find(|other| other.seed.name == name) {
                     return Err(wrong(format!(
-                        "{source}: a second seed structure named '{name}', the first is {}; give each a name of its \
-                         own (name=… in its comment line)",
+                        "{source}: a second seed structure named '{name}', the first is {}; give each a unique name \
+                         (name=… in its comment line)",
                         first.source
                     )));
                 }
@@ -102,7 +102,7 @@ impl Loader<'_> {
             let SourcedStructure { seed: SeedStructure { name, structure }, source } = named;
             if let Some(other) = first.insert(ContentHash::of(&rounded(structure)), named) {
                 let message = format!(
-                    "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find little that is new",
+                    "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find few new structures",
                     other.seed.name, other.source
                 );
                 warnings.push(self.seeds_warning(message));

@@ -114,9 +114,9 @@ async fn read_import(store: &Store, id: &str, number: &str) -> Result<CandidateD
 
 async fn read_candidate(store: &Store, named: Named) -> Result<CandidateDetails, StoreError> {
     let stored = store.candidate(&named.candidate).await?;
-    let stored = stored.ok_or_else(|| damaged(&named, "it is not there"))?;
+    let stored = stored.ok_or_else(|| damaged(&named, "it is missing"))?;
     let logged = store.decisions(stored.decision..=stored.decision).await?.into_iter().next();
-    let logged = logged.ok_or_else(|| damaged(&named, "the decision about it is not there"))?;
+    let logged = logged.ok_or_else(|| damaged(&named, "its decision is missing"))?;
     let rules = rules(store).await?;
     let view = stored.block.view();
     let (structure, content) = (view.structure(), view.id().content);

@@ -40,7 +40,7 @@ fn filters_are_evaluated() {
         ("seed = 'fcc 100' AND kind != control", true),
         ("energy_per_atom = -2", true),
         ("energy != -6", false),
-        // What is not there meets no comparison.
+        // A comparison with a missing property is false.
         ("walk = 0 or walk != 0", false),
         ("not walk = 0", true),
     ] {

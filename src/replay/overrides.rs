@@ -108,7 +108,7 @@ fn set_key(table: &mut Table, key: &str, value: Value) -> Result<(), String> {
     let (sections, name) = key.rsplit_once('.').unwrap_or(("", key));
     for section in sections.split('.') {
         let inside = place.entry(section).or_insert_with(|| Value::Table(Table::new()));
-        place = inside.as_table_mut().ok_or_else(|| format!("{section} is no table"))?;
+        place = inside.as_table_mut().ok_or_else(|| format!("{section} is not a table"))?;
     }
     place.insert(name.to_owned(), value);
     Ok(())

@@ -97,7 +97,9 @@ async fn join(
     loop {
         let joined = uplink.join().await.map_err(Failure::failed)?;
         let setup: AgentConfig = serde_json::from_slice(&joined.setup).map_err(|error| {
-            Failure::Failed(format!("the orchestrator's setup: {error}: run the same program everywhere"))
+            Failure::Failed(format!(
+                "the orchestrator's configuration: {error}: run the same version of calmwalk on all hosts"
+            ))
         })?;
         match model(&joined, &setup, directory).await? {
             Some(model) => return Ok((uplink, joined, AgentConfig { model, ..setup })),

@@ -169,7 +169,7 @@ async fn expired(time: &mut Option<Pin<Box<Sleep>>>) {
 
 fn database_unreachable() -> Failure {
     Failure::Failed(format!(
-        "stopping, but the database has not answered for {} s: walks stand at their last checkpoints; run the same command to continue the campaign",
+        "stopping, but the database has not answered for {} s: walks keep their last checkpoints; run the same command to continue the campaign",
         DATABASE_TIMEOUT.as_secs()
     ))
 }

@@ -70,7 +70,7 @@ async fn find(store: &Store, id: &str) -> Result<StructureRecord, ApiError> {
         return Ok(StructureRecord { id: id.to_owned(), structure, content, candidate: None });
     }
     let named = store.find_candidate(id).await?;
-    let missing = || ApiError::new(StatusCode::NOT_FOUND, format!("{} is not there", named.candidate));
+    let missing = || ApiError::new(StatusCode::NOT_FOUND, format!("{} is missing", named.candidate));
     let candidate = store.candidate(&named.candidate).await?.ok_or_else(missing)?;
     let view = candidate.block.view();
     let (structure, content) = (view.structure(), view.id().content);
