@@ -108,7 +108,7 @@ fn cut_for_five_seconds() {
     linked.cable.mend();
     let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
-    assert!(!hosts.orchestrator_stderr().contains("others get its walks"), "{}", hosts.orchestrator_stderr());
+    assert!(!hosts.orchestrator_stderr().contains("its walks go to other walkers"), "{}", hosts.orchestrator_stderr());
 }
 
 /// Longer than the limit: the orchestrator's own walker gets the walks. The host that comes back joins anew; of what it
@@ -120,7 +120,7 @@ fn cut_for_a_minute() {
     linked.cable.cut();
     let begun = Instant::now();
     linked.walker_waits();
-    wait_until("the walks are handed on", || linked.head_says("others get its walks"));
+    wait_until("the walks are handed on", || linked.head_says("its walks go to other walkers"));
     let handed_on = linked.counters();
     wait_until("they go on elsewhere", || linked.counters().sent > handed_on.sent);
     // So that there is something left to do for the host that comes back.
@@ -145,7 +145,7 @@ fn cut_for_good() {
     assert_eq!(agent, Some(1), "{}", hosts.said(0));
     let last_words = "calmwalk: the orchestrator has not answered for 0.3 min";
     assert!(hosts.said(0).contains(last_words), "{}", hosts.said(0));
-    assert!(hosts.orchestrator_stderr().contains("others get its walks"), "{}", hosts.orchestrator_stderr());
+    assert!(hosts.orchestrator_stderr().contains("its walks go to other walkers"), "{}", hosts.orchestrator_stderr());
 }
 
 /// What one side says is lost, then what the other says: each time both notice, and go on where they were.
@@ -165,7 +165,7 @@ fn one_way() {
     }
     let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
-    assert!(!hosts.orchestrator_stderr().contains("others get its walks"), "{}", hosts.orchestrator_stderr());
+    assert!(!hosts.orchestrator_stderr().contains("its walks go to other walkers"), "{}", hosts.orchestrator_stderr());
 }
 
 /// One packet in five is lost, in both directions and from the first on: the walkers wait more, that is all.
