@@ -105,7 +105,8 @@ fn structures_that_no_walk_can_start_from_are_refused() {
 fn seed_structures_need_names_of_their_own() {
     let seeds = Seeds::new();
     let named = good().replace("Properties", "name=bulk Properties");
-    let words = ":30: a second seed structure named 'bulk', the first is two.extxyz:1; give each a unique name";
+    let words =
+        ":30: a second seed structure named 'bulk', the first is two.extxyz:1; give each a unique name";
     seeds.refused("two.extxyz", named.repeat(2), &[words]);
 }
 

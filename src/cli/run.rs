@@ -166,8 +166,14 @@ async fn run(
         log_and_print(format_args!("label.slots = 0: labels come from calmwalk label --store {shown}"));
     }
     let over = Arc::new(Notify::new());
-    let run =
-        runtime::RunContext { campaign, store: &store, process: &process, directory, listen, over: &over };
+    let run = runtime::RunContext {
+        campaign,
+        store: &store,
+        process: &process,
+        directory,
+        listen,
+        limit_reached: &over,
+    };
     let (limits, used_up) = (campaign.config.budget(), time_budget::exhausted_time_limit(&store).await?);
     let work = async {
         if used_up.is_some() {

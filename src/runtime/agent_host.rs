@@ -63,13 +63,13 @@ pub async fn run(
     ));
     let place = Place::of(directory).map_err(Failure::failed)?;
     let mixture = joined.newest().await;
-    let (flag, asked) = (Arc::clone(&stopping), Arc::clone(&stop));
+    let (flag, wake) = (Arc::clone(&stopping), Arc::clone(&stop));
     let numbers = Arc::clone(&state.numbers);
     let dispatch = |incoming| {
         tokio::spawn(Agent { uplink, joined, incoming, stopping, patience, numbers }.run(move |news| match news {
             News::Stop => {
                 flag.store(true, Ordering::Relaxed);
-                asked.notify_one();
+                wake.notify_one();
             }
             News::Silent { untold, idle } => log_and_warn(format_args!(
                 "the orchestrator does not answer: {untold} unsent reports, {idle} of {walkers} walkers idle"

@@ -58,7 +58,7 @@ pub struct RunContext<'a> {
     /// Where agents of other hosts may join.
     pub listen: Option<&'a Listen>,
     /// Notified when a time limit is reached.
-    pub over: &'a Arc<Notify>,
+    pub limit_reached: &'a Arc<Notify>,
 }
 
 /// Printed when a campaign is asked to stop.
@@ -134,10 +134,10 @@ pub fn stop_signal(message: &'static str) -> Result<(Arc<AtomicBool>, Arc<Notify
 }
 
 /// Calls `stop` when a time limit is reached, as a stop signal would.
-fn stop_when_over(over: &Arc<Notify>, stop: impl FnOnce() + Send + 'static) {
-    let over = Arc::clone(over);
+fn stop_at_limit(limit_reached: &Arc<Notify>, stop: impl FnOnce() + Send + 'static) {
+    let limit_reached = Arc::clone(limit_reached);
     tokio::spawn(async move {
-        over.notified().await;
+        limit_reached.notified().await;
         stop();
     });
 }

@@ -22,7 +22,7 @@ use wire::place::Place;
 use super::agent_server::{self, AgentServer};
 use super::process_manager::{self, ProcessManager};
 use super::{
-    CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, spawn, start_reactor, stop_signal, stop_when_over,
+    CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, spawn, start_reactor, stop_at_limit, stop_signal,
     wanted_walkers,
 };
 use crate::exit_status::Failure;
@@ -58,10 +58,10 @@ async fn run_in(place: &Place, run: RunContext<'_>, selector: Selector) -> Resul
     let server = Server::open(place, sizes, session(process)).map_err(Failure::failed)?;
 
     let (stopping, stop) = stop_signal(STOP_MESSAGE)?;
-    let asked = (Arc::clone(&stopping), Arc::clone(&stop));
-    stop_when_over(run.over, move || {
-        asked.0.store(true, Ordering::Relaxed);
-        asked.1.notify_one();
+    let handles = (Arc::clone(&stopping), Arc::clone(&stop));
+    stop_at_limit(run.limit_reached, move || {
+        handles.0.store(true, Ordering::Relaxed);
+        handles.1.notify_one();
     });
     let limits = Limits {
         silence: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
@@ -76,12 +76,12 @@ async fn run_in(place: &Place, run: RunContext<'_>, selector: Selector) -> Resul
         ProcessManager::new(store, process.clone(), line, walkers, labellers, Arc::clone(&stopping));
 
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
-    let here = server.run(shared, to_reactor.clone(), manager.listener());
+    let local = server.run(shared, to_reactor.clone(), manager.listener());
     let agents = AgentServer::open(run, session(process), &mixture).await?;
     let agents_line = agents.handle();
-    let elsewhere = agents.run(Arc::clone(&stopping), to_reactor);
+    let remote = agents.run(Arc::clone(&stopping), to_reactor);
     let serving = tokio::spawn(async {
-        tokio::try_join!(async { here.await.map_err(Failure::failed) }, elsewhere).map(|_| ())
+        tokio::try_join!(async { local.await.map_err(Failure::failed) }, remote).map(|_| ())
     });
     let reactor = start_reactor(run, selector, incoming, &stopping);
     supervise(manager, reactor, agents_line, serving, &stop).await
@@ -115,23 +115,23 @@ async fn supervise(
     mut serving: JoinHandle<Result<(), Failure>>,
     stop: &Notify,
 ) -> Result<reactor::Ended, Failure> {
-    let (mut decided, mut closed, mut asked) = (None, None, false);
+    let (mut reactor_result, mut transport_result, mut stop_requested) = (None, None, false);
     let mut database_deadline = None;
-    while decided.is_none() || closed.is_none() || !manager.has_ended() {
-        if asked && decided.is_none() && manager.has_ended() {
+    while reactor_result.is_none() || transport_result.is_none() || !manager.has_ended() {
+        if stop_requested && reactor_result.is_none() && manager.has_ended() {
             database_deadline.get_or_insert_with(|| Box::pin(sleep(DATABASE_TIMEOUT)));
         }
-        let happened = tokio::select! {
+        let event = tokio::select! {
             () = expired(&mut database_deadline) => return Err(database_unreachable()),
             event = manager.next_event() => ManagerEvent::Process(event),
             () = stop.notified() => ManagerEvent::StopRequested,
-            ended = &mut reactor, if decided.is_none() => ManagerEvent::ReactorEnded(flatten(ended)),
-            ended = &mut serving, if closed.is_none() => ManagerEvent::TransportEnded(flatten(ended)),
+            ended = &mut reactor, if reactor_result.is_none() => ManagerEvent::ReactorEnded(flatten(ended)),
+            ended = &mut serving, if transport_result.is_none() => ManagerEvent::TransportEnded(flatten(ended)),
         };
-        match happened {
+        match event {
             ManagerEvent::Process(event) => manager.handle(event).await,
             ManagerEvent::StopRequested => {
-                asked = true;
+                stop_requested = true;
                 manager.stop();
             }
             ManagerEvent::ReactorEnded(ended) => {
@@ -140,20 +140,20 @@ async fn supervise(
                     Ok(reactor::Ended::Done) => manager.wait_for_labels(),
                     _ => manager.stop(),
                 }
-                decided = Some(ended);
+                reactor_result = Some(ended);
             }
             ManagerEvent::TransportEnded(ended) => {
                 if ended.is_err() {
                     manager.stop();
                 }
-                closed = Some(ended);
+                transport_result = Some(ended);
             }
         }
     }
-    closed.transpose()?;
+    transport_result.transpose()?;
     manager.failure()?;
-    match decided.transpose()? {
-        Some(reactor::Ended::Done) if !asked => Ok(reactor::Ended::Done),
+    match reactor_result.transpose()? {
+        Some(reactor::Ended::Done) if !stop_requested => Ok(reactor::Ended::Done),
         // Every walk may be over, but the labellers were asked to stop and may have left jobs.
         _ => Ok(reactor::Ended::Stopped),
     }

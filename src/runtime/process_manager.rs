@@ -18,7 +18,7 @@ use crate::exit_status::Failure;
 use crate::output::log_and_print;
 
 /// Interval between checks for unfinished labels after the last walk has ended.
-pub const LAST_LABELS_POLL_INTERVAL: Duration = Duration::from_millis(100);
+pub const LABEL_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 /// A labeller that has run this long counts as working: its configuration is valid.
 pub const PROVEN_AFTER: Duration = Duration::from_secs(10);
 
@@ -30,7 +30,7 @@ pub struct ProcessManager<'a> {
     walkers: Children,
     labellers: Labellers,
     heartbeats: Interval,
-    last_labels: Option<Interval>,
+    label_checks: Option<Interval>,
     /// Whether all walkers, and all labellers, have ended.
     ended: [bool; 2],
     /// Tells the reactor to dismiss the walkers.
@@ -49,7 +49,7 @@ pub enum Event {
     /// Heartbeats are due.
     Heartbeat,
     /// A check for unfinished labels is due.
-    LastLabels,
+    LabelCheck,
 }
 
 impl<'a> ProcessManager<'a> {
@@ -72,7 +72,7 @@ impl<'a> ProcessManager<'a> {
             walkers,
             labellers,
             heartbeats,
-            last_labels: None,
+            label_checks: None,
             ended: [false; 2],
             stopping,
             failure: None,
@@ -91,8 +91,8 @@ impl<'a> ProcessManager<'a> {
 
     /// Waits for the next event. Cancel-safe.
     pub async fn next_event(&mut self) -> Event {
-        let last_labels = async {
-            match &mut self.last_labels {
+        let label_checks = async {
+            match &mut self.label_checks {
                 Some(interval) => interval.tick().await,
                 None => std::future::pending().await,
             }
@@ -101,7 +101,7 @@ impl<'a> ProcessManager<'a> {
             event = self.walkers.next() => Event::Walker(event),
             event = self.labellers.children.next() => Event::Labeller(event),
             _ = self.heartbeats.tick() => Event::Heartbeat,
-            _ = last_labels => Event::LastLabels,
+            _ = label_checks => Event::LabelCheck,
         }
     }
 
@@ -109,14 +109,14 @@ impl<'a> ProcessManager<'a> {
     /// missing.
     pub async fn handle(&mut self, event: Event) {
         let done = match event {
-            Event::Walker(event) => self.walker(event).await,
-            Event::Labeller(event) => self.labeller(event).await,
+            Event::Walker(event) => self.handle_walker(event).await,
+            Event::Labeller(event) => self.handle_labeller(event).await,
             Event::Heartbeat => {
-                let looked = self.send_heartbeats().await;
-                self.db_status.observe(&looked);
-                looked
+                let written = self.send_heartbeats().await;
+                self.db_status.observe(&written);
+                written
             }
-            Event::LastLabels => self.check_last_labels().await,
+            Event::LabelCheck => self.check_labels().await,
         };
         match done {
             Ok(()) => {}
@@ -128,7 +128,7 @@ impl<'a> ProcessManager<'a> {
 
     /// Asks all processes to end in order.
     pub fn stop(&mut self) {
-        self.last_labels = None;
+        self.label_checks = None;
         self.stopping.store(true, Ordering::Relaxed);
         self.walkers.stop();
         self.labellers.children.stop();
@@ -137,13 +137,13 @@ impl<'a> ProcessManager<'a> {
     /// Lets the labellers finish the queue, since no more structures will come.
     pub fn wait_for_labels(&mut self) {
         if !self.is_stopping() {
-            self.last_labels = Some(interval(LAST_LABELS_POLL_INTERVAL));
+            self.label_checks = Some(interval(LABEL_CHECK_INTERVAL));
         }
     }
 
     /// Whether all processes have ended and no external label is awaited.
     pub fn has_ended(&self) -> bool {
-        self.ended == [true; 2] && self.last_labels.is_none()
+        self.ended == [true; 2] && self.label_checks.is_none()
     }
 
     /// Fails if the campaign cannot go on.
@@ -160,7 +160,7 @@ impl<'a> ProcessManager<'a> {
         self.stop();
     }
 
-    async fn walker(&mut self, event: launcher::Event) -> Result<(), StoreError> {
+    async fn handle_walker(&mut self, event: launcher::Event) -> Result<(), StoreError> {
         match event {
             launcher::Event::Started { number, incarnation, pid } => {
                 self.records.walker_started(number, incarnation, pid).await?;
@@ -184,7 +184,7 @@ impl<'a> ProcessManager<'a> {
         Ok(())
     }
 
-    async fn labeller(&mut self, event: launcher::Event) -> Result<(), StoreError> {
+    async fn handle_labeller(&mut self, event: launcher::Event) -> Result<(), StoreError> {
         match event {
             launcher::Event::Started { number, pid, .. } => self.labellers.started(number, pid),
             launcher::Event::Said { number, line } => {
@@ -218,9 +218,9 @@ impl<'a> ProcessManager<'a> {
         self.labellers.read_heartbeats(self.store, PROVEN_AFTER).await
     }
 
-    async fn check_last_labels(&mut self) -> Result<(), StoreError> {
+    async fn check_labels(&mut self) -> Result<(), StoreError> {
         if !self.store.awaits_labels(unix_milliseconds()).await? {
-            self.last_labels = None;
+            self.label_checks = None;
             self.labellers.children.stop();
         }
         Ok(())

@@ -18,10 +18,10 @@ use workers::walk::WalkContext;
 use workers::walker;
 
 use super::db_status::DbStatus;
-use super::process_manager::LAST_LABELS_POLL_INTERVAL;
+use super::process_manager::LABEL_CHECK_INTERVAL;
 use super::spawn::stop_labellers;
 use super::{
-    CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, on_stop_signal, start_reactor, stop_when_over,
+    CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, on_stop_signal, start_reactor, stop_at_limit,
     wanted_walkers,
 };
 use crate::campaign::Campaign;
@@ -58,7 +58,7 @@ struct Tasks {
     labellers: JoinSet<Result<(), StoreError>>,
     reactor: ReactorTask,
     /// The store to poll for labels that other processes make, if this one makes none.
-    labels_of_others: Option<Store>,
+    external_labels: Option<Store>,
     closing: Arc<Closing>,
     stopping: Arc<AtomicBool>,
 }
@@ -73,14 +73,14 @@ impl Tasks {
             asked.0.store(true, Ordering::Relaxed);
             asked.1.stop();
         };
-        stop_when_over(run.over, stop.clone());
+        stop_at_limit(run.limit_reached, stop.clone());
         on_stop_signal(STOP_MESSAGE, stop)?;
         let (to_reactor, incoming) = mpsc::channel(CHANNEL);
         let walkers = start_walkers(run.campaign, &to_reactor, &stopping)?;
         let labellers = start_labellers(run, &closing)?;
         let reactor = start_reactor(run, selector, incoming, &stopping);
-        let labels_of_others = labellers.is_empty().then(|| run.store.clone());
-        Ok(Self { walkers, labellers, reactor, labels_of_others, closing, stopping })
+        let external_labels = labellers.is_empty().then(|| run.store.clone());
+        Ok(Self { walkers, labellers, reactor, external_labels, closing, stopping })
     }
 
     /// Waits for all of them. A labeller that cannot go on stops the campaign, because its queue could only grow.
@@ -100,7 +100,7 @@ impl Tasks {
             self.stopping.store(true, Ordering::Relaxed);
             self.closing.stop();
         }
-        if let Some(store) = self.labels_of_others.filter(|_| matches!(ended, Ok(reactor::Ended::Done))) {
+        if let Some(store) = self.external_labels.filter(|_| matches!(ended, Ok(reactor::Ended::Done))) {
             wait_for_labels(&store, &self.closing).await?;
         }
         let panicked = self.walkers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
@@ -126,7 +126,7 @@ async fn wait_for_labels(store: &Store, closing: &Closing) -> Result<(), StoreEr
         match store.awaits_labels(unix_milliseconds()).await {
             Ok(false) => break,
             Err(error) if !error.is_transient() => return Err(error),
-            _ => tokio::time::sleep(LAST_LABELS_POLL_INTERVAL).await,
+            _ => tokio::time::sleep(LABEL_CHECK_INTERVAL).await,
         }
     }
     Ok(())

@@ -108,7 +108,11 @@ fn cut_for_five_seconds() {
     linked.cable.mend();
     let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
-    assert!(!hosts.orchestrator_stderr().contains("its walks go to other walkers"), "{}", hosts.orchestrator_stderr());
+    assert!(
+        !hosts.orchestrator_stderr().contains("its walks go to other walkers"),
+        "{}",
+        hosts.orchestrator_stderr()
+    );
 }
 
 /// Longer than the limit: the orchestrator's own walker gets the walks. The host that comes back joins anew; of what it
@@ -145,7 +149,11 @@ fn cut_for_good() {
     assert_eq!(agent, Some(1), "{}", hosts.said(0));
     let last_words = "calmwalk: the orchestrator has not answered for 0.3 min";
     assert!(hosts.said(0).contains(last_words), "{}", hosts.said(0));
-    assert!(hosts.orchestrator_stderr().contains("its walks go to other walkers"), "{}", hosts.orchestrator_stderr());
+    assert!(
+        hosts.orchestrator_stderr().contains("its walks go to other walkers"),
+        "{}",
+        hosts.orchestrator_stderr()
+    );
 }
 
 /// What one side says is lost, then what the other says: each time both notice, and go on where they were.
@@ -165,7 +173,11 @@ fn one_way() {
     }
     let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
-    assert!(!hosts.orchestrator_stderr().contains("its walks go to other walkers"), "{}", hosts.orchestrator_stderr());
+    assert!(
+        !hosts.orchestrator_stderr().contains("its walks go to other walkers"),
+        "{}",
+        hosts.orchestrator_stderr()
+    );
 }
 
 /// One packet in five is lost, in both directions and from the first on: the walkers wait more, that is all.
