@@ -17,7 +17,7 @@ pub struct ForgettingRule {
 
 /// State of the alarm in a run.
 #[derive(Clone, Debug)]
-pub struct ForgettingAlarm {
+pub struct AlarmState {
     forgetting: ForgettingRule,
     raised: bool,
 }
@@ -60,7 +60,7 @@ impl ForgettingRule {
     }
 }
 
-impl ForgettingAlarm {
+impl AlarmState {
     /// Starts without an alarm.
     pub fn new(forgetting: ForgettingRule) -> Self {
         Self { forgetting, raised: false }
@@ -84,7 +84,7 @@ mod tests {
     #[test]
     fn an_alarm_is_reported_when_it_begins_and_when_it_ends() {
         let forgetting = ForgettingRule { limit: 0.2, combination: Combination::Convex };
-        let mut alarm = ForgettingAlarm::new(forgetting);
+        let mut alarm = AlarmState::new(forgetting);
         let said: Vec<_> = [0.1, 0.21, 0.3, 0.19, 0.21, 0.17, 0.1, 0.25]
             .into_iter()
             .map(|share| alarm.update(share, share > 0.2))

@@ -9,7 +9,7 @@ use orchestrator::reactor::Notice;
 use store::Fate;
 use wire::{Origin, WalkId};
 
-use crate::forgetting::{ForgettingAlarm, ForgettingRule};
+use crate::forgetting::{AlarmState, ForgettingRule};
 use crate::output::{count, print_stderr};
 use crate::walk_ends::WalkEnds;
 
@@ -26,7 +26,7 @@ pub struct Display {
     accepted: u64,
     /// Whether the display has reported that walkers wait for labels.
     waiting: bool,
-    forgetting: ForgettingAlarm,
+    forgetting: AlarmState,
     ends: WalkEnds,
     /// Whether the display has warned of early ends.
     warned: bool,
@@ -61,7 +61,7 @@ impl Display {
             walk_steps,
             accepted: 0,
             waiting: false,
-            forgetting: ForgettingAlarm::new(forgetting),
+            forgetting: AlarmState::new(forgetting),
             warned: ends.is_alarming(),
             ends,
             last_line: Instant::now(),

@@ -58,7 +58,7 @@ pub async fn run(
     };
     let mut ticks = interval(SIGN_OF_LIFE);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut given_up = None;
+    let mut failure = None;
     loop {
         let done = tokio::select! {
             event = manager.labellers.children.next() => match event {
@@ -72,12 +72,12 @@ pub async fn run(
             }
         };
         if let Err(error) = manager.check(done) {
-            given_up.get_or_insert(error.to_string());
+            failure.get_or_insert(error.to_string());
             manager.labellers.children.stop();
         }
     }
-    let given_up = given_up.or_else(|| all_failed_message(&mut manager.labellers.children));
-    match given_up.filter(|_| !stopping.load(Ordering::Relaxed)) {
+    let failure = failure.or_else(|| all_failed_message(&mut manager.labellers.children));
+    match failure.filter(|_| !stopping.load(Ordering::Relaxed)) {
         Some(why) => Err(Failure::Failed(format!("no slot is left: {why}"))),
         None if stopping.load(Ordering::Relaxed) => Ok(ExitStatus::Interrupted),
         None => Ok(ExitStatus::Done),

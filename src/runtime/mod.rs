@@ -1,7 +1,7 @@
 //! Runs a campaign: walkers and labellers in separate processes, or everything in one process.
 
 pub mod agent_host;
-mod agent_server;
+mod agent_service;
 mod db_status;
 pub mod label_pool;
 mod labellers;

@@ -19,7 +19,7 @@ use wire::ipc::{Server, Sizes, space_needed};
 use wire::mixture::SharedMixture;
 use wire::place::Place;
 
-use super::agent_server::{self, AgentServer};
+use super::agent_service::{self, AgentService};
 use super::process_manager::{self, ProcessManager};
 use super::{
     CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, spawn, start_reactor, stop_at_limit, stop_signal,
@@ -77,7 +77,7 @@ async fn run_in(place: &Place, run: RunContext<'_>, selector: Selector) -> Resul
 
     let (to_reactor, incoming) = mpsc::channel(CHANNEL);
     let local = server.run(shared, to_reactor.clone(), manager.listener());
-    let agents = AgentServer::open(run, session(process), &mixture).await?;
+    let agents = AgentService::open(run, session(process), &mixture).await?;
     let agents_line = agents.handle();
     let remote = agents.run(Arc::clone(&stopping), to_reactor);
     let serving = tokio::spawn(async {
@@ -111,7 +111,7 @@ enum ManagerEvent {
 async fn supervise(
     mut manager: ProcessManager<'_>,
     mut reactor: ReactorTask,
-    agents: agent_server::Handle,
+    agents: agent_service::Handle,
     mut serving: JoinHandle<Result<(), Failure>>,
     stop: &Notify,
 ) -> Result<reactor::Ended, Failure> {

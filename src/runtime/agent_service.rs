@@ -20,7 +20,7 @@ use crate::output::{count, log_and_print, log_and_warn};
 use crate::process_config::{self, AgentConfig};
 
 /// Lets agents join if this run listens.
-pub struct AgentServer {
+pub struct AgentService {
     hub: Option<Hub>,
     store: Store,
     mixture: Arc<Mixture>,
@@ -36,7 +36,7 @@ impl Handle {
     }
 }
 
-impl AgentServer {
+impl AgentService {
     /// Starts to listen if the run is configured to.
     pub async fn open(run: RunContext<'_>, session: u64, mixture: &Arc<Mixture>) -> Result<Self, Failure> {
         // Writes wait here while the database is unreachable.
