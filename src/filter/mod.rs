@@ -145,7 +145,7 @@ impl Comparison {
         }
     }
 
-    fn sign(self) -> &'static str {
+    fn symbol(self) -> &'static str {
         match self {
             Self::Equal => "=",
             Self::Different => "!=",
@@ -217,7 +217,7 @@ impl fmt::Display for Filter {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Number(field, comparison, value) => {
-                write!(f, "{} {} {value:?}", field.name(), comparison.sign())
+                write!(f, "{} {} {value:?}", field.name(), comparison.symbol())
             }
             Self::Text(field, wanted, value) => {
                 let quote = if value.contains('\'') { '"' } else { '\'' };

@@ -59,9 +59,9 @@ const SYMBOLS: [&str; 8] = ["!=", "<=", ">=", "=", "<", ">", "(", ")"];
 
 pub(super) fn parse(text: &str) -> Result<Filter, FilterError> {
     let mut parser = Parser { tokens: tokenize(text)?, next: 0, depth: 0 };
-    let condition = parser.disjunction()?;
+    let filter = parser.disjunction()?;
     match parser.peek() {
-        Token::End => Ok(condition),
+        Token::End => Ok(filter),
         _ => Err(parser.error("'and', 'or' or the end")),
     }
 }
@@ -163,7 +163,7 @@ impl Parser {
             return Err(self.error(format!("at most {MAX_DEPTH} nested parentheses and 'not'")));
         }
         self.depth += 1;
-        let condition = if self.keyword("not") {
+        let filter = if self.keyword("not") {
             Filter::Not(Box::new(self.operand()?))
         } else if *self.peek() == Token::Symbol("(") {
             self.take();
@@ -177,7 +177,7 @@ impl Parser {
             self.comparison()?
         };
         self.depth -= 1;
-        Ok(condition)
+        Ok(filter)
     }
 
     fn comparison(&mut self) -> Result<Filter, FilterError> {
@@ -187,7 +187,7 @@ impl Parser {
         };
         if let Some((field, _)) = NumberField::ALL.iter().find(|(_, known)| *known == name) {
             self.take();
-            let comparison = self.comparison_sign()?;
+            let comparison = self.comparison_operator()?;
             return Ok(Filter::Number(*field, comparison, self.number()?));
         }
         let Some((field, _)) = TextField::ALL.iter().find(|(_, known)| *known == name) else {
@@ -203,7 +203,7 @@ impl Parser {
         Ok(Filter::Text(*field, wanted, self.text(*field)?))
     }
 
-    fn comparison_sign(&mut self) -> Result<Comparison, FilterError> {
+    fn comparison_operator(&mut self) -> Result<Comparison, FilterError> {
         let comparison = match self.peek() {
             Token::Symbol("=") => Comparison::Equal,
             Token::Symbol("!=") => Comparison::Different,
