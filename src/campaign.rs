@@ -1,7 +1,7 @@
-//! Everything that a configuration names, loaded and checked: what `validate` does and `run` begins with.
+//! Loads and checks everything that a configuration names. `validate` stops there, and `run` starts with it.
 
 mod load;
-mod seeds;
+mod seed_structures;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -17,43 +17,43 @@ use wire::{CampaignId, ContentHash};
 use workers::settings::{GuardSettings, WalkSettings};
 
 use crate::config::{Config, ConfigError, LabelMethod, Loaded, Warning, without_changeable};
-use crate::labelling::resolved_method;
-use crate::outcome::Failure;
-use crate::output::warn;
-use crate::setup::MethodSetup;
+use crate::exit_status::Failure;
+use crate::label_setup::resolved_method;
+use crate::output::log_and_warn;
+use crate::process_config::MethodConfig;
 use load::Loader;
 pub use load::check_sound;
 
-/// Keys that name files: a campaign depends on what is in them, not on where they are.
+/// Keys that name files. The identity of a campaign includes the files' contents, not their paths.
 const FILE_KEYS: [&str; 4] =
     ["/potential/model", "/calm/artifact", "/calm/training_frames", "/label/method/reference/file"];
 
-/// A campaign ready to run.
+/// A campaign that is ready to run.
 pub struct Campaign {
     /// The configuration.
     pub config: Config,
-    /// Where it is.
+    /// Path of the configuration file.
     pub path: PathBuf,
     /// Its text.
     pub text: String,
     /// The model.
     pub model: Arc<GraceModel>,
-    /// Its mixture at the start.
+    /// The initial mixture.
     pub artifact: Artifact,
     /// Seed structures, in the order of the files.
-    pub seeds: Vec<NamedSeed>,
+    pub seed_structures: Vec<SourcedStructure>,
     /// Features of the training frames, if the configuration names them.
     pub training: Option<TrainingFrames>,
     /// The label protocol.
     pub protocol: Protocol,
     /// Name and hash of every file whose content must not change.
     pub file_hashes: Vec<(String, String)>,
-    /// What is possible but hardly meant.
+    /// Settings that are valid but likely mistakes.
     pub warnings: Vec<Warning>,
 }
 
-/// A seed structure and where it came from.
-pub struct NamedSeed {
+/// A seed structure and its source.
+pub struct SourcedStructure {
     /// Name and structure.
     pub seed: SeedStructure,
     /// `file:line`
@@ -64,7 +64,7 @@ impl Campaign {
     /// Reads a configuration and every file that it names.
     ///
     /// # Errors
-    /// Everything that is wrong with the configuration; else what is wrong with the files, of each key the first.
+    /// Fails with all errors of the configuration, otherwise with the first error of each file key.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
         let Loaded { config, text, mut warnings } = Config::load(path)?;
         let loader = Loader { path, text: &text, config: &config };
@@ -73,13 +73,14 @@ impl Campaign {
             let training = loader.training_frames(&model, &artifact.mixture)?;
             Ok((artifact, training))
         });
-        let labels = loader.seeds(&model).and_then(|seeds| {
+        let labels = loader.seed_structures(&model).and_then(|seeds| {
             let protocol = loader.protocol(&seeds)?;
             Ok((seeds, protocol))
         });
-        let ((artifact, training), (seeds, (protocol, mut file_hashes))) = both(path, grades, labels)?;
-        warnings.extend(loader.doubtful_grades(&model, &artifact, &seeds, training.as_ref())?);
-        warnings.extend(loader.doubtful_seeds(&seeds, &model));
+        let ((artifact, training), (seeds, (protocol, mut file_hashes))) =
+            combine_errors(path, grades, labels)?;
+        warnings.extend(loader.suspicious_grades(&model, &artifact, &seeds, training.as_ref())?);
+        warnings.extend(loader.suspicious_seed_structures(&seeds, &model));
         file_hashes.insert(0, loader.hash("potential.model", &config.potential.model)?);
         let others = [
             ("calm.artifact", &config.calm.artifact),
@@ -89,22 +90,33 @@ impl Campaign {
             file_hashes.extend(file.as_ref().map(|file| loader.hash(key, file)).transpose()?);
         }
         let path = path.to_owned();
-        Ok(Self { config, path, text, model, artifact, seeds, training, protocol, file_hashes, warnings })
+        Ok(Self {
+            config,
+            path,
+            text,
+            model,
+            artifact,
+            seed_structures: seeds,
+            training,
+            protocol,
+            file_hashes,
+            warnings,
+        })
     }
 
-    /// Prints the warnings on the standard error and in the log.
+    /// Prints the warnings to standard error and logs them.
     pub fn print_warnings(&self) {
-        self.warnings.iter().for_each(warn);
+        self.warnings.iter().for_each(log_and_warn);
     }
 
     /// How labels are made.
-    pub fn method(&self) -> Result<MethodSetup, Failure> {
-        MethodSetup::of(&self.config.label)
+    pub fn method(&self) -> Result<MethodConfig, Failure> {
+        MethodConfig::from_section(&self.config.label)
     }
 
-    /// What the label of each seed structure depends on in its cost. A program must be there.
+    /// Size of the label of each seed structure, on which its cost depends. A program must be installed.
     pub fn label_sizes(&self) -> Result<Vec<dft::Size>, Failure> {
-        let structures = self.seeds.iter().map(|seed| &seed.seed.structure);
+        let structures = self.seed_structures.iter().map(|seed| &seed.seed.structure);
         Ok(match &self.config.label.method {
             LabelMethod::Reference(_) => structures
                 .map(|structure| dft::Size { atoms: structure.len(), electrons: 0.0, k_points: 1 })
@@ -117,7 +129,7 @@ impl Campaign {
         })
     }
 
-    /// Where the files are that grades depend on, by the keys of the configuration.
+    /// Paths of the files that determine grades, by configuration key.
     pub fn grade_files(&self) -> Value {
         let calm = &self.config.calm;
         let files = [
@@ -130,22 +142,22 @@ impl Campaign {
         files.map(|(key, path)| (key.to_owned(), json!(path.to_string_lossy()))).collect()
     }
 
-    /// The hash of a file that the configuration names under this key.
+    /// Hash of the file that the configuration names under this key.
     pub fn hash_of(&self, key: &str) -> String {
         let hashes = self.file_hashes.iter().find(|(name, _)| name == key);
         hashes.map(|(_, hash)| hash.clone()).unwrap_or_default()
     }
 
-    /// Bytes of the largest message between walker and selector: a candidate of the largest seed structure, and the
-    /// checkpoints of its walk (three states with velocities and forces, each with what is found again in it).
+    /// Size of the largest message between walker and selector, bytes: a candidate of the largest seed structure with
+    /// the checkpoints of its walk (three states with velocities and forces).
     pub fn largest_message(&self) -> usize {
-        let atoms = self.seeds.iter().map(|named| named.seed.structure.len()).max().unwrap_or(0);
+        let atoms = self.seed_structures.iter().map(|named| named.seed.structure.len()).max().unwrap_or(0);
         let features = self.artifact.mixture.dimension();
         8 * atoms * (9 + features) + 512 * atoms + 16_384
     }
 
-    /// The configuration with every default filled in, files by their content instead of their paths: what a campaign
-    /// that goes on is compared with.
+    /// The configuration with every default filled in, and with hashes instead of paths. A campaign that continues is
+    /// compared with it.
     pub fn resolved(&self) -> Value {
         let mut value = serde_json::to_value(self.config.without_paths()).expect("plain data becomes JSON");
         for pointer in FILE_KEYS {
@@ -157,29 +169,29 @@ impl Campaign {
         value["files"] = Value::Object(hashes.collect());
         value["label"]["protocol"] = json!(self.config.label.protocol_name());
         value["label"]["method"] = resolved_method(&self.config.label, &self.protocol);
-        // What a campaign has that began before there was a choice.
+        // Campaigns that began before this key existed have none.
         if self.config.potential.precision == Precision::Double {
             value["potential"].as_object_mut().map(|potential| potential.remove("precision"));
         }
-        // Where a campaign is kept is no part of what it is.
+        // The location of the store is not part of the campaign's identity.
         value["run"].as_object_mut().map(|run| run.remove("store"));
         if self.config.campaign.mode == Mode::Reproducible {
             value["instructions"] = json!(instructions());
         }
-        let seed =
-            |named: &NamedSeed| format!("{} {}", named.seed.name, ContentHash::of(&named.seed.structure));
-        value["seeds"] = self.seeds.iter().map(seed).collect();
+        let seed = |named: &SourcedStructure| {
+            format!("{} {}", named.seed.name, ContentHash::of(&named.seed.structure))
+        };
+        value["seeds"] = self.seed_structures.iter().map(seed).collect();
         value
     }
 
-    /// The hash of everything that a campaign begins with and that cannot change while it lasts, and of the seed
-    /// structures of its start.
+    /// Hash of everything that cannot change during a campaign, and of the initial seed structures.
     pub fn id(&self) -> CampaignId {
         let fixed = without_changeable(&self.resolved());
         let mut hasher = blake3::Hasher::new();
         hasher.update(b"calmwalk campaign 1");
         hasher.update(fixed.to_string().as_bytes());
-        for named in &self.seeds {
+        for named in &self.seed_structures {
             hasher.update(named.seed.name.as_bytes());
             hasher.update(&ContentHash::of(&named.seed.structure).0);
         }
@@ -188,23 +200,23 @@ impl Campaign {
         CampaignId(id)
     }
 
-    /// The seed structures as the store keeps them.
-    pub fn stored_seeds(&self) -> Vec<store::SeedStructure> {
-        let stored = |(index, named): (usize, &NamedSeed)| store::SeedStructure {
+    /// The seed structures as stored.
+    pub fn stored_seed_structures(&self) -> Vec<store::SeedStructure> {
+        let stored = |(index, named): (usize, &SourcedStructure)| store::SeedStructure {
             index: index as u32,
             name: named.seed.name.clone(),
             source: named.source.clone(),
             structure: named.seed.structure.clone(),
         };
-        self.seeds.iter().enumerate().map(stored).collect()
+        self.seed_structures.iter().enumerate().map(stored).collect()
     }
 
-    /// What the orchestrator needs of the model.
+    /// The part of the model that the orchestrator needs.
     pub fn grader(&self) -> Grader {
         grader(&self.model)
     }
 
-    /// What walks need of the configuration.
+    /// The part of the configuration that walks need.
     pub fn walk_settings(&self) -> WalkSettings {
         let Config { campaign, walk, collect, guard, .. } = &self.config;
         WalkSettings {
@@ -234,14 +246,14 @@ impl Campaign {
         }
     }
 
-    /// What the selector needs of the configuration.
+    /// The part of the configuration that the selector needs.
     pub fn selector_settings(&self) -> selector::Settings {
         selector_settings(&self.config)
     }
 }
 
-/// Both, or what is wrong with either.
-fn both<A, B>(
+/// Both values, or the errors of both.
+fn combine_errors<A, B>(
     path: &Path,
     a: Result<A, ConfigError>,
     b: Result<B, ConfigError>,
@@ -253,8 +265,8 @@ fn both<A, B>(
     }
 }
 
-/// What grades depend on: the model, its mixture at the start, and the training frames if they are watched. `name` stands
-/// for the configuration in what is said about its files.
+/// Loads what grades depend on: the model, the initial mixture, and the training frames if they are monitored. `name`
+/// stands for the configuration in error messages.
 pub fn load_for_grades(
     config: &Config,
     name: &Path,
@@ -266,14 +278,14 @@ pub fn load_for_grades(
     Ok((model, artifact, training))
 }
 
-/// What of a model the grades need.
+/// The part of the model that grades need.
 pub fn grader(model: &GraceModel) -> Grader {
     let n = model.elements().len();
     let cutoffs = (0..n * n).map(|k| model.pair_cutoff(k / n, k % n)).collect();
     Grader::new(model.elements().to_vec(), cutoffs)
 }
 
-/// What the selector needs of a configuration.
+/// The part of a configuration that the selector needs.
 pub fn selector_settings(config: &Config) -> selector::Settings {
     let Config { campaign, calm, collect, guard, run, .. } = config;
     selector::Settings {
@@ -292,7 +304,7 @@ pub fn selector_settings(config: &Config) -> selector::Settings {
     }
 }
 
-/// The instruction sets that the numerical libraries choose among: another choice gives other last bits.
+/// The instruction sets that the numerical libraries select from. Another set changes the last bits of results.
 pub fn instructions() -> String {
     let mut names = vec![std::env::consts::ARCH];
     #[cfg(target_arch = "x86_64")]

@@ -1,5 +1,7 @@
-//! The log: what this process does, one line an event at the end of a file (docs/log.md). Processes that write to the same file do
-//! not tear each other's lines: each is one write to a file that is opened to append.
+//! The log of this process: one line per event, appended to a file (docs/log.md).
+//!
+//! Several processes may write to the same file. Each line is one write to a file opened for appending, so lines do
+//! not interleave.
 
 mod format;
 #[cfg(test)]
@@ -15,16 +17,16 @@ use serde::{Deserialize, Serialize};
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Level, Metadata, Subscriber};
 
-use self::format::{Fields, Line};
-use crate::outcome::Failure;
+use self::format::{Fields, LogLine};
+use crate::exit_status::Failure;
 
-/// The packages of this program. Of what libraries have to say, only warnings and errors are kept.
-const OURS: [&str; 5] = ["calmwalk", "orchestrator", "store", "wire", "workers"];
+/// The packages of this program. Only warnings and errors are logged from other crates.
+const WORKSPACE_CRATES: [&str; 5] = ["calmwalk", "orchestrator", "store", "wire", "workers"];
 
-/// What children are told.
-static SETUP: OnceLock<Setup> = OnceLock::new();
+/// Configuration for child processes.
+static CONFIG: OnceLock<LogConfig> = OnceLock::new();
 
-/// Arguments of commands that run for long.
+/// Options of long-running commands.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Options {
     /// Append the log of this process and its children to this file (docs/log.md)
@@ -38,7 +40,7 @@ pub struct Options {
     format: Format,
 }
 
-/// How much is written down: this and what is more serious.
+/// The least serious level that is logged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LogLevel {
@@ -52,7 +54,7 @@ pub enum LogLevel {
     Debug,
 }
 
-/// How a line is written.
+/// Format of a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Format {
@@ -62,43 +64,43 @@ pub enum Format {
     Json,
 }
 
-/// What the log of a process is.
+/// Configuration of the log of a process.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
-pub struct Setup {
-    /// The file, wherever a process works.
+pub struct LogConfig {
+    /// Absolute path of the file.
     file: PathBuf,
     level: LogLevel,
     format: Format,
 }
 
 impl Options {
-    /// Begins the log of this process, if there is to be one.
+    /// Initializes the log of this process if one is requested.
     ///
     /// # Errors
-    /// A file that cannot be written.
-    pub fn begin(&self, process: &'static str) -> Result<(), Failure> {
+    /// Fails if the file cannot be written.
+    pub fn init(&self, process: &'static str) -> Result<(), Failure> {
         let Some(file) = &self.file else { return Ok(()) };
         let file = std::path::absolute(file).map_err(|error| cannot_write(file, &error))?;
-        begin(Some(Setup { file, level: self.level, format: self.format }), process, None)
+        init(Some(LogConfig { file, level: self.level, format: self.format }), process, None)
     }
 }
 
-/// What a process that this one starts is to log.
-pub fn for_children() -> Option<Setup> {
-    SETUP.get().cloned()
+/// The log configuration for child processes.
+pub fn child_config() -> Option<LogConfig> {
+    CONFIG.get().cloned()
 }
 
-/// Begins the log of a process that others have started: what it is called, and its number among its like.
-pub fn begin(setup: Option<Setup>, process: &'static str, number: Option<u32>) -> Result<(), Failure> {
+/// Initializes the log of a child process. `process` is its kind and `number` its number among those of that kind.
+pub fn init(setup: Option<LogConfig>, process: &'static str, number: Option<u32>) -> Result<(), Failure> {
     let Some(setup) = setup else { return Ok(()) };
     let opened = OpenOptions::new().append(true).create(true).mode(0o600).open(&setup.file);
     let file = opened.map_err(|error| cannot_write(&setup.file, &error))?;
     let name = number.map_or_else(|| process.to_owned(), |number| format!("{process} {number}"));
     let log = Log { file, level: setup.level.into(), format: setup.format, name };
-    // A process has one log, which begins with its command.
+    // A process has one log, initialized by its command.
     if tracing::subscriber::set_global_default(log).is_ok() {
-        let _ = SETUP.set(setup);
+        let _ = CONFIG.set(setup);
     }
     Ok(())
 }
@@ -107,27 +109,28 @@ fn cannot_write(file: &Path, error: &std::io::Error) -> Failure {
     Failure::Input(format!("--log: cannot write to {}: {error}", file.display()))
 }
 
-/// Where events go.
+/// Subscriber that writes events to the file.
 struct Log {
     file: File,
     level: Level,
     format: Format,
-    /// What process this is.
+    /// Name of the process.
     name: String,
 }
 
 impl Subscriber for Log {
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
         let package = metadata.target().split("::").next().unwrap_or_default();
-        let level = if OURS.contains(&package) { self.level } else { self.level.min(Level::WARN) };
+        let level =
+            if WORKSPACE_CRATES.contains(&package) { self.level } else { self.level.min(Level::WARN) };
         metadata.is_event() && *metadata.level() <= level
     }
 
     fn event(&self, event: &Event<'_>) {
         let mut fields = Fields::default();
         event.record(&mut fields);
-        fields.correct();
-        let line = Line {
+        fields.remove_wrong_hint();
+        let line = LogLine {
             time: store::unix_milliseconds(),
             level: *event.metadata().level(),
             process: &self.name,
@@ -139,11 +142,11 @@ impl Subscriber for Log {
             Format::Text => line.text(),
             Format::Json => line.json(),
         };
-        // That it cannot be kept stops no work.
+        // A log that cannot be written stops no work.
         let _ = (&self.file).write_all(text.as_bytes());
     }
 
-    // Spans of libraries, which are never enabled.
+    // Only libraries create spans, and they are never enabled.
     fn new_span(&self, _: &Attributes<'_>) -> Id {
         Id::from_u64(1)
     }

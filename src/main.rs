@@ -1,37 +1,38 @@
-//! calmwalk expands the training set of an interatomic potential: walkers run molecular dynamics biased along the
-//! gradient of the CALM extrapolation grade, a selector decides what is new, and what is new is labelled.
+//! calmwalk expands the training set of an interatomic potential. Walkers run molecular dynamics biased along the
+//! gradient of the CALM extrapolation grade, a selector accepts the structures that are new, and labellers label
+//! them.
 
-mod actors;
-mod bill;
-mod budget;
+mod atomic_file;
+mod budget_usage;
 mod campaign;
+mod candidate_details;
 mod cli;
-mod condition;
 mod config;
+mod disk_forecast;
 mod duration;
-mod ends;
-mod energies;
-mod forecast;
+mod energy_errors;
+mod exit_status;
+mod filter;
 mod forgetting;
-mod frames;
-mod interrupt;
-mod labelling;
-mod learned;
+mod label_cost;
+mod label_setup;
+mod label_statistics;
 mod log;
-mod mixture;
+mod mixture_status;
 mod notify;
-mod origin;
-mod outcome;
 mod output;
+mod process_config;
 mod progress;
+mod provenance;
 mod replay;
 mod report;
-mod setup;
-mod story;
+mod runtime;
+mod signals;
 mod summary;
 mod unlabelled;
+mod walk_ends;
 mod web;
-mod whole_file;
+mod xyz_reader;
 
 use std::process::ExitCode;
 
@@ -43,7 +44,7 @@ fn main() -> ExitCode {
         Ok(ended) => ended.exit_code(),
         Err(failure) => {
             tracing::error!("{failure}");
-            output::show(format_args!("calmwalk: {failure}"));
+            output::print_stderr(format_args!("calmwalk: {failure}"));
             failure.exit_code()
         }
     }

@@ -1,4 +1,4 @@
-//! What commands print: text and JSON on the standard output, tables with aligned columns, a bar for long work.
+//! Output of the commands: text and JSON on standard output, aligned tables and progress bars.
 
 use std::fmt::Display;
 use std::io::{self, BufWriter, ErrorKind, IsTerminal, Write};
@@ -8,12 +8,12 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use store::Location;
 
-use crate::outcome::Failure;
+use crate::exit_status::Failure;
 
-/// Work that ends sooner than this shows no bar.
+/// Shorter work shows no bar.
 const BAR_AFTER: Duration = Duration::from_secs(1);
 
-/// Writes to the standard output. A reader who has seen enough (`| head`) is no failure.
+/// Writes to standard output. A closed pipe (`| head`) is no failure.
 pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Failure> {
     let mut out = BufWriter::new(io::stdout().lock());
     match write(&mut out).and_then(|()| out.flush()) {
@@ -24,53 +24,53 @@ pub fn print(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(),
     }
 }
 
-/// Writes a line to the standard error, and nowhere else. That nobody reads it, or that it cannot be kept, stops no work.
-pub fn show(line: impl Display) {
+/// Prints a line to standard error. Ignores errors, which must not stop any work.
+pub fn print_stderr(line: impl Display) {
     let _ = writeln!(io::stderr().lock(), "{line}");
 }
 
-/// The same, and in the log.
-pub fn say(line: impl Display) {
+/// Prints a line to standard error and logs it.
+pub fn log_and_print(line: impl Display) {
     tracing::info!("{line}");
-    show(line);
+    print_stderr(line);
 }
 
-/// The same of what should not be.
-pub fn warn(line: impl Display) {
+/// Prints a warning to standard error and logs it.
+pub fn log_and_warn(line: impl Display) {
     tracing::warn!("{line}");
-    show(line);
+    print_stderr(line);
 }
 
-/// Says that what goes to the store may be read by others, if its URL allows that.
-pub fn say_if_unprotected(location: &Location) {
+/// Warns if the connection to the store is unencrypted.
+pub fn warn_if_unencrypted(location: &Location) {
     if let Location::Server(url) = location
         && url.is_unprotected()
     {
-        warn(format_args!(
-            "WARNING: what goes to and from {url} is not encrypted (sslmode=disable): whoever is on the network can read and \
-             change it"
+        log_and_warn(format_args!(
+            "WARNING: the connection to {url} is not encrypted (sslmode=disable): anyone on the network can read and change \
+             the data"
         ));
     }
 }
 
-/// Writes JSON to the standard output.
+/// Prints JSON to standard output.
 pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
     let text = serde_json::to_string_pretty(value).map_err(Failure::failed)?;
     print(|out| writeln!(out, "{text}"))
 }
 
-/// A number of things: `1 label`, `2 labels`.
+/// A number with its noun: `1 label`, `2 labels`.
 pub fn count<N: Display + PartialEq + From<u8>>(number: N, noun: &str) -> String {
     let plural = if number == N::from(1) { "" } else { "s" };
     format!("{number} {noun}{plural}")
 }
 
-/// `x` with a number of decimals, or a dash where there is none.
+/// `x` with a fixed number of decimals, or a dash.
 pub fn decimals(x: Option<f64>, decimals: usize) -> String {
     x.map_or("–".to_owned(), |x| format!("{x:.decimals$}"))
 }
 
-/// A range in words, such as that of a bin: open below, above, or both, which is where there is no value.
+/// A range such as that of a bin. A missing bound leaves it open; without any bound the value is unknown.
 pub fn range(above: Option<f64>, up_to: Option<f64>) -> String {
     match (above, up_to) {
         (Some(above), Some(up_to)) => format!("{above}–{up_to}"),
@@ -80,15 +80,15 @@ pub fn range(above: Option<f64>, up_to: Option<f64>) -> String {
     }
 }
 
-/// Lines whose columns stand below each other.
+/// Rows with aligned columns.
 pub struct Table {
-    /// Each column's width so far, and whether it holds numbers, which stand to the right.
+    /// Width of each column and whether it is right-aligned, as numbers are.
     columns: Vec<(usize, bool)>,
     rows: Vec<Vec<String>>,
 }
 
 impl Table {
-    /// A table with these column titles; those of numbers begin with `>`.
+    /// A table with these column titles. Titles of numeric columns begin with `>`.
     pub fn new(titles: &[&str]) -> Self {
         let columns = titles.iter().map(|title| (0, title.starts_with('>'))).collect();
         let mut table = Self { columns, rows: Vec::new() };
@@ -96,7 +96,7 @@ impl Table {
         table
     }
 
-    /// Adds a line.
+    /// Adds a row.
     pub fn push(&mut self, row: Vec<String>) {
         for ((width, _), cell) in self.columns.iter_mut().zip(&row) {
             *width = (*width).max(cell.chars().count());
@@ -104,7 +104,7 @@ impl Table {
         self.rows.push(row);
     }
 
-    /// Writes all lines.
+    /// Writes all rows.
     pub fn write(&self, out: &mut dyn Write) -> io::Result<()> {
         for row in &self.rows {
             let cells = row.iter().zip(&self.columns).map(|(cell, (width, number))| match number {
@@ -117,14 +117,14 @@ impl Table {
     }
 }
 
-/// A progress bar, only on a terminal and only for work that lasts.
+/// A progress bar. It appears only on a terminal and only for long work.
 pub struct Bar {
     bar: ProgressBar,
     begun: Instant,
 }
 
 impl Bar {
-    /// A bar of this length (none: unknown) by an indicatif template.
+    /// A bar of this length (`None`: unknown) with an indicatif template.
     pub fn new(length: Option<u64>, template: &str) -> Self {
         let bar = ProgressBar::with_draw_target(length, ProgressDrawTarget::hidden());
         bar.set_style(
@@ -133,17 +133,17 @@ impl Bar {
         Self { bar, begun: Instant::now() }
     }
 
-    /// Whether there is a terminal to show it.
+    /// Whether standard error is a terminal.
     pub fn is_shown(&self) -> bool {
         io::stderr().is_terminal()
     }
 
-    /// Writes something else meanwhile.
+    /// Hides the bar while `write` runs.
     pub fn suspend(&self, write: impl FnOnce()) {
         self.bar.suspend(write);
     }
 
-    /// Moves it.
+    /// Moves the bar.
     pub fn set(&self, position: u64, message: impl FnOnce() -> String) {
         if self.bar.is_hidden() && self.begun.elapsed() > BAR_AFTER {
             self.bar.set_draw_target(ProgressDrawTarget::stderr());

@@ -1,4 +1,4 @@
-//! What a run shows while it lasts: bars on a terminal, plain lines otherwise.
+//! Displays the progress of a run: bars on a terminal, plain lines otherwise.
 
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -9,14 +9,14 @@ use orchestrator::reactor::Notice;
 use store::Fate;
 use wire::{Origin, WalkId};
 
-use crate::ends::Ends;
-use crate::forgetting::{Alarm, Forgetting};
-use crate::output::{count, show};
+use crate::forgetting::{AlarmState, ForgettingRule};
+use crate::output::{count, print_stderr};
+use crate::walk_ends::WalkEnds;
 
-/// Time between two plain lines that only say where the walks stand.
+/// Interval between plain lines that only report steps.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
-/// Follows a run.
+/// Display of a run.
 pub struct Display {
     bars: Option<Bars>,
     names: BTreeMap<WalkId, String>,
@@ -24,11 +24,11 @@ pub struct Display {
     /// Steps of a whole walk.
     walk_steps: u64,
     accepted: u64,
-    /// Whether it was said that walkers wait for labels.
+    /// Whether the display has reported that walkers wait for labels.
     waiting: bool,
-    forgetting: Alarm,
-    ends: Ends,
-    /// Whether it was said that walk after walk ends early.
+    forgetting: AlarmState,
+    ends: WalkEnds,
+    /// Whether the display has warned of early ends.
     warned: bool,
     last_line: Instant,
 }
@@ -40,13 +40,13 @@ struct Bars {
 }
 
 impl Display {
-    /// Follows walks of `walk_steps` steps each; `walks` are (walk, seed structure, where it stands).
-    /// `ends` are those of earlier runs.
+    /// Displays walks of `walk_steps` steps each. `walks` are (walk, seed structure, current step), `ends` those of
+    /// earlier runs.
     pub fn new(
         walk_steps: u64,
         walks: Vec<(WalkId, String, u64)>,
-        ends: Ends,
-        forgetting: Forgetting,
+        ends: WalkEnds,
+        forgetting: ForgettingRule,
     ) -> Self {
         let (mut names, mut steps) = (BTreeMap::new(), BTreeMap::new());
         for (walk, name, step) in walks {
@@ -61,8 +61,8 @@ impl Display {
             walk_steps,
             accepted: 0,
             waiting: false,
-            forgetting: Alarm::new(forgetting),
-            warned: ends.are_alarming(),
+            forgetting: AlarmState::new(forgetting),
+            warned: ends.is_alarming(),
             ends,
             last_line: Instant::now(),
         };
@@ -70,7 +70,7 @@ impl Display {
         display
     }
 
-    /// Takes in one notice.
+    /// Takes a notice of the reactor.
     pub fn notice(&mut self, notice: &Notice<'_>) {
         match notice {
             Notice::Progress(walk, progress) => {
@@ -83,7 +83,7 @@ impl Display {
         self.draw();
     }
 
-    /// Takes the bars away.
+    /// Removes the bars.
     pub fn finish(self) {
         if let Some(bars) = self.bars {
             bars.steps.finish_and_clear();
@@ -113,7 +113,7 @@ impl Display {
         for decision in &commit.decisions {
             let share = decision.detail["training_frames"]["share_above_one"].as_f64();
             let raised = decision.detail["forgetting_alarm"].as_bool();
-            let alarm = share.zip(raised).and_then(|(share, raised)| self.forgetting.decided(share, raised));
+            let alarm = share.zip(raised).and_then(|(share, raised)| self.forgetting.update(share, raised));
             if let Some(alarm) = alarm {
                 tracing::warn!("{alarm}");
                 self.show_lasting(&alarm);
@@ -121,7 +121,7 @@ impl Display {
         }
         for decision in commit.decisions.iter().filter(|decision| decision.kind == "ended") {
             if let Some(walk) = decision.walk {
-                // Whatever was left of its steps will not be made.
+                // The walk will not make its remaining steps.
                 self.steps.insert(walk, self.walk_steps);
                 let text = |key: &str| decision.detail[key].as_str().unwrap_or_default();
                 self.ends.add(walk.0, text("end"), text("reason"));
@@ -129,7 +129,7 @@ impl Display {
                 self.show(&format!("{}: ended ({end}) at step {}", self.name(walk), decision.detail["step"]));
             }
         }
-        if !self.warned && self.ends.are_alarming() {
+        if !self.warned && self.ends.is_alarming() {
             self.warned = true;
             let warning = format!("WARNING: {}", self.ends.warning());
             tracing::warn!("{warning}");
@@ -137,7 +137,7 @@ impl Display {
         }
     }
 
-    /// Said once, until a walk goes on.
+    /// Reported once, until a walk advances.
     fn queue_full(&mut self, jobs: u64) {
         if !std::mem::replace(&mut self.waiting, true) {
             let line = format!("walkers wait: the label queue is full ({} in it)", count(jobs, "structure"));
@@ -153,16 +153,16 @@ impl Display {
     fn show(&self, line: &str) {
         match &self.bars {
             Some(bars) => bars.message.set_message(line.to_owned()),
-            None => show(line),
+            None => print_stderr(line),
         }
     }
 
-    /// Shows what the next line must not take away.
+    /// Shows a line that the next one does not replace.
     fn show_lasting(&self, line: &str) {
         match &self.bars {
-            // A terminal that is gone needs no line.
+            // Ignore a terminal that is gone.
             Some(bars) => drop(bars.all.println(line)),
-            None => show(line),
+            None => print_stderr(line),
         }
     }
 
@@ -174,7 +174,7 @@ impl Display {
             bars.steps.set_message(format!("{} accepted", self.accepted));
         } else if self.last_line.elapsed() > LINE_INTERVAL {
             self.last_line = Instant::now();
-            show(format_args!("{done} of {all} steps, {} accepted in this run", self.accepted));
+            print_stderr(format_args!("{done} of {all} steps, {} accepted in this run", self.accepted));
         }
     }
 }

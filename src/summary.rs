@@ -1,4 +1,4 @@
-//! What came of a campaign, in numbers, and whether the grade told where the potential errs.
+//! Summary of a finished campaign: its numbers, and whether the grade predicted the potential's errors.
 
 use std::fmt;
 
@@ -6,43 +6,43 @@ use calm::watch::GradeDistribution;
 use store::{Status, Store, StoreError, Unlabelled};
 use wire::ContentHash;
 
-use crate::budget;
-use crate::ends::Ends;
-use crate::learned::{self, Grades, Learned};
+use crate::budget_usage;
+use crate::label_statistics::{self, ErrorsByGrade, LabelStatistics};
 use crate::output::{count, decimals};
 use crate::unlabelled;
+use crate::walk_ends::WalkEnds;
 
-/// Seed structures with failed labels that are shown.
-const SHOWN: usize = 8;
+/// Largest number of seed structures with failed labels to show.
+const MAX_SHOWN: usize = 8;
 
-/// A finished campaign.
+/// Summary of a campaign.
 #[derive(Clone, Debug)]
 pub struct Summary {
     status: Status,
-    learned: Learned,
-    /// Where labels finally failed.
+    statistics: LabelStatistics,
+    /// Structures whose labels failed for good.
     unlabelled: Vec<Unlabelled>,
-    /// Grades of the training frames under the newest mixture, if they are watched.
+    /// Grades of the training frames under the newest mixture, if they are monitored.
     training: Option<GradeDistribution>,
 }
 
-/// Gathers the summary of a campaign, with the labels of one protocol.
-pub async fn of(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
+/// Reads the summary of a campaign with the labels of one protocol.
+pub async fn read(store: &Store, protocol: ContentHash) -> Result<Summary, StoreError> {
     let status = store.status().await?;
-    let learned = learned::of(store, protocol).await?;
+    let statistics = label_statistics::read(store, protocol).await?;
     let unlabelled = store.unlabelled(protocol, true).await?;
     let values = store.values().await?;
     let watched = values.iter().find(|(name, _)| name == "training_frames");
     let watched: Option<GradeDistribution> = watched.and_then(|(_, text)| serde_json::from_str(text).ok());
-    Ok(Summary { status, learned, unlabelled, training: watched })
+    Ok(Summary { status, statistics, unlabelled, training: watched })
 }
 
 impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { status: Status { candidates, labels, walks, mixture_version, .. }, learned, .. } = self;
+        let Self { status: Status { candidates, labels, walks, mixture_version, .. }, statistics, .. } = self;
         let of = |origin: &str| walks.iter().filter(|walk| walk.origin == origin).count();
         writeln!(f, "walks            {} biased, {} control", of("biased"), of("control"))?;
-        let ends = Ends::of(walks);
+        let ends = WalkEnds::from_walks(walks);
         writeln!(f, "                 ended: {}", ends.in_words())?;
         ends.lines().iter().try_for_each(|line| writeln!(f, "                 {line}"))?;
         let declined = &candidates.declined;
@@ -58,7 +58,7 @@ impl fmt::Display for Summary {
             declined.budget,
             declined.backlog
         )?;
-        writeln!(f, "                 {} refused by walkers' own guards", candidates.refused_by_walkers)?;
+        writeln!(f, "                 {} refused by walkers' guards", candidates.refused_by_walkers)?;
         let superseded = match labels.superseded {
             0 => String::new(),
             jobs => format!(", {jobs} superseded"),
@@ -70,14 +70,14 @@ impl fmt::Display for Summary {
         writeln!(
             f,
             "labels           {} biased and {} control structures labelled{}, {} failed, {} dropped{superseded}{excluded}",
-            learned.biased.structures + learned.shared,
-            learned.control.structures + learned.shared,
-            both(learned),
+            statistics.biased.structures + statistics.shared,
+            statistics.control.structures + statistics.shared,
+            shared_note(statistics),
             labels.failed,
             labels.dropped
         )?;
-        write!(f, "{}", unlabelled::shown(&self.unlabelled, 17, SHOWN))?;
-        if let Some(budget) = budget::shown(&self.status.budget) {
+        write!(f, "{}", unlabelled::describe(&self.unlabelled, 17, MAX_SHOWN))?;
+        if let Some(budget) = budget_usage::describe(&self.status.budget) {
             writeln!(f, "budget           {budget}")?;
         }
         writeln!(f, "mixture          version {mixture_version}")?;
@@ -93,9 +93,9 @@ impl fmt::Display for Summary {
             f,
             "           atoms   mean error   γ > 1   γ_nbr > 1   ρ(γ, error)   ρ(γ_nbr, error)   ROC-AUC(γ)   ROC-AUC(γ_nbr)"
         )?;
-        writeln!(f, "  biased   {}", line(&self.learned.biased))?;
-        writeln!(f, "  control  {}", line(&self.learned.control))?;
-        let energies = self.learned.energies.summary();
+        writeln!(f, "  biased   {}", line(&self.statistics.biased))?;
+        writeln!(f, "  control  {}", line(&self.statistics.control))?;
+        let energies = self.statistics.energies.summary();
         if let Some(line) = energies.line() {
             writeln!(f, "energy error of the potential: {line}")?;
         }
@@ -103,19 +103,22 @@ impl fmt::Display for Summary {
     }
 }
 
-/// That structures are counted twice which biased walks and controls both found.
-fn both(learned: &Learned) -> String {
-    match learned.shared {
+/// Says that structures found by both biased and control walks are counted twice.
+fn shared_note(statistics: &LabelStatistics) -> String {
+    match statistics.shared {
         0 => String::new(),
         shared => {
-            format!(" ({shared} of them both, and not compared: {})", count(learned.all.structures, "label"))
+            format!(
+                " ({shared} of them by both and not compared: {})",
+                count(statistics.all.structures, "label")
+            )
         }
     }
 }
 
-/// A line of numbers.
-fn line(grades: &Grades) -> String {
-    let Grades { gamma, gamma_nbr, .. } = grades;
+/// A line of the comparison.
+fn line(grades: &ErrorsByGrade) -> String {
+    let ErrorsByGrade { gamma, gamma_nbr, .. } = grades;
     if gamma.atoms() == 0 {
         return "no labelled structures".to_owned();
     }

@@ -1,12 +1,12 @@
-//! What part of the collected space has no label because labels finally failed, in words.
+//! Describes the collected structures whose labels failed for good.
 
 use store::{Range, Unlabelled};
 
 use crate::output::Table;
 
-/// A line behind a title of `width` characters, and one for each seed structure and formula, `most` of these; nothing if
-/// no label failed.
-pub fn shown(unlabelled: &[Unlabelled], width: usize, most: usize) -> String {
+/// A line with a title of `width` characters, then one line for each seed structure and formula, at most `most`.
+/// Empty if no label failed.
+pub fn describe(unlabelled: &[Unlabelled], width: usize, most: usize) -> String {
     if unlabelled.is_empty() {
         return String::new();
     }
@@ -23,7 +23,7 @@ pub fn shown(unlabelled: &[Unlabelled], width: usize, most: usize) -> String {
     ]);
     unlabelled.iter().take(most).for_each(|part| table.push(line(part)));
     let mut text = Vec::new();
-    // Nothing prevents writing to memory.
+    // Writing to memory cannot fail.
     let _ = table.write(&mut text);
     let table = String::from_utf8_lossy(&text).into_owned();
     let more = match unlabelled.len().saturating_sub(most) {
@@ -32,7 +32,7 @@ pub fn shown(unlabelled: &[Unlabelled], width: usize, most: usize) -> String {
     };
     let title = "unlabelled";
     format!(
-        "{title:<width$}the labels of {failed} structures failed, and this part of what was collected has none:\n{table}{more}"
+        "{title:<width$}the labels of {failed} structures failed, which leaves these ranges without labels:\n{table}{more}"
     )
 }
 
@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_failed_stands_beside_what_did_not() {
+    fn failed_ranges_are_compared_with_labelled_ones() {
         let range = |low, high| Range { low: Some(low), high: Some(high) };
         let part = Unlabelled {
             seed_structure: "fcc".into(),
@@ -74,12 +74,12 @@ mod tests {
             relative_volume: range(1.4, 1.4),
             relative_volume_labelled: Range::default(),
         };
-        let text = shown(&[part.clone(), part], 12, 1);
+        let text = describe(&[part.clone(), part], 12, 1);
         let lines: Vec<_> = text.lines().collect();
         assert!(lines[0].starts_with("unlabelled  the labels of 4 structures failed"), "{text}");
         let cells: Vec<_> = lines[2].split("  ").map(str::trim).filter(|cell| !cell.is_empty()).collect();
         assert_eq!(cells, ["fcc", "Al32", "2", "9", "3.00 to 4.00", "1.50 to 2.25", "1.400", "–"]);
         assert!(lines[3].contains("1 more") && lines.len() == 4, "{text}");
-        assert_eq!(shown(&[], 12, 8), "");
+        assert_eq!(describe(&[], 12, 8), "");
     }
 }

@@ -10,7 +10,7 @@ use store::Location;
 
 use crate::common;
 use crate::common::campaign::{Small, outcome, outcome_at};
-use crate::common::place::{Place, on_store};
+use crate::common::label_campaign::{LabelCampaign, on_store};
 use crate::common::processes::{processes_in, wait_until};
 use crate::common::{calmwalk, kills, random, refuse, stderr, succeed};
 
@@ -30,7 +30,7 @@ fn visible(directory: &Path) -> Vec<String> {
 fn a_copy_of_a_running_campaign_can_be_run_on() {
     // Seconds of work, so that it is under way while it is copied.
     let small = Small { steps: 3000, per_seed: 1000, ..Small::default() };
-    let place = Place::new(&small, &[]);
+    let place = LabelCampaign::new(&small, &[]);
     let elsewhere = tempfile::tempdir().unwrap();
     let copy = elsewhere.path().join("copy").display().to_string();
     let mut run = place.run();
@@ -60,7 +60,7 @@ fn a_copy_of_a_running_campaign_can_be_run_on() {
 #[test]
 fn a_killed_backup_leaves_nothing_that_looks_like_one() {
     let small = Small { steps: 60, ..Small::default() };
-    let place = Place::new(&small, &[]);
+    let place = LabelCampaign::new(&small, &[]);
     assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
     // Enough for a copy to take its time.
     on_store(place.location(), async |store| {
@@ -107,7 +107,7 @@ fn a_killed_backup_leaves_nothing_that_looks_like_one() {
 #[test]
 fn check_and_compact_tell_what_they_find() {
     let small = Small { steps: 60, ..Small::default() };
-    let place = Place::new(&small, &[]);
+    let place = LabelCampaign::new(&small, &[]);
     assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
     let said = succeed(place.path(), ["store", "check", place.argument()]);
     assert!(said.starts_with("no problems found in "), "{said}");
@@ -140,7 +140,7 @@ fn check_and_compact_tell_what_they_find() {
 #[test]
 fn a_damaged_file_is_found() {
     let small = Small { steps: 60, ..Small::default() };
-    let place = Place::new(&small, &[]);
+    let place = LabelCampaign::new(&small, &[]);
     if place.argument() != "." {
         // A server looks after its files itself.
         return;

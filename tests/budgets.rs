@@ -8,8 +8,8 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::common::campaign::{Outcome, Small, outcome};
-use crate::common::desk::Desk;
-use crate::common::processes::{carrying_out, hold, signal, wait_until};
+use crate::common::config_tester::ConfigTester;
+use crate::common::processes::{hold, processes_running, signal, wait_until};
 use crate::common::{Running, program, succeed};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "here"];
@@ -41,7 +41,7 @@ fn walks(status: &Value) -> Vec<(String, String)> {
 }
 
 /// A campaign without budgets.
-fn undisturbed(small: &Small) -> Outcome {
+fn uninterrupted_outcome(small: &Small) -> Outcome {
     let directory = write(small, "");
     succeed(directory.path(), RUN);
     outcome(&directory.path().join("here"))
@@ -107,7 +107,7 @@ fn as_many_structures_are_collected_as_there_may_be_labels_for() {
 fn a_limit_of_time_stops_walks_where_they_stand() {
     // Seconds of work, so that the clock is looked at before it is done.
     let small = Small { steps: 3000, per_seed: 1000, ..Small::default() };
-    let expected = undisturbed(&small);
+    let expected = uninterrupted_outcome(&small);
     let directory = write(&small, "[budget]\nwall_hours = 1e-6\n");
     let here = directory.path();
     let summary = succeed(here, RUN);
@@ -163,8 +163,8 @@ fn a_long_queue_raises_the_threshold_and_the_log_can_be_replayed() {
     let run = program(here).args(RUN).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let mut run = Running(run);
     // While nobody makes labels the queue only grows.
-    wait_until("a labeller is at work", || !carrying_out(here, "labeller").is_empty());
-    let labellers = carrying_out(here, "labeller");
+    wait_until("a labeller is at work", || !processes_running(here, "labeller").is_empty());
+    let labellers = processes_running(here, "labeller");
     labellers.iter().for_each(|pid| hold(*pid, here.join("here").to_str().unwrap()));
     let raised = || decisions(here).into_iter().filter(|line| line.contains("\"raised_by\"")).count();
     wait_until("the threshold is raised", || here.join("here/campaign.sqlite").exists() && raised() > 0);
@@ -177,16 +177,16 @@ fn a_long_queue_raises_the_threshold_and_the_log_can_be_replayed() {
 
 #[test]
 fn wrong_budgets_and_queues_are_refused() {
-    let desk = Desk::new();
-    desk.refused_with(
+    let tester = ConfigTester::new();
+    tester.refused_with(
         "# labels = 1000",
         "labels = 1",
         &["budget.labels is 1; expected at least 2: a structure and its control"],
     );
-    desk.refused_with("# labels = 1000", "labels = 0", &["expected a whole number above 0"]);
-    desk.refused_with("# wall_hours = 24.0", "wall_hours = -1.0", &["expected a finite number above 0"]);
-    desk.refused_with("# core_hours = 100.0", "core_hour = 100.0", &["did you mean `core_hours`?"]);
-    desk.refused_with(
+    tester.refused_with("# labels = 1000", "labels = 0", &["expected a whole number above 0"]);
+    tester.refused_with("# wall_hours = 24.0", "wall_hours = -1.0", &["expected a finite number above 0"]);
+    tester.refused_with("# core_hours = 100.0", "core_hour = 100.0", &["did you mean `core_hours`?"]);
+    tester.refused_with(
         "# queue_full = \"wait\"",
         "queue_full = \"raise\"",
         &["label.queue_full is \"raise\"; expected \"wait\", or mode = \"live\"", "how fast labels are made"],

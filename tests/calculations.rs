@@ -7,8 +7,8 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::common::campaign::{Small, outcome_at};
-use crate::common::place::{LEAVE_LABEL, Place, are_single, on_store};
-use crate::common::processes::{calculating, carrying_out, processes_in, signal, wait_until};
+use crate::common::label_campaign::{LabelCampaign, WRITE_FIXED_LABEL, check_single_labels, on_store};
+use crate::common::processes::{calculation_processes, processes_in, processes_running, signal, wait_until};
 
 /// Takes half a second, and starts what never ends by itself.
 const SCRIPT: &str = r#"
@@ -43,15 +43,15 @@ impl Random {
 }
 
 /// A campaign whose labels are made by [`SCRIPT`], below `scratch`.
-fn place(scratch: &Path) -> Place {
+fn place(scratch: &Path) -> LabelCampaign {
     let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
     let keys = format!(
         "[label]\nslots = 0\nattempts = 20\nscratch = {:?}\nmethod = {command} # ",
         scratch.display().to_string()
     );
     let small = Small { walkers: 1, steps: 120, ..Small::default() };
-    let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
-    fs::write(place.path().join("label.sh"), SCRIPT.to_owned() + LEAVE_LABEL).unwrap();
+    let place = LabelCampaign::new(&small, &[("[label]\nmethod", &keys)]);
+    fs::write(place.path().join("label.sh"), SCRIPT.to_owned() + WRITE_FIXED_LABEL).unwrap();
     place
 }
 
@@ -64,15 +64,15 @@ fn directories(scratch: &Path) -> Vec<PathBuf> {
 }
 
 /// Those who can be killed now.
-fn victims(place: &Place, scratch: &Path, who: Victim) -> Vec<u32> {
+fn victims(place: &LabelCampaign, scratch: &Path, who: Victim) -> Vec<u32> {
     let started = |what: &str| {
-        let all = calculating(scratch).into_iter();
+        let all = calculation_processes(scratch).into_iter();
         all.filter(|(_, command)| command.starts_with(what)).map(|(pid, _)| pid).collect()
     };
     match who {
-        Label => carrying_out(place.path(), "label"),
-        Labeller => carrying_out(place.path(), "labeller"),
-        Keeper => carrying_out(place.path(), "calculation-runner"),
+        Label => processes_running(place.path(), "label"),
+        Labeller => processes_running(place.path(), "labeller"),
+        Keeper => processes_running(place.path(), "calculation-runner"),
         Program => started("sh label.sh"),
         Child => started("sleep 1000"),
     }
@@ -107,7 +107,7 @@ fn each_label_comes_once_whoever_is_killed() {
     // The last labellers leave by themselves.
     label.0.wait().unwrap();
     outcome_at(place.argument(), place.path());
-    assert!(on_store(place.location(), are_single) > 2);
+    assert!(on_store(place.location(), check_single_labels) > 2);
     wait_until("nobody is left", || processes_in(place.path()).is_empty());
 
     // What a killed one has only just made is cleared away by those who come later.
@@ -116,7 +116,7 @@ fn each_label_comes_once_whoever_is_killed() {
         assert!(touched.unwrap().success());
     }
     assert_eq!(place.label(&["--until-empty"]).0.wait().unwrap().code(), Some(0), "{}", place.said());
-    assert_eq!((calculating(&scratch), directories(&scratch)), (vec![], vec![]), "{killed:?}");
+    assert_eq!((calculation_processes(&scratch), directories(&scratch)), (vec![], vec![]), "{killed:?}");
     assert_eq!(fs::read_dir(&scratch).unwrap().count(), 0);
 }
 
@@ -154,7 +154,7 @@ const SETUP: &str = "<atom symbol=\"Al\" Z=\"13\" core=\"10\" valence=\"3\"/>\n<
                      <!-- energy -1.5 -->\n";
 
 /// A campaign whose labels are made by [`GPAW`].
-fn with_setup(home: &Path) -> Place {
+fn with_setup(home: &Path) -> LabelCampaign {
     fs::write(home.join("Al.PBE"), SETUP).unwrap();
     fs::write(home.join("gpaw.sh"), GPAW).unwrap();
     let command = ["sh".to_owned(), home.join("gpaw.sh").display().to_string()];
@@ -163,7 +163,7 @@ fn with_setup(home: &Path) -> Place {
          pseudopotentials = {scratch:?}, spin = false }} }} # ",
         scratch = home.display().to_string()
     );
-    Place::new(&Small { walkers: 1, steps: 120, ..Small::default() }, &[("[label]\nmethod", &keys)])
+    LabelCampaign::new(&Small { walkers: 1, steps: 120, ..Small::default() }, &[("[label]\nmethod", &keys)])
 }
 
 #[test]
@@ -179,7 +179,7 @@ fn a_setup_that_is_replaced_between_two_labels_makes_none() {
         "{said}"
     );
     // Who begins now is refused.
-    assert!(said.contains("labels made here would be of another protocol than 'gpaw'"), "{said}");
+    assert!(said.contains("labels made here would not belong to the campaign's protocol 'gpaw'"), "{said}");
     assert!(said.contains("settings.pseudopotentials.Al"), "{said}");
     assert_eq!((place.jobs("labelled"), place.jobs("failed")), (1, 0), "{said}");
     fs::write(&setup, SETUP).unwrap();
@@ -188,7 +188,7 @@ fn a_setup_that_is_replaced_between_two_labels_makes_none() {
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
     outcome_at(place.argument(), place.path());
     // All by the setup of the protocol, and it is not kept with any of them.
-    assert!(on_store(place.location(), are_single) > 2);
+    assert!(on_store(place.location(), check_single_labels) > 2);
     for job in on_store(place.location(), async |store| store.queue_list(None, u32::MAX, 0).await.unwrap()) {
         let details = place.job(&job.candidate);
         assert!(details.attempts_made.iter().all(|attempt| attempt.class.is_none()), "{details:?}");

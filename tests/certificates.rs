@@ -136,16 +136,16 @@ fn an_agent_that_cannot_accept_the_orchestrators_certificate_ends_and_says_why()
         let mut hosts = hosts(&orchestrator, &agent);
         let log = hosts.home.path().join("log");
         hosts.options[0].push(format!("--log={}", log.display()));
-        let mut run = hosts.lead();
-        wait_until("it listens", || hosts.head_said().contains("agents may join"));
+        let mut run = hosts.start_orchestrator();
+        wait_until("it listens", || hosts.orchestrator_stderr().contains("agents may join"));
         let mut waiting = hosts.agent(0);
         assert_eq!(waiting.0.wait().unwrap().code(), Some(2), "{}", hosts.said(0));
         assert!(hosts.said(0).contains(expected), "{}", hosts.said(0));
         signal(run.0.id(), "TERM");
-        assert_eq!(run.0.wait().unwrap().code(), Some(130), "{}", hosts.head_said());
+        assert_eq!(run.0.wait().unwrap().code(), Some(130), "{}", hosts.orchestrator_stderr());
         let log = fs::read_to_string(log).unwrap();
         assert!(log.contains("a connection was refused") && !log.contains("open file limit"), "{log}");
-        hosts.are_empty();
+        hosts.assert_cleaned_up();
     }
 }
 
@@ -159,13 +159,13 @@ fn an_agent_whose_certificate_the_orchestrator_refuses_ends_and_says_why() {
     // It trusts both, but is known to one.
     fs::write(agent.join("authority.pem"), format!("{}{}", other.pem, authority.pem)).unwrap();
     let hosts = hosts(&orchestrator, &agent);
-    let mut run = hosts.lead();
-    wait_until("it listens", || hosts.head_said().contains("agents may join"));
+    let mut run = hosts.start_orchestrator();
+    wait_until("it listens", || hosts.orchestrator_stderr().contains("agents may join"));
     let mut waiting = hosts.agent(0);
     assert_eq!(waiting.0.wait().unwrap().code(), Some(2), "{}", hosts.said(0));
     let said = hosts.said(0);
     assert!(said.contains("refuses the certificate") && said.contains("another authority"), "{said}");
     signal(run.0.id(), "TERM");
-    assert_eq!(run.0.wait().unwrap().code(), Some(130), "{}", hosts.head_said());
-    hosts.are_empty();
+    assert_eq!(run.0.wait().unwrap().code(), Some(130), "{}", hosts.orchestrator_stderr());
+    hosts.assert_cleaned_up();
 }

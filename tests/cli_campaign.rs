@@ -10,7 +10,7 @@ use atoms::{Evaluation, NeighbourList, Potential, read_extxyz};
 use potentials::{Eam, EamStyle};
 use serde_json::Value as Json;
 
-use crate::common::processes::{nothing_is_left, wait_until};
+use crate::common::processes::{assert_no_leftovers, wait_until};
 use crate::common::{Running, config, deviation, program, refuse, succeed, write_frames};
 
 /// Two seed structures, a few hundred steps, two structures from each and as many of their controls.
@@ -363,5 +363,5 @@ fn status_works_while_a_campaign_runs_and_after_it_was_killed() {
     let not_running = "not running (resume with calmwalk run)";
     wait_until("the labeller has left", || succeed(here, ["status", "small"]).contains(not_running));
     assert!(succeed(here, ["clean", "small"]).contains("files from shared memory"));
-    nothing_is_left(&here.join("small"));
+    assert_no_leftovers(&here.join("small"));
 }

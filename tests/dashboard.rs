@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use crate::common::campaign::Small;
-use crate::common::http::{first_event, get, reckoned, request, said};
+use crate::common::http::{first_event, get, get_computed, request, said};
 use crate::common::processes::wait_until;
 use crate::common::{Running, config, program, refuse, succeed};
 
@@ -249,7 +249,7 @@ fn a_live_campaign_is_looked_at_and_changed() {
 
 /// The components are those of the artifact, and some have moved.
 fn check_mixture(live: &Live) {
-    let mixture = reckoned(&live.address, "/api/mixture");
+    let mixture = get_computed(&live.address, "/api/mixture");
     assert_eq!(mixture["version"], live.status()["mixture_version"]);
     let artifact = config("data/al_eam_1l/gmm_artifacts.npz").display().to_string();
     let shown = succeed(live.here(), ["calm", "info", &artifact, "--json"]);
@@ -366,7 +366,7 @@ fn check_copy(live: &Live, id: &str) {
     let [address] = said(&mut shown.0, ["dashboard at http://"]);
     let address = address.trim_end_matches('/');
     assert_eq!(all_lines(address, "", 50), all_lines(&live.address, "", 50));
-    assert_eq!(reckoned(address, "/api/mixture"), reckoned(&live.address, "/api/mixture"));
+    assert_eq!(get_computed(address, "/api/mixture"), get_computed(&live.address, "/api/mixture"));
     assert_eq!(get(address, "/api/actions").json()["possible"], false);
     let token = [("x-calmwalk-token", live.token.as_str())];
     assert_eq!(request(address, "POST", &format!("/api/candidates/{id}/drop"), &token, "{}").status, 403);

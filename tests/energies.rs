@@ -170,9 +170,8 @@ fn energy_errors_are_without_the_difference_of_zeros() {
     let sum: f64 = of_structures.values().map(|error| error.abs()).sum();
     near(&shown["mean"], sum / of_structures.len() as f64);
     near(&shown["largest"], errors.values().fold(0.0, |largest: f64, error| largest.max(error.abs())));
-    let note = format!(
-        "energy errors are without the offsets of the elements (eV an atom, E_label − E_model): Al {offset:.4}"
-    );
+    let note =
+        format!("energy errors exclude the element offsets (eV/atom, E_label − E_model): Al {offset:.4}");
     for (id, error) in &errors {
         let story = json(here, ["explain", "here", id]);
         let model = &story["labels"][0]["model"];

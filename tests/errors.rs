@@ -77,7 +77,7 @@ fn structures_of_both_walks_are_counted_and_not_compared() {
         .unwrap();
     let summary = succeed(here, ["run", "campaign.toml"]);
     let words =
-        "4 biased and 4 control structures labelled (2 of them both, and not compared: 6 labels), 0 failed";
+        "4 biased and 4 control structures labelled (2 of them by both and not compared: 6 labels), 0 failed";
     assert!(summary.contains(words), "{summary}");
     let status = json(here, ["status", "campaign"]);
     assert_eq!((&status["labels"]["labelled"], &status["shared_structures"]), (&6.into(), &2.into()));
@@ -92,7 +92,7 @@ fn structures_of_both_walks_are_counted_and_not_compared() {
     assert_eq!((structures, &errors["shared_structures"]), ([6, 2, 2], &2.into()));
     succeed(here, ["report", "campaign", "-o", "report"]);
     let page = fs::read_to_string(here.join("report/report.html")).unwrap();
-    assert!(page.contains("2 structures that biased walks and their controls have both found are left out"));
+    assert!(page.contains("2 structures found by both biased walks and their controls are excluded"));
 }
 
 #[test]

@@ -45,18 +45,18 @@ fn a_campaign_whose_walks_all_diverge_has_failed() {
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(summary.contains("ended: 4 blew up (too hot)"), "{summary}");
     assert!(
-        summary.contains("4 too hot, as walk ") && summary.contains(" is above the allowed 2 K"),
+        summary.contains("4 too hot, such as walk ") && summary.contains(" is above the allowed 2 K"),
         "{summary}"
     );
     assert!(summary.contains("what to change: a smaller walk.time_step"), "{summary}");
     // Of three walks or four: they may end together.
-    assert!(said.contains("WARNING: ") && said.contains(" walks that have ended did so early ("), "{said}");
+    assert!(said.contains("WARNING: ") && said.contains(" finished walks ended early ("), "{said}");
     assert!(said.contains("the campaign has failed: 4 of 4 walks"), "{said}");
 
     let shown = succeed(here, ["status", "campaign"]);
     assert!(shown.contains("4 ended (4 blew up)") && shown.contains("too hot: try a smaller"), "{shown}");
     let all = succeed(here, ["status", "campaign", "--all"]);
-    assert!(all.contains("4 too hot, as walk ") && all.contains("what to change: "), "{all}");
+    assert!(all.contains("4 too hot, such as walk ") && all.contains("what to change: "), "{all}");
     let status: Value = serde_json::from_str(&succeed(here, ["status", "campaign", "--json"])).unwrap();
     let ends = status["ends"].as_array().unwrap();
     assert_eq!((ends.len(), &ends[0]["end"], &ends[0]["cause"]), (1, &"blew_up".into(), &"too_hot".into()));
@@ -66,7 +66,7 @@ fn a_campaign_whose_walks_all_diverge_has_failed() {
     assert_eq!(calmwalk(here, ["run", "campaign.toml"]).status.code(), Some(1));
     let events = fs::read_to_string(here.join("events")).unwrap();
     let told: Vec<_> = events.lines().filter(|line| line.starts_with("failing_walks ")).collect();
-    assert!(told.len() == 1 && told[0].contains("walks that have ended did so early"), "{events}");
+    assert!(told.len() == 1 && told[0].contains("finished walks ended early"), "{events}");
 }
 
 #[test]

@@ -16,9 +16,11 @@ use std::time::Duration;
 use crate::common;
 use crate::common::Running;
 use crate::common::campaign::{Small, outcome};
-use crate::common::hosts::undisturbed;
+use crate::common::hosts::uninterrupted_outcome;
 use crate::common::http::{first_event, request, said};
-use crate::common::processes::{carrying_out, go_on, hold_walkers, nothing_is_left, signal, wait_until};
+use crate::common::processes::{
+    assert_no_leftovers, pause_walkers, processes_running, resume_processes, signal, wait_until,
+};
 
 /// Descriptors that the campaign's process may have.
 const LIMIT: usize = 256;
@@ -100,13 +102,13 @@ fn a_flood_of_connections_takes_nothing_from_the_campaign_and_its_user() {
     let mut run = Running(command.spawn().unwrap());
     let [at] = said(&mut run.0, ["dashboard at http://"]);
     let (address, token) = at.split_once("/#token=").unwrap();
-    let held = hold_walkers(here, 2);
+    let held = pause_walkers(here, 2);
 
     let flood = Flood::begin(address);
     wait_until("the flood is there", || flood.opened() >= connections());
     signal(held[0], "KILL");
     wait_until("the walker is replaced", || {
-        carrying_out(here, "walker").iter().any(|pid| !held.contains(pid))
+        processes_running(here, "walker").iter().any(|pid| !held.contains(pid))
     });
     let allowed =
         request(address, "GET", "/api/actions", &[("x-calmwalk-token", token), ("Connection", "close")], "");
@@ -116,10 +118,10 @@ fn a_flood_of_connections_takes_nothing_from_the_campaign_and_its_user() {
     assert!(taken < LIMIT * 7 / 8, "{taken} descriptors");
     drop(flood);
 
-    go_on(&held);
+    resume_processes(&held);
     assert_eq!(run.0.wait().unwrap().code(), Some(0));
-    assert_eq!(outcome(here), undisturbed(&small));
-    nothing_is_left(here);
+    assert_eq!(outcome(here), uninterrupted_outcome(&small));
+    assert_no_leftovers(here);
 }
 
 #[test]

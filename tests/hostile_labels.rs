@@ -12,8 +12,8 @@ use store::JobState;
 
 use crate::common;
 use crate::common::campaign::Small;
-use crate::common::place::{LEAVE_LABEL, Place, on_store, queue};
-use crate::common::processes::{calculating, go_on, hold_walkers, wait_until};
+use crate::common::label_campaign::{LabelCampaign, WRITE_FIXED_LABEL, on_store, queue};
+use crate::common::processes::{calculation_processes, pause_walkers, resume_processes, wait_until};
 use crate::common::{program, stderr};
 
 /// What a script leaves, as a script, and what is said of the label then.
@@ -57,7 +57,7 @@ fn script(home: &Path) -> String {
     for (kind, left, _) in LEFT {
         script += &format!("{kind}) {left}; exit ;;\n");
     }
-    script + "esac\n" + LEAVE_LABEL
+    script + "esac\n" + WRITE_FIXED_LABEL
 }
 
 /// Two atoms, `number` hundredths of an Å further apart.
@@ -84,10 +84,10 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     let keys =
         format!("[label]\nslots = 0\nscratch = {:?}\nmethod = {command} # ", scratch.display().to_string());
     let small = Small { walkers: 1, steps: 60, ..Small::default() };
-    let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
+    let place = LabelCampaign::new(&small, &[("[label]\nmethod", &keys)]);
     fs::write(place.path().join("label.sh"), script(&home)).unwrap();
     let mut run = place.run();
-    let walkers = hold_walkers(place.path(), 1);
+    let walkers = pause_walkers(place.path(), 1);
     // What another user could have made before.
     let campaign = on_store(place.location(), async |store| store.campaign().await.unwrap().id);
     let trap = scratch.join(format!("calmwalk-{campaign}"));
@@ -98,7 +98,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     LEFT.iter().for_each(|(kind, ..)| fs::create_dir(home.join("kinds").join(kind)).unwrap());
     let mut label = place.label(&["--wait-timeout", "2m"]);
     wait_until("all have come and gone", || fs::read_dir(home.join("kinds")).unwrap().count() == 0);
-    go_on(&walkers);
+    resume_processes(&walkers);
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());
 
@@ -118,7 +118,7 @@ fn whatever_a_program_leaves_costs_one_attempt() {
     }
     // Nobody has had to be started again, nothing is left, and nothing was done where others can write.
     assert!(!place.said().contains("pausing"), "{}", place.said());
-    assert_eq!(calculating(&scratch), []);
+    assert_eq!(calculation_processes(&scratch), []);
     let left: Vec<_> = fs::read_dir(&scratch).unwrap().map(|entry| entry.unwrap().path()).collect();
     assert_eq!(left.as_slice(), std::slice::from_ref(&trap));
     assert_eq!(fs::read_dir(&trap).unwrap().count(), 0);
@@ -140,7 +140,7 @@ impl Once {
         let here = home.path();
         fs::create_dir(here.join("scratch")).unwrap();
         let script = script.replace("$HERE", &here.display().to_string());
-        fs::write(here.join("label.sh"), script + LEAVE_LABEL).unwrap();
+        fs::write(here.join("label.sh"), script + WRITE_FIXED_LABEL).unwrap();
         let config = format!(
             "[label]\nscratch = {:?}\n{keys}\nmethod = {{ command = {{ command = [\"sh\", \"label.sh\"], files = [\"label.sh\"], \
              version = \"1\" }} }}\n",
@@ -163,7 +163,7 @@ impl Once {
         fs::read_to_string(self.home.path().join(name)).unwrap()
     }
 
-    fn nothing_is_left(&self) {
+    fn assert_no_leftovers(&self) {
         assert_eq!(fs::read_dir(self.home.path().join("scratch")).unwrap().count(), 0);
     }
 }
@@ -185,7 +185,7 @@ fn a_scratch_directory_that_others_can_write_to_is_refused() {
     assert!(said.contains(&expected) && said.contains("name that as label.scratch"), "{said}");
     fs::set_permissions(&scratch, Permissions::from_mode(0o1777)).unwrap();
     label(once.command().output().unwrap());
-    once.nothing_is_left();
+    once.assert_no_leftovers();
 }
 
 #[test]
@@ -219,7 +219,7 @@ fn programs_get_the_environment_that_they_need_and_no_password() {
         }
     }
     assert!(once.read("program").contains("CALMWALK_CORES=1\n"));
-    once.nothing_is_left();
+    once.assert_no_leftovers();
 }
 
 #[test]
@@ -229,12 +229,12 @@ fn walkers_have_no_password() {
     let mut command = program(directory.path());
     command.args(["run", "campaign.toml", "--directory", "."]).env("PGPASSWORD", "hunter2").env("KEPT", "1");
     let mut run = common::Running(command.stderr(std::process::Stdio::null()).spawn().unwrap());
-    let walkers = hold_walkers(directory.path(), 1);
+    let walkers = pause_walkers(directory.path(), 1);
     let environment = fs::read(format!("/proc/{}/environ", walkers[0])).unwrap();
     let environment = String::from_utf8_lossy(&environment).replace('\0', "\n");
     assert!(environment.contains("KEPT=1\n") && !environment.contains("hunter2"), "{environment}");
     run.0.kill().unwrap();
-    go_on(&walkers);
+    resume_processes(&walkers);
 }
 
 /// A daemon has a session of its own, no parent, and here not even an environment.
@@ -253,7 +253,7 @@ fn daemons_end_with_the_calculation() {
     assert!(stderr(&output).contains("time limit"), "{}", stderr(&output));
     let daemon = once.read("daemon");
     assert!(!Path::new("/proc").join(daemon.trim()).exists(), "{daemon} is left");
-    once.nothing_is_left();
+    once.assert_no_leftovers();
 }
 
 /// What loses its parent becomes a child of the calculation's keeper, which has to take note of its end.

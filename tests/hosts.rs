@@ -6,9 +6,9 @@ use std::fs;
 use std::time::Duration;
 
 use crate::common::campaign::{Small, outcome};
-use crate::common::hosts::{Hosts, undisturbed};
-use crate::common::line::SlowLine;
-use crate::common::processes::{carrying_out, go_on, hold_walkers, signal, wait_until};
+use crate::common::delay_proxy::DelayProxy;
+use crate::common::hosts::{Hosts, uninterrupted_outcome};
+use crate::common::processes::{pause_walkers, processes_running, resume_processes, signal, wait_until};
 use crate::common::{Running, kills, random};
 
 /// A silent agent is soon taken for dead.
@@ -23,49 +23,49 @@ fn a_campaign_on_three_hosts_comes_to_the_same() {
     // An agent may be there before its orchestrator.
     let mut first = hosts.agent(0);
     wait_until("the agent waits", || hosts.said(0).contains("waiting for the orchestrator"));
-    let mut orchestrator = hosts.lead();
+    let mut orchestrator = hosts.start_orchestrator();
     // One that comes late to a campaign that is over would wait for the next run of it.
-    let held = hold_walkers(hosts.home.path(), 1);
+    let held = pause_walkers(hosts.home.path(), 1);
     let mut second = hosts.agent(1);
     for host in 0..2 {
         wait_until("it has joined", || hosts.said(host).contains("joined: 1 walker,"));
     }
-    go_on(&held);
+    resume_processes(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
     assert_eq!((first.0.wait().unwrap().code(), second.0.wait().unwrap().code()), (Some(0), Some(0)));
     for host in 0..2 {
         assert!(hosts.said(host).contains("joined: 1 walker, mixture version "), "{}", hosts.said(host));
     }
-    assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
-    hosts.are_empty();
+    assert_eq!(outcome(hosts.home.path()), uninterrupted_outcome(&small));
+    hosts.assert_cleaned_up();
 }
 
 #[test]
 fn agents_leave_in_order_and_a_campaign_stops_in_order() {
     let small = Small::default();
     let hosts = Hosts::new(&small, 2, "");
-    let mut orchestrator = hosts.lead();
-    let held = hold_walkers(hosts.home.path(), 1);
+    let mut orchestrator = hosts.start_orchestrator();
+    let held = pause_walkers(hosts.home.path(), 1);
     let mut agents = [hosts.agent(0), hosts.agent(1)];
-    let at_work = |host: usize| !carrying_out(hosts.others[host].path(), "walker").is_empty();
+    let at_work = |host: usize| !processes_running(hosts.others[host].path(), "walker").is_empty();
     wait_until("walkers are at work", || at_work(0) && at_work(1));
     signal(agents[0].0.id(), "TERM");
     assert_eq!(agents[0].0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
     signal(orchestrator.0.id(), "TERM");
-    go_on(&held);
+    resume_processes(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(130));
     assert_eq!(agents[1].0.wait().unwrap().code(), Some(130), "{}", hosts.said(1));
-    hosts.are_empty();
-    let mut orchestrator = hosts.lead();
-    let held = hold_walkers(hosts.home.path(), 1);
+    hosts.assert_cleaned_up();
+    let mut orchestrator = hosts.start_orchestrator();
+    let held = pause_walkers(hosts.home.path(), 1);
     let joined = hosts.said(0).matches("joined: 1 walker,").count();
     let mut agent = hosts.agent(0);
     wait_until("it has joined", || hosts.said(0).matches("joined: 1 walker,").count() > joined);
-    go_on(&held);
+    resume_processes(&held);
     assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0));
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
-    assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
-    hosts.are_empty();
+    assert_eq!(outcome(hosts.home.path()), uninterrupted_outcome(&small));
+    hosts.assert_cleaned_up();
 }
 
 /// 200 ms each way, so an agent with a turn ahead works through it as ever.
@@ -73,22 +73,26 @@ fn agents_leave_in_order_and_a_campaign_stops_in_order() {
 fn a_slow_line_changes_nothing() {
     let small = Small { walks_per_round: 3, seeds: &["fcc-100", "vacancy", "fcc-097"], ..Small::default() };
     let mut hosts = Hosts::new(&small, 1, "agent_silence_limit = 30.0");
-    let line = SlowLine::to(hosts.endpoints[0].trim_start_matches("tcp/"), Duration::from_millis(200));
-    hosts.endpoints[1] = format!("tcp/{}", line.here);
+    let proxy = DelayProxy::to(hosts.endpoints[0].trim_start_matches("tcp/"), Duration::from_millis(200));
+    hosts.endpoints[1] = format!("tcp/{}", proxy.address);
     hosts.options[1] = vec!["--prefetch=1".into()];
     let mut agent = hosts.agent(0);
-    let mut orchestrator = hosts.lead();
+    let mut orchestrator = hosts.start_orchestrator();
     // On an idle machine the orchestrator's own walker would be through before the agent has joined.
-    let held = hold_walkers(hosts.home.path(), 1);
+    let held = pause_walkers(hosts.home.path(), 1);
     wait_until("the agent has joined", || hosts.said(0).contains("joined: 1 walker,"));
-    go_on(&held);
-    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
+    resume_processes(&held);
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.orchestrator_stderr());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
-    assert!(!hosts.head_said().contains("gives no sign of life"), "{}", hosts.head_said());
+    assert!(!hosts.orchestrator_stderr().contains("sends no heartbeat"), "{}", hosts.orchestrator_stderr());
     assert!(hosts.said(0).contains("joined: 1 walker,"), "{}", hosts.said(0));
-    assert!(line.carried() > 1_000_000, "candidates came over the line: {} bytes", line.carried());
-    assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
-    hosts.are_empty();
+    assert!(
+        proxy.bytes_forwarded() > 1_000_000,
+        "candidates came over the line: {} bytes",
+        proxy.bytes_forwarded()
+    );
+    assert_eq!(outcome(hosts.home.path()), uninterrupted_outcome(&small));
+    hosts.assert_cleaned_up();
 }
 
 #[test]
@@ -111,7 +115,7 @@ fn what_a_killed_agent_leaves_is_removed_by_the_next() {
         signal(agent.0.id(), "TERM");
     }
     assert_eq!(second.0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
-    hosts.are_empty();
+    hosts.assert_cleaned_up();
 }
 
 /// Kills a process, which is seen to be dead then.
@@ -124,19 +128,19 @@ fn kill(running: &mut Running) {
 #[test]
 fn kills_on_every_host_change_nothing() {
     let small = Small::default();
-    let expected = undisturbed(&small);
+    let expected = uninterrupted_outcome(&small);
     let (mut done, mut campaigns) = (0, 0);
     while done < kills() {
         campaigns += 1;
         let hosts = hosts(&small, 2);
-        let mut orchestrator = hosts.lead();
+        let mut orchestrator = hosts.start_orchestrator();
         let mut agents = [hosts.agent(0), hosts.agent(1)];
         let ended = loop {
             // Another instant in each campaign: one that is over before it must not be tried again for ever.
             std::thread::sleep(Duration::from_millis(random(done + 10_000 * campaigns) % 1500));
             match orchestrator.0.try_wait().unwrap() {
                 Some(ended) if ended.code().is_some() => break ended,
-                Some(_) => orchestrator = hosts.lead(),
+                Some(_) => orchestrator = hosts.start_orchestrator(),
                 None => {}
             }
             for (host, agent) in agents.iter_mut().enumerate() {
@@ -156,7 +160,7 @@ fn kills_on_every_host_change_nothing() {
                 0 => kill(&mut orchestrator),
                 1 | 2 => kill(&mut agents[host]),
                 _ => {
-                    let walkers = carrying_out(hosts.others[host].path(), "walker");
+                    let walkers = processes_running(hosts.others[host].path(), "walker");
                     walkers.into_iter().for_each(|pid| signal(pid, "KILL"));
                 }
             }

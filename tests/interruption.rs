@@ -9,9 +9,10 @@ use std::time::{Duration, Instant};
 
 use crate::common;
 use crate::common::campaign::{Counters, Outcome, Small, outcome};
-use crate::common::place::LEAVE_LABEL;
+use crate::common::label_campaign::WRITE_FIXED_LABEL;
 use crate::common::processes::{
-    calculating, carrying_out, go_on, hold_walkers, nothing_is_left, processes_in, signal, wait_until,
+    assert_no_leftovers, calculation_processes, pause_walkers, processes_in, processes_running,
+    resume_processes, signal, wait_until,
 };
 use crate::common::{Running, kills, program, random};
 
@@ -32,14 +33,14 @@ fn plain(small: &Small, directory: &Path) {
 fn with_program(small: &Small, directory: &Path) {
     let scratch = directory.canonicalize().unwrap().join("scratch").display().to_string();
     std::fs::create_dir_all(&scratch).unwrap();
-    std::fs::write(directory.join("label.sh"), format!("sleep 0.05\n{LEAVE_LABEL}")).unwrap();
+    std::fs::write(directory.join("label.sh"), format!("sleep 0.05\n{WRITE_FIXED_LABEL}")).unwrap();
     let command = r#"{ command = { command = ["sh", "label.sh"], files = ["label.sh"], version = "1" } }"#;
     let keys = format!("[label]\nattempts = 20\nscratch = {scratch:?}\nmethod = {command} # ");
     std::fs::write(small.write(directory), small.text().replace("[label]\nmethod", &keys)).unwrap();
 }
 
 /// Runs to the end without any disturbance, all in one process.
-fn undisturbed(small: &Small, write: Write) -> (Outcome, Duration) {
+fn uninterrupted_outcome(small: &Small, write: Write) -> (Outcome, Duration) {
     let directory = tempfile::tempdir().unwrap();
     write(small, directory.path());
     let begun = Instant::now();
@@ -57,13 +58,13 @@ fn kill(directory: &Path, running: &Running, choice: u64, programs_too: bool) ->
     let kind = choice % 6;
     let mut victims = match kind {
         0 => vec![running.0.id()],
-        1 => carrying_out(directory, "walker"),
-        2 => carrying_out(directory, "labeller"),
+        1 => processes_running(directory, "walker"),
+        2 => processes_running(directory, "labeller"),
         ALL => processes_in(directory).iter().map(|process| process.pid).collect(),
-        4 => carrying_out(directory, "calculation-runner"),
+        4 => processes_running(directory, "calculation-runner"),
         _ if programs_too => {
             let scratch = directory.canonicalize().unwrap().join("scratch");
-            calculating(&scratch)
+            calculation_processes(&scratch)
                 .into_iter()
                 .filter(|(_, line)| line.starts_with("sh "))
                 .map(|(pid, _)| pid)
@@ -83,7 +84,7 @@ fn kill(directory: &Path, running: &Running, choice: u64, programs_too: bool) ->
 
 /// A few kills in each campaign, at any instant from the very start on, with one walker or two.
 fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) {
-    let (expected, takes) = undisturbed(&Small { walkers: 1, ..small.clone() }, write);
+    let (expected, takes) = uninterrupted_outcome(&Small { walkers: 1, ..small.clone() }, write);
     assert!(expected.decisions.matches("\"kind\":\"accepted\"").count() >= 4, "{}", expected.decisions);
     assert!(expected.decisions.contains("\"kind\":\"control\""));
     let (mut done, mut campaigns) = (0, 0);
@@ -113,7 +114,7 @@ fn disturbed(small: &Small, write: Write, options: &[&str], kills: u64) {
             finished = ended.code() == Some(0);
         }
         assert_eq!(outcome(directory.path()), expected, "after {done} kills in {campaigns} campaigns");
-        nothing_is_left(directory.path());
+        assert_no_leftovers(directory.path());
     }
 }
 
@@ -135,27 +136,27 @@ fn kills_of_a_campaign_whose_labels_a_program_makes_change_nothing() {
 #[test]
 fn ctrl_c_and_sigterm_stop_in_order_and_lose_nothing() {
     let small = Small::default();
-    let (expected, _) = undisturbed(&small, plain);
+    let (expected, _) = uninterrupted_outcome(&small, plain);
     for name in ["INT", "TERM"] {
         let directory = tempfile::tempdir().unwrap();
         small.write(directory.path());
         let mut running = start(directory.path(), &[]);
         wait_until("structures are found", || Counters::of(".", directory.path()).sent > 0);
         // It must not be over before it is told.
-        let held = hold_walkers(directory.path(), 2);
+        let held = pause_walkers(directory.path(), 2);
         signal(running.0.id(), name);
-        go_on(&held);
+        resume_processes(&held);
         assert_eq!(running.0.wait().unwrap().code(), Some(130), "{name}");
         assert_eq!(start(directory.path(), &[]).0.wait().unwrap().code(), Some(0));
         assert_eq!(outcome(directory.path()), expected, "{name}");
-        nothing_is_left(directory.path());
+        assert_no_leftovers(directory.path());
     }
 }
 
 #[test]
 fn live_mode_loses_and_doubles_nothing() {
     let small = Small { mode: "live", ..Small::default() };
-    let (_, takes) = undisturbed(&small, plain);
+    let (_, takes) = uninterrupted_outcome(&small, plain);
     let directory = tempfile::tempdir().unwrap();
     small.write(directory.path());
     for kill in 0..5 {
@@ -166,7 +167,7 @@ fn live_mode_loses_and_doubles_nothing() {
     }
     assert_eq!(start(directory.path(), &[]).0.wait().unwrap().code(), Some(0));
     outcome(directory.path());
-    nothing_is_left(directory.path());
+    assert_no_leftovers(directory.path());
 }
 
 /// All walks are over, but a label is still being made elsewhere: whoever stops then must not be told that all is done.

@@ -7,8 +7,10 @@ use std::time::{Duration, Instant};
 use store::{JobState, Standing};
 
 use crate::common::campaign::{Outcome, Small, outcome, outcome_at};
-use crate::common::place::Place;
-use crate::common::processes::{carrying_out, go_on, nothing_is_left, processes_in, signal, wait_until};
+use crate::common::label_campaign::LabelCampaign;
+use crate::common::processes::{
+    assert_no_leftovers, processes_in, processes_running, resume_processes, signal, wait_until,
+};
 use crate::common::{Running, calmwalk, config, program, refuse, succeed};
 
 /// `run` starts no labellers of its own.
@@ -27,8 +29,8 @@ fn expected(small: &Small) -> Outcome {
 }
 
 /// A campaign that is over, and in whose queue is one structure that takes its time. Returns its name as well.
-fn with_large_structure(changes: &[(&str, &str)]) -> (Place, String) {
-    let place = Place::new(&Small { steps: 60, ..Small::default() }, changes);
+fn with_large_structure(changes: &[(&str, &str)]) -> (LabelCampaign, String) {
+    let place = LabelCampaign::new(&Small { steps: 60, ..Small::default() }, changes);
     assert_eq!(ended(&mut place.run()), Some(0), "{}", place.said());
     let name = place.queue_large();
     (place, name)
@@ -37,7 +39,7 @@ fn with_large_structure(changes: &[(&str, &str)]) -> (Place, String) {
 #[test]
 fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     let small = Small::default();
-    let place = Place::new(&small, &[NO_SLOTS]);
+    let place = LabelCampaign::new(&small, &[NO_SLOTS]);
     // It may be there before the campaign.
     let mut label = place.label(&["--concurrency", "2", "--method", "reference", "--wait-timeout", "2m"]);
     wait_until("it waits", || place.said().contains("waiting for the campaign: there is no campaign in"));
@@ -57,13 +59,13 @@ fn a_campaign_without_labellers_of_its_own_is_labelled_by_others() {
     assert!(labels > 0 && said.matches(": labelled ").count() == labels, "{labels} in {said}");
     assert_eq!(outcome_at(place.argument(), place.path()), expected(&small));
     assert_eq!(place.status()["processes"], serde_json::json!([]));
-    nothing_is_left(place.path());
+    assert_no_leftovers(place.path());
 }
 
 #[test]
 fn everything_in_one_process_waits_for_labels_of_others() {
     let small = Small { steps: 60, ..Small::default() };
-    let place = Place::new(&small, &[NO_SLOTS]);
+    let place = LabelCampaign::new(&small, &[NO_SLOTS]);
     let mut run = place.start(&["run", "campaign.toml", "--directory", ".", "--in-process"]);
     wait_until("walks are over", || {
         let status = place.status();
@@ -82,7 +84,7 @@ fn what_it_is_killed_over_is_labelled_by_the_next() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--until-empty"]);
     // Its slot is held so that the label is not made before it is killed.
-    place.hold_in_mid_label();
+    place.pause_labeller();
     label.0.kill().unwrap();
     label.0.wait().unwrap();
     wait_until("its slot ends with it", || processes_in(place.path()).is_empty());
@@ -99,14 +101,14 @@ fn a_slot_that_is_killed_is_replaced_and_the_others_go_on() {
     let (place, name) = with_large_structure(&[]);
     let mut label = place.label(&["--concurrency", "2", "--until-empty"]);
     place.wait_for_lease();
-    let slots = carrying_out(place.path(), "labeller");
+    let slots = processes_running(place.path(), "labeller");
     // The label is not made before its slot is found.
     slots.iter().for_each(|slot| place.hold(*slot));
     let holder = place.job(&name).job.holder.unwrap();
     let pid: u32 = holder.rsplit('-').nth(1).unwrap().parse().unwrap();
     assert!(slots.len() == 2 && slots.contains(&pid), "{slots:?} {holder}");
     signal(pid, "KILL");
-    go_on(&slots);
+    resume_processes(&slots);
     assert_eq!(ended(&mut label), Some(0), "{}", place.said());
     assert!(place.said().contains("killed by signal 9 (SIGKILL); pausing"), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Labelled);
@@ -135,7 +137,7 @@ fn a_stop_finishes_the_label_in_hand_or_gives_it_back() {
 #[test]
 fn wrong_files_methods_and_stores_are_refused() {
     let label = config("data/Al_mm.eam.fs");
-    let place = Place::new(
+    let place = LabelCampaign::new(
         &Small { steps: 60, ..Small::default() },
         &[(&label.display().to_string(), "label.eam.fs"), NO_SLOTS],
     );
@@ -184,7 +186,7 @@ fn wrong_files_methods_and_stores_are_refused() {
 
 /// The program on another host, as far as one can show it: with process numbers of its own, and another boot.
 /// `None` where this is not permitted.
-fn elsewhere(place: &Place) -> Option<Command> {
+fn elsewhere(place: &LabelCampaign) -> Option<Command> {
     let boot = place.path().join("boot_id");
     fs::write(&boot, "11111111-2222-3333-4444-555555555555\n").unwrap();
     let flags = ["--user", "--map-root-user", "--pid", "--fork", "--kill-child", "--mount-proc"];
@@ -212,7 +214,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     let Some(command) = elsewhere(&place) else { return };
     let arguments = ["label", "--until-empty", "--store", place.argument()];
     let mut late = place.spawn(command, &arguments);
-    let slot = place.hold_in_mid_label();
+    let slot = place.pause_labeller();
     let begun = Instant::now();
     let first = place.job(&name).job;
     assert_eq!(
@@ -242,7 +244,7 @@ fn a_labeller_elsewhere_keeps_its_job_when_a_run_starts() {
     let Some(command) = elsewhere(&place) else { return };
     let arguments = ["label", "--until-empty", "--store", place.argument()];
     let mut label = place.spawn(command, &arguments);
-    let slot = place.hold_in_mid_label();
+    let slot = place.pause_labeller();
     let mut run = place.run();
     wait_until("it runs", || {
         let output = calmwalk(place.path(), ["status", place.argument()]);

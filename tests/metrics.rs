@@ -9,7 +9,7 @@ use serde_json::Value;
 use crate::common::campaign::Small;
 use crate::common::hosts::Hosts;
 use crate::common::http::{Answer, get, request, said};
-use crate::common::processes::{one_carrying_out, signal, wait_until};
+use crate::common::processes::{signal, wait_for_process, wait_until};
 use crate::common::{Running, program, refuse, succeed};
 
 /// A metric: its type, and its samples by labels as they are written.
@@ -132,7 +132,7 @@ fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
     assert_eq!(value("calmwalk_agent_turns_taken_total", ""), Some(0.0));
     assert_eq!(value("calmwalk_agent_link_silence_seconds", ""), None, "nobody was ever heard");
 
-    let mut orchestrator = hosts.lead();
+    let mut orchestrator = hosts.start_orchestrator();
     let is_above = |name: &str, labels: &str| value(name, labels) > Some(0.0);
     wait_until("it delivers candidates", || is_above("calmwalk_agent_turns_total", "outcome=\"candidate\""));
     wait_until("a question was answered", || is_above("calmwalk_agent_link_round_trip_seconds", ""));
@@ -153,7 +153,7 @@ fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
     let steps = number("calmwalk_agent_steps_total");
     assert!(steps > 0.0 && steps <= 40.0 * taken, "{metrics:?}");
 
-    let walker = one_carrying_out(hosts.others[0].path(), "walker");
+    let walker = wait_for_process(hosts.others[0].path(), "walker");
     signal(walker, "KILL");
     wait_until("it is replaced", || {
         value("calmwalk_agent_walker_restarts_total", "") == Some(1.0)
@@ -167,8 +167,8 @@ fn an_agent_is_scraped_before_it_has_joined_and_through_losses() {
     signal(agent.0.id(), "TERM");
     assert_eq!(agent.0.wait().unwrap().code(), Some(130), "{}", hosts.said(0));
     signal(orchestrator.0.id(), "TERM");
-    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(130), "{}", hosts.head_said());
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(130), "{}", hosts.orchestrator_stderr());
     let open = refuse(hosts.home.path(), ["agent", "--join", "tcp/127.0.0.1:1", "--metrics", "0.0.0.0:0"]);
     assert!(open.contains("ssh -L"), "{open}");
-    hosts.are_empty();
+    hosts.assert_cleaned_up();
 }

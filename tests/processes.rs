@@ -10,8 +10,8 @@ use store::Store;
 use crate::common;
 use crate::common::campaign::{Outcome, Small, outcome};
 use crate::common::processes::{
-    carrying_out, go_on, hold, hold_walkers, nothing_is_left, one_carrying_out, processes_in, signal,
-    wait_until,
+    assert_no_leftovers, hold, pause_walkers, processes_in, processes_running, resume_processes, signal,
+    wait_for_process, wait_until,
 };
 use crate::common::{Running, calmwalk, config, program, refuse, succeed};
 
@@ -55,7 +55,7 @@ fn with_keys(path: &Path, keys: &str) {
 fn ends_as_undisturbed(mut running: Running, directory: &Path, small: &Small) {
     assert_eq!(wait(&mut running), Some(0), "{}", said(directory));
     assert_eq!(outcome(directory), expected(small));
-    nothing_is_left(directory);
+    assert_no_leftovers(directory);
 }
 
 /// Runs a long campaign to its end. What `disturb` does to it when its walkers are at work must change nothing.
@@ -106,14 +106,14 @@ fn wait_for_work(directory: &Path) {
         let status = serde_json::from_slice::<Value>(&output.stdout).unwrap_or_default();
         status["mixture_version"].as_u64().is_some_and(|version| version > 0)
     });
-    wait_until("both are there", || carrying_out(directory, "walker").len() == 2);
+    wait_until("both are there", || processes_running(directory, "walker").len() == 2);
 }
 
 #[test]
 fn a_hung_walker_is_killed_and_replaced() {
     let mut hung = 0;
     let directory = disturbed("silence_limit = 10.0", |here| {
-        hung = one_carrying_out(here, "walker");
+        hung = wait_for_process(here, "walker");
         signal(hung, "STOP");
     });
     assert!(!processes_in(directory.path()).iter().any(|process| process.pid == hung));
@@ -125,7 +125,7 @@ fn a_hung_walker_is_killed_and_replaced() {
 
 #[test]
 fn a_walker_that_is_told_to_end_leaves_its_walk_to_another() {
-    let directory = disturbed("", |here| signal(one_carrying_out(here, "walker"), "TERM"));
+    let directory = disturbed("", |here| signal(wait_for_process(here, "walker"), "TERM"));
     let endings = endings(directory.path());
     assert!(endings.iter().any(|ending| ending.contains("exit code 130")), "{endings:?}");
 }
@@ -133,13 +133,13 @@ fn a_walker_that_is_told_to_end_leaves_its_walk_to_another() {
 #[test]
 fn a_labeller_that_is_told_to_end_is_replaced() {
     disturbed("", |here| {
-        let held = hold_walkers(here, 2);
-        let labeller = one_carrying_out(here, "labeller");
+        let held = pause_walkers(here, 2);
+        let labeller = wait_for_process(here, "labeller");
         signal(labeller, "TERM");
         wait_until("another is there", || {
-            carrying_out(here, "labeller").first().is_some_and(|other| *other != labeller)
+            processes_running(here, "labeller").first().is_some_and(|other| *other != labeller)
         });
-        go_on(&held);
+        resume_processes(&held);
     });
 }
 
@@ -153,7 +153,7 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
     let running = start(here);
     wait_for_work(here);
     // The other does not end the campaign before this one was given up.
-    let held = hold_walkers(here, 2);
+    let held = pause_walkers(here, 2);
     let model = fs::read(here.join("model.npz")).unwrap();
     fs::write(here.join("model.npz"), b"spoiled").unwrap();
     signal(held[0], "KILL");
@@ -165,7 +165,7 @@ fn a_walker_that_cannot_start_is_given_up_and_the_others_go_on() {
     let table = succeed(here, ["status", "."]);
     assert!(table.contains("given up") && table.contains("another content"), "{table}");
     fs::write(here.join("model.npz"), model).unwrap();
-    go_on(&held);
+    resume_processes(&held);
     ends_as_undisturbed(running, here, &small);
 }
 
@@ -186,14 +186,14 @@ fn a_run_may_have_more_descriptors_than_its_walkers() {
     let mut command = Command::new("sh");
     command.args(["-c", &script]).current_dir(here).stdout(Stdio::null()).stderr(Stdio::null());
     let mut running = Running(command.spawn().unwrap());
-    let held = hold_walkers(here, 2);
+    let held = pause_walkers(here, 2);
     assert_eq!(descriptors(running.0.id()), ["600", "600"]);
-    for child in held.iter().chain(&carrying_out(here, "labeller")) {
+    for child in held.iter().chain(&processes_running(here, "labeller")) {
         assert_eq!(descriptors(*child), ["300", "600"]);
     }
-    go_on(&held);
+    resume_processes(&held);
     assert_eq!(wait(&mut running), Some(0));
-    nothing_is_left(here);
+    assert_no_leftovers(here);
 }
 
 #[test]
@@ -205,14 +205,14 @@ fn without_any_walker_the_campaign_fails_and_can_go_on() {
     with_keys(&here.join("campaign.toml"), "restarts = 1");
     let mut running = start(here);
     wait_for_work(here);
-    let held = hold_walkers(here, 2);
+    let held = pause_walkers(here, 2);
     let model = fs::read(here.join("model.npz")).unwrap();
     fs::write(here.join("model.npz"), b"spoiled").unwrap();
     held.into_iter().for_each(|walker| signal(walker, "KILL"));
     assert_eq!(wait(&mut running), Some(1), "{}", said(here));
     let message = said(here);
     assert!(message.contains("no walker is left") && message.contains("another content"), "{message}");
-    nothing_is_left(here);
+    assert_no_leftovers(here);
     fs::write(here.join("model.npz"), model).unwrap();
     ends_as_undisturbed(start(here), here, &small);
 }
@@ -225,20 +225,20 @@ fn walkers_end_with_their_orchestrator_and_labellers_are_adopted() {
     small.write(here);
     let mut running = start(here);
     wait_for_work(here);
-    let labellers = carrying_out(here, "labeller");
+    let labellers = processes_running(here, "labeller");
     assert_eq!(labellers.len(), 1);
     // So that it does not just look whether anybody needs it.
     hold(labellers[0], here.to_str().unwrap());
     running.0.kill().unwrap();
     running.0.wait().unwrap();
-    wait_until("walkers are gone", || carrying_out(here, "walker").is_empty());
+    wait_until("walkers are gone", || processes_running(here, "walker").is_empty());
     let running = start(here);
-    wait_until("there are walkers again", || carrying_out(here, "walker").len() == 2);
+    wait_until("there are walkers again", || processes_running(here, "walker").len() == 2);
     // While a labeller is held, the campaign does not end either.
     let second = refuse(here, RUN);
     assert!(second.contains(&format!("process {}", running.0.id())), "{second}");
     signal(labellers[0], "CONT");
-    assert_eq!(carrying_out(here, "labeller"), labellers);
+    assert_eq!(processes_running(here, "labeller"), labellers);
     ends_as_undisturbed(running, here, &small);
 }
 
@@ -257,7 +257,7 @@ fn a_labeller_finishes_the_queue_without_an_orchestrator_and_leaves() {
     assert_eq!((&labels["queued"], &labels["leased"]), (&0.into(), &0.into()), "{labels}");
     assert!(labels["labelled"].as_u64().unwrap() > 0);
     succeed(here, ["clean"]);
-    nothing_is_left(here);
+    assert_no_leftovers(here);
 }
 
 #[test]
@@ -277,7 +277,7 @@ fn two_campaigns_on_one_host_do_not_see_each_other() {
     let expected = expected(&small);
     for directory in &directories {
         assert_eq!(outcome(directory.path()), expected);
-        nothing_is_left(directory.path());
+        assert_no_leftovers(directory.path());
     }
 }
 
@@ -297,7 +297,7 @@ fn clean_removes_what_killed_processes_left_and_nothing_else() {
     assert!(place.directory().exists());
     let said = succeed(here, ["clean", "."]);
     assert!(said.contains("files from shared memory") && !said.contains(" 0 files"), "{said}");
-    nothing_is_left(here);
+    assert_no_leftovers(here);
 }
 
 /// The program with a shared memory of its own, of `megabytes` with `filled` of them taken.
@@ -344,7 +344,7 @@ fn shared_memory_is_the_users_alone() {
     long().write(here);
     let mut running = start(here);
     wait_for_work(here);
-    let held = hold_walkers(here, 2);
+    let held = pause_walkers(here, 2);
     let place = wire::place::Place::of(here).unwrap();
     assert_eq!(fs::metadata(place.directory()).unwrap().mode() & 0o777, 0o700);
     let mut segments = 0;
@@ -358,7 +358,7 @@ fn shared_memory_is_the_users_alone() {
     }
     assert!(segments > 0);
     signal(running.0.id(), "TERM");
-    go_on(&held);
+    resume_processes(&held);
     assert_eq!(wait(&mut running), Some(130));
-    nothing_is_left(here);
+    assert_no_leftovers(here);
 }

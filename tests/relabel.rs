@@ -8,13 +8,13 @@ use serde_json::Value;
 use store::{CampaignLock, JobState};
 
 use crate::common::campaign::Small;
-use crate::common::place::Place;
+use crate::common::label_campaign::LabelCampaign;
 use crate::common::processes::signal;
 use crate::common::{calmwalk, config, random, refuse, stderr, succeed};
 
 /// A campaign that is over, and how many labels it has.
-fn labelled() -> (Place, u64) {
-    let place = Place::new(&Small { steps: 120, ..Small::default() }, &[]);
+fn labelled() -> (LabelCampaign, u64) {
+    let place = LabelCampaign::new(&Small { steps: 120, ..Small::default() }, &[]);
     assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
     let labels = place.jobs("labelled");
     assert!(labels > 2, "{labels}");
@@ -22,7 +22,7 @@ fn labelled() -> (Place, u64) {
 }
 
 /// Writes `fine.toml`: the same campaign with another label potential, by a protocol of this name.
-fn another_protocol(place: &Place, name: &str) {
+fn another_protocol(place: &LabelCampaign, name: &str) {
     let potential = config("data/Al_mm.eam.fs");
     let text = fs::read_to_string(place.path().join("campaign.toml")).unwrap();
     let text = text.replace(&potential.display().to_string(), "fine.eam.fs");
@@ -32,17 +32,17 @@ fn another_protocol(place: &Place, name: &str) {
     fs::write(place.path().join("fine.eam.fs"), potential).unwrap();
 }
 
-fn relabel(place: &Place, arguments: &[&str]) -> String {
+fn relabel(place: &LabelCampaign, arguments: &[&str]) -> String {
     succeed(place.path(), [&["relabel", place.argument()], arguments].concat())
 }
 
-fn run(place: &Place, configuration: &str) {
+fn run(place: &LabelCampaign, configuration: &str) {
     let mut run = place.start(&["run", configuration, "--directory", "."]);
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", place.said());
 }
 
 /// Names of the protocols in an export, one a structure, and names of their candidates.
-fn exported(place: &Place) -> Vec<(String, String)> {
+fn exported(place: &LabelCampaign) -> Vec<(String, String)> {
     let text = String::from_utf8(place.export()).unwrap();
     let value = |line: &str, key: &str| {
         let (_, rest) = line.split_once(&format!(" {key}=")).unwrap();
@@ -52,7 +52,7 @@ fn exported(place: &Place) -> Vec<(String, String)> {
     comments.map(|line| (value(line, "protocol"), value(line, "candidate_id"))).collect()
 }
 
-fn check(place: &Place) {
+fn check(place: &LabelCampaign) {
     let found = succeed(place.path(), ["store", "check", place.argument()]);
     assert!(found.starts_with("nothing found"), "{found}");
 }
@@ -76,7 +76,7 @@ fn a_campaign_goes_over_to_another_protocol_label_by_label() {
         format!(
             "{labels} structures would be queued again for protocol 'fine', to replace {labels} labels of 'reference'"
         ),
-        format!("if they take as long as {labels} labels by 'reference' did"),
+        format!("estimated from {labels} labels by 'reference'"),
         "nothing was changed".to_owned(),
     ] {
         assert!(planned.contains(&words), "{words} in {planned}");
@@ -203,7 +203,7 @@ fn labellers_go_on_with_the_new_protocol() {
     another_protocol(&place, "fine");
     let name = place.queue_large();
     let mut label = place.label(&[]);
-    let slot = place.hold_in_mid_label();
+    let slot = place.pause_labeller();
     relabel(&place, &["--config", "fine.toml", "--all"]);
     signal(slot, "CONT");
     assert_eq!(label.0.wait().unwrap().code(), Some(0), "{}", place.said());

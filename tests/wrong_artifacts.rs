@@ -1,8 +1,8 @@
 //! Artifacts that load and mean nothing: refused where a campaign would otherwise collect nothing, or everything.
 
 use crate::common;
-use crate::common::arrays::changed as with_arrays;
-use crate::common::desk::{Desk, changed, line};
+use crate::common::config_tester::{ConfigTester, changed, line};
+use crate::common::npz::with_changed_arrays as with_arrays;
 use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
 const ARTIFACT: &str = "data/al_eam_1l/gmm_artifacts.npz";
@@ -38,7 +38,7 @@ fn of_silicon(array: &str) -> Vec<u8> {
 
 #[test]
 fn artifacts_that_are_nonsense_are_refused() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     let at = format!("c.toml:{}: calm.artifact: bad.npz: component 0 of Al: ", line(&path(ARTIFACT)));
     let inverse = "its inverse covariance";
     for (array, factor, words) in [
@@ -56,14 +56,14 @@ fn artifacts_that_are_nonsense_are_refused() {
         ("effective_count_0", 0.0, "5400 environments of weight 0 in sum"),
         ("effective_count_0", 1e-3, "does not belong to its scatter and count"),
     ] {
-        desk.write("bad.npz", scaled(array, factor));
-        desk.refused_with(&path(ARTIFACT), "bad.npz", &[&at, words]);
+        tester.write("bad.npz", scaled(array, factor));
+        tester.refused_with(&path(ARTIFACT), "bad.npz", &[&at, words]);
     }
     for array in ["scatter_0", "inv_cov_0"] {
-        desk.write("bad.npz", of_silicon(array));
-        desk.refused_with(&path(ARTIFACT), "bad.npz", &[&at, inverse, "does not belong"]);
+        tester.write("bad.npz", of_silicon(array));
+        tester.refused_with(&path(ARTIFACT), "bad.npz", &[&at, inverse, "does not belong"]);
     }
-    desk.write(
+    tester.write(
         "bad.npz",
         with_arrays(&config(ARTIFACT), |name, numbers| {
             if name == "inv_cov_0" {
@@ -71,47 +71,47 @@ fn artifacts_that_are_nonsense_are_refused() {
             }
         }),
     );
-    desk.refused_with(&path(ARTIFACT), "bad.npz", &["array 'inv_cov_0'", "expected symmetric matrices"]);
+    tester.refused_with(&path(ARTIFACT), "bad.npz", &["array 'inv_cov_0'", "expected symmetric matrices"]);
 }
 
 /// What no single component shows: numbers that belong together, but to other data.
 #[test]
 fn the_grades_of_the_training_frames_tell() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     let frames = path("data/al_eam_1l/seed_frames.extxyz");
     let at = format!("c.toml:{}: calm.training_frames: {frames}: ", line(&frames));
     // Another centroid, with the true covariance.
-    desk.write("bad.npz", scaled("centroids_0", 0.5));
-    desk.refused_with(&path(ARTIFACT), "bad.npz", &[&at, "the median of γ is ", "expected 0.001 to 1"]);
+    tester.write("bad.npz", scaled("centroids_0", 0.5));
+    tester.refused_with(&path(ARTIFACT), "bad.npz", &[&at, "the median of γ is ", "expected 0.001 to 1"]);
 }
 
 #[test]
 fn many_training_atoms_outside_are_warned_of() {
-    let desk = Desk::new();
-    desk.write("half.npz", scaled("eff_interp_thresholds", 0.5));
-    desk.write("c.toml", changed(&path(ARTIFACT), "half.npz"));
-    let output = calmwalk(desk.path(), ["validate", "c.toml"]);
+    let tester = ConfigTester::new();
+    tester.write("half.npz", scaled("eff_interp_thresholds", 0.5));
+    tester.write("c.toml", changed(&path(ARTIFACT), "half.npz"));
+    let output = calmwalk(tester.path(), ["validate", "c.toml"]);
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let at = format!("WARNING: c.toml:{}: calm.training_frames: ", line("training_frames = "));
-    let words = "35 % of the atoms have γ > 1 under the mixture as it begins, where 2 to 9 % are usual";
+    let words = "35 % of the atoms have γ > 1 under the initial mixture, where 2 to 9 % are usual";
     let warning = stderr(&output);
     assert!(warning.starts_with(&at) && warning.contains(words), "{warning}");
 }
 
 #[test]
 fn without_training_frames_the_seed_structures_tell() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     // γ × 10⁻³: the export has no scatter that would show it.
     let model = with_arrays(&config("data/al_eam_1l/kokkos.npz"), |name, numbers| {
         if name == "uq_inv_cov" {
             numbers.iter_mut().for_each(|value| *value *= 1e-6);
         }
     });
-    desk.write("model.npz", model);
+    tester.write("model.npz", model);
     let text = changed("artifact = ", "update = \"never\" # ").replace("training_frames = ", "# ");
     let text = text.replace(&path("data/al_eam_1l/kokkos.npz"), "model.npz");
-    desk.write("c.toml", text);
-    let output = calmwalk(desk.path(), ["validate", "c.toml"]);
+    tester.write("c.toml", text);
+    let output = calmwalk(tester.path(), ["validate", "c.toml"]);
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let at = format!("WARNING: c.toml:{}: potential.model: ", line("model = "));
     let warning = stderr(&output);
@@ -121,28 +121,28 @@ fn without_training_frames_the_seed_structures_tell() {
 
 #[test]
 fn score_refuses_nonsense_and_info_shows_it() {
-    let desk = Desk::new();
-    desk.write("bad.npz", scaled("inv_cov_0", 1e-6));
+    let tester = ConfigTester::new();
+    tester.write("bad.npz", scaled("inv_cov_0", 1e-6));
     let (model, frames) = (path("data/al_eam_1l/kokkos.npz"), path("data/al_eam_1l/seed_frames.extxyz"));
     let arguments = ["--model", &model, "--artifact", "bad.npz", &frames, "--output", "out.extxyz"];
-    let message = refuse(desk.path(), ["calm", "score"].into_iter().chain(arguments));
+    let message = refuse(tester.path(), ["calm", "score"].into_iter().chain(arguments));
     assert!(
         message.contains("bad.npz: component 0 of Al: its inverse covariance does not belong"),
         "{message}"
     );
-    let shown = succeed(desk.path(), ["calm", "info", "bad.npz"]);
+    let shown = succeed(tester.path(), ["calm", "info", "bad.npz"]);
     assert!(shown.contains("UNUSABLE        component 0 of Al: its inverse covariance"), "{shown}");
-    let shown = succeed(desk.path(), ["calm", "info", "bad.npz", "--json"]);
+    let shown = succeed(tester.path(), ["calm", "info", "bad.npz", "--json"]);
     let shown: serde_json::Value = serde_json::from_str(&shown).unwrap();
     assert_eq!(shown["faults"].as_array().unwrap().len(), 1, "{shown}");
 }
 
 #[test]
 fn the_demos_are_sound() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     for name in ["aluminium.toml", "silicon.toml"] {
-        desk.write("c.toml", common::demo(name));
-        let output = calmwalk(desk.path(), ["validate", "c.toml"]);
+        tester.write("c.toml", common::demo(name));
+        let output = calmwalk(tester.path(), ["validate", "c.toml"]);
         assert_eq!((output.status.code(), stderr(&output).as_str()), (Some(0), ""), "{name}");
         let shown = String::from_utf8(output.stdout).unwrap();
         assert!(shown.ends_with("  warnings         none\n"), "{shown}");

@@ -173,9 +173,9 @@ impl Drop for Disk<'_> {
 #[test]
 fn a_full_disk_loses_nothing() {
     let small = Small::default();
-    let undisturbed = written(&small);
-    succeed(undisturbed.path(), RUN);
-    let expected = outcome(&undisturbed.path().join("here"));
+    let uninterrupted_outcome = written(&small);
+    succeed(uninterrupted_outcome.path(), RUN);
+    let expected = outcome(&uninterrupted_outcome.path().join("here"));
     // Full when the database is begun, when it is published, when it is opened, in mid-campaign.
     for size in ["size=4k", "size=64k", "size=200k", "size=300k", "size=600k", "size=800k"] {
         let directory = written(&small);
@@ -210,8 +210,8 @@ fn a_log_that_cannot_be_kept_stops_no_campaign() {
 #[test]
 fn a_second_run_of_a_campaign_names_the_first() {
     let small = Small::default();
-    let undisturbed = written(&small);
-    succeed(undisturbed.path(), RUN);
+    let uninterrupted_outcome = written(&small);
+    succeed(uninterrupted_outcome.path(), RUN);
     let directory = written(&small);
     let mut first = program(directory.path());
     let first = first.args(RUN).stdout(Stdio::null()).stderr(Stdio::null());
@@ -231,7 +231,7 @@ fn a_second_run_of_a_campaign_names_the_first() {
     let message = assert_plain(&second, 2);
     assert!(message.contains(&format!("being run by process {} (calmwalk run)", first.0.id())), "{message}");
     assert_eq!(first.0.wait().unwrap().code(), Some(0));
-    assert_eq!(outcome(&directory.path().join("here")), outcome(&undisturbed.path().join("here")));
+    assert_eq!(outcome(&directory.path().join("here")), outcome(&uninterrupted_outcome.path().join("here")));
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::io::{Cursor, Read, Write};
 
 use npyz::npz::{NpzArchive, NpzWriter, file_name_from_array_name};
 
-use crate::common::desk::{Desk, changed, line};
+use crate::common::config_tester::{ConfigTester, changed, line};
 use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
 const MODEL: &str = "data/al_eam_1l/kokkos.npz";
@@ -14,7 +14,7 @@ const ARTIFACT: &str = "data/al_eam_1l/gmm_artifacts.npz";
 
 #[test]
 fn every_wrong_key_is_named_with_its_line() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     let langevin = "# thermostat = { langevin = { friction = 0.01 } }";
     for (from, to, expected) in [
         ("temperature = 600.0", "temprature = 600.0", "unknown key `temprature`, expected one of"),
@@ -99,7 +99,7 @@ fn every_wrong_key_is_named_with_its_line() {
             "unknown value `dft`, expected one of `reference`, `abinit`, ",
         ),
     ] {
-        let message = desk.refused(changed(from, to));
+        let message = tester.refused(changed(from, to));
         let line = line(from);
         let at = [format!("c.toml:{line}: "), format!("c.toml:{line}:"), format!("c.toml:{}:", line + 1)];
         assert!(at.iter().any(|at| message.contains(at)), "{message}\nexpected line {line} for {to}");
@@ -109,21 +109,22 @@ fn every_wrong_key_is_named_with_its_line() {
 
 #[test]
 fn whole_sections_and_files_that_are_none_are_told() {
-    let desk = Desk::new();
-    desk.refused_with("[potential]\nmodel", "model", &["c.toml:", "`model`"]);
-    desk.refused_with("tau = 0.15 ", "# ", &["missing key `tau`", "[walk]"]);
-    desk.refused_with("[seeds]", "[walk]", &[&format!("c.toml:{}:", line("[walk]")), "duplicate key"]);
-    assert!(desk.refused("").contains("c.toml:1:1: missing key `potential`"));
+    let tester = ConfigTester::new();
+    tester.refused_with("[potential]\nmodel", "model", &["c.toml:", "`model`"]);
+    tester.refused_with("tau = 0.15 ", "# ", &["missing key `tau`", "[walk]"]);
+    tester.refused_with("[seeds]", "[walk]", &[&format!("c.toml:{}:", line("[walk]")), "duplicate key"]);
+    assert!(tester.refused("").contains("c.toml:1:1: missing key `potential`"));
     let binary: Vec<u8> = (0..=255).collect();
     assert!(
-        desk.refused(binary)
+        tester
+            .refused(binary)
             .contains("c.toml:2: found bytes that are not text; expected a configuration in TOML")
     );
-    assert!(desk.refused("[walk\n").contains("c.toml:1:"));
-    fs::remove_file(desk.path().join("c.toml")).unwrap();
-    assert!(refuse(desk.path(), ["run", "c.toml"]).contains("cannot read c.toml: No such file"));
-    fs::create_dir(desk.path().join("c.toml")).unwrap();
-    assert!(refuse(desk.path(), ["run", "c.toml"]).contains("cannot read c.toml: Is a directory"));
+    assert!(tester.refused("[walk\n").contains("c.toml:1:"));
+    fs::remove_file(tester.path().join("c.toml")).unwrap();
+    assert!(refuse(tester.path(), ["run", "c.toml"]).contains("cannot read c.toml: No such file"));
+    fs::create_dir(tester.path().join("c.toml")).unwrap();
+    assert!(refuse(tester.path(), ["run", "c.toml"]).contains("cannot read c.toml: Is a directory"));
 }
 
 /// The bytes of an npz file without some of its arrays.
@@ -150,33 +151,33 @@ fn path(file: &str) -> String {
 
 #[test]
 fn broken_models_and_artifacts_are_named() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     for (file, key) in [(MODEL, "potential.model"), (ARTIFACT, "calm.artifact")] {
         let at = format!("c.toml:{}: {key}: ", line(&path(file)));
         let whole = fs::read(config(file)).unwrap();
         for size in [0, 1, 100, whole.len() / 10, whole.len() / 2, whole.len() - 1] {
-            desk.write("cut.npz", &whole[..size]);
-            desk.refused_with(&path(file), "cut.npz", &[&at, "cut.npz", "npz a"]);
+            tester.write("cut.npz", &whole[..size]);
+            tester.refused_with(&path(file), "cut.npz", &[&at, "cut.npz", "npz a"]);
         }
         for place in 1..10 {
             let mut damaged = whole.clone();
             damaged[whole.len() * place / 10] ^= 0xff;
-            desk.write("cut.npz", damaged);
-            desk.refused_with(&path(file), "cut.npz", &["c.toml:", "cut.npz"]);
+            tester.write("cut.npz", damaged);
+            tester.refused_with(&path(file), "cut.npz", &["c.toml:", "cut.npz"]);
         }
-        desk.write("cut.npz", "units metal\natom_style atomic\n");
-        desk.refused_with(&path(file), "cut.npz", &[&at, "cut.npz", "npz archive"]);
-        desk.refused_with(&path(file), "absent.npz", &[&at, "absent.npz", "No such file"]);
-        desk.refused_with(&path(file), ".", &[&at, "directory"]);
+        tester.write("cut.npz", "units metal\natom_style atomic\n");
+        tester.refused_with(&path(file), "cut.npz", &[&at, "cut.npz", "npz archive"]);
+        tester.refused_with(&path(file), "absent.npz", &[&at, "absent.npz", "No such file"]);
+        tester.refused_with(&path(file), ".", &[&at, "directory"]);
     }
-    desk.refused_with(&path(MODEL), &path(ARTIFACT), &["gmm_artifacts.npz", "not a kokkos.npz export"]);
+    tester.refused_with(&path(MODEL), &path(ARTIFACT), &["gmm_artifacts.npz", "not a kokkos.npz export"]);
 }
 
 #[test]
 fn a_model_without_feature_arrays_cannot_be_graded_with() {
-    let desk = Desk::new();
-    desk.write("bare.npz", without(MODEL, |name| name.starts_with("uq_")));
-    desk.refused_with(
+    let tester = ConfigTester::new();
+    tester.write("bare.npz", without(MODEL, |name| name.starts_with("uq_")));
+    tester.refused_with(
         &path(MODEL),
         "bare.npz",
         &["potential.model: bare.npz: no feature projection (uq_* arrays)"],
@@ -185,23 +186,23 @@ fn a_model_without_feature_arrays_cannot_be_graded_with() {
 
 #[test]
 fn an_artifact_must_belong_to_the_model() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     let silicon = path("data/si_sw_1l/gmm_artifacts.npz");
     let expected =
         ["calm.artifact: ", &silicon, "another model: its list of elements is Si, that of the model Al"];
-    desk.refused_with(&path(ARTIFACT), &silicon, &expected);
+    tester.refused_with(&path(ARTIFACT), &silicon, &expected);
 }
 
 #[test]
 fn a_mixture_without_statistics_can_be_scored_with_but_not_updated() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     let advice =
         "scored with but not updated; give the gmm_artifacts.npz of the build, or leave calm.artifact out";
     let export = path(MODEL);
-    desk.refused_with(&path(ARTIFACT), &export, &["calm.artifact: ", &export, advice]);
-    desk.write("stripped.npz", without(ARTIFACT, |name| name.starts_with("scatter_")));
-    desk.refused_with(&path(ARTIFACT), "stripped.npz", &["stripped.npz", advice]);
-    let left_out = desk.refused(changed("artifact = ", "# artifact = "));
+    tester.refused_with(&path(ARTIFACT), &export, &["calm.artifact: ", &export, advice]);
+    tester.write("stripped.npz", without(ARTIFACT, |name| name.starts_with("scatter_")));
+    tester.refused_with(&path(ARTIFACT), "stripped.npz", &["stripped.npz", advice]);
+    let left_out = tester.refused(changed("artifact = ", "# artifact = "));
     assert!(
         left_out.contains(&format!("c.toml:{}: calm.artifact is left out", line("[calm]"))),
         "{left_out}"
@@ -209,39 +210,43 @@ fn a_mixture_without_statistics_can_be_scored_with_but_not_updated() {
 
     // Without updates the export is enough.
     let never = changed("artifact = ", "update = \"never\" # ").replace("steps = 2000 ", "steps = 60 ");
-    desk.write("c.toml", never.replace("# equilibration = 500", "equilibration = 10"));
-    let valid = succeed(desk.path(), ["validate", "c.toml"]);
+    tester.write("c.toml", never.replace("# equilibration = 500", "equilibration = 10"));
+    let valid = succeed(tester.path(), ["validate", "c.toml"]);
     assert!(valid.contains("it can be scored with but not updated"), "{valid}");
-    let summary = succeed(desk.path(), ["run", "c.toml"]);
+    let summary = succeed(tester.path(), ["run", "c.toml"]);
     assert!(summary.contains("mixture          version 0"), "{summary}");
 }
 
 #[test]
 fn options_of_label_jobs_must_leave_them_where_they_are_found() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     for option in ["--clusters=other", "-Mother"] {
         let keys =
             format!("[label]\nbatch_system = \"slurm\"\nscratch = \"/s\"\nbatch_options = [{option:?}]");
-        desk.refused_with("[label]", &keys, &["label.batch_options", option, "in the cluster of the host"]);
+        tester.refused_with("[label]", &keys, &["label.batch_options", option, "in the cluster of the host"]);
     }
 }
 
 #[test]
 fn training_frames_and_label_potentials_must_fit() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     let (frames, label) = (path("data/al_eam_1l/seed_frames.extxyz"), path("data/Al_mm.eam.fs"));
-    desk.refused_with(&frames, "absent.extxyz", &["calm.training_frames: absent.extxyz"]);
+    tester.refused_with(&frames, "absent.extxyz", &["calm.training_frames: absent.extxyz"]);
     let silicon = path("data/si_sw_1l/seed_frames.extxyz");
-    desk.refused_with(&frames, &silicon, &[&format!("{silicon}:1: atom 0 is Si"), "knows Al"]);
-    desk.refused_with(&label, "absent.eam", &["label.method.reference.file: ", "absent.eam", "No such file"]);
-    desk.refused_with(&label, &path("data/Si.sw"), &["label.method.reference.file: ", "Si.sw"]);
-    desk.refused_with("\"eam_fs\"", "\"stillinger_weber\"", &["Al_mm.eam.fs, line 2: found 22 words"]);
+    tester.refused_with(&frames, &silicon, &[&format!("{silicon}:1: atom 0 is Si"), "knows Al"]);
+    tester.refused_with(
+        &label,
+        "absent.eam",
+        &["label.method.reference.file: ", "absent.eam", "No such file"],
+    );
+    tester.refused_with(&label, &path("data/Si.sw"), &["label.method.reference.file: ", "Si.sw"]);
+    tester.refused_with("\"eam_fs\"", "\"stillinger_weber\"", &["Al_mm.eam.fs, line 2: found 22 words"]);
     let of_silicon = format!("{{ kind = \"stillinger_weber\", file = \"{}\" }}", path("data/Si.sw"));
     let expected = ["Si.sw: the label potential knows Si, but seed structure 'fcc-100' (", "has Al"];
-    desk.refused_with(&format!("{{ kind = \"eam_fs\", file = \"{label}\" }}"), &of_silicon, &expected);
+    tester.refused_with(&format!("{{ kind = \"eam_fs\", file = \"{label}\" }}"), &of_silicon, &expected);
     for size in [0, 20, 2000] {
-        desk.write("cut.eam", &fs::read(&label).unwrap()[..size]);
-        desk.refused_with(&label, "cut.eam", &["label.method.reference.file: ", "cut.eam"]);
+        tester.write("cut.eam", &fs::read(&label).unwrap()[..size]);
+        tester.refused_with(&label, "cut.eam", &["label.method.reference.file: ", "cut.eam"]);
     }
 }
 

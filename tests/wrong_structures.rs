@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use crate::common::desk::{Desk, changed, line};
+use crate::common::config_tester::{ConfigTester, changed, line};
 use crate::common::{calmwalk, config, stderr, succeed};
 
 const CELL: &str = "Lattice=\"8.4 0 0 0 8.4 0 0 0 8.4\"";
@@ -23,7 +23,7 @@ fn good() -> String {
 
 /// A desk whose demo takes its seed structures from `name`.
 struct Seeds {
-    desk: Desk,
+    tester: ConfigTester,
     files: String,
     at: String,
 }
@@ -32,13 +32,13 @@ impl Seeds {
     fn new() -> Self {
         let files = config("data/aluminium_seeds.extxyz").display().to_string();
         let at = format!("c.toml:{}: seeds.files: ", line(&files));
-        Self { desk: Desk::new(), files, at }
+        Self { tester: ConfigTester::new(), files, at }
     }
 
     fn refused(&self, name: &str, content: impl AsRef<[u8]>, words: &[&str]) {
-        self.desk.write(name, content);
+        self.tester.write(name, content);
         let words: Vec<_> = [self.at.as_str(), name].into_iter().chain(words.iter().copied()).collect();
-        self.desk.refused_with(&self.files, name, &words);
+        self.tester.refused_with(&self.files, name, &words);
     }
 }
 
@@ -105,7 +105,8 @@ fn structures_that_no_walk_can_start_from_are_refused() {
 fn seed_structures_need_names_of_their_own() {
     let seeds = Seeds::new();
     let named = good().replace("Properties", "name=bulk Properties");
-    let words = ":30: a second seed structure named 'bulk', the first is two.extxyz:1; give each a name";
+    let words =
+        ":30: a second seed structure named 'bulk', the first is two.extxyz:1; give each a unique name";
     seeds.refused("two.extxyz", named.repeat(2), &[words]);
 }
 
@@ -119,12 +120,12 @@ fn other_files_are_refused() {
     );
     seeds.refused("POSCAR", "bulk\n1.0\n8.4 0 0\n", &["POSCAR:4: the file ends here, expected"]);
     seeds.refused("seeds.extxyz", "Si.sw\n", &["seeds.extxyz:1: found 'Si.sw'"]);
-    seeds.desk.refused_with(
+    seeds.tester.refused_with(
         &seeds.files,
         "absent.extxyz",
         &[&seeds.at, "absent.extxyz: cannot be opened: No such file"],
     );
-    seeds.desk.refused_with(
+    seeds.tester.refused_with(
         &seeds.files,
         ".",
         &[&seeds.at, ".: cannot be opened: it is a directory; expected a file"],
@@ -144,15 +145,15 @@ fn structures_from_which_nothing_can_be_collected_are_refused() {
         ":1: the structure has no periodic direction, and so no volume for walk.volume_ramp to change";
     seeds.refused("cluster.extxyz", &cluster, &[words]);
     // Without a ramp it needs no cell.
-    seeds.desk.write("c.toml", changed(&seeds.files, "cluster.extxyz").replace("volume_ramp = ", "# "));
-    succeed(seeds.desk.path(), ["validate", "c.toml"]);
+    seeds.tester.write("c.toml", changed(&seeds.files, "cluster.extxyz").replace("volume_ramp = ", "# "));
+    succeed(seeds.tester.path(), ["validate", "c.toml"]);
 }
 
 /// What `validate` warns of, in a valid campaign with these seed structures.
 fn warnings(seeds: &Seeds, name: &str, content: impl AsRef<[u8]>) -> Vec<String> {
-    seeds.desk.write(name, content);
-    seeds.desk.write("c.toml", changed(&seeds.files, name));
-    let output = calmwalk(seeds.desk.path(), ["validate", "c.toml"]);
+    seeds.tester.write(name, content);
+    seeds.tester.write("c.toml", changed(&seeds.files, name));
+    let output = calmwalk(seeds.tester.path(), ["validate", "c.toml"]);
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     stderr(&output).lines().map(str::to_owned).collect()
 }
@@ -203,8 +204,8 @@ fn lengths_in_bohr_are_warned_of() {
 #[test]
 fn the_good_structure_is_good() {
     let seeds = Seeds::new();
-    seeds.desk.write("good.extxyz", good());
-    seeds.desk.write("c.toml", changed(&seeds.files, "good.extxyz"));
-    let valid = succeed(seeds.desk.path(), ["validate", "c.toml"]);
+    seeds.tester.write("good.extxyz", good());
+    seeds.tester.write("c.toml", changed(&seeds.files, "good.extxyz"));
+    let valid = succeed(seeds.tester.path(), ["validate", "c.toml"]);
     assert!(valid.contains("seed structures  1, of 27 to 27 atoms"), "{valid}");
 }

@@ -3,13 +3,13 @@
 use std::fs;
 
 use crate::common;
-use crate::common::desk::{Desk, changed, line};
+use crate::common::config_tester::{ConfigTester, changed, line};
 use crate::common::{calmwalk, config, refuse, stderr, succeed};
 
 /// The warnings of `validate` about the demo with other values, which are also those of `run`; it must be valid.
-fn warnings(desk: &Desk, text: &str) -> Vec<String> {
-    desk.write("c.toml", text);
-    let output = calmwalk(desk.path(), ["validate", "c.toml"]);
+fn warnings(tester: &ConfigTester, text: &str) -> Vec<String> {
+    tester.write("c.toml", text);
+    let output = calmwalk(tester.path(), ["validate", "c.toml"]);
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let warnings: Vec<_> = stderr(&output).lines().map(str::to_owned).collect();
     let shown = String::from_utf8(output.stdout).unwrap();
@@ -23,7 +23,7 @@ fn warnings(desk: &Desk, text: &str) -> Vec<String> {
 
 #[test]
 fn unusual_values_are_warned_of_at_their_own_lines() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     for (from, to, expected) in [
         (
             "# time_step = 2.0",
@@ -44,28 +44,28 @@ fn unusual_values_are_warned_of_at_their_own_lines() {
         ("from = 1.0, to = 1.4", "from = 1.0, to = 14", "walk.volume_ramp.to: 14 V/V₀ is unusual"),
         ("# time_limit = 86400.0", "time_limit = 1", "label.time_limit: 1 s is unusual"),
     ] {
-        let found = warnings(&desk, &changed(from, to));
+        let found = warnings(&tester, &changed(from, to));
         let at = format!("WARNING: c.toml:{}: ", line(from));
         let [warning] = found.as_slice() else { panic!("{to}: {found:?}") };
         assert!(warning.starts_with(&at) && warning.contains(expected), "{warning}\nexpected {at}{expected}");
     }
-    assert!(warnings(&desk, &common::demo("aluminium.toml")).is_empty());
+    assert!(warnings(&tester, &common::demo("aluminium.toml")).is_empty());
 }
 
 #[test]
 fn run_gives_the_same_warnings_and_goes_on() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     let text = changed("steps = 2000 ", "steps = 5 ").replace("# equilibration = 500", "equilibration = 1");
-    let expected = warnings(&desk, &text);
+    let expected = warnings(&tester, &text);
     assert_eq!(expected.len(), 1, "{expected:?}");
-    let output = calmwalk(desk.path(), ["run", "c.toml"]);
+    let output = calmwalk(tester.path(), ["run", "c.toml"]);
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     assert_eq!(stderr(&output).lines().next(), Some(expected[0].as_str()));
 }
 
 #[test]
 fn values_that_nobody_can_mean_are_refused() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     for (from, to, expected) in [
         (
             "from = 1.0, to = 1.4",
@@ -76,13 +76,13 @@ fn values_that_nobody_can_mean_are_refused() {
         ("# skin = 0.5", "skin = 50", "walk.skin is 50; expected at most 10 Å"),
         ("# silence_limit = 120.0", "silence_limit = 1", "run.silence_limit is 1; expected 5 to 1e6 s"),
     ] {
-        desk.refused_with(from, to, &[&format!("c.toml:{}: ", line(from)), expected]);
+        tester.refused_with(from, to, &[&format!("c.toml:{}: ", line(from)), expected]);
     }
     // Of a table of its own, too.
     let abinit = "[label.method.abinit]\npseudopotentials = \"/\"\ncutoff = 10\nk_spacing = 6\n";
     let text = changed("method = { reference", "# method = { reference")
         .replace("\n[budget]", &format!("\n{abinit}\n[budget]"));
-    let message = desk.refused(&text);
+    let message = tester.refused(&text);
     let at = |words: &str| 1 + text.lines().position(|line| line == words).unwrap();
     for expected in [
         "2 errors in c.toml:\n".to_owned(),
@@ -101,7 +101,7 @@ fn values_that_nobody_can_mean_are_refused() {
 
 #[test]
 fn everything_that_is_wrong_is_told_at_once() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     let mut text = changed("tau = 0.15 ", "# ").replace("temperature = 600.0", "temprature = 600.0");
     for (from, to) in [
         ("model = ", "modle = "),
@@ -116,7 +116,7 @@ fn everything_that_is_wrong_is_told_at_once() {
         assert!(text.contains(from), "{from}");
         text = text.replacen(from, to, 1);
     }
-    let message = desk.refused(&text);
+    let message = tester.refused(&text);
     let lines: Vec<_> = message.lines().filter(|line| line.starts_with("c.toml:")).collect();
     let expected = [
         ("rng_seed", "campaign.rng_seed: invalid value: integer `-1`"),
@@ -143,28 +143,28 @@ fn everything_that_is_wrong_is_told_at_once() {
 
 #[test]
 fn missing_keys_are_told_together() {
-    let desk = Desk::new();
-    let message = desk.refused("[walk]\n[potential]\n");
+    let tester = ConfigTester::new();
+    let message = tester.refused("[walk]\n[potential]\n");
     for key in ["temperature", "steps", "tau", "model", "calm", "seeds", "collect", "label"] {
         assert!(message.contains(&format!("missing key `{key}`")), "{key}: {message}");
     }
     let md = fs::read_to_string(config("md-aluminium.toml")).unwrap();
-    desk.write(
+    tester.write(
         "md.toml",
         md.replace("temperature = ", "temprature = ").replace("trajectory = ", "# trajectory = "),
     );
-    let message = refuse(desk.path(), ["md", "md.toml"]);
+    let message = refuse(tester.path(), ["md", "md.toml"]);
     for words in ["2 errors in md.toml", "did you mean `temperature`?", "missing key `trajectory`"] {
         assert!(message.contains(words), "{words}: {message}");
     }
-    desk.write("md.toml", md.replace("time_step = 2.0", "time_step = 200.0"));
-    let message = refuse(desk.path(), ["md", "md.toml"]);
+    tester.write("md.toml", md.replace("time_step = 2.0", "time_step = 200.0"));
+    let message = refuse(tester.path(), ["md", "md.toml"]);
     assert!(message.contains("dynamics.time_step is 200; expected at most 20 fs"), "{message}");
 }
 
 #[test]
 fn names_that_are_nearly_right_get_a_hint() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     for (from, to, expected) in [
         ("temperature = 600.0", "temperature = 600.0\ngap = 100", "it belongs in [collect]"),
         ("temperature = 600.0", "temperature = 600.0\ntime_limit = 100", "it belongs in [label] or [notify]"),
@@ -177,11 +177,11 @@ fn names_that_are_nearly_right_get_a_hint() {
             "makes labels through `ase`: see docs/dft-codes.md",
         ),
     ] {
-        desk.refused_with(from, to, &[expected]);
+        tester.refused_with(from, to, &[expected]);
     }
     let abinit = "\n[label.method.abinit]\necut = 400\n[budget]";
     let text = changed("method = { reference", "# method = { reference").replacen("\n[budget]", abinit, 1);
-    let message = desk.refused(text);
+    let message = tester.refused(text);
     assert!(
         message.contains("unknown key `ecut`") && message.contains("did you mean `cutoff`?"),
         "{message}"
@@ -190,7 +190,7 @@ fn names_that_are_nearly_right_get_a_hint() {
 
 #[test]
 fn other_things_in_the_place_of_files_are_told() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     let seeds = config("data/aluminium_seeds.extxyz").display().to_string();
     for (name, expected) in [
         ("seeds.cif", "convert it with `ase convert seeds.cif seeds.extxyz`"),
@@ -199,20 +199,20 @@ fn other_things_in_the_place_of_files_are_told() {
         ("folder.extxyz", "folder.extxyz: cannot be opened: it is a directory; expected a file"),
     ] {
         match name.starts_with("folder") {
-            true => fs::create_dir(desk.path().join(name)).unwrap(),
-            false => desk.write(name, "data_Al\n_cell_length_a 4.05\n"),
+            true => fs::create_dir(tester.path().join(name)).unwrap(),
+            false => tester.write(name, "data_Al\n_cell_length_a 4.05\n"),
         }
-        desk.refused_with(&seeds, name, &["seeds.files: ", expected]);
+        tester.refused_with(&seeds, name, &["seeds.files: ", expected]);
     }
     let model = config("data/al_eam_1l/kokkos.npz").display().to_string();
     let score = |input: &str| {
-        refuse(desk.path(), ["calm", "score", "--model", &model, input, "--output", "out.extxyz"])
+        refuse(tester.path(), ["calm", "score", "--model", &model, input, "--output", "out.extxyz"])
     };
     assert!(score("seeds.cif").contains("expected extended XYZ; convert it with `ase convert seeds.cif"));
     assert!(score("folder").contains("it is a directory"));
     // The directory that `init` makes, in the place of its configuration.
-    succeed(desk.path(), ["init", "mine"]);
-    let message = refuse(desk.path(), ["validate", "mine"]);
+    succeed(tester.path(), ["init", "mine"]);
+    let message = refuse(tester.path(), ["validate", "mine"]);
     assert!(
         message.contains("cannot read mine: Is a directory")
             && message.contains("did you mean mine/campaign.toml?"),
@@ -222,7 +222,7 @@ fn other_things_in_the_place_of_files_are_told() {
 
 #[test]
 fn urls_of_no_known_kind_are_no_directories() {
-    let desk = Desk::new();
+    let tester = ConfigTester::new();
     let store = "postgre://user:secret@host/database";
     let told = |message: String| {
         assert!(message.contains("postgre://user@host/database"), "{message}");
@@ -231,19 +231,19 @@ fn urls_of_no_known_kind_are_no_directories() {
             "{message}"
         );
     };
-    told(desk.refused(changed("[run]", &format!("[run]\nstore = \"{store}\""))));
-    told(refuse(desk.path(), ["status", store]));
-    told(refuse(desk.path(), ["label", "--store", store]));
-    desk.write("c.toml", common::demo("aluminium.toml"));
-    let message = refuse(desk.path(), ["run", "c.toml", "--directory", store]);
+    told(tester.refused(changed("[run]", &format!("[run]\nstore = \"{store}\""))));
+    told(refuse(tester.path(), ["status", store]));
+    told(refuse(tester.path(), ["label", "--store", store]));
+    tester.write("c.toml", common::demo("aluminium.toml"));
+    let message = refuse(tester.path(), ["run", "c.toml", "--directory", store]);
     assert!(message.contains("--directory is a URL") && !message.contains("secret"), "{message}");
-    assert!(!desk.path().join("postgre:").exists());
+    assert!(!tester.path().join("postgre:").exists());
 }
 
 #[test]
 fn arguments_that_are_nearly_right_get_a_hint() {
-    let desk = Desk::new();
-    desk.write("c.toml", common::demo("aluminium.toml"));
+    let tester = ConfigTester::new();
+    tester.write("c.toml", common::demo("aluminium.toml"));
     for (arguments, expected) in [
         (vec!["run", "c.toml", "--dashboard", "8080"], "expected ADDRESS:PORT, such as 127.0.0.1:8080"),
         (vec!["run", "c.toml", "--metrics", ":9464"], "expected ADDRESS:PORT, such as 127.0.0.1:9464"),
@@ -264,7 +264,7 @@ fn arguments_that_are_nearly_right_get_a_hint() {
             "joined by the word 'and'",
         ),
     ] {
-        let message = refuse(desk.path(), &arguments);
+        let message = refuse(tester.path(), &arguments);
         assert!(message.contains(expected), "{arguments:?}: {message}");
     }
 }

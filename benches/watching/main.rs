@@ -13,7 +13,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use common::campaign::Small;
-use common::http::{get, listen, reckoned, said};
+use common::http::{get, get_computed, listen, said};
 use common::{Running, program, succeed};
 
 /// Candidates, if not given.
@@ -73,7 +73,7 @@ fn main() {
     let begun = Instant::now();
     row("force errors, before they are there", || look("/api/errors"));
     row("the table meanwhile", || look(PAGES[2]));
-    let errors = reckoned(address, "/api/errors");
+    let errors = get_computed(address, "/api/errors");
     println!(
         "force errors of {} labels after {:.1} s",
         errors["all"]["structures"],

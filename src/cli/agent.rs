@@ -7,13 +7,13 @@ use orchestrator::launcher::raise_descriptor_limit;
 use store::ProcessRecord;
 use wire::net::{self, Address, Tls};
 
-use super::{Ended, Failure, block_on, duration_between};
-use crate::actors::scratch::{self, Scratch};
-use crate::actors::{agent, cores};
+use super::{ExitStatus, Failure, block_on, duration_between};
 use crate::duration::Duration;
 use crate::log::Options;
-use crate::output::warn;
-use crate::web::{self, agent::Watched};
+use crate::output::log_and_warn;
+use crate::runtime::scratch_dir::{self, ScratchDir};
+use crate::runtime::{agent_host, cores};
+use crate::web::{self, agent_metrics::AgentState};
 
 /// Run walkers on this host for a campaign led by `calmwalk run --listen` on another host
 ///
@@ -51,17 +51,17 @@ pub struct Agent {
 }
 
 impl Agent {
-    pub fn run(self) -> Result<Ended, Failure> {
-        self.log.begin("agent")?;
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        self.log.init("agent")?;
         let walkers = self.walkers.unwrap_or_else(|| (cores() / self.threads).max(1));
         let tls = self.tls.as_deref().map(Tls::in_directory);
         if let Some(tls) = &tls {
             let checked = tls.check_for_agent().map_err(Failure::input)?;
-            checked.warnings.iter().for_each(|warning| warn(format_args!("WARNING: {warning}")));
+            checked.warnings.iter().for_each(|warning| log_and_warn(format_args!("WARNING: {warning}")));
         }
         raise_descriptor_limit();
-        scratch::clean();
-        let scratch = Scratch::new().map_err(|error| {
+        scratch_dir::clean();
+        let scratch = ScratchDir::new().map_err(|error| {
             Failure::Failed(format!(
                 "cannot create a directory in {}: {error}",
                 std::env::temp_dir().display()
@@ -79,13 +79,13 @@ impl Agent {
             walkers,
             ahead: self.prefetch,
         };
-        let watched = Watched::default();
+        let watched = AgentState::default();
         block_on(async {
             if let Some(address) = self.metrics {
-                web::serve_metrics(web::listen(address).await?, web::agent::router(watched.clone()))?;
+                web::serve_metrics(web::listen(address).await?, web::agent_metrics::router(watched.clone()))?;
             }
             let (tls, threads, timeout) = (tls.as_ref(), self.threads as usize, self.wait_timeout.get());
-            agent::work(&self.join, tls, agent, threads, timeout, scratch.path(), &watched).await
+            agent_host::run(&self.join, tls, agent, threads, timeout, scratch.path(), &watched).await
         })?
     }
 }

@@ -3,7 +3,7 @@
 use orchestrator::launcher;
 use workers::labeller::keep;
 
-use super::{Ended, Failure};
+use super::{ExitStatus, Failure};
 
 /// Internal: run one calculation for a labeller
 ///
@@ -12,9 +12,9 @@ use super::{Ended, Failure};
 pub struct CalculationRunner {}
 
 impl CalculationRunner {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
         keep().map_err(Failure::failed)?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }

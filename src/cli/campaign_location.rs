@@ -9,7 +9,7 @@ use store::{DATABASE, Location, Store};
 use super::Failure;
 use crate::campaign::Campaign;
 use crate::config::compare;
-use crate::origin::Origin;
+use crate::provenance::Provenance;
 
 /// The default directory of a campaign: the path of its configuration without the extension.
 pub fn default_directory(config: &Path) -> PathBuf {
@@ -107,10 +107,12 @@ pub async fn check_former_locations(campaign: &Campaign, directory: &Path) -> Re
 async fn is_campaign_of(former: &Path, campaign: &Campaign, directory: &Path) -> bool {
     let Ok(store) = Store::open_read_only(former).await else { return false };
     let in_force = store.campaign().await.ok().map(|found| found.configuration_in_force);
-    let found = Origin::of(&store).await.ok().flatten();
+    let found = Provenance::read(&store).await.ok().flatten();
     store.close().await;
     match found {
-        Some(found) => found.file.path == Origin::new(&campaign.path, &campaign.text, directory).file.path,
+        Some(found) => {
+            found.file.path == Provenance::new(&campaign.path, &campaign.text, directory).file.path
+        }
         // Campaigns of early versions do not record the file: compare the content.
         None => {
             let in_force = in_force.and_then(|text| serde_json::from_str::<Value>(&text).ok());

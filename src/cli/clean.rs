@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use store::CampaignLock;
 use wire::place::{Place, PlaceError, Removed};
 
-use super::{Ended, Failure};
+use super::{ExitStatus, Failure};
 use crate::output::{count, print};
 
 /// Remove shared-memory files left behind by killed processes
@@ -20,7 +20,7 @@ pub struct Clean {
 }
 
 impl Clean {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         if self.directories.is_empty() {
             for shared in Place::all().map_err(Failure::failed)? {
                 let campaign = shared.campaign_directory();
@@ -35,7 +35,7 @@ impl Clean {
             let shared = Place::of(directory).map_err(Failure::input)?;
             report(directory, clean(&shared, Some(directory))?)?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 

@@ -4,9 +4,9 @@ use std::net::SocketAddr;
 
 use store::Store;
 
-use super::{CampaignLocation, Ended, Failure, block_on};
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
 use crate::log::Options;
-use crate::output::say;
+use crate::output::log_and_print;
 use crate::web::{self, dashboard};
 
 /// Serve a read-only dashboard of a campaign to a web browser
@@ -25,17 +25,17 @@ pub struct Dashboard {
 }
 
 impl Dashboard {
-    pub fn run(self) -> Result<Ended, Failure> {
-        self.log.begin("dashboard")?;
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        self.log.init("dashboard")?;
         block_on(async {
             let listener = web::listen(self.address).await?;
             let store = Store::open_read_only(&self.location.get()?).await?;
             let address = listener.local_addr().map_err(Failure::failed)?;
             let serving = web::Server::start(listener, dashboard::Dashboard::new(store, None, None).router());
-            say(format_args!("dashboard at http://{address}/"));
+            log_and_print(format_args!("dashboard at http://{address}/"));
             tokio::signal::ctrl_c().await.map_err(Failure::failed)?;
             serving.end();
-            Ok(Ended::Done)
+            Ok(ExitStatus::Done)
         })?
     }
 }

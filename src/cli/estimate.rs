@@ -7,10 +7,10 @@ use analysis::{CostModel, Measured, Size};
 use serde_json::json;
 use store::{Location, Store};
 
-use super::{Ended, Failure, block_on, campaign_location};
-use crate::bill::{CoreHours, Costs, digits, size_of};
+use super::{ExitStatus, Failure, block_on, campaign_location};
 use crate::campaign::Campaign;
-use crate::forecast::Forecast;
+use crate::disk_forecast::DiskForecast;
+use crate::label_cost::{CoreHours, CostEstimator, cost_size, two_digits};
 use crate::output::{Table, count, print, print_json};
 
 /// Seed structures shown without --all.
@@ -65,11 +65,11 @@ struct CampaignEstimate {
     cost: Option<CoreHours>,
     /// Where the costs come from.
     cost_source: String,
-    disk: Forecast,
+    disk: DiskForecast,
 }
 
 impl Estimate {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let campaign = Campaign::load(&self.config)?;
         let estimate = self.estimate(&campaign)?;
         if self.json {
@@ -77,17 +77,17 @@ impl Estimate {
         } else {
             print(|out| write(out, &self.config, &estimate, self.all))?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     fn estimate(&self, campaign: &Campaign) -> Result<CampaignEstimate, Failure> {
-        let sizes: Vec<_> = campaign.label_sizes()?.iter().map(size_of).collect();
+        let sizes: Vec<_> = campaign.label_sizes()?.iter().map(cost_size).collect();
         let (costs, cost_source) = self.costs(sizes.first())?;
         let config = &campaign.config;
         let (copies, per_seed) = (config.labels_of_each(), config.collect.per_seed.get());
         let labels = u64::from(copies) * u64::from(per_seed);
         let seed_structures: Vec<_> = campaign
-            .seeds
+            .seed_structures
             .iter()
             .zip(sizes)
             .map(|(seed, size)| SeedEstimate {
@@ -108,17 +108,17 @@ impl Estimate {
             seed_structures,
             labels: limit.unwrap_or(sum),
             limited_by: limit.and(config.budget().structures_by),
-            cost: cost.map(|cost| cost.times(fraction)),
+            cost: cost.map(|cost| cost.scaled(fraction)),
             cost_source,
-            disk: Forecast::of(campaign),
+            disk: DiskForecast::from_campaign(campaign),
         })
     }
 
     /// The cost model, and a description of its source.
-    fn costs(&self, first: Option<&Size>) -> Result<(Option<Costs>, String), Failure> {
+    fn costs(&self, first: Option<&Size>) -> Result<(Option<CostEstimator>, String), Failure> {
         if let (Some(core_seconds), Some(size)) = (self.core_seconds, first) {
             let measured = Measured { size: *size, core_seconds };
-            let costs = Costs::by(CostModel::fit(&[measured], None));
+            let costs = CostEstimator::from_model(CostModel::fit(&[measured], None));
             return Ok((Some(costs), "--core-seconds".into()));
         }
         let Some(campaign) = &self.cost_from else {
@@ -135,11 +135,11 @@ fn newest_labels(count: usize) -> String {
     if count == 1 { "newest label".to_owned() } else { format!("{count} newest labels") }
 }
 
-async fn fit_costs(location: &Location) -> Result<Costs, Failure> {
+async fn fit_costs(location: &Location) -> Result<CostEstimator, Failure> {
     let store = Store::open_read_only(location).await?;
     let none = || Failure::Input("--cost-from: that campaign has no labels".into());
     let protocol = store.protocol_in_force().await?.ok_or_else(none)?;
-    let costs = Costs::of(&store, protocol.hash).await?;
+    let costs = CostEstimator::from_store(&store, protocol.hash).await?;
     store.close().await;
     if costs.measured() == 0 { Err(none()) } else { Ok(costs) }
 }
@@ -175,7 +175,7 @@ fn write(out: &mut dyn Write, path: &Path, estimate: &CampaignEstimate, all: boo
             size.atoms.to_string(),
             size.electrons.map_or("–".into(), |electrons| electrons.to_string()),
             size.k_points.to_string(),
-            cost_per_label.map_or("–".into(), |hours| digits(hours.expected)),
+            cost_per_label.map_or("–".into(), |hours| two_digits(hours.expected)),
         ]);
     }
     table.write(out)?;

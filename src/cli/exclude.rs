@@ -4,8 +4,8 @@ use std::io::{self, Write};
 
 use store::{ExcludedLabel, ExclusionChange, Store, unix_milliseconds};
 
-use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::output::{Table, print, print_json, say_if_unprotected};
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::output::{Table, print, print_json, warn_if_unencrypted};
 
 /// Exclude bad labels from exports and statistics, or include them again
 ///
@@ -43,7 +43,7 @@ fn parse_reason(text: &str) -> Result<String, String> {
 }
 
 impl Exclude {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         if self.list {
             let excluded = block_on(self.read())??;
             if self.json {
@@ -51,7 +51,7 @@ impl Exclude {
             } else {
                 print(|out| write_list(out, &excluded))?
             }
-            return Ok(Ended::Done);
+            return Ok(ExitStatus::Done);
         }
         let changes = block_on(self.change())??;
         if self.json {
@@ -59,7 +59,7 @@ impl Exclude {
         } else {
             print(|out| changes.iter().try_for_each(|change| writeln!(out, "{}", self.message(change))))?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     async fn read(&self) -> Result<Vec<ExcludedLabel>, Failure> {
@@ -71,7 +71,7 @@ impl Exclude {
 
     async fn change(&self) -> Result<Vec<ExclusionChange>, Failure> {
         let location = self.location.get()?;
-        say_if_unprotected(&location);
+        warn_if_unencrypted(&location);
         let store = Store::open(&location).await?;
         let now = unix_milliseconds();
         let changes = match &self.reason {

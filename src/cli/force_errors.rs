@@ -6,8 +6,8 @@ use analysis::{CompletionBin, ErrorBin};
 use serde_json::{Value, json};
 use store::{Protocol, Store};
 
-use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::learned::{self, Grades, LARGE, Learned};
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::label_statistics::{self, ErrorsByGrade, LARGE_FORCE_ERROR, LabelStatistics};
 use crate::output::{Table, count, decimals, print, print_json, range};
 
 /// Failed structures listed per line.
@@ -33,20 +33,20 @@ pub struct ForceErrors {
 }
 
 impl ForceErrors {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let (protocol, learned) = block_on(self.read())??;
         if self.json {
             print_json(&as_json(&protocol, &learned))?;
         } else {
             print(|out| write(out, &protocol, &learned))?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
-    async fn read(&self) -> Result<(Protocol, Learned), Failure> {
+    async fn read(&self) -> Result<(Protocol, LabelStatistics), Failure> {
         let store = Store::open_read_only(&self.location.get()?).await?;
         let protocol = self.select_protocol(&store).await?;
-        let learned = learned::of(&store, protocol.hash).await?;
+        let learned = label_statistics::read(&store, protocol.hash).await?;
         store.close().await;
         Ok((protocol, learned))
     }
@@ -65,8 +65,8 @@ impl ForceErrors {
     }
 }
 
-fn write(out: &mut dyn Write, protocol: &Protocol, learned: &Learned) -> io::Result<()> {
-    let Learned { all, .. } = learned;
+fn write(out: &mut dyn Write, protocol: &Protocol, learned: &LabelStatistics) -> io::Result<()> {
+    let LabelStatistics { all, .. } = learned;
     writeln!(
         out,
         "force error |F_model − F_label| by grade under the original mixture, protocol '{}'",
@@ -96,7 +96,7 @@ fn write(out: &mut dyn Write, protocol: &Protocol, learned: &Learned) -> io::Res
     write_completion(out, "V/V₀", &learned.by_expansion.bins())
 }
 
-fn write_correlations(out: &mut dyn Write, learned: &Learned) -> io::Result<()> {
+fn write_correlations(out: &mut dyn Write, learned: &LabelStatistics) -> io::Result<()> {
     let mut table = Table::new(&[
         "",
         ">structures",
@@ -109,7 +109,7 @@ fn write_correlations(out: &mut dyn Write, learned: &Learned) -> io::Result<()> 
     ]);
     for (name, grades) in [("all", &learned.all), ("biased", &learned.biased), ("control", &learned.control)]
     {
-        let Grades { structures, gamma, gamma_nbr } = grades;
+        let ErrorsByGrade { structures, gamma, gamma_nbr } = grades;
         table.push(vec![
             name.into(),
             structures.to_string(),
@@ -124,7 +124,7 @@ fn write_correlations(out: &mut dyn Write, learned: &Learned) -> io::Result<()> 
     table.write(out)
 }
 
-fn write_energies(out: &mut dyn Write, learned: &Learned) -> io::Result<()> {
+fn write_energies(out: &mut dyn Write, learned: &LabelStatistics) -> io::Result<()> {
     let energies = learned.energies.summary();
     writeln!(out)?;
     if let Some(line) = energies.line() {
@@ -134,7 +134,7 @@ fn write_energies(out: &mut dyn Write, learned: &Learned) -> io::Result<()> {
 }
 
 fn write_bins(out: &mut dyn Write, name: &str, bins: &[ErrorBin]) -> io::Result<()> {
-    let large = format!(">above {LARGE} eV/Å (%)");
+    let large = format!(">above {LARGE_FORCE_ERROR} eV/Å (%)");
     let mut table = Table::new(&[
         name,
         ">atoms",
@@ -191,11 +191,11 @@ fn write_completion(out: &mut dyn Write, name: &str, bins: &[CompletionBin<Strin
 }
 
 /// The output of `--json`.
-pub fn as_json(protocol: &Protocol, learned: &Learned) -> Value {
+pub fn as_json(protocol: &Protocol, learned: &LabelStatistics) -> Value {
     json!({
         "protocol": protocol.name,
         "protocol_hash": protocol.hash.to_string(),
-        "large": LARGE,
+        "large": LARGE_FORCE_ERROR,
         "all": grades_as_json(&learned.all),
         "biased": grades_as_json(&learned.biased),
         "control": grades_as_json(&learned.control),
@@ -206,7 +206,7 @@ pub fn as_json(protocol: &Protocol, learned: &Learned) -> Value {
     })
 }
 
-fn grades_as_json(grades: &Grades) -> Value {
+fn grades_as_json(grades: &ErrorsByGrade) -> Value {
     let one = |errors: &analysis::ForceErrors| {
         json!({
             "spearman": errors.spearman(), "roc_auc": errors.roc_auc(), "left_out": errors.left_out(),

@@ -9,10 +9,10 @@ use store::{CampaignLock, Imported, Store, unix_milliseconds};
 use wire::ContentHash;
 use workers::labeller::LabelBounds;
 
-use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::frames::Frames;
-use crate::labelling;
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::label_setup;
 use crate::output::{count, print};
+use crate::xyz_reader::XyzReader;
 
 /// Import labelled structures
 ///
@@ -60,7 +60,7 @@ impl File {
 }
 
 impl Import {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let files: Vec<_> = self.files.iter().map(|path| read(path)).collect::<Result<_, _>>()?;
         let (protocol, imported) = block_on(self.import(&files))??;
         let Imported { labels, checks, known } = imported;
@@ -69,7 +69,7 @@ impl Import {
             let (labels, checks) = (count(labels, "label"), count(checks, "check"));
             writeln!(out, "imported {labels} and {checks} of protocol '{name}'; {known} already known")
         })?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     async fn import(&self, files: &[File]) -> Result<(Protocol, Imported), Failure> {
@@ -77,7 +77,7 @@ impl Import {
         let store = Store::open(&location).await?;
         // Imported structures change which candidates are duplicates: exclude a run.
         let _lock = CampaignLock::acquire_at(&location, "calmwalk import").await?;
-        let bounds = labelling::bounds(&store).await?;
+        let bounds = label_setup::read_bounds(&store).await?;
         files.iter().try_for_each(|file| file.check(&bounds))?;
         let protocol = match &self.protocol {
             Some(name) => protocol_named(&store, name).await?,
@@ -98,7 +98,7 @@ impl Import {
 fn read(path: &Path) -> Result<File, Failure> {
     let name = path.display().to_string();
     let (mut frames, mut lines) = (Vec::new(), Vec::new());
-    for (number, frame) in Frames::open(path).map_err(Failure::input)?.enumerate() {
+    for (number, frame) in XyzReader::open(path).map_err(Failure::input)?.enumerate() {
         let frame = frame.map_err(Failure::input)?;
         let label =
             label(&frame).map_err(|error| Failure::Input(format!("{name}:{}: {error}", frame.line)))?;

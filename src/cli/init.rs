@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::{Ended, Failure};
+use super::{ExitStatus, Failure};
 use crate::output::print;
 
 /// Create a small runnable example with a commented campaign.toml
@@ -31,7 +31,7 @@ const FILES: [(&str, &[u8]); 5] = [
 ];
 
 impl Init {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let config = self.directory.join("campaign.toml");
         let files = FILES.iter().map(|(path, content)| (self.directory.join(path), *content));
         let files: Vec<_> = files.chain([(config.clone(), CAMPAIGN)]).collect();
@@ -49,7 +49,7 @@ impl Init {
             writeln!(out, "  calmwalk run {}", config.display())?;
             writeln!(out, "  calmwalk status {}", self.directory.display())
         })?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 

@@ -8,14 +8,14 @@ use std::time::Instant;
 use store::{Location, Store, StoreError};
 use tokio::sync::Notify;
 
-use super::{Ended, Failure, block_on, campaign_location, duration_between};
-use crate::actors::asked_to_stop;
-use crate::actors::slots::{self, Slots};
+use super::{ExitStatus, Failure, block_on, campaign_location, duration_between};
 use crate::config::Config;
 use crate::duration::Duration;
-use crate::labelling::{HostOptions, Labelling};
+use crate::label_setup::{HostOptions, LabelSetup};
 use crate::log::Options;
-use crate::output::{say, say_if_unprotected};
+use crate::output::{log_and_print, warn_if_unencrypted};
+use crate::runtime::label_pool::{self, LabelPool};
+use crate::runtime::stop_signal;
 
 /// Between two attempts to open a campaign that does not exist yet.
 const RETRY_INTERVAL: std::time::Duration = std::time::Duration::from_secs(2);
@@ -59,17 +59,17 @@ pub struct Label {
 }
 
 impl Label {
-    pub fn run(self) -> Result<Ended, Failure> {
-        self.log.begin("label")?;
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        self.log.init("label")?;
         block_on(self.label())?
     }
 
-    async fn label(self) -> Result<Ended, Failure> {
-        let (stopping, stop) = asked_to_stop("stopping: labels in progress finish or return to the queue …")?;
-        say_if_unprotected(&campaign_location::parse(&self.store)?);
+    async fn label(self) -> Result<ExitStatus, Failure> {
+        let (stopping, stop) = stop_signal("stopping: labels in progress finish or return to the queue …")?;
+        warn_if_unencrypted(&campaign_location::parse(&self.store)?);
         loop {
-            let Some((opened, labelling)) = self.wait_for_campaign(&stopping, &stop).await? else {
-                return Ok(Ended::Interrupted);
+            let Some((opened, label_setup)) = self.wait_for_campaign(&stopping, &stop).await? else {
+                return Ok(ExitStatus::Interrupted);
             };
             let location = match campaign_location::parse(&self.store)? {
                 Location::Directory(directory) => std::path::absolute(directory).map_err(Failure::failed)?,
@@ -79,22 +79,22 @@ impl Label {
                 }
                 Location::Server(url) => url.as_str().into(),
             };
-            let protocol = labelling.protocol.clone();
-            let slots = Slots {
+            let protocol = label_setup.protocol.clone();
+            let slots = LabelPool {
                 number: self.concurrency,
                 location,
-                labelling,
+                label_setup,
                 until_empty: self.until_empty,
                 grace: self.grace_period.get(),
             };
-            let ended = slots::work(&opened, slots, &stopping, &stop).await?;
+            let ended = label_pool::run(&opened, slots, &stopping, &stop).await?;
             let is_in_force = opened.is_in_force(protocol.hash).await?;
             opened.close().await;
-            if ended == Ended::Interrupted || is_in_force {
+            if ended == ExitStatus::Interrupted || is_in_force {
                 return Ok(ended);
             }
             let name = protocol.name;
-            say(format_args!(
+            log_and_print(format_args!(
                 "the campaign replaced label protocol '{name}': continuing with the new protocol"
             ));
         }
@@ -105,7 +105,7 @@ impl Label {
         &self,
         stopping: &Arc<AtomicBool>,
         stop: &Notify,
-    ) -> Result<Option<(Store, Labelling)>, Failure> {
+    ) -> Result<Option<(Store, LabelSetup)>, Failure> {
         let (started, mut reported) = (Instant::now(), false);
         while !stopping.load(Ordering::Relaxed) {
             // Parsed at each attempt: the campaign may appear in a subdirectory.
@@ -116,14 +116,14 @@ impl Label {
                 Err(OpenError::Fatal(failure)) => return Err(failure),
             };
             if !std::mem::replace(&mut reported, true) {
-                say(format_args!("waiting for the campaign: {error}"));
+                log_and_print(format_args!("waiting for the campaign: {error}"));
             }
             tokio::select! { () = tokio::time::sleep(RETRY_INTERVAL) => {}, () = stop.notified() => {} }
         }
         Ok(None)
     }
 
-    async fn open(&self, location: &Location) -> Result<(Store, Labelling), OpenError> {
+    async fn open(&self, location: &Location) -> Result<(Store, LabelSetup), OpenError> {
         let store = Store::open(location).await?;
         let Some(protocol) = store.protocol_in_force().await? else {
             let lacks = "label protocol yet";
@@ -132,8 +132,8 @@ impl Label {
         let label = self.config.as_deref().map(Config::load_label).transpose();
         let label = label.map_err(|error| OpenError::Fatal(error.into()))?;
         let options = HostOptions { method: self.method.as_deref(), files: &self.files, label };
-        match Labelling::of(&store, protocol, options).await {
-            Ok(labelling) => Ok((store, labelling)),
+        match LabelSetup::read(&store, protocol, options).await {
+            Ok(label_setup) => Ok((store, label_setup)),
             Err(failure) => Err(OpenError::Fatal(failure)),
         }
     }

@@ -11,14 +11,14 @@ use store::Protocol;
 use tokio::sync::Notify;
 use workers::labeller::{Once, label_once};
 
-use super::{Ended, Failure, block_on};
-use crate::actors::asked_to_stop;
+use super::{ExitStatus, Failure, block_on};
+use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::config::Config;
-use crate::labelling;
+use crate::label_setup;
 use crate::log::Options;
 use crate::output::{print, print_json};
-use crate::setup::MethodSetup;
-use crate::whole_file::{WholeFile, cannot_write};
+use crate::process_config::MethodConfig;
+use crate::runtime::stop_signal;
 
 /// Label the structures of a file, to test a label protocol without a campaign
 ///
@@ -70,23 +70,23 @@ struct Labelled {
 }
 
 impl LabelFile {
-    pub fn run(self) -> Result<Ended, Failure> {
-        self.log.begin("label-file")?;
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        self.log.init("label-file")?;
         block_on(async {
-            let (_, stop) = asked_to_stop("stopping …")?;
+            let (_, stop) = stop_signal("stopping …")?;
             self.label(&stop).await
         })?
     }
 
     /// Labels the structures one after the other, up to the first failure.
-    async fn label(&self, stop: &Notify) -> Result<Ended, Failure> {
+    async fn label(&self, stop: &Notify) -> Result<ExitStatus, Failure> {
         let section = Config::load_label(&self.config)?;
         let frames = read_structures(&self.structures).map_err(Failure::input)?;
-        let setup = MethodSetup::of(&section)?;
-        let protocol = labelling::protocol(section.protocol_name(), setup.identity()?);
+        let setup = MethodConfig::from_section(&section)?;
+        let protocol = label_setup::protocol(section.protocol_name(), setup.identity()?);
         let method = setup.load(&protocol)?;
         let bounds = section.bounds();
-        let mut output = self.output.as_deref().map(WholeFile::create).transpose()?;
+        let mut output = self.output.as_deref().map(AtomicFile::create).transpose()?;
         for frame in frames {
             let source = format!("{}:{}", self.structures.display(), frame.line);
             let structure = frame.structure;
@@ -95,7 +95,7 @@ impl LabelFile {
                 attempt = label_once(&method, &structure, &bounds) => attempt?,
                 () = stop.notified() => {
                     method.stop().await?;
-                    return Ok(Ended::Interrupted);
+                    return Ok(ExitStatus::Interrupted);
                 }
             };
             let labelled = Labelled::new(source, &structure, &protocol, attempt)?;
@@ -108,8 +108,8 @@ impl LabelFile {
                 write_frame(file, &labelled.frame(structure)).map_err(|error| cannot_write(path, error))?;
             }
         }
-        output.map_or(Ok(()), WholeFile::finish)?;
-        Ok(Ended::Done)
+        output.map_or(Ok(()), AtomicFile::finish)?;
+        Ok(ExitStatus::Done)
     }
 }
 

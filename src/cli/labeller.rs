@@ -8,10 +8,10 @@ use store::{Location, ProcessRecord, Store, unix_milliseconds};
 use tokio::signal::unix::{SignalKind, signal};
 use workers::labeller::{Closing, LabellerSettings, Method, Stay, Timing, insist, serve};
 
-use super::{Ended, Failure, block_on};
+use super::{ExitStatus, Failure, block_on};
 use crate::log;
-use crate::output::show;
-use crate::setup::{self, LabellerSetup};
+use crate::output::print_stderr;
+use crate::process_config::{self, LabellerConfig};
 
 /// Internal: a labeller process, started by `calmwalk run` and `calmwalk label`
 ///
@@ -22,10 +22,10 @@ use crate::setup::{self, LabellerSetup};
 pub struct Labeller {}
 
 impl Labeller {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
-        let setup: LabellerSetup = setup::read()?;
-        log::begin(setup.log.clone(), "labeller", setup.number)?;
+        let setup: LabellerConfig = process_config::from_stdin()?;
+        log::init(setup.log.clone(), "labeller", setup.number)?;
         match &setup.slot {
             Some(slot) => launcher::end_with_parent(slot.parent).map_err(Failure::failed)?,
             None => launcher::own_session().map_err(Failure::failed)?,
@@ -33,11 +33,11 @@ impl Labeller {
         let method = setup.method.load(&setup.protocol)?;
         let closing = Arc::new(Closing::default());
         block_on(label(setup, method, &closing))??;
-        Ok(if closing.is_stopping() { Ended::Interrupted } else { Ended::Done })
+        Ok(if closing.is_stopping() { ExitStatus::Interrupted } else { ExitStatus::Done })
     }
 }
 
-async fn label(setup: LabellerSetup, method: Method, closing: &Arc<Closing>) -> Result<(), Failure> {
+async fn label(setup: LabellerConfig, method: Method, closing: &Arc<Closing>) -> Result<(), Failure> {
     let (mut terminate, asked) =
         (signal(SignalKind::terminate()).map_err(Failure::failed)?, Arc::clone(closing));
     tokio::spawn(async move {
@@ -69,7 +69,7 @@ async fn label(setup: LabellerSetup, method: Method, closing: &Arc<Closing>) -> 
     let reports = slot.is_some();
     let report = |line: &str| {
         if reports {
-            show(line);
+            print_stderr(line);
         }
     };
     serve(store.clone(), method, settings, record, closing, unix_milliseconds, report).await?;

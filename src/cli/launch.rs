@@ -12,10 +12,10 @@ use orchestrator::slurm::{JobNames, Phase, Plan, Slurm, SlurmError, Wanted, plan
 use store::Location;
 
 use self::job_specs::JobSpecs;
-use super::{Ended, Failure, block_on, campaign_location};
+use super::{ExitStatus, Failure, block_on, campaign_location};
 use crate::campaign::Campaign;
 use crate::config::Config;
-use crate::output::{count, print, say};
+use crate::output::{count, log_and_print, print};
 
 /// How long to wait for one command of Slurm, which itself waits for a busy slurmctld.
 const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
@@ -103,7 +103,7 @@ pub fn job_names(location: &Location) -> JobNames {
 }
 
 impl Launch {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let System::Slurm = self.on;
         let directory = self.directory()?;
         let slurm = Slurm::with_patience(COMMAND_TIMEOUT);
@@ -122,12 +122,12 @@ impl Launch {
             }
             let (names, wanted) = (job_names(&location), self.wanted(&location));
             if wanted.labellers == 0 && campaign.config.label.slots == 0 {
-                say("label.slots = 0 and no labeller jobs: start labellers with calmwalk label");
+                log_and_print("label.slots = 0 and no labeller jobs: start labellers with calmwalk label");
             }
             let specs = JobSpecs::new(&self, &campaign, &directory, wanted)?;
             block_on(self.launch(&slurm, &names, &specs, wanted))??;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     /// The canonical path of the campaign's directory, from which the names of its jobs follow.
@@ -146,7 +146,7 @@ impl Launch {
         if let Location::Directory(_) = location
             && labellers > 0
         {
-            say(
+            log_and_print(
                 "--labellers is ignored: the SQLite store of the campaign is limited to one node, where the orchestrator starts \
                  label.slots labellers; set run.store to a PostgreSQL database for labellers on other nodes",
             );

@@ -37,7 +37,7 @@ use ::store::Location;
 use clap::{Parser, Subcommand};
 
 use crate::duration::Duration;
-use crate::outcome::{Ended, Failure};
+use crate::exit_status::{ExitStatus, Failure};
 
 /// Grow the training set of an interatomic potential by molecular dynamics biased towards structures it does not know.
 ///
@@ -87,7 +87,7 @@ enum Command {
 }
 
 /// Runs the command.
-pub fn run(arguments: Arguments) -> Result<Ended, Failure> {
+pub fn run(arguments: Arguments) -> Result<ExitStatus, Failure> {
     match arguments.command {
         Command::Init(command) => command.run(),
         Command::Validate(command) => command.run(),

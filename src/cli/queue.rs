@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use store::{Attempt, Job, JobDetails, JobState, Location, Store, unix_milliseconds};
 
-use super::{CampaignLocation, Ended, Failure, block_on};
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
 use crate::output::{Table, count, decimals, print, print_json};
 
 /// List, show, drop, retry or prioritise structures in the label queue
@@ -83,7 +83,7 @@ fn parse_state(name: &str) -> Result<JobState, String> {
 }
 
 impl Queue {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = &self.location.get()?;
         match &self.action {
             Action::List(list) => {
@@ -100,7 +100,7 @@ impl Queue {
             }
             action => self.change(location, action)?,
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     /// Changes one job after the other, and prints the new state of each.

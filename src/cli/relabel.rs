@@ -12,11 +12,11 @@ use store::{CampaignLock, Location, NewProtocol, Protocol, Requeued, Store, unix
 use self::protocol_change::ProtocolChange;
 use self::selection::Selection;
 use super::campaign_location::shell_argument;
-use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::bill::{self, Again};
-use crate::condition::Condition;
-use crate::origin::Origin;
-use crate::output::{count, print, print_json, say_if_unprotected};
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::filter::Filter;
+use crate::label_cost::{self, RelabelCost};
+use crate::output::{count, print, print_json, warn_if_unencrypted};
+use crate::provenance::Provenance;
 
 /// Compute labels again, or switch the campaign to another label protocol
 ///
@@ -39,7 +39,7 @@ pub struct Relabel {
     all: bool,
     /// As --all, but only structures that match a filter, such as 'max_force > 20'; see `calmwalk export --help` for its syntax
     #[arg(long = "where", value_name = "FILTER")]
-    condition: Option<Condition>,
+    condition: Option<Filter>,
     /// With --all or --where: also relabel structures labelled by the current protocol
     #[arg(long)]
     include_current: bool,
@@ -64,7 +64,7 @@ struct RelabelReport {
     /// Its differences from the current protocol, one line each.
     changes: Vec<String>,
     selection: Selection,
-    cost: Again,
+    cost: RelabelCost,
     /// Numbers of structures.
     requeued: Requeued,
     /// What the user does next.
@@ -72,19 +72,19 @@ struct RelabelReport {
 }
 
 impl Relabel {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let report = block_on(self.relabel())??;
         if self.json {
             print_json(&report.as_json(self.dry_run))?;
         } else {
             print(|out| report.write(out, self.dry_run, self.config.is_some()))?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     async fn relabel(&self) -> Result<RelabelReport, Failure> {
         let location = self.location.get()?;
-        say_if_unprotected(&location);
+        warn_if_unencrypted(&location);
         let store = match self.dry_run {
             true => Store::open_read_only(&location).await?,
             false => Store::open(&location).await?,
@@ -107,7 +107,7 @@ impl Relabel {
         let protocol = new.as_ref().map_or(&in_force, |new| &new.protocol).clone();
         let selection = self.select(&store, &protocol).await?;
         let moved = if new.is_some() { store.unlabelled_by_others(protocol.hash).await? } else { 0 };
-        let cost = bill::again(&store, &in_force, &selection.sizes()).await?;
+        let cost = label_cost::relabel_cost(&store, &in_force, &selection.sizes()).await?;
         let next = self.next(&store, &location).await?;
         let mut requeued = Requeued { again: selection.structures().len() as u64, moved };
         if !self.dry_run {
@@ -123,7 +123,7 @@ impl Relabel {
         if store.status().await?.led {
             return Ok("the campaign is running: its labellers compute the labels".to_owned());
         }
-        let origin = Origin::of(store).await?;
+        let origin = Provenance::read(store).await?;
         let given = self.config.as_ref().map(|path| path.display().to_string());
         let config = given.or(origin.map(|origin| origin.file.path)).unwrap_or("CONFIG".to_owned());
         let directory = match location {

@@ -4,9 +4,9 @@ use std::io::{self, Write};
 
 use store::Store;
 
-use super::{CampaignLocation, Ended, Failure, block_on};
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
 use crate::output::{Table, count, decimals, print, print_json};
-use crate::replay::{self, Change, Moved, Report, Setting, Stop, Tally};
+use crate::replay::{self, FateChange, FateCounts, MissingFeatures, RelocatedFiles, Report, RuleOverride};
 
 /// Changed decisions printed without --json.
 const SHOWN: usize = 20;
@@ -25,16 +25,16 @@ pub struct Replay {
     location: CampaignLocation,
     /// Change a configuration key of the selector to a value (TOML), such as collect.when.threshold=2.0; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
-    settings: Vec<Setting>,
+    settings: Vec<RuleOverride>,
     #[command(flatten)]
-    moved: Moved,
+    moved: RelocatedFiles,
     /// Print JSON, with all changed decisions
     #[arg(long)]
     json: bool,
 }
 
 impl Replay {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let report = block_on(self.replay())??;
         if self.json {
             print_json(&report)?;
@@ -42,7 +42,7 @@ impl Replay {
             print(|out| write_report(out, &report))?;
         }
         match report.difference {
-            None => Ok(Ended::Done),
+            None => Ok(ExitStatus::Done),
             Some(difference) => Err(Failure::Failed(format!(
                 "decision {} is not reproduced: {} was {}, and is now {}",
                 difference.decision, difference.what, difference.recorded, difference.now
@@ -64,7 +64,7 @@ fn write_report(out: &mut dyn Write, report: &Report) -> io::Result<()> {
     for (key, value) in &report.set {
         writeln!(out, "            {key} = {value}")?;
     }
-    if let Some(Stop { decision, candidate, walk, step }) = &report.stopped {
+    if let Some(MissingFeatures { decision, candidate, walk, step }) = &report.stopped {
         writeln!(
             out,
             "            stopped: the features of candidate {candidate} (decision {decision}, walk {walk},"
@@ -74,8 +74,8 @@ fn write_report(out: &mut dyn Write, report: &Report) -> io::Result<()> {
     if report.set.is_empty() {
         return write_verification(out, report);
     }
-    write_tally(out, "before", before)?;
-    write_tally(out, "now", now)?;
+    write_counts(out, "before", before)?;
+    write_counts(out, "now", now)?;
     if report.walks_cut_short > 0 {
         let walks = report.walks_cut_short;
         writeln!(
@@ -99,7 +99,7 @@ fn write_verification(out: &mut dyn Write, report: &Report) -> io::Result<()> {
         }
         return Ok(());
     }
-    let Tally { candidates, accepted, mixture_version, .. } = report.now;
+    let FateCounts { candidates, accepted, mixture_version, .. } = report.now;
     writeln!(out, "            all reproduced bit by bit: {accepted} of {candidates} candidates accepted")?;
     if report.same_mixture == Some(true) {
         writeln!(out, "            mixture version {mixture_version} is identical to the stored one")?;
@@ -107,8 +107,8 @@ fn write_verification(out: &mut dyn Write, report: &Report) -> io::Result<()> {
     Ok(())
 }
 
-fn write_tally(out: &mut dyn Write, when: &str, tally: &Tally) -> io::Result<()> {
-    let Tally { candidates, accepted, declined, mixture_version } = tally;
+fn write_counts(out: &mut dyn Write, when: &str, counts: &FateCounts) -> io::Result<()> {
+    let FateCounts { candidates, accepted, declined, mixture_version } = counts;
     let reasons: Vec<_> = declined.iter().map(|(reason, count)| format!("{count} {reason}")).collect();
     let reasons = if reasons.is_empty() { String::new() } else { format!(" ({})", reasons.join(", ")) };
     writeln!(
@@ -119,7 +119,7 @@ fn write_tally(out: &mut dyn Write, when: &str, tally: &Tally) -> io::Result<()>
     )
 }
 
-fn write_changes(out: &mut dyn Write, title: &str, changes: &[Change]) -> io::Result<()> {
+fn write_changes(out: &mut dyn Write, title: &str, changes: &[FateChange]) -> io::Result<()> {
     if changes.is_empty() {
         return Ok(());
     }

@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 
 use store::Store;
 
-use super::{CampaignLocation, Ended, Failure, block_on};
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::atomic_file::{AtomicFile, cannot_create};
 use crate::output::{count, print};
 use crate::report::{self, File, PAGE};
-use crate::whole_file::{WholeFile, cannot_create};
 
 /// Write a report of a campaign: figures, tables, settings and provenance
 ///
@@ -27,21 +27,21 @@ pub struct Report {
 }
 
 impl Report {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
         // Fail before the long computation.
         create_directory(&self.output)?;
         let files = block_on(async {
             let store = Store::open_read_only(&location).await?;
-            let files = report::of(&store).await;
+            let files = report::build(&store).await;
             store.close().await;
             files
         })??;
         for File { path, bytes } in &files {
             let path = self.output.join(path);
             path.parent().map_or(Ok(()), create_directory)?;
-            let mut file = WholeFile::create(&path)?;
-            file.write_all(bytes).map_err(|error| crate::whole_file::cannot_write(&path, error))?;
+            let mut file = AtomicFile::create(&path)?;
+            file.write_all(bytes).map_err(|error| crate::atomic_file::cannot_write(&path, error))?;
             file.finish()?;
         }
         let page = self.output.join(PAGE);
@@ -53,7 +53,7 @@ impl Report {
                 count(files.len() - 1, "file")
             )
         })?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 

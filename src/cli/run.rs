@@ -19,17 +19,17 @@ use wire::net::{Endpoint, Tls};
 use workers::labeller::GUARD;
 
 use super::campaign_location::{self, shell_argument};
-use super::{Ended, Failure, block_on, duration_between};
-use crate::actors::notify::{self, Notifier};
-use crate::actors::{self, budget, in_process, processes};
+use super::{ExitStatus, Failure, block_on, duration_between};
 use crate::campaign::Campaign;
+use crate::disk_forecast::{self, DiskForecast, megabytes};
 use crate::duration::Duration;
-use crate::ends::Ends;
-use crate::forecast::{self, Forecast, megabytes};
-use crate::labelling::LABEL_METHOD;
-use crate::origin::Origin;
-use crate::output::{print, say, say_if_unprotected, warn};
-use crate::{log, story, summary, web};
+use crate::label_setup::LABEL_METHOD_KEY;
+use crate::output::{log_and_print, log_and_warn, print, warn_if_unencrypted};
+use crate::provenance::Provenance;
+use crate::runtime::notify::{self, Notifier};
+use crate::runtime::{self, multi_process, single_process, time_budget};
+use crate::walk_ends::WalkEnds;
+use crate::{candidate_details, log, summary, web};
 
 /// Run a campaign until it is finished, or resume it
 ///
@@ -63,7 +63,7 @@ pub struct Run {
     #[arg(long, value_name = "NAME", requires = "announce")]
     host: Option<String>,
     #[command(flatten)]
-    web: web::Addresses,
+    web: web::ListenAddresses,
     #[command(flatten)]
     log: log::Options,
     /// How long to wait for another run to release the campaign, such as 15m
@@ -72,8 +72,8 @@ pub struct Run {
 }
 
 impl Run {
-    pub fn run(self) -> Result<Ended, Failure> {
-        self.log.begin("orchestrator")?;
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        self.log.init("orchestrator")?;
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();
         let directory = match self.directory {
@@ -85,31 +85,31 @@ impl Run {
             }
         };
         create_directory(&directory)?;
-        let listen = self.listen.map(|endpoint| actors::Listen {
+        let listen = self.listen.map(|endpoint| runtime::Listen {
             endpoint,
             tls: self.tls.as_deref().map(Tls::in_directory),
             announce: self.announce,
             host: self.host.unwrap_or_else(store::this_host),
         });
-        listen.iter().try_for_each(actors::Listen::check)?;
+        listen.iter().try_for_each(runtime::Listen::check)?;
         if !self.in_process {
             raise_descriptor_limit();
         }
         let wait_timeout = self.wait_timeout.get();
         let ended = block_on(async {
             let location = campaign.config.location(&directory)?;
-            say_if_unprotected(&location);
+            warn_if_unencrypted(&location);
             let web = self.web.listen().await?;
             let _lock = lock::directory(&directory, &location, wait_timeout).await?;
-            listen.iter().try_for_each(actors::Listen::begins)?;
+            listen.iter().try_for_each(runtime::Listen::clear_announcement)?;
             let (in_process, adopt) = (self.in_process, self.adopt);
             let options = RunOptions { in_process, adopt, listen: listen.as_ref(), web, wait_timeout };
             run(&campaign, &directory, &location, options).await
         })?
         .map_err(|failure| failure.in_campaign(&directory))?;
-        listen.iter().try_for_each(|listen| listen.has_ended(ended))?;
-        if ended == Ended::Interrupted {
-            say("stopped; run the same command again to resume the campaign");
+        listen.iter().try_for_each(|listen| listen.announce_end(ended))?;
+        if ended == ExitStatus::Interrupted {
+            log_and_print("stopped; run the same command again to resume the campaign");
         }
         Ok(ended)
     }
@@ -140,8 +140,8 @@ struct RunOptions<'a> {
     in_process: bool,
     /// Whether the campaign may have been started with another configuration file.
     adopt: bool,
-    listen: Option<&'a actors::Listen>,
-    web: web::Listening,
+    listen: Option<&'a runtime::Listen>,
+    web: web::BoundListeners,
     wait_timeout: std::time::Duration,
 }
 
@@ -150,10 +150,10 @@ async fn run(
     directory: &Path,
     location: &Location,
     options: RunOptions<'_>,
-) -> Result<Ended, Failure> {
+) -> Result<ExitStatus, Failure> {
     let RunOptions { in_process, adopt, listen, web, wait_timeout } = options;
     let lock = lock::server(location, wait_timeout).await?;
-    let origin = Origin::new(&campaign.path, &campaign.text, directory);
+    let origin = Provenance::new(&campaign.path, &campaign.text, directory);
     let store = open_store(campaign, location, &origin, adopt).await?;
     let store = lock.iter().fold(store, Store::led_by);
     if let Location::Directory(directory) = &location {
@@ -163,25 +163,36 @@ async fn run(
     let selector = restore_selector(campaign, &store).await?;
     if campaign.config.label.slots == 0 {
         let store = shell_argument(location);
-        say(format_args!("label.slots = 0: start labellers with calmwalk label --store {store}"));
+        log_and_print(format_args!("label.slots = 0: start labellers with calmwalk label --store {store}"));
     }
     let over = Arc::new(Notify::new());
-    let run = actors::Run { campaign, store: &store, process: &process, directory, listen, over: &over };
-    let (limits, used_up) = (campaign.config.budget(), budget::time_used_up(&store).await?);
+    let run = runtime::RunContext {
+        campaign,
+        store: &store,
+        process: &process,
+        directory,
+        listen,
+        limit_reached: &over,
+    };
+    let (limits, used_up) = (campaign.config.budget(), time_budget::exhausted_time_limit(&store).await?);
     let work = async {
         if used_up.is_some() {
             // The budget allows no further work.
             return Ok(reactor::Ended::Stopped);
         }
-        if in_process { in_process::work(run, selector).await } else { processes::work(run, selector).await }
+        if in_process {
+            single_process::run(run, selector).await
+        } else {
+            multi_process::run(run, selector).await
+        }
     };
     let serving = web.serve(location, &store, &campaign.artifact).await?;
     let mut notifier = Notifier::new(&campaign.config, &store, location).await?;
     let worked = tokio::select! {
         ended = work => ended,
-        error = budget::keep(&store, &limits, &over) => Err(error.into()),
+        error = time_budget::track(&store, &limits, &over) => Err(error.into()),
         error = lock::lost(lock.as_ref()) => Err(error.into()),
-        never = notify::keep(&mut notifier) => match never {},
+        never = notify::run(&mut notifier) => match never {},
     };
     notify::finish(notifier, worked.as_ref().err()).await;
     serving.end().await;
@@ -196,11 +207,11 @@ async fn run(
     }
     if !store.status().await?.finished {
         store.close().await;
-        return Ok(Ended::Interrupted);
+        return Ok(ExitStatus::Interrupted);
     }
-    let summary = summary::of(&store, campaign.protocol.hash).await?;
+    let summary = summary::read(&store, campaign.protocol.hash).await?;
     let status = store.status().await?;
-    let (failed, ends) = (status.labels.failed, Ends::of(&status.walks));
+    let (failed, ends) = (status.labels.failed, WalkEnds::from_walks(&status.walks));
     let argument = shell_argument(location);
     let file = match location {
         Location::Directory(_) => format!("/{DATABASE}"),
@@ -217,18 +228,18 @@ async fn run(
         writeln!(out, "  calmwalk export {argument} --output dataset.extxyz")
     })?;
     store.close().await;
-    if ends.none_in_order() {
-        warn(format_args!("calmwalk: the campaign has failed: {}", ends.warning()));
-        return Ok(Ended::NoneInOrder);
+    if ends.all_early() {
+        log_and_warn(format_args!("calmwalk: the campaign has failed: {}", ends.warning()));
+        return Ok(ExitStatus::NoWalkCompleted);
     }
-    Ok(Ended::Done)
+    Ok(ExitStatus::Done)
 }
 
 /// Creates the campaign, or opens an existing one and checks that it belongs to this configuration.
 async fn open_store(
     campaign: &Campaign,
     location: &Location,
-    origin: &Origin,
+    origin: &Provenance,
     adopt: bool,
 ) -> Result<Store, Failure> {
     let now = unix_milliseconds();
@@ -243,7 +254,7 @@ async fn open_store(
                 resolved_configuration: resolved.to_string(),
                 configuration_in_force: resolved.to_string(),
             };
-            let store = Store::create(location, &record, &campaign.stored_seeds(), now).await?;
+            let store = Store::create(location, &record, &campaign.stored_seed_structures(), now).await?;
             resume::record_start(&store, origin, location).await?;
             store
         }
@@ -265,11 +276,16 @@ async fn open_store(
 async fn write_metadata(campaign: &Campaign, store: &Store) -> Result<(), Failure> {
     let text = |json: serde_json::Result<String>| json.map_err(Failure::failed);
     let method = campaign.method()?;
-    store.leave_note(LABEL_METHOD, &text(serde_json::to_string(&method))?).await?;
+    store.leave_note(LABEL_METHOD_KEY, &text(serde_json::to_string(&method))?).await?;
     store.leave_note(GUARD, &text(serde_json::to_string(&campaign.config.label.guard))?).await?;
     let elements: Vec<_> = campaign.model.elements().iter().map(|species| species.symbol()).collect();
-    store.leave_note(story::ELEMENTS, &text(serde_json::to_string(&elements))?).await?;
-    store.leave_note(forecast::NOTE, &text(serde_json::to_string(&Forecast::of(campaign)))?).await?;
+    store.leave_note(candidate_details::ELEMENTS_KEY, &text(serde_json::to_string(&elements))?).await?;
+    store
+        .leave_note(
+            disk_forecast::METADATA_KEY,
+            &text(serde_json::to_string(&DiskForecast::from_campaign(campaign)))?,
+        )
+        .await?;
     Ok(())
 }
 
@@ -279,11 +295,11 @@ async fn warn_if_disk_is_too_small(
     directory: &Path,
     store: &Store,
 ) -> Result<(), Failure> {
-    let forecast = Forecast::of(campaign);
-    let needed = (forecast.bytes() + forecast::LOG).saturating_sub(store.size().await?);
+    let forecast = DiskForecast::from_campaign(campaign);
+    let needed = (forecast.bytes() + disk_forecast::WAL_BYTES).saturating_sub(store.size().await?);
     let free = store::free_space(directory)?;
     if free < needed {
-        warn(format_args!(
+        log_and_warn(format_args!(
             "WARNING: the campaign needs {} more on the disk of {}, but only {} are free (forecast: {forecast})",
             megabytes(needed),
             directory.display(),
@@ -327,7 +343,7 @@ async fn restore_selector(campaign: &Campaign, store: &Store) -> Result<Selector
     let mut selector = Selector::restore(
         campaign.selector_settings(),
         store.campaign().await?.id,
-        campaign.seeds.iter().map(|named| named.seed.clone()).collect(),
+        campaign.seed_structures.iter().map(|named| named.seed.clone()).collect(),
         campaign.grader(),
         Arc::new(campaign.artifact.mixture.clone()),
         campaign.training.clone(),

@@ -21,12 +21,12 @@ pub use self::expected_end::ExpectedEnd;
 use self::label_summary::LabelSummary;
 pub use self::mixture_summary::MixtureSummary;
 use self::page::Page;
-use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::budget;
-use crate::ends::Ends;
-use crate::forecast::{self, Forecast, megabytes};
-use crate::origin::Origin;
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::budget_usage;
+use crate::disk_forecast::{self, DiskForecast, megabytes};
 use crate::output::{count, decimals, print, print_json};
+use crate::provenance::Provenance;
+use crate::walk_ends::WalkEnds;
 
 /// Show the progress of a campaign
 ///
@@ -48,7 +48,7 @@ pub struct Status {
 }
 
 impl Status {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
         let snapshot = block_on(Snapshot::read_location(&location))??;
         let jobs = block_on(BatchJobs::query(&location))?;
@@ -58,7 +58,7 @@ impl Status {
             let page = if self.all { Page::unlimited() } else { Page::unlimited().screen() };
             print(|out| snapshot.write(out, &jobs, page, self.walks))?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 
@@ -67,7 +67,7 @@ impl Status {
 pub struct Snapshot {
     campaign: store::Campaign,
     /// `None` for campaigns of early versions.
-    origin: Option<Origin>,
+    origin: Option<Provenance>,
     status: CampaignStatus,
     mixture: MixtureSummary,
     disk: Disk,
@@ -85,14 +85,14 @@ impl Snapshot {
 
     /// Reads the state of a campaign.
     pub async fn read(store: &Store) -> Result<Self, Failure> {
-        let forecast = store.note(forecast::NOTE).await?;
+        let forecast = store.note(disk_forecast::METADATA_KEY).await?;
         let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
         let (campaign, status) = (store.campaign().await?, store.status().await?);
         let labels = LabelSummary::read(store, &status).await?;
         let configuration: Value = serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default();
         Ok(Self {
             end: ExpectedEnd::extrapolate(&status, &configuration, labels.bill()),
-            origin: Origin::of(store).await?,
+            origin: Provenance::read(store).await?,
             mixture: MixtureSummary(store.values().await?),
             disk: Disk { bytes: store.size().await?, forecast },
             campaign,
@@ -179,7 +179,7 @@ impl Snapshot {
             page.titled(out, "", &format!("configured by {}", origin.file.path))?;
         }
         page.titled(out, "state", &processes::state(status))?;
-        let ends = Ends::of(&status.walks);
+        let ends = WalkEnds::from_walks(&status.walks);
         page.titled(out, "walks", &describe_walks(status, &ends))?;
         if page.is_unlimited() {
             ends.lines().iter().try_for_each(|line| page.titled(out, "", line))?;
@@ -192,7 +192,7 @@ impl Snapshot {
         mixture.write(out, page, &campaign.mode)?;
         write_candidates(out, page, &status.candidates, labels.shared)?;
         labels.write(out, page, status)?;
-        if let Some(budget) = budget::shown(&status.budget) {
+        if let Some(budget) = budget_usage::describe(&status.budget) {
             page.titled(out, "budget", &budget)?;
         }
         page.titled(out, "disk", &disk.describe(page, status))?;
@@ -209,7 +209,7 @@ struct Disk {
     /// Current size.
     bytes: u64,
     /// Last forecast of the orchestrator for the end of the campaign.
-    forecast: Option<Forecast>,
+    forecast: Option<DiskForecast>,
 }
 
 impl Disk {
@@ -217,7 +217,7 @@ impl Disk {
     fn at_the_end(&self, status: &CampaignStatus) -> Option<u64> {
         let Candidates { accepted, control, .. } = status.candidates;
         let forecast = self.forecast.filter(|_| !status.finished)?;
-        Some(self.bytes + forecast.still_to_come(accepted + control, self.bytes))
+        Some(self.bytes + forecast.remaining_bytes(accepted + control, self.bytes))
     }
 
     fn describe(&self, page: &Page, status: &CampaignStatus) -> String {
@@ -236,12 +236,12 @@ impl Disk {
     }
 }
 
-fn describe_walks(status: &CampaignStatus, ends: &Ends) -> String {
+fn describe_walks(status: &CampaignStatus, ends: &WalkEnds) -> String {
     let under_way = status.walks.iter().filter(|walk| walk.is_under_way()).count();
     let state = if status.led { "active" } else { "not finished" };
     let ended = match ends.ended() {
         0 => "0 ended".to_owned(),
-        ended => format!("{ended} ended ({})", ends.without_causes()),
+        ended => format!("{ended} ended ({})", ends.counts_by_end()),
     };
     let speed = status.steps_per_second.filter(|_| under_way > 0);
     let speed = speed.map_or(String::new(), |speed| format!("; {} steps/s", decimals(Some(speed), 1)));

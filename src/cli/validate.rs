@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use calm::Artifact;
 
-use super::{Ended, Failure};
+use super::{ExitStatus, Failure};
 use crate::campaign::Campaign;
-use crate::forecast::Forecast;
+use crate::disk_forecast::DiskForecast;
 use crate::output::{count, print};
 
 /// Check a configuration and all files that it refers to
@@ -22,19 +22,19 @@ pub struct Validate {
 }
 
 impl Validate {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let campaign = Campaign::load(&self.config)?;
         campaign.print_warnings();
         print(|out| write(out, &self.config, &campaign))?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 
 fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()> {
-    let Campaign { model, artifact: Artifact { mixture, .. }, seeds, .. } = campaign;
+    let Campaign { model, artifact: Artifact { mixture, .. }, seed_structures, .. } = campaign;
     let elements: Vec<_> = model.elements().iter().map(|species| species.symbol()).collect();
     let architecture = model.description().architecture;
-    let atoms = || seeds.iter().map(|named| named.seed.structure.len());
+    let atoms = || seed_structures.iter().map(|named| named.seed.structure.len());
     let (min, max) = (atoms().min().unwrap_or(0), atoms().max().unwrap_or(0));
     writeln!(out, "{} is a valid campaign", path.display())?;
     writeln!(out, "  potential        {architecture}, {}, cutoff {} Å", elements.join(" "), model.cutoff())?;
@@ -47,9 +47,9 @@ fn write(out: &mut dyn Write, path: &Path, campaign: &Campaign) -> io::Result<()
             "                   without scatter matrices and counts: it can grade structures but not be updated"
         )?;
     }
-    writeln!(out, "  seed structures  {}, with {min} to {max} atoms", seeds.len())?;
+    writeln!(out, "  seed structures  {}, with {min} to {max} atoms", seed_structures.len())?;
     writeln!(out, "  labels           protocol '{}'", campaign.protocol.name)?;
-    writeln!(out, "  disk             {}", Forecast::of(campaign))?;
+    writeln!(out, "  disk             {}", DiskForecast::from_campaign(campaign))?;
     match campaign.warnings.len() {
         0 => writeln!(out, "  warnings         none"),
         count => writeln!(out, "  warnings         {count}, see above"),

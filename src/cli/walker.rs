@@ -8,9 +8,9 @@ use wire::ipc::IpcWalker;
 use workers::walk::WalkContext;
 use workers::walker;
 
-use super::{Ended, Failure};
-use crate::setup::{self, WalkerSetup};
-use crate::{interrupt, log};
+use super::{ExitStatus, Failure};
+use crate::process_config::{self, WalkerConfig};
+use crate::{log, signals};
 
 /// Internal: a walker process, started by `calmwalk run` and `calmwalk agent`
 ///
@@ -19,20 +19,20 @@ use crate::{interrupt, log};
 pub struct Walker {}
 
 impl Walker {
-    pub fn run(self) -> Result<Ended, Failure> {
-        let setup: WalkerSetup = setup::read()?;
-        log::begin(setup.log.clone(), "walker", Some(setup.door.walker()))?;
+    pub fn run(self) -> Result<ExitStatus, Failure> {
+        let setup: WalkerConfig = process_config::from_stdin()?;
+        log::init(setup.log.clone(), "walker", Some(setup.door.walker()))?;
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
         launcher::end_with_parent(setup.parent).map_err(Failure::failed)?;
-        let stopping = interrupt::flag()?;
+        let stopping = signals::stop_flag()?;
         let threads = Threads::new(setup.threads).map_err(Failure::failed)?;
         let context = WalkContext { model: setup.load_model()?, threads, settings: Arc::new(setup.settings) };
         let mut transport = IpcWalker::connect(&setup.door, stopping).map_err(Failure::failed)?;
         let ended = walker::run(&context, &mut transport);
         match (ended, transport.failure()) {
             (_, Some(failure)) => Err(Failure::failed(failure)),
-            (walker::Ended::SentHome, None) => Ok(Ended::Done),
-            (walker::Ended::Stopped, None) => Ok(Ended::Interrupted),
+            (walker::Ended::SentHome, None) => Ok(ExitStatus::Done),
+            (walker::Ended::Stopped, None) => Ok(ExitStatus::Interrupted),
         }
     }
 }

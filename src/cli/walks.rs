@@ -3,7 +3,7 @@
 use store::{Location, Store, unix_milliseconds};
 use wire::WalkId;
 
-use super::{CampaignLocation, Ended, Failure, block_on};
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
 use crate::output::print;
 
 /// Pause or resume walks
@@ -39,11 +39,11 @@ pub struct WalkSelection {
 }
 
 impl Walks {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
         let messages = block_on(change(&location, &self.action))??;
         print(|out| messages.iter().try_for_each(|line| writeln!(out, "{line}")))?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 

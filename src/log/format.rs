@@ -1,4 +1,4 @@
-//! A line of the log.
+//! Formats a line of the log.
 
 use std::fmt::{Debug, Write};
 
@@ -8,33 +8,33 @@ use tracing::field::{Field, Visit};
 
 const DAY: i64 = 86_400_000;
 
-/// What an event says: its message, and numbers and words with names.
+/// Message and named values of an event.
 #[derive(Debug, Default)]
 pub struct Fields {
     message: String,
     named: Map<String, Value>,
 }
 
-/// An event and where it comes from.
+/// An event with its source.
 #[derive(Debug)]
-pub struct Line<'a> {
+pub struct LogLine<'a> {
     /// ms since 1970.
     pub time: i64,
     pub level: Level,
-    /// What process this is, as `walker 3`.
+    /// Name of the process, such as `walker 3`.
     pub process: &'a str,
     pub pid: u32,
-    /// The module that says it.
+    /// Module of the event.
     pub target: &'a str,
     pub fields: Fields,
 }
 
-/// What zenoh adds whenever it cannot accept a connection, also where a certificate was refused.
+/// zenoh adds this hint whenever it cannot accept a connection, even if a certificate was refused.
 const FILE_LIMIT_HINT: &str = ". Hint: increase the system open file limit.";
 
 impl Fields {
-    /// Takes out a hint that is wrong.
-    pub fn correct(&mut self) {
+    /// Removes a hint that does not apply.
+    pub fn remove_wrong_hint(&mut self) {
         let is_right = |why: &str| why.contains("(os error 23)") || why.contains("(os error 24)");
         if let Some(why) = self.message.strip_suffix(FILE_LIMIT_HINT)
             && !is_right(why)
@@ -44,11 +44,11 @@ impl Fields {
     }
 }
 
-impl Line<'_> {
-    /// For people. Whatever is said is one line.
+impl LogLine<'_> {
+    /// Text for people, escaped to one line.
     pub fn text(&self) -> String {
         let Self { time, level, process, pid, fields, .. } = self;
-        let mut text = format!("{} {level:<5} {process} [{pid}] ", utc(*time));
+        let mut text = format!("{} {level:<5} {process} [{pid}] ", format_utc(*time));
         for character in fields.message.chars() {
             match character.is_control() {
                 true => text.extend(character.escape_default()),
@@ -67,7 +67,7 @@ impl Line<'_> {
     pub fn json(&self) -> String {
         let Self { time, level, process, pid, target, fields } = self;
         let object = serde_json::json!({
-            "time": utc(*time), "level": level.as_str().to_lowercase(), "process": process, "pid": pid,
+            "time": format_utc(*time), "level": level.as_str().to_lowercase(), "process": process, "pid": pid,
             "target": target, "message": fields.message, "fields": fields.named,
         });
         format!("{object}\n")
@@ -78,7 +78,7 @@ impl Visit for Fields {
     fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
         match field.name() {
             "message" => self.message = format!("{value:?}"),
-            // Where libraries keep what a message of the crate log has besides.
+            // Metadata of messages from the crate `log`.
             name if name.starts_with("log.") => {}
             name => drop(self.named.insert(name.to_owned(), format!("{value:?}").into())),
         }
@@ -108,8 +108,8 @@ impl Visit for Fields {
     }
 }
 
-/// As 2026-03-01T12:00:00.250Z (RFC 3339), from ms since 1970.
-pub fn utc(milliseconds: i64) -> String {
+/// Formats ms since 1970 as 2026-03-01T12:00:00.250Z (RFC 3339).
+pub fn format_utc(milliseconds: i64) -> String {
     let (year, month, day) = date(milliseconds.div_euclid(DAY));
     let of_day = milliseconds.rem_euclid(DAY);
     let (hour, minute) = (of_day / 3_600_000, of_day / 60_000 % 60);
@@ -117,14 +117,14 @@ pub fn utc(milliseconds: i64) -> String {
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{thousandth:03}Z")
 }
 
-/// The Gregorian date of a day, counted from 1970-01-01. Years are taken to begin in March, so that a leap day is their last.
+/// Gregorian date of a day counted from 1970-01-01. Years start in March here, so that a leap day comes last.
 fn date(day: i64) -> (i64, i64, i64) {
-    // From 0000-03-01; 400 years have 146 097 days.
+    // Days from 0000-03-01; 400 years have 146 097 days.
     let day = day + 719_468;
     let (era, day) = (day.div_euclid(146_097), day.rem_euclid(146_097));
     let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
     let day = day - (365 * year + year / 4 - year / 100);
-    // Months from March have 31, 30, 31, 30, 31 days, twice, and then 31 and the rest.
+    // Month lengths from March are 31, 30, 31, 30, 31 twice, then 31 and the rest.
     let month = (5 * day + 2) / 153;
     let in_month = day - (153 * month + 2) / 5 + 1;
     let month = if month < 10 { month + 3 } else { month - 9 };

@@ -4,7 +4,7 @@ use std::thread;
 
 use tracing::{debug, info, warn};
 
-use super::format::utc;
+use super::format::format_utc;
 use super::*;
 
 fn log(file: &Path, format: Format, level: LogLevel) -> Log {
@@ -14,12 +14,12 @@ fn log(file: &Path, format: Format, level: LogLevel) -> Log {
 
 #[test]
 fn a_time_is_a_date() {
-    assert_eq!(utc(0), "1970-01-01T00:00:00.000Z");
-    assert_eq!(utc(951_782_400_000), "2000-02-29T00:00:00.000Z");
-    assert_eq!(utc(1_709_251_199_999), "2024-02-29T23:59:59.999Z");
-    assert_eq!(utc(1_709_251_200_000), "2024-03-01T00:00:00.000Z");
-    assert_eq!(utc(4_107_542_400_000), "2100-03-01T00:00:00.000Z");
-    assert_eq!(utc(-1), "1969-12-31T23:59:59.999Z");
+    assert_eq!(format_utc(0), "1970-01-01T00:00:00.000Z");
+    assert_eq!(format_utc(951_782_400_000), "2000-02-29T00:00:00.000Z");
+    assert_eq!(format_utc(1_709_251_199_999), "2024-02-29T23:59:59.999Z");
+    assert_eq!(format_utc(1_709_251_200_000), "2024-03-01T00:00:00.000Z");
+    assert_eq!(format_utc(4_107_542_400_000), "2100-03-01T00:00:00.000Z");
+    assert_eq!(format_utc(-1), "1969-12-31T23:59:59.999Z");
 }
 
 #[test]
@@ -51,7 +51,7 @@ fn an_event_is_one_line_whatever_it_says() {
 }
 
 #[test]
-fn what_is_less_serious_is_left_out_and_so_is_what_libraries_tell() {
+fn lower_levels_and_events_of_libraries_are_omitted() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("log");
     tracing::subscriber::with_default(log(&path, Format::Text, LogLevel::Info), || {
@@ -67,7 +67,7 @@ fn what_is_less_serious_is_left_out_and_so_is_what_libraries_tell() {
 }
 
 #[test]
-fn writers_to_one_file_tear_no_lines() {
+fn lines_of_several_writers_do_not_interleave() {
     let directory = tempfile::tempdir().unwrap();
     let path = Arc::new(directory.path().join("log"));
     let writers: Vec<_> = (0..8_u64)
@@ -95,7 +95,7 @@ fn writers_to_one_file_tear_no_lines() {
 }
 
 #[test]
-fn a_refused_connection_is_not_laid_to_the_limit_of_open_files() {
+fn a_refused_connection_does_not_blame_the_limit_of_open_files() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("log");
     let hint = "Hint: increase the system open file limit.";

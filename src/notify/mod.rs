@@ -1,5 +1,5 @@
-//! What the owner of a campaign is told of, each thing once: the core, which knows neither clock nor store. `actors/notify` is its
-//! shell.
+//! Decides which events to report to the owner of a campaign, each once. This core knows neither clock nor store;
+//! `runtime/notify` runs it.
 
 use std::collections::BTreeMap;
 
@@ -7,53 +7,53 @@ use serde::{Deserialize, Serialize};
 use store::Status;
 
 use crate::config::{NotifyEvent, NotifySection};
-use crate::ends::Ends;
-use crate::forgetting::Forgetting;
+use crate::forgetting::ForgettingRule;
 use crate::output::count;
+use crate::walk_ends::WalkEnds;
 
 const MINUTE: f64 = 60_000.0;
-/// What was told last of forgetting, while the alarm holds.
-const HOLDS: &str = "holds";
+/// Stored for the event `forgetting` while the alarm is raised.
+const ALARM_RAISED: &str = "holds";
 
-/// Under which name it is kept in the store what was told.
-pub const NOTE: &str = "notified";
+/// Metadata key under which the store keeps what was reported.
+pub const METADATA_KEY: &str = "notified";
 
-/// What was told last, by the name of the event: also by earlier runs.
+/// What was last reported of each event, by this run or earlier ones.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(transparent)]
-pub struct Told(BTreeMap<String, String>);
+pub struct SentNotifications(BTreeMap<String, String>);
 
-/// Something that has happened.
+/// An event to report.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Due {
-    /// What.
+pub struct Notification {
+    /// Kind of the event.
     pub event: NotifyEvent,
-    /// In words.
+    /// Text of the message.
     pub message: String,
 }
 
-/// Looks at a campaign again and again.
+/// Tracks the state of a campaign and finds new events.
 #[derive(Debug)]
-pub struct Watch {
+pub struct NotificationTracker {
     settings: NotifySection,
-    told: Told,
-    /// Candidates and labels so far, and since when there are no more, ms.
-    still: Option<((u64, u64), i64)>,
+    sent: SentNotifications,
+    /// Number of candidates and labels, and since when it has not changed, ms.
+    idle_since: Option<((u64, u64), i64)>,
 }
 
-impl Watch {
-    /// Goes on where others left off.
-    pub fn new(settings: NotifySection, told: Told) -> Self {
-        Self { settings, told, still: None }
+impl NotificationTracker {
+    /// Continues from the events that earlier runs reported.
+    pub fn new(settings: NotifySection, sent: SentNotifications) -> Self {
+        Self { settings, sent, idle_since: None }
     }
 
-    /// What was told, with what is due.
-    pub fn told(&self) -> &Told {
-        &self.told
+    /// All reported events, including those returned last.
+    pub fn sent(&self) -> &SentNotifications {
+        &self.sent
     }
 
-    /// What there is to tell of a campaign that stands so at the time `now`, ms since 1970.
-    pub fn look(&mut self, status: &Status, now: i64) -> Vec<Due> {
+    /// Returns the events of a campaign with this status at the time `now`, ms since 1970.
+    pub fn check(&mut self, status: &Status, now: i64) -> Vec<Notification> {
         let candidates = status.candidates.seen + status.candidates.control;
         let labels = status.budget.used.labels + status.labels.failed;
         let mut due = Vec::new();
@@ -64,7 +64,7 @@ impl Watch {
             due.extend(self.due(NotifyEvent::Budget, format!("{limit:?}"), format!("{key} is used up")));
         }
         due.extend(self.failed_labels(status.labels.failed));
-        due.extend(self.failing_walks(&Ends::of(&status.walks)));
+        due.extend(self.failing_walks(&WalkEnds::from_walks(&status.walks)));
         if status.finished {
             due.extend(self.due(
                 NotifyEvent::End,
@@ -77,30 +77,36 @@ impl Watch {
         due
     }
 
-    /// What there is to tell of a mixture of which this share of the training atoms has γ > 1; `raised` is whether the selector
-    /// found that to be an alarm.
-    pub fn look_at_training(&mut self, forgetting: &Forgetting, share: f64, raised: bool) -> Option<Due> {
+    /// Returns an event if the forgetting alarm is raised or cleared. `share` is that of training atoms with γ > 1,
+    /// `raised` the selector's check.
+    pub fn check_training(
+        &mut self,
+        forgetting: &ForgettingRule,
+        share: f64,
+        raised: bool,
+    ) -> Option<Notification> {
         let event = NotifyEvent::Forgetting;
-        let (holds, was) = (forgetting.holds(share, raised)?, self.told.0.get(event.name()));
+        let (holds, was) = (forgetting.evaluate(share, raised)?, self.sent.0.get(event.name()));
         match holds {
-            true => self.due(event, HOLDS.to_owned(), forgetting.begun(share)),
-            false if was.is_some_and(|was| was == HOLDS) => {
-                self.due(event, "over".to_owned(), forgetting.over(share))
+            true => self.due(event, ALARM_RAISED.to_owned(), forgetting.raised_message(share)),
+            false if was.is_some_and(|was| was == ALARM_RAISED) => {
+                self.due(event, "over".to_owned(), forgetting.cleared_message(share))
             }
             false => None,
         }
     }
 
-    /// A run could not go on. That is news each time.
-    pub fn failed(&mut self, why: &str) -> Option<Due> {
+    /// Reports that a run cannot go on, every time.
+    pub fn failed(&mut self, why: &str) -> Option<Notification> {
         let event = NotifyEvent::Failure;
-        self.is_wanted(event).then(|| Due { event, message: format!("calmwalk run cannot go on: {why}") })
+        self.is_wanted(event)
+            .then(|| Notification { event, message: format!("calmwalk run cannot go on: {why}") })
     }
 
-    fn stall(&mut self, so_far: (u64, u64), shown: String, now: i64) -> Option<Due> {
-        let (before, since) = *self.still.get_or_insert((so_far, now));
+    fn stall(&mut self, so_far: (u64, u64), shown: String, now: i64) -> Option<Notification> {
+        let (before, since) = *self.idle_since.get_or_insert((so_far, now));
         if before != so_far {
-            self.still = Some((so_far, now));
+            self.idle_since = Some((so_far, now));
             return None;
         }
         let minutes = (now - since) as f64 / MINUTE;
@@ -112,24 +118,24 @@ impl Watch {
         self.due(NotifyEvent::Stall, shown, message)
     }
 
-    /// Every so many.
-    fn failed_labels(&mut self, failed: u64) -> Option<Due> {
+    /// Reports every `notify.failed_labels` failures.
+    fn failed_labels(&mut self, failed: u64) -> Option<Notification> {
         let each = u64::from(self.settings.failed_labels.get());
         let reached = failed / each * each;
-        let told = self.told.0.get(NotifyEvent::FailedLabels.name()).and_then(|told| told.parse().ok());
-        if reached <= told.unwrap_or(0) {
+        let sent = self.sent.0.get(NotifyEvent::FailedLabels.name()).and_then(|sent| sent.parse().ok());
+        if reached <= sent.unwrap_or(0) {
             return None;
         }
         let message = match failed {
-            1 => "the label of 1 structure has finally failed".to_owned(),
-            failed => format!("the labels of {failed} structures have finally failed"),
+            1 => "the label of 1 structure has failed for good".to_owned(),
+            failed => format!("the labels of {failed} structures have failed for good"),
         };
         self.due(NotifyEvent::FailedLabels, reached.to_string(), message)
     }
 
-    /// Once a campaign.
-    fn failing_walks(&mut self, ends: &Ends) -> Option<Due> {
-        if !ends.are_alarming() {
+    /// Reports once per campaign.
+    fn failing_walks(&mut self, ends: &WalkEnds) -> Option<Notification> {
+        if !ends.is_alarming() {
             return None;
         }
         self.due(NotifyEvent::FailingWalks, "yes".into(), ends.warning())
@@ -139,13 +145,13 @@ impl Watch {
         self.settings.on.contains(&event)
     }
 
-    /// An event that was not told yet: `identity` tells it from others of its kind.
-    fn due(&mut self, event: NotifyEvent, identity: String, message: String) -> Option<Due> {
-        if !self.is_wanted(event) || self.told.0.get(event.name()) == Some(&identity) {
+    /// Returns an event unless it was reported already. `identity` distinguishes events of one kind.
+    fn due(&mut self, event: NotifyEvent, identity: String, message: String) -> Option<Notification> {
+        if !self.is_wanted(event) || self.sent.0.get(event.name()) == Some(&identity) {
             return None;
         }
-        self.told.0.insert(event.name().to_owned(), identity);
-        Some(Due { event, message })
+        self.sent.0.insert(event.name().to_owned(), identity);
+        Some(Notification { event, message })
     }
 }
 
@@ -155,16 +161,16 @@ mod tests {
 
     const MINUTES: i64 = 60_000;
 
-    fn watch() -> Watch {
-        Watch::new(NotifySection::default(), Told::default())
+    fn watch() -> NotificationTracker {
+        NotificationTracker::new(NotifySection::default(), SentNotifications::default())
     }
 
-    fn events(due: &[Due]) -> Vec<NotifyEvent> {
+    fn events(due: &[Notification]) -> Vec<NotifyEvent> {
         due.iter().map(|due| due.event).collect()
     }
 
     #[test]
-    fn a_stall_is_told_once_and_again_after_the_next_candidate() {
+    fn a_stall_is_reported_once_and_again_after_the_next_candidate() {
         let (mut watch, mut status) = (watch(), Status::default());
         for (minute, seen, expected) in [
             (0, 5, 0),
@@ -177,51 +183,51 @@ mod tests {
             (999, 6, 0),
         ] {
             status.candidates.seen = seen;
-            assert_eq!(watch.look(&status, minute * MINUTES).len(), expected, "{minute}");
+            assert_eq!(watch.check(&status, minute * MINUTES).len(), expected, "{minute}");
         }
-        // Also over a restart.
-        let mut next = Watch::new(NotifySection::default(), watch.told().clone());
+        // A restart does not repeat it.
+        let mut next = NotificationTracker::new(NotifySection::default(), watch.sent().clone());
         for minute in [1000, 2000] {
-            assert_eq!(next.look(&status, minute * MINUTES), []);
+            assert_eq!(next.check(&status, minute * MINUTES), []);
         }
     }
 
     #[test]
-    fn failures_are_told_by_the_dozen() {
+    fn failures_are_reported_in_batches() {
         let (mut watch, mut status) = (watch(), Status::default());
         for (failed, expected) in [(9, 0), (10, 1), (11, 0), (3, 0), (12, 0), (39, 1), (40, 1)] {
             status.labels.failed = failed;
-            assert_eq!(watch.look(&status, 0).len(), expected, "{failed}");
+            assert_eq!(watch.check(&status, 0).len(), expected, "{failed}");
         }
     }
 
     #[test]
-    fn walks_that_end_early_one_after_the_other_are_told_once() {
+    fn repeated_early_ends_are_reported_once() {
         let (mut watch, mut status) = (watch(), Status::default());
         let walk = |state: &str| store::WalkStatus { state: state.into(), ..store::WalkStatus::default() };
         for (state, expected) in
             [("blew_up", 0), ("collected", 0), ("trapped", 0), ("blew_up", 1), ("blew_up", 0)]
         {
             status.walks.push(walk(state));
-            let due = watch.look(&status, 0);
+            let due = watch.check(&status, 0);
             assert_eq!(due.len(), expected, "{:?}", status.walks);
             assert!(due.iter().all(|due| due.event == NotifyEvent::FailingWalks), "{due:?}");
         }
     }
 
     #[test]
-    fn an_end_by_a_budget_is_both_and_a_larger_budget_is_another() {
+    fn a_budget_and_its_end_are_reported_and_a_larger_budget_again() {
         use NotifyEvent::{Budget, End};
         let (mut watch, mut status) = (watch(), Status { finished: true, ..Status::default() });
         status.budget.used_up = Some("budget.labels".into());
         status.budget.limits.labels = Some(5);
-        assert_eq!(events(&watch.look(&status, 0)), [Budget, End]);
-        assert_eq!(watch.look(&status, 0), []);
+        assert_eq!(events(&watch.check(&status, 0)), [Budget, End]);
+        assert_eq!(watch.check(&status, 0), []);
         status.budget.limits.labels = Some(6);
         status.candidates.seen = 1;
-        assert_eq!(events(&watch.look(&status, 0)), [Budget, End]);
+        assert_eq!(events(&watch.check(&status, 0)), [Budget, End]);
         let only = NotifySection { on: vec![End], ..NotifySection::default() };
-        let mut only = Watch::new(only, Told::default());
-        assert_eq!((events(&only.look(&status, 0)), only.failed("x")), (vec![End], None));
+        let mut only = NotificationTracker::new(only, SentNotifications::default());
+        assert_eq!((events(&only.check(&status, 0)), only.failed("x")), (vec![End], None));
     }
 }

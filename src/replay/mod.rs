@@ -1,10 +1,10 @@
-//! The recorded candidates of a campaign once more before its selector, by its own rules or by others: no dynamics, no
-//! labels.
+//! Replays the recorded candidates of a campaign through its selector, by its own rules or others. Runs no dynamics
+//! and makes no labels.
 
-mod files;
+mod follow;
+mod overrides;
+mod relocated;
 mod report;
-mod rules;
-mod stream;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -16,35 +16,39 @@ use store::Store;
 
 use crate::campaign::{self, grader};
 use crate::config::Config;
-use crate::outcome::Failure;
+use crate::exit_status::Failure;
 use crate::output::Bar;
 
-pub use files::Moved;
-pub use report::{Change, Report, Stop, Tally};
-pub use rules::Setting;
+pub use overrides::RuleOverride;
+pub use relocated::RelocatedFiles;
+pub use report::{FateChange, FateCounts, MissingFeatures, Report};
 
 const BAR: &str = "{bar:32} {pos}/{len} decisions  {eta} left";
 
-/// Replays the campaign in a store to where it stands now.
-pub async fn replay(store: &Store, settings: &[Setting], moved: &Moved) -> Result<Report, Failure> {
+/// Replays the campaign in a store up to its current state.
+pub async fn replay(
+    store: &Store,
+    settings: &[RuleOverride],
+    moved: &RelocatedFiles,
+) -> Result<Report, Failure> {
     let begun = Instant::now();
     let campaign = store.campaign().await?;
     let resolved: Value = serde_json::from_str(&campaign.resolved_configuration)
         .map_err(|error| Failure::Failed(format!("damaged database: the configuration: {error}")))?;
-    let mut config = rules::configuration(&campaign.configuration, settings)?;
-    files::find(&mut config, &resolved, &store.grade_files().await?, moved)?;
+    let mut config = overrides::configuration(&campaign.configuration, settings)?;
+    relocated::find(&mut config, &resolved, &store.grade_files().await?, moved)?;
     let mut replay = open(store, &config, settings).await?;
     let end = store.newest_mixture().await?;
-    let mut report = Report::new(&campaign, settings, is_other(&resolved), end.decision);
+    let mut report = Report::new(&campaign, settings, is_other_processor(&resolved), end.decision);
     let bar = Bar::new(Some(end.decision.unsigned_abs()), BAR);
-    stream::follow(store, &mut replay, &mut report, end.decision, &bar).await?;
+    follow::follow(store, &mut replay, &mut report, end.decision, &bar).await?;
     report.close(&replay, &end).map_err(failure)?;
     report.seconds = begun.elapsed().as_secs_f64();
     Ok(report)
 }
 
-/// The selector's judge before the first decision.
-async fn open(store: &Store, config: &Config, settings: &[Setting]) -> Result<Replay, Failure> {
+/// The selector's state before the first decision.
+async fn open(store: &Store, config: &Config, settings: &[RuleOverride]) -> Result<Replay, Failure> {
     let (model, artifact, training) = campaign::load_for_grades(config, Path::new("(the campaign)"))?;
     let seeds = store.seed_structures().await?.into_iter();
     let seeds = seeds.map(|seed| SeedStructure { name: seed.name, structure: seed.structure }).collect();
@@ -61,8 +65,8 @@ async fn open(store: &Store, config: &Config, settings: &[Setting]) -> Result<Re
     replay.map_err(failure)
 }
 
-/// Whether the campaign began on another kind of processor than this one.
-fn is_other(resolved: &Value) -> bool {
+/// Whether the campaign began on a processor with other instruction sets.
+fn is_other_processor(resolved: &Value) -> bool {
     resolved["instructions"].as_str().is_some_and(|then| then != campaign::instructions())
 }
 

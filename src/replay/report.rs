@@ -1,4 +1,4 @@
-//! What a replay came to, beside what was recorded.
+//! Compares a replay with the recorded campaign.
 
 use std::collections::BTreeMap;
 
@@ -7,57 +7,57 @@ use serde::Serialize;
 use serde_json::{Value, json};
 use store::{AtomGrades, LoggedDecision, NewestMixture, StoredCandidate};
 
-use super::Setting;
+use super::RuleOverride;
 
-/// What a replay came to.
+/// Result of a replay.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
     /// Id of the campaign.
     pub campaign: String,
-    /// The keys that were set, with their values.
+    /// Overridden keys with their values.
     pub set: BTreeMap<String, String>,
     /// Decisions that the campaign has.
     pub recorded: i64,
-    /// Those that were replayed.
+    /// Decisions that were replayed.
     pub replayed: i64,
-    /// Candidates of biased walks among them, as they were decided.
-    pub before: Tally,
-    /// The same now.
-    pub now: Tally,
-    /// Accepted before, and not now.
-    pub no_longer_accepted: Vec<Change>,
-    /// Accepted now, and not before.
-    pub newly_accepted: Vec<Change>,
-    /// Walks that ended for what was collected and that would go on now; what they would find is not known.
+    /// Recorded fates of the replayed candidates of biased walks.
+    pub before: FateCounts,
+    /// Fates in the replay.
+    pub now: FateCounts,
+    /// Accepted in the campaign but not in the replay.
+    pub no_longer_accepted: Vec<FateChange>,
+    /// Accepted in the replay but not in the campaign.
+    pub newly_accepted: Vec<FateChange>,
+    /// Walks that ended with a quota and would go on in the replay. What they would find is unknown.
     pub walks_cut_short: u64,
-    /// Where the replay had to stop, if it had.
-    pub stopped: Option<Stop>,
-    /// By the same rules: the first thing that is not as it was recorded.
+    /// Where the replay had to stop, if it did.
+    pub stopped: Option<MissingFeatures>,
+    /// With unchanged rules: the first difference from the record.
     pub difference: Option<Difference>,
-    /// By the same rules, to the end: the mixture at the end is the stored one, byte for byte.
+    /// With unchanged rules, at the end: whether the mixture equals the stored one byte for byte.
     pub same_mixture: Option<bool>,
-    /// Seconds that it took.
+    /// Duration, s.
     pub seconds: f64,
-    /// This processor may give other last digits than that on which the campaign began.
+    /// Whether this processor may round differently from the one of the campaign.
     pub other_processor: bool,
 }
 
-/// Numbers of candidates by what became of them.
+/// Numbers of candidates by fate.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Tally {
-    /// All of them.
+pub struct FateCounts {
+    /// All candidates.
     pub candidates: u64,
     /// Accepted.
     pub accepted: u64,
     /// Declined, by reason; `walk over` if their walk would have ended before.
     pub declined: BTreeMap<String, u64>,
-    /// Version of the mixture at the end.
+    /// Final version of the mixture.
     pub mixture_version: u64,
 }
 
-/// A candidate with another fate than before.
+/// A candidate with another fate in the replay.
 #[derive(Clone, Debug, Serialize)]
-pub struct Change {
+pub struct FateChange {
     /// Number of the decision.
     pub decision: i64,
     /// Name of the candidate.
@@ -66,15 +66,15 @@ pub struct Change {
     pub walk: u32,
     /// Its step.
     pub step: u64,
-    /// γ_max under the selector's mixture, before and now.
+    /// γ_max under the selector's mixture, in the campaign and in the replay.
     pub gamma_max: (Option<f64>, Option<f64>),
-    /// Why it was declined, before or now.
+    /// Why it was declined, in either.
     pub reason: String,
 }
 
-/// Where a replay stops: the features of that candidate were not kept.
+/// Where a replay stops because the candidate's features were not kept.
 #[derive(Clone, Debug, Serialize)]
-pub struct Stop {
+pub struct MissingFeatures {
     /// Number of the decision.
     pub decision: i64,
     /// Name of the candidate.
@@ -85,32 +85,32 @@ pub struct Stop {
     pub step: u64,
 }
 
-/// Something that is not as it was recorded.
+/// A difference from the record.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Difference {
     /// Number of the decision.
     pub decision: i64,
-    /// Which of its values, of a JSON value by its path.
+    /// Which value differs; within JSON, by its path.
     pub what: String,
-    /// The value in the log.
+    /// The recorded value.
     pub recorded: Value,
-    /// The value now.
+    /// The value in the replay.
     pub now: Value,
 }
 
-/// A place of the log.
-pub struct Recorded<'a> {
+/// An entry of the decision log.
+pub struct LogEntry<'a> {
     /// The decision.
     pub decision: &'a LoggedDecision,
-    /// The candidate that it is about.
+    /// Its candidate.
     pub candidate: Option<&'a StoredCandidate>,
 }
 
 impl Report {
-    /// One of nothing yet.
+    /// An empty report.
     pub fn new(
         campaign: &store::Campaign,
-        settings: &[Setting],
+        settings: &[RuleOverride],
         other_processor: bool,
         recorded: i64,
     ) -> Self {
@@ -120,8 +120,8 @@ impl Report {
             set: set.collect(),
             recorded,
             replayed: 0,
-            before: Tally::default(),
-            now: Tally::default(),
+            before: FateCounts::default(),
+            now: FateCounts::default(),
             no_longer_accepted: Vec::new(),
             newly_accepted: Vec::new(),
             walks_cut_short: 0,
@@ -133,8 +133,8 @@ impl Report {
         }
     }
 
-    /// Takes in a place of the log and what came of it now.
-    pub fn take(&mut self, recorded: Recorded<'_>, now: Option<Replayed>, exact: bool) {
+    /// Adds an entry of the log and its outcome in the replay.
+    pub fn add(&mut self, recorded: LogEntry<'_>, now: Option<Replayed>, exact: bool) {
         let decision = recorded.decision;
         self.replayed = decision.sequence;
         self.before.mixture_version = decision.mixture_version;
@@ -153,7 +153,7 @@ impl Report {
         self.before.count(before_reason.as_deref());
         self.now.count(now_reason.as_deref());
         let gamma_max = |detail: &Value| detail["selector"]["gamma_max"].as_f64();
-        let change = |reason| Change {
+        let change = |reason| FateChange {
             decision: decision.sequence,
             candidate: decision.candidate.clone().unwrap_or_default(),
             walk: decision.walk.unwrap_or_default(),
@@ -168,9 +168,9 @@ impl Report {
         }
     }
 
-    /// The replay cannot go on with this decision.
+    /// Records that the replay cannot go on with this decision.
     pub fn stop(&mut self, decision: &LoggedDecision) {
-        self.stopped = Some(Stop {
+        self.stopped = Some(MissingFeatures {
             decision: decision.sequence,
             candidate: decision.candidate.clone().unwrap_or_default(),
             walk: decision.walk.unwrap_or_default(),
@@ -178,7 +178,7 @@ impl Report {
         });
     }
 
-    /// Takes in how it ended.
+    /// Adds the result at the end.
     pub fn close(&mut self, replay: &Replay, end: &NewestMixture) -> Result<(), ReplayError> {
         self.now.mixture_version = replay.mixture().version();
         self.walks_cut_short = replay.cut_short();
@@ -197,7 +197,7 @@ impl Report {
     }
 }
 
-impl Tally {
+impl FateCounts {
     fn count(&mut self, reason: Option<&str>) {
         self.candidates += 1;
         match reason {
@@ -207,7 +207,7 @@ impl Tally {
     }
 }
 
-/// Why a candidate was declined; none if it was accepted.
+/// Why a candidate was declined. `None` if it was accepted.
 fn reason(kind: &str, detail: &Value) -> Option<String> {
     (kind == "declined").then(|| detail["reason"].as_str().unwrap_or_default().to_owned())
 }
@@ -218,8 +218,8 @@ fn step(decision: &LoggedDecision) -> u64 {
     place.and_then(|place| place.rsplit('.').next()).and_then(|step| step.parse().ok()).unwrap_or_default()
 }
 
-/// The first thing in which a decision is not the recorded one.
-fn difference(recorded: &Recorded<'_>, now: Option<&Replayed>) -> Option<Difference> {
+/// The first difference between a decision and its record.
+fn difference(recorded: &LogEntry<'_>, now: Option<&Replayed>) -> Option<Difference> {
     let before = recorded.decision;
     let as_json = |kind: &str, walk: Option<u32>, candidate: Option<String>, version: u64, detail: &Value| {
         json!({
@@ -248,7 +248,7 @@ fn all(grades: &AtomGrades) -> Vec<f64> {
     [grades.gamma.as_slice(), &grades.gamma_nbr].concat()
 }
 
-/// The first path at which two JSON values are not the same text.
+/// The first path at which two JSON values have different texts.
 fn first_difference(path: &str, before: &Value, now: &Value) -> Option<(String, Value, Value)> {
     if let (Value::Object(old), Value::Object(new)) = (before, now) {
         let keys = old.keys().chain(new.keys().filter(|key| !old.contains_key(*key)));

@@ -1,11 +1,11 @@
-//! Numbers as comma-separated values (RFC 4180), every digit of them.
+//! Comma-separated values (RFC 4180) with full precision.
 
-/// Rows below a line of titles.
+/// A header and rows.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Csv(String);
 
 impl Csv {
-    /// Only the titles.
+    /// Starts with the header.
     pub fn new(titles: &[&str]) -> Self {
         let mut csv = Self(String::new());
         csv.push(titles);
@@ -19,13 +19,13 @@ impl Csv {
         self.0.push('\n');
     }
 
-    /// What is in the file.
+    /// The content of the file.
     pub fn into_bytes(self) -> Vec<u8> {
         self.0.into_bytes()
     }
 }
 
-/// A number so that it reads back as the same; nothing for one that is not there.
+/// A number with as many digits as needed to read the same value back. Empty if it is missing or not finite.
 pub fn number(x: impl Into<Option<f64>>) -> String {
     x.into().filter(|x| x.is_finite()).map_or(String::new(), |x| x.to_string())
 }

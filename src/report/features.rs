@@ -1,4 +1,4 @@
-//! Features of a sample of atoms, element by element.
+//! Features of sampled atoms, by element.
 
 use std::collections::BTreeMap;
 
@@ -6,26 +6,26 @@ use analysis::{PrincipalAxes, Thinned};
 use atoms::Species;
 use wire::Origin;
 
-/// Elements that are looked at: those with the most atoms.
-pub const ELEMENTS: usize = 6;
-/// Atoms of one element and origin that are kept.
-const ATOMS: usize = 4096;
+/// Largest number of elements. Those with the most atoms are kept.
+pub const MAX_ELEMENTS: usize = 6;
+/// Largest number of atoms kept of each element and origin.
+const MAX_ATOMS: usize = 4096;
 
-/// Features of atoms of several elements.
-pub struct Features(BTreeMap<Species, [Cloud; 2]>);
+/// Features of atoms, by element.
+pub struct Features(BTreeMap<Species, [FeatureSample; 2]>);
 
-/// Those of one element and origin.
-pub struct Cloud {
+/// Features of one element and origin.
+pub struct FeatureSample {
     atoms: Thinned<Vec<f64>>,
-    /// The mean over the atoms of each structure.
+    /// Mean over the atoms of each structure.
     centroids: Vec<Vec<f64>>,
 }
 
-/// Both origins of one element in the plane of the first two principal components of all of its atoms.
+/// Atoms of one element, projected onto the first two principal components of both origins together.
 pub struct Plane {
     /// The element.
     pub element: Species,
-    /// Of the whole variance, the share along each.
+    /// Share of the variance along each component.
     pub shares: [f64; 2],
     /// Biased walks.
     pub biased: Points,
@@ -33,10 +33,10 @@ pub struct Plane {
     pub control: Points,
 }
 
-/// Points in that plane.
+/// Projected points.
 #[derive(Default)]
 pub struct Points {
-    /// Atoms of which there were.
+    /// Number of atoms before sampling.
     pub seen: u64,
     /// Atoms.
     pub atoms: Vec<[f64; 2]>,
@@ -45,13 +45,13 @@ pub struct Points {
 }
 
 impl Features {
-    /// None yet, of these elements.
+    /// Starts empty, for these elements.
     pub fn new(elements: &[Species]) -> Self {
-        let cloud = || Cloud { atoms: Thinned::new(ATOMS), centroids: Vec::new() };
-        Self(elements.iter().map(|element| (*element, [cloud(), cloud()])).collect())
+        let sample = || FeatureSample { atoms: Thinned::new(MAX_ATOMS), centroids: Vec::new() };
+        Self(elements.iter().map(|element| (*element, [sample(), sample()])).collect())
     }
 
-    /// The elements with the most atoms of either origin.
+    /// The elements with the most atoms, of both origins together.
     pub fn most_frequent(biased: &BTreeMap<Species, u64>, control: &BTreeMap<Species, u64>) -> Vec<Species> {
         let mut counts = biased.clone();
         for (element, number) in control {
@@ -59,34 +59,34 @@ impl Features {
         }
         let mut elements: Vec<_> = counts.into_iter().collect();
         elements.sort_by_key(|(element, number)| (std::cmp::Reverse(*number), *element));
-        elements.into_iter().take(ELEMENTS).map(|(element, _)| element).collect()
+        elements.into_iter().take(MAX_ELEMENTS).map(|(element, _)| element).collect()
     }
 
-    /// Those of the atoms of a structure, [n × D].
-    pub fn push(&mut self, origin: Origin, species: &[Species], features: &[f64]) {
+    /// Adds the features of a structure's atoms, [n × D].
+    pub fn add(&mut self, origin: Origin, species: &[Species], features: &[f64]) {
         let dimension = features.len().checked_div(species.len()).unwrap_or(0);
         if dimension == 0 {
             return;
         }
-        for (element, clouds) in &mut self.0 {
-            let cloud = &mut clouds[usize::from(origin == Origin::Control)];
+        for (element, samples) in &mut self.0 {
+            let sample = &mut samples[usize::from(origin == Origin::Control)];
             let rows = species.iter().zip(features.chunks_exact(dimension));
             let rows: Vec<_> = rows.filter(|(of, _)| *of == element).map(|(_, row)| row.to_vec()).collect();
             if !rows.is_empty() {
-                cloud.centroids.push(mean(&rows));
-                rows.into_iter().for_each(|row| cloud.atoms.push(row));
+                sample.centroids.push(mean(&rows));
+                rows.into_iter().for_each(|row| sample.atoms.push(row));
             }
         }
     }
 
-    /// A plane for each element that has atoms enough.
+    /// The projection of each element that has enough atoms.
     pub fn planes(&self) -> Vec<Plane> {
-        self.0.iter().filter_map(|(element, clouds)| Plane::of(*element, clouds)).collect()
+        self.0.iter().filter_map(|(element, samples)| Plane::fit(*element, samples)).collect()
     }
 }
 
 impl Plane {
-    fn of(element: Species, [biased, control]: &[Cloud; 2]) -> Option<Self> {
+    fn fit(element: Species, [biased, control]: &[FeatureSample; 2]) -> Option<Self> {
         let first = biased.atoms.kept().chain(control.atoms.kept()).next()?;
         let rows = biased.atoms.kept().chain(control.atoms.kept());
         let rows: Vec<_> = rows.filter(|row| row.len() == first.len()).flatten().copied().collect();
@@ -96,10 +96,10 @@ impl Plane {
             let along = axes.project(row);
             [along[0], along[1]]
         };
-        let points = |cloud: &Cloud| Points {
-            seen: cloud.atoms.seen(),
-            atoms: cloud.atoms.kept().map(place).collect(),
-            centroids: cloud.centroids.iter().map(place).collect(),
+        let points = |sample: &FeatureSample| Points {
+            seen: sample.atoms.seen(),
+            atoms: sample.atoms.kept().map(place).collect(),
+            centroids: sample.centroids.iter().map(place).collect(),
         };
         Some(Self { element, shares, biased: points(biased), control: points(control) })
     }
@@ -126,9 +126,9 @@ mod tests {
         for k in 0..20 {
             let (x, y) = (f64::from(k), f64::from(k % 2));
             // Aluminium differs along (1, 0), magnesium not at all.
-            features.push(Origin::Biased, &[al, mg], &[x, y, 7.0, 7.0]);
+            features.add(Origin::Biased, &[al, mg], &[x, y, 7.0, 7.0]);
         }
-        features.push(Origin::Control, &[al, al], &[0.0, 0.0, 2.0, 0.0]);
+        features.add(Origin::Control, &[al, al], &[0.0, 0.0, 2.0, 0.0]);
         let planes = features.planes();
         assert_eq!(planes.len(), 1, "atoms that do not differ have no plane");
         let plane = &planes[0];

@@ -1,12 +1,13 @@
-//! What came of a campaign, as a document: read from the store (`gathered`), drawn (`figures`), told (`page`). The same campaign
-//! gives the same bytes: nothing of the clock or of where it is made is in it.
+//! Builds the report of a campaign: reads the store (`report_data`), draws the figures (`figures`) and writes the
+//! page (`page`). The same campaign always gives the same bytes, since the report contains neither the date nor the
+//! place of its making.
 
+mod collections;
 mod csv;
 mod features;
 mod figures;
-mod gathered;
 mod page;
-mod sample;
+mod report_data;
 mod style;
 mod tables;
 #[cfg(test)]
@@ -16,26 +17,26 @@ use ::figures::{to_png, to_svg};
 use store::Store;
 
 use self::csv::Csv;
-use self::gathered::Gathered;
-use crate::outcome::Failure;
+use self::report_data::ReportData;
+use crate::exit_status::Failure;
 
-/// Dots an inch of the images.
+/// Resolution of the images, dots per inch.
 const RESOLUTION: f64 = 300.0;
 
-/// A figure with what is said of it, or why there is none.
-struct Part {
+/// A figure of the page, or the reason why it is missing.
+struct FigureEntry {
     /// Name of its files.
     name: &'static str,
     /// Its title.
     title: &'static str,
     /// The figure, or why it is missing.
-    drawn: Result<Drawn, String>,
+    drawn: Result<FigureContent, String>,
 }
 
-/// A figure, its caption, and the numbers in it.
-struct Drawn {
+/// A figure with its caption and data.
+struct FigureContent {
     figure: ::figures::Figure,
-    /// With `_{…}` and `^{…}`.
+    /// Supports `_{…}` and `^{…}`.
     caption: String,
     numbers: Csv,
 }
@@ -44,16 +45,16 @@ struct Drawn {
 pub struct File {
     /// Its path in the report's directory.
     pub path: String,
-    /// What is in it.
+    /// Its content.
     pub bytes: Vec<u8>,
 }
 
-/// Reads the campaign and makes all files of its report, the page first.
-pub async fn of(store: &Store) -> Result<Vec<File>, Failure> {
-    let gathered = Gathered::of(store).await?;
-    let parts = figures::all(&gathered);
-    let tables = tables::all(&gathered);
-    let page = page::write(&gathered, &parts, &tables);
+/// Reads the campaign and builds all files of its report, the page first.
+pub async fn build(store: &Store) -> Result<Vec<File>, Failure> {
+    let data = ReportData::read(store).await?;
+    let parts = figures::all(&data);
+    let tables = tables::all(&data);
+    let page = page::write(&data, &parts, &tables);
     let mut files = vec![File { path: PAGE.to_owned(), bytes: page.into_bytes() }];
     for part in parts {
         let Ok(drawn) = part.drawn else { continue };
@@ -71,5 +72,5 @@ pub async fn of(store: &Store) -> Result<Vec<File>, Failure> {
     Ok(files)
 }
 
-/// The page's file.
+/// File name of the page.
 pub const PAGE: &str = "report.html";

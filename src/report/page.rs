@@ -1,26 +1,26 @@
-//! The page: one HTML file with its font and figures in it, which asks nobody for anything.
+//! The page: one self-contained HTML file with fonts and figures.
 
 use std::fmt::Write;
 
 use figures::{BOLD, REGULAR, escape, to_html, to_svg};
 
-use super::gathered::Gathered;
+use super::report_data::ReportData;
 use super::style::grouped;
 use super::tables::{Cell, Table, collection_rule};
-use super::{Drawn, Part};
+use super::{FigureContent, FigureEntry};
 
 const STYLE: &str = include_str!("page.css");
 
-/// What stands below a heading.
+/// Content of a section.
 enum Block<'a> {
     Paragraph(String),
-    Figure(&'a Part, usize),
+    Figure(&'a FigureEntry, usize),
     Table(&'a Table, usize),
 }
 
-/// The page.
-pub fn write(gathered: &Gathered, parts: &[Part], tables: &[Table]) -> String {
-    let title = format!("Campaign {}", gathered.campaign.id);
+/// Writes the page.
+pub fn write(data: &ReportData, parts: &[FigureEntry], tables: &[Table]) -> String {
+    let title = format!("Campaign {}", data.campaign.id);
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n<title>{}</title>\n<style>\n{}{}{STYLE}</style>\n\
@@ -29,9 +29,9 @@ pub fn write(gathered: &Gathered, parts: &[Part], tables: &[Table]) -> String {
         face(REGULAR, "normal"),
         face(BOLD, "bold"),
         escape(&title),
-        to_html(&lead(gathered))
+        to_html(&lead(data))
     );
-    for (heading, blocks) in sections(gathered, parts, tables) {
+    for (heading, blocks) in sections(data, parts, tables) {
         if blocks.is_empty() {
             continue;
         }
@@ -52,11 +52,11 @@ pub fn write(gathered: &Gathered, parts: &[Part], tables: &[Table]) -> String {
 }
 
 fn sections<'a>(
-    gathered: &Gathered,
-    parts: &'a [Part],
+    data: &ReportData,
+    parts: &'a [FigureEntry],
     tables: &'a [Table],
 ) -> Vec<(&'static str, Vec<Block<'a>>)> {
-    // Figures are numbered as far as they are there, tables likewise.
+    // Numbers the figures and tables that exist.
     let numbered = |name: &str| {
         let place = parts.iter().position(|part| part.name == name)?;
         let before = parts[..place].iter().filter(|part| part.drawn.is_ok()).count();
@@ -67,15 +67,15 @@ fn sections<'a>(
         Some(Block::Table(&tables[place], place + 1))
     };
     let blocks = |blocks: Vec<Option<Block<'a>>>| blocks.into_iter().flatten().collect::<Vec<_>>();
-    let why = collection_rule(&gathered.configuration).map(|rule| {
+    let why = collection_rule(&data.configuration).map(|rule| {
         Block::Paragraph(format!(
-            "A structure of a biased walk becomes a candidate when {rule}, under the mixture that the walker sees; the selector \
-             decides with the newest."
+            "A structure of a biased walk becomes a candidate when {rule}, under the walker’s mixture. The selector decides with the \
+             newest mixture."
         ))
     });
     vec![
         ("Summary", blocks(vec![table("summary")])),
-        ("What was collected, and why", blocks(vec![why, numbered("collection"), table("seed-structures")])),
+        ("Collected structures", blocks(vec![why, numbered("collection"), table("seed-structures")])),
         (
             "Biased against control walks",
             blocks(vec![
@@ -95,7 +95,7 @@ fn sections<'a>(
             ]),
         ),
         (
-            "Cost, failures, and what has no label",
+            "Cost, failures and unlabelled structures",
             blocks(vec![numbered("cost"), table("failures"), numbered("completion"), table("unlabelled")]),
         ),
         ("Settings", blocks(vec![table("settings")])),
@@ -103,12 +103,12 @@ fn sections<'a>(
     ]
 }
 
-fn lead(gathered: &Gathered) -> String {
-    let candidates = &gathered.standing.candidates;
-    let (biased, control) = (&gathered.sample.biased, &gathered.sample.control);
+fn lead(data: &ReportData) -> String {
+    let candidates = &data.status.candidates;
+    let (biased, control) = (&data.collections.biased, &data.collections.control);
     format!(
-        "{} structures were accepted of {} candidates of biased walks, and {} frames were kept of control walks; {} of all these have \
-         labels. Grades are those of the original mixture, with which the campaign began, unless it is said otherwise.",
+        "The selector accepted {} structures of {} candidates from biased walks and collected {} frames from control walks; {} of them are \
+         labelled. Unless stated otherwise, grades are those of the original mixture, with which the campaign began.",
         grouped(candidates.accepted),
         grouped(candidates.seen),
         grouped(candidates.control),
@@ -116,10 +116,10 @@ fn lead(gathered: &Gathered) -> String {
     )
 }
 
-fn write_figure(html: &mut String, part: &Part, number: usize) {
-    let Part { name, title, drawn } = part;
+fn write_figure(html: &mut String, part: &FigureEntry, number: usize) {
+    let FigureEntry { name, title, drawn } = part;
     let _ = match drawn {
-        Ok(Drawn { figure, caption, .. }) => writeln!(
+        Ok(FigureContent { figure, caption, .. }) => writeln!(
             html,
             "<figure id=\"figure-{name}\">\n{}<figcaption><strong>Figure {number}. {}.</strong> {} \
              <span class=\"files\">Files: figures/{name}.svg, .png, .csv.</span></figcaption>\n</figure>",
@@ -140,7 +140,7 @@ fn write_table(html: &mut String, table: &Table, number: usize) {
     let Table { name, caption, titles, rows, shown } = table;
     let more = match rows.len().saturating_sub(*shown) {
         0 => String::new(),
-        more => format!(" {} more rows are only in its file.", grouped(more as u64)),
+        more => format!(" The file has {} more rows.", grouped(more as u64)),
     };
     let _ = writeln!(
         html,
@@ -181,7 +181,7 @@ fn write_cell(column: usize, cell: &Cell) -> String {
     }
 }
 
-/// The font in the page, so that it looks the same everywhere.
+/// Embeds a font, so that the page looks the same everywhere.
 fn face(font: &[u8], weight: &str) -> String {
     format!(
         "@font-face {{ font-family: 'Report Sans'; font-weight: {weight}; \
@@ -190,7 +190,7 @@ fn face(font: &[u8], weight: &str) -> String {
     )
 }
 
-/// Base 64 (RFC 4648).
+/// Base64 (RFC 4648).
 fn base64(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);

@@ -1,15 +1,15 @@
-//! What all figures of a report have in common.
+//! Common style of the figures.
 
 use analysis::quantile;
 use figures::{Axis, Colour, Figure, Key, Marker, Scale, Stroke, legend};
 use wire::Origin;
 
-/// Width of a figure over two columns of a journal: 180 mm, points.
+/// Width of a two-column figure of a journal: 180 mm, in points.
 pub const WIDTH: f64 = 510.0;
 
-/// How either origin looks: by colour, and without colour by dashes and by the form of marks.
+/// Style of an origin, distinguishable by colour, dashes and marker shape.
 #[derive(Clone, Copy, Debug)]
-pub struct Look {
+pub struct OriginStyle {
     /// Colour.
     pub colour: Colour,
     /// Line.
@@ -21,15 +21,15 @@ pub struct Look {
 }
 
 /// How an origin looks.
-pub fn look(origin: Origin) -> Look {
+pub fn origin_style(origin: Origin) -> OriginStyle {
     match origin {
-        Origin::Biased => Look {
+        Origin::Biased => OriginStyle {
             colour: Colour::VERMILLION,
             line: Colour::VERMILLION.line(1.3),
             marker: Marker::Disc,
             name: "biased",
         },
-        Origin::Control => Look {
+        Origin::Control => OriginStyle {
             colour: Colour::BLUE,
             line: Stroke { dashes: &[4.0, 1.6], ..Colour::BLUE.line(1.3) },
             marker: Marker::Square,
@@ -38,14 +38,16 @@ pub fn look(origin: Origin) -> Look {
     }
 }
 
-/// Says at the upper right which is which, of those that are shown.
+/// Draws the legend of the shown origins at the upper right.
 pub fn origins(figure: &mut Figure, shown: &[Origin]) {
-    let keys: Vec<_> =
-        shown.iter().map(|origin| (Key::Line(look(*origin).line), look(*origin).name)).collect();
+    let keys: Vec<_> = shown
+        .iter()
+        .map(|origin| (Key::Line(origin_style(*origin).line), origin_style(*origin).name))
+        .collect();
     legend(figure, [WIDTH - 8.0, 12.0], &keys);
 }
 
-/// An axis that shows nearly all of the values, 0.1 % at either end left out, and `must` in any case.
+/// An axis over the values without 0.1 % at either end, extended to include `must`.
 pub fn axis(title: &str, scale: Scale, values: &[f64], must: Option<f64>) -> Axis {
     let is_usable = |x: &f64| x.is_finite() && (scale == Scale::Linear || *x > 0.0);
     let mut ascending: Vec<_> = values.iter().copied().filter(is_usable).collect();
@@ -65,7 +67,7 @@ pub fn axis(title: &str, scale: Scale, values: &[f64], must: Option<f64>) -> Axi
     }
 }
 
-/// A large number, with a thin space between thousands.
+/// A large number with no-break spaces between thousands.
 pub fn grouped(number: u64) -> String {
     let digits = number.to_string();
     let mut text = String::new();

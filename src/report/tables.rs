@@ -1,54 +1,60 @@
-//! The tables of a report: what people read, and every digit of it for a file.
+//! The tables of a report, rounded for the page and with full precision for a file.
 
 mod facts;
 mod labels;
-mod seeds;
+mod seed_structures;
 mod settings;
 
 use super::csv::{self, Csv};
-use super::gathered::Gathered;
+use super::report_data::ReportData;
 
 pub use facts::collection_rule;
 
-/// Rows of a table on the page, where it grows with the campaign.
-const ROWS: usize = 60;
+/// Largest number of rows on the page, for tables that grow with the campaign.
+const MAX_PAGE_ROWS: usize = 60;
 
-/// Rows below titles.
+/// A table.
 pub struct Table {
-    /// Name of its file, and the place on the page.
+    /// Name of its file and its anchor on the page.
     pub name: &'static str,
-    /// What it shows; with `_{…}` and `^{…}`, as the titles.
+    /// Caption. Supports `_{…}` and `^{…}`, as the titles do.
     pub caption: String,
-    /// Titles of columns.
+    /// Column titles.
     pub titles: Vec<&'static str>,
-    /// Rows. One of a single cell is a heading of those below it, and is not in the file.
+    /// Rows. A row of a single cell is a heading and is not written to the file.
     pub rows: Vec<Vec<Cell>>,
-    /// Rows on the page, at most; the file has all.
+    /// Largest number of rows on the page. The file has all.
     pub shown: usize,
 }
 
 /// A cell.
 #[derive(Clone, Debug)]
 pub struct Cell {
-    /// As people read it.
+    /// Rounded, for the page.
     pub shown: String,
-    /// With every digit.
+    /// Full precision, for the file.
     pub exact: String,
-    /// Numbers stand to the right.
+    /// Numbers are right-aligned.
     pub is_number: bool,
 }
 
 impl Table {
     fn new(name: &'static str, caption: &str, titles: &[&'static str]) -> Self {
-        Self { name, caption: caption.into(), titles: titles.to_vec(), rows: Vec::new(), shown: ROWS }
+        Self {
+            name,
+            caption: caption.into(),
+            titles: titles.to_vec(),
+            rows: Vec::new(),
+            shown: MAX_PAGE_ROWS,
+        }
     }
 
-    /// The same with every row on the page.
+    /// Shows every row on the page.
     fn whole(self) -> Self {
         Self { shown: usize::MAX, ..self }
     }
 
-    /// Its file.
+    /// The content of its file.
     pub fn csv(&self) -> Csv {
         let titles: Vec<_> = self.titles.iter().map(|title| figures::plain(title)).collect();
         let titles: Vec<_> = titles.iter().map(String::as_str).collect();
@@ -61,7 +67,7 @@ impl Table {
     }
 }
 
-/// Words.
+/// A text.
 fn text(words: impl Into<String>) -> Cell {
     let words = words.into();
     Cell { shown: words.clone(), exact: words, is_number: false }
@@ -72,31 +78,31 @@ fn count(number: u64) -> Cell {
     Cell { shown: super::style::grouped(number), exact: number.to_string(), is_number: true }
 }
 
-/// A number with so many decimals for people, a dash where there is none.
+/// A number with a fixed number of decimals, or a dash.
 fn real(x: impl Into<Option<f64>>, decimals: usize) -> Cell {
     let x = x.into();
     Cell { shown: crate::output::decimals(x, decimals), exact: csv::number(x), is_number: true }
 }
 
-/// A share, shown in percent; its file has the same.
+/// A share, in percent on the page and in the file.
 fn percent(share: Option<f64>) -> Cell {
     real(share.map(|share| 100.0 * share), 1)
 }
 
-/// All that have rows, in the order of the page.
-pub fn all(gathered: &Gathered) -> Vec<Table> {
-    let mut tables = vec![facts::summary(gathered), seeds::of(gathered)];
-    if let Some(found) = &gathered.labels {
+/// All tables with rows, in the order of the page.
+pub fn all(data: &ReportData) -> Vec<Table> {
+    let mut tables = vec![facts::summary(data), seed_structures::seed_structures(data)];
+    if let Some(found) = &data.labels {
         tables.extend([
-            labels::correlations(&found.learned),
-            labels::quantiles("quantiles-gamma", "γ", &found.learned.all.gamma),
-            labels::quantiles("quantiles-gamma-nbr", "γ_{nbr}", &found.learned.all.gamma_nbr),
-            labels::energy_offsets(&found.learned),
+            labels::correlations(&found.statistics),
+            labels::quantiles("quantiles-gamma", "γ", &found.statistics.all.gamma),
+            labels::quantiles("quantiles-gamma-nbr", "γ_{nbr}", &found.statistics.all.gamma_nbr),
+            labels::energy_offsets(&found.statistics),
             labels::failures(&found.failures),
             labels::unlabelled(&found.unlabelled),
         ]);
     }
-    tables.extend([settings::settings(gathered), facts::provenance(gathered)]);
+    tables.extend([settings::settings(data), facts::provenance(data)]);
     tables.retain(|table| !table.rows.is_empty());
     tables
 }

@@ -39,11 +39,11 @@ async fn begin(directory: &std::path::Path, configuration: &str) -> Store {
 }
 
 async fn offer(store: &Store, step: u64, origin: Origin, fate: Fate, keep_features: bool) {
-    // Those of a control are like those of its biased walk, and not the same.
+    // The structure of a control walk differs slightly from that of its biased walk.
     let shift = if origin == Origin::Control { 0.001 } else { 0.0 };
     let structure = structure(2.5 + 0.01 * step as f64 + shift);
     let content = ContentHash::of(&structure);
-    // Each atom a little newer than the one before it.
+    // The grades increase from atom to atom.
     let grades: Vec<_> = (0..ATOMS).map(|k| 0.2 * (k + 1) as f64).collect();
     let walk = WalkId(u32::from(origin == Origin::Control));
     let id = CandidateId { campaign: CAMPAIGN, walk, segment: 0, step, content };
@@ -84,7 +84,7 @@ async fn label_all(store: &Store) {
     let protocol = Protocol { hash: ContentHash([3; 32]), name: "dft".into(), settings };
     store.add_protocol(&protocol, 0).await.unwrap();
     while let Some(lease) = store.lease(protocol.hash, "a", 0, 1000).await.unwrap() {
-        // The error of an atom is a half of its grade.
+        // The error of an atom is half its grade.
         let forces = (0..ATOMS).map(|k| [0.1 * (k + 1) as f64, 0.0, 0.0]).collect();
         let label = Label { energy: -1.0, forces, stress: None, details: Default::default() };
         store.complete(&lease, &label, 500).await.unwrap();
@@ -120,11 +120,11 @@ fn file<'a>(files: &'a [File], path: &str) -> &'a str {
 #[tokio::test]
 async fn every_setting_is_on_the_page() {
     let directory = tempfile::tempdir().unwrap();
-    // More keys than a table that grows with the campaign shows, and one that comes last in the alphabet.
+    // More keys than the page shows of a table that grows with the campaign, and one that comes last in the alphabet.
     let keys: serde_json::Map<_, _> = (0..80).map(|k| (format!("key{k:02}"), json!(k))).collect();
     let configuration = json!({ "guard": keys, "walk": { "temperature": 417.0, "volume_ramp": null } });
     let store = begin(directory.path(), &configuration.to_string()).await;
-    let files = of(&store).await.unwrap();
+    let files = build(&store).await.unwrap();
     let page = words(file(&files, PAGE));
     for expected in ["[guard]", "key79", "[walk]", "temperature", "417.0", "volume_ramp", "not set"] {
         assert!(page.contains(expected), "{expected}: {page}");
@@ -140,7 +140,7 @@ async fn every_setting_is_on_the_page() {
 async fn what_is_missing_is_said() {
     let directory = tempfile::tempdir().unwrap();
     let store = begin(directory.path(), "{}").await;
-    let files = of(&store).await.unwrap();
+    let files = build(&store).await.unwrap();
     assert!(!files.iter().any(|file| file.path.starts_with("figures/")), "nothing to draw");
     let page = words(file(&files, PAGE));
     for expected in [
@@ -157,7 +157,7 @@ async fn what_is_missing_is_said() {
         offer(&store, step, Origin::Biased, Fate::Accepted, false).await;
     }
     offer(&store, 99, Origin::Biased, Fate::Declined(Decline::Covered), false).await;
-    let files = of(&store).await.unwrap();
+    let files = build(&store).await.unwrap();
     let page = words(file(&files, PAGE));
     for expected in ["no force error is known", "The store has no features", "n = 31", "240 atoms"] {
         assert!(page.replace('\u{a0}', "").contains(expected), "{expected}: {page}");
@@ -178,7 +178,7 @@ async fn figures_have_the_numbers_of_the_store() {
         offer(&store, 1000 + step, Origin::Biased, Fate::Declined(Decline::Duplicate), true).await;
     }
     label_all(&store).await;
-    let files = of(&store).await.unwrap();
+    let files = build(&store).await.unwrap();
     assert_eq!(files.iter().filter(|file| file.path.ends_with(".png")).count(), 8);
     for svg in files.iter().filter(|file| file.path.ends_with(".svg")) {
         words(std::str::from_utf8(&svg.bytes).unwrap());
@@ -191,7 +191,7 @@ async fn figures_have_the_numbers_of_the_store() {
     );
     assert!(!page.contains("https://") && page.contains("[walk]") && page.contains("tau"));
 
-    // Eight atoms of each of 80 structures; the grades 1.2, 1.4 and 1.6 have errors of a half of that.
+    // Eight atoms of each of 80 structures. The grades 1.2, 1.4 and 1.6 have half of that as error.
     let correlations = file(&files, "tables/correlations.csv");
     let all: Vec<_> = correlations.lines().nth(1).unwrap().split(',').collect();
     assert_eq!((all[1], all[2], all[6]), ("80", "640", "1"), "{correlations}");
@@ -222,6 +222,6 @@ async fn figures_have_the_numbers_of_the_store() {
     let seeds = file(&files, "tables/seed-structures.csv");
     assert!(seeds.contains("\"a<b>&\"\"row\"\"\",Al8,0,,80,40,0,40,0,0,0,40,80,0"), "{seeds}");
 
-    let again = of(&store).await.unwrap();
+    let again = build(&store).await.unwrap();
     assert!(files.iter().zip(&again).all(|(a, b)| a.path == b.path && a.bytes == b.bytes), "the same bytes");
 }

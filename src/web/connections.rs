@@ -1,7 +1,7 @@
-//! The connections of a listener: how many there may be, how long each may be idle, and which one goes when there is no room.
+//! Limits the connections of a listener: their number, their idle time, and which one is closed for a new one.
 //!
-//! Every user of this host can connect. Connections therefore have bounds, and the process keeps descriptors in reserve for
-//! the processes that it starts: at a bound the connection that has been idle for longest makes room for the newest.
+//! Every user of this host can connect, so connections are limited, and the process reserves file descriptors for its
+//! children. At the limit, the connection that has been idle longest is closed for the newest.
 
 use std::collections::BTreeMap;
 use std::os::fd::AsRawFd;
@@ -12,14 +12,14 @@ use rustix::process::{Resource, getrlimit};
 use tokio::net::TcpStream;
 use tokio::task::JoinHandle;
 
-/// Connections of one listener at most.
-const MOST: usize = 64;
-/// A connection is idle for so long before it makes room for another: whoever has connected gets so much time to ask.
-const LEAST_IDLE: Duration = Duration::from_millis(200);
-/// Descriptors that connections leave free at least, where the limit allows it: to start a process takes up to ten.
-const RESERVE: u64 = 64;
+/// Largest number of connections of one listener.
+const MAX_CONNECTIONS: usize = 64;
+/// Time for which a new connection may be idle before it can be closed for another: long enough to send a request.
+const MIN_IDLE_TIME: Duration = Duration::from_millis(200);
+/// File descriptors reserved for other purposes, where the limit allows. Starting a process takes up to ten.
+const MIN_RESERVED_DESCRIPTORS: u64 = 64;
 
-/// The connections that are open. Clones share them.
+/// The open connections. Clones share them.
 #[derive(Clone, Debug, Default)]
 pub struct Connections(Arc<Mutex<Open>>);
 
@@ -37,49 +37,49 @@ struct Connection {
     task: Option<JoinHandle<()>>,
 }
 
-/// What a connection does.
+/// What a connection is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum State {
-    /// It waits for a request to be complete, or for the client to take an answer.
+    /// Waiting for a complete request, or for the client to read a response.
     Idle,
-    /// It is told events until the client leaves.
-    Events,
-    /// A request is being answered.
-    Answering,
+    /// Streaming events until the client leaves.
+    Streaming,
+    /// Responding to a request.
+    Responding,
 }
 
-/// A place among the connections, given back when this is dropped.
+/// Registration of a connection, removed on drop.
 #[derive(Debug)]
-pub struct Place {
+pub struct ConnectionGuard {
     connections: Connections,
     number: u64,
 }
 
-/// Whether a connection may be served.
+/// Whether a new connection may be served.
 #[derive(Debug)]
 pub enum Admission {
-    /// Yes.
+    /// At once.
     Now,
-    /// Yes, when this one has gone.
-    After(JoinHandle<()>),
-    /// Not before so long.
+    /// After this connection has closed.
+    AfterClosing(JoinHandle<()>),
+    /// Try again after this time.
     Later(Duration),
-    /// No: all others are at work.
-    Never,
+    /// Refuse it: all others are responding.
+    Refuse,
 }
 
 impl Connections {
-    /// Whether a new connection may be served, and which one goes for it.
+    /// Decides whether to serve a new connection, and which one to close for it.
     pub fn admit(&self, stream: &TcpStream) -> Admission {
         let mut open = self.open();
-        if open.by_number.len() < MOST && leaves_reserve(stream) {
+        if open.by_number.len() < MAX_CONNECTIONS && leaves_reserve(stream) {
             return Admission::Now;
         }
-        open.make_room(Instant::now())
+        open.evict(Instant::now())
     }
 
-    /// Takes a place for a connection that `serve` begins to serve.
-    pub fn add(&self, serve: impl FnOnce(Place) -> JoinHandle<()>) {
+    /// Registers a connection and serves it with `serve`.
+    pub fn add(&self, serve: impl FnOnce(ConnectionGuard) -> JoinHandle<()>) {
         let number = {
             let mut open = self.open();
             open.next_number += 1;
@@ -88,14 +88,14 @@ impl Connections {
             open.by_number.insert(number, connection);
             number
         };
-        let task = serve(Place { connections: self.clone(), number });
-        // It may be over already.
+        let task = serve(ConnectionGuard { connections: self.clone(), number });
+        // It may have ended already.
         if let Some(connection) = self.open().by_number.get_mut(&number) {
             connection.task = Some(task);
         }
     }
 
-    /// Closes all of them.
+    /// Closes all connections.
     pub fn close(&self) {
         self.open().by_number.values().filter_map(|open| open.task.as_ref()).for_each(JoinHandle::abort);
     }
@@ -106,15 +106,15 @@ impl Connections {
 }
 
 impl Open {
-    /// Closes the connection that has been idle for longest, or else the one that was told events for longest.
-    fn make_room(&mut self, now: Instant) -> Admission {
-        // One that has no task yet has only just come.
+    /// Closes the connection that has been idle longest, or else the one that has streamed events longest.
+    fn evict(&mut self, now: Instant) -> Admission {
+        // A connection without a task has only just been accepted.
         let others = self.by_number.iter().filter(|(_, open)| open.task.is_some());
         let first = others.min_by_key(|(_, open)| (open.state, open.since));
-        let Some((number, open)) = first.filter(|(_, open)| open.state != State::Answering) else {
-            return Admission::Never;
+        let Some((number, open)) = first.filter(|(_, open)| open.state != State::Responding) else {
+            return Admission::Refuse;
         };
-        let left = LEAST_IDLE.saturating_sub(now.saturating_duration_since(open.since));
+        let left = MIN_IDLE_TIME.saturating_sub(now.saturating_duration_since(open.since));
         if !left.is_zero() {
             return Admission::Later(left);
         }
@@ -122,22 +122,22 @@ impl Open {
         match self.by_number.remove(&number).and_then(|open| open.task) {
             Some(task) => {
                 task.abort();
-                Admission::After(task)
+                Admission::AfterClosing(task)
             }
-            None => Admission::Never,
+            None => Admission::Refuse,
         }
     }
 }
 
-impl Place {
-    /// The connection does something else from now on.
-    pub fn enter(&self, state: State) {
+impl ConnectionGuard {
+    /// Sets the state of the connection.
+    pub fn set_state(&self, state: State) {
         if let Some(open) = self.connections.open().by_number.get_mut(&self.number) {
             (open.state, open.since) = (state, Instant::now());
         }
     }
 
-    /// How long the connection has been idle; zero while it is not.
+    /// How long the connection has been idle. Zero unless it is idle.
     pub fn idle(&self) -> Duration {
         let open = self.connections.open();
         let idle = open.by_number.get(&self.number).filter(|open| open.state == State::Idle);
@@ -145,22 +145,22 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for ConnectionGuard {
     fn drop(&mut self) {
         self.connections.open().by_number.remove(&self.number);
     }
 }
 
-/// Whether enough descriptors are left for others. The system gives each file the lowest free number, so the number tells how
-/// many are taken.
+/// Whether enough descriptors remain. A new file gets the lowest free number, so the number tells how many are in
+/// use.
 fn leaves_reserve(stream: &TcpStream) -> bool {
     let number = u64::try_from(stream.as_raw_fd()).unwrap_or(u64::MAX);
     getrlimit(Resource::Nofile).current.is_none_or(|limit| number < limit - reserve(limit))
 }
 
-/// Descriptors in reserve under this limit: a quarter of it, [`RESERVE`] at least, and never more than half.
+/// Descriptors to reserve under this limit: a quarter of it, at least [`MIN_RESERVED_DESCRIPTORS`], at most half.
 fn reserve(limit: u64) -> u64 {
-    RESERVE.max(limit / 4).min(limit / 2)
+    MIN_RESERVED_DESCRIPTORS.max(limit / 4).min(limit / 2)
 }
 
 #[cfg(test)]
@@ -179,32 +179,32 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn the_longest_idle_goes_first_and_who_is_answered_stays() {
+    async fn the_longest_idle_is_closed_first_and_responding_ones_stay() {
         let now = Instant::now() + Duration::from_secs(3600);
         let mut open = open(
             &[
-                (State::Answering, 100),
-                (State::Events, 90),
+                (State::Responding, 100),
+                (State::Streaming, 90),
                 (State::Idle, 10),
                 (State::Idle, 20),
-                (State::Events, 80),
+                (State::Streaming, 80),
             ],
             now,
         );
         for gone in [4, 3, 2, 5] {
-            assert!(matches!(open.make_room(now), Admission::After(_)));
+            assert!(matches!(open.evict(now), Admission::AfterClosing(_)));
             assert!(!open.by_number.contains_key(&gone), "{gone} goes: {open:?}");
         }
-        assert!(matches!(open.make_room(now), Admission::Never));
+        assert!(matches!(open.evict(now), Admission::Refuse));
         assert_eq!(open.by_number.len(), 1);
     }
 
     #[tokio::test]
-    async fn who_has_just_connected_has_time_to_ask() {
+    async fn new_connections_have_time_to_send_a_request() {
         let now = Instant::now() + Duration::from_secs(3600);
         let mut open = open(&[(State::Idle, 0)], now);
-        let Admission::Later(left) = open.make_room(now) else { panic!("it is new") };
-        assert!(matches!(open.make_room(now + left), Admission::After(_)));
+        let Admission::Later(left) = open.evict(now) else { panic!("it is new") };
+        assert!(matches!(open.evict(now + left), Admission::AfterClosing(_)));
     }
 
     #[test]

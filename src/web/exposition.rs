@@ -1,21 +1,21 @@
-//! The text format of Prometheus, version 0.0.4.
+//! The text exposition format of Prometheus, version 0.0.4.
 
 use std::fmt::Write;
 
-/// As HTTP calls it.
+/// Its media type.
 pub const CONTENT_TYPE: &str = "text/plain; version=0.0.4; charset=utf-8";
 
-/// Metrics as text. Each has its lines together.
+/// Metrics as text, grouped by name.
 #[derive(Debug, Default)]
 pub struct Text(String);
 
 impl Text {
-    /// A number that only grows; its name ends with `_total`.
+    /// Adds a counter. Its name ends with `_total`.
     pub fn counter(&mut self, name: &str, help: &str, samples: &[(&[(&str, &str)], f64)]) {
         self.metric(name, "counter", help, samples);
     }
 
-    /// A number that may do anything.
+    /// Adds a gauge.
     pub fn gauge(&mut self, name: &str, help: &str, samples: &[(&[(&str, &str)], f64)]) {
         self.metric(name, "gauge", help, samples);
     }
@@ -39,7 +39,7 @@ impl Text {
         }
     }
 
-    /// All of it.
+    /// The text.
     pub fn into_string(self) -> String {
         self.0
     }

@@ -1,4 +1,4 @@
-//! `/metrics` for Prometheus: what `calmwalk status` reads, read when it is asked for. docs/metrics.md lists it.
+//! `/metrics` for Prometheus: the values of `calmwalk status`, read on request. docs/metrics.md lists them.
 
 use std::collections::BTreeMap;
 
@@ -14,7 +14,7 @@ use crate::cli::status::Snapshot;
 
 const SECONDS_PER_HOUR: f64 = 3600.0;
 
-/// The metrics of a campaign.
+/// Serves the metrics of a campaign.
 pub fn router(store: Store) -> Router {
     Router::new().route("/metrics", get(metrics)).with_state(store)
 }
@@ -26,14 +26,14 @@ async fn metrics(State(store): State<Store>) -> Response {
     }
 }
 
-/// Everything. Labels have few values each: kinds, states, reasons and classes, never walks or structures.
+/// All metrics. Labels have few values: kinds, states, reasons and classes, never walks or structures.
 pub fn text(snapshot: &Snapshot) -> String {
     let (campaign, status) = (snapshot.campaign(), snapshot.status());
     let mut text = Text::default();
     let id = campaign.id.to_string();
     let labels =
         [("campaign", id.as_str()), ("mode", &campaign.mode), ("version", env!("CARGO_PKG_VERSION"))];
-    text.gauge("calmwalk_info", "What runs: always 1.", &[(&labels, 1.0)]);
+    text.gauge("calmwalk_info", "Information about the campaign; always 1.", &[(&labels, 1.0)]);
     text.gauge(
         "calmwalk_finished",
         "Whether the campaign is finished.",
@@ -49,7 +49,7 @@ pub fn text(snapshot: &Snapshot) -> String {
         .zip(snapshot.failures())
         .map(|(labels, found)| (&labels[..], (found.labelled + found.given_up + found.unfinished) as f64))
         .collect();
-    text.gauge("calmwalk_failed_label_jobs", "Label jobs that met a class of failures.", &samples);
+    text.gauge("calmwalk_failed_label_jobs", "Label jobs with a failure of this class.", &samples);
     processes(&mut text, status);
     if let Some(share) = snapshot.share_above_one() {
         text.gauge(
@@ -62,7 +62,7 @@ pub fn text(snapshot: &Snapshot) -> String {
     if let Some(end) = snapshot.end().time {
         text.gauge(
             "calmwalk_expected_end_timestamp_seconds",
-            "When the campaign is expected to end, as things are now.",
+            "Expected end of the campaign, if nothing changes.",
             &[(&[], end as f64 / 1000.0)],
         );
     }
@@ -83,17 +83,13 @@ fn candidates(text: &mut Text, status: &Status) {
     let labels = fates.map(|(fate, _)| [("fate", fate)]);
     let samples: Vec<_> =
         labels.iter().zip(fates).map(|(labels, (_, count))| (&labels[..], count as f64)).collect();
-    text.counter(
-        "calmwalk_candidates_total",
-        "Candidates of biased walks, by what became of them.",
-        &samples,
-    );
+    text.counter("calmwalk_candidates_total", "Candidates of biased walks by fate.", &samples);
     let control = candidates.control as f64;
     text.counter("calmwalk_control_frames_total", "Frames of control walks.", &[(&[], control)]);
     let refused = candidates.refused_by_walkers as f64;
     text.counter(
         "calmwalk_refused_structures_total",
-        "Structures that walkers' own guards refused.",
+        "Structures refused by the walkers' guards.",
         &[(&[], refused)],
     );
     let version = status.mixture_version as f64;
@@ -108,13 +104,13 @@ fn walks(text: &mut Text, status: &Status) {
         labels.iter().zip(states.values()).map(|(labels, count)| (&labels[..], *count as f64)).collect();
     text.gauge("calmwalk_walks", "Walks by state.", &samples);
     if let Some(pace) = status.steps_per_second {
-        text.gauge("calmwalk_steps_per_second", "Steps of all walks together.", &[(&[], pace)]);
+        text.gauge("calmwalk_steps_per_second", "Steps per second of all walks together.", &[(&[], pace)]);
     }
     let under_way = status.walks.iter().filter(|walk| matches!(walk.state.as_str(), "waiting" | "running"));
     if let Some(gamma) = under_way.filter_map(|walk| walk.gamma_max).reduce(f64::max) {
         text.gauge(
             "calmwalk_walk_grade_max",
-            "Largest extrapolation grade of the walks under way.",
+            "Largest extrapolation grade of the running walks.",
             &[(&[], gamma)],
         );
     }
@@ -138,32 +134,28 @@ fn label_queue(text: &mut Text, status: &Status) {
         let age = (unix_milliseconds() - lease.started).max(0) as f64 / 1000.0;
         text.gauge(
             "calmwalk_oldest_lease_age_seconds",
-            "Age of the oldest label attempt under way.",
+            "Age of the oldest running label attempt.",
             &[(&[], age)],
         );
     }
     let used = &status.budget.used;
     let made = used.labels as f64;
-    text.counter("calmwalk_labels_made_total", "Labels made, also those kept beside others.", &[(&[], made)]);
+    text.counter("calmwalk_labels_made_total", "Labels made, including checks.", &[(&[], made)]);
     let core_seconds = used.core_hours * SECONDS_PER_HOUR;
-    // What an attempt took is only known when it has ended: until then it is reckoned, and so the sum may fall.
+    // The cost of an attempt is known only at its end and estimated before, so the sum may decrease.
     text.gauge(
         "calmwalk_label_core_seconds",
-        "Core-seconds of label attempts, those under way so far.",
+        "Core-seconds of label attempts, including running ones.",
         &[(&[], core_seconds)],
     );
     let seconds = used.wall_hours * SECONDS_PER_HOUR;
-    text.counter(
-        "calmwalk_under_way_seconds_total",
-        "Time for which the campaign was under way.",
-        &[(&[], seconds)],
-    );
+    text.counter("calmwalk_under_way_seconds_total", "Running time of the campaign.", &[(&[], seconds)]);
 }
 
 fn processes(text: &mut Text, status: &Status) {
     let mut kinds: BTreeMap<(&str, &str), u64> = BTreeMap::new();
     for process in &status.processes {
-        // What else is said of a process may be anything.
+        // Other states contain free text.
         let known = ["running", "stopping", "pausing", "silent", "gone"];
         let state = known.into_iter().find(|state| process.state == *state).unwrap_or("given_up");
         *kinds.entry((&process.kind, state)).or_default() += 1;

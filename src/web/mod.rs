@@ -1,12 +1,12 @@
-//! What a campaign shows over HTTP, to this host only.
+//! Serves a campaign over HTTP, to this host only.
 
-pub mod agent;
+pub mod agent_metrics;
 mod connections;
 pub mod dashboard;
 pub mod exposition;
-mod guard;
 pub mod metrics;
-mod serve;
+mod security;
+mod server;
 
 use std::net::SocketAddr;
 
@@ -15,15 +15,15 @@ use calm::Artifact;
 use store::{Location, Store};
 use tokio::net::TcpListener;
 
-use self::dashboard::{Acting, Dashboard};
-pub use self::serve::Server;
-use crate::mixture::Original;
-use crate::outcome::Failure;
-use crate::output::{say, show};
+use self::dashboard::{Dashboard, Mutations};
+pub use self::server::Server;
+use crate::exit_status::Failure;
+use crate::mixture_status::InitialMixture;
+use crate::output::{log_and_print, print_stderr};
 
-/// Where a campaign is shown, as arguments.
+/// Options for the addresses to serve on.
 #[derive(Debug, clap::Args)]
-pub struct Addresses {
+pub struct ListenAddresses {
     /// Serve the dashboard to web browsers at this address, such as 127.0.0.1:8080 (docs/dashboard.md)
     #[arg(long, value_name = "ADDRESS:PORT", value_parser = address)]
     dashboard: Option<SocketAddr>,
@@ -32,7 +32,7 @@ pub struct Addresses {
     metrics: Option<SocketAddr>,
 }
 
-/// An address to serve on, as an argument.
+/// Parses an address to serve on.
 pub fn address(text: &str) -> Result<SocketAddr, String> {
     let of_this_host = text.strip_prefix("localhost:").map(|port| format!("127.0.0.1:{port}"));
     of_this_host.as_deref().unwrap_or(text).parse().map_err(|_| {
@@ -44,39 +44,39 @@ pub fn address(text: &str) -> Result<SocketAddr, String> {
     })
 }
 
-/// The same, held.
+/// The bound listeners.
 #[derive(Debug)]
-pub struct Listening {
+pub struct BoundListeners {
     dashboard: Option<TcpListener>,
     metrics: Option<TcpListener>,
 }
 
-/// What is served, until this is dropped.
+/// The running servers. They stop on drop.
 #[derive(Debug, Default)]
-pub struct Serving {
+pub struct RunningServers {
     servers: Vec<Server>,
-    shown: Option<Store>,
+    read_store: Option<Store>,
 }
 
-impl Serving {
-    /// Serves no more, and closes what was read from: whoever closes a database last tidies it up.
+impl RunningServers {
+    /// Stops the servers and closes their store. The last process that closes a database cleans it up.
     pub async fn end(self) {
         self.servers.iter().for_each(Server::end);
-        if let Some(shown) = &self.shown {
-            shown.close().await;
+        if let Some(read_store) = &self.read_store {
+            read_store.close().await;
         }
     }
 }
 
-impl Drop for Serving {
+impl Drop for RunningServers {
     fn drop(&mut self) {
         self.servers.iter().for_each(Server::end);
     }
 }
 
-impl Addresses {
-    /// Takes the addresses, before any work begins that would be in vain.
-    pub async fn listen(&self) -> Result<Listening, Failure> {
+impl ListenAddresses {
+    /// Binds the addresses before any work begins.
+    pub async fn listen(&self) -> Result<BoundListeners, Failure> {
         let (mut dashboard, mut metrics) = (None, None);
         if let Some(address) = self.dashboard {
             dashboard = Some(listen(address).await?);
@@ -84,63 +84,63 @@ impl Addresses {
         if let Some(address) = self.metrics {
             metrics = Some(listen(address).await?);
         }
-        Ok(Listening { dashboard, metrics })
+        Ok(BoundListeners { dashboard, metrics })
     }
 }
 
-impl Listening {
-    /// Begins to serve. What is shown is read through connections of its own: whoever asks often does not keep the campaign
-    /// waiting. What is changed goes through `store`.
+impl BoundListeners {
+    /// Starts the servers. They read through separate connections, so that frequent requests do not slow the
+    /// campaign. Mutations go through `store`.
     pub async fn serve(
         self,
         location: &Location,
         store: &Store,
         artifact: &Artifact,
-    ) -> Result<Serving, Failure> {
-        let mut serving = Serving::default();
+    ) -> Result<RunningServers, Failure> {
+        let mut serving = RunningServers::default();
         if self.dashboard.is_none() && self.metrics.is_none() {
             return Ok(serving);
         }
-        let shown = Store::open_read_only(location).await?;
-        serving.shown = Some(shown.clone());
+        let read_store = Store::open_read_only(location).await?;
+        serving.read_store = Some(read_store.clone());
         if let Some(listener) = self.metrics {
-            serving.servers.push(serve_metrics(listener, metrics::router(shown.clone()))?);
+            serving.servers.push(serve_metrics(listener, metrics::router(read_store.clone()))?);
         }
         if let Some(listener) = self.dashboard {
-            let original = Original { symbols: artifact.symbols.clone(), mixture: artifact.mixture.clone() };
-            let acting = Acting::new(store.clone())?;
+            let original =
+                InitialMixture { symbols: artifact.symbols.clone(), mixture: artifact.mixture.clone() };
+            let mutations = Mutations::new(store.clone())?;
             let address = listener.local_addr().map_err(Failure::failed)?;
             tracing::info!("dashboard at http://{address}/");
-            // The token is for whoever reads this, and for no file.
-            show(format_args!("dashboard at http://{address}/#token={}", acting.token()));
-            let router = Dashboard::new(shown, Some(acting), Some(original)).router();
+            // Print the token, but do not log it.
+            print_stderr(format_args!("dashboard at http://{address}/#token={}", mutations.token()));
+            let router = Dashboard::new(read_store, Some(mutations), Some(original)).router();
             serving.servers.push(Server::start(listener, router));
         }
         Ok(serving)
     }
 }
 
-/// An address to serve on, before any work begins that would be in vain. What is served asks nobody who he is, so it is
-/// one of this host.
+/// Binds an address before any work begins. Requests are not authenticated, so the address must be loopback.
 pub async fn listen(address: SocketAddr) -> Result<TcpListener, Failure> {
     if !address.ip().is_loopback() {
         return Err(Failure::Input(format!(
-            "will not listen on {address}: whoever reaches it could read the campaign; name an address of this host, as \
-             127.0.0.1:{port}, and reach it from elsewhere with ssh -L {port}:127.0.0.1:{port}",
+            "will not listen on {address}: anyone who reaches it could read the campaign; use a loopback address such as \
+             127.0.0.1:{port}, and reach it from other hosts with ssh -L {port}:127.0.0.1:{port}",
             port = address.port()
         )));
     }
     TcpListener::bind(address).await.map_err(|error| {
         Failure::Input(format!(
-            "cannot listen on {address}: {error}; name another port, or port 0 for any that is free"
+            "cannot listen on {address}: {error}; use another port, or port 0 for any free one"
         ))
     })
 }
 
-/// Says where metrics are served, and serves them.
+/// Prints the address of the metrics and serves them.
 pub fn serve_metrics(listener: TcpListener, router: Router) -> Result<Server, Failure> {
     let address = listener.local_addr().map_err(Failure::failed)?;
-    say(format_args!("metrics at http://{address}/metrics"));
+    log_and_print(format_args!("metrics at http://{address}/metrics"));
     Ok(Server::start(listener, router))
 }
 
@@ -149,7 +149,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn addresses_are_told_from_ports() {
+    fn addresses_need_a_host_and_a_port() {
         assert_eq!(address("127.0.0.1:8080"), Ok(([127, 0, 0, 1], 8080).into()));
         assert_eq!(address("localhost:8080"), address("127.0.0.1:8080"));
         for text in ["9464", ":9464"] {

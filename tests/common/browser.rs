@@ -1,4 +1,4 @@
-//! Chromium without a screen, which is driven over HTTP by `chromedriver`. Debian's packages: chromium and chromium-driver.
+//! Drives headless Chromium over HTTP with `chromedriver`. Debian's packages are chromium and chromium-driver.
 
 use std::fs;
 use std::io::{BufRead, BufReader};
@@ -11,7 +11,7 @@ use super::Running;
 use super::http::{get, request};
 use super::processes::wait_until;
 
-/// Keys that are no characters, as WebDriver calls them.
+/// WebDriver codes of special keys.
 pub const TAB: char = '\u{e004}';
 pub const ENTER: char = '\u{e007}';
 pub const ESCAPE: char = '\u{e00c}';
@@ -25,7 +25,7 @@ pub struct Browser {
 }
 
 impl Browser {
-    /// With a window of this size, on dark ground or on light.
+    /// Opens a window of this size with a dark or light theme.
     pub fn start(dark: bool, (width, height): (u32, u32)) -> Self {
         let driver = Command::new("chromedriver").arg("--port=0").stdout(Stdio::piped()).spawn();
         let mut driver = Running(driver.expect("chromedriver, of Debian's package chromium-driver"));
@@ -42,7 +42,7 @@ impl Browser {
             vec!["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", &size];
         arguments.extend(dark.then_some("--force-dark-mode"));
         let wanted = json!({ "alwaysMatch": {
-            // A busy machine takes longer than the half minute that a script has otherwise.
+            // A busy machine may exceed the default script timeout of 30 s.
             "timeouts": { "script": 300_000, "pageLoad": 300_000 },
             "goog:chromeOptions": { "args": arguments },
             "goog:loggingPrefs": { "browser": "ALL", "performance": "ALL" },
@@ -60,17 +60,17 @@ impl Browser {
         answer.json()["value"].take()
     }
 
-    /// Goes to an address.
+    /// Opens a URL.
     pub fn show(&self, url: &str) {
         self.tell("/url", &json!({ "url": url }));
     }
 
-    /// Gives the window this width.
+    /// Sets the width of the window.
     pub fn widen(&self, width: u32) {
         self.tell("/window/rect", &json!({ "width": width, "height": 1600 }));
     }
 
-    /// Gives pages this width, also below the least width of a window.
+    /// Sets the width of pages, which may be below the minimum width of a window.
     pub fn resize(&self, width: u32) {
         let parameters = json!({ "width": width, "height": 900, "deviceScaleFactor": 1, "mobile": false });
         self.tell(
@@ -79,17 +79,17 @@ impl Browser {
         );
     }
 
-    /// What a script returns.
+    /// Returns the result of a script.
     pub fn run(&self, script: &str) -> Value {
         self.tell("/execute/sync", &json!({ "script": script, "args": [] }))
     }
 
-    /// Waits until a script finds something true.
+    /// Waits until a script returns a true value.
     pub fn wait(&self, script: &str) {
         wait_until(script, || self.run(&format!("return Boolean({script})")) == true);
     }
 
-    /// Presses keys, one after the other, as whoever sits before it: what has the keyboard's focus gets them.
+    /// Presses keys one after the other. The focused element receives them.
     pub fn press(&self, keys: &[char]) {
         let strokes = keys
             .iter()
@@ -98,13 +98,13 @@ impl Browser {
         self.tell("/actions", &json!({ "actions": [keyboard] }));
     }
 
-    /// Lines of one of its logs.
+    /// Lines of one of the browser's logs.
     pub fn log(&self, kind: &str) -> Vec<Value> {
         let Value::Array(lines) = self.tell("/se/log", &json!({ "type": kind })) else { panic!("a list") };
         lines
     }
 
-    /// Writes what the window shows, or an element alone (a CSS selector), as PNG into a file.
+    /// Saves a screenshot of the window, or of one element (a CSS selector), as PNG.
     pub fn picture(&self, file: &Path, of: Option<&str>) {
         let of = of.map(|selector| {
             let found = self.tell("/element", &json!({ "using": "css selector", "value": selector }));
@@ -119,8 +119,8 @@ impl Browser {
         fs::write(file, bytes).unwrap();
     }
 
-    /// Every address that pages asked for.
-    pub fn asked_for(&self) -> Vec<String> {
+    /// Every URL that pages requested.
+    pub fn requested_urls(&self) -> Vec<String> {
         let asked = |line: Value| -> Option<String> {
             let message: Value = serde_json::from_str(line["message"].as_str()?).ok()?;
             let is_request = message["message"]["method"] == "Network.requestWillBeSent";

@@ -1,4 +1,5 @@
-//! A campaign of seconds: two seed structures of aluminium, short hot walks, thresholds low enough to collect.
+//! A campaign of a few seconds: two seed structures of aluminium, short hot walks, and thresholds low enough to
+//! collect.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -26,7 +27,7 @@ impl Default for Small {
 }
 
 impl Small {
-    /// The configuration as text.
+    /// Text of the configuration.
     pub fn text(&self) -> String {
         let Self { mode, walkers, walks_per_round, steps, per_seed, .. } = self;
         let file = |path: &str| config(path).display().to_string();
@@ -70,7 +71,7 @@ turn_steps = 40
         )
     }
 
-    /// Writes configuration and seed structures into `directory`; returns the configuration's path.
+    /// Writes configuration and seed structures into `directory`. Returns the path of the configuration.
     pub fn write(&self, directory: &Path) -> PathBuf {
         let frames =
             atoms::read_extxyz(&config("data/aluminium_seeds.extxyz")).expect("the demo's seed structures");
@@ -87,7 +88,7 @@ turn_steps = 40
     }
 }
 
-/// Everything of a campaign that must be the same bytes however it was interrupted.
+/// The results of a campaign that must not depend on interruptions, byte for byte.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Outcome {
     pub decisions: String,
@@ -96,19 +97,19 @@ pub struct Outcome {
     pub dataset: Vec<u8>,
 }
 
-/// How far a campaign has come.
+/// Progress of a campaign.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd)]
 pub struct Counters {
     /// Candidates and control frames that reached the selector.
     pub sent: u64,
-    /// Of them, in the data set.
+    /// Those of them in the data set.
     pub accepted: u64,
     /// Labels made.
     pub labels: u64,
 }
 
 impl Counters {
-    /// As `status` has them; nothing before there is a campaign.
+    /// Reads `status`. Zero before the campaign exists.
     pub fn of(location: &str, directory: &Path) -> Self {
         let output = super::calmwalk(directory, ["status", location, "--json"]);
         let status = serde_json::from_slice::<serde_json::Value>(&output.stdout).unwrap_or_default();
@@ -121,18 +122,18 @@ impl Counters {
         }
     }
 
-    /// Whether none of them is below what it was.
-    pub fn is_no_less_than(&self, before: &Self) -> bool {
+    /// Whether no counter has decreased.
+    pub fn has_not_decreased_since(&self, before: &Self) -> bool {
         self.sent >= before.sent && self.accepted >= before.accepted && self.labels >= before.labels
     }
 }
 
-/// Reads the outcome of the campaign in `directory` and checks that nothing is lost or doubled in it.
+/// Reads the outcome of the campaign in `directory` and checks that nothing is lost or duplicated.
 pub fn outcome(directory: &Path) -> Outcome {
     outcome_at(&directory.display().to_string(), directory)
 }
 
-/// The same of a campaign wherever it is kept; `directory` is where something may be written.
+/// The same for a campaign at any location. Temporary files go to `directory`.
 pub fn outcome_at(location: &str, directory: &Path) -> Outcome {
     let output = directory.join("dataset.extxyz");
     let arguments = ["export", location, "--control", "--output"];
@@ -144,7 +145,7 @@ pub fn outcome_at(location: &str, directory: &Path) -> Outcome {
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     runtime.block_on(async {
         let store = Store::open_read_only(location).await.expect("the campaign's database");
-        check_books(&store).await;
+        check_consistency(&store).await;
         let walks = store.load_walks().await.expect("walks").into_iter();
         Outcome {
             decisions: store.decision_log_text().await.expect("decisions"),
@@ -155,8 +156,8 @@ pub fn outcome_at(location: &str, directory: &Path) -> Outcome {
     })
 }
 
-/// Every accepted candidate has one label, decisions are numbered without gaps, nothing is left in the queue.
-async fn check_books(store: &Store) {
+/// Every accepted candidate has one label, decisions are numbered without gaps, and the queue is empty.
+async fn check_consistency(store: &Store) {
     let status = store.status().await.expect("status");
     assert!(status.finished, "{status:?}");
     let decisions = store.decisions(1..=i64::MAX).await.expect("decisions");

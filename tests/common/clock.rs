@@ -1,9 +1,9 @@
-//! Clocks that are wrong: libfaketime, from the package of that name.
+//! Runs programs with a wrong clock, using libfaketime from the package of that name.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// A clock that is set by hand.
+/// A clock that is set manually.
 pub struct Clock {
     file: PathBuf,
 }
@@ -15,15 +15,15 @@ impl Clock {
         clock
     }
 
-    /// As `+1h`.
+    /// Sets the offset, such as `+1h`.
     pub fn set(&self, offset: &str) {
-        // At once, as a reader sees it.
+        // Readers must never see a partial file.
         let new = self.file.with_extension("new");
         fs::write(&new, format!("{offset}\n")).unwrap();
         fs::rename(new, &self.file).unwrap();
     }
 
-    /// A program that starts others by this clock. Time that passes is measured as ever.
+    /// A command that starts others with this clock. Monotonic time is unaffected.
     pub fn starter(&self) -> Vec<String> {
         let library = "/usr/$LIB/faketime/libfaketimeMT.so.1";
         let variables = [
@@ -37,7 +37,7 @@ impl Clock {
     }
 }
 
-/// The library leaves these of processes that are killed.
+/// The library leaves these files of killed processes.
 impl Drop for Clock {
     fn drop(&mut self) {
         for entry in fs::read_dir("/dev/shm").into_iter().flatten().flatten() {

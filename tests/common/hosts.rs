@@ -1,4 +1,4 @@
-//! A campaign on several hosts: its orchestrator, and agents.
+//! A campaign on several hosts: an orchestrator and agents.
 
 use std::fs;
 use std::net::TcpListener;
@@ -9,25 +9,25 @@ use tempfile::TempDir;
 use wire::place::Place;
 
 use super::campaign::{Outcome, Small, outcome};
-use super::processes::{nothing_is_left, processes_in, wait_until};
+use super::processes::{assert_no_leftovers, processes_in, wait_until};
 use super::{Running, program, through};
 
-/// A campaign with its orchestrator's directory, and one for each other host.
+/// A campaign with the directory of its orchestrator and one for each other host.
 pub struct Hosts {
     pub home: TempDir,
     pub others: Vec<TempDir>,
-    /// Where the orchestrator listens, and where agents find it.
+    /// Where the orchestrator listens, and where agents connect.
     pub endpoints: [String; 2],
-    /// Whether agents may join at all.
+    /// Whether the orchestrator listens at all.
     pub listens: bool,
-    /// More options of `run`, and of `agent`.
+    /// Further options of `run` and of `agent`.
     pub options: [Vec<String>; 2],
-    /// What the orchestrator is started with, and what agents are: a program that starts them, with its arguments.
+    /// Commands with arguments that start the orchestrator and the agents.
     pub through: [Vec<String>; 2],
 }
 
 impl Hosts {
-    /// The orchestrator has a walker of its own, and `keys` in the section `[run]`.
+    /// The orchestrator has one walker of its own. `keys` are added to the section `[run]`.
     pub fn new(small: &Small, others: usize, keys: &str) -> Self {
         let home = tempfile::tempdir().unwrap();
         let path = Small { walkers: 1, ..small.clone() }.write(home.path());
@@ -41,7 +41,7 @@ impl Hosts {
         Self { home, others, endpoints, listens: true, options, through }
     }
 
-    pub fn lead(&self) -> Running {
+    pub fn start_orchestrator(&self) -> Running {
         let home = self.home.path();
         let mut command = through(&self.through[0], home);
         command.args(["run", "campaign.toml", "--directory", "."]);
@@ -51,7 +51,7 @@ impl Hosts {
         started(command.args(&self.options[0]), &home.join("said"))
     }
 
-    /// Each has one walker.
+    /// Each agent has one walker.
     pub fn agent(&self, host: usize) -> Running {
         let directory = self.others[host].path();
         let mut command = through(&self.through[1], directory);
@@ -60,19 +60,19 @@ impl Hosts {
         started(&mut command, &directory.join("said"))
     }
 
-    /// What the agent of a host has said.
+    /// Standard error of an agent.
     pub fn said(&self, host: usize) -> String {
         fs::read_to_string(self.others[host].path().join("said")).unwrap_or_default()
     }
 
-    /// What the orchestrator has said.
-    pub fn head_said(&self) -> String {
+    /// Standard error of the orchestrator.
+    pub fn orchestrator_stderr(&self) -> String {
         fs::read_to_string(self.home.path().join("said")).unwrap_or_default()
     }
 
-    /// Everybody is gone and has left nothing behind.
-    pub fn are_empty(&self) {
-        nothing_is_left(self.home.path());
+    /// All processes have ended and left nothing behind.
+    pub fn assert_cleaned_up(&self) {
+        assert_no_leftovers(self.home.path());
         for host in &self.others {
             wait_until("every process is gone", || processes_in(host.path()).is_empty());
             let left: Vec<PathBuf> =
@@ -85,14 +85,14 @@ impl Hosts {
     }
 }
 
-/// Starts a program that writes what it says to the end of a file.
+/// Starts a program whose standard error is appended to a file.
 pub fn started(command: &mut Command, said: &Path) -> Running {
     let said = fs::File::options().create(true).append(true).open(said).unwrap();
     Running(command.stdout(Stdio::null()).stderr(said).spawn().expect("the program starts"))
 }
 
-/// What the campaign comes to in one process.
-pub fn undisturbed(small: &Small) -> Outcome {
+/// The outcome of the campaign in a single process.
+pub fn uninterrupted_outcome(small: &Small) -> Outcome {
     let directory = tempfile::tempdir().unwrap();
     small.write(directory.path());
     let mut command = program(directory.path());

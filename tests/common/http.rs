@@ -1,4 +1,4 @@
-//! Asking a program over HTTP, with whatever headers.
+//! A minimal HTTP client with arbitrary headers.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-/// What was answered.
+/// A response.
 #[derive(Clone, Debug)]
 pub struct Answer {
     pub status: u16,
@@ -23,7 +23,7 @@ impl Answer {
     }
 }
 
-/// Sends a request; without a header `Host` it calls the host by its address.
+/// Sends a request. Without a `Host` header it uses the address.
 pub fn request(address: &str, method: &str, path: &str, headers: &[(&str, &str)], body: &str) -> Answer {
     let mut stream = BufReader::new(send(address, method, path, headers, body));
     let mut head = String::new();
@@ -34,20 +34,20 @@ pub fn request(address: &str, method: &str, path: &str, headers: &[(&str, &str)]
         let (name, value) = line.split_once(':')?;
         name.eq_ignore_ascii_case("content-length").then(|| value.trim().parse().expect("a length"))
     });
-    // Some keep the line open behind it.
+    // Some servers keep the connection open.
     let mut body = String::new();
     stream.take(length.unwrap_or(u64::MAX)).read_to_string(&mut body).expect("a body");
     let status = head.split(' ').nth(1).and_then(|status| status.parse().ok()).expect("a status");
     Answer { status, head, body }
 }
 
-/// The answer to a plain question.
+/// Sends a GET request.
 pub fn get(address: &str, path: &str) -> Answer {
     request(address, "GET", path, &[], "")
 }
 
-/// The answer to a question that takes time to be reckoned, when it is.
-pub fn reckoned(address: &str, path: &str) -> Value {
+/// Repeats a GET request until the result is computed.
+pub fn get_computed(address: &str, path: &str) -> Value {
     let mut answer = get(address, path);
     while answer.status == 202 {
         std::thread::sleep(Duration::from_millis(20));
@@ -64,7 +64,7 @@ pub fn first_event(address: &str, path: &str) -> Value {
     serde_json::from_str(&data.expect("an event")).expect("JSON")
 }
 
-/// Listens to a stream of events and reads all that comes, until this process ends or the stream does.
+/// Reads a stream of events in the background until this process or the stream ends.
 pub fn listen(address: &str, path: &str) -> std::thread::JoinHandle<()> {
     let mut stream = send(address, "GET", path, &[], "");
     stream.set_read_timeout(None).expect("a socket");
@@ -84,7 +84,7 @@ fn send(address: &str, method: &str, path: &str, headers: &[(&str, &str)], body:
     stream
 }
 
-/// What stands behind `begin` on a line of the standard error, which is read on to its end.
+/// The rest of the lines on standard error that start with `begins`. Keeps reading in the background.
 pub fn said<const N: usize>(child: &mut Child, begins: [&str; N]) -> [String; N] {
     let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();
     let mut found = begins.map(|_| None);

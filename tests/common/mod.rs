@@ -1,16 +1,16 @@
-//! Running the program as its users do.
+//! Runs the program as users do.
 #![allow(dead_code)] // Each test program uses a part.
 
-pub mod arrays;
 pub mod browser;
 pub mod campaign;
 pub mod clock;
-pub mod desk;
+pub mod config_tester;
+pub mod delay_proxy;
 pub mod hosts;
 pub mod http;
-pub mod line;
+pub mod label_campaign;
 pub mod mutate;
-pub mod place;
+pub mod npz;
 pub mod processes;
 pub mod report;
 pub mod slurm;
@@ -20,12 +20,12 @@ use std::process::{Child, Command, Output};
 
 use atoms::extxyz::{Frame, write_frame};
 
-/// Kills in one test: 20, or `CALMWALK_KILLS`.
+/// Number of kills in one test: 20, or `CALMWALK_KILLS`.
 pub fn kills() -> u64 {
     std::env::var("CALMWALK_KILLS").ok().and_then(|text| text.parse().ok()).unwrap_or(20)
 }
 
-/// A small deterministic sequence for instants (SplitMix64).
+/// A deterministic pseudorandom number (SplitMix64).
 pub fn random(seed: u64) -> u64 {
     let mut z = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x9e37_79b9_7f4a_7c15);
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -33,12 +33,12 @@ pub fn random(seed: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// A file of `configs/`.
+/// Path of a file in `configs/`.
 pub fn config(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("configs").join(path)
 }
 
-/// The text of a file of `configs/`, with the data that it names where they are.
+/// Text of a file in `configs/`, with absolute paths of data files.
 pub fn demo(name: &str) -> String {
     let text = std::fs::read_to_string(config(name)).expect("a configuration of the project");
     text.replace("\"data/", &format!("\"{}/", config("data").display()))
@@ -51,7 +51,7 @@ pub fn program(directory: &Path) -> Command {
     command
 }
 
-/// The same, started by another program with its arguments, if there is one.
+/// The same, started by another command if there is one.
 pub fn through(starter: &[String], directory: &Path) -> Command {
     let Some((first, rest)) = starter.split_first() else { return program(directory) };
     let mut command = Command::new(first);
@@ -59,7 +59,7 @@ pub fn through(starter: &[String], directory: &Path) -> Command {
     command
 }
 
-/// Runs it to its end.
+/// Runs the program to its end.
 pub fn calmwalk<A: AsRef<std::ffi::OsStr>>(
     directory: &Path,
     arguments: impl IntoIterator<Item = A>,
@@ -67,7 +67,7 @@ pub fn calmwalk<A: AsRef<std::ffi::OsStr>>(
     program(directory).args(arguments).output().expect("the program starts")
 }
 
-/// The same, and it must succeed; returns its standard output.
+/// Runs the program, which must succeed. Returns its standard output.
 pub fn succeed<A: AsRef<std::ffi::OsStr>>(
     directory: &Path,
     arguments: impl IntoIterator<Item = A>,
@@ -77,14 +77,14 @@ pub fn succeed<A: AsRef<std::ffi::OsStr>>(
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// The same, and it must fail with exit code 2; returns its standard error.
+/// Runs the program, which must fail with exit code 2. Returns its standard error.
 pub fn refuse<A: AsRef<std::ffi::OsStr>>(directory: &Path, arguments: impl IntoIterator<Item = A>) -> String {
     let output = calmwalk(directory, arguments);
     assert_eq!(output.status.code(), Some(2), "{}", stderr(&output));
     stderr(&output)
 }
 
-/// A process that is killed in the end, also when a test fails.
+/// A process that is killed on drop, also when a test fails.
 pub struct Running(pub Child);
 
 impl Drop for Running {
@@ -94,7 +94,7 @@ impl Drop for Running {
     }
 }
 
-/// What it wrote to the standard error.
+/// Standard error of a process.
 pub fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }

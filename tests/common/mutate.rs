@@ -1,11 +1,11 @@
-//! Files that are damaged in ways that follow from a number.
+//! Damages files in ways determined by a number.
 
-/// Mutations of each file, `small` or `CALMWALK_MUTATIONS`.
+/// Number of mutations of each file: `small`, or `CALMWALK_MUTATIONS`.
 pub fn mutations(small: u64) -> u64 {
     std::env::var("CALMWALK_MUTATIONS").ok().and_then(|text| text.parse().ok()).unwrap_or(small)
 }
 
-/// What is put into texts: numbers at the edges, and what closes or opens something.
+/// Insertions for text files: extreme numbers and delimiters.
 const WORDS: [&str; 28] = [
     "0",
     "-1",
@@ -37,8 +37,8 @@ const WORDS: [&str; 28] = [
     "\u{feff}",
 ];
 
-/// The bytes with one to four of: bits flipped, bytes set, a part cut out, doubled, moved or left out from some place on, a word
-/// put in.
+/// Applies one to four mutations: flips a bit, sets a byte, truncates, removes, duplicates or moves a part, or
+/// inserts a word.
 pub fn mutated(bytes: &[u8], number: u64) -> Vec<u8> {
     let mut source = number.wrapping_mul(0x2545_f491_4f6c_dd1d);
     let mut below = |bound: usize| {
@@ -69,7 +69,7 @@ pub fn mutated(bytes: &[u8], number: u64) -> Vec<u8> {
                 bytes.splice(at..at, word.bytes());
             }
             _ => {
-                // A number in the place of another.
+                // Replaces a number by another.
                 let is_of_number =
                     |byte: &u8| byte.is_ascii_digit() || matches!(byte, b'.' | b'-' | b'+' | b'e');
                 let begin = (at..length).find(|place| is_of_number(&bytes[*place])).unwrap_or(at);
@@ -81,7 +81,7 @@ pub fn mutated(bytes: &[u8], number: u64) -> Vec<u8> {
     bytes
 }
 
-/// As in `common`: this file is also compiled without it.
+/// A copy of the function in `common`, since this file is also compiled without it.
 fn random(seed: u64) -> u64 {
     let mut z = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x9e37_79b9_7f4a_7c15);
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

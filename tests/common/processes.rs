@@ -1,4 +1,4 @@
-//! The processes of a campaign, as the system sees them.
+//! Finds and signals the processes of a campaign.
 
 use std::fs;
 use std::path::Path;
@@ -9,14 +9,14 @@ use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection, PgConnection};
 use wire::place::Place;
 
-/// A process that works in a directory: its number and the command that it carries out.
+/// A process in a directory: its pid and its command.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Process {
     pub pid: u32,
     pub command: String,
 }
 
-/// Every living process of the program that works in `directory`.
+/// All running processes of the program in `directory`.
 pub fn processes_in(directory: &Path) -> Vec<Process> {
     let directory = directory.canonicalize().expect("the campaign's directory");
     let numbers = fs::read_dir("/proc").expect("/proc").flatten();
@@ -31,23 +31,23 @@ pub fn processes_in(directory: &Path) -> Vec<Process> {
     numbers.filter_map(process).collect()
 }
 
-/// Those that carry out `command`.
-pub fn carrying_out(directory: &Path, command: &str) -> Vec<u32> {
+/// Those that run `command`.
+pub fn processes_running(directory: &Path, command: &str) -> Vec<u32> {
     processes_in(directory).into_iter().filter(|p| p.command == command).map(|p| p.pid).collect()
 }
 
-/// One that carries out `command`, as soon as there is one.
-pub fn one_carrying_out(directory: &Path, command: &str) -> u32 {
+/// Waits for a process that runs `command`.
+pub fn wait_for_process(directory: &Path, command: &str) -> u32 {
     let mut found = None;
     wait_until(&format!("a {command} is at work"), || {
-        found = carrying_out(directory, command).first().copied();
+        found = processes_running(directory, command).first().copied();
         found.is_some()
     });
     found.expect("it was waited for")
 }
 
-/// What calculations in directories below `scratch` have started: numbers of processes, with their commands.
-pub fn calculating(scratch: &Path) -> Vec<(u32, String)> {
+/// Processes that calculations in directories below `scratch` have started: pids with their command lines.
+pub fn calculation_processes(scratch: &Path) -> Vec<(u32, String)> {
     let mark = format!("CALMWALK_CALCULATION={}/", scratch.display());
     let numbers = fs::read_dir("/proc").expect("/proc").flatten();
     let numbers = numbers.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
@@ -59,14 +59,14 @@ pub fn calculating(scratch: &Path) -> Vec<(u32, String)> {
     numbers.filter_map(marked).collect()
 }
 
-/// Sends a signal; nothing happens to a process that is gone.
+/// Sends a signal. Ignores a process that has ended.
 pub fn signal(pid: u32, name: &str) {
     let sent = Command::new("kill").args([format!("-{name}"), pid.to_string()]).output();
     sent.expect("kill runs");
 }
 
-/// Stops a process, but not within a transaction: others could not write, and would give up. `store` is the campaign's
-/// directory or URL.
+/// Stops a process with SIGSTOP, but not within a transaction, which would block other writers. `store` is the
+/// campaign's directory or URL.
 pub fn hold(pid: u32, store: &str) {
     wait_until("it is held outside of a transaction", || {
         signal(pid, "STOP");
@@ -78,7 +78,7 @@ pub fn hold(pid: u32, store: &str) {
     });
 }
 
-/// Whether nobody keeps the jobs of a campaign for longer than a second.
+/// Whether the job table can be locked within a second.
 fn can_write(store: &str) -> bool {
     tokio::runtime::Runtime::new().expect("a runtime").block_on(async {
         let Some((server, schema)) = store.split_once("?schema=") else {
@@ -93,23 +93,23 @@ fn can_write(store: &str) -> bool {
     })
 }
 
-/// Stops all walkers as soon as there are so many. Nothing is found and no campaign ends until they [`go_on`].
-pub fn hold_walkers(directory: &Path, number: usize) -> Vec<u32> {
+/// Stops all walkers as soon as there are `number` of them. No campaign ends until they [`resume_processes`].
+pub fn pause_walkers(directory: &Path, number: usize) -> Vec<u32> {
     let mut walkers = Vec::new();
     wait_until(&format!("there are {number} walkers"), || {
-        walkers = carrying_out(directory, "walker");
+        walkers = processes_running(directory, "walker");
         walkers.len() == number
     });
     walkers.iter().for_each(|pid| signal(*pid, "STOP"));
     walkers
 }
 
-/// Lets them go on who were stopped.
-pub fn go_on(held: &[u32]) {
+/// Resumes stopped processes.
+pub fn resume_processes(held: &[u32]) {
     held.iter().for_each(|pid| signal(*pid, "CONT"));
 }
 
-/// Waits until something is so.
+/// Waits until a condition holds.
 pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !is_so() {
@@ -118,8 +118,8 @@ pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     }
 }
 
-/// Checks that a campaign that came to its end left no process and nothing in shared memory.
-pub fn nothing_is_left(directory: &Path) {
+/// Checks that a finished campaign left no process and nothing in shared memory.
+pub fn assert_no_leftovers(directory: &Path) {
     wait_until("every process is gone", || processes_in(directory).is_empty());
     let place = Place::of(directory).expect("the campaign's directory");
     assert!(!place.directory().exists(), "{} is left", place.directory().display());

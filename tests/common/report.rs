@@ -1,4 +1,4 @@
-//! What must be true of the report of a campaign whose labels are made.
+//! Checks the report of a fully labelled campaign.
 
 use std::fs;
 use std::path::Path;
@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use super::succeed;
 
-/// Reports on the campaign in `campaign`, twice, and compares with what other commands say of it.
+/// Writes the report of the campaign in `campaign` twice, and compares it with the output of other commands.
 pub fn check(here: &Path, campaign: &str, status: &Value, errors: &Value) {
     let said = succeed(here, ["report", campaign, "-o", "one/report"]);
     assert!(said.starts_with("one/report/report.html and "), "{said}");
@@ -37,7 +37,7 @@ pub fn check(here: &Path, campaign: &str, status: &Value, errors: &Value) {
     }
     assert!(!page.contains("https://") && !page.contains("<script") && !page.contains("<link"));
 
-    // What `errors` says of the same campaign.
+    // Compare with `errors`.
     let quantiles = text("tables/quantiles-gamma.csv");
     let bins = errors["all"]["gamma"]["bins"].as_array().expect("bins");
     assert_eq!(quantiles.lines().count(), bins.len() + 1);
@@ -53,7 +53,7 @@ pub fn check(here: &Path, campaign: &str, status: &Value, errors: &Value) {
     assert_eq!(all[7].parse().ok(), errors["all"]["gamma_nbr"]["spearman"].as_f64());
     assert_eq!(all[8].parse().ok(), errors["all"]["gamma"]["roc_auc"].as_f64());
 
-    // And `status`.
+    // Compare with `status`.
     let collection = text("figures/collection.csv");
     for fate in ["covered", "duplicate", "guard", "budget", "backlog"] {
         let number = &status["candidates"]["declined"][fate];
@@ -65,7 +65,7 @@ pub fn check(here: &Path, campaign: &str, status: &Value, errors: &Value) {
     let unlabelled = text("tables/unlabelled.csv");
     let parts = status["unlabelled"].as_array().expect("parts");
     assert_eq!(unlabelled.lines().count(), parts.len() + 1, "{unlabelled}");
-    assert_eq!(page.contains("has no label because all attempts failed"), !parts.is_empty());
+    assert_eq!(page.contains("without a label because all attempts failed"), !parts.is_empty());
     for (row, part) in unlabelled.lines().skip(1).zip(parts) {
         let cells: Vec<_> = row.split(',').collect();
         assert_eq!(

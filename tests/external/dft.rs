@@ -13,8 +13,8 @@ use atoms::{Cell, Structure, Vec3, read_extxyz};
 use serde_json::Value;
 
 use crate::common;
-use crate::common::place::queue;
-use crate::common::processes::{calculating, carrying_out, signal, wait_until};
+use crate::common::label_campaign::queue;
+use crate::common::processes::{calculation_processes, processes_running, signal, wait_until};
 use crate::common::{config, demo, deviation, program, random, stderr, succeed};
 
 /// Directories of calculations: a campaign has a directory in `scratch`, and each calculation one in it.
@@ -79,7 +79,7 @@ fn labels_survive_kills_of_labeller_keeper_and_code() {
     for round in 0..6 {
         let begun = Instant::now();
         wait_until("ABINIT is at work", || {
-            calculating(&scratch).iter().any(|(_, command)| is_abinit(command))
+            calculation_processes(&scratch).iter().any(|(_, command)| is_abinit(command))
                 || run.try_wait().unwrap().is_some()
         });
         if run.try_wait().unwrap().is_some() {
@@ -87,17 +87,18 @@ fn labels_survive_kills_of_labeller_keeper_and_code() {
         }
         std::thread::sleep(Duration::from_millis(random(round) % 3000));
         let victim = match round % 3 {
-            0 => {
-                calculating(&scratch).into_iter().find(|(_, command)| is_abinit(command)).map(|(pid, _)| pid)
-            }
-            1 => carrying_out(here, "labeller").first().copied(),
-            _ => carrying_out(here, "calculation-runner").first().copied(),
+            0 => calculation_processes(&scratch)
+                .into_iter()
+                .find(|(_, command)| is_abinit(command))
+                .map(|(pid, _)| pid),
+            1 => processes_running(here, "labeller").first().copied(),
+            _ => processes_running(here, "calculation-runner").first().copied(),
         };
         victim.into_iter().for_each(|pid| signal(pid, "KILL"));
         assert!(begun.elapsed() < Duration::from_secs(300));
     }
     assert!(run.wait().unwrap().success());
-    wait_until("every calculation is gone", || calculating(&scratch).is_empty());
+    wait_until("every calculation is gone", || calculation_processes(&scratch).is_empty());
     // What a killed labeller had only just made is cleared away by those who come a minute later.
     for directory in directories(&scratch) {
         let touched = Command::new("touch").args(["-d", "2 minutes ago"]).arg(directory).status();
@@ -215,7 +216,7 @@ fn a_pseudopotential_that_is_replaced_between_two_labels_makes_none() {
     let output = program(&here).args(["run", "campaign.toml"]).output().unwrap();
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("labels made here would be of another protocol than 'abinit'"), "{said}");
+    assert!(said.contains("labels made here would not belong to the campaign's protocol 'abinit'"), "{said}");
     let status: Value = serde_json::from_str(&succeed(&here, ["status", "campaign", "--json"])).unwrap();
     assert_eq!(
         (&status["labels"]["labelled"], &status["labels"]["failed"]),

@@ -13,8 +13,8 @@ use tempfile::TempDir;
 
 use crate::common;
 use crate::common::campaign::{Outcome, Small, outcome_at};
-use crate::common::hosts::undisturbed;
-use crate::common::processes::{carrying_out, nothing_is_left, wait_until};
+use crate::common::hosts::uninterrupted_outcome;
+use crate::common::processes::{assert_no_leftovers, processes_running, wait_until};
 use crate::common::slurm::{ci, hold, slurm};
 use crate::common::{Running, calmwalk, program, stderr, succeed};
 
@@ -158,8 +158,8 @@ impl OnSlurm {
 
     /// Waits until orchestrator and agents are at work.
     fn at_work(&self, agents: usize) {
-        let walkers = || carrying_out(self.directory(), "walker").len();
-        let joined = || carrying_out(self.directory(), "agent").len();
+        let walkers = || processes_running(self.directory(), "walker").len();
+        let joined = || processes_running(self.directory(), "agent").len();
         wait_until("everybody is at work", || walkers() > agents && joined() == agents);
     }
 
@@ -174,7 +174,7 @@ impl OnSlurm {
         let last = self.jobs()["orchestrator"].last().unwrap().clone();
         assert_eq!(last.state, "COMPLETED", "{}", self.logs());
         assert_eq!(fs::read_to_string(self.directory().join("endpoint")).unwrap(), "over\n");
-        nothing_is_left(self.directory());
+        assert_no_leftovers(self.directory());
     }
 
     /// An agent that waited to go on when the campaign was done has been taken away.
@@ -234,7 +234,7 @@ fn a_campaign_comes_to_the_same_however_often_it_is_launched() {
     assert_eq!(jobs, ["RUNNING"; 3], "{status}");
     assert_eq!(status["jobs"][1]["walkers"], 1);
     campaign.labelled();
-    campaign.comes_to(&undisturbed(&small));
+    campaign.comes_to(&uninterrupted_outcome(&small));
     for role in ["orchestrator", "agent-0", "agent-1"] {
         let job = campaign.job(role);
         assert_eq!((job.state.as_str(), restarts(&job.id)), ("COMPLETED", 0), "{}", campaign.logs());
@@ -295,7 +295,7 @@ fn at_the_notice_a_campaign_leaves_and_goes_on_when_it_is_requeued() {
     slurm(&["scancel", "--batch", "--signal=TERM", &orchestrator]);
     wait_until("the orchestrator is requeued", || restarts(&orchestrator) == 1);
     campaign.labelled();
-    campaign.comes_to(&undisturbed(&small));
+    campaign.comes_to(&uninterrupted_outcome(&small));
     assert!(campaign.log("orchestrator").contains("exit code 130"), "{}", campaign.logs());
     campaign.nobody_failed();
 }
@@ -316,7 +316,7 @@ fn before_its_time_is_over_a_job_is_told_and_requeued() {
     let orchestrator = campaign.job("orchestrator").id;
     wait_until("the notice has come", || restarts(&orchestrator) == 1);
     campaign.labelled();
-    campaign.comes_to(&undisturbed(&small));
+    campaign.comes_to(&uninterrupted_outcome(&small));
     campaign.nobody_failed();
 }
 
@@ -335,7 +335,7 @@ fn on_a_server_jobs_make_the_labels() {
         campaign.location.replacen("postgres://", "postgresql://", 1) + "&application_name=look";
     let text = succeed(campaign.directory(), ["status", &another_way]);
     assert!(text.contains("labeller 1") && text.contains("running"), "{text}");
-    campaign.comes_to(&undisturbed(&small));
+    campaign.comes_to(&uninterrupted_outcome(&small));
     campaign.nobody_failed();
     let made: Vec<_> = labellers().map(|(role, _)| campaign.log(&role)).collect();
     assert!(made.iter().all(|log| log.contains("exit code 0")), "{made:?}");
@@ -355,7 +355,7 @@ fn an_agent_that_is_cancelled_is_missed_by_nobody_and_launched_again() {
     assert_eq!((again.matches("submitted").count(), again.matches(" kept").count()), (1, 2), "{again}");
     assert!(again.contains("agent 1: job"), "{again}");
     campaign.labelled();
-    campaign.comes_to(&undisturbed(&small));
+    campaign.comes_to(&uninterrupted_outcome(&small));
 }
 
 #[test]
@@ -372,10 +372,10 @@ fn a_campaign_survives_the_loss_of_slurmctld() {
     assert!(text.contains("no answer from Slurm"), "{text}");
     assert!(asked.elapsed() < Duration::from_secs(20));
     assert!(campaign.status()["jobs_unknown"].is_string());
-    assert_eq!(carrying_out(campaign.directory(), "agent").len(), 2, "they go on");
+    assert_eq!(processes_running(campaign.directory(), "agent").len(), 2, "they go on");
     ci("revive");
     campaign.labelled();
-    campaign.comes_to(&undisturbed(&small));
+    campaign.comes_to(&uninterrupted_outcome(&small));
 }
 
 #[test]
@@ -387,7 +387,7 @@ fn a_campaign_is_stopped_in_order_and_launched_again() {
     let text = campaign.stop();
     assert!(text.contains("3 jobs cancelled"), "{text}");
     wait_until("no job is left", || campaign.jobs().values().flatten().all(|job| job.state == "CANCELLED"));
-    nothing_is_left(campaign.directory());
+    assert_no_leftovers(campaign.directory());
     assert!(
         campaign.log("orchestrator").contains("stopped; run the same command again"),
         "{}",
@@ -400,7 +400,7 @@ fn a_campaign_is_stopped_in_order_and_launched_again() {
     assert!(processes.iter().all(|process| process["state"] != "running"), "{status}");
     assert_eq!(campaign.launched().matches("submitted").count(), 3);
     campaign.labelled();
-    campaign.comes_to(&undisturbed(&small));
+    campaign.comes_to(&uninterrupted_outcome(&small));
 }
 
 #[test]
@@ -422,7 +422,7 @@ fn with_certificates_agents_reach_the_orchestrator_by_the_name_of_its_node() {
     let endpoint = fs::read_to_string(campaign.directory().join("endpoint")).unwrap();
     assert!(endpoint.starts_with(&format!("tcp/{node}:")), "{endpoint}");
     campaign.labelled();
-    campaign.comes_to(&undisturbed(&small));
+    campaign.comes_to(&uninterrupted_outcome(&small));
 }
 
 #[test]
@@ -441,7 +441,7 @@ fn what_cannot_go_on_is_not_requeued() {
     let log = campaign.log("orchestrator");
     assert!(log.contains("exit code 2") && log.contains("seeds.extxyz"), "{log}");
     assert_eq!(restarts(&campaign.job("orchestrator").id), 0);
-    nothing_is_left(campaign.directory());
+    assert_no_leftovers(campaign.directory());
 }
 
 #[test]

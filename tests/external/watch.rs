@@ -10,8 +10,8 @@ use serde_json::Value;
 
 use crate::common;
 use crate::common::campaign::Small;
-use crate::common::place::Place;
-use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::common::label_campaign::LabelCampaign;
+use crate::common::processes::{processes_running, signal, wait_until};
 use crate::common::{Running, succeed};
 
 /// A terminal with the program in it; when that has ended, its exit code is on the screen.
@@ -20,7 +20,7 @@ struct Terminal {
 }
 
 impl Terminal {
-    fn open(place: &Place, name: &str, size: (u32, u32), environment: &str) -> Self {
+    fn open(place: &LabelCampaign, name: &str, size: (u32, u32), environment: &str) -> Self {
         Self::of(place.path(), place.argument(), name, size, environment)
     }
 
@@ -102,8 +102,8 @@ impl Drop for Terminal {
 }
 
 /// Two walks that find nothing and are not done for a long time.
-fn endless() -> (Place, Running) {
-    let place = Place::new(
+fn endless() -> (LabelCampaign, Running) {
+    let place = LabelCampaign::new(
         &Small { steps: 1_000_000, ..Small::default() },
         &[("threshold = 1.0", "threshold = 1e6"), ("threshold = 1.0", "threshold = 1e6")],
     );
@@ -115,8 +115,8 @@ fn endless() -> (Place, Running) {
 }
 
 /// A campaign whose walks are over and whose structures wait for labels that nobody makes.
-fn waiting() -> Place {
-    let place = Place::new(&Small::default(), &[("[label]", "[label]\nslots = 0")]);
+fn waiting() -> LabelCampaign {
+    let place = LabelCampaign::new(&Small::default(), &[("[label]", "[label]\nslots = 0")]);
     let mut run = place.run();
     let over = |walk: &Value| !["waiting", "running"].contains(&walk["state"].as_str().unwrap());
     wait_until("every walk is over", || {
@@ -128,7 +128,7 @@ fn waiting() -> Place {
     place
 }
 
-fn queue(place: &Place, state: &str) -> Vec<Value> {
+fn queue(place: &LabelCampaign, state: &str) -> Vec<Value> {
     let list = succeed(place.path(), ["queue", place.argument(), "list", "--state", state, "--json"]);
     serde_json::from_str(&list).unwrap()
 }
@@ -263,7 +263,7 @@ fn structures_in_the_queue_are_changed_and_candidates_told_about() {
 fn the_terminal_is_given_back_however_it_ends() {
     let place = waiting();
     let here = place.path();
-    let watching = || carrying_out(here, "watch");
+    let watching = || processes_running(here, "watch");
     for (name, how) in [("terminated", "TERM"), ("interrupted", "INT")] {
         let terminal = Terminal::open(&place, name, (80, 24), "");
         terminal.wait_for("1 walks: 4");

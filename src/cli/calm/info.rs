@@ -9,7 +9,7 @@ use npz::Archive;
 use potentials::grace::GraceModel;
 use serde::Serialize;
 
-use crate::cli::{Ended, Failure};
+use crate::cli::{ExitStatus, Failure};
 use crate::output::{Table, decimals, print, print_json};
 
 /// Components printed without --json.
@@ -102,14 +102,14 @@ struct ComponentInfo {
 }
 
 impl Info {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let content = inspect(&self.file)?;
         if self.json {
             print_json(&content)?;
         } else {
             print(|out| content.write(&self.file, out))?;
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 

@@ -4,7 +4,7 @@ mod info;
 mod score;
 mod scorer;
 
-use super::{Ended, Failure};
+use super::{ExitStatus, Failure};
 
 /// Inspect a CALM mixture, or grade structures with it
 #[derive(Debug, clap::Subcommand)]
@@ -14,7 +14,7 @@ pub enum Calm {
 }
 
 impl Calm {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         match self {
             Self::Info(command) => command.run(),
             Self::Score(command) => command.run(),

@@ -11,11 +11,11 @@ use npyz::{NpyWriter, WriterBuilder};
 use potentials::grace::GraceModel;
 
 use super::scorer::Scorer;
+use crate::atomic_file::{AtomicFile, cannot_write};
 use crate::campaign::check_sound;
-use crate::cli::{Ended, Failure};
-use crate::frames::Frames;
+use crate::cli::{ExitStatus, Failure};
 use crate::output::{self, Bar, print};
-use crate::whole_file::{WholeFile, cannot_write};
+use crate::xyz_reader::XyzReader;
 
 /// Keys of labels in a frame.
 const LABELS: [&str; 5] = ["energy", "free_energy", "forces", "stress", "virial"];
@@ -54,15 +54,15 @@ pub struct Score {
 }
 
 impl Score {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let (model, artifact) = load(&self.model, self.artifact.as_deref())?;
         let dimension = artifact.mixture.dimension();
         let mut scorer = Scorer::new(Arc::new(model), Arc::new(artifact.mixture));
-        let mut frames = Frames::open(&self.input).map_err(Failure::input)?;
+        let mut frames = XyzReader::open(&self.input).map_err(Failure::input)?;
         let bar = Bar::new(frames.length, BAR);
-        let mut output = WholeFile::create(&self.output)?;
+        let mut output = AtomicFile::create(&self.output)?;
         let cannot = |error| cannot_write(self.features.as_deref().unwrap_or(Path::new("")), error);
-        let mut feature_file = self.features.as_deref().map(WholeFile::create).transpose()?;
+        let mut feature_file = self.features.as_deref().map(AtomicFile::create).transpose()?;
         let matrix = feature_file.as_mut().map(|file| feature_matrix(file, dimension));
         let mut matrix = matrix.transpose().map_err(cannot)?;
         let mut count = 0_u64;
@@ -82,7 +82,7 @@ impl Score {
             return Err(Failure::input(FileError::Empty(self.input)));
         }
         matrix.map_or(Ok(()), NpyWriter::finish).map_err(cannot)?;
-        feature_file.map_or(Ok(()), WholeFile::finish)?;
+        feature_file.map_or(Ok(()), AtomicFile::finish)?;
         output.finish()?;
         drop(bar);
         print(|out| {
@@ -93,7 +93,7 @@ impl Score {
                 self.output.display()
             )
         })?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     fn at(&self, line: usize, error: impl std::fmt::Display) -> Failure {
@@ -164,6 +164,6 @@ fn move_labels_to_reference(frame: &mut Frame) {
 }
 
 /// Starts the array of features in NumPy's format; the number of rows is written at the end.
-fn feature_matrix(file: &mut WholeFile, dimension: usize) -> io::Result<NpyWriter<f64, &mut WholeFile>> {
+fn feature_matrix(file: &mut AtomicFile, dimension: usize) -> io::Result<NpyWriter<f64, &mut AtomicFile>> {
     npyz::WriteOptions::new().default_dtype().writer(file).begin_2d(dimension as u64)
 }

@@ -7,11 +7,11 @@ use calm::{UpdateEnd, UpdateRule};
 
 use super::grades::block;
 use super::{SHOWN, line, shortened_list};
+use crate::candidate_details::{Coverage, DecisionDetails, Update};
 use crate::output::{self, Table, decimals};
-use crate::story::{Coverage, Decided, Update};
 
-pub fn write(out: &mut dyn Write, decision: &Decided, atoms: usize) -> io::Result<()> {
-    let Decided { number, round, kind, mixture_version, .. } = decision;
+pub fn write(out: &mut dyn Write, decision: &DecisionDetails, atoms: usize) -> io::Result<()> {
+    let DecisionDetails { number, round, kind, mixture_version, .. } = decision;
     let round = if *round == 0 { String::new() } else { format!(", round {round}") };
     let what = match (kind.as_str(), decision.reason.as_deref()) {
         ("control", _) => "control frame: labelled, but does not update the mixture".to_owned(),
@@ -121,7 +121,7 @@ fn describe_end(end: UpdateEnd) -> &'static str {
     }
 }
 
-fn write_coverage(out: &mut dyn Write, decision: &Decided, coverage: &Coverage) -> io::Result<()> {
+fn write_coverage(out: &mut dyn Write, decision: &DecisionDetails, coverage: &Coverage) -> io::Result<()> {
     if decision.reason.as_deref() == Some("covered") {
         let by = match coverage.by.as_slice() {
             [] => "no update unseen by its walker is near in the log".to_owned(),

@@ -5,10 +5,10 @@ use std::io::{self, Write};
 use calm::CollectionRule;
 
 use super::{INDENT, SHOWN, line};
+use crate::candidate_details::{Atom, CandidateGrades, Trigger};
 use crate::output::{Table, count, decimals};
-use crate::story::{Atom, Grades, Trigger};
 
-pub fn write(out: &mut dyn Write, grades: &Grades) -> io::Result<()> {
+pub fn write(out: &mut dyn Write, grades: &CandidateGrades) -> io::Result<()> {
     let mut table = Table::new(&["mixture", ">version", ">γ_max", ">γ_nbr max", ">atoms γ > 1"]);
     for (name, grade) in
         [("walker's", &grades.walker), ("selector's", &grades.selector), ("original", &grades.original)]
@@ -33,7 +33,7 @@ pub fn write(out: &mut dyn Write, grades: &Grades) -> io::Result<()> {
     }
 }
 
-fn write_trigger(out: &mut dyn Write, trigger: &Trigger, grades: &Grades) -> io::Result<()> {
+fn write_trigger(out: &mut dyn Write, trigger: &Trigger, grades: &CandidateGrades) -> io::Result<()> {
     let Trigger { rule, threshold, needed, above_walker, above_selector } = trigger;
     let rule = match rule {
         CollectionRule::MaximumGrade { .. } => format!("maximum_grade: γ_max > {threshold}"),

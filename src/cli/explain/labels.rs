@@ -5,13 +5,13 @@ use std::io::{self, Write};
 use store::{Attempt, Exclusion, Job, Superseded, unix_milliseconds};
 
 use super::line;
+use crate::candidate_details::{CandidateDetails, CandidateLabel, ForceError, LabelJob};
 use crate::output::count;
-use crate::story::{ForceError, LabelJob, Story, StoryLabel};
 
 /// Lines printed from the end of a log.
 const LOG_LINES: usize = 10;
 
-pub fn write(out: &mut dyn Write, story: &Story) -> io::Result<()> {
+pub fn write(out: &mut dyn Write, story: &CandidateDetails) -> io::Result<()> {
     if story.jobs.is_empty() && story.labels.is_empty() {
         return line(out, "label", "no label job: only accepted candidates and control frames get one");
     }
@@ -71,8 +71,8 @@ fn write_attempt(out: &mut dyn Write, attempt: &Attempt) -> io::Result<()> {
     tail.iter().try_for_each(|text| line(out, "", &format!("  | {text}")))
 }
 
-fn write_label(out: &mut dyn Write, label: &StoryLabel, atoms: usize) -> io::Result<()> {
-    let StoryLabel { protocol, protocol_hash, standing, source, energy, energy_per_atom, .. } = label;
+fn write_label(out: &mut dyn Write, label: &CandidateLabel, atoms: usize) -> io::Result<()> {
+    let CandidateLabel { protocol, protocol_hash, standing, source, energy, energy_per_atom, .. } = label;
     let status = format!("{standing:?}").to_lowercase();
     line(
         out,

@@ -8,9 +8,9 @@ use std::io::{self, Write};
 
 use store::{Location, Store};
 
-use super::{CampaignLocation, Ended, Failure, block_on};
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::candidate_details::{self, CandidateDetails, Discovery, Distances, StructureSummary};
 use crate::output::{count, decimals, print, print_json};
-use crate::story::{self, Description, Distances, Found, Story};
 
 /// Indent of lines without a title.
 const INDENT: &str = "             ";
@@ -36,14 +36,14 @@ pub struct Explain {
 }
 
 impl Explain {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let story = block_on(read(self.location.get()?, &self.id))??;
         if self.json {
             print_json(&story)?
         } else {
             print(|out| write(out, &story))?
         }
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 }
 
@@ -54,14 +54,14 @@ pub async fn text(location: Location, id: &str) -> Result<String, Failure> {
     Ok(String::from_utf8_lossy(&text).into_owned())
 }
 
-async fn read(location: Location, id: &str) -> Result<Story, Failure> {
+async fn read(location: Location, id: &str) -> Result<CandidateDetails, Failure> {
     let store = Store::open_read_only(&location).await?;
-    let story = story::read(&store, id).await?;
+    let story = candidate_details::read(&store, id).await?;
     store.close().await;
     Ok(story)
 }
 
-fn write(out: &mut dyn Write, story: &Story) -> io::Result<()> {
+fn write(out: &mut dyn Write, story: &CandidateDetails) -> io::Result<()> {
     writeln!(out, "{}", story.id)?;
     write_structure(out, &story.structure)?;
     if let (Some(file), Some(frame)) = (&story.file, story.frame) {
@@ -100,15 +100,15 @@ fn shortened_list<T: AsRef<str>>(names: impl ExactSizeIterator<Item = T>) -> Str
     shown.join(", ")
 }
 
-fn write_structure(out: &mut dyn Write, structure: &Description) -> io::Result<()> {
-    let Description { formula, atoms, volume, hash, .. } = structure;
+fn write_structure(out: &mut dyn Write, structure: &StructureSummary) -> io::Result<()> {
+    let StructureSummary { formula, atoms, volume, hash, .. } = structure;
     let volume = volume
         .map_or(String::new(), |volume| format!(", {volume:.2} Å³ ({:.3} Å³/atom)", volume / *atoms as f64));
     line(out, "structure", &format!("{formula}, {}{volume}; content {}", count(*atoms, "atom"), &hash[..16]))
 }
 
-fn write_found(out: &mut dyn Write, found: &Found) -> io::Result<()> {
-    let Found { walk, segment, step, seed_structure_name, temperature, relative_volume, .. } = found;
+fn write_found(out: &mut dyn Write, found: &Discovery) -> io::Result<()> {
+    let Discovery { walk, segment, step, seed_structure_name, temperature, relative_volume, .. } = found;
     line(
         out,
         "from",
@@ -163,7 +163,7 @@ fn write_distances(out: &mut dyn Write, distances: &Distances, control: bool) ->
     line(out, "guard", &(found + &limit))
 }
 
-fn write_same(out: &mut dyn Write, story: &Story) -> io::Result<()> {
+fn write_same(out: &mut dyn Write, story: &CandidateDetails) -> io::Result<()> {
     if !story.same_structure.is_empty() {
         let names = story.same_structure.iter().map(|named| &named.candidate);
         line(out, "the same as", &shortened_list(names))?;

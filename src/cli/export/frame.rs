@@ -3,17 +3,17 @@
 use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, Value};
 use store::{ExportRow, ExportSource};
 
-use crate::condition::Facts;
+use crate::filter::StructureProperties;
 
 /// The quantities of a structure for a filter.
-pub fn facts(row: &ExportRow) -> Facts<'_> {
+pub fn facts(row: &ExportRow) -> StructureProperties<'_> {
     let largest = |grades: &[f64]| grades.iter().copied().reduce(f64::max);
-    let of_label = Facts {
+    let of_label = StructureProperties {
         energy: Some(row.label.energy),
         max_force: Some(row.label.max_force()),
         species: &row.structure.species,
         kind: "imported",
-        ..Facts::default()
+        ..StructureProperties::default()
     };
     let ExportSource::Candidate {
         block, original, origin, seed_structure_name, mixture_version_after, ..
@@ -22,7 +22,7 @@ pub fn facts(row: &ExportRow) -> Facts<'_> {
         return of_label;
     };
     let view = block.view();
-    Facts {
+    StructureProperties {
         gamma: largest(&original.gamma),
         gamma_nbr: largest(&original.gamma_nbr),
         volume: Some(view.relative_volume()),

@@ -12,10 +12,10 @@ use store::records::Protocol;
 use store::{DATABASE, ExportFilter, ExportPlace, ExportRow, ExportSource, JobState, LOCK, Store};
 
 use self::split::Shares;
-use super::{CampaignLocation, Ended, Failure, block_on};
-use crate::condition::Condition;
+use super::{CampaignLocation, ExitStatus, Failure, block_on};
+use crate::atomic_file::{AtomicFile, cannot_write, refuse_to_replace};
+use crate::filter::Filter;
 use crate::output::{self, Bar, print};
-use crate::whole_file::{WholeFile, cannot_write, refuse_to_replace};
 
 /// Structures per read.
 const PAGE: u32 = 200;
@@ -54,7 +54,7 @@ pub struct Export {
     /// energy_per_atom (eV, label), max_force (eV/Å, label). Texts (= !=): element (any atom of the structure), kind (biased,
     /// control or imported), seed (name of the seed structure, in quotes if it contains spaces).
     #[arg(long = "where", value_name = "FILTER")]
-    condition: Option<Condition>,
+    condition: Option<Filter>,
     /// Split into several files, such as train=0.9,test=0.1 for FILE-train and FILE-test
     ///
     /// Assigns the seed structures at random to the files in these proportions. All structures found from one seed structure go
@@ -102,7 +102,7 @@ struct Exported {
 /// A file to write.
 struct Part {
     path: PathBuf,
-    file: WholeFile,
+    file: AtomicFile,
     count: Count,
     /// Seed structures assigned to this file, also those without labelled structures.
     assigned: usize,
@@ -134,7 +134,7 @@ async fn check_completeness(
 }
 
 impl Export {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let Exported { counts, labels, others } = block_on(self.export())??;
         for (path, count, _) in &counts {
             if matches!(self.keys, KeyNames::Grace) && (1..count.frames).contains(&count.without_stress) {
@@ -178,7 +178,7 @@ impl Export {
                 "accepted structures without a label: {waiting} not labelled yet, {failed} failed, {dropped} dropped"
             )
         })?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     async fn export(&self) -> Result<Exported, Failure> {
@@ -195,7 +195,7 @@ impl Export {
             last = Some(row.place);
             for row in page {
                 missing.remove(&row.place);
-                if self.condition.as_ref().is_some_and(|condition| !condition.is_met(&frame::facts(&row))) {
+                if self.condition.as_ref().is_some_and(|condition| !condition.matches(&frame::facts(&row))) {
                     continue;
                 }
                 frames += 1;
@@ -249,7 +249,7 @@ impl Export {
         let [database, log, lock] = files.map(|name| self.location.location.join(name));
         let own = [&database, &log, &lock].map(|file| (file.as_path(), "a file of the campaign itself"));
         refuse_to_replace(&path, own)?;
-        Ok(Part { file: WholeFile::create(&path)?, path, count: Count::default(), assigned })
+        Ok(Part { file: AtomicFile::create(&path)?, path, count: Count::default(), assigned })
     }
 
     fn filter(&self, protocol: &Protocol) -> ExportFilter {

@@ -9,9 +9,9 @@ use wire::net::Tls;
 
 use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
 use super::{FOLDER, Launch, absolute};
+use crate::atomic_file::cannot_write;
 use crate::campaign::Campaign;
-use crate::outcome::Failure;
-use crate::whole_file::cannot_write;
+use crate::exit_status::Failure;
 
 /// The file in the campaign's directory to which the orchestrator announces its endpoint.
 const ENDPOINT: &str = "endpoint";

@@ -4,8 +4,8 @@ use std::fs;
 use std::io::Write;
 use std::path::Path;
 
-use crate::outcome::Failure;
-use crate::whole_file::{WholeFile, cannot_write};
+use crate::atomic_file::{AtomicFile, cannot_write};
+use crate::exit_status::Failure;
 
 /// The built-in templates, from `configs/slurm`.
 const TEMPLATES: [(&str, &str); 4] = [
@@ -82,7 +82,7 @@ fn placeholder(text: &str) -> Option<&str> {
 
 /// Writes a script atomically: a job may read it at this moment.
 pub fn write(path: &Path, text: &str) -> Result<(), Failure> {
-    let mut file = WholeFile::create(path)?;
+    let mut file = AtomicFile::create(path)?;
     file.write_all(text.as_bytes()).map_err(|error| cannot_write(path, error))?;
     file.finish()
 }

@@ -10,7 +10,7 @@ use serde::Deserialize;
 use toml::Spanned;
 
 use crate::config::{ConfigError, Document, KnownKeys, PotentialFile, place_of_offset, read_text};
-use crate::output::warn;
+use crate::output::log_and_warn;
 
 /// Placeholder values for invalid required keys, so that the other keys can be checked too.
 const PLACEHOLDERS: &str = r#"
@@ -97,7 +97,7 @@ impl MdConfig {
         let config = document.read(PLACEHOLDERS, &known);
         let warnings = document.check_ranges("dynamics");
         document.finish()?;
-        warnings.iter().for_each(warn);
+        warnings.iter().for_each(log_and_warn);
         let mut config: Self = config.ok_or_else(|| ConfigError::unreadable(path))?;
         let directory = path.parent().unwrap_or(Path::new(""));
         for file in [&mut config.structure, &mut config.potential.file] {

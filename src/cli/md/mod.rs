@@ -13,10 +13,10 @@ use md::{Dynamics, Settings, State, Stream, default_time_step};
 
 use self::config::{DynamicsSection, MdConfig, OutputSection};
 use self::trajectory::{Trajectory, time};
-use super::{Ended, Failure};
-use crate::interrupt;
+use super::{ExitStatus, Failure};
+use crate::atomic_file::refuse_to_replace;
 use crate::output::{Bar, count, decimals, print};
-use crate::whole_file::refuse_to_replace;
+use crate::signals;
 
 const BAR: &str = "{bar:32} {pos}/{len} steps  {eta} left  {msg}";
 
@@ -36,7 +36,7 @@ pub struct Md {
 }
 
 impl Md {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let (config, start, mut potential) = MdConfig::load(&self.config)?;
         let path = self.output.unwrap_or_else(|| config.output.trajectory.clone());
         let inputs = [
@@ -50,7 +50,7 @@ impl Md {
         let mut dynamics = Dynamics::new(state, settings, &mut *potential).map_err(|error| {
             Failure::Input(format!("{}:{}: {error}", config.structure.get_ref().display(), start.line))
         })?;
-        let stopping = interrupt::flag()?;
+        let stopping = signals::stop_flag()?;
         let mut trajectory = Trajectory::create(&path)?;
         let started = Instant::now();
         let progress = Progress::new(&config);
@@ -75,7 +75,7 @@ impl Md {
             writeln!(out, "{steps} of {atoms} in {seconds:.1} s, {frames} in {file}")
         })?;
         let interrupted = dynamics.state().step < config.dynamics.steps;
-        Ok(if interrupted { Ended::Interrupted } else { Ended::Done })
+        Ok(if interrupted { ExitStatus::Interrupted } else { ExitStatus::Done })
     }
 }
 

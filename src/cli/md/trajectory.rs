@@ -7,8 +7,8 @@ use atoms::extxyz::{Column, Frame, Keys, Labels, write_frame};
 use atoms::units::ACCELERATION;
 use md::Dynamics;
 
+use crate::atomic_file::{cannot_create, cannot_write};
 use crate::cli::Failure;
-use crate::whole_file::{cannot_create, cannot_write};
 
 /// A trajectory file, valid after every frame.
 pub struct Trajectory {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use store::{Location, Store};
 
-use crate::outcome::Failure;
+use crate::exit_status::Failure;
 
 /// Writes the archived calculation directories of a candidate to `output`, one file per attempt. Returns the paths, each with
 /// the names of the files that were too large to archive.

@@ -8,9 +8,9 @@ use store::{Protocol, Store, StoreError};
 
 use super::Failure;
 use crate::config::{Change, Config, LabelSection, changed_keys};
-use crate::labelling::{self, LABEL_METHOD};
-use crate::origin::{self, Origin};
-use crate::setup::MethodSetup;
+use crate::label_setup::{self, LABEL_METHOD_KEY};
+use crate::process_config::MethodConfig;
+use crate::provenance::{self, Provenance};
 
 /// The new label protocol, and what changes with it.
 pub struct ProtocolChange {
@@ -28,8 +28,8 @@ impl ProtocolChange {
     /// Reads the [label] section of a file and loads its method on this host. `None` if its protocol is the current one.
     pub async fn read(store: &Store, path: &Path, in_force: &Protocol) -> Result<Option<Self>, Failure> {
         let section = Config::load_label(path)?;
-        let method = MethodSetup::of(&section)?;
-        let protocol = labelling::protocol(section.protocol_name(), method.identity()?);
+        let method = MethodConfig::from_section(&section)?;
+        let protocol = label_setup::protocol(section.protocol_name(), method.identity()?);
         if protocol.hash == in_force.hash {
             return Ok(None);
         }
@@ -38,11 +38,11 @@ impl ProtocolChange {
         let before = store.campaign().await?.configuration_in_force;
         let before = serde_json::from_str(&before)
             .map_err(|error| StoreError::damaged("the configuration in force", error))?;
-        let after = labelling::with_protocol(&before, &section, &protocol);
+        let after = label_setup::with_protocol(&before, &section, &protocol);
         let changed = changed_keys(&before, &after).into_iter();
         let changes = changed.map(|(key, before, after)| Change::Key { key, before, after }).collect();
         let note = serde_json::to_string(&method).map_err(Failure::failed)?;
-        let mut notes = vec![(LABEL_METHOD, note)];
+        let mut notes = vec![(LABEL_METHOD_KEY, note)];
         notes.extend(origin_note(store, path).await?);
         Ok(Some(Self { protocol, configuration: after.to_string(), changes, notes }))
     }
@@ -55,11 +55,11 @@ impl ProtocolChange {
 
 /// The record that lets the campaign resume with this file.
 async fn origin_note(store: &Store, path: &Path) -> Result<Option<(&'static str, String)>, Failure> {
-    let Some(known) = Origin::of(store).await? else { return Ok(None) };
+    let Some(known) = Provenance::read(store).await? else { return Ok(None) };
     let text = std::fs::read_to_string(path)
         .map_err(|error| Failure::Input(format!("cannot read {}: {error}", path.display())))?;
     let note = serde_json::to_string(&known.relabelled(path, &text)).map_err(Failure::failed)?;
-    Ok(Some((origin::NOTE, note)))
+    Ok(Some((provenance::METADATA_KEY, note)))
 }
 
 /// Checks that names and protocols correspond one to one in the campaign.
@@ -87,6 +87,6 @@ async fn check_elements(store: &Store, section: &LabelSection, path: &Path) -> R
     let seeds = store.seed_structures().await?;
     let species: BTreeSet<Species> =
         seeds.iter().flat_map(|seed| seed.structure.species.iter().copied()).collect();
-    labelling::supports(section, &species)
+    label_setup::supports(section, &species)
         .map_err(|error| Failure::Input(format!("{}: label.method: {error}", path.display())))
 }

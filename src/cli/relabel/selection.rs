@@ -7,7 +7,7 @@ use wire::ContentHash;
 
 use super::Failure;
 use crate::cli::export::frame::facts;
-use crate::condition::Condition;
+use crate::filter::Filter;
 use crate::output;
 
 /// Structures per read.
@@ -108,7 +108,7 @@ impl Selection {
 pub async fn matching(
     store: &Store,
     all: Vec<Relabellable>,
-    condition: &Condition,
+    condition: &Filter,
 ) -> Result<Vec<Relabellable>, Failure> {
     let mut matching = HashSet::new();
     for protocol in store.protocols().await? {
@@ -118,7 +118,7 @@ pub async fn matching(
             let page = store.labelled(&filter, last, PAGE).await?;
             let Some(row) = page.last() else { break };
             last = Some(row.place);
-            let rows = page.iter().filter(|row| condition.is_met(&facts(row)));
+            let rows = page.iter().filter(|row| condition.matches(&facts(row)));
             matching.extend(rows.map(|row| ContentHash::of(&row.structure).0));
         }
     }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use store::{CampaignLock, Location, StoreError};
 
-use crate::output::say;
+use crate::output::log_and_print;
 
 /// The name of the lock holder in messages of other processes.
 const HOLDER: &str = "calmwalk run";
@@ -53,7 +53,7 @@ async fn retry_until(
         match acquire().await {
             Err(error @ StoreError::Locked { .. }) if started.elapsed() < timeout => {
                 if !std::mem::replace(&mut waiting, true) {
-                    say(format_args!("waiting: {error}"));
+                    log_and_print(format_args!("waiting: {error}"));
                 }
                 tokio::time::sleep(RETRY_INTERVAL).await;
             }

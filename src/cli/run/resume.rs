@@ -7,14 +7,17 @@ use store::{Location, Store, unix_milliseconds};
 
 use crate::campaign::Campaign;
 use crate::config::{Change, Refused, compare, place};
-use crate::origin::{self, Match, Origin};
-use crate::outcome::Failure;
-use crate::output::{count, say};
+use crate::exit_status::Failure;
+use crate::output::{count, log_and_print};
+use crate::provenance::{self, ConfigMatch, Provenance};
 
 /// Records the configuration of a new campaign.
-pub async fn record_start(store: &Store, origin: &Origin, location: &Location) -> Result<(), Failure> {
+pub async fn record_start(store: &Store, origin: &Provenance, location: &Location) -> Result<(), Failure> {
     record(store, origin).await?;
-    say(format_args!("starting campaign '{}' in {location} with {}", origin.name, origin.file.path));
+    log_and_print(format_args!(
+        "starting campaign '{}' in {location} with {}",
+        origin.name, origin.file.path
+    ));
     Ok(())
 }
 
@@ -23,19 +26,21 @@ pub async fn resume(
     campaign: &Campaign,
     store: &Store,
     location: &Location,
-    origin: &Origin,
+    origin: &Provenance,
     adopt: bool,
 ) -> Result<(), Failure> {
-    let known = Origin::of(store).await?;
+    let known = Provenance::read(store).await?;
     let has_campaign = matches!(location, Location::Directory(_));
     let matched = known.as_ref().map(|known| known.compare(origin, has_campaign, Path::exists));
-    let other = known.as_ref().filter(|_| matched == Some(Match::Other));
+    let other = known.as_ref().filter(|_| matched == Some(ConfigMatch::Other));
     let resolved = campaign.resolved();
     let changes = compare(&in_force(store).await?, &resolved)
         .map_err(|refused| changed_content(campaign, location, other, &refused))?;
     match other {
         Some(known) if !adopt => return Err(other_file(campaign, location, known)),
-        Some(known) => say(format_args!("configuration: {} replaces {}", origin.file.path, known.file.path)),
+        Some(known) => {
+            log_and_print(format_args!("configuration: {} replaces {}", origin.file.path, known.file.path))
+        }
         None => {}
     }
     record(store, &known.map_or_else(|| origin.clone(), |known| known.continued(origin))).await?;
@@ -43,8 +48,8 @@ pub async fn resume(
     if changes.is_empty() {
         return Ok(());
     }
-    changes.iter().for_each(|change| say(format_args!("configuration: {change}")));
-    store.add_seed_structures(&campaign.stored_seeds()).await?;
+    changes.iter().for_each(|change| log_and_print(format_args!("configuration: {change}")));
+    store.add_seed_structures(&campaign.stored_seed_structures()).await?;
     let details: Vec<_> = changes.iter().map(Change::detail).collect();
     Ok(store.set_configuration_in_force(&resolved.to_string(), &details, unix_milliseconds()).await?)
 }
@@ -58,13 +63,13 @@ async fn in_force(store: &Store) -> Result<Value, Failure> {
     })
 }
 
-async fn record(store: &Store, origin: &Origin) -> Result<(), Failure> {
+async fn record(store: &Store, origin: &Provenance) -> Result<(), Failure> {
     let text = serde_json::to_string(origin).map_err(Failure::failed)?;
-    Ok(store.leave_note(origin::NOTE, &text).await?)
+    Ok(store.leave_note(provenance::METADATA_KEY, &text).await?)
 }
 
 /// Reports where the campaign resumes.
-async fn report_progress(store: &Store, origin: &Origin, location: &Location) -> Result<(), Failure> {
+async fn report_progress(store: &Store, origin: &Provenance, location: &Location) -> Result<(), Failure> {
     let status = store.status().await?;
     let decisions = store.newest_mixture().await?.decision;
     let steps: u64 = status.walks.iter().map(|walk| walk.step).sum();
@@ -82,8 +87,8 @@ async fn report_progress(store: &Store, origin: &Origin, location: &Location) ->
     };
     let name = &origin.name;
     match status.finished {
-        true => say(format_args!("campaign '{name}' in {location} is finished: {progress}")),
-        false => say(format_args!("resuming campaign '{name}' in {location}: {progress}")),
+        true => log_and_print(format_args!("campaign '{name}' in {location} is finished: {progress}")),
+        false => log_and_print(format_args!("resuming campaign '{name}' in {location}: {progress}")),
     }
     Ok(())
 }
@@ -92,7 +97,7 @@ async fn report_progress(store: &Store, origin: &Origin, location: &Location) ->
 fn changed_content(
     campaign: &Campaign,
     location: &Location,
-    other: Option<&Origin>,
+    other: Option<&Provenance>,
     refused: &Refused,
 ) -> Failure {
     let at = place(&campaign.path, &campaign.text, refused.key());
@@ -104,7 +109,7 @@ fn changed_content(
 }
 
 /// The configuration is compatible, but the campaign was started with another file.
-fn other_file(campaign: &Campaign, location: &Location, known: &Origin) -> Failure {
+fn other_file(campaign: &Campaign, location: &Location, known: &Provenance) -> Failure {
     let (given, name, file) = (campaign.path.display(), &known.name, &known.file.path);
     let elsewhere = elsewhere(location);
     Failure::Input(format!(

@@ -4,7 +4,7 @@ use serde::Serialize;
 use serde_json::Value;
 use store::{Status, unix_milliseconds};
 
-use crate::bill::{Bill, SECONDS_PER_HOUR, digits};
+use crate::label_cost::{QueueCost, SECONDS_PER_HOUR, two_digits};
 
 /// An extrapolation from the current state: existing walks at their current speed, and queued labels on the cores in use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
@@ -21,7 +21,7 @@ pub struct ExpectedEnd {
 
 impl ExpectedEnd {
     /// Extrapolates from the status of a campaign with this configuration.
-    pub fn extrapolate(status: &Status, configuration: &Value, bill: &Bill) -> Self {
+    pub fn extrapolate(status: &Status, configuration: &Value, bill: &QueueCost) -> Self {
         if status.finished {
             return Self::default();
         }
@@ -49,8 +49,9 @@ impl ExpectedEnd {
     /// A description; `None` if the end is unknown.
     pub fn describe(&self) -> Option<String> {
         let milliseconds = self.time? - unix_milliseconds();
-        let hours = digits(milliseconds.max(0) as f64 / 1000.0 / SECONDS_PER_HOUR);
-        let part = |what: &str, hours: Option<f64>| hours.map(|hours| format!("{what} {} h", digits(hours)));
+        let hours = two_digits(milliseconds.max(0) as f64 / 1000.0 / SECONDS_PER_HOUR);
+        let part =
+            |what: &str, hours: Option<f64>| hours.map(|hours| format!("{what} {} h", two_digits(hours)));
         let parts = [
             part("walks", self.walks_hours),
             part("labels", self.labels_hours),
@@ -68,7 +69,7 @@ mod tests {
 
     use super::*;
 
-    fn campaign() -> (Status, Value, Bill) {
+    fn campaign() -> (Status, Value, QueueCost) {
         let walk = |state: &str, step| WalkStatus { state: state.into(), step, ..WalkStatus::default() };
         let status = Status {
             walks: vec![walk("running", 4_000), walk("waiting", 0), walk("collected", 7)],
@@ -76,7 +77,7 @@ mod tests {
             led: true,
             ..Status::default()
         };
-        (status, json!({ "walk": { "equilibration": 1_000, "steps": 19_000 } }), Bill::default())
+        (status, json!({ "walk": { "equilibration": 1_000, "steps": 19_000 } }), QueueCost::default())
     }
 
     #[test]

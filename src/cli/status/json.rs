@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 
 use super::Snapshot;
 use super::batch_jobs::BatchJobs;
-use crate::ends::Ends;
+use crate::walk_ends::WalkEnds;
 
 /// Incremented when a key is removed or changes its meaning.
 pub const VERSION: u32 = 1;
@@ -24,7 +24,7 @@ pub fn to_json(snapshot: &Snapshot, jobs: &BatchJobs) -> serde_json::Result<Valu
     json["staleness"] = mixture.staleness();
     json["disk"] = serde_json::to_value(disk)?;
     json["disk"]["at_the_end"] = json!(disk.at_the_end(status));
-    json["ends"] = json!(Ends::of(&status.walks));
+    json["ends"] = json!(WalkEnds::from_walks(&status.walks));
     json["expected_end"] = json!(end);
     labels.add_to(&mut json, status);
     jobs.add_to(&mut json);

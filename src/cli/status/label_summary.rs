@@ -7,7 +7,7 @@ use store::{FailureCount, JobState, Labels, Status, Store, StoreError, Unlabelle
 
 use super::page::{Page, cut};
 use super::processes::since;
-use crate::bill::{self, Bill, digits};
+use crate::label_cost::{self, QueueCost, two_digits};
 use crate::output::count;
 use crate::unlabelled;
 
@@ -17,7 +17,7 @@ const MAX_STRUCTURES: u64 = 20_000;
 /// Costs and failures of the labels of the current protocol.
 #[derive(Clone, Debug, Default)]
 pub struct LabelSummary {
-    pub(super) bill: Bill,
+    pub(super) bill: QueueCost,
     pub(super) failures: Vec<FailureCount>,
     pub(super) unlabelled: Vec<Unlabelled>,
     /// The states of label jobs by protocol, as text.
@@ -42,11 +42,17 @@ impl LabelSummary {
             (_, labelled) => store.unlabelled(protocol.hash, labelled <= MAX_STRUCTURES).await?,
         };
         let by_protocol = by_protocol(&store.jobs_by_protocol().await?, &protocol.name);
-        Ok(Self { bill: bill::of(store, protocol.hash).await?, failures, unlabelled, by_protocol, shared })
+        Ok(Self {
+            bill: label_cost::queue_cost(store, protocol.hash).await?,
+            failures,
+            unlabelled,
+            by_protocol,
+            shared,
+        })
     }
 
     /// Costs of the labels so far, and of the queued ones.
-    pub fn bill(&self) -> &Bill {
+    pub fn bill(&self) -> &QueueCost {
         &self.bill
     }
 
@@ -76,14 +82,14 @@ impl LabelSummary {
         if self.failures.len() > page.few {
             page.titled(out, "", &format!("… and {} more classes", self.failures.len() - page.few))?;
         }
-        unlabelled::shown(&self.unlabelled, 12, page.few)
+        unlabelled::describe(&self.unlabelled, 12, page.few)
             .lines()
             .try_for_each(|line| writeln!(out, "{}", cut(line, page.width)))
     }
 
     fn cost(&self, used: f64) -> String {
-        let Bill { unfinished, remaining, hours_left, cores, measured, overhead } = &self.bill;
-        let used = format!("{} core-hours so far", digits(used));
+        let QueueCost { unfinished, remaining, hours_left, cores, measured, overhead } = &self.bill;
+        let used = format!("{} core-hours so far", two_digits(used));
         let Some(remaining) = remaining else {
             return match unfinished {
                 0 => used,
@@ -98,7 +104,7 @@ impl LabelSummary {
             false => String::new(),
         };
         let done = match hours_left {
-            Some(hours) => format!("done in {} h on {}", digits(*hours), count(*cores, "core")),
+            Some(hours) => format!("done in {} h on {}", two_digits(*hours), count(*cores, "core")),
             None => "no active labellers".to_owned(),
         };
         format!(
@@ -147,7 +153,7 @@ fn by_protocol(jobs: &[(String, JobState, u64)], in_force: &str) -> Vec<String> 
 
 fn describe_rate(status: &Status) -> String {
     let average = per_hour(status)
-        .map_or(String::new(), |average| format!("; {} per hour on average", digits(average)));
+        .map_or(String::new(), |average| format!("; {} per hour on average", two_digits(average)));
     format!("{} computed in the last hour{average}", status.labels_last_hour)
 }
 

@@ -12,7 +12,7 @@ use store::{
 use wire::CampaignId;
 
 use super::*;
-use crate::bill::{Bill, CoreHours};
+use crate::label_cost::{CoreHours, QueueCost};
 
 /// A large campaign with a value for every field.
 pub fn large() -> Snapshot {
@@ -22,7 +22,7 @@ pub fn large() -> Snapshot {
     });
     let values = [(orchestrator::selector::STALENESS, staleness), ("training_frames", training)];
     let hours = CoreHours { expected: 123_456.0, low: 98_765.0, high: 234_567.0 };
-    let bill = Bill {
+    let bill = QueueCost {
         unfinished: 12_345,
         measured: 5000,
         overhead: 1.25,
@@ -52,7 +52,7 @@ pub fn large() -> Snapshot {
             resolved_configuration: String::new(),
             configuration_in_force: String::new(),
         },
-        origin: Some(Origin::new(
+        origin: Some(Provenance::new(
             Path::new("/scratch/a-long-name-of-a-project/a-long-name-of-a-campaign/campaign.toml"),
             "",
             Path::new("/scratch"),
@@ -61,7 +61,7 @@ pub fn large() -> Snapshot {
         mixture: MixtureSummary(values.map(|(name, value)| (name.to_owned(), value.to_string())).into()),
         disk: Disk {
             bytes: 123_456_789_012,
-            forecast: Some(Forecast {
+            forecast: Some(DiskForecast {
                 structures: 9 << 33,
                 rest: 1 << 32,
                 declined: 1 << 30,

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use store::{DATABASE, Store, unix_milliseconds};
 
-use super::{CampaignLocation, Ended, Failure};
+use super::{CampaignLocation, ExitStatus, Failure};
 use crate::cli::block_on;
-use crate::forecast::megabytes;
+use crate::disk_forecast::megabytes;
 use crate::output::{Bar, print};
 
 const BAR: &str = "copying {bar:32} {percent} %  {eta} left";
@@ -26,12 +26,12 @@ pub struct Backup {
 }
 
 impl Backup {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         block_on(self.backup())??;
         let target = self.target.display();
         let size = std::fs::metadata(self.target.join(DATABASE)).map_or(0, |file| file.len());
         print(|out| writeln!(out, "backed up to {target}, {}", megabytes(size)))?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     async fn backup(&self) -> Result<(), Failure> {

@@ -3,7 +3,7 @@
 use calm::Component;
 use store::{ComponentRecord, Finding, Store, StoreError};
 
-use super::{CampaignLocation, Ended, Failure};
+use super::{CampaignLocation, ExitStatus, Failure};
 use crate::cli::block_on;
 use crate::output::{Bar, print};
 
@@ -23,14 +23,14 @@ pub struct Check {
 }
 
 impl Check {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let (findings, rows) = block_on(self.check())??;
         print(|out| {
             findings.iter().try_for_each(|finding| writeln!(out, "{finding}"))?;
             if findings.is_empty() { writeln!(out, "no problems found in {rows} rows") } else { Ok(()) }
         })?;
         match findings.len() {
-            0 => Ok(Ended::Done),
+            0 => Ok(ExitStatus::Done),
             found => Err(Failure::Failed(format!("{found} findings in {}", self.location.get()?))),
         }
     }

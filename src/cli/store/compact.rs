@@ -2,10 +2,10 @@
 
 use store::{CampaignLock, Store, unix_milliseconds};
 
-use super::{CampaignLocation, Ended, Failure};
+use super::{CampaignLocation, ExitStatus, Failure};
 use crate::cli::block_on;
-use crate::forecast::megabytes;
-use crate::output::{print, say};
+use crate::disk_forecast::megabytes;
+use crate::output::{log_and_print, print};
 
 /// Free unused space in a campaign's store
 ///
@@ -20,10 +20,10 @@ pub struct Compact {
 }
 
 impl Compact {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let (before, after) = block_on(self.compact())??;
         print(|out| writeln!(out, "{} before, {} after", megabytes(before), megabytes(after)))?;
-        Ok(Ended::Done)
+        Ok(ExitStatus::Done)
     }
 
     async fn compact(&self) -> Result<(u64, u64), Failure> {
@@ -35,7 +35,7 @@ impl Compact {
         let before = store.size().await?;
         if self.drop_declined_features {
             let dropped = store.drop_declined_features(unix_milliseconds()).await?;
-            say(format_args!(
+            log_and_print(format_args!(
                 "deleted the features of {dropped} declined candidates: calmwalk replay --set stops at the first of them"
             ));
         }

@@ -4,7 +4,7 @@ mod backup;
 mod check;
 mod compact;
 
-use super::{CampaignLocation, Ended, Failure};
+use super::{CampaignLocation, ExitStatus, Failure};
 
 /// Check, back up or compact the store of a campaign
 #[derive(Debug, clap::Args)]
@@ -22,7 +22,7 @@ enum Action {
 }
 
 impl StoreCommand {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         match self.action {
             Action::Check(command) => command.run(),
             Action::Backup(command) => command.run(),

@@ -6,7 +6,7 @@ use store::{DecidedCandidate, Job, JobState, RecentDecision, WalkStatus};
 use super::pane::{Entry, Tone};
 use crate::cli::status::page::cut;
 use crate::cli::status::walks;
-use crate::condition::{self, Condition, Facts};
+use crate::filter::{self, Filter, StructureProperties};
 use crate::output::decimals;
 
 /// Columns of the queue: `>` marks numbers, trailing blanks reserve width.
@@ -25,8 +25,8 @@ pub const UNKNOWN_QUANTITIES: [&[&str]; 3] = [
 ];
 
 /// The entries of walks that match the filter. `led`: whether an orchestrator runs.
-pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Condition>) -> Vec<Entry> {
-    let matches = |walk: &&WalkStatus| filter.is_none_or(|filter| filter.is_met(&facts_of_walk(walk)));
+pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Filter>) -> Vec<Entry> {
+    let matches = |walk: &&WalkStatus| filter.is_none_or(|filter| filter.matches(&facts_of_walk(walk)));
     let tone = |walk: &WalkStatus| match walk.state.as_str() {
         _ if walk.paused => Tone::Attention,
         "running" if led => Tone::Active,
@@ -45,10 +45,10 @@ pub fn walk_entries(walks: &[WalkStatus], led: bool, filter: Option<&Condition>)
 }
 
 /// The entries of label jobs that match the filter.
-pub fn job_entries(jobs: &[Job], filter: Option<&Condition>) -> Vec<Entry> {
+pub fn job_entries(jobs: &[Job], filter: Option<&Filter>) -> Vec<Entry> {
     let matches = |job: &&Job| {
-        let species = condition::species(&job.formula);
-        filter.is_none_or(|filter| filter.is_met(&facts_of_job(job, &species)))
+        let species = filter::species(&job.formula);
+        filter.is_none_or(|filter| filter.matches(&facts_of_job(job, &species)))
     };
     let tone = |state: JobState| match state {
         JobState::Leased | JobState::Labelled => Tone::Active,
@@ -76,12 +76,12 @@ pub fn job_entries(jobs: &[Job], filter: Option<&Condition>) -> Vec<Entry> {
 /// The entries of decisions that match the filter.
 pub fn decision_entries<'a>(
     decisions: impl Iterator<Item = &'a RecentDecision>,
-    filter: Option<&Condition>,
+    filter: Option<&Filter>,
 ) -> Vec<Entry> {
     let matches = |decision: &&RecentDecision| {
         let formula = decision.candidate.as_ref().map_or("", |found| &found.formula);
-        let species = condition::species(formula);
-        filter.is_none_or(|filter| filter.is_met(&facts_of_decision(decision, &species)))
+        let species = filter::species(formula);
+        filter.is_none_or(|filter| filter.matches(&facts_of_decision(decision, &species)))
     };
     decisions.filter(matches).map(decision_entry).collect()
 }
@@ -89,8 +89,8 @@ pub fn decision_entries<'a>(
 fn decision_entry(decision: &RecentDecision) -> Entry {
     let RecentDecision { sequence, kind, walk, detail, candidate, .. } = decision;
     let found = candidate.as_ref();
-    let number = |of: fn(&DecidedCandidate) -> Option<f64>, digits| match found {
-        Some(found) => decimals(of(found), digits),
+    let number = |of: fn(&DecidedCandidate) -> Option<f64>, two_digits| match found {
+        Some(found) => decimals(of(found), two_digits),
         None => String::new(),
     };
     let what = match (found.and_then(|found| found.reason.as_deref()), detail["end"].as_str()) {
@@ -126,8 +126,8 @@ pub fn without_campaign(candidate: &str) -> &str {
     candidate.split_once('-').map_or(candidate, |(_, rest)| rest)
 }
 
-fn facts_of_walk(walk: &WalkStatus) -> Facts<'_> {
-    Facts {
+fn facts_of_walk(walk: &WalkStatus) -> StructureProperties<'_> {
+    StructureProperties {
         gamma: walk.gamma_max,
         volume: walk.relative_volume,
         temperature: walk.temperature,
@@ -135,12 +135,12 @@ fn facts_of_walk(walk: &WalkStatus) -> Facts<'_> {
         step: Some(walk.step),
         kind: &walk.origin,
         seed: Some(&walk.seed_structure),
-        ..Facts::default()
+        ..StructureProperties::default()
     }
 }
 
-fn facts_of_job<'a>(job: &'a Job, species: &'a [Species]) -> Facts<'a> {
-    Facts {
+fn facts_of_job<'a>(job: &'a Job, species: &'a [Species]) -> StructureProperties<'a> {
+    StructureProperties {
         gamma: job.original_gamma,
         gamma_nbr: job.original_gamma_nbr,
         volume: job.relative_volume,
@@ -150,15 +150,18 @@ fn facts_of_job<'a>(job: &'a Job, species: &'a [Species]) -> Facts<'a> {
         species,
         kind: &job.origin,
         seed: Some(&job.seed_structure),
-        ..Facts::default()
+        ..StructureProperties::default()
     }
 }
 
-fn facts_of_decision<'a>(decision: &'a RecentDecision, species: &'a [Species]) -> Facts<'a> {
-    let of_walk =
-        Facts { walk: decision.walk, mixture_version: Some(decision.mixture_version), ..Facts::default() };
+fn facts_of_decision<'a>(decision: &'a RecentDecision, species: &'a [Species]) -> StructureProperties<'a> {
+    let of_walk = StructureProperties {
+        walk: decision.walk,
+        mixture_version: Some(decision.mixture_version),
+        ..StructureProperties::default()
+    };
     let Some(found) = &decision.candidate else { return of_walk };
-    Facts {
+    StructureProperties {
         gamma: found.original_gamma,
         gamma_nbr: found.original_gamma_nbr,
         volume: found.relative_volume,

@@ -3,18 +3,18 @@
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use store::JobState;
 
-use super::super::Ended;
+use super::super::ExitStatus;
 use super::entries::{UNKNOWN_QUANTITIES, without_campaign};
 use super::state::{DECISIONS, Message, Mode, Prompt, PromptKind, QUEUE, State, Text, WALKS};
 use crate::cli::queue::Action as QueueAction;
 use crate::cli::walks::{Action as WalksAction, WalkSelection};
-use crate::condition::Condition;
+use crate::filter::Filter;
 
 /// An action outside the state.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Request {
     /// Exit.
-    Quit(Ended),
+    Quit(ExitStatus),
     /// Poll at once, because another view was selected.
     Refresh,
     /// Read the history of a candidate.
@@ -52,7 +52,7 @@ impl State {
         }
         let control = key.modifiers.contains(KeyModifiers::CONTROL);
         if control && key.code == KeyCode::Char('c') {
-            return Some(Request::Quit(Ended::Interrupted));
+            return Some(Request::Quit(ExitStatus::Interrupted));
         }
         self.message = None;
         match std::mem::take(&mut self.mode) {
@@ -71,7 +71,7 @@ impl State {
 
     fn key_in_panes(&mut self, code: KeyCode) -> Option<Request> {
         match code {
-            KeyCode::Char('q') => return Some(Request::Quit(Ended::Done)),
+            KeyCode::Char('q') => return Some(Request::Quit(ExitStatus::Done)),
             KeyCode::Tab => self.focus = (self.focus + 1) % self.panes.len(),
             KeyCode::BackTab => self.focus = (self.focus + self.panes.len() - 1) % self.panes.len(),
             KeyCode::Char('1') => self.focus = WALKS,
@@ -113,7 +113,7 @@ impl State {
         self.mode = Mode::Text(Text { title: title.to_owned(), text: Some(text), ..Text::default() });
     }
 
-    fn filter(&mut self, filter: Option<Condition>) {
+    fn filter(&mut self, filter: Option<Filter>) {
         self.pane().filter = filter;
         self.update_panes();
     }
@@ -239,8 +239,8 @@ impl State {
 
 impl State {
     /// Parses a filter, and checks that the pane has its quantities.
-    fn parse_filter(&self, text: &str) -> Result<Condition, String> {
-        let condition: Condition = text.parse().map_err(|error| format!("invalid filter: {error}"))?;
+    fn parse_filter(&self, text: &str) -> Result<Filter, String> {
+        let condition: Filter = text.parse().map_err(|error| format!("invalid filter: {error}"))?;
         let is_not_known = |name: &&str| UNKNOWN_QUANTITIES[self.focus].contains(name);
         match condition.names().into_iter().find(is_not_known) {
             None => Ok(condition),

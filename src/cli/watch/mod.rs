@@ -25,7 +25,7 @@ use self::keys::Request;
 use self::reader::{Poller, Reader};
 use self::screen::Screen;
 use self::state::State;
-use super::{CampaignLocation, Ended, Failure, block_on, duration_between, explain, queue, walks};
+use super::{CampaignLocation, ExitStatus, Failure, block_on, duration_between, explain, queue, walks};
 use crate::duration::Duration;
 
 /// Monitor and control a campaign in the terminal
@@ -44,7 +44,7 @@ pub struct Watch {
 }
 
 impl Watch {
-    pub fn run(self) -> Result<Ended, Failure> {
+    pub fn run(self) -> Result<ExitStatus, Failure> {
         let location = self.location.get()?;
         if !io::stdout().is_terminal() {
             return Err(Failure::Input(
@@ -57,7 +57,7 @@ impl Watch {
 }
 
 /// Polls, draws and handles keys until the user quits.
-async fn watch(location: Location, interval: std::time::Duration) -> Result<Ended, Failure> {
+async fn watch(location: Location, interval: std::time::Duration) -> Result<ExitStatus, Failure> {
     let mut reader = Reader::new(location.clone());
     // Before the screen opens, so that an error is printed normally.
     let mut state = State::new(reader.poll(state::JobView::default()).await?);
@@ -88,9 +88,9 @@ async fn watch(location: Location, interval: std::time::Duration) -> Result<Ende
                 poller.poll_now(state.view);
                 None
             }
-            _ = interrupt.recv() => return Ok(Ended::Interrupted),
-            _ = terminate.recv() => return Ok(Ended::Interrupted),
-            _ = hangup.recv() => return Ok(Ended::Interrupted),
+            _ = interrupt.recv() => return Ok(ExitStatus::Interrupted),
+            _ = terminate.recv() => return Ok(ExitStatus::Interrupted),
+            _ = hangup.recv() => return Ok(ExitStatus::Interrupted),
         };
         match request {
             None => {}

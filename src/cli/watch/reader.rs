@@ -8,7 +8,7 @@ use tokio::time::timeout;
 
 use super::state::{JobView, WINDOW};
 use crate::cli::status::Snapshot;
-use crate::outcome::Failure;
+use crate::exit_status::Failure;
 
 /// Maximum number of jobs read per state.
 const MAX_JOBS: u32 = 300;

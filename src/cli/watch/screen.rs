@@ -11,7 +11,7 @@ use ratatui::crossterm::terminal::{
 use ratatui::prelude::CrosstermBackend;
 use ratatui::{Frame, Terminal};
 
-use crate::outcome::Failure;
+use crate::exit_status::Failure;
 
 /// The terminal while it is drawn on.
 pub struct Screen {

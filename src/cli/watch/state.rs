@@ -11,7 +11,7 @@ use super::keys::Request;
 use super::pane::Pane;
 use super::reader::Reading;
 use crate::cli::status::Snapshot;
-use crate::outcome::Failure;
+use crate::exit_status::Failure;
 
 /// Number of newest decisions kept, for charts and filters.
 pub const WINDOW: usize = 2000;

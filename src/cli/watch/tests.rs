@@ -263,7 +263,7 @@ fn a_history_is_shown_if_its_text_view_is_still_open() {
     press(&mut state, "q");
     state.complete(Completed::Explain(id, Ok("late".into())));
     assert!(matches!(state.mode, Mode::Panes));
-    assert_eq!(press(&mut state, "q"), Some(Request::Quit(Ended::Done)));
+    assert_eq!(press(&mut state, "q"), Some(Request::Quit(ExitStatus::Done)));
 }
 
 #[test]
@@ -279,7 +279,7 @@ fn the_last_state_stays_while_the_campaign_cannot_be_read() {
     assert!(!screen(&mut state, 80, 24).contains("outdated"));
     assert_eq!((state.focus, state.panes[QUEUE].entries.len()), (WALKS, 0));
     let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
-    assert_eq!(state.key(control_c), Some(Request::Quit(Ended::Interrupted)));
+    assert_eq!(state.key(control_c), Some(Request::Quit(ExitStatus::Interrupted)));
 }
 
 #[test]

@@ -1,34 +1,34 @@
-//! What became of candidates, and how fast new structures were found.
+//! Fates of candidates, and the rate at which new structures were found.
 
 use ::figures::{Anchor, Axis, Colour, Figure, Panel, Scale};
 use store::Candidates;
 
-use super::super::gathered::Gathered;
+use super::super::report_data::ReportData;
 use super::super::style::{WIDTH, grouped};
-use super::super::{Csv, Drawn, csv};
+use super::super::{Csv, FigureContent, csv};
 use super::row;
 
-pub fn draw(gathered: &Gathered) -> Result<Drawn, String> {
-    let candidates = &gathered.standing.candidates;
+pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
+    let candidates = &data.status.candidates;
     if candidates.seen == 0 {
         return Err("No candidate has reached the selector yet.".into());
     }
-    let description = "Candidates by what became of them, and accepted structures against candidates";
+    let description = "Candidates by fate, and accepted structures against candidates";
     let mut figure = Figure::new("collection", description, WIDTH, 190.0);
     let mut numbers = Csv::new(&["panel", "fate", "candidates", "accepted"]);
     let places = row(2, [86.0, 74.0, 14.0], 22.0, 128.0);
     draw_fates(&mut figure, &mut numbers, places[0], candidates);
-    draw_progress(&mut figure, &mut numbers, places[1], gathered);
+    draw_progress(&mut figure, &mut numbers, places[1], data);
     let caption = format!(
-        "Candidates of biased walks (n = {}). a, By what the selector decided: accepted, or declined because the newest \
-         mixture covered them (another walk had found their like), because they were there already, because atoms were too \
-         close, because there were as many as there may be, or because too many labels were waiting. {} more were refused by the \
-         walkers’ own guards and never became candidates. b, Accepted structures against candidates in the order of the \
-         decisions; dashed, every candidate accepted. The flatter the line, the less that is found is new.",
+        "Candidates of biased walks (n = {}). a, By decision of the selector: accepted, or declined because the newest mixture \
+         covered them (another walk had found a similar structure), as duplicates, because atoms were too close (guard), because \
+         the quota was reached (budget), or because too many labels were queued (backlog). The walkers’ guards refused {} more \
+         structures before they became candidates. b, Accepted structures against candidates in the order of the decisions; \
+         dashed, every candidate accepted. The flatter the line, the fewer new structures the walks find.",
         grouped(candidates.seen),
         grouped(candidates.refused_by_walkers),
     );
-    Ok(Drawn { figure, caption, numbers })
+    Ok(FigureContent { figure, caption, numbers })
 }
 
 fn draw_fates(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangle, candidates: &Candidates) {
@@ -56,10 +56,10 @@ fn draw_fates(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangl
     panel.draw(figure);
 }
 
-fn draw_progress(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangle, gathered: &Gathered) {
+fn draw_progress(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangle, data: &ReportData) {
     let (mut seen, mut accepted) = (0, 0);
     let mut line = vec![[0.0, 0.0]];
-    for part in gathered.fates.chunk_by(|a, b| a.part == b.part) {
+    for part in data.fates.chunk_by(|a, b| a.part == b.part) {
         seen += part.iter().map(|fate| fate.number).sum::<u64>();
         accepted += part.iter().filter(|fate| fate.fate == "accepted").map(|fate| fate.number).sum::<u64>();
         line.push([seen as f64, accepted as f64]);

@@ -1,22 +1,22 @@
-//! Which structures got their labels, by how new and how stretched they are.
+//! Share of structures that were labelled, by grade and by volume.
 
 use ::figures::{Axis, Colour, Figure, Marker, Panel, Rectangle, Scale};
 use analysis::CompletionBin;
 
-use super::super::gathered::Gathered;
+use super::super::report_data::ReportData;
 use super::super::style::{WIDTH, grouped};
-use super::super::{Csv, Drawn, csv};
+use super::super::{Csv, FigureContent, csv};
 use super::row;
 
-pub fn draw(gathered: &Gathered) -> Result<Drawn, String> {
-    let none = "No label has been made, and none has finally failed.";
-    let labels = gathered.labels.as_ref().ok_or(none)?;
-    let (by_gamma, by_expansion) = (labels.learned.by_gamma.bins(), labels.learned.by_expansion.bins());
+pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
+    let none = "No label job is finished yet.";
+    let labels = data.labels.as_ref().ok_or(none)?;
+    let (by_gamma, by_expansion) = (labels.statistics.by_gamma.bins(), labels.statistics.by_expansion.bins());
     let (labelled, failed) = counts(&by_gamma);
     if labelled + failed == 0 {
         return Err(none.into());
     }
-    let description = "Share of structures that got their labels, by grade and by volume";
+    let description = "Labelled share of structures, by grade and by volume";
     let mut figure = Figure::new("completion", description, WIDTH, 176.0);
     let mut numbers =
         Csv::new(&["panel", "above", "up_to", "labelled", "failed", "share", "share_low", "share_high"]);
@@ -27,14 +27,14 @@ pub fn draw(gathered: &Gathered) -> Result<Drawn, String> {
         draw_bins(&mut figure, &mut numbers, (letter, title), &bins, place);
     }
     let caption = format!(
-        "Share of the structures that have their labels among those whose labels were made or finally failed, by (a) their largest γ \
-         under the original mixture and (b) their volume by that of the seed structure. Bars, 95 % intervals (Wilson); above the axis, \
-         how many structures are in the bin. {} structures are labelled and {} failed, frames of control walks included. What failed was \
-         collected and is missing from every statement about force errors.",
+        "Share of labelled structures among those that were labelled or failed for good, by (a) their largest γ under the original \
+         mixture and (b) their volume relative to that of the seed structure. Bars, 95 % intervals (Wilson); above the axis, the number \
+         of structures in the bin. {} structures are labelled and {} failed, frames of control walks included. Force errors do not \
+         include failed structures.",
         grouped(labelled),
         grouped(failed)
     );
-    Ok(Drawn { figure, caption, numbers })
+    Ok(FigureContent { figure, caption, numbers })
 }
 
 fn counts(bins: &[CompletionBin<String>]) -> (u64, u64) {
@@ -48,7 +48,7 @@ fn draw_bins(
     bins: &[CompletionBin<String>],
     place: Rectangle,
 ) {
-    // Ends of bins stand where bins end; behind the last, what has no value.
+    // Ticks are at the edges of bins. Structures without a value come after the last bin.
     let ends = bins.iter().enumerate().filter_map(|(k, bin)| match (bin.above, bin.up_to) {
         (_, Some(end)) => Some((k as f64 + 1.0, end.to_string())),
         (None, None) => Some((k as f64 + 0.5, "unknown".to_owned())),

@@ -1,21 +1,21 @@
-//! What labels cost.
+//! Cost of labels.
 
 use ::figures::{Axis, Colour, Figure, Marker, Panel, Scale};
 use analysis::{Histogram, logarithmic_edges, quantile};
 use store::LabelCost;
 
-use super::super::gathered::Gathered;
+use super::super::report_data::ReportData;
 use super::super::style::{WIDTH, axis, grouped};
-use super::super::{Csv, Drawn, csv};
+use super::super::{Csv, FigureContent, csv};
 use super::row;
 
 /// Bins of the histogram.
 const BINS: usize = 24;
-/// Labels that have marks.
-const DRAWN: usize = 3000;
+/// Largest number of labels drawn as points.
+const MAX_DRAWN: usize = 3000;
 
-pub fn draw(gathered: &Gathered) -> Result<Drawn, String> {
-    let costs = gathered.labels.as_ref().map_or(&[][..], |labels| &labels.costs);
+pub fn draw(data: &ReportData) -> Result<FigureContent, String> {
+    let costs = data.labels.as_ref().map_or(&[][..], |labels| &labels.costs);
     if costs.is_empty() {
         return Err("No label was made in this campaign, so none has a cost.".into());
     }
@@ -43,15 +43,15 @@ pub fn draw(gathered: &Gathered) -> Result<Drawn, String> {
     let x = axis(title, Scale::Logarithmic, &sizes, None);
     let y = axis("core-seconds per label", Scale::Logarithmic, &seconds, None);
     let mut panel = Panel::new(places[1], x, y);
-    let every = costs.len().div_ceil(DRAWN);
+    let every = costs.len().div_ceil(MAX_DRAWN);
     let points = costs.iter().step_by(every).map(|cost| [size(cost), cost.core_seconds]);
     panel.dots(points, Marker::Disc, 1.8, Colour::BLUE.faint(0.45), None);
     panel.letter('b');
     panel.draw(&mut figure);
-    Ok(Drawn { figure, caption: caption(gathered, seconds), numbers })
+    Ok(FigureContent { figure, caption: caption(data, seconds), numbers })
 }
 
-/// What the cost depends on: electrons, where every label has some.
+/// The size that the cost depends on: electrons if every label has them, otherwise atoms.
 fn size(costs: &[LabelCost]) -> (&'static str, fn(&LabelCost) -> f64) {
     match costs.iter().all(|cost| cost.electrons.is_some_and(|electrons| electrons > 0.0)) {
         true => ("electrons", |cost| cost.electrons.unwrap_or(f64::NAN)),
@@ -59,15 +59,15 @@ fn size(costs: &[LabelCost]) -> (&'static str, fn(&LabelCost) -> f64) {
     }
 }
 
-fn caption(gathered: &Gathered, mut seconds: Vec<f64>) -> String {
+fn caption(data: &ReportData, mut seconds: Vec<f64>) -> String {
     seconds.sort_by(f64::total_cmp);
     let of = |share| quantile(&seconds, share).map_or(String::new(), |x| format!("{x:.3}"));
     format!(
-        "Core-seconds of the attempts that brought labels (n = {}): median {}, 90 % quantile {}. a, How many labels took how long. \
-         b, By their size. Attempts in vain are not in it; with them, all attempts took {:.4} core-hours.",
+        "Core-seconds of successful label attempts (n = {}): median {}, 90 % quantile {}. a, Distribution. b, By size. Failed attempts \
+         are not shown; all attempts together took {:.4} core-hours.",
         grouped(seconds.len() as u64),
         of(0.5),
         of(0.9),
-        gathered.standing.budget.used.core_hours
+        data.status.budget.used.core_hours
     )
 }

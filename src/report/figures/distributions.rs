@@ -4,26 +4,26 @@ use ::figures::{Figure, Panel, Scale};
 use analysis::{Histogram, logarithmic_edges, quantile};
 use wire::Origin;
 
-use super::super::sample::{Atom, Sample};
+use super::super::collections::{Atom, Collections};
 use super::super::style::{WIDTH, axis, grouped, origins};
-use super::super::{Csv, Drawn};
+use super::super::{Csv, FigureContent};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};
 
-/// What is shown of an atom.
-type OfAtom = fn(&Atom) -> Option<f64>;
+/// A quantity of an atom.
+type AtomQuantity = fn(&Atom) -> Option<f64>;
 
-/// Bins of a panel.
+/// Number of bins of a panel.
 const BINS: usize = 40;
 
-pub fn draw(sample: &Sample) -> Result<Drawn, String> {
-    let shown = origins_of(sample);
+pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
+    let shown = origins_of(collections);
     if shown.is_empty() {
         return Err(NOTHING_COLLECTED.into());
     }
     let description = "Distributions of grades and force errors of biased and control walks";
     let mut figure = Figure::new("distributions", description, WIDTH, 168.0);
     let mut numbers = Csv::new(&["panel", "origin", "low", "high", "atoms"]);
-    let panels: [(char, &str, OfAtom); 3] = [
+    let panels: [(char, &str, AtomQuantity); 3] = [
         ('a', "γ", |atom| Some(atom.gamma)),
         ('b', "γ_{nbr}", |atom| Some(atom.gamma_nbr)),
         ('c', "force error (eV Å^{−1})", |atom| atom.error),
@@ -31,7 +31,7 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
     let places = row(3, [40.0, 40.0, 10.0], 26.0, 106.0);
     for ((letter, title, of), place) in panels.into_iter().zip(places) {
         let values = |origin: Origin| -> Vec<f64> {
-            let (_, collection) = sample.both()[usize::from(origin == Origin::Control)];
+            let (_, collection) = collections.both()[usize::from(origin == Origin::Control)];
             collection.atoms.kept().filter_map(of).filter(|x| x.is_finite()).collect()
         };
         let all: Vec<f64> = shown.iter().flat_map(|origin| values(*origin)).collect();
@@ -54,12 +54,12 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
         panel.draw(&mut figure);
     }
     origins(&mut figure, &shown);
-    Ok(Drawn { figure, caption: caption(sample, &shown), numbers })
+    Ok(FigureContent { figure, caption: caption(collections, &shown), numbers })
 }
 
-fn caption(sample: &Sample, shown: &[Origin]) -> String {
+fn caption(collections: &Collections, shown: &[Origin]) -> String {
     let of = |origin: &Origin| {
-        let (_, collection) = sample.both()[usize::from(*origin == Origin::Control)];
+        let (_, collection) = collections.both()[usize::from(*origin == Origin::Control)];
         let atoms = &collection.atoms;
         let mut grades: Vec<_> = atoms.kept().map(|atom| atom.gamma_nbr).filter(|x| x.is_finite()).collect();
         grades.sort_by(f64::total_cmp);
@@ -70,7 +70,7 @@ fn caption(sample: &Sample, shown: &[Origin]) -> String {
             n => format!("mean force error {:.3} eV Å^{{−1}}", errors.iter().sum::<f64>() / n as f64),
         };
         let drawn = match (atoms.kept().len() as u64) < atoms.seen() {
-            true => format!(", a sample of {} of them drawn", grouped(atoms.kept().len() as u64)),
+            true => format!(", of which a sample of {} is shown", grouped(atoms.kept().len() as u64)),
             false => String::new(),
         };
         format!(
@@ -83,10 +83,10 @@ fn caption(sample: &Sample, shown: &[Origin]) -> String {
     };
     let both: Vec<_> = shown.iter().map(of).collect();
     format!(
-        "Atoms of all structures that were collected, under the original mixture. a, Grade γ. b, Its average over the \
-         neighbourhood, γ_{{nbr}}. c, Force error |F_{{model}} − F_{{label}}| of the atoms whose structures have labels. Dashed, the \
-         calibrated threshold 1. Bins of one width on the logarithmic axis; axes leave out 0.1 % of the atoms at either end. {}.{}",
+        "Atoms of all collected structures, under the original mixture. a, Grade γ. b, Its average over the neighbourhood, \
+         γ_{{nbr}}. c, Force error |F_{{model}} − F_{{label}}| of the atoms of labelled structures. Dashed, the calibrated \
+         threshold 1. Bins have equal widths on the logarithmic axis; axes omit 0.1 % of the atoms at either end. {}.{}",
         both.join("; "),
-        sample.left_out()
+        collections.left_out()
     )
 }

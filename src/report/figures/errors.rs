@@ -4,34 +4,34 @@ use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale, Side};
 use analysis::{Band, bands, density, even_edges, quantile};
 use wire::Origin;
 
-use super::super::sample::{Atom, Sample};
-use super::super::style::{WIDTH, axis, grouped, look, origins};
-use super::super::{Csv, Drawn, csv};
+use super::super::collections::{Atom, Collections};
+use super::super::style::{WIDTH, axis, grouped, origin_style, origins};
+use super::super::{Csv, FigureContent, csv};
 use super::NO_LABELS;
 
-/// Bins of a panel.
+/// Number of bins of a panel.
 const BINS: usize = 16;
-/// A bin with fewer atoms is not drawn.
-pub const LEAST: u64 = 20;
-/// Places of a marginal density.
-const PLACES: usize = 160;
+/// Bins with fewer atoms are not drawn.
+pub const MIN_ATOMS: u64 = 20;
+/// Grid points of a marginal density.
+const GRID_POINTS: usize = 160;
 
-/// What is plotted against the error.
-struct Against {
+/// A quantity to plot the error against.
+struct Quantity {
     letter: char,
     title: &'static str,
     scale: Scale,
     of: fn(&Atom) -> Option<f64>,
 }
 
-const AGAINST: [Against; 2] = [
-    Against { letter: 'a', title: "γ_{nbr}", scale: Scale::Logarithmic, of: |atom| Some(atom.gamma_nbr) },
-    Against { letter: 'b', title: "d_{nn} / d_{nn}^{0}", scale: Scale::Linear, of: |atom| atom.stretch },
+const QUANTITIES: [Quantity; 2] = [
+    Quantity { letter: 'a', title: "γ_{nbr}", scale: Scale::Logarithmic, of: |atom| Some(atom.gamma_nbr) },
+    Quantity { letter: 'b', title: "d_{nn} / d_{nn}^{0}", scale: Scale::Linear, of: |atom| atom.stretch },
 ];
 
-pub fn draw(sample: &Sample) -> Result<Drawn, String> {
-    let has_labels = |of: &(Origin, _)| !pairs(sample, of.0, |_| Some(1.0)).is_empty();
-    let shown: Vec<_> = sample.both().into_iter().filter(has_labels).map(|(origin, _)| origin).collect();
+pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
+    let has_labels = |of: &(Origin, _)| !pairs(collections, of.0, |_| Some(1.0)).is_empty();
+    let shown: Vec<_> = collections.both().into_iter().filter(has_labels).map(|(origin, _)| origin).collect();
     if shown.is_empty() {
         return Err(NO_LABELS.into());
     }
@@ -40,23 +40,23 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
     let mut figure = Figure::new("errors", description, WIDTH, 262.0);
     let mut numbers =
         Csv::new(&["panel", "origin", "low", "high", "atoms", "p10", "p25", "median", "p75", "p90"]);
-    for (against, left) in AGAINST.iter().zip([46.0, 302.0]) {
+    for (against, left) in QUANTITIES.iter().zip([46.0, 302.0]) {
         let place = Rectangle { x: left, y: 56.0, width: 162.0, height: 170.0 };
-        draw_panel(&mut figure, &mut numbers, sample, &shown, against, place);
+        draw_panel(&mut figure, &mut numbers, collections, &shown, against, place);
     }
     origins(&mut figure, &shown);
-    Ok(Drawn { figure, caption: caption(sample, &shown), numbers })
+    Ok(FigureContent { figure, caption: caption(collections, &shown), numbers })
 }
 
 fn draw_panel(
     figure: &mut Figure,
     numbers: &mut Csv,
-    sample: &Sample,
+    collections: &Collections,
     shown: &[Origin],
-    against: &Against,
+    against: &Quantity,
     place: Rectangle,
 ) {
-    let of: Vec<_> = shown.iter().map(|origin| (*origin, pairs(sample, *origin, against.of))).collect();
+    let of: Vec<_> = shown.iter().map(|origin| (*origin, pairs(collections, *origin, against.of))).collect();
     let all =
         |k: usize| -> Vec<f64> { of.iter().flat_map(|(_, pairs)| pairs.iter().map(move |p| p[k])).collect() };
     let x = axis(against.title, against.scale, &all(0), Some(1.0));
@@ -80,7 +80,7 @@ fn draw_panel(
     draw_margins(figure, &of, place, &x, &y);
 }
 
-/// Edges of the bins of a panel: of one width on its axis.
+/// Edges of the bins of a panel, equally wide on its axis.
 fn edges(x: &Axis) -> Vec<f64> {
     match x.scale {
         Scale::Linear => even_edges(x.low, x.high, BINS),
@@ -88,7 +88,7 @@ fn edges(x: &Axis) -> Vec<f64> {
     }
 }
 
-/// Middle of a bin on the axis of a panel.
+/// Midpoint of a bin on the axis of a panel.
 pub fn middle(panel: &Panel, band: &Band) -> f64 {
     match panel.x.scale {
         Scale::Linear => 0.5 * (band.low + band.high),
@@ -96,9 +96,9 @@ pub fn middle(panel: &Panel, band: &Band) -> f64 {
     }
 }
 
-/// What is between two of the quantiles of bins that have atoms enough, one behind the other.
+/// Draws the band between two quantiles over runs of bins with enough atoms.
 pub fn ribbons(panel: &mut Panel, bands: &[Band], [low, high]: [usize; 2], paint: ::figures::Paint) {
-    for run in bands.split(|band| band.number < LEAST) {
+    for run in bands.split(|band| band.number < MIN_ATOMS) {
         let points: Vec<_> = run
             .iter()
             .filter_map(|band| band.quantiles.map(|q| (middle(panel, band), q[low], q[high])))
@@ -108,28 +108,28 @@ pub fn ribbons(panel: &mut Panel, bands: &[Band], [low, high]: [usize; 2], paint
 }
 
 fn draw_bands(panel: &mut Panel, origin: Origin, bands: &[Band]) {
-    let colour = look(origin).colour;
+    let colour = origin_style(origin).colour;
     ribbons(panel, bands, [1, 5], colour.faint(0.14));
     ribbons(panel, bands, [2, 4], colour.faint(0.22));
 }
 
 fn draw_medians(panel: &mut Panel, origin: Origin, bands: &[Band]) {
-    let look = look(origin);
-    for run in bands.split(|band| band.number < LEAST) {
+    let style = origin_style(origin);
+    for run in bands.split(|band| band.number < MIN_ATOMS) {
         let median = |band: &Band| Some([middle(panel, band), band.quantiles?[3]]);
         let points: Vec<_> = run.iter().filter_map(median).collect();
-        panel.line(points.clone(), look.line);
-        panel.dots(points, look.marker, 1.9, look.colour, Some(Colour::WHITE.line(0.4)));
+        panel.line(points.clone(), style.line);
+        panel.dots(points, style.marker, 1.9, style.colour, Some(Colour::WHITE.line(0.4)));
     }
 }
 
-/// Densities of what is on either axis, above and at the right.
+/// Draws the marginal densities above and to the right.
 fn draw_margins(figure: &mut Figure, of: &[(Origin, Vec<[f64; 2]>)], place: Rectangle, x: &Axis, y: &Axis) {
     let above = Rectangle { y: place.y - 31.0, height: 28.0, ..place };
     let right = Rectangle { x: place.right() + 3.0, width: 30.0, ..place };
     let along = |axis: &Axis, k: usize| -> Vec<(Origin, Vec<(f64, f64)>)> {
         let on = |pairs: &Vec<[f64; 2]>| pairs.iter().map(|pair| axis.place(pair[k])).collect::<Vec<_>>();
-        of.iter().map(|(origin, pairs)| (*origin, density(&on(pairs), 0.0, 1.0, PLACES))).collect()
+        of.iter().map(|(origin, pairs)| (*origin, density(&on(pairs), 0.0, 1.0, GRID_POINTS))).collect()
     };
     let (horizontal, vertical) = (along(x, 0), along(y, 1));
     let (places, densities) = (
@@ -154,21 +154,21 @@ fn draw_margins(figure: &mut Figure, of: &[(Origin, Vec<[f64; 2]>)], place: Rect
 
 fn draw_density(panel: &mut Panel, origin: Origin, line: &[(f64, f64)], at: fn(f64, f64) -> [f64; 2]) {
     let (Some(first), Some(last)) = (line.first(), line.last()) else { return };
-    let look = look(origin);
+    let style = origin_style(origin);
     let points: Vec<_> = line.iter().map(|(place, density)| at(*place, *density)).collect();
     let ring = [at(first.0, 0.0)].into_iter().chain(points.clone()).chain([at(last.0, 0.0)]);
-    panel.rings([ring], Some(look.colour.faint(0.15)), None);
-    panel.line(points, ::figures::Stroke { width: 1.0, ..look.line });
+    panel.rings([ring], Some(style.colour.faint(0.15)), None);
+    panel.line(points, ::figures::Stroke { width: 1.0, ..style.line });
 }
 
-/// (what is plotted, error) of the labelled atoms.
-fn pairs(sample: &Sample, origin: Origin, of: fn(&Atom) -> Option<f64>) -> Vec<[f64; 2]> {
-    let (_, collection) = sample.both()[usize::from(origin == Origin::Control)];
+/// Pairs of quantity and error of the labelled atoms.
+fn pairs(collections: &Collections, origin: Origin, of: fn(&Atom) -> Option<f64>) -> Vec<[f64; 2]> {
+    let (_, collection) = collections.both()[usize::from(origin == Origin::Control)];
     let pair = |atom: &Atom| Some([of(atom)?, atom.error?]).filter(|[x, y]| x.is_finite() && y.is_finite());
     collection.atoms.kept().filter_map(pair).collect()
 }
 
-/// Adds bins to the numbers of a figure: panel, origin, edges, atoms and five of the quantiles.
+/// Writes the bins to the figure's data: panel, origin, edges, number of atoms and five quantiles.
 pub fn push_bands(numbers: &mut Csv, panel: &str, origin: &str, bands: &[Band]) {
     for band in bands {
         let mut cells =
@@ -179,16 +179,16 @@ pub fn push_bands(numbers: &mut Csv, panel: &str, origin: &str, bands: &[Band]) 
     }
 }
 
-fn caption(sample: &Sample, shown: &[Origin]) -> String {
+fn caption(collections: &Collections, shown: &[Origin]) -> String {
     let medians = |origin: &Origin| {
-        let stretched = pairs(sample, *origin, |atom| atom.stretch);
+        let stretched = pairs(collections, *origin, |atom| atom.stretch);
         let mut errors: Vec<_> = stretched.iter().filter(|[x, _]| *x > 1.15).map(|[_, y]| *y).collect();
         errors.sort_by(f64::total_cmp);
         let far = match quantile(&errors, 0.5) {
             Some(median) => format!("{median:.3} eV Å^{{−1}} (n = {})", grouped(errors.len() as u64)),
             None => "unknown (n = 0)".to_owned(),
         };
-        let (a, b) = (pairs(sample, *origin, |atom| Some(atom.gamma_nbr)).len(), stretched.len());
+        let (a, b) = (pairs(collections, *origin, |atom| Some(atom.gamma_nbr)).len(), stretched.len());
         format!(
             "{}: n = {} atoms in a and {} in b, median error where d_{{nn}}/d_{{nn}}^{{0}} > 1.15: {far}",
             origin.name(),
@@ -199,10 +199,10 @@ fn caption(sample: &Sample, shown: &[Origin]) -> String {
     let both: Vec<_> = shown.iter().map(medians).collect();
     format!(
         "a, Force error |F_{{model}} − F_{{label}}| of labelled atoms against γ_{{nbr}} under the original mixture. b, The same errors \
-         against the distance of an atom to its nearest neighbour by the shortest distance in the seed structure of its walk; atoms \
-         that have no neighbour within twice that distance are left out. Lines, medians; bands, P_{{25}}–P_{{75}} and P_{{10}}–P_{{90}}, in \
-         bins of one width on the axis with at least {LEAST} atoms. Margins, Gaussian kernel densities on the axes as drawn, each with \
-         area 1. Dashed, γ_{{nbr}} = 1 and the distance in the seed structure. {}.",
+         against the distance of an atom to its nearest neighbour relative to the shortest distance in the seed structure of its walk; \
+         atoms without a neighbour within twice that distance are omitted. Lines, medians; bands, P_{{25}}–P_{{75}} and \
+         P_{{10}}–P_{{90}}, in equally wide bins with at least {MIN_ATOMS} atoms. Margins, Gaussian kernel densities on the axes as \
+         drawn, each with area 1. Dashed, γ_{{nbr}} = 1 and the distance in the seed structure. {}.",
         both.join("; ")
     )
 }

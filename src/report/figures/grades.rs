@@ -1,23 +1,23 @@
-//! Force error against either grade, all labelled atoms together, with nested percentile bands (as the paper's Fig. 2).
+//! Force error against either grade, for all labelled atoms, with nested percentile bands (as the paper's Fig. 2).
 
 use ::figures::{Colour, Figure, Key, Panel, Scale, legend};
 use analysis::{bands, logarithmic_edges, spearman};
 use wire::Origin;
 
-use super::super::sample::{Atom, Sample};
+use super::super::collections::{Atom, Collections};
 use super::super::style::{WIDTH, axis, grouped};
-use super::super::{Csv, Drawn, csv};
-use super::errors::{LEAST, middle, ribbons};
+use super::super::{Csv, FigureContent, csv};
+use super::errors::{MIN_ATOMS, middle, ribbons};
 use super::{NO_LABELS, row};
 
-/// What is shown of an atom.
-type OfAtom = fn(&Atom) -> f64;
+/// A quantity of an atom.
+type AtomQuantity = fn(&Atom) -> f64;
 
-/// Bins of a panel.
+/// Number of bins of a panel.
 const BINS: usize = 18;
 
-pub fn draw(sample: &Sample) -> Result<Drawn, String> {
-    let atoms = |origin: Origin| sample.both()[usize::from(origin == Origin::Control)].1.atoms.kept();
+pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
+    let atoms = |origin: Origin| collections.both()[usize::from(origin == Origin::Control)].1.atoms.kept();
     let labelled = atoms(Origin::Biased).chain(atoms(Origin::Control)).filter(|atom| atom.error.is_some());
     let labelled: Vec<Atom> = labelled.copied().collect();
     if labelled.is_empty() {
@@ -27,7 +27,7 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
     let mut figure = Figure::new("grades", description, WIDTH, 226.0);
     let mut numbers =
         Csv::new(&["panel", "low", "high", "atoms", "p5", "p10", "p25", "median", "p75", "p90", "p95"]);
-    let panels: [(char, &str, OfAtom); 2] =
+    let panels: [(char, &str, AtomQuantity); 2] =
         [('a', "γ", |atom| atom.gamma), ('b', "γ_{nbr}", |atom| atom.gamma_nbr)];
     let mut correlations = Vec::new();
     for ((letter, title, of), place) in panels.into_iter().zip(row(2, [46.0, 56.0, 12.0], 28.0, 162.0)) {
@@ -43,7 +43,7 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
         for (ends, opacity) in [([0, 6], 0.13), ([1, 5], 0.2), ([2, 4], 0.3)] {
             ribbons(&mut panel, &found, ends, Colour::BLUE.faint(opacity));
         }
-        for run in found.split(|band| band.number < LEAST) {
+        for run in found.split(|band| band.number < MIN_ATOMS) {
             let median = |band: &analysis::Band| Some([middle(&panel, band), band.quantiles?[3]]);
             let points: Vec<_> = run.iter().filter_map(median).collect();
             panel.line(points, Colour::INK.dashed(1.3));
@@ -70,9 +70,9 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
     let caption = format!(
         "Force error |F_{{model}} − F_{{label}}| of all labelled atoms, of biased and control walks together, against (a) the grade γ and \
          (b) its average over the neighbourhood, γ_{{nbr}}, both under the original mixture. Black, medians; bands, P_{{25}}–P_{{75}}, \
-         P_{{10}}–P_{{90}} and P_{{5}}–P_{{95}}, in bins of one width on the logarithmic axis with at least {LEAST} atoms. Dashed grey, the \
-         calibrated threshold 1. {}.",
+         P_{{10}}–P_{{90}} and P_{{5}}–P_{{95}}, in bins of equal width on the logarithmic axis with at least {MIN_ATOMS} atoms. Dashed \
+         grey, the calibrated threshold 1. {}.",
         correlations.join("; ")
     );
-    Ok(Drawn { figure, caption, numbers })
+    Ok(FigureContent { figure, caption, numbers })
 }

@@ -1,4 +1,4 @@
-//! The figures, a file each: from numbers to a drawing with its caption and its numbers.
+//! The figures, one per file: each draws a panel or more and provides its caption and data.
 
 mod collection;
 mod completion;
@@ -13,52 +13,48 @@ use ::figures::{Axis, Panel, Rectangle, Scale};
 use analysis::Histogram;
 use wire::Origin;
 
-use super::gathered::Gathered;
-use super::sample::Sample;
-use super::style::look;
-use super::{Csv, Part, csv};
+use super::collections::Collections;
+use super::report_data::ReportData;
+use super::style::origin_style;
+use super::{Csv, FigureEntry, csv};
 
-/// All of them, in the order of the page.
-pub fn all(gathered: &Gathered) -> Vec<Part> {
-    let part = |name, title, drawn| Part { name, title, drawn };
+/// All figures, in the order of the page.
+pub fn all(data: &ReportData) -> Vec<FigureEntry> {
+    let part = |name, title, drawn| FigureEntry { name, title, drawn };
     vec![
-        part("collection", "What was collected", collection::draw(gathered)),
-        part("distributions", "Grades and force errors", distributions::draw(&gathered.sample)),
-        part(
-            "errors",
-            "Force errors where structures are new, and where they are stretched",
-            errors::draw(&gathered.sample),
-        ),
-        part("space", "Volumes and composition", space::draw(&gathered.sample)),
-        part("features", "Feature space", projection::draw(&gathered.sample)),
-        part("grades", "Force errors by grade", grades::draw(&gathered.sample)),
-        part("cost", "What labels cost", cost::draw(gathered)),
-        part("completion", "Structures that got their labels", completion::draw(gathered)),
+        part("collection", "Candidates and accepted structures", collection::draw(data)),
+        part("distributions", "Grades and force errors", distributions::draw(&data.collections)),
+        part("errors", "Force errors of new and of stretched structures", errors::draw(&data.collections)),
+        part("space", "Volumes and composition", space::draw(&data.collections)),
+        part("features", "Feature space", projection::draw(&data.collections)),
+        part("grades", "Force errors by grade", grades::draw(&data.collections)),
+        part("cost", "Cost of labels", cost::draw(data)),
+        part("completion", "Labelled share of structures", completion::draw(data)),
     ]
 }
 
-/// Steps of a histogram as a panel shows them: shares in percent, of either origin.
+/// Draws histograms of either origin as shares in percent.
 fn draw_histograms(panel: &mut Panel, histograms: &[(Origin, Histogram)]) {
     for (origin, histogram) in histograms {
-        let look = look(*origin);
+        let style = origin_style(*origin);
         let (edges, shares) = (histogram.edges(), histogram.shares());
         let mut outline = vec![[edges[0], 0.0]];
         for (edges, share) in edges.windows(2).zip(&shares) {
             outline.extend([[edges[0], 100.0 * share], [edges[1], 100.0 * share]]);
         }
         outline.push([edges[edges.len() - 1], 0.0]);
-        panel.rings([outline.clone()], Some(look.colour.faint(0.18)), None);
-        panel.line(outline, look.line);
+        panel.rings([outline.clone()], Some(style.colour.faint(0.18)), None);
+        panel.line(outline, style.line);
     }
 }
 
-/// A vertical axis for histograms.
+/// The vertical axis of histograms.
 fn share_axis(title: &str, histograms: &[(Origin, Histogram)]) -> Axis {
     let largest = histograms.iter().flat_map(|(_, histogram)| histogram.shares()).fold(0.0, f64::max);
     Axis::new(title, Scale::Linear, 0.0, 108.0 * largest.max(1e-6))
 }
 
-/// Adds the bins of histograms to the numbers of a figure: panel, origin, lower edge, upper edge, count.
+/// Writes the bins of histograms to the figure's data: panel, origin, lower edge, upper edge, count.
 fn push_histograms(numbers: &mut Csv, panel: &str, histograms: &[(Origin, Histogram)]) {
     for (origin, histogram) in histograms {
         for (edges, count) in histogram.edges().windows(2).zip(histogram.counts()) {
@@ -69,20 +65,20 @@ fn push_histograms(numbers: &mut Csv, panel: &str, histograms: &[(Origin, Histog
     }
 }
 
-/// The origins of which something was collected.
-fn origins_of(sample: &Sample) -> Vec<Origin> {
-    let both = sample.both().into_iter();
+/// The origins with collected structures.
+fn origins_of(collections: &Collections) -> Vec<Origin> {
+    let both = collections.both().into_iter();
     both.filter(|(_, of)| of.structures.seen() > 0).map(|(origin, _)| origin).collect()
 }
 
-/// Places of `number` panels beside each other, with room for the words at their axes.
+/// Rectangles of `number` panels side by side, with room for axis labels.
 fn row(number: usize, [left, gap, right]: [f64; 3], top: f64, height: f64) -> Vec<Rectangle> {
     let n = number as f64;
     let width = (super::style::WIDTH - left - right - gap * (n - 1.0)) / n;
     (0..number).map(|k| Rectangle { x: left + k as f64 * (width + gap), y: top, width, height }).collect()
 }
 
-/// Why nothing is shown of a campaign that has collected nothing.
+/// Shown instead of a figure of collected structures.
 const NOTHING_COLLECTED: &str = "No structure has been collected yet.";
-/// Why nothing is shown of force errors.
+/// Shown instead of a figure of force errors.
 const NO_LABELS: &str = "No structure has a label yet, so no force error is known.";

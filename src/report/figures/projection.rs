@@ -1,31 +1,31 @@
-//! Features in the plane of their first two principal components, with 95 % contours (the paper's Fig. 7a).
+//! Features projected onto their first two principal components, with 95 % contours (the paper's Fig. 7a).
 
 use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale};
 use analysis::{PlaneDensity, contours};
 use wire::Origin;
 
-use super::super::features::{ELEMENTS, Plane, Points};
-use super::super::sample::Sample;
-use super::super::style::{WIDTH, grouped, look, origins};
-use super::super::{Csv, Drawn, csv};
+use super::super::collections::Collections;
+use super::super::features::{MAX_ELEMENTS, Plane, Points};
+use super::super::style::{WIDTH, grouped, origin_style, origins};
+use super::super::{Csv, FigureContent, csv};
 use super::NOTHING_COLLECTED;
 
-/// Of the atoms, so many are inside of a contour.
-const INSIDE: f64 = 0.95;
-/// Places of the grid of a density, along either side.
+/// Share of the atoms inside a contour.
+const CONTOUR_SHARE: f64 = 0.95;
+/// Grid points of a density along each side.
 const GRID: usize = 128;
-/// Atoms that are drawn of either origin.
-const DRAWN: usize = 1500;
-/// Fewer atoms have no contour.
-const LEAST: usize = 50;
+/// Largest number of atoms drawn of each origin.
+const MAX_DRAWN: usize = 1500;
+/// Least number of atoms for a contour.
+const MIN_ATOMS: usize = 50;
 
-pub fn draw(sample: &Sample) -> Result<Drawn, String> {
-    if sample.both().iter().all(|(_, of)| of.structures.seen() == 0) {
+pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
+    if collections.both().iter().all(|(_, of)| of.structures.seen() == 0) {
         return Err(NOTHING_COLLECTED.into());
     }
-    let planes = sample.features.planes();
+    let planes = collections.features.planes();
     if planes.is_empty() {
-        return Err("The store has no features of what was collected, or they do not differ.".into());
+        return Err("The store has no features of the collected structures, or they do not differ.".into());
     }
     let columns = planes.len().min(3);
     let rows = planes.len().div_ceil(columns);
@@ -51,7 +51,7 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
         .filter(|origin| planes.iter().any(|plane| !plane.points(*origin).atoms.is_empty()))
         .collect();
     origins(&mut figure, &shown);
-    Ok(Drawn { figure, caption: caption(sample, &planes), numbers })
+    Ok(FigureContent { figure, caption: caption(collections, &planes), numbers })
 }
 
 impl Plane {
@@ -78,29 +78,29 @@ fn draw_plane(figure: &mut Figure, numbers: &mut Csv, plane: &Plane, place: Rect
     };
     let mut panel = Panel::new(place, axis(0), axis(1));
     for (origin, points) in both {
-        let look = look(origin);
-        let every = points.atoms.len().div_ceil(DRAWN).max(1);
+        let style = origin_style(origin);
+        let every = points.atoms.len().div_ceil(MAX_DRAWN).max(1);
         panel.dots(
             points.atoms.iter().step_by(every).copied(),
-            look.marker,
+            style.marker,
             0.7,
-            look.colour.faint(0.28),
+            style.colour.faint(0.28),
             None,
         );
         push(numbers, plane, origin, "atom", points.atoms.iter().map(|point| (0, *point)));
     }
     for (origin, lines) in &lines {
-        let look = look(*origin);
+        let style = origin_style(*origin);
         let closed = lines.iter().map(|line| line.iter().chain(line.first()).copied());
-        panel.rings(closed.clone(), None, Some(look.line));
+        panel.rings(closed.clone(), None, Some(style.line));
         let numbered =
             lines.iter().enumerate().flat_map(|(k, line)| line.iter().map(move |point| (k, *point)));
         push(numbers, plane, *origin, "contour", numbered);
     }
     for (origin, points) in both {
-        let look = look(origin);
+        let style = origin_style(origin);
         let edge = Some(Colour::WHITE.line(0.5));
-        panel.dots(points.centroids.iter().copied(), look.marker, 2.1, look.colour, edge);
+        panel.dots(points.centroids.iter().copied(), style.marker, 2.1, style.colour, edge);
         push(numbers, plane, origin, "centroid", points.centroids.iter().map(|point| (0, *point)));
     }
     let corner = [panel.x.low, panel.y.high];
@@ -110,9 +110,9 @@ fn draw_plane(figure: &mut Figure, numbers: &mut Csv, plane: &Plane, place: Rect
 }
 
 fn contours_of(atoms: &[[f64; 2]]) -> Vec<Vec<[f64; 2]>> {
-    let density = Some(atoms).filter(|atoms| atoms.len() >= LEAST);
+    let density = Some(atoms).filter(|atoms| atoms.len() >= MIN_ATOMS);
     let Some(density) = density.and_then(|atoms| PlaneDensity::of(atoms, GRID)) else { return Vec::new() };
-    density.level(atoms, INSIDE).map_or(Vec::new(), |level| contours(&density, level))
+    density.level(atoms, CONTOUR_SHARE).map_or(Vec::new(), |level| contours(&density, level))
 }
 
 fn push(
@@ -128,7 +128,7 @@ fn push(
     }
 }
 
-fn caption(sample: &Sample, planes: &[Plane]) -> String {
+fn caption(collections: &Collections, planes: &[Plane]) -> String {
     let of = |plane: &Plane| {
         let one = |origin: Origin| {
             let points = plane.points(origin);
@@ -139,16 +139,16 @@ fn caption(sample: &Sample, planes: &[Plane]) -> String {
         format!("{}: {}, {}", plane.element.symbol(), one(Origin::Biased), one(Origin::Control))
     };
     let all: Vec<_> = planes.iter().map(of).collect();
-    let elements = sample.biased.elements.len().max(sample.control.elements.len());
-    let chosen = match elements > ELEMENTS {
-        true => format!(" of the {ELEMENTS} elements with the most atoms"),
+    let elements = collections.biased.elements.len().max(collections.control.elements.len());
+    let chosen = match elements > MAX_ELEMENTS {
+        true => format!(" of the {MAX_ELEMENTS} elements with the most atoms"),
         false => String::new(),
     };
     format!(
-        "Features z of atoms{chosen}, projected onto their first two principal components, which are those of the atoms of both \
-         collections together, one projection for each element; in brackets, the share of the variance. Lines enclose the smallest \
-         regions that hold 95 % of the atoms of either collection, by a Gaussian kernel density of Scott’s width. Large marks are the \
-         means of structures, small ones atoms ({DRAWN} of either collection at most). From {} structures evenly spread over the \
+        "Features z of atoms{chosen}, projected onto the first two principal components of both collections together, one projection for \
+         each element; in brackets, the share of the variance. Lines enclose the smallest regions with 95 % of the atoms of either \
+         collection, by a Gaussian kernel density with Scott’s bandwidth. Large marks are means of structures, small ones atoms \
+         ({MAX_DRAWN} of either collection at most). From {} structures evenly spread over the \
          decision log: {}.",
         if planes.is_empty() { "no" } else { "up to 256 biased and 256 control" },
         all.join("; ")

@@ -1,24 +1,24 @@
-//! Volumes and composition of what was collected.
+//! Volumes and composition of the collected structures.
 
 use ::figures::{Axis, Figure, Panel, Rectangle, Scale};
 use analysis::{Histogram, even_edges};
 use wire::Origin;
 
-use super::super::sample::{Sample, Shape};
-use super::super::style::{WIDTH, axis, grouped, look, origins};
-use super::super::{Csv, Drawn};
+use super::super::collections::{Collections, StructureSize};
+use super::super::style::{WIDTH, axis, grouped, origin_style, origins};
+use super::super::{Csv, FigureContent};
 use super::{NOTHING_COLLECTED, draw_histograms, origins_of, push_histograms, row, share_axis};
 
-/// What is shown of a structure.
-type OfShape = fn(&Shape) -> Option<f64>;
+/// A quantity of a structure.
+type SizeQuantity = fn(&StructureSize) -> Option<f64>;
 
-/// Bins of a histogram.
+/// Number of bins of a histogram.
 const BINS: usize = 24;
-/// Elements that have bars of their own: those with the most atoms.
-const ELEMENTS: usize = 12;
+/// Largest number of elements with bars. Those with the most atoms are shown.
+const MAX_ELEMENTS: usize = 12;
 
-pub fn draw(sample: &Sample) -> Result<Drawn, String> {
-    let shown = origins_of(sample);
+pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
+    let shown = origins_of(collections);
     if shown.is_empty() {
         return Err(NOTHING_COLLECTED.into());
     }
@@ -26,44 +26,44 @@ pub fn draw(sample: &Sample) -> Result<Drawn, String> {
     let mut figure = Figure::new("space", description, WIDTH, 168.0);
     let mut numbers = Csv::new(&["panel", "origin", "low", "high", "number"]);
     let places = row(3, [40.0, 44.0, 10.0], 26.0, 106.0);
-    let panels: [(char, &str, OfShape); 2] = [
+    let panels: [(char, &str, SizeQuantity); 2] = [
         ('a', "V / V_{0}", |shape| Some(shape.relative_volume)),
         ('b', "volume (Å^{3} per atom)", |shape| shape.volume_per_atom),
     ];
     for ((letter, title, of), place) in panels.into_iter().zip(&places) {
-        draw_volumes(&mut figure, &mut numbers, sample, &shown, (letter, title, of), *place);
+        draw_volumes(&mut figure, &mut numbers, collections, &shown, (letter, title, of), *place);
     }
-    draw_elements(&mut figure, &mut numbers, sample, &shown, places[2]);
+    draw_elements(&mut figure, &mut numbers, collections, &shown, places[2]);
     origins(&mut figure, &shown);
     let of = |origin: &Origin| {
-        let (_, collection) = sample.both()[usize::from(*origin == Origin::Control)];
+        let (_, collection) = collections.both()[usize::from(*origin == Origin::Control)];
         let atoms: u64 = collection.elements.values().sum();
         let structures = grouped(collection.structures.seen());
         format!("{}: {structures} structures, {} atoms", origin.name(), grouped(atoms))
     };
     let both: Vec<_> = shown.iter().map(of).collect();
     let caption = format!(
-        "All structures that were collected, labelled or not. a, Volume by that of the seed structure. b, Volume by atoms, of \
-         structures that repeat in three directions. c, Share of the atoms by element{}. {}.",
-        match sample.biased.elements.len().max(sample.control.elements.len()) > ELEMENTS {
-            true => format!(", the {ELEMENTS} most frequent of them"),
+        "All collected structures, labelled or not. a, Volume relative to that of the seed structure. b, Volume per atom of \
+         structures that are periodic in three directions. c, Share of the atoms by element{}. {}.",
+        match collections.biased.elements.len().max(collections.control.elements.len()) > MAX_ELEMENTS {
+            true => format!(", the {MAX_ELEMENTS} most frequent of them"),
             false => String::new(),
         },
         both.join("; ")
     );
-    Ok(Drawn { figure, caption, numbers })
+    Ok(FigureContent { figure, caption, numbers })
 }
 
 fn draw_volumes(
     figure: &mut Figure,
     numbers: &mut Csv,
-    sample: &Sample,
+    collections: &Collections,
     shown: &[Origin],
-    (letter, title, of): (char, &str, OfShape),
+    (letter, title, of): (char, &str, SizeQuantity),
     place: Rectangle,
 ) {
     let values = |origin: &Origin| -> Vec<f64> {
-        let (_, collection) = sample.both()[usize::from(*origin == Origin::Control)];
+        let (_, collection) = collections.both()[usize::from(*origin == Origin::Control)];
         collection.structures.kept().filter_map(of).filter(|x| x.is_finite()).collect()
     };
     let all: Vec<_> = shown.iter().flat_map(values).collect();
@@ -86,13 +86,14 @@ fn draw_volumes(
 fn draw_elements(
     figure: &mut Figure,
     numbers: &mut Csv,
-    sample: &Sample,
+    collections: &Collections,
     shown: &[Origin],
     place: Rectangle,
 ) {
-    let mut elements: Vec<_> = sample.biased.elements.keys().chain(sample.control.elements.keys()).collect();
+    let mut elements: Vec<_> =
+        collections.biased.elements.keys().chain(collections.control.elements.keys()).collect();
     let of = |element: &atoms::Species, origin: Origin| {
-        let (_, collection) = sample.both()[usize::from(origin == Origin::Control)];
+        let (_, collection) = collections.both()[usize::from(origin == Origin::Control)];
         let all: u64 = collection.elements.values().sum();
         let number = collection.elements.get(element).copied().unwrap_or_default();
         (number, 100.0 * number as f64 / all.max(1) as f64)
@@ -108,7 +109,7 @@ fn draw_elements(
     }
     let number = |element: &atoms::Species| of(element, Origin::Biased).0 + of(element, Origin::Control).0;
     elements.sort_by_key(|element| (std::cmp::Reverse(number(element)), **element));
-    elements.truncate(ELEMENTS);
+    elements.truncate(MAX_ELEMENTS);
     let names: Vec<_> = elements.iter().map(|element| element.symbol().to_owned()).collect();
     let shares = elements.iter().flat_map(|element| shown.iter().map(|origin| of(element, *origin).1));
     let y = Axis::new("atoms (%)", Scale::Linear, 0.0, 1.08 * shares.fold(0.0, f64::max));
@@ -116,10 +117,10 @@ fn draw_elements(
     let width = 0.7 / shown.len() as f64;
     for (k, element) in elements.iter().enumerate() {
         for (n, origin) in shown.iter().enumerate() {
-            let (left, look) = (k as f64 + 0.15 + width * n as f64, look(*origin));
+            let (left, style) = (k as f64 + 0.15 + width * n as f64, origin_style(*origin));
             let (_, share) = of(element, *origin);
-            panel.bar([left, 0.0], [left + width, share], look.colour.faint(0.3));
-            panel.line([[left, 0.0], [left, share], [left + width, share], [left + width, 0.0]], look.line);
+            panel.bar([left, 0.0], [left + width, share], style.colour.faint(0.3));
+            panel.line([[left, 0.0], [left, share], [left + width, share], [left + width, 0.0]], style.line);
         }
     }
     panel.letter('c');

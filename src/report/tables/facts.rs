@@ -1,23 +1,23 @@
-//! What the campaign is: in numbers, by its settings, and where it comes from.
+//! Summary and provenance of the campaign.
 
 use std::collections::BTreeSet;
 
 use calm::CollectionRule;
 use serde_json::Value;
 
-use super::super::gathered::Gathered;
+use super::super::report_data::ReportData;
 use super::super::style::grouped;
 use super::settings::flatten;
 use super::{Table, text};
 
 /// The campaign in a few lines.
-pub fn summary(gathered: &Gathered) -> Table {
+pub fn summary(data: &ReportData) -> Table {
     let mut table = Table::new("summary", "The campaign in numbers.", &["", "value"]);
-    let status = &gathered.standing;
+    let status = &data.status;
     let mut row = |name: &str, value: String| table.rows.push(vec![text(name), text(value)]);
-    row("campaign", format!("{}, {} mode", gathered.campaign.id, gathered.campaign.mode));
+    row("campaign", format!("{}, {} mode", data.campaign.id, data.campaign.mode));
     let walks = |origin: &str| status.walks.iter().filter(|walk| walk.origin == origin).count() as u64;
-    let state = if status.finished { "has ended" } else { "is not over: numbers are those of the moment" };
+    let state = if status.finished { "has ended" } else { "is not over: numbers are current" };
     row("state", state.into());
     row("walks", format!("{} biased, {} control", grouped(walks("biased")), grouped(walks("control"))));
     let candidates = &status.candidates;
@@ -30,7 +30,7 @@ pub fn summary(gathered: &Gathered) -> Table {
     row(
         "label jobs",
         format!(
-            "{} labelled, {} failed, {} dropped, {} superseded, {} in work, {} waiting; {} labels excluded by hand",
+            "{} labelled, {} failed, {} dropped, {} superseded, {} leased, {} queued; {} labels excluded by hand",
             grouped(labels.labelled),
             grouped(labels.failed),
             grouped(labels.dropped),
@@ -40,14 +40,14 @@ pub fn summary(gathered: &Gathered) -> Table {
             grouped(labels.excluded)
         ),
     );
-    if let Some(found) = &gathered.labels {
-        let energies = found.learned.energies.summary();
+    if let Some(found) = &data.labels {
+        let energies = found.statistics.energies.summary();
         row("energy error", energies.line().unwrap_or_else(|| energies.offsets.note.clone()));
     }
     row("imported structures", grouped(status.imported));
     row("cost of labels", format!("{:.4} core-hours", status.budget.used.core_hours));
     let mut mixture = format!("version {}", status.mixture_version);
-    let training = gathered.values.get("training_frames");
+    let training = data.values.get("training_frames");
     let number = |key: &str| training.and_then(|training| training[key].as_f64());
     if let Some((median, share)) = number("median").zip(number("share_above_one")) {
         mixture +=
@@ -60,7 +60,7 @@ pub fn summary(gathered: &Gathered) -> Table {
     table
 }
 
-/// When a structure becomes a candidate, in words; `None` where the configuration does not say.
+/// The collection rule as text. `None` if the configuration has none.
 pub fn collection_rule(configuration: &Value) -> Option<String> {
     let rule = serde_json::from_value(configuration["collect"]["when"].clone()).ok()?;
     Some(match rule {
@@ -75,18 +75,18 @@ pub fn collection_rule(configuration: &Value) -> Option<String> {
     })
 }
 
-/// Versions, hashes, and where everything comes from.
-pub fn provenance(gathered: &Gathered) -> Table {
-    let mut table = Table::new("provenance", "Where it comes from.", &["", "value"]).whole();
+/// Versions, hashes and sources.
+pub fn provenance(data: &ReportData) -> Table {
+    let mut table = Table::new("provenance", "Provenance of the campaign.", &["", "value"]).whole();
     let mut row = |name: String, value: String| table.rows.push(vec![text(name), text(value)]);
-    let campaign = &gathered.campaign;
+    let campaign = &data.campaign;
     row("campaign".into(), campaign.id.to_string());
-    if let Some(begun) = gathered.begun {
-        row("begun".into(), date(begun));
+    if let Some(begun) = data.started {
+        row("started".into(), date(begun));
     }
-    row("begun by".into(), format!("calmwalk {}", campaign.program_version));
+    row("started by".into(), format!("calmwalk {}", campaign.program_version));
     row("report by".into(), format!("calmwalk {}", env!("CARGO_PKG_VERSION")));
-    if let Some(labels) = &gathered.labels {
+    if let Some(labels) = &data.labels {
         row("label protocol".into(), labels.protocol.name.clone());
         row("protocol hash (BLAKE3)".into(), labels.protocol.hash.to_string());
         let mut pairs = Vec::new();
@@ -95,26 +95,25 @@ pub fn provenance(gathered: &Gathered) -> Table {
             .into_iter()
             .for_each(|(key, value)| value.into_iter().for_each(|value| row(key.clone(), value)));
     }
-    if let Some(files) = gathered.configuration["files"].as_object() {
+    if let Some(files) = data.configuration["files"].as_object() {
         for (key, hash) in files {
             row(format!("file {key} (BLAKE3)"), hash.as_str().unwrap_or_default().to_owned());
         }
     }
-    let sources: BTreeSet<_> = gathered.seeds.iter().map(|seed| seed.source.as_str()).collect();
-    let seeds = gathered.seeds.len() as u64;
+    let sources: BTreeSet<_> = data.seeds.iter().map(|seed| seed.source.as_str()).collect();
+    let seeds = data.seeds.len() as u64;
     row(
         "seed structures".into(),
         format!("{} of {}", grouped(seeds), sources.into_iter().collect::<Vec<_>>().join(", ")),
     );
-    let hosts: BTreeSet<_> =
-        gathered.standing.processes.iter().map(|process| process.host.as_str()).collect();
+    let hosts: BTreeSet<_> = data.status.processes.iter().map(|process| process.host.as_str()).collect();
     if !hosts.is_empty() {
         row("hosts".into(), hosts.into_iter().collect::<Vec<_>>().join(", "));
     }
     table
 }
 
-/// ms since 1970 as a date, UTC (the calendar of Howard Hinnant's `civil_from_days`).
+/// Formats ms since 1970 as a date, UTC (with Howard Hinnant's `civil_from_days`).
 fn date(milliseconds: i64) -> String {
     let minutes = milliseconds.div_euclid(60_000);
     let (days, minute) = (minutes.div_euclid(1440), minutes.rem_euclid(1440));

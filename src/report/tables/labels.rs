@@ -1,17 +1,17 @@
-//! Force errors by grade, failures, and what has no label because of them.
+//! Force errors by grade, failures, and unlabelled structures.
 
 use analysis::ForceErrors;
 use store::{FailureCount, Range, Unlabelled};
 
 use super::{Cell, Table, count, percent, real, text};
-use crate::learned::{LARGE, Learned};
+use crate::label_statistics::{LARGE_FORCE_ERROR, LabelStatistics};
 use crate::output::range;
 
-/// How grades and errors go together.
-pub fn correlations(learned: &Learned) -> Table {
+/// Correlation of grades and errors.
+pub fn correlations(statistics: &LabelStatistics) -> Table {
     let caption = format!(
         "Force error |F_{{model}} − F_{{label}}| and the grades under the original mixture: mean error, Spearman’s ρ between grade and \
-         error, and ROC-AUC of the grade as a test for errors above {LARGE} eV Å^{{−1}}."
+         error, and ROC-AUC of the grade as a test for errors above {LARGE_FORCE_ERROR} eV Å^{{−1}}."
     );
     let titles = [
         "",
@@ -27,7 +27,8 @@ pub fn correlations(learned: &Learned) -> Table {
         "sampled atoms",
     ];
     let mut table = Table::new("correlations", &caption, &titles);
-    for (name, grades) in [("all", &learned.all), ("biased", &learned.biased), ("control", &learned.control)]
+    for (name, grades) in
+        [("all", &statistics.all), ("biased", &statistics.biased), ("control", &statistics.control)]
     {
         let (gamma, nbr) = (&grades.gamma, &grades.gamma_nbr);
         if gamma.atoms() > 0 {
@@ -49,12 +50,12 @@ pub fn correlations(learned: &Learned) -> Table {
     table
 }
 
-/// The table of quantiles by one of the grades, as the paper's.
+/// The table of quantiles by one of the grades, as in the paper.
 pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) -> Table {
     let caption = format!(
         "Force errors of all labelled atoms (n = {}) by {grade} under the original mixture: percentiles in eV Å^{{−1}}, the share of atoms \
-         in each bin, and the share with an error above {LARGE} eV Å^{{−1}}. Without label, atoms of structures whose labels finally \
-         failed; possible, that share if every one of them were below or above.",
+         in each bin, and the share with an error above {LARGE_FORCE_ERROR} eV Å^{{−1}}. Without label: atoms of structures whose labels failed \
+         for good. Possible: the range of that share if all of them were below or above.",
         super::super::style::grouped(errors.atoms())
     );
     let titles = [
@@ -88,16 +89,16 @@ pub fn quantiles(name: &'static str, grade: &'static str, errors: &ForceErrors) 
     table
 }
 
-/// What was taken out of energies before errors are shown.
-pub fn energy_offsets(learned: &Learned) -> Table {
-    let offsets = learned.energies.summary().offsets;
+/// Element offsets that are removed from energies before errors are shown.
+pub fn energy_offsets(statistics: &LabelStatistics) -> Table {
+    let offsets = statistics.energies.summary().offsets;
     let caption = format!(
-        "Labels and the potential have other zeros of energy: E_{{label}} − E_{{model}} of an atom of each element, by least squares over {} \
-         labelled structures ({} more are too far from the others). Energy errors are without these offsets. Where elements are not told \
-         apart by the labelled compositions, only sums of their offsets count.",
+        "Offsets between the energy references of labels and potential: E_{{label}} − E_{{model}} per atom of each element, by least squares \
+         over {} labelled structures ({} outliers excluded). Energy errors exclude these offsets. Where the labelled compositions do not \
+         determine the offsets separately, only their sums are meaningful.",
         offsets.structures, offsets.left_out
     );
-    let mut table = Table::new("energy-offsets", &caption, &["element", "offset (eV)", "told apart"]);
+    let mut table = Table::new("energy-offsets", &caption, &["element", "offset (eV)", "separate"]);
     for offset in offsets.elements {
         let separate = if offset.separate { "yes" } else { "no" };
         table.rows.push(vec![text(offset.element), real(offset.offset, 4), text(separate)]);
@@ -107,10 +108,10 @@ pub fn energy_offsets(learned: &Learned) -> Table {
 
 /// Failures by class.
 pub fn failures(failures: &[FailureCount]) -> Table {
-    let caption = "Label jobs that met a failure, by its class: those that have their labels all the same, those that were given up, and \
-                   those that are not done.";
+    let caption = "Label jobs with a failure, by its class: those labelled later, those that failed for good, and those that are \
+                   unfinished.";
     let mut table =
-        Table::new("failures", caption, &["class", "jobs", "labelled later", "given up", "unfinished"]);
+        Table::new("failures", caption, &["class", "jobs", "labelled later", "failed", "unfinished"]);
     for FailureCount { class, labelled, given_up, unfinished } in failures {
         let all = labelled + given_up + unfinished;
         let counts = [all, *labelled, *given_up, *unfinished].map(count);
@@ -119,10 +120,10 @@ pub fn failures(failures: &[FailureCount]) -> Table {
     table
 }
 
-/// What part of the collected space has no label because labels failed.
+/// The part of the collected space without labels because of failures.
 pub fn unlabelled(unlabelled: &[Unlabelled]) -> Table {
-    let caption = "The part of what was collected that has no label because all attempts failed, by seed structure: ranges of the largest \
-                   γ under the original mixture and of V/V_{0}, beside those of what is labelled.";
+    let caption = "Collected structures without a label because all attempts failed, by seed structure: ranges of the largest γ under the \
+                   original mixture and of V/V_{0}, compared with those of labelled structures.";
     let titles = [
         "seed structure",
         "formula",
@@ -141,15 +142,15 @@ pub fn unlabelled(unlabelled: &[Unlabelled]) -> Table {
     for part in unlabelled {
         let mut row =
             vec![text(&part.seed_structure), text(&part.formula), count(part.failed), count(part.labelled)];
-        row.extend(ends(&part.gamma, 2));
-        row.extend(ends(&part.gamma_labelled, 2));
-        row.extend(ends(&part.relative_volume, 3));
-        row.extend(ends(&part.relative_volume_labelled, 3));
+        row.extend(range_cells(&part.gamma, 2));
+        row.extend(range_cells(&part.gamma_labelled, 2));
+        row.extend(range_cells(&part.relative_volume, 3));
+        row.extend(range_cells(&part.relative_volume_labelled, 3));
         table.rows.push(row);
     }
     table
 }
 
-fn ends(range: &Range, decimals: usize) -> [Cell; 2] {
+fn range_cells(range: &Range, decimals: usize) -> [Cell; 2] {
     [range.low, range.high].map(|end| real(end, decimals))
 }

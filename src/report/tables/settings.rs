@@ -2,10 +2,10 @@
 
 use serde_json::Value;
 
-use super::super::gathered::Gathered;
+use super::super::report_data::ReportData;
 use super::{Cell, Table, text};
 
-/// Sections in the order of the configuration file; the table puts any other section behind them.
+/// Sections in the order of the configuration file. Other sections follow.
 const SECTIONS: [&str; 11] = [
     "campaign",
     "potential",
@@ -19,15 +19,15 @@ const SECTIONS: [&str; 11] = [
     "run",
     "notify",
 ];
-/// Hashes of files and the list of seed structures have tables of their own.
-const ELSEWHERE: [&str; 2] = ["files", "seeds"];
+/// Hashes of files and the list of seed structures have their own tables.
+const EXCLUDED_SECTIONS: [&str; 2] = ["files", "seeds"];
 
-/// The table: a heading a section, then its keys. A key without a value is shown as not set.
-pub fn settings(gathered: &Gathered) -> Table {
+/// The table: a heading for each section, then its keys. A key without a value is shown as not set.
+pub fn settings(data: &ReportData) -> Table {
     let caption = "The configuration in force, with every default filled in. Units are those of the documentation: eV, Å, fs, K. \
                    Files are named by their BLAKE3 hashes under Versions and provenance.";
     let mut table = Table::new("settings", caption, &["key", "value"]).whole();
-    for (section, pairs) in sections(&gathered.configuration) {
+    for (section, pairs) in sections(&data.configuration) {
         table.rows.push(vec![text(format!("[{section}]"))]);
         table.rows.extend(pairs.into_iter().map(|(key, value)| {
             let name = key.strip_prefix(&format!("{section}.")).unwrap_or(&key).to_owned();
@@ -42,12 +42,12 @@ pub fn settings(gathered: &Gathered) -> Table {
 /// A full key and its value; `None` where the key is not set.
 type Setting = (String, Option<String>);
 
-/// Each section that has keys, in the order of [`SECTIONS`]. Keys of no section are those of `campaign`.
+/// Each section that has keys, in the order of [`SECTIONS`]. Keys outside any section belong to `campaign`.
 fn sections(configuration: &Value) -> Vec<(String, Vec<Setting>)> {
     let mut found: Vec<(String, Vec<Setting>)> =
         SECTIONS.iter().map(|name| ((*name).to_owned(), Vec::new())).collect();
     for (name, value) in configuration.as_object().into_iter().flatten() {
-        if ELSEWHERE.contains(&name.as_str()) {
+        if EXCLUDED_SECTIONS.contains(&name.as_str()) {
             continue;
         }
         let section = if value.is_object() { name.as_str() } else { "campaign" };
@@ -55,7 +55,7 @@ fn sections(configuration: &Value) -> Vec<(String, Vec<Setting>)> {
             found.push((section.to_owned(), Vec::new()));
             found.len() - 1
         });
-        // The hash of a file stands in its place.
+        // Show the hash in place of a file.
         let mut pairs = Vec::new();
         flatten(name, value, &mut pairs);
         let hash = |key: &str| configuration["files"][key].as_str().map(str::to_owned);

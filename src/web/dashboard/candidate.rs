@@ -1,4 +1,4 @@
-//! One candidate or imported structure: its story, its atoms, and files of them.
+//! One candidate or imported structure: its details, its atoms, and files to download.
 
 use atoms::Structure;
 use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, write_frame};
@@ -11,27 +11,27 @@ use store::{Standing, Store, StoreError, StoredCandidate};
 use wire::ContentHash;
 
 use super::Dashboard;
-use super::answer::{Answer, Refusal, json};
-use crate::story;
+use super::response::{ApiError, ApiResult, json};
+use crate::candidate_details;
 
-/// What may be shown of it.
-struct Found {
+/// A structure with its candidate.
+struct StructureRecord {
     /// Its name.
     id: String,
     structure: Structure,
     content: ContentHash,
-    /// None of imported structures.
+    /// `None` for imported structures.
     candidate: Option<StoredCandidate>,
 }
 
 /// `GET /api/candidates/ID`: what `calmwalk explain ID --json` prints.
-pub async fn story(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> Answer {
-    json(&story::read(&dashboard.store, &id).await?)
+pub async fn details(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> ApiResult {
+    json(&candidate_details::read(&dashboard.store, &id).await?)
 }
 
 /// `GET /api/candidates/ID/structure`: species, positions and cell (Å).
-pub async fn structure(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> Answer {
-    let Found { id, structure, .. } = find(&dashboard.store, &id).await?;
+pub async fn structure(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> ApiResult {
+    let StructureRecord { id, structure, .. } = find(&dashboard.store, &id).await?;
     let species: Vec<_> = structure.species.iter().map(|species| species.symbol()).collect();
     json(&json!({
         "id": id, "species": species, "positions": structure.positions, "cell": structure.cell.0,
@@ -39,26 +39,27 @@ pub async fn structure(State(dashboard): State<Dashboard>, Path(id): Path<String
     }))
 }
 
-/// `GET /api/candidates/ID/structure.extxyz`: with γ and γ_nbr of the original mixture, and the label if there is one.
-pub async fn extxyz(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> Answer {
+/// `GET /api/candidates/ID/structure.extxyz`: with γ and γ_nbr of the original mixture, and the label if there is
+/// one.
+pub async fn extxyz(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> ApiResult {
     let store = &dashboard.store;
     let found = find(store, &id).await?;
     let id = found.id.clone();
     let mut bytes = Vec::new();
     write_frame(&mut bytes, &frame(store, found).await?).map_err(unwritable)?;
-    Ok(file(&format!("{id}.extxyz"), bytes))
+    Ok(attachment(&format!("{id}.extxyz"), bytes))
 }
 
 /// `GET /api/candidates/ID/structure.poscar`
-pub async fn poscar(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> Answer {
-    let Found { id, structure, .. } = find(&dashboard.store, &id).await?;
+pub async fn poscar(State(dashboard): State<Dashboard>, Path(id): Path<String>) -> ApiResult {
+    let StructureRecord { id, structure, .. } = find(&dashboard.store, &id).await?;
     let mut bytes = Vec::new();
     write_poscar(&mut bytes, &structure, &id).map_err(unwritable)?;
-    Ok(file(&format!("{id}.poscar"), bytes))
+    Ok(attachment(&format!("{id}.poscar"), bytes))
 }
 
-async fn find(store: &Store, id: &str) -> Result<Found, Refusal> {
-    if let Some(number) = id.strip_prefix(story::IMPORT) {
+async fn find(store: &Store, id: &str) -> Result<StructureRecord, ApiError> {
+    if let Some(number) = id.strip_prefix(candidate_details::IMPORT_PREFIX) {
         let found = match number.parse() {
             Ok(number) => store.imported_structure(number).await?,
             Err(_) => None,
@@ -66,17 +67,17 @@ async fn find(store: &Store, id: &str) -> Result<Found, Refusal> {
         let imported = store.imported_structures().await?;
         let found = found.ok_or(StoreError::UnknownImport { id: id.to_owned(), imported })?;
         let (structure, content) = (found.structure, found.content);
-        return Ok(Found { id: id.to_owned(), structure, content, candidate: None });
+        return Ok(StructureRecord { id: id.to_owned(), structure, content, candidate: None });
     }
     let named = store.find_candidate(id).await?;
-    let gone = || Refusal::new(StatusCode::NOT_FOUND, format!("{} is not there", named.candidate));
-    let candidate = store.candidate(&named.candidate).await?.ok_or_else(gone)?;
+    let missing = || ApiError::new(StatusCode::NOT_FOUND, format!("{} is missing", named.candidate));
+    let candidate = store.candidate(&named.candidate).await?.ok_or_else(missing)?;
     let view = candidate.block.view();
     let (structure, content) = (view.structure(), view.id().content);
-    Ok(Found { id: named.candidate, structure, content, candidate: Some(candidate) })
+    Ok(StructureRecord { id: named.candidate, structure, content, candidate: Some(candidate) })
 }
 
-async fn frame(store: &Store, found: Found) -> Result<Frame, StoreError> {
+async fn frame(store: &Store, found: StructureRecord) -> Result<Frame, StoreError> {
     let mut frame = Frame::from(found.structure);
     let labels = store.labels_of(found.content).await?;
     if let Some(labelled) = labels.into_iter().find(|label| label.record.standing == Standing::Label) {
@@ -98,13 +99,13 @@ async fn frame(store: &Store, found: Found) -> Result<Frame, StoreError> {
     Ok(frame)
 }
 
-/// To be kept under this name, which is that of a candidate: no quotes, no line breaks.
-fn file(name: &str, bytes: Vec<u8>) -> axum::response::Response {
-    let kept = format!("attachment; filename=\"{name}\"");
+/// A file to download. Names of candidates have no quotes or line breaks.
+fn attachment(name: &str, bytes: Vec<u8>) -> axum::response::Response {
+    let disposition = format!("attachment; filename=\"{name}\"");
     let kind = "text/plain; charset=utf-8".to_owned();
-    ([(header::CONTENT_TYPE, kind), (header::CONTENT_DISPOSITION, kept)], bytes).into_response()
+    ([(header::CONTENT_TYPE, kind), (header::CONTENT_DISPOSITION, disposition)], bytes).into_response()
 }
 
-fn unwritable(error: impl ToString) -> Refusal {
-    Refusal::new(StatusCode::UNPROCESSABLE_ENTITY, error)
+fn unwritable(error: impl ToString) -> ApiError {
+    ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, error)
 }

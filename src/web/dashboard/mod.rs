@@ -1,15 +1,15 @@
-//! The dashboard: pages for a browser, and the numbers that they show as JSON. docs/dashboard.md describes it.
+//! The dashboard: pages for a browser, and a JSON API. docs/dashboard.md describes it.
 
 mod actions;
-mod answer;
+mod cache;
 mod candidate;
-mod errors;
-mod files;
-mod kept;
-mod live;
+mod candidate_table;
+mod force_errors;
 mod mixture;
-mod samples;
-mod table;
+mod response;
+mod sse;
+mod static_files;
+mod time_series;
 
 use axum::Router;
 use axum::extract::{Path, State};
@@ -17,61 +17,61 @@ use axum::middleware;
 use axum::routing::{get, post};
 use store::Store;
 
-pub use self::actions::Acting;
-use self::answer::{Answer, json};
-use self::kept::Kept;
-use self::live::Live;
-use super::guard;
-use crate::mixture::Original;
+pub use self::actions::Mutations;
+use self::cache::CachedResponse;
+use self::response::{ApiResult, json};
+use self::sse::StatusFeed;
+use super::security;
+use crate::mixture_status::InitialMixture;
 
-/// Candidates of a walk that are shown as its trace, at most.
-const TRACE: u32 = 2000;
+/// Largest number of candidates in the trace of a walk.
+const MAX_TRACE_POINTS: u32 = 2000;
 
-/// What every request may need. Clones share it.
+/// State of the request handlers. Clones share it.
 #[derive(Clone, Debug)]
 pub struct Dashboard {
-    /// To be read only, through connections of its own.
+    /// Read-only, with separate connections.
     store: Store,
-    live: Live,
-    errors: Kept,
-    mixture: Kept,
-    /// Where the campaign is run here, the mixture that it began with.
-    original: Option<Original>,
-    /// None where nothing may be changed.
-    acting: Option<Acting>,
+    feed: StatusFeed,
+    errors: CachedResponse,
+    mixture: CachedResponse,
+    /// The initial mixture, if this process runs the campaign.
+    initial: Option<InitialMixture>,
+    /// `None` if nothing may be changed.
+    mutations: Option<Mutations>,
 }
 
 impl Dashboard {
-    /// Shows what this store has, and begins to look at it every few seconds.
-    pub fn new(store: Store, acting: Option<Acting>, original: Option<Original>) -> Self {
-        let (errors, mixture) = (Kept::default(), Kept::default());
-        Self { live: Live::begin(store.clone()), errors, mixture, original, store, acting }
+    /// Shows the content of `store` and polls it every few seconds.
+    pub fn new(store: Store, mutations: Option<Mutations>, initial: Option<InitialMixture>) -> Self {
+        let (errors, mixture) = (CachedResponse::default(), CachedResponse::default());
+        Self { feed: StatusFeed::start(store.clone()), errors, mixture, initial, store, mutations }
     }
 
-    /// Its pages.
+    /// Routes of the dashboard.
     pub fn router(self) -> Router {
         Router::new()
-            .route("/", get(files::index))
-            .route("/pages/{name}", get(files::file))
-            .route("/api/events", get(live::events))
-            .route("/api/samples", get(live::samples))
-            .route("/api/candidates", get(table::page))
-            .route("/api/candidates/{id}", get(candidate::story))
+            .route("/", get(static_files::index))
+            .route("/pages/{name}", get(static_files::file))
+            .route("/api/events", get(sse::events))
+            .route("/api/samples", get(sse::samples))
+            .route("/api/candidates", get(candidate_table::page))
+            .route("/api/candidates/{id}", get(candidate::details))
             .route("/api/candidates/{id}/structure", get(candidate::structure))
             .route("/api/candidates/{id}/structure.extxyz", get(candidate::extxyz))
             .route("/api/candidates/{id}/structure.poscar", get(candidate::poscar))
-            .route("/api/candidates/{id}/{action}", post(actions::act))
-            .route("/api/actions", get(actions::allowed))
-            .route("/api/errors", get(errors::errors))
+            .route("/api/candidates/{id}/{action}", post(actions::act_on_job))
+            .route("/api/actions", get(actions::action_status))
+            .route("/api/errors", get(force_errors::force_errors))
             .route("/api/mixture", get(mixture::mixture))
             .route("/api/walks/{walk}/candidates", get(trace))
             .route("/api/walks/{walk}/{action}", post(actions::act_on_walks))
-            .fallback(answer::nothing_there)
-            .layer(middleware::map_response(guard::shut_in))
+            .fallback(response::not_found)
+            .layer(middleware::map_response(security::add_security_headers))
             .with_state(self)
     }
 }
 
-async fn trace(State(dashboard): State<Dashboard>, Path(walk): Path<u32>) -> Answer {
-    json(&dashboard.store.list_walk(walk, TRACE).await?)
+async fn trace(State(dashboard): State<Dashboard>, Path(walk): Path<u32>) -> ApiResult {
+    json(&dashboard.store.list_walk(walk, MAX_TRACE_POINTS).await?)
 }

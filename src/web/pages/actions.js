@@ -1,62 +1,62 @@
-// What may be changed from here: asked again before it is done, and with the token that `calmwalk run` has printed.
+// Actions on jobs and walks. Each asks for confirmation and for the token that `calmwalk run` has printed.
 
-import { act, ask, ofCandidate } from "./api.js";
+import { candidatePath, fetchJson, postAction } from "./api.js";
 import { element } from "./dom.js";
 import { shortName } from "./format.js";
 
-/** The actions by name: what they say, when they may be done, and whether they take something away. */
+/** Actions by name: title, states of jobs they apply to, question, and whether they are destructive. */
 const ACTIONS = {
-  prioritise: { title: "Give another priority …", states: ["queued", "leased"] },
-  retry: { title: "Put back into the queue …", states: ["failed", "dropped"], question: "It is labelled again, past any guard, with all its attempts before it." },
-  drop: { title: "Drop …", states: ["queued", "leased", "failed"], question: "It will not be labelled, and not exported.", isGrave: true },
+  prioritise: { title: "Change priority …", states: ["queued", "leased"] },
+  retry: { title: "Retry …", states: ["failed", "dropped"], question: "The structure is queued again with a full number of attempts. Guards do not apply." },
+  drop: { title: "Drop …", states: ["queued", "leased", "failed"], question: "The structure will be neither labelled nor exported.", isGrave: true },
 };
 
-// The address that was printed ends with it; it stays out of the address from then on.
+// The printed address ends with the token. It is removed from the address bar.
 const given = location.hash.match(/^#token=([0-9a-f]+)$/);
 if (given) {
   sessionStorage.setItem("token", given[1]);
   history.replaceState(null, "", location.pathname);
 }
 
-/** Whether anything may be changed here. */
-const possible = ask("/api/actions").then((allowed) => allowed.possible, () => false);
+/** Whether this dashboard allows actions. */
+const possible = fetchJson("/api/actions").then((allowed) => allowed.possible, () => false);
 
-/** Buttons for what may be done with a job; `done` is called when something was. */
+/** Buttons for the actions on a job. `done` is called after an action. */
 export function buttons(job, done) {
   const place = element("p", { class: "actions" });
   possible.then((isPossible) => {
     if (!isPossible) return;
     const allowed = Object.entries(ACTIONS).filter(([, action]) => action.states.includes(job.state));
     place.append(...allowed.map(([name, { title, question, isGrave }]) => {
-      const asked = { title, question, isGrave, about: shortName(job.candidate), path: ofCandidate(job.candidate, `/${name}`),
+      const action = { title, question, isGrave, about: shortName(job.candidate), path: candidatePath(job.candidate, `/${name}`),
         priority: name === "prioritise" ? job.priority : null };
-      return element("button", { type: "button", class: isGrave && "grave", onclick: () => confirm(asked, done) }, title);
+      return element("button", { type: "button", class: isGrave && "grave", onclick: () => confirm(action, done) }, title);
     }));
   });
   return place;
 }
 
-/** Whether walks can be paused here, and resumed. */
+/** Whether walks can be paused and resumed here. */
 export const canPause = () => possible;
 
-/** A button that pauses a walk or lets it go on; without a walk, all of them. */
+/** A button that pauses or resumes a walk, or all walks if `walk` is null. */
 export function pauseButton(walk, isPaused, done) {
   const title = isPaused ? "Resume" : "Pause";
-  const about = walk == null ? "all walks that have more steps to make" : `walk ${walk}`;
-  const question = isPaused ? "It gets turns again."
-    : "It gets no turn after the one in hand, until it is resumed; in reproducible mode the other walks of its round wait for it.";
-  const asked = { title, about, question, path: `/api/walks/${walk ?? "all"}/${isPaused ? "resume" : "pause"}` };
+  const about = walk == null ? "all unfinished walks" : `walk ${walk}`;
+  const question = isPaused ? "It gets assignments again."
+    : "It finishes its current assignment and gets no other until it is resumed. In reproducible mode the other walks of its round wait for it.";
+  const action = { title, about, question, path: `/api/walks/${walk ?? "all"}/${isPaused ? "resume" : "pause"}` };
   const keep = walk == null ? `${title} all` : `walk ${walk}`;
-  // Another button has its place then.
+  // Another button has replaced this one.
   const changed = () => {
     done();
     document.querySelector(`[data-keep="${keep}"]`)?.focus();
   };
   return element("button", { type: "button", class: "small", "aria-label": `${title} ${about} …`, "data-keep": keep,
-    onclick: () => confirm(asked, changed) }, walk == null ? `${title} all …` : `${title} …`);
+    onclick: () => confirm(action, changed) }, walk == null ? `${title} all …` : `${title} …`);
 }
 
-/** Asks whether it is meant, and for the token. */
+/** Asks for confirmation and for the token. */
 function confirm({ title, about, question, isGrave, path, priority: before }, done) {
   const wrong = element("p", { class: "wrong", role: "alert" });
   const token = element("input", { type: "password", name: "token", autocomplete: "off", required: true, value: sessionStorage.getItem("token") ?? "" });
@@ -64,7 +64,7 @@ function confirm({ title, about, question, isGrave, path, priority: before }, do
   const submit = async (event) => {
     event.preventDefault();
     try {
-      await act(path, token.value, priority ? { priority: priority.valueAsNumber } : {});
+      await postAction(path, token.value, priority ? { priority: priority.valueAsNumber } : {});
       sessionStorage.setItem("token", token.value);
       dialog.close();
       done();
@@ -72,13 +72,13 @@ function confirm({ title, about, question, isGrave, path, priority: before }, do
       wrong.textContent = error.message;
     }
   };
-  const dialog = element("dialog", { "aria-labelledby": "asked", onclose: () => dialog.remove() },
-    element("form", { onsubmit: submit }, element("h2", { id: "asked" }, `${title.replace(" …", "")}: ${about}`),
+  const dialog = element("dialog", { "aria-labelledby": "action-title", onclose: () => dialog.remove() },
+    element("form", { onsubmit: submit }, element("h2", { id: "action-title" }, `${title.replace(" …", "")}: ${about}`),
       question && element("p", {}, question),
-      priority && element("label", {}, "priority, higher first ", priority),
-      element("label", {}, "token that calmwalk run has printed ", token), wrong,
-      element("p", { class: "actions" }, element("button", { class: isGrave && "grave" }, "Do it"),
-        element("button", { type: "button", onclick: () => dialog.close() }, "Leave it"))));
+      priority && element("label", {}, "priority (higher first) ", priority),
+      element("label", {}, "token printed by calmwalk run ", token), wrong,
+      element("p", { class: "actions" }, element("button", { class: isGrave && "grave" }, "Confirm"),
+        element("button", { type: "button", onclick: () => dialog.close() }, "Cancel"))));
   document.body.append(dialog);
   dialog.showModal();
 }

@@ -1,60 +1,60 @@
-// What this page asks the program for.
+// Requests to the program.
 
-/** Between two questions for what is being reckoned, ms. */
-const PAUSE = 500;
+/** Interval between requests for a result that is being computed, ms. */
+const POLL_INTERVAL = 500;
 
-/** The answer as JSON; throws an Error that says why there is none. */
-export async function ask(path, signal) {
-  return answered(await fetch(path, { signal, cache: "no-store" }));
+/** Returns the response as JSON. Throws an Error with the message of a failure. */
+export async function fetchJson(path, signal) {
+  return parseResponse(await fetch(path, { signal, cache: "no-store" }));
 }
 
-/** The same of what takes long to be reckoned: asks until it is there. */
-export async function askUntilReckoned(path, signal) {
+/** Requests a result that takes long to compute, until it is ready. */
+export async function fetchComputed(path, signal) {
   for (;;) {
-    const found = await ask(path, signal);
+    const found = await fetchJson(path, signal);
     if (!found.reckoning) return found;
-    await new Promise((resolve) => setTimeout(resolve, PAUSE));
+    await new Promise((resolve) => setTimeout(resolve, POLL_INTERVAL));
     signal?.throwIfAborted();
   }
 }
 
-/** Changes something, which has this path. */
-export async function act(path, token, what) {
+/** Performs the action at this path. */
+export async function postAction(path, token, what) {
   const headers = { "content-type": "application/json", "x-calmwalk-token": token };
-  return answered(await fetch(path, { method: "POST", headers, body: JSON.stringify(what) }));
+  return parseResponse(await fetch(path, { method: "POST", headers, body: JSON.stringify(what) }));
 }
 
-async function answered(response) {
+async function parseResponse(response) {
   const found = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Error(found.error ?? `the program answers ${response.status}`);
+  if (!response.ok) throw new Error(found.error ?? `the program responded with status ${response.status}`);
   return found;
 }
 
-/** The path of a candidate's own things. */
-export function ofCandidate(id, what = "") {
+/** Path of a candidate, or of something below it. */
+export function candidatePath(id, what = "") {
   return `/api/candidates/${encodeURIComponent(id)}${what}`;
 }
 
 const listeners = new Set();
-let newest = null;
+let latest = null;
 
-/** Calls `hear` with the newest news and with all that come, until the signal. */
-export function listen(hear, signal) {
-  listeners.add(hear);
-  signal.addEventListener("abort", () => listeners.delete(hear));
-  if (newest) hear(newest);
+/** Calls `listener` with the latest update and all that follow, until the signal aborts. */
+export function listen(listener, signal) {
+  listeners.add(listener);
+  signal.addEventListener("abort", () => listeners.delete(listener));
+  if (latest) listener(latest);
 }
 
-/** Begins to listen to the program; `tell` hears how the connection is, and with news the campaign's status. */
-export function connect(tell) {
+/** Connects to the event stream. `onState` receives the state of the connection and, with updates, the campaign's status. */
+export function connect(onState) {
   const source = new EventSource("/api/events");
-  source.onopen = () => tell("live");
-  source.onerror = () => tell("lost");
+  source.onopen = () => onState("live");
+  source.onerror = () => onState("lost");
   source.onmessage = (event) => {
-    const news = JSON.parse(event.data);
-    tell(news.error ? "blind" : "live", news.error, news.status);
-    if (news.error) return;
-    newest = news;
-    listeners.forEach((hear) => hear(news));
+    const update = JSON.parse(event.data);
+    onState(update.error ? "unreachable" : "live", update.error, update.status);
+    if (update.error) return;
+    latest = update;
+    listeners.forEach((listener) => listener(update));
   };
 }

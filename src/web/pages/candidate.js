@@ -1,7 +1,7 @@
-// The story of one candidate: what `calmwalk explain` tells, with its atoms in space.
+// Details of one candidate, as in `calmwalk explain`, with a view of its atoms.
 
 import { buttons } from "./actions.js";
-import { ask, ofCandidate } from "./api.js";
+import { candidatePath, fetchJson } from "./api.js";
 import { DASHES, LINES } from "./colours.js";
 import { element, facts, section, state, table } from "./dom.js";
 import { decimals, digits, duration, percent, shortName, time, whole } from "./format.js";
@@ -10,30 +10,30 @@ import { view } from "./structure.js";
 
 export const TITLE = "Candidate";
 
-/** Why no further α was tried. */
+/** Why the search for α ended. */
 const ENDS = {
   maximum_below_target: "it brought γ_max below the target",
-  inflated: "no α sufficed, the inflation did",
-  inflation_exhausted: "no α sufficed, and the bounded inflation did not either",
-  count_below_limit: "it left few enough atoms above",
-  fallback_maximum: "no α left few enough atoms above, this one brought γ_max below the target",
-  fallback_last: "no α sufficed, the last was taken",
+  inflated: "no α sufficed, but the inflation did",
+  inflation_exhausted: "neither an α nor the bounded inflation sufficed",
+  count_below_limit: "it left few enough atoms above the threshold",
+  fallback_maximum: "no α left few enough atoms above the threshold; this one brought γ_max below the target",
+  fallback_last: "no α sufficed; the last one was used",
 };
 
 export async function show(content, address, signal) {
   const id = decodeURIComponent(address);
-  const [story, structure] = await Promise.all([ask(ofCandidate(id), signal), ask(ofCandidate(id, "/structure"), signal)]);
-  content.replaceChildren(element("h1", {}, shortName(story.id)), head(story));
-  const { found, grades, decision } = story;
-  // The button that was pressed is gone.
-  const again = () => show(content, address, signal).then(() => content.focus());
-  content.append(section("Structure", about(story), downloads(story), view(structure, grades?.atoms, story.labels)));
+  const [details, structure] = await Promise.all([fetchJson(candidatePath(id), signal), fetchJson(candidatePath(id, "/structure"), signal)]);
+  content.replaceChildren(element("h1", {}, shortName(details.id)), head(details));
+  const { found, grades, decision } = details;
+  // The pressed button no longer exists.
+  const reload = () => show(content, address, signal).then(() => content.focus());
+  content.append(section("Structure", about(details), downloads(details), view(structure, grades?.atoms, details.labels)));
   if (grades) content.append(section("Grades", graded(grades)));
   if (decision) content.append(section("Decision", decided(decision)));
   if (found) content.append(trace(found, grades, signal));
   if (decision) content.append(...covered(decision.coverage));
-  content.append(section("Label", ...labels(story, again, signal)));
-  content.append(section("Not recorded", element("ul", {}, story.not_recorded.map((what) => element("li", {}, what)))));
+  content.append(section("Label", ...labels(details, reload, signal)));
+  content.append(section("Not recorded", element("ul", {}, details.not_recorded.map((what) => element("li", {}, what)))));
 }
 
 function head({ id, kind, decision, jobs }) {
@@ -46,15 +46,15 @@ function about({ kind, structure, found, file, frame, same_structure: same, same
   const near = found?.distances;
   return facts([
     ["formula", `${formula}, ${whole(atoms)} atoms`],
-    ["volume", volume && `${digits(volume, "Å³")} (${digits(volume / atoms, "Å³")} an atom)${found ? `, V/V₀ ${decimals(found.relative_volume, 4)}` : ""}`],
+    ["volume", volume && `${digits(volume, "Å³")} (${digits(volume / atoms, "Å³")} per atom)${found ? `, V/V₀ ${decimals(found.relative_volume, 4)}` : ""}`],
     ["found", found && element("span", {}, `walk ${found.walk} of seed structure ${found.seed_structure_name}, segment ${found.segment}, step ${whole(found.step)}, `,
       `at ${decimals(found.temperature, 0, "K")}`)],
-    ["energy by the potential", found && `${decimals(found.energy / atoms, 4, "eV")} an atom`],
-    ["a control of", found?.control_of != null && element("span", {}, `walk ${found.control_of}`, found.partner && [": ", link(found.partner)])],
+    ["energy of the potential", found && `${decimals(found.energy / atoms, 4, "eV")} per atom`],
+    ["control of", found?.control_of != null && element("span", {}, `walk ${found.control_of}`, found.partner && [": ", link(found.partner)])],
     ["shortest distance", near?.shortest && `${decimals(near.shortest, 3, "Å")} (atoms ${near.atoms.join(" and ")})` +
-      (near.least == null || kind === "control" ? "" : `; the selector's guard asks for ${decimals(near.least, 3, "Å")}`)],
+      (near.least == null || kind === "control" ? "" : `; the selector's guard requires ${decimals(near.least, 3, "Å")}`)],
     ["imported from", file && `${file}, frame ${frame}`],
-    ["the same structure", (same.length > 0 || imported) && element("span", {}, same.map((named) => [link(named), " "]).flat(),
+    ["same structure", (same.length > 0 || imported) && element("span", {}, same.map((named) => [link(named), " "]).flat(),
       imported && element("a", { href: `#candidate/import-${imported}` }, `import-${imported}`))],
   ]);
 }
@@ -64,18 +64,18 @@ function link({ candidate, decision }) {
 }
 
 function downloads({ id }) {
-  const file = (kind, name) => element("a", { href: ofCandidate(id, `/structure.${kind}`), download: "" }, name);
+  const file = (kind, name) => element("a", { href: candidatePath(id, `/structure.${kind}`), download: "" }, name);
   return element("p", { class: "downloads" }, file("extxyz", "extended XYZ"), " ", file("poscar", "POSCAR"));
 }
 
 function graded(grades) {
   const columns = [["mixture"], ["version", true], ["γ_max", true], ["γ_nbr, largest", true], ["atoms with γ > 1", true]];
   const row = (name, grade) => [name, whole(grade.mixture_version), decimals(grade.gamma_max, 3), decimals(grade.gamma_nbr_max, 3), whole(grade.atoms_above_1)];
-  const rows = [row("the walker's", grades.walker), row("the selector's, at the decision", grades.selector), row("the original one", grades.original)];
+  const rows = [row("walker", grades.walker), row("selector, at the decision", grades.selector), row("original", grades.original)];
   const { trigger } = grades;
   return element("div", {}, table("Grades under three mixtures", columns, rows), facts([
-    ["staleness", `the selector's mixture was newer by ${whole(grades.staleness)} versions`],
-    ["collection rule", trigger && `${trigger.needed} atoms with γ > ${digits(trigger.threshold)} make a candidate; there were ` +
+    ["staleness", `the walker's mixture was ${whole(grades.staleness)} versions behind`],
+    ["collection rule", trigger && `requires ${trigger.needed} atoms with γ > ${digits(trigger.threshold)}; there were ` +
       `${trigger.above_walker} under the walker's mixture, ${trigger.above_selector} under the selector's`],
   ]));
 }
@@ -86,7 +86,7 @@ function decided(decision) {
     ["number", whole(decision.number)],
     ["round", decision.round > 0 ? whole(decision.round) : null],
     ["decision", decision.reason ? `${decision.kind}: ${decision.reason}` : decision.kind],
-    ["threshold raised", decision.raised_by && `by a factor of ${digits(decision.raised_by)} to ${digits(decision.raised_threshold)}, since many waited for labels`],
+    ["threshold raised", decision.raised_by && `by a factor of ${digits(decision.raised_by)} to ${digits(decision.raised_threshold)}, because of a long label queue`],
     ["mixture afterwards", `version ${whole(decision.mixture_version)}`],
     ["update", update && `${update.combination ?? ""} with α = ${digits(update.alpha)}; ${ENDS[update.ended_by]}`],
     ["γ_max afterwards", update && decimals(update.gamma_max_after, 3)],
@@ -96,11 +96,11 @@ function decided(decision) {
   ]);
   if (!update || update.trials.length === 0) return list;
   const columns = [["α", true], ["γ_max", true], ["atoms above", true]];
-  return element("div", {}, list, table("Every α that was tried", columns,
+  return element("div", {}, list, table("Trials of α", columns,
     update.trials.map((trial) => [digits(trial.alpha), decimals(trial.gamma_max, 3), whole(trial.above)])));
 }
 
-/** What the walk offered before: the store knows the walk's γ where it was a candidate, and nowhere else. */
+/** Earlier candidates of the walk. The store knows the walk's γ only at its candidates. */
 function trace(found, grades, signal) {
   const place = element("div", { class: "plots" });
   const draw = (offered) => {
@@ -109,13 +109,13 @@ function trace(found, grades, signal) {
     const marks = (key, shape, k) => ({ name: key === "gamma" ? "original mixture" : "the walker's mixture", shape, colour: LINES[k],
       points: before.filter((one) => one[key] != null).map((one) => [one.step, one[key], `#candidate/${encodeURIComponent(one.id)}`,
         `step ${one.step}: ${one.fate}`]) });
-    place.replaceChildren(plot({ title: `Walk ${found.walk}, segment ${found.segment}: what it offered until then`,
+    place.replaceChildren(plot({ title: `Walk ${found.walk}, segment ${found.segment}: earlier candidates`,
       x: { title: "step" }, y: { title: "γ_max", least: 0 },
       lines: [{ colour: LINES[0], points: points("gamma") }, { colour: LINES[1], dash: DASHES[1], points: points("walker_gamma") }],
       marks: [marks("gamma", "circle", 0), marks("walker_gamma", "diamond", 1)] }));
   };
-  ask(`/api/walks/${found.walk}/candidates`, signal).then(draw).catch(() => {});
-  return section("Before", place);
+  fetchJson(`/api/walks/${found.walk}/candidates`, signal).then(draw).catch(() => {});
+  return section("Earlier", place);
 }
 
 function covered({ by, later, looked_until: until }) {
@@ -124,13 +124,13 @@ function covered({ by, later, looked_until: until }) {
   const parts = [];
   if (by.length > 0) parts.push(section("Covered by updates of", list(by), more(by)));
   if (later.length > 0) parts.push(section("Covered later", list(later), more(later)));
-  if (until) parts.push(element("p", { class: "quiet" }, `The log was followed to decision ${whole(until)}.`));
+  if (until) parts.push(element("p", { class: "quiet" }, `Checked up to decision ${whole(until)}.`));
   return parts;
 }
 
-function labels({ jobs, labels: made }, again, signal) {
-  if (jobs.length + made.length === 0) return [element("p", {}, "It has no label job.")];
-  return [...jobs.map((found) => element("div", {}, job(found), buttons(found, again))), ...made.map(label)];
+function labels({ jobs, labels: made }, reload, signal) {
+  if (jobs.length + made.length === 0) return [element("p", {}, "No label job.")];
+  return [...jobs.map((found) => element("div", {}, job(found), buttons(found, reload))), ...made.map(label)];
 }
 
 function job(found) {
@@ -138,15 +138,15 @@ function job(found) {
   return element("div", {}, facts([
     ["job", `${found.job}, protocol ${found.protocol}`],
     ["state", element("span", {}, state(found.state), ` priority ${found.priority}`)],
-    ["excluded", found.excluded && `its label is left out of exports and statistics: ${found.excluded}`],
-    ["held by", holder && `${holder}, until ${time(found.expires)}`],
+    ["excluded", found.excluded && `its label is excluded from exports and statistics: ${found.excluded}`],
+    ["leased by", holder && `${holder}, until ${time(found.expires)}`],
     ["cost", found.core_seconds == null ? null : digits(found.core_seconds, "core-seconds")],
-    ["by hand", byHand.map((done) => `${done.action}${done.priority == null ? "" : ` ${done.priority}`}${done.reason ? ` (${done.reason})` : ""}, ${time(done.time)}`).join("; ")],
+    ["manual actions", byHand.map((done) => `${done.action}${done.priority == null ? "" : ` ${done.priority}`}${done.reason ? ` (${done.reason})` : ""}, ${time(done.time)}`).join("; ")],
   ]), attempts.map(attempt));
 }
 
 function attempt(made) {
-  const how = made.outcome ?? "under way";
+  const how = made.outcome ?? "running";
   const lasted = made.ended == null ? `since ${time(made.started)}` : `after ${duration(made.ended - made.started)}`;
   const failed = made.class ? ` (${made.class})` : "";
   const line = `attempt ${made.attempt}: ${how}${failed} ${lasted}, by ${made.holder}`;
@@ -156,10 +156,10 @@ function attempt(made) {
     : element("p", { class: "attempt" }, line);
 }
 
-/** Without the difference of the zeros, and what was taken out; or why there is none. */
+/** The energy error without element offsets, with the offsets; or why there is none. */
 function energyError({ energy_error_per_atom: error, energy_offsets: offsets }) {
-  if (error != null) return `${decimals(1000 * error, 2, "meV")} an atom; ${offsets.note}`;
-  return offsets.structures > 0 ? `not shown: too few labels speak for this composition; ${offsets.note}` : offsets.note;
+  if (error != null) return `${decimals(1000 * error, 2, "meV")} per atom; ${offsets.note}`;
+  return offsets.structures > 0 ? `not shown: too few labels for this composition; ${offsets.note}` : offsets.note;
 }
 
 function label(made) {
@@ -167,10 +167,10 @@ function label(made) {
   return facts([
     [made.standing, `protocol ${made.protocol}; ${made.source}; ${time(made.received)}`],
     ["excluded", made.excluded && `${made.excluded.reason}; ${time(made.excluded.time)}`],
-    ["energy", `${decimals(made.energy, 6, "eV")} (${decimals(made.energy_per_atom, 6, "eV")} an atom)`],
+    ["energy", `${decimals(made.energy, 6, "eV")} (${decimals(made.energy_per_atom, 6, "eV")} per atom)`],
     ["largest force", decimals(made.largest_force, 4, "eV/Å")],
     ["pressure", made.pressure == null ? null : digits(made.pressure, "eV/Å³")],
-    ["error of the potential's energy", model && energyError(model)],
-    ["errors of its forces", model && `mean ${decimals(model.mean, 4)}, largest ${decimals(model.largest, 4, "eV/Å")} (atom ${model.atom})`],
+    ["energy error of the potential", model && energyError(model)],
+    ["force errors of the potential", model && `mean ${decimals(model.mean, 4)}, largest ${decimals(model.largest, 4, "eV/Å")} (atom ${model.atom})`],
   ]);
 }

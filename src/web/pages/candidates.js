@@ -1,6 +1,6 @@
-// The table of candidates: the program sorts, filters and pages; this asks for a page and shows it.
+// The table of candidates. The program sorts, filters and pages; this script shows one page.
 
-import { ask } from "./api.js";
+import { fetchJson } from "./api.js";
 import { FATES } from "./colours.js";
 import { element, renew, state } from "./dom.js";
 import { decimals, shortName, whole } from "./format.js";
@@ -9,19 +9,19 @@ export const TITLE = "Candidates";
 
 const LENGTH = 50;
 const STATES = ["queued", "leased", "labelled", "failed", "dropped", "superseded"];
-/** Columns: title, whether it holds numbers, and the order that its title asks for. */
+/** Columns: title, whether it is numeric, and the sort order of its title. */
 const COLUMNS = [["candidate"], ["decision", true, "decision"], ["fate"], ["label"], ["priority", true, "queue"], ["γ_max", true, "gamma"],
   ["γ_nbr", true], ["V/V₀", true, "volume"], ["T", true], ["seed structure"], ["formula"], ["atoms", true], ["attempts", true]];
 
 export function show(content, rest, signal) {
-  // What is asked for stands in the address, so that it can be kept and sent to others.
-  const asked = new URLSearchParams(rest);
-  const [place, told] = [element("div"), element("p", { role: "status" })];
+  // The query is part of the address, so that it can be bookmarked and shared.
+  const params = new URLSearchParams(rest);
+  const [place, progress] = [element("div"), element("p", { role: "status" })];
   const change = (changes) => {
-    for (const [key, value] of Object.entries(changes)) value ? asked.set(key, value) : asked.delete(key);
-    // The queue's order is that of one state.
-    if (asked.get("order") === "queue" && !asked.get("state")) asked.set("state", "queued");
-    history.replaceState(null, "", `#candidates/${asked}`);
+    for (const [key, value] of Object.entries(changes)) value ? params.set(key, value) : params.delete(key);
+    // The queue order applies to one state.
+    if (params.get("order") === "queue" && !params.get("state")) params.set("state", "queued");
+    history.replaceState(null, "", `#candidates/${params}`);
     pages.length = 0;
     load(null);
   };
@@ -31,44 +31,44 @@ export function show(content, rest, signal) {
     const mine = ++last;
     const wait = setTimeout(() => place.setAttribute("aria-busy", "true"), 200);
     try {
-      const page = await wholePage(asked, after, signal, (looked) => {
-        if (mine === last) told.textContent = `looked at ${whole(looked)} candidates …`;
+      const page = await fetchPage(params, after, signal, (searched) => {
+        if (mine === last) progress.textContent = `${whole(searched)} candidates searched …`;
       }, () => mine !== last);
-      if (mine === last) renew(place, ...lines(page, asked, change, pages, after, load));
+      if (mine === last) renew(place, ...lines(page, params, change, pages, after, load));
     } catch (error) {
       if (error.name !== "AbortError" && mine === last) place.replaceChildren(element("p", { class: "wrong", role: "alert" }, error.message));
     } finally {
       clearTimeout(wait);
       if (mine === last) {
-        told.textContent = "";
+        progress.textContent = "";
         place.removeAttribute("aria-busy");
       }
     }
   };
-  content.append(filters(asked, change), told, place);
+  content.append(filters(params, change), progress, place);
   return load(null);
 }
 
-/** A rare kind takes several looks. */
-async function wholePage(asked, after, signal, tell, isOver) {
-  let [found, looked, next] = [[], 0, after];
+/** A filter with few matches takes several requests. */
+async function fetchPage(params, after, signal, onProgress, isStale) {
+  let [found, searched, next] = [[], 0, after];
   do {
-    const query = new URLSearchParams(asked);
+    const query = new URLSearchParams(params);
     query.set("limit", LENGTH - found.length);
     if (next) query.set("after", next);
-    const page = await ask(`/api/candidates?${query}`, signal);
+    const page = await fetchJson(`/api/candidates?${query}`, signal);
     found = found.concat(page.candidates);
-    looked += page.looked_at;
+    searched += page.looked_at;
     next = page.next;
-    if (next && found.length < LENGTH) tell(looked);
-  } while (next && found.length < LENGTH && !isOver());
+    if (next && found.length < LENGTH) onProgress(searched);
+  } while (next && found.length < LENGTH && !isStale());
   return { candidates: found, next };
 }
 
-function filters(asked, change) {
+function filters(params, change) {
   const choice = (label, key, names) => element("label", {}, label, element("select", { onchange: (event) => change({ [key]: event.target.value }) },
-    element("option", { value: "" }, "all"), names.map((name) => element("option", { value: name, selected: asked.get(key) === name }, name))));
-  const where = element("input", { type: "search", size: 34, value: asked.get("where") ?? "", placeholder: "gamma > 2 and element = Mo",
+    element("option", { value: "" }, "all"), names.map((name) => element("option", { value: name, selected: params.get(key) === name }, name))));
+  const where = element("input", { type: "search", size: 34, value: params.get("where") ?? "", placeholder: "gamma > 2 and element = Mo",
     spellcheck: "false", autocomplete: "off" });
   const submit = (event) => {
     event.preventDefault();
@@ -76,16 +76,16 @@ function filters(asked, change) {
   };
   return element("form", { class: "filters", role: "search", onsubmit: submit }, choice("fate", "fate", Object.keys(FATES)),
     choice("label", "state", STATES), element("label", {}, "where", where), element("button", {}, "Show"),
-    element("details", {}, element("summary", {}, "What may stand there"), element("p", {},
+    element("details", {}, element("summary", {}, "Syntax"), element("p", {},
       "gamma, gamma_nbr (original mixture), volume (V/V₀), temperature (K), walk, step, mixture_version (after the decision), atoms, " +
       "energy (eV), energy_per_atom and max_force (eV/Å) of the label, with = != < <= > >=; " +
       "element, kind (biased or control), seed with = and !=; and, or, not and parentheses. " +
-      "What a candidate does not have, as an energy without a label, meets no comparison.")));
+      "A comparison with a missing value, such as the energy of an unlabelled candidate, is false.")));
 }
 
-function lines({ candidates, next }, asked, change, pages, after, load) {
-  const order = asked.get("order") || "decision";
-  const ascending = asked.get("ascending") === "true";
+function lines({ candidates, next }, params, change, pages, after, load) {
+  const order = params.get("order") || "decision";
+  const ascending = params.get("ascending") === "true";
   const head = ([title, isNumber, key]) => {
     if (!key) return element("th", { scope: "col", class: isNumber && "number" }, title);
     const isIt = key === order;
@@ -104,9 +104,9 @@ function lines({ candidates, next }, asked, change, pages, after, load) {
   const number = pages.length + 1;
   return [
     element("div", { class: "scrolls", role: "region", tabindex: "0", "aria-label": "Candidates" }, table),
-    candidates.length === 0 && element("p", {}, "No candidate is so."),
+    candidates.length === 0 && element("p", {}, "No candidate matches."),
     element("p", { class: "turn", role: "status" },
-      element("button", { type: "button", "data-keep": "before", disabled: pages.length === 0, onclick: back }, "← before"),
+      element("button", { type: "button", "data-keep": "before", disabled: pages.length === 0, onclick: back }, "← previous"),
       ` page ${number} `, element("button", { type: "button", "data-keep": "next", disabled: !next, onclick: on }, "next →")),
   ].filter(Boolean);
 }

@@ -1,13 +1,13 @@
-// Colours that people with any kind of colour vision tell apart: a scale (viridis) for γ, and few for kinds (Okabe and Ito).
+// Colours that are safe for colour-blind readers: viridis for γ, and the palette of Okabe and Ito for categories.
 
 const SCALE = [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99],
   [170, 220, 50], [253, 231, 37]];
 
-/** For lines, on light and on dark ground; dashes tell those apart that share a colour. */
+/** Line colours for light and dark backgrounds. Dashes distinguish lines of one colour. */
 export const LINES = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b58900", "#56b4e9"];
 export const DASHES = ["", "6 3", "2 3"];
 
-/** Colour and shape of what became of a candidate. */
+/** Colour and marker shape by fate. */
 export const FATES = {
   accepted: { colour: "#009e73", shape: "circle" },
   covered: { colour: "#56b4e9", shape: "square" },
@@ -25,7 +25,7 @@ export function scale(share) {
   return SCALE[below].map((value, k) => Math.round(value + (place - below) * (SCALE[below + 1][k] - value)));
 }
 
-/** [r, g, b] as CSS has it, lighter (> 0) or darker (< 0). */
+/** [r, g, b] as CSS colour, lighter (> 0) or darker (< 0). */
 export function css([r, g, b], change = 0) {
   const moved = (value) => Math.round(change < 0 ? value * (1 + change) : value + (255 - value) * change);
   return `rgb(${moved(r)} ${moved(g)} ${moved(b)})`;

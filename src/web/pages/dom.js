@@ -1,11 +1,11 @@
-// Elements of a page. Whatever comes from a campaign becomes text, never markup.
+// Builds elements of a page. Data of a campaign becomes text, never markup.
 
-/** An element with attributes (`on…`: a function that is called on the event) and children (texts or elements). */
+/** An element with attributes (`on…`: an event listener) and children (texts or elements). */
 export function element(name, attributes = {}, ...children) {
   return fill(document.createElement(name), attributes, children);
 }
 
-/** The same for drawings. */
+/** The same for SVG. */
 export function drawing(name, attributes = {}, ...children) {
   return fill(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, children);
 }
@@ -20,18 +20,18 @@ function fill(made, attributes, children) {
   return made;
 }
 
-/** A heading with what belongs to it. */
+/** A section with a heading. */
 export function section(title, ...children) {
   return element("section", {}, element("h2", {}, title), ...children);
 }
 
-/** Names with their values; those without a value are left out. */
+/** A list of names and values. Entries without a value are omitted. */
 export function facts(pairs) {
   const shown = pairs.filter(([, value]) => value != null && value !== "" && value !== false);
   return element("dl", {}, shown.map(([name, value]) => element("div", {}, element("dt", {}, name), element("dd", {}, value))));
 }
 
-/** A table; a column is [title, whether it holds numbers]. */
+/** A table. A column is [title, whether it is numeric]. */
 export function table(caption, columns, rows) {
   const head = columns.map(([title, isNumber]) => element("th", { scope: "col", class: isNumber && "number" }, titleOf(title)));
   const cell = (value, k) => element("td", { class: columns[k][1] && "number" }, value ?? "–");
@@ -41,18 +41,18 @@ export function table(caption, columns, rows) {
       element("thead", {}, element("tr", {}, head)), element("tbody", {}, lines)));
 }
 
-/** A title may have several lines, what stands in its parentheses has one. */
+/** A title may wrap, but its part in parentheses does not. */
 function titleOf(title) {
   return title.split(/(\([^)]*\))/).map((part) => (part.startsWith("(") ? element("span", { class: "whole" }, part) : part));
 }
 
-/** A sentence in a table, which may have several lines. */
+/** A sentence in a table, which may wrap. */
 export function sentence(...parts) {
   return element("span", { class: "sentence" }, ...parts);
 }
 
-/** Puts children into a place. What had the keyboard's focus there has it again, if it is there again (`data-keep`, or the name of
- *  a region), or the first region if it cannot be used; and regions stay scrolled as they were. */
+/** Replaces the children of a place. Restores the keyboard focus (by `data-keep` or the name of a region; the first region if the
+ *  element is disabled) and the scroll positions of regions. */
 export function renew(place, ...children) {
   const name = (found) => found?.dataset?.keep ?? found?.getAttribute("aria-label");
   const had = place.contains(document.activeElement) ? name(document.activeElement) : null;
@@ -64,7 +64,7 @@ export function renew(place, ...children) {
   (again?.disabled ? place.querySelector(".scrolls") : again)?.focus({ preventScroll: true });
 }
 
-/** A word that says a state, with a mark that does not depend on its colour. */
+/** A state with a marker that does not rely on colour. */
 export function state(name) {
   return element("span", { class: "state", "data-state": name }, name.replaceAll("_", " "));
 }

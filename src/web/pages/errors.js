@@ -1,6 +1,6 @@
-// Whether the grade told where the potential errs: force errors of the labels by grade.
+// Force errors of the labels by grade.
 
-import { askUntilReckoned, listen } from "./api.js";
+import { fetchComputed, listen } from "./api.js";
 import { LINES } from "./colours.js";
 import { element, section, table } from "./dom.js";
 import { decimals, percent, tick, whole } from "./format.js";
@@ -11,13 +11,13 @@ export const TITLE = "Errors";
 const KINDS = [["all", "all structures"], ["biased", "biased walks"], ["control", "control walks"]];
 
 export async function show(content, _, signal) {
-  const again = element("button", { type: "button", onclick: () => load() }, "Reckon again");
+  const again = element("button", { type: "button", onclick: () => load() }, "Recompute");
   const place = element("div", { role: "status" }, element("p", {}, "Reading all labels …"));
   content.append(element("p", {}, "Force errors |F_model − F_label| (eV/Å) by the grade of each atom under the original mixture. ", again), place);
   const load = async () => {
     place.setAttribute("aria-busy", "true");
     try {
-      place.replaceChildren(...shown(await askUntilReckoned("/api/errors", signal)));
+      place.replaceChildren(...shown(await fetchComputed("/api/errors", signal)));
     } finally {
       place.removeAttribute("aria-busy");
     }
@@ -27,7 +27,7 @@ export async function show(content, _, signal) {
   listen(({ status }) => {
     const came = labels != null && status.labels.labelled !== labels;
     labels = status.labels.labelled;
-    // Once more with the next news: what the program keeps may be older than the newest label. Who reads it keeps it.
+    // Load again with the next update: the cached result may be older than the newest label. Do not replace what has the focus.
     if ((came || due) && !place.contains(document.activeElement)) load().catch(() => {});
     due = came;
   }, signal);
@@ -35,7 +35,7 @@ export async function show(content, _, signal) {
 
 function shown(errors) {
   const { all } = errors;
-  if (all.atoms === 0) return [element("p", {}, "There are no labels of candidates yet.")];
+  if (all.atoms === 0) return [element("p", {}, "No candidate has a label yet.")];
   return [
     section(`Protocol ${errors.protocol}`, correlations(errors), energies(errors.energy),
       element("div", { class: "plots" }, figure("γ", all.gamma), figure("γ_nbr", all.gamma_nbr))),
@@ -55,7 +55,7 @@ function correlations(errors) {
   return table("Rank correlations, and the area under the ROC curve", columns, rows);
 }
 
-/** Energy errors without the offsets of the elements, which the note gives; or why there are none. */
+/** Energy errors without the element offsets, which the note gives; or why there are none. */
 function energies({ structures, mean, median, p90, largest, offsets }) {
   const milli = (error) => decimals(1000 * error, 2);
   const line = structures > 0 && `Energy error |E_model − E_label|: mean ${milli(mean)}, median ${milli(median)}, 90 % below ${milli(p90)}, largest `

@@ -1,21 +1,21 @@
-// Numbers as people read them, each with its unit.
+// Formats numbers with their units.
 
 const NONE = "–";
 
-/** With a number of decimals. */
+/** With a fixed number of decimals. */
 export function decimals(value, digits, unit = "") {
   if (value == null || !Number.isFinite(value)) return NONE;
   return value.toFixed(digits).replace("-", "−") + (unit && `\u202f${unit}`);
 }
 
-/** Whole, in groups of three digits. */
+/** A whole number in groups of three digits. */
 export function whole(value, unit = "") {
   if (value == null) return NONE;
   const text = Math.round(value).toString();
   return text.replace(/\B(?=(\d{3})+$)/g, "\u202f") + (unit && `\u202f${unit}`);
 }
 
-/** With three digits that count. */
+/** With three significant digits. */
 export function digits(value, unit = "") {
   if (value == null || !Number.isFinite(value)) return NONE;
   const size = Math.abs(value);
@@ -23,12 +23,12 @@ export function digits(value, unit = "") {
   return decimals(value, size >= 100 ? 0 : size >= 10 ? 1 : size >= 1 ? 2 : 3, unit);
 }
 
-/** A round number, with as many digits as it has. */
+/** A number with up to six significant digits. */
 export function tick(value) {
   return String(Number(value.toPrecision(6))).replace("-", "−");
 }
 
-/** A part of a whole. */
+/** A share in percent. */
 export function percent(part) {
   return part == null ? NONE : `${digits(100 * part)}\u202f%`;
 }
@@ -38,13 +38,13 @@ export function bytes(value) {
   return value >= 1e9 ? digits(value / 1e9, "GB") : digits(value / 1e6, "MB");
 }
 
-/** A time, ms since 1970, in the reader's zone. */
+/** A time, ms since 1970, in the local time zone. */
 export function time(milliseconds) {
   if (milliseconds == null) return NONE;
   return new Date(milliseconds).toLocaleString([], { dateStyle: "medium", timeStyle: "medium" });
 }
 
-/** How long something lasts, ms. */
+/** A duration in ms. */
 export function duration(milliseconds) {
   const seconds = Math.max(0, milliseconds / 1000);
   if (seconds < 120) return digits(seconds, "s");
@@ -57,7 +57,7 @@ export function ago(milliseconds) {
   return milliseconds == null ? NONE : `${duration(Date.now() - milliseconds)} ago`;
 }
 
-/** The part of a candidate's name that tells it from others of its campaign. */
+/** The part of a candidate's name that is unique within its campaign. */
 export function shortName(id) {
   return id.replace(/^[0-9a-f]{8}-/, "").replace(/-[0-9a-f]{16}$/, "");
 }

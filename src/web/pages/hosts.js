@@ -1,4 +1,4 @@
-// Hosts, and the processes that work there for the campaign.
+// Hosts and their processes.
 
 import { listen } from "./api.js";
 import { element, renew, section, sentence, state, table } from "./dom.js";
@@ -6,7 +6,7 @@ import { ago, time } from "./format.js";
 
 export const TITLE = "Hosts";
 
-const COLUMNS = [["process"], ["number", true], ["state"], ["last sign of life"], ["started"], ["pid", true],
+const COLUMNS = [["process"], ["number", true], ["state"], ["last heartbeat"], ["started"], ["pid", true],
   ["restarts", true], ["remark"]];
 
 export function show(content, _, signal) {
@@ -16,7 +16,7 @@ export function show(content, _, signal) {
 }
 
 function hosts(processes) {
-  if (processes.length === 0) return [element("p", {}, "No process works for this campaign.")];
+  if (processes.length === 0) return [element("p", {}, "This campaign has no processes.")];
   const names = [...new Set(processes.map((process) => process.host))].sort();
   return names.map((host) => section(host, table(`Processes of ${host}`, COLUMNS,
     processes.filter((process) => process.host === host).map((process) => [

@@ -1,4 +1,4 @@
-// Which page is shown: the part of the address behind '#' says it.
+// Shows the page that the fragment of the address names.
 
 import { connect, listen } from "./api.js";
 import { element } from "./dom.js";
@@ -8,11 +8,11 @@ import * as errors from "./errors.js";
 import * as hosts from "./hosts.js";
 import * as mixture from "./mixture.js";
 import * as overview from "./overview.js";
-import { standing } from "./standing.js";
+import { campaignState } from "./campaign_state.js";
 
 /** Pages in the order of the menu, by the first word of their address. */
 const PAGES = { overview, candidates, mixture, errors, hosts };
-const CONNECTIONS = { live: "● live", finished: "✓ finished", stopped: "○ stopped: nobody runs the campaign", lost: "○ no connection: trying again", blind: "○ the database does not answer" };
+const CONNECTIONS = { live: "● live", finished: "✓ finished", stopped: "○ stopped: no run is active", lost: "○ no connection: retrying", unreachable: "○ the database does not answer" };
 
 let shown = new AbortController();
 
@@ -41,7 +41,7 @@ function menu() {
   document.getElementById("pages").append(...Object.entries(PAGES).map(link));
 }
 
-/** Light, dark, or as the system has it. */
+/** Light, dark, or the system setting. */
 function theme() {
   const button = document.getElementById("theme");
   const names = ["system", "light", "dark"];
@@ -49,7 +49,7 @@ function theme() {
   const use = () => {
     document.documentElement.dataset.theme = chosen;
     button.textContent = `${{ system: "◐", light: "☀", dark: "☾" }[chosen]} ${chosen}`;
-    button.setAttribute("aria-label", `Colours: ${chosen}; press for others`);
+    button.setAttribute("aria-label", `Colours: ${chosen}; press to change`);
   };
   button.addEventListener("click", () => {
     chosen = names[(names.indexOf(chosen) + 1) % names.length];
@@ -60,10 +60,10 @@ function theme() {
   use();
 }
 
-/** A campaign that nobody runs is not live, however well the connection is. */
+/** The connection counts as live only while a run is active. */
 function connection(link, why = "", status = null) {
   const line = document.getElementById("connection");
-  const what = status ? standing(status) : "running";
+  const what = status ? campaignState(status) : "running";
   const how = link === "live" && what !== "running" ? what : link;
   if (line.dataset.how !== how) line.textContent = CONNECTIONS[how];
   line.dataset.how = how;
@@ -73,10 +73,10 @@ function connection(link, why = "", status = null) {
 menu();
 theme();
 connect(connection);
-listen((news) => {
-  document.title = document.title.replace(/calmwalk.*$/, `calmwalk ${news.status.name ?? news.status.campaign.slice(0, 8)}`);
+listen((update) => {
+  document.title = document.title.replace(/calmwalk.*$/, `calmwalk ${update.status.name ?? update.status.campaign.slice(0, 8)}`);
 }, new AbortController().signal);
-// The address says which page is shown, and stays.
+// Keep the address, which names the page.
 document.querySelector(".skip").addEventListener("click", (event) => {
   event.preventDefault();
   document.getElementById("content").focus();

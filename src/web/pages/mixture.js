@@ -1,6 +1,6 @@
 // The mixture in force: its components by element, and how far each has moved since the campaign began.
 
-import { askUntilReckoned } from "./api.js";
+import { fetchComputed } from "./api.js";
 import { LINES } from "./colours.js";
 import { drawing, element, facts, section, table } from "./dom.js";
 import { decimals, digits, whole } from "./format.js";
@@ -16,14 +16,14 @@ const COMPONENTS = [["component", true], ["θ", true], ["environments at the sta
 const BAR = 120;
 
 export async function show(content, chosen, signal) {
-  const again = element("button", { type: "button", onclick: () => load() }, "Reckon again");
-  const place = element("div", { role: "status" }, element("p", {}, "reading the mixture …"));
-  content.append(element("p", {}, "The Gaussians by which structures are graded. An accepted structure widens those of its elements: ",
-    "how far a covariance C has moved from that of the start, C₀, is told by the eigenvalues λ of C relative to C₀. ", again), place);
+  const again = element("button", { type: "button", onclick: () => load() }, "Recompute");
+  const place = element("div", { role: "status" }, element("p", {}, "Reading the mixture …"));
+  content.append(element("p", {}, "The Gaussians that grade structures. An accepted structure widens those of its elements. ",
+    "The eigenvalues λ of a covariance C relative to the initial one, C₀, measure how far it has moved. ", again), place);
   const load = async () => {
     place.setAttribute("aria-busy", "true");
     try {
-      const mixture = await askUntilReckoned("/api/mixture", signal);
+      const mixture = await fetchComputed("/api/mixture", signal);
       place.removeAttribute("role");
       place.replaceChildren(...shown(mixture, decodeURIComponent(chosen)));
     } finally {
@@ -72,7 +72,7 @@ function byName(elements, one, choose) {
     element("button", { type: "button", class: "pick", "aria-pressed": String(found === one), onclick: () => choose(found) }, found.name),
     whole(found.own.length), whole(found.moved), whole(found.before), gained(found.before, found.now), power(found.condition),
     digits(found.distance), bar(found.distance, most)]);
-  return table("Elements; press one to see its components", ELEMENTS, rows);
+  return table("Elements; select one to see its components", ELEMENTS, rows);
 }
 
 function components({ name, own }) {
@@ -82,14 +82,14 @@ function components({ name, own }) {
     one.moved ? digits(one.distance) : "not moved", bar(one.distance, most)]);
   return section(`Components of ${name}`, table(`Components of ${name}`, COMPONENTS, rows),
     element("p", { class: "quiet" }, "θ: calibrated threshold of σ. Condition number of C + εI. Widest growth √λ_max and strongest shrinkage √λ_min: ",
-      "factors on the width, in the direction of feature space that changed most. Distance: √Σ ln²λ, 0 if it has not moved. None of them has a unit."));
+      "factors on the width, in the direction of feature space that changed most. Distance: √Σ ln²λ, 0 if it has not moved. All are dimensionless."));
 }
 
 function gained(before, now) {
   return before == null || now == null ? null : whole(now - before);
 }
 
-/** A number of which the size matters. */
+/** An order of magnitude. */
 function power(value) {
   return value == null ? null : value.toExponential(1);
 }
@@ -98,7 +98,7 @@ function times(factor) {
   return factor == null ? null : `× ${digits(factor)}`;
 }
 
-/** What stands in the cell before it, as a length. */
+/** The value of the previous cell as a bar. */
 function bar(value, most) {
   if (!(value > 0)) return "";
   return drawing("svg", { class: "length", width: BAR, height: 10, "aria-hidden": "true" },

@@ -1,15 +1,15 @@
-// How the campaign stands.
+// Overview of the campaign.
 
 import { canPause, pauseButton } from "./actions.js";
 import { listen } from "./api.js";
 import { element, facts, renew, section, sentence, state, table } from "./dom.js";
 import { bytes, decimals, digits, duration, percent, time, whole } from "./format.js";
 import { overTime } from "./plots.js";
-import { standing } from "./standing.js";
+import { campaignState } from "./campaign_state.js";
 
 export const TITLE = "Overview";
 
-/** Walks that are shown; those under way before the others. */
+/** Largest number of walks shown; running ones come first. */
 const WALKS = 40;
 
 const WALK_COLUMNS = [["walk", true], ["seed structure"], ["origin"], ["state"], ["step", true], ["T", true], ["V/V₀", true],
@@ -19,7 +19,7 @@ export function show(content, _, signal) {
   const tiles = element("div", { class: "tiles" });
   const plots = element("div", { class: "plots" });
   const rest = element("div");
-  content.append(tiles, section("Since this program began to look", plots), rest);
+  content.append(tiles, section("Since the dashboard started", plots), rest);
   overTime(plots, signal);
   let [status, changes] = [null, false];
   const draw = () => {
@@ -34,8 +34,8 @@ export function show(content, _, signal) {
     changes = can;
     if (status) draw();
   });
-  listen((news) => {
-    status = news.status;
+  listen((update) => {
+    status = update.status;
     draw();
   }, signal);
 }
@@ -50,35 +50,35 @@ function summary(status) {
   const underWay = walks.filter(isUnderWay).length;
   const declined = Object.entries(candidates.declined).filter(([, count]) => count > 0)
     .map(([reason, count]) => `${whole(count)} ${reason}`).join(", ");
-  const how = standing(status);
+  const how = campaignState(status);
   return [
     tile("Campaign", state(how), `${status.campaign.slice(0, 8)}, ${status.mode} mode`,
       status.round > 0 ? `round ${whole(status.round)}` : "", `${bytes(status.disk.bytes)} on disk`),
-    tile("Walks", `${whole(underWay)} ${status.led ? "under way" : "not finished"}`, ended(status.ends, walks.length - underWay),
+    tile("Walks", `${whole(underWay)} ${status.led ? "running" : "unfinished"}`, ended(status.ends, walks.length - underWay),
       status.steps_per_second == null ? "" : `${digits(status.steps_per_second)} steps/s in all`),
     tile("Candidates", `${whole(candidates.accepted)} accepted`,
       `of ${whole(candidates.seen)} seen (${percent(share(candidates.accepted, candidates.seen))})`,
       declined && `declined: ${declined}`, `${whole(candidates.control)} control frames`,
-      status.shared_structures > 0 && `${whole(status.shared_structures)} of them structures of their biased walks`),
-    tile("Labels", `${whole(labels.labelled)} made`, `${whole(labels.queued)} wait, ${whole(labels.leased)} in work`,
+      status.shared_structures > 0 && `${whole(status.shared_structures)} of them identical to structures of their biased walks`),
+    tile("Labels", `${whole(labels.labelled)} made`, `${whole(labels.queued)} queued, ${whole(labels.leased)} leased`,
       `${whole(labels.failed)} failed, ${whole(labels.dropped)} dropped${labels.superseded > 0 ? `, ${whole(labels.superseded)} superseded` : ""}${
         labels.excluded > 0 ? `, ${whole(labels.excluded)} excluded` : ""}`,
       `${whole(status.labels_last_hour)} in the last hour`),
     tile("Mixture", `version ${whole(version)}`,
-      training ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not watched",
-      training?.alarm ? element("span", { class: "wrong" }, "it forgets: more than calm.forgetting_alarm") : "",
-      staleness ? `walkers saw the newest in ${percent(staleness.share_of_newest)} of the decisions` : ""),
+      training ? `training atoms with γ > 1: ${percent(training.share_above_one)}` : "training frames are not monitored",
+      training?.alarm ? element("span", { class: "wrong" }, "forgetting: above calm.forgetting_alarm") : "",
+      staleness ? `walkers had the newest version in ${percent(staleness.share_of_newest)} of decisions` : ""),
   ];
 }
 
-/** How walks have ended, early ends with their number. */
+/** Number of ended walks, with early ends. */
 function ended(ends, number) {
   const early = ends.filter((end) => end.cause != null).reduce((sum, end) => sum + end.walks, 0);
   const text = `${whole(number)} ended`;
   return early === 0 ? text : element("span", {}, `${text}, `, element("span", { class: "wrong" }, `${whole(early)} of them early`));
 }
 
-/** Causes of early ends, and what to change. */
+/** Causes of early ends and advice. */
 function earlyEnds(ends) {
   const rows = ends.filter((end) => end.cause != null).map((end) => [whole(end.walks), state(end.end),
     sentence(`walk ${end.walk}: ${end.reason}`), sentence(end.advice)]);
@@ -99,9 +99,9 @@ function queue(status) {
     ["cost of the queue", remaining && `${digits(remaining.expected)} (${digits(remaining.low)} to ${digits(remaining.high)}) core-hours`],
   ]);
   if (failures.length === 0) return list;
-  const columns = [["class of failures"], ["given up", true], ["labelled all the same", true], ["not done", true]];
+  const columns = [["class of failure"], ["failed", true], ["labelled later", true], ["unfinished", true]];
   const rows = failures.map((failure) => [failure.class, whole(failure.given_up), whole(failure.labelled), whole(failure.unfinished)]);
-  return element("div", {}, list, table("Failures of labels by class", columns, rows));
+  return element("div", {}, list, table("Label failures by class", columns, rows));
 }
 
 function budget(status) {
@@ -112,19 +112,19 @@ function budget(status) {
   return facts([
     ["labels", `${whole(used.labels)}${limits.labels == null ? "" : ` of ${whole(limits.labels)}`}`],
     ["core-hours", of(used.core_hours, limits.core_hours, "core-hours")],
-    ["time under way", of(used.wall_hours, limits.wall_hours, "h")],
+    ["running time", of(used.wall_hours, limits.wall_hours, "h")],
     ["used up", over],
-    ["expected end", end.time == null ? null : `${time(end.time)} at the latest, as things are now`],
+    ["expected end", end.time == null ? null : `${time(end.time)} at the latest, if nothing changes`],
     ["walks need", hours(end.walks_hours)],
     ["labels need", hours(end.labels_hours)],
   ]);
 }
 
-/** `changed` is called when walks were paused here or resumed; false where they cannot be. */
+/** `changed` is called after walks were paused or resumed; false if they cannot be. */
 function walks({ walks: all, led }, changed) {
   const order = [...all].sort((a, b) => isUnderWay(b) - isUnderWay(a) || a.walk - b.walk);
   const change = (some, isPaused) => () => {
-    // The next news say so too.
+    // The next update confirms it.
     some.forEach((walk) => { walk.paused = isPaused; });
     changed();
   };
@@ -138,7 +138,7 @@ function walks({ walks: all, led }, changed) {
   return element("div", {},
     changed && element("p", { class: "actions" }, going.length > 0 && pauseButton(null, false, change(going, true)),
       paused.length > 0 && pauseButton(null, true, change(paused, false))),
-    table("Walks, those under way first", changed ? [...WALK_COLUMNS, ["pause"]] : WALK_COLUMNS, rows),
+    table("Walks, running ones first", changed ? [...WALK_COLUMNS, ["pause"]] : WALK_COLUMNS, rows),
     more > 0 && element("p", { class: "quiet" }, `… and ${whole(more)} more (calmwalk status --all)`));
 }
 

@@ -1,4 +1,4 @@
-// Plots: lines or points over two axes, drawn as SVG, with a sentence for those who do not see them.
+// Draws plots as SVG: lines or points over two axes, with a description for screen readers.
 
 import { drawing, element } from "./dom.js";
 import { digits, tick } from "./format.js";
@@ -13,7 +13,7 @@ const SHAPES = {
 const HOLLOW = new Set(["cross", "plus", "ring"]);
 
 /**
- * A plot: `title`, `x` and `y` (axes: title; `ticks` makes a text of a number; `least`, `most`: what must be seen; `logarithmic`), and
+ * A plot: `title`, `x` and `y` (axes: title; `ticks` formats a number; `least`, `most`: values to include; `logarithmic`), and
  * `lines` ({name, colour, dash, points: [[x, y], …]}), `bands` ({colour, points: [[x, low, high], …]}) and `marks` ({name, colour, shape,
  * points: [[x, y, href, text], …]}). A y of null breaks a line.
  */
@@ -21,7 +21,7 @@ export function plot({ title, x, y, lines = [], bands = [], marks = [] }) {
   const points = [...lines, ...marks].flatMap((one) => one.points).filter(([, value]) => value != null);
   const edges = bands.flatMap((band) => band.points.flatMap(([at, low, high]) => [[at, low], [at, high]]));
   const all = [...points, ...edges].filter(([a, b]) => Number.isFinite(a) && Number.isFinite(b));
-  if (all.length === 0) return figure(title, [], element("p", { class: "quiet empty" }, "nothing to show yet"));
+  if (all.length === 0) return figure(title, [], element("p", { class: "quiet empty" }, "no data yet"));
   const across = axis(x, all.map(([value]) => value), LEFT, WIDTH - RIGHT);
   const up = axis(y, all.map(([, value]) => value), HEIGHT - BOTTOM, TOP);
   const svg = drawing("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": described(title, x, y, lines, marks, all) },
@@ -55,7 +55,7 @@ function mark({ colour, shape }, [x, y, href, text], across, up) {
   return href ? drawing("a", { href, tabindex: "-1" }, drawn) : drawn;
 }
 
-/** Where numbers stand between two places, and the round ones among them. */
+/** Maps numbers to positions between `from` and `to`, with round ticks. */
 function axis({ least, most, logarithmic, ticks = tick }, values, from, to) {
   let low = values.reduce((a, b) => Math.min(a, b), least ?? Infinity);
   let high = values.reduce((a, b) => Math.max(a, b), most ?? -Infinity);
@@ -69,7 +69,7 @@ function axis({ least, most, logarithmic, ticks = tick }, values, from, to) {
   return { at, ticks: logarithmic ? roundPowers(low, high) : roundNumbers(low, high, number), text: ticks };
 }
 
-/** An axis for a single value, which keeps its sign: where it is 0, the axis begins there. */
+/** Range around a single value. It keeps the sign, and starts at 0 for a value of 0. */
 function around(value, logarithmic) {
   if (logarithmic) return [value - 0.5, value + 0.5];
   const part = 0.1 * Math.abs(value);
@@ -84,7 +84,7 @@ function roundNumbers(low, high, number) {
   return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, k) => (first + k) * step);
 }
 
-/** Between 10^low and 10^high: powers of ten, with their doubles and fivefolds where there would be few. */
+/** Powers of ten between 10^low and 10^high, with factors of 2 and 5 if there are few. */
 function roundPowers(low, high) {
   const factors = high - low < 2 ? [1, 2, 5] : [1];
   const powers = Array.from({ length: Math.ceil(high) - Math.floor(low) + 1 }, (_, k) => Math.floor(low) + k);
@@ -117,7 +117,7 @@ function path(points, across, up) {
       return "";
     }
     const place = `${across.at(x).toFixed(1)} ${up.at(y).toFixed(1)}`;
-    // A line of no length is a dot, where a point stands alone.
+    // A line of zero length draws an isolated point as a dot.
     const drawn = begins ? `M${place}h0` : `L${place}`;
     begins = false;
     return drawn;

@@ -1,13 +1,13 @@
-// The plots of the overview: over time since the program began to look, and of the newest candidates.
+// The plots of the overview: over time since the dashboard started, and of the newest candidates.
 
-import { ask, listen } from "./api.js";
+import { fetchJson, listen } from "./api.js";
 import { DASHES, FATES, LINES } from "./colours.js";
 import { shortName, tick, whole } from "./format.js";
 import { plot } from "./plot.js";
 
-/** Samples that are kept here beside those that the program had. */
-const ROOM = 2000;
-/** Newest candidates that are shown. */
+/** Largest number of samples kept by this page. */
+const MAX_SAMPLES = 2000;
+/** Number of newest candidates shown. */
 const NEWEST = 200;
 
 export function overTime(place, signal) {
@@ -15,24 +15,24 @@ export function overTime(place, signal) {
   let newest = [];
   let seen = -1;
   const draw = () => place.replaceChildren(...(samples.length > 1 ? drawn(samples) : []), newestCandidates(newest));
-  const begin = ask("/api/samples", signal).then((found) => { samples = found; }).catch(() => {});
+  const begin = fetchJson("/api/samples", signal).then((found) => { samples = found; }).catch(() => {});
   listen(async ({ status, sample }) => {
     await begin;
     if (samples.at(-1)?.time !== sample.time) samples.push(sample);
-    if (samples.length > ROOM) samples = samples.filter((_, k) => k % 2 === 0);
+    if (samples.length > MAX_SAMPLES) samples = samples.filter((_, k) => k % 2 === 0);
     const now = status.candidates.seen + status.candidates.control;
     if (now !== seen) {
       seen = now;
-      newest = await ask(`/api/candidates?limit=${NEWEST}`, signal).then((page) => page.candidates).catch(() => newest);
+      newest = await fetchJson(`/api/candidates?limit=${NEWEST}`, signal).then((page) => page.candidates).catch(() => newest);
     }
-    // Who points at something, or reads it, keeps it.
+    // Do not replace what has the focus.
     if (!signal.aborted && !place.contains(document.activeElement)) draw();
   }, signal);
 }
 
 function drawn(samples) {
   const last = samples.at(-1).time;
-  // One axis for all, however much of it each plot has values for.
+  // All plots share one time axis.
   const x = axisOfTime(last - samples[0].time);
   const at = (sample) => (sample.time - last) / x.unit;
   const line = (read) => samples.map((sample) => [at(sample), read(sample)]);
@@ -52,8 +52,8 @@ function drawn(samples) {
       colour: LINES[2], points: rate((sample) => sample.labels, (labels, now, then) =>
         (3.6e6 * labels) / (now.time - then.time)) }] }),
     plot({ title: "Label queue", x, y: { title: "jobs", least: 0, most: 4, ticks: whole }, lines: [
-      { name: "waiting", colour: LINES[0], points: line((sample) => sample.queued) },
-      { name: "in work", colour: LINES[1], dash: DASHES[1], points: line((sample) => sample.leased) }] }),
+      { name: "queued", colour: LINES[0], points: line((sample) => sample.queued) },
+      { name: "leased", colour: LINES[1], dash: DASHES[1], points: line((sample) => sample.leased) }] }),
   ];
 }
 

@@ -1,18 +1,18 @@
-// Atoms in space, coloured by γ: turned with the mouse or the arrow keys, picked with the mouse, the keys , and . or in the table.
+// A 3D view of the atoms, coloured by γ. Rotate with the mouse or arrow keys; select an atom with the mouse, with , and . or in the table.
 
 import { css, scale } from "./colours.js";
 import { element } from "./dom.js";
 import { decimals } from "./format.js";
 
-/** Radii that atoms are drawn with, Å: covalent ones, a little smaller, by period and group about right. */
+/** Drawn radii, Å: slightly below the covalent radii. */
 const RADII = { H: 0.35, C: 0.6, N: 0.58, O: 0.55, F: 0.53, Al: 0.95, Si: 0.9, P: 0.88, S: 0.85, Cl: 0.82 };
 const RADIUS = 1.05;
 const TURN = Math.PI / 24;
 
-/** Colours: the number of an atom that they show, in words. */
+/** Quantities to colour atoms by. */
 const BY = { gamma_original: "γ, original mixture", gamma_walker: "γ, the walker's mixture", gamma_nbr_original: "γ_nbr, original mixture", error: "force error (eV/Å)" };
 
-/** The picture with its table; `grades` of each atom may be missing. */
+/** The view with its table. `grades` may be missing. */
 export function view(found, grades, labels) {
   const structure = { ...found, positions: found.positions.map((at) => inCell(at, found)) };
   const errors = labels.find((label) => label.standing === "label")?.model?.atoms;
@@ -20,8 +20,8 @@ export function view(found, grades, labels) {
   const choices = Object.keys(BY).filter((key) => atoms.some((atom) => atom[key] != null));
   const state = { turned: [[1, 0, 0], [0, 0.2, 0.98], [0, -0.98, 0.2]], zoom: 1, picked: null, by: choices[0] };
   const canvas = element("canvas", { tabindex: "0", role: "application", "aria-describedby": "picked",
-    "aria-label": `${atoms.length} atoms. Arrow keys turn, + and − zoom, comma and full stop pick an atom; the table has the same numbers.` });
-  const said = element("p", { id: "picked", role: "status" }, "No atom is picked.");
+    "aria-label": `${atoms.length} atoms. Arrow keys rotate, + and − zoom, comma and full stop select an atom; the table has the same numbers.` });
+  const selection = element("p", { id: "picked", role: "status" }, "No atom is selected.");
   const legend = element("div", { class: "legend" });
   const rows = new Map();
   const draw = () => paint(canvas, structure, atoms, state);
@@ -29,7 +29,7 @@ export function view(found, grades, labels) {
     rows.get(state.picked)?.removeAttribute("aria-selected");
     state.picked = k;
     rows.get(k)?.setAttribute("aria-selected", "true");
-    said.textContent = k == null ? "No atom is picked." : told(atoms[k]);
+    selection.textContent = k == null ? "No atom is selected." : describe(atoms[k]);
     draw();
   };
   const chooser = choices.length > 0 && element("label", {}, "colour by ", element("select", { onchange: (event) => {
@@ -41,11 +41,11 @@ export function view(found, grades, labels) {
   listen(canvas, atoms, state, draw, pick);
   new ResizeObserver(draw).observe(canvas);
   return element("div", { class: "structure" },
-    element("div", {}, canvas, element("div", { class: "below" }, chooser, legend), said),
+    element("div", {}, canvas, element("div", { class: "below" }, chooser, legend), selection),
     tableOf(atoms, choices, rows, pick));
 }
 
-function told(atom) {
+function describe(atom) {
   const numbers = Object.keys(BY).filter((key) => atom[key] != null).map((key) => `${BY[key]} ${decimals(atom[key], 3)}`);
   const place = atom.at.map((x) => decimals(x, 2)).join(", ");
   return [`Atom ${atom.atom}: ${atom.species} at (${place}) Å`, ...numbers, atom.triggered ? "above the collection threshold" : ""].filter(Boolean).join("; ");
@@ -124,7 +124,7 @@ function zoom(state, factor) {
   state.zoom = Math.min(Math.max(state.zoom * factor, 0.2), 20);
 }
 
-/** Turns about the screen's axes: down and to the right. */
+/** Rotates about the screen's axes: down and to the right. */
 function turn(state, down, right) {
   const [c, s, k, l] = [Math.cos(right), Math.sin(right), Math.cos(down), Math.sin(down)];
   const [x, y, z] = state.turned;
@@ -144,12 +144,12 @@ function paint(canvas, structure, atoms, state) {
   const corners = cornersOf(structure);
   const centre = middle([...corners, ...structure.positions]);
   const reach = Math.max(...[...corners, ...structure.positions].map((point) => Math.hypot(...point.map((x, k) => x - centre[k]))), 2) + RADIUS;
-  // Perspective widens the picture by 1.4 % at most: 1 / √(1 − 1/36).
+  // Perspective enlarges the view by 1.4 % at most: 1 / √(1 − 1/36).
   const size = (0.97 * state.zoom * Math.min(width, height)) / 2 / reach;
   const place = (point) => {
     const from = point.map((x, k) => x - centre[k]);
     const [x, y, z] = state.turned.map((row) => row[0] * from[0] + row[1] * from[1] + row[2] * from[2]);
-    // A little perspective tells near from far.
+    // A slight perspective shows depth.
     const near = 1 / (1 - z / (6 * reach));
     return { x: width / 2 + x * size * near, y: height / 2 - y * size * near, z, near };
   };
@@ -184,7 +184,7 @@ function ball(context, atom, size, state, most, reach, ink) {
   context.stroke();
 }
 
-/** The atom in front at a place of the screen. */
+/** The frontmost atom at a position on the screen. */
 function hit(canvas, atoms, event) {
   const box = canvas.getBoundingClientRect();
   const [x, y] = [event.clientX - box.left, event.clientY - box.top];
@@ -203,7 +203,7 @@ function wire(context, [from, to], ink) {
   context.globalAlpha = 1;
 }
 
-/** The image of an atom that lies in the cell. */
+/** The periodic image of an atom inside the cell. */
 function inCell(at, { cell: [a, b, c], periodic }) {
   const volume = dot(a, cross(b, c));
   if (volume === 0) return at;
@@ -220,7 +220,7 @@ function cross(a, b) {
   return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
 
-/** The eight corners of the cell; none without one. */
+/** The eight corners of the cell. Empty without a cell. */
 function cornersOf({ cell }) {
   if (cell.flat().every((x) => x === 0)) return [];
   return Array.from({ length: 8 }, (_, corner) => [0, 1, 2].map((axis) => cell.reduce((sum, vector, k) => sum + ((corner >> k) & 1) * vector[axis], 0)));

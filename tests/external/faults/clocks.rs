@@ -11,8 +11,10 @@ use serde_json::Value;
 
 use crate::common::campaign::{Counters, Small, outcome};
 use crate::common::clock::Clock;
-use crate::common::hosts::{Hosts, started, undisturbed};
-use crate::common::processes::{carrying_out, go_on, hold_walkers, nothing_is_left, signal, wait_until};
+use crate::common::hosts::{Hosts, started, uninterrupted_outcome};
+use crate::common::processes::{
+    assert_no_leftovers, pause_walkers, processes_running, resume_processes, signal, wait_until,
+};
 use crate::common::{calmwalk, random, through};
 
 #[test]
@@ -50,15 +52,15 @@ fn jumping(small: &Small, disturb: impl Fn(&Path, u64)) -> tempfile::TempDir {
         disturb(here, jump);
         sleep(Duration::from_millis(200 + random(jump) % 1000));
         let after = Counters::of(".", here);
-        assert!(after.is_no_less_than(&before), "{before:?} {after:?}");
+        assert!(after.has_not_decreased_since(&before), "{before:?} {after:?}");
         before = after;
         if let Some(ended) = run.0.try_wait().unwrap() {
             assert_eq!(ended.code(), Some(0), "{}", fs::read_to_string(&said).unwrap());
             break;
         }
     }
-    assert_eq!(outcome(here), undisturbed(small));
-    nothing_is_left(here);
+    assert_eq!(outcome(here), uninterrupted_outcome(small));
+    assert_no_leftovers(here);
     directory
 }
 
@@ -88,7 +90,7 @@ fn labellers_that_are_killed_while_the_clock_jumps_lose_and_double_nothing() {
         // After one more it would be given up.
         if jump % 2 == 0
             && killed.get() < 5
-            && let Some(labeller) = carrying_out(here, "labeller").first()
+            && let Some(labeller) = processes_running(here, "labeller").first()
         {
             signal(*labeller, "KILL");
             killed.set(killed.get() + 1);
@@ -108,8 +110,8 @@ fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
     };
     let mut hosts = Hosts::new(&small, 2, "agent_silence_limit = 60.0");
     let clocks = tempfile::tempdir().unwrap();
-    let mut orchestrator = hosts.lead();
-    let held = hold_walkers(hosts.home.path(), 1);
+    let mut orchestrator = hosts.start_orchestrator();
+    let held = pause_walkers(hosts.home.path(), 1);
     let mut agents = Vec::new();
     let mut set = Vec::new();
     for (host, offset) in ["+1h", "-1h"].into_iter().enumerate() {
@@ -123,7 +125,7 @@ fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
     for host in 0..2 {
         wait_until("it has joined", || hosts.said(host).contains("joined: 1 walker,"));
     }
-    go_on(&held);
+    resume_processes(&held);
     for jump in 0.. {
         set[jump % 2].set(["-1h", "+1h", "+0"][jump % 3]);
         sleep(Duration::from_millis(300));
@@ -131,11 +133,11 @@ fn agents_whose_clocks_are_wrong_take_part_as_others_do() {
             break;
         }
     }
-    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.orchestrator_stderr());
     for (host, agent) in agents.iter_mut().enumerate() {
         assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(host));
     }
-    assert!(!hosts.head_said().contains("gives no sign of life"), "{}", hosts.head_said());
-    assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
-    hosts.are_empty();
+    assert!(!hosts.orchestrator_stderr().contains("sends no heartbeat"), "{}", hosts.orchestrator_stderr());
+    assert_eq!(outcome(hosts.home.path()), uninterrupted_outcome(&small));
+    hosts.assert_cleaned_up();
 }

@@ -9,8 +9,10 @@ use tempfile::TempDir;
 
 use super::must;
 use crate::common::campaign::{Counters, Small, outcome};
-use crate::common::hosts::{started, undisturbed};
-use crate::common::processes::{go_on, hold_walkers, nothing_is_left, processes_in, signal, wait_until};
+use crate::common::hosts::{started, uninterrupted_outcome};
+use crate::common::processes::{
+    assert_no_leftovers, pause_walkers, processes_in, resume_processes, signal, wait_until,
+};
 use crate::common::{Running, program, random, through};
 
 const RUN: [&str; 4] = ["run", "campaign.toml", "--directory", "."];
@@ -78,10 +80,10 @@ fn a_full_disk_ends_a_run_and_loses_nothing() {
         wait_until("the campaign advances", || Counters::of(".", &disk.at).sent > before.sent);
         std::thread::sleep(Duration::from_millis(random(full) % 200));
         // It must not be over before the disk is full.
-        let held = hold_walkers(&disk.at, 2);
+        let held = pause_walkers(&disk.at, 2);
         before = Counters::of(".", &disk.at);
         disk.fill();
-        go_on(&held);
+        resume_processes(&held);
         assert_eq!(run.0.wait().unwrap().code(), Some(1));
         let said = disk.said();
         let words = "the disk is full: nothing was written, and what was committed before is safe; make space and start again";
@@ -92,11 +94,11 @@ fn a_full_disk_ends_a_run_and_loses_nothing() {
         assert!(said.contains("the disk is full"), "{said}");
         disk.make_space();
         let after = Counters::of(".", &disk.at);
-        assert!(after.is_no_less_than(&before), "{before:?} {after:?}");
+        assert!(after.has_not_decreased_since(&before), "{before:?} {after:?}");
     }
     assert_eq!(disk.run().0.wait().unwrap().code(), Some(0), "{}", disk.said());
-    assert_eq!(outcome(&disk.at), undisturbed(&small()));
-    nothing_is_left(&disk.at);
+    assert_eq!(outcome(&disk.at), uninterrupted_outcome(&small()));
+    assert_no_leftovers(&disk.at);
 }
 
 /// What a campaign needs of it is reserved when it begins.
@@ -118,13 +120,13 @@ fn shared_memory_that_others_fill_does_no_harm() {
     let said = here.join("said");
     let mut run = started(through(&starter, here).args(RUN), &said);
     wait_until("walkers are at work", || Counters::of(".", here).sent > 0);
-    let held = hold_walkers(here, 2);
+    let held = pause_walkers(here, 2);
     must(&format!("{inside} sh -c '! dd if=/dev/zero of=/dev/shm/filler bs=64k'"));
     // Those that are started now find it full.
     signal(held[0], "KILL");
-    go_on(&held);
+    resume_processes(&held);
     assert_eq!(run.0.wait().unwrap().code(), Some(0), "{}", fs::read_to_string(&said).unwrap());
     wait_until("every process is gone", || processes_in(here).is_empty());
     must(&format!("{inside} sh -c 'rm /dev/shm/filler && ! ls /dev/shm | grep ^cw-'"));
-    assert_eq!(outcome(here), undisturbed(&small()));
+    assert_eq!(outcome(here), uninterrupted_outcome(&small()));
 }

@@ -9,8 +9,8 @@ use super::cable::{Cable, HEAD, NODE};
 use super::must;
 use crate::common::Running;
 use crate::common::campaign::{Counters, Outcome, Small, outcome};
-use crate::common::hosts::{Hosts, undisturbed};
-use crate::common::processes::{carrying_out, go_on, hold_walkers, wait_until};
+use crate::common::hosts::{Hosts, uninterrupted_outcome};
+use crate::common::processes::{pause_walkers, processes_running, resume_processes, wait_until};
 
 /// Three walks side by side: one for the orchestrator's own walker, two for the agent.
 fn small() -> Small {
@@ -49,17 +49,17 @@ impl Linked {
         let [prefetch, timeout] =
             ["--prefetch=1".to_owned(), format!("--wait-timeout={}s", (60.0 * patience) as u64)];
         hosts.options = [tls(HEAD).into(), tls(NODE).into_iter().chain([prefetch, timeout]).collect()];
-        let (orchestrator, agent) = (hosts.lead(), hosts.agent(0));
+        let (orchestrator, agent) = (hosts.start_orchestrator(), hosts.agent(0));
         Self { hosts, cable, orchestrator, agent }
     }
 
     fn are_at_work(&self) {
         // It does not end the campaign before the other host has joined.
-        let held = hold_walkers(self.hosts.home.path(), 1);
+        let held = pause_walkers(self.hosts.home.path(), 1);
         wait_until("the other host is at work", || {
-            !carrying_out(self.hosts.others[0].path(), "walker").is_empty()
+            !processes_running(self.hosts.others[0].path(), "walker").is_empty()
         });
-        go_on(&held);
+        resume_processes(&held);
         wait_until("structures are found", || self.counters().accepted > 0);
     }
 
@@ -72,24 +72,24 @@ impl Linked {
     }
 
     fn head_says(&self, words: &str) -> bool {
-        self.hosts.head_said().contains(words)
+        self.hosts.orchestrator_stderr().contains(words)
     }
 
     /// The agent's walker has nothing to do any more.
     fn walker_waits(&self) {
-        let said = "reports are kept for it, 1 of 1 walkers wait";
+        let said = "unsent reports, 1 of 1 walkers idle";
         wait_until("the agent's walker waits", || self.agent_says(said));
     }
 
     /// Waits for the end, at which the counters are at least these; returns the exit code of the agent.
     fn ends_as(mut self, expected: &Outcome, before: Counters) -> (Option<i32>, Hosts) {
         let ended = self.orchestrator.0.wait().unwrap();
-        assert_eq!(ended.code(), Some(0), "{}", self.hosts.head_said());
+        assert_eq!(ended.code(), Some(0), "{}", self.hosts.orchestrator_stderr());
         let agent = self.agent.0.wait().unwrap();
         let after = self.counters();
-        assert!(after.is_no_less_than(&before), "{before:?} {after:?}");
+        assert!(after.has_not_decreased_since(&before), "{before:?} {after:?}");
         assert_eq!(&outcome(self.hosts.home.path()), expected, "{}", self.hosts.said(0));
-        self.hosts.are_empty();
+        self.hosts.assert_cleaned_up();
         (agent.code(), self.hosts)
     }
 }
@@ -107,9 +107,13 @@ fn cut_for_five_seconds() {
     linked.cable.cut();
     sleep(Duration::from_secs(5));
     linked.cable.mend();
-    let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
+    let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
-    assert!(!hosts.head_said().contains("others get its walks"), "{}", hosts.head_said());
+    assert!(
+        !hosts.orchestrator_stderr().contains("its walks go to other walkers"),
+        "{}",
+        hosts.orchestrator_stderr()
+    );
 }
 
 /// Longer than the limit: the orchestrator's own walker gets the walks. The host that comes back joins anew; of what it
@@ -121,17 +125,17 @@ fn cut_for_a_minute() {
     linked.cable.cut();
     let begun = Instant::now();
     linked.walker_waits();
-    wait_until("the walks are handed on", || linked.head_says("others get its walks"));
+    wait_until("the walks are handed on", || linked.head_says("its walks go to other walkers"));
     let handed_on = linked.counters();
     wait_until("they go on elsewhere", || linked.counters().sent > handed_on.sent);
     // So that there is something left to do for the host that comes back.
-    let held = hold_walkers(linked.hosts.home.path(), 1);
+    let held = pause_walkers(linked.hosts.home.path(), 1);
     sleep(Duration::from_secs(60).saturating_sub(begun.elapsed()));
     linked.cable.mend();
     wait_until("the agent is back", || linked.agent_says("the orchestrator answers again"));
-    wait_until("it joins anew", || linked.hosts.head_said().matches("): joined").count() >= 2);
-    go_on(&held);
-    let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
+    wait_until("it joins anew", || linked.hosts.orchestrator_stderr().matches("): joined").count() >= 2);
+    resume_processes(&held);
+    let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
 }
 
@@ -142,11 +146,15 @@ fn cut_for_good() {
     let before = linked.counters();
     linked.cable.cut();
     linked.walker_waits();
-    let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
+    let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(1), "{}", hosts.said(0));
     let last_words = "calmwalk: the orchestrator has not answered for 0.3 min";
     assert!(hosts.said(0).contains(last_words), "{}", hosts.said(0));
-    assert!(hosts.head_said().contains("others get its walks"), "{}", hosts.head_said());
+    assert!(
+        hosts.orchestrator_stderr().contains("its walks go to other walkers"),
+        "{}",
+        hosts.orchestrator_stderr()
+    );
 }
 
 /// What one side says is lost, then what the other says: each time both notice, and go on where they were.
@@ -164,9 +172,13 @@ fn one_way() {
         linked.cable.drop_where(None, None);
         wait_until("the orchestrator is heard again", || said("the orchestrator answers again") > back);
     }
-    let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
+    let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
-    assert!(!hosts.head_said().contains("others get its walks"), "{}", hosts.head_said());
+    assert!(
+        !hosts.orchestrator_stderr().contains("its walks go to other walkers"),
+        "{}",
+        hosts.orchestrator_stderr()
+    );
 }
 
 /// One packet in five is lost, in both directions and from the first on: the walkers wait more, that is all.
@@ -178,6 +190,6 @@ fn a_fifth_is_lost() {
     let linked = Linked::with_cable(cable, 300.0, 60.0);
     linked.are_at_work();
     let before = linked.counters();
-    let (agent, hosts) = linked.ends_as(&undisturbed(&small()), before);
+    let (agent, hosts) = linked.ends_as(&uninterrupted_outcome(&small()), before);
     assert_eq!(agent, Some(0), "{}", hosts.said(0));
 }

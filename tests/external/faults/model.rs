@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use crate::common::campaign::{Small, outcome};
 use crate::common::config;
-use crate::common::hosts::{Hosts, undisturbed};
-use crate::common::line::SlowLine;
-use crate::common::processes::{carrying_out, go_on, hold_walkers, signal, wait_until};
+use crate::common::delay_proxy::DelayProxy;
+use crate::common::hosts::{Hosts, uninterrupted_outcome};
+use crate::common::processes::{pause_walkers, processes_running, resume_processes, signal, wait_until};
 
 /// Long enough to kill somebody while a question is on its way.
 const DELAY: Duration = Duration::from_secs(1);
@@ -27,25 +27,25 @@ fn an_orchestrator_is_killed_while_its_model_is_fetched() {
     let elsewhere = ["unshare", "--mount", "sh", "-c", "mount -t tmpfs none \"$0\" && exec \"$@\""];
     hosts.through[1] =
         elsewhere.map(str::to_owned).into_iter().chain([models.display().to_string()]).collect();
-    let line = SlowLine::to(hosts.endpoints[0].trim_start_matches("tcp/"), DELAY);
-    hosts.endpoints[1] = format!("tcp/{}", line.here);
+    let proxy = DelayProxy::to(hosts.endpoints[0].trim_start_matches("tcp/"), DELAY);
+    hosts.endpoints[1] = format!("tcp/{}", proxy.address);
 
     // So that there is something left to do for the host that comes, and comes back.
-    let hold = || hold_walkers(hosts.home.path(), 1);
-    let mut orchestrator = hosts.lead();
+    let hold = || pause_walkers(hosts.home.path(), 1);
+    let mut orchestrator = hosts.start_orchestrator();
     hold();
     let mut agent = hosts.agent(0);
-    wait_until("the agent asks for the model", || hosts.said(0).contains("fetching the model"));
+    wait_until("the agent asks for the model", || hosts.said(0).contains("downloading the model"));
     signal(orchestrator.0.id(), "KILL");
     orchestrator.0.wait().unwrap();
-    wait_until("its walker is gone", || carrying_out(hosts.home.path(), "walker").is_empty());
-    let mut orchestrator = hosts.lead();
+    wait_until("its walker is gone", || processes_running(hosts.home.path(), "walker").is_empty());
+    let mut orchestrator = hosts.start_orchestrator();
     let held = hold();
     wait_until("the agent has joined it", || hosts.said(0).contains("joined: 1 walker,"));
-    go_on(&held);
-    assert!(hosts.said(0).contains("joining anew"), "{}", hosts.said(0));
-    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.head_said());
+    resume_processes(&held);
+    assert!(hosts.said(0).contains("joining again"), "{}", hosts.said(0));
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", hosts.orchestrator_stderr());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", hosts.said(0));
-    assert_eq!(outcome(hosts.home.path()), undisturbed(&small));
-    hosts.are_empty();
+    assert_eq!(outcome(hosts.home.path()), uninterrupted_outcome(&small));
+    hosts.assert_cleaned_up();
 }

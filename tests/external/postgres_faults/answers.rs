@@ -11,7 +11,7 @@ use store::JobState;
 use wire::ContentHash;
 
 use crate::common::campaign::Small;
-use crate::common::place::{Place, on_store, queue};
+use crate::common::label_campaign::{LabelCampaign, on_store, queue};
 use crate::common::processes::wait_until;
 use crate::common::random;
 
@@ -122,7 +122,7 @@ fn small(number: u64) -> Structure {
 #[test]
 fn answers_to_commits_get_lost_and_no_job_does() {
     const JOBS: u64 = 47;
-    let place = Place::on_server(&Small { steps: 60, ..Small::default() }, &[]);
+    let place = LabelCampaign::on_server(&Small { steps: 60, ..Small::default() }, &[]);
     assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
     let structures: Vec<_> = (0..JOBS).map(small).collect();
     for (structure, step) in structures.iter().zip(1..) {

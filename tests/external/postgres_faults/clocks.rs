@@ -7,14 +7,14 @@ use std::time::Duration;
 use crate::common::Running;
 use crate::common::campaign::{Small, outcome_at};
 use crate::common::clock::Clock;
-use crate::common::hosts::undisturbed;
-use crate::common::place::Place;
-use crate::common::processes::{carrying_out, signal, wait_until};
+use crate::common::hosts::uninterrupted_outcome;
+use crate::common::label_campaign::LabelCampaign;
+use crate::common::processes::{processes_running, signal, wait_until};
 use crate::common::{random, through};
 
 /// `calmwalk label` with this clock on another host, as far as one can show it: with process numbers of its own, and
 /// another boot.
-fn label(place: &Place, clock: &Clock) -> Running {
+fn label(place: &LabelCampaign, clock: &Clock) -> Running {
     let boot = place.path().join("boot_id");
     fs::write(&boot, "11111111-2222-3333-4444-555555555555\n").unwrap();
     let elsewhere = ["unshare", "--pid", "--mount", "--fork", "--kill-child", "--mount-proc", "sh", "-c"];
@@ -24,7 +24,7 @@ fn label(place: &Place, clock: &Clock) -> Running {
     place.spawn(through(&starter, place.path()), &["label", "--store", place.argument()])
 }
 
-fn clocks(place: &Place) -> [Clock; 2] {
+fn clocks(place: &LabelCampaign) -> [Clock; 2] {
     ["+1h", "-1h"].map(|offset| {
         let directory = place.path().join(offset);
         fs::create_dir(&directory).unwrap();
@@ -36,7 +36,7 @@ fn clocks(place: &Place) -> [Clock; 2] {
 #[test]
 fn labellers_with_wrong_clocks_label_everything_once() {
     let small = Small { steps: 1600, per_seed: 12, ..Small::default() };
-    let place = Place::on_server(&small, &[("[label]", "[label]\nslots = 0\nlease = 2")]);
+    let place = LabelCampaign::on_server(&small, &[("[label]", "[label]\nslots = 0\nlease = 2")]);
     let mut run = place.run();
     wait_until("there is a campaign", || place.jobs("queued") > 0);
     let clocks = clocks(&place);
@@ -58,22 +58,22 @@ fn labellers_with_wrong_clocks_label_everything_once() {
         "{}",
         place.said()
     );
-    assert_eq!(outcome_at(place.argument(), place.path()), undisturbed(&small));
+    assert_eq!(outcome_at(place.argument(), place.path()), uninterrupted_outcome(&small));
 }
 
 /// One an hour behind has a structure in hand, and does not get on for some seconds; one an hour ahead looks for work.
 #[test]
 fn a_lease_lasts_however_late_others_think_it_is() {
     let small = Small { steps: 60, ..Small::default() };
-    let place = Place::on_server(&small, &[("[label]", "[label]\nlease = 60")]);
+    let place = LabelCampaign::on_server(&small, &[("[label]", "[label]\nlease = 60")]);
     assert_eq!(place.run().0.wait().unwrap().code(), Some(0), "{}", place.said());
     let name = place.queue_large();
     let [ahead, behind] = clocks(&place);
     let mut first = label(&place, &behind);
-    let slot = place.hold_in_mid_label();
+    let slot = place.pause_labeller();
     assert_eq!(place.jobs("leased"), 1, "it was stopped too late: {}", place.said());
     let mut second = label(&place, &ahead);
-    wait_until("another looks", || carrying_out(place.path(), "labeller").len() == 2);
+    wait_until("another looks", || processes_running(place.path(), "labeller").len() == 2);
     // Some looks at the queue.
     sleep(Duration::from_secs(8));
     signal(slot, "CONT");

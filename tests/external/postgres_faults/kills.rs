@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use super::server::Campaign;
 use crate::common::campaign::{Outcome, Small};
-use crate::common::hosts::undisturbed;
-use crate::common::processes::{carrying_out, signal};
+use crate::common::hosts::uninterrupted_outcome;
+use crate::common::processes::{processes_running, signal};
 use crate::common::{Running, kills, random};
 
 /// A campaign with two agents, in which everybody is killed sooner or later and started again.
@@ -19,7 +19,7 @@ struct Killed {
 impl Killed {
     fn new(small: &Small, name: &str) -> Self {
         let campaign = Campaign::new(small, name, 2, "agent_silence_limit = 0.5");
-        let orchestrator = campaign.hosts.lead();
+        let orchestrator = campaign.hosts.start_orchestrator();
         let agents = [campaign.hosts.agent(0), campaign.hosts.agent(1)];
         Self { campaign, orchestrator, agents }
     }
@@ -36,9 +36,9 @@ impl Killed {
             match choice % 8 {
                 0 | 1 => self.orchestrator.0.id(),
                 2 | 3 => self.agents[host].0.id(),
-                4 => which(carrying_out(self.campaign.hosts.others[host].path(), "walker")),
-                5 => which(carrying_out(home, "walker")),
-                _ => which(carrying_out(home, "labeller")),
+                4 => which(processes_running(self.campaign.hosts.others[host].path(), "walker")),
+                5 => which(processes_running(home, "walker")),
+                _ => which(processes_running(home, "labeller")),
             },
             "KILL",
         );
@@ -48,10 +48,10 @@ impl Killed {
     fn start_again(&mut self) -> bool {
         match self.orchestrator.0.try_wait().unwrap().map(|ended| ended.code()) {
             Some(Some(code)) => {
-                assert_eq!(code, 0, "{}", self.campaign.hosts.head_said());
+                assert_eq!(code, 0, "{}", self.campaign.hosts.orchestrator_stderr());
                 return true;
             }
-            Some(None) => self.orchestrator = self.campaign.hosts.lead(),
+            Some(None) => self.orchestrator = self.campaign.hosts.start_orchestrator(),
             None => {}
         }
         for (host, agent) in self.agents.iter_mut().enumerate() {
@@ -108,7 +108,7 @@ fn killed(small: &Small, name: &str, check: impl Fn(&Outcome)) {
 #[test]
 fn kills_change_nothing_in_a_reproducible_campaign() {
     let small = Small::default();
-    let expected = undisturbed(&small);
+    let expected = uninterrupted_outcome(&small);
     killed(&small, "kills", |outcome| assert_eq!(outcome, &expected));
 }
 

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use super::server::{Campaign, control};
 use crate::common::campaign::Small;
-use crate::common::hosts::undisturbed;
-use crate::common::processes::{carrying_out, one_carrying_out, signal, wait_until};
+use crate::common::hosts::uninterrupted_outcome;
+use crate::common::processes::{processes_running, signal, wait_for_process, wait_until};
 use crate::common::random;
 
 /// Some 20 s of work for two walkers.
@@ -18,9 +18,9 @@ fn long() -> Small {
 #[test]
 fn restarts_change_nothing() {
     let small = long();
-    let expected = undisturbed(&small);
+    let expected = uninterrupted_outcome(&small);
     let campaign = Campaign::new(&small, "restarts", 1, "");
-    let (mut orchestrator, mut agent) = (campaign.hosts.lead(), campaign.hosts.agent(0));
+    let (mut orchestrator, mut agent) = (campaign.hosts.start_orchestrator(), campaign.hosts.agent(0));
     let mut before = campaign.counters();
     for restart in 0..4 {
         wait_until("the campaign advances", || {
@@ -30,11 +30,11 @@ fn restarts_change_nothing() {
         before = campaign.counters();
         sleep(Duration::from_millis(random(restart) % 500));
         control(if restart % 3 == 0 { "restart" } else { "crash" });
-        assert!(orchestrator.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.head_said());
+        assert!(orchestrator.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.orchestrator_stderr());
         let after = campaign.counters();
-        assert!(after.is_no_less_than(&before), "{before:?} {after:?}");
+        assert!(after.has_not_decreased_since(&before), "{before:?} {after:?}");
     }
-    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.head_said());
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.orchestrator_stderr());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.said(0));
     assert_eq!(campaign.outcome(), expected);
 }
@@ -43,18 +43,18 @@ fn restarts_change_nothing() {
 #[test]
 fn restarts_change_nothing_in_one_process() {
     let small = long();
-    let expected = undisturbed(&small);
+    let expected = uninterrupted_outcome(&small);
     let mut campaign = Campaign::new(&small, "one", 0, "");
     campaign.hosts.listens = false;
     campaign.hosts.options[0] = vec!["--in-process".into()];
-    let mut orchestrator = campaign.hosts.lead();
+    let mut orchestrator = campaign.hosts.start_orchestrator();
     for restart in 0..2 {
         let before = campaign.counters();
         wait_until("the campaign advances", || campaign.counters().sent > before.sent);
         sleep(Duration::from_millis(random(50 + restart) % 500));
         control("crash");
     }
-    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.head_said());
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.orchestrator_stderr());
     assert_eq!(campaign.outcome(), expected);
 }
 
@@ -62,29 +62,29 @@ fn restarts_change_nothing_in_one_process() {
 #[test]
 fn a_server_that_is_away_for_a_minute_is_waited_for() {
     let small = long();
-    let expected = undisturbed(&small);
+    let expected = uninterrupted_outcome(&small);
     let campaign = Campaign::new(&small, "away", 1, "");
-    let (mut orchestrator, mut agent) = (campaign.hosts.lead(), campaign.hosts.agent(0));
+    let (mut orchestrator, mut agent) = (campaign.hosts.start_orchestrator(), campaign.hosts.agent(0));
     wait_until("labels are made", || campaign.counters().labels > 0);
     let before = campaign.counters();
     control("halt");
-    let said = |words: &str| campaign.hosts.head_said().contains(words);
+    let said = |words: &str| campaign.hosts.orchestrator_stderr().contains(words);
     wait_until("it says why it waits", || {
         said("waiting for the database: the database server does not answer")
     });
-    let labeller = one_carrying_out(campaign.home(), "labeller");
+    let labeller = wait_for_process(campaign.home(), "labeller");
     signal(labeller, "KILL");
     wait_until("another is there", || {
-        carrying_out(campaign.home(), "labeller").first().is_some_and(|other| *other != labeller)
+        processes_running(campaign.home(), "labeller").first().is_some_and(|other| *other != labeller)
     });
     sleep(Duration::from_secs(60));
-    assert!(orchestrator.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.head_said());
+    assert!(orchestrator.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.orchestrator_stderr());
     assert!(agent.0.try_wait().unwrap().is_none(), "{}", campaign.hosts.said(0));
     control("resume");
     wait_until("it says that it goes on", || said("the database answers again"));
     let after = campaign.counters();
-    assert!(after.is_no_less_than(&before), "{before:?} {after:?}");
-    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.head_said());
+    assert!(after.has_not_decreased_since(&before), "{before:?} {after:?}");
+    assert_eq!(orchestrator.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.orchestrator_stderr());
     assert_eq!(agent.0.wait().unwrap().code(), Some(0), "{}", campaign.hosts.said(0));
     assert_eq!(campaign.outcome(), expected);
 }

@@ -6,7 +6,7 @@ use std::process::Command;
 
 use crate::common::campaign::{Counters, Outcome, Small, outcome_at};
 use crate::common::hosts::Hosts;
-use crate::common::processes::nothing_is_left;
+use crate::common::processes::assert_no_leftovers;
 
 /// Does something to the server: `restart` in order, or after a `crash`; `halt` and `resume` it.
 pub fn control(action: &str) {
@@ -49,7 +49,7 @@ impl Campaign {
     pub fn outcome(&self) -> Outcome {
         let outcome = outcome_at(&self.location, self.home());
         fs::remove_file(self.home().join("dataset.extxyz")).expect("the exported data set");
-        nothing_is_left(self.home());
+        assert_no_leftovers(self.home());
         outcome
     }
 }

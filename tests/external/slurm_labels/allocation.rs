@@ -3,7 +3,7 @@
 use std::fs;
 
 use super::jobs::Jobs;
-use crate::common::processes::{calculating, carrying_out, signal, wait_until};
+use crate::common::processes::{calculation_processes, processes_running, signal, wait_until};
 use crate::common::program;
 use crate::common::slurm::slurm;
 
@@ -30,9 +30,9 @@ fn a_step_ends_with_its_keeper_and_its_label_is_made_again() {
     wait_until("a step is at work", || jobs.begun().len() == 1);
     // Nobody is left who might tidy up.
     for who in ["label", "labeller", "calculation-runner"] {
-        carrying_out(jobs.place.path(), who).into_iter().for_each(|pid| signal(pid, "KILL"));
+        processes_running(jobs.place.path(), who).into_iter().for_each(|pid| signal(pid, "KILL"));
     }
-    wait_until("the step has ended", || calculating(&scratch).is_empty());
+    wait_until("the step has ended", || calculation_processes(&scratch).is_empty());
     let label = jobs.place.label(&["--wait-timeout", "2m"]);
     wait_until("it is begun again", || jobs.begun().len() == 2);
     jobs.go();

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use super::jobs::{Jobs, only};
-use crate::common::processes::{calculating, signal, wait_until};
+use crate::common::processes::{calculation_processes, signal, wait_until};
 use crate::common::slurm::ci;
 
 /// Every process of the node that belongs to this job of Slurm: the daemon's own for the job, and what works in `scratch`.
@@ -20,8 +20,8 @@ fn of_job(id: &str, scratch: &Path) -> Vec<u32> {
 }
 
 /// Nothing of any calculation goes on.
-fn nothing_is_left(jobs: &Jobs, scratch: &Path) {
-    wait_until("every calculation is gone", || calculating(scratch).is_empty());
+fn assert_no_leftovers(jobs: &Jobs, scratch: &Path) {
+    wait_until("every calculation is gone", || calculation_processes(scratch).is_empty());
     let over = ["COMPLETED", "FAILED", "CANCELLED", "NODE_FAIL"];
     wait_until("every job is over", || jobs.jobs().iter().all(|[_, state, _]| over.contains(&&**state)));
     assert!(jobs.jobs().iter().all(|[id, ..]| of_job(id, scratch).is_empty()));
@@ -51,7 +51,7 @@ fn a_label_outlives_the_daemon_of_its_node() {
     assert!(
         jobs.attempts().iter().all(|attempt| attempt["class"].is_null() || attempt["class"] == "lost_node")
     );
-    nothing_is_left(&jobs, &scratch);
+    assert_no_leftovers(&jobs, &scratch);
 }
 
 /// As when the node loses its power: only slurmctld is left, and the node comes back knowing of nothing.
@@ -80,5 +80,5 @@ fn a_label_whose_node_dies_is_made_again_once() {
     let labels = jobs.finish(run, label);
     assert_eq!(jobs.begun().len(), labels + 1, "{}", jobs.place.said());
     only(&jobs, "lost_node");
-    nothing_is_left(&jobs, &scratch);
+    assert_no_leftovers(&jobs, &scratch);
 }

@@ -8,8 +8,8 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::common::campaign::{Small, outcome_at};
-use crate::common::place::{LEAVE_LABEL, Place, are_single, on_store};
-use crate::common::processes::{carrying_out, processes_in, signal, wait_until};
+use crate::common::label_campaign::{LabelCampaign, WRITE_FIXED_LABEL, check_single_labels, on_store};
+use crate::common::processes::{processes_in, processes_running, signal, wait_until};
 use crate::common::slurm::{ci, hold, slurm};
 use crate::common::{Running, succeed};
 
@@ -24,7 +24,7 @@ while [ ! -e $HERE/go ]; do sleep 0.1; done
 
 /// A campaign whose labels are jobs of their own.
 pub struct Jobs {
-    pub place: Place,
+    pub place: LabelCampaign,
     /// Its scratch directory is there, and what tells the script what to do.
     pub home: TempDir,
     _node: MutexGuard<'static, ()>,
@@ -54,9 +54,9 @@ impl Jobs {
             scratch.display().to_string()
         );
         let small = Small { walkers: 1, steps: 120, ..Small::default() };
-        let place = Place::new(&small, &[("[label]\nmethod", &keys)]);
+        let place = LabelCampaign::new(&small, &[("[label]\nmethod", &keys)]);
         let script = SCRIPT.replace("$HERE", &home.path().display().to_string());
-        fs::write(place.path().join("label.sh"), script + LEAVE_LABEL).unwrap();
+        fs::write(place.path().join("label.sh"), script + WRITE_FIXED_LABEL).unwrap();
         Self { place, home, _node }
     }
 
@@ -102,7 +102,7 @@ impl Jobs {
         label.0.wait().unwrap();
         outcome_at(self.place.argument(), self.place.path());
         wait_until("nobody is left", || processes_in(self.place.path()).is_empty());
-        on_store(self.place.location(), are_single)
+        on_store(self.place.location(), check_single_labels)
     }
 
     /// The queue, as `queue list` has it.
@@ -120,7 +120,7 @@ impl Jobs {
 
     /// Kills whoever makes labels, with no time to tidy up.
     pub fn kill(&self, label: &mut Running) {
-        carrying_out(self.place.path(), "labeller").into_iter().for_each(|pid| signal(pid, "KILL"));
+        processes_running(self.place.path(), "labeller").into_iter().for_each(|pid| signal(pid, "KILL"));
         label.0.kill().unwrap();
         label.0.wait().unwrap();
     }

@@ -1,0 +1,164 @@
+//! Reads the seed structures and checks that walks can start from them.
+
+use std::collections::HashMap;
+
+use atoms::{NeighbourList, Structure, extxyz, read_structures, shortest_distance};
+use calm::CollectionRule;
+use orchestrator::selector::SeedStructure;
+use potentials::grace::GraceModel;
+use wire::ContentHash;
+
+use super::SourcedStructure;
+use super::load::Loader;
+use crate::config::{ConfigError, Warning, place};
+
+const FILES: &str = "seeds.files";
+
+/// Nearest neighbours of solids and molecules are 0.79 to 1.48 times the sum of their radii (U, H₂) apart. Confusing
+/// Bohr and Å changes distances by a factor of 1.89.
+const USUAL_BONDS: std::ops::RangeInclusive<f64> = 0.65..=1.5;
+
+impl Loader<'_> {
+    /// Reads every frame of every file. Names must be unique.
+    pub fn seed_structures(&self, model: &GraceModel) -> Result<Vec<SourcedStructure>, ConfigError> {
+        let mut seeds: Vec<SourcedStructure> = Vec::new();
+        for file in &self.config.seeds.files {
+            let path = file.get_ref();
+            let wrong = |message: String| self.file_error(FILES, file, message);
+            let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            let frames = read_structures(path).map_err(|error| wrong(error.to_string()))?;
+            for (number, frame) in frames.into_iter().enumerate() {
+                let source = format!("{}:{}", path.display(), frame.line);
+                let named = frame.info.get("name").and_then(extxyz::Value::text).map(str::to_owned);
+                let name = named.unwrap_or_else(|| format!("{stem}-{number}"));
+                self.check_seed_structure(&frame.structure, model)
+                    .map_err(|error| wrong(format!("{source}: {error}")))?;
+                if let Some(first) = seeds.iter().find(|other| other.seed.name == name) {
+                    return Err(wrong(format!(
+                        "{source}: a second seed structure named '{name}', the first is {}; give each a unique name \
+                         (name=… in its comment line)",
+                        first.source
+                    )));
+                }
+                seeds.push(SourcedStructure {
+                    seed: SeedStructure { name, structure: frame.structure },
+                    source,
+                });
+            }
+        }
+        Ok(seeds)
+    }
+
+    /// Checks that a walk can start and collect: the model knows the elements, no atoms overlap, each atom has a
+    /// neighbour, there are as many atoms as the collection rule requires, and a volume ramp has a cell.
+    fn check_seed_structure(&self, structure: &Structure, model: &GraceModel) -> Result<(), String> {
+        structure.validate().map_err(|error| error.to_string())?;
+        model.element_indices(&structure.species).map_err(|error| error.to_string())?;
+        let mut neighbours = NeighbourList::new(model.cutoff(), 0.0);
+        neighbours.update(structure).map_err(|error| error.to_string())?;
+        let least = self.config.guard.least_distance.get();
+        if let Some((i, j, d)) = shortest_distance(structure, &neighbours).filter(|(_, _, d)| *d < least) {
+            return Err(format!(
+                "atoms {i} and {j} are {d:.3} Å apart, closer than guard.least_distance = {least} Å: no walk can start \
+                 here"
+            ));
+        }
+        let alone = (0..structure.len()).find(|i| structure.len() > 1 && neighbours.of(*i).is_empty());
+        if let Some(atom) = alone {
+            let cutoff = model.cutoff();
+            return Err(format!(
+                "atom {atom} has no neighbour within the cutoff, {cutoff} Å: a walk would end at its first step (are \
+                 positions and cell in Å, not Bohr?)"
+            ));
+        }
+        self.check_collectable(structure)
+    }
+
+    fn check_collectable(&self, structure: &Structure) -> Result<(), String> {
+        let atoms = structure.len();
+        if let CollectionRule::AtomCount { least, .. } = self.config.collect.when
+            && least.get() > atoms
+        {
+            return Err(format!(
+                "the structure has {atoms} atoms, fewer than the {least} that must be new at once \
+                 (collect.when.least): nothing can ever be collected from it; give a larger cell or a smaller `least`"
+            ));
+        }
+        if self.config.walk.volume_ramp.is_some() && structure.periodic == [false; 3] {
+            return Err(
+                "the structure has no periodic direction, and so no volume for walk.volume_ramp to change; give it a \
+                 cell (Lattice=… in its comment line), or leave walk.volume_ramp out"
+                    .to_owned(),
+            );
+        }
+        Ok(())
+    }
+
+    /// Warns of likely mistakes: duplicate structures and distances that do not match the elements.
+    pub fn suspicious_seed_structures(&self, seeds: &[SourcedStructure], model: &GraceModel) -> Vec<Warning> {
+        let mut first = HashMap::new();
+        let mut warnings = Vec::new();
+        for named in seeds {
+            let SourcedStructure { seed: SeedStructure { name, structure }, source } = named;
+            if let Some(other) = first.insert(ContentHash::of(&rounded(structure)), named) {
+                let message = format!(
+                    "seed structure '{name}' ({source}) is the same as '{}' ({}): walks from it find few new structures",
+                    other.seed.name, other.source
+                );
+                warnings.push(self.seeds_warning(message));
+            }
+            if let Some(strange) = suspicious_distances(structure, model.cutoff()) {
+                warnings.push(self.seeds_warning(format!("seed structure '{name}' ({source}): {strange}")));
+            }
+        }
+        warnings
+    }
+
+    fn seeds_warning(&self, message: String) -> Warning {
+        Warning { at: place(self.path, self.text, FILES), key: FILES.to_owned(), message }
+    }
+}
+
+/// The structure with lengths rounded to the precision of files, Å.
+fn rounded(structure: &Structure) -> Structure {
+    const DIGIT: f64 = 1e-4;
+    let mut structure = structure.clone();
+    let lengths = structure.cell.0.iter_mut().chain(&mut structure.positions).flatten();
+    // Turns −0 into 0.
+    lengths.for_each(|x| *x = (*x / DIGIT).round() * DIGIT + 0.0);
+    structure
+}
+
+/// Describes nearest-neighbour distances that do not match the elements.
+fn suspicious_distances(structure: &Structure, cutoff: f64) -> Option<String> {
+    let mut neighbours = NeighbourList::new(cutoff, 0.0);
+    neighbours.update(structure).ok()?;
+    let mut bonds = Vec::new();
+    // For each atom, the nearest neighbour relative to the radii: distance, and distance divided by the sum of radii.
+    let mut nearest: Vec<(f64, f64)> = (0..structure.len())
+        .filter_map(|i| {
+            neighbours.bonds_within(structure, i, cutoff, &mut bonds);
+            let relative = bonds.iter().filter_map(|bond| {
+                let other = structure.species[bond.atom as usize];
+                Some((bond.r, bond.r / (structure.species[i].radius()? + other.radius()?)))
+            });
+            relative.min_by(|a, b| a.1.total_cmp(&b.1))
+        })
+        .collect();
+    nearest.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let (distance, ratio) = *nearest.get(nearest.len() / 2)?;
+    if USUAL_BONDS.contains(&ratio) {
+        return None;
+    }
+    let mass: f64 = structure.species.iter().map(|species| species.mass()).sum();
+    let density = match structure.periodic {
+        // 1 u/Å³ in g/cm³.
+        [true, true, true] => format!(", at {:.2} g/cm³", 1.660_539 * mass / structure.cell.volume()),
+        _ => String::new(),
+    };
+    let instead = if ratio > 1.0 { "Bohr" } else { "nm, or in Å scaled to Bohr" };
+    Some(format!(
+        "nearest neighbours are {distance:.2} Å apart, {ratio:.2} times the sum of their radii{density}: are positions and \
+         cell in {instead}? expected Å"
+    ))
+}

@@ -1,0 +1,201 @@
+//! Errors of the potential's energies against labels, after removing element offsets.
+
+use analysis::{EnergyOffsets, Thinned, TooFewLabels, quantile};
+use atoms::{Species, Structure};
+use serde::Serialize;
+use store::{Store, StoreError};
+use wire::ContentHash;
+use workers::labeller::{energy_offsets, labelled_energy};
+
+/// Least number of labelled structures that must support a composition before its energy error is shown. One alone
+/// would have no error.
+const MIN_SUPPORT: f64 = 2.0;
+/// Largest number of errors kept for quantiles. Beyond it a systematic sample is kept.
+const MAX_SAMPLES: usize = 1 << 20;
+
+/// Element offsets between the energies of one label protocol and those of the potential.
+#[derive(Clone, Debug)]
+pub struct EnergyReference(Result<EnergyOffsets, TooFewLabels>);
+
+/// The fitted offsets, for display and JSON.
+#[derive(Clone, Debug, Serialize)]
+pub struct OffsetSummary {
+    /// Labelled structures used in the fit. 0 without a fit.
+    pub structures: usize,
+    /// Outliers that the fit excludes.
+    pub left_out: usize,
+    /// The offset of each element. Empty without a fit.
+    pub elements: Vec<OffsetEntry>,
+    /// Summary as text, or why there is no fit.
+    pub note: String,
+}
+
+/// The offset of an element.
+#[derive(Clone, Debug, Serialize)]
+pub struct OffsetEntry {
+    /// Chemical symbol.
+    pub element: &'static str,
+    /// E_label − E_model per atom, eV.
+    pub offset: f64,
+    /// Whether the labelled compositions determine the offset of this element. If not, only sums over compositions
+    /// are meaningful.
+    pub separate: bool,
+}
+
+/// Energy errors of labelled structures.
+#[derive(Clone, Debug)]
+pub struct EnergyErrors {
+    reference: EnergyReference,
+    /// Absolute errors, eV/atom.
+    errors: Thinned<f64>,
+    sum: f64,
+    largest: f64,
+    left_out: u64,
+}
+
+/// Summary of the errors.
+#[derive(Clone, Debug, Serialize)]
+pub struct EnergySummary {
+    /// Labelled structures with an error.
+    pub structures: u64,
+    /// Labelled structures without an error, since too few labels support their compositions.
+    pub left_out: u64,
+    /// Mean of |E_model − E_label| after removing the offsets, eV/atom. `None` without structures, like the following
+    /// fields.
+    pub mean: Option<f64>,
+    /// Median, eV/atom.
+    pub median: Option<f64>,
+    /// 90 % quantile, eV/atom.
+    pub p90: Option<f64>,
+    /// Maximum, eV/atom.
+    pub largest: Option<f64>,
+    /// The offsets that were removed.
+    pub offsets: OffsetSummary,
+}
+
+impl EnergyReference {
+    /// Fits the element offsets to the labels of this protocol.
+    pub async fn fit(store: &Store, protocol: ContentHash) -> Result<Self, StoreError> {
+        energy_offsets(store, protocol).await.map(Self)
+    }
+
+    /// E_model − E_label per atom after removing the offsets, eV. `None` if too few labels support the composition.
+    pub fn error_per_atom(&self, structure: &Structure, model: f64, label: f64) -> Option<f64> {
+        let found = labelled_energy(structure, model, label);
+        self.0.as_ref().ok()?.error_per_atom(&found, MIN_SUPPORT).filter(|error| error.is_finite())
+    }
+
+    /// The fit for display and JSON.
+    pub fn summary(&self) -> OffsetSummary {
+        let note = self.note();
+        let Ok(fit) = &self.0 else {
+            return OffsetSummary { structures: 0, left_out: 0, elements: Vec::new(), note };
+        };
+        let elements = fit.elements().map(|found| OffsetEntry {
+            element: Species::from_atomic_number(found.element).map_or("?", Species::symbol),
+            offset: found.offset,
+            separate: found.is_separate,
+        });
+        OffsetSummary {
+            structures: fit.structures(),
+            left_out: fit.left_out(),
+            elements: elements.collect(),
+            note,
+        }
+    }
+
+    fn note(&self) -> String {
+        let fit = match &self.0 {
+            Ok(fit) => fit,
+            Err(TooFewLabels { structures, needed }) => {
+                return format!(
+                    "no energy errors: fitting the element offsets between labels and the potential takes at least {needed} \
+                     labelled structures; there {}",
+                    match structures {
+                        1 => "is 1".to_owned(),
+                        n => format!("are {n}"),
+                    }
+                );
+            }
+        };
+        let elements: Vec<_> = fit.elements().collect();
+        let symbol = |element: u8| Species::from_atomic_number(element).map_or("?", Species::symbol);
+        let offset =
+            |found: &analysis::ElementOffset| format!("{} {:.4}", symbol(found.element), found.offset);
+        let offsets: Vec<_> = elements.iter().map(offset).collect();
+        let mut note = format!(
+            "energy errors exclude the element offsets (eV/atom, E_label − E_model): {}; least squares over {} labelled \
+             structures",
+            offsets.join(", "),
+            fit.structures()
+        );
+        if fit.left_out() > 0 {
+            note += &format!(", without {} outliers", fit.left_out());
+        }
+        let together: Vec<_> = elements.iter().filter(|found| !found.is_separate).collect();
+        if !together.is_empty() {
+            let symbols: Vec<_> = together.iter().map(|found| symbol(found.element)).collect();
+            note += &format!(
+                "; the labelled compositions do not determine the offsets of {} separately, only sums",
+                symbols.join(", ")
+            );
+        }
+        note
+    }
+}
+
+impl EnergyErrors {
+    /// Starts without errors.
+    pub fn new(reference: EnergyReference) -> Self {
+        Self { reference, errors: Thinned::new(MAX_SAMPLES), sum: 0.0, largest: 0.0, left_out: 0 }
+    }
+
+    /// Adds a labelled structure with its energies, eV.
+    pub fn add(&mut self, structure: &Structure, model: f64, label: f64) {
+        match self.reference.error_per_atom(structure, model, label) {
+            Some(error) => {
+                self.errors.push(error.abs());
+                self.sum += error.abs();
+                self.largest = self.largest.max(error.abs());
+            }
+            None => self.left_out += 1,
+        }
+    }
+
+    /// Summarizes the errors.
+    pub fn summary(&self) -> EnergySummary {
+        let mut sorted: Vec<f64> = self.errors.kept().copied().collect();
+        sorted.sort_by(f64::total_cmp);
+        let structures = self.errors.seen();
+        let any = |x: f64| (structures > 0).then_some(x);
+        EnergySummary {
+            structures,
+            left_out: self.left_out,
+            mean: any(self.sum / structures.max(1) as f64),
+            median: quantile(&sorted, 0.5),
+            p90: quantile(&sorted, 0.9),
+            largest: any(self.largest),
+            offsets: self.reference.summary(),
+        }
+    }
+}
+
+impl EnergySummary {
+    /// One line of text in meV/atom, without the note. `None` without errors.
+    pub fn line(&self) -> Option<String> {
+        let milli = |x: Option<f64>| crate::output::decimals(x.map(|x| 1000.0 * x), 1);
+        self.mean?;
+        let mut line = format!(
+            "mean {}, median {}, 90 % below {}, largest {} meV/atom, over {} structures",
+            milli(self.mean),
+            milli(self.median),
+            milli(self.p90),
+            milli(self.largest),
+            self.structures
+        );
+        if self.left_out > 0 {
+            line += &format!(" ({} more have compositions with too few labels)", self.left_out);
+        }
+        Some(line)
+    }
+}

@@ -1,0 +1,117 @@
+use proptest::prelude::*;
+use proptest::test_runner::RngSeed;
+
+use super::*;
+
+fn properties() -> StructureProperties<'static> {
+    static SPECIES: [Species; 0] = [];
+    StructureProperties {
+        gamma: Some(2.5),
+        step: Some(300),
+        kind: "biased",
+        seed: Some("fcc 100"),
+        species: &SPECIES,
+        ..StructureProperties::default()
+    }
+}
+
+fn matches(text: &str) -> bool {
+    let species: Vec<Species> = ["Mo", "Mo", "C"].map(|symbol| symbol.parse().unwrap()).to_vec();
+    text.parse::<Filter>().unwrap().matches(&StructureProperties {
+        species: &species,
+        energy: Some(-6.0),
+        ..properties()
+    })
+}
+
+#[test]
+fn filters_are_evaluated() {
+    for (text, expected) in [
+        ("gamma > 2 and element = Mo", true),
+        ("gamma > 2 and element = Al", false),
+        ("element != Al", true),
+        ("element != C", false),
+        ("gamma>=2.5", true),
+        ("gamma < 2.5 or step = 3e2", true),
+        // `and` binds closer than `or`, `not` closest.
+        ("atoms = 3 or atoms = 4 and step = 0", true),
+        ("(atoms = 3 or atoms = 4) and step = 0", false),
+        ("not gamma > 3 and step <= 300", true),
+        ("seed = 'fcc 100' AND kind != control", true),
+        ("energy_per_atom = -2", true),
+        ("energy != -6", false),
+        // A comparison with a missing property is false.
+        ("walk = 0 or walk != 0", false),
+        ("not walk = 0", true),
+    ] {
+        assert_eq!(matches(text), expected, "{text}");
+    }
+}
+
+#[test]
+fn names_are_those_in_the_expression() {
+    let condition: Filter = "not (gamma > 2 or element = Mo) and max_force < 5".parse().unwrap();
+    assert_eq!(condition.names(), ["gamma", "element", "max_force"]);
+}
+
+#[test]
+fn errors_have_positions() {
+    for (text, position, found, expected) in [
+        ("", 1, "the end", "gamma_nbr"),
+        ("gama > 2", 1, "'gama'", "one of gamma,"),
+        ("gamma 2", 7, "'2'", "one of = != <"),
+        ("gamma > Mo", 9, "'Mo'", "a number"),
+        ("gamma > inf", 9, "'inf'", "a number"),
+        ("gamma > 2 element = Mo", 11, "'element'", "'and', 'or' or the end"),
+        ("(gamma > 2", 11, "the end", "')'"),
+        ("element > Mo", 9, "'>'", "= or != after element"),
+        ("element = Xx", 11, "'Xx'", "the symbol of an element"),
+        ("kind = biassed", 8, "'biassed'", "biased, control or imported"),
+        ("seed = 'fcc", 8, "an unterminated text", "a closing '"),
+        ("γ > 2", 1, "'γ'", "one of gamma,"),
+        ("gamma > 2 && step = 1", 11, "'&'", "a name"),
+    ] {
+        let error = text.parse::<Filter>().unwrap_err();
+        assert_eq!((error.position, error.found.as_str()), (position, found), "{text}");
+        assert!(error.expected.contains(expected), "{text}: {error}");
+    }
+    let deep = "not ".repeat(100_000) + "gamma > 1";
+    assert!(deep.parse::<Filter>().unwrap_err().expected.contains("at most 100"));
+}
+
+fn conditions() -> impl Strategy<Value = Filter> {
+    use Comparison::*;
+    let number =
+        proptest::sample::select(NumberField::ALL.iter().map(|(field, _)| *field).collect::<Vec<_>>());
+    let comparison = proptest::sample::select(vec![Equal, Different, Below, AtMost, Above, AtLeast]);
+    let finite = any::<f64>().prop_filter("finite", |x| x.is_finite());
+    let numbers = (number, comparison, finite).prop_map(|(a, b, c)| Filter::Number(a, b, c));
+    let seed = ("[a-zé' ()=0-9]{0,12}", any::<bool>())
+        .prop_map(|(name, equal)| Filter::Text(TextField::Seed, equal, name));
+    let element = proptest::sample::select(vec!["Al", "Mo"]);
+    let element = element.prop_map(|symbol| Filter::Text(TextField::Element, true, symbol.to_owned()));
+    prop_oneof![numbers, seed, element].prop_recursive(5, 40, 2, |inner| {
+        let pair = (inner.clone(), inner.clone());
+        prop_oneof![
+            inner.prop_map(|a| Filter::Not(Box::new(a))),
+            pair.clone().prop_map(|(a, b)| Filter::And(Box::new(a), Box::new(b))),
+            pair.prop_map(|(a, b)| Filter::Or(Box::new(a), Box::new(b))),
+        ]
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { rng_seed: RngSeed::Fixed(6), ..ProptestConfig::default() })]
+
+    #[test]
+    fn displayed_filters_parse_back(condition in conditions()) {
+        prop_assert_eq!(condition.to_string().parse::<Filter>(), Ok(condition));
+    }
+
+    #[test]
+    fn any_text_is_a_filter_or_an_error_inside_it(text in "([a-z_]{1,9}|[ ()<>=!'\"γ.0-9-]|and|or|not|gamma > 1){0,12}") {
+        if let Err(error) = text.parse::<Filter>() {
+            prop_assert!((1..=text.chars().count() + 1).contains(&error.position), "{error}");
+        }
+    }
+}

@@ -1,0 +1,304 @@
+//! How the labels of a campaign are made, as read from its store. Labellers without the configuration file use it.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use atoms::Species;
+use dft::Code;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use store::{Protocol, Store};
+use wire::ContentHash;
+use workers::labeller::LabelBounds;
+
+use crate::config::{LabelMethod, LabelSection, PotentialFile, PotentialKind, changed_keys};
+use crate::exit_status::Failure;
+use crate::process_config::MethodConfig;
+
+/// Configuration key of a reference potential's file.
+pub const REFERENCE_FILE: &str = "label.method.reference.file";
+
+/// Metadata key under which the leader stores its [`MethodConfig`], with the paths of its host.
+pub const LABEL_METHOD_KEY: &str = "label_method";
+
+/// What a labeller needs to know about the campaign.
+#[derive(Clone, Debug)]
+pub struct LabelSetup {
+    /// How to make labels, with files on this host.
+    pub method: MethodConfig,
+    /// The protocol of new jobs.
+    pub protocol: Protocol,
+    /// Attempts before a label counts as failed.
+    pub attempts: u32,
+    /// Limits of plausible labels.
+    pub bounds: LabelBounds,
+    /// How long a job is leased.
+    pub lease: Duration,
+}
+
+/// Options for the host on which labels are made.
+#[derive(Debug, Default)]
+pub struct HostOptions<'a> {
+    /// The method that the campaign must have.
+    pub method: Option<&'a str>,
+    /// Files that are not where the leader has them.
+    pub files: &'a [PathBuf],
+    /// How to call the program on this host: another command or other paths, but the same protocol.
+    pub label: Option<LabelSection>,
+}
+
+/// The `[label]` section of the configuration in force.
+#[derive(Deserialize)]
+struct EffectiveConfig {
+    label: LabelLimits,
+}
+
+#[derive(Deserialize)]
+struct LabelLimits {
+    attempts: u32,
+    #[serde(flatten)]
+    bounds: LabelBounds,
+    /// Campaigns of earlier versions have no lease.
+    #[serde(default = "default_lease")]
+    lease: u32,
+}
+
+fn default_lease() -> u32 {
+    600
+}
+
+/// The protocol with these settings. Its hash is that of the settings.
+pub fn protocol(name: &str, settings: Value) -> Protocol {
+    let hash = ContentHash(*blake3::hash(settings.to_string().as_bytes()).as_bytes());
+    Protocol { hash, name: name.to_owned(), settings }
+}
+
+/// Protocol settings of a program's labels.
+pub fn code_identity(method: &str, code: &dyn Code) -> Value {
+    json!({ "method": method, "settings": code.identity() })
+}
+
+/// Protocol settings of a reference potential.
+pub fn reference_identity(kind: PotentialKind, file_hash: &str) -> Value {
+    json!({ "method": "reference", "kind": kind, "file_hash": file_hash })
+}
+
+/// The part of the label method that a campaign's configuration records: what determines the labels. The command and
+/// the paths of files may change.
+pub fn resolved_method(label: &LabelSection, protocol: &Protocol) -> Value {
+    match &label.method {
+        LabelMethod::Reference(PotentialFile { kind, .. }) => {
+            json!({ "reference": { "kind": kind, "file": null } })
+        }
+        LabelMethod::Code(settings) => json!({ settings.name(): protocol.settings }),
+    }
+}
+
+/// The configuration of a campaign with another label protocol.
+pub fn with_protocol(configuration: &Value, label: &LabelSection, protocol: &Protocol) -> Value {
+    let mut configuration = configuration.clone();
+    configuration["label"]["protocol"] = json!(protocol.name);
+    configuration["label"]["method"] = resolved_method(label, protocol);
+    if let Some(files) = configuration["files"].as_object_mut() {
+        files.remove(REFERENCE_FILE);
+        if let LabelMethod::Reference(_) = label.method {
+            files.insert(REFERENCE_FILE.to_owned(), protocol.settings["file_hash"].clone());
+        }
+    }
+    configuration
+}
+
+/// Checks that labels can be made for these elements.
+pub fn supports(label: &LabelSection, species: &BTreeSet<Species>) -> Result<(), String> {
+    match &label.method {
+        LabelMethod::Reference(reference) => {
+            let potential = reference.load()?;
+            match species.iter().find(|species| !potential.species().contains(species)) {
+                Some(missing) => Err(format!("the label potential does not know {missing}")),
+                None => Ok(()),
+            }
+        }
+        LabelMethod::Code(settings) => {
+            let code = settings.prepare(&label.pass_environment).map_err(|error| error.to_string())?;
+            code.supports(species).map_err(|error| error.to_string())
+        }
+    }
+}
+
+impl LabelSetup {
+    /// Reads the setup of `protocol`, which is in force, and locates on this host what the method needs.
+    pub async fn read(store: &Store, protocol: Protocol, here: HostOptions<'_>) -> Result<Self, Failure> {
+        let text = store.campaign().await?.configuration_in_force;
+        let EffectiveConfig { label: LabelLimits { attempts, bounds, lease } } =
+            serde_json::from_str(&text).map_err(unreadable)?;
+        let noted = store.note(LABEL_METHOD_KEY).await?.ok_or_else(|| {
+            Failure::Failed(
+                "the store has no label settings: an earlier version of this program last ran the campaign; run it once \
+                 with this one"
+                    .to_owned(),
+            )
+        })?;
+        let noted: MethodConfig = serde_json::from_str(&noted).map_err(unreadable)?;
+        let found = noted.name();
+        if let Some(wanted) = here.method.filter(|wanted| *wanted != found) {
+            return Err(Failure::Input(format!(
+                "--method {wanted}, but the labels of this campaign are made by the method '{found}': leave --method out, \
+                 or name the intended campaign"
+            )));
+        }
+        let method = noted.for_this_host(&protocol, here)?;
+        let lease = Duration::from_secs(lease.into());
+        Ok(Self { method, protocol, attempts, bounds, lease })
+    }
+}
+
+/// Limits of plausible labels, from the configuration in force.
+pub async fn read_bounds(store: &Store) -> Result<LabelBounds, Failure> {
+    let text = store.campaign().await?.configuration_in_force;
+    let configuration: Value = serde_json::from_str(&text).map_err(unreadable)?;
+    match &configuration["label"] {
+        Value::Null => Ok(LabelBounds::default()),
+        label => LabelBounds::deserialize(label).map_err(unreadable),
+    }
+}
+
+fn unreadable(error: serde_json::Error) -> Failure {
+    Failure::Failed(format!(
+        "cannot read the label settings in the store ({error}): another version of this program may have written them, \
+         or the database is damaged; run calmwalk store check"
+    ))
+}
+
+impl MethodConfig {
+    /// The method of a configuration, with absolute paths.
+    pub fn from_section(label: &LabelSection) -> Result<Self, Failure> {
+        let absolute = |path: &Path| std::path::absolute(path).map_err(Failure::failed);
+        match &label.method {
+            LabelMethod::Reference(PotentialFile { kind, file }) => {
+                let file = file.get_ref();
+                let file_hash = hash(file)
+                    .map_err(|error| Failure::Input(format!("cannot read {}: {error}", file.display())))?;
+                Ok(Self::Reference { kind: *kind, file: absolute(file)?, file_hash })
+            }
+            LabelMethod::Code(settings) => {
+                let mut settings = Box::new(settings.clone());
+                for path in settings.paths() {
+                    *path = absolute(path)?;
+                }
+                Ok(Self::Code { settings, running: label.running() })
+            }
+        }
+    }
+
+    /// Protocol settings of the labels. A program must be installed.
+    pub fn identity(&self) -> Result<Value, Failure> {
+        match self {
+            Self::Reference { kind, file_hash, .. } => Ok(reference_identity(*kind, file_hash)),
+            Self::Code { settings, running } => {
+                let code = settings.prepare(&running.pass_environment).map_err(Failure::input)?;
+                Ok(code_identity(settings.name(), &*code))
+            }
+        }
+    }
+
+    /// Name of the method in the configuration.
+    fn name(&self) -> &'static str {
+        match self {
+            Self::Reference { .. } => "reference",
+            Self::Code { settings, .. } => settings.name(),
+        }
+    }
+
+    /// Replaces files and commands by those of this host. Fails if they would make labels of another protocol.
+    fn for_this_host(self, protocol: &Protocol, here: HostOptions<'_>) -> Result<Self, Failure> {
+        let given = here.label.as_ref().map(Self::from_section).transpose()?;
+        match (self, given) {
+            (Self::Reference { kind, file, .. }, None) => {
+                let (file, file_hash) = find_file(&file, protocol, here.files)?;
+                Ok(Self::Reference { kind, file, file_hash })
+            }
+            (noted @ Self::Code { .. }, given) => {
+                let (name, method) = (noted.name(), given.unwrap_or(noted));
+                if let Some(file) = here.files.first() {
+                    return Err(Failure::Input(format!(
+                        "--file {}: give the files of the method '{name}' in a --config",
+                        file.display()
+                    )));
+                }
+                if method.name() != name {
+                    return Err(method_mismatch(method.name(), name));
+                }
+                let identity = method.identity().map_err(|failure| {
+                    Failure::Input(format!(
+                        "cannot make labels on this host: {failure}; if the missing file or program has another path here, \
+                         give it in a --config"
+                    ))
+                })?;
+                check_protocol(&identity, protocol)?;
+                Ok(method)
+            }
+            (Self::Reference { .. }, Some(given)) => Err(method_mismatch(given.name(), "reference")),
+        }
+    }
+}
+
+/// Checks that labels with these settings belong to the protocol.
+pub fn check_protocol(identity: &Value, protocol: &Protocol) -> Result<(), Failure> {
+    match changed_keys(&protocol.settings, identity).first() {
+        None => Ok(()),
+        Some((key, before, after)) => Err(Failure::Input(format!(
+            "labels made here would not belong to the campaign's protocol '{}': {key} is {after} here, but {before} \
+             in the protocol",
+            protocol.name
+        ))),
+    }
+}
+
+fn method_mismatch(found: &str, expected: &str) -> Failure {
+    Failure::Input(match (found, expected) {
+        ("reference", "reference") => {
+            "--config: give the file of a reference potential with --file".to_owned()
+        }
+        _ => format!(
+            "--config has the label method '{found}', but the labels of this campaign are made by '{expected}'"
+        ),
+    })
+}
+
+/// The file with which labels of the protocol are made, and its BLAKE3 hash: one of `given`, or the leader's file.
+fn find_file(noted: &Path, protocol: &Protocol, given: &[PathBuf]) -> Result<(PathBuf, String), Failure> {
+    let expected = protocol.settings["file_hash"].as_str().unwrap_or_default();
+    let mut found = None;
+    for path in given {
+        let hash = hash(path).map_err(|error| {
+            Failure::Input(format!("--file {}: cannot be read ({error})", path.display()))
+        })?;
+        if hash != expected {
+            // A file that is not needed is most likely a mistake.
+            return Err(Failure::Input(format!(
+                "--file {}: its content (BLAKE3 {hash}) differs from that of the file that makes this campaign's \
+                 labels",
+                path.display()
+            )));
+        }
+        found = Some((std::path::absolute(path).map_err(Failure::failed)?, hash));
+    }
+    if let Some(found) = found {
+        return Ok(found);
+    }
+    let why = match hash(noted) {
+        Ok(hash) if hash == expected => return Ok((noted.to_owned(), hash)),
+        Ok(hash) => format!("{} here has another content (BLAKE3 {hash})", noted.display()),
+        Err(error) => format!("{} cannot be read here ({error})", noted.display()),
+    };
+    Err(Failure::Input(format!(
+        "{REFERENCE_FILE}: this campaign's labels need the file with BLAKE3 {expected}, but {why}; copy it to this \
+         host and pass it with --file"
+    )))
+}
+
+fn hash(path: &Path) -> std::io::Result<String> {
+    Ok(blake3::hash(&fs::read(path)?).to_string())
+}

@@ -1,0 +1,133 @@
+//! Statistics of the labels of a campaign: the potential's errors, whether the grade predicted them, and which
+//! structures have no label.
+
+use analysis::{Bins, Completion, ForceErrors};
+use atoms::cell::{norm, sub};
+use store::{AtomGrades, ExportFilter, ExportSource, Finished, Store, StoreError};
+use wire::{ContentHash, Origin};
+
+use crate::energy_errors::{EnergyErrors, EnergyReference};
+
+/// Force errors above this count as large, eV/Å, as in the paper.
+pub const LARGE_FORCE_ERROR: f64 = 1.0;
+
+/// Rows read from the store at a time.
+const PAGE_ROWS: u32 = 256;
+/// Largest number of atoms kept for ranks and quantiles. Beyond it a systematic sample is kept.
+const MAX_SAMPLES: usize = 1 << 20;
+
+/// Force errors by both grades of the original mixture.
+#[derive(Clone, Debug)]
+pub struct ErrorsByGrade {
+    /// Labelled structures.
+    pub structures: u64,
+    /// By γ.
+    pub gamma: ForceErrors,
+    /// By γ_nbr.
+    pub gamma_nbr: ForceErrors,
+}
+
+/// Statistics of the labels of one protocol.
+#[derive(Clone, Debug)]
+pub struct LabelStatistics {
+    /// Of all structures.
+    pub all: ErrorsByGrade,
+    /// Of structures from biased walks.
+    pub biased: ErrorsByGrade,
+    /// Of frames from control walks.
+    pub control: ErrorsByGrade,
+    /// Energy errors of all structures.
+    pub energies: EnergyErrors,
+    /// Labelled structures that both a biased walk and a control walk found, for example before the bias separates
+    /// them. `all` counts them once, and the comparison excludes them.
+    pub shared: u64,
+    /// Labelled and failed structures by their largest γ, with the names of the failed ones.
+    pub by_gamma: Completion<String>,
+    /// The same by V/V₀.
+    pub by_expansion: Completion<String>,
+}
+
+/// Reads the labels of one protocol page by page.
+pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistics, StoreError> {
+    let mut statistics = LabelStatistics {
+        all: ErrorsByGrade::new(),
+        biased: ErrorsByGrade::new(),
+        control: ErrorsByGrade::new(),
+        energies: EnergyErrors::new(EnergyReference::fit(store, protocol).await?),
+        shared: 0,
+        by_gamma: Completion::new(Bins::of_grades()),
+        by_expansion: Completion::new(Bins::of_expansion()),
+    };
+    let shared = store.structures_of_both_origins().await?;
+    let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
+    let mut after = None;
+    loop {
+        let page = store.labelled(&filter, after, PAGE_ROWS).await?;
+        let Some(last) = page.last() else { break };
+        after = Some(last.place);
+        for row in &page {
+            let ExportSource::Candidate { origin, block, original, .. } = &row.source else { continue };
+            let forces = block.view().forces;
+            let errors = forces.iter().zip(&row.label.forces).map(|(model, label)| norm(sub(*model, *label)));
+            let errors: Vec<_> = errors.collect();
+            match (shared.contains(&block.view().id().content), *origin) {
+                (false, origin) => statistics.for_origin(origin, |grades| grades.labelled(original, &errors)),
+                (true, Origin::Biased) => {
+                    statistics.shared += 1;
+                    statistics.all.labelled(original, &errors);
+                }
+                // Counted with the biased walk.
+                (true, Origin::Control) => continue,
+            }
+            statistics.energies.add(&row.structure, block.view().energy(), row.label.energy);
+        }
+    }
+    let mut after = 0;
+    loop {
+        let page = store.finished(protocol, after, PAGE_ROWS).await?;
+        let Some(last) = page.last() else { break };
+        after = last.decision;
+        page.iter().for_each(|candidate| statistics.finished(candidate));
+    }
+    Ok(statistics)
+}
+
+impl LabelStatistics {
+    fn for_origin(&mut self, origin: Origin, mut change: impl FnMut(&mut ErrorsByGrade)) {
+        let of_origin = if origin == Origin::Biased { &mut self.biased } else { &mut self.control };
+        [&mut self.all, of_origin].into_iter().for_each(&mut change);
+    }
+
+    fn finished(&mut self, candidate: &Finished) {
+        for (completion, value) in
+            [(&mut self.by_gamma, candidate.gamma), (&mut self.by_expansion, candidate.relative_volume)]
+        {
+            match candidate.labelled {
+                true => completion.labelled(value),
+                false => completion.failed(value, candidate.candidate.clone()),
+            }
+        }
+        if let Some(grades) = &candidate.unlabelled {
+            self.for_origin(candidate.origin, |all| all.unlabelled(grades));
+        }
+    }
+}
+
+impl ErrorsByGrade {
+    fn new() -> Self {
+        let errors = ForceErrors::new(Bins::of_grades(), LARGE_FORCE_ERROR, MAX_SAMPLES);
+        Self { structures: 0, gamma: errors.clone(), gamma_nbr: errors }
+    }
+
+    fn labelled(&mut self, original: &AtomGrades, errors: &[f64]) {
+        self.structures += 1;
+        for (by, grades) in [(&mut self.gamma, &original.gamma), (&mut self.gamma_nbr, &original.gamma_nbr)] {
+            grades.iter().zip(errors).for_each(|(grade, error)| by.push(*grade, *error));
+        }
+    }
+
+    fn unlabelled(&mut self, original: &AtomGrades) {
+        original.gamma.iter().for_each(|grade| self.gamma.push_unlabelled(*grade));
+        original.gamma_nbr.iter().for_each(|grade| self.gamma_nbr.push_unlabelled(*grade));
+    }
+}

@@ -1,0 +1,143 @@
+//! Feeds decisions and candidates from the store to the replay.
+
+use std::collections::VecDeque;
+use std::panic::resume_unwind;
+use std::sync::Arc;
+use std::thread;
+
+use calm::Mixture;
+use orchestrator::selector::{Examined, Examiner, Replay, SelectorError};
+use store::{Store, StoredCandidate};
+
+use super::failure;
+use super::report::{LogEntry, Report};
+use crate::exit_status::Failure;
+use crate::output::Bar;
+use crate::runtime::cores;
+
+/// Decisions read at a time.
+const PAGE_ROWS: i64 = 500;
+/// Candidates that each core grades per batch. With more of them, the mixture is more often outdated when they are
+/// decided.
+const CANDIDATES_PER_CORE: u32 = 8;
+
+/// Follows the log up to decision `last`, or until something differs or is missing.
+pub async fn follow(
+    store: &Store,
+    replay: &mut Replay,
+    report: &mut Report,
+    last: i64,
+    bar: &Bar,
+) -> Result<(), Failure> {
+    let mut prefetch = Prefetch::new(replay.is_exact());
+    for first in (1..=last).step_by(PAGE_ROWS as usize) {
+        let to = last.min(first + PAGE_ROWS - 1);
+        let page = store.decisions(first..=to).await?;
+        if page.len() as i64 != to - first + 1 {
+            return Err(damaged(first, &format!("one of the {} from it on is missing", to - first + 1)));
+        }
+        for recorded in &page {
+            let candidate = match recorded.candidate {
+                Some(_) if replay.comes_to(recorded).map_err(failure)? => {
+                    Some(prefetch.take(store, replay, recorded.sequence).await?)
+                }
+                _ => None,
+            };
+            if let Some(PrefetchedCandidate { examined: None, .. }) = candidate {
+                report.stop(recorded);
+                return Ok(());
+            }
+            let (stored, examined) = candidate.map(|ready| (ready.stored, ready.examined)).unzip();
+            let examined = examined.flatten().transpose().map_err(Failure::failed)?;
+            let now = replay.follow(recorded, examined).map_err(failure)?;
+            report.add(LogEntry { decision: recorded, candidate: stored.as_ref() }, now, replay.is_exact());
+            bar.set(recorded.sequence.unsigned_abs(), String::new);
+            if report.difference.is_some() {
+                return Ok(());
+            }
+        }
+    }
+    Ok(())
+}
+
+fn damaged(decision: i64, problem: &str) -> Failure {
+    Failure::Failed(format!(
+        "decision {decision}: {problem}: the database is damaged; restore the campaign from a backup"
+    ))
+}
+
+/// A stored candidate without its arrays, and graded unless its features were not kept.
+struct PrefetchedCandidate {
+    stored: StoredCandidate,
+    examined: Option<Result<Examined, SelectorError>>,
+}
+
+/// Candidates after a position in the log.
+struct Prefetch {
+    /// Whether candidates of control walks are needed.
+    control: bool,
+    ready: VecDeque<PrefetchedCandidate>,
+}
+
+impl Prefetch {
+    fn new(control: bool) -> Self {
+        Self { control, ready: VecDeque::new() }
+    }
+
+    /// The candidate of a decision. Skips candidates that were not needed.
+    async fn take(
+        &mut self,
+        store: &Store,
+        replay: &Replay,
+        decision: i64,
+    ) -> Result<PrefetchedCandidate, Failure> {
+        self.ready.retain(|ready| ready.stored.decision >= decision);
+        if self.ready.is_empty() {
+            let cores = cores();
+            let stored = store.candidates(decision - 1, self.control, CANDIDATES_PER_CORE * cores).await?;
+            self.ready = examine(stored, replay.examiner(), replay.mixture(), cores as usize)?.into();
+        }
+        let ready = self.ready.pop_front().filter(|ready| ready.stored.decision == decision);
+        ready.ok_or_else(|| damaged(decision, "its candidate is missing"))
+    }
+}
+
+/// Grades candidates on every core.
+fn examine(
+    stored: Vec<StoredCandidate>,
+    examiner: &Examiner,
+    mixture: &Arc<Mixture>,
+    cores: usize,
+) -> Result<Vec<PrefetchedCandidate>, Failure> {
+    let each = stored.len().div_ceil(cores).max(1);
+    let (mut stored, mut parts) = (stored.into_iter(), Vec::new());
+    while stored.len() > 0 {
+        parts.push(stored.by_ref().take(each).collect::<Vec<_>>());
+    }
+    let examined = thread::scope(|scope| {
+        let examine = |part: Vec<StoredCandidate>| {
+            let one = |stored| examine_one(stored, examiner, mixture);
+            scope.spawn(move || part.into_iter().map(one).collect::<Result<Vec<_>, _>>())
+        };
+        let threads: Vec<_> = parts.into_iter().map(examine).collect();
+        let joined =
+            threads.into_iter().map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
+        joined.collect::<Result<Vec<_>, Failure>>()
+    });
+    Ok(examined?.into_iter().flatten().collect())
+}
+
+fn examine_one(
+    mut stored: StoredCandidate,
+    examiner: &Examiner,
+    mixture: &Arc<Mixture>,
+) -> Result<PrefetchedCandidate, Failure> {
+    let Some(features) = stored.features.take() else {
+        return Ok(PrefetchedCandidate { stored, examined: None });
+    };
+    let block = stored
+        .block
+        .with_features(&features)
+        .map_err(|error| damaged(stored.decision, &error.to_string()))?;
+    Ok(PrefetchedCandidate { examined: Some(examiner.examine_block(block, mixture)), stored })
+}

@@ -1,0 +1,60 @@
+//! Locates the files that determine grades.
+
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+
+use crate::config::Config;
+use crate::exit_status::Failure;
+
+/// Files that are not where the campaign last found them.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub struct RelocatedFiles {
+    /// Path of the model, if it has moved since the last run
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// Path of the artifact, if it has moved
+    #[arg(long, value_name = "FILE")]
+    artifact: Option<PathBuf>,
+    /// Path of the training frames, if they have moved
+    #[arg(long, value_name = "FILE")]
+    training_frames: Option<PathBuf>,
+}
+
+/// Sets the paths in `config`, from the options or from where the campaign last found them (`found`, paths by key).
+/// Checks that the contents are those that the campaign began with.
+pub fn find(
+    config: &mut Config,
+    resolved: &Value,
+    found: &Value,
+    moved: &RelocatedFiles,
+) -> Result<(), Failure> {
+    let calm = &mut config.calm;
+    let files = [
+        ("potential.model", "--model", Some(&mut config.potential.model), &moved.model),
+        ("calm.artifact", "--artifact", calm.artifact.as_mut(), &moved.artifact),
+        ("calm.training_frames", "--training-frames", calm.training_frames.as_mut(), &moved.training_frames),
+    ];
+    for (key, option, place, moved) in files {
+        let Some(place) = place else { continue };
+        let path = moved.clone().or_else(|| found[key].as_str().map(PathBuf::from));
+        let path = path.ok_or_else(|| {
+            Failure::Input(format!("the store has no path of {key}; give it with {option} FILE"))
+        })?;
+        let expected = resolved["files"][key].as_str().unwrap_or_default();
+        check(&path, expected)
+            .map_err(|error| Failure::Input(format!("{key}: {error}; give its path with {option} FILE")))?;
+        *place.get_mut() = path;
+    }
+    Ok(())
+}
+
+fn check(path: &Path, expected: &str) -> Result<(), String> {
+    let shown = path.display();
+    let bytes = std::fs::read(path).map_err(|error| format!("cannot read {shown}: {error}"))?;
+    let found = blake3::hash(&bytes).to_string();
+    if found == expected {
+        return Ok(());
+    }
+    Err(format!("{shown} has another content (BLAKE3 {found}) than that of the campaign ({expected})"))
+}

@@ -1,0 +1,100 @@
+//! Reads the data of a report from the store.
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+use store::{
+    Campaign, FailureCount, FateCount, LabelCost, Protocol, SeedStructure, Status, Store, StoreError,
+    Unlabelled,
+};
+
+use super::collections::Collections;
+use crate::label_statistics::{self, LabelStatistics};
+
+/// Largest number of labels in the cost figure: the newest.
+const MAX_COSTS: u32 = 100_000;
+/// Number of parts into which the decision log is divided.
+const MAX_PARTS: u64 = 200;
+
+/// Data of a campaign.
+pub struct ReportData {
+    /// Id and configuration.
+    pub campaign: Campaign,
+    /// Counts, walks, budget.
+    pub status: Status,
+    /// The configuration in force with every default filled in.
+    pub configuration: Value,
+    /// Values that the selector stores about its mixture, by name.
+    pub values: BTreeMap<String, Value>,
+    /// Seed structures.
+    pub seeds: Vec<SeedStructure>,
+    /// Fates of candidates along the decision log.
+    pub fates: Vec<FateCount>,
+    /// Fates by seed structure.
+    pub fates_by_seed: Vec<FateCount>,
+    /// The collected structures.
+    pub collections: Collections,
+    /// `None` without a label protocol.
+    pub labels: Option<Labels>,
+    /// Start of the campaign, ms since 1970.
+    pub started: Option<i64>,
+}
+
+/// Labels of the protocol in force.
+pub struct Labels {
+    /// The protocol.
+    pub protocol: Protocol,
+    /// Statistics of force errors and completion.
+    pub statistics: LabelStatistics,
+    /// Cost of each label, newest first.
+    pub costs: Vec<LabelCost>,
+    /// Failures of attempts.
+    pub failures: Vec<FailureCount>,
+    /// Structures whose labels failed for good.
+    pub unlabelled: Vec<Unlabelled>,
+}
+
+impl ReportData {
+    /// Reads the data page by page.
+    pub async fn read(store: &Store) -> Result<Self, StoreError> {
+        let campaign = store.campaign().await?;
+        let seeds = store.seed_structures().await?;
+        let protocol = store.protocol_in_force().await?;
+        let decisions = store.newest_mixture().await?.decision;
+        let part = u32::try_from(decisions.max(1).unsigned_abs().div_ceil(MAX_PARTS)).unwrap_or(u32::MAX);
+        let values = store.values().await?.into_iter();
+        let values = values.filter_map(|(name, text)| Some((name, serde_json::from_str(&text).ok()?)));
+        let collections =
+            Collections::read(store, protocol.as_ref().map(|protocol| protocol.hash), &seeds).await?;
+        let labels = match protocol {
+            Some(protocol) => Some(Labels::read(store, protocol).await?),
+            None => None,
+        };
+        let first = store.operations(0, 1).await?;
+        Ok(Self {
+            status: store.status().await?,
+            configuration: serde_json::from_str(&campaign.configuration_in_force).unwrap_or_default(),
+            values: values.collect(),
+            fates: store.fates_by_decision(part).await?,
+            fates_by_seed: store.fates_by_seed_structure().await?,
+            started: first.first().map(|operation| operation.time),
+            campaign,
+            seeds,
+            collections,
+            labels,
+        })
+    }
+}
+
+impl Labels {
+    async fn read(store: &Store, protocol: Protocol) -> Result<Self, StoreError> {
+        let hash = protocol.hash;
+        Ok(Self {
+            statistics: label_statistics::read(store, hash).await?,
+            costs: store.label_costs(hash, MAX_COSTS).await?,
+            failures: store.failures(hash).await?,
+            unlabelled: store.unlabelled(hash, true).await?,
+            protocol,
+        })
+    }
+}

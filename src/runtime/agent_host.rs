@@ -1,0 +1,253 @@
+//! Runs an agent: starts walkers as processes on this host and connects them to the orchestrator on another.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, PoisonError};
+use std::time::Duration;
+
+use calm::Mixture;
+use orchestrator::launcher::{self, Children, Launch};
+use orchestrator::supervisor::{Limits, Standing};
+use tokio::sync::{Notify, mpsc};
+use tokio::task::JoinHandle;
+use tokio::time::{MissedTickBehavior, interval};
+use wire::ipc::{self, IpcError, Server, Sizes, space_needed};
+use wire::mixture::SharedMixture;
+use wire::net::{self, Address, Joined, NetError, Parted, Tls, Uplink};
+use wire::place::Place;
+use wire::transport::Incoming;
+use workers::agent::{self, Agent, News};
+
+use super::process_manager::all_failed_message;
+use super::{CHANNEL, STOP_MESSAGE, stop_signal};
+use crate::exit_status::{ExitStatus, Failure};
+use crate::log;
+use crate::output::{count, log_and_print, log_and_warn};
+use crate::process_config::{self, AgentConfig, WalkerConfig};
+use crate::web::agent_metrics::AgentState;
+
+/// Interval at which the walkers' states are published for the agent's metrics.
+const STATUS_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Works for a campaign until it is over or this process is asked to stop. Temporary files are kept in `directory`.
+///
+/// Await this on the main thread: the walkers end with the thread that starts them.
+pub async fn run(
+    address: &Address,
+    tls: Option<&Tls>,
+    agent: net::Agent,
+    threads: usize,
+    patience: Duration,
+    directory: &Path,
+    state: &AgentState,
+) -> Result<ExitStatus, Failure> {
+    let (stopping, stop) = stop_signal(STOP_MESSAGE)?;
+    let walkers = agent.walkers;
+    let (uplink, joined, setup) = tokio::select! {
+        joined = join(address, tls, agent, directory) => joined?,
+        () = stop.notified() => return Ok(ExitStatus::Interrupted),
+        () = address.over() => {
+            log_and_print("the campaign is over");
+            return Ok(ExitStatus::Done);
+        }
+        () = tokio::time::sleep(patience) => {
+            let minutes = patience.as_secs_f64() / 60.0;
+            return Err(Failure::Failed(format!("no orchestrator has answered at {address} for {minutes:.1} min")));
+        }
+    };
+    log_and_print(format_args!(
+        "joined: {}, mixture version {}",
+        count(walkers, "walker"),
+        joined.newest().await.version()
+    ));
+    let place = Place::of(directory).map_err(Failure::failed)?;
+    let mixture = joined.newest().await;
+    let (flag, wake) = (Arc::clone(&stopping), Arc::clone(&stop));
+    let numbers = Arc::clone(&state.numbers);
+    let dispatch = |incoming| {
+        tokio::spawn(Agent { uplink, joined, incoming, stopping, patience, numbers }.run(move |news| match news {
+            News::Stop => {
+                flag.store(true, Ordering::Relaxed);
+                wake.notify_one();
+            }
+            News::Silent { untold, idle } => log_and_warn(format_args!(
+                "the orchestrator does not answer: {untold} unsent reports, {idle} of {walkers} walkers idle"
+            )),
+            News::Back => log_and_print("the orchestrator answers again"),
+        }))
+    };
+    let ended = run_in(&place, &setup, (walkers, threads), &mixture, dispatch, &stop, state).await;
+    let removed = place.remove().map_err(Failure::failed);
+    let ended = ended?;
+    removed?;
+    Ok(ended)
+}
+
+/// Waits until the orchestrator admits this agent, and loads what the walkers need.
+async fn join(
+    address: &Address,
+    tls: Option<&Tls>,
+    agent: net::Agent,
+    directory: &Path,
+) -> Result<(Arc<Uplink>, Joined, AgentConfig), Failure> {
+    let waiting = |why: &NetError| log_and_warn(format_args!("waiting for the orchestrator: {why}"));
+    let uplink = Uplink::open(address, tls, agent, waiting).await.map_err(Failure::input)?;
+    let uplink = Arc::new(uplink);
+    loop {
+        let joined = uplink.join().await.map_err(Failure::failed)?;
+        let setup: AgentConfig = serde_json::from_slice(&joined.setup).map_err(|error| {
+            Failure::Failed(format!(
+                "the orchestrator's configuration: {error}: run the same version of calmwalk on all hosts"
+            ))
+        })?;
+        match model(&joined, &setup, directory).await? {
+            Some(model) => return Ok((uplink, joined, AgentConfig { model, ..setup })),
+            None => log_and_print("the orchestrator has restarted: joining again"),
+        }
+    }
+}
+
+/// Path of the model: the orchestrator's file if this host can read it, otherwise a downloaded copy. `None` if this
+/// agent lost its membership before the download finished.
+async fn model(joined: &Joined, setup: &AgentConfig, directory: &Path) -> Result<Option<PathBuf>, Failure> {
+    let hash = &setup.model_hash;
+    if process_config::verify_hash(&setup.model, hash).is_ok() {
+        return Ok(Some(setup.model.clone()));
+    }
+    log_and_print("the orchestrator's model file is not on this host: downloading the model …");
+    let path = directory.join("kokkos.npz");
+    let bytes = match joined.file(hash).await {
+        Err(Parted::Stranger(_)) => return Ok(None),
+        bytes => bytes.map_err(Failure::failed)?,
+    };
+    fs::write(&path, bytes)
+        .map_err(|error| Failure::Failed(format!("cannot write {}: {error}", path.display())))?;
+    process_config::verify_hash(&path, hash).map_err(Failure::failed)?;
+    Ok(Some(path))
+}
+
+/// The walkers of this host and the task that dispatches assignments to them.
+struct AgentHost {
+    walkers: Children,
+    state: AgentState,
+    line: ipc::Handle,
+    dispatching: DispatchTask,
+    serving: JoinHandle<Result<(), IpcError>>,
+    /// How the last walker failed, if all have failed for good.
+    given_up: Option<String>,
+}
+
+type DispatchTask = JoinHandle<Result<agent::Ended, Parted>>;
+
+async fn run_in(
+    place: &Place,
+    setup: &AgentConfig,
+    (walkers, threads): (u32, usize),
+    mixture: &Mixture,
+    dispatch: impl FnOnce(mpsc::Receiver<Incoming>) -> DispatchTask,
+    stop: &Notify,
+    state: &AgentState,
+) -> Result<ExitStatus, Failure> {
+    let sizes = Sizes { walkers, message_bytes: setup.message_bytes };
+    let needed =
+        SharedMixture::space_needed(mixture, walkers).map_err(Failure::failed)? + space_needed(&sizes);
+    let _prepared = place.prepare(needed).map_err(Failure::failed)?;
+    let shared = SharedMixture::create(&place.mixture(), mixture, walkers).map_err(Failure::failed)?;
+    let server = Server::open(place, sizes, u64::from(std::process::id())).map_err(Failure::failed)?;
+    let line = server.handle();
+    let limits = Limits {
+        silence: Duration::from_secs_f64(setup.silence_limit),
+        restarts: setup.restarts,
+        ..Limits::default()
+    };
+    let walkers = Children::new(walkers, limits, launch(setup, threads, line.clone()));
+    let (to_agent, incoming) = mpsc::channel(CHANNEL);
+    let signs = walkers.signs();
+    let heard = move |walker, useful| if useful { signs.useful(walker) } else { signs.heard(walker) };
+    let serving = tokio::spawn(server.run(shared, to_agent, heard));
+    let dispatching = dispatch(incoming);
+    AgentHost { walkers, state: state.clone(), line, dispatching, serving, given_up: None }
+        .supervise(stop)
+        .await
+}
+
+/// Returns the function that launches a walker.
+fn launch(
+    setup: &AgentConfig,
+    threads: usize,
+    line: ipc::Handle,
+) -> impl FnMut(u32, u32) -> Launch + Send + 'static {
+    let (setup, parent) = (setup.clone(), std::process::id());
+    move |number, incarnation| {
+        line.expect(number, incarnation);
+        let setup = WalkerConfig {
+            parent,
+            door: line.door(number, incarnation),
+            model: setup.model.clone(),
+            model_hash: setup.model_hash.clone(),
+            precision: setup.precision,
+            threads,
+            settings: setup.settings.clone(),
+            log: log::child_config(),
+        };
+        Launch::this_program(["walker"], process_config::to_bytes(&setup)).without_database()
+    }
+}
+
+impl AgentHost {
+    /// Runs until every walker has ended and every report is delivered.
+    async fn supervise(mut self, stop: &Notify) -> Result<ExitStatus, Failure> {
+        let (mut dispatched, mut gone) = (None, false);
+        let mut ticks = interval(STATUS_INTERVAL);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        while dispatched.is_none() || !gone {
+            tokio::select! {
+                event = self.walkers.next() => gone |= self.handle(event),
+                _ = ticks.tick() => {
+                    let walkers = self.walkers.status();
+                    *self.state.walkers.lock().unwrap_or_else(PoisonError::into_inner) = walkers;
+                }
+                () = stop.notified() => self.walkers.stop(),
+                ended = &mut self.dispatching, if dispatched.is_none() => {
+                    let ended = ended.map_err(Failure::failed)?;
+                    match ended {
+                        Ok(agent::Ended::Done) => self.walkers.close(),
+                        _ => self.walkers.stop(),
+                    }
+                    dispatched = Some(ended.map_err(Failure::failed));
+                }
+            }
+        }
+        self.serving.await.map_err(Failure::failed)?.map_err(Failure::failed)?;
+        match dispatched.transpose()? {
+            Some(agent::Ended::Done) => Ok(ExitStatus::Done),
+            _ => match self.given_up {
+                Some(how) => Err(Failure::Failed(format!("no walker is left: {how}"))),
+                None => Ok(ExitStatus::Interrupted),
+            },
+        }
+    }
+
+    /// Handles an event of a walker process. Returns whether all walkers have ended.
+    fn handle(&mut self, event: launcher::Event) -> bool {
+        match event {
+            launcher::Event::Started { .. } => {}
+            launcher::Event::Said { number, line } => log_and_print(format_args!("walker {number}: {line}")),
+            launcher::Event::Ended { number, ended } => {
+                self.line.gone(number, ended.incarnation, ended.ending.is_own_fault());
+                if ended.then == Standing::GoneHome {
+                    self.walkers.close();
+                } else {
+                    log_and_warn(format_args!("walker {number}: {}; {}", ended.ending, ended.then));
+                }
+            }
+            launcher::Event::AllGone => {
+                self.line.close();
+                self.given_up = all_failed_message(&mut self.walkers);
+                return true;
+            }
+        }
+        false
+    }
+}

@@ -1,0 +1,161 @@
+//! Serves the agents of other hosts on the orchestrator's side.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+use calm::Mixture;
+use serde_json::json;
+use store::{ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds};
+use tokio::sync::mpsc;
+use tokio::time::{MissedTickBehavior, interval};
+use wire::net::{self, AgentEvent, Hub, NetError, Welcome};
+use wire::transport::Incoming;
+use workers::labeller::SIGN_OF_LIFE;
+
+use super::RunContext;
+use crate::exit_status::Failure;
+use crate::output::{count, log_and_print, log_and_warn};
+use crate::process_config::{self, AgentConfig};
+
+/// Lets agents join if this run listens.
+pub struct AgentService {
+    hub: Option<Hub>,
+    store: Store,
+    mixture: Arc<Mixture>,
+}
+
+/// Closes the server.
+pub struct Handle(Option<net::Handle>);
+
+impl Handle {
+    /// Tells agents that there is no more work.
+    pub fn close(&self) {
+        self.0.iter().for_each(net::Handle::close);
+    }
+}
+
+impl AgentService {
+    /// Starts to listen if the run is configured to.
+    pub async fn open(run: RunContext<'_>, session: u64, mixture: &Arc<Mixture>) -> Result<Self, Failure> {
+        // Writes wait here while the database is unreachable.
+        let (store, mixture) = (run.store.clone().patient(SERVER_AWAY), Arc::clone(mixture));
+        let Some(listen) = run.listen else { return Ok(Self { hub: None, store, mixture }) };
+        let config = &run.campaign.config;
+        let model = std::path::absolute(config.potential.model.get_ref()).map_err(Failure::failed)?;
+        let model_hash = run.campaign.hash_of("potential.model");
+        let setup = AgentConfig {
+            model: model.clone(),
+            model_hash: model_hash.clone(),
+            precision: config.potential.precision,
+            settings: run.campaign.walk_settings(),
+            message_bytes: run.campaign.largest_message(),
+            silence_limit: config.run.silence_limit.get(),
+            restarts: config.run.restarts,
+        };
+        let welcome =
+            Welcome { setup: process_config::to_bytes(&setup), files: BTreeMap::from([(model_hash, model)]) };
+        let patience = Duration::from_secs_f64(config.run.agent_silence_limit.get());
+        let hub = Hub::open(&listen.endpoint, listen.tls.as_ref(), session, patience, welcome).await;
+        let hub = hub.map_err(|error| match error {
+            NetError::Ended { .. } => Failure::failed(error),
+            error => Failure::input(error),
+        })?;
+        listen.announce(hub.endpoint())?;
+        log_and_print(format_args!("agents may join at {}", hub.endpoint()));
+        Ok(Self { hub: Some(hub), store, mixture })
+    }
+
+    pub fn handle(&self) -> Handle {
+        Handle(self.hub.as_ref().map(Hub::handle))
+    }
+
+    /// Serves agents until there is no more work and the last agent has left.
+    pub async fn run(
+        self,
+        stopping: Arc<AtomicBool>,
+        to_reactor: mpsc::Sender<Incoming>,
+    ) -> Result<(), Failure> {
+        let Some(hub) = self.hub else { return Ok(()) };
+        let (sender, events) = mpsc::unbounded_channel();
+        let on_event = move |event| drop(sender.send(event));
+        let (ended, ()) = tokio::join!(
+            hub.run(self.mixture, stopping, to_reactor, on_event),
+            record_events(&self.store, events)
+        );
+        ended.map_err(Failure::failed)
+    }
+}
+
+/// Reports the agents' events: on standard error, in `status` and in the operations log. Skips what a busy database
+/// cannot take.
+async fn record_events(store: &Store, mut events: mpsc::UnboundedReceiver<AgentEvent>) {
+    let mut records = BTreeMap::new();
+    let mut heartbeats = interval(SIGN_OF_LIFE);
+    heartbeats.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        let written = tokio::select! {
+            event = events.recv() => match event {
+                Some(event) => record_event(store, &mut records, event).await,
+                None => return,
+            },
+            _ = heartbeats.tick() => write_heartbeats(store, &mut records).await,
+        };
+        if let Err(error) = written {
+            log_and_warn(format_args!("cannot record the state of agents: {error}"));
+        }
+    }
+}
+
+async fn write_heartbeats(
+    store: &Store,
+    records: &mut BTreeMap<String, ProcessRecord>,
+) -> Result<(), StoreError> {
+    let living = records.values_mut().filter(|record| record.state == "running");
+    let living: Vec<_> = living
+        .map(|record| {
+            record.last_seen = unix_milliseconds();
+            record.clone()
+        })
+        .collect();
+    store.upsert_processes(&living).await
+}
+
+async fn record_event(
+    store: &Store,
+    records: &mut BTreeMap<String, ProcessRecord>,
+    event: AgentEvent,
+) -> Result<(), StoreError> {
+    let now = unix_milliseconds();
+    let (agent, what, state) = match event {
+        AgentEvent::Joined(agent) => (agent, "joined", "running"),
+        AgentEvent::Silent(agent) => (agent, "sends no heartbeat", "silent"),
+        AgentEvent::Back(agent) => (agent, "is back", "running"),
+        AgentEvent::Lost(agent) => (agent, "timed out: its walks go to other walkers", "lost"),
+        AgentEvent::Left(agent) => (agent, "left", "left"),
+        AgentEvent::Dropped(why) => {
+            log_and_warn(format_args!("rejected a message from another host: {why}"));
+            return store.log_operation(now, "messages_dropped", &json!({ "remark": why })).await;
+        }
+    };
+    let walkers = count(agent.walkers, "walker");
+    log_and_print(format_args!("agent {} (process {}, {walkers}): {what}", agent.host, agent.pid));
+    let record = records.entry(agent.id.clone()).or_insert_with(|| ProcessRecord {
+        id: agent.id.clone(),
+        host: agent.host.clone(),
+        // This host cannot check whether the process lives.
+        birth: String::new(),
+        ..ProcessRecord::new(ProcessRecord::AGENT, None, agent.pid, now)
+    });
+    (record.last_seen, record.state) = (now, state.to_owned());
+    record.remark = walkers;
+    if state == "left" {
+        records.remove(&agent.id);
+        store.remove_process(&agent.id).await?;
+    } else {
+        store.upsert_process(record).await?;
+    }
+    let detail = json!({ "id": agent.id, "host": agent.host, "pid": agent.pid, "walkers": agent.walkers, "what": what });
+    store.log_operation(now, "agent", &detail).await
+}

@@ -1,0 +1,180 @@
+//! Runs a campaign with walkers and labellers in separate processes, and restarts them when they fail.
+//!
+//! Walkers end with this process. Labellers outlive it, and the next run adopts them.
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use orchestrator::launcher::Children;
+use orchestrator::reactor;
+use orchestrator::selector::Selector;
+use orchestrator::supervisor::Limits;
+use store::ProcessRecord;
+use tokio::sync::{Notify, mpsc};
+use tokio::task::{JoinError, JoinHandle};
+use tokio::time::{Sleep, sleep};
+use wire::ipc::{Server, Sizes, space_needed};
+use wire::mixture::SharedMixture;
+use wire::place::Place;
+
+use super::agent_service::{self, AgentService};
+use super::process_manager::{self, ProcessManager};
+use super::{
+    CHANNEL, ReactorTask, RunContext, STOP_MESSAGE, spawn, start_reactor, stop_at_limit, stop_signal,
+    wanted_walkers,
+};
+use crate::exit_status::Failure;
+
+/// Time that the last writes to the database may take after all processes have ended.
+const DATABASE_TIMEOUT: Duration = Duration::from_secs(60);
+/// Heartbeat timeout of labellers: they write heartbeats to the database, which may be busy for a while.
+pub const LABELLER_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Runs the campaign until it is finished or stopped.
+///
+/// Await this on the main thread: the walkers end with the thread that starts them.
+pub async fn run(run: RunContext<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
+    let place = Place::of(run.directory).map_err(Failure::failed)?;
+    let ended = run_in(&place, run, selector).await;
+    // No process needs the shared memory any more. The next start removes what cannot be removed now.
+    let removed = place.remove().map_err(Failure::failed);
+    let ended = ended?;
+    removed?;
+    Ok(ended)
+}
+
+async fn run_in(place: &Place, run: RunContext<'_>, selector: Selector) -> Result<reactor::Ended, Failure> {
+    let RunContext { campaign, store, process, .. } = run;
+    let walkers = wanted_walkers(campaign);
+    let mixture = Arc::clone(selector.mixture());
+    let sizes = Sizes { walkers, message_bytes: campaign.largest_message() };
+    let needed =
+        SharedMixture::space_needed(&mixture, walkers).map_err(Failure::failed)? + space_needed(&sizes);
+    let _prepared = place.prepare(needed).map_err(Failure::failed)?;
+    let shared = SharedMixture::create(&place.mixture(), &mixture, walkers);
+    let shared = shared.map_err(Failure::failed)?;
+    let server = Server::open(place, sizes, session(process)).map_err(Failure::failed)?;
+
+    let (stopping, stop) = stop_signal(STOP_MESSAGE)?;
+    let handles = (Arc::clone(&stopping), Arc::clone(&stop));
+    stop_at_limit(run.limit_reached, move || {
+        handles.0.store(true, Ordering::Relaxed);
+        handles.1.notify_one();
+    });
+    let limits = Limits {
+        silence: Duration::from_secs_f64(campaign.config.run.silence_limit.get()),
+        restarts: campaign.config.run.restarts,
+        ..Limits::default()
+    };
+    let line = server.handle();
+    let walkers = Children::new(walkers, limits, spawn::walker_launcher(campaign, line.clone())?);
+    let limits = Limits { silence: limits.silence.max(LABELLER_TIMEOUT), outlives: true, ..limits };
+    let labellers = spawn::start_labellers(run, limits).await?;
+    let manager =
+        ProcessManager::new(store, process.clone(), line, walkers, labellers, Arc::clone(&stopping));
+
+    let (to_reactor, incoming) = mpsc::channel(CHANNEL);
+    let local = server.run(shared, to_reactor.clone(), manager.listener());
+    let agents = AgentService::open(run, session(process), &mixture).await?;
+    let agents_line = agents.handle();
+    let remote = agents.run(Arc::clone(&stopping), to_reactor);
+    let serving = tokio::spawn(async {
+        tokio::try_join!(async { local.await.map_err(Failure::failed) }, remote).map(|_| ())
+    });
+    let reactor = start_reactor(run, selector, incoming, &stopping);
+    supervise(manager, reactor, agents_line, serving, &stop).await
+}
+
+/// Distinguishes the walkers of this run from those of any other.
+fn session(process: &ProcessRecord) -> u64 {
+    let hash = blake3::hash(process.id.as_bytes());
+    let [a, b, c, d, e, f, g, h, ..] = *hash.as_bytes();
+    u64::from_le_bytes([a, b, c, d, e, f, g, h])
+}
+
+/// An event of the main loop.
+enum ManagerEvent {
+    /// From a child process.
+    Process(process_manager::Event),
+    /// A stop was requested.
+    StopRequested,
+    /// The reactor has ended.
+    ReactorEnded(Result<reactor::Ended, Failure>),
+    /// The transport has ended.
+    TransportEnded(Result<(), Failure>),
+}
+
+/// Supervises the processes until all walks are over and every structure has its label, or until a stop is requested.
+/// Then waits until all processes have ended.
+async fn supervise(
+    mut manager: ProcessManager<'_>,
+    mut reactor: ReactorTask,
+    agents: agent_service::Handle,
+    mut serving: JoinHandle<Result<(), Failure>>,
+    stop: &Notify,
+) -> Result<reactor::Ended, Failure> {
+    let (mut reactor_result, mut transport_result, mut stop_requested) = (None, None, false);
+    let mut database_deadline = None;
+    while reactor_result.is_none() || transport_result.is_none() || !manager.has_ended() {
+        if stop_requested && reactor_result.is_none() && manager.has_ended() {
+            database_deadline.get_or_insert_with(|| Box::pin(sleep(DATABASE_TIMEOUT)));
+        }
+        let event = tokio::select! {
+            () = expired(&mut database_deadline) => return Err(database_unreachable()),
+            event = manager.next_event() => ManagerEvent::Process(event),
+            () = stop.notified() => ManagerEvent::StopRequested,
+            ended = &mut reactor, if reactor_result.is_none() => ManagerEvent::ReactorEnded(flatten(ended)),
+            ended = &mut serving, if transport_result.is_none() => ManagerEvent::TransportEnded(flatten(ended)),
+        };
+        match event {
+            ManagerEvent::Process(event) => manager.handle(event).await,
+            ManagerEvent::StopRequested => {
+                stop_requested = true;
+                manager.stop();
+            }
+            ManagerEvent::ReactorEnded(ended) => {
+                agents.close();
+                match ended {
+                    Ok(reactor::Ended::Done) => manager.wait_for_labels(),
+                    _ => manager.stop(),
+                }
+                reactor_result = Some(ended);
+            }
+            ManagerEvent::TransportEnded(ended) => {
+                if ended.is_err() {
+                    manager.stop();
+                }
+                transport_result = Some(ended);
+            }
+        }
+    }
+    transport_result.transpose()?;
+    manager.failure()?;
+    match reactor_result.transpose()? {
+        Some(reactor::Ended::Done) if !stop_requested => Ok(reactor::Ended::Done),
+        // Every walk may be over, but the labellers were asked to stop and may have left jobs.
+        _ => Ok(reactor::Ended::Stopped),
+    }
+}
+
+/// Waits until the deadline, if there is one.
+async fn expired(time: &mut Option<Pin<Box<Sleep>>>) {
+    match time {
+        Some(time) => time.await,
+        None => std::future::pending().await,
+    }
+}
+
+fn database_unreachable() -> Failure {
+    Failure::Failed(format!(
+        "stopping, but the database has not answered for {} s: walks keep their last checkpoints; run the same command to continue the campaign",
+        DATABASE_TIMEOUT.as_secs()
+    ))
+}
+
+/// The result of a task. A panic is a failure too.
+fn flatten<T>(ended: Result<Result<T, impl ToString>, JoinError>) -> Result<T, Failure> {
+    ended.map_err(Failure::failed)?.map_err(Failure::failed)
+}

@@ -1,0 +1,98 @@
+//! Launches the processes of a campaign and adopts running labellers.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use orchestrator::launcher::{Children, Launch, ask_to_end};
+use orchestrator::supervisor::Limits;
+use store::{ProcessRecord, Store, StoreError};
+use wire::ipc::Handle;
+
+use super::RunContext;
+use super::labellers::Labellers;
+use crate::campaign::Campaign;
+use crate::exit_status::Failure;
+use crate::label_setup::LabelSetup;
+use crate::log;
+use crate::process_config::{self, LabellerConfig, WalkerConfig};
+
+/// Returns the function that launches a walker.
+pub fn walker_launcher(
+    campaign: &Campaign,
+    line: Handle,
+) -> Result<impl FnMut(u32, u32) -> Launch + Send + 'static, Failure> {
+    let (model, model_hash) =
+        (absolute(campaign.config.potential.model.get_ref())?, campaign.hash_of("potential.model"));
+    let (parent, settings) = (std::process::id(), campaign.walk_settings());
+    let precision = campaign.config.potential.precision;
+    let threads = campaign.config.run.threads.get();
+    Ok(move |number, incarnation| {
+        line.expect(number, incarnation);
+        let setup = WalkerConfig {
+            parent,
+            door: line.door(number, incarnation),
+            model: model.clone(),
+            model_hash: model_hash.clone(),
+            precision,
+            threads,
+            settings: settings.clone(),
+            log: log::child_config(),
+        };
+        Launch::this_program(["walker"], process_config::to_bytes(&setup)).without_database()
+    })
+}
+
+/// Adopts the labellers that an earlier run left with the same configuration, and launches the missing ones.
+pub async fn start_labellers(run: RunContext<'_>, limits: Limits) -> Result<Labellers, Failure> {
+    let RunContext { campaign, store, directory, .. } = run;
+    let location = match &campaign.config.run.store {
+        Some(url) => PathBuf::from(url),
+        None => absolute(directory)?,
+    };
+    let label = &campaign.config.label;
+    let label_setup = LabelSetup {
+        method: campaign.method()?,
+        protocol: campaign.protocol.clone(),
+        attempts: label.attempts.get(),
+        bounds: label.bounds(),
+        lease: Duration::from_secs(label.lease.get().into()),
+    };
+    let setup = LabellerConfig::new(location, label_setup);
+    let (hash, slots) = (setup.hash(), label.slots as u32);
+    let mut labellers = Children::new(slots, limits, move |number, incarnation| {
+        let restarts = incarnation.saturating_sub(1);
+        let setup = LabellerConfig { number: Some(number), restarts, ..setup.clone() };
+        Launch::this_program(["labeller"], process_config::to_bytes(&setup)).for_own_session()
+    });
+    let mut adopted = BTreeMap::new();
+    for found in running_labellers(store).await? {
+        let wanted = found.number.filter(|_| found.setup.as_ref() == Some(&hash) && found.state == "running");
+        match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.birth).is_ok()) {
+            Some(number) => drop(adopted.insert(number, found.pid)),
+            // Ignore a labeller that has ended meanwhile.
+            None => drop(ask_to_end(found.pid, &found.birth)),
+        }
+    }
+    Ok(Labellers::new(labellers, adopted, campaign.config.label.attempts.get()))
+}
+
+/// Asks the labellers of an earlier run to end, because this run makes labels itself.
+pub async fn stop_labellers(store: &Store) -> Result<(), Failure> {
+    for found in running_labellers(store).await? {
+        let _ = ask_to_end(found.pid, &found.birth);
+    }
+    Ok(())
+}
+
+/// Running labellers on this host that an earlier run started. Those of `calmwalk label` have no number and are left
+/// alone.
+async fn running_labellers(store: &Store) -> Result<Vec<ProcessRecord>, StoreError> {
+    let mut labellers = store.processes(Some(ProcessRecord::LABELLER)).await?;
+    labellers.retain(|found| found.number.is_some() && found.is_local() && !found.is_gone());
+    Ok(labellers)
+}
+
+fn absolute(path: &Path) -> Result<PathBuf, Failure> {
+    std::path::absolute(path).map_err(Failure::failed)
+}

@@ -1,0 +1,154 @@
+//! Measures how fast walks advance, from the reactor's notices, and stores it every few seconds for display. It
+//! affects no decision.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::convert::Infallible;
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use orchestrator::reactor::Notice;
+use store::{Pace, Store, unix_milliseconds};
+use tokio::time::{MissedTickBehavior, interval};
+use wire::WalkId;
+use wire::messages::Progress;
+
+/// Interval between writes.
+const WRITE_INTERVAL: Duration = Duration::from_secs(3);
+/// Shortest time over which a speed is measured, s.
+const MIN_INTERVAL: f64 = 1.0;
+/// Time constant of the moving average, s.
+const AVERAGING_TIME: f64 = 30.0;
+
+/// Throughput of the walks of a run.
+#[derive(Debug, Default)]
+pub struct Throughput {
+    walks: BTreeMap<u32, Walk>,
+    /// Walks with changes since the last write.
+    changed: BTreeSet<u32>,
+    all: Speed,
+    /// Steps of all walks in this run.
+    steps: u64,
+}
+
+#[derive(Debug, Default)]
+struct Walk {
+    pace: Pace,
+    speed: Speed,
+    /// Steps in this run, including repeated ones.
+    steps: u64,
+}
+
+/// Exponential moving average of steps per second.
+#[derive(Debug, Default)]
+struct Speed {
+    /// Number of steps and time (ms) of the last update.
+    from: Option<(u64, i64)>,
+    average: Option<f64>,
+}
+
+impl Speed {
+    fn update(&mut self, steps: u64, now: i64) {
+        let (before, since) = *self.from.get_or_insert((steps, now));
+        let seconds = (now - since) as f64 / 1000.0;
+        if seconds < MIN_INTERVAL {
+            return;
+        }
+        let found = (steps - before) as f64 / seconds;
+        let weight = 1.0 - (-seconds / AVERAGING_TIME).exp();
+        self.average = Some(self.average.map_or(found, |average| average + weight * (found - average)));
+        self.from = Some((steps, now));
+    }
+}
+
+impl Throughput {
+    /// Takes a notice of the reactor at the time `now`, ms since 1970.
+    pub fn notice(&mut self, notice: &Notice<'_>, now: i64) {
+        match notice {
+            Notice::Progress(walk, progress) => self.update(*walk, progress, now),
+            Notice::Committed(commit) => {
+                let begun = commit.walks.iter().filter(|record| record.progress.step > 0);
+                begun.for_each(|record| self.update(record.walk, &record.progress, now));
+            }
+            Notice::QueueFull(_) => {}
+        }
+    }
+
+    fn update(&mut self, walk: WalkId, progress: &Progress, now: i64) {
+        let known = self.walks.contains_key(&walk.0);
+        let entry = self.walks.entry(walk.0).or_default();
+        // The steps of earlier runs do not count, and neither does a rollback to a checkpoint.
+        if known && entry.pace.segment == progress.segment {
+            let made = progress.step.saturating_sub(entry.pace.step);
+            entry.steps += made;
+            self.steps += made;
+        }
+        entry.speed.update(entry.steps, now);
+        entry.pace = Pace {
+            walk: walk.0,
+            seen: now,
+            segment: progress.segment,
+            step: progress.step,
+            steps_per_second: entry.speed.average,
+            tau: Some(progress.tau),
+            temperature: Some(progress.temperature),
+            relative_volume: Some(progress.relative_volume),
+            gamma_max: Some(progress.gamma_max),
+        };
+        self.changed.insert(walk.0);
+    }
+
+    /// The changed walks, and steps per second of all walks.
+    fn take_changes(&mut self, now: i64) -> (Vec<Pace>, Option<f64>) {
+        self.all.update(self.steps, now);
+        let changed = std::mem::take(&mut self.changed);
+        (changed.iter().map(|walk| self.walks[walk].pace.clone()).collect(), self.all.average)
+    }
+}
+
+/// Writes the throughput periodically, for ever. Ignores errors: other writers report a broken database.
+pub async fn record(store: &Store, throughput: &Mutex<Throughput>) -> Infallible {
+    let mut write = interval(WRITE_INTERVAL);
+    write.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        write.tick().await;
+        let now = unix_milliseconds();
+        let (changed, all) = throughput.lock().unwrap_or_else(PoisonError::into_inner).take_changes(now);
+        let _ = store.set_paces(&changed, all, now).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(segment: u32, step: u64) -> Progress {
+        Progress { segment, step, temperature: 300.0, ..Progress::default() }
+    }
+
+    #[test]
+    fn waiting_time_counts_towards_the_speed() {
+        let mut throughput = Throughput::default();
+        let walk = WalkId(3);
+        // Continues at step 1000 with 50 steps per second on average: it waits every other second.
+        for second in 0..200_i64 {
+            let step = 1000 + 100 * (second as u64 / 2);
+            throughput.notice(&Notice::Progress(walk, at(0, step)), 1000 * second);
+        }
+        let (changed, _) = throughput.take_changes(200_000);
+        let pace = changed[0].steps_per_second.unwrap();
+        assert!((pace - 50.0).abs() < 2.0, "{pace}");
+        assert_eq!((changed[0].walk, changed[0].step, changed[0].seen), (3, 10_900, 199_000));
+        assert_eq!(throughput.take_changes(201_000).0, [], "nothing new was heard");
+    }
+
+    #[test]
+    fn rollbacks_do_not_count_as_steps() {
+        let mut throughput = Throughput::default();
+        throughput.take_changes(0);
+        for (segment, step, now) in [(0, 500, 0), (0, 600, 1000), (1, 100, 2000), (1, 200, 3000)] {
+            throughput.notice(&Notice::Progress(WalkId(0), at(segment, step)), now);
+        }
+        let (_, all) = throughput.take_changes(4000);
+        assert_eq!(all, Some(50.0), "200 steps in 4 s");
+    }
+}

@@ -1,0 +1,288 @@
+//! Counts how walks ended and why, and gives advice on early ends. Pure functions, shared by everything that shows
+//! them.
+
+use serde::Serialize;
+use store::WalkStatus;
+
+/// Fewer early ends are not a pattern yet.
+const MIN_EARLY_ENDS: u64 = 3;
+
+/// Why a walk ended before it made all its steps or collected all its structures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EarlyEndCause {
+    /// The temperature exceeded `guard.highest_temperature`.
+    TooHot,
+    /// An energy or force is not finite.
+    NotFinite,
+    /// An atom has no neighbour.
+    LostAtom,
+    /// The walk crashed several walkers.
+    Crashed,
+    /// The shortest-bond guard refused its structures repeatedly.
+    Trapped,
+    /// No walk can start from the seed structure.
+    BadStart,
+    /// Any other cause.
+    Other,
+}
+
+/// The walks that ended in one way.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct EndCount {
+    /// As stored: `steps`, `collected`, `budget`, `trapped`, `blew_up` or `bad_start`.
+    pub end: String,
+    /// `None` if the walks did not end early.
+    pub cause: Option<EarlyEndCause>,
+    /// Number of walks.
+    pub walks: u64,
+    /// Number of the first of these walks.
+    pub walk: u32,
+    /// Why that walk ended, as text.
+    pub reason: String,
+    /// What to change.
+    pub advice: Option<&'static str>,
+}
+
+/// How the walks of a campaign ended.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[serde(transparent)]
+pub struct WalkEnds(Vec<EndCount>);
+
+/// Why a walk with this state and reason ended early. `None` for a walk that is running, made all its steps,
+/// collected all it may, or ended with a budget.
+pub fn early_end_cause(state: &str, reason: &str) -> Option<EarlyEndCause> {
+    let has = |words: &str| reason.contains(words);
+    match state {
+        "waiting" | "running" | "steps" | "collected" | "budget" => None,
+        "trapped" => Some(EarlyEndCause::Trapped),
+        _ if has("walkers crashed") || has("walker crashed") => Some(EarlyEndCause::Crashed),
+        "bad_start" => Some(EarlyEndCause::BadStart),
+        _ if has("is above the allowed") => Some(EarlyEndCause::TooHot),
+        _ if has("not finite") => Some(EarlyEndCause::NotFinite),
+        _ if has("has no neighbour") => Some(EarlyEndCause::LostAtom),
+        _ => Some(EarlyEndCause::Other),
+    }
+}
+
+/// Whether `early` of `ended` walks are too many to be accidents.
+fn is_pattern(ended: u64, early: u64) -> bool {
+    early >= MIN_EARLY_ENDS && 2 * early >= ended
+}
+
+impl EarlyEndCause {
+    /// Short description.
+    pub fn in_words(self) -> &'static str {
+        match self {
+            Self::TooHot => "too hot",
+            Self::NotFinite => "forces not finite",
+            Self::LostAtom => "an atom left the structure",
+            Self::Crashed => "walkers crashed",
+            Self::Trapped => "atoms repeatedly too close",
+            Self::BadStart => "invalid start",
+            Self::Other => "diverged",
+        }
+    }
+
+    /// What to change.
+    pub fn advice(self) -> &'static str {
+        match self {
+            Self::TooHot => "a smaller walk.time_step or walk.tau, or guard.zbl",
+            Self::NotFinite => "guard.zbl, a smaller walk.time_step or walk.tau",
+            Self::LostAtom => "a smaller walk.tau, a narrower walk.volume_ramp or a lower walk.temperature",
+            Self::Crashed => {
+                "nothing in the configuration: check the walkers' last output in the log, and the free memory"
+            }
+            Self::Trapped => "a smaller walk.tau, or guard.zbl; guard.least_distance says what is too close",
+            Self::BadStart => "the seed structure: the reason says what is wrong with it",
+            Self::Other => "a smaller walk.time_step or walk.tau, or guard.zbl",
+        }
+    }
+}
+
+impl WalkEnds {
+    /// Counts these walks, except those that are running.
+    pub fn from_walks(walks: &[WalkStatus]) -> Self {
+        let mut ends = Self::default();
+        for walk in walks.iter().filter(|walk| !walk.is_under_way()) {
+            ends.add(walk.walk, &walk.state, &walk.reason);
+        }
+        ends
+    }
+
+    /// Counts a walk that has ended.
+    pub fn add(&mut self, walk: u32, end: &str, reason: &str) {
+        let cause = early_end_cause(end, reason);
+        if let Some(count) = self.0.iter_mut().find(|count| count.end == end && count.cause == cause) {
+            count.walks += 1;
+            return;
+        }
+        let advice = cause.map(EarlyEndCause::advice);
+        self.0.push(EndCount { end: end.into(), cause, walks: 1, walk, reason: reason.into(), advice });
+        self.0.sort_by(|a, b| (a.cause, &a.end).cmp(&(b.cause, &b.end)));
+    }
+
+    /// Number of walks that have ended.
+    pub fn ended(&self) -> u64 {
+        self.0.iter().map(|count| count.walks).sum()
+    }
+
+    /// Number of walks that ended early.
+    pub fn early(&self) -> u64 {
+        self.causes().map(|(_, count)| count.walks).sum()
+    }
+
+    /// Whether walks have ended, and all of them early.
+    pub fn all_early(&self) -> bool {
+        self.ended() > 0 && self.early() == self.ended()
+    }
+
+    /// Early ends, by cause.
+    pub fn causes(&self) -> impl Iterator<Item = (EarlyEndCause, &EndCount)> {
+        self.0.iter().filter_map(|count| Some((count.cause?, count)))
+    }
+
+    /// All ends in one line: `12 collected, 3 blew up (too hot)`.
+    pub fn in_words(&self) -> String {
+        let one = |EndCount { end, cause, walks, .. }: &EndCount| {
+            let end = end.replace('_', " ");
+            match cause {
+                Some(cause) if *cause != EarlyEndCause::Trapped => {
+                    format!("{walks} {end} ({})", cause.in_words())
+                }
+                _ => format!("{walks} {end}"),
+            }
+        };
+        self.0.iter().map(one).collect::<Vec<_>>().join(", ")
+    }
+
+    /// All ends in one line without causes: `12 collected, 3 blew up`.
+    pub fn counts_by_end(&self) -> String {
+        let mut numbers: Vec<(&str, u64)> = Vec::new();
+        for EndCount { end, walks, .. } in &self.0 {
+            match numbers.iter_mut().find(|(known, _)| known == end) {
+                Some((_, number)) => *number += walks,
+                None => numbers.push((end, *walks)),
+            }
+        }
+        let one = |(end, number): (&str, u64)| format!("{number} {}", end.replace('_', " "));
+        numbers.into_iter().map(one).collect::<Vec<_>>().join(", ")
+    }
+
+    /// Whether many walks ended early.
+    pub fn is_alarming(&self) -> bool {
+        is_pattern(self.ended(), self.early())
+    }
+
+    /// The early ends and what to change, two lines for each cause.
+    pub fn lines(&self) -> Vec<String> {
+        let two = |(cause, EndCount { walks, walk, reason, .. }): (EarlyEndCause, &EndCount)| {
+            let what = format!("{walks} {}, such as walk {walk}: {reason}", cause.in_words());
+            [what, format!("  what to change: {}", cause.advice())]
+        };
+        self.causes().flat_map(two).collect()
+    }
+
+    /// Text of the warning about early ends.
+    pub fn warning(&self) -> String {
+        let causes: Vec<_> =
+            self.causes().map(|(cause, count)| format!("{} {}", count.walks, cause.in_words())).collect();
+        let advice =
+            self.causes().max_by_key(|(_, count)| count.walks).map_or("", |(cause, _)| cause.advice());
+        let (early, ended) = (self.early(), self.ended());
+        format!(
+            "{early} of {ended} finished walks ended early ({}); what to change: {advice}",
+            causes.join(", ")
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use atoms::{Cell, Evaluation, NeighbourList, Structure};
+    use workers::guard::blown_up;
+    use workers::settings::GuardSettings;
+
+    use super::*;
+
+    fn walk(number: u32, state: &str, reason: &str) -> WalkStatus {
+        WalkStatus { walk: number, state: state.into(), reason: reason.into(), ..WalkStatus::default() }
+    }
+
+    #[test]
+    fn reasons_of_the_guard_have_causes() {
+        let settings = GuardSettings {
+            least_distance: 1.2,
+            least_distance_fraction: 0.75,
+            highest_temperature: 1000.0,
+            refusals_in_a_row: 10,
+            most_returns: 3,
+            tau_factor: 0.5,
+            checkpoint_interval: 100,
+        };
+        let pair = |distance: f64| Structure {
+            species: vec!["Al".parse().unwrap(); 2],
+            positions: vec![[0.0; 3], [distance, 0.0, 0.0]],
+            cell: Cell::orthorhombic(50.0, 50.0, 50.0),
+            periodic: [true; 3],
+        };
+        let said = |distance, force, temperature| {
+            let structure = pair(distance);
+            let mut neighbours = NeighbourList::new(5.0, 0.0);
+            neighbours.update(&structure).unwrap();
+            let evaluation = Evaluation { forces: vec![[force; 3]; 2], ..Evaluation::default() };
+            blown_up(&settings, &structure, &neighbours, &evaluation, temperature).unwrap()
+        };
+        for (reason, expected) in [
+            (said(2.0, 0.0, 2000.0), EarlyEndCause::TooHot),
+            (said(2.0, f64::NAN, 300.0), EarlyEndCause::NotFinite),
+            (said(20.0, 0.0, 300.0), EarlyEndCause::LostAtom),
+        ] {
+            assert_eq!(
+                early_end_cause("blew_up", &format!("at step 3: {reason}")),
+                Some(expected),
+                "{reason}"
+            );
+        }
+        assert_eq!(
+            early_end_cause("blew_up", "4 walkers crashed in this turn"),
+            Some(EarlyEndCause::Crashed)
+        );
+        assert_eq!(
+            early_end_cause("bad_start", "an element that the model does not know"),
+            Some(EarlyEndCause::BadStart)
+        );
+        assert_eq!(early_end_cause("running", ""), None);
+    }
+
+    #[test]
+    fn ends_are_counted_by_cause() {
+        let walks = [
+            walk(0, "collected", ""),
+            walk(1, "running", ""),
+            walk(2, "blew_up", "at step 5: 9000 K is above the allowed 800 K"),
+            walk(3, "blew_up", "at step 7: 9999 K is above the allowed 800 K"),
+            walk(4, "trapped", "refused by the shortest-bond guard again and again"),
+            walk(5, "collected", ""),
+        ];
+        let ends = WalkEnds::from_walks(&walks);
+        assert_eq!((ends.ended(), ends.early(), ends.all_early()), (5, 3, false));
+        assert_eq!(ends.in_words(), "2 collected, 2 blew up (too hot), 1 trapped");
+        assert_eq!(ends.counts_by_end(), "2 collected, 2 blew up, 1 trapped");
+        let (_, hot) = ends.causes().next().unwrap();
+        assert_eq!((hot.walk, hot.reason.as_str()), (2, "at step 5: 9000 K is above the allowed 800 K"));
+        assert!(ends.warning().starts_with("3 of 5 finished walks ended early (2 too hot, 1 atoms"));
+        assert!(
+            WalkEnds::from_walks(&walks[2..5]).all_early() && !WalkEnds::from_walks(&walks[1..2]).all_early()
+        );
+    }
+
+    #[test]
+    fn many_early_ends_are_a_pattern() {
+        for (ended, early, expected) in
+            [(0, 0, false), (2, 2, false), (3, 3, true), (6, 3, true), (7, 3, false), (100, 50, true)]
+        {
+            assert_eq!(is_pattern(ended, early), expected, "{early} of {ended}");
+        }
+    }
+}

@@ -1,0 +1,6 @@
+// The state of a campaign.
+
+/** `finished`, `running`, or `stopped` if no process runs the campaign. */
+export function campaignState(status) {
+  return status.finished ? "finished" : status.led ? "running" : "stopped";
+}

@@ -1,0 +1,59 @@
+//! Reads the frames of a file one at a time. Errors name the file.
+
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use atoms::extxyz::{Frame, Reader};
+use atoms::{FileError, open_extxyz};
+
+/// Reads an extended XYZ file frame by frame.
+pub struct XyzReader {
+    path: PathBuf,
+    /// Length of the file, bytes. `None` for a pipe.
+    pub length: Option<u64>,
+    read: Arc<AtomicU64>,
+    reader: Reader<Box<dyn BufRead>>,
+}
+
+/// Counts the bytes read.
+struct Counting(File, Arc<AtomicU64>);
+
+impl XyzReader {
+    /// Opens the file.
+    pub fn open(path: &Path) -> Result<Self, FileError> {
+        let file = open_extxyz(path)?;
+        let length = file.metadata().ok().filter(|found| found.is_file()).map(|found| found.len());
+        let read = Arc::new(AtomicU64::new(0));
+        let input: Box<dyn BufRead> = Box::new(BufReader::new(Counting(file, Arc::clone(&read))));
+        Ok(Self { path: path.to_owned(), length, read, reader: Reader::new(input) })
+    }
+
+    /// Bytes read so far.
+    pub fn position(&self) -> u64 {
+        self.read.load(Ordering::Relaxed)
+    }
+}
+
+impl Iterator for XyzReader {
+    type Item = Result<Frame, FileError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let frame = self.reader.next()?;
+        Some(frame.map_err(|error| FileError::Extxyz {
+            path: self.path.clone(),
+            line: error.line,
+            fault: error.fault,
+        }))
+    }
+}
+
+impl Read for Counting {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        let count = self.0.read(buffer)?;
+        self.1.fetch_add(count as u64, Ordering::Relaxed);
+        Ok(count)
+    }
+}
