@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use calm::watch::ForgettingAlarm;
+use calm::forgetting::ForgettingAlarm;
 use calm::{Artifact, UpdateSettings};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{Mode, Next, SeedStructure, Selector, Settings, Snapshot, UpdateProtocol};
@@ -102,7 +102,7 @@ fn selector(mode: Mode, turn_steps: u64, model: &GraceModel) -> Selector {
         turn_steps,
         update: UpdateProtocol::Carried,
         search: UpdateSettings {
-            combination: calm::Combination::Convex,
+            combination: calm::CovarianceUpdateKind::Convex,
             ladder: None,
             stop: toml::from_str(&format!("{rule}target = 1.25")).unwrap(),
         },

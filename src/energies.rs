@@ -1,6 +1,6 @@
 //! How far the potential's energies are from those of labels, without the difference of their zeros.
 
-use analysis::{EnergyOffsets, Thinned, TooFewLabels, quantile};
+use analysis::{EnergyOffsets, SystematicSample, TooFewLabels, quantile};
 use atoms::{Species, Structure};
 use serde::Serialize;
 use store::{Store, StoreError};
@@ -45,7 +45,7 @@ pub struct Offset {
 pub struct EnergyErrors {
     zeros: Zeros,
     /// Absolute values, eV an atom.
-    errors: Thinned<f64>,
+    errors: SystematicSample<f64>,
     sum: f64,
     largest: f64,
     left_out: u64,
@@ -139,14 +139,14 @@ impl Zeros {
 impl EnergyErrors {
     /// Of no structure yet.
     pub fn new(zeros: Zeros) -> Self {
-        Self { zeros, errors: Thinned::new(ROOM), sum: 0.0, largest: 0.0, left_out: 0 }
+        Self { zeros, errors: SystematicSample::new(ROOM), sum: 0.0, largest: 0.0, left_out: 0 }
     }
 
     /// A labelled structure with its energies, eV.
     pub fn push(&mut self, structure: &Structure, model: f64, label: f64) {
         match self.zeros.error_per_atom(structure, model, label) {
             Some(error) => {
-                self.errors.push(error.abs());
+                self.errors.add(error.abs());
                 self.sum += error.abs();
                 self.largest = self.largest.max(error.abs());
             }
@@ -156,9 +156,9 @@ impl EnergyErrors {
 
     /// What they come to.
     pub fn summary(&self) -> EnergySummary {
-        let mut sorted: Vec<f64> = self.errors.kept().copied().collect();
+        let mut sorted: Vec<f64> = self.errors.items().copied().collect();
         sorted.sort_by(f64::total_cmp);
-        let structures = self.errors.seen();
+        let structures = self.errors.total();
         let any = |x: f64| (structures > 0).then_some(x);
         EnergySummary {
             structures,

@@ -1,6 +1,6 @@
 //! The alarm over a mixture that forgets its training data: when it begins, when it ends, and what can be done about it.
 
-use calm::rules::Combination;
+use calm::rules::CovarianceUpdateKind;
 
 use crate::config::CalmSection;
 
@@ -12,7 +12,7 @@ const CLEARLY_BELOW: f64 = 0.9;
 pub struct Forgetting {
     /// Share of the training atoms above which there is an alarm.
     limit: f64,
-    combination: Combination,
+    combination: CovarianceUpdateKind,
 }
 
 /// Follows the alarm through a run.
@@ -37,10 +37,10 @@ impl Forgetting {
     /// The alarm, with what can be done about it.
     pub fn begun(&self, share: f64) -> String {
         let other = match self.combination {
-            Combination::Convex => {
+            CovarianceUpdateKind::Convex => {
                 "combination = \"additive\", which forgets nothing, or with smaller values of ladder"
             }
-            Combination::Additive => "smaller values of ladder",
+            CovarianceUpdateKind::Additive => "smaller values of ladder",
         };
         format!(
             "the mixture forgets its training data: {:.1} % of the training atoms have γ > 1 (calm.forgetting_alarm: {:.1} %), \
@@ -83,7 +83,7 @@ mod tests {
 
     #[test]
     fn an_alarm_is_said_when_it_begins_and_when_it_ends() {
-        let forgetting = Forgetting { limit: 0.2, combination: Combination::Convex };
+        let forgetting = Forgetting { limit: 0.2, combination: CovarianceUpdateKind::Convex };
         let mut alarm = Alarm::new(forgetting);
         let said: Vec<_> = [0.1, 0.21, 0.3, 0.19, 0.21, 0.17, 0.1, 0.25]
             .into_iter()

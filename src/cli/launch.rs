@@ -8,7 +8,7 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use orchestrator::slurm::{JobNames, Phase, Plan, Slurm, SlurmError, Wanted, plan};
+use orchestrator::slurm::{JobNames, JobPhase, Plan, Slurm, SlurmError, Wanted, plan};
 use store::Location;
 
 use self::order::Order;
@@ -172,7 +172,7 @@ impl Launch {
         order.write()?;
         let jobs = slurm.jobs(names).await.or_else(jobs)?;
         let Plan { cancel, submit } = plan(&wanted, &jobs);
-        for job in jobs.iter().filter(|job| job.phase() != Phase::Over) {
+        for job in jobs.iter().filter(|job| job.phase() != JobPhase::Over) {
             let becomes = if cancel.contains(&job.id) { "is cancelled" } else { "is there" };
             print(|out| writeln!(out, "{}: job {} ({}) {becomes}", job.role, job.id, job.state))?;
         }

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use analysis::Thinned;
+use analysis::SystematicSample;
 use atoms::cell::{norm, sub};
 use atoms::{NeighbourList, Species, Structure, shortest_distance};
 use store::{Collected, JobState, SeedStructure, Store, StoreError};
@@ -38,15 +38,15 @@ pub struct Sample {
 /// What was collected from walks of one kind.
 pub struct Collection {
     /// Every structure.
-    pub structures: Thinned<Shape>,
+    pub structures: SystematicSample<Shape>,
     /// Every atom.
-    pub atoms: Thinned<Atom>,
+    pub atoms: SystematicSample<Atom>,
     /// How many atoms of each element.
     pub elements: BTreeMap<Species, u64>,
     /// How many structures by seed structure and what became of their labels.
     pub labels: BTreeMap<u32, Counts>,
     /// Decisions about structures whose features are looked at.
-    sampled: Thinned<i64>,
+    sampled: SystematicSample<i64>,
 }
 
 /// What became of the labels of some structures.
@@ -109,7 +109,7 @@ impl Sample {
         let elements = Features::most_frequent(&biased.elements, &control.elements);
         let mut features = Features::new(&elements);
         for (origin, collection) in [(Origin::Biased, &biased), (Origin::Control, &control)] {
-            for decision in collection.sampled.kept() {
+            for decision in collection.sampled.items() {
                 let found = store.candidates(decision - 1, true, 1).await?;
                 let Some(found) = found.first().filter(|found| found.decision == *decision) else { continue };
                 if let Some(numbers) = &found.features {
@@ -142,11 +142,11 @@ impl Sample {
 impl Collection {
     fn new() -> Self {
         Self {
-            structures: Thinned::new(STRUCTURES),
-            atoms: Thinned::new(ATOMS),
+            structures: SystematicSample::new(STRUCTURES),
+            atoms: SystematicSample::new(ATOMS),
             elements: BTreeMap::new(),
             labels: BTreeMap::new(),
-            sampled: Thinned::new(WITH_FEATURES),
+            sampled: SystematicSample::new(WITH_FEATURES),
         }
     }
 
@@ -162,14 +162,14 @@ impl Collection {
         let structure = view.structure();
         let periodic = structure.periodic == [true; 3];
         let volume = structure.cell.signed_volume().abs() / structure.len() as f64;
-        self.structures.push(Shape {
+        self.structures.add(Shape {
             relative_volume: view.relative_volume(),
             volume_per_atom: periodic.then_some(volume),
         });
         for species in &structure.species {
             *self.elements.entry(*species).or_default() += 1;
         }
-        self.sampled.push(row.decision);
+        self.sampled.add(row.decision);
         self.push_atoms(row, view.forces, &structure, shortest);
     }
 
@@ -184,7 +184,7 @@ impl Collection {
         let stretches = shortest.filter(|_| is_labelled).map(|shortest| stretches(structure, shortest));
         for (k, gamma) in row.original.gamma.iter().enumerate() {
             let label = row.label_forces.as_ref().and_then(|label| label.get(k));
-            self.atoms.push(Atom {
+            self.atoms.add(Atom {
                 gamma: *gamma,
                 gamma_nbr: row.original.gamma_nbr.get(k).copied().unwrap_or(f64::NAN),
                 error: label.zip(forces.get(k)).map(|(label, model)| norm(sub(*model, *label))),

@@ -1,7 +1,7 @@
 //! What all figures of a report have in common.
 
 use analysis::quantile;
-use figures::{Axis, Colour, Figure, Key, Marker, Scale, Stroke, legend};
+use figures::{Axis, Colour, Figure, LegendKey, Marker, Scale, Stroke, legend};
 use wire::Origin;
 
 /// Width of a figure over two columns of a journal: 180 mm, points.
@@ -41,7 +41,7 @@ pub fn look(origin: Origin) -> Look {
 /// Says at the upper right which is which, of those that are shown.
 pub fn origins(figure: &mut Figure, shown: &[Origin]) {
     let keys: Vec<_> =
-        shown.iter().map(|origin| (Key::Line(look(*origin).line), look(*origin).name)).collect();
+        shown.iter().map(|origin| (LegendKey::Line(look(*origin).line), look(*origin).name)).collect();
     legend(figure, [WIDTH - 8.0, 12.0], &keys);
 }
 

@@ -1,6 +1,6 @@
 //! What was decided, by which numbers, and what followed from it for others.
 
-use calm::watch::GradeDistribution;
+use calm::forgetting::GradeDistribution;
 use calm::{Trial, UpdateEnd, UpdateRule};
 use orchestrator::selector::{STALENESS, Staleness};
 use serde::{Deserialize, Serialize};

@@ -1,6 +1,6 @@
 //! Which part of what was attempted got its label.
 
-use crate::{Bins, wilson};
+use crate::{Bins, wilson_interval};
 
 /// Counts labels that were made and labels that finally failed, by a number that is known of either: a grade, an
 /// expansion. A failed label is censored, not absent: it counts among the attempted, and its structure stays known.
@@ -24,14 +24,14 @@ pub struct CompletionBin<T> {
     pub failed: Vec<T>,
     /// Labelled of attempted; `None` if nothing was.
     pub share: Option<f64>,
-    /// Where the probability of a label is, with 95 % ([`wilson`]).
+    /// Where the probability of a label is, with 95 % ([`wilson_interval`]).
     pub interval: Option<(f64, f64)>,
 }
 
 impl<T: Clone> Completion<T> {
     /// Sorts into `bins`.
     pub fn new(bins: Bins) -> Self {
-        let counts = vec![(0, Vec::new()); bins.number()];
+        let counts = vec![(0, Vec::new()); bins.count()];
         Self { bins, counts, unknown: (0, Vec::new()) }
     }
 
@@ -57,7 +57,7 @@ impl<T: Clone> Completion<T> {
 
     fn place(&mut self, value: Option<f64>) -> &mut (u64, Vec<T>) {
         match value.filter(|value| value.is_finite()) {
-            Some(value) => &mut self.counts[self.bins.place(value)],
+            Some(value) => &mut self.counts[self.bins.index_of(value)],
             None => &mut self.unknown,
         }
     }
@@ -74,7 +74,7 @@ fn bin<T: Clone>(
         labelled: *labelled,
         failed: failed.clone(),
         share: (attempted > 0).then(|| *labelled as f64 / attempted as f64),
-        interval: wilson(*labelled, attempted),
+        interval: wilson_interval(*labelled, attempted),
     }
 }
 
@@ -84,7 +84,7 @@ mod tests {
 
     #[test]
     fn failures_count_among_the_attempted() {
-        let mut completion = Completion::new(Bins::of_expansion());
+        let mut completion = Completion::new(Bins::for_volume_ratio());
         for _ in 0..3 {
             completion.labelled(Some(1.0));
         }
@@ -97,14 +97,14 @@ mod tests {
         assert_eq!((bins[1].labelled, bins[1].share, &bins[1].failed), (3, Some(1.0), &vec![]));
         assert_eq!((bins[5].above, bins[5].up_to), (Some(1.35), Some(1.45)));
         assert_eq!((bins[5].labelled, bins[5].share), (1, Some(1.0 / 3.0)));
-        assert_eq!((&bins[5].failed, bins[5].interval), (&vec!["a", "b"], wilson(1, 3)));
+        assert_eq!((&bins[5].failed, bins[5].interval), (&vec!["a", "b"], wilson_interval(1, 3)));
         assert_eq!((bins[6].share, bins[6].up_to), (Some(0.0), None));
         assert_eq!((bins[0].share, bins[0].interval), (None, None));
     }
 
     #[test]
     fn what_has_no_value_is_not_lost() {
-        let mut completion = Completion::new(Bins::of_grades());
+        let mut completion = Completion::new(Bins::for_grades());
         completion.labelled(None);
         completion.failed(Some(f64::INFINITY), "a");
         let last = completion.bins().pop().unwrap();

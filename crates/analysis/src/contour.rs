@@ -2,13 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use crate::PlaneDensity;
+use crate::Density2d;
 
 /// Where a line crosses the side of a square: the side that begins at a place of the grid, to the right or upwards.
-type Side = (usize, usize, bool);
+type GridEdge = (usize, usize, bool);
 
 /// The closed lines on which the density is `level`. What reaches the edge of the grid is closed beyond it.
-pub fn contours(density: &PlaneDensity, level: f64) -> Vec<Vec<[f64; 2]>> {
+pub fn contours(density: &Density2d, level: f64) -> Vec<Vec<[f64; 2]>> {
     let mut next = segments(density, level);
     let mut lines = Vec::new();
     while let Some((first, mut side)) = next.pop_first() {
@@ -26,7 +26,7 @@ pub fn contours(density: &PlaneDensity, level: f64) -> Vec<Vec<[f64; 2]>> {
 }
 
 /// From side to side, with what is above the level on the left: each side is left by one line at most.
-fn segments(density: &PlaneDensity, level: f64) -> BTreeMap<Side, Side> {
+fn segments(density: &Density2d, level: f64) -> BTreeMap<GridEdge, GridEdge> {
     let mut next = BTreeMap::new();
     for row in 0..=density.size() {
         for column in 0..=density.size() {
@@ -55,12 +55,12 @@ fn segments(density: &PlaneDensity, level: f64) -> BTreeMap<Side, Side> {
 }
 
 /// The density with a border of nothing around the grid, whose places are counted from that border.
-fn value(density: &PlaneDensity, column: usize, row: usize) -> f64 {
+fn value(density: &Density2d, column: usize, row: usize) -> f64 {
     let is_inside = |k: usize| k >= 1 && k <= density.size();
     if is_inside(column) && is_inside(row) { density.value(column - 1, row - 1) } else { f64::NEG_INFINITY }
 }
 
-fn crossing(density: &PlaneDensity, level: f64, (column, row, is_horizontal): Side) -> [f64; 2] {
+fn crossing(density: &Density2d, level: f64, (column, row, is_horizontal): GridEdge) -> [f64; 2] {
     let (right, up) = if is_horizontal { (1, 0) } else { (0, 1) };
     let (from, to) = (value(density, column, row), value(density, column + right, row + up));
     let part = (level - from) / (to - from);
@@ -88,7 +88,7 @@ mod tests {
     #[test]
     fn a_disc_has_a_round_contour_through_its_level() {
         let points: Vec<_> = cloud([2.0, -1.0]).collect();
-        let density = PlaneDensity::of(&points, 96).unwrap();
+        let density = Density2d::from_points(&points, 96).unwrap();
         let level = density.level(&points, 0.95).unwrap();
         let lines = contours(&density, level);
         assert_eq!(lines.len(), 1);
@@ -102,7 +102,7 @@ mod tests {
     #[test]
     fn two_clouds_have_two() {
         let points: Vec<_> = cloud([0.0, 0.0]).chain(cloud([9.0, 9.0])).collect();
-        let density = PlaneDensity::of(&points, 96).unwrap();
+        let density = Density2d::from_points(&points, 96).unwrap();
         let lines = contours(&density, density.level(&points, 0.95).unwrap());
         assert_eq!(lines.len(), 2);
         assert!(area(&lines[0]) * area(&lines[1]) > 0.0, "both turn the same way");
@@ -111,7 +111,7 @@ mod tests {
     #[test]
     fn what_reaches_the_edge_is_closed() {
         let points: Vec<_> = cloud([0.0, 0.0]).collect();
-        let density = PlaneDensity::of(&points, 32).unwrap();
+        let density = Density2d::from_points(&points, 32).unwrap();
         let lines = contours(&density, 0.0);
         assert_eq!(lines.len(), 1);
         assert_eq!(lines[0].len(), 4 * 32);

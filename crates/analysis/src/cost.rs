@@ -90,7 +90,7 @@ impl CostModel {
             ([1.0, x - centre[0], k - centre[1]], label.core_seconds.ln())
         };
         let points: Vec<_> = labels.iter().map(|label| point(label)).collect();
-        let fit = Fit::of(&points, guess.as_ref().map(point))?;
+        let fit = Fit::new(&points, guess.as_ref().map(point))?;
         Some(Self { by_electrons, centre, fit })
     }
 

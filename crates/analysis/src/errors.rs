@@ -1,8 +1,8 @@
 //! How a grade foretells the force error of atoms.
 
 use crate::quantiles::quantile;
-use crate::ranks::{roc_auc, spearman};
-use crate::{Bins, Thinned};
+use crate::rank_statistics::{roc_auc, spearman};
+use crate::{Bins, SystematicSample};
 
 /// Gathers grades with the force errors of labelled atoms, and the grades of atoms whose label failed: those have an
 /// error too, which nobody knows. Counts are exact; ranks and quantiles come from the atoms that there is room for, a
@@ -11,7 +11,7 @@ use crate::{Bins, Thinned};
 pub struct ForceErrors {
     bins: Bins,
     threshold: f64,
-    pairs: Thinned<(f64, f64)>,
+    pairs: SystematicSample<(f64, f64)>,
     counts: Vec<Counts>,
     sum: f64,
     left_out: u64,
@@ -52,27 +52,27 @@ pub struct ErrorBin {
 impl ForceErrors {
     /// Sorts grades into `bins`; errors above `threshold`, eV/Å, are large. Keeps `room` atoms at most, 24 bytes each.
     pub fn new(bins: Bins, threshold: f64, room: usize) -> Self {
-        let counts = vec![Counts::default(); bins.number()];
-        Self { bins, threshold, pairs: Thinned::new(room), counts, sum: 0.0, left_out: 0 }
+        let counts = vec![Counts::default(); bins.count()];
+        Self { bins, threshold, pairs: SystematicSample::new(room), counts, sum: 0.0, left_out: 0 }
     }
 
     /// A labelled atom: its grade, and |F_model − F_label|, eV/Å. What is not finite is counted and left out.
-    pub fn push(&mut self, grade: f64, error: f64) {
+    pub fn add(&mut self, grade: f64, error: f64) {
         if !(grade.is_finite() && error.is_finite()) {
             self.left_out += 1;
             return;
         }
-        let counts = &mut self.counts[self.bins.place(grade)];
+        let counts = &mut self.counts[self.bins.index_of(grade)];
         counts.labelled += 1;
         counts.above += u64::from(error > self.threshold);
         self.sum += error;
-        self.pairs.push((grade, error));
+        self.pairs.add((grade, error));
     }
 
     /// An atom of a structure whose label failed.
-    pub fn push_unlabelled(&mut self, grade: f64) {
+    pub fn add_unlabelled(&mut self, grade: f64) {
         if grade.is_finite() {
-            self.counts[self.bins.place(grade)].unlabelled += 1;
+            self.counts[self.bins.index_of(grade)].unlabelled += 1;
         } else {
             self.left_out += 1;
         }
@@ -80,12 +80,12 @@ impl ForceErrors {
 
     /// Labelled atoms.
     pub fn atoms(&self) -> u64 {
-        self.pairs.seen()
+        self.pairs.total()
     }
 
     /// Of them, those that ranks and quantiles come from.
     pub fn sampled(&self) -> usize {
-        self.pairs.kept().len()
+        self.pairs.items().len()
     }
 
     /// Atoms without a finite grade or error.
@@ -99,9 +99,9 @@ impl ForceErrors {
     }
 
     /// Share of the labelled atoms in the bins that begin at `edge` or above it.
-    pub fn share_above(&self, edge: f64) -> Option<f64> {
-        let is_above = |place: &usize| self.bins.edges(*place).0.is_some_and(|above| above >= edge);
-        let above = (0..self.bins.number()).filter(is_above).map(|place| self.counts[place].labelled);
+    pub fn fraction_above(&self, edge: f64) -> Option<f64> {
+        let is_above = |index: &usize| self.bins.edges(*index).0.is_some_and(|above| above >= edge);
+        let above = (0..self.bins.count()).filter(is_above).map(|index| self.counts[index].labelled);
         (self.atoms() > 0).then(|| above.sum::<u64>() as f64 / self.atoms() as f64)
     }
 
@@ -119,17 +119,17 @@ impl ForceErrors {
 
     /// The force errors by bin of the grade, also of those in which there is none.
     pub fn bins(&self) -> Vec<ErrorBin> {
-        let mut errors = vec![Vec::new(); self.bins.number()];
-        for (grade, error) in self.pairs.kept() {
-            errors[self.bins.place(*grade)].push(*error);
+        let mut errors = vec![Vec::new(); self.bins.count()];
+        for (grade, error) in self.pairs.items() {
+            errors[self.bins.index_of(*grade)].push(*error);
         }
         errors.iter_mut().for_each(|errors| errors.sort_by(f64::total_cmp));
-        (0..self.bins.number()).map(|place| self.bin(place, &errors[place])).collect()
+        (0..self.bins.count()).map(|index| self.bin(index, &errors[index])).collect()
     }
 
-    fn bin(&self, place: usize, errors: &[f64]) -> ErrorBin {
-        let Counts { labelled, above: large, unlabelled } = self.counts[place];
-        let (above, up_to) = self.bins.edges(place);
+    fn bin(&self, index: usize, errors: &[f64]) -> ErrorBin {
+        let Counts { labelled, above: large, unlabelled } = self.counts[index];
+        let (above, up_to) = self.bins.edges(index);
         let part = |part: u64, of: u64| (of > 0).then(|| part as f64 / of as f64);
         let all = labelled + unlabelled;
         ErrorBin {
@@ -147,7 +147,7 @@ impl ForceErrors {
     }
 
     fn rows(&self) -> (Vec<f64>, Vec<f64>) {
-        self.pairs.kept().copied().unzip()
+        self.pairs.items().copied().unzip()
     }
 }
 
@@ -159,11 +159,11 @@ mod tests {
 
     #[test]
     fn a_table_by_hand() {
-        let mut errors = ForceErrors::new(Bins::of_grades(), 1.0, 1000);
+        let mut errors = ForceErrors::new(Bins::for_grades(), 1.0, 1000);
         for (grade, error) in [(0.2, 0.1), (0.5, 0.3), (0.4, 0.2), (3.0, 1.0), (4.0, 2.0), (f64::NAN, 1.0)] {
-            errors.push(grade, error);
+            errors.add(grade, error);
         }
-        [3.5, 4.5, 9.0].into_iter().for_each(|grade| errors.push_unlabelled(grade));
+        [3.5, 4.5, 9.0].into_iter().for_each(|grade| errors.add_unlabelled(grade));
         let bins = errors.bins();
         assert_eq!((errors.atoms(), errors.left_out(), bins.len()), (5, 1, 7));
         assert_eq!((bins[0].atoms, bins[0].median, bins[0].large), (3, Some(0.2), Some(0.0)));
@@ -175,7 +175,7 @@ mod tests {
         // Nothing is known where every label failed, and that is not the same as where there was nothing.
         assert_eq!((bins[6].median, bins[6].large, bins[6].large_between), (None, None, Some((0.0, 1.0))));
         assert_eq!((bins[1].atoms, bins[1].large_between), (0, None));
-        assert_eq!((errors.mean(), errors.share_above(1.0)), (Some(3.6 / 5.0), Some(0.4)));
+        assert_eq!((errors.mean(), errors.fraction_above(1.0)), (Some(3.6 / 5.0), Some(0.4)));
         // Grades 0.2 0.5 0.4 3 4 against 0.1 0.3 0.2 1 2: the same order.
         assert!((errors.spearman().unwrap() - 1.0).abs() < 1e-14);
         assert_eq!(errors.roc_auc(), Some(1.0));
@@ -186,14 +186,14 @@ mod tests {
         fn nothing_is_lost_and_a_sample_is_near(seed in 0_u64..1000) {
             let number = |k: u64| ((k * 2_654_435_761 + seed) % 1_000_003) as f64 / 1_000_003.0;
             let (mut all, mut some) = (
-                ForceErrors::new(Bins::of_grades(), 1.0, 100_000),
-                ForceErrors::new(Bins::of_grades(), 1.0, 2_000),
+                ForceErrors::new(Bins::for_grades(), 1.0, 100_000),
+                ForceErrors::new(Bins::for_grades(), 1.0, 2_000),
             );
             for k in 0..6_000 {
                 let grade = 3.0 * number(k);
                 let error = grade * number(7 * k + 1);
-                all.push(grade, error);
-                some.push(grade, error);
+                all.add(grade, error);
+                some.add(grade, error);
             }
             prop_assert!(all.sampled() == 6_000 && some.sampled() <= 2_000);
             let counts = |errors: &ForceErrors| -> Vec<_> {

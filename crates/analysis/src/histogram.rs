@@ -20,16 +20,16 @@ impl Histogram {
     }
 
     /// Of values that are at hand.
-    pub fn of(edges: Vec<f64>, values: impl IntoIterator<Item = f64>) -> Self {
+    pub fn from_values(edges: Vec<f64>, values: impl IntoIterator<Item = f64>) -> Self {
         let mut histogram = Self::new(edges);
-        values.into_iter().for_each(|value| histogram.push(value));
+        values.into_iter().for_each(|value| histogram.add(value));
         histogram
     }
 
     /// Counts one.
-    pub fn push(&mut self, value: f64) {
-        match place(&self.edges, value) {
-            Some(place) => self.counts[place] += 1,
+    pub fn add(&mut self, value: f64) {
+        match bin_index(&self.edges, value) {
+            Some(index) => self.counts[index] += 1,
             None => self.outside += 1,
         }
     }
@@ -50,14 +50,14 @@ impl Histogram {
     }
 
     /// Of all values, the share in each bin.
-    pub fn shares(&self) -> Vec<f64> {
+    pub fn fractions(&self) -> Vec<f64> {
         let all = self.outside + self.counts.iter().sum::<u64>();
         self.counts.iter().map(|count| *count as f64 / all.max(1) as f64).collect()
     }
 }
 
 /// The bin between `edges` that holds a value: it has its lower edge, the last one both.
-pub(crate) fn place(edges: &[f64], value: f64) -> Option<usize> {
+pub(crate) fn bin_index(edges: &[f64], value: f64) -> Option<usize> {
     let bins = edges.len().checked_sub(1)?;
     if value.is_nan() || value < edges[0] || value > edges[bins] {
         return None;
@@ -66,13 +66,13 @@ pub(crate) fn place(edges: &[f64], value: f64) -> Option<usize> {
 }
 
 /// Edges of `bins` bins of one width.
-pub fn even_edges(low: f64, high: f64, bins: usize) -> Vec<f64> {
+pub fn linear_edges(low: f64, high: f64, bins: usize) -> Vec<f64> {
     (0..=bins).map(|k| low + (high - low) * k as f64 / bins as f64).collect()
 }
 
 /// Edges of `bins` bins that are as wide on a logarithmic scale; `low` and `high` above 0.
 pub fn logarithmic_edges(low: f64, high: f64, bins: usize) -> Vec<f64> {
-    even_edges(low.ln(), high.ln(), bins).into_iter().map(f64::exp).collect()
+    linear_edges(low.ln(), high.ln(), bins).into_iter().map(f64::exp).collect()
 }
 
 #[cfg(test)]
@@ -82,10 +82,10 @@ mod tests {
     #[test]
     fn each_bin_has_its_lower_edge() {
         let values = [0.0, 0.9, 1.0, 2.9, 3.0, 3.1, -0.1, f64::NAN];
-        let histogram = Histogram::of(even_edges(0.0, 3.0, 3), values);
+        let histogram = Histogram::from_values(linear_edges(0.0, 3.0, 3), values);
         assert_eq!((histogram.counts(), histogram.outside()), (&[2, 1, 2][..], 3));
-        assert_eq!(histogram.shares(), [0.25, 0.125, 0.25]);
-        assert_eq!(Histogram::new(vec![0.0, 1.0]).shares(), [0.0]);
+        assert_eq!(histogram.fractions(), [0.25, 0.125, 0.25]);
+        assert_eq!(Histogram::new(vec![0.0, 1.0]).fractions(), [0.0]);
     }
 
     #[test]

@@ -8,24 +8,24 @@ use crate::quantiles::quantile;
 
 /// Differences beyond this come from no calculation, eV an atom: an all-electron calculation of the heaviest element has
 /// 1.5 · 10⁶.
-const IMPOSSIBLE: f64 = 1e7;
+const MAX_PLAUSIBLE: f64 = 1e7;
 /// A structure is left out of the fit if it is further from it than this, eV an atom …
-const LEAST_CUT: f64 = 1.0;
+const MIN_CUT: f64 = 1.0;
 /// … and than so many standard deviations, as the median absolute residual gives them for normal noise.
 const CUT: f64 = 10.0;
-const SCALE_OF_MEDIAN: f64 = 1.4826;
+const MAD_TO_SIGMA: f64 = 1.4826;
 /// Eigenvalues below this part of the largest are zero but for rounding.
-const RANK: f64 = 1e-12;
+const RANK_TOLERANCE: f64 = 1e-12;
 /// Residuals above these have a bounded influence on the robust start, eV an atom. The large one comes first: elements whose zeros are
 /// far from the others' are found while none of their structures weighs nothing.
-const KNEES: [f64; 2] = [1.0, 0.01];
+const HUBER_THRESHOLDS: [f64; 2] = [1.0, 0.01];
 /// Rounds of the robust start, if its offsets do not settle earlier: they change by less than this, eV.
-const ROUNDS: usize = 50;
-const SETTLED: f64 = 1e-4;
+const MAX_ITERATIONS: usize = 50;
+const CONVERGENCE: f64 = 1e-4;
 /// Rounds in which structures may still be left out or taken in again.
-const SELECTIONS: usize = 10;
+const MAX_SELECTIONS: usize = 10;
 /// A composition whose part outside of the fit's space, squared, is larger than this part of it is not described.
-const OUTSIDE: f64 = 1e-9;
+const OUTSIDE_TOLERANCE: f64 = 1e-9;
 
 /// A labelled structure as the fit sees it.
 #[derive(Clone, Debug, PartialEq)]
@@ -101,7 +101,7 @@ impl EnergyOffsets {
     /// # Errors
     /// [`TooFewLabels`] unless there is one more structure than elements.
     pub fn fit(labels: &[LabelledEnergy]) -> Result<Self, TooFewLabels> {
-        let is_possible = |label: &&LabelledEnergy| label.difference_per_atom().abs() <= IMPOSSIBLE;
+        let is_possible = |label: &&LabelledEnergy| label.difference_per_atom().abs() <= MAX_PLAUSIBLE;
         let possible: Vec<_> = labels.iter().filter(is_possible).collect();
         let elements =
             possible.iter().flat_map(|label| label.composition.iter().map(|(element, _)| *element));
@@ -110,16 +110,16 @@ impl EnergyOffsets {
         if possible.len() < needed {
             return Err(TooFewLabels { structures: possible.len(), needed });
         }
-        let rows: Vec<_> = possible.iter().map(|label| Row::of(label, &elements)).collect();
+        let rows: Vec<_> = possible.iter().map(|label| Row::new(label, &elements)).collect();
         let mut used = within_cut(&residuals(&rows, &robust_start(&rows, elements.len())));
-        let mut solved = Solved::of(&rows, &weights(&used), elements.len());
-        for _ in 0..SELECTIONS {
+        let mut solved = Solved::solve(&rows, &weights(&used), elements.len());
+        for _ in 0..MAX_SELECTIONS {
             let again = within_cut(&residuals(&rows, &solved.offsets));
             if again == used {
                 break;
             }
             used = again;
-            solved = Solved::of(&rows, &weights(&used), elements.len());
+            solved = Solved::solve(&rows, &weights(&used), elements.len());
         }
         let Solved { offsets, inverse, projection } = solved;
         let structures = used.iter().filter(|used| **used).count();
@@ -155,15 +155,15 @@ impl EnergyOffsets {
         }
         let inside = form(&self.projection, &row);
         let leverage = form(&self.inverse, &row);
-        if size - inside > OUTSIDE * size || leverage <= 0.0 { 0.0 } else { 1.0 / leverage }
+        if size - inside > OUTSIDE_TOLERANCE * size || leverage <= 0.0 { 0.0 } else { 1.0 / leverage }
     }
 
-    /// (E_model − E_label) an atom without the offsets, eV. `None` where fewer than `least_support` structures speak for the
+    /// (E_model − E_label) an atom without the offsets, eV. `None` where fewer than `min_support` structures speak for the
     /// composition.
-    pub fn error_per_atom(&self, label: &LabelledEnergy, least_support: f64) -> Option<f64> {
+    pub fn error_per_atom(&self, label: &LabelledEnergy, min_support: f64) -> Option<f64> {
         let support = self.support(&label.composition);
         // Rounding must not decide about whole numbers.
-        if support <= 0.0 || support < least_support * (1.0 - 1e-6) {
+        if support <= 0.0 || support < min_support * (1.0 - 1e-6) {
             return None;
         }
         let row = self.row(&label.composition)?;
@@ -183,7 +183,7 @@ impl EnergyOffsets {
 }
 
 impl Row {
-    fn of(label: &LabelledEnergy, elements: &[u8]) -> Self {
+    fn new(label: &LabelledEnergy, elements: &[u8]) -> Self {
         let atoms = label.atoms();
         let fraction = |(element, number): &(u8, u32)| {
             let index = elements.binary_search(element).expect("the elements of all rows are known");
@@ -204,12 +204,12 @@ fn robust_start(rows: &[Row], elements: usize) -> Vec<f64> {
     differences.sort_by(f64::total_cmp);
     let median = quantile(&differences, 0.5).unwrap_or(0.0);
     let mut offsets = vec![median; elements];
-    for knee in KNEES {
-        for _ in 0..ROUNDS {
+    for knee in HUBER_THRESHOLDS {
+        for _ in 0..MAX_ITERATIONS {
             let residuals = residuals(rows, &offsets);
             let weights: Vec<_> = residuals.iter().map(|residual| knee / residual.abs().max(knee)).collect();
-            let before = std::mem::replace(&mut offsets, Solved::of(rows, &weights, elements).offsets);
-            if before.iter().zip(&offsets).all(|(before, now)| (before - now).abs() < SETTLED) {
+            let before = std::mem::replace(&mut offsets, Solved::solve(rows, &weights, elements).offsets);
+            if before.iter().zip(&offsets).all(|(before, now)| (before - now).abs() < CONVERGENCE) {
                 break;
             }
         }
@@ -225,7 +225,7 @@ fn residuals(rows: &[Row], offsets: &[f64]) -> Vec<f64> {
 fn within_cut(residuals: &[f64]) -> Vec<bool> {
     let mut sizes: Vec<_> = residuals.iter().map(|residual| residual.abs()).collect();
     sizes.sort_by(f64::total_cmp);
-    let cut = (CUT * SCALE_OF_MEDIAN * quantile(&sizes, 0.5).unwrap_or(0.0)).max(LEAST_CUT);
+    let cut = (CUT * MAD_TO_SIGMA * quantile(&sizes, 0.5).unwrap_or(0.0)).max(MIN_CUT);
     residuals.iter().map(|residual| residual.abs() <= cut).collect()
 }
 
@@ -241,7 +241,7 @@ struct Solved {
 }
 
 impl Solved {
-    fn of(rows: &[Row], weights: &[f64], elements: usize) -> Self {
+    fn solve(rows: &[Row], weights: &[f64], elements: usize) -> Self {
         let mut normal = Mat::<f64>::zeros(elements, elements);
         let mut right = vec![0.0; elements];
         for (row, weight) in rows.iter().zip(weights) {
@@ -265,7 +265,7 @@ fn pseudo_inverse(matrix: &Mat<f64>) -> (Mat<f64>, Mat<f64>) {
     let Ok(eigen) = matrix.self_adjoint_eigen(Side::Lower) else { return (inverse, projection) };
     let (values, vectors) = (eigen.S(), eigen.U());
     let largest = (0..n).map(|k| values[k]).fold(0.0, f64::max);
-    for column in (0..n).filter(|column| values[*column] > RANK * largest) {
+    for column in (0..n).filter(|column| values[*column] > RANK_TOLERANCE * largest) {
         for i in 0..n {
             for k in 0..n {
                 let product = vectors[(i, column)] * vectors[(k, column)];

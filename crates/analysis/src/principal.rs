@@ -19,7 +19,7 @@ impl PrincipalAxes {
     /// The first `number` axes of rows that follow each other in `rows`: eigenvectors of their covariance. An axis points
     /// to where its largest component is positive, so that the same rows give the same numbers. `None` of fewer than two
     /// rows, of rows that do not differ, of numbers that are not finite, or if the eigenvalues do not converge.
-    pub fn of(rows: &[f64], dimension: usize, number: usize) -> Option<Self> {
+    pub fn fit(rows: &[f64], dimension: usize, number: usize) -> Option<Self> {
         let count = rows.len().checked_div(dimension)?;
         if count < 2 || number > dimension || !rows.iter().all(|x| x.is_finite()) {
             return None;
@@ -39,7 +39,9 @@ impl PrincipalAxes {
         }
         // Eigenvalues ascend.
         let last = (0..number).map(|k| dimension - 1 - k);
-        let axes = last.clone().map(|column| turned((0..dimension).map(|k| vectors[(k, column)]).collect()));
+        let axes = last
+            .clone()
+            .map(|column| with_fixed_sign((0..dimension).map(|k| vectors[(k, column)]).collect()));
         let shares = last.clone().map(|column| values[column].max(0.0) / trace);
         Some(Self { axes: axes.collect(), shares: shares.collect(), mean })
     }
@@ -54,7 +56,7 @@ impl PrincipalAxes {
     }
 }
 
-fn turned(mut axis: Vec<f64>) -> Vec<f64> {
+fn with_fixed_sign(mut axis: Vec<f64>) -> Vec<f64> {
     let largest =
         axis.iter().copied().fold(0.0, |largest: f64, x| if x.abs() > largest.abs() { x } else { largest });
     if largest < 0.0 {
@@ -75,7 +77,7 @@ mod tests {
         for (a, b) in [(3.0, 0.0), (-3.0, 0.0), (0.0, 1.0), (0.0, -1.0)] {
             (0..3).for_each(|k| rows.push([1.0, 2.0, 3.0][k] + a * long[k] + b * thin[k]));
         }
-        let axes = PrincipalAxes::of(&rows, 3, 2).unwrap();
+        let axes = PrincipalAxes::fit(&rows, 3, 2).unwrap();
         for (found, expected) in axes.shares.iter().zip([0.9, 0.1]) {
             assert!((found - expected).abs() < 1e-12, "{:?}", axes.shares);
         }
@@ -86,11 +88,11 @@ mod tests {
 
     #[test]
     fn nothing_is_said_of_nothing() {
-        assert_eq!(PrincipalAxes::of(&[], 3, 2), None);
-        assert_eq!(PrincipalAxes::of(&[1.0, 2.0], 2, 2), None, "one row");
-        assert_eq!(PrincipalAxes::of(&[1.0, 2.0, 1.0, 2.0], 2, 2), None, "the same row twice");
-        assert_eq!(PrincipalAxes::of(&[7.1; 40], 2, 2), None, "they differ from their mean by rounding");
-        assert_eq!(PrincipalAxes::of(&[1.0, f64::NAN, 1.0, 2.0], 2, 2), None);
-        assert_eq!(PrincipalAxes::of(&[1.0], 0, 0), None);
+        assert_eq!(PrincipalAxes::fit(&[], 3, 2), None);
+        assert_eq!(PrincipalAxes::fit(&[1.0, 2.0], 2, 2), None, "one row");
+        assert_eq!(PrincipalAxes::fit(&[1.0, 2.0, 1.0, 2.0], 2, 2), None, "the same row twice");
+        assert_eq!(PrincipalAxes::fit(&[7.1; 40], 2, 2), None, "they differ from their mean by rounding");
+        assert_eq!(PrincipalAxes::fit(&[1.0, f64::NAN, 1.0, 2.0], 2, 2), None);
+        assert_eq!(PrincipalAxes::fit(&[1.0], 0, 0), None);
     }
 }

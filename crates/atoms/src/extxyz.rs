@@ -12,7 +12,7 @@
 //! have no line (a column count beyond 64 bits ends in a panic).
 
 mod comment;
-mod fault;
+mod error;
 mod labels;
 mod read;
 mod table;
@@ -23,8 +23,8 @@ use std::collections::BTreeMap;
 
 use crate::structure::Structure;
 
-pub use fault::{ExtxyzError, Fault};
-pub use labels::{Keys, LabelError, Labels};
+pub use error::{ExtxyzError, ExtxyzErrorKind};
+pub use labels::{LabelError, LabelKeys, Labels};
 pub use read::Reader;
 pub use value::Value;
 pub use write::{WriteError, write_frame};
@@ -54,12 +54,12 @@ pub struct Column {
     /// Entries per atom.
     pub width: usize,
     /// The entries, atom by atom.
-    pub entries: Entries,
+    pub entries: ColumnData,
 }
 
 /// Entries of one type, [n · width].
 #[derive(Clone, Debug, PartialEq)]
-pub enum Entries {
+pub enum ColumnData {
     /// `R`
     Real(Vec<f64>),
     /// `I` (ASE reads 32 bits only)
@@ -70,7 +70,7 @@ pub enum Entries {
     Text(Vec<String>),
 }
 
-impl Entries {
+impl ColumnData {
     /// Number of entries.
     pub fn len(&self) -> usize {
         match self {
@@ -90,15 +90,15 @@ impl Entries {
 impl Column {
     /// A column of vectors, [n × 3].
     pub fn vectors(vectors: &[[f64; 3]]) -> Self {
-        Self { width: 3, entries: Entries::Real(vectors.concat()) }
+        Self { width: 3, entries: ColumnData::Real(vectors.concat()) }
     }
 
     /// The entries as reals, if they are numbers.
     pub fn reals(&self) -> Option<Vec<f64>> {
         match &self.entries {
-            Entries::Real(values) => Some(values.clone()),
-            Entries::Int(values) => Some(values.iter().map(|value| *value as f64).collect()),
-            Entries::Bool(_) | Entries::Text(_) => None,
+            ColumnData::Real(values) => Some(values.clone()),
+            ColumnData::Int(values) => Some(values.iter().map(|value| *value as f64).collect()),
+            ColumnData::Bool(_) | ColumnData::Text(_) => None,
         }
     }
 }

@@ -9,7 +9,7 @@ use linked_cells::LinkedCells;
 use sites::Sites;
 
 /// More neighbours than this of one atom mean that atoms overlap or the cell has collapsed.
-const MOST_NEIGHBOURS: usize = 20_000;
+const MAX_NEIGHBOURS: usize = 20_000;
 
 /// A directed bond i → j + image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -110,25 +110,25 @@ impl NeighbourList {
 
     /// Neighbours of atom `i` within cutoff + skin (a few may be farther than the cutoff).
     #[inline]
-    pub fn of(&self, i: usize) -> &[Neighbour] {
+    pub fn neighbours_of(&self, i: usize) -> &[Neighbour] {
         &self.neighbours[self.offsets[i]..self.offsets[i + 1]]
     }
 
     /// Those neighbours of atom `i` that come later than `i` itself in canonical order: over all atoms each pair once.
     #[inline]
-    pub fn later(&self, i: usize) -> &[Neighbour] {
+    pub fn later_neighbours_of(&self, i: usize) -> &[Neighbour] {
         &self.neighbours[self.later[i]..self.offsets[i + 1]]
     }
 
-    /// Where each neighbour [of](Self::of) atom `i` stands in [`NeighbourList::site_positions`].
+    /// Where each neighbour [of](Self::neighbours_of) atom `i` stands in [`NeighbourList::site_positions`].
     #[inline]
     pub fn sites_of(&self, i: usize) -> &[u32] {
         &self.sites.of_neighbour[self.offsets[i]..self.offsets[i + 1]]
     }
 
-    /// The same of its [later](Self::later) neighbours.
+    /// The same of its [later](Self::later_neighbours_of) neighbours.
     #[inline]
-    pub fn later_sites(&self, i: usize) -> &[u32] {
+    pub fn later_sites_of(&self, i: usize) -> &[u32] {
         &self.sites.of_neighbour[self.later[i]..self.offsets[i + 1]]
     }
 
@@ -142,7 +142,7 @@ impl NeighbourList {
     #[inline]
     pub fn bonds_within(&self, structure: &Structure, i: usize, cutoff: f64, bonds: &mut Vec<Bond>) {
         bonds.clear();
-        for neighbour in self.of(i) {
+        for neighbour in self.neighbours_of(i) {
             let d = neighbour.displacement(structure, i);
             let square = cell::dot(d, d);
             if square < cutoff * cutoff {
@@ -175,8 +175,8 @@ impl NeighbourList {
                 if (certain || is_within(neighbour)) && neighbour != own {
                     found.push(neighbour);
                 }
-                if found.len() - start > MOST_NEIGHBOURS {
-                    return Err(StructureError::Crowded { atom: i, limit: MOST_NEIGHBOURS, reach });
+                if found.len() - start > MAX_NEIGHBOURS {
+                    return Err(StructureError::Crowded { atom: i, limit: MAX_NEIGHBOURS, reach });
                 }
                 Ok(())
             })?;
@@ -185,7 +185,8 @@ impl NeighbourList {
         self.sort(&found, &ends);
         for i in 0..structure.len() {
             let own = Neighbour { atom: i as u32, image: [0; 3] };
-            self.later.push(self.offsets[i] + self.of(i).partition_point(|neighbour| *neighbour < own));
+            self.later
+                .push(self.offsets[i] + self.neighbours_of(i).partition_point(|neighbour| *neighbour < own));
         }
         self.sites.number(&self.offsets, &self.neighbours);
         Ok(())
@@ -238,7 +239,7 @@ impl NeighbourList {
             .map(|(old, new)| cell::sub(*new, cell::row_times(*old, &f)))
             .map(|u| cell::dot(u, u))
             .fold(0.0, f64::max);
-        let least = least_singular_value(&f) * (self.cutoff + self.skin) - 2.0 * largest.sqrt();
+        let least = min_singular_value(&f) * (self.cutoff + self.skin) - 2.0 * largest.sqrt();
         // The margin is for the rounding of the singular value.
         least > self.cutoff * (1.0 + 1e-7)
     }
@@ -250,7 +251,7 @@ pub fn shortest_distance(structure: &Structure, neighbours: &NeighbourList) -> O
     let mut shortest = None;
     let mut least = f64::INFINITY;
     for i in 0..neighbours.len() {
-        for neighbour in neighbours.later(i) {
+        for neighbour in neighbours.later_neighbours_of(i) {
             let d = neighbour.displacement(structure, i);
             let squared = cell::dot(d, d);
             if squared < least {
@@ -273,7 +274,7 @@ fn deformation_gradient(reference: &Structure, structure: &Structure) -> Matrix3
 
 /// Square root of the least eigenvalue of F Fᵀ, by the trigonometric solution of the cubic
 /// (Smith, Commun. ACM 4, 168 (1961)).
-fn least_singular_value(f: &Matrix3) -> f64 {
+fn min_singular_value(f: &Matrix3) -> f64 {
     let c: Matrix3 = std::array::from_fn(|i| std::array::from_fn(|j| cell::dot(f[i], f[j])));
     let mean = (c[0][0] + c[1][1] + c[2][2]) / 3.0;
     let deviator: Matrix3 =
@@ -295,15 +296,15 @@ mod tests {
     #[test]
     fn least_singular_value_of_known_deformations() {
         let stretch = [[1.1, 0.0, 0.0], [0.0, 0.93, 0.0], [0.0, 0.0, 1.02]];
-        assert!((least_singular_value(&stretch) - 0.93).abs() < 1e-9);
+        assert!((min_singular_value(&stretch) - 0.93).abs() < 1e-9);
         let (s, c) = 0.7_f64.sin_cos();
         let turned = stretch.map(|row| cell::row_times(row, &[[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]));
-        assert!((least_singular_value(&turned) - 0.93).abs() < 1e-9);
-        assert_eq!(least_singular_value(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 1.0);
+        assert!((min_singular_value(&turned) - 0.93).abs() < 1e-9);
+        assert_eq!(min_singular_value(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 1.0);
         // Simple shear g: s² − g s − 1 = 0 has the roots s_max and −s_min.
         let g: f64 = 0.3;
         let sheared = [[1.0, 0.0, 0.0], [g, 1.0, 0.0], [0.0, 0.0, 1.0]];
         let exact = ((g * g + 4.0).sqrt() - g) / 2.0;
-        assert!((least_singular_value(&sheared) - exact).abs() < 1e-9);
+        assert!((min_singular_value(&sheared) - exact).abs() < 1e-9);
     }
 }

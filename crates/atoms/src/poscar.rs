@@ -6,37 +6,37 @@ use std::fmt;
 use std::io::{BufRead, ErrorKind, Write};
 
 use crate::cell::{Cell, Vec3};
-use crate::extxyz::{Column, Entries, Frame};
+use crate::extxyz::{Column, ColumnData, Frame};
 use crate::species::{Species, UnknownSpecies};
 use crate::structure::{Structure, StructureError};
 
 /// What is wrong with a file, and where.
 #[derive(Debug, thiserror::Error)]
-#[error("line {line}: {fault}")]
+#[error("line {line}: {kind}")]
 pub struct PoscarError {
     /// Line of the file, from 1.
     pub line: usize,
     /// What is wrong with it.
     #[source]
-    pub fault: Fault,
+    pub kind: PoscarErrorKind,
 }
 
 /// What is wrong with a line.
 #[derive(Debug, thiserror::Error)]
-pub enum Fault {
+pub enum PoscarErrorKind {
     /// The stream cannot be read.
     #[error("cannot be read: {0}")]
     Io(std::io::Error),
     /// The stream ends too early.
     #[error("the file ends here, expected {0}")]
-    End(Part),
+    End(PoscarSection),
     /// A line of another kind.
     #[error("found '{found}', expected {expected}")]
     Line {
         /// The line.
         found: String,
         /// What it should be.
-        expected: Part,
+        expected: PoscarSection,
     },
     /// A file of VASP 4, which does not say what its atoms are.
     #[error(
@@ -53,7 +53,7 @@ pub enum Fault {
 
 /// A part of the file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Part {
+pub enum PoscarSection {
     /// Line 1.
     Comment,
     /// Line 2.
@@ -72,7 +72,7 @@ pub enum Part {
     PositionAndFlags,
 }
 
-impl fmt::Display for Part {
+impl fmt::Display for PoscarSection {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Comment => "a comment",
@@ -95,15 +95,15 @@ impl fmt::Display for Part {
 pub fn read_poscar(input: impl BufRead) -> Result<Frame, PoscarError> {
     let mut lines = Lines { input, number: 0, text: String::new() };
     let frame = frame(&mut lines);
-    frame.map_err(|fault| PoscarError { line: lines.number, fault })
+    frame.map_err(|fault| PoscarError { line: lines.number, kind: fault })
 }
 
-fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, Fault> {
-    let comment = lines.take(Part::Comment)?.to_owned();
-    let factors = lines.parse(Part::Scale, factors)?;
+fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, PoscarErrorKind> {
+    let comment = lines.take(PoscarSection::Comment)?.to_owned();
+    let factors = lines.parse(PoscarSection::Scale, factors)?;
     let mut lattice = [[0.0; 3]; 3];
     for vector in &mut lattice {
-        *vector = lines.parse(Part::LatticeVector, vector3)?;
+        *vector = lines.parse(PoscarSection::LatticeVector, vector3)?;
     }
     let factors = match factors {
         Scale::Factors(factors) => factors,
@@ -111,23 +111,23 @@ fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, Fault> {
     };
     let stretch = |x: Vec3| -> Vec3 { std::array::from_fn(|k| x[k] * factors[k]) };
     let cell = Cell(lattice.map(stretch));
-    let symbols = symbols(lines.take(Part::Symbols)?)?;
-    let counts = lines.parse(Part::Counts, |text| counts(text, symbols.len()))?;
-    let mut mode = lines.parse(Part::Mode, mode)?;
+    let symbols = symbols(lines.take(PoscarSection::Symbols)?)?;
+    let counts = lines.parse(PoscarSection::Counts, |text| counts(text, symbols.len()))?;
+    let mut mode = lines.parse(PoscarSection::Mode, mode)?;
     let selective = mode == Mode::Selective;
     if selective {
-        mode = lines.parse(Part::Mode, mode_of_positions)?;
+        mode = lines.parse(PoscarSection::Mode, mode_of_positions)?;
     }
     let mut structure = Structure { species: vec![], positions: vec![], cell, periodic: [true; 3] };
     let mut flags = Vec::new();
     for (species, count) in symbols.into_iter().zip(counts) {
         for _ in 0..count {
             let position = if selective {
-                let (position, free) = lines.parse(Part::PositionAndFlags, position_and_flags)?;
+                let (position, free) = lines.parse(PoscarSection::PositionAndFlags, position_and_flags)?;
                 flags.extend(free);
                 position
             } else {
-                lines.parse(Part::Position, vector3)?
+                lines.parse(PoscarSection::Position, vector3)?
             };
             structure.species.push(species);
             let cartesian = mode == Mode::Cartesian;
@@ -140,7 +140,7 @@ fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, Fault> {
         frame.info.insert("comment".to_owned(), comment.into());
     }
     if selective {
-        let entries = Entries::Bool(flags);
+        let entries = ColumnData::Bool(flags);
         frame.arrays.insert("move_mask".to_owned(), Column { width: 3, entries });
     }
     Ok(frame)
@@ -213,22 +213,26 @@ struct Lines<R> {
 }
 
 impl<R: BufRead> Lines<R> {
-    fn take(&mut self, expected: Part) -> Result<&str, Fault> {
+    fn take(&mut self, expected: PoscarSection) -> Result<&str, PoscarErrorKind> {
         self.text.clear();
         self.number += 1;
         match self.input.read_line(&mut self.text) {
-            Ok(0) => Err(Fault::End(expected)),
+            Ok(0) => Err(PoscarErrorKind::End(expected)),
             Ok(_) => Ok(self.text.trim()),
             Err(error) if error.kind() == ErrorKind::InvalidData => {
-                Err(Fault::Line { found: "bytes that are not text".to_owned(), expected })
+                Err(PoscarErrorKind::Line { found: "bytes that are not text".to_owned(), expected })
             }
-            Err(error) => Err(Fault::Io(error)),
+            Err(error) => Err(PoscarErrorKind::Io(error)),
         }
     }
 
-    fn parse<T>(&mut self, expected: Part, parse: impl Fn(&str) -> Option<T>) -> Result<T, Fault> {
+    fn parse<T>(
+        &mut self,
+        expected: PoscarSection,
+        parse: impl Fn(&str) -> Option<T>,
+    ) -> Result<T, PoscarErrorKind> {
         let text = self.take(expected)?;
-        parse(text).ok_or_else(|| Fault::Line { found: text.chars().take(60).collect(), expected })
+        parse(text).ok_or_else(|| PoscarErrorKind::Line { found: text.chars().take(60).collect(), expected })
     }
 }
 
@@ -268,12 +272,12 @@ fn position_and_flags(text: &str) -> Option<(Vec3, Vec<bool>)> {
 }
 
 /// Element symbols; VASP may add the potential's name and a hash: `Al_pv/6a2f54`.
-fn symbols(text: &str) -> Result<Vec<Species>, Fault> {
+fn symbols(text: &str) -> Result<Vec<Species>, PoscarErrorKind> {
     if text.is_empty() {
-        return Err(Fault::Line { found: String::new(), expected: Part::Symbols });
+        return Err(PoscarErrorKind::Line { found: String::new(), expected: PoscarSection::Symbols });
     }
     if text.split_whitespace().all(|word| word.parse::<u64>().is_ok()) {
-        return Err(Fault::NoSymbols(text.chars().take(60).collect()));
+        return Err(PoscarErrorKind::NoSymbols(text.chars().take(60).collect()));
     }
     let species = |word: &str| word.split(['_', '/']).next().unwrap_or(word).parse::<Species>();
     Ok(text

@@ -44,7 +44,7 @@ pub enum FileError {
         line: usize,
         /// What is wrong with it.
         #[source]
-        fault: extxyz::Fault,
+        fault: extxyz::ExtxyzErrorKind,
     },
     /// It is not the POSCAR that its name tells.
     #[error("{}:{line}: {fault}", path.display())]
@@ -55,7 +55,7 @@ pub enum FileError {
         line: usize,
         /// What is wrong with it.
         #[source]
-        fault: poscar::Fault,
+        fault: poscar::PoscarErrorKind,
     },
 }
 
@@ -103,7 +103,7 @@ pub fn read_extxyz(path: &Path) -> Result<Vec<Frame>, FileError> {
     match frames {
         Ok(frames) if frames.is_empty() => Err(FileError::Empty(path.to_owned())),
         Ok(frames) => Ok(frames),
-        Err(error) => Err(FileError::Extxyz { path: path.to_owned(), line: error.line, fault: error.fault }),
+        Err(error) => Err(FileError::Extxyz { path: path.to_owned(), line: error.line, fault: error.kind }),
     }
 }
 
@@ -112,7 +112,7 @@ pub fn read_poscar(path: &Path) -> Result<Frame, FileError> {
     poscar::read_poscar(open(path)?).map_err(|error| FileError::Poscar {
         path: path.to_owned(),
         line: error.line,
-        fault: error.fault,
+        fault: error.kind,
     })
 }
 

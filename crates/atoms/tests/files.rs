@@ -5,7 +5,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use atoms::extxyz::{Column, Entries, Frame, Reader, Value, write_frame};
+use atoms::extxyz::{Column, ColumnData, Frame, Reader, Value, write_frame};
 use atoms::poscar::write_poscar;
 use atoms::{Cell, Species, Structure, read_extxyz, read_structures};
 use proptest::collection::{btree_map, vec};
@@ -75,10 +75,10 @@ fn info_to_json(value: &Value) -> Json {
 
 fn column_to_json(column: &Column) -> Json {
     let items: Vec<Json> = match &column.entries {
-        Entries::Real(values) => values.iter().map(|value| real(*value)).collect(),
-        Entries::Int(values) => values.iter().map(|value| json!(value)).collect(),
-        Entries::Bool(values) => values.iter().map(|value| json!(value)).collect(),
-        Entries::Text(values) => values.iter().map(|value| json!(value)).collect(),
+        ColumnData::Real(values) => values.iter().map(|value| real(*value)).collect(),
+        ColumnData::Int(values) => values.iter().map(|value| json!(value)).collect(),
+        ColumnData::Bool(values) => values.iter().map(|value| json!(value)).collect(),
+        ColumnData::Text(values) => values.iter().map(|value| json!(value)).collect(),
     };
     if column.width == 1 { items.into() } else { items.chunks(column.width).map(Json::from).collect() }
 }
@@ -95,7 +95,7 @@ fn assert_same(frame: &Frame, ase: &Json) {
     let (mut given, mut results) = (serde_json::Map::new(), serde_json::Map::new());
     for (name, column) in &frame.arrays {
         match (name.as_str(), &column.entries) {
-            ("move_mask", Entries::Bool(flags)) => {
+            ("move_mask", ColumnData::Bool(flags)) => {
                 let row = |atom: usize| &flags[atom * column.width..(atom + 1) * column.width];
                 free = (0..structure.len())
                     .map(|i| if let [a, b, c] = *row(i) { [a, b, c] } else { [row(i)[0]; 3] })
@@ -332,10 +332,10 @@ fn any_column(atoms: usize) -> impl Strategy<Value = Column> {
     (1..5_usize).prop_flat_map(move |width| {
         let length = width * atoms;
         let entries = prop_oneof![
-            vec(real.clone(), length).prop_map(Entries::Real),
-            vec(any::<i32>().prop_map(i64::from), length).prop_map(Entries::Int),
-            vec(any::<bool>(), length).prop_map(Entries::Bool),
-            vec("[!-~é]{1,8}", length).prop_map(Entries::Text),
+            vec(real.clone(), length).prop_map(ColumnData::Real),
+            vec(any::<i32>().prop_map(i64::from), length).prop_map(ColumnData::Int),
+            vec(any::<bool>(), length).prop_map(ColumnData::Bool),
+            vec("[!-~é]{1,8}", length).prop_map(ColumnData::Text),
         ];
         entries.prop_map(move |entries| Column { width, entries })
     })

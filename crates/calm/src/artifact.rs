@@ -200,9 +200,9 @@ impl Artifact {
             return Err(invalid(file, "uq_n_elements", element_count, symbols.len()));
         }
         let (slots, dimension) = (count(file, "uq_max_clusters")?, count(file, "uq_feature_dim")?);
-        let centroids = file.numbers("uq_centroids")?.shaped(&[element_count, slots, dimension])?;
+        let centroids = file.numbers("uq_centroids")?.with_shape(&[element_count, slots, dimension])?;
         let inverses = symmetric(file, "uq_inv_cov", &[element_count, slots, dimension, dimension])?;
-        let thresholds = file.numbers("uq_interp_thresholds")?.shaped(&[element_count, slots])?;
+        let thresholds = file.numbers("uq_interp_thresholds")?.with_shape(&[element_count, slots])?;
         if slots == 0 || dimension == 0 {
             return Err(invalid(file, "uq_centroids", "no centroid", "at least one an element"));
         }
@@ -332,7 +332,7 @@ fn thresholds(file: &Archive, elements: usize) -> Result<Vec<Vec<f64>>, Artifact
 
 /// Square matrices of this shape, one after the other, each the same as its transpose but for rounding.
 fn symmetric(file: &Archive, key: &str, shape: &[usize]) -> Result<Vec<f64>, ArtifactError> {
-    let numbers = file.numbers(key)?.shaped(shape)?;
+    let numbers = file.numbers(key)?.with_shape(shape)?;
     let dimension = shape.last().copied().unwrap_or_default();
     for (index, matrix) in numbers.chunks_exact((dimension * dimension).max(1)).enumerate() {
         let largest = matrix.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
@@ -371,10 +371,10 @@ impl Slots {
         let square = [slots, dimension, dimension];
         let inverses = symmetric(file, &format!("inv_cov_{element}"), &square)?;
         let scatters = symmetric(file, &format!("scatter_{element}"), &square)?;
-        let counts = file.numbers(&format!("counts_{element}"))?.shaped(&[slots])?;
+        let counts = file.numbers(&format!("counts_{element}"))?.with_shape(&[slots])?;
         let weighted = format!("effective_count_{element}");
         let effective = if file.contains(&weighted) {
-            file.numbers(&weighted)?.shaped(&[slots])?
+            file.numbers(&weighted)?.with_shape(&[slots])?
         } else {
             counts.clone()
         };

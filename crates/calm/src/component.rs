@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::linear::{self, LinearError, regularised_inverse, symmetrised, view};
-use crate::numbers::{Lender, Numbers};
+use crate::storage::{SharedNumbers, Storage};
 
 /// A component, as slices: what the grade needs. Made from a [`Component`] or from a block of shared memory.
 #[derive(Debug, Clone, Copy)]
@@ -41,7 +41,7 @@ impl Statistics {
 /// One Gaussian of the mixture, of one species. Immutable: an update makes a new one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Component {
-    numbers: Numbers,
+    numbers: Storage,
     threshold: f64,
     statistics: Option<Statistics>,
 }
@@ -95,7 +95,7 @@ impl Component {
         not_negative("threshold", threshold)?;
         let inverse = symmetric("inverse covariance", &inverse, dimension)?;
         let statistics = statistics.map(|found| checked_statistics(found, dimension)).transpose()?;
-        Ok(Self { numbers: Numbers::Owned { centroid, inverse }, threshold, statistics })
+        Ok(Self { numbers: Storage::Owned { centroid, inverse }, threshold, statistics })
     }
 
     /// A component of dimension D evaluated in place: `lender` has S, `[D × D]`, and behind it **μ**, `[D]`. It has no
@@ -107,17 +107,21 @@ impl Component {
     ///
     /// # Errors
     /// A dimension of zero, a length that is not D² + D, a threshold that is negative or not finite.
-    pub fn lent(lender: Arc<Lender>, dimension: usize, threshold: f64) -> Result<Self, ComponentError> {
+    pub fn from_shared(
+        shared: Arc<SharedNumbers>,
+        dimension: usize,
+        threshold: f64,
+    ) -> Result<Self, ComponentError> {
         if dimension == 0 {
             return Err(ComponentError::Empty);
         }
         not_negative("threshold", threshold)?;
         let (found, expected) =
-            ((*lender).as_ref().len(), dimension.saturating_mul(dimension.saturating_add(1)));
+            ((*shared).as_ref().len(), dimension.saturating_mul(dimension.saturating_add(1)));
         if found != expected {
             return Err(ComponentError::Length { what: "lent component", found, expected });
         }
-        Ok(Self { numbers: Numbers::Lent { lender, dimension }, threshold, statistics: None })
+        Ok(Self { numbers: Storage::Shared { shared, dimension }, threshold, statistics: None })
     }
 
     /// The stand-in for an element that the artifact does not hold: **μ** = 0, S = 10⁶ I, θ = 1, no data.
@@ -128,7 +132,7 @@ impl Component {
         inverse.iter_mut().step_by(dimension + 1).for_each(|value| *value = 1.0 / linear::REGULARISATION);
         let scatter = vec![0.0; dimension * dimension];
         Self {
-            numbers: Numbers::Owned { centroid: vec![0.0; dimension], inverse },
+            numbers: Storage::Owned { centroid: vec![0.0; dimension], inverse },
             threshold: 1.0,
             statistics: Some(Statistics { scatter, count: 0.0, effective_count: 0.0 }),
         }
@@ -144,7 +148,7 @@ impl Component {
         let inverse = regularised_inverse(covariance, self.dimension())?;
         let scatter = covariance.iter().map(|value| value * effective_count).collect();
         Ok(Self {
-            numbers: Numbers::Owned { centroid: self.centroid().to_vec(), inverse },
+            numbers: Storage::Owned { centroid: self.centroid().to_vec(), inverse },
             threshold: self.threshold,
             statistics: Some(Statistics { scatter, count, effective_count }),
         })

@@ -69,7 +69,7 @@ pub enum GradeError {
 
 impl GradeError {
     /// Of a call for some atoms of a structure: with the number that the atom has there.
-    pub(crate) fn of_atoms(mut self, atoms: &[u32]) -> Self {
+    pub(crate) fn with_atom_indices(mut self, atoms: &[u32]) -> Self {
         match &mut self {
             Self::Length { .. } => {}
             Self::Element { atom, .. } | Self::Distance { atom, .. } => *atom = atoms[*atom] as usize,

@@ -20,7 +20,7 @@ pub struct Fraction(f64);
 /// The values of α to try, ascending, each above 0 and not above 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<f64>", into = "Vec<f64>")]
-pub struct AlphaLadder(Vec<f64>);
+pub struct AlphaValues(Vec<f64>);
 
 /// A setting out of its range.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -52,7 +52,7 @@ impl Fraction {
     }
 }
 
-impl AlphaLadder {
+impl AlphaValues {
     /// The values, ascending.
     pub fn values(&self) -> &[f64] {
         &self.0
@@ -73,7 +73,7 @@ impl TryFrom<f64> for Fraction {
     }
 }
 
-impl TryFrom<Vec<f64>> for AlphaLadder {
+impl TryFrom<Vec<f64>> for AlphaValues {
     type Error = RuleError;
     fn try_from(found: Vec<f64>) -> Result<Self, RuleError> {
         let within = found.iter().all(|&alpha| alpha > 0.0 && alpha <= 1.0);
@@ -97,8 +97,8 @@ impl From<Fraction> for f64 {
     }
 }
 
-impl From<AlphaLadder> for Vec<f64> {
-    fn from(ladder: AlphaLadder) -> Vec<f64> {
+impl From<AlphaValues> for Vec<f64> {
+    fn from(ladder: AlphaValues) -> Vec<f64> {
         ladder.0
     }
 }
@@ -158,7 +158,7 @@ pub enum UpdateRule {
 /// How old and new covariance are combined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Combination {
+pub enum CovarianceUpdateKind {
     /// (1 − α) C + α C_batch, the paper's.
     #[default]
     Convex,
@@ -166,9 +166,9 @@ pub enum Combination {
     Additive,
 }
 
-impl Combination {
+impl CovarianceUpdateKind {
     /// This combination with a weight α.
-    pub fn with(self, alpha: f64) -> CovarianceUpdate {
+    pub fn with_alpha(self, alpha: f64) -> CovarianceUpdate {
         match self {
             Self::Convex => CovarianceUpdate::Convex { alpha },
             Self::Additive => CovarianceUpdate::Additive { alpha },
@@ -179,8 +179,8 @@ impl Combination {
     ///
     /// Convex: the paper's six. Additive: from 0.0005 to 1 in steps of about two (1, 2, 5 a decade), since without
     /// the factor 1 − α already a very small α can suffice, and a larger one than needed covers too much.
-    pub fn default_ladder(self) -> AlphaLadder {
-        AlphaLadder(match self {
+    pub fn default_alphas(self) -> AlphaValues {
+        AlphaValues(match self {
             Self::Convex => vec![0.05, 0.1, 0.2, 0.4, 0.7, 1.0],
             Self::Additive => vec![0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0],
         })
@@ -193,10 +193,10 @@ impl Combination {
 pub struct UpdateSettings {
     /// Convex or additive.
     #[serde(default)]
-    pub combination: Combination,
-    /// The α to try; left out, [`Combination::default_ladder`].
+    pub combination: CovarianceUpdateKind,
+    /// The α to try; left out, [`CovarianceUpdateKind::default_alphas`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub ladder: Option<AlphaLadder>,
+    pub ladder: Option<AlphaValues>,
     /// Which α is chosen.
     pub stop: UpdateRule,
 }
@@ -204,7 +204,7 @@ pub struct UpdateSettings {
 impl UpdateSettings {
     /// The α to try, ascending.
     pub fn alphas(&self) -> Vec<f64> {
-        self.ladder.clone().unwrap_or_else(|| self.combination.default_ladder()).into()
+        self.ladder.clone().unwrap_or_else(|| self.combination.default_alphas()).into()
     }
 }
 

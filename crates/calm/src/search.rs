@@ -2,10 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::alpha_scan::AlphaScan;
 use crate::grade::maximum;
-use crate::ladder::TrialLadder;
 use crate::mixture::{ChangedComponent, Mixture};
-use crate::rules::{Combination, UpdateRule, UpdateSettings, atom_limit, count_above};
+use crate::rules::{CovarianceUpdateKind, UpdateRule, UpdateSettings, atom_limit, count_above};
 use crate::update::{Batch, CovarianceUpdate, UpdateError};
 
 /// Inflation multiplies a scatter by this at most, each round.
@@ -53,7 +53,7 @@ pub struct UpdateOutcome {
     /// Version of the mixture that the trials started from.
     pub base_version: u64,
     /// Convex or additive.
-    pub combination: Combination,
+    pub combination: CovarianceUpdateKind,
     /// The chosen α.
     pub alpha: f64,
     /// The trials in order, up to the one that decided.
@@ -72,7 +72,7 @@ pub struct UpdateOutcome {
 
 /// Finds the update of a mixture for a collected structure; every trial starts from the covariance before it.
 ///
-/// `elements` holds an element index for each atom, `features` is `[atoms × D]`. Trials use [`TrialLadder`] where it
+/// `elements` holds an element index for each atom, `features` is `[atoms × D]`. Trials use [`AlphaScan`] where it
 /// is accurate; the decision is always the one that direct inverses would give.
 ///
 /// # Errors
@@ -85,7 +85,7 @@ pub fn update(
 ) -> Result<UpdateOutcome, UpdateError> {
     let batch = Batch::new(mixture, elements, features)?;
     let (trials, alpha, mut end) = choose(&batch, settings)?;
-    let mut changed = batch.updated(settings.combination.with(alpha))?;
+    let mut changed = batch.updated(settings.combination.with_alpha(alpha))?;
     let mut inflations = Vec::new();
     if let (UpdateEnd::InflationExhausted, UpdateRule::MaximumGrade { target }) = (end, settings.stop) {
         (changed, inflations) = inflate(&batch, changed, target.get())?;
@@ -140,10 +140,11 @@ fn choose(batch: &Batch, settings: &UpdateSettings) -> Result<(Vec<Trial>, f64, 
             (threshold.get(), Some(atom_limit(atoms, fraction, least)), target.get())
         }
     };
-    let ladder = TrialLadder::new(batch, settings.combination);
+    let ladder = AlphaScan::new(batch, settings.combination);
     let mut trials = Vec::new();
     for alpha in settings.alphas() {
-        let gamma = trial(batch, &ladder, settings.combination.with(alpha), alpha, [threshold, target])?;
+        let gamma =
+            trial(batch, &ladder, settings.combination.with_alpha(alpha), alpha, [threshold, target])?;
         let trial = Trial { alpha, gamma_max: maximum(&gamma), above: count_above(&gamma, threshold) };
         trials.push(trial);
         match limit {
@@ -165,7 +166,7 @@ fn choose(batch: &Batch, settings: &UpdateSettings) -> Result<(Vec<Trial>, f64, 
 /// γ of the batch under one α: from the ladder, unless that is inaccurate or a grade lies too near a threshold.
 fn trial(
     batch: &Batch,
-    ladder: &TrialLadder<'_>,
+    ladder: &AlphaScan<'_>,
     update: CovarianceUpdate,
     alpha: f64,
     thresholds: [f64; 2],

@@ -152,7 +152,7 @@ impl Artifact {
         let elements = self.symbols.iter().enumerate();
         let of_element = elements.filter_map(|(element, symbol)| {
             let components: Vec<_> = self.mixture.components(element)?.iter().map(AsRef::as_ref).collect();
-            let spread = Spread::of(&components);
+            let spread = Spread::new(&components);
             let faults = components.iter().enumerate().filter_map(|(slot, component)| {
                 let fault = check(component, &spread, &reach)
                     .and_then(|()| unlike(&components[..slot], component))
@@ -186,7 +186,7 @@ struct Spread {
 
 impl Spread {
     /// Without statistics ⟨σ²⟩ is at most D. A component with few data has the largest threshold of its element.
-    fn of(components: &[&Component]) -> Self {
+    fn new(components: &[&Component]) -> Self {
         let spread = |component: &&Component| match component.statistics() {
             Some(statistics) => mean_square(component, &statistics.covariance()).max(0.0).sqrt(),
             None => (component.dimension() as f64).sqrt(),

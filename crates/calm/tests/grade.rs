@@ -195,7 +195,7 @@ fn a_lent_component_is_as_good_as_an_owned_one() {
     let owned = niobium().mixture;
     let block = |component: &Component| Block([component.inverse(), component.centroid()].concat());
     let lend = |component: &Arc<Component>| {
-        let lent = Component::lent(Arc::new(block(component)), 130, component.threshold()).unwrap();
+        let lent = Component::from_shared(Arc::new(block(component)), 130, component.threshold()).unwrap();
         assert_eq!(lent.view().centroid, component.centroid());
         Arc::new(lent)
     };
@@ -213,7 +213,7 @@ fn a_lent_component_is_as_good_as_an_owned_one() {
     assert_eq!(grade(&lent), grade(&owned));
 
     let lent = |length: usize, dimension, threshold| {
-        Component::lent(Arc::new(Block(vec![0.0; length])), dimension, threshold)
+        Component::from_shared(Arc::new(Block(vec![0.0; length])), dimension, threshold)
     };
     assert_eq!(lent(0, 0, 1.0), Err(ComponentError::Empty));
     let length = |found| ComponentError::Length { what: "lent component", found, expected: 12 };

@@ -3,10 +3,10 @@
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
-use calm::rules::{AlphaLadder, Fraction, Positive, atom_limit};
+use calm::rules::{AlphaValues, Fraction, Positive, atom_limit};
 use calm::{
-    CollectionRule, Combination, Component, Mixture, Statistics, UpdateEnd, UpdateRule, UpdateSettings,
-    update,
+    CollectionRule, Component, CovarianceUpdateKind, Mixture, Statistics, UpdateEnd, UpdateRule,
+    UpdateSettings, update,
 };
 
 use crate::common;
@@ -27,11 +27,11 @@ fn the_papers_values_are_the_defaults() {
     assert_eq!(collection("rule = 'atom_count'"), rule);
     let settings: UpdateSettings = toml::from_str("stop = { rule = 'atom_count' }").unwrap();
     let stop = UpdateRule::AtomCount { threshold, fraction, least, target: positive(1.25) };
-    assert_eq!(settings, UpdateSettings { combination: Combination::Convex, ladder: None, stop });
+    assert_eq!(settings, UpdateSettings { combination: CovarianceUpdateKind::Convex, ladder: None, stop });
     assert_eq!(settings.alphas(), [0.05, 0.1, 0.2, 0.4, 0.7, 1.0]);
-    for combination in [Combination::Convex, Combination::Additive] {
-        let ladder = combination.default_ladder();
-        assert_eq!(AlphaLadder::try_from(ladder.values().to_vec()).unwrap(), ladder);
+    for combination in [CovarianceUpdateKind::Convex, CovarianceUpdateKind::Additive] {
+        let ladder = combination.default_alphas();
+        assert_eq!(AlphaValues::try_from(ladder.values().to_vec()).unwrap(), ladder);
     }
 }
 

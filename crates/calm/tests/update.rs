@@ -6,8 +6,8 @@ use std::sync::Arc;
 use calm::grade::maximum;
 use calm::search::inflate;
 use calm::{
-    Artifact, Batch, ChangedComponent, Combination, Component, CovarianceUpdate, Grades, Mixture, Statistics,
-    TrialLadder, UpdateError, pseudo_inverse, regularised_inverse, update,
+    AlphaScan, Artifact, Batch, ChangedComponent, Component, CovarianceUpdate, CovarianceUpdateKind, Grades,
+    Mixture, Statistics, UpdateError, pseudo_inverse, regularised_inverse, update,
 };
 
 use crate::common;
@@ -138,13 +138,13 @@ fn the_reference_search_is_reproduced() {
 }
 
 /// Ladder and direct grades of a batch, as the largest relative deviation over all α that the ladder trusts.
-fn ladder_deviation(batch: &Batch, combination: Combination) -> (f64, usize) {
-    let ladder = TrialLadder::new(batch, combination);
+fn ladder_deviation(batch: &Batch, combination: CovarianceUpdateKind) -> (f64, usize) {
+    let ladder = AlphaScan::new(batch, combination);
     let (mut worst, mut trusted) = (0.0_f64, 0);
-    for alpha in Vec::from(combination.default_ladder()) {
+    for alpha in Vec::from(combination.default_alphas()) {
         let update = match combination {
-            Combination::Convex => CovarianceUpdate::Convex { alpha },
-            Combination::Additive => CovarianceUpdate::Additive { alpha },
+            CovarianceUpdateKind::Convex => CovarianceUpdate::Convex { alpha },
+            CovarianceUpdateKind::Additive => CovarianceUpdate::Additive { alpha },
         };
         let direct = batch.gamma_under(&batch.updated(update).unwrap());
         if let Some(fast) = ladder.gamma(alpha) {
@@ -164,9 +164,9 @@ fn the_ladder_gives_the_direct_grades() {
     let features = numbers(&data("niobium_reference.npz"), "features");
     let elements = vec![1; features.len() / 130];
     let batch = Batch::new(&mixture, &elements, &features).unwrap();
-    let (convex, trusted) = ladder_deviation(&batch, Combination::Convex);
+    let (convex, trusted) = ladder_deviation(&batch, CovarianceUpdateKind::Convex);
     assert!(convex < LADDER && trusted >= 5, "{convex:e}, {trusted} of 6");
-    let (additive, trusted) = ladder_deviation(&batch, Combination::Additive);
+    let (additive, trusted) = ladder_deviation(&batch, CovarianceUpdateKind::Additive);
     assert!(additive < LADDER && trusted == 11, "{additive:e}, {trusted} of 11");
 }
 
@@ -181,7 +181,7 @@ fn the_ladder_gives_the_direct_grades_far_outside() {
             .collect();
         let batch = Batch::new(&mixture, &[0; 108], &features).unwrap();
         println!("{model}, γ_max before {:.1}", maximum(batch.gamma()));
-        for combination in [Combination::Convex, Combination::Additive] {
+        for combination in [CovarianceUpdateKind::Convex, CovarianceUpdateKind::Additive] {
             let (worst, trusted) = ladder_deviation(&batch, combination);
             assert!(worst < LADDER && trusted >= 5, "{model} {scale} {combination:?}: {worst:e}, {trusted}");
         }

@@ -16,8 +16,8 @@ use serde_json::{Value, json};
 
 use crate::moments::{self, Moments};
 use crate::{
-    Calculated, Code, Exit, Failure, FailureClass, Input, PassedEnvironment, Remedy, SetupError, Size, judge,
-    program, script_result,
+    DftBackend, Exit, Failure, FailureClass, Input, PassedEnvironment, Results, RetryAdjustment, SetupError,
+    Size, script_output, validation, version_query,
 };
 
 /// The script that a calculator is run by.
@@ -27,7 +27,7 @@ const SCRIPT_FILE: &str = "job.py";
 const CALCULATOR_FILE: &str = "calculator.py";
 
 /// Counts changes of the script that change a label's value.
-const RECIPE: u32 = 1;
+const INPUT_VERSION: u32 = 1;
 
 /// `[label.method.ase]`
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -67,20 +67,20 @@ impl Settings {
             found: self.calculator.display().to_string(),
             expected: format!("a Python file that defines calculator(), but: {error}"),
         })?;
-        let environment = program::environment(&self.environment);
-        let who = Who::ask(&self.command, &environment, passed, &calculator)?;
+        let environment = version_query::environment(&self.environment);
+        let who = Versions::ask(&self.command, &environment, passed, &calculator)?;
         Ok(Ase { settings: self.clone(), environment, calculator, who })
     }
 }
 
 /// What the script says of ASE and of the calculator's file.
 #[derive(Clone, Debug, Deserialize)]
-struct Who {
+struct Versions {
     ase: String,
     version: String,
 }
 
-impl Who {
+impl Versions {
     fn ask(
         command: &[String],
         environment: &BTreeMap<String, String>,
@@ -88,10 +88,10 @@ impl Who {
         calculator: &[u8],
     ) -> Result<Self, SetupError> {
         let files = [(SCRIPT_FILE, SCRIPT.as_bytes()), (CALCULATOR_FILE, calculator)];
-        let said = program::ask(command, &[SCRIPT_FILE], environment, passed, &files)?;
+        let said = version_query::run(command, &[SCRIPT_FILE], environment, passed, &files)?;
         said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
             let reason = format!("is no Python with ASE: it does not say its version but {:?}", said.trim());
-            program::another(command, reason)
+            version_query::wrong_program(command, reason)
         })
     }
 }
@@ -102,15 +102,15 @@ pub struct Ase {
     settings: Settings,
     environment: BTreeMap<String, String>,
     calculator: Vec<u8>,
-    who: Who,
+    who: Versions,
 }
 
-impl Code for Ase {
+impl DftBackend for Ase {
     fn identity(&self) -> Value {
         // Destructured, so that a new setting is not forgotten here.
         let Settings { command: _, environment: _, calculator: _, moments } = &self.settings;
         json!({
-            "code": "ase", "ase": self.who.ase, "recipe": RECIPE, "version": self.who.version,
+            "code": "ase", "ase": self.who.ase, "recipe": INPUT_VERSION, "version": self.who.version,
             "calculator": blake3::hash(&self.calculator).to_hex().to_string(), "moments": moments,
         })
     }
@@ -120,16 +120,20 @@ impl Code for Ase {
         Ok(())
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-        structure.validate().map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
+        structure.validate().map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         let table = &self.settings.moments;
         let task = json!({
             "species": structure.species,
             "positions": structure.positions,
             "cell": structure.cell.0,
             "periodic": structure.periodic,
-            "moments": (!table.is_empty()).then(|| moments::initial(structure, table, remedies)),
-            "remedies": remedies.iter().map(|remedy| remedy.name()).collect::<Vec<_>>(),
+            "moments": (!table.is_empty()).then(|| moments::initial(structure, table, adjustments)),
+            "remedies": adjustments.iter().map(|remedy| remedy.name()).collect::<Vec<_>>(),
         });
         let files = [
             (SCRIPT_FILE, SCRIPT.into()),
@@ -144,11 +148,11 @@ impl Code for Ase {
         })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
         let by = [("ase", self.who.ase.as_str()), ("version", self.who.version.as_str())];
-        match script_result::read(structure, directory, &by)? {
+        match script_output::read(structure, directory, &by)? {
             Some(calculated) => Ok(calculated),
-            None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+            None => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),
         }
     }
 

@@ -19,7 +19,10 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use crate::{Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, SetupError, Size, find, judge};
+use crate::{
+    DftBackend, Exit, Failure, FailureClass, Input, Results, RetryAdjustment, SetupError, Size, executable,
+    validation,
+};
 
 const STRUCTURE: &str = "structure.extxyz";
 const LABEL: &str = "label.extxyz";
@@ -60,7 +63,7 @@ impl Settings {
             let expected = "a program and its arguments, such as [\"python3\", \"label.py\"]".to_owned();
             return Err(SetupError::Setting { key: "command", found: "nothing".to_owned(), expected });
         };
-        find::program(program)?;
+        executable::find(program)?;
         let mut files = BTreeMap::new();
         for path in &self.files {
             let fault = |expected: String| SetupError::Setting {
@@ -82,7 +85,7 @@ impl Settings {
     }
 }
 
-impl Code for Command {
+impl DftBackend for Command {
     fn identity(&self) -> serde_json::Value {
         let hash =
             |(name, content): (&String, &Vec<u8>)| (name.clone(), blake3::hash(content).to_hex().to_string());
@@ -94,24 +97,30 @@ impl Code for Command {
         Ok(())
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
         let mut text = Vec::new();
         write_frame(&mut text, &Frame::from(structure.clone()))
-            .map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+            .map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         let mut files = self.files.clone();
         files.insert(STRUCTURE.to_owned(), text);
-        let names: Vec<_> = remedies.iter().map(|remedy| remedy.name()).collect();
+        let names: Vec<_> = adjustments.iter().map(|remedy| remedy.name()).collect();
         let environment = BTreeMap::from([("CALMWALK_REMEDIES".to_owned(), names.join(","))]);
         Ok(Input { files, command: self.command.clone(), environment, ..Input::default() })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
         match exit {
             Exit::Code(0) => read::label(structure, &directory.join(LABEL)),
-            Exit::Code(3) => Err(FailureClass::NotConverged.because("the command says so (exit code 3)")),
-            Exit::Code(4) => Err(FailureClass::OutOfMemory.because("the command says so (exit code 4)")),
-            Exit::Code(5) => Err(FailureClass::BadInput.because("the command says so (exit code 5)")),
-            _ => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+            Exit::Code(3) => {
+                Err(FailureClass::NotConverged.with_message("the command says so (exit code 3)"))
+            }
+            Exit::Code(4) => Err(FailureClass::OutOfMemory.with_message("the command says so (exit code 4)")),
+            Exit::Code(5) => Err(FailureClass::BadInput.with_message("the command says so (exit code 5)")),
+            _ => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),
         }
     }
 

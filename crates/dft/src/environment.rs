@@ -47,7 +47,7 @@ const NAMES: &[&str] = &[
 ];
 
 /// Beginnings of the names of further variables that every program gets.
-const BEGINNINGS: &[&[&str]] = &[
+const PREFIXES: &[&[&str]] = &[
     // Programs that make labels.
     &[
         "ABINIT",
@@ -175,7 +175,7 @@ impl PassedEnvironment {
     }
 
     /// The first that is neither a name nor the beginning of one.
-    pub fn fault(&self) -> Option<&str> {
+    pub fn invalid_pattern(&self) -> Option<&str> {
         let is_name = |pattern: &str| {
             let name = pattern.strip_suffix('*').unwrap_or(pattern);
             !name.is_empty() && !name.contains(['*', '=', '\0', ' '])
@@ -184,7 +184,7 @@ impl PassedEnvironment {
     }
 
     /// What a program gets of the environment of this process.
-    pub fn of_this_process(&self) -> impl Iterator<Item = (OsString, OsString)> {
+    pub fn from_current_process(&self) -> impl Iterator<Item = (OsString, OsString)> {
         env::vars_os().filter(|(name, _)| self.passes(name))
     }
 
@@ -194,8 +194,7 @@ impl PassedEnvironment {
         let Some(name) = name.to_str() else { return false };
         let begins = |begin: &str| name.starts_with(begin);
         let mut named = self.patterns.iter();
-        let allowed =
-            NAMES.contains(&name) || BEGINNINGS.iter().copied().flatten().any(|begin| begins(begin));
+        let allowed = NAMES.contains(&name) || PREFIXES.iter().copied().flatten().any(|begin| begins(begin));
         let matched = self.patterns.iter().filter_map(|pattern| pattern.strip_suffix('*')).any(begins);
         named.any(|pattern| pattern == name) || ((allowed || matched) && !is_secret(name))
     }
@@ -255,8 +254,9 @@ mod tests {
         assert!(passes(&["MY_SITE"], "MY_SITE") && !passes(&["MY_SITE"], "MY_SITES"));
         assert!(passes(&["MY_*"], "MY_SITE") && !passes(&["MY_*"], "MY_TOKEN"));
         assert!(passes(&["MY_TOKEN"], "MY_TOKEN"));
-        let fault =
-            |pattern: &str| PassedEnvironment::new(vec![pattern.to_owned()]).fault().map(str::to_owned);
+        let fault = |pattern: &str| {
+            PassedEnvironment::new(vec![pattern.to_owned()]).invalid_pattern().map(str::to_owned)
+        };
         assert_eq!((fault("MY_*"), fault("A")), (None, None));
         for wrong in ["", "*", "A*B", "A=1", "A B"] {
             assert_eq!(fault(wrong).as_deref(), Some(wrong));

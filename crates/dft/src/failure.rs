@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-/// Kind of a failure: what is tried next depends on it ([`crate::remedies`]).
+/// Kind of a failure: what is tried next depends on it ([`crate::adjustments`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum FailureClass {
     /// The program ended by an error or a signal that says nothing more.
@@ -62,12 +62,12 @@ impl FailureClass {
     }
 
     /// The class of that name.
-    pub fn named(name: &str) -> Option<Self> {
+    pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|class| class.name() == name)
     }
 
     /// A failure of this class.
-    pub fn because(self, message: impl Into<String>) -> Failure {
+    pub fn with_message(self, message: impl Into<String>) -> Failure {
         Failure { class: self, message: message.into() }
     }
 }

@@ -13,11 +13,11 @@ use rustix::fs::{Mode, OFlags};
 use rustix::io::Errno;
 
 /// Bytes of the largest file that is read into memory as a whole: 256 MiB.
-pub const LARGEST: u64 = 256 << 20;
+pub const MAX_BYTES: u64 = 256 << 20;
 /// Bytes of the largest file that is read piece by piece, as VASP's: 16 GiB.
-pub const LARGEST_IN_PIECES: u64 = 16 << 30;
+pub const MAX_STREAMED_BYTES: u64 = 16 << 30;
 /// Bytes of the longest piece of such a file: 1 MiB.
-pub const LONGEST_PIECE: usize = 1 << 20;
+pub const MAX_PIECE_BYTES: usize = 1 << 20;
 
 /// Why a file is not read. It completes a sentence that begins with the name of the file.
 #[derive(Debug, thiserror::Error)]
@@ -60,17 +60,17 @@ pub struct Tail {
     pub bytes: Vec<u8>,
 }
 
-/// The whole content, of at most [`LARGEST`] bytes.
+/// The whole content, of at most [`MAX_BYTES`] bytes.
 ///
 /// # Errors
 /// See [`ResultFileError`].
 pub fn read(path: &Path) -> Result<Vec<u8>, ResultFileError> {
     let (file, length) = open(path)?;
-    within(length, LARGEST)?;
+    within(length, MAX_BYTES)?;
     let mut content = Vec::new();
     // It may grow while it is read.
-    let read = file.take(LARGEST + 1).read_to_end(&mut content)?;
-    within(read as u64, LARGEST)?;
+    let read = file.take(MAX_BYTES + 1).read_to_end(&mut content)?;
+    within(read as u64, MAX_BYTES)?;
     Ok(content)
 }
 
@@ -86,15 +86,15 @@ pub fn tail(path: &Path, bytes: u64) -> Result<Tail, ResultFileError> {
     Ok(Tail { length, bytes: end })
 }
 
-/// A reader of a file of at most [`LARGEST_IN_PIECES`] bytes. It fails where more than [`LONGEST_PIECE`] bytes come without
+/// A reader of a file of at most [`MAX_STREAMED_BYTES`] bytes. It fails where more than [`MAX_PIECE_BYTES`] bytes come without
 /// the byte `mark`, so that a parser that keeps what stands between two of them needs no more memory.
 ///
 /// # Errors
 /// See [`ResultFileError`].
 pub fn pieces(path: &Path, mark: u8) -> Result<Pieces, ResultFileError> {
     let (file, length) = open(path)?;
-    within(length, LARGEST_IN_PIECES)?;
-    Ok(Pieces { file: BufReader::new(file.take(LARGEST_IN_PIECES)), mark, since_mark: 0 })
+    within(length, MAX_STREAMED_BYTES)?;
+    Ok(Pieces { file: BufReader::new(file.take(MAX_STREAMED_BYTES)), mark, since_mark: 0 })
 }
 
 fn within(bytes: u64, most: u64) -> Result<(), ResultFileError> {
@@ -145,9 +145,9 @@ impl Read for Pieces {
 
 impl BufRead for Pieces {
     fn fill_buf(&mut self) -> io::Result<&[u8]> {
-        if self.since_mark > LONGEST_PIECE {
+        if self.since_mark > MAX_PIECE_BYTES {
             let what = if self.mark == b'\n' { "line" } else { "text without a tag" };
-            let message = format!("has a {what} of more than {LONGEST_PIECE} bytes");
+            let message = format!("has a {what} of more than {MAX_PIECE_BYTES} bytes");
             return Err(io::Error::new(io::ErrorKind::InvalidData, message));
         }
         self.file.fill_buf()
@@ -217,7 +217,7 @@ mod tests {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("sparse");
         let file = File::create(&path).unwrap();
-        file.set_len(LARGEST + 1).unwrap();
+        file.set_len(MAX_BYTES + 1).unwrap();
         let message = read(&path).unwrap_err().to_string();
         assert_eq!(message, "has 268435457 bytes, expected at most 268435456");
         assert_eq!(tail(&path, 5).unwrap().bytes, [0; 5]);
@@ -225,8 +225,8 @@ mod tests {
         let mut line = Vec::new();
         let message = pieces(&path, b'\n').unwrap().read_until(b'\n', &mut line).unwrap_err().to_string();
         assert_eq!(message, "has a line of more than 1048576 bytes");
-        assert!(line.len() < 2 * LONGEST_PIECE);
-        file.set_len(LARGEST_IN_PIECES + 1).unwrap();
+        assert!(line.len() < 2 * MAX_PIECE_BYTES);
+        file.set_len(MAX_STREAMED_BYTES + 1).unwrap();
         assert!(matches!(pieces(&path, b'\n'), Err(ResultFileError::TooLarge { .. })));
     }
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Code, PassedEnvironment, SetupError, abinit, ase, command, cp2k, gpaw, vasp};
+use crate::{DftBackend, PassedEnvironment, SetupError, abinit, ase, command, cp2k, gpaw, vasp};
 
 /// Which program makes labels, and how: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -57,7 +57,7 @@ impl Settings {
     ///
     /// # Errors
     /// What is missing or impossible, before anything is run.
-    pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Box<dyn Code>, SetupError> {
+    pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Box<dyn DftBackend>, SetupError> {
         Ok(match self {
             Self::Abinit(settings) => Box::new(settings.prepare(passed)?),
             Self::Ase(settings) => Box::new(settings.prepare(passed)?),

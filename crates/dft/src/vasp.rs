@@ -18,7 +18,7 @@ mod outcar;
 mod output;
 mod potcar;
 #[cfg(test)]
-mod real;
+mod real_output_tests;
 mod result;
 mod vasprun;
 
@@ -30,16 +30,17 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::{self, Enclosed};
+use crate::checks::{at_least, positive};
 use crate::moments::{self, Moments};
-use crate::setting::{at_least, positive};
+use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, SetupError, Size, Smearing, find, program,
+    DftBackend, Exit, Failure, FailureClass, Input, Results, RetryAdjustment, SetupError, Size, Smearing,
+    executable, version_query,
 };
 use potcar::Potcar;
 
 /// Counts changes of what is written here that change a label's value.
-const RECIPE: u32 = 1;
+const INPUT_VERSION: u32 = 1;
 
 /// `[label.method.vasp]`
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -142,7 +143,7 @@ impl Settings {
             "VASP, such as [\"mpirun\", \"-np\", \"16\", \"vasp_std\"]",
         )?;
         incar::check(self)?;
-        find::program(&self.command[0])?;
+        executable::find(&self.command[0])?;
         let potcars = self.variants.iter().map(|(species, variant)| {
             Ok((*species, Potcar::find(&self.pseudopotentials, *species, variant)?))
         });
@@ -166,7 +167,7 @@ impl Vasp {
     }
 }
 
-impl Code for Vasp {
+impl DftBackend for Vasp {
     fn identity(&self) -> Value {
         let potcar = |(species, potcar): (&Species, &Potcar)| {
             (species.symbol(), json!({ "title": potcar.title, "hash": potcar.hash }))
@@ -193,7 +194,7 @@ impl Code for Vasp {
             tags,
         } = &self.settings;
         json!({
-            "code": "vasp", "version": version, "recipe": RECIPE, "functional": "PBE", "precision": "Accurate",
+            "code": "vasp", "version": version, "recipe": INPUT_VERSION, "functional": "PBE", "precision": "Accurate",
             "cutoff": cutoff, "k_spacing": k_spacing, "smearing": smearing, "smearing_width": smearing_width,
             "spin": spin, "moments": moments, "energy_tolerance": energy_tolerance, "vacuum": vacuum, "tags": tags,
             "pseudopotentials": pseudopotentials,
@@ -204,42 +205,48 @@ impl Code for Vasp {
         species.iter().try_for_each(|species| self.potcar(*species).map(drop))
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        let (poscar, order) = poscar(&enclosed.structure)?;
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
+        let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
+        let (poscar, order) = poscar(&padded.structure)?;
         let mut potcar = Vec::new();
         for species in order.chunk_by(|a, b| structure.species[*a] == structure.species[*b]) {
             let part = self.potcar(structure.species[species[0]]);
-            potcar.extend(&part.map_err(|error| FailureClass::BadInput.because(error.to_string()))?.content);
+            potcar.extend(
+                &part.map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?.content,
+            );
         }
-        let moments = moments::initial(structure, &self.settings.moments, remedies);
+        let moments = moments::initial(structure, &self.settings.moments, adjustments);
         let moments: Vec<f64> = order.iter().map(|atom| moments[*atom]).collect();
         let k_spacing = self.settings.k_spacing;
         let files = [
             ("POSCAR", poscar),
             ("POTCAR", potcar),
-            ("INCAR", incar::incar(&self.settings, &moments, remedies).into_bytes()),
-            ("KPOINTS", incar::kpoints(enclosed.mesh(k_spacing), k_spacing).into_bytes()),
+            ("INCAR", incar::incar(&self.settings, &moments, adjustments).into_bytes()),
+            ("KPOINTS", incar::kpoints(padded.mesh(k_spacing), k_spacing).into_bytes()),
         ];
         Ok(Input {
             files: files.map(|(name, content)| (name.to_owned(), content)).into(),
             command: self.settings.command.clone(),
-            environment: program::environment(&self.settings.environment),
+            environment: version_query::environment(&self.settings.environment),
             ..Input::default()
         })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
-        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        let (_, order) = poscar(&enclosed.structure)?;
-        let calculated = result::read(&enclosed.structure, &order, &self.settings.version, directory, exit)?;
-        Ok(enclosed.seen_from_outside(calculated))
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+        let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
+        let (_, order) = poscar(&padded.structure)?;
+        let calculated = result::read(&padded.structure, &order, &self.settings.version, directory, exit)?;
+        Ok(padded.without_padding_stress(calculated))
     }
 
     fn size(&self, structure: &Structure) -> Size {
         let Settings { vacuum, k_spacing, .. } = self.settings;
         let potcars = structure.species.iter().filter_map(|species| self.potcars.get(species));
-        lattice::size(structure, vacuum, k_spacing, potcars.map(|potcar| potcar.valence).sum())
+        padded_structure::size(structure, vacuum, k_spacing, potcars.map(|potcar| potcar.valence).sum())
     }
 }
 
@@ -247,6 +254,6 @@ impl Code for Vasp {
 fn poscar(structure: &Structure) -> Result<(Vec<u8>, Vec<usize>), Failure> {
     let mut text = Vec::new();
     let order = write_poscar(&mut text, structure, &structure.formula())
-        .map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+        .map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
     Ok((text, order))
 }

@@ -23,64 +23,64 @@ pub struct Axis {
     /// Largest.
     pub high: f64,
     ticks: Vec<Tick>,
-    speaks: bool,
+    has_labels: bool,
 }
 
 /// Ticks that have words, about.
-const TICKS: usize = 5;
+const DEFAULT_TICKS: usize = 5;
 
 impl Axis {
     /// An axis with even ticks. What is not a range of finite numbers, above zero if the scale is logarithmic, becomes one.
     pub fn new(title: &str, scale: Scale, low: f64, high: f64) -> Self {
         let (low, high) = range(scale, low, high);
-        let ticks = ticks::of(scale, low, high, TICKS);
-        Self { title: title.into(), scale, low, high, ticks, speaks: true }
+        let ticks = ticks::choose(scale, low, high, DEFAULT_TICKS);
+        Self { title: title.into(), scale, low, high, ticks, has_labels: true }
     }
 
     /// An axis of things that have names and no order: the first is at ½, the next at 1½ and so on.
-    pub fn of_names(title: &str, names: &[String]) -> Self {
+    pub fn categorical(title: &str, names: &[String]) -> Self {
         let tick = |(k, name): (usize, &String)| Tick { at: k as f64 + 0.5, words: name.clone() };
         let ticks = names.iter().enumerate().map(tick).collect();
         let high = names.len().max(1) as f64;
-        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, speaks: true }
+        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, has_labels: true }
     }
 
     /// An axis of bins, each as wide as the next, with words at these places: 1 is the end of the first bin.
-    pub fn of_bins(title: &str, bins: usize, words: impl IntoIterator<Item = (f64, String)>) -> Self {
+    pub fn binned(title: &str, bins: usize, words: impl IntoIterator<Item = (f64, String)>) -> Self {
         let ticks = words.into_iter().map(|(at, words)| Tick { at, words }).collect();
         let high = bins.max(1) as f64;
-        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, speaks: true }
+        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, has_labels: true }
     }
 
     /// The same with about so many ticks.
     pub fn with_ticks(mut self, number: usize) -> Self {
-        self.ticks = ticks::of(self.scale, self.low, self.high, number);
+        self.ticks = ticks::choose(self.scale, self.low, self.high, number);
         self
     }
 
     /// The same with another title.
-    pub fn titled(mut self, title: &str) -> Self {
+    pub fn with_title(mut self, title: &str) -> Self {
         title.clone_into(&mut self.title);
         self
     }
 
     /// The same without ticks.
-    pub fn bare(mut self) -> Self {
+    pub fn without_ticks(mut self) -> Self {
         self.ticks.clear();
         self
     }
 
     /// The same without words: another panel has the same axis.
-    pub fn silent(mut self) -> Self {
-        self.speaks = false;
+    pub fn without_labels(mut self) -> Self {
+        self.has_labels = false;
         self
     }
 
     /// Where a value is: 0 at the beginning, 1 at the end. What has no place is far before the beginning.
-    pub fn place(&self, value: f64) -> f64 {
+    pub fn position(&self, value: f64) -> f64 {
         let of = |x: f64| if self.scale == Scale::Linear { x } else { x.ln() };
-        let place = (of(value) - of(self.low)) / (of(self.high) - of(self.low));
-        if place.is_nan() { -FAR } else { place.clamp(-FAR, FAR) }
+        let position = (of(value) - of(self.low)) / (of(self.high) - of(self.low));
+        if position.is_nan() { -MAX_POSITION } else { position.clamp(-MAX_POSITION, MAX_POSITION) }
     }
 
     /// Its ticks.
@@ -89,13 +89,13 @@ impl Axis {
     }
 
     /// Whether it has words.
-    pub(crate) fn speaks(&self) -> bool {
-        self.speaks
+    pub(crate) fn has_labels(&self) -> bool {
+        self.has_labels
     }
 }
 
 /// What is farther outside than so many lengths of the axis is there.
-const FAR: f64 = 10.0;
+const MAX_POSITION: f64 = 10.0;
 
 fn range(scale: Scale, low: f64, high: f64) -> (f64, f64) {
     let is_usable = |x: f64| x.is_finite() && (scale == Scale::Linear || x > 0.0);
@@ -117,10 +117,13 @@ mod tests {
     #[test]
     fn places_are_shares_of_the_axis() {
         let axis = Axis::new("x", Scale::Linear, -1.0, 3.0);
-        assert_eq!([-1.0, 0.0, 3.0, 5.0].map(|x| axis.place(x)), [0.0, 0.25, 1.0, 1.5]);
+        assert_eq!([-1.0, 0.0, 3.0, 5.0].map(|x| axis.position(x)), [0.0, 0.25, 1.0, 1.5]);
         let axis = Axis::new("x", Scale::Logarithmic, 0.01, 100.0);
-        assert!((axis.place(1.0) - 0.5).abs() < 1e-12 && (axis.place(0.1) - 0.25).abs() < 1e-12);
-        assert_eq!([0.0, -1.0, f64::NAN, f64::INFINITY].map(|x| axis.place(x)), [-FAR, -FAR, -FAR, FAR]);
+        assert!((axis.position(1.0) - 0.5).abs() < 1e-12 && (axis.position(0.1) - 0.25).abs() < 1e-12);
+        assert_eq!(
+            [0.0, -1.0, f64::NAN, f64::INFINITY].map(|x| axis.position(x)),
+            [-MAX_POSITION, -MAX_POSITION, -MAX_POSITION, MAX_POSITION]
+        );
     }
 
     #[test]

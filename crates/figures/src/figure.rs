@@ -1,6 +1,6 @@
 //! What stands on a sheet.
 
-use crate::words::Anchor;
+use crate::rich_text::Anchor;
 use crate::{Colour, Paint, Point, Stroke};
 
 /// A sheet with what was drawn on it, in that order.

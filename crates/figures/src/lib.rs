@@ -9,19 +9,19 @@ mod font;
 mod legend;
 mod panel;
 mod png;
+mod rich_text;
 mod svg;
 mod ticks;
-mod words;
 
 pub use axis::{Axis, Scale};
 pub use colours::{Colour, Paint, Stroke};
 pub use figure::{Figure, Item, Marker, Rectangle, Text};
 pub use font::{BOLD, FAMILY, REGULAR};
-pub use legend::{Key, legend};
+pub use legend::{LegendKey, legend};
 pub use panel::{Panel, Side};
 pub use png::{PngError, to_png};
+pub use rich_text::{Anchor, escape, plain, to_html, width};
 pub use svg::to_svg;
-pub use words::{Anchor, escape, plain, to_html, width};
 
 /// A place on a sheet or among data: x, y.
 pub type Point = [f64; 2];

@@ -3,7 +3,7 @@
 use tiny_skia::{FillRule, LineJoin, Mask, PathBuilder, Pixmap, StrokeDash, Transform};
 use ttf_parser::OutlineBuilder;
 
-use crate::words::runs;
+use crate::rich_text::runs;
 use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text, font, width};
 
 /// Points an inch has.
@@ -85,7 +85,7 @@ impl Sheet {
         self.set_clip(clip);
         let mask = self.clip.as_ref().filter(|_| clip.is_some()).map(|(_, mask)| mask);
         if let Some(paint) = fill {
-            let (rule, paint) = (FillRule::EvenOdd, of(paint));
+            let (rule, paint) = (FillRule::EvenOdd, to_skia_paint(paint));
             self.pixmap.fill_path(&path, &paint, rule, self.transform, mask);
         }
         if let Some(Stroke { paint, width, dashes }) = stroke {
@@ -96,7 +96,7 @@ impl Sheet {
                 dash: StrokeDash::new(dashes, 0.0),
                 ..tiny_skia::Stroke::default()
             };
-            self.pixmap.stroke_path(&path, &of(paint), &stroke, self.transform, mask);
+            self.pixmap.stroke_path(&path, &to_skia_paint(paint), &stroke, self.transform, mask);
         }
     }
 
@@ -126,10 +126,10 @@ impl Sheet {
         let place = Transform::from_translate(*x as f32, *y as f32).pre_rotate(turn);
         let mut builder = Glyphs { builder: PathBuilder::new(), place, scale: 0.0, at: [0.0; 2] };
         for run in runs(words) {
-            let size = size * run.level.scale();
+            let size = size * run.script.scale();
             builder.scale = size / font::units();
             for character in run.text.chars() {
-                builder.at = [pen, run.level.drop() * text.size];
+                builder.at = [pen, run.script.baseline_shift() * text.size];
                 font::outline(character, *bold, &mut builder);
                 pen += size * font::advance(character, *bold);
             }
@@ -203,7 +203,7 @@ fn add_mark(builder: &mut PathBuilder, marker: Marker, [x, y]: Point, radius: f6
     }
 }
 
-fn of(Paint { colour: Colour(red, green, blue), opacity }: Paint) -> tiny_skia::Paint<'static> {
+fn to_skia_paint(Paint { colour: Colour(red, green, blue), opacity }: Paint) -> tiny_skia::Paint<'static> {
     let mut paint = tiny_skia::Paint { anti_alias: true, ..tiny_skia::Paint::default() };
     paint.set_color_rgba8(red, green, blue, (255.0 * opacity).round() as u8);
     paint

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use crate::font::FAMILY;
-use crate::words::{escape, runs};
+use crate::rich_text::{escape, runs};
 use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text};
 
 /// The SVG element, which may stand in a file or in HTML.
@@ -61,12 +61,12 @@ impl Svg<'_> {
         let weight = if *bold { " font-weight=\"bold\"" } else { "" };
         let (mut spans, mut lowered) = (String::new(), 0.0);
         for run in runs(words) {
-            let drop = run.level.drop() * size;
+            let drop = run.script.baseline_shift() * size;
             let _ = write!(
                 spans,
                 "<tspan dy=\"{}\" font-size=\"{}\">{}</tspan>",
                 short(drop - lowered),
-                short(run.level.scale() * size),
+                short(run.script.scale() * size),
                 escape(run.text)
             );
             lowered = drop;

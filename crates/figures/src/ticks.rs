@@ -12,7 +12,7 @@ pub struct Tick {
 }
 
 /// Ticks of an axis from `low` to `high`, about `number` of them with words.
-pub fn of(scale: Scale, low: f64, high: f64, number: usize) -> Vec<Tick> {
+pub fn choose(scale: Scale, low: f64, high: f64, number: usize) -> Vec<Tick> {
     match scale {
         Scale::Linear => linear(low, high, number),
         Scale::Logarithmic => logarithmic(low, high, number),

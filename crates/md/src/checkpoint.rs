@@ -4,10 +4,10 @@ use atoms::Evaluation;
 use serde::{Deserialize, Serialize};
 
 use crate::dynamics::DynamicsError;
-use crate::ramp::VolumeRamp;
 use crate::random::Stream;
 use crate::state::State;
 use crate::thermostat::Thermostat;
+use crate::volume_ramp::VolumeRamp;
 
 /// A run between two steps.
 ///
@@ -49,7 +49,7 @@ impl Checkpoint {
         if !(self.time_step.is_finite() && self.time_step > 0.0) {
             return Err(DynamicsError::TimeStep(self.time_step));
         }
-        if let Some(fault) = self.thermostat.fault(n) {
+        if let Some(fault) = self.thermostat.invalid_setting(n) {
             return Err(DynamicsError::Thermostat(fault));
         }
         match self.ramp {

@@ -5,10 +5,10 @@ use atoms::units::ACCELERATION;
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, StructureError};
 
 use crate::checkpoint::Checkpoint;
-use crate::ramp::VolumeRamp;
 use crate::random::Stream;
 use crate::state::{self, State};
 use crate::thermostat::Thermostat;
+use crate::volume_ramp::VolumeRamp;
 
 /// How a run is made, beside where it starts.
 #[derive(Clone, Debug, PartialEq)]

@@ -10,15 +10,15 @@
 mod checkpoint;
 mod dynamics;
 mod nose_hoover;
-mod ramp;
 mod random;
 mod state;
 mod thermostat;
+mod volume_ramp;
 
 pub use checkpoint::Checkpoint;
 pub use dynamics::{Dynamics, DynamicsError, Settings, default_time_step};
 pub use nose_hoover::NoseHooverChain;
-pub use ramp::{VolumeRamp, scale_volume};
-pub use random::{Purpose, Stream, philox};
+pub use random::{Stream, StreamId, philox};
 pub use state::{State, kinetic_energy, masses, maxwell_boltzmann, momentum, temperature};
 pub use thermostat::{Langevin, Thermostat};
+pub use volume_ramp::{VolumeRamp, scale_volume};

@@ -5,7 +5,7 @@ use atoms::units::{ACCELERATION, BOLTZMANN};
 use atoms::{Species, Structure, Vec3};
 use serde::{Deserialize, Serialize};
 
-use crate::random::{Purpose, Stream};
+use crate::random::{Stream, StreamId};
 
 /// A point in phase space.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -60,7 +60,7 @@ pub fn maxwell_boltzmann(species: &[Species], temperature: f64, stream: &Stream)
         .enumerate()
         .map(|(atom, mass)| {
             let width = (BOLTZMANN * temperature * ACCELERATION / mass).sqrt();
-            scale(stream.normals(0, atom as u32, Purpose::InitialVelocities), width)
+            scale(stream.normals(0, atom as u32, StreamId::InitialVelocities), width)
         })
         .collect();
     let drift = scale(momentum(&velocities, &masses), 1.0 / masses.iter().sum::<f64>());

@@ -5,7 +5,7 @@ use atoms::{Vec3, cell};
 use serde::{Deserialize, Serialize};
 
 use crate::nose_hoover::NoseHooverChain;
-use crate::random::{Purpose, Stream};
+use crate::random::{Stream, StreamId};
 
 /// The thermostat, with its dynamical variables.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -46,7 +46,7 @@ impl Thermostat {
     }
 
     /// What is wrong with the numbers for `atoms` atoms, if anything is.
-    pub(crate) fn fault(&self, atoms: usize) -> Option<&'static str> {
+    pub(crate) fn invalid_setting(&self, atoms: usize) -> Option<&'static str> {
         let positive = |x: f64| x.is_finite() && x > 0.0;
         match self {
             Self::None => None,
@@ -96,7 +96,7 @@ impl Langevin {
         let kept = (-self.friction * time_step).exp();
         let heat = -(-2.0 * self.friction * time_step).exp_m1() * BOLTZMANN * self.temperature * ACCELERATION;
         for (atom, (v, mass)) in velocities.iter_mut().zip(masses).enumerate() {
-            let noise = stream.normals(step, atom as u32, Purpose::Langevin);
+            let noise = stream.normals(step, atom as u32, StreamId::Langevin);
             *v = cell::add(cell::scale(*v, kept), cell::scale(noise, (heat / mass).sqrt()));
         }
     }

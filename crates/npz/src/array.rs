@@ -1,6 +1,6 @@
 //! An array and what can be asked of it.
 
-use crate::error::{Error, Place};
+use crate::error::{ArrayName, Error};
 
 /// An array that was read. The product of the shape is the length of the data.
 #[derive(Debug, Clone)]
@@ -9,7 +9,7 @@ pub struct Array<T> {
     pub shape: Vec<usize>,
     /// All values.
     pub data: Vec<T>,
-    pub(crate) place: Place,
+    pub(crate) name: ArrayName,
 }
 
 impl<T> Array<T> {
@@ -17,7 +17,7 @@ impl<T> Array<T> {
     ///
     /// # Errors
     /// If the shape is another.
-    pub fn shaped(self, expected: &[usize]) -> Result<Vec<T>, Error> {
+    pub fn with_shape(self, expected: &[usize]) -> Result<Vec<T>, Error> {
         if self.shape == expected {
             return Ok(self.data);
         }
@@ -39,7 +39,7 @@ impl<T> Array<T> {
     ///
     /// # Errors
     /// If there are more or none.
-    pub fn single(mut self) -> Result<T, Error> {
+    pub fn into_scalar(mut self) -> Result<T, Error> {
         match (self.data.pop(), self.data.is_empty()) {
             (Some(value), true) => Ok(value),
             _ => Err(self.wrong_shape("a single number")),
@@ -47,7 +47,7 @@ impl<T> Array<T> {
     }
 
     fn wrong_shape(&self, expected: impl ToString) -> Error {
-        self.place.wrong_shape(format!("{:?}", self.shape), expected)
+        self.name.wrong_shape(format!("{:?}", self.shape), expected)
     }
 }
 
@@ -58,7 +58,7 @@ impl<T: Copy + Into<f64>> Array<T> {
     /// Names the first that is not.
     pub fn finite(self) -> Result<Self, Error> {
         match self.data.iter().map(|&value| value.into()).find(|value| !value.is_finite()) {
-            Some(value) => Err(self.place.wrong_value(format!("partly {value}"), "finite numbers")),
+            Some(value) => Err(self.name.wrong_value(format!("partly {value}"), "finite numbers")),
             None => Ok(self),
         }
     }

@@ -81,12 +81,12 @@ pub enum Error {
 
 /// The array that an error is about.
 #[derive(Debug, Clone)]
-pub(crate) struct Place {
+pub(crate) struct ArrayName {
     pub path: PathBuf,
     pub key: String,
 }
 
-impl Place {
+impl ArrayName {
     pub fn missing(&self) -> Error {
         let Self { path, key } = self.clone();
         Error::Missing { path, key }

@@ -8,7 +8,7 @@ use std::io::Read;
 use npyz::TypeStr;
 
 /// Longest header text, bytes. NumPy itself warns of those above 10 000.
-const LONGEST: usize = 1 << 16;
+const MAX_HEADER_BYTES: usize = 1 << 16;
 
 /// Type and shape of an array.
 #[derive(Debug)]
@@ -34,7 +34,7 @@ impl Header {
             2 | 3 => (4, u32::from_le_bytes(bytes(&mut source)?)),
             _ => return Err(format!(".npy format version {major}")),
         };
-        if text_length as usize > LONGEST {
+        if text_length as usize > MAX_HEADER_BYTES {
             return Err(format!("a header of {text_length} bytes"));
         }
         let mut text = vec![0; text_length as usize];

@@ -11,9 +11,9 @@
 
 mod archive;
 mod array;
+mod checked;
 mod error;
 mod header;
-mod numbers;
 
 pub use archive::Archive;
 pub use array::Array;

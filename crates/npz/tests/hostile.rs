@@ -13,7 +13,7 @@ fn refused(bytes: Vec<u8>) -> Option<String> {
         archive.numbers("a").err(),
         archive.strings("a").err(),
         archive.integers("a").err(),
-        archive.singles("a").err(),
+        archive.floats_f32("a").err(),
     ]
     .map(|error| error.as_ref().map(Error::to_string));
     for error in errors.iter().flatten() {

@@ -120,7 +120,7 @@ impl AddPairs<'_> {
     fn add<const ONE: bool>(self) {
         let squared_cutoff = self.functions.cutoff * self.functions.cutoff;
         for i in 0..self.kinds.len() {
-            let (later, sites) = (self.neighbours.later(i), self.neighbours.later_sites(i));
+            let (later, sites) = (self.neighbours.later_neighbours_of(i), self.neighbours.later_sites_of(i));
             let (near, atoms) = self.near.collect(i, later, sites, squared_cutoff);
             let mut here = [NONE; 2];
             for (near, atoms) in near.chunks(LANES).zip(atoms.chunks(LANES)) {

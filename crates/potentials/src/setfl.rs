@@ -22,7 +22,7 @@ pub enum EamStyle {
 }
 
 /// Fewest points of a table: the interpolation differentiates over five of them.
-const FEWEST_POINTS: usize = 5;
+const MIN_POINTS: usize = 5;
 
 /// The tables of a setfl file.
 #[derive(Debug)]
@@ -68,7 +68,7 @@ impl Setfl {
             let what = format!("the pair energy r φ(r) of {element}");
             pair.push(read_tables(&mut lines, a + 1, grid.distances, &what)?);
         }
-        refuse_rest(&mut lines)?;
+        reject_trailing(&mut lines)?;
         Ok(Self {
             species,
             density_spacing: grid.density_spacing,
@@ -116,10 +116,10 @@ impl Grid {
         let line = lines.require("'nrho drho nr dr cutoff'")?;
         let tokens: Vec<&str> = line.split_whitespace().collect();
         let points = |index: usize, what: &str| {
-            let expected = format!("{what}, a whole number of at least {FEWEST_POINTS}");
+            let expected = format!("{what}, a whole number of at least {MIN_POINTS}");
             let token = tokens.get(index).copied().unwrap_or("the end of the line");
             match token.parse::<usize>() {
-                Ok(count) if count >= FEWEST_POINTS => Ok(count),
+                Ok(count) if count >= MIN_POINTS => Ok(count),
                 _ => Err(lines.error(format!("'{token}'"), expected)),
             }
         };
@@ -170,7 +170,7 @@ fn read_tables(
 }
 
 /// Values after the last table mean that the counts in the header are wrong.
-fn refuse_rest(lines: &mut Lines<'_>) -> Result<(), PotentialFileError> {
+fn reject_trailing(lines: &mut Lines<'_>) -> Result<(), PotentialFileError> {
     while let Some(line) = lines.next() {
         if !line.trim().is_empty() {
             return Err(lines.error(format!("'{}'", line.trim()), "the end of the file"));

@@ -176,7 +176,7 @@ impl StillingerWeber {
     ) {
         self.arms.clear();
         let row = self.elements.index(structure.species[i]) * self.elements.len();
-        for neighbour in neighbours.of(i) {
+        for neighbour in neighbours.neighbours_of(i) {
             let d = neighbour.displacement(structure, i);
             let squared = dot(d, d);
             let j = neighbour.atom as usize;

@@ -81,7 +81,7 @@ impl Zbl {
         self.elements.check(structure, neighbours, self.outer)?;
         for i in 0..structure.len() {
             let row = self.elements.index(structure.species[i]) * self.elements.len();
-            for neighbour in neighbours.later(i) {
+            for neighbour in neighbours.later_neighbours_of(i) {
                 let d = neighbour.displacement(structure, i);
                 let squared = dot(d, d);
                 if squared >= self.outer * self.outer {

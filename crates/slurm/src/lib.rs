@@ -2,8 +2,8 @@
 //!
 //! What does not answer has said nothing: an error here is never a word about a job.
 
-mod commands;
-mod phase;
+mod client;
+mod job_phase;
 
-pub use commands::{Commands, SlurmError};
-pub use phase::Phase;
+pub use client::{SlurmClient, SlurmError};
+pub use job_phase::JobPhase;

@@ -5,8 +5,8 @@ use std::panic::resume_unwind;
 use std::sync::Arc;
 use std::thread::{self, available_parallelism};
 
+use calm::forgetting::{GradeDistribution, grade_distribution};
 use calm::grade::maximum;
-use calm::watch::{GradeDistribution, grade_distribution};
 use calm::{GradeError, Grades, Mixture, UpdateOutcome};
 use serde_json::json;
 use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate};
@@ -53,7 +53,7 @@ impl TrainingFrames {
             gammas.collect::<Result<Vec<_>, _>>()
         });
         let gamma = gamma.map_err(|source| SelectorError::Training { source })?;
-        Ok(GradeDistribution::of(&gamma.concat()))
+        Ok(GradeDistribution::from_grades(&gamma.concat()))
     }
 }
 

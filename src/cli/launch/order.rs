@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use orchestrator::slurm::{Job, JobNames, Phase, Plan, Request, Role, Wanted};
+use orchestrator::slurm::{Job, JobNames, JobPhase, Plan, Request, Role, Wanted};
 use wire::net::Tls;
 
 use super::scripts::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
@@ -101,7 +101,7 @@ impl Order {
 
     /// The orchestrator's job that stays, if there is one.
     pub fn leader(&self, jobs: &[Job], cancelled: &[u64]) -> Option<u64> {
-        let stays = |job: &&Job| matches!(job.phase(), Phase::Pending | Phase::Running);
+        let stays = |job: &&Job| matches!(job.phase(), JobPhase::Pending | JobPhase::Running);
         let mut leaders = jobs.iter().filter(|job| job.role == Role::Orchestrator).filter(stays);
         leaders.find(|job| !cancelled.contains(&job.id)).map(|job| job.id)
     }

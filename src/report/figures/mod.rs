@@ -41,20 +41,20 @@ pub fn all(gathered: &Gathered) -> Vec<Part> {
 fn draw_histograms(panel: &mut Panel, histograms: &[(Origin, Histogram)]) {
     for (origin, histogram) in histograms {
         let look = look(*origin);
-        let (edges, shares) = (histogram.edges(), histogram.shares());
+        let (edges, shares) = (histogram.edges(), histogram.fractions());
         let mut outline = vec![[edges[0], 0.0]];
         for (edges, share) in edges.windows(2).zip(&shares) {
             outline.extend([[edges[0], 100.0 * share], [edges[1], 100.0 * share]]);
         }
         outline.push([edges[edges.len() - 1], 0.0]);
-        panel.rings([outline.clone()], Some(look.colour.faint(0.18)), None);
+        panel.polygons([outline.clone()], Some(look.colour.faint(0.18)), None);
         panel.line(outline, look.line);
     }
 }
 
 /// A vertical axis for histograms.
 fn share_axis(title: &str, histograms: &[(Origin, Histogram)]) -> Axis {
-    let largest = histograms.iter().flat_map(|(_, histogram)| histogram.shares()).fold(0.0, f64::max);
+    let largest = histograms.iter().flat_map(|(_, histogram)| histogram.fractions()).fold(0.0, f64::max);
     Axis::new(title, Scale::Linear, 0.0, 108.0 * largest.max(1e-6))
 }
 
@@ -72,7 +72,7 @@ fn push_histograms(numbers: &mut Csv, panel: &str, histograms: &[(Origin, Histog
 /// The origins of which something was collected.
 fn origins_of(sample: &Sample) -> Vec<Origin> {
     let both = sample.both().into_iter();
-    both.filter(|(_, of)| of.structures.seen() > 0).map(|(origin, _)| origin).collect()
+    both.filter(|(_, of)| of.structures.total() > 0).map(|(origin, _)| origin).collect()
 }
 
 /// Places of `number` panels beside each other, with room for the words at their axes.

@@ -1,7 +1,7 @@
 //! Features in the plane of their first two principal components, with 95 % contours (the paper's Fig. 7a).
 
 use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale};
-use analysis::{PlaneDensity, contours};
+use analysis::{Density2d, contours};
 use wire::Origin;
 
 use super::super::features::{ELEMENTS, Plane, Points};
@@ -20,7 +20,7 @@ const DRAWN: usize = 1500;
 const LEAST: usize = 50;
 
 pub fn draw(sample: &Sample) -> Result<Drawn, String> {
-    if sample.both().iter().all(|(_, of)| of.structures.seen() == 0) {
+    if sample.both().iter().all(|(_, of)| of.structures.total() == 0) {
         return Err(NOTHING_COLLECTED.into());
     }
     let planes = sample.features.planes();
@@ -92,7 +92,7 @@ fn draw_plane(figure: &mut Figure, numbers: &mut Csv, plane: &Plane, place: Rect
     for (origin, lines) in &lines {
         let look = look(*origin);
         let closed = lines.iter().map(|line| line.iter().chain(line.first()).copied());
-        panel.rings(closed.clone(), None, Some(look.line));
+        panel.polygons(closed.clone(), None, Some(look.line));
         let numbered =
             lines.iter().enumerate().flat_map(|(k, line)| line.iter().map(move |point| (k, *point)));
         push(numbers, plane, *origin, "contour", numbered);
@@ -104,14 +104,16 @@ fn draw_plane(figure: &mut Figure, numbers: &mut Csv, plane: &Plane, place: Rect
         push(numbers, plane, origin, "centroid", points.centroids.iter().map(|point| (0, *point)));
     }
     let corner = [panel.x.low, panel.y.high];
-    panel.words(corner, [6.0, 11.0], plane.element.symbol(), ::figures::Anchor::Start).bold = true;
-    panel.letter(letter);
+    panel.text(corner, [6.0, 11.0], plane.element.symbol(), ::figures::Anchor::Start).bold = true;
+    panel.panel_letter(letter);
     panel.draw(figure);
 }
 
 fn contours_of(atoms: &[[f64; 2]]) -> Vec<Vec<[f64; 2]>> {
     let density = Some(atoms).filter(|atoms| atoms.len() >= LEAST);
-    let Some(density) = density.and_then(|atoms| PlaneDensity::of(atoms, GRID)) else { return Vec::new() };
+    let Some(density) = density.and_then(|atoms| Density2d::from_points(atoms, GRID)) else {
+        return Vec::new();
+    };
     density.level(atoms, INSIDE).map_or(Vec::new(), |level| contours(&density, level))
 }
 

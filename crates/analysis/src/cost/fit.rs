@@ -26,29 +26,30 @@ pub(super) struct Fit {
 }
 
 /// Degrees of freedom of the noise, and weight of the scale that is taken for granted, in labels.
-const FREEDOM: f64 = 4.0;
+const DEGREES_OF_FREEDOM: f64 = 4.0;
 
 /// The weights settle in some ten rounds; more would only show in the last digits.
-const ROUNDS: usize = 60;
+const ITERATIONS: usize = 60;
 
 impl Fit {
     /// By expectation and maximisation: with weights, this is a linear problem; from what is left over follow the scale
     /// and the weights. `None` without any point or guess.
-    pub fn of(points: &[Point], guess: Option<Point>) -> Option<Self> {
+    pub fn new(points: &[Point], guess: Option<Point>) -> Option<Self> {
         if points.is_empty() && guess.is_none() {
             return None;
         }
         let (mut weights, mut scale) = (vec![1.0; points.len()], SCATTER);
         let (mut coefficients, mut covariance) = solve(points, &weights, scale, guess)?;
-        for _ in 0..ROUNDS {
+        for _ in 0..ITERATIONS {
             let squares = |(point, weight): (&Point, &f64)| weight * residual(&coefficients, point).powi(2);
             let left_over: f64 = points.iter().zip(&weights).map(squares).sum();
             // A single label fits by itself and says nothing of the scale.
             let freedom = points.len().saturating_sub(1) as f64;
-            scale = ((FREEDOM * SCATTER * SCATTER + left_over) / (FREEDOM + freedom)).sqrt();
+            scale = ((DEGREES_OF_FREEDOM * SCATTER * SCATTER + left_over) / (DEGREES_OF_FREEDOM + freedom))
+                .sqrt();
             for (weight, point) in weights.iter_mut().zip(points) {
                 let away = residual(&coefficients, point) / scale;
-                *weight = (FREEDOM + 1.0) / (FREEDOM + away * away);
+                *weight = (DEGREES_OF_FREEDOM + 1.0) / (DEGREES_OF_FREEDOM + away * away);
             }
             (coefficients, covariance) = solve(points, &weights, scale, guess)?;
         }
@@ -75,7 +76,8 @@ impl Fit {
 
     /// Mean of the factors by which labels took more than in the middle, each believed as much as in the fit.
     fn mean_of_factors(&self, points: &[Point], weights: &[f64]) -> f64 {
-        let (mut sum, mut weight) = (FREEDOM * (0.5 * self.scale.powi(2)).exp(), FREEDOM);
+        let (mut sum, mut weight) =
+            (DEGREES_OF_FREEDOM * (0.5 * self.scale.powi(2)).exp(), DEGREES_OF_FREEDOM);
         for (point, w) in points.iter().zip(weights) {
             sum += w * residual(&self.coefficients, point).exp();
             weight += w;
@@ -137,7 +139,7 @@ mod tests {
     #[test]
     fn without_noise_the_line_goes_through_the_points() {
         let points: Vec<_> = [-1.0, 0.0, 1.0].map(|x| ([1.0, x, 0.0], 5.0 + 1.5 * x)).to_vec();
-        let fit = Fit::of(&points, None).unwrap();
+        let fit = Fit::new(&points, None).unwrap();
         // The scale of three points without noise: σ² = 4 · 0.26² / 6; the prior of the slope, 2 ± 0.75, holds against
         // two points at a distance of 1, whose weights are 5/4: (2.5 · 1.5 / σ² + 2 / 0.75²) / (2.5 / σ² + 1 / 0.75²).
         let (data, prior) = (2.5 / (4.0 * SCATTER * SCATTER / 6.0), 0.75_f64.powi(-2));

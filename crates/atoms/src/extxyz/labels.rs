@@ -16,12 +16,12 @@ pub struct Labels {
 
 /// The names under which labels are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Keys {
+pub enum LabelKeys {
     /// `energy`, `forces`, `stress`: ASE makes them the results of the frame's calculator.
     Ase,
     /// `REF_energy`, `REF_forces`, `REF_stress` (9 numbers), which MACE trains on by default.
     Mace,
-    /// As [`Keys::Ase`] with the same energy also as `free_energy`: gracemaker reads through ASE and
+    /// As [`LabelKeys::Ase`] with the same energy also as `free_energy`: gracemaker reads through ASE and
     /// prefers the free energy. If one frame of a file lacks the stress, it uses no stress of that file.
     Grace,
     /// `energy`, `force`, `virial` (eV, 9 numbers; −volume × stress): what `gap_fit` of QUIP reads by default.
@@ -69,30 +69,30 @@ impl Frame {
     }
 
     /// Replaces all labels of the frame, whatever their names.
-    pub fn set_labels(&mut self, labels: &Labels, keys: Keys) {
+    pub fn set_labels(&mut self, labels: &Labels, keys: LabelKeys) {
         for quantity in QUANTITIES {
             for key in [quantity.to_owned(), format!("REF_{quantity}")] {
                 self.info.remove(&key);
                 self.arrays.remove(&key);
             }
         }
-        let prefix = if keys == Keys::Mace { "REF_" } else { "" };
+        let prefix = if keys == LabelKeys::Mace { "REF_" } else { "" };
         if let Some(energy) = labels.energy {
             self.info.insert(format!("{prefix}energy"), energy.into());
-            if keys == Keys::Grace {
+            if keys == LabelKeys::Grace {
                 self.info.insert("free_energy".to_owned(), energy.into());
             }
         }
         if let Some(forces) = &labels.forces {
-            let key = if keys == Keys::Gap { "force".to_owned() } else { format!("{prefix}forces") };
+            let key = if keys == LabelKeys::Gap { "force".to_owned() } else { format!("{prefix}forces") };
             self.arrays.insert(key, Column::vectors(forces));
         }
-        if let (Some(stress), Keys::Gap) = (labels.stress, keys) {
+        if let (Some(stress), LabelKeys::Gap) = (labels.stress, keys) {
             let volume = self.structure.cell.volume();
             let virial = stress.concat().into_iter().map(|s| -s * volume);
             self.info.insert("virial".to_owned(), virial.collect::<Vec<_>>().into());
         } else if let Some(stress) = labels.stress {
-            let value = if keys == Keys::Mace { stress.concat().into() } else { stress.into() };
+            let value = if keys == LabelKeys::Mace { stress.concat().into() } else { stress.into() };
             self.info.insert(format!("{prefix}stress"), value);
         }
     }

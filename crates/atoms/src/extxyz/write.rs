@@ -3,7 +3,7 @@
 use std::io::Write;
 
 use super::comment::{is_verbatim, quote};
-use super::{Column, Entries, Frame, Value};
+use super::{Column, ColumnData, Frame, Value};
 use crate::structure::StructureError;
 
 /// Why a frame cannot be written so that this reader and ASE read the same back.
@@ -114,12 +114,12 @@ fn kind(name: &str, column: &Column, atoms: usize) -> Result<char, &'static str>
         return Err("has not one row of the same width for each atom");
     }
     match &column.entries {
-        Entries::Real(_) => Ok('R'),
-        Entries::Bool(_) => Ok('L'),
-        Entries::Int(values) if values.iter().all(|value| i32::try_from(*value).is_ok()) => Ok('I'),
-        Entries::Int(_) => Err("has integers of more than 32 bits, which ASE cannot read"),
-        Entries::Text(words) if words.iter().all(|word| is_word(word)) => Ok('S'),
-        Entries::Text(_) => Err("has texts that are empty or have white space"),
+        ColumnData::Real(_) => Ok('R'),
+        ColumnData::Bool(_) => Ok('L'),
+        ColumnData::Int(values) if values.iter().all(|value| i32::try_from(*value).is_ok()) => Ok('I'),
+        ColumnData::Int(_) => Err("has integers of more than 32 bits, which ASE cannot read"),
+        ColumnData::Text(words) if words.iter().all(|word| is_word(word)) => Ok('S'),
+        ColumnData::Text(_) => Err("has texts that are empty or have white space"),
     }
 }
 
@@ -130,14 +130,18 @@ fn is_word(text: &str) -> bool {
 fn write_entries(text: &mut Vec<u8>, column: &Column, atom: usize) -> std::io::Result<()> {
     let row = atom * column.width..(atom + 1) * column.width;
     match &column.entries {
-        Entries::Real(values) => {
+        ColumnData::Real(values) => {
             values.get(row).into_iter().flatten().try_for_each(|x| write!(text, " {x:?}"))
         }
-        Entries::Int(values) => values.get(row).into_iter().flatten().try_for_each(|i| write!(text, " {i}")),
-        Entries::Bool(values) => {
+        ColumnData::Int(values) => {
+            values.get(row).into_iter().flatten().try_for_each(|i| write!(text, " {i}"))
+        }
+        ColumnData::Bool(values) => {
             values.get(row).into_iter().flatten().try_for_each(|b| write!(text, " {}", flag(*b)))
         }
-        Entries::Text(words) => words.get(row).into_iter().flatten().try_for_each(|s| write!(text, " {s}")),
+        ColumnData::Text(words) => {
+            words.get(row).into_iter().flatten().try_for_each(|s| write!(text, " {s}"))
+        }
     }
 }
 

@@ -24,12 +24,12 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::{self, Enclosed};
+use crate::checks::{at_least, positive};
 use crate::moments::Moments;
-use crate::setting::{at_least, positive};
+use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    Calculated, Code, Exit, Failure, Input, PassedEnvironment, Remedy, SetupError, Size, Smearing, judge,
-    program,
+    DftBackend, Exit, Failure, Input, PassedEnvironment, Results, RetryAdjustment, SetupError, Size,
+    Smearing, validation, version_query,
 };
 use pseudopotentials::Pseudopotential;
 
@@ -37,7 +37,7 @@ use pseudopotentials::Pseudopotential;
 const HARTREE: f64 = 27.211_386_245_988;
 
 /// Counts changes of what is written here that change a label's value.
-const RECIPE: u32 = 1;
+const INPUT_VERSION: u32 = 1;
 
 /// `[label.method.abinit]`
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -107,7 +107,7 @@ impl Settings {
         positive("energy_tolerance", self.energy_tolerance)?;
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
-        let environment = program::environment(&self.environment);
+        let environment = version_query::environment(&self.environment);
         let version = version(&self.command, &environment, passed)?;
         let pseudopotentials = pseudopotentials::find(&self.pseudopotentials, &self.variants)?;
         Ok(Abinit { settings: self.clone(), environment, version, pseudopotentials })
@@ -120,12 +120,15 @@ fn version(
     environment: &BTreeMap<String, String>,
     passed: &PassedEnvironment,
 ) -> Result<String, SetupError> {
-    let said = program::ask(command, &["--version"], environment, passed, &[])?;
+    let said = version_query::run(command, &["--version"], environment, passed, &[])?;
     // Each process of a parallel run may say it.
     let version =
         said.split_whitespace().next().filter(|word| word.starts_with(|c: char| c.is_ascii_digit()));
     version.map(str::to_owned).ok_or_else(|| {
-        program::another(command, format!("is not ABINIT: it says {:?} of its version", said.trim()))
+        version_query::wrong_program(
+            command,
+            format!("is not ABINIT: it says {:?} of its version", said.trim()),
+        )
     })
 }
 
@@ -161,7 +164,7 @@ impl Abinit {
     }
 }
 
-impl Code for Abinit {
+impl DftBackend for Abinit {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, &str> =
             self.pseudopotentials.iter().map(|(species, p)| (species.symbol(), p.original.hash())).collect();
@@ -183,7 +186,7 @@ impl Code for Abinit {
             vacuum,
         } = &self.settings;
         json!({
-            "code": "abinit", "version": self.version, "recipe": RECIPE, "functional": "PBE", "cutoff": cutoff,
+            "code": "abinit", "version": self.version, "recipe": INPUT_VERSION, "functional": "PBE", "cutoff": cutoff,
             "fine_cutoff": fine_cutoff, "k_spacing": k_spacing, "smearing": smearing,
             "smearing_width": smearing_width, "spin": spin, "moments": moments, "energy_tolerance": energy_tolerance,
             "vacuum": vacuum, "pseudopotentials": hashes,
@@ -194,21 +197,25 @@ impl Code for Abinit {
         self.of_one_kind(species).map(|_| ())
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-        input::write(self, &Enclosed::new(structure, self.settings.vacuum)?, remedies)
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
+        input::write(self, &PaddedStructure::new(structure, self.settings.vacuum)?, adjustments)
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
-        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        match output::read(&enclosed.structure, directory, &self.version, self.settings.smearing)? {
-            Some(calculated) => Ok(enclosed.seen_from_outside(calculated)),
-            None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+        let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
+        match output::read(&padded.structure, directory, &self.version, self.settings.smearing)? {
+            Some(calculated) => Ok(padded.without_padding_stress(calculated)),
+            None => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),
         }
     }
 
     fn size(&self, structure: &Structure) -> Size {
         let Settings { vacuum, k_spacing, .. } = self.settings;
         let valence = structure.species.iter().filter_map(|species| self.pseudopotentials.get(species));
-        lattice::size(structure, vacuum, k_spacing, valence.map(|p| p.valence).sum())
+        padded_structure::size(structure, vacuum, k_spacing, valence.map(|p| p.valence).sum())
     }
 }

@@ -6,8 +6,8 @@ use atoms::cell::{Matrix3, Vec3};
 use atoms::{Cell, Species, Structure, units};
 
 use super::{HARTREE, Smearing};
-use crate::same::same_structure;
-use crate::{Calculated, Failure, FailureClass, judge};
+use crate::structure_check::check_same_structure;
+use crate::{Failure, FailureClass, Results, validation};
 
 /// Lattice vectors have seven decimals, bohr.
 const DIGITS: f64 = 1e-6;
@@ -18,9 +18,9 @@ pub(super) fn read(
     directory: &Path,
     version: &str,
     smearing: Smearing,
-) -> Result<Option<Calculated>, Failure> {
+) -> Result<Option<Results>, Failure> {
     let text = |name| {
-        let content = judge::left(directory, name)?.unwrap_or_default();
+        let content = validation::read_output_file(directory, name)?.unwrap_or_default();
         Ok::<_, Failure>(String::from_utf8_lossy(&content).into_owned())
     };
     parse(structure, &text("run.abo")?, &text("stdout")?, version, smearing)
@@ -33,10 +33,10 @@ pub(super) fn parse(
     printed: &str,
     version: &str,
     smearing: Smearing,
-) -> Result<Option<Calculated>, Failure> {
+) -> Result<Option<Results>, Failure> {
     let calculated_by = stated_version(output);
     if let Some(found) = calculated_by {
-        judge::same_version("ABINIT", found, version)?;
+        validation::check_version("ABINIT", found, version)?;
     }
     if let Some(message) = error(printed) {
         let class = match message.to_lowercase() {
@@ -44,23 +44,27 @@ pub(super) fn parse(
             words if words.contains("memory") || words.contains("allocat") => FailureClass::OutOfMemory,
             _ => FailureClass::Crashed,
         };
-        return Err(class.because(format!("ABINIT says: {message}")));
+        return Err(class.with_message(format!("ABINIT says: {message}")));
     }
     if !is_whole(output) {
         return Ok(None);
     }
     let steps = energies(output);
     if output.contains("was not enough SCF cycles to converge") || !output.contains(" is converged :") {
-        return Err(FailureClass::NotConverged.because(format!("not in {} electronic steps", steps.len())));
+        return Err(
+            FailureClass::NotConverged.with_message(format!("not in {} electronic steps", steps.len()))
+        );
     }
-    let unreadable = || FailureClass::Implausible.because("run.abo is whole, but its numbers cannot be read");
+    let unreadable =
+        || FailureClass::Implausible.with_message("run.abo is whole, but its numbers cannot be read");
     calculated_by.ok_or_else(unreadable)?;
-    same_structure(structure, &found(output).ok_or_else(unreadable)?, DIGITS)?;
+    check_same_structure(structure, &found(output).ok_or_else(unreadable)?, DIGITS)?;
     let calculated = numbers(output, &steps, smearing).ok_or_else(unreadable)?;
-    judge::numbers(&calculated, structure.len())?;
+    validation::check_numbers(&calculated, structure.len())?;
     match last_step(printed).contains("The minimal occupation factor is") {
         true => {
-            Err(FailureClass::Implausible.because("the highest band is occupied: there are too few bands"))
+            Err(FailureClass::Implausible
+                .with_message("the highest band is occupied: there are too few bands"))
         }
         false => Ok(Some(calculated)),
     }
@@ -78,7 +82,7 @@ fn is_whole(output: &str) -> bool {
     output.contains("Calculation completed.") && last.starts_with("+Overall time at end")
 }
 
-fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<Calculated> {
+fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<Results> {
     let results = document(output, "ResultsGS")?;
     let free = *energies.last()?;
     // The summary has fewer digits, but must be of the same calculation.
@@ -90,7 +94,7 @@ fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<Calcula
     let entropy = value(document(output, "EnergyTerms")?, "'-kT*entropy'")?;
     let order = if smearing == Smearing::MethfesselPaxton { 1.0 } else { 0.0 };
     let force = HARTREE / units::BOHR;
-    Some(Calculated {
+    Some(Results {
         energy: free * HARTREE,
         energy_without_smearing: Some((free - entropy / (2.0 + order)) * HARTREE),
         forces: rows(results, "cartesian_forces").map(|row| vector(row, force)).collect::<Option<_>>()?,

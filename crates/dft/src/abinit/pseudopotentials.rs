@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 
 use atoms::Species;
 
-use crate::{Original, SetupError, paw};
+use crate::{PinnedFile, SetupError, paw};
 
 /// What is known of a pseudopotential.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Pseudopotential {
     /// Its file.
-    pub original: Original,
+    pub original: PinnedFile,
     /// Electrons that it treats.
     pub valence: f64,
     /// Whether it is a PAW setup.
@@ -68,7 +68,7 @@ fn read(species: Species, path: PathBuf) -> Result<Pseudopotential, SetupError> 
     let wrong =
         |reason: String| SetupError::Pseudopotential { species, reason: format!("{shown}: {reason}") };
     let paw = path.extension().is_some_and(|extension| extension == "xml");
-    let (original, content) = Original::hashed(path).map_err(|error| wrong(error.to_string()))?;
+    let (original, content) = PinnedFile::open(path).map_err(|error| wrong(error.to_string()))?;
     let valence = match paw {
         true => paw::valence(&content, species),
         false => valence(&content, species),

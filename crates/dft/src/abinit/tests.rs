@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::{FailureClass, Original};
+use crate::{FailureClass, PinnedFile};
 
 const INPUT: &str = include_str!("../../tests/data/abinit/run.abi");
 const OUTPUT: &str = include_str!("../../tests/data/abinit/run.abo");
@@ -20,10 +20,10 @@ fn silicon() -> Structure {
 fn abinit(settings: Settings) -> Abinit {
     let known = [("Si", 4.0, false), ("Fe", 16.0, true)].map(|(symbol, valence, paw)| {
         let path = format!("/{symbol}.{}", if paw { "xml" } else { "psp8" });
-        let original = Original::pretended(&path, &symbol.to_lowercase());
+        let original = PinnedFile::fake(&path, &symbol.to_lowercase());
         (symbol.parse().unwrap(), Pseudopotential { original, valence, paw })
     });
-    let environment = program::environment(&settings.environment);
+    let environment = version_query::environment(&settings.environment);
     Abinit { settings, environment, version: "9.6.2".into(), pseudopotentials: known.into() }
 }
 
@@ -32,15 +32,15 @@ fn settings() -> Settings {
     Settings { cutoff: 200.0, k_spacing: 1.2, steps: 60, ..Settings::default() }
 }
 
-fn input(settings: Settings, remedies: &[Remedy]) -> String {
-    let remedies = BTreeSet::from_iter(remedies.iter().copied());
-    let input = abinit(settings.clone()).input(&silicon(), &remedies).unwrap();
-    assert_eq!(input, abinit(settings).input(&silicon(), &remedies).unwrap());
+fn input(settings: Settings, adjustments: &[RetryAdjustment]) -> String {
+    let adjustments = BTreeSet::from_iter(adjustments.iter().copied());
+    let input = abinit(settings.clone()).input(&silicon(), &adjustments).unwrap();
+    assert_eq!(input, abinit(settings).input(&silicon(), &adjustments).unwrap());
     assert_eq!(input.command, ["abinit", "run.abi"]);
     String::from_utf8(input.files["run.abi"].clone()).unwrap()
 }
 
-fn parse(structure: &Structure, output: &str) -> Result<Option<Calculated>, Failure> {
+fn parse(structure: &Structure, output: &str) -> Result<Option<Results>, Failure> {
     output::parse(structure, output, "", "9.6.2", Smearing::Gaussian)
 }
 
@@ -64,7 +64,7 @@ fn the_input_is_the_one_that_the_output_is_of() {
 
 #[test]
 fn remedies_change_nothing_that_the_accuracy_depends_on() {
-    let (plain, changed) = (input(settings(), &[]), input(settings(), &Remedy::ALL));
+    let (plain, changed) = (input(settings(), &[]), input(settings(), &RetryAdjustment::ALL));
     let added = ["diemix 0.25\n", "npulayit 15\n", "iscf 17\n", "nline 8\n", "nnsclo 2\n"];
     let mut restored = changed.replace("nstep 180\n", "nstep 60\n").replace("  0 0 0.5\n", "  0 0 1.0\n");
     for keyword in added {

@@ -5,20 +5,20 @@ use std::path::Path;
 use atoms::Structure;
 use atoms::extxyz::{Frame, Reader};
 
-use crate::same::same_structure;
-use crate::{Calculated, Failure, FailureClass, result_file};
+use crate::structure_check::check_same_structure;
+use crate::{Failure, FailureClass, Results, result_file};
 
 /// What the digits allow that ASE writes.
 const TOLERANCE: f64 = 1e-6;
 
 /// The numbers of the file, if it is whole and of this structure.
-pub(super) fn label(structure: &Structure, path: &Path) -> Result<Calculated, Failure> {
+pub(super) fn label(structure: &Structure, path: &Path) -> Result<Results, Failure> {
     let frame = whole_frame(path).map_err(|fault| {
         let name = path.file_name().unwrap_or_default().display();
-        FailureClass::Crashed.because(format!("the command ended with 0, but {name} {fault}"))
+        FailureClass::Crashed.with_message(format!("the command ended with 0, but {name} {fault}"))
     })?;
-    same_structure(structure, &frame.structure, TOLERANCE)?;
-    numbers(frame).map_err(|message| FailureClass::Implausible.because(message))
+    check_same_structure(structure, &frame.structure, TOLERANCE)?;
+    numbers(frame).map_err(|message| FailureClass::Implausible.with_message(message))
 }
 
 /// The one frame of a file; or what is wrong with it.
@@ -36,7 +36,7 @@ fn whole_frame(path: &Path) -> Result<Frame, String> {
     }
 }
 
-fn numbers(mut frame: Frame) -> Result<Calculated, String> {
+fn numbers(mut frame: Frame) -> Result<Results, String> {
     // Names with this prefix would go before the plain ones.
     frame.info.retain(|key, _| !key.starts_with("REF_"));
     frame.arrays.retain(|key, _| !key.starts_with("REF_"));
@@ -58,7 +58,7 @@ fn numbers(mut frame: Frame) -> Result<Calculated, String> {
         }
     };
     let extended = frame.structure.periodic != [false; 3];
-    Ok(Calculated {
+    Ok(Results {
         energy: free.unwrap_or(energy),
         energy_without_smearing: free.map(|_| energy),
         forces,

@@ -23,11 +23,12 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::{self, Enclosed};
+use crate::checks::{at_least, positive};
 use crate::moments::Moments;
-use crate::setting::{at_least, positive};
+use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    Calculated, Code, Exit, Failure, Input, PassedEnvironment, Remedy, SetupError, Size, judge, program,
+    DftBackend, Exit, Failure, Input, PassedEnvironment, Results, RetryAdjustment, SetupError, Size,
+    validation, version_query,
 };
 use data::Kind;
 
@@ -41,7 +42,7 @@ const BOHR: f64 = 0.529_177_208_59;
 const OUTPUT: &str = "run.out";
 
 /// Counts changes of what is written here that change a label's value.
-const RECIPE: u32 = 1;
+const INPUT_VERSION: u32 = 1;
 
 /// Grids of less than this, eV, hold no pseudopotential: the number was meant in Rydberg.
 const LEAST_CUTOFF: f64 = 1000.0;
@@ -116,7 +117,7 @@ impl Settings {
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
         let kinds = data::find(self)?;
-        let environment = program::environment(&self.environment);
+        let environment = version_query::environment(&self.environment);
         let version = version(&self.command, &environment, passed)?;
         Ok(Cp2k { settings: self.clone(), environment, version, kinds })
     }
@@ -128,11 +129,11 @@ fn version(
     environment: &BTreeMap<String, String>,
     passed: &PassedEnvironment,
 ) -> Result<String, SetupError> {
-    let said = program::ask(command, &["--version"], environment, passed, &[])?;
+    let said = version_query::run(command, &["--version"], environment, passed, &[])?;
     let version = said.split("CP2K version ").nth(1).and_then(|rest| rest.split_whitespace().next());
-    version
-        .map(str::to_owned)
-        .ok_or_else(|| program::another(command, "is not CP2K: it does not say its version".into()))
+    version.map(str::to_owned).ok_or_else(|| {
+        version_query::wrong_program(command, "is not CP2K: it does not say its version".into())
+    })
 }
 
 /// CP2K, ready to be used.
@@ -155,7 +156,7 @@ impl Cp2k {
     }
 }
 
-impl Code for Cp2k {
+impl DftBackend for Cp2k {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, String> =
             self.kinds.iter().map(|(species, kind)| (species.symbol(), kind.entries.hash())).collect();
@@ -177,7 +178,7 @@ impl Code for Cp2k {
             vacuum,
         } = &self.settings;
         json!({
-            "code": "cp2k", "version": self.version, "recipe": RECIPE, "functional": "PBE", "basis": basis,
+            "code": "cp2k", "version": self.version, "recipe": INPUT_VERSION, "functional": "PBE", "basis": basis,
             "cutoff": cutoff, "relative_cutoff": relative_cutoff, "k_spacing": k_spacing,
             "smearing": "fermi_dirac", "smearing_width": smearing_width, "spin": spin, "moments": moments,
             "density_tolerance": density_tolerance, "vacuum": vacuum, "pseudopotentials": hashes,
@@ -188,20 +189,24 @@ impl Code for Cp2k {
         species.iter().try_for_each(|species| self.kind(*species).map(|_| ()))
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-        input::write(self, &Enclosed::new(structure, self.settings.vacuum)?, remedies)
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
+        input::write(self, &PaddedStructure::new(structure, self.settings.vacuum)?, adjustments)
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
-        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        match output::read(&enclosed.structure, directory, &self.version)? {
-            Some(calculated) => Ok(enclosed.seen_from_outside(calculated)),
-            None => Err(judge::without_result(exit, directory, &[OUTPUT, "stdout", "stderr"])),
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+        let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
+        match output::read(&padded.structure, directory, &self.version)? {
+            Some(calculated) => Ok(padded.without_padding_stress(calculated)),
+            None => Err(validation::failure_without_result(exit, directory, &[OUTPUT, "stdout", "stderr"])),
         }
     }
 
     fn size(&self, structure: &Structure) -> Size {
         let Settings { vacuum, k_spacing, .. } = self.settings;
-        lattice::size(structure, vacuum, k_spacing, self.electrons(structure))
+        padded_structure::size(structure, vacuum, k_spacing, self.electrons(structure))
     }
 }

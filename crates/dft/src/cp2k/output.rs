@@ -6,8 +6,8 @@ use atoms::cell::{Matrix3, Vec3};
 use atoms::{Cell, Species, Structure, units};
 
 use super::{BOHR, HARTREE, OUTPUT};
-use crate::same::same_structure;
-use crate::{Calculated, Failure, FailureClass, judge};
+use crate::structure_check::check_same_structure;
+use crate::{Failure, FailureClass, Results, validation};
 
 /// Lattice vectors have three decimals, Å, positions six.
 const CELL_DIGITS: f64 = 1e-3;
@@ -20,41 +20,39 @@ pub(super) fn read(
     structure: &Structure,
     directory: &Path,
     version: &str,
-) -> Result<Option<Calculated>, Failure> {
-    let output = judge::left(directory, OUTPUT)?.unwrap_or_default();
+) -> Result<Option<Results>, Failure> {
+    let output = validation::read_output_file(directory, OUTPUT)?.unwrap_or_default();
     parse(structure, &String::from_utf8_lossy(&output), version)
 }
 
 /// As [`read`].
-pub(super) fn parse(
-    structure: &Structure,
-    output: &str,
-    version: &str,
-) -> Result<Option<Calculated>, Failure> {
+pub(super) fn parse(structure: &Structure, output: &str, version: &str) -> Result<Option<Results>, Failure> {
     let calculated_by = stated_version(output);
     if let Some(found) = calculated_by {
-        judge::same_version("CP2K", found, version)?;
+        validation::check_version("CP2K", found, version)?;
     }
     let steps = steps(output);
     // Newer versions abort then.
     if output.contains("SCF run NOT converged") {
-        return Err(FailureClass::NotConverged.because(format!("not in {} electronic steps", steps.len())));
+        return Err(
+            FailureClass::NotConverged.with_message(format!("not in {} electronic steps", steps.len()))
+        );
     }
     if let Some(message) = abort(output) {
-        return Err(FailureClass::Crashed.because(format!("CP2K says: {message}")));
+        return Err(FailureClass::Crashed.with_message(format!("CP2K says: {message}")));
     }
     if !is_whole(output) {
         return Ok(None);
     }
     if !output.contains("*** SCF run converged in") {
-        return Err(FailureClass::NotConverged.because("it does not say that it converged"));
+        return Err(FailureClass::NotConverged.with_message("it does not say that it converged"));
     }
-    let implausible = |message: String| FailureClass::Implausible.because(message);
+    let implausible = |message: String| FailureClass::Implausible.with_message(message);
     let unreadable = || implausible(format!("{OUTPUT} is whole, but its numbers cannot be read"));
     calculated_by.ok_or_else(unreadable)?;
     let (found, volume) = found(output).ok_or_else(unreadable)?;
-    same_structure(structure, &found, CELL_DIGITS)?;
-    same_structure(structure, &Structure { cell: structure.cell, ..found }, POSITION_DIGITS)?;
+    check_same_structure(structure, &found, CELL_DIGITS)?;
+    check_same_structure(structure, &Structure { cell: structure.cell, ..found }, POSITION_DIGITS)?;
     if (volume - structure.cell.volume()).abs() > VOLUME_DIGITS {
         return Err(implausible(format!("the cell has {volume} Å³, not {}", structure.cell.volume())));
     }
@@ -62,7 +60,7 @@ pub(super) fn parse(
         return Err(implausible("the highest orbital is occupied: there are too few orbitals".into()));
     }
     let calculated = numbers(output, steps.len() as u32).ok_or_else(unreadable)?;
-    judge::numbers(&calculated, structure.len())?;
+    validation::check_numbers(&calculated, structure.len())?;
     Ok(Some(calculated))
 }
 
@@ -79,7 +77,7 @@ fn is_whole(output: &str) -> bool {
     output.contains("PROGRAM ENDED AT") && last.contains("PROGRAM STOPPED IN")
 }
 
-fn numbers(output: &str, steps: u32) -> Option<Calculated> {
+fn numbers(output: &str, steps: u32) -> Option<Results> {
     let energy: f64 = word_after(output, "ENERGY| Total FORCE_EVAL ( QS ) energy [a.u.]:")?.parse().ok()?;
     // −TS: the limit of no smearing is in the middle of free and internal energy.
     let entropy: f64 = word_after(output, "Electronic entropic energy:")?.parse().ok()?;
@@ -87,7 +85,7 @@ fn numbers(output: &str, steps: u32) -> Option<Calculated> {
     let forces = forces.lines().skip_while(|line| !line.trim_start().starts_with('#')).skip(1);
     let forces = forces.take_while(|line| !line.trim_start().starts_with("SUM"));
     let moments = moments(output);
-    Some(Calculated {
+    Some(Results {
         energy: energy * HARTREE,
         energy_without_smearing: Some((energy - 0.5 * entropy) * HARTREE),
         forces: forces

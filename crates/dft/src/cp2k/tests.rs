@@ -21,7 +21,7 @@ fn silicon() -> Structure {
 fn cp2k(settings: Settings) -> Cp2k {
     let entries = Entries { potential: "Si GTH-PBE".into(), basis: "Si SZV".into() };
     let kind = Kind { potential: "GTH-PBE".into(), valence: 4.0, entries };
-    let environment = program::environment(&settings.environment);
+    let environment = version_query::environment(&settings.environment);
     let kinds = BTreeMap::from([("Si".parse().unwrap(), kind)]);
     Cp2k { settings, environment, version: "2023.1".into(), kinds }
 }
@@ -38,15 +38,15 @@ fn settings() -> Settings {
     }
 }
 
-fn input(settings: Settings, remedies: &[Remedy]) -> String {
-    let remedies = BTreeSet::from_iter(remedies.iter().copied());
-    let input = cp2k(settings.clone()).input(&silicon(), &remedies).unwrap();
-    assert_eq!(input, cp2k(settings).input(&silicon(), &remedies).unwrap());
+fn input(settings: Settings, adjustments: &[RetryAdjustment]) -> String {
+    let adjustments = BTreeSet::from_iter(adjustments.iter().copied());
+    let input = cp2k(settings.clone()).input(&silicon(), &adjustments).unwrap();
+    assert_eq!(input, cp2k(settings).input(&silicon(), &adjustments).unwrap());
     assert_eq!(input.command, ["cp2k", "-i", "run.inp", "-o", "run.out"]);
     String::from_utf8(input.files["run.inp"].clone()).unwrap()
 }
 
-fn parse(structure: &Structure, output: &str) -> Result<Option<Calculated>, Failure> {
+fn parse(structure: &Structure, output: &str) -> Result<Option<Results>, Failure> {
     output::parse(structure, output, "2023.1")
 }
 
@@ -57,9 +57,9 @@ fn the_input_is_the_one_that_the_output_is_of() {
 
 #[test]
 fn remedies_change_nothing_that_the_accuracy_depends_on() {
-    let slower = input(settings(), &[Remedy::SlowerMixing]);
+    let slower = input(settings(), &[RetryAdjustment::SlowerMixing]);
     assert_eq!(slower.replace("ALPHA 0.2", "ALPHA 0.4"), INPUT);
-    let changed = input(settings(), &Remedy::ALL);
+    let changed = input(settings(), &RetryAdjustment::ALL);
     let restored = changed
         .replace("MAX_SCF 600", "MAX_SCF 200")
         .replace("ALPHA 0.2", "ALPHA 0.4")

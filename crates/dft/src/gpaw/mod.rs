@@ -22,12 +22,12 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::{self, Enclosed};
+use crate::checks::{at_least, positive};
 use crate::moments::Moments;
-use crate::setting::{at_least, positive};
+use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    Calculated, Code, Exit, Failure, Input, PassedEnvironment, Remedy, SetupError, Size, Smearing, judge,
-    program, script_result,
+    DftBackend, Exit, Failure, Input, PassedEnvironment, Results, RetryAdjustment, SetupError, Size,
+    Smearing, script_output, validation, version_query,
 };
 use setups::Setup;
 
@@ -35,7 +35,7 @@ use setups::Setup;
 pub const SCRIPT: &str = concat!(include_str!("../script.py"), include_str!("job.py"));
 
 /// Counts changes of what is written here that change a label's value.
-const RECIPE: u32 = 1;
+const INPUT_VERSION: u32 = 1;
 
 /// `[label.method.gpaw]`
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -106,13 +106,13 @@ impl Settings {
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
         let environment = self.environment();
-        let who = Who::ask(&self.command, &environment, passed)?;
+        let who = Versions::ask(&self.command, &environment, passed)?;
         let setups = setups::find(&who.setup_paths, &self.variants)?;
         Ok(Gpaw { settings: self.clone(), environment, who, setups })
     }
 
     fn environment(&self) -> BTreeMap<String, String> {
-        let mut environment = program::environment(&self.environment);
+        let mut environment = version_query::environment(&self.environment);
         if let Some(directory) = &self.pseudopotentials {
             environment.insert("GPAW_SETUP_PATH".into(), directory.to_string_lossy().into_owned());
         }
@@ -122,23 +122,23 @@ impl Settings {
 
 /// What GPAW says of itself.
 #[derive(Clone, Debug, Deserialize)]
-struct Who {
+struct Versions {
     gpaw: String,
     ase: String,
     setup_paths: Vec<PathBuf>,
 }
 
-impl Who {
+impl Versions {
     fn ask(
         command: &[String],
         environment: &BTreeMap<String, String>,
         passed: &PassedEnvironment,
     ) -> Result<Self, SetupError> {
         let files = [(input::SCRIPT_FILE, SCRIPT.as_bytes())];
-        let said = program::ask(command, &[input::SCRIPT_FILE], environment, passed, &files)?;
+        let said = version_query::run(command, &[input::SCRIPT_FILE], environment, passed, &files)?;
         said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
             let reason = format!("is no Python with GPAW: it does not say its version but {:?}", said.trim());
-            program::another(command, reason)
+            version_query::wrong_program(command, reason)
         })
     }
 }
@@ -148,7 +148,7 @@ impl Who {
 pub struct Gpaw {
     settings: Settings,
     environment: BTreeMap<String, String>,
-    who: Who,
+    who: Versions,
     setups: BTreeMap<Species, Setup>,
 }
 
@@ -170,7 +170,7 @@ impl Gpaw {
     }
 }
 
-impl Code for Gpaw {
+impl DftBackend for Gpaw {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, &str> =
             self.setups.iter().map(|(species, setup)| (species.symbol(), setup.original.hash())).collect();
@@ -192,7 +192,7 @@ impl Code for Gpaw {
             vacuum,
         } = &self.settings;
         json!({
-            "code": "gpaw", "version": self.who.gpaw, "ase": self.who.ase, "recipe": RECIPE, "functional": "PBE",
+            "code": "gpaw", "version": self.who.gpaw, "ase": self.who.ase, "recipe": INPUT_VERSION, "functional": "PBE",
             "cutoff": cutoff, "k_spacing": k_spacing, "smearing": smearing, "smearing_width": smearing_width,
             "spin": spin, "moments": moments, "energy_tolerance": energy_tolerance,
             "force_tolerance": force_tolerance, "vacuum": vacuum, "pseudopotentials": hashes,
@@ -214,21 +214,25 @@ impl Code for Gpaw {
         Ok(())
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-        input::write(self, &Enclosed::new(structure, self.settings.vacuum)?, remedies)
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
+        input::write(self, &PaddedStructure::new(structure, self.settings.vacuum)?, adjustments)
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
-        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+        let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
         let by = [("gpaw", self.who.gpaw.as_str()), ("ase", self.who.ase.as_str())];
-        match script_result::read(&enclosed.structure, directory, &by)? {
-            Some(calculated) => Ok(enclosed.seen_from_outside(calculated)),
-            None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+        match script_output::read(&padded.structure, directory, &by)? {
+            Some(calculated) => Ok(padded.without_padding_stress(calculated)),
+            None => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),
         }
     }
 
     fn size(&self, structure: &Structure) -> Size {
         let Settings { vacuum, k_spacing, .. } = self.settings;
-        lattice::size(structure, vacuum, k_spacing, self.electrons(structure))
+        padded_structure::size(structure, vacuum, k_spacing, self.electrons(structure))
     }
 }

@@ -5,13 +5,13 @@ use std::path::PathBuf;
 
 use atoms::Species;
 
-use crate::{Original, SetupError, paw};
+use crate::{PinnedFile, SetupError, paw};
 
 /// What is known of a setup.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Setup {
     /// Its file.
-    pub original: Original,
+    pub original: PinnedFile,
     /// Electrons that it treats.
     pub valence: f64,
 }
@@ -66,7 +66,7 @@ pub(super) fn name(species: Species, variants: &BTreeMap<Species, String>) -> St
 }
 
 fn read(species: Species, path: PathBuf) -> Result<Setup, String> {
-    let (original, content) = Original::hashed(path).map_err(|error| format!("cannot be read: {error}"))?;
+    let (original, content) = PinnedFile::open(path).map_err(|error| format!("cannot be read: {error}"))?;
     Ok(Setup { original, valence: paw::valence(&content, species)? })
 }
 

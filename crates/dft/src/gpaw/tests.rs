@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::*;
-use crate::{FailureClass, Original};
+use crate::{FailureClass, PinnedFile};
 
 const RESULT: &[u8] = include_bytes!("../../tests/data/gpaw/result.json");
 
@@ -20,14 +20,14 @@ fn silicon() -> Structure {
 }
 
 fn gpaw(settings: Settings) -> Gpaw {
-    let who = Who { gpaw: "22.8.0".into(), ase: "3.22.1".into(), setup_paths: vec!["/setups".into()] };
-    let setup = Setup { original: Original::pretended("/setups/Si.PBE", "abc"), valence: 4.0 };
+    let who = Versions { gpaw: "22.8.0".into(), ase: "3.22.1".into(), setup_paths: vec!["/setups".into()] };
+    let setup = Setup { original: PinnedFile::fake("/setups/Si.PBE", "abc"), valence: 4.0 };
     let setups = BTreeMap::from([("Si".parse().unwrap(), setup)]);
     Gpaw { environment: settings.environment(), settings, who, setups }
 }
 
-fn task(code: &Gpaw, remedies: &[Remedy]) -> Value {
-    let input = code.input(&silicon(), &BTreeSet::from_iter(remedies.iter().copied())).unwrap();
+fn task(code: &Gpaw, adjustments: &[RetryAdjustment]) -> Value {
+    let input = code.input(&silicon(), &BTreeSet::from_iter(adjustments.iter().copied())).unwrap();
     serde_json::from_slice(&input.files["input.json"]).unwrap()
 }
 
@@ -38,7 +38,7 @@ fn left(result: &[u8]) -> tempfile::TempDir {
     directory
 }
 
-fn read(structure: &Structure, result: &[u8]) -> Result<Calculated, Failure> {
+fn read(structure: &Structure, result: &[u8]) -> Result<Results, Failure> {
     gpaw(Settings::default()).read(structure, left(result).path(), Exit::Code(0))
 }
 
@@ -65,7 +65,7 @@ fn the_protocol_of_the_paper_is_written() {
 #[test]
 fn remedies_change_nothing_that_the_accuracy_depends_on() {
     let code = gpaw(Settings::default());
-    let (plain, mut changed) = (task(&code, &[]), task(&code, &Remedy::ALL));
+    let (plain, mut changed) = (task(&code, &[]), task(&code, &RetryAdjustment::ALL));
     assert_ne!(plain, changed);
     assert_eq!(changed["moments"], json!([0.5, 0.5]));
     changed["moments"] = plain["moments"].clone();

@@ -7,8 +7,8 @@ use atoms::Structure;
 use super::outcar::Outcar;
 use super::output::Output;
 use super::vasprun;
-use crate::same::same_structure;
-use crate::{Calculated, Exit, Failure, FailureClass, judge, result_file};
+use crate::structure_check::check_same_structure;
+use crate::{Exit, Failure, FailureClass, Results, result_file, validation};
 
 /// Reads the calculation of `structure`, whose atoms stand in the files in the order `order`, by VASP of this version.
 pub(super) fn read(
@@ -17,11 +17,11 @@ pub(super) fn read(
     version: &str,
     directory: &Path,
     exit: Exit,
-) -> Result<Calculated, Failure> {
+) -> Result<Results, Failure> {
     let outcar = match result_file::pieces(&directory.join("OUTCAR"), b'\n') {
         Ok(file) => Outcar::read(file),
         Err(error) if error.is_missing() => Outcar::default(),
-        Err(error) => return Err(judge::unreadable("OUTCAR", &error)),
+        Err(error) => return Err(validation::unreadable("OUTCAR", &error)),
     };
     let magnetism = (outcar.moments.clone(), outcar.magnetisation);
     let denied = outcar.denies_convergence();
@@ -37,18 +37,20 @@ pub(super) fn read(
     };
     check(&output, &in_file_order, version)?;
     if denied {
-        return Err(FailureClass::NotConverged.because("OUTCAR does not say that EDIFF was reached"));
+        return Err(FailureClass::NotConverged.with_message("OUTCAR does not say that EDIFF was reached"));
     }
-    let calculated = Calculated {
+    let calculated = Results {
         energy: output.energy,
         energy_without_smearing: Some(output.energy_without_smearing),
-        forces: back(&output.forces, order),
+        forces: restore_order(&output.forces, order),
         stress: output.stress,
-        magnetic_moments: Some(magnetism.0).filter(|m| m.len() == order.len()).map(|m| back(&m, order)),
+        magnetic_moments: Some(magnetism.0)
+            .filter(|m| m.len() == order.len())
+            .map(|m| restore_order(&m, order)),
         magnetisation: magnetism.1,
         electronic_steps: Some(output.steps),
     };
-    judge::numbers(&calculated, structure.len())?;
+    validation::check_numbers(&calculated, structure.len())?;
     Ok(calculated)
 }
 
@@ -58,21 +60,21 @@ fn check(output: &Output, asked: &Structure, version: &str) -> Result<(), Failur
         let found = &output.version;
         let message =
             format!("calculated by VASP {found}, but `version` says {version}: correct one of them");
-        return Err(FailureClass::OtherProgram.because(message));
+        return Err(FailureClass::OtherProgram.with_message(message));
     }
     if output.steps >= output.most_steps {
         let message = format!("the electrons did not converge in {} steps", output.steps);
-        return Err(FailureClass::NotConverged.because(message));
+        return Err(FailureClass::NotConverged.with_message(message));
     }
     if output.ionic_steps != 1 {
         let message = format!("found {} ionic steps, expected one", output.ionic_steps);
-        return Err(FailureClass::Implausible.because(message));
+        return Err(FailureClass::Implausible.with_message(message));
     }
     if output.forces.len() != asked.len() {
         let message = format!("found {} forces, expected {}", output.forces.len(), asked.len());
-        return Err(FailureClass::Implausible.because(message));
+        return Err(FailureClass::Implausible.with_message(message));
     }
-    same_structure(asked, &output.structure, output.resolution)
+    check_same_structure(asked, &output.structure, output.resolution)
 }
 
 /// Whether `5.4.4.18Apr17` is 5.4.4, and 5.4.40 is not.
@@ -81,7 +83,7 @@ fn is_version(found: &str, expected: &str) -> bool {
 }
 
 /// Values in the order of the structure from values in that of the files. Each atom stands in `order` once.
-fn back<T: Copy + Default>(values: &[T], order: &[usize]) -> Vec<T> {
+fn restore_order<T: Copy + Default>(values: &[T], order: &[usize]) -> Vec<T> {
     let mut sorted = vec![T::default(); values.len()];
     for (value, atom) in values.iter().zip(order) {
         sorted[*atom] = *value;
@@ -90,7 +92,7 @@ fn back<T: Copy + Default>(values: &[T], order: &[usize]) -> Vec<T> {
 }
 
 /// What VASP says before it gives up, and what that means. Where its way to the ground state broke down, another may not.
-const LAST_WORDS: [(&str, FailureClass); 9] = [
+const ERROR_MESSAGES: [(&str, FailureClass); 9] = [
     ("BRMIX: very serious problems", FailureClass::NotConverged),
     ("EDDDAV: Call to ZHEGV failed", FailureClass::NotConverged),
     ("Error EDDDAV", FailureClass::NotConverged),
@@ -106,11 +108,11 @@ const LAST_WORDS: [(&str, FailureClass); 9] = [
 fn without_output(exit: Exit, directory: &Path, xml: &str, outcar: &str) -> Failure {
     let from_outside = matches!(exit, Exit::TimeLimit | Exit::OutOfMemory | Exit::LostNode);
     let said = if from_outside { String::new() } else { end_of(&directory.join("stdout")) };
-    if let Some((words, class)) = LAST_WORDS.iter().find(|(words, _)| said.contains(words)) {
-        return class.because(format!("VASP gave up: {words}"));
+    if let Some((words, class)) = ERROR_MESSAGES.iter().find(|(words, _)| said.contains(words)) {
+        return class.with_message(format!("VASP gave up: {words}"));
     }
-    let failure = judge::without_result(exit, directory, &["stdout", "stderr"]);
-    failure.class.because(format!("{}; vasprun.xml {xml}; OUTCAR {outcar}", failure.message))
+    let failure = validation::failure_without_result(exit, directory, &["stdout", "stderr"]);
+    failure.class.with_message(format!("{}; vasprun.xml {xml}; OUTCAR {outcar}", failure.message))
 }
 
 /// The last part of a file; empty if there is none.
@@ -136,7 +138,7 @@ mod tests {
 
     #[test]
     fn values_go_back_to_their_atoms() {
-        assert_eq!(back(&['a', 'c', 'b'], &[0, 2, 1]), ['a', 'b', 'c']);
-        assert_eq!(back(&[10, 12, 11, 13], &[2, 0, 3, 1]), [12, 13, 10, 11]);
+        assert_eq!(restore_order(&['a', 'c', 'b'], &[0, 2, 1]), ['a', 'b', 'c']);
+        assert_eq!(restore_order(&[10, 12, 11, 13], &[2, 0, 3, 1]), [12, 13, 10, 11]);
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use dft::abinit::Settings;
-use dft::{Code, FailureClass, PassedEnvironment, Remedy, Smearing};
+use dft::{DftBackend, FailureClass, PassedEnvironment, RetryAdjustment, Smearing};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
@@ -49,7 +49,7 @@ fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();
     assert_eq!(few.identity(), enough.identity());
     // Whatever the remedies, the energy is the same.
-    let every = attempt(&enough, &structures::silicon(), &Remedy::ALL.into()).unwrap();
+    let every = attempt(&enough, &structures::silicon(), &RetryAdjustment::ALL.into()).unwrap();
     for other in [label(&enough, &structures::silicon()), every] {
         assert!((calculated.energy - other.energy).abs() < 1e-5, "{calculated:?} {other:?}");
     }

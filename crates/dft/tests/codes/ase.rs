@@ -8,7 +8,7 @@ use std::process::Command;
 use atoms::cell::{Vec3, add};
 use atoms::{Cell, Structure};
 use dft::ase::{Ase, Settings};
-use dft::{Calculated, Code, Exit, Failure, FailureClass, PassedEnvironment, Remedy, SetupError};
+use dft::{DftBackend, Exit, Failure, FailureClass, PassedEnvironment, Results, RetryAdjustment, SetupError};
 use tempfile::TempDir;
 
 fn python() -> String {
@@ -26,9 +26,13 @@ fn prepared(calculator: &str) -> Ase {
 }
 
 /// Writes the input, runs the script, reads what it left.
-fn run(code: &dyn Code, structure: &Structure, remedies: &[Remedy]) -> Result<Calculated, Failure> {
+fn run(
+    code: &dyn DftBackend,
+    structure: &Structure,
+    adjustments: &[RetryAdjustment],
+) -> Result<Results, Failure> {
     let place = TempDir::new().unwrap();
-    let input = code.input(structure, &remedies.iter().copied().collect::<BTreeSet<_>>())?;
+    let input = code.input(structure, &adjustments.iter().copied().collect::<BTreeSet<_>>())?;
     for (name, content) in &input.files {
         std::fs::write(place.path().join(name), content).unwrap();
     }
@@ -108,7 +112,7 @@ fn a_command_that_uses_ase_gives_the_same_but_for_the_digits_of_its_file() {
     };
     let found = run(&settings.prepare(&PassedEnvironment::default()).unwrap(), &alloy(), &[]).unwrap();
     let expected = run(&prepared(EMT), &alloy(), &[]).unwrap();
-    let numbers = |label: &Calculated| {
+    let numbers = |label: &Results| {
         let energies = [label.energy, label.energy_without_smearing.unwrap()];
         [energies.as_slice(), &label.forces.concat(), &label.stress.unwrap().concat()].concat()
     };
@@ -190,7 +194,7 @@ fn what_goes_wrong_is_told() {
 #[test]
 fn remedies_and_moments_reach_the_calculator() {
     let text = format!(
-        "{EMT}def calculator(remedies):\n    assert remedies == {{'more_steps', 'other_moments'}}, remedies\n    return C()\n\
+        "{EMT}def calculator(adjustments):\n    assert adjustments == {{'more_steps', 'other_moments'}}, adjustments\n    return C()\n\
          class C(EMT):\n    def calculate(self, atoms, *a):\n        super().calculate(atoms, *a)\n        \
          self.results['magmoms'] = atoms.get_initial_magnetic_moments()\n        self.results['magmom'] = 4.5\n"
     );
@@ -198,7 +202,7 @@ fn remedies_and_moments_reach_the_calculator() {
     let mut settings = settings(&place, &text);
     settings.moments = [("Cu".parse().unwrap(), 3.0)].into();
     let code = settings.prepare(&PassedEnvironment::default()).unwrap();
-    let found = run(&code, &alloy(), &[Remedy::OtherMoments, Remedy::MoreSteps]).unwrap();
+    let found = run(&code, &alloy(), &[RetryAdjustment::OtherMoments, RetryAdjustment::MoreSteps]).unwrap();
     assert_eq!(found.magnetic_moments, Some(vec![0.5, 1.5, 0.5, 1.5, 0.5, 0.5, 1.5, 0.5]));
     assert_eq!(found.magnetisation, Some(4.5));
     assert!(run(&code, &alloy(), &[]).is_err());
@@ -241,9 +245,9 @@ fn what_is_missing_is_found_before_anything_is_calculated() {
 
 /// Plane waves for silicon, as few as there can be; with few steps at first.
 const GPAW: &str = "from gpaw import GPAW, PW\nimport gpaw\nversion = 'GPAW ' + gpaw.__version__\n\
-                    def calculator(remedies):\n    return GPAW(mode=PW(200), xc='PBE', kpts={'size': (2, 2, 2), 'gamma': True},\n        \
+                    def calculator(adjustments):\n    return GPAW(mode=PW(200), xc='PBE', kpts={'size': (2, 2, 2), 'gamma': True},\n        \
                     occupations={'name': 'fermi-dirac', 'width': 0.1}, convergence={'energy': 1e-7, 'density': 1e-6},\n        \
-                    symmetry={'point_group': False}, maxiter=60 if 'more_steps' in remedies else 3, txt='-')\n";
+                    symmetry={'point_group': False}, maxiter=60 if 'more_steps' in adjustments else 3, txt='-')\n";
 
 fn silicon() -> Structure {
     Structure {
@@ -259,7 +263,7 @@ fn gpaw_converges_with_more_steps_and_its_forces_are_derivatives_of_its_free_ene
     let code = prepared(GPAW);
     assert!(code.identity()["version"].as_str().unwrap().starts_with("GPAW "));
     assert_eq!(run(&code, &silicon(), &[]).unwrap_err().class, FailureClass::NotConverged);
-    let calculate = |structure: &Structure| run(&code, structure, &[Remedy::MoreSteps]).unwrap();
+    let calculate = |structure: &Structure| run(&code, structure, &[RetryAdjustment::MoreSteps]).unwrap();
     let found = calculate(&silicon());
     assert_ne!(Some(found.energy), found.energy_without_smearing);
     assert!(found.electronic_steps.is_some_and(|steps| steps > 3), "{found:?}");

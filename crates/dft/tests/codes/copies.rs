@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use dft::{Code, PassedEnvironment, abinit, cp2k, gpaw};
+use dft::{DftBackend, PassedEnvironment, abinit, cp2k, gpaw};
 use tempfile::TempDir;
 
 use crate::run::{calculate, label, prepared};
@@ -19,7 +19,7 @@ fn copies(from: &str, names: &[&str]) -> TempDir {
 }
 
 /// Compares a label of silicon, whose data is gone when the program begins, with one whose data stays.
-fn needs_no_files(code: &dyn Code, data: TempDir) {
+fn needs_no_files(code: &dyn DftBackend, data: TempDir) {
     let (structure, place) = (structures::silicon(), TempDir::new().unwrap());
     let expected = label(code, &structure);
     let input = prepared(code, &structure, &BTreeSet::new(), place.path()).unwrap();

@@ -1,7 +1,7 @@
 //! CP2K. Coarse grids and the smallest basis, with which it stays itself.
 
 use dft::cp2k::Settings;
-use dft::{Code, FailureClass, PassedEnvironment, Remedy};
+use dft::{DftBackend, FailureClass, PassedEnvironment, RetryAdjustment};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
@@ -47,7 +47,7 @@ fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();
     assert_eq!(few.identity(), enough.identity());
     // Whatever the remedies, the energy is the same.
-    let every = attempt(&enough, &structures::oxygen(), &Remedy::ALL.into()).unwrap();
+    let every = attempt(&enough, &structures::oxygen(), &RetryAdjustment::ALL.into()).unwrap();
     for other in [label(&enough, &structures::oxygen()), every] {
         assert!((calculated.energy - other.energy).abs() < 1e-4, "{calculated:?} {other:?}");
     }

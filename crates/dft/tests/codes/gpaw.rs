@@ -1,7 +1,7 @@
 //! GPAW. Real-space grids for densities make an egg-box of some 1e-4 eV/Å.
 
 use dft::gpaw::Settings;
-use dft::{Code, FailureClass, PassedEnvironment, Remedy};
+use dft::{DftBackend, FailureClass, PassedEnvironment, RetryAdjustment};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
@@ -52,7 +52,7 @@ fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();
     assert_eq!(few.identity(), enough.identity());
     // Whatever the remedies, the energy is the same.
-    let every = attempt(&enough, &structures::silicon(), &Remedy::ALL.into()).unwrap();
+    let every = attempt(&enough, &structures::silicon(), &RetryAdjustment::ALL.into()).unwrap();
     for other in [label(&enough, &structures::silicon()), every] {
         assert!((calculated.energy - other.energy).abs() < 1e-5, "{calculated:?} {other:?}");
     }

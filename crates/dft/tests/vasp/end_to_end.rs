@@ -6,17 +6,17 @@ use std::path::Path;
 use std::process::Command;
 
 use atoms::{Cell, Structure, read_poscar};
-use dft::{Code, Exit, FailureClass, Input, Remedy};
+use dft::{DftBackend, Exit, FailureClass, Input, RetryAdjustment};
 use tempfile::TempDir;
 
 use super::{alumina, assert_close, data, expected, settings, text};
 
-fn input(structure: &Structure, remedies: &[Remedy]) -> Input {
+fn input(structure: &Structure, adjustments: &[RetryAdjustment]) -> Input {
     let directory = TempDir::new().unwrap();
     let mut settings = settings(directory.path(), "5.4.4", &["Al", "O"]);
     settings.moments = [("O".parse().unwrap(), 0.25)].into();
     let code = settings.prepare().unwrap();
-    code.input(structure, &BTreeSet::from_iter(remedies.iter().copied())).unwrap()
+    code.input(structure, &BTreeSet::from_iter(adjustments.iter().copied())).unwrap()
 }
 
 fn file(input: &Input, name: &str) -> String {
@@ -98,7 +98,7 @@ fn a_left_handed_cell_is_turned_and_its_numbers_are_the_same() {
 
 #[test]
 fn remedies_leave_all_files_but_incar_alone() {
-    let (plain, mut remedied) = (input(&alumina(), &[]), input(&alumina(), &Remedy::ALL));
+    let (plain, mut remedied) = (input(&alumina(), &[]), input(&alumina(), &RetryAdjustment::ALL));
     let incar = file(&remedied, "INCAR");
     assert!(incar.contains("\nMAGMOM = 2*0.5 1*0.125\n"), "{incar}");
     assert!(incar.contains("\nNELM = 300\nALGO = All\n"), "{incar}");

@@ -9,7 +9,7 @@ use std::sync::LazyLock;
 
 use atoms::{Cell, Structure};
 use dft::vasp::{Settings, Vasp};
-use dft::{Calculated, Code, Exit, Failure};
+use dft::{DftBackend, Exit, Failure, Results};
 use tempfile::TempDir;
 
 fn data(name: &str) -> PathBuf {
@@ -33,9 +33,9 @@ fn alumina() -> Structure {
 }
 
 /// The numbers of `tests/data/vasp`, as it was written.
-fn expected() -> Calculated {
+fn expected() -> Results {
     let kilobar = [[-120.5, 3.25, -7.125], [3.25, 80.0, 12.5], [-7.125, 12.5, -12345.678]];
-    Calculated {
+    Results {
         energy: -24.30612345,
         energy_without_smearing: Some(-24.20612345),
         forces: vec![[0.12345678, -0.2, 0.03], [0.37654322, -0.05, -1.78], [-0.5, 0.25, 1.75]],
@@ -47,8 +47,8 @@ fn expected() -> Calculated {
 }
 
 #[track_caller]
-fn assert_close(found: &Calculated, expected: &Calculated, tolerance: f64) {
-    let numbers = |calculated: &Calculated| {
+fn assert_close(found: &Results, expected: &Results, tolerance: f64) {
+    let numbers = |calculated: &Results| {
         let mut numbers = calculated.forces.concat();
         numbers.extend(calculated.stress.iter().flatten().flatten());
         numbers.extend(calculated.magnetic_moments.iter().flatten());
@@ -89,7 +89,7 @@ fn settings(directory: &Path, version: &str, elements: &[&str]) -> Settings {
 }
 
 /// Judges these files as the calculation of [`alumina`].
-fn read(files: &[(&str, &[u8])], exit: Exit) -> Result<Calculated, Failure> {
+fn read(files: &[(&str, &[u8])], exit: Exit) -> Result<Results, Failure> {
     let directory = TempDir::new().unwrap();
     for (name, content) in files {
         std::fs::write(directory.path().join(name), content).unwrap();

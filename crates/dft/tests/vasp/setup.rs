@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use dft::vasp::Settings;
-use dft::{Code, SetupError};
+use dft::{DftBackend, SetupError};
 use tempfile::TempDir;
 
 use super::{alumina, potcar, settings};
@@ -46,7 +46,7 @@ fn the_identity_holds_what_changes_a_label() {
 fn calculations_read_the_potentials_that_were_hashed() {
     let home = TempDir::new().unwrap();
     let settings = settings(home.path(), "5.4.4", &["Al", "O"]);
-    let potcar_of = |code: &dyn Code| {
+    let potcar_of = |code: &dyn DftBackend| {
         let files = code.input(&alumina(), &BTreeSet::new()).unwrap().files;
         String::from_utf8(files["POTCAR"].clone()).unwrap()
     };

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use atoms::{Cell, Evaluation, NeighbourList, Potential, Structure};
-use calm::{Artifact, GradesInParts, Mixture};
+use calm::{Artifact, BatchedGrades, Mixture};
 use potentials::grace::{Grace, GraceModel, Instructions, Precision, PullBack, RadialPath, Threads};
 
 /// A model, and how gracemaker gets one like it.
@@ -82,7 +82,7 @@ pub struct Case {
     neighbours: NeighbourList,
     elements: Vec<usize>,
     mixture: Mixture,
-    grades: GradesInParts,
+    grades: BatchedGrades,
     pull_back: PullBack,
     out: Evaluation,
 }
@@ -108,7 +108,7 @@ impl Case {
             neighbours,
             elements,
             mixture,
-            grades: GradesInParts::default(),
+            grades: BatchedGrades::default(),
             pull_back: PullBack::default(),
             out: Evaluation::default(),
         }
@@ -168,7 +168,7 @@ impl Case {
         let within = |i: usize| {
             let d = |n: &atoms::Neighbour| n.displacement(&self.structure, i);
             self.neighbours
-                .of(i)
+                .neighbours_of(i)
                 .iter()
                 .filter(|n| d(n).iter().map(|x| x * x).sum::<f64>() < cutoff * cutoff)
                 .count()

@@ -6,19 +6,19 @@ use atoms::Vec3;
 
 use super::batches::Placed;
 use super::bonds::BondWork;
+use super::chunked_slices::ChunkedSlice;
 use super::instructions::{Instructions, Pass};
-use super::layer_work::{
-    BackwardWork, Cotangents, Here, Traced, TracedBonds, backward_bonds, backward_tape, forward,
+use super::layer_passes::{
+    BackwardWork, Cotangents, LayerInput, Traced, TracedBonds, backward_bonds, backward_tape, forward,
 };
 use super::messages::Returns;
-use super::parts::Parts;
 use super::projection::{FeatureMap, Projected};
 use super::readout::{Readout, ReadoutWork};
 use super::vector::Vector;
 
 /// A batch forwards through one layer.
 pub(super) struct Forward<'a, 'b, V: Vector> {
-    pub here: Here<'a, V>,
+    pub here: LayerInput<'a, V>,
     pub placed: Placed,
     pub trace: &'a mut Traced<'b, V>,
     /// Where the tape goes to, and work arrays.
@@ -58,12 +58,12 @@ impl<'b, V: Vector, B: Fn(usize) -> &'b [V]> Pass for Energies<'_, V, B> {
 
 /// A batch backwards through one layer, with `N` cotangents.
 pub(super) struct Backward<'a, 'b, 'c, V: Vector, const N: usize> {
-    pub here: Here<'a, V>,
+    pub here: LayerInput<'a, V>,
     pub placed: Placed,
     pub tape: &'a [V],
     pub bonds: &'a mut TracedBonds<'b, V>,
     pub from: Cotangents<'a, V>,
-    pub to: &'a mut [Parts<'c, Vec3>; 2],
+    pub to: &'a mut [ChunkedSlice<'c, Vec3>; 2],
     pub returns: Option<&'a mut Returns<V>>,
     pub work: (&'a mut BackwardWork<V>, &'a mut BondWork<V>),
 }

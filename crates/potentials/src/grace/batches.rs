@@ -6,17 +6,17 @@ use super::instructions::Instructions;
 use super::tape::Batch;
 
 /// Most atoms of a batch.
-const MOST: usize = 16;
+const MAX_BATCH_ATOMS: usize = 16;
 
 /// What the tape of a batch and that of one cotangent may take in memory, bytes: about the second cache.
 const TAPE_BYTES: usize = 1 << 20;
 
 /// Places that a thread takes at once, about: enough for the projection to be read seldom, few enough for their tapes to stay in
 /// the third cache.
-const CHUNK: usize = 64;
+const CHUNK_ATOMS: usize = 64;
 
 /// Chunks of a small structure, so that two threads have something to do.
-const FEWEST_CHUNKS: usize = 2;
+const MIN_CHUNKS: usize = 2;
 
 /// Batches behind one another that one thread evaluates.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -43,7 +43,7 @@ pub(super) struct Batches {
 impl Batches {
     /// For atoms of the elements given, each of which takes so many bytes of tape.
     pub fn update(&mut self, elements: &[usize], tape_bytes: usize) {
-        let size = (TAPE_BYTES / tape_bytes.max(1)).clamp(1, MOST);
+        let size = (TAPE_BYTES / tape_bytes.max(1)).clamp(1, MAX_BATCH_ATOMS);
         self.order.clear();
         self.order.extend(0..elements.len() as u32);
         self.order.sort_unstable_by_key(|atom| (elements[*atom as usize], *atom));
@@ -65,7 +65,7 @@ impl Batches {
     fn divide(&mut self) {
         self.chunks.clear();
         let n = self.order.len();
-        let chunks = n.div_ceil(CHUNK).max(FEWEST_CHUNKS);
+        let chunks = n.div_ceil(CHUNK_ATOMS).max(MIN_CHUNKS);
         let (mut first, mut start) = (0, 0);
         for (k, (places, _)) in self.batches.iter().enumerate() {
             if places.end * chunks >= n * (self.chunks.len() + 1) {
@@ -115,7 +115,10 @@ mod tests {
             let mut end = 0;
             for (places, element) in &batches.batches {
                 assert_eq!(places.start, end);
-                assert!(places.len() * tape_bytes <= TAPE_BYTES.max(tape_bytes) && places.len() <= MOST);
+                assert!(
+                    places.len() * tape_bytes <= TAPE_BYTES.max(tape_bytes)
+                        && places.len() <= MAX_BATCH_ATOMS
+                );
                 assert!(
                     batches.order[places.clone()].iter().all(|atom| elements[*atom as usize] == *element)
                 );

@@ -6,8 +6,8 @@
 use atoms::{Matrix3, NeighbourList, Structure, Vec3};
 
 use super::batches::Batches;
+use super::chunked_slices::{ChunkedSlice, Layout, PerChunk};
 use super::layer::Layer;
-use super::parts::{Layout, OfChunks, Parts};
 use super::radial_network::RadialWork;
 use super::tape::Slot;
 use super::threads::Threads;
@@ -59,8 +59,8 @@ impl Bonds {
         offsets.clear();
         offsets.resize(n + 1, 0);
         found.resize_with(batches.chunks.len().max(found.len()), Vec::new);
-        let counts = Parts::new(Layout::Even(1), 0, &mut offsets[1..]);
-        let work = (counts, OfChunks::within(&batches.chunks, found));
+        let counts = ChunkedSlice::new(Layout::Even(1), 0, &mut offsets[1..]);
+        let work = (counts, PerChunk::within(&batches.chunks, found));
         threads.each(&batches.chunks, work, &|chunk, (mut counts, mut found), _| {
             let Some(found) = found.only() else { return };
             found.clear();
@@ -68,7 +68,7 @@ impl Bonds {
                 let before = found.len();
                 let atom = batches.order[place] as usize;
                 found.extend(bonds_of(atom, layer, structure, neighbours, elements, batches));
-                counts.of(&(place..place + 1))[0] = found.len() - before;
+                counts.slice(&(place..place + 1))[0] = found.len() - before;
             }
         });
         block_offsets.clear();
@@ -78,9 +78,9 @@ impl Bonds {
             offsets[place + 1] += offsets[place];
         }
         bonds.resize(offsets[n], Bond { neighbour: 0, element: 0, d: [0.0; 3], r: 0.0 });
-        let all = Parts::new(Layout::Ragged(offsets, 1), 0, &mut bonds[..]);
+        let all = ChunkedSlice::new(Layout::Ragged(offsets, 1), 0, &mut bonds[..]);
         threads.each(&batches.chunks, all, &|chunk, mut all, _| {
-            all.of(&chunk.places).copy_from_slice(&found[chunk.number]);
+            all.slice(&chunk.places).copy_from_slice(&found[chunk.number]);
         });
         self.find_incoming();
     }
@@ -145,7 +145,7 @@ fn bonds_of<V: Vector>(
     elements: &[usize],
     batches: &Batches,
 ) -> impl Iterator<Item = Bond> {
-    neighbours.of(atom).iter().filter_map(move |neighbour| {
+    neighbours.neighbours_of(atom).iter().filter_map(move |neighbour| {
         let j = neighbour.atom as usize;
         let d = neighbour.displacement(structure, atom);
         let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + SQUARE_FLOOR).sqrt();

@@ -6,11 +6,11 @@ use atoms::{Evaluation, Matrix3, NeighbourList, PotentialError, Structure, Vec3}
 
 use super::batches::Batches;
 use super::instructions::Instructions;
-use super::layer_work::LayerWork;
+use super::layer_passes::LayerState;
 use super::model::GraceModel;
 use super::network::Network;
-use super::passes::Scratch;
 use super::projection::ProjectionWork;
+use super::sweeps::Scratch;
 use super::threads::Threads;
 use super::vector::Vector;
 
@@ -47,7 +47,7 @@ pub(super) struct Evaluator<V: Vector> {
     /// Element of each atom.
     elements: Vec<usize>,
     pub(super) batches: Batches,
-    pub(super) layers: Vec<LayerWork<V>>,
+    pub(super) layers: Vec<LayerState<V>>,
     /// One for each thread.
     pub(super) scratch: Vec<Mutex<Scratch<V>>>,
     // In the order of evaluation:
@@ -82,7 +82,7 @@ impl<V: Vector> Evaluator<V> {
             threads,
             elements: Vec::new(),
             batches: Batches::default(),
-            layers: network.layers.iter().map(|_| LayerWork::default()).collect(),
+            layers: network.layers.iter().map(|_| LayerState::default()).collect(),
             scratch,
             energies: Vec::new(),
             density_cotangents: Vec::new(),

@@ -6,16 +6,16 @@ use npz::Archive;
 
 use super::error::{GraceError, mismatch, unsupported};
 use super::linear::{Linear, LinearPart};
-use super::placement::place;
 use super::product::{Combination, Combined, Coupled, Product, Term};
+use super::register_allocation::allocate;
 use super::schedule::depth_first;
-use super::steps::Steps;
 use super::tape::{Operation, Tensor};
+use super::tape_program::TapeProgram;
 use super::vector::{Number, Vector, lanes_for};
 use super::weights::Weights;
 
 /// A longer tape than this is taken for damage (64 MiB an atom).
-const LONGEST_TAPE: usize = 1 << 20;
+const MAX_TAPE_LANES: usize = 1 << 20;
 
 /// A graph under construction.
 pub(super) struct Graph<'a, V: Vector> {
@@ -70,7 +70,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         channels: usize,
     ) -> Result<Tensor, GraceError> {
         let tensor = Tensor { start: self.end, components, channels, width: lanes_for::<V>(channels) };
-        if components.saturating_mul(tensor.width) > LONGEST_TAPE - self.end {
+        if components.saturating_mul(tensor.width) > MAX_TAPE_LANES - self.end {
             return Err(unsupported(
                 self.archive,
                 format!("'{name}' has {components} components of {channels}"),
@@ -179,7 +179,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         let (archive, key) = (self.archive, |suffix: &str| format!("{prefix}_{suffix}"));
         let lefts = archive.indices(&key("left_ind"), left.components)?;
         let rights = archive.exactly_indices(&key("right_ind"), lefts.len(), right.components)?;
-        let sums = archive.exactly_indices(&key("m_sum_ind"), lefts.len(), LONGEST_TAPE)?;
+        let sums = archive.exactly_indices(&key("m_sum_ind"), lefts.len(), MAX_TAPE_LANES)?;
         let coefficients = archive.floats(&key(coefficients), &[lefts.len()])?;
         let components = sums.iter().max().map_or(0, |last| last + 1);
 
@@ -228,7 +228,7 @@ impl<'a, V: Vector> Graph<'a, V> {
 
     /// The operations without results that neither the basis nor `message` needs, whose rows get their places on the tapes;
     /// those of `message` too.
-    pub fn finish(mut self, message: Option<&mut Tensor>) -> Steps<V> {
+    pub fn finish(mut self, message: Option<&mut Tensor>) -> TapeProgram<V> {
         let mut needed = vec![false; self.end];
         self.basis.iter().for_each(|(row, _)| needed[*row] = true);
         let mut fixed = vec![self.density()];
@@ -239,7 +239,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         for tensor in &self.tensors {
             tensor.rows().for_each(|row| widths[row] = tensor.width);
         }
-        place(depth_first(self.operations), &widths, fixed, &self.basis, message)
+        allocate(depth_first(self.operations), &widths, fixed, &self.basis, message)
     }
 }
 

@@ -4,13 +4,13 @@ use std::ops::Range;
 
 use super::batch_passes::{Backward, BeginProjectBack, Energies, Forward, Project, ProjectBack};
 use super::batches::{Batches, Chunk, Placed};
+use super::chunked_slices::{ChunkedSlice, Divide, Layout};
 use super::evaluate::{Evaluator, Grade};
 use super::instructions::Instructions;
-use super::layer_work::{Cotangents, Gradients, Here, LayerWork};
+use super::layer_passes::{Cotangents, Gradients, LayerInput, LayerState};
 use super::network::Network;
-use super::parts::{Divide, Layout, Parts};
-use super::passes::{Scratch, begin_returns, gradients_of, of_thread};
 use super::projection::Projected;
+use super::sweeps::{Scratch, begin_returns, gradients_of, of_thread};
 use super::vector::Vector;
 
 /// The most layers before the last one.
@@ -21,20 +21,20 @@ struct Pass<'a, V: Vector> {
     network: &'a Network<V>,
     instructions: Instructions,
     batches: &'a Batches,
-    here: Here<'a, V>,
+    here: LayerInput<'a, V>,
     grade: Option<&'a Grade<'a>>,
 }
 
 /// What it leaves of atoms, to be divided.
 struct Results<'a, V> {
-    energies: Parts<'a, f64>,
+    energies: ChunkedSlice<'a, f64>,
     /// ∂E/∂(W B)
-    densities: Parts<'a, V>,
+    densities: ChunkedSlice<'a, V>,
     gradients: Gradients<'a, V>,
     /// None where nothing is graded.
     projected: Option<Projected<'a, V>>,
     /// The bases of the layers before, in whose place two cotangents leave those from the features.
-    bases: [Parts<'a, V>; BEFORE],
+    bases: [ChunkedSlice<'a, V>; BEFORE],
 }
 
 impl<V: Send> Divide for Results<'_, V> {
@@ -68,16 +68,16 @@ impl<V: Vector> Evaluator<V> {
         let Self { network, instructions, batches, scratch, projection, .. } = self;
         let last = self.layers.len() - 1;
         let (before, here) = self.layers.split_at_mut(last);
-        let LayerWork { bonds, messages, gradients, returns, rows, .. } = &mut here[0];
-        let here = Here::new(network, last, (bonds, messages, rows));
+        let LayerState { bonds, messages, gradients, returns, rows, .. } = &mut here[0];
+        let here = LayerInput::new(network, last, (bonds, messages, rows));
         let of_densities = network.readout.blocks.len() * network.readout.density_lanes();
         let map = network.feature_map.as_ref().filter(|_| grade.is_some());
         let mut results = Results {
-            energies: Parts::new(Layout::Even(1), 0, &mut self.energies[..]),
-            densities: Parts::new(Layout::Even(of_densities), 0, &mut self.density_cotangents[..]),
+            energies: ChunkedSlice::new(Layout::Even(1), 0, &mut self.energies[..]),
+            densities: ChunkedSlice::new(Layout::Even(of_densities), 0, &mut self.density_cotangents[..]),
             gradients: gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns),
             projected: map.map(|map| projection.parts(map)),
-            bases: [(); BEFORE].map(|()| Parts::empty()),
+            bases: [(); BEFORE].map(|()| ChunkedSlice::empty()),
         };
         for (bases, (work, layer)) in results.bases.iter_mut().zip(before.iter_mut().zip(&network.layers)) {
             *bases = work.trace.bases_mut(layer);
@@ -100,7 +100,7 @@ impl<V: Vector> Evaluator<V> {
 impl<V: Vector> Pass<'_, V> {
     /// One cotangent goes back while the tape of its batch is in the first caches; two wait for the features.
     fn run<const N: usize>(&self, chunk: &Chunk, results: &mut Results<V>, scratch: &mut Scratch<V>) {
-        let Here { layer, bonds, .. } = self.here;
+        let LayerInput { layer, bonds, .. } = self.here;
         let batches = chunk.batches.clone().map(|batch| self.batches.placed(batch, self.instructions));
         scratch.trace.hold_bases(layer, &chunk.places);
         if N == 1 {
@@ -130,10 +130,10 @@ impl<V: Vector> Pass<'_, V> {
         if N == 2 {
             trace.keep(&places, &scratch.tape);
         }
-        let own = &*traced.bases.of(&places);
-        let before = results.bases.each_mut().map(|bases| &*bases.of(&places));
+        let own = &*traced.bases.slice(&places);
+        let before = results.bases.each_mut().map(|bases| &*bases.slice(&places));
         let basis = |k: usize| if k == last { own } else { before[k] };
-        let (energies, cotangents) = (results.energies.of(&places), results.densities.of(&places));
+        let (energies, cotangents) = (results.energies.slice(&places), results.densities.slice(&places));
         let (readout, work) = (&self.network.readout, &mut scratch.readout);
         self.instructions.run(Energies { readout, placed, basis, energies, cotangents, work });
     }
@@ -149,11 +149,11 @@ impl<V: Vector> Pass<'_, V> {
         let Some(grade) = self.grade else { return };
         let (instructions, last) = (self.instructions, self.network.layers.len() - 1);
         let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
-        let own = traced.bases.of(places);
-        let mut before = results.bases.each_mut().map(|bases| bases.of(places));
+        let own = traced.bases.slice(places);
+        let mut before = results.bases.each_mut().map(|bases| bases.slice(places));
         let bases = |k: usize| if k == last { &*own } else { &*before[k] };
         instructions.run(Project { map, places, bases, work, instructions });
-        let (features, cotangent) = (work.features.of(places), &mut scratch.feature_cotangent);
+        let (features, cotangent) = (work.features.slice(places), &mut scratch.feature_cotangent);
         cotangent.resize(if N == 2 { features.len() } else { 0 }, 0.0);
         grade(&self.batches.order[places.clone()], features, cotangent);
         if N == 1 {
@@ -170,9 +170,9 @@ impl<V: Vector> Pass<'_, V> {
         let (readout, places) = (&self.network.readout, placed.places());
         let (last, lanes) = (readout.blocks.len() - 1, readout.density_lanes());
         let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
-        let densities = (&results.densities.of(&places)[last * lanes..], readout.blocks.len() * lanes);
-        let from = Cotangents { densities, basis: traced.bases.of(&places), returned: None };
-        let tape = if N == 1 { &scratch.tape[..] } else { traced.tapes.of(&places) };
+        let densities = (&results.densities.slice(&places)[last * lanes..], readout.blocks.len() * lanes);
+        let from = Cotangents { densities, basis: traced.bases.slice(&places), returned: None };
+        let tape = if N == 1 { &scratch.tape[..] } else { traced.tapes.slice(&places) };
         let (here, bonds, to) = (self.here, &mut traced.bonds, &mut results.gradients.bonds);
         let (returns, work) =
             (results.gradients.returns.only(), (&mut scratch.backward, &mut scratch.bonds[last]));

@@ -4,8 +4,8 @@ use super::graph::Graph;
 use super::harmonics::Harmonics;
 use super::radial::RadialFunctions;
 use super::readout::Block;
-use super::steps::Steps;
 use super::tape::Tensor;
+use super::tape_program::TapeProgram;
 use super::vector::Vector;
 
 /// The weights of one layer: T_q,lm,n = Σ_j R_nl(r) Y_lm(v) m_q,n(j), the messages m of the neighbours being
@@ -18,7 +18,7 @@ pub(super) struct Layer<V: Vector> {
     pub message: Message<V>,
     /// T, \[q\]\[lm\]\[channel\], at the beginning of the tape.
     pub density: Tensor,
-    pub steps: Steps<V>,
+    pub steps: TapeProgram<V>,
 }
 
 /// What an atom tells its neighbours: m_q,n = x_q,n + c_q,n with the tensor x of the layer before, zero beyond its

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use atoms::{PotentialError, Species};
 use npz::Archive;
 
-use super::assembly::Reading;
+use super::builder::ModelParts;
 use super::error::GraceError;
 use super::network::{AnyNetwork, Network};
 use super::precision::Precision;
@@ -122,7 +122,7 @@ impl GraceModel {
         any: fn(Arc<Network<V>>) -> AnyNetwork,
     ) -> Result<Self, GraceError> {
         let architecture = detect(archive);
-        let Reading { network, pair_cutoffs, description } = match architecture {
+        let ModelParts { network, pair_cutoffs, description } = match architecture {
             Architecture::OneLayer => one_layer::read(archive, path)?,
             Architecture::TwoLayer => two_layers::read(archive, path)?,
             Architecture::ThreeLayer => three_layers::read(archive, path)?,

@@ -3,11 +3,11 @@
 use npz::Archive;
 
 use super::error::{GraceError, mismatch};
-use super::globals::Embedding;
 use super::matrix::Matrix;
 use super::radial::column_by_order;
 use super::radial_network::RadialNetwork;
 use super::readout::{Activation, Block, Readout};
+use super::shared_reader::Embedding;
 use super::vector::{Double, Vector, to_lanes};
 use super::weights::with_transpose;
 

@@ -3,9 +3,9 @@
 use std::ops::Range;
 
 use super::batches::Chunk;
+use super::chunked_slices::{ChunkedSlice, Divide, Layout};
 use super::instructions::Instructions;
 use super::matrix::{Factors, Matrix, Rows};
-use super::parts::{Divide, Layout, Parts};
 use super::vector::{Number, Vector};
 use super::weights::with_transpose;
 
@@ -66,10 +66,10 @@ pub(super) struct ProjectionWork<V> {
 
 /// The part of it that belongs to some atoms.
 pub(super) struct Projected<'a, V> {
-    projected: Parts<'a, V>,
-    norms: Parts<'a, f64>,
+    projected: ChunkedSlice<'a, V>,
+    norms: ChunkedSlice<'a, f64>,
     /// z
-    pub features: Parts<'a, f64>,
+    pub features: ChunkedSlice<'a, f64>,
 }
 
 impl<V: Vector> ProjectionWork<V> {
@@ -85,9 +85,9 @@ impl<V: Vector> ProjectionWork<V> {
     pub fn parts(&mut self, map: &FeatureMap<V>) -> Projected<'_, V> {
         let (even, projection) = (Layout::Even, &map.projection);
         Projected {
-            projected: Parts::new(even(map.lanes()), 0, &mut self.projected[..]),
-            norms: Parts::new(even(projection.n_norms()), 0, &mut self.norms[..]),
-            features: Parts::new(even(projection.feature_dimension()), 0, &mut self.features[..]),
+            projected: ChunkedSlice::new(even(map.lanes()), 0, &mut self.projected[..]),
+            norms: ChunkedSlice::new(even(projection.n_norms()), 0, &mut self.norms[..]),
+            features: ChunkedSlice::new(even(projection.feature_dimension()), 0, &mut self.features[..]),
         }
     }
 }
@@ -157,7 +157,7 @@ impl<V: Vector> FeatureMap<V> {
     ) {
         let (map, n, lanes) = (&self.projection, places.len(), self.lanes());
         let width = map.feature_dimension();
-        let (all_norms, all_projected) = (work.norms.of(places), work.projected.of(places));
+        let (all_norms, all_projected) = (work.norms.slice(places), work.projected.slice(places));
         all_norms.fill(SQUARE_FLOOR);
         all_projected.fill(V::ZERO);
         for (layer, maps) in self.maps.iter().enumerate() {
@@ -172,7 +172,7 @@ impl<V: Vector> FeatureMap<V> {
         }
         all_norms.iter_mut().for_each(|square| *square = square.sqrt());
         let rows = all_projected.chunks_exact_mut(lanes).zip(all_norms.chunks_exact(map.n_norms()));
-        for (z, (projected, norms)) in work.features.of(places).chunks_exact_mut(width).zip(rows) {
+        for (z, (projected, norms)) in work.features.slice(places).chunks_exact_mut(width).zip(rows) {
             let scale = if map.normalize { 1.0 / (norms[0] + NORM_FLOOR) } else { 1.0 };
             let projected = &mut V::flat_mut(projected)[..map.dimension];
             for (z, p) in z.iter_mut().zip(projected) {
@@ -195,8 +195,8 @@ impl<V: Vector> FeatureMap<V> {
     #[inline(always)]
     pub fn begin_backward(&self, places: &Range<usize>, cotangent: &[f64], work: &mut Projected<V>) {
         let map = &self.projection;
-        let rows = work.projected.of(places).chunks_exact_mut(self.lanes());
-        let rows = rows.zip(work.norms.of(places).chunks_exact_mut(map.n_norms()));
+        let rows = work.projected.slice(places).chunks_exact_mut(self.lanes());
+        let rows = rows.zip(work.norms.slice(places).chunks_exact_mut(map.n_norms()));
         for (cotangent, (projected, norms)) in cotangent.chunks_exact(map.feature_dimension()).zip(rows) {
             let (of_projected, of_norms) = cotangent.split_at(map.dimension);
             let inverse = 1.0 / (norms[0] + NORM_FLOOR);
@@ -224,8 +224,8 @@ impl<V: Vector> FeatureMap<V> {
         let (maps, stride) = (&self.maps[layer], self.projection.n_norms());
         let from = Rows::of_atoms(places.len(), self.lanes());
         let to = Rows::of_atoms(places.len(), maps.forward.input_lanes());
-        let factors = Factors { numbers: &work.norms.of(places)[layer + 1..], stride };
-        let lanes = (&*work.projected.of(places), bases);
+        let factors = Factors { numbers: &work.norms.slice(places)[layer + 1..], stride };
+        let lanes = (&*work.projected.slice(places), bases);
         maps.transposed.scale_multiply_add(lanes, from, (to, factors), instructions);
     }
 

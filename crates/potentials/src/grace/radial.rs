@@ -5,7 +5,7 @@ use super::radial_table::{RadialTable, b_splines};
 use super::vector::{Double, MOST_LANES, Number, Vector, lanes_for};
 
 /// Where each pair of elements needs a table, more bytes than this in all are not worth it.
-const LARGEST_TABLES: usize = 1 << 28;
+const MAX_TABLE_BYTES: usize = 1 << 28;
 
 /// How radial functions are evaluated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
@@ -44,7 +44,7 @@ impl<V: Vector> RadialFunctions<V> {
             if known.is_none() {
                 tables.push(RadialTable::new(&network, *cutoff, pair, V::Number::TABLE_ERROR).rounded());
             }
-            if !network.pair_biases.is_empty() && tables[0].bytes() * cutoffs.len() > LARGEST_TABLES {
+            if !network.pair_biases.is_empty() && tables[0].bytes() * cutoffs.len() > MAX_TABLE_BYTES {
                 tables.clear();
                 break;
             }

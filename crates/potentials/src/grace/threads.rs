@@ -6,7 +6,7 @@ use std::sync::Arc;
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 
 use super::batches::Chunk;
-use super::parts::Divide;
+use super::chunked_slices::Divide;
 
 /// The calling thread alone, or a pool of threads. Results have the same bits whatever it is.
 #[derive(Clone, Debug, Default)]

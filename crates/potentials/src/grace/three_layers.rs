@@ -9,22 +9,22 @@
 
 use npz::Archive;
 
-use super::assembly::{Draft, Reading};
+use super::builder::{ModelBuilder, ModelParts};
 use super::error::{GraceError, mismatch};
-use super::globals::{Embedding, elements, refuse_other_variants};
 use super::graph::Graph;
 use super::layer::{LayerDraft, Message};
 use super::model::Architecture;
 use super::networks::enveloped_network;
 use super::radial::{RadialFunctions, RadialPath};
 use super::readout::Block;
+use super::shared_reader::{Embedding, elements, reject_unsupported_variants};
 use super::tape::Tensor;
 use super::two_layers::{expect_list, invariant_norm};
 use super::vector::{Number, Vector};
 
-pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Reading<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
-    refuse_other_variants(
+    reject_unsupported_variants(
         archive,
         &[
             ("nn_dtype", 0, "another arithmetic than double precision"),
@@ -48,8 +48,16 @@ pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Rea
     }
     let architecture = Architecture::ThreeLayer;
     let block_order = vec![0, 1, 2];
-    Draft { archive, architecture, elements, layers, block_order, n_densities, weights: reader.weights }
-        .finish()
+    ModelBuilder {
+        archive,
+        architecture,
+        elements,
+        layers,
+        block_order,
+        n_densities,
+        weights: reader.weights,
+    }
+    .finish()
 }
 
 struct Reader<'a> {

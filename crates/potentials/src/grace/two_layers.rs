@@ -7,10 +7,9 @@
 
 use npz::Archive;
 
-use super::assembly::{Draft, Reading};
-use super::copies::{BlockNames, ignore_copies};
+use super::block_aliases::{BlockAliases, ignore_aliases};
+use super::builder::{ModelBuilder, ModelParts};
 use super::error::{GraceError, mismatch, unsupported};
-use super::globals::{Embedding, Powers, cutoffs, elements, refuse_other_radial_variants};
 use super::graph::Graph;
 use super::invariant_norm::InvariantNorm;
 use super::layer::{LayerDraft, Message};
@@ -18,15 +17,16 @@ use super::model::Architecture;
 use super::networks::radial_network;
 use super::radial::{RadialFunctions, RadialPath};
 use super::readout::Block;
+use super::shared_reader::{Embedding, Powers, cutoffs, elements, reject_unsupported_radial_variants};
 use super::tape::Tensor;
 use super::vector::Vector;
 
 const FIRST: Powers = Powers { letter: "A", third_with_mixed: false, taken_by: &["I1", "rho"] };
 const SECOND: Powers = Powers { letter: "B", third_with_mixed: false, taken_by: &["I2"] };
 
-pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Reading<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
-    let names = BlockNames::read(archive)?;
+    let names = BlockAliases::read(archive)?;
     let mut weights = 0;
     let embedding = Embedding::read(archive, elements.len(), &mut weights)?;
     let mut reader = Reader {
@@ -43,8 +43,8 @@ pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Rea
     let (first, message, first_order) = reader.first_layer(n_densities)?;
     let (second, second_order) = reader.second_layer(message, n_densities)?;
     expect_lists(archive, [first_order, second_order])?;
-    ignore_copies(archive, &names)?;
-    Draft {
+    ignore_aliases(archive, &names)?;
+    ModelBuilder {
         archive,
         architecture: Architecture::TwoLayer,
         elements,
@@ -129,7 +129,7 @@ impl<'a> Reader<'a> {
         density: &str,
     ) -> Result<(usize, RadialFunctions<V>), GraceError> {
         let (archive, prefix) = (self.archive, format!("mlp_rad_{name}"));
-        refuse_other_radial_variants(archive, &prefix, density)?;
+        reject_unsupported_radial_variants(archive, &prefix, density)?;
         let channels = archive.count(&format!("{prefix}_n_rad_max"), 1, 4096)?;
         let network = radial_network::<V>(archive, &prefix, self.lmax, channels, &mut self.weights)?;
         Ok((channels, RadialFunctions::new(network, self.n_elements, self.cutoffs.clone(), self.path)))

@@ -1,0 +1,81 @@
+//! The two names of arrays in files of GRACE-2L.
+//!
+//! An export calls the invariants of the first layer `rho` and those of the second `I2`, with the norms `I_nl_LN` and
+//! `I_0_LN`, and holds the same arrays under the names that the model's maker gave them too.
+
+use npz::Archive;
+
+use super::error::{GraceError, unsupported};
+
+/// Names that the model's maker gave to the invariants of the first and second layer.
+pub(super) struct BlockAliases([String; 2]);
+
+/// What the exporter calls them.
+const EXPORTED: [&str; 2] = ["rho", "I2"];
+
+/// What the exporter calls their norms.
+const NORMS: [&str; 2] = ["I_nl_LN", "I_0_LN"];
+
+impl BlockAliases {
+    /// From the list of reductions, which must be the known ones.
+    pub fn read(archive: &Archive) -> Result<Self, GraceError> {
+        let names = archive.strings("reduce_names")?;
+        let sources = |name: &str| archive.strings(&format!("{name}_instruction_names"));
+        let mut found: [Option<String>; 2] = [None, None];
+        for name in names.iter().filter(|name| !["I1", "I", "B"].contains(&name.as_str())) {
+            for (found, exported) in found.iter_mut().zip(EXPORTED) {
+                if sources(name)? == sources(exported)? {
+                    *found = Some(name.clone());
+                }
+            }
+        }
+        match (names.len(), found) {
+            (5, [Some(first), Some(second)]) => Ok(Self([first, second])),
+            _ => Err(unsupported(
+                archive,
+                format!(
+                    "'reduce_names' lists {}, where two-layer models are known to have I1, I, B and the invariants \
+                     of each layer",
+                    names.join(", ")
+                ),
+            )),
+        }
+    }
+
+    /// The layers in the alphabetical order of the names of their invariants, which is that of the basis.
+    pub fn order(&self) -> Vec<usize> {
+        let mut order = vec![0, 1];
+        order.sort_by_key(|layer| &self.0[*layer]);
+        order
+    }
+}
+
+/// Passes over arrays that hold the same as one that was read, and refuses a file in which they differ.
+pub(super) fn ignore_aliases(archive: &Archive, names: &BlockAliases) -> Result<(), GraceError> {
+    let left_over: Vec<String> = archive.unread().into_iter().map(str::to_owned).collect();
+    for key in left_over {
+        let of_norm = ["_scale", "_lin_scale", "_type", "_n_out"]
+            .iter()
+            .filter(|suffix| key.ends_with(&format!("_LN{suffix}")))
+            .flat_map(|suffix| NORMS.map(|norm| format!("{norm}{suffix}")));
+        let of_reduction = names.0.iter().zip(EXPORTED).filter_map(|(name, exported)| {
+            key.strip_prefix(name.as_str()).map(|rest| format!("{exported}{rest}"))
+        });
+        let originals: Vec<String> =
+            of_norm.chain(of_reduction).filter(|original| archive.contains(original)).collect();
+        if !originals.is_empty() && !originals.iter().any(|original| same(archive, &key, original)) {
+            let reason = format!("array '{key}' is not the same as {}", originals.join(" or "));
+            return Err(unsupported(archive, reason));
+        }
+    }
+    Ok(())
+}
+
+/// Whether both arrays hold the same.
+fn same(archive: &Archive, one: &str, other: &str) -> bool {
+    let numbers = |key: &str| archive.numbers(key).map(|array| (array.shape, array.data));
+    match (numbers(one), numbers(other)) {
+        (Ok(one), Ok(other)) => one == other,
+        _ => matches!((archive.strings(one), archive.strings(other)), (Ok(one), Ok(other)) if one == other),
+    }
+}

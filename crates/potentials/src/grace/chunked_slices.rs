@@ -1,0 +1,139 @@
+//! Arrays with a part for each place, to be divided among threads.
+
+use std::ops::Range;
+
+use super::batches::Chunk;
+
+/// Something of which chunks of atoms have a part each.
+pub(super) trait Divide: Sized + Send {
+    /// What stands before a chunk, and the rest.
+    fn divide(self, chunk: &Chunk) -> (Self, Self);
+}
+
+/// How many numbers a place has.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Layout<'a> {
+    /// Each has as many.
+    Even(usize),
+    /// Those of a place begin at its offset, times a factor.
+    Ragged(&'a [usize], usize),
+}
+
+impl Layout<'_> {
+    #[inline(always)]
+    fn begin(&self, place: usize) -> usize {
+        match self {
+            Self::Even(n) => place * n,
+            Self::Ragged(offsets, n) => offsets[place] * n,
+        }
+    }
+}
+
+/// The numbers of some places.
+#[derive(Debug)]
+pub(super) struct ChunkedSlice<'a, T> {
+    layout: Layout<'a>,
+    /// Where the array begins.
+    begin: usize,
+    numbers: &'a mut [T],
+}
+
+impl<'a, T> ChunkedSlice<'a, T> {
+    /// Of an array that begins with the numbers of the place `first`.
+    #[inline(always)]
+    pub fn new(layout: Layout<'a>, first: usize, numbers: &'a mut [T]) -> Self {
+        Self { layout, begin: layout.begin(first), numbers }
+    }
+
+    /// Nothing of any place.
+    pub fn empty() -> Self {
+        Self::new(Layout::Even(0), 0, &mut [])
+    }
+
+    /// Those of some places.
+    #[inline(always)]
+    pub fn slice(&mut self, places: &Range<usize>) -> &mut [T] {
+        &mut self.numbers
+            [self.layout.begin(places.start) - self.begin..self.layout.begin(places.end) - self.begin]
+    }
+}
+
+impl<T: Send> Divide for ChunkedSlice<'_, T> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let begin = self.layout.begin(chunk.places.start);
+        let Self { layout, begin: start, numbers } = self;
+        let (first, second) = numbers.split_at_mut(begin - start);
+        (Self { layout, begin: start, numbers: first }, Self { layout, begin, numbers: second })
+    }
+}
+
+/// The numbers of some places, for whoever reads them; as many for each.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct SharedSlice<'a, T> {
+    of_one: usize,
+    first: usize,
+    numbers: &'a [T],
+}
+
+impl<'a, T> SharedSlice<'a, T> {
+    /// Of an array that begins with the numbers of the place `first`.
+    pub fn new(of_one: usize, first: usize, numbers: &'a [T]) -> Self {
+        Self { of_one, first, numbers }
+    }
+
+    /// Those of some places; none of what is empty.
+    #[inline(always)]
+    pub fn slice(self, places: &Range<usize>) -> &'a [T] {
+        let index = |place: usize| (place - self.first) * self.of_one;
+        self.numbers.get(index(places.start)..index(places.end)).unwrap_or_default()
+    }
+}
+
+/// One for each chunk.
+#[derive(Debug)]
+pub(super) struct PerChunk<'a, T> {
+    first: usize,
+    items: &'a mut [T],
+}
+
+impl<'a, T> PerChunk<'a, T> {
+    /// Of some chunks, of a list for all; which may be empty.
+    pub fn within(chunks: &[Chunk], items: &'a mut [T]) -> Self {
+        let first = chunks.first().map_or(0, |chunk| chunk.number);
+        let end = (first + chunks.len()).min(items.len());
+        Self { first, items: &mut items[first.min(end)..end] }
+    }
+
+    /// That of the only chunk that is left.
+    pub fn only(&mut self) -> Option<&mut T> {
+        self.items.first_mut()
+    }
+}
+
+impl<T: Send> Divide for PerChunk<'_, T> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let middle = (chunk.number - self.first).min(self.items.len());
+        let (first, second) = self.items.split_at_mut(middle);
+        (Self { first: self.first, items: first }, Self { first: chunk.number, items: second })
+    }
+}
+
+impl<A: Divide> Divide for Option<A> {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        self.map(|part| part.divide(chunk)).unzip()
+    }
+}
+
+impl<A: Divide, B: Divide> Divide for (A, B) {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let (a, b) = (self.0.divide(chunk), self.1.divide(chunk));
+        ((a.0, b.0), (a.1, b.1))
+    }
+}
+
+impl<A: Divide> Divide for [A; 2] {
+    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+        let [a, b] = self.map(|part| part.divide(chunk));
+        ([a.0, b.0], [a.1, b.1])
+    }
+}
