@@ -21,7 +21,7 @@ const PAIRS: usize = 5;
 /// For so long a campaign has the machine at a time.
 const TURN: Duration = Duration::from_millis(500);
 /// How often it is looked whether it has ended.
-const LOOK: Duration = Duration::from_millis(1);
+const POLL_INTERVAL: Duration = Duration::from_millis(1);
 
 fn main() {
     let pairs = std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(PAIRS);
@@ -70,7 +70,7 @@ impl UnderWay {
         }
         let run = self.run.as_mut().expect("it was started above");
         while !self.ended && begun.elapsed() < TURN {
-            std::thread::sleep(LOOK);
+            std::thread::sleep(POLL_INTERVAL);
             if let Some(status) = run.try_wait().expect("a child of this process") {
                 assert!(status.success());
                 self.ended = true;

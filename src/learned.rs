@@ -102,8 +102,8 @@ impl Learned {
             [(&mut self.by_gamma, candidate.gamma), (&mut self.by_expansion, candidate.relative_volume)]
         {
             match candidate.labelled {
-                true => completion.labelled(value),
-                false => completion.failed(value, candidate.candidate.clone()),
+                true => completion.add_labelled(value),
+                false => completion.add_failed(value, candidate.candidate.clone()),
             }
         }
         if let Some(grades) = &candidate.unlabelled {

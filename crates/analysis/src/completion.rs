@@ -36,12 +36,12 @@ impl<T: Clone> Completion<T> {
     }
 
     /// A structure that has its label.
-    pub fn labelled(&mut self, value: Option<f64>) {
+    pub fn add_labelled(&mut self, value: Option<f64>) {
         self.place(value).0 += 1;
     }
 
     /// A structure, called `name`, whose label finally failed.
-    pub fn failed(&mut self, value: Option<f64>, name: T) {
+    pub fn add_failed(&mut self, value: Option<f64>, name: T) {
         self.place(value).1.push(name);
     }
 
@@ -86,12 +86,12 @@ mod tests {
     fn failures_count_among_the_attempted() {
         let mut completion = Completion::new(Bins::for_volume_ratio());
         for _ in 0..3 {
-            completion.labelled(Some(1.0));
+            completion.add_labelled(Some(1.0));
         }
-        completion.labelled(Some(1.4));
-        completion.failed(Some(1.42), "a");
-        completion.failed(Some(1.38), "b");
-        completion.failed(Some(1.5), "c");
+        completion.add_labelled(Some(1.4));
+        completion.add_failed(Some(1.42), "a");
+        completion.add_failed(Some(1.38), "b");
+        completion.add_failed(Some(1.5), "c");
         let bins = completion.bins();
         assert_eq!(bins.len(), 7);
         assert_eq!((bins[1].labelled, bins[1].share, &bins[1].failed), (3, Some(1.0), &vec![]));
@@ -105,8 +105,8 @@ mod tests {
     #[test]
     fn what_has_no_value_is_not_lost() {
         let mut completion = Completion::new(Bins::for_grades());
-        completion.labelled(None);
-        completion.failed(Some(f64::INFINITY), "a");
+        completion.add_labelled(None);
+        completion.add_failed(Some(f64::INFINITY), "a");
         let last = completion.bins().pop().unwrap();
         assert_eq!((last.above, last.up_to, last.labelled, last.failed), (None, None, 1, vec!["a"]));
     }

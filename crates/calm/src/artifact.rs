@@ -140,7 +140,7 @@ impl From<Error> for ArtifactError {
 impl Artifact {
     /// Loads `gmm_artifacts.npz`: a mixture that can be graded with and updated.
     ///
-    /// Of two sets of thresholds the weighted ones are used. Slots at the end that can never be the nearest are left
+    /// Of two sets of thresholds the weighted ones are used. ElementComponents at the end that can never be the nearest are left
     /// out. Elements that the artifact does not hold get [`Component::unknown_element`].
     ///
     /// # Errors
@@ -165,7 +165,7 @@ impl Artifact {
             let place = place.ok_or_else(|| {
                 invalid(file, "elements", element, format!("an index below {}", symbols.len()))
             })?;
-            let slots = Slots::read(file, element, thresholds.get(element))?;
+            let slots = ElementComponents::read(file, element, thresholds.get(element))?;
             dimension = slots.dimension;
             *place = Some(slots.components(path, element)?);
         }
@@ -210,7 +210,7 @@ impl Artifact {
         let rows = thresholds.chunks_exact(slots).zip(centroids.chunks_exact(slots * dimension));
         let rows = rows.zip(inverses.chunks_exact(slots * dimension * dimension));
         for (element, ((thresholds, centroids), inverses)) in rows.enumerate() {
-            let slots = Slots {
+            let slots = ElementComponents {
                 dimension,
                 thresholds: thresholds.to_vec(),
                 centroids: centroids.to_vec(),
@@ -347,7 +347,7 @@ fn symmetric(file: &Archive, key: &str, shape: &[usize]) -> Result<Vec<f64>, Art
 }
 
 /// The arrays of one element, slot by slot.
-struct Slots {
+struct ElementComponents {
     dimension: usize,
     thresholds: Vec<f64>,
     centroids: Vec<f64>,
@@ -355,7 +355,7 @@ struct Slots {
     statistics: Vec<Statistics>,
 }
 
-impl Slots {
+impl ElementComponents {
     fn read(file: &Archive, element: usize, thresholds: Option<&Vec<f64>>) -> Result<Self, ArtifactError> {
         let key = format!("centroids_{element}");
         let centroids = file.numbers(&key)?;

@@ -217,7 +217,7 @@ impl CollectionRule {
     }
 
     /// The same rule with its threshold times `factor`, which is finite and above 0.
-    pub fn raised(mut self, factor: f64) -> Self {
+    pub fn with_threshold_factor(mut self, factor: f64) -> Self {
         match &mut self {
             Self::MaximumGrade { threshold } | Self::AtomCount { threshold, .. } => threshold.0 *= factor,
         }

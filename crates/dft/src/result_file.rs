@@ -17,7 +17,7 @@ pub const MAX_BYTES: u64 = 256 << 20;
 /// Bytes of the largest file that is read piece by piece, as VASP's: 16 GiB.
 pub const MAX_STREAMED_BYTES: u64 = 16 << 30;
 /// Bytes of the longest piece of such a file: 1 MiB.
-pub const MAX_PIECE_BYTES: usize = 1 << 20;
+pub const MAX_RECORD_BYTES: usize = 1 << 20;
 
 /// Why a file is not read. It completes a sentence that begins with the name of the file.
 #[derive(Debug, thiserror::Error)]
@@ -86,15 +86,15 @@ pub fn tail(path: &Path, bytes: u64) -> Result<Tail, ResultFileError> {
     Ok(Tail { length, bytes: end })
 }
 
-/// A reader of a file of at most [`MAX_STREAMED_BYTES`] bytes. It fails where more than [`MAX_PIECE_BYTES`] bytes come without
+/// A reader of a file of at most [`MAX_STREAMED_BYTES`] bytes. It fails where more than [`MAX_RECORD_BYTES`] bytes come without
 /// the byte `mark`, so that a parser that keeps what stands between two of them needs no more memory.
 ///
 /// # Errors
 /// See [`ResultFileError`].
-pub fn pieces(path: &Path, mark: u8) -> Result<Pieces, ResultFileError> {
+pub fn open_delimited(path: &Path, delimiter: u8) -> Result<DelimitedReader, ResultFileError> {
     let (file, length) = open(path)?;
     within(length, MAX_STREAMED_BYTES)?;
-    Ok(Pieces { file: BufReader::new(file.take(MAX_STREAMED_BYTES)), mark, since_mark: 0 })
+    Ok(DelimitedReader { file: BufReader::new(file.take(MAX_STREAMED_BYTES)), delimiter, since_delimiter: 0 })
 }
 
 fn within(bytes: u64, most: u64) -> Result<(), ResultFileError> {
@@ -127,15 +127,15 @@ fn describe(kind: FileType) -> &'static str {
     }
 }
 
-/// See [`pieces`].
+/// See [`open_delimited`].
 #[derive(Debug)]
-pub struct Pieces {
+pub struct DelimitedReader {
     file: BufReader<Take<File>>,
-    mark: u8,
-    since_mark: usize,
+    delimiter: u8,
+    since_delimiter: usize,
 }
 
-impl Read for Pieces {
+impl Read for DelimitedReader {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let read = self.fill_buf()?.read(buffer)?;
         self.consume(read);
@@ -143,11 +143,11 @@ impl Read for Pieces {
     }
 }
 
-impl BufRead for Pieces {
+impl BufRead for DelimitedReader {
     fn fill_buf(&mut self) -> io::Result<&[u8]> {
-        if self.since_mark > MAX_PIECE_BYTES {
-            let what = if self.mark == b'\n' { "line" } else { "text without a tag" };
-            let message = format!("has a {what} of more than {MAX_PIECE_BYTES} bytes");
+        if self.since_delimiter > MAX_RECORD_BYTES {
+            let what = if self.delimiter == b'\n' { "line" } else { "text without a tag" };
+            let message = format!("has a {what} of more than {MAX_RECORD_BYTES} bytes");
             return Err(io::Error::new(io::ErrorKind::InvalidData, message));
         }
         self.file.fill_buf()
@@ -155,9 +155,9 @@ impl BufRead for Pieces {
 
     fn consume(&mut self, bytes: usize) {
         let consumed = self.file.buffer().get(..bytes).unwrap_or_default();
-        match consumed.iter().rposition(|byte| *byte == self.mark) {
-            Some(place) => self.since_mark = bytes - place,
-            None => self.since_mark += bytes,
+        match consumed.iter().rposition(|byte| *byte == self.delimiter) {
+            Some(place) => self.since_delimiter = bytes - place,
+            None => self.since_delimiter += bytes,
         }
         self.file.consume(bytes);
     }
@@ -180,7 +180,7 @@ mod tests {
         assert_eq!(read(&path).unwrap(), b"one\ntwo\n");
         let Tail { length, bytes } = tail(&path, 3).unwrap();
         assert_eq!((length, bytes.as_slice()), (8, &b"wo\n"[..]));
-        assert_eq!(pieces(&path, b'\n').unwrap().lines().count(), 2);
+        assert_eq!(open_delimited(&path, b'\n').unwrap().lines().count(), 2);
     }
 
     /// All of these are refused by whoever reads, at once.
@@ -204,7 +204,7 @@ mod tests {
             let expected = format!("is {found}, expected a regular file");
             assert_eq!(read(&at(name)).unwrap_err().to_string(), expected);
             assert_eq!(tail(&at(name), 10).unwrap_err().to_string(), expected);
-            assert_eq!(pieces(&at(name), b'\n').unwrap_err().to_string(), expected);
+            assert_eq!(open_delimited(&at(name), b'\n').unwrap_err().to_string(), expected);
         }
         assert_eq!(
             read(Path::new("/dev/zero")).unwrap_err().to_string(),
@@ -223,10 +223,11 @@ mod tests {
         assert_eq!(tail(&path, 5).unwrap().bytes, [0; 5]);
         // One line without an end.
         let mut line = Vec::new();
-        let message = pieces(&path, b'\n').unwrap().read_until(b'\n', &mut line).unwrap_err().to_string();
+        let message =
+            open_delimited(&path, b'\n').unwrap().read_until(b'\n', &mut line).unwrap_err().to_string();
         assert_eq!(message, "has a line of more than 1048576 bytes");
-        assert!(line.len() < 2 * MAX_PIECE_BYTES);
+        assert!(line.len() < 2 * MAX_RECORD_BYTES);
         file.set_len(MAX_STREAMED_BYTES + 1).unwrap();
-        assert!(matches!(pieces(&path, b'\n'), Err(ResultFileError::TooLarge { .. })));
+        assert!(matches!(open_delimited(&path, b'\n'), Err(ResultFileError::TooLarge { .. })));
     }
 }

@@ -12,8 +12,8 @@
 //! - other moments: half of them to start from;
 //! - more memory: all processors share each k-point (`KPAR = 1`).
 
+mod fixed_width;
 mod incar;
-mod numbers;
 mod outcar;
 mod output;
 mod potcar;

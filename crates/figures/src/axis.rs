@@ -39,7 +39,7 @@ impl Axis {
 
     /// An axis of things that have names and no order: the first is at ½, the next at 1½ and so on.
     pub fn categorical(title: &str, names: &[String]) -> Self {
-        let tick = |(k, name): (usize, &String)| Tick { at: k as f64 + 0.5, words: name.clone() };
+        let tick = |(k, name): (usize, &String)| Tick { position: k as f64 + 0.5, label: name.clone() };
         let ticks = names.iter().enumerate().map(tick).collect();
         let high = names.len().max(1) as f64;
         Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, has_labels: true }
@@ -47,7 +47,7 @@ impl Axis {
 
     /// An axis of bins, each as wide as the next, with words at these places: 1 is the end of the first bin.
     pub fn binned(title: &str, bins: usize, words: impl IntoIterator<Item = (f64, String)>) -> Self {
-        let ticks = words.into_iter().map(|(at, words)| Tick { at, words }).collect();
+        let ticks = words.into_iter().map(|(position, label)| Tick { position, label }).collect();
         let high = bins.max(1) as f64;
         Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, has_labels: true }
     }

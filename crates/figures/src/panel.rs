@@ -145,11 +145,11 @@ impl Panel {
     fn draw_horizontal(&self, figure: &mut Figure) {
         let bottom = self.area.bottom();
         for tick in self.x.ticks() {
-            let x = self.area.x + self.area.width * self.x.position(tick.at);
-            let length = if tick.words.is_empty() { SMALL_TICK } else { TICK };
+            let x = self.area.x + self.area.width * self.x.position(tick.position);
+            let length = if tick.label.is_empty() { SMALL_TICK } else { TICK };
             figure.line(vec![[x, bottom], [x, bottom + length]], Colour::INK.line(AXIS));
-            if self.x.has_labels() && !tick.words.is_empty() {
-                figure.text([x, bottom + 11.0], &tick.words, Anchor::Middle);
+            if self.x.has_labels() && !tick.label.is_empty() {
+                figure.text([x, bottom + 11.0], &tick.label, Anchor::Middle);
             }
         }
         if self.x.has_labels() {
@@ -162,12 +162,12 @@ impl Panel {
     fn draw_vertical(&self, figure: &mut Figure) {
         let (left, mut widest) = (self.area.x, 0.0_f64);
         for tick in self.y.ticks() {
-            let y = self.area.bottom() - self.area.height * self.y.position(tick.at);
-            let length = if tick.words.is_empty() { SMALL_TICK } else { TICK };
+            let y = self.area.bottom() - self.area.height * self.y.position(tick.position);
+            let length = if tick.label.is_empty() { SMALL_TICK } else { TICK };
             figure.line(vec![[left, y], [left - length, y]], Colour::INK.line(AXIS));
-            if self.y.has_labels() && !tick.words.is_empty() {
-                figure.text([left - 5.0, y + 0.35 * Text::SIZE], &tick.words, Anchor::End);
-                widest = widest.max(Text::SIZE * crate::width(&tick.words, false));
+            if self.y.has_labels() && !tick.label.is_empty() {
+                figure.text([left - 5.0, y + 0.35 * Text::SIZE], &tick.label, Anchor::End);
+                widest = widest.max(Text::SIZE * crate::width(&tick.label, false));
             }
         }
         if self.y.has_labels() {

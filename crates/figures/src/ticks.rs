@@ -6,9 +6,9 @@ use crate::Scale;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tick {
     /// Value.
-    pub at: f64,
+    pub position: f64,
     /// Words.
-    pub words: String,
+    pub label: String,
 }
 
 /// Ticks of an axis from `low` to `high`, about `number` of them with words.
@@ -26,8 +26,8 @@ fn linear(low: f64, high: f64, number: usize) -> Vec<Tick> {
     // A step as 2.5 would need one more; those of `step` do not.
     let (first, last) = ((low / step - 1e-9).ceil() as i64, (high / step + 1e-9).floor() as i64);
     let tick = |k: i64| {
-        let at = k as f64 * step;
-        Tick { at, words: minus(format!("{at:.decimals$}")) }
+        let position = k as f64 * step;
+        Tick { position, label: minus(format!("{position:.decimals$}")) }
     };
     (first..=last).map(tick).collect()
 }
@@ -52,9 +52,9 @@ fn logarithmic(low: f64, high: f64, number: usize) -> Vec<Tick> {
     let mut ticks = Vec::new();
     for power in first..=last {
         for digit in 1..10 {
-            let at = f64::from(digit) * 10_f64.powi(power);
-            let is_inside = at >= low * (1.0 - 1e-9) && at <= high * (1.0 + 1e-9);
-            let speaks = match digit {
+            let position = f64::from(digit) * 10_f64.powi(power);
+            let is_inside = position >= low * (1.0 - 1e-9) && position <= high * (1.0 + 1e-9);
+            let has_label = match digit {
                 1 => power.rem_euclid(every) == 0,
                 2 | 5 => decades < 2.0,
                 3 | 7 => decades < 0.95,
@@ -62,8 +62,8 @@ fn logarithmic(low: f64, high: f64, number: usize) -> Vec<Tick> {
             };
             if is_inside && (every == 1 || digit == 1) {
                 ticks.push(Tick {
-                    at,
-                    words: if speaks { power_of_ten(digit, power) } else { String::new() },
+                    position,
+                    label: if has_label { power_of_ten(digit, power) } else { String::new() },
                 });
             }
         }
@@ -90,26 +90,26 @@ fn minus(number: String) -> String {
 mod tests {
     use super::*;
 
-    fn words(ticks: &[Tick]) -> Vec<&str> {
-        ticks.iter().map(|tick| tick.words.as_str()).filter(|words| !words.is_empty()).collect()
+    fn label(ticks: &[Tick]) -> Vec<&str> {
+        ticks.iter().map(|tick| tick.label.as_str()).filter(|label| !label.is_empty()).collect()
     }
 
     #[test]
     fn steps_are_one_two_or_five() {
-        assert_eq!(words(&linear(0.0, 1.0, 5)), ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]);
-        assert_eq!(words(&linear(0.93, 1.42, 5)), ["1.0", "1.1", "1.2", "1.3", "1.4"]);
-        assert_eq!(words(&linear(-3.0, 12.0, 4)), ["0", "5", "10"]);
-        assert_eq!(words(&linear(-0.12, 0.1, 3)), ["−0.1", "0.0", "0.1"]);
-        assert_eq!(words(&linear(0.0, 23_000.0, 3)), ["0", "10000", "20000"]);
+        assert_eq!(label(&linear(0.0, 1.0, 5)), ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]);
+        assert_eq!(label(&linear(0.93, 1.42, 5)), ["1.0", "1.1", "1.2", "1.3", "1.4"]);
+        assert_eq!(label(&linear(-3.0, 12.0, 4)), ["0", "5", "10"]);
+        assert_eq!(label(&linear(-0.12, 0.1, 3)), ["−0.1", "0.0", "0.1"]);
+        assert_eq!(label(&linear(0.0, 23_000.0, 3)), ["0", "10000", "20000"]);
     }
 
     #[test]
     fn decades_have_small_ticks_between_them() {
         let ticks = logarithmic(0.01, 10.0, 6);
-        assert_eq!(words(&ticks), ["0.01", "0.1", "1", "10"]);
+        assert_eq!(label(&ticks), ["0.01", "0.1", "1", "10"]);
         assert_eq!(ticks.len(), 28);
-        assert_eq!(words(&logarithmic(0.3, 3.0, 5)), ["0.5", "1", "2"]);
-        assert_eq!(words(&logarithmic(18.0, 75.0, 5)), ["20", "30", "50", "70"]);
-        assert_eq!(words(&logarithmic(1e-6, 1e6, 4)), ["10^{−6}", "0.001", "1", "1000", "10^{6}"]);
+        assert_eq!(label(&logarithmic(0.3, 3.0, 5)), ["0.5", "1", "2"]);
+        assert_eq!(label(&logarithmic(18.0, 75.0, 5)), ["20", "30", "50", "70"]);
+        assert_eq!(label(&logarithmic(1e-6, 1e6, 4)), ["10^{−6}", "0.001", "1", "1000", "10^{6}"]);
     }
 }

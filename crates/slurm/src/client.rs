@@ -34,23 +34,23 @@ pub enum SlurmError {
     },
     /// It takes too long.
     #[error("{program} has given no answer for {seconds} s: is slurmctld at work? ('scontrol ping' says so)")]
-    Silent {
+    TimedOut {
         /// The command.
         program: &'static str,
         /// How long.
         seconds: u64,
     },
     /// It has failed.
-    #[error("{program} failed: {said}")]
+    #[error("{program} failed: {stderr}")]
     Failed {
         /// The command.
         program: &'static str,
         /// What it wrote.
-        said: String,
+        stderr: String,
     },
     /// It says something else than what it was asked for.
     #[error("{program} wrote {found:?}, and {expected} was expected")]
-    Unreadable {
+    UnexpectedOutput {
         /// The command.
         program: &'static str,
         /// What it wrote.
@@ -103,7 +103,7 @@ impl SlurmClient {
         let entries = text.lines().filter_map(|line| line.split_once('='));
         let name =
             entries.map(|(key, value)| (key.trim(), value.trim())).find(|(key, _)| *key == "ClusterName");
-        let (_, name) = name.ok_or_else(|| SlurmError::Unreadable {
+        let (_, name) = name.ok_or_else(|| SlurmError::UnexpectedOutput {
             program: SCONTROL,
             found: text.lines().next().unwrap_or_default().to_owned(),
             expected: "its configuration with the key ClusterName",
@@ -119,7 +119,11 @@ impl SlurmClient {
         // With several clusters its name follows.
         let id = text.trim().split(';').next().and_then(|id| id.parse().ok());
         let expected = "the number of a job";
-        id.ok_or_else(|| SlurmError::Unreadable { program: SBATCH, found: text.trim().to_owned(), expected })
+        id.ok_or_else(|| SlurmError::UnexpectedOutput {
+            program: SBATCH,
+            found: text.trim().to_owned(),
+            expected,
+        })
     }
 
     /// Has jobs ended: each process of theirs gets SIGTERM, and SIGKILL after Slurm's `KillWait`. Those that have ended
@@ -153,13 +157,13 @@ impl SlurmClient {
             }
         }
         command.env("SLURM_TIME_FORMAT", "standard");
-        let timed_out = |_| SlurmError::Silent { program, seconds: self.timeout.as_secs() };
+        let timed_out = |_| SlurmError::TimedOut { program, seconds: self.timeout.as_secs() };
         let output = tokio::time::timeout(self.timeout, command.output()).await.map_err(timed_out)?;
         let output = output.map_err(|source| SlurmError::Missing { program, source })?;
         if !output.status.success() {
-            let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-            let said = if said.is_empty() { output.status.to_string() } else { said };
-            return Err(SlurmError::Failed { program, said });
+            let stderr = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+            let stderr = if stderr.is_empty() { output.status.to_string() } else { stderr };
+            return Err(SlurmError::Failed { program, stderr });
         }
         Ok(String::from_utf8_lossy(&output.stdout).into_owned())
     }

@@ -133,7 +133,8 @@ impl Judge {
         });
         if self.raised > 1.0 {
             detail["raised_by"] = json!(self.raised);
-            detail["threshold"] = json!(self.settings.collection.raised(self.raised).threshold());
+            detail["threshold"] =
+                json!(self.settings.collection.with_threshold_factor(self.raised).threshold());
         }
         let (fate, verdict) = match self.reason_to_decline(id, candidate.content, &graded) {
             Some(reason) => {
@@ -217,7 +218,8 @@ impl Judge {
             Some(Decline::Budget)
         } else if !self.settings.collection.is_met(&graded.selector.gamma) {
             Some(Decline::Covered)
-        } else if !self.settings.collection.raised(self.raised).is_met(&graded.selector.gamma) {
+        } else if !self.settings.collection.with_threshold_factor(self.raised).is_met(&graded.selector.gamma)
+        {
             Some(Decline::Backlog)
         } else {
             None

@@ -44,7 +44,7 @@ impl Slurm {
         let text = self.commands.queue(Job::FORMAT, &["--states=all"]).await?;
         let job = |line: &str| {
             let (found, expected) = (line.to_owned(), "what --format asks for");
-            let unreadable = |()| SlurmError::Unreadable { program: "squeue", found, expected };
+            let unreadable = |()| SlurmError::UnexpectedOutput { program: "squeue", found, expected };
             Job::parse(line, names).map_err(unreadable).transpose()
         };
         text.lines().filter_map(job).collect()

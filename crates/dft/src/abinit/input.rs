@@ -21,7 +21,7 @@ pub(super) fn write(
 ) -> Result<Input, Failure> {
     let bad = |error: crate::SetupError| FailureClass::BadInput.with_message(error.to_string());
     let species = BTreeSet::from_iter(padded.structure.species.iter().copied());
-    let pseudopotentials = abinit.of_one_kind(&species).map_err(bad)?;
+    let pseudopotentials = abinit.matching_pseudopotentials(&species).map_err(bad)?;
     let mut text = fixed(&abinit.settings);
     electrons(&mut text, &abinit.settings, padded, &pseudopotentials, adjustments);
     steps(&mut text, &abinit.settings, pseudopotentials.values().any(|p| p.paw), adjustments);

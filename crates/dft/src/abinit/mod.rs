@@ -143,7 +143,7 @@ pub struct Abinit {
 
 impl Abinit {
     /// The pseudopotentials of these elements, which ABINIT wants to be all norm-conserving or all PAW.
-    fn of_one_kind(
+    fn matching_pseudopotentials(
         &self,
         species: &BTreeSet<Species>,
     ) -> Result<BTreeMap<Species, &Pseudopotential>, SetupError> {
@@ -194,7 +194,7 @@ impl DftBackend for Abinit {
     }
 
     fn supports(&self, species: &BTreeSet<Species>) -> Result<(), SetupError> {
-        self.of_one_kind(species).map(|_| ())
+        self.matching_pseudopotentials(species).map(|_| ())
     }
 
     fn input(

@@ -5,7 +5,7 @@ use std::io::BufRead;
 use atoms::cell::{Matrix3, Vec3};
 use atoms::{Cell, Species, Structure};
 
-use super::numbers::numbers;
+use super::fixed_width::numbers;
 use super::output::{self, Output};
 
 /// Positions have five decimals.

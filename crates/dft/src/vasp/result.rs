@@ -18,14 +18,15 @@ pub(super) fn read(
     directory: &Path,
     exit: Exit,
 ) -> Result<Results, Failure> {
-    let outcar = match result_file::pieces(&directory.join("OUTCAR"), b'\n') {
+    let outcar = match result_file::open_delimited(&directory.join("OUTCAR"), b'\n') {
         Ok(file) => Outcar::read(file),
         Err(error) if error.is_missing() => Outcar::default(),
         Err(error) => return Err(validation::unreadable("OUTCAR", &error)),
     };
     let magnetism = (outcar.moments.clone(), outcar.magnetisation);
     let denied = outcar.denies_convergence();
-    let xml = result_file::pieces(&directory.join("vasprun.xml"), b'<').map_err(|error| error.to_string());
+    let xml =
+        result_file::open_delimited(&directory.join("vasprun.xml"), b'<').map_err(|error| error.to_string());
     let output = match xml.and_then(vasprun::read) {
         Ok(output) => output,
         Err(xml) => outcar.output().map_err(|outcar| without_output(exit, directory, &xml, &outcar))?,

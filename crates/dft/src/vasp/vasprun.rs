@@ -7,7 +7,7 @@ use atoms::{Cell, Species, Structure};
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
-use super::numbers::{numbers, vector};
+use super::fixed_width::{numbers, vector};
 use super::output::{self, Output};
 
 /// Decimals of lengths, forces and stresses.

@@ -11,7 +11,7 @@ use super::instructions::{Instructions, Pass};
 use super::layer_passes::{
     BackwardWork, Cotangents, LayerInput, Traced, TracedBonds, backward_bonds, backward_tape, forward,
 };
-use super::messages::Returns;
+use super::messages::ReturnedCotangents;
 use super::projection::{FeatureMap, Projected};
 use super::readout::{Readout, ReadoutWork};
 use super::vector::Vector;
@@ -64,7 +64,7 @@ pub(super) struct Backward<'a, 'b, 'c, V: Vector, const N: usize> {
     pub bonds: &'a mut TracedBonds<'b, V>,
     pub from: Cotangents<'a, V>,
     pub to: &'a mut [ChunkedSlice<'c, Vec3>; 2],
-    pub returns: Option<&'a mut Returns<V>>,
+    pub returns: Option<&'a mut ReturnedCotangents<V>>,
     pub work: (&'a mut BackwardWork<V>, &'a mut BondWork<V>),
 }
 

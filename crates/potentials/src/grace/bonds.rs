@@ -61,7 +61,7 @@ impl Bonds {
         found.resize_with(batches.chunks.len().max(found.len()), Vec::new);
         let counts = ChunkedSlice::new(Layout::Even(1), 0, &mut offsets[1..]);
         let work = (counts, PerChunk::within(&batches.chunks, found));
-        threads.each(&batches.chunks, work, &|chunk, (mut counts, mut found), _| {
+        threads.for_each_chunk(&batches.chunks, work, &|chunk, (mut counts, mut found), _| {
             let Some(found) = found.only() else { return };
             found.clear();
             for place in chunk.places.clone() {
@@ -79,7 +79,7 @@ impl Bonds {
         }
         bonds.resize(offsets[n], Bond { neighbour: 0, element: 0, d: [0.0; 3], r: 0.0 });
         let all = ChunkedSlice::new(Layout::Ragged(offsets, 1), 0, &mut bonds[..]);
-        threads.each(&batches.chunks, all, &|chunk, mut all, _| {
+        threads.for_each_chunk(&batches.chunks, all, &|chunk, mut all, _| {
             all.slice(&chunk.places).copy_from_slice(&found[chunk.number]);
         });
         self.find_incoming();
@@ -106,7 +106,7 @@ impl Bonds {
 
     /// The bonds of the atom at a place.
     #[inline(always)]
-    pub fn of(&self, place: usize) -> &[Bond] {
+    pub fn at(&self, place: usize) -> &[Bond] {
         &self.bonds[self.offsets[place]..self.offsets[place + 1]]
     }
 

@@ -5,9 +5,9 @@ use std::ops::Range;
 use super::batches::Chunk;
 
 /// Something of which chunks of atoms have a part each.
-pub(super) trait Divide: Sized + Send {
+pub(super) trait SplitByChunk: Sized + Send {
     /// What stands before a chunk, and the rest.
-    fn divide(self, chunk: &Chunk) -> (Self, Self);
+    fn split(self, chunk: &Chunk) -> (Self, Self);
 }
 
 /// How many numbers a place has.
@@ -58,8 +58,8 @@ impl<'a, T> ChunkedSlice<'a, T> {
     }
 }
 
-impl<T: Send> Divide for ChunkedSlice<'_, T> {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+impl<T: Send> SplitByChunk for ChunkedSlice<'_, T> {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
         let begin = self.layout.begin(chunk.places.start);
         let Self { layout, begin: start, numbers } = self;
         let (first, second) = numbers.split_at_mut(begin - start);
@@ -110,30 +110,30 @@ impl<'a, T> PerChunk<'a, T> {
     }
 }
 
-impl<T: Send> Divide for PerChunk<'_, T> {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
+impl<T: Send> SplitByChunk for PerChunk<'_, T> {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
         let middle = (chunk.number - self.first).min(self.items.len());
         let (first, second) = self.items.split_at_mut(middle);
         (Self { first: self.first, items: first }, Self { first: chunk.number, items: second })
     }
 }
 
-impl<A: Divide> Divide for Option<A> {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        self.map(|part| part.divide(chunk)).unzip()
+impl<A: SplitByChunk> SplitByChunk for Option<A> {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
+        self.map(|part| part.split(chunk)).unzip()
     }
 }
 
-impl<A: Divide, B: Divide> Divide for (A, B) {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        let (a, b) = (self.0.divide(chunk), self.1.divide(chunk));
+impl<A: SplitByChunk, B: SplitByChunk> SplitByChunk for (A, B) {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
+        let (a, b) = (self.0.split(chunk), self.1.split(chunk));
         ((a.0, b.0), (a.1, b.1))
     }
 }
 
-impl<A: Divide> Divide for [A; 2] {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        let [a, b] = self.map(|part| part.divide(chunk));
+impl<A: SplitByChunk> SplitByChunk for [A; 2] {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
+        let [a, b] = self.map(|part| part.split(chunk));
         ([a.0, b.0], [a.1, b.1])
     }
 }

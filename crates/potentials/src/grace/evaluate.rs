@@ -115,8 +115,8 @@ impl<V: Vector> Evaluator<V> {
             self.project();
             Ok(())
         })?;
-        self.put_energies();
-        self.put_features();
+        self.scatter_energies();
+        self.scatter_features();
         Ok(())
     }
 
@@ -135,11 +135,11 @@ impl<V: Vector> Evaluator<V> {
             true => self.pass::<2>(structure, neighbours, grade),
             false => self.pass::<1>(structure, neighbours, grade),
         })?;
-        self.put_energies();
-        self.put_features();
-        self.put_forces(energy);
+        self.scatter_energies();
+        self.scatter_features();
+        self.scatter_forces(energy);
         if let Some(pull_back) = pull_back {
-            self.put_pull_back(both, pull_back);
+            self.scatter_pull_back(both, pull_back);
         }
         Ok(())
     }
@@ -201,8 +201,8 @@ impl<V: Vector> Evaluator<V> {
             }
             None => self.backward_layers::<1>(layers),
         });
-        self.put_forces(energy);
-        self.put_pull_back(cotangent.is_some(), pull_back);
+        self.scatter_forces(energy);
+        self.scatter_pull_back(cotangent.is_some(), pull_back);
     }
 
     /// The cotangents of the bases of all atoms from those of their features, [n, D] in the order of the structure.
@@ -250,21 +250,21 @@ impl<V: Vector> Evaluator<V> {
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
         self.threads.clone().run(|| self.pass::<1>(structure, neighbours, None))?;
-        self.put_energies();
-        self.put_forces(out);
+        self.scatter_energies();
+        self.scatter_forces(out);
         Ok(())
     }
 
     // From the order of evaluation to that of the structure.
 
-    fn put_energies(&mut self) {
+    fn scatter_energies(&mut self) {
         self.atomic_energies.resize(self.elements.len(), 0.0);
         for (atom, energy) in self.batches.order.iter().zip(&self.energies) {
             self.atomic_energies[*atom as usize] = *energy;
         }
     }
 
-    fn put_features(&mut self) {
+    fn scatter_features(&mut self) {
         let Some(projection) = self.network.projection() else { return };
         let width = projection.feature_dimension();
         self.features.resize(self.elements.len() * width, 0.0);
@@ -273,7 +273,7 @@ impl<V: Vector> Evaluator<V> {
         }
     }
 
-    fn put_forces(&self, energy: &mut Evaluation) {
+    fn scatter_forces(&self, energy: &mut Evaluation) {
         energy.reset(self.elements.len());
         energy.atomic_energies.copy_from_slice(&self.atomic_energies);
         for (atom, force) in self.batches.order.iter().zip(&self.forces[0]) {
@@ -282,7 +282,7 @@ impl<V: Vector> Evaluator<V> {
         energy.virial = self.strain_derivative(0).map(|row| row.map(|x| -x));
     }
 
-    fn put_pull_back(&self, is_computed: bool, pull_back: &mut PullBack) {
+    fn scatter_pull_back(&self, is_computed: bool, pull_back: &mut PullBack) {
         pull_back.reset(self.elements.len());
         if is_computed {
             for (atom, force) in self.batches.order.iter().zip(&self.forces[1]) {

@@ -4,13 +4,13 @@ use std::ops::Range;
 
 use super::batch_passes::{Backward, BeginProjectBack, Energies, Forward, Project, ProjectBack};
 use super::batches::{Batches, Chunk, Placed};
-use super::chunked_slices::{ChunkedSlice, Divide, Layout};
+use super::chunked_slices::{ChunkedSlice, Layout, SplitByChunk};
 use super::evaluate::{Evaluator, Grade};
 use super::instructions::Instructions;
 use super::layer_passes::{Cotangents, Gradients, LayerInput, LayerState};
 use super::network::Network;
 use super::projection::Projected;
-use super::sweeps::{Scratch, begin_returns, gradients_of, of_thread};
+use super::sweeps::{Scratch, begin_returns, gradients_of, lock_scratch};
 use super::vector::Vector;
 
 /// The most layers before the last one.
@@ -37,11 +37,11 @@ struct Results<'a, V> {
     bases: [ChunkedSlice<'a, V>; BEFORE],
 }
 
-impl<V: Send> Divide for Results<'_, V> {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        let (energies, densities) = (self.energies.divide(chunk), self.densities.divide(chunk));
-        let (gradients, projected) = (self.gradients.divide(chunk), self.projected.divide(chunk));
-        let bases = self.bases.divide(chunk);
+impl<V: Send> SplitByChunk for Results<'_, V> {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
+        let (energies, densities) = (self.energies.split(chunk), self.densities.split(chunk));
+        let (gradients, projected) = (self.gradients.split(chunk), self.projected.split(chunk));
+        let bases = self.bases.split(chunk);
         (
             Self {
                 energies: energies.0,
@@ -83,8 +83,8 @@ impl<V: Vector> Evaluator<V> {
             *bases = work.trace.bases_mut(layer);
         }
         let pass = Pass { network, instructions: *instructions, batches, here, grade };
-        self.threads.each(&batches.chunks, results, &|chunk, mut results, thread| {
-            let scratch = &mut of_thread(scratch, thread);
+        self.threads.for_each_chunk(&batches.chunks, results, &|chunk, mut results, thread| {
+            let scratch = &mut lock_scratch(scratch, thread);
             if let Some(returns) = results.gradients.returns.only() {
                 begin_returns::<V, N>(here.layer, returns);
             }
@@ -102,19 +102,19 @@ impl<V: Vector> Pass<'_, V> {
     fn run<const N: usize>(&self, chunk: &Chunk, results: &mut Results<V>, scratch: &mut Scratch<V>) {
         let LayerInput { layer, bonds, .. } = self.here;
         let batches = chunk.batches.clone().map(|batch| self.batches.placed(batch, self.instructions));
-        scratch.trace.hold_bases(layer, &chunk.places);
+        scratch.trace.reserve_bases(layer, &chunk.places);
         if N == 1 {
             for placed in batches {
                 if self.grade.is_none() {
-                    scratch.trace.hold_bases(layer, &placed.places());
+                    scratch.trace.reserve_bases(layer, &placed.places());
                 }
-                scratch.trace.hold(layer, bonds, &placed.places(), false);
+                scratch.trace.reserve(layer, bonds, &placed.places(), false);
                 self.forward::<N>(placed, results, scratch);
                 self.backward::<N>(placed, results, scratch);
             }
             self.grade::<N>(&chunk.places, results, scratch);
         } else {
-            scratch.trace.hold(layer, bonds, &chunk.places, true);
+            scratch.trace.reserve(layer, bonds, &chunk.places, true);
             batches.clone().for_each(|placed| self.forward::<N>(placed, results, scratch));
             self.grade::<N>(&chunk.places, results, scratch);
             batches.for_each(|placed| self.backward::<N>(placed, results, scratch));
@@ -123,7 +123,7 @@ impl<V: Vector> Pass<'_, V> {
 
     fn forward<const N: usize>(&self, placed: Placed, results: &mut Results<V>, scratch: &mut Scratch<V>) {
         let (last, places) = (self.network.layers.len() - 1, placed.places());
-        let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
+        let mut traced = scratch.trace.slices(self.here.layer, self.here.bonds);
         let (here, trace) = (self.here, &mut traced);
         let work = (&mut scratch.tape, &mut scratch.bonds[last]);
         self.instructions.run(Forward { here, placed, trace, work });
@@ -148,7 +148,7 @@ impl<V: Vector> Pass<'_, V> {
         let (Some(map), Some(work)) = (&self.network.feature_map, &mut results.projected) else { return };
         let Some(grade) = self.grade else { return };
         let (instructions, last) = (self.instructions, self.network.layers.len() - 1);
-        let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
+        let mut traced = scratch.trace.slices(self.here.layer, self.here.bonds);
         let own = traced.bases.slice(places);
         let mut before = results.bases.each_mut().map(|bases| bases.slice(places));
         let bases = |k: usize| if k == last { &*own } else { &*before[k] };
@@ -169,7 +169,7 @@ impl<V: Vector> Pass<'_, V> {
     fn backward<const N: usize>(&self, placed: Placed, results: &mut Results<V>, scratch: &mut Scratch<V>) {
         let (readout, places) = (&self.network.readout, placed.places());
         let (last, lanes) = (readout.blocks.len() - 1, readout.density_lanes());
-        let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
+        let mut traced = scratch.trace.slices(self.here.layer, self.here.bonds);
         let densities = (&results.densities.slice(&places)[last * lanes..], readout.blocks.len() * lanes);
         let from = Cotangents { densities, basis: traced.bases.slice(&places), returned: None };
         let tape = if N == 1 { &scratch.tape[..] } else { traced.tapes.slice(&places) };

@@ -6,10 +6,10 @@ use atoms::Vec3;
 
 use super::batches::{Batches, Chunk, Placed};
 use super::bonds::{BondWork, Bonds, OwnBonds, accumulate, reverse};
-use super::chunked_slices::{ChunkedSlice, Divide, Layout, PerChunk, SharedSlice};
+use super::chunked_slices::{ChunkedSlice, Layout, PerChunk, SharedSlice, SplitByChunk};
 use super::layer::{Layer, Message};
 use super::matrix::Rows;
-use super::messages::{Returns, accumulate_messages, reverse_messages};
+use super::messages::{ReturnedCotangents, accumulate_messages, reverse_messages};
 use super::network::Network;
 use super::readout::Block;
 use super::tape::{Slot, Tensor};
@@ -25,7 +25,7 @@ pub(super) struct LayerState<V> {
     /// Cotangents of what depends on the layer before, from the energy and from the features, [n, lanes].
     pub message_cotangents: [Vec<V>; 2],
     /// What each chunk adds to them.
-    pub returns: Vec<Returns<V>>,
+    pub returns: Vec<ReturnedCotangents<V>>,
     /// The row of each bond's neighbour there.
     pub rows: Vec<u32>,
     /// ∂/∂d of the energy and of H for each bond.
@@ -47,7 +47,7 @@ impl<V: Vector> LayerState<V> {
         row_of.resize(elements.len(), 0);
         self.rows.resize(self.bonds.bonds.len(), 0);
         if self.returns.len() < batches.chunks.len() {
-            self.returns.resize_with(batches.chunks.len(), Returns::default);
+            self.returns.resize_with(batches.chunks.len(), ReturnedCotangents::default);
         }
         for (chunk, returns) in batches.chunks.iter().zip(&mut self.returns) {
             returns.find(&self.bonds, chunk, row_of, &mut self.rows);
@@ -97,22 +97,22 @@ pub(super) struct TracedBonds<'a, V> {
 impl<V> TracedBonds<'_, V> {
     /// The bonds of the atom at a place.
     #[inline(always)]
-    fn of<'a>(&'a mut self, place: usize, bonds: &'a Bonds) -> OwnBonds<'a, V> {
+    fn at<'a>(&'a mut self, place: usize, bonds: &'a Bonds) -> OwnBonds<'a, V> {
         let places = place..place + 1;
         let (values, derivatives) = (self.values.slice(&places), self.derivatives.slice(&places));
-        OwnBonds { bonds: bonds.of(place), values, derivatives }
+        OwnBonds { bonds: bonds.at(place), values, derivatives }
     }
 }
 
 impl<V: Vector> Trace<V> {
     /// Makes room for the bases of the atoms at some places, and forgets others.
-    pub fn hold_bases(&mut self, layer: &Layer<V>, places: &Range<usize>) {
+    pub fn reserve_bases(&mut self, layer: &Layer<V>, places: &Range<usize>) {
         grow(&mut self.bases, places.len() * layer.steps.basis_lanes);
         self.first_basis = places.start;
     }
 
     /// The same for their bonds and, if they are to be kept, their tapes.
-    pub fn hold(&mut self, layer: &Layer<V>, bonds: &Bonds, places: &Range<usize>, keep_tapes: bool) {
+    pub fn reserve(&mut self, layer: &Layer<V>, bonds: &Bonds, places: &Range<usize>, keep_tapes: bool) {
         let blocks = bonds.block_offsets[places.end] - bonds.block_offsets[places.start];
         let of_block = V::LANES * layer.radial.output_lanes();
         grow(&mut self.tapes, if keep_tapes { places.len() * layer.steps.kept_lanes } else { 0 });
@@ -122,12 +122,12 @@ impl<V: Vector> Trace<V> {
     }
 
     /// What it holds.
-    pub fn held<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a Bonds) -> Traced<'a, V> {
+    pub fn slices<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a Bonds) -> Traced<'a, V> {
         self.parts(layer, bonds).0
     }
 
     /// What of it a reverse sweep needs, with the cotangents of the basis.
-    pub fn kept<'a>(
+    pub fn backward_slices<'a>(
         &'a mut self,
         layer: &Layer<V>,
         bonds: &'a Bonds,
@@ -172,10 +172,10 @@ impl<V: Vector> Trace<V> {
     }
 }
 
-impl<V: Send> Divide for Traced<'_, V> {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        let (tapes, bases) = (self.tapes.divide(chunk), self.bases.divide(chunk));
-        let bonds = self.bonds.divide(chunk);
+impl<V: Send> SplitByChunk for Traced<'_, V> {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
+        let (tapes, bases) = (self.tapes.split(chunk), self.bases.split(chunk));
+        let bonds = self.bonds.split(chunk);
         (
             Self { tapes: tapes.0, bases: bases.0, bonds: bonds.0 },
             Self { tapes: tapes.1, bases: bases.1, bonds: bonds.1 },
@@ -183,9 +183,9 @@ impl<V: Send> Divide for Traced<'_, V> {
     }
 }
 
-impl<V: Send> Divide for TracedBonds<'_, V> {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        let (values, derivatives) = (self.values.divide(chunk), self.derivatives.divide(chunk));
+impl<V: Send> SplitByChunk for TracedBonds<'_, V> {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
+        let (values, derivatives) = (self.values.split(chunk), self.derivatives.split(chunk));
         (
             Self { values: values.0, derivatives: derivatives.0 },
             Self { values: values.1, derivatives: derivatives.1 },
@@ -237,7 +237,7 @@ pub(super) fn forward<V: Vector>(
     tape[..batch.atoms * steps.fixed_lanes].fill(V::ZERO);
     for (slot, place) in places.clone().enumerate() {
         let density = (&mut tape[..], Slot { slot, slots: batch.atoms });
-        let own = trace.bonds.of(place, bonds);
+        let own = trace.bonds.at(place, bonds);
         match layer.message.from {
             None => accumulate(layer, batch.element, own, density, work),
             Some(_) => accumulate_messages(layer, batch.element, own, received, density, work),
@@ -280,12 +280,12 @@ pub(super) struct Gradients<'a, V> {
     /// Of the energy and of H, for each bond.
     pub bonds: [ChunkedSlice<'a, Vec3>; 2],
     /// Of messages, one for each chunk.
-    pub returns: PerChunk<'a, Returns<V>>,
+    pub returns: PerChunk<'a, ReturnedCotangents<V>>,
 }
 
-impl<V: Send> Divide for Gradients<'_, V> {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        let (bonds, returns) = (self.bonds.divide(chunk), self.returns.divide(chunk));
+impl<V: Send> SplitByChunk for Gradients<'_, V> {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
+        let (bonds, returns) = (self.bonds.split(chunk), self.returns.split(chunk));
         (Self { bonds: bonds.0, returns: returns.0 }, Self { bonds: bonds.1, returns: returns.1 })
     }
 }
@@ -359,14 +359,14 @@ pub(super) fn backward_bonds<V: Vector, const N: usize>(
     &LayerInput { layer, bonds, received, rows, .. }: &LayerInput<V>,
     placed: &Placed,
     traced: &mut TracedBonds<V>,
-    (to, mut returns): (&mut [ChunkedSlice<Vec3>; 2], Option<&mut Returns<V>>),
+    (to, mut returns): (&mut [ChunkedSlice<Vec3>; 2], Option<&mut ReturnedCotangents<V>>),
     (tape, work): (&BackwardWork<V>, &mut BondWork<V>),
 ) {
     let atoms = placed.batch.atoms;
     for (slot, place) in placed.places().enumerate() {
         let slots = std::array::from_fn(|k| Slot { slot: k * atoms + slot, slots: N * atoms });
         let cotangent = (&tape.tape[..], slots);
-        let own = traced.of(place, bonds);
+        let own = traced.at(place, bonds);
         let mut both = to.each_mut().map(|part| Some(part.slice(&(place..place + 1))));
         let gradients: [&mut [Vec3]; N] = std::array::from_fn(|k| both[k].take().unwrap_or_default());
         match &mut returns {

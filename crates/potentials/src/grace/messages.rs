@@ -16,14 +16,14 @@ use super::vector::Vector;
 /// layer before. Every chunk sums its own, and the sums are added in the order of chunks, so that it does not matter who
 /// worked them out.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Returns<V> {
+pub(super) struct ReturnedCotangents<V> {
     /// Places of those, in ascending order.
     to: Vec<u32>,
     /// A row for each of them.
     cotangents: [Vec<V>; 2],
 }
 
-impl<V: Vector> Returns<V> {
+impl<V: Vector> ReturnedCotangents<V> {
     /// Finds out to whom the chunk returns, and writes the row of each bond's neighbour. `row_of` has a number for each atom of
     /// the structure, which is not read.
     pub fn find(&mut self, bonds: &Bonds, chunk: &Chunk, row_of: &mut [u32], rows: &mut [u32]) {
@@ -111,7 +111,7 @@ pub(super) fn reverse_messages<V: Vector, const N: usize>(
     (cotangent, slots): (&[V], [Slot; N]),
     work: &mut BondWork<V>,
     gradients: [&mut [Vec3]; N],
-    (rows, returns): (&[u32], &mut Returns<V>),
+    (rows, returns): (&[u32], &mut ReturnedCotangents<V>),
 ) {
     let blocks = own.blocks(layer).zip(rows.chunks(V::LANES));
     for (k, ((bonds, values, derivatives), rows)) in blocks.enumerate() {

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::batches::Chunk;
-use super::chunked_slices::{ChunkedSlice, Divide, Layout};
+use super::chunked_slices::{ChunkedSlice, Layout, SplitByChunk};
 use super::instructions::Instructions;
 use super::matrix::{Factors, Matrix, Rows};
 use super::vector::{Number, Vector};
@@ -92,10 +92,10 @@ impl<V: Vector> ProjectionWork<V> {
     }
 }
 
-impl<V: Send> Divide for Projected<'_, V> {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        let (projected, norms) = (self.projected.divide(chunk), self.norms.divide(chunk));
-        let features = self.features.divide(chunk);
+impl<V: Send> SplitByChunk for Projected<'_, V> {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
+        let (projected, norms) = (self.projected.split(chunk), self.norms.split(chunk));
+        let features = self.features.split(chunk);
         (
             Self { projected: projected.0, norms: norms.0, features: features.0 },
             Self { projected: projected.1, norms: norms.1, features: features.1 },

@@ -12,7 +12,7 @@ use super::chunked_slices::{ChunkedSlice, Layout, PerChunk, SharedSlice};
 use super::evaluate::{Evaluator, add};
 use super::layer::Layer;
 use super::layer_passes::{BackwardWork, Cotangents, Gradients, LayerInput, LayerState, Trace, send};
-use super::messages::Returns;
+use super::messages::ReturnedCotangents;
 use super::network::Network;
 use super::readout::ReadoutWork;
 use super::vector::Vector;
@@ -46,7 +46,7 @@ impl<V: Vector> Scratch<V> {
 }
 
 /// A thread that panicked has left nothing in its arrays that anybody reads.
-pub(super) fn of_thread<V>(scratch: &[Mutex<Scratch<V>>], thread: usize) -> MutexGuard<'_, Scratch<V>> {
+pub(super) fn lock_scratch<V>(scratch: &[Mutex<Scratch<V>>], thread: usize) -> MutexGuard<'_, Scratch<V>> {
     scratch[thread].lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -85,11 +85,11 @@ impl<V: Vector> Evaluator<V> {
             None => ChunkedSlice::empty(),
         };
         let all = 0..batches.order.len();
-        trace.hold_bases(here.layer, &all);
-        trace.hold(here.layer, bonds, &all, true);
-        let work = (trace.held(here.layer, bonds), sent);
-        self.threads.each(&batches.chunks, work, &|chunk, (mut trace, mut sent), thread| {
-            let Scratch { tape, bonds, .. } = &mut *of_thread(scratch, thread);
+        trace.reserve_bases(here.layer, &all);
+        trace.reserve(here.layer, bonds, &all, true);
+        let work = (trace.slices(here.layer, bonds), sent);
+        self.threads.for_each_chunk(&batches.chunks, work, &|chunk, (mut trace, mut sent), thread| {
+            let Scratch { tape, bonds, .. } = &mut *lock_scratch(scratch, thread);
             for batch in chunk.batches.clone() {
                 let placed = batches.placed(batch, *instructions);
                 let (places, trace) = (placed.places(), &mut trace);
@@ -112,17 +112,21 @@ impl<V: Vector> Evaluator<V> {
             ChunkedSlice::new(Layout::Even(1), 0, &mut self.energies[..]),
             ChunkedSlice::new(Layout::Even(per_atom), 0, &mut self.density_cotangents[..]),
         );
-        self.threads.each(&batches.chunks, work, &|chunk, (mut energies, mut cotangents), thread| {
-            let work = &mut of_thread(scratch, thread).readout;
-            for batch in chunk.batches.clone() {
-                let placed = batches.placed(batch, *instructions);
-                let places = placed.places();
-                let basis = |k: usize| layers[k].trace.bases(&network.layers[k]).slice(&places);
-                let (energies, cotangents) = (energies.slice(&places), cotangents.slice(&places));
-                let readout = &network.readout;
-                instructions.run(Energies { readout, placed, basis, energies, cotangents, work });
-            }
-        });
+        self.threads.for_each_chunk(
+            &batches.chunks,
+            work,
+            &|chunk, (mut energies, mut cotangents), thread| {
+                let work = &mut lock_scratch(scratch, thread).readout;
+                for batch in chunk.batches.clone() {
+                    let placed = batches.placed(batch, *instructions);
+                    let places = placed.places();
+                    let basis = |k: usize| layers[k].trace.bases(&network.layers[k]).slice(&places);
+                    let (energies, cotangents) = (energies.slice(&places), cotangents.slice(&places));
+                    let readout = &network.readout;
+                    instructions.run(Energies { readout, placed, basis, energies, cotangents, work });
+                }
+            },
+        );
     }
 
     /// All atoms backwards through layer `k`, with `N` cotangents: of the energy, and of the features.
@@ -132,11 +136,11 @@ impl<V: Vector> Evaluator<V> {
         let (lanes, n_layers) = (network.readout.density_lanes(), network.layers.len());
         let LayerState { bonds, trace, messages, gradients, returns, rows, .. } = &mut here[k];
         let here = LayerInput::new(network, k, (bonds, messages, rows));
-        let (tapes, traced, cotangents) = trace.kept(here.layer, bonds);
+        let (tapes, traced, cotangents) = trace.backward_slices(here.layer, bonds);
         let to = gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns);
-        self.threads.each(&batches.chunks, ((tapes, traced), to), &|chunk, (trace, to), thread| {
+        self.threads.for_each_chunk(&batches.chunks, ((tapes, traced), to), &|chunk, (trace, to), thread| {
             let (mut tapes, mut traced) = trace;
-            let Scratch { bonds: work, backward, .. } = &mut *of_thread(scratch, thread);
+            let Scratch { bonds: work, backward, .. } = &mut *lock_scratch(scratch, thread);
             let Gradients { bonds: mut to, mut returns } = to;
             if let Some(returns) = returns.only() {
                 begin_returns::<V, N>(here.layer, returns);
@@ -171,7 +175,7 @@ impl<V: Vector> Evaluator<V> {
             ChunkedSlice::new(even, 0, &mut of_features[..]),
         ];
         let work = (forces, PerChunk::within(&batches.chunks, &mut self.virials));
-        self.threads.each(&batches.chunks, work, &|chunk, (mut forces, mut virials), _| {
+        self.threads.for_each_chunk(&batches.chunks, work, &|chunk, (mut forces, mut virials), _| {
             let Some(virials) = virials.only() else { return };
             for place in chunk.places.clone() {
                 for k in 0..N {
@@ -189,7 +193,7 @@ impl<V: Vector> Evaluator<V> {
             sums.resize(n * lanes, V::ZERO);
             let sums = ChunkedSlice::new(Layout::Even(lanes), 0, sums);
             let returns = &returns[..batches.chunks.len()];
-            self.threads.each(&batches.chunks, sums, &|chunk, mut sums, _| {
+            self.threads.for_each_chunk(&batches.chunks, sums, &|chunk, mut sums, _| {
                 let sums = sums.slice(&chunk.places);
                 returns.iter().for_each(|returns| returns.add_to(k, &chunk.places, lanes, sums));
             });
@@ -200,7 +204,7 @@ impl<V: Vector> Evaluator<V> {
     pub(super) fn project(&mut self) {
         let Self { network, instructions, batches, layers, projection: work, .. } = self;
         let Some(map) = &network.feature_map else { return };
-        self.threads.share(&batches.chunks, work.parts(map), &|places, mut work| {
+        self.threads.for_each_share(&batches.chunks, work.parts(map), &|places, mut work| {
             let bases = |k: usize| layers[k].trace.bases(&network.layers[k]).slice(places);
             let work = &mut work;
             instructions.run(Project { map, places, bases, work, instructions: *instructions });
@@ -212,13 +216,13 @@ impl<V: Vector> Evaluator<V> {
         let Self { network, instructions, batches, layers, projection: projected, .. } = self;
         let Some(map) = &network.feature_map else { return };
         let cotangent = SharedSlice::new(map.projection.feature_dimension(), 0, cotangent);
-        self.threads.share(&batches.chunks, projected.parts(map), &|places, mut work| {
+        self.threads.for_each_share(&batches.chunks, projected.parts(map), &|places, mut work| {
             let (cotangent, work) = (cotangent.slice(places), &mut work);
             instructions.run(BeginProjectBack { map, places, cotangent, work });
         });
         for (k, (work, layer)) in layers.iter_mut().zip(&network.layers).enumerate() {
             let work = (projected.parts(map), work.trace.copy_of_bases(layer));
-            self.threads.share(&batches.chunks, work, &|places, (mut work, mut bases)| {
+            self.threads.for_each_share(&batches.chunks, work, &|places, (mut work, mut bases)| {
                 let (bases, work, instructions) = (bases.slice(places), &mut work, *instructions);
                 instructions.run(ProjectBack { map, layer: k, places, bases, work, instructions });
             });
@@ -237,7 +241,7 @@ pub(super) fn gradients_of<'a, V: Vector, const N: usize>(
     bonds: &'a Bonds,
     chunks: &[Chunk],
     [of_energy, of_features]: &'a mut [Vec<Vec3>; 2],
-    returns: &'a mut [Returns<V>],
+    returns: &'a mut [ReturnedCotangents<V>],
 ) -> Gradients<'a, V> {
     let ragged = Layout::Ragged(&bonds.offsets, 1);
     let of_features =
@@ -248,6 +252,9 @@ pub(super) fn gradients_of<'a, V: Vector, const N: usize>(
 }
 
 /// Makes room for the message cotangents of a chunk.
-pub(super) fn begin_returns<V: Vector, const N: usize>(layer: &Layer<V>, returns: &mut Returns<V>) {
+pub(super) fn begin_returns<V: Vector, const N: usize>(
+    layer: &Layer<V>,
+    returns: &mut ReturnedCotangents<V>,
+) {
     returns.begin(N, layer.message.passed() * layer.density.width);
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 
 use super::batches::Chunk;
-use super::chunked_slices::Divide;
+use super::chunked_slices::SplitByChunk;
 
 /// The calling thread alone, or a pool of threads. Results have the same bits whatever it is.
 #[derive(Clone, Debug, Default)]
@@ -39,7 +39,7 @@ impl Threads {
     }
 
     /// Deals `work` out by chunks; to be called within [`Threads::run`]. `act` is told which thread does it.
-    pub(super) fn each<W: Divide>(
+    pub(super) fn for_each_chunk<W: SplitByChunk>(
         &self,
         chunks: &[Chunk],
         work: W,
@@ -52,8 +52,9 @@ impl Threads {
             }
             _ => {
                 let (before, after) = chunks.split_at(chunks.len() / 2);
-                let (first, second) = work.divide(&after[0]);
-                let (first, second) = (|| self.each(before, first, act), || self.each(after, second, act));
+                let (first, second) = work.split(&after[0]);
+                let (first, second) =
+                    (|| self.for_each_chunk(before, first, act), || self.for_each_chunk(after, second, act));
                 match &self.0 {
                     Some(_) => drop(rayon::join(first, second)),
                     None => (first(), second()).0,
@@ -62,17 +63,17 @@ impl Threads {
         }
     }
 
-    /// As [`Threads::each`], in as many pieces of about the same size as there are threads, so that each is as large as can be.
-    pub(super) fn share<W: Divide>(
+    /// As [`Threads::for_each_chunk`], in as many pieces of about the same size as there are threads, so that each is as large as can be.
+    pub(super) fn for_each_share<W: SplitByChunk>(
         &self,
         chunks: &[Chunk],
         work: W,
         act: &(impl Fn(&Range<usize>, W) + Sync),
     ) {
-        self.share_in(self.count(), chunks, work, act);
+        self.split_into_shares(self.count(), chunks, work, act);
     }
 
-    fn share_in<W: Divide>(
+    fn split_into_shares<W: SplitByChunk>(
         &self,
         pieces: usize,
         chunks: &[Chunk],
@@ -85,10 +86,10 @@ impl Threads {
             [only] => act(&only.places, work),
             _ => {
                 let (before, after) = chunks.split_at(chunks.len() * (pieces / 2) / pieces);
-                let (first, second) = work.divide(&after[0]);
+                let (first, second) = work.split(&after[0]);
                 rayon::join(
-                    || self.share_in(pieces / 2, before, first, act),
-                    || self.share_in(pieces - pieces / 2, after, second, act),
+                    || self.split_into_shares(pieces / 2, before, first, act),
+                    || self.split_into_shares(pieces - pieces / 2, after, second, act),
                 );
             }
         }

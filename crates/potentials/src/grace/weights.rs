@@ -22,13 +22,13 @@ impl<V: Vector> Weights<V> {
     /// [inputs × outputs]
     #[inline(always)]
     pub fn forward(&self, element: usize) -> &Matrix<V> {
-        &self.of(element).0
+        &self.for_element(element).0
     }
 
     /// [outputs × inputs]
     #[inline(always)]
     pub fn transposed(&self, element: usize) -> &Matrix<V> {
-        &self.of(element).1
+        &self.for_element(element).1
     }
 
     /// Adds other weights of the same shape.
@@ -40,7 +40,7 @@ impl<V: Vector> Weights<V> {
     }
 
     #[inline(always)]
-    fn of(&self, element: usize) -> &(Matrix<V>, Matrix<V>) {
+    fn for_element(&self, element: usize) -> &(Matrix<V>, Matrix<V>) {
         &self.0[if self.0.len() == 1 { 0 } else { element }]
     }
 }

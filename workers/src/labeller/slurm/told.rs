@@ -30,7 +30,7 @@ impl Told {
     pub const FORMAT: &str = "%i|%T|%N|%M|%r";
 
     pub fn parse(line: &str) -> Result<Self, SlurmError> {
-        let unreadable = || SlurmError::Unreadable {
+        let unreadable = || SlurmError::UnexpectedOutput {
             program: "squeue",
             found: line.to_owned(),
             expected: "what --format asks for",

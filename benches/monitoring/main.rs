@@ -1,7 +1,7 @@
 //! What it costs to watch a large campaign: `status` and the pages of the dashboard with a million candidates, and twenty browsers that
 //! listen to its news.
 //!
-//! `cargo bench --bench watching`; a number behind `--` is how many candidates there are.
+//! `cargo bench --bench monitoring`; a number behind `--` is how many candidates there are.
 
 #[path = "../../tests/common/mod.rs"]
 mod common;
