@@ -1,27 +1,28 @@
-//! How one number is distributed, bin by bin of another.
+//! Quantiles of one quantity in bins of another.
 
 use crate::histogram::bin_index;
 use crate::quantiles::quantile;
 
-/// The values of y whose x is in one bin.
+/// The y values of one bin in x.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct QuantileBin {
     /// Lower edge of the bin in x.
     pub low: f64,
     /// Upper edge.
     pub high: f64,
-    /// Values in it.
+    /// Number of values in the bin.
     pub number: u64,
     /// 5, 10, 25, 50, 75, 90 and 95 % quantiles of y; `None` in an empty bin.
     pub quantiles: Option<[f64; 7]>,
 }
 
 impl QuantileBin {
-    /// The shares that [`Self::quantiles`] have.
+    /// The probabilities of [`Self::quantiles`].
     pub const LEVELS: [f64; 7] = [0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95];
 }
 
-/// Sorts pairs (x, y) into bins of x between ascending edges, as a [`crate::Histogram`] does. What is outside is left out.
+/// Sorts pairs (x, y) into bins of x, with the edge convention of [`crate::Histogram`]. Edges must ascend.
+/// Pairs outside the edges are ignored.
 pub fn binned_quantiles(edges: &[f64], pairs: impl IntoIterator<Item = (f64, f64)>) -> Vec<QuantileBin> {
     let mut bins = vec![Vec::new(); edges.len().saturating_sub(1)];
     for (x, y) in pairs {

@@ -1,9 +1,9 @@
-//! Which part of what was attempted got its label.
+//! The fraction of attempted labels that succeeded.
 
 use crate::{Bins, wilson_interval};
 
-/// Counts labels that were made and labels that finally failed, by a number that is known of either: a grade, an
-/// expansion. A failed label is censored, not absent: it counts among the attempted, and its structure stays known.
+/// Counts labels and final label failures in bins of a quantity known for both, such as the grade or the
+/// volume. A failed label is censored, not absent: it counts as attempted, and its structure is listed.
 #[derive(Clone, Debug)]
 pub struct Completion<T> {
     bins: Bins,
@@ -11,41 +11,41 @@ pub struct Completion<T> {
     unknown: (u64, Vec<T>),
 }
 
-/// What was attempted in one bin.
+/// The attempts in one bin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CompletionBin<T> {
-    /// Values above this; `None` from the lowest on.
+    /// Lower edge; `None` for the first bin.
     pub above: Option<f64>,
-    /// Up to this; `None` without an end.
+    /// Upper edge, inclusive; `None` for the last bin.
     pub up_to: Option<f64>,
-    /// Structures that have their labels.
+    /// Labelled structures.
     pub labelled: u64,
-    /// Those whose labels finally failed.
+    /// Structures whose label finally failed.
     pub failed: Vec<T>,
-    /// Labelled of attempted; `None` if nothing was.
+    /// Labelled / attempted; `None` without attempts.
     pub share: Option<f64>,
-    /// Where the probability of a label is, with 95 % ([`wilson_interval`]).
+    /// 95 % confidence interval of the probability of a label ([`wilson_interval`]).
     pub interval: Option<(f64, f64)>,
 }
 
 impl<T: Clone> Completion<T> {
-    /// Sorts into `bins`.
+    /// An empty table with these bins.
     pub fn new(bins: Bins) -> Self {
         let counts = vec![(0, Vec::new()); bins.count()];
         Self { bins, counts, unknown: (0, Vec::new()) }
     }
 
-    /// A structure that has its label.
+    /// Counts a labelled structure.
     pub fn add_labelled(&mut self, value: Option<f64>) {
         self.place(value).0 += 1;
     }
 
-    /// A structure, called `name`, whose label finally failed.
+    /// Counts the structure `name`, whose label finally failed.
     pub fn add_failed(&mut self, value: Option<f64>, name: T) {
         self.place(value).1.push(name);
     }
 
-    /// By bin, also those where nothing was attempted; and last what has no finite value, if there is something.
+    /// The table, including empty bins. A last row holds structures without a finite value, if there are any.
     pub fn bins(&self) -> Vec<CompletionBin<T>> {
         let sorted = self.counts.iter().enumerate();
         let mut bins: Vec<_> = sorted.map(|(place, counts)| bin(self.bins.edges(place), counts)).collect();

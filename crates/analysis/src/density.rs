@@ -1,14 +1,14 @@
-//! Smooth densities of samples: a Gaussian kernel of Scott's width (1992), on a grid.
+//! Kernel density estimates on a grid: Gaussian kernels with Scott's bandwidth (1992).
 
 use crate::quantiles::quantile;
 
-/// The kernel is taken for nothing at so many of its widths.
+/// The kernel is cut off at this number of bandwidths.
 const KERNEL_RADIUS: f64 = 4.0;
-/// Kernel and grid may not be narrower than this part of the range.
+/// Lower limit of the bandwidth, as a fraction of the range.
 const MIN_RELATIVE_WIDTH: f64 = 1e-3;
 
-/// The density of values at `points` places from `low` to `high`: pairs of place and density, whose integral over all places is
-/// the share of values in the range. Nothing of fewer than two values.
+/// The density of values on `points` grid points from `low` to `high`, as pairs (x, density). Its integral is
+/// the fraction of values in the range. Empty for fewer than two values.
 pub fn kernel_density(values: &[f64], low: f64, high: f64, points: usize) -> Vec<(f64, f64)> {
     let Some(width) = width(values, 1, high - low).filter(|_| points > 1 && low < high) else {
         return Vec::new();
@@ -25,19 +25,19 @@ pub fn kernel_density(values: &[f64], low: f64, high: f64, points: usize) -> Vec
     smooth.iter().enumerate().map(|(k, weight)| (low + step * k as f64, weight * scale)).collect()
 }
 
-/// The density of points in a plane, on a grid that reaches beyond them.
+/// The density of points in a plane, on a grid that extends beyond them.
 #[derive(Clone, Debug)]
 pub struct Density2d {
     low: [f64; 2],
     step: [f64; 2],
     size: usize,
-    /// Row by row of the second coordinate, [size × size].
+    /// Row by row in the second coordinate, [size × size].
     values: Vec<f64>,
 }
 
 impl Density2d {
-    /// Of some points, on a grid of `size` × `size` places. `None` of fewer than three points, or if they lie on a line that is
-    /// parallel to an axis.
+    /// Estimates the density on a grid of `size` × `size` points. `None` for fewer than three points, or if
+    /// they lie on a line parallel to an axis.
     pub fn from_points(points: &[[f64; 2]], size: usize) -> Option<Self> {
         if points.len() < 3 || size < 8 {
             return None;
@@ -67,7 +67,7 @@ impl Density2d {
         Some(Self { low, step, size, values })
     }
 
-    /// The density at a point, between neighbours linearly; 0 outside of the grid. In units of points a cell.
+    /// The density at a point, interpolated linearly; 0 outside the grid. In points per grid cell.
     pub fn at(&self, [x, y]: [f64; 2]) -> f64 {
         let place =
             |value: f64, axis: usize| linear_weights((value - self.low[axis]) / self.step[axis], self.size);
@@ -80,31 +80,33 @@ impl Density2d {
         sum
     }
 
-    /// The density above which this share of the points lies: the region that it encloses is the smallest that holds them.
+    /// The density above which this fraction of the points lies: it bounds the smallest region that contains
+    /// them.
     pub fn level(&self, points: &[[f64; 2]], share: f64) -> Option<f64> {
         let mut densities: Vec<_> = points.iter().map(|point| self.at(*point)).collect();
         densities.sort_by(f64::total_cmp);
         quantile(&densities, 1.0 - share)
     }
 
-    /// Places a side has.
+    /// Grid points per side.
     pub fn size(&self) -> usize {
         self.size
     }
 
-    /// The density at a place of the grid.
+    /// The density at a grid point.
     pub fn value(&self, column: usize, row: usize) -> f64 {
         self.values[row * self.size + column]
     }
 
-    /// Where a place of the grid is, also between places.
+    /// The coordinates of a grid point, also at fractional indices.
     pub fn point(&self, column: f64, row: f64) -> [f64; 2] {
         [self.low[0] + self.step[0] * column, self.low[1] + self.step[1] * row]
     }
 }
 
-/// Scott's width in so many dimensions, σ n^(−1/(d + 4)): the spread is the standard deviation, or what it would be by the
-/// quartiles if that is less. Not below a part of `range`. `None` of fewer than two values.
+/// Scott's bandwidth in `dimensions` dimensions, σ n^(−1/(d + 4)). σ is the standard deviation, or the estimate
+/// from the quartiles if that is smaller. At least a fixed fraction of `range`. `None` for fewer than two
+/// values.
 fn width(values: &[f64], dimensions: i32, range: f64) -> Option<f64> {
     if values.len() < 2 {
         return None;
@@ -126,7 +128,7 @@ fn range(values: &[f64]) -> Option<(f64, f64)> {
     (least.is_finite() && largest.is_finite()).then_some((least, largest))
 }
 
-/// The two places of a grid that share a value, and how; none outside.
+/// The two grid points next to a position with their weights; none outside the grid.
 fn linear_weights(position: f64, size: usize) -> impl Iterator<Item = (usize, f64)> {
     let is_inside = position >= 0.0 && position <= (size - 1) as f64;
     let below = if is_inside { (position.floor() as usize).min(size - 2) } else { 0 };
@@ -134,7 +136,7 @@ fn linear_weights(position: f64, size: usize) -> impl Iterator<Item = (usize, f6
     [(below, 1.0 - part), (below + 1, part)].into_iter().filter(move |_| is_inside)
 }
 
-/// A row convolved with a Gaussian of this width in steps.
+/// A row convolved with a Gaussian; `width` is in grid steps.
 fn convolved(row: &[f64], width: f64) -> Vec<f64> {
     let reach = (KERNEL_RADIUS * width).ceil() as usize;
     let kernel: Vec<_> = (0..=reach).map(|k| (-0.5 * (k as f64 / width).powi(2)).exp()).collect();
@@ -157,7 +159,7 @@ fn transposed(values: &[f64], size: usize) -> Vec<f64> {
 mod tests {
     use super::*;
 
-    /// Quantiles of a normal distribution's sample, about (Tukey's λ with 0.1349).
+    /// Approximate quantiles of a normal sample (Tukey's λ with 0.1349).
     fn normal(n: usize) -> impl Iterator<Item = f64> {
         (0..n).map(move |k| {
             let p = (k as f64 + 0.5) / n as f64;
@@ -171,7 +173,7 @@ mod tests {
         let density = kernel_density(&values, -5.0, 5.0, 401);
         let integral: f64 = density.iter().map(|(_, density)| density * 10.0 / 400.0).sum();
         assert!((integral - 1.0).abs() < 2e-3, "{integral}");
-        // The kernel makes it wider by 1 + n^(−2/5) in the variance; Tukey's λ is within a percent or two.
+        // The kernel raises the variance by 1 + n^(−2/5); Tukey's λ deviates by a percent or two.
         let middle = density[200].1;
         assert!((middle - 0.3989).abs() < 0.012, "{middle}");
         assert!((density[160].1 / middle - (-0.5_f64).exp()).abs() < 0.02);
@@ -194,7 +196,7 @@ mod tests {
         let level = plane.level(&points, 0.95).unwrap();
         let inside = points.iter().filter(|point| plane.at(**point) >= level).count() as f64;
         assert!((inside / points.len() as f64 - 0.95).abs() < 0.002, "{inside}");
-        // Of a normal distribution that is the ellipse at √(−2 ln 0.05) = 2.448 standard deviations.
+        // For a normal distribution this is the ellipse at √(−2 ln 0.05) = 2.448 standard deviations.
         assert!(plane.at([3.0 * 2.1, 0.0]) > level && plane.at([3.0 * 2.8, 0.0]) < level);
         assert!(plane.at([0.0, 2.1]) > level && plane.at([0.0, 2.8]) < level);
         let sum: f64 = (0..96 * 96).map(|k| plane.value(k % 96, k / 96)).sum();

@@ -1,5 +1,6 @@
-//! What is learned from the numbers of a campaign: how grades foretell force errors, what labels cost, by how much zeros of
-//! energy differ, how what was collected is distributed. Plain numbers in and out; where they come from, and how they are shown, is not known here.
+//! Statistics of a campaign: force errors by grade, label costs, energy offsets between potential and labels,
+//! and distributions of what was collected. Functions take and return plain numbers; reading data and drawing
+//! results happens elsewhere.
 
 mod binned_quantiles;
 mod bins;

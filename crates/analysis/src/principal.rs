@@ -1,24 +1,24 @@
-//! The directions in which rows of numbers differ most.
+//! Principal component analysis.
 
 use faer::{Mat, Side};
 
-/// Rows that differ by less than this from their mean, both squared, do not differ but by rounding.
+/// Relative squared deviation from the mean below which rows differ only by rounding.
 const ROUNDING: f64 = 1e-24;
 
 /// Mean and leading principal axes of rows of `dimension` numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PrincipalAxes {
     mean: Vec<f64>,
-    /// Unit vectors, the one with the largest variance first.
+    /// Unit vectors, by descending variance.
     axes: Vec<Vec<f64>>,
-    /// Of the whole variance, the share along each.
+    /// Fraction of the total variance along each axis.
     pub shares: Vec<f64>,
 }
 
 impl PrincipalAxes {
-    /// The first `number` axes of rows that follow each other in `rows`: eigenvectors of their covariance. An axis points
-    /// to where its largest component is positive, so that the same rows give the same numbers. `None` of fewer than two
-    /// rows, of rows that do not differ, of numbers that are not finite, or if the eigenvalues do not converge.
+    /// Finds the first `number` axes, the eigenvectors of the covariance of rows stored consecutively in
+    /// `rows`. The largest component of each axis is positive, so that the result is reproducible. `None` for
+    /// fewer than two rows, identical rows, numbers that are not finite, or eigenvalues that do not converge.
     pub fn fit(rows: &[f64], dimension: usize, number: usize) -> Option<Self> {
         let count = rows.len().checked_div(dimension)?;
         if count < 2 || number > dimension || !rows.iter().all(|x| x.is_finite()) {
@@ -46,7 +46,7 @@ impl PrincipalAxes {
         Some(Self { axes: axes.collect(), shares: shares.collect(), mean })
     }
 
-    /// A row by its components along the axes, from the mean of all.
+    /// Components of a row along the axes, relative to the mean.
     pub fn project(&self, row: &[f64]) -> Vec<f64> {
         let along = |axis: &Vec<f64>| {
             let parts = axis.iter().zip(row).zip(&self.mean);
@@ -81,7 +81,7 @@ mod tests {
         for (found, expected) in axes.shares.iter().zip([0.9, 0.1]) {
             assert!((found - expected).abs() < 1e-12, "{:?}", axes.shares);
         }
-        // The second axis points to where x grows.
+        // The second axis points towards growing x.
         let point = axes.project(&[1.0 + 0.6 - 0.8, 2.0 + 0.8 + 0.6, 7.0]);
         assert!((point[0] - 1.0).abs() < 1e-12 && (point[1] + 1.0).abs() < 1e-12, "{point:?}");
     }

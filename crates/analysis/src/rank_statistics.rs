@@ -1,14 +1,14 @@
-//! What depends on the order of values only.
+//! Statistics that depend on the order of values only.
 
-/// Spearman's ρ: Pearson's correlation of the ranks, where equal values share their mean rank. `None` below two values,
-/// or if all of one row are equal.
+/// Spearman's ρ: Pearson's correlation of the ranks, with mean ranks for ties. `None` for fewer than two values
+/// or if all values of one argument are equal.
 ///
 /// # Panics
-/// If the rows have different lengths.
+/// If the lengths differ.
 pub fn spearman(a: &[f64], b: &[f64]) -> Option<f64> {
     assert_eq!(a.len(), b.len(), "pairs of values");
     let (a, b) = (average_ranks(a), average_ranks(b));
-    // Whatever the values are, the mean of their ranks is this.
+    // The mean rank does not depend on the values.
     let mean = 0.5 * (a.len() as f64 + 1.0);
     let (mut covariance, mut variance_a, mut variance_b) = (0.0, 0.0, 0.0);
     for (x, y) in a.iter().zip(&b) {
@@ -20,12 +20,12 @@ pub fn spearman(a: &[f64], b: &[f64]) -> Option<f64> {
     (spread > 0.0).then(|| covariance / spread)
 }
 
-/// Area under the receiver operating characteristic of `grades` as a test for `errors` above `threshold`: the
-/// probability that an atom with a larger error has the larger grade, where equal grades count half (Mann and Whitney).
-/// `None` if no atom, or every one, is above.
+/// Area under the ROC curve of `grades` as a classifier of `errors` above `threshold`: the probability that the
+/// atom with the larger error has the larger grade, where ties count half (Mann and Whitney). `None` if all
+/// errors are on the same side of the threshold.
 ///
 /// # Panics
-/// If the rows have different lengths.
+/// If the lengths differ.
 pub fn roc_auc(grades: &[f64], errors: &[f64], threshold: f64) -> Option<f64> {
     assert_eq!(grades.len(), errors.len(), "a grade for each error");
     let (mut positive, mut ranks_of_positive) = (0_u64, 0.0);
@@ -40,7 +40,7 @@ pub fn roc_auc(grades: &[f64], errors: &[f64], threshold: f64) -> Option<f64> {
     (positive > 0.0 && negative > 0.0).then(|| wins / (positive * negative))
 }
 
-/// Rank of each value, from 1; equal values share their mean rank.
+/// Rank of each value, from 1; ties share their mean rank.
 fn average_ranks(values: &[f64]) -> Vec<f64> {
     let mut order: Vec<_> = (0..values.len()).collect();
     order.sort_by(|i, j| values[*i].total_cmp(&values[*j]));
@@ -70,7 +70,7 @@ mod tests {
         assert_eq!(spearman(&[1.0], &[1.0]), None);
         assert_eq!(spearman(&[], &[]), None);
         assert_eq!(spearman(&[2.0, 2.0], &[1.0, 3.0]), None);
-        // The two zeros are one value.
+        // Both zeros are equal.
         assert_eq!(average_ranks(&[0.0, -0.0, 1.0]), [1.5, 1.5, 3.0]);
     }
 
@@ -84,7 +84,7 @@ mod tests {
         assert_eq!(roc_auc(&[1.0, 2.0], &[0.0, 2.0], 1.0), Some(1.0));
     }
 
-    /// By each pair of pairs: what ranks avoid.
+    /// Reference implementation over all pairs.
     fn auc_by_pairs(grades: &[f64], errors: &[f64], threshold: f64) -> Option<f64> {
         let (mut won, mut pairs) = (0.0, 0.0);
         for (grade, error) in grades.iter().zip(errors) {
@@ -98,7 +98,7 @@ mod tests {
         (pairs > 0.0).then(|| won / pairs)
     }
 
-    /// A rank is the number of smaller values, and half of that of equal ones.
+    /// Rank: the number of smaller values plus half the number of equal ones.
     fn rank(values: &[f64], value: f64) -> f64 {
         let count = |test: &dyn Fn(f64) -> bool| values.iter().filter(|x| test(**x)).count() as f64;
         count(&|x| x < value) + 0.5 * (count(&|x| x == value) + 1.0)

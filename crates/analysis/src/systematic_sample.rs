@@ -1,23 +1,23 @@
-//! A sample of a stream whose length is not known, in bounded memory.
+//! A bounded sample of a stream of unknown length.
 
-/// Keeps items of a stream, each with the same probability: all while there is room, and from then on a half, a quarter …
-/// Which are kept depends on nothing but their places in the stream, so two streams side by side keep the same places.
+/// Keeps items of a stream with equal probability: all of them up to the capacity, then a half, a quarter, and
+/// so on. The choice depends only on the index in the stream, so parallel streams keep the same indices.
 #[derive(Clone, Debug)]
 pub struct SystematicSample<T> {
     kept: Vec<(u32, T)>,
     room: usize,
-    /// An item is kept if the level of its place is at least this.
+    /// An item is kept if the level of its index is at least this.
     least: u32,
     seen: u64,
 }
 
 impl<T> SystematicSample<T> {
-    /// Keeps `room` items at most, one at least.
+    /// A sample of at most `room` items (at least one).
     pub fn new(room: usize) -> Self {
         Self { kept: Vec::new(), room: room.max(1), least: 0, seen: 0 }
     }
 
-    /// The next item.
+    /// Offers the next item.
     pub fn add(&mut self, item: T) {
         let level = mixed(self.seen).trailing_zeros();
         self.seen += 1;
@@ -31,18 +31,18 @@ impl<T> SystematicSample<T> {
         }
     }
 
-    /// Those that were kept, in order.
+    /// The sampled items, in order.
     pub fn items(&self) -> impl ExactSizeIterator<Item = &T> {
         self.kept.iter().map(|(_, item)| item)
     }
 
-    /// How many there were.
+    /// Number of items offered.
     pub fn total(&self) -> u64 {
         self.seen
     }
 }
 
-/// A number whose bits are as good as random: the finaliser of SplitMix64, different for each `place`.
+/// The finaliser of SplitMix64: pseudo-random bits for each index.
 fn mixed(place: u64) -> u64 {
     let mut x = place.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x9e37_79b9_7f4a_7c15);
     x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -66,9 +66,9 @@ mod tests {
         let mut thinned = SystematicSample::new(4096);
         (0..1_000_000).for_each(|k| thinned.add(k));
         let kept: Vec<i64> = thinned.items().copied().collect();
-        // Between an eighth of the room and all of it: each halving leaves about a half.
+        // Between an eighth of the capacity and all of it: each halving keeps about half.
         assert!((1024..=4096).contains(&kept.len()) && thinned.total() == 1_000_000);
-        // The mean of n even draws from 0..N lies within five of its standard deviations, N / √(12 n).
+        // The mean of n uniform draws from 0..N is within five standard deviations, N / √(12 n).
         let n = kept.len() as f64;
         let mean = kept.iter().sum::<i64>() as f64 / n;
         assert!((mean - 5e5).abs() < 5.0 * 1e6 / (12.0 * n).sqrt(), "{mean}");

@@ -1,10 +1,10 @@
-//! How far a share that was counted may be from the true one.
+//! Confidence interval of a proportion.
 
-/// 97.5 % of a normal distribution lie below so many standard deviations.
+/// 97.5 % quantile of the normal distribution.
 const NORMAL_97_5: f64 = 1.959_963_984_540_054;
 
-/// Wilson's interval for a probability, of which `successes` of `all` trials are known: it holds the true one in 95 % of
-/// the cases, stays within 0 and 1, and says something after a single trial. `None` without any.
+/// Wilson's 95 % confidence interval of a probability after `successes` in `all` trials. It stays within 0 and
+/// 1 and is informative after a single trial. `None` without trials.
 pub fn wilson_interval(successes: u64, all: u64) -> Option<(f64, f64)> {
     if all == 0 {
         return None;
@@ -27,14 +27,14 @@ mod tests {
         // The roots of (p − 187/225)² = z² p (1 − p) / 225.
         let (low, high) = wilson_interval(187, 225).unwrap();
         assert!((low - 0.776_694).abs() < 1e-6 && (high - 0.874_411).abs() < 1e-6, "{low} {high}");
-        // One failure alone: at most z²/(1 + z²) = 0.793.
+        // A single failure: at most z²/(1 + z²) = 0.793.
         let (low, high) = wilson_interval(0, 1).unwrap();
         assert!(low == 0.0 && (high - 0.793_45).abs() < 1e-4, "{high}");
         assert_eq!(wilson_interval(0, 0), None);
     }
 
     proptest! {
-        /// Wilson's interval is where a normal test would not refuse the share that was found.
+        /// The ends of Wilson's interval are where a normal test rejects the observed proportion.
         #[test]
         fn its_ends_are_refused_just_so((successes, all) in (1_u64..500).prop_flat_map(|n| (0..=n, Just(n)))) {
             let (low, high) = wilson_interval(successes, all).unwrap();

@@ -1,34 +1,35 @@
-//! The grades of a batch under one α after the other, without an inverse for each.
+//! The grades of a batch for one α after another, without an inverse for each.
 //!
-//! With the Cholesky factor of the updated covariance, C′ + εI = LLᵀ, and **x** = L⁻¹**δ**
+//! With the Cholesky factor of the updated covariance, C′ + εI = LLᵀ, and **x** = L⁻¹**δ**,
 //!
 //! σ² = **δ**ᵀ(C′ + εI)⁻¹**δ** = |**x**|².
 //!
-//! A factor and a triangular solution cost a fraction of an inverse, and are backward stable whatever the directions of
-//! the batch (Golub & Van Loan, Matrix Computations, §4.2). What remains is the rounding of C′ itself, some units of
-//! rounding times its largest eigenvalue, which does no harm as long as the least is not tiny. Where it could, the
-//! trial declines and the caller inverts.
+//! A factorisation and a triangular solve cost a fraction of an inverse and are backward stable for any
+//! directions of the batch (Golub & Van Loan, Matrix Computations, §4.2). The rounding error of C′ itself
+//! remains: a few units of rounding times its largest eigenvalue, which is harmless unless the smallest
+//! eigenvalue is tiny. In that case the trial returns `None` and the caller inverts.
 
 use crate::linear::{cholesky, is_positive, regularised, solve_lower, trace, view};
 use crate::rules::CovarianceUpdateKind;
 use crate::update::{Batch, CovarianceUpdate, Group};
 
-/// A trial is trusted if the estimated relative error of its least eigenvalue is below this.
+/// A trial is accepted if the estimated relative error of its smallest eigenvalue is below this.
 const TRUSTED_ERROR: f64 = 1e-8;
 
-/// All trials of one batch.
+/// The trials of one batch.
 pub struct AlphaScan<'a> {
     batch: &'a Batch,
     combination: CovarianceUpdateKind,
 }
 
 impl<'a> AlphaScan<'a> {
-    /// The trials of a batch with one way to combine the covariances.
+    /// Prepares the trials of a batch with this kind of covariance update.
     pub fn new(batch: &'a Batch, combination: CovarianceUpdateKind) -> Self {
         Self { batch, combination }
     }
 
-    /// γ of each atom of the batch after an update with α, `[atoms]`; `None` if this way is not accurate enough.
+    /// γ of each atom of the batch after an update with α, `[atoms]`; `None` if this method is not accurate
+    /// enough.
     pub fn gamma(&self, alpha: f64) -> Option<Vec<f64>> {
         let update = self.combination.with_alpha(alpha);
         let grades: Option<Vec<_>> = self.batch.groups.iter().map(|group| grades(group, update)).collect();
@@ -45,7 +46,7 @@ fn grades(group: &Group, update: CovarianceUpdate) -> Option<Vec<f64>> {
         return None;
     }
     let factor = cholesky(&covariance, dimension)?;
-    // No pivot is less than the least eigenvalue.
+    // No pivot is smaller than the smallest eigenvalue.
     let least = (0..dimension).map(|k| factor[(k, k)] * factor[(k, k)]).fold(f64::INFINITY, f64::min);
     if trace * f64::EPSILON > TRUSTED_ERROR * least {
         return None;

@@ -1,16 +1,16 @@
-//! Grades of a structure that come some atoms at a time.
+//! Grades of a structure computed in batches of atoms.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::grade::{GradeError, Grades};
 use crate::mixture::Mixture;
 
-/// What [`Grades::evaluate`] gives, to the last bit, where the features of a structure are known some atoms at a time, and by
-/// several threads.
+/// Gives the same bits as [`Grades::evaluate`] where the features of a structure arrive in batches of atoms
+/// from several threads.
 #[derive(Debug, Default)]
 pub struct BatchedGrades {
     collected: Mutex<Collected>,
-    /// Arrays that no thread has in use.
+    /// Buffers that no thread uses.
     idle: Mutex<Vec<Scratch>>,
 }
 
@@ -20,7 +20,7 @@ struct Collected {
     error: Option<GradeError>,
 }
 
-/// What one thread grades.
+/// Buffers of one thread.
 #[derive(Debug, Default)]
 struct Scratch {
     elements: Vec<usize>,
@@ -28,7 +28,7 @@ struct Scratch {
 }
 
 impl BatchedGrades {
-    /// Begins with a structure of `n` atoms.
+    /// Starts a structure of `n` atoms.
     pub fn begin(&mut self, n: usize) {
         let Collected { grades, error } = self.collected.get_mut().unwrap_or_else(PoisonError::into_inner);
         *error = None;
@@ -37,10 +37,11 @@ impl BatchedGrades {
         grades.component.resize(n, 0);
     }
 
-    /// Grades some `atoms` of it, and writes ∂γ_a/∂**z**_a, `[atoms × D]`, which is zero where they cannot be graded; not to an
-    /// empty `gradient`.
+    /// Grades the batch `atoms` and writes ∂γ_a/∂**z**_a, `[atoms × D]`, unless `gradient` is empty. The
+    /// gradient is zero where grading fails.
     ///
-    /// `elements` are those of the whole structure, `features` those of the atoms, `[atoms × D]`.
+    /// `elements` has the element index of every atom of the structure, `features` the features of the batch,
+    /// `[atoms × D]`.
     pub fn add(
         &self,
         mixture: &Mixture,
@@ -68,7 +69,7 @@ impl BatchedGrades {
     /// The grades of all atoms.
     ///
     /// # Errors
-    /// That of the first atom which has one.
+    /// The error of the first atom that has one.
     pub fn finish(&mut self) -> Result<&Grades, GradeError> {
         let Collected { grades, error } = self.collected.get_mut().unwrap_or_else(PoisonError::into_inner);
         match error {
@@ -98,7 +99,7 @@ impl Collected {
     }
 }
 
-/// A thread that panicked has left nothing there that anybody reads.
+/// Poisoning is harmless: nobody reads what a panicked thread left here.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -110,7 +111,7 @@ mod tests {
     use super::*;
     use crate::component::Component;
 
-    /// Two elements, three features; what stands on the diagonals and in the centres does not matter.
+    /// Two elements, three features, arbitrary centroids and diagonals.
     fn mixture() -> Mixture {
         let component = |k: usize| {
             let inverse = (0..9).map(|e| if e % 4 == 0 { 1.0 + (k + e) as f64 } else { 0.1 }).collect();

@@ -1,23 +1,23 @@
-//! How far a covariance has moved from another, and how well it is conditioned.
+//! Drift of a component's covariance, and its condition number.
 
 use crate::component::Component;
 use crate::linear::{LinearError, cholesky, eigenvalues, solve_lower, view};
 
-/// How a component's covariance C has moved since another, C₀ (both with the regularisation εI): from the eigenvalues λ of C
-/// relative to C₀, C v = λ C₀ v, each a direction of feature space in which the variance has become λ times as large.
+/// How far a component's covariance C has drifted from an earlier one, C₀ (both with the regularisation εI).
+/// Computed from the generalised eigenvalues λ, C v = λ C₀ v: along v the variance has changed by the factor λ.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Drift {
-    /// √λ_max: by what factor the width has grown in the direction in which it grew most; 1 if it has not moved.
+    /// √λ_max: the largest factor by which the width has grown along any direction; 1 without drift.
     pub grown: f64,
-    /// √λ_min: the same of the direction in which it shrank most.
+    /// √λ_min: the smallest such factor (the strongest shrinkage).
     pub shrunk: f64,
-    /// √Σ ln²λ: the distance of the two, which does not depend on the scale or the axes of features (Förstner and Moonen
-    /// 1999); 0 if it has not moved.
+    /// √Σ ln²λ: the distance of the two covariances, invariant under linear transformations of the features
+    /// (Förstner and Moonen 1999); 0 without drift.
     pub distance: f64,
 }
 
-/// Condition number of a component's regularised covariance: the largest of its eigenvalues by the smallest. `None` where that is
-/// beyond double precision.
+/// Condition number of a component's regularised covariance: largest / smallest eigenvalue. `None` if it
+/// exceeds double precision.
 ///
 /// # Errors
 /// Eigenvalues that do not converge.
@@ -28,7 +28,7 @@ pub fn condition_number(component: &Component) -> Result<Option<f64>, LinearErro
     Ok((least > 0.0).then(|| largest / least))
 }
 
-/// How far `now` has moved from `before`. `None` where the covariance of either is singular in double precision, or their
+/// The drift from `before` to `now`. `None` if either covariance is singular in double precision or the
 /// dimensions differ.
 ///
 /// # Errors
@@ -53,7 +53,7 @@ pub fn drift(before: &Component, now: &Component) -> Result<Option<Drift>, Linea
     }))
 }
 
-/// The first and the last of ascending numbers.
+/// The first and the last element.
 fn ends(ascending: &[f64]) -> (f64, f64) {
     let [first, .., last] = ascending else {
         let only = ascending.first().copied().unwrap_or_default();
@@ -66,7 +66,7 @@ fn ends(ascending: &[f64]) -> (f64, f64) {
 mod tests {
     use super::*;
 
-    /// A component with these variances along axes that are turned by an angle in the plane of the first two.
+    /// A component with these variances along axes rotated by `angle` in the plane of the first two.
     fn turned(variances: [f64; 3], angle: f64) -> Component {
         let (s, c) = angle.sin_cos();
         let axes = [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]];

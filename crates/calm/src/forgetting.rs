@@ -1,8 +1,8 @@
-//! Whether the live mixture still knows the original training data.
+//! Detects a live mixture that forgets the original training data.
 //!
-//! Convex updates shrink the covariance in directions that recent structures do not visit, so that the training data
-//! themselves drift towards γ > 1. Two measures: the distribution of their grades, if their features are at hand,
-//! and forgetting factors from the statistics alone.
+//! Convex updates shrink the covariance in directions that recent structures do not visit, so that the training
+//! data drift towards γ > 1. There are two measures: the distribution of their grades, if their features are
+//! available, and forgetting factors computed from the statistics alone.
 
 use std::sync::Arc;
 
@@ -24,17 +24,18 @@ pub struct GradeDistribution {
     pub median: f64,
     /// 95 % quantile.
     pub percentile_95: f64,
-    /// Largest.
+    /// Maximum.
     pub maximum: f64,
-    /// Share of the atoms with γ > 1; 2 to 5 % of the training data of foundation models under a fresh mixture (paper).
+    /// Fraction of the atoms with γ > 1; 2 to 5 % of the training data of foundation models under a fresh
+    /// mixture (paper).
     pub share_above_one: f64,
 }
 
-/// When the drift of the training data's grades is an alarm.
+/// When the drift of the training data's grades raises an alarm.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ForgettingAlarm {
-    /// Alarm when more than this share of the training atoms has γ > 1.
+    /// Raises the alarm when more than this fraction of the training atoms has γ > 1.
     pub share_above_one: Fraction,
 }
 
@@ -47,18 +48,18 @@ pub struct ForgettingFactor {
     pub slot: usize,
     /// √⟨σ²⟩/θ of the component's training atoms under the original mixture.
     pub original: f64,
-    /// The same under the live one.
+    /// The same under the live mixture.
     pub live: f64,
-    /// Their ratio: 1 is unchanged, above 1 forgets on the average.
+    /// Their ratio: 1 is unchanged, above 1 means forgetting on average.
     pub factor: f64,
-    /// The largest factor by which σ has grown along any one direction: what the average hides.
+    /// The largest factor by which σ has grown along any direction, which the average hides.
     pub worst_direction: f64,
 }
 
 /// Mixtures that cannot be compared.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ForgettingError {
-    /// The original has no scatter.
+    /// The original has no statistics.
     #[error(
         "component {slot} of element {element} of the original mixture has no scatter; load gmm_artifacts.npz"
     )]
@@ -68,7 +69,7 @@ pub enum ForgettingError {
         /// Component index.
         slot: usize,
     },
-    /// A covariance without eigenvalues.
+    /// A covariance whose eigenvalues do not converge.
     #[error("component {slot} of element {element}: {source}")]
     Linear {
         /// Element index.
@@ -78,7 +79,7 @@ pub enum ForgettingError {
         /// What failed.
         source: LinearError,
     },
-    /// They do not have the same components.
+    /// The mixtures have different components.
     #[error(
         "the live mixture has no component {slot} of element {element} with the original's centroid and threshold"
     )]
@@ -91,7 +92,7 @@ pub enum ForgettingError {
 }
 
 impl GradeDistribution {
-    /// The distribution of some grades; all zero for none.
+    /// The distribution of these grades; all zero without grades.
     ///
     /// Quantiles are interpolated linearly between order statistics.
     pub fn from_grades(gamma: &[f64]) -> Self {
@@ -108,9 +109,9 @@ impl GradeDistribution {
     }
 }
 
-/// The distribution of γ of training atoms under a mixture; compare the live mixture's with the original's.
+/// The distribution of γ of training atoms under a mixture. Compare the live mixture's with the original's.
 ///
-/// `elements` holds an element index for each atom of all frames, `features` is `[atoms × D]`.
+/// `elements` has the element index of each atom of all frames, `features` is `[atoms × D]`.
 ///
 /// # Errors
 /// Those of [`Grades::evaluate`].
@@ -125,35 +126,37 @@ pub fn grade_distribution(
 }
 
 impl Default for ForgettingAlarm {
-    /// 20 %: well above the 2 to 9 % that fresh mixtures leave outside.
+    /// 20 %, well above the 2 to 9 % of fresh mixtures.
     fn default() -> Self {
         Self { share_above_one: Fraction::FIFTH }
     }
 }
 
 impl ForgettingAlarm {
-    /// Whether the live distribution of the training data's grades calls for an alarm.
+    /// Whether the live distribution of the training data's grades raises the alarm.
     ///
-    /// A mixture that left more outside from the start alarms only when it has become worse.
+    /// If the original mixture already exceeds the limit, the alarm requires that the live one is worse.
     pub fn is_raised(&self, original: &GradeDistribution, live: &GradeDistribution) -> bool {
         live.share_above_one > self.share_above_one.get() && live.share_above_one > original.share_above_one
     }
 }
 
-/// The forgetting factors of every component that has training data, without their features.
+/// The forgetting factor of every component that has training data, computed without their features.
 ///
-/// The second moment of the training features about the centroid is the original covariance C = scatter/count, so
-/// the mean of σ² over them is ⟨σ²⟩ = tr(S C), exactly, whatever their distribution, with the original S or the live
-/// one; the factor is √(tr(S_live C) / tr(S_original C)). The factor of the worst direction is the square root of the
-/// largest eigenvalue of (C + εI)^½ S_live (C + εI)^½: an update with weight α multiplies it by at most (1 − α)^−½.
+/// The second moment of the training features about the centroid is the original covariance C = scatter/count.
+/// The mean of σ² over them is therefore exactly ⟨σ²⟩ = tr(S C) for any distribution, with the original S or
+/// the live one, and the factor is √(tr(S_live C) / tr(S_original C)). The factor of the worst direction is the
+/// square root of the largest eigenvalue of (C + εI)^½ S_live (C + εI)^½; an update with weight α multiplies it
+/// by at most (1 − α)^−½.
 ///
-/// Neither is a statement on the tail of γ. The mean follows rare far atoms more than the median does, and falls when
-/// directions that the batches do visit grow, although others are forgotten; the worst direction may be one that
-/// matters little to any atom. Atoms must still be assigned to the same centroids, which are fixed. For a weighted
-/// artifact the mean is the weighted one.
+/// Neither measures the tail of γ. The mean is more sensitive to rare outlying atoms than the median, and it
+/// falls when directions that the batches visit grow although others are forgotten. The worst direction may
+/// matter little to any atom. Both assume that atoms stay assigned to the same centroids, which are fixed. For
+/// a weighted artifact the mean is the weighted one.
 ///
 /// # Errors
-/// Mixtures that are not versions of the same artifact, an original without statistics, failing eigenvalues.
+/// Mixtures that are not versions of the same artifact, an original without statistics, eigenvalues that do not
+/// converge.
 pub fn forgetting_factors(
     original: &Mixture,
     live: &Mixture,
@@ -185,7 +188,7 @@ pub fn forgetting_factors(
     Ok(out)
 }
 
-/// √λ_max of (C + εI)^½ S (C + εI)^½, by way of the eigenvectors of C.
+/// √λ_max of (C + εI)^½ S (C + εI)^½, from the eigenvectors of C.
 fn worst_direction(covariance: &[f64], inverse: &[f64], dimension: usize) -> Result<f64, LinearError> {
     let regularised = regularised(covariance, dimension);
     let Eigen { values, vectors } = eigen(view(&regularised, dimension, dimension))?;

@@ -1,13 +1,13 @@
 //! CALM: a calibrated extrapolation grade from a mixture of Gaussians over the feature vectors of a potential.
 //!
-//! This crate knows numbers, not atoms: element indices, feature vectors **z** of dimension D, and pairs.
-//! A [`Mixture`] is loaded from an [`Artifact`]; [`Grades`] evaluates σ, γ and ∂γ/∂z; [`neighbourhood`]
-//! averages γ over pairs; [`rules`] say when a structure is collected and when an update has done enough;
-//! [`search::update`] finds the update; [`forgetting`] tells whether the mixture still knows its training data.
+//! This crate works on numbers, not atoms: element indices, feature vectors **z** of dimension D, and pairs. An
+//! [`Artifact`] holds a [`Mixture`]; [`Grades`] evaluates σ, γ and ∂γ/∂z; [`neighbourhood`] averages γ over
+//! pairs; [`rules`] decides when a structure is collected and when an update is sufficient; [`search::update`]
+//! finds the update; [`forgetting`] detects whether the mixture still covers its training data.
 //!
-//! Matrices are dense, row-major `f64`; batches of features are `[atoms × D]`, row-major.
-//! All sums run in a fixed order on one thread, so results are the same bits from run to run on one kind of
-//! processor (the grade: on every processor).
+//! Matrices are dense, row-major `f64`; batches of features are `[atoms × D]`, row-major. All sums run in a
+//! fixed order on one thread, so results are bitwise reproducible on one kind of processor (grades on every
+//! processor).
 
 mod alpha_scan;
 pub mod artifact;

@@ -1,40 +1,42 @@
-//! Whether the numbers of a mixture can have come from training data.
+//! Checks whether training data can have produced the numbers of a mixture.
 //!
-//! A mixture loads as soon as its arrays fit together, and any inverse covariance gives grades: one that is a million times
-//! too small grades everything 0.001, so that nothing is ever collected. A build leaves traces that cannot be faked by
-//! accident, and they are what is checked here:
+//! A mixture loads if its arrays fit together, and any inverse covariance gives grades: one that is a million
+//! times too small grades everything 0.001, so that nothing is ever collected. A build satisfies relations that
+//! wrong numbers do not satisfy by accident:
 //!
-//! - S = (C + εI)⁻¹ with ε = 10⁻⁶, so S is positive definite, none of its eigenvalues is above 1/ε, and
-//!   tr(S (C + εI)) = D. The last holds for covariances of any rank.
-//! - The mean of σ² over the training data of a component is tr(SC), and θ is a quantile of σ or a multiple of one.
-//! - Features of a normalised basis are no longer than the columns of the projection, and so are their means.
+//! - S = (C + εI)⁻¹ with ε = 10⁻⁶, so S is positive definite, no eigenvalue exceeds 1/ε, and tr(S (C + εI)) =
+//!   D. The last holds for covariances of any rank.
+//! - The mean of σ² over the training data of a component is tr(SC), and θ is a quantile of σ or a multiple of
+//!   one.
+//! - Features of a normalised basis are no longer than the columns of the projection, and neither are their
+//!   means.
 
 use crate::artifact::{Artifact, SENTINEL};
 use crate::component::Component;
 use crate::linear::{LinearError, REGULARISATION, cholesky, eigenvalues, regularised, view};
 
-/// Numbers are stored in single precision: relative rounding of each, with room for sums that were rounded too.
+/// Files store single precision: the relative rounding of a number, with a margin for sums of rounded numbers.
 const STORED: f64 = 1.0 / (1 << 22) as f64;
 
-/// Largest deviation of tr(S (C + εI))/D from 1, besides rounding; builds deviate by 10⁻⁴.
+/// Largest deviation of tr(S (C + εI))/D from 1 apart from rounding; builds deviate by 10⁻⁴.
 const TRACE_TOLERANCE: f64 = 0.05;
 
-/// Largest condition number of S: beyond it the build's pseudo-inverse leaves directions out.
+/// Largest condition number of S: above it the build's pseudo-inverse drops directions.
 const CONDITION_LIMIT: f64 = 1e15;
 
-/// σ histograms of builds begin here, so no threshold is below.
+/// The σ histograms of builds start here, so no threshold is smaller.
 const LEAST_THRESHOLD: f64 = 0.01;
 
-/// Thresholds are at most this multiple of √⟨σ²⟩: fewer than 1 in 10⁴ environments are beyond it (Markov). Builds: 1 to 3.
+/// Largest θ/√⟨σ²⟩: fewer than 1 in 10⁴ environments exceed it (Markov). Builds: 1 to 3.
 const THRESHOLD_SPAN: f64 = 100.0;
 
-/// Thresholds are at least this share of √⟨σ²⟩, however heavy the tail of σ is.
+/// Smallest θ/√⟨σ²⟩, even for heavy tails of σ.
 const THRESHOLD_SHARE: f64 = 1e-3;
 
-/// Centroids may exceed the length of the features by this factor, for rounding.
+/// Tolerance for centroids that exceed the bound of the features by rounding.
 const REACH: f64 = 1.01;
 
-/// A component that no training data can have made.
+/// A component that no training data can produce.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("component {slot} of {element}: {fault}")]
 pub struct UnsoundComponent {
@@ -64,7 +66,7 @@ pub enum ComponentFault {
         "its inverse covariance has a condition number of at least {found:.1e}; expected at most {CONDITION_LIMIT:.0e}"
     )]
     Condition {
-        /// A lower bound of the condition number.
+        /// Lower bound of the condition number.
         found: f64,
     },
     /// S is larger than the regularisation allows.
@@ -87,7 +89,7 @@ pub enum ComponentFault {
         /// Largest eigenvalue.
         largest: f64,
     },
-    /// Data without weight, or weight without data.
+    /// Data without weight or weight without data.
     #[error(
         "it has {count} environments of weight {effective_count} in sum; expected both to be positive, or both 0"
     )]
@@ -106,47 +108,47 @@ pub enum ComponentFault {
         /// tr(S (C + εI))/D.
         found: f64,
     },
-    /// θ is beyond what σ can be.
+    /// θ is outside the range of σ.
     #[error("its threshold is {found:.3e}; expected {least:.1e} to {most:.1e}")]
     Threshold {
         /// θ.
         found: f64,
-        /// The least that makes sense.
+        /// Smallest plausible value.
         least: f64,
-        /// The most that makes sense.
+        /// Largest plausible value.
         most: f64,
     },
-    /// **μ** = 0 of a component that has data.
+    /// **μ** = 0 for a component with data.
     #[error("its centroid is zero; expected the mean of its features")]
     NoCentroid,
-    /// **μ** is where no feature vector is.
+    /// **μ** is outside the range of the features.
     #[error(
         "its centroid is {found:.3e} in feature {feature}, where the model's features are between ±{most:.3e}"
     )]
     Centroid {
         /// Index of the feature.
         feature: usize,
-        /// The number there.
+        /// Its value.
         found: f64,
-        /// The largest that a feature can be.
+        /// The largest possible value.
         most: f64,
     },
-    /// The same centroid twice.
+    /// Two components have the same centroid.
     #[error("it has the centroid of component {first}; expected one of its own")]
     Duplicate {
-        /// The component that has it too.
+        /// The first of the two.
         first: usize,
     },
-    /// A matrix that linear algebra fails on.
+    /// A matrix for which the linear algebra failed.
     #[error(transparent)]
     Linear(#[from] LinearError),
 }
 
 impl Artifact {
-    /// The components that no training data can have made, in order, each with the first thing that is wrong with it.
+    /// The components that no training data can produce, in order, each with its first fault.
     ///
-    /// Stand-ins of elements without data, and unused slots, are sound. A matrix that is positive definite but for the
-    /// rounding of its storage is sound.
+    /// Placeholders of elements without data and unused slots are valid. So is a matrix that is positive
+    /// definite up to the rounding of its storage.
     pub fn unsound_components(&self) -> Vec<UnsoundComponent> {
         let reach = self.reach();
         let elements = self.symbols.iter().enumerate();
@@ -164,7 +166,7 @@ impl Artifact {
         of_element.flatten().collect()
     }
 
-    /// The largest value of each projected feature: the length of its column, if the basis has length 1 at most.
+    /// The largest value of each projected feature: the norm of its column, since the basis has at most norm 1.
     fn reach(&self) -> Vec<f64> {
         let projection = &self.projection;
         if !projection.normalised {
@@ -185,7 +187,8 @@ struct Spread {
 }
 
 impl Spread {
-    /// Without statistics ⟨σ²⟩ is at most D. A component with few data has the largest threshold of its element.
+    /// Without statistics, ⟨σ²⟩ is at most D. A component with few data gets the largest threshold of its
+    /// element.
     fn new(components: &[&Component]) -> Self {
         let spread = |component: &&Component| match component.statistics() {
             Some(statistics) => mean_square(component, &statistics.covariance()).max(0.0).sqrt(),
@@ -193,7 +196,7 @@ impl Spread {
         };
         let with_data = components.iter().filter(|component| has_data(component)).map(spread);
         let (least, largest) = with_data.fold((f64::INFINITY, 0.0_f64), |(a, b), x| (a.min(x), b.max(x)));
-        // A component whose data are all the same has θ = 1.
+        // A component whose data are all equal has θ = 1.
         Self { least: if least.is_finite() { least } else { 0.0 }, largest: largest.max(1.0) }
     }
 }
@@ -222,7 +225,7 @@ fn check_inverse(component: &Component) -> Result<(), ComponentFault> {
     }
     match cholesky(inverse, dimension) {
         Some(factor) => {
-            // No pivot is less than the least eigenvalue.
+            // No pivot is smaller than the smallest eigenvalue.
             let least = (0..dimension).map(|k| factor[(k, k)].powi(2)).fold(f64::INFINITY, f64::min);
             match found / least {
                 found if found > CONDITION_LIMIT => Err(ComponentFault::Condition { found }),
@@ -281,7 +284,7 @@ fn check_centroid(component: &Component, reach: &[f64]) -> Result<(), ComponentF
     if centroid.iter().all(|value| *value == 0.0) {
         return Err(ComponentFault::NoCentroid);
     }
-    // Features that no projection bounds have to be below the fill of unused slots.
+    // Features without a bound from the projection must be smaller than the fill value of unused slots.
     let bounds = reach.iter().map(|reach| REACH * reach).chain(std::iter::repeat(SENTINEL));
     let mut beyond = centroid.iter().zip(bounds).enumerate();
     match beyond.find(|(_, (value, most))| value.abs() > *most) {
@@ -290,7 +293,8 @@ fn check_centroid(component: &Component, reach: &[f64]) -> Result<(), ComponentF
     }
 }
 
-/// Whether a component stands for data: neither an unused slot nor the stand-in of an element without any.
+/// Whether a component represents data: it is neither an unused slot nor the placeholder of an element without
+/// data.
 fn is_used(component: &Component) -> bool {
     if component.statistics().is_some() {
         return has_data(component);
@@ -299,7 +303,7 @@ fn is_used(component: &Component) -> bool {
     !diagonal(component.inverse(), component.dimension()).all(stand_in)
 }
 
-/// Of two components with the same centroid the second is never the nearest.
+/// If two components share a centroid, the second is never the nearest.
 fn unlike(before: &[&Component], component: &Component) -> Result<(), ComponentFault> {
     if !is_used(component) {
         return Ok(());
@@ -314,13 +318,13 @@ fn diagonal(matrix: &[f64], dimension: usize) -> impl Iterator<Item = f64> {
     matrix.iter().step_by(dimension + 1).copied()
 }
 
-/// The least and the largest eigenvalue.
+/// The smallest and the largest eigenvalue.
 fn extremes(matrix: &[f64], dimension: usize) -> Result<(f64, f64), LinearError> {
     let values = eigenvalues(view(matrix, dimension, dimension))?;
     Ok((values.first().copied().unwrap_or_default(), values.last().copied().unwrap_or_default()))
 }
 
-/// How far the eigenvalues of a stored matrix move by rounding, at most: by the length of the error.
+/// Upper bound of the shift of the eigenvalues by the rounding of a stored matrix: the norm of the error.
 fn rounding(largest: f64, dimension: usize) -> f64 {
     STORED * largest * dimension as f64
 }

@@ -1,11 +1,11 @@
-//! Where the large arrays of a component are: in memory of their own, or lent by somebody, such as a block of
-//! memory shared between processes.
+//! Storage of a component's large arrays: private memory, or memory shared by its owner, such as a block shared
+//! between processes.
 
 use std::fmt;
 use std::sync::Arc;
 
-/// Who lends the numbers of a component and keeps them as they are while it lives. It must give the same slice
-/// every time.
+/// Provides the numbers of a component and keeps them unchanged while it lives. Must return the same slice on
+/// every call.
 pub type SharedNumbers = dyn AsRef<[f64]> + Send + Sync;
 
 /// Centroid **μ**, `[D]`, and inverse covariance S, `[D × D]`, of a component.
@@ -13,7 +13,7 @@ pub type SharedNumbers = dyn AsRef<[f64]> + Send + Sync;
 pub(crate) enum Storage {
     /// In private memory.
     Owned { centroid: Vec<f64>, inverse: Vec<f64> },
-    /// S and behind it **μ**, `[D² + D]`, in memory of somebody else.
+    /// S followed by **μ**, `[D² + D]`, in memory that is shared.
     Shared { shared: Arc<SharedNumbers>, dimension: usize },
 }
 
@@ -44,7 +44,7 @@ impl Storage {
     }
 }
 
-/// Equal by value, wherever the numbers are.
+/// Compares values, independent of the storage.
 impl PartialEq for Storage {
     fn eq(&self, other: &Self) -> bool {
         self.centroid() == other.centroid() && self.inverse() == other.inverse()

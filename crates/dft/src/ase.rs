@@ -1,11 +1,12 @@
-//! Any calculator of the Atomic Simulation Environment, in the user's Python, run by a script of ours ([`SCRIPT`]).
+//! Any calculator of the Atomic Simulation Environment, in the user's Python, run by our script ([`SCRIPT`]).
 //!
-//! The script finds `input.json` and the user's `calculator.py` in its directory and leaves `result.json`, whole or not at
-//! all. `input.json` has `species`, `positions` and `cell` (Å), `periodic`, `moments` (μ_B, or null) and the names of the
-//! `remedies`. `result.json` is either `{"converged": {…}}` with `species`, `positions`, `cell`, `energy` (eV, the one whose
-//! derivative the forces are), `energy_without_smearing`, `forces` (eV/Å), `stress` (eV/Å³, xx yy zz yz xz xy), `moments`,
-//! `magnetisation` (μ_B) and `steps`, null where there is none; or `{"failure": {"class": …, "message": …}}`. In either case `by`
-//! has the versions of ASE and of the calculator's file, which must be those of the protocol.
+//! The script reads `input.json` and the user's `calculator.py` in its directory and writes `result.json`
+//! atomically. `input.json` has `species`, `positions` and `cell` (Å), `periodic`, `moments` (μ_B, or null) and
+//! `remedies`, the names of the retry adjustments. `result.json` is either `{"converged": {…}}` with `species`,
+//! `positions`, `cell`, `energy` (eV, the one consistent with the forces), `energy_without_smearing`, `forces`
+//! (eV/Å), `stress` (eV/Å³, xx yy zz yz xz xy), `moments`, `magnetisation` (μ_B) and `steps`, null where
+//! absent; or `{"failure": {"class": …, "message": …}}`. In both cases `by` has the versions of ASE and of the
+//! calculator's file, which must match the protocol.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -20,28 +21,30 @@ use crate::{
     Size, script_output, validation, version_query,
 };
 
-/// The script that a calculator is run by.
+/// The script that runs the calculator.
 pub const SCRIPT: &str = concat!(include_str!("script.py"), include_str!("ase/job.py"));
 
 const SCRIPT_FILE: &str = "job.py";
 const CALCULATOR_FILE: &str = "calculator.py";
 
-/// Counts changes of the script that change a label's value.
+/// Version of the script; raised when a change affects label values.
 const INPUT_VERSION: u32 = 1;
 
-/// `[label.method.ase]`
+/// The settings of `[label.method.ase]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
-    /// A Python that has ASE, and what it is started by: `["mpirun", "-np", "4", "gpaw", "python"]`.
+    /// A Python with ASE and its launcher: `["mpirun", "-np", "4", "gpaw", "python"]`.
     pub command: Vec<String>,
-    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
     pub environment: BTreeMap<String, String>,
-    /// A Python file that defines `calculator()`, which returns an ASE calculator; if it has a parameter, that is the set
-    /// of names of the remedies. It may define a text `version` of what the labels depend on beside this file, and
-    /// `converged(calculator)`. It is read once, at the start, and stands alone in each calculation's directory. Needed.
+    /// A Python file that defines `calculator()`, which returns an ASE calculator. If the function has a
+    /// parameter, it receives the set of retry adjustments by name. The file may define a string `version` for
+    /// everything else that labels depend on, and `converged(calculator)`. It is read once at the start and
+    /// copied alone into each calculation's directory. Required.
     pub calculator: PathBuf,
-    /// Initial magnetic moment by element, μ_B, 1 for all others; if there are none, no atom gets one.
+    /// Initial magnetic moment of each element, μ_B. Default: 1 for the elements not listed; without this table
+    /// no atom has a moment.
     pub moments: Moments,
 }
 
@@ -57,10 +60,10 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Reads the calculator's file and asks for the versions.
+    /// Reads the calculator's file and queries the versions.
     ///
     /// # Errors
-    /// No such file, a program that is no Python with ASE, a file that Python cannot load.
+    /// A missing file, a program that is not Python with ASE, a file that Python cannot load.
     pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Ase, SetupError> {
         let calculator = std::fs::read(&self.calculator).map_err(|error| SetupError::Setting {
             key: "calculator",
@@ -73,7 +76,7 @@ impl Settings {
     }
 }
 
-/// What the script says of ASE and of the calculator's file.
+/// The versions of ASE and of the calculator's file, as the script reports them.
 #[derive(Clone, Debug, Deserialize)]
 struct Versions {
     ase: String,
@@ -96,7 +99,7 @@ impl Versions {
     }
 }
 
-/// A calculator, ready to be used.
+/// A configured calculator.
 #[derive(Clone, Debug)]
 pub struct Ase {
     settings: Settings,
@@ -107,7 +110,7 @@ pub struct Ase {
 
 impl DftBackend for Ase {
     fn identity(&self) -> Value {
-        // Destructured, so that a new setting is not forgotten here.
+        // Destructure, so that a new setting cannot be forgotten here.
         let Settings { command: _, environment: _, calculator: _, moments } = &self.settings;
         json!({
             "code": "ase", "ase": self.who.ase, "recipe": INPUT_VERSION, "version": self.who.version,
@@ -116,7 +119,7 @@ impl DftBackend for Ase {
     }
 
     fn supports(&self, _: &BTreeSet<Species>) -> Result<(), SetupError> {
-        // Only the calculator knows, and only when it calculates.
+        // Only the calculator knows, and only while it calculates.
         Ok(())
     }
 

@@ -1,4 +1,4 @@
-//! What a program that makes labels must be able to do.
+//! The interface to a program that makes labels.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -8,73 +8,73 @@ use atoms::{Species, Structure};
 
 use crate::{Failure, FailureClass, PinnedFile, RetryAdjustment};
 
-/// A program that makes labels, with its settings. It is made by its module's `Settings`, which finds the program and
-/// its pseudopotentials.
+/// A configured program that makes labels. Each program's `Settings` locates the program and its
+/// pseudopotentials and creates it.
 ///
-/// A label is made in this order: [`Self::input`] gives files, which are written to an empty directory; the program is
-/// run there; [`Self::read`] judges what it left.
+/// Steps of a label: write the files of [`Self::input`] to an empty directory, run the command there, and pass
+/// the directory to [`Self::read`].
 pub trait DftBackend: Send + Sync {
-    /// Everything that changes a label's value: settings, version of the program, hashes of pseudopotentials. Labels of
-    /// equal identity may stand in one data set. Nothing that only changes how long it takes.
+    /// Everything that changes the value of a label: settings, program version, hashes of pseudopotentials.
+    /// Labels of equal identity may share a data set. Excludes what only changes the run time.
     fn identity(&self) -> serde_json::Value;
 
-    /// Whether it can label structures of these species.
+    /// Checks that it can label structures with these species.
     ///
     /// # Errors
-    /// [`SetupError`] for the first that it cannot: no pseudopotential, a title that does not fit.
+    /// [`SetupError`] for the first species without a matching pseudopotential.
     fn supports(&self, species: &BTreeSet<Species>) -> Result<(), SetupError>;
 
-    /// The files that a calculation starts from, and the command.
+    /// The input files and the command of a calculation.
     ///
     /// # Errors
-    /// [`FailureClass::BadInput`](crate::FailureClass) if the structure cannot be written for this program.
+    /// [`FailureClass::BadInput`](crate::FailureClass) if the program's input cannot express the structure.
     fn input(&self, structure: &Structure, adjustments: &BTreeSet<RetryAdjustment>)
     -> Result<Input, Failure>;
 
-    /// Judges the calculation that was run in `directory` and ended so, and reads its numbers. Nothing is believed
-    /// unless the program says that it converged and has calculated the very structure that was asked for: atoms, order,
-    /// species and cell. What says that another version of the program has made it is
+    /// Reads the results of the calculation in `directory`, which ended with `exit`. Accepts them only if the
+    /// program states convergence and calculated exactly the requested structure: atoms, order, species and
+    /// cell. If another version of the program made the output, the failure is
     /// [`FailureClass::OtherProgram`](crate::FailureClass).
     ///
     /// # Errors
-    /// Why it is no label. What can no longer be read is a failure like any other.
+    /// Why there is no label. Output that cannot be read is a failure like any other.
     fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure>;
 
-    /// What its cost depends on.
+    /// The quantities that determine the cost of a calculation.
     fn size(&self, structure: &Structure) -> Size;
 }
 
-/// What a calculation starts from.
+/// Input of a calculation.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Input {
     /// Content of each file by its name in the directory.
     pub files: BTreeMap<String, Vec<u8>>,
-    /// The program with its arguments; what it prints is kept in the files `stdout` and `stderr` beside the others.
+    /// The program with its arguments. Its output is kept in the files `stdout` and `stderr` beside the others.
     pub command: Vec<String>,
-    /// What is added to its environment.
+    /// Additional environment variables.
     pub environment: BTreeMap<String, String>,
-    /// Large files that the program reads besides, such as pseudopotentials: copies of these are put into the folder `data`
-    /// beside the directory, by these names. All calculations have the same, and so they need not be kept.
+    /// Large files that the program also reads, such as pseudopotentials. They are copied under these names
+    /// into the folder `data` beside the directory. All calculations share them, so they need not be kept.
     pub data: BTreeMap<String, PinnedFile>,
 }
 
 /// How a program ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {
-    /// With this code: many programs say 0 whatever happened.
+    /// It returned this exit code; many programs return 0 in any case.
     Code(i32),
-    /// By this signal.
+    /// A signal ended it.
     Signal(i32),
-    /// It was ended because its time was over.
+    /// It exceeded its time limit.
     TimeLimit,
-    /// It was ended because it used too much memory.
+    /// It exceeded its memory limit.
     OutOfMemory,
-    /// The machine it ran on was lost.
+    /// Its node was lost.
     LostNode,
 }
 
 impl Exit {
-    /// The failure that this end means where the program's files tell nothing better.
+    /// The failure that follows from this end if the program's files give no better reason.
     pub fn failure(self) -> Failure {
         match self {
             Self::Code(code) => FailureClass::Crashed.with_message(format!("ended with exit code {code}")),
@@ -88,63 +88,63 @@ impl Exit {
     }
 }
 
-/// The numbers of a calculation.
+/// The results of a calculation.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Results {
-    /// The energy whose derivative the forces are, eV: with smearing, the free energy.
+    /// The energy consistent with the forces, eV: with smearing, the free energy.
     pub energy: f64,
-    /// Extrapolated to no smearing, eV; none if the program gives none.
+    /// The energy extrapolated to zero smearing, eV, if the program reports it.
     pub energy_without_smearing: Option<f64>,
-    /// Forces, [n], eV/Å.
+    /// Forces, `[n]`, eV/Å.
     pub forces: Vec<Vec3>,
-    /// Stress, eV/Å³, tension positive; none where it is not defined or not given.
+    /// Stress, eV/Å³, tension positive; `None` if it is undefined or not reported.
     pub stress: Option<Matrix3>,
-    /// Magnetic moment of each atom, [n], μ_B; none without spin or if the program gives none.
+    /// Magnetic moment of each atom, `[n]`, μ_B; `None` without spin or if not reported.
     pub magnetic_moments: Option<Vec<f64>>,
     /// Magnetic moment of the cell, μ_B.
     pub magnetisation: Option<f64>,
-    /// Electronic steps that it took.
+    /// Number of electronic steps.
     pub electronic_steps: Option<u32>,
 }
 
-/// What the cost of a calculation depends on.
+/// The quantities that determine the cost of a calculation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Size {
-    /// Atoms.
+    /// Number of atoms.
     pub atoms: usize,
-    /// Electrons that the program treats (valence); 0 where that is unknown.
+    /// Number of valence electrons; 0 if unknown.
     pub electrons: f64,
-    /// Points of the k-point mesh, without symmetry; 1 where there is none.
+    /// Number of k-points before symmetry; 1 without a mesh.
     pub k_points: usize,
 }
 
-/// Why a program cannot be used at all: found before anything is run.
+/// Why a program is unusable; found before anything runs.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SetupError {
-    /// The program is not there, or does not start.
+    /// The program is missing or does not start.
     #[error("{program}: {reason}")]
     Program {
-        /// As the settings call it.
+        /// Its name in the settings.
         program: String,
-        /// What is wrong, and what to do.
+        /// What is wrong and how to fix it.
         reason: String,
     },
-    /// A pseudopotential is missing or is not what it should be.
+    /// A pseudopotential is missing or does not match.
     #[error("pseudopotential of {species}: {reason}")]
     Pseudopotential {
         /// The element.
         species: Species,
-        /// What is wrong, with the path, and what to do.
+        /// What is wrong, with the path, and how to fix it.
         reason: String,
     },
-    /// A setting has an impossible value.
+    /// A setting has an invalid value.
     #[error("{key}: found {found}, expected {expected}")]
     Setting {
         /// The key in the method's section.
         key: &'static str,
         /// Its value.
         found: String,
-        /// What it may be.
+        /// The valid values.
         expected: String,
     },
 }

@@ -8,7 +8,7 @@ fn wrong(key: &'static str, found: impl Display, expected: String) -> Result<(),
     Err(SetupError::Setting { key, found: found.to_string(), expected })
 }
 
-/// A finite number above 0.
+/// Requires a positive finite number.
 pub(crate) fn positive(key: &'static str, value: f64) -> Result<(), SetupError> {
     match value.is_finite() && value > 0.0 {
         true => Ok(()),
@@ -16,7 +16,7 @@ pub(crate) fn positive(key: &'static str, value: f64) -> Result<(), SetupError> 
     }
 }
 
-/// A number that is not below `least`.
+/// Requires at least `least`.
 pub(crate) fn at_least<T: PartialOrd + Display>(
     key: &'static str,
     value: T,

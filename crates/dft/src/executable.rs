@@ -1,10 +1,10 @@
-//! Where programs are.
+//! Locates executables.
 
 use std::path::{Path, PathBuf};
 
 use crate::SetupError;
 
-/// The file of a program: as it stands if it is an absolute path, otherwise sought where the shell would.
+/// Finds a program: an absolute path is used as is, a name is looked up in PATH.
 ///
 /// # Errors
 /// [`SetupError::Program`] if there is no such file.

@@ -1,7 +1,8 @@
-//! What calmwalk knows of the programs that make labels: their inputs, how to tell that a calculation is good, and
-//! where its numbers stand. Files and numbers only; who runs the programs, and where, is not known here.
+//! Interfaces to the programs that make labels: their inputs, the validation of their outputs, and the
+//! adjustments of a retry. This crate handles files and numbers only and runs no calculations.
 //!
-//! Units: eV, Å, eV/Å, eV/Å³ (tension positive), μ_B. What a program writes in others is converted by its module.
+//! Units: eV, Å, eV/Å, eV/Å³ (tension positive), μ_B. The module of each program converts from the program's
+//! own units.
 
 pub mod abinit;
 pub mod ase;

@@ -1,4 +1,4 @@
-//! Magnetic moments that a calculation starts from.
+//! Initial magnetic moments.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,11 +9,12 @@ use crate::RetryAdjustment;
 /// Initial moment of each element, μ_B.
 pub type Moments = BTreeMap<Species, f64>;
 
-/// Elements that are not in the table start from this, μ_B: a calculation that starts without any moment never finds
-/// one, and stretched structures of elements that are not magnetic may have some.
+/// Default moment of an element, μ_B. A calculation that starts without moments never finds any, and strained
+/// structures of nonmagnetic elements may have some.
 const DEFAULT_MOMENT: f64 = 1.0;
 
-/// Initial moment of each atom, [n], μ_B. With [`RetryAdjustment::OtherMoments`] half of it, which is nearer to other solutions.
+/// Initial moment of each atom, `[n]`, μ_B. [`RetryAdjustment::OtherMoments`] halves it, to converge to another
+/// solution.
 pub(crate) fn initial(
     structure: &Structure,
     table: &Moments,

@@ -1,29 +1,29 @@
-//! Structures as codes with periodic basis functions take them.
+//! Structures in the form that codes with periodic basis functions need.
 
 use atoms::cell::{self, scale};
 use atoms::{NeighbourList, Structure, shortest_distance};
 
 use crate::{Failure, FailureClass, Results, Size, k_mesh};
 
-/// No nuclei that a campaign could want are as near as this, Å; some codes calculate them without a word.
+/// Minimum distance of atoms, Å. No campaign needs smaller ones, and some codes accept them silently.
 const MIN_DISTANCE: f64 = 0.4;
 
-/// A structure in a right-handed cell that repeats in all directions.
+/// A structure in a right-handed cell that is periodic in all directions.
 #[derive(Clone, Debug)]
 pub(crate) struct PaddedStructure {
-    /// Species and positions as they were.
+    /// The structure, with the original species and positions.
     pub structure: Structure,
-    /// The lattice vectors that repeat by themselves, not only because a code wants them to.
+    /// Which lattice vectors were periodic in the original structure.
     repeats: [bool; 3],
 }
 
 impl PaddedStructure {
-    /// Directions that do not repeat get a lattice vector, orthogonal to all others, as long as the atoms extend in it
-    /// and `vacuum`, Å, beyond, rounded up to whole Å. Of a left-handed cell, the last two lattice vectors change places. Positions stay as
-    /// they are.
+    /// Gives each non-periodic direction a lattice vector that is orthogonal to all others. Its length is the
+    /// extent of the atoms plus `vacuum`, Å, rounded up to whole Å. Swaps the last two lattice vectors of a
+    /// left-handed cell. Positions do not change.
     ///
     /// # Errors
-    /// [`FailureClass::BadInput`] for a structure that is invalid, or whose atoms coincide.
+    /// [`FailureClass::BadInput`] for an invalid structure or coinciding atoms.
     pub fn new(structure: &Structure, vacuum: f64) -> Result<Self, Failure> {
         structure.validate().map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         let padded = Self::unchecked(structure, vacuum);
@@ -39,7 +39,7 @@ impl PaddedStructure {
             let along = structure.positions.iter().map(|position| cell::dot(*position, direction));
             let (least, most) = along
                 .fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), x| (least.min(x), most.max(x)));
-            // In whole Å, for the energy not to depend on the positions by way of the plane waves that fit the cell.
+            // Rounding to Å keeps the number of plane waves, and so the energy, independent of the positions.
             cell.0[row] = scale(direction, (most - least + vacuum - 1e-9).ceil());
         }
         if cell.signed_volume() < 0.0 {
@@ -65,21 +65,21 @@ impl PaddedStructure {
         )))
     }
 
-    /// The Γ-centred mesh of this spacing, Å⁻¹; one point in directions that were open.
+    /// The Γ-centred mesh of this spacing, Å⁻¹; one point along padded directions.
     pub fn mesh(&self, spacing: f64) -> [u32; 3] {
         k_mesh::gamma_centred(&self.structure.cell, self.repeats, spacing)
     }
 
-    /// What was calculated in this cell, as it holds for the structure: with open directions there is no stress.
+    /// Removes the stress if a direction was padded, because it is undefined for the original structure.
     pub fn without_padding_stress(&self, calculated: Results) -> Results {
         let stress = calculated.stress.filter(|_| self.repeats == [true; 3]);
         Results { stress, ..calculated }
     }
 }
 
-/// What the cost of a structure depends on, with this vacuum, this k-spacing and so many valence electrons.
+/// The quantities that determine the cost, for this vacuum, k-point spacing and number of valence electrons.
 pub(crate) fn size(structure: &Structure, vacuum: f64, k_spacing: f64, electrons: f64) -> Size {
-    // A structure that cannot be calculated is refused when its input is written.
+    // Writing the input reports structures that cannot be calculated.
     let mesh = PaddedStructure::new(structure, vacuum).map_or([1; 3], |padded| padded.mesh(k_spacing));
     Size { atoms: structure.len(), electrons, k_points: mesh.iter().map(|n| *n as usize).product() }
 }

@@ -1,11 +1,11 @@
-//! The head of PAW setups in the XML that GPAW and ABINIT share.
+//! The header of PAW setups in the XML format that GPAW and ABINIT share.
 
 use atoms::Species;
 
-/// How far into a file its head reaches, bytes.
+/// Bytes of a file that contain the header.
 const HEAD: usize = 8192;
 
-/// Valence electrons that a setup states, if it is of this element and of PBE; otherwise what is wrong.
+/// Number of valence electrons of a PBE setup of this element, or what is wrong with the file.
 pub(crate) fn valence(setup: &[u8], species: Species) -> Result<f64, String> {
     let head = String::from_utf8_lossy(&setup[..setup.len().min(HEAD)]);
     let valence = attribute(&head, "atom", "valence").and_then(|valence| valence.trim().parse::<f64>().ok());

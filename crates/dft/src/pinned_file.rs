@@ -1,20 +1,20 @@
-//! Files that the protocol's identity holds by their content, and of which every calculation gets a copy.
+//! Files whose content belongs to the protocol's identity and which are copied for every calculation.
 
 use std::io::{Error, ErrorKind, Read, Result};
 use std::path::{Path, PathBuf};
 
 use flate2::read::GzDecoder;
 
-/// Where a program finds the copies, seen from the directory in which it is run.
+/// Where a program finds the copies, relative to its working directory.
 pub(crate) const DATA_DIRECTORY: &str = "../data";
 
-/// Pseudopotentials have at most some MB; a file that grows without end is none.
+/// Limit against archives that expand without end; pseudopotentials have a few MB.
 const MAX_UNPACKED_BYTES: u64 = 64 << 20;
 
-/// Digits of a hash by which people tell two apart.
+/// Digits of a hash in messages.
 const SHORT_HASH_DIGITS: usize = 12;
 
-/// A file as it was when it was hashed.
+/// A file identified by the hash of its content.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PinnedFile {
     path: PathBuf,
@@ -22,22 +22,22 @@ pub struct PinnedFile {
 }
 
 impl PinnedFile {
-    /// Hashes a file. Returns its content as well, unpacked if its name ends with `.gz`.
+    /// Hashes a file. Also returns its content, decompressed if the name ends with `.gz`.
     ///
     /// # Errors
-    /// The file cannot be read or unpacked.
+    /// The file cannot be read or decompressed.
     pub fn open(path: PathBuf) -> Result<(Self, Vec<u8>)> {
         let content = content(&path)?;
         Ok((Self { hash: hash(&content), path }, content))
     }
 
-    /// One that is not there.
+    /// A file that does not exist.
     #[cfg(test)]
     pub(crate) fn fake(path: &str, hash: &str) -> Self {
         Self { path: path.into(), hash: hash.to_owned() }
     }
 
-    /// Where it is.
+    /// Its path.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -47,10 +47,10 @@ impl PinnedFile {
         &self.hash
     }
 
-    /// The bytes that were hashed, to be copied.
+    /// Reads the content and compares it with the hash.
     ///
     /// # Errors
-    /// The file cannot be read, or is another by now.
+    /// The file cannot be read, or its content has changed.
     pub fn content(&self) -> Result<Vec<u8>> {
         let content = content(&self.path)?;
         let found = hash(&content);
@@ -103,7 +103,7 @@ mod tests {
             (&b"first"[..], &b"first"[..])
         );
 
-        // As long as before, and by the same name.
+        // Same length and same name.
         fs::write(directory.path().join("new"), "other").unwrap();
         fs::rename(directory.path().join("new"), &path).unwrap();
         let error = original.content().unwrap_err().to_string();

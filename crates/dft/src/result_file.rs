@@ -1,8 +1,8 @@
-//! Files that a program has left in its directory.
+//! Reads files that a program left in its directory.
 //!
-//! Under the name of a result there may be anything: a pipe that nobody writes to, a link to a device that never ends, a
-//! sparse file that is larger than the memory. All files that a program has left are therefore opened here: without waiting
-//! and without following a link, regular files only, and up to a size.
+//! Anything may stand under the name of a result: a pipe without a writer, a link to an endless device, a
+//! sparse file larger than the memory. This module opens all such files: regular files only, up to a size
+//! limit, without blocking and without following links.
 
 use std::fs::{File, FileType};
 use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Take};
@@ -12,55 +12,55 @@ use std::path::Path;
 use rustix::fs::{Mode, OFlags};
 use rustix::io::Errno;
 
-/// Bytes of the largest file that is read into memory as a whole: 256 MiB.
+/// Size limit of a file that is read into memory: 256 MiB.
 pub const MAX_BYTES: u64 = 256 << 20;
-/// Bytes of the largest file that is read piece by piece, as VASP's: 16 GiB.
+/// Size limit of a file that is streamed, such as VASP's: 16 GiB.
 pub const MAX_STREAMED_BYTES: u64 = 16 << 30;
-/// Bytes of the longest piece of such a file: 1 MiB.
+/// Size limit of a record in a streamed file: 1 MiB.
 pub const MAX_RECORD_BYTES: usize = 1 << 20;
 
-/// Why a file is not read. It completes a sentence that begins with the name of the file.
+/// Why a file is not read. The message continues a sentence that starts with the file's name.
 #[derive(Debug, thiserror::Error)]
 pub enum ResultFileError {
-    /// There is none.
+    /// The file does not exist.
     #[error("is missing")]
     Missing,
-    /// Reading it might never end.
+    /// Not a regular file; reading it might never end.
     #[error("is {found}, expected a regular file")]
     NotRegular {
         /// What it is.
         found: &'static str,
     },
-    /// It might fill the memory.
+    /// Too large for the memory.
     #[error("has {bytes} bytes, expected at most {most}")]
     TooLarge {
         /// Its size.
         bytes: u64,
-        /// The bound.
+        /// The limit.
         most: u64,
     },
-    /// The system refuses.
+    /// The system reports an error.
     #[error("cannot be read: {0}")]
     Io(#[from] io::Error),
 }
 
 impl ResultFileError {
-    /// Whether there is no such file.
+    /// Whether the file does not exist.
     pub fn is_missing(&self) -> bool {
         matches!(self, Self::Missing)
     }
 }
 
-/// The last part of a file.
+/// The end of a file.
 #[derive(Debug)]
 pub struct Tail {
-    /// Bytes of the whole file.
+    /// Size of the whole file, bytes.
     pub length: u64,
-    /// The last of them.
+    /// Its last bytes.
     pub bytes: Vec<u8>,
 }
 
-/// The whole content, of at most [`MAX_BYTES`] bytes.
+/// Reads a file of at most [`MAX_BYTES`] bytes.
 ///
 /// # Errors
 /// See [`ResultFileError`].
@@ -68,13 +68,13 @@ pub fn read(path: &Path) -> Result<Vec<u8>, ResultFileError> {
     let (file, length) = open(path)?;
     within(length, MAX_BYTES)?;
     let mut content = Vec::new();
-    // It may grow while it is read.
+    // The file may grow while it is read.
     let read = file.take(MAX_BYTES + 1).read_to_end(&mut content)?;
     within(read as u64, MAX_BYTES)?;
     Ok(content)
 }
 
-/// The last `bytes` of a file, however large it is.
+/// Reads the last `bytes` of a file of any size.
 ///
 /// # Errors
 /// See [`ResultFileError`].
@@ -86,8 +86,9 @@ pub fn tail(path: &Path, bytes: u64) -> Result<Tail, ResultFileError> {
     Ok(Tail { length, bytes: end })
 }
 
-/// A reader of a file of at most [`MAX_STREAMED_BYTES`] bytes. It fails where more than [`MAX_RECORD_BYTES`] bytes come without
-/// the byte `mark`, so that a parser that keeps what stands between two of them needs no more memory.
+/// Opens a file of at most [`MAX_STREAMED_BYTES`] bytes for streaming. Reading fails if more than
+/// [`MAX_RECORD_BYTES`] bytes come without a `delimiter`, which bounds the memory of a parser that keeps one
+/// record.
 ///
 /// # Errors
 /// See [`ResultFileError`].
@@ -101,9 +102,9 @@ fn within(bytes: u64, most: u64) -> Result<(), ResultFileError> {
     if bytes > most { Err(ResultFileError::TooLarge { bytes, most }) } else { Ok(()) }
 }
 
-/// The file with its size, if it is a regular one.
+/// Opens a regular file; also returns its size.
 fn open(path: &Path) -> Result<(File, u64), ResultFileError> {
-    // NONBLOCK: to open a pipe waits for somebody who writes to it otherwise.
+    // Without NONBLOCK, opening a pipe waits for a writer.
     let flags = OFlags::RDONLY | OFlags::NONBLOCK | OFlags::NOFOLLOW | OFlags::NOCTTY | OFlags::CLOEXEC;
     let file = match rustix::fs::open(path, flags, Mode::empty()) {
         Ok(file) => File::from(file),
@@ -183,7 +184,7 @@ mod tests {
         assert_eq!(open_delimited(&path, b'\n').unwrap().lines().count(), 2);
     }
 
-    /// All of these are refused by whoever reads, at once.
+    /// Every reader rejects all of these at once.
     #[test]
     fn nothing_but_a_regular_file_is_read() {
         let home = tempfile::tempdir().unwrap();
@@ -221,7 +222,7 @@ mod tests {
         let message = read(&path).unwrap_err().to_string();
         assert_eq!(message, "has 268435457 bytes, expected at most 268435456");
         assert_eq!(tail(&path, 5).unwrap().bytes, [0; 5]);
-        // One line without an end.
+        // A line without an end.
         let mut line = Vec::new();
         let message =
             open_delimited(&path, b'\n').unwrap().read_until(b'\n', &mut line).unwrap_err().to_string();

@@ -1,31 +1,31 @@
-//! What is changed before a calculation that failed is tried again. Nothing of it touches the accuracy of the protocol:
-//! a calculation that converges with a remedy gives the same numbers as one that did without.
+//! What changes before a failed calculation is tried again. No adjustment affects the accuracy of the protocol:
+//! a calculation that converges with one gives the same numbers as without.
 
 use std::collections::BTreeSet;
 
 use crate::FailureClass;
 
-/// One change.
+/// One adjustment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum RetryAdjustment {
-    /// More electronic steps are allowed.
+    /// Allow more electronic steps.
     MoreSteps,
-    /// The density is mixed more carefully.
+    /// Mix densities more cautiously.
     SlowerMixing,
-    /// Another way to minimise.
+    /// Use another minimisation algorithm.
     OtherAlgorithm,
-    /// Other magnetic moments to start from.
+    /// Start from other magnetic moments.
     OtherMoments,
-    /// Twice the memory.
+    /// Request twice the memory.
     MoreMemory,
-    /// Twice the time.
+    /// Allow twice the time.
     MoreTime,
-    /// Not where it failed.
+    /// Avoid the nodes on which it failed.
     OtherNode,
 }
 
 impl RetryAdjustment {
-    /// All of them.
+    /// All adjustments.
     pub const ALL: [Self; 7] = [
         Self::MoreSteps,
         Self::SlowerMixing,
@@ -36,7 +36,7 @@ impl RetryAdjustment {
         Self::OtherNode,
     ];
 
-    /// Short name, as the store keeps it.
+    /// Name in the store.
     pub fn name(self) -> &'static str {
         match self {
             Self::MoreSteps => "more_steps",
@@ -50,7 +50,7 @@ impl RetryAdjustment {
     }
 }
 
-/// The ladder of a class: what each further failure of that class adds.
+/// The adjustments that each further failure of a class adds.
 fn ladder(class: FailureClass) -> &'static [&'static [RetryAdjustment]] {
     use RetryAdjustment::*;
     match class {
@@ -63,8 +63,8 @@ fn ladder(class: FailureClass) -> &'static [&'static [RetryAdjustment]] {
     }
 }
 
-/// What to change after the failures of a job so far, oldest first; `None` if its last class has no rung left, and the job
-/// is to be given up.
+/// The adjustments for the next attempt, from the failures of a job so far, oldest first. `None` if nothing is
+/// left to try for the last failure's class and the job has failed.
 pub fn adjustments(failures: &[FailureClass]) -> Option<BTreeSet<RetryAdjustment>> {
     let mut changes = BTreeSet::new();
     for class in BTreeSet::from_iter(failures) {

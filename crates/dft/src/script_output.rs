@@ -1,4 +1,4 @@
-//! What our Python scripts leave: `result.json`, whole or not at all.
+//! Reads `result.json`, which our Python scripts write atomically.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -10,10 +10,10 @@ use serde::Deserialize;
 use crate::structure_check::check_same_structure;
 use crate::{Failure, FailureClass, Results, validation};
 
-/// Numbers go to the script and back without a loss.
+/// The script returns numbers without loss.
 const TOLERANCE: f64 = 1e-9;
 
-/// `result.json`: one of the first two, and versions by the names of what has made it.
+/// `result.json`: one of the first two fields, and the versions by program.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ScriptOutput {
@@ -44,8 +44,8 @@ struct ScriptFailure {
     message: String,
 }
 
-/// The calculation of `structure` that was run in `directory`, by programs of these names and versions; `None` if there is
-/// no whole result.
+/// Reads the calculation of `structure` in `directory`, made by programs of these names and versions; `None`
+/// without a complete result.
 pub(crate) fn read(
     structure: &Structure,
     directory: &Path,

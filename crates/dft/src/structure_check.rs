@@ -1,13 +1,13 @@
-//! Whether a program has calculated the structure that it was given.
+//! Checks that a program calculated the requested structure.
 
 use atoms::cell::{norm, scale, sub};
 use atoms::{Structure, Vec3};
 
 use crate::{Failure, FailureClass};
 
-/// Compares what a program says it calculated with what it was asked for: as many atoms, of the same species in the same
-/// order, in the same cell and, up to lattice vectors of the directions that repeat, at the same places. `tolerance`, Å,
-/// is what the digits of the program's file allow, for the entries of the cell and the distance of each atom.
+/// Compares the structure of an output with the requested one: the same species in the same order in the same
+/// cell and, modulo lattice vectors of the periodic directions, at the same positions. `tolerance`, Å, is the
+/// precision of the output, for the elements of the cell and the displacement of each atom.
 ///
 /// # Errors
 /// [`FailureClass::Implausible`] with the first difference.
@@ -30,7 +30,7 @@ pub(crate) fn check_same_structure(
     }
     for i in (0..3).filter(|i| asked.periodic[*i]) {
         let (found, asked) = (found.cell.0[i], asked.cell.0[i]);
-        // Written so that a number that is none is a difference.
+        // Written so that NaN counts as a difference.
         if !sub(found, asked).iter().all(|x| x.abs() <= tolerance) {
             return other(format!("found the lattice vector {found:?}, expected {asked:?} (Å)"));
         }

@@ -1,18 +1,19 @@
-//! What is asked of every calculation, whatever program made it.
+//! Checks that apply to every calculation, whichever program made it.
 
 use std::path::Path;
 
 use crate::result_file::{self, ResultFileError};
 use crate::{Exit, Failure, FailureClass, Results};
 
-/// Why a calculation that left no whole result is no label. `logs` are the files in `directory` whose ends tell more.
+/// The failure of a calculation without a complete result. `logs` are files in `directory` whose last lines go
+/// into the message.
 pub(crate) fn failure_without_result(exit: Exit, directory: &Path, logs: &[&str]) -> Failure {
     let ends =
         logs.iter().filter_map(|log| Some(format!("{log} ends with: {}", tail(&directory.join(log))?)));
     let told = ends.collect::<Vec<_>>().join("; ");
     let Failure { class, message } = exit.failure();
     let (class, message) = match exit {
-        // What is not ours to send comes from the kernel; shells and launchers make 128 + 9 of it.
+        // If we did not send the signal, the kernel did; shells and launchers return 128 + 9.
         Exit::Signal(9) | Exit::Code(137) => {
             (FailureClass::OutOfMemory, "killed, as the kernel does where memory is exhausted".to_owned())
         }
@@ -37,7 +38,7 @@ fn mentions_memory(log: &str) -> bool {
     .any(|words| log.contains(words))
 }
 
-/// The last lines of a file, as one; `None` if there are none.
+/// The last lines of a file, joined to one; `None` if there are none.
 fn tail(path: &Path) -> Option<String> {
     const BYTES: u64 = 4096;
     const LINES: usize = 6;
@@ -53,10 +54,10 @@ fn tail(path: &Path) -> Option<String> {
     (!last.is_empty()).then_some(last)
 }
 
-/// The file of that name which a calculation has left; none if there is none.
+/// Reads a file that a calculation left; `None` if it does not exist.
 ///
 /// # Errors
-/// [`FailureClass::Crashed`] if there is something that is not to be read.
+/// [`FailureClass::Crashed`] if the file must not be read.
 pub(crate) fn read_output_file(directory: &Path, name: &str) -> Result<Option<Vec<u8>>, Failure> {
     match result_file::read(&directory.join(name)) {
         Ok(content) => Ok(Some(content)),
@@ -65,12 +66,12 @@ pub(crate) fn read_output_file(directory: &Path, name: &str) -> Result<Option<Ve
     }
 }
 
-/// The failure of a calculation that has left such a file.
+/// The failure of a calculation that left such a file.
 pub(crate) fn unreadable(name: &str, error: &ResultFileError) -> Failure {
     FailureClass::Crashed.with_message(format!("{name} {error}"))
 }
 
-/// Looks at which version a result says it is of; versions as people read them.
+/// Compares the version of a result with the expected one.
 ///
 /// # Errors
 /// [`FailureClass::OtherProgram`]
@@ -82,7 +83,7 @@ pub(crate) fn check_version(program: &str, found: &str, expected: &str) -> Resul
     if found == expected { Ok(()) } else { Err(another()) }
 }
 
-/// Looks at the numbers: as many as atoms, and finite.
+/// Checks that the arrays match the number of atoms and all numbers are finite.
 ///
 /// # Errors
 /// [`FailureClass::Implausible`]

@@ -1,4 +1,4 @@
-//! `run.abi`.
+//! Writes `run.abi`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -11,7 +11,7 @@ use crate::padded_structure::PaddedStructure;
 use crate::pinned_file::DATA_DIRECTORY;
 use crate::{Failure, FailureClass, Input, RetryAdjustment, Smearing, moments};
 
-/// Name of the input; ABINIT calls its output after it.
+/// Name of the input file; ABINIT derives the name of its output from it.
 const NAME: &str = "run.abi";
 
 pub(super) fn write(
@@ -37,7 +37,8 @@ pub(super) fn write(
     })
 }
 
-/// What no structure changes: PBE, forces and stress, no symmetry but time reversal, no files beside the output.
+/// Keywords that do not depend on the structure: PBE, forces and stress, no symmetry but time reversal, no
+/// files beside the output.
 fn fixed(settings: &Settings) -> String {
     let occupation = match settings.smearing {
         Smearing::FermiDirac => 3,
@@ -59,13 +60,13 @@ fn electrons(
     adjustments: &BTreeSet<RetryAdjustment>,
 ) {
     let structure = &padded.structure;
-    // Without spin, no moments: bands are counted with those of the first attempt, so that all have as many.
+    // Bands are counted with the moments of the first attempt, so that every attempt has the same number.
     let counted =
         if settings.spin { moments::initial(structure, &settings.moments, &BTreeSet::new()) } else { vec![] };
     let moment: f64 = counted.iter().map(|moment| moment.abs()).sum();
     let electrons: f64 =
         structure.species.iter().filter_map(|s| pseudopotentials.get(s)).map(|p| p.valence).sum();
-    // A fifth more than are full, and some for small cells: the highest must be empty.
+    // A fifth more bands than are occupied, and a few for small cells: the highest band must be empty.
     let bands = (0.6 * (electrons + moment)).ceil() as u64 + 4;
     *text += &format!("nband {bands}\n");
     if pseudopotentials.values().any(|p| p.paw) {
@@ -88,7 +89,7 @@ fn steps(text: &mut String, settings: &Settings, paw: bool, adjustments: &BTreeS
         *text += "diemix 0.25\nnpulayit 15\n";
     }
     if adjustments.contains(&RetryAdjustment::OtherAlgorithm) {
-        // 7 mixes potentials, 17 densities: each is the default of the other kind of pseudopotential.
+        // 7 mixes potentials, 17 densities; each is the default of the other kind of pseudopotential.
         *text += &format!("iscf {}\nnline 8\nnnsclo 2\n", if paw { 7 } else { 17 });
     }
 }
@@ -103,7 +104,7 @@ fn structure(
         pseudopotentials.keys().map(|species| species.atomic_number().to_string()).collect();
     *text +=
         &format!("natom {}\nntypat {}\nznucl {}\ntypat\n", structure.len(), numbers.len(), numbers.join(" "));
-    // ABINIT cuts long lines off.
+    // ABINIT truncates long lines.
     for atoms in structure.species.chunks(20) {
         for species in atoms {
             let kind = pseudopotentials.keys().position(|other| other == species).unwrap_or_default() + 1;
@@ -118,7 +119,7 @@ fn structure(
     *text += "  Angstrom\n";
 }
 
-/// With all digits.
+/// Writes a vector with all digits.
 fn vector(text: &mut String, [x, y, z]: Vec3) {
     // Writing to a string cannot fail.
     let _ = writeln!(text, "  {x:?} {y:?} {z:?}");

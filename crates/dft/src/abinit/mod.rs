@@ -1,15 +1,16 @@
 //! ABINIT with plane waves and norm-conserving pseudopotentials (psp8) or PAW setups (xml).
 //!
-//! Spin-polarised PBE, no symmetry but time reversal. The energy is the free energy; with PAW it is that of the
-//! double-counting expression, as in ABINIT's own summary. Directions of a structure that do not repeat get vacuum, and
-//! no stress is given then.
+//! Spin-polarised PBE, no symmetry but time reversal. The energy is the free energy; with PAW it is the
+//! double-counting expression, as in ABINIT's own summary. Non-periodic directions get vacuum; such structures
+//! have no stress.
 //!
-//! Remedies:
+//! Adjustments of a retry:
 //! - more steps: three times as many;
-//! - slower mixing: a quarter of the residual is mixed in at first (0.7 otherwise), and 15 old steps count instead of 7;
-//! - another algorithm: densities are mixed instead of potentials (with PAW the other way round), and wave functions are
-//!   brought nearer to convergence in each step;
-//! - other moments: half of them to start from.
+//! - slower mixing: mixes a quarter of the residual at first (default 0.7) with a history of 15 steps (default
+//!   7);
+//! - another algorithm: mixes densities instead of potentials (with PAW the reverse) and converges wave
+//!   functions further in each step;
+//! - other moments: half of the initial moments.
 
 mod input;
 mod output;
@@ -36,40 +37,40 @@ use pseudopotentials::Pseudopotential;
 /// eV (CODATA 2018).
 const HARTREE: f64 = 27.211_386_245_988;
 
-/// Counts changes of what is written here that change a label's value.
+/// Version of the generated input; raised when a change affects label values.
 const INPUT_VERSION: u32 = 1;
 
-/// `[label.method.abinit]`
+/// The settings of `[label.method.abinit]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
-    /// ABINIT, and what it is started by: `["mpirun", "-np", "4", "abinit"]`.
+    /// ABINIT with its launcher: `["mpirun", "-np", "4", "abinit"]`.
     pub command: Vec<String>,
-    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
     pub environment: BTreeMap<String, String>,
     /// Directory of the pseudopotentials, `Si.psp8` or `Si.xml`.
     pub pseudopotentials: PathBuf,
-    /// File of an element where it has another name: `{ Zn = "Zn-sp.psp8" }`.
+    /// File names that differ from that pattern: `{ Zn = "Zn-sp.psp8" }`.
     pub variants: BTreeMap<Species, String>,
-    /// Kinetic energy of the fastest plane wave, eV.
+    /// Plane-wave cutoff, eV.
     pub cutoff: f64,
-    /// That of the fine grid of PAW, eV; twice `cutoff` if there is none.
+    /// Cutoff of the fine PAW grid, eV. Default: twice `cutoff`.
     pub fine_cutoff: Option<f64>,
-    /// Largest distance of k-points, Å⁻¹, 2π included; the mesh is Γ-centred.
+    /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
     pub k_spacing: f64,
-    /// Occupation of states near the Fermi level.
+    /// Occupation function of the electronic states.
     pub smearing: Smearing,
-    /// Its width, eV.
+    /// Width of the smearing, eV.
     pub smearing_width: f64,
-    /// Whether the two spins have their own densities.
+    /// Whether the calculation is spin-polarised.
     pub spin: bool,
-    /// Initial magnetic moment by element, μ_B; 1 for all others.
+    /// Initial magnetic moment of each element, μ_B. Default: 1.
     pub moments: Moments,
-    /// Largest change of the energy in an electronic step, twice in a row, eV.
+    /// Tolerance of the energy between electronic steps, met twice in a row, eV.
     pub energy_tolerance: f64,
-    /// Most electronic steps.
+    /// Maximum number of electronic steps.
     pub steps: u32,
-    /// Space between images in directions that do not repeat, Å.
+    /// Vacuum along non-periodic directions, Å.
     pub vacuum: f64,
 }
 
@@ -95,10 +96,10 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Asks ABINIT for its version and finds the pseudopotentials.
+    /// Queries ABINIT's version and finds the pseudopotentials.
     ///
     /// # Errors
-    /// A program that does not answer, a setting with an impossible value, a file that is not what its name says.
+    /// A program that does not answer, an invalid setting, a file that does not match its name.
     pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Abinit, SetupError> {
         positive("cutoff", self.cutoff)?;
         at_least("fine_cutoff", self.fine_cutoff.unwrap_or(self.cutoff), self.cutoff)?;
@@ -114,14 +115,14 @@ impl Settings {
     }
 }
 
-/// `9.6.2`
+/// The version, such as `9.6.2`.
 fn version(
     command: &[String],
     environment: &BTreeMap<String, String>,
     passed: &PassedEnvironment,
 ) -> Result<String, SetupError> {
     let said = version_query::run(command, &["--version"], environment, passed, &[])?;
-    // Each process of a parallel run may say it.
+    // Each process of a parallel run may print it.
     let version =
         said.split_whitespace().next().filter(|word| word.starts_with(|c: char| c.is_ascii_digit()));
     version.map(str::to_owned).ok_or_else(|| {
@@ -132,7 +133,7 @@ fn version(
     })
 }
 
-/// ABINIT, ready to be used.
+/// A configured ABINIT.
 #[derive(Clone, Debug)]
 pub struct Abinit {
     settings: Settings,
@@ -142,7 +143,7 @@ pub struct Abinit {
 }
 
 impl Abinit {
-    /// The pseudopotentials of these elements, which ABINIT wants to be all norm-conserving or all PAW.
+    /// The pseudopotentials of these elements. ABINIT requires that all are norm-conserving or all are PAW.
     fn matching_pseudopotentials(
         &self,
         species: &BTreeSet<Species>,
@@ -168,7 +169,7 @@ impl DftBackend for Abinit {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, &str> =
             self.pseudopotentials.iter().map(|(species, p)| (species.symbol(), p.original.hash())).collect();
-        // Destructured, so that a new setting is not forgotten here.
+        // Destructure, so that a new setting cannot be forgotten here.
         let Settings {
             command: _,
             environment: _,

@@ -1,4 +1,4 @@
-//! `run.abo`, and the errors among what ABINIT prints.
+//! Reads `run.abo` and the errors that ABINIT prints.
 
 use std::path::Path;
 
@@ -12,7 +12,8 @@ use crate::{Failure, FailureClass, Results, validation};
 /// Lattice vectors have seven decimals, bohr.
 const DIGITS: f64 = 1e-6;
 
-/// The calculation of `structure` that was run in `directory` by this version; `None` if there is no whole output.
+/// Reads the calculation of `structure` in `directory`, made by this version; `None` if the output is
+/// incomplete.
 pub(super) fn read(
     structure: &Structure,
     directory: &Path,
@@ -26,7 +27,7 @@ pub(super) fn read(
     parse(structure, &text("run.abo")?, &text("stdout")?, version, smearing)
 }
 
-/// As [`read`].
+/// As [`read`], from the text of the output.
 pub(super) fn parse(
     structure: &Structure,
     output: &str,
@@ -70,13 +71,13 @@ pub(super) fn parse(
     }
 }
 
-/// `9.6.2` of `.Version 9.6.2 of ABINIT`; nothing where that is cut off.
+/// `9.6.2` from `.Version 9.6.2 of ABINIT`; `None` if the line is truncated.
 fn stated_version(output: &str) -> Option<&str> {
     let (_, rest) = output.split_once(".Version ")?;
     rest.split_once(" of ABINIT").map(|(version, _)| version.trim())
 }
 
-/// Whether it says that it is completed and ends with the time that it took.
+/// Whether the output states that the calculation completed and ends with its timing.
 fn is_whole(output: &str) -> bool {
     let last = output.ends_with('\n').then(|| output.lines().next_back()).flatten().unwrap_or_default();
     output.contains("Calculation completed.") && last.starts_with("+Overall time at end")
@@ -85,12 +86,12 @@ fn is_whole(output: &str) -> bool {
 fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<Results> {
     let results = document(output, "ResultsGS")?;
     let free = *energies.last()?;
-    // The summary has fewer digits, but must be of the same calculation.
+    // The summary has fewer digits but must belong to the same calculation.
     let total = value(results, "etotal")?;
     if (free - total).abs() > 2e-8 * total.abs() {
         return None;
     }
-    // −TS, Hartree; between U and F, the limit of no smearing depends on the order of the smearing.
+    // −TS, Hartree. Where the zero-smearing limit lies between U and F depends on the order of the smearing.
     let entropy = value(document(output, "EnergyTerms")?, "'-kT*entropy'")?;
     let order = if smearing == Smearing::MethfesselPaxton { 1.0 } else { 0.0 };
     let force = HARTREE / units::BOHR;
@@ -108,7 +109,7 @@ fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<Results
     })
 }
 
-/// The structure at the end.
+/// The structure at the end of the output.
 fn found(output: &str) -> Option<Structure> {
     let results = document(output, "ResultsGS")?;
     let species = rows(results, "xred")
@@ -133,7 +134,7 @@ fn energies(output: &str) -> Vec<f64> {
     steps.filter_map(|step| step.split_whitespace().nth(1)?.parse().ok()).collect()
 }
 
-/// Last column of the table of spheres, which with spin is the difference of the two, μ_B.
+/// Last column of the table of atomic spheres, with spin the difference of the two spins, μ_B.
 fn moments(output: &str) -> Option<Vec<f64>> {
     let (_, table) =
         output.rsplit_once(" Integrated electronic and magnetization densities in atomic spheres:")?;
@@ -154,7 +155,7 @@ fn value(document: &str, key: &str) -> Option<f64> {
     line.trim_start().strip_prefix(':')?.trim().parse().ok()
 }
 
-/// The list under a key of a document, a row each.
+/// The rows of the list under a key.
 fn rows<'a>(document: &'a str, key: &str) -> impl Iterator<Item = &'a str> {
     let lines = document.lines().skip_while(move |line| !line.starts_with(key)).skip(1);
     lines.map_while(|line| line.strip_prefix("- ["))
@@ -175,12 +176,12 @@ fn numbers_of<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
     Some([next()?, next()?, next()?])
 }
 
-/// What is printed from the last electronic step on.
+/// The output from the last electronic step on.
 fn last_step(printed: &str) -> &str {
     printed.rsplit_once("ITER STEP NUMBER").map_or("", |(_, rest)| rest)
 }
 
-/// The message of the first error that is printed, as one line.
+/// The message of the first error, as one line.
 fn error(printed: &str) -> Option<String> {
     let (_, rest) = printed.split_once("--- !ERROR\n").or_else(|| printed.split_once("--- !BUG\n"))?;
     let (_, message) = rest.split_once("message: |\n")?;

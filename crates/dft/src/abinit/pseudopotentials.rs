@@ -7,25 +7,25 @@ use atoms::Species;
 
 use crate::{PinnedFile, SetupError, paw};
 
-/// What is known of a pseudopotential.
+/// A pseudopotential.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Pseudopotential {
     /// Its file.
     pub original: PinnedFile,
-    /// Electrons that it treats.
+    /// Number of valence electrons.
     pub valence: f64,
     /// Whether it is a PAW setup.
     pub paw: bool,
 }
 
 impl Pseudopotential {
-    /// Name of the copy that a calculation reads: ABINIT goes by its ending.
+    /// File name of the copy for a calculation: ABINIT depends on the extension.
     pub fn copy(&self, species: Species) -> String {
         format!("{species}.{}", if self.paw { "xml" } else { "psp8" })
     }
 }
 
-/// All that are in the directory.
+/// All pseudopotentials in the directory.
 pub(super) fn find(
     directory: &Path,
     variants: &BTreeMap<Species, String>,
@@ -47,7 +47,7 @@ pub(super) fn find(
     Ok(found)
 }
 
-/// The error for an element that has none.
+/// The error for an element without a pseudopotential.
 pub(super) fn missing(
     species: Species,
     directory: &Path,
@@ -76,9 +76,10 @@ fn read(species: Species, path: PathBuf) -> Result<Pseudopotential, SetupError> 
     Ok(Pseudopotential { original, valence: valence.map_err(wrong)?, paw })
 }
 
-/// Valence electrons of a `psp8` file: Z and the valence begin its second line, format and functional the third.
+/// Valence electrons of a `psp8` file: Z and the valence start its second line, format and functional its
+/// third.
 fn valence(file: &[u8], species: Species) -> Result<f64, String> {
-    // 11 is ABINIT's own PBE, the other that of libxc.
+    // 11 is ABINIT's own PBE, the other is libxc's.
     const PBE: [&str; 2] = ["11", "-101130"];
     let head = String::from_utf8_lossy(&file[..file.len().min(4096)]);
     let mut lines = head.lines().skip(1).map(str::split_whitespace);

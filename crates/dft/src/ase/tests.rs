@@ -1,4 +1,5 @@
-//! Without Python: what is written, and what is made of a result. With it: `tests/ase.rs`.
+//! Tests that do not need Python: the input, and the parsing of a result. Tests with Python:
+//! `tests/codes/ase.rs`.
 
 use atoms::Cell;
 
@@ -45,7 +46,7 @@ fn the_task_is_the_structure_with_its_moments_and_remedies() {
     assert_eq!(changed["remedies"], json!(["slower_mixing", "other_moments"]));
 }
 
-/// What is read of this result; its structure is [`copper`] in any case.
+/// Reads this result for the structure [`copper`].
 fn read(mut converged: Value) -> Result<Results, Failure> {
     let structure = task(&ase(Moments::new()), &[]);
     for key in ["species", "positions", "cell"] {

@@ -1,4 +1,4 @@
-//! The label that a command left.
+//! Reads the label that a command wrote.
 
 use std::path::Path;
 
@@ -8,10 +8,10 @@ use atoms::extxyz::{Frame, Reader};
 use crate::structure_check::check_same_structure;
 use crate::{Failure, FailureClass, Results, result_file};
 
-/// What the digits allow that ASE writes.
+/// The precision of the digits that ASE writes.
 const TOLERANCE: f64 = 1e-6;
 
-/// The numbers of the file, if it is whole and of this structure.
+/// The results in the file, if it is complete and describes this structure.
 pub(super) fn label(structure: &Structure, path: &Path) -> Result<Results, Failure> {
     let frame = whole_frame(path).map_err(|fault| {
         let name = path.file_name().unwrap_or_default().display();
@@ -21,10 +21,10 @@ pub(super) fn label(structure: &Structure, path: &Path) -> Result<Results, Failu
     numbers(frame).map_err(|message| FailureClass::Implausible.with_message(message))
 }
 
-/// The one frame of a file; or what is wrong with it.
+/// The only frame of a file, or what is wrong with it.
 fn whole_frame(path: &Path) -> Result<Frame, String> {
     let text = result_file::read(path).map_err(|error| error.to_string())?;
-    // A number that was cut off would be taken for another.
+    // Without a line break at the end, the last number may be truncated.
     if text.last() != Some(&b'\n') {
         return Err("does not end with a line break: it is not whole".to_owned());
     }
@@ -37,7 +37,7 @@ fn whole_frame(path: &Path) -> Result<Frame, String> {
 }
 
 fn numbers(mut frame: Frame) -> Result<Results, String> {
-    // Names with this prefix would go before the plain ones.
+    // Keys with this prefix would take precedence over the plain ones.
     frame.info.retain(|key, _| !key.starts_with("REF_"));
     frame.arrays.retain(|key, _| !key.starts_with("REF_"));
     let labels = frame.labels().map_err(|error| error.to_string())?;

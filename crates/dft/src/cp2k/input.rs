@@ -1,4 +1,4 @@
-//! `run.inp`.
+//! Writes `run.inp`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -9,7 +9,7 @@ use super::{Cp2k, OUTPUT, Settings, data};
 use crate::padded_structure::PaddedStructure;
 use crate::{Failure, FailureClass, Input, RetryAdjustment, moments};
 
-/// Name of the input.
+/// Name of the input file.
 const NAME: &str = "run.inp";
 
 pub(super) fn write(
@@ -18,7 +18,7 @@ pub(super) fn write(
     adjustments: &BTreeSet<RetryAdjustment>,
 ) -> Result<Input, Failure> {
     let species = BTreeSet::from_iter(padded.structure.species.iter().copied());
-    // The entries that the identity holds, and no others.
+    // Only the entries that the identity contains.
     let (mut potentials, mut bases) = (String::new(), String::new());
     for species in species {
         let kind =
@@ -47,9 +47,9 @@ pub(super) fn write(
     })
 }
 
-/// What CP2K is told of the number of electrons and orbitals.
+/// Electrons and orbitals in CP2K's input.
 struct Spins {
-    /// 2 S + 1 to start from; smearing lets the moment go where it wants.
+    /// Initial 2 S + 1; smearing lets the moment relax.
     multiplicity: u64,
     /// Empty orbitals of each spin.
     empty: [u64; 2],
@@ -62,11 +62,11 @@ impl Spins {
         let sum =
             |moments: Vec<f64>| if cp2k.settings.spin { moments.iter().sum::<f64>().abs() } else { 0.0 };
         let parity = electrons % 2;
-        // The nearest that as many electrons can have.
+        // The nearest value that this number of electrons allows.
         let unpaired =
             2 * ((sum(initial(adjustments)) - parity as f64) / 2.0).round().max(0.0) as u64 + parity;
         let unpaired = if cp2k.settings.spin { unpaired.min(electrons) } else { 0 };
-        // As many orbitals with every remedy.
+        // The same number of orbitals for every retry adjustment.
         let orbitals = (0.6 * (electrons as f64 + sum(initial(&BTreeSet::new())))).ceil() as u64 + 4;
         let occupied = [electrons.div_ceil(2) + unpaired / 2, (electrons / 2).saturating_sub(unpaired / 2)];
         Self { multiplicity: unpaired + 1, empty: occupied.map(|n| orbitals.saturating_sub(n).max(1)) }
@@ -90,7 +90,7 @@ fn method(settings: &Settings, spins: &Spins) -> String {
     )
 }
 
-/// Γ alone needs no section. MacDonald's shift brings meshes of even size to Γ.
+/// Γ alone needs no section. MacDonald's shift puts Γ on meshes of even size.
 fn k_points(mesh: [u32; 3]) -> String {
     if mesh == [1; 3] {
         return String::new();
@@ -105,8 +105,8 @@ fn k_points(mesh: [u32; 3]) -> String {
 fn steps(settings: &Settings, spins: &Spins, adjustments: &BTreeSet<RetryAdjustment>) -> String {
     let has = |remedy| adjustments.contains(&remedy);
     let steps = settings.steps.saturating_mul(if has(RetryAdjustment::MoreSteps) { 3 } else { 1 });
-    // Broyden's method stagnates with less than 0.2. It stays Broyden's: Pulay's oscillates or ends by a bad condition
-    // number even where nothing is difficult, and Kerker's looks converged to CP2K long before it is.
+    // Broyden's method stagnates below 0.2. Pulay's oscillates or stops at a bad condition number even in
+    // simple cases, and with Kerker's CP2K reports convergence far too early.
     let careful = has(RetryAdjustment::SlowerMixing) || has(RetryAdjustment::OtherAlgorithm);
     let (alpha, memory) =
         (if careful { 0.2 } else { 0.4 }, if has(RetryAdjustment::OtherAlgorithm) { 4 } else { 8 });

@@ -1,4 +1,4 @@
-//! What the script is told.
+//! Writes the input of the script.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -79,7 +79,7 @@ fn parameters(
         "symmetry": { "point_group": false },
         "spinpol": settings.spin,
         "occupations": occupations(settings.smearing, settings.smearing_width),
-        // GPAW counts the energy per valence electron.
+        // GPAW's criterion is per valence electron.
         "convergence": {
             "energy": settings.energy_tolerance / electrons.max(1.0),
             "forces": settings.force_tolerance,
@@ -100,7 +100,7 @@ fn parameters(
 
 fn occupations(smearing: Smearing, width: f64) -> Value {
     match smearing {
-        // Of order 0, Methfessel and Paxton's function is the Gaussian.
+        // Methfessel–Paxton of order 0 is the Gaussian.
         Smearing::Gaussian => json!({ "name": "methfessel-paxton", "order": 0, "width": width }),
         Smearing::MethfesselPaxton => json!({ "name": "methfessel-paxton", "order": 1, "width": width }),
         Smearing::FermiDirac => json!({ "name": "fermi-dirac", "width": width }),

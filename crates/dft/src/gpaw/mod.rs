@@ -1,14 +1,14 @@
-//! GPAW with plane waves and PAW setups, run by a script of ours ([`SCRIPT`]).
+//! GPAW with plane waves and PAW setups, run by our script ([`SCRIPT`]).
 //!
-//! Spin-polarised PBE, no symmetry but time reversal. The energy is the free energy. Directions of a structure that do
-//! not repeat get vacuum, and no stress is given then.
+//! Spin-polarised PBE, no symmetry but time reversal. The energy is the free energy. Non-periodic directions
+//! get vacuum; such structures have no stress.
 //!
-//! Remedies:
+//! Adjustments of a retry:
 //! - more steps: three times as many;
-//! - slower mixing: Pulay mixing with β 0.02 instead of 0.05, 8 old densities instead of 5, and twice the weight of long
-//!   waves;
-//! - another algorithm: conjugate gradients instead of Davidson's;
-//! - other moments: half of them to start from.
+//! - slower mixing: Pulay mixing with β 0.02 instead of 0.05, a history of 8 densities instead of 5, and twice
+//!   the weight of long waves;
+//! - another algorithm: conjugate gradients instead of Davidson;
+//! - other moments: half of the initial moments.
 
 mod input;
 mod setups;
@@ -31,43 +31,43 @@ use crate::{
 };
 use setups::Setup;
 
-/// The script that GPAW is run by.
+/// The script that runs GPAW.
 pub const SCRIPT: &str = concat!(include_str!("../script.py"), include_str!("job.py"));
 
-/// Counts changes of what is written here that change a label's value.
+/// Version of the generated input; raised when a change affects label values.
 const INPUT_VERSION: u32 = 1;
 
-/// `[label.method.gpaw]`
+/// The settings of `[label.method.gpaw]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
-    /// A Python that has GPAW, and what it is started by: `["mpirun", "-np", "4", "gpaw", "python"]`.
+    /// A Python with GPAW and its launcher: `["mpirun", "-np", "4", "gpaw", "python"]`.
     pub command: Vec<String>,
-    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
     pub environment: BTreeMap<String, String>,
-    /// Directory of the setups; where GPAW itself looks if there is none.
+    /// Directory of the setups. Default: GPAW's own search path.
     pub pseudopotentials: Option<PathBuf>,
-    /// Setup of an element where it is not the one without a name: `{ Ni = "10" }`.
+    /// Setups other than the default one of an element: `{ Ni = "10" }`.
     pub variants: BTreeMap<Species, String>,
-    /// Kinetic energy of the fastest plane wave, eV.
+    /// Plane-wave cutoff, eV.
     pub cutoff: f64,
-    /// Largest distance of k-points, Å⁻¹, 2π included; the mesh is Γ-centred.
+    /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
     pub k_spacing: f64,
-    /// Occupation of states near the Fermi level.
+    /// Occupation function of the electronic states.
     pub smearing: Smearing,
-    /// Its width, eV.
+    /// Width of the smearing, eV.
     pub smearing_width: f64,
-    /// Whether the two spins have their own densities.
+    /// Whether the calculation is spin-polarised.
     pub spin: bool,
-    /// Initial magnetic moment by element, μ_B; 1 for all others.
+    /// Initial magnetic moment of each element, μ_B. Default: 1.
     pub moments: Moments,
-    /// Largest change of the energy in the last three electronic steps, eV.
+    /// Tolerance of the energy over the last three electronic steps, eV.
     pub energy_tolerance: f64,
-    /// Largest change of a force in the last electronic step, eV/Å.
+    /// Tolerance of the forces in the last electronic step, eV/Å.
     pub force_tolerance: f64,
-    /// Most electronic steps.
+    /// Maximum number of electronic steps.
     pub steps: u32,
-    /// Space between images in directions that do not repeat, Å.
+    /// Vacuum along non-periodic directions, Å.
     pub vacuum: f64,
 }
 
@@ -93,10 +93,10 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Asks GPAW for its version and finds the setups.
+    /// Queries GPAW's version and finds the setups.
     ///
     /// # Errors
-    /// A program that does not answer, a setting with an impossible value.
+    /// A program that does not answer, an invalid setting.
     pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Gpaw, SetupError> {
         positive("cutoff", self.cutoff)?;
         positive("k_spacing", self.k_spacing)?;
@@ -120,7 +120,7 @@ impl Settings {
     }
 }
 
-/// What GPAW says of itself.
+/// The versions and paths that GPAW reports.
 #[derive(Clone, Debug, Deserialize)]
 struct Versions {
     gpaw: String,
@@ -143,7 +143,7 @@ impl Versions {
     }
 }
 
-/// GPAW, ready to be used.
+/// A configured GPAW.
 #[derive(Clone, Debug)]
 pub struct Gpaw {
     settings: Settings,
@@ -159,7 +159,7 @@ impl Gpaw {
             .ok_or_else(|| setups::missing(species, &self.who.setup_paths, &self.settings.variants))
     }
 
-    /// Valence electrons of a structure; elements without a setup have none.
+    /// Valence electrons of a structure; elements without a setup count none.
     fn electrons(&self, structure: &Structure) -> f64 {
         structure
             .species
@@ -174,7 +174,7 @@ impl DftBackend for Gpaw {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, &str> =
             self.setups.iter().map(|(species, setup)| (species.symbol(), setup.original.hash())).collect();
-        // Destructured, so that a new setting is not forgotten here.
+        // Destructure, so that a new setting cannot be forgotten here.
         let Settings {
             command: _,
             environment: _,

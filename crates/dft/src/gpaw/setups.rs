@@ -1,4 +1,4 @@
-//! PAW setups, found as GPAW finds them: `Si.PBE` or `Si.PBE.gz` in the first of the directories that has one.
+//! PAW setups, found as GPAW does: `Si.PBE` or `Si.PBE.gz` in the first directory that has one.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -7,16 +7,16 @@ use atoms::Species;
 
 use crate::{PinnedFile, SetupError, paw};
 
-/// What is known of a setup.
+/// A setup.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Setup {
     /// Its file.
     pub original: PinnedFile,
-    /// Electrons that it treats.
+    /// Number of valence electrons.
     pub valence: f64,
 }
 
-/// All setups that are there.
+/// All available setups.
 pub(super) fn find(
     directories: &[PathBuf],
     variants: &BTreeMap<Species, String>,
@@ -24,7 +24,7 @@ pub(super) fn find(
     let mut setups = BTreeMap::new();
     for species in (1..=118).filter_map(|number| Species::from_atomic_number(number).ok()) {
         let name = name(species, variants);
-        // GPAW takes the last by name of a directory's candidates.
+        // Of the candidates in a directory GPAW takes the last by name.
         let candidates = |directory: &PathBuf| [directory.join(format!("{name}.gz")), directory.join(&name)];
         let Some(path) = directories.iter().flat_map(candidates).find(|path| path.is_file()) else {
             if variants.contains_key(&species) {
@@ -42,7 +42,7 @@ pub(super) fn find(
     Ok(setups)
 }
 
-/// The error for an element that has none.
+/// The error for an element without a setup.
 pub(super) fn missing(
     species: Species,
     directories: &[PathBuf],

@@ -1,4 +1,4 @@
-//! Without GPAW: what is written, and what is made of a result that GPAW left (`tests/data/gpaw`).
+//! Tests that do not need GPAW: the input, and the parsing of a stored result (`tests/data/gpaw`).
 
 use std::collections::BTreeSet;
 
@@ -7,7 +7,7 @@ use crate::{FailureClass, PinnedFile};
 
 const RESULT: &[u8] = include_bytes!("../../tests/data/gpaw/result.json");
 
-/// What `RESULT` was made from.
+/// The structure of `RESULT`.
 fn silicon() -> Structure {
     let task: Value = serde_json::from_slice(include_bytes!("../../tests/data/gpaw/input.json")).unwrap();
     let take = |key: &str| task[key].clone();
@@ -31,7 +31,7 @@ fn task(code: &Gpaw, adjustments: &[RetryAdjustment]) -> Value {
     serde_json::from_slice(&input.files["input.json"]).unwrap()
 }
 
-/// What GPAW left, in a directory of its own.
+/// A directory with GPAW's result.
 fn left(result: &[u8]) -> tempfile::TempDir {
     let directory = tempfile::tempdir().unwrap();
     std::fs::write(directory.path().join("result.json"), result).unwrap();
@@ -88,7 +88,7 @@ fn calculations_read_copies_of_what_was_hashed() {
     let code = Gpaw { setups, ..gpaw(Settings { variants, ..Settings::default() }) };
     assert_eq!(task(&code, &[])["setups"], json!("../data"));
     let data = code.input(&silicon(), &BTreeSet::new()).unwrap().data;
-    // By the name that GPAW looks for.
+    // Under the name that GPAW looks for.
     assert_eq!(data.keys().collect::<Vec<_>>(), ["Si.mine.PBE"]);
     let hash = blake3::hash(before.as_bytes()).to_hex().to_string();
     assert_eq!(code.identity()["pseudopotentials"], json!({ "Si": hash }));

@@ -1,9 +1,9 @@
-//! Numbers as Fortran writes them into columns of fixed width.
+//! Parses numbers in Fortran's fixed-width columns.
 
 use atoms::Vec3;
 
-/// The numbers of a text, whose columns have `decimals` decimals where they run together. A column that was too narrow
-/// (`*****`) makes all of them no numbers. `None` if there is something else.
+/// The numbers of a text; where columns run together, each number ends after `decimals` decimals. Overflowed
+/// columns (`*****`) give NaN. `None` for other text.
 pub(super) fn numbers(text: &str, decimals: usize) -> Option<Vec<f64>> {
     let mut numbers = Vec::new();
     for word in text.split_whitespace() {
@@ -21,7 +21,7 @@ pub(super) fn numbers(text: &str, decimals: usize) -> Option<Vec<f64>> {
     }
 }
 
-/// Each of such numbers ends where its decimals do.
+/// Splits such a word after the decimals of each number.
 fn run_together(word: &str, decimals: usize, numbers: &mut Vec<f64>) -> Option<()> {
     let mut rest = word;
     while !rest.is_empty() {
@@ -32,7 +32,7 @@ fn run_together(word: &str, decimals: usize, numbers: &mut Vec<f64>) -> Option<(
     Some(())
 }
 
-/// Three numbers. If one was too long for its column, none of them is known.
+/// Three numbers; `None` if a column overflowed.
 pub(super) fn vector(text: &str, decimals: usize) -> Option<Vec3> {
     if text.contains('*') {
         return Some([f64::NAN; 3]);

@@ -1,4 +1,4 @@
-//! `INCAR` and `KPOINTS`.
+//! Writes `INCAR` and `KPOINTS`.
 
 use std::collections::BTreeSet;
 use std::fmt::Write;
@@ -6,7 +6,7 @@ use std::fmt::Write;
 use super::Settings;
 use crate::{RetryAdjustment, SetupError, Smearing};
 
-/// What is written here, or would undo it, and cannot be a further tag.
+/// Tags that are written here or would override those; users cannot set them.
 const RESERVED_TAGS: [&str; 37] = [
     "ALGO",
     "AMIX",
@@ -47,7 +47,7 @@ const RESERVED_TAGS: [&str; 37] = [
     "LSTOP",
 ];
 
-/// Checks the further tags of the settings.
+/// Checks the further tags in the settings.
 pub(super) fn check(settings: &Settings) -> Result<(), SetupError> {
     for (tag, value) in &settings.tags {
         let found = format!("{tag} = {value:?}");
@@ -68,7 +68,7 @@ pub(super) fn check(settings: &Settings) -> Result<(), SetupError> {
     Ok(())
 }
 
-/// `INCAR` for atoms with these moments, in the order of POSCAR.
+/// `INCAR` for these initial moments, in the order of POSCAR.
 pub(super) fn incar(settings: &Settings, moments: &[f64], adjustments: &BTreeSet<RetryAdjustment>) -> String {
     let has = |remedy| adjustments.contains(&remedy);
     let mut lines = vec![
@@ -101,7 +101,7 @@ pub(super) fn incar(settings: &Settings, moments: &[f64], adjustments: &BTreeSet
             lines.extend([("AMIX_MAG", "0.4".to_owned()), ("BMIX_MAG", "0.0001".to_owned())]);
         }
     }
-    // Each group of processors that has k-points of its own keeps all that is not distributed by k-points once more.
+    // Each group of processes with its own k-points holds a copy of all data not distributed by k-points.
     let k_groups = if has(RetryAdjustment::MoreMemory) { 1 } else { settings.k_groups };
     lines.extend([("KPAR", k_groups.to_string()), ("NCORE", settings.cores_per_band.to_string())]);
     let further = settings.tags.iter().map(|(tag, value)| (tag.as_str(), value.clone()));
@@ -120,7 +120,7 @@ fn ismear(smearing: Smearing) -> i32 {
     }
 }
 
-/// Lines of INCAR are not long: `8*1.0 4*5.0`.
+/// Run-length encoding, because lines of INCAR are short: `8*1.0 4*5.0`.
 fn runs(moments: &[f64]) -> String {
     let run = |run: &[f64]| format!("{}*{:?}", run.len(), run[0]);
     moments.chunk_by(|a, b| a == b).map(run).collect::<Vec<_>>().join(" ")

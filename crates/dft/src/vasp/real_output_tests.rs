@@ -1,4 +1,4 @@
-//! Files of real calculations, which belong to others and are read where they are (`CALMWALK_PEER_DATA`).
+//! Tests on files of real calculations, which we do not own and read in place (`CALMWALK_PEER_DATA`).
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -9,7 +9,7 @@ use tempfile::TempDir;
 use super::result;
 use crate::{Exit, Failure, FailureClass, Results};
 
-/// The folder of the files, or nothing (said aloud) where they are not at hand.
+/// The folder of the files; prints a note and returns `None` if it is unavailable.
 fn peer(name: &str) -> Option<PathBuf> {
     let Some(root) = std::env::var_os("CALMWALK_PEER_DATA") else {
         eprintln!("CALMWALK_PEER_DATA is not set: {name} is not tested");
@@ -18,7 +18,7 @@ fn peer(name: &str) -> Option<PathBuf> {
     Some(Path::new(&root).join("vasp").join(name))
 }
 
-/// The structure that a file begins with, found without a parser.
+/// The initial structure of a file, extracted without the parser.
 fn initial(xml: &str) -> Structure {
     let part = |from: &str, to: &str| {
         let begin = xml.find(from).unwrap() + from.len();
@@ -43,20 +43,20 @@ fn initial(xml: &str) -> Structure {
     Structure { species, positions, cell, periodic: [true; 3] }
 }
 
-/// Judges files as a calculation of `structure`, whose atoms stand in their order.
+/// Reads files as a calculation of `structure`, in its own order of atoms.
 fn judge(structure: &Structure, version: &str, directory: &TempDir, exit: Exit) -> Result<Results, Failure> {
     let order: Vec<usize> = (0..structure.len()).collect();
     result::read(structure, &order, version, directory.path(), exit)
 }
 
-/// Judges a file of ours as the calculation of the structure that it begins with.
+/// Reads one file as the calculation of its own initial structure.
 fn judge_text(xml: &str, version: &str) -> Result<Results, Failure> {
     let directory = TempDir::new().unwrap();
     std::fs::write(directory.path().join("vasprun.xml"), xml).unwrap();
     judge(&initial(xml), version, &directory, Exit::Code(0))
 }
 
-/// The numbers that matter.
+/// The numbers to compare.
 fn numbers(calculated: &Results) -> Vec<f64> {
     let energies = [calculated.energy, calculated.energy_without_smearing.unwrap()];
     [energies.as_slice(), &calculated.stress.unwrap().concat(), &calculated.forces.concat()].concat()
@@ -69,7 +69,7 @@ fn assert_close(found: &[f64], expected: &[f64], tolerance: f64) {
     assert!(close, "{found:?}\n{expected:?}");
 }
 
-/// Converged calculations, and what ASE says of them: energies (free, σ → 0), stress, the first force; eV, Å.
+/// Converged calculations with ASE's values: energies (free, σ → 0), stress, the first force; eV, Å.
 const CONVERGED: [(&str, &str, [f64; 14]); 3] = [
     (
         "converged_si_static",
@@ -146,7 +146,7 @@ fn converged_calculations_give_the_numbers_of_ase() {
         assert_close(&numbers(&calculated), &ase, 1e-8);
         assert_eq!(calculated.magnetic_moments.is_some(), name != "converged_ti_o_v6", "{name}");
 
-        // From OUTCAR the same but for its digits: six decimals of forces and, in old versions, of energies.
+        // OUTCAR agrees up to its digits: six decimals of forces and, in old versions, of energies.
         std::fs::write(directory.path().join("vasprun.xml"), &xml[..xml.len() - 40]).unwrap();
         let from_outcar = judge(&structure, version, &directory, Exit::Code(0)).unwrap();
         assert_close(&numbers(&from_outcar), &numbers(&calculated), 6e-7);
@@ -176,7 +176,7 @@ fn a_calculation_without_stress_is_read_without() {
     let failure = judge_text(&xml, "5.4.4").unwrap_err();
     let expected = (FailureClass::Implausible, "found 3 ionic steps, expected one");
     assert_eq!((failure.class, failure.message.as_str()), expected);
-    // The first step alone, as a static calculation would leave it.
+    // The first step alone, like a static calculation.
     let end = xml.find("</calculation>").unwrap() + "</calculation>".len();
     let calculated = judge_text(&format!("{}\n</modeling>\n", &xml[..end]), "5.4.4").unwrap();
     assert_eq!(calculated.stress, None);

@@ -1,4 +1,4 @@
-//! Judging what a calculation left.
+//! Reads what a calculation left.
 
 use std::path::Path;
 
@@ -10,7 +10,8 @@ use super::vasprun;
 use crate::structure_check::check_same_structure;
 use crate::{Exit, Failure, FailureClass, Results, result_file, validation};
 
-/// Reads the calculation of `structure`, whose atoms stand in the files in the order `order`, by VASP of this version.
+/// Reads the calculation of `structure` by this version of VASP. `order` gives the order of the atoms in the
+/// files.
 pub(super) fn read(
     structure: &Structure,
     order: &[usize],
@@ -55,7 +56,7 @@ pub(super) fn read(
     Ok(calculated)
 }
 
-/// Whether it is the calculation that was asked for, and converged.
+/// Checks that it is the requested calculation and that it converged.
 fn check(output: &Output, asked: &Structure, version: &str) -> Result<(), Failure> {
     if !is_version(&output.version, version) {
         let found = &output.version;
@@ -78,12 +79,12 @@ fn check(output: &Output, asked: &Structure, version: &str) -> Result<(), Failur
     check_same_structure(asked, &output.structure, output.resolution)
 }
 
-/// Whether `5.4.4.18Apr17` is 5.4.4, and 5.4.40 is not.
+/// Whether a version such as `5.4.4.18Apr17` is 5.4.4; 5.4.40 is not.
 fn is_version(found: &str, expected: &str) -> bool {
     found.strip_prefix(expected).is_some_and(|rest| !rest.starts_with(|c: char| c.is_alphanumeric()))
 }
 
-/// Values in the order of the structure from values in that of the files. Each atom stands in `order` once.
+/// Reorders values from the files' order to the structure's; `order` is a permutation.
 fn restore_order<T: Copy + Default>(values: &[T], order: &[usize]) -> Vec<T> {
     let mut sorted = vec![T::default(); values.len()];
     for (value, atom) in values.iter().zip(order) {
@@ -92,7 +93,8 @@ fn restore_order<T: Copy + Default>(values: &[T], order: &[usize]) -> Vec<T> {
     sorted
 }
 
-/// What VASP says before it gives up, and what that means. Where its way to the ground state broke down, another may not.
+/// VASP's last messages before it stops, and their class. Where the minimisation broke down, another algorithm
+/// may succeed.
 const ERROR_MESSAGES: [(&str, FailureClass); 9] = [
     ("BRMIX: very serious problems", FailureClass::NotConverged),
     ("EDDDAV: Call to ZHEGV failed", FailureClass::NotConverged),
@@ -105,7 +107,7 @@ const ERROR_MESSAGES: [(&str, FailureClass); 9] = [
     ("NELECT < 0", FailureClass::BadInput),
 ];
 
-/// Why there is no whole output.
+/// The failure of a calculation without complete output.
 fn without_output(exit: Exit, directory: &Path, xml: &str, outcar: &str) -> Failure {
     let from_outside = matches!(exit, Exit::TimeLimit | Exit::OutOfMemory | Exit::LostNode);
     let said = if from_outside { String::new() } else { end_of(&directory.join("stdout")) };
@@ -116,7 +118,7 @@ fn without_output(exit: Exit, directory: &Path, xml: &str, outcar: &str) -> Fail
     failure.class.with_message(format!("{}; vasprun.xml {xml}; OUTCAR {outcar}", failure.message))
 }
 
-/// The last part of a file; empty if there is none.
+/// The end of a file; empty if it does not exist.
 fn end_of(path: &Path) -> String {
     const BYTES: u64 = 65_536;
     let end = result_file::tail(path, BYTES).map_or_else(|_| Vec::new(), |end| end.bytes);
