@@ -1,6 +1,6 @@
-//! VASP POSCAR (version 5, with a line of element symbols), read and written.
+//! Reads and writes VASP POSCAR files (version 5, with a line of element symbols).
 //!
-//! The kept crate `vasp-poscar` 0.3 rests on `failure`, which is retired (RUSTSEC-2020-0036).
+//! The existing crate `vasp-poscar` 0.3 depends on `failure`, which is unmaintained (RUSTSEC-2020-0036).
 
 use std::fmt;
 use std::io::{BufRead, ErrorKind, Write};
@@ -10,13 +10,13 @@ use crate::extxyz::{Column, ColumnData, Frame};
 use crate::species::{Species, UnknownSpecies};
 use crate::structure::{Structure, StructureError};
 
-/// What is wrong with a file, and where.
+/// An error with its line.
 #[derive(Debug, thiserror::Error)]
 #[error("line {line}: {kind}")]
 pub struct PoscarError {
     /// Line of the file, from 1.
     pub line: usize,
-    /// What is wrong with it.
+    /// What is wrong.
     #[source]
     pub kind: PoscarErrorKind,
 }
@@ -30,28 +30,28 @@ pub enum PoscarErrorKind {
     /// The stream ends too early.
     #[error("the file ends here, expected {0}")]
     End(PoscarSection),
-    /// A line of another kind.
+    /// A line has the wrong format.
     #[error("found '{found}', expected {expected}")]
     Line {
         /// The line.
         found: String,
-        /// What it should be.
+        /// The expected content.
         expected: PoscarSection,
     },
-    /// A file of VASP 4, which does not say what its atoms are.
+    /// A file of VASP 4, which does not name its elements.
     #[error(
         "found '{0}', expected element symbols: this is a file of VASP 4; insert a line such as 'Al Si' above it"
     )]
     NoSymbols(String),
-    /// A symbol of no element.
+    /// An unknown element symbol.
     #[error(transparent)]
     Species(#[from] UnknownSpecies),
-    /// The structure as a whole.
+    /// The structure is invalid.
     #[error(transparent)]
     Structure(#[from] StructureError),
 }
 
-/// A part of the file.
+/// A section of the file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PoscarSection {
     /// Line 1.
@@ -66,9 +66,9 @@ pub enum PoscarSection {
     Counts,
     /// `Direct` or `Cartesian`.
     Mode,
-    /// A line of an atom.
+    /// An atom line.
     Position,
-    /// A line of an atom with selective dynamics.
+    /// An atom line with selective dynamics.
     PositionAndFlags,
 }
 
@@ -89,9 +89,9 @@ impl fmt::Display for PoscarSection {
 
 /// Reads one structure, periodic in all directions.
 ///
-/// The comment becomes the text `comment` of `info`, the flags of selective dynamics the array
-/// `move_mask` [n × 3] (true: free to move), as ASE calls it. What follows the positions
-/// (velocities, predictor–corrector data) is ignored.
+/// The comment becomes the text `comment` of `info`; the flags of selective dynamics become the array
+/// `move_mask` `[n × 3]` (true: free to move), as in ASE. Data after the positions (velocities,
+/// predictor–corrector data) are ignored.
 pub fn read_poscar(input: impl BufRead) -> Result<Frame, PoscarError> {
     let mut lines = Lines { input, number: 0, text: String::new() };
     let frame = frame(&mut lines);
@@ -149,20 +149,20 @@ fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, PoscarErrorKind> {
 /// Why a structure cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
-    /// The stream does not take it.
+    /// The stream reports an error.
     #[error("cannot be written: {0}")]
     Io(#[from] std::io::Error),
-    /// The structure is not one, or its cell has no volume.
+    /// The structure is invalid or its cell has no volume.
     #[error(transparent)]
     Structure(#[from] StructureError),
 }
 
-/// Writes a structure in Cartesian coordinates and returns the order of its atoms: the k-th position
-/// of the file is that of atom `order[k]`.
+/// Writes a structure in Cartesian coordinates. Returns the order of its atoms: position k of the file belongs
+/// to atom `order[k]`.
 ///
-/// Atoms of one element stand together, elements in the order of their first atom. The format has no
-/// word for directions that are not periodic: the cell must span space whatever `periodic` says.
-/// Only the first line of `comment` is written.
+/// Atoms are grouped by element, elements in the order of their first atom. The format cannot express
+/// non-periodic directions, so the cell must span space in any case. Only the first line of `comment` is
+/// written.
 pub fn write_poscar(
     out: &mut impl Write,
     structure: &Structure,
@@ -242,7 +242,7 @@ enum Scale {
     Volume(f64),
 }
 
-/// One factor or three; what follows them is a remark.
+/// One factor or three; the rest of the line is a comment.
 fn factors(text: &str) -> Option<Scale> {
     let numbers: Vec<f64> = text.split_whitespace().map_while(|word| word.parse().ok()).take(3).collect();
     match *numbers {
@@ -254,7 +254,7 @@ fn factors(text: &str) -> Option<Scale> {
     }
 }
 
-/// Three numbers; what follows them is a remark.
+/// Three numbers; the rest of the line is a comment.
 fn vector3(text: &str) -> Option<Vec3> {
     let numbers =
         text.split_whitespace().take(3).map(|word| word.parse().ok().filter(|x: &f64| x.is_finite()));
@@ -300,7 +300,7 @@ enum Mode {
     Cartesian,
 }
 
-/// Only the first letter counts.
+/// Only the first letter is significant.
 fn mode(text: &str) -> Option<Mode> {
     match text.chars().next()? {
         'S' | 's' => Some(Mode::Selective),

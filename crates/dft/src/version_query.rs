@@ -1,4 +1,4 @@
-//! Asking a program who it is.
+//! Queries the version of a program.
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -7,14 +7,14 @@ use std::time::{Duration, Instant};
 
 use crate::{PassedEnvironment, SetupError};
 
-/// Programs that say who they are do so at once; a cold file system may need its time.
+/// Programs answer at once, but a cold file system may be slow.
 const TIMEOUT: Duration = Duration::from_secs(120);
 
-/// What `command` with further arguments prints, run in a directory of its own with these files (name and content). Its
-/// environment is what is `passed` on of that of this process, and `environment`.
+/// Runs `command` with further arguments in a temporary directory with these files (name, content) and returns
+/// its output. Its environment consists of the `passed` variables of the current process and `environment`.
 ///
 /// # Errors
-/// [`SetupError::Program`] if it cannot be started, fails, or does not end.
+/// [`SetupError::Program`] if it does not start, fails, or does not end.
 pub(crate) fn run(
     command: &[String],
     arguments: &[&str],
@@ -49,7 +49,7 @@ pub(crate) fn run(
         match child.try_wait().map_err(|error| wrong(error.to_string()))? {
             Some(status) => break status,
             None if begin.elapsed() > TIMEOUT => {
-                // It may have ended just now.
+                // It may have just ended.
                 let _ = child.kill();
                 let _ = child.wait();
                 return Err(wrong(format!("gave no answer in {} s", TIMEOUT.as_secs())));
@@ -66,26 +66,26 @@ pub(crate) fn run(
     Err(wrong(format!("{status}, and says: {last}")))
 }
 
-/// Reads to the end, so that the program never waits for a reader.
+/// Reads to the end, so that the program never blocks on a full pipe.
 fn drain(pipe: Option<impl Read + Send + 'static>) -> std::thread::JoinHandle<String> {
     std::thread::spawn(move || {
         let mut bytes = Vec::new();
         if let Some(mut pipe) = pipe {
-            // What was read before an error is still worth showing.
+            // What was read before an error is still useful.
             let _ = pipe.read_to_end(&mut bytes);
         }
         String::from_utf8_lossy(&bytes).into_owned()
     })
 }
 
-/// The environment of a run: one thread, unless the settings say otherwise.
+/// The environment of a calculation: one thread unless the settings say otherwise.
 pub(crate) fn environment(settings: &BTreeMap<String, String>) -> BTreeMap<String, String> {
     let mut environment = BTreeMap::from([("OMP_NUM_THREADS".to_owned(), "1".to_owned())]);
     environment.extend(settings.iter().map(|(key, value)| (key.clone(), value.clone())));
     environment
 }
 
-/// A directory for the time of a question.
+/// A temporary directory with these files.
 fn working_directory(files: &[(&str, &[u8])]) -> std::io::Result<tempfile::TempDir> {
     let directory = tempfile::Builder::new().prefix("calmwalk-").tempdir()?;
     for (name, content) in files {
@@ -94,7 +94,7 @@ fn working_directory(files: &[(&str, &[u8])]) -> std::io::Result<tempfile::TempD
     Ok(directory)
 }
 
-/// The error of a program that answers as another would.
+/// The error for a program that is not the expected one.
 pub(crate) fn wrong_program(command: &[String], reason: String) -> SetupError {
     SetupError::Program { program: command.join(" "), reason }
 }

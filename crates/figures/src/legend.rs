@@ -1,23 +1,23 @@
-//! What marks and colours mean.
+//! Legends.
 
 use crate::{Anchor, Figure, Item, Marker, Paint, Rectangle, Stroke, Text, width};
 
-/// A sample of what is explained.
+/// The sample of a legend entry.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum LegendKey {
     /// A filled box.
     Area(Paint),
     /// A line.
     Line(Stroke),
-    /// A mark.
+    /// A marker.
     Dot(Marker, Paint),
 }
 
-/// Width of a sample, and the gap behind words, points.
+/// Width of a sample and gap between entries, points.
 const SAMPLE: f64 = 14.0;
 const GAP: f64 = 12.0;
 
-/// Samples and their words in a row that ends at `right`; `base` is the line on which the words stand.
+/// Draws entries in a row that ends at `right`, with the text on the baseline `base`.
 pub fn legend(figure: &mut Figure, [right, base]: [f64; 2], keys: &[(LegendKey, &str)]) {
     let of = |words: &str| SAMPLE + 4.0 + Text::SIZE * width(words, false);
     let whole =

@@ -1,44 +1,44 @@
-//! Data between two axes.
+//! Plots data between two axes.
 
 use crate::axis::Axis;
 use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text};
 
-/// Length of a tick, and of a small one, points.
+/// Length of a major and of a minor tick, points.
 const TICK: f64 = 3.0;
 const SMALL_TICK: f64 = 1.7;
 /// Width of axes and ticks, points.
 const AXIS: f64 = 0.6;
 
-/// A part of a sheet with a horizontal and a vertical axis. What is drawn outside of it is not seen.
+/// A plotting area with a horizontal and a vertical axis. Data outside the area are clipped.
 #[derive(Clone, Debug)]
 pub struct Panel {
-    /// Where it is, without the words at its axes.
+    /// The area without axis labels.
     pub area: Rectangle,
-    /// Horizontal.
+    /// Horizontal axis.
     pub x: Axis,
-    /// Vertical.
+    /// Vertical axis.
     pub y: Axis,
     data: Vec<Item>,
 }
 
 impl Panel {
-    /// An empty one.
+    /// An empty panel.
     pub fn new(area: Rectangle, x: Axis, y: Axis) -> Self {
         Self { area, x, y, data: Vec::new() }
     }
 
-    /// Where a pair of values is on the sheet.
+    /// Converts data coordinates to sheet coordinates.
     pub fn to_sheet(&self, [x, y]: Point) -> Point {
         let Rectangle { x: left, width, height, .. } = self.area;
         [left + width * self.x.position(x), self.area.bottom() - height * self.y.position(y)]
     }
 
-    /// A line through pairs of values.
+    /// Draws a polyline.
     pub fn line(&mut self, points: impl IntoIterator<Item = Point>, stroke: Stroke) {
         self.shape([points], false, None, Some(stroke));
     }
 
-    /// Lines that end where they begin, and what is inside of them.
+    /// Draws closed polygons with their interior.
     pub fn polygons<L: IntoIterator<Item = Point>>(
         &mut self,
         lines: impl IntoIterator<Item = L>,
@@ -48,19 +48,19 @@ impl Panel {
         self.shape(lines, true, fill, stroke);
     }
 
-    /// What is between two lines that have the same x: (x, low, high).
+    /// Draws the band between two curves with the same x, given as (x, low, high).
     pub fn band(&mut self, points: &[(f64, f64, f64)], fill: Paint) {
         let upper = points.iter().map(|(x, _, high)| [*x, *high]);
         let lower = points.iter().rev().map(|(x, low, _)| [*x, *low]);
         self.polygons([upper.chain(lower)], Some(fill), None);
     }
 
-    /// A filled box from one pair of values to another.
+    /// Draws a filled box between two corners.
     pub fn bar(&mut self, [x, y]: Point, [to_x, to_y]: Point, fill: Paint) {
         self.polygons([[[x, y], [to_x, y], [to_x, to_y], [x, to_y]]], Some(fill), None);
     }
 
-    /// Marks.
+    /// Draws markers.
     pub fn dots(
         &mut self,
         points: impl IntoIterator<Item = Point>,
@@ -76,19 +76,19 @@ impl Panel {
         }
     }
 
-    /// A dashed line where x has this value.
+    /// Draws a dashed vertical line at x.
     pub fn vertical_line(&mut self, x: f64) {
         let (low, high) = (self.y.low, self.y.high);
         self.line([[x, low], [x, high]], Colour::GREY.dashed(0.7));
     }
 
-    /// The same where y has it.
+    /// Draws a dashed horizontal line at y.
     pub fn horizontal_line(&mut self, y: f64) {
         let (low, high) = (self.x.low, self.x.high);
         self.line([[low, y], [high, y]], Colour::GREY.dashed(0.7));
     }
 
-    /// Words at a pair of values, moved by so many points.
+    /// Draws text at data coordinates with an offset in points.
     pub fn text(&mut self, at: Point, [right, down]: Point, words: &str, anchor: Anchor) -> &mut Text {
         let [x, y] = self.to_sheet(at);
         let mut sheet = Figure::new("", "", 0.0, 0.0);
@@ -100,7 +100,7 @@ impl Panel {
         }
     }
 
-    /// Says in the middle that there is nothing, and why.
+    /// Draws a message in the middle of a panel without data.
     pub fn placeholder(&mut self, why: &str) {
         let Rectangle { x, y, width, height } = self.area;
         let mut sheet = Figure::new("", "", 0.0, 0.0);
@@ -108,7 +108,7 @@ impl Panel {
         self.data.append(&mut sheet.items);
     }
 
-    /// A letter above the upper left corner, as captions name it.
+    /// Draws the panel letter above the upper left corner.
     pub fn panel_letter(&mut self, letter: char) {
         let mut sheet = Figure::new("", "", 0.0, 0.0);
         let text = sheet.text([self.area.x - 24.0, self.area.y - 6.0], &letter.to_string(), Anchor::Start);
@@ -116,14 +116,14 @@ impl Panel {
         self.data.append(&mut sheet.items);
     }
 
-    /// Draws it: data, then axes with all four sides.
+    /// Draws the data, then the axes with a frame.
     pub fn draw(self, figure: &mut Figure) {
         let sides = vec![self.area.corners()];
         let stroke = Some(Colour::INK.line(AXIS));
         self.draw_with(figure, Item::Shape { lines: sides, closed: true, fill: None, stroke, clip: None });
     }
 
-    /// Draws it with its lower side only, as the margin of another panel.
+    /// Draws the panel as a marginal plot, with one axis line only.
     pub fn draw_as_margin(self, figure: &mut Figure, side: Side) {
         let corners = self.area.corners();
         let line = match side {
@@ -191,11 +191,11 @@ impl Panel {
     }
 }
 
-/// The side on which a margin has its line.
+/// The axis line of a marginal plot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Side {
-    /// Below: the margin stands above its panel.
+    /// The lower one, for a plot above its panel.
     Below,
-    /// Left: it stands at the right.
+    /// The left one, for a plot to the right of its panel.
     Left,
 }

@@ -1,4 +1,4 @@
-//! A figure as PNG: the same items, drawn by tiny-skia with the font of the program.
+//! Writes a figure as PNG with tiny-skia and the built-in font.
 
 use tiny_skia::{FillRule, LineJoin, Mask, PathBuilder, Pixmap, StrokeDash, Transform};
 use ttf_parser::OutlineBuilder;
@@ -6,22 +6,22 @@ use ttf_parser::OutlineBuilder;
 use crate::rich_text::runs;
 use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text, font, width};
 
-/// Points an inch has.
+/// Points per inch.
 const POINTS: f64 = 72.0;
 const METRES: f64 = 0.0254;
 
-/// Why a figure became no image.
+/// Why a figure cannot be rendered.
 #[derive(Debug, thiserror::Error)]
 pub enum PngError {
-    /// Nothing, or more than there is room for.
+    /// The image would be empty or too large.
     #[error("a figure of {0} × {1} points has no image at {2} dots an inch")]
     Size(f64, f64, f64),
-    /// The encoder.
+    /// The encoder reports an error.
     #[error("a figure cannot be written as PNG: {0}")]
     Encoding(#[from] png::EncodingError),
 }
 
-/// The bytes of a PNG file with so many dots an inch.
+/// Renders a figure as PNG at this resolution.
 pub fn to_png(figure: &Figure, dots_per_inch: f64) -> Result<Vec<u8>, PngError> {
     let scale = dots_per_inch / POINTS;
     let size = || PngError::Size(figure.width, figure.height, dots_per_inch);
@@ -42,7 +42,7 @@ fn encode(pixmap: &Pixmap, dots_per_inch: f64) -> Result<Vec<u8>, PngError> {
     let per_metre = (dots_per_inch / METRES).round() as u32;
     let unit = png::Unit::Meter;
     encoder.set_pixel_dims(Some(png::PixelDimensions { xppu: per_metre, yppu: per_metre, unit }));
-    // The sheet is white, so nothing is seen through it.
+    // The white background is opaque.
     let colours: Vec<u8> = pixmap.pixels().iter().flat_map(|p| [p.red(), p.green(), p.blue()]).collect();
     encoder.write_header()?.write_image_data(&colours)?;
     Ok(bytes)
@@ -51,7 +51,7 @@ fn encode(pixmap: &Pixmap, dots_per_inch: f64) -> Result<Vec<u8>, PngError> {
 struct Sheet {
     pixmap: Pixmap,
     transform: Transform,
-    /// The last one, since many items have the same.
+    /// The last clip mask, because consecutive items often share one.
     clip: Option<(Rectangle, Mask)>,
 }
 
@@ -134,12 +134,12 @@ impl Sheet {
                 pen += size * font::advance(character, *bold);
             }
         }
-        // Letters overlap nowhere, and their holes are turned the other way: either rule fills them alike.
+        // Glyphs do not overlap and their holes have the opposite orientation, so both fill rules agree.
         self.path(builder.builder, Some((*colour).into()), None, None);
     }
 }
 
-/// Puts outlines of characters where they stand on the sheet.
+/// Transforms glyph outlines to sheet coordinates.
 struct Glyphs {
     builder: PathBuilder,
     place: Transform,

@@ -1,40 +1,40 @@
-//! Lines of markup with `_{below}` and `^{above}`, as in V_{0} and eV Å^{−1}.
+//! Text with `_{subscript}` and `^{superscript}`, as in V_{0} and eV Å^{−1}.
 
 use crate::font::advance;
 
-/// Which part of a line of words stands at its place.
+/// Which part of a text is at its position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Anchor {
-    /// Its beginning.
+    /// The start.
     Start,
-    /// Its middle.
+    /// The middle.
     Middle,
-    /// Its end.
+    /// The end.
     End,
 }
 
-/// A part of a line that is set alike.
+/// A part of a text with one style.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Run<'a> {
-    /// What it says.
+    /// The characters.
     pub text: &'a str,
-    /// On the line, below or above it.
+    /// Vertical style.
     pub script: Script,
 }
 
-/// Where a run stands.
+/// Vertical style of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Script {
-    /// On the line.
+    /// On the baseline.
     Normal,
-    /// Below it, smaller.
+    /// Subscript.
     Sub,
-    /// Above it, smaller.
+    /// Superscript.
     Super,
 }
 
 impl Script {
-    /// By how much it is lower than the line, in heights of the font.
+    /// Downward shift from the baseline, in font sizes.
     pub fn baseline_shift(self) -> f64 {
         match self {
             Self::Normal => 0.0,
@@ -43,13 +43,13 @@ impl Script {
         }
     }
 
-    /// Height of its font by that of the line.
+    /// Font size relative to the line.
     pub fn scale(self) -> f64 {
         if self == Self::Normal { 1.0 } else { 0.72 }
     }
 }
 
-/// The parts of a line. Braces that are not closed end with it.
+/// Splits a text into runs. Unclosed braces end with the text.
 pub fn runs(markup: &str) -> Vec<Run<'_>> {
     let (mut runs, mut rest) = (Vec::new(), markup);
     let mut push = |text, script| {
@@ -70,13 +70,13 @@ pub fn runs(markup: &str) -> Vec<Run<'_>> {
     runs
 }
 
-/// Width of a line in a font of height 1.
+/// Width of a text at font size 1.
 pub fn width(markup: &str, bold: bool) -> f64 {
     let of = |run: Run<'_>| run.script.scale() * run.text.chars().map(|c| advance(c, bold)).sum::<f64>();
     runs(markup).into_iter().map(of).sum()
 }
 
-/// The same without marks, for a file of numbers.
+/// The text without braces, for data files.
 pub fn plain(markup: &str) -> String {
     let of = |run: &Run<'_>| match run.script {
         Script::Normal => run.text.to_owned(),
@@ -86,7 +86,7 @@ pub fn plain(markup: &str) -> String {
     runs(markup).iter().map(of).collect()
 }
 
-/// The same as HTML.
+/// The text as HTML.
 pub fn to_html(markup: &str) -> String {
     let of = |run: &Run<'_>| {
         let text = escape(run.text);
@@ -99,7 +99,7 @@ pub fn to_html(markup: &str) -> String {
     runs(markup).iter().map(of).collect()
 }
 
-/// With what means something in XML and HTML written so that it does not. Characters that XML has no place for are left out.
+/// Escapes XML and HTML special characters. Drops characters that XML does not allow.
 pub fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for character in text.chars() {

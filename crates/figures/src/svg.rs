@@ -1,4 +1,4 @@
-//! A figure as SVG 1.1: words stay words, one unit is a point.
+//! Writes a figure as SVG 1.1. Text stays text, and one unit is a point.
 
 use std::fmt::Write;
 
@@ -6,7 +6,7 @@ use crate::font::FAMILY;
 use crate::rich_text::{escape, runs};
 use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text};
 
-/// The SVG element, which may stand in a file or in HTML.
+/// The SVG element, for a file or for HTML.
 pub fn to_svg(figure: &Figure) -> String {
     let Figure { name, description, width, height, items } = figure;
     let (width, height) = (short(*width), short(*height));
@@ -151,7 +151,7 @@ fn hexadecimal(Colour(red, green, blue): Colour) -> String {
     format!("#{red:02x}{green:02x}{blue:02x}")
 }
 
-/// Two decimals, and none that say nothing.
+/// At most two decimals, without trailing zeros.
 fn short(number: f64) -> String {
     let text = format!("{number:.2}");
     let text = text.trim_end_matches('0').trim_end_matches('.');

@@ -1,17 +1,17 @@
-//! Where an axis has its ticks, and what stands there.
+//! Positions and labels of ticks.
 
 use crate::Scale;
 
-/// A tick: where, among data, and what it says; a small one says nothing.
+/// A tick; minor ticks have no label.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tick {
-    /// Value.
+    /// Position in data coordinates.
     pub position: f64,
-    /// Words.
+    /// Label, empty for a minor tick.
     pub label: String,
 }
 
-/// Ticks of an axis from `low` to `high`, about `number` of them with words.
+/// Ticks of an axis from `low` to `high`, about `number` of them labelled.
 pub fn choose(scale: Scale, low: f64, high: f64, number: usize) -> Vec<Tick> {
     match scale {
         Scale::Linear => linear(low, high, number),
@@ -19,11 +19,11 @@ pub fn choose(scale: Scale, low: f64, high: f64, number: usize) -> Vec<Tick> {
     }
 }
 
-/// At multiples of 1, 2 or 5 times a power of ten.
+/// Ticks at multiples of 1, 2 or 5 times a power of ten.
 fn linear(low: f64, high: f64, number: usize) -> Vec<Tick> {
     let step = step((high - low) / number.max(1) as f64);
     let decimals = (-step.log10().floor()).max(0.0) as usize;
-    // A step as 2.5 would need one more; those of `step` do not.
+    // A step such as 2.5 would need one more decimal; the steps of `step` do not.
     let (first, last) = ((low / step - 1e-9).ceil() as i64, (high / step + 1e-9).floor() as i64);
     let tick = |k: i64| {
         let position = k as f64 * step;
@@ -32,7 +32,7 @@ fn linear(low: f64, high: f64, number: usize) -> Vec<Tick> {
     (first..=last).map(tick).collect()
 }
 
-/// The least of 1, 2, 5 times a power of ten that is not below `least`.
+/// The smallest of 1, 2, 5 times a power of ten that is at least `least`.
 fn step(least: f64) -> f64 {
     let power = 10_f64.powf(least.log10().floor());
     let of = |factor: f64| factor * power;
@@ -43,8 +43,8 @@ fn step(least: f64) -> f64 {
         .unwrap_or(10.0 * power)
 }
 
-/// At powers of ten, and between them small; over less than two decades also 2 and 5 have words, over less than one
-/// 3 and 7 as well.
+/// Major ticks at powers of ten, minor ticks between them. Below two decades 2 and 5 are labelled too, below
+/// one also 3 and 7.
 fn logarithmic(low: f64, high: f64, number: usize) -> Vec<Tick> {
     let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);
     let decades = (high / low).log10();
@@ -71,7 +71,7 @@ fn logarithmic(low: f64, high: f64, number: usize) -> Vec<Tick> {
     ticks
 }
 
-/// 0.001 to 1000 in full, others as a power.
+/// 0.001 to 1000 in decimal notation, others as powers.
 fn power_of_ten(digit: i32, power: i32) -> String {
     match power {
         -3..=-1 => format!("{:.*}", power.unsigned_abs() as usize, f64::from(digit) * 10_f64.powi(power)),
@@ -81,7 +81,7 @@ fn power_of_ten(digit: i32, power: i32) -> String {
     }
 }
 
-/// With the sign that is as wide as a digit.
+/// Replaces the hyphen with a minus sign, which is as wide as a digit.
 fn minus(number: String) -> String {
     number.replace('-', "−")
 }

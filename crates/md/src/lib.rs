@@ -1,5 +1,5 @@
-//! Molecular dynamics: velocity Verlet, Langevin (BAOAB) and Nosé–Hoover chains, counter-based random
-//! numbers, the volume ramp, and checkpoints from which a run continues bit for bit.
+//! Molecular dynamics: velocity Verlet, Langevin (BAOAB) and Nosé–Hoover chains, counter-based random numbers,
+//! volume ramps, and checkpoints from which a run resumes bit for bit.
 //!
 //! ```text
 //!  Checkpoint ──resume──▶ Dynamics ──step(potential)──▶ Dynamics ──checkpoint()──▶ Checkpoint

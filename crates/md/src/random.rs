@@ -1,9 +1,9 @@
-//! Counter-based random numbers: each is a pure function of what it is for, so that nothing has to
-//! be stored to repeat or continue a sequence.
+//! Counter-based random numbers: pure functions of their counters, so that repeating or continuing a sequence
+//! needs no stored state.
 
 use serde::{Deserialize, Serialize};
 
-/// What a random number is for; different purposes never share numbers.
+/// The use of a random number; different uses never share numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[repr(u32)]
 pub enum StreamId {
@@ -13,14 +13,14 @@ pub enum StreamId {
     Langevin = 1,
 }
 
-/// The random numbers of one segment of one walk.
+/// The random stream of one segment of a walk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stream {
     /// The campaign's random seed.
     pub rng_seed: u64,
     /// The walk.
     pub walk: u32,
-    /// The segment of the walk, raised when it goes back to a checkpoint.
+    /// The segment of the walk, incremented by each return to a checkpoint.
     pub segment: u32,
 }
 
@@ -32,8 +32,8 @@ impl Stream {
 
     /// Three independent standard normal numbers.
     ///
-    /// Walk and segment are enciphered with the random seed into the 64-bit key of the stream: two of
-    /// n streams share a key with probability n²/2⁶⁵. Within a stream no two numbers are the same draw.
+    /// The random seed encrypts walk and segment into the 64-bit key of the stream: two of n streams share a
+    /// key with probability n²/2⁶⁵. Within a stream no two calls share a draw.
     pub fn normals(&self, step: u64, atom: u32, id: StreamId) -> [f64; 3] {
         let [k0, k1, ..] = philox([self.walk, self.segment, 0, 0], words(self.rng_seed));
         let [low, high] = words(step);
@@ -70,7 +70,7 @@ pub fn philox(counter: [u32; 4], key: [u32; 2]) -> [u32; 4] {
     x
 }
 
-/// Low and high half.
+/// Lower and upper half.
 fn words(x: u64) -> [u32; 2] {
     [x as u32, (x >> 32) as u32]
 }

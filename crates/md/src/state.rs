@@ -1,4 +1,4 @@
-//! Positions, velocities, and the kinetic energy and temperature they give.
+//! Positions and velocities, with kinetic energy and temperature.
 
 use atoms::cell::{add, dot, scale, sub};
 use atoms::units::{ACCELERATION, BOLTZMANN};
@@ -12,9 +12,9 @@ use crate::random::{Stream, StreamId};
 pub struct State {
     /// Species, positions (never wrapped), cell.
     pub structure: Structure,
-    /// Velocities, [n], Å/fs.
+    /// Velocities, `[n]`, Å/fs.
     pub velocities: Vec<Vec3>,
-    /// Number of steps made.
+    /// Number of completed steps.
     pub step: u64,
 }
 
@@ -26,7 +26,7 @@ impl State {
     }
 }
 
-/// Standard atomic weights, [n], u.
+/// Standard atomic weights, `[n]`, u.
 pub fn masses(species: &[Species]) -> Vec<f64> {
     species.iter().map(|species| species.mass()).collect()
 }

@@ -1,15 +1,15 @@
-//! What can be wrong with a file.
+//! Errors of the extended XYZ format.
 
 use crate::species::UnknownSpecies;
 use crate::structure::StructureError;
 
-/// What is wrong with a file, and where.
+/// An error with its line.
 #[derive(Debug, thiserror::Error)]
 #[error("line {line}: {kind}")]
 pub struct ExtxyzError {
     /// Line of the file, from 1.
     pub line: usize,
-    /// What is wrong with it.
+    /// What is wrong.
     #[source]
     pub kind: ExtxyzErrorKind,
 }
@@ -23,53 +23,53 @@ pub enum ExtxyzErrorKind {
     /// Not UTF-8.
     #[error("found bytes that are not text, expected UTF-8")]
     Encoding,
-    /// The first line of a frame.
+    /// The first line of a frame is not a number of atoms.
     #[error("found '{found}', expected the number of atoms of a frame")]
     Count {
         /// The line.
         found: String,
     },
-    /// The stream ends within a frame.
+    /// The stream ends inside a frame.
     #[error("the file ends after {found} of the {expected} atoms of the frame at line {start}")]
     Truncated {
         /// Atoms read.
         found: u64,
-        /// Atoms announced.
+        /// Atoms stated in the header.
         expected: u64,
         /// Where the frame starts.
         start: usize,
     },
-    /// A quote or bracket of the comment line.
+    /// A quote or bracket in the comment line is not closed.
     #[error("column {column}: {delimiter} is opened and never closed")]
     Unclosed {
-        /// Where it is opened, from 1.
+        /// Where it opens, from 1.
         column: usize,
         /// The opening character.
         delimiter: char,
     },
-    /// An equals sign of the comment line.
+    /// An equals sign in the comment line has no key.
     #[error("column {column}: found '=', expected a key before it")]
     NoKey {
-        /// Where it stands, from 1.
+        /// Where it is, from 1.
         column: usize,
     },
-    /// A key of the comment line, or a column, given twice.
+    /// A key of the comment line or a column occurs twice.
     #[error("{key} is given twice, expected one value")]
     Repeated {
         /// The key.
         key: String,
     },
-    /// The value of a key of the comment line.
+    /// A key of the comment line has an invalid value.
     #[error("{key} is '{found}', expected {expected}")]
     Key {
         /// The key.
         key: String,
         /// Its value.
         found: String,
-        /// What it should be.
+        /// The valid values.
         expected: &'static str,
     },
-    /// The number of fields of an atom line.
+    /// An atom line has the wrong number of fields.
     #[error("found {found} fields, expected {expected} (see Properties)")]
     Fields {
         /// Fields of the line.
@@ -77,7 +77,7 @@ pub enum ExtxyzErrorKind {
         /// Fields that `Properties` describes.
         expected: usize,
     },
-    /// A field of an atom line.
+    /// A field of an atom line is invalid.
     #[error("field {field} ({name}): found '{found}', expected {expected}")]
     Field {
         /// Which field, from 1.
@@ -86,18 +86,18 @@ pub enum ExtxyzErrorKind {
         name: String,
         /// The field.
         found: String,
-        /// What it should be.
+        /// The valid values.
         expected: &'static str,
     },
-    /// The element of an atom line.
+    /// An unknown element in an atom line.
     #[error("field {field}: {source}")]
     Species {
         /// Which field, from 1.
         field: usize,
-        /// The element.
+        /// The unknown element.
         source: UnknownSpecies,
     },
-    /// The frame as a whole.
+    /// The structure is invalid.
     #[error(transparent)]
     Structure(#[from] StructureError),
 }
@@ -112,7 +112,7 @@ impl ExtxyzErrorKind {
     }
 }
 
-/// The beginning of a text that may be long.
+/// The start of a text that may be long.
 pub(super) fn excerpt(text: &str) -> String {
     let start: String = text.trim().chars().take(60).collect();
     if start.len() < text.trim().len() { start + "…" } else { start }

@@ -9,7 +9,7 @@ use super::{Frame, Value, comment};
 use crate::cell::{Cell, Matrix3};
 use crate::structure::Structure;
 
-/// The frames of a stream, one after another. The first error is the last item.
+/// Iterates over the frames of a stream. Ends after the first error.
 pub struct Reader<R> {
     input: R,
     /// Number of the line in `text`, from 1.
@@ -24,7 +24,7 @@ impl<R: BufRead> Reader<R> {
         Self { input, line: 0, text: String::new(), ended: false }
     }
 
-    /// Takes the next line into `text`; false at the end of the stream.
+    /// Reads the next line into `text`; false at the end of the stream.
     fn advance(&mut self) -> Result<bool, ExtxyzError> {
         self.text.clear();
         self.line += 1;
@@ -50,7 +50,7 @@ impl<R: BufRead> Reader<R> {
         Ok(None)
     }
 
-    /// The frame of `count` atoms whose first line, `start`, has been read.
+    /// Reads the atoms of a frame with `count` atoms whose first line, `start`, has been read.
     fn body(&mut self, count: u64, start: usize) -> Result<Frame, ExtxyzError> {
         if !self.advance()? {
             return Err(ExtxyzErrorKind::Truncated { found: 0, expected: count, start }.at(self.line));
@@ -83,7 +83,7 @@ impl<R: BufRead> Iterator for Reader<R> {
     }
 }
 
-/// What the comment line says.
+/// The parsed comment line.
 struct Header {
     info: BTreeMap<String, Value>,
     cell: Cell,

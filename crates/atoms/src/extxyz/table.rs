@@ -8,10 +8,10 @@ use super::{Column, ColumnData};
 use crate::cell::Vec3;
 use crate::species::{Species, UnknownSpecies};
 
-/// The atoms of a frame as they are read.
+/// The atoms of a frame while it is read.
 pub(super) struct Table {
     columns: Vec<TableColumn>,
-    /// Fields of a line.
+    /// Fields per line.
     width: usize,
     /// Whether more fields are an error.
     exact: bool,
@@ -30,7 +30,7 @@ enum Content {
     AtomicNumber,
     Position,
     Array(Column),
-    /// Symbols where atomic numbers are given too: ASE takes the numbers.
+    /// Symbols beside atomic numbers: ASE uses the numbers.
     Ignored,
 }
 
@@ -109,7 +109,7 @@ impl Table {
     }
 }
 
-/// What a column is for; on failure what was expected.
+/// The use of a column; on failure, what was expected.
 fn content(name: &str, kind: &str, width: usize, numbered: bool) -> Result<Content, &'static str> {
     match (name, kind, width) {
         ("species" | "symbols", "S", 1) if numbered => Ok(Content::Ignored),
@@ -132,7 +132,7 @@ fn field_fault(index: usize, name: &str, found: &str, expected: &'static str) ->
     ExtxyzErrorKind::Field { field: index + 1, name: excerpt(name), found: excerpt(found), expected }
 }
 
-/// A symbol in any case: `AL` is aluminium.
+/// A symbol in any letter case: `AL` is aluminium.
 fn symbol((index, field): (usize, &str)) -> Result<Species, ExtxyzErrorKind> {
     let (first, rest) = field.split_at_checked(1).unwrap_or((field, ""));
     let capitalised = first.to_ascii_uppercase() + &rest.to_ascii_lowercase();
@@ -148,7 +148,7 @@ fn atomic_number((index, field): (usize, &str)) -> Result<Species, ExtxyzErrorKi
 }
 
 impl ColumnData {
-    /// Adds a field; on failure what was expected.
+    /// Adds a field; on failure, returns what was expected.
     fn push(&mut self, field: &str) -> Result<(), &'static str> {
         match self {
             Self::Real(values) => values.push(field.parse().map_err(|_| "a number")?),

@@ -15,7 +15,7 @@ fn info(comment: &str) -> BTreeMap<String, Value> {
     only(&format!("1\n{comment}\nAl 0 0 0\n")).info
 }
 
-/// Frames, read and written again.
+/// Writes frames, reads them and writes them again.
 fn rewritten(frame: &Frame) -> String {
     let mut text = Vec::new();
     write_frame(&mut text, frame).unwrap();
@@ -92,7 +92,7 @@ fn values_of_every_type() {
     assert_eq!(info["commas"], vec![1, 2].into());
 }
 
-/// Each of these takes minutes where the time grows with the square of the length.
+/// With quadratic run time each of these would take minutes.
 #[test]
 fn long_comment_lines_take_time_in_proportion() {
     let letters = "k".repeat(10_000_000);

@@ -6,16 +6,16 @@ use super::comment::{is_verbatim, quote};
 use super::{Column, ColumnData, Frame, Value};
 use crate::structure::StructureError;
 
-/// Why a frame cannot be written so that this reader and ASE read the same back.
+/// Why a frame cannot be written so that this reader and ASE read it back.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
-    /// The stream does not take it.
+    /// The stream reports an error.
     #[error("cannot be written: {0}")]
     Io(#[from] std::io::Error),
-    /// The structure is not one.
+    /// The structure is invalid.
     #[error(transparent)]
     Structure(#[from] StructureError),
-    /// A key or its value.
+    /// A key or its value cannot be written.
     #[error("the info key '{key}' {fault}")]
     Key {
         /// The key.
@@ -23,7 +23,7 @@ pub enum WriteError {
         /// What is wrong.
         fault: &'static str,
     },
-    /// A column.
+    /// A column cannot be written.
     #[error("the column '{name}' {fault}")]
     Column {
         /// Its name.
@@ -33,9 +33,9 @@ pub enum WriteError {
     },
 }
 
-/// Writes one frame; nothing if it cannot be written.
+/// Writes one frame, or nothing if it cannot be written.
 ///
-/// Keys and columns stand in alphabetical order: the same frame gives the same bytes.
+/// Keys and columns are in alphabetical order, so equal frames give equal bytes.
 pub fn write_frame(out: &mut impl Write, frame: &Frame) -> Result<(), WriteError> {
     frame.structure.validate()?;
     let mut text = Vec::new();
@@ -76,7 +76,7 @@ fn comment(frame: &Frame) -> Result<String, WriteError> {
     Ok(words.join(" "))
 }
 
-/// The value as text; on failure what is wrong.
+/// The value as text; on failure, what is wrong.
 fn info(key: &str, value: &Value) -> Result<String, &'static str> {
     match key {
         "Lattice" | "Properties" | "pbc" => return Err("belongs to the structure"),
@@ -102,7 +102,7 @@ fn matrix(value: &Value) -> Option<String> {
     }
 }
 
-/// The letter for the type of a column; on failure what is wrong.
+/// The type letter of a column; on failure, what is wrong.
 fn kind(name: &str, column: &Column, atoms: usize) -> Result<char, &'static str> {
     if matches!(name, "species" | "symbols" | "Z" | "numbers" | "pos" | "positions") {
         return Err("belongs to the structure");
