@@ -1,8 +1,10 @@
-//! What it costs walks to wait for each other: the walks of the aluminium campaign of `configs/`, each on a walker of its
-//! own, in live mode and in rounds. Real dynamics and real decisions, one after the other on this machine; what they
-//! would take side by side is told by a clock that goes by the processor time of each turn.
+//! The time that walks spend waiting for each other: the walks of the aluminium campaign of `configs/`, one
+//! walker each, in live mode and in rounds. Dynamics and decisions are real and run one after another on this
+//! machine; a simulated clock that advances by the processor time of each assignment gives the time they would
+//! take in parallel.
 //!
-//! `cargo bench --bench rounds`; a number behind `--` is the steps of a turn. The figures are in `docs/benchmarks.md`.
+//! `cargo bench --bench rounds`; a number after `--` sets the steps per assignment. The results are in
+//! `docs/benchmarks.md`.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -21,7 +23,7 @@ use wire::{CampaignId, CandidateBlock};
 use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
-/// Steps of a turn, if not given: as in `configs/`.
+/// Default steps per assignment, as in `configs/`.
 const TURN_STEPS: u64 = 250;
 
 fn main() {
@@ -33,18 +35,18 @@ fn main() {
     println!("candidates an hour, live over rounds: {:.2}", rate(&live) / rate(&rounds));
 }
 
-/// What a campaign came to.
+/// Result of a campaign.
 #[derive(Default)]
 struct Campaign {
     candidates: u32,
     accepted: u32,
-    /// By the clock of walkers side by side.
+    /// Time on the simulated clock of parallel walkers.
     time: Duration,
-    /// Of all walkers together.
+    /// Total processor time of all walkers.
     work: Duration,
 }
 
-/// A turn under way: when it ends, in which order turns that end at the same time were begun, what comes of it.
+/// A running assignment: when it ends, the order of start for ties, and its report.
 struct Turn(Duration, u64, Report);
 
 impl Campaign {
@@ -59,7 +61,7 @@ impl Campaign {
         selector.begin_walks();
         let (mut campaign, mut turns, mut begun) = (Self::default(), BinaryHeap::new(), 0);
         loop {
-            // As many walkers as walks: whoever has a turn begins it now.
+            // There are as many walkers as walks, so every assignment starts at once.
             while let Next::Turn(assignment) = selector.next_turn() {
                 let used = processor_time();
                 let report = advance(&context, &assignment, Arc::clone(selector.mixture()), || false, |_| {});
@@ -89,7 +91,7 @@ impl Campaign {
     }
 }
 
-/// Processor time of this thread: what else is at work on the machine does not count.
+/// Processor time of this thread, which other load on the machine does not affect.
 fn processor_time() -> Duration {
     Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap()
 }

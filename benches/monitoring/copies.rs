@@ -1,5 +1,5 @@
-//! A campaign with many candidates: copies of one, which differ in their names, grades and volumes. Accepted ones have structures of
-//! their own, whose atoms differ in their grades and in the errors of their forces.
+//! A campaign with many candidates: copies of one with different names, grades and volumes. Accepted candidates
+//! have distinct structures with distinct grades and force errors.
 
 use std::path::Path;
 
@@ -10,22 +10,22 @@ use wire::{Candidate, CandidateBlock, CandidateId, ContentHash, WalkId};
 
 use crate::common::random;
 
-/// Walks.
+/// Number of walks.
 pub const WALKS: u64 = 1000;
-/// One candidate in so many is accepted.
+/// One in this many candidates is accepted.
 const ACCEPTED: u64 = 20;
-/// Bytes of a stored structure before its species, a byte each, and its positions (`store/src/encoding.rs`).
+/// Bytes of a stored structure before its species (one byte each) and positions (`store/src/encoding.rs`).
 const BEFORE_SPECIES: usize = 75;
-/// Stands in the count before numbers that are not compressed (`store/src/numbers.rs`).
+/// Flag in the count before uncompressed numbers (`store/src/numbers.rs`).
 const PLAIN: u64 = 1 << 63;
 
-/// `copy`: what an accepted one has of its own.
+/// `copy`: the columns that differ between accepted candidates.
 const ONE: [&str; 2] = [
     "CREATE TEMP TABLE one AS SELECT * FROM candidate WHERE fate = 'accepted' AND origin = 'biased' ORDER BY decision DESC LIMIT 1",
     "CREATE TEMP TABLE copy (i INTEGER PRIMARY KEY, hash BLOB, data BLOB, forces BLOB, grades BLOB, id TEXT, block BLOB)",
 ];
 
-/// `$1` is how many candidates there are to be more; each statement is one of SQLite's.
+/// `$1` is the number of candidates to add; each string is one statement of SQLite.
 const MORE: [&str; 12] = [
     "CREATE TEMP TABLE new (decision INTEGER PRIMARY KEY, i INTEGER, is_accepted INTEGER, reason TEXT, structure INTEGER, hash BLOB,
         id TEXT, x REAL)",
@@ -72,7 +72,7 @@ const MORE: [&str; 12] = [
         FROM n CROSS JOIN (SELECT * FROM walk LIMIT 1)",
 ];
 
-/// Adds candidates to a campaign that has ended, as fast as SQLite can: what is lost with the machine is made again.
+/// Adds candidates to a finished campaign without durability, because a lost database can be generated again.
 pub fn make(here: &Path, candidates: u64) {
     let file = here.join("campaign/campaign.sqlite");
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
@@ -80,7 +80,7 @@ pub fn make(here: &Path, candidates: u64) {
         let labelled = newest(&here.join("campaign")).await;
         let options =
             SqliteConnectOptions::new().filename(file).foreign_keys(false).pragma("temp_store", "memory");
-        // Rows come in any order of the indexes: all of these fit.
+        // Rows arrive in any order of the indexes; the cache holds all pages.
         let options = options.journal_mode(SqliteJournalMode::Off).pragma("cache_size", "-1000000");
         let mut connection =
             options.synchronous(SqliteSynchronous::Off).connect().await.expect("the database");
@@ -117,7 +117,7 @@ async fn newest(campaign: &Path) -> ExportRow {
     rows.pop().expect("a labelled candidate")
 }
 
-/// Fills `copy`: one atom of each is moved, since no two structures share their content, by a ten-thousandth of an ångström at most.
+/// Fills `copy`. No two structures may share their content, so one atom of each moves by at most 10⁻⁴ Å.
 async fn copy(connection: &mut SqliteConnection, one: ExportRow, candidates: u64) {
     let ExportRow { source: ExportSource::Candidate { original, block, .. }, mut structure, label, .. } = one
     else {

@@ -1,7 +1,7 @@
-//! What it costs to watch a large campaign: `status` and the pages of the dashboard with a million candidates, and twenty browsers that
-//! listen to its news.
+//! The cost of monitoring a large campaign: `status` and the dashboard's pages with a million candidates, and
+//! twenty browsers that listen to its events.
 //!
-//! `cargo bench --bench monitoring`; a number behind `--` is how many candidates there are.
+//! `cargo bench --bench monitoring`; a number after `--` sets the number of candidates.
 
 #[path = "../../tests/common/mod.rs"]
 mod common;
@@ -16,10 +16,10 @@ use common::campaign::Small;
 use common::http::{get, listen, reckoned, said};
 use common::{Running, program, succeed};
 
-/// Candidates, if not given.
+/// Default number of candidates.
 const CANDIDATES: u64 = 1_000_000;
 const TRIES: usize = 11;
-/// So many listen for so long.
+/// Number of listeners and duration of the measurement.
 const LISTENERS: usize = 20;
 const LISTENING: Duration = Duration::from_secs(60);
 
@@ -82,7 +82,7 @@ fn main() {
     row("force errors", || look("/api/errors"));
     println!("\nmemory of the server: {}", memory(server.0.id()));
     let listeners: Vec<_> = (0..LISTENERS).map(|_| listen(address, "/api/events")).collect();
-    // What they are told first is not what they are told again and again.
+    // Skip the initial messages, which differ from the periodic ones.
     thread::sleep(Duration::from_secs(5));
     let (before, begun) = (processor_seconds(server.0.id()), Instant::now());
     thread::sleep(LISTENING);
@@ -104,17 +104,17 @@ fn row(name: &str, mut act: impl FnMut()) {
     println!("| {name} | {:.0} ms | {:.0} ms |", times[TRIES / 2], times[TRIES - 1]);
 }
 
-/// What a process and its threads have used so far.
+/// Processor time of a process and its threads so far.
 fn processor_seconds(pid: u32) -> f64 {
     let text = fs::read_to_string(format!("/proc/{pid}/stat")).expect("the process lives");
     let (_, rest) = text.rsplit_once(')').expect("a name in brackets");
     let ticks: u64 =
         rest.split_whitespace().skip(11).take(2).map(|n| n.parse::<u64>().expect("a number")).sum();
-    // Linux shows hundredths of a second to everybody.
+    // Linux reports hundredths of a second to user space.
     ticks as f64 / 100.0
 }
 
-/// Memory that a process has, and had at most.
+/// Current and peak memory of a process.
 fn memory(pid: u32) -> String {
     let text = fs::read_to_string(format!("/proc/{pid}/status")).expect("the process lives");
     let megabytes = |name: &str| -> u64 {

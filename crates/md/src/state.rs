@@ -49,10 +49,10 @@ pub fn temperature(kinetic_energy: f64, degrees_of_freedom: usize) -> f64 {
     2.0 * kinetic_energy / (degrees_of_freedom as f64 * BOLTZMANN)
 }
 
-/// Velocities (Å/fs) from the Maxwell–Boltzmann distribution at `temperature` (K), without motion of the
-/// centre of mass and scaled to exactly that temperature with 3n − 3 degrees of freedom.
+/// Velocities (Å/fs) from the Maxwell–Boltzmann distribution at `temperature` (K), without centre-of-mass
+/// motion and scaled to exactly that temperature with 3n − 3 degrees of freedom.
 ///
-/// A single atom is left at rest.
+/// A single atom is at rest.
 pub fn maxwell_boltzmann(species: &[Species], temperature: f64, stream: &Stream) -> Vec<Vec3> {
     let masses = masses(species);
     let mut velocities: Vec<Vec3> = masses
@@ -86,7 +86,7 @@ mod tests {
         let energy = kinetic_energy(&velocities, &masses);
         assert!((temperature(energy, 3 * 3999) - 750.0).abs() < 1e-9);
         assert!(momentum(&velocities, &masses).iter().all(|p| p.abs() < 1e-9));
-        // Each element holds half of the energy; a sum of 6000 squares scatters by √(2/6000).
+        // Each element has half of the energy; a sum of 6000 squares fluctuates by √(2/6000).
         let hydrogen: f64 =
             (0..4000).step_by(2).map(|i| kinetic_energy(&velocities[i..=i], &masses[i..=i])).sum();
         assert!((2.0 * hydrogen / energy - 1.0).abs() < 5.0 * f64::sqrt(2.0 / 6000.0));

@@ -5,10 +5,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::state::State;
 
-/// Relative volume V/V₀ that grows linearly with the step and then stays.
+/// A relative volume V/V₀ that changes linearly with the step and then stays constant.
 ///
-/// Volume means the extent of the directions that repeat: area for a slab, length for a wire. A cluster has
-/// none and is left alone.
+/// Volume means the extent along periodic directions: area for a slab, length for a wire. A cluster has none
+/// and does not change.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct VolumeRamp {
     /// V/V₀ at the start.
@@ -48,9 +48,8 @@ impl VolumeRamp {
     }
 }
 
-/// Scales the volume by `ratio`: the lattice vectors of the directions that repeat by `ratio`^(1/number of
-/// them), and all positions affinely with them. Nothing moves at right angles to those directions, and the
-/// lattice vectors of the others stay.
+/// Scales the volume by `ratio`: the n periodic lattice vectors by `ratio`^(1/n), and all positions affinely
+/// with them. Components orthogonal to those directions and the other lattice vectors do not change.
 pub fn scale_volume(structure: &mut Structure, ratio: f64) {
     let dimensions = structure.periodic.iter().filter(|periodic| **periodic).count();
     if dimensions == 0 {
@@ -69,7 +68,7 @@ pub fn scale_volume(structure: &mut Structure, ratio: f64) {
     }
 }
 
-/// Volume, area or length of the directions that repeat; 1 for a cluster.
+/// Volume, area or length of the periodic directions; 1 for a cluster.
 fn extent(structure: &Structure) -> f64 {
     structure.cell.completed(structure.periodic).volume()
 }

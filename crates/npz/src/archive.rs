@@ -1,4 +1,4 @@
-//! Opening an archive and reading its arrays.
+//! Opens archives and reads their arrays.
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;
@@ -13,10 +13,10 @@ use crate::array::Array;
 use crate::error::{ArrayName, Error};
 use crate::header::Header;
 
-/// Larger arrays than this are taken for damage, bytes.
+/// Larger arrays count as corrupt, bytes.
 const MAX_ARRAY_BYTES: u64 = 1 << 32;
 
-/// An open archive. Arrays are read when asked for, and the archive remembers which ones were.
+/// An open archive. Arrays are read on demand, and the archive records which ones were read.
 pub struct Archive<R: Read + Seek = BufReader<File>> {
     path: PathBuf,
     names: BTreeSet<String>,
@@ -28,7 +28,7 @@ impl Archive {
     /// Opens a file.
     ///
     /// # Errors
-    /// If it cannot be opened or is no archive.
+    /// If it cannot be opened or is not an archive.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let opened = match path.is_dir() {
             true => Err(ErrorKind::IsADirectory.into()),
@@ -40,10 +40,10 @@ impl Archive {
 }
 
 impl<'a> Archive<Cursor<&'a [u8]>> {
-    /// Reads an archive in memory; errors call it `name`.
+    /// Reads an archive in memory; errors refer to it as `name`.
     ///
     /// # Errors
-    /// If the bytes are no archive.
+    /// If the bytes are not an archive.
     pub fn from_bytes(name: impl AsRef<Path>, bytes: &'a [u8]) -> Result<Self, Error> {
         Self::read(name.as_ref(), Cursor::new(bytes))
     }
@@ -57,12 +57,12 @@ impl<R: Read + Seek> Archive<R> {
         Ok(Self { path: path.to_owned(), names, zip: zip.into(), requested: RefCell::default() })
     }
 
-    /// The file, as errors name it.
+    /// The path, as used in errors.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Whether there is an array of that name.
+    /// Whether the archive has this array.
     pub fn contains(&self, key: &str) -> bool {
         self.names.contains(key)
     }
@@ -72,13 +72,13 @@ impl<R: Read + Seek> Archive<R> {
         self.names.iter().map(String::as_str)
     }
 
-    /// Names of the arrays that were neither asked for nor ignored.
+    /// Names of the arrays that were neither read nor ignored.
     pub fn unread(&self) -> Vec<&str> {
         let requested = self.requested.borrow();
         self.names().filter(|name| !requested.contains(*name)).collect()
     }
 
-    /// Notes that an array needs no reading.
+    /// Marks an array as not needed.
     pub fn ignore(&self, key: &str) {
         self.requested.borrow_mut().insert(key.to_owned());
     }
@@ -88,10 +88,10 @@ impl<R: Read + Seek> Archive<R> {
         self.array_name(key).wrong_value(found, expected)
     }
 
-    /// Floating-point numbers, integers and truth values of any usual type, as `f64`.
+    /// Numbers of any common type (floats, integers, booleans) as `f64`.
     ///
     /// # Errors
-    /// If there is no such array, or it is damaged or of another type.
+    /// If the array is missing, corrupt or of another type.
     pub fn numbers(&self, key: &str) -> Result<Array<f64>, Error> {
         let entry = self.entry(key)?;
         match entry.kind() {
@@ -117,7 +117,7 @@ impl<R: Read + Seek> Archive<R> {
         }
     }
 
-    /// Single-precision numbers as stored.
+    /// Single-precision numbers.
     ///
     /// # Errors
     /// As [`Archive::numbers`].
@@ -129,7 +129,7 @@ impl<R: Read + Seek> Archive<R> {
         }
     }
 
-    /// Texts, stored as bytes (`S`) or as characters (`U`), without their NUL padding.
+    /// Strings, stored as bytes (`S`) or characters (`U`), without NUL padding.
     ///
     /// # Errors
     /// As [`Archive::numbers`].
@@ -148,10 +148,10 @@ impl<R: Read + Seek> Archive<R> {
         ArrayName { path: self.path.clone(), key: key.to_owned() }
     }
 
-    /// Header and data of an array, the length of the data being what the header announces.
+    /// Header and data of an array; the length of the data matches the header.
     ///
-    /// The header is compared with the size that the archive announces before any of the data are read, and these are
-    /// read to their end, where the archive compares their checksum.
+    /// Compares the header with the size in the archive before reading any data, and reads the data to their
+    /// end, where the archive verifies the checksum.
     fn entry(&self, key: &str) -> Result<Entry, Error> {
         let name = self.array_name(key);
         if !self.contains(key) {

@@ -1,19 +1,19 @@
-//! Numbers that must be finite, and integers that count or point at something.
+//! Accessors that check values: finite numbers, counts and indices.
 
 use std::io::{Read, Seek};
 
 use crate::{Archive, Error};
 
 impl<R: Read + Seek> Archive<R> {
-    /// Finite numbers of exactly this shape.
+    /// Finite numbers of this shape.
     ///
     /// # Errors
-    /// As [`Archive::numbers`], and if the shape is another or a number not finite.
+    /// As [`Archive::numbers`], and if the shape differs or a number is not finite.
     pub fn floats(&self, key: &str, shape: &[usize]) -> Result<Vec<f64>, Error> {
         self.numbers(key)?.finite()?.with_shape(shape)
     }
 
-    /// Extents and finite numbers of an array of `N` dimensions, none of them empty.
+    /// Shape and finite numbers of a non-empty array with `N` dimensions.
     ///
     /// # Errors
     /// As [`Archive::floats`].
@@ -29,7 +29,7 @@ impl<R: Read + Seek> Archive<R> {
         self.numbers(key)?.finite()?.into_scalar()
     }
 
-    /// One finite number, or `default` where the array is absent.
+    /// One finite number, or `default` if the array is absent.
     ///
     /// # Errors
     /// As [`Archive::floats`].
@@ -37,10 +37,10 @@ impl<R: Read + Seek> Archive<R> {
         if self.contains(key) { self.scalar(key) } else { Ok(default) }
     }
 
-    /// One integer from `least` to `most`.
+    /// One integer from `min` to `max`.
     ///
     /// # Errors
-    /// As [`Archive::integers`], and if there is not one, or one outside these bounds.
+    /// As [`Archive::integers`], and if there is not exactly one integer within these bounds.
     pub fn count(&self, key: &str, min: usize, max: usize) -> Result<usize, Error> {
         let value = self.integers(key)?.into_scalar()?;
         match usize::try_from(value) {
@@ -49,7 +49,7 @@ impl<R: Read + Seek> Archive<R> {
         }
     }
 
-    /// One integer that must be `expected`, because other arrays say so.
+    /// One integer that must equal `expected`, which other arrays determine.
     ///
     /// # Errors
     /// As [`Archive::count`].
@@ -61,7 +61,7 @@ impl<R: Read + Seek> Archive<R> {
         Err(self.invalid(key, value, expected))
     }
 
-    /// A flag, 0 or 1; `default` where it is absent.
+    /// A flag, 0 or 1; `default` if absent.
     ///
     /// # Errors
     /// As [`Archive::count`].
@@ -69,7 +69,7 @@ impl<R: Read + Seek> Archive<R> {
         if self.contains(key) { Ok(self.count(key, 0, 1)? == 1) } else { Ok(default) }
     }
 
-    /// Indices below `bound`, as many as the array holds.
+    /// Indices below `bound`, any number of them.
     ///
     /// # Errors
     /// As [`Archive::integers`], and if an index is not below the bound.
@@ -87,7 +87,7 @@ impl<R: Read + Seek> Archive<R> {
     /// `length` indices below `bound`.
     ///
     /// # Errors
-    /// As [`Archive::indices`], and if there are more or fewer.
+    /// As [`Archive::indices`], and if the number of indices differs.
     pub fn exactly_indices(&self, key: &str, length: usize, bound: usize) -> Result<Vec<usize>, Error> {
         let indices = self.indices(key, bound)?;
         if indices.len() == length {

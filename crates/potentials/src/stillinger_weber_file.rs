@@ -1,8 +1,8 @@
 //! The parameter file of the Stillinger–Weber potential.
 //!
-//! Entries of fourteen words, over one or more lines: `element₁ element₂ element₃ ε σ a λ γ cosθ₀
-//! A B p q tol`; `#` begins a comment. Each ordered triplet of the elements has one entry.
-//! Source: the description of `pair_style sw` in the LAMMPS manual.
+//! Entries of fourteen words, over one or more lines: `element₁ element₂ element₃ ε σ a λ γ cosθ₀ A B p q tol`;
+//! `#` starts a comment. Each ordered triplet of the elements has one entry. Source: the description of
+//! `pair_style sw` in the LAMMPS manual.
 
 use std::path::Path;
 
@@ -17,7 +17,7 @@ pub(crate) struct Parameters {
     pub(crate) epsilon: f64,
     /// σ, Å.
     pub(crate) sigma: f64,
-    /// a: the pair reaches to a σ.
+    /// a: the range of the pair is a σ.
     pub(crate) a: f64,
     /// λ, strength of the three-body energy.
     pub(crate) lambda: f64,
@@ -27,18 +27,18 @@ pub(crate) struct Parameters {
     pub(crate) cosine: f64,
     /// A, strength of the two-body energy.
     pub(crate) big_a: f64,
-    /// B, share of its repulsion.
+    /// B, relative strength of the repulsion.
     pub(crate) big_b: f64,
-    /// p, power of the repulsion.
+    /// p, exponent of the repulsion.
     pub(crate) p: f64,
-    /// q, power of the attraction.
+    /// q, exponent of the attraction.
     pub(crate) q: f64,
-    /// Where the exponentials are so small that the pair may be left out; 0: nowhere.
+    /// The value of the exponentials below which the pair is neglected; 0: never.
     pub(crate) tolerance: f64,
 }
 
 impl Parameters {
-    /// Where the pair ends, Å: a σ, or where exp(min(γ, 1) σ / (r − aσ)) has fallen to the tolerance.
+    /// The range of the pair, Å: a σ, or where exp(min(γ, 1) σ / (r − aσ)) equals the tolerance.
     ///
     /// This is the manual's virtual cutoff; a tolerance above 0.01 counts as 0.01.
     pub(crate) fn reach(&self) -> f64 {
@@ -54,7 +54,7 @@ impl Parameters {
 /// The entries of a file.
 #[derive(Debug)]
 pub(crate) struct Entries {
-    /// Every element of the file, in the order of appearance.
+    /// All elements of the file, in order of appearance.
     pub(crate) species: Vec<Species>,
     /// `[(i * elements + j) * elements + k]`, i the centre.
     pub(crate) parameters: Vec<Parameters>,
@@ -98,7 +98,7 @@ impl Entries {
     }
 }
 
-/// The next fourteen words that are no comment; `None` at the end of the file.
+/// The next fourteen words outside comments; `None` at the end of the file.
 fn read_entry(lines: &mut Lines<'_>) -> Result<Option<Entry>, PotentialFileError> {
     let mut words: Vec<&str> = Vec::new();
     let mut first_line = 0;
@@ -149,7 +149,7 @@ fn read_parameters(lines: &Lines<'_>, words: &[&str]) -> Result<Parameters, Pote
     })
 }
 
-/// A pair has one energy and an angle too: entries that mean the same must say the same.
+/// Checks that entries which describe the same pair or angle agree.
 ///
 /// The product λ ε may differ by the rounding of its factors in the file.
 fn check_symmetry(lines: &Lines<'_>, entries: &[Entry]) -> Result<(), PotentialFileError> {

@@ -1,4 +1,4 @@
-//! Slurm's own commands, asked and told as child processes.
+//! Runs Slurm's commands as child processes.
 
 use std::ffi::{OsStr, OsString};
 use std::io;
@@ -7,96 +7,96 @@ use std::time::Duration;
 
 use tokio::process::Command;
 
-/// Jobs in one call of `scancel`.
+/// Maximum number of jobs per call of `scancel`.
 const JOBS_PER_CANCEL: usize = 200;
-/// Where Slurm is and who this is; all other variables of its name belong to a job that this process may be part of, and
-/// would be taken for options of another.
+/// Variables that locate Slurm and identify the user. All other Slurm variables belong to a job that this
+/// process may be part of; commands would take them for options.
 const KEPT_VARIABLES: [&str; 3] = ["SLURM_CONF", "SLURM_CONF_SERVER", "SLURM_JWT"];
 
-/// Slurm, as far as this host can reach it.
+/// Slurm, through its commands on this host.
 #[derive(Clone, Debug)]
 pub struct SlurmClient {
     timeout: Duration,
-    /// What they are started with instead of the environment of this process.
+    /// Environment of the commands in place of the current process's.
     environment: Option<Vec<(OsString, OsString)>>,
 }
 
-/// Why Slurm did not do what it was asked for.
+/// Why a Slurm command failed.
 #[derive(Debug, thiserror::Error)]
 pub enum SlurmError {
-    /// There is no such command.
+    /// The command does not exist.
     #[error("cannot start {program}: {source}; Slurm's commands have to be on the PATH")]
     Missing {
         /// The command.
         program: &'static str,
-        /// Why not.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// It takes too long.
+    /// It exceeded its time limit.
     #[error("{program} has given no answer for {seconds} s: is slurmctld at work? ('scontrol ping' says so)")]
     TimedOut {
         /// The command.
         program: &'static str,
-        /// How long.
+        /// The limit.
         seconds: u64,
     },
-    /// It has failed.
+    /// It failed.
     #[error("{program} failed: {stderr}")]
     Failed {
         /// The command.
         program: &'static str,
-        /// What it wrote.
+        /// Its message.
         stderr: String,
     },
-    /// It says something else than what it was asked for.
+    /// Its output has an unexpected format.
     #[error("{program} wrote {found:?}, and {expected} was expected")]
     UnexpectedOutput {
         /// The command.
         program: &'static str,
-        /// What it wrote.
+        /// Its output.
         found: String,
-        /// What it should have written.
+        /// The expected output.
         expected: &'static str,
     },
 }
 
 impl SlurmError {
-    /// Whether there is no Slurm here at all.
+    /// Whether Slurm is not installed.
     pub fn is_missing(&self) -> bool {
         matches!(self, Self::Missing { source, .. } if source.kind() == io::ErrorKind::NotFound)
     }
 }
 
 impl SlurmClient {
-    /// Those that are not waited for for longer than this.
+    /// A client whose commands may take at most this time.
     pub fn with_timeout(timeout: Duration) -> Self {
         Self { timeout, environment: None }
     }
 
-    /// The same, started with this environment and not with that of this process: jobs get it, too.
+    /// Runs commands with this environment in place of the current process's. Jobs inherit it.
     pub fn with_environment(self, environment: Vec<(OsString, OsString)>) -> Self {
         Self { environment: Some(environment), ..self }
     }
 
-    /// What `squeue` writes of this user's jobs, a line each, in this format. With `options` it may be asked for some of
-    /// them, and for those that have ended within the last minutes (`MinJobAge` in Slurm's configuration).
+    /// The output of `squeue` for this user's jobs in this format, one line per job. `options` can select jobs
+    /// or include those that ended within the last minutes (`MinJobAge` in Slurm's configuration).
     ///
     /// # Errors
-    /// See [`SlurmError`]; as of all that follow.
+    /// See [`SlurmError`], also for the following functions.
     pub async fn queue(&self, format: &str, options: &[&str]) -> Result<String, SlurmError> {
         let user = format!("--user={}", rustix::process::getuid().as_raw());
         let arguments = ["--noheader", "--array", &user, "--format", format];
         self.run("squeue", arguments.iter().chain(options)).await
     }
 
-    /// The exit code of a job that has ended as `code:signal`, while Slurm still knows it.
+    /// The exit code of a finished job as `code:signal`, while Slurm still knows the job.
     pub async fn exit_code(&self, id: u64) -> Result<Option<String>, SlurmError> {
         let text = self.run("scontrol", ["--oneliner", "show", "job", &id.to_string()]).await?;
         let code = text.split_whitespace().find_map(|word| word.strip_prefix("ExitCode="));
         Ok(code.map(str::to_owned))
     }
 
-    /// The name of the cluster; numbers and names of jobs mean nothing in another.
+    /// The name of the cluster. Ids and names of jobs are meaningless on another cluster.
     pub async fn cluster_name(&self) -> Result<String, SlurmError> {
         const SCONTROL: &str = "scontrol";
         let text = self.run(SCONTROL, ["show", "config"]).await?;
@@ -111,12 +111,12 @@ impl SlurmClient {
         Ok(name.to_owned())
     }
 
-    /// Submits a job with these arguments of `sbatch` and returns its number.
+    /// Submits a job with these arguments of `sbatch` and returns its id.
     pub async fn submit(&self, arguments: &[impl AsRef<OsStr>]) -> Result<u64, SlurmError> {
         const SBATCH: &str = "sbatch";
         let arguments = arguments.iter().map(AsRef::as_ref);
         let text = self.run(SBATCH, [OsStr::new("--parsable")].into_iter().chain(arguments)).await?;
-        // With several clusters its name follows.
+        // With several clusters the name of the cluster follows.
         let id = text.trim().split(';').next().and_then(|id| id.parse().ok());
         let expected = "the number of a job";
         id.ok_or_else(|| SlurmError::UnexpectedOutput {
@@ -126,8 +126,8 @@ impl SlurmClient {
         })
     }
 
-    /// Has jobs ended: each process of theirs gets SIGTERM, and SIGKILL after Slurm's `KillWait`. Those that have ended
-    /// are no error.
+    /// Cancels jobs: their processes get SIGTERM, and SIGKILL after Slurm's `KillWait`. Ignores jobs that have
+    /// ended.
     pub async fn cancel(&self, ids: &[u64]) -> Result<(), SlurmError> {
         for ids in ids.chunks(JOBS_PER_CANCEL) {
             let ids = ids.iter().map(u64::to_string);
@@ -136,7 +136,7 @@ impl SlurmClient {
         Ok(())
     }
 
-    /// What a command writes to its standard output.
+    /// The standard output of a command.
     async fn run(
         &self,
         program: &'static str,
@@ -144,7 +144,7 @@ impl SlurmClient {
     ) -> Result<String, SlurmError> {
         let mut command = Command::new(program);
         command.args(arguments).stdin(Stdio::null()).kill_on_drop(true);
-        // Habits of the user, too, would show something else than is expected.
+        // The user's own settings would change the output format too.
         let inherited = self.environment.clone().unwrap_or_else(|| std::env::vars_os().collect());
         command.env_clear();
         for (name, value) in inherited {

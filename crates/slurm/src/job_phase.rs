@@ -1,20 +1,20 @@
-//! Where a job stands.
+//! The phase of a job.
 
-/// Where a job stands, as far as it matters to who has submitted it.
+/// The phase of a job from the submitter's point of view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JobPhase {
-    /// It waits.
+    /// Waits in the queue.
     Pending,
-    /// It has a node. States that are not known count as this one: nothing is submitted beside them.
+    /// Has a node. Unknown states count as running, so that no duplicate is submitted.
     Running,
-    /// It ends; it may be requeued then.
+    /// Is ending; it may be requeued.
     Completing,
-    /// It has ended and will not come back.
+    /// Has ended and will not be requeued.
     Over,
 }
 
 impl JobPhase {
-    /// That of a state in Slurm's words, as `RUNNING`.
+    /// The phase for a state in Slurm's notation, such as `RUNNING`.
     pub fn from_state(state: &str) -> Self {
         match state {
             "PENDING" | "REQUEUED" | "REQUEUE_FED" | "REQUEUE_HOLD" | "RESV_DEL_HOLD" | "SPECIAL_EXIT" => {

@@ -1,23 +1,23 @@
-//! The two names of arrays in files of GRACE-2L.
+//! Aliases of arrays in GRACE-2L files.
 //!
-//! An export calls the invariants of the first layer `rho` and those of the second `I2`, with the norms `I_nl_LN` and
-//! `I_0_LN`, and holds the same arrays under the names that the model's maker gave them too.
+//! An export calls the invariants of the first layer `rho` and those of the second `I2`, with the norms
+//! `I_nl_LN` and `I_0_LN`, and also holds the same arrays under the names that the author of the model chose.
 
 use npz::Archive;
 
 use super::error::{GraceError, unsupported};
 
-/// Names that the model's maker gave to the invariants of the first and second layer.
+/// The author's names of the invariants of the first and second layer.
 pub(super) struct BlockAliases([String; 2]);
 
-/// What the exporter calls them.
+/// The exporter's names.
 const EXPORTED: [&str; 2] = ["rho", "I2"];
 
-/// What the exporter calls their norms.
+/// The exporter's names of their norms.
 const NORMS: [&str; 2] = ["I_nl_LN", "I_0_LN"];
 
 impl BlockAliases {
-    /// From the list of reductions, which must be the known ones.
+    /// Reads the list of reductions and matches the two names.
     pub fn read(archive: &Archive) -> Result<Self, GraceError> {
         let names = archive.strings("reduce_names")?;
         let sources = |name: &str| archive.strings(&format!("{name}_instruction_names"));
@@ -42,7 +42,7 @@ impl BlockAliases {
         }
     }
 
-    /// The layers in the alphabetical order of the names of their invariants, which is that of the basis.
+    /// The layers in the alphabetical order of their invariants' names, which is the order of the basis.
     pub fn order(&self) -> Vec<usize> {
         let mut order = vec![0, 1];
         order.sort_by_key(|layer| &self.0[*layer]);
@@ -50,7 +50,7 @@ impl BlockAliases {
     }
 }
 
-/// Passes over arrays that hold the same as one that was read, and refuses a file in which they differ.
+/// Ignores arrays that duplicate one that was read; rejects the file if they differ.
 pub(super) fn ignore_aliases(archive: &Archive, names: &BlockAliases) -> Result<(), GraceError> {
     let left_over: Vec<String> = archive.unread().into_iter().map(str::to_owned).collect();
     for key in left_over {
@@ -71,7 +71,7 @@ pub(super) fn ignore_aliases(archive: &Archive, names: &BlockAliases) -> Result<
     Ok(())
 }
 
-/// Whether both arrays hold the same.
+/// Whether both arrays are equal.
 fn same(archive: &Archive, one: &str, other: &str) -> bool {
     let numbers = |key: &str| archive.numbers(key).map(|array| (array.shape, array.data));
     match (numbers(one), numbers(other)) {

@@ -1,4 +1,4 @@
-//! Puts a model together from its layers.
+//! Assembles a model from its layers.
 
 use atoms::Species;
 use npz::Archive;
@@ -12,13 +12,13 @@ use super::projection::{FeatureMap, Projection, ProjectionMaps, rows_of_projecti
 use super::shared_reader::reject_unread_arrays;
 use super::vector::Vector;
 
-/// What a reader found out about a file.
+/// What a reader has extracted from a file.
 pub(super) struct ModelBuilder<'a, V: Vector> {
     pub archive: &'a Archive,
     pub architecture: Architecture,
     pub elements: Vec<Species>,
     pub layers: Vec<LayerDraft<'a, V>>,
-    /// The layers in the order of their blocks of the basis B in the file.
+    /// The layers in the order of their blocks in the file's basis B.
     pub block_order: Vec<usize>,
     /// Number of densities y.
     pub n_densities: usize,
@@ -26,16 +26,16 @@ pub(super) struct ModelBuilder<'a, V: Vector> {
     pub weights: usize,
 }
 
-/// A whole model, as it was read.
+/// All parts of a model.
 pub(super) struct ModelParts<V: Vector> {
     pub network: Network<V>,
-    /// The largest r_c of all layers for centre and neighbour element, [n_elements²], Å.
+    /// The largest r_c over all layers for centre and neighbour element, `[n_elements²]`, Å.
     pub pair_cutoffs: Vec<f64>,
     pub description: GraceDescription,
 }
 
 impl<V: Vector> ModelBuilder<'_, V> {
-    /// Reads what follows the layers, and refuses the file if any array is left over.
+    /// Reads what follows the layers. Rejects the file if an array remains unread.
     pub fn finish(mut self) -> Result<ModelParts<V>, GraceError> {
         let archive = self.archive;
         let blocks = self.layers.iter().map(|layer| layer.block.clone()).collect();
@@ -89,7 +89,7 @@ fn basis_dimension(sources: &[Vec<(usize, usize)>]) -> usize {
     sources.iter().flatten().map(|(components, channels)| components * channels).sum()
 }
 
-/// The row of the projection matrix for each place of the padded basis of each layer.
+/// The row of the projection matrix for each index of each layer's padded basis.
 fn places<V: Vector>(sources: &[Vec<(usize, usize)>], block_order: &[usize]) -> Vec<Vec<Option<usize>>> {
     let (mut firsts, mut first) = (vec![0; sources.len()], 0);
     for layer in block_order {
@@ -99,8 +99,8 @@ fn places<V: Vector>(sources: &[Vec<(usize, usize)>], block_order: &[usize]) -> 
     firsts.into_iter().zip(sources).map(|(first, sources)| rows_of_projection::<V>(first, sources)).collect()
 }
 
-/// The feature map, if the file holds one. `sources` are those of each layer's basis, `block_order` the layers in the
-/// order of their blocks in the file.
+/// The feature map, if the file has one. `sources` describes each layer's basis, `block_order` gives the order
+/// of the layers' blocks in the file.
 fn feature_map<V: Vector>(
     archive: &Archive,
     sources: &[Vec<(usize, usize)>],

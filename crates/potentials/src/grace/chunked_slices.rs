@@ -1,21 +1,21 @@
-//! Arrays with a part for each place, to be divided among threads.
+//! Slices with elements per place that threads can split by chunks of atoms.
 
 use std::ops::Range;
 
 use super::batches::Chunk;
 
-/// Something of which chunks of atoms have a part each.
+/// Data that can be split at a chunk boundary.
 pub(super) trait SplitByChunk: Sized + Send {
-    /// What stands before a chunk, and the rest.
+    /// The part before a chunk, and the rest.
     fn split(self, chunk: &Chunk) -> (Self, Self);
 }
 
-/// How many numbers a place has.
+/// How many elements a place has.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Layout<'a> {
-    /// Each has as many.
+    /// The same number for each place.
     Even(usize),
-    /// Those of a place begin at its offset, times a factor.
+    /// The elements of a place start at its offset times a factor.
     Ragged(&'a [usize], usize),
 }
 
@@ -29,28 +29,28 @@ impl Layout<'_> {
     }
 }
 
-/// The numbers of some places.
+/// A mutable slice over some places.
 #[derive(Debug)]
 pub(super) struct ChunkedSlice<'a, T> {
     layout: Layout<'a>,
-    /// Where the array begins.
+    /// Index of its first element in the whole array.
     begin: usize,
     numbers: &'a mut [T],
 }
 
 impl<'a, T> ChunkedSlice<'a, T> {
-    /// Of an array that begins with the numbers of the place `first`.
+    /// From an array that starts with the elements of the place `first`.
     #[inline(always)]
     pub fn new(layout: Layout<'a>, first: usize, numbers: &'a mut [T]) -> Self {
         Self { layout, begin: layout.begin(first), numbers }
     }
 
-    /// Nothing of any place.
+    /// A slice without elements.
     pub fn empty() -> Self {
         Self::new(Layout::Even(0), 0, &mut [])
     }
 
-    /// Those of some places.
+    /// The elements of these places.
     #[inline(always)]
     pub fn slice(&mut self, places: &Range<usize>) -> &mut [T] {
         &mut self.numbers
@@ -67,7 +67,7 @@ impl<T: Send> SplitByChunk for ChunkedSlice<'_, T> {
     }
 }
 
-/// The numbers of some places, for whoever reads them; as many for each.
+/// A read-only slice over some places with a fixed number of elements each.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SharedSlice<'a, T> {
     of_one: usize,
@@ -76,12 +76,12 @@ pub(super) struct SharedSlice<'a, T> {
 }
 
 impl<'a, T> SharedSlice<'a, T> {
-    /// Of an array that begins with the numbers of the place `first`.
+    /// From an array that starts with the elements of the place `first`.
     pub fn new(of_one: usize, first: usize, numbers: &'a [T]) -> Self {
         Self { of_one, first, numbers }
     }
 
-    /// Those of some places; none of what is empty.
+    /// The elements of these places; empty if the slice is.
     #[inline(always)]
     pub fn slice(self, places: &Range<usize>) -> &'a [T] {
         let index = |place: usize| (place - self.first) * self.of_one;
@@ -89,7 +89,7 @@ impl<'a, T> SharedSlice<'a, T> {
     }
 }
 
-/// One for each chunk.
+/// One item per chunk.
 #[derive(Debug)]
 pub(super) struct PerChunk<'a, T> {
     first: usize,
@@ -97,14 +97,14 @@ pub(super) struct PerChunk<'a, T> {
 }
 
 impl<'a, T> PerChunk<'a, T> {
-    /// Of some chunks, of a list for all; which may be empty.
+    /// The items of these chunks from the list for all chunks, which may be empty.
     pub fn within(chunks: &[Chunk], items: &'a mut [T]) -> Self {
         let first = chunks.first().map_or(0, |chunk| chunk.number);
         let end = (first + chunks.len()).min(items.len());
         Self { first, items: &mut items[first.min(end)..end] }
     }
 
-    /// That of the only chunk that is left.
+    /// The item of the only remaining chunk.
     pub fn only(&mut self) -> Option<&mut T> {
         self.items.first_mut()
     }

@@ -1,4 +1,4 @@
-//! Energy, features and their derivatives for one structure.
+//! Energy, features and derivatives of a structure.
 
 use std::sync::{Arc, Mutex};
 
@@ -17,14 +17,14 @@ use super::vector::Vector;
 /// The derivatives of a function H of the features: its cotangent ∂H/∂z pulled back to the atoms.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PullBack {
-    /// +∂H/∂r, [n].
+    /// +∂H/∂r, `[n]`.
     pub gradient: Vec<Vec3>,
     /// +∂H/∂ε, symmetric.
     pub virial: Matrix3,
 }
 
 impl PullBack {
-    /// Sets the gradient to `n` atoms and zero.
+    /// Resizes the gradient to `n` atoms and sets it to zero.
     pub fn reset(&mut self, n: usize) {
         self.gradient.clear();
         self.gradient.resize(n, [0.0; 3]);
@@ -32,15 +32,15 @@ impl PullBack {
     }
 }
 
-/// Takes some atoms and their features z, [atoms, D], and writes ∂H/∂z of each, to no numbers where that is not asked for; is
-/// called by several threads at a time.
+/// Receives some atoms and their features z, `[atoms, D]`, and writes ∂H/∂z of each unless the output is empty.
+/// Several threads call it concurrently.
 pub type Grade<'a> = dyn Fn(&[u32], &[f64], &mut [f64]) + Sync + 'a;
 
-/// A network with its work arrays.
+/// A network with its scratch arrays.
 #[derive(Debug)]
 pub(super) struct Evaluator<V: Vector> {
     model: Arc<GraceModel>,
-    /// That of the model.
+    /// The network of the model.
     pub(super) network: Arc<Network<V>>,
     pub(super) instructions: Instructions,
     pub(super) threads: Threads,
@@ -51,11 +51,11 @@ pub(super) struct Evaluator<V: Vector> {
     /// One for each thread.
     pub(super) scratch: Vec<Mutex<Scratch<V>>>,
     // In the order of evaluation:
-    /// E, [n]
+    /// E, `[n]`.
     pub(super) energies: Vec<f64>,
-    /// ∂E/∂(W B), [n, layers, lanes]
+    /// ∂E/∂(W B), `[n, layers, lanes]`.
     pub(super) density_cotangents: Vec<V>,
-    /// −∂E/∂r and −∂H/∂r, [n]
+    /// −∂E/∂r and −∂H/∂r, `[n]`.
     pub(super) forces: [Vec<Vec3>; 2],
     /// ∂E/∂ε and ∂H/∂ε of each chunk.
     pub(super) virials: Vec<[Matrix3; 2]>,
@@ -65,7 +65,7 @@ pub(super) struct Evaluator<V: Vector> {
     features: Vec<f64>,
     /// ∂H/∂z, in the order of evaluation.
     feature_cotangent: Vec<f64>,
-    /// A number for each atom, for whoever needs it.
+    /// A scratch number per atom.
     numbers: Vec<u32>,
 }
 
@@ -144,7 +144,7 @@ impl<V: Vector> Evaluator<V> {
         Ok(())
     }
 
-    /// Elements and bonds of a structure; results of an earlier one are dropped.
+    /// Takes over elements and bonds of a structure; discards earlier results.
     fn take(&mut self, structure: &Structure, neighbours: &NeighbourList) -> Result<(), PotentialError> {
         self.elements.clear();
         self.atomic_energies.clear();
@@ -192,7 +192,7 @@ impl<V: Vector> Evaluator<V> {
         }
         let cotangent = feature_cotangent.filter(|_| self.network.feature_map.is_some());
         self.begin_derivatives();
-        // There are no bonds of a structure that was refused.
+        // A rejected structure has no bonds.
         let layers = if self.batches.order.is_empty() { 0 } else { self.layers.len() };
         self.threads.clone().run(|| match cotangent {
             Some(cotangent) => {
@@ -205,7 +205,7 @@ impl<V: Vector> Evaluator<V> {
         self.scatter_pull_back(cotangent.is_some(), pull_back);
     }
 
-    /// The cotangents of the bases of all atoms from those of their features, [n, D] in the order of the structure.
+    /// The cotangents of all bases from those of the features, `[n, D]` in the order of the structure.
     fn pull_back_features(&mut self, cotangent: &[f64]) {
         let Some(projection) = self.network.projection() else { return };
         let width = projection.feature_dimension();
@@ -218,7 +218,7 @@ impl<V: Vector> Evaluator<V> {
         self.feature_cotangent = in_order;
     }
 
-    /// All atoms backwards through the first `layers`.
+    /// The reverse pass of all atoms through the first `layers`.
     fn backward_layers<const N: usize>(&mut self, layers: usize) {
         for k in (0..layers).rev() {
             self.backward_layer::<N>(k);
@@ -226,7 +226,7 @@ impl<V: Vector> Evaluator<V> {
         }
     }
 
-    /// All that is asked of a structure, of whose last layer nothing is kept.
+    /// Evaluates a structure without storing its last layer.
     fn pass<const N: usize>(
         &mut self,
         structure: &Structure,
@@ -255,7 +255,7 @@ impl<V: Vector> Evaluator<V> {
         Ok(())
     }
 
-    // From the order of evaluation to that of the structure.
+    // From evaluation order to the order of the structure:
 
     fn scatter_energies(&mut self) {
         self.atomic_energies.resize(self.elements.len(), 0.0);
@@ -292,7 +292,7 @@ impl<V: Vector> Evaluator<V> {
         }
     }
 
-    /// ∂E/∂ε or ∂H/∂ε, the chunks' added in their order.
+    /// ∂E/∂ε or ∂H/∂ε, summed over chunks in order.
     fn strain_derivative(&self, k: usize) -> Matrix3 {
         let mut sum = [[0.0; 3]; 3];
         for virials in &self.virials {
@@ -308,7 +308,8 @@ pub(super) fn add(sum: &mut Matrix3, x: &Matrix3) {
     }
 }
 
-/// The tensor is symmetric because energy and features do not change under rotation; this removes rounding.
+/// Symmetrises the tensor, which is symmetric up to rounding because energy and features are rotationally
+/// invariant.
 fn symmetric(tensor: &Matrix3) -> Matrix3 {
     std::array::from_fn(|a| std::array::from_fn(|b| 0.5 * (tensor[a][b] + tensor[b][a])))
 }

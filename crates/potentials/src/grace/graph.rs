@@ -1,4 +1,4 @@
-//! Builds the tape of an atom in one layer from the index lists of a model file.
+//! Builds the operations of one layer from the index lists of a model file.
 
 use std::collections::BTreeMap;
 
@@ -14,19 +14,19 @@ use super::tape_program::TapeProgram;
 use super::vector::{Number, Vector, lanes_for};
 use super::weights::Weights;
 
-/// A longer tape than this is taken for damage (64 MiB an atom).
+/// A longer tape indicates a corrupt file (64 MiB per atom).
 const MAX_TAPE_LANES: usize = 1 << 20;
 
 /// A graph under construction.
 pub(super) struct Graph<'a, V: Vector> {
     pub(super) archive: &'a Archive,
-    /// All tensors, as they stand on the tape.
+    /// All tensors, in their order on the tape.
     tensors: Vec<Tensor>,
-    /// Tensors that a reduction may name.
+    /// Tensors that reductions may refer to by name.
     named: Vec<(String, Tensor)>,
     end: usize,
     pub(super) operations: Vec<Operation<V>>,
-    /// First lane and number of lanes of each row that goes into the basis B.
+    /// First lane and number of lanes of each row of the basis B.
     pub(super) basis: Vec<(usize, usize)>,
     /// Components and channels of each source of the basis.
     pub(super) sources: Vec<(usize, usize)>,
@@ -36,7 +36,7 @@ pub(super) struct Graph<'a, V: Vector> {
 }
 
 impl<'a, V: Vector> Graph<'a, V> {
-    /// A graph that holds the sum over neighbours alone; errors call it `name`.
+    /// A graph with only the sum over neighbours; errors call it `name`.
     pub fn new(
         archive: &'a Archive,
         name: &str,
@@ -82,8 +82,8 @@ impl<'a, V: Vector> Graph<'a, V> {
         Ok(tensor)
     }
 
-    /// FC: out_k,w = f_w (Σ_n W^left_kn x^left_n,w + Σ_c:to(c)=w Σ_n W^right_kn x^right_n,from(c)), the weights
-    /// of each component chosen by the tile lists.
+    /// FC: out_k,w = f_w (Σ_n W^left_kn x^left_n,w + Σ_c:to(c)=w Σ_n W^right_kn x^right_n,from(c)); the tile
+    /// lists select the weights of each component.
     pub fn linear(&mut self, name: &str, left: Tensor, right: Tensor) -> Result<Tensor, GraceError> {
         let (archive, key) = (self.archive, |suffix: &str| format!("fc_{name}_{suffix}"));
         let channels = archive.count(&key("n_out"), 1, 1 << 16)?;
@@ -149,7 +149,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         Ok(ChannelWeights { inputs, tiles, weights })
     }
 
-    /// The product left × right, coupled by Clebsch–Gordan coefficients channel by channel.
+    /// The product left × right, coupled by Clebsch–Gordan coefficients per channel.
     pub fn product(&mut self, name: &str, left: Tensor, right: Tensor) -> Result<Tensor, GraceError> {
         let (archive, key) = (self.archive, |suffix: &str| format!("prod_{name}_{suffix}"));
         if left.channels != right.channels {
@@ -168,7 +168,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         Ok(out)
     }
 
-    /// The tensor `name` from factors of equally many channels, by the lists whose names begin with `prefix`.
+    /// The tensor `name` from factors with equal numbers of channels, by the lists with the prefix `prefix`.
     pub(super) fn coupled(
         &mut self,
         name: &str,
@@ -196,7 +196,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         Ok(out)
     }
 
-    /// Rows of `tensor` combined by a list of (row of the result, row of the tensor, factor).
+    /// Combines rows of `tensor` by a list of (row of the result, row of the tensor, factor).
     pub fn combination(
         &mut self,
         name: &str,
@@ -214,7 +214,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         Ok(out)
     }
 
-    /// Gives a tensor a name that reductions may use.
+    /// Makes a tensor available to reductions under this name.
     pub fn name(&mut self, name: &str, tensor: Tensor) {
         self.named.push((name.to_owned(), tensor));
     }
@@ -226,8 +226,8 @@ impl<'a, V: Vector> Graph<'a, V> {
         })
     }
 
-    /// The operations without results that neither the basis nor `message` needs, whose rows get their places on the tapes;
-    /// those of `message` too.
+    /// Removes operations whose results neither the basis nor `message` needs, and allocates lanes on the
+    /// tapes, also for `message`.
     pub fn finish(mut self, message: Option<&mut Tensor>) -> TapeProgram<V> {
         let mut needed = vec![false; self.end];
         self.basis.iter().for_each(|(row, _)| needed[*row] = true);
@@ -243,7 +243,7 @@ impl<'a, V: Vector> Graph<'a, V> {
     }
 }
 
-/// One part in place of those that take the same rows to the same rows.
+/// Merges parts that map the same rows to the same rows.
 fn merged<V: Vector>(parts: Vec<LinearPart<V>>) -> Vec<LinearPart<V>> {
     let mut found: Vec<LinearPart<V>> = Vec::new();
     for part in parts {
@@ -255,7 +255,7 @@ fn merged<V: Vector>(parts: Vec<LinearPart<V>>) -> Vec<LinearPart<V>> {
     found
 }
 
-/// Weights [k, n, tile] that mix channels.
+/// Weights `[k, n, tile]` that mix channels.
 struct ChannelWeights {
     inputs: usize,
     tiles: usize,

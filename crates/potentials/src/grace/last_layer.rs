@@ -1,4 +1,4 @@
-//! The last layer, forwards and backwards while what is needed of it is in the cache.
+//! Forward and reverse pass of the last layer while its data are in the cache.
 
 use std::ops::Range;
 
@@ -13,10 +13,10 @@ use super::projection::Projected;
 use super::sweeps::{Scratch, begin_returns, gradients_of, lock_scratch};
 use super::vector::Vector;
 
-/// The most layers before the last one.
+/// Maximum number of layers before the last.
 const BEFORE: usize = 2;
 
-/// What all threads read.
+/// Data shared by all threads.
 struct Pass<'a, V: Vector> {
     network: &'a Network<V>,
     instructions: Instructions,
@@ -25,15 +25,15 @@ struct Pass<'a, V: Vector> {
     grade: Option<&'a Grade<'a>>,
 }
 
-/// What it leaves of atoms, to be divided.
+/// Output arrays, split by chunk.
 struct Results<'a, V> {
     energies: ChunkedSlice<'a, f64>,
     /// ∂E/∂(W B)
     densities: ChunkedSlice<'a, V>,
     gradients: Gradients<'a, V>,
-    /// None where nothing is graded.
+    /// `None` without grading.
     projected: Option<Projected<'a, V>>,
-    /// The bases of the layers before, in whose place two cotangents leave those from the features.
+    /// The bases of the earlier layers. With two cotangents, the cotangents from the features overwrite them.
     bases: [ChunkedSlice<'a, V>; BEFORE],
 }
 
@@ -62,8 +62,8 @@ impl<V: Send> SplitByChunk for Results<'_, V> {
 }
 
 impl<V: Vector> Evaluator<V> {
-    /// All atoms through the last layer, forwards and backwards, with `N` cotangents: of the energy, and of what `grade` makes
-    /// of the features.
+    /// The forward and reverse pass of all atoms through the last layer with `N` cotangents: of the energy, and
+    /// of what `grade` computes from the features.
     pub(super) fn pass_last_layer<const N: usize>(&mut self, grade: Option<&Grade>) {
         let Self { network, instructions, batches, scratch, projection, .. } = self;
         let last = self.layers.len() - 1;
@@ -98,7 +98,8 @@ impl<V: Vector> Evaluator<V> {
 }
 
 impl<V: Vector> Pass<'_, V> {
-    /// One cotangent goes back while the tape of its batch is in the first caches; two wait for the features.
+    /// With one cotangent, the reverse pass runs while the tape of the batch is in the cache; with two it waits
+    /// for the features.
     fn run<const N: usize>(&self, chunk: &Chunk, results: &mut Results<V>, scratch: &mut Scratch<V>) {
         let LayerInput { layer, bonds, .. } = self.here;
         let batches = chunk.batches.clone().map(|batch| self.batches.placed(batch, self.instructions));
@@ -138,7 +139,7 @@ impl<V: Vector> Pass<'_, V> {
         self.instructions.run(Energies { readout, placed, basis, energies, cotangents, work });
     }
 
-    /// From the bases of some atoms to their features, and with two cotangents back to those of the bases.
+    /// Computes features from bases and, with two cotangents, goes back to the cotangents of the bases.
     fn grade<const N: usize>(
         &self,
         places: &Range<usize>,

@@ -1,4 +1,4 @@
-//! The forward pass and the reverse sweep of one layer, batch by batch.
+//! Forward and reverse pass of one layer, batch by batch.
 
 use std::ops::Range;
 
@@ -15,25 +15,25 @@ use super::readout::Block;
 use super::tape::{Slot, Tensor};
 use super::vector::Vector;
 
-/// Arrays of one layer for all atoms, in the order in which they are evaluated.
+/// Arrays of one layer for all atoms, in evaluation order.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LayerState<V> {
     pub bonds: Bonds,
     pub trace: Trace<V>,
-    /// m, [n, lanes of a message]; empty in the first layer.
+    /// m, `[n, lanes of a message]`; empty in the first layer.
     pub messages: Vec<V>,
-    /// Cotangents of what depends on the layer before, from the energy and from the features, [n, lanes].
+    /// Cotangents of the messages from the energy and from the features, `[n, lanes]`.
     pub message_cotangents: [Vec<V>; 2],
-    /// What each chunk adds to them.
+    /// The contribution of each chunk to them.
     pub returns: Vec<ReturnedCotangents<V>>,
-    /// The row of each bond's neighbour there.
+    /// The row of each bond's neighbour in them.
     pub rows: Vec<u32>,
     /// ∂/∂d of the energy and of H for each bond.
     pub gradients: [Vec<Vec3>; 2],
 }
 
 impl<V: Vector> LayerState<V> {
-    /// The bonds of a structure are known: makes room for what belongs to them.
+    /// Sizes the arrays for the current bonds.
     pub fn begin(&mut self, layer: &Layer<V>, batches: &Batches, elements: &[usize], row_of: &mut Vec<u32>) {
         self.gradients.iter_mut().for_each(|gradients| gradients.resize(self.bonds.bonds.len(), [0.0; 3]));
         if layer.message.from.is_none() {
@@ -55,25 +55,25 @@ impl<V: Vector> LayerState<V> {
     }
 }
 
-/// What the forward pass leaves of some atoms for the reverse sweep.
+/// What the forward pass leaves for the reverse pass of some atoms.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Trace<V> {
-    /// The first place of those.
+    /// First place.
     first: usize,
-    /// The first of those whose basis is kept, which may be more.
+    /// First place whose basis is kept; there may be more of these.
     first_basis: usize,
-    /// What the reverse sweep reads of the tape of one batch after another, [places, kept lanes]
+    /// The part of each batch's tape that the reverse pass reads, `[places, kept lanes]`.
     tapes: Vec<V>,
-    /// The basis B of this layer, [places, lanes]
+    /// The basis B of this layer, `[places, lanes]`.
     bases: Vec<V>,
-    /// Its cotangents from the features, [places, lanes]
+    /// Its cotangents from the features, `[places, lanes]`.
     basis_cotangents: Vec<V>,
-    /// Radial values of bonds and their derivatives, block by block.
+    /// Radial values of bonds and their derivatives, in blocks.
     values: Vec<V>,
     derivatives: Vec<V>,
 }
 
-/// The trace of some atoms, to be divided.
+/// Slices of the trace that can be split.
 pub(super) struct Traced<'a, V> {
     pub tapes: ChunkedSlice<'a, V>,
     pub bases: ChunkedSlice<'a, V>,
@@ -81,14 +81,14 @@ pub(super) struct Traced<'a, V> {
 }
 
 impl<V: Vector> Traced<'_, V> {
-    /// Keeps of the tape of a batch what the reverse sweep needs.
+    /// Stores the part of a batch's tape that the reverse pass needs.
     pub fn keep(&mut self, places: &Range<usize>, tape: &[V]) {
         let kept = self.tapes.slice(places);
         kept.copy_from_slice(&tape[..kept.len()]);
     }
 }
 
-/// What it holds of bonds.
+/// The bond data of the trace.
 pub(super) struct TracedBonds<'a, V> {
     values: ChunkedSlice<'a, V>,
     derivatives: ChunkedSlice<'a, V>,
@@ -105,13 +105,13 @@ impl<V> TracedBonds<'_, V> {
 }
 
 impl<V: Vector> Trace<V> {
-    /// Makes room for the bases of the atoms at some places, and forgets others.
+    /// Allocates the bases of these places and discards others.
     pub fn reserve_bases(&mut self, layer: &Layer<V>, places: &Range<usize>) {
         grow(&mut self.bases, places.len() * layer.steps.basis_lanes);
         self.first_basis = places.start;
     }
 
-    /// The same for their bonds and, if they are to be kept, their tapes.
+    /// Allocates the bond data and, on request, the tapes of these places.
     pub fn reserve(&mut self, layer: &Layer<V>, bonds: &Bonds, places: &Range<usize>, keep_tapes: bool) {
         let blocks = bonds.block_offsets[places.end] - bonds.block_offsets[places.start];
         let of_block = V::LANES * layer.radial.output_lanes();
@@ -121,12 +121,12 @@ impl<V: Vector> Trace<V> {
         self.first = places.start;
     }
 
-    /// What it holds.
+    /// The slices of all data.
     pub fn slices<'a>(&'a mut self, layer: &Layer<V>, bonds: &'a Bonds) -> Traced<'a, V> {
         self.parts(layer, bonds).0
     }
 
-    /// What of it a reverse sweep needs, with the cotangents of the basis.
+    /// The slices that a reverse pass needs, with the cotangents of the basis.
     pub fn backward_slices<'a>(
         &'a mut self,
         layer: &Layer<V>,
@@ -155,18 +155,18 @@ impl<V: Vector> Trace<V> {
         SharedSlice::new(layer.steps.basis_lanes, self.first_basis, &self.bases)
     }
 
-    /// B, whose place its cotangents are to take.
+    /// B, to be overwritten by its cotangents.
     pub fn bases_mut(&mut self, layer: &Layer<V>) -> ChunkedSlice<'_, V> {
         ChunkedSlice::new(Layout::Even(layer.steps.basis_lanes), self.first_basis, &mut self.bases)
     }
 
-    /// A copy of B, whose place its cotangents are to take.
+    /// A copy of B, to be overwritten by its cotangents.
     pub fn copy_of_bases(&mut self, layer: &Layer<V>) -> ChunkedSlice<'_, V> {
         self.basis_cotangents.clone_from(&self.bases);
         ChunkedSlice::new(Layout::Even(layer.steps.basis_lanes), self.first_basis, &mut self.basis_cotangents)
     }
 
-    /// The cotangents of B stand in its place: there are no bases any more.
+    /// Replaces B with its cotangents.
     pub fn take_cotangents(&mut self) {
         std::mem::swap(&mut self.bases, &mut self.basis_cotangents);
     }
@@ -193,18 +193,18 @@ impl<V: Send> SplitByChunk for TracedBonds<'_, V> {
     }
 }
 
-/// Makes an array at least so long.
+/// Grows an array to at least this length.
 pub(super) fn grow<V: Vector>(lanes: &mut Vec<V>, length: usize) {
     if lanes.len() < length {
         lanes.resize(length, V::ZERO);
     }
 }
 
-/// A layer, and what is known of all atoms before it is passed.
+/// A layer with the data of all atoms before its pass.
 #[derive(Clone, Copy)]
 pub(super) struct LayerInput<'a, V: Vector> {
     pub layer: &'a Layer<V>,
-    /// What the readout takes from it.
+    /// The layer's part of the readout.
     pub block: &'a Block<V>,
     pub bonds: &'a Bonds,
     /// The messages of all atoms.
@@ -214,7 +214,7 @@ pub(super) struct LayerInput<'a, V: Vector> {
 }
 
 impl<'a, V: Vector> LayerInput<'a, V> {
-    /// Layer `k`, with the bonds, the messages and the rows of its work arrays.
+    /// Layer `k` with the bonds, messages and rows of its arrays.
     pub fn new(
         network: &'a Network<V>,
         k: usize,
@@ -224,7 +224,7 @@ impl<'a, V: Vector> LayerInput<'a, V> {
     }
 }
 
-/// The tape of a batch, and its part of the basis.
+/// Computes the tape of a batch and its part of the basis.
 #[inline(always)]
 pub(super) fn forward<V: Vector>(
     &LayerInput { layer, bonds, received, .. }: &LayerInput<V>,
@@ -246,7 +246,7 @@ pub(super) fn forward<V: Vector>(
     steps.forward(batch, tape, trace.bases.slice(&places));
 }
 
-/// Adds what the tape of a batch says to the messages of its atoms, which begin as constants.
+/// Adds the results of a batch to the messages of its atoms, which start as constants.
 #[inline(always)]
 pub(super) fn send<V: Vector>(
     tensor: &Tensor,
@@ -265,21 +265,21 @@ pub(super) fn send<V: Vector>(
     }
 }
 
-/// Where the cotangents of a batch come from.
+/// Inputs of a batch's reverse pass.
 pub(super) struct Cotangents<'a, V> {
-    /// ∂E/∂(W B) of the layer's block, a row of `stride` lanes for each atom.
+    /// ∂E/∂(W B) of the layer's block, one row of `stride` lanes per atom.
     pub densities: (&'a [V], usize),
-    /// Those of the basis from the features, a row for each atom.
+    /// Cotangents of the basis from the features, one row per atom.
     pub basis: &'a [V],
-    /// The message of the next layer and its cotangents, a row for each atom.
+    /// The message of the next layer and its cotangents, one row per atom.
     pub returned: Option<(&'a Message<V>, [&'a [V]; 2])>,
 }
 
-/// Where they go to.
+/// Outputs of a reverse pass.
 pub(super) struct Gradients<'a, V> {
-    /// Of the energy and of H, for each bond.
+    /// Gradients of the energy and of H for each bond.
     pub bonds: [ChunkedSlice<'a, Vec3>; 2],
-    /// Of messages, one for each chunk.
+    /// Message cotangents per chunk.
     pub returns: PerChunk<'a, ReturnedCotangents<V>>,
 }
 
@@ -290,16 +290,16 @@ impl<V: Send> SplitByChunk for Gradients<'_, V> {
     }
 }
 
-/// Arrays of one thread for a batch in a layer.
+/// Scratch arrays of one thread for a batch in a layer.
 #[derive(Clone, Debug, Default)]
 pub(super) struct BackwardWork<V> {
     /// Cotangents of the basis from the energy.
     basis: Vec<V>,
-    /// Cotangents of the tape for the energy and for the features.
+    /// Cotangents of the tape from the energy and from the features.
     tape: Vec<V>,
 }
 
-/// A batch back along the tape.
+/// The reverse pass of a batch along its tape.
 #[inline(always)]
 pub(super) fn backward_tape<V: Vector, const N: usize>(
     &LayerInput { layer, block, .. }: &LayerInput<V>,
@@ -340,7 +340,8 @@ fn energy_basis_cotangent<V: Vector>(
     weights.multiply_add((densities, &mut out[..]), from, to, placed.batch.instructions);
 }
 
-/// Adds the cotangents of messages, a row for each atom, to the cotangents of the tape in the slots from `first` of `slots`.
+/// Adds the cotangents of messages, one row per atom, to the tape's cotangents in the slots from `first` of
+/// `slots`.
 #[inline(always)]
 fn add_returned<V: Vector>(tensor: &Tensor, rows: &[V], tape: &mut [V], (first, slots): (usize, usize)) {
     for (atom, row) in rows.chunks_exact(tensor.components * tensor.width).enumerate() {
@@ -353,7 +354,7 @@ fn add_returned<V: Vector>(tensor: &Tensor, rows: &[V], tape: &mut [V], (first, 
     }
 }
 
-/// A batch from the cotangents of its tape back along its bonds.
+/// The reverse pass of a batch from the cotangents of its tape along its bonds.
 #[inline(always)]
 pub(super) fn backward_bonds<V: Vector, const N: usize>(
     &LayerInput { layer, bonds, received, rows, .. }: &LayerInput<V>,

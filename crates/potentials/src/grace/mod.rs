@@ -1,9 +1,9 @@
-//! The graph atomic cluster expansion (GRACE) and its CALM features, in double precision or mostly in single
+//! The graph atomic cluster expansion (GRACE) and its CALM features, in double or mixed precision
 //! ([`Precision`]).
 //!
-//! Reads the `kokkos.npz` file that gracemaker exports for LAMMPS. The model's maths is that of
-//! Bochkarev, Lysogorskiy and Drautz, Phys. Rev. X 14, 021036 (2024); the feature map is that of the CALM paper
-//! (Methods, "Latent features and uncertainty models").
+//! Reads the `kokkos.npz` file that gracemaker exports for LAMMPS. The model is that of Bochkarev, Lysogorskiy
+//! and Drautz, Phys. Rev. X 14, 021036 (2024); the feature map is that of the CALM paper (Methods, "Latent
+//! features and uncertainty models").
 //!
 //! ```no_run
 //! # use std::{path::Path, sync::Arc};
@@ -15,7 +15,7 @@
 //! let mut grace = Grace::new(model);
 //! neighbours.update(structure)?;
 //! grace.forward(structure, &neighbours)?;
-//! let cotangent = vec![1.0; grace.features().len()]; // ∂H/∂z, here of H = Σ z
+//! let cotangent = vec![1.0; grace.features().len()]; // ∂H/∂z, here for H = Σ z
 //! let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
 //! grace.backward(Some(&cotangent), &mut energy, &mut pull_back);
 //! # Ok(())

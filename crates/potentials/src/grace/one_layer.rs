@@ -1,7 +1,8 @@
-//! Reads GRACE-1L and lays out its graph:
+//! Reads GRACE-1L and builds its graph:
 //!
-//! A → A1 = FC(A, A) → AA = A1 × A1 → AA1 = FC(AA, A) → AAA = AA1 × A1; AA2 = FC(AA, A) → AAAA = AA2 × AA2,
-//! of which the energy takes the invariants of as many as the model's maximum order says.
+//! A → A1 = FC(A, A) → AA = A1 × A1 → AA1 = FC(AA, A) → AAA = AA1 × A1; AA2 = FC(AA, A) → AAAA = AA2 × AA2.
+//!
+//! The energy uses the invariants up to the model's maximum order.
 
 use npz::Archive;
 

@@ -1,6 +1,7 @@
-//! Where the rows of a graph stand on the tapes.
+//! Allocates lanes on the tapes to the rows of a graph.
 //!
-//! A row that nobody needs any more leaves its place to a later one, so that the tapes of a batch stay in the first caches.
+//! Rows that are no longer needed release their lanes to later ones, so that the tapes of a batch stay in the
+//! L1 and L2 caches.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,17 +9,17 @@ use super::tape::{Operation, Tensor};
 use super::tape_program::{Gather, Gathered, Ranges, Step, TapeProgram};
 use super::vector::Vector;
 
-/// The rows of a graph, by their lanes there, with the lanes that they have on a tape.
+/// The allocated lanes of the graph's rows.
 #[derive(Clone, Debug, Default)]
 struct Registers {
     of: BTreeMap<usize, usize>,
-    /// Lanes that were left, by the width of their rows.
+    /// Released lanes, by the width of the row.
     free: BTreeMap<usize, Vec<usize>>,
     end: usize,
 }
 
 impl Registers {
-    /// Whether it had no place before.
+    /// Allocates a row; false if it already has lanes.
     fn take(&mut self, row: usize, width: usize) -> bool {
         if self.of.contains_key(&row) {
             return false;
@@ -29,7 +30,7 @@ impl Registers {
         true
     }
 
-    /// Leaves the places of rows behind the first lanes.
+    /// Releases rows whose lanes are not before `first`.
     fn leave(&mut self, rows: impl IntoIterator<Item = usize>, first: usize, widths: &[usize]) {
         for row in rows {
             if self.of[&row] >= first {
@@ -39,8 +40,9 @@ impl Registers {
     }
 }
 
-/// Gives places to all rows. `widths` has the number of lanes of each row, at its lane in the graph; the tensors `whole` stay
-/// so, `message` among them, which learns its place; `basis` has the first lanes and widths of what goes into the basis.
+/// Allocates all rows. `widths` gives the number of lanes of each row, indexed by its lane in the graph. The
+/// tensors `whole` stay contiguous, among them `message`, which receives its lanes. `basis` lists the first
+/// lanes and widths of the basis rows.
 pub(super) fn allocate<V: Vector>(
     operations: Vec<Operation<V>>,
     widths: &[usize],
@@ -82,8 +84,8 @@ pub(super) fn allocate<V: Vector>(
     }
 }
 
-/// The places of rows that stand whole at the beginning of both tapes, in their order in the graph: of the tensors `whole`, of
-/// those that are normalised, and those that no operation makes.
+/// Allocates the contiguous rows at the start of both tapes, in graph order: those of the tensors `whole`, of
+/// normalised tensors, and those that no operation produces.
 fn fixed<V: Vector>(
     operations: &[Operation<V>],
     mut whole: Vec<Tensor>,
@@ -103,14 +105,14 @@ fn fixed<V: Vector>(
     places
 }
 
-/// Rows that are read or go into the basis, which no operation makes.
+/// Rows that are read or belong to the basis, but that no operation produces.
 fn given<V: Vector>(operations: &[Operation<V>], basis: &[(usize, usize)]) -> BTreeSet<usize> {
     let made: BTreeSet<usize> = operations.iter().flat_map(Operation::writes).collect();
     let taken = operations.iter().flat_map(Operation::reads).chain(basis.iter().map(|(row, _)| *row));
     taken.filter(|row| !made.contains(row)).collect()
 }
 
-/// Forwards a row has its place until it is read for the last time, if it does not stand before `kept`.
+/// Forward, a row that does not start before `kept` keeps its lanes until its last read.
 fn along_tape<V: Vector>(operations: &[Operation<V>], places: &mut Registers, kept: usize, widths: &[usize]) {
     let uses = operations.iter().enumerate();
     let last: BTreeMap<usize, usize> =
@@ -126,8 +128,8 @@ fn along_tape<V: Vector>(operations: &[Operation<V>], places: &mut Registers, ke
     }
 }
 
-/// Backwards a cotangent has its place from the first time that something is added to it until its row's own operation; for
-/// each operation the rows that get theirs there.
+/// In reverse, a cotangent has lanes from the first contribution to it until its row's own operation. Returns
+/// the rows that each operation allocates.
 fn along_cotangents<V: Vector>(
     operations: &[Operation<V>],
     places: &mut Registers,
@@ -149,7 +151,7 @@ fn ranges(rows: Vec<usize>, places: &Registers, widths: &[usize]) -> Ranges {
     Ranges::new(rows.into_iter().map(|row| (places.of[&row], widths[row])).collect())
 }
 
-/// Those rows of the basis that are made here.
+/// The basis rows that are produced here.
 fn gather(
     basis: &[(usize, usize)],
     made_here: &dyn Fn(usize) -> bool,
@@ -198,7 +200,7 @@ mod tests {
     #[test]
     fn rows_leave_their_places_to_later_ones_unless_the_reverse_sweep_reads_them() {
         let steps = chain();
-        // x has its place, 6x is kept, and 36x² stands where 2x stood.
+        // x is fixed, 6x is kept, and 36x² reuses the lanes of 2x.
         assert_eq!((steps.fixed_lanes, steps.kept_lanes, steps.tape_lanes), (1, 2, 4));
         assert_eq!(steps.cotangent_lanes, 3);
     }

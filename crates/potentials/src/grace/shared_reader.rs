@@ -1,4 +1,4 @@
-//! What models of all depths have in common: elements, switches, cutoffs, embeddings, and the order of products.
+//! Reads what models of all depths share: elements, switches, cutoffs, embeddings, and the order of products.
 
 use atoms::Species;
 use npz::Archive;
@@ -22,7 +22,7 @@ pub(super) fn elements(archive: &Archive) -> Result<Vec<Species>, GraceError> {
     Ok(elements)
 }
 
-/// Refuses a file in which one of these switches, where it is there, is not as supported.
+/// Rejects a file in which one of these switches is present with an unsupported value.
 pub(super) fn reject_unsupported_variants(
     archive: &Archive,
     switches: &[(&str, usize, &str)],
@@ -35,7 +35,7 @@ pub(super) fn reject_unsupported_variants(
     Ok(())
 }
 
-/// Switches of one radial network, one sum over neighbours and the whole file.
+/// Checks the switches of one radial network, one sum over neighbours and the whole file.
 pub(super) fn reject_unsupported_radial_variants(
     archive: &Archive,
     network: &str,
@@ -58,7 +58,7 @@ pub(super) fn reject_unsupported_radial_variants(
     )
 }
 
-/// Refuses a file with arrays that nothing has asked for, but those of the mixture.
+/// Rejects a file with unread arrays other than those of the mixture.
 pub(super) fn reject_unread_arrays(archive: &Archive, depth: &str) -> Result<(), GraceError> {
     let mut left_over = archive.unread();
     left_over.retain(|name| !name.starts_with("uq_"));
@@ -74,7 +74,7 @@ pub(super) fn reject_unread_arrays(archive: &Archive, depth: &str) -> Result<(),
     ))
 }
 
-/// r_c for centre and neighbour element, [n_elements²], Å.
+/// r_c for centre and neighbour element, `[n_elements²]`, Å.
 pub(super) fn cutoffs(archive: &Archive, n_elements: usize) -> Result<Vec<f64>, GraceError> {
     let rcut = archive.scalar("rcut")?;
     let (key, cutoffs) = if archive.count("has_bond_specific_cutoff", 0, 1)? == 1 {
@@ -88,7 +88,7 @@ pub(super) fn cutoffs(archive: &Archive, n_elements: usize) -> Result<Vec<f64>, 
     }
 }
 
-/// The embedding Z of the elements, [element, size].
+/// The embedding Z of the elements, `[element, size]`.
 pub(super) struct Embedding {
     size: usize,
     values: Vec<f64>,
@@ -108,7 +108,7 @@ impl Embedding {
         Ok(Self { size, values })
     }
 
-    /// Numbers that stand for one element.
+    /// Numbers per element.
     pub fn size(&self) -> usize {
         self.size
     }
@@ -117,8 +117,8 @@ impl Embedding {
         self.values.chunks_exact(self.size)
     }
 
-    /// Z_i W + Z_j W′ + b for centre i and neighbour j, [element²][outputs]; W and W′, row-major
-    /// [size, outputs], stand behind one another.
+    /// Z_i W + Z_j W′ + b for centre i and neighbour j, `[element²][outputs]`; W and W′, row-major `[size,
+    /// outputs]`, follow one another.
     pub fn pair_biases(&self, weights: &[f64], bias: &[f64]) -> Vec<Vec<Double>> {
         let outputs = bias.len();
         let pairs = self.rows().flat_map(|i| self.rows().map(move |j| (i, j)));
@@ -129,7 +129,8 @@ impl Embedding {
         pairs.map(|pair| to_lanes(&(0..outputs).map(|o| sum(pair, o)).collect::<Vec<_>>())).collect()
     }
 
-    /// Z W for each element with the weights `{prefix}_W` [size, channels] times `{prefix}_norm` times `scale`.
+    /// Z W for each element with the weights `{prefix}_W` `[size, channels]` times `{prefix}_norm` times
+    /// `scale`.
     pub fn transformed<V: Vector>(
         &self,
         archive: &Archive,
@@ -149,14 +150,13 @@ impl Embedding {
     }
 }
 
-/// The products of a tensor x with itself that reductions may take: x → x1 = FC(x, x) → xx = x1 × x1 →
-/// xx1 = FC(xx, x) → xxx = xx1 × x1 (or x); xx2 = FC(xx, x) → xxxx = xx2 × xx2. The file calls them by repeating
-/// the letter of x.
+/// The powers of a tensor x that reductions may use: x → x1 = FC(x, x) → xx = x1 × x1 → xx1 = FC(xx, x) → xxx =
+/// xx1 × x1 (or x); xx2 = FC(xx, x) → xxxx = xx2 × xx2. The file names them by repeating the letter of x.
 pub(super) struct Powers<'a> {
     pub letter: &'a str,
     /// Whether xxx is xx1 × x1.
     pub third_with_mixed: bool,
-    /// The reductions that take them.
+    /// The reductions that use them.
     pub taken_by: &'a [&'a str],
 }
 
@@ -166,7 +166,7 @@ impl Powers<'_> {
         std::array::from_fn(|k| self.letter.repeat(k + 1))
     }
 
-    /// Makes as many as the reductions take, and says how many orders that are.
+    /// Builds as many powers as the reductions use and returns their number.
     pub fn make<V: Vector>(&self, graph: &mut Graph<V>, x: Tensor) -> Result<usize, GraceError> {
         let [one, two, three, four] = &self.names();
         let order = self.highest_order(graph.archive)?;

@@ -1,4 +1,4 @@
-//! The passes over all atoms, chunk by chunk, by all threads.
+//! Passes over all atoms, parallel over chunks.
 
 use std::ops::Range;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -17,16 +17,16 @@ use super::network::Network;
 use super::readout::ReadoutWork;
 use super::vector::Vector;
 
-/// Work arrays of one thread.
+/// Scratch arrays of one thread.
 #[derive(Clone, Debug)]
 pub(super) struct Scratch<V> {
     /// For each layer.
     pub bonds: Vec<BondWork<V>>,
     pub readout: ReadoutWork<V>,
-    /// Of one batch.
+    /// For one batch.
     pub tape: Vec<V>,
     pub backward: BackwardWork<V>,
-    /// Of atoms whose trace is not kept.
+    /// For atoms whose trace is not kept.
     pub trace: Trace<V>,
     /// ∂H/∂z of these.
     pub feature_cotangent: Vec<f64>,
@@ -45,13 +45,13 @@ impl<V: Vector> Scratch<V> {
     }
 }
 
-/// A thread that panicked has left nothing in its arrays that anybody reads.
+/// Poisoning is harmless: nobody reads what a panicked thread left in its arrays.
 pub(super) fn lock_scratch<V>(scratch: &[Mutex<Scratch<V>>], thread: usize) -> MutexGuard<'_, Scratch<V>> {
     scratch[thread].lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl<V: Vector> Evaluator<V> {
-    /// Makes room for what the passes leave.
+    /// Sizes the output arrays of the passes.
     pub(super) fn begin_passes(&mut self) {
         let (n, readout) = (self.batches.order.len(), &self.network.readout);
         self.energies.resize(n, 0.0);
@@ -71,7 +71,7 @@ impl<V: Vector> Evaluator<V> {
         self.virials.resize(self.batches.chunks.len(), Default::default());
     }
 
-    /// All atoms forwards through layer `k`, and what they tell the next one.
+    /// The forward pass of all atoms through layer `k`, and their messages to the next one.
     pub(super) fn forward_layer(&mut self, k: usize) {
         let Self { network, instructions, batches, scratch, .. } = self;
         let (here, after) = self.layers.split_at_mut(k + 1);
@@ -129,7 +129,7 @@ impl<V: Vector> Evaluator<V> {
         );
     }
 
-    /// All atoms backwards through layer `k`, with `N` cotangents: of the energy, and of the features.
+    /// The reverse pass of all atoms through layer `k`, with `N` cotangents: of the energy and of the features.
     pub(super) fn backward_layer<const N: usize>(&mut self, k: usize) {
         let Self { network, instructions, batches, scratch, density_cotangents, .. } = self;
         let (here, after) = self.layers.split_at_mut(k + 1);
@@ -163,7 +163,7 @@ impl<V: Vector> Evaluator<V> {
         });
     }
 
-    /// Sums what bonds and chunks have left of layer `k`.
+    /// Sums the contributions of bonds and chunks to layer `k`.
     pub(super) fn finish_layer<const N: usize>(&mut self, k: usize) {
         let Self { network, batches, layers, .. } = self;
         let (layer, n) = (&network.layers[k], batches.order.len());
@@ -211,7 +211,7 @@ impl<V: Vector> Evaluator<V> {
         });
     }
 
-    /// The cotangents of the bases of all layers from those of the features, [n, D].
+    /// The cotangents of the bases of all layers from those of the features, `[n, D]`.
     pub(super) fn project_back(&mut self, cotangent: &[f64]) {
         let Self { network, instructions, batches, layers, projection: projected, .. } = self;
         let Some(map) = &network.feature_map else { return };
@@ -230,12 +230,12 @@ impl<V: Vector> Evaluator<V> {
     }
 }
 
-/// The numbers of some places, `of_one` for each.
+/// The elements of these places, `of_one` per place.
 fn part<'a, V>(numbers: &'a [V], places: &Range<usize>, of_one: usize) -> &'a [V] {
     numbers.get(places.start * of_one..places.end * of_one).unwrap_or_default()
 }
 
-/// Where `N` cotangents of a layer go to.
+/// The output arrays for `N` cotangents of a layer.
 pub(super) fn gradients_of<'a, V: Vector, const N: usize>(
     layer: &Layer<V>,
     bonds: &'a Bonds,
@@ -251,7 +251,7 @@ pub(super) fn gradients_of<'a, V: Vector, const N: usize>(
     Gradients { bonds, returns: PerChunk::within(chunks, returns) }
 }
 
-/// Makes room for the message cotangents of a chunk.
+/// Sizes the message cotangents of a chunk.
 pub(super) fn begin_returns<V: Vector, const N: usize>(
     layer: &Layer<V>,
     returns: &mut ReturnedCotangents<V>,
