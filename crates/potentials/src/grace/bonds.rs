@@ -11,7 +11,7 @@ use super::layer::Layer;
 use super::radial_network::RadialWork;
 use super::tape::Slot;
 use super::threads::Threads;
-use super::vector::{MOST_LANES, Number, Vector};
+use super::vector::{MAX_LANES, Number, Vector};
 
 /// Keeps r differentiable at d = 0, Å².
 const SQUARE_FLOOR: f64 = 1e-10;
@@ -211,8 +211,8 @@ pub(super) fn distances<V: Vector>(
     layer: &Layer<V>,
     centre: usize,
     bonds: &[Bond],
-) -> [(usize, f64); MOST_LANES] {
-    let mut distances = [(0, 0.0); MOST_LANES];
+) -> [(usize, f64); MAX_LANES] {
+    let mut distances = [(0, 0.0); MAX_LANES];
     for (distance, bond) in distances.iter_mut().zip(bonds) {
         *distance = (layer.radial.pair(centre, bond.element as usize), bond.r);
     }
@@ -244,7 +244,7 @@ fn transpose<V: Vector>(rows: &[V], columns: &mut [V]) {
 /// v and r of a block; v is zero in unused lanes. Both are rounded after the division.
 #[inline(always)]
 pub(super) fn directions<V: Vector>(bonds: &[Bond]) -> ([V; 3], V) {
-    let (mut ds, mut rs) = ([[0.0; MOST_LANES]; 3], [1.0; MOST_LANES]);
+    let (mut ds, mut rs) = ([[0.0; MAX_LANES]; 3], [1.0; MAX_LANES]);
     for (b, bond) in bonds.iter().enumerate() {
         rs[b] = bond.r;
         for (axis, d) in ds.iter_mut().zip(bond.d) {

@@ -2,7 +2,7 @@
 
 use super::radial_network::{RadialNetwork, RadialWork};
 use super::radial_table::{RadialTable, b_splines};
-use super::vector::{Double, MOST_LANES, Number, Vector, lanes_for};
+use super::vector::{Double, MAX_LANES, Number, Vector, lanes_for};
 
 /// Limit of the total size of tables if every pair of elements needs its own, bytes.
 const MAX_TABLE_BYTES: usize = 1 << 28;
@@ -99,7 +99,7 @@ impl<V: Vector> RadialFunctions<V> {
             return self.evaluate_exactly(bonds, work, values, derivatives);
         }
         let (lanes, mut places) = (self.output_lanes(), V::ZERO);
-        let mut located = [(&self.tables[0], 0); MOST_LANES];
+        let mut located = [(&self.tables[0], 0); MAX_LANES];
         for (b, (pair, r)) in bonds.iter().enumerate() {
             let table = &self.tables[self.table_of_pair[*pair]];
             let (interval, t) = table.locate(*r);

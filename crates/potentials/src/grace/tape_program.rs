@@ -1,36 +1,37 @@
-//! What is done with a batch along its tape, and back along the tape of its cotangents.
+//! Executes the operations of a layer on a batch, forward and in reverse.
 
 use super::tape::{Batch, Operation};
 use super::vector::Vector;
 
-/// The operations of a layer in their order, with the places of all rows on both tapes.
+/// The operations of a layer in order, with the lanes of all rows on both tapes.
 ///
-/// Both tapes begin with the same rows: the sum over neighbours, what the next layer is told, and others that keep their places.
-/// On the tape there follow those that the reverse sweep reads, then those that leave their places to one another.
+/// Both tapes start with the same rows: the sum over neighbours, the message to the next layer, and others with
+/// fixed lanes. On the forward tape there follow the rows that the reverse pass reads, then those whose lanes
+/// are reused.
 #[derive(Clone, Debug)]
 pub(super) struct TapeProgram<V: Vector> {
     pub steps: Vec<Step<V>>,
-    /// Of rows that no operation makes.
+    /// Basis rows that no operation produces.
     pub given: Gather,
-    /// Lanes of the rows that have the same places on both tapes, for one slot.
+    /// Lanes of the rows with the same position on both tapes, for one slot.
     pub fixed_lanes: usize,
-    /// Those from the beginning of the tape that the reverse sweep needs.
+    /// Lanes at the start of the tape that the reverse pass needs.
     pub kept_lanes: usize,
     pub tape_lanes: usize,
     pub cotangent_lanes: usize,
-    /// Of the basis B.
+    /// Lanes of the basis B.
     pub basis_lanes: usize,
 }
 
-/// An operation, and what comes before and after it.
+/// An operation with what precedes and follows it.
 #[derive(Clone, Debug)]
 pub(super) struct Step<V: Vector> {
     pub operation: Operation<V>,
-    /// Results that are sums, on the tape.
+    /// Results that are sums and must be zeroed, on the tape.
     pub sums: Ranges,
-    /// Cotangents to which nothing has been added before this step of the reverse sweep.
+    /// Cotangents that receive their first contribution in this step of the reverse pass.
     pub fresh: Ranges,
-    /// Results that go into the basis.
+    /// Results that belong to the basis.
     pub basis: Gather,
 }
 
@@ -40,7 +41,7 @@ impl<V: Vector> TapeProgram<V> {
         self.steps.iter().map(|step| &step.operation)
     }
 
-    /// From the sum over neighbours to the basis, a row for each atom.
+    /// From the sum over neighbours to the basis, one row per atom.
     #[inline(always)]
     pub fn forward(&self, batch: &Batch, tape: &mut [V], basis: &mut [V]) {
         let lanes = self.basis_lanes;
@@ -52,7 +53,7 @@ impl<V: Vector> TapeProgram<V> {
         }
     }
 
-    /// From `N` cotangents of the basis, a row for each atom, to those of the sum over neighbours.
+    /// From `N` cotangents of the basis, one row per atom, to those of the sum over neighbours.
     #[inline(always)]
     pub fn backward<const N: usize>(&self, batch: &Batch, tape: &[V], cotangent: &mut [V], bases: [&[V]; N]) {
         for step in self.steps.iter().rev() {
@@ -64,24 +65,24 @@ impl<V: Vector> TapeProgram<V> {
     }
 }
 
-/// Rows that go into the basis B.
+/// Rows to copy to the basis B.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Gather(pub Vec<Gathered>);
 
-/// One of them.
+/// A row of the basis.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Gathered {
-    /// First lane on the tape, and on that of cotangents.
+    /// First lane on the tape and on the cotangents' tape.
     pub tape: usize,
     pub cotangent: usize,
     /// First lane in the basis.
     pub position: usize,
-    /// Lanes.
+    /// Number of lanes.
     pub width: usize,
 }
 
 impl Gather {
-    /// Into `out`, a row of `stride` lanes for each atom.
+    /// Copies the rows to `out`, one row of `stride` lanes per atom.
     #[inline(always)]
     fn forward<V: Vector>(&self, atoms: usize, tape: &[V], out: &mut [V], stride: usize) {
         for &Gathered { tape: row, position, width, .. } in &self.0 {
@@ -92,7 +93,7 @@ impl Gather {
         }
     }
 
-    /// Adds to `N` cotangents of the rows, from a row of `stride` lanes for each atom.
+    /// Adds to `N` cotangents of the rows, from one row of `stride` lanes per atom.
     #[inline(always)]
     fn backward<V: Vector, const N: usize>(
         &self,
@@ -114,12 +115,12 @@ impl Gather {
     }
 }
 
-/// Ranges of a tape, lanes for one slot.
+/// Ranges of lanes on a tape, for one slot.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Ranges(Vec<(usize, usize)>);
 
 impl Ranges {
-    /// From the first lanes and the numbers of lanes of rows, some of them more than once.
+    /// From first lanes and widths of rows, which may repeat.
     pub fn new(mut rows: Vec<(usize, usize)>) -> Self {
         rows.sort_unstable();
         rows.dedup();

@@ -1,4 +1,4 @@
-//! Threads that evaluate a structure together.
+//! Threads that evaluate one structure in parallel.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -8,15 +8,15 @@ use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 use super::batches::Chunk;
 use super::chunked_slices::SplitByChunk;
 
-/// The calling thread alone, or a pool of threads. Results have the same bits whatever it is.
+/// The calling thread or a thread pool. Results have the same bits with either.
 #[derive(Clone, Debug, Default)]
 pub struct Threads(Option<Arc<ThreadPool>>);
 
 impl Threads {
-    /// `n` threads of their own; for less than two the calling thread.
+    /// A pool of `n` threads; the calling thread if `n` is less than two.
     ///
     /// # Errors
-    /// The system gives no more threads.
+    /// The system cannot create the threads.
     pub fn new(n: usize) -> Result<Self, ThreadPoolBuildError> {
         if n < 2 {
             return Ok(Self::default());
@@ -25,12 +25,12 @@ impl Threads {
         Ok(Self(Some(Arc::new(builder.build()?))))
     }
 
-    /// How many they are.
+    /// Number of threads.
     pub fn count(&self) -> usize {
         self.0.as_ref().map_or(1, |pool| pool.current_num_threads())
     }
 
-    /// Does some work as one of them, so that the others are there to help.
+    /// Runs `work` on a thread of the pool, so that the others can help.
     pub(super) fn run<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
         match &self.0 {
             Some(pool) => pool.install(work),
@@ -38,7 +38,8 @@ impl Threads {
         }
     }
 
-    /// Deals `work` out by chunks; to be called within [`Threads::run`]. `act` is told which thread does it.
+    /// Splits `work` by chunks and runs `act` on each; call it within [`Threads::run`]. `act` receives the
+    /// index of its thread.
     pub(super) fn for_each_chunk<W: SplitByChunk>(
         &self,
         chunks: &[Chunk],
@@ -63,7 +64,8 @@ impl Threads {
         }
     }
 
-    /// As [`Threads::for_each_chunk`], in as many pieces of about the same size as there are threads, so that each is as large as can be.
+    /// As [`Threads::for_each_chunk`], but in as many parts of about equal size as there are threads, so that
+    /// parts are as large as possible.
     pub(super) fn for_each_share<W: SplitByChunk>(
         &self,
         chunks: &[Chunk],

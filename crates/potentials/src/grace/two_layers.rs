@@ -1,9 +1,9 @@
-//! Reads GRACE-2L and lays out its graph.
+//! Reads GRACE-2L and builds its graph.
 //!
-//! The first layer is that of GRACE-1L, except AAA = AA1 × A. From A, AA, AAA, AAAA it makes I1, with weights of the
-//! central element, and from this the message I. The second layer sums over neighbours B0, as A, and
-//! T_y,q = Σ_j R1 Y_y I_q(j), couples YI_f = Σ C T_y,q, reduces B = (YI, B0) and goes on with B as the first with A.
-//! The invariants of both layers are normalised and summed.
+//! The first layer is that of GRACE-1L, except that AAA = AA1 × A. It reduces A, AA, AAA, AAAA to I1 with
+//! weights of the central element, and I1 to the message I. The second layer sums B0 over neighbours, like A,
+//! and T_y,q = Σ_j R1 Y_y I_q(j), couples YI_f = Σ C T_y,q, reduces B = (YI, B0), and continues with B as the
+//! first layer does with A. The invariants of both layers are normalised and summed.
 
 use npz::Archive;
 
@@ -168,7 +168,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// The norm `name` of as many densities.
+/// The norm `name` of this many densities.
 pub(super) fn invariant_norm(
     archive: &Archive,
     name: &str,
@@ -186,7 +186,7 @@ pub(super) fn invariant_norm(
     Ok(InvariantNorm { linear, scale })
 }
 
-/// Whether the file lists the operations that the graph has, and no other.
+/// Checks that the file lists exactly the operations of the graph.
 fn expect_lists(archive: &Archive, orders: [usize; 2]) -> Result<(), GraceError> {
     let [(mut maps, mut products), (more_maps, more_products)] =
         [FIRST.lists(orders[0]), SECOND.lists(orders[1])];
@@ -207,7 +207,7 @@ fn expect_lists(archive: &Archive, orders: [usize; 2]) -> Result<(), GraceError>
     }
 }
 
-/// Whether the list `key` holds the expected names, in any order.
+/// Checks that the list `key` has the expected names, in any order.
 pub(super) fn expect_list(archive: &Archive, key: &str, mut expected: Vec<String>) -> Result<(), GraceError> {
     let mut found = archive.strings(key)?;
     found.sort();
