@@ -19,7 +19,7 @@ use tempfile::TempDir;
 /// Default number of pairs.
 const PAIRS: usize = 5;
 /// Time slice of a campaign.
-const TURN: Duration = Duration::from_millis(500);
+const TIME_SLICE: Duration = Duration::from_millis(500);
 /// How often the bench checks whether a campaign has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(1);
 
@@ -28,7 +28,7 @@ fn main() {
     println!("campaign steps a second (all in one process, in processes of their own), and their ratio");
     let mut ratios = Vec::new();
     for pair in 0..pairs {
-        let mut both = [UnderWay::new(&["--in-process"]), UnderWay::new(&[])];
+        let mut both = [RunningCampaign::new(&["--in-process"]), RunningCampaign::new(&[])];
         // Alternate which campaign of a pair goes first.
         let mut turn = pair % 2;
         while both.iter().any(|campaign| !campaign.ended) {
@@ -44,7 +44,7 @@ fn main() {
 }
 
 /// A complete campaign, including start and end.
-struct UnderWay {
+struct RunningCampaign {
     directory: TempDir,
     options: Vec<&'static str>,
     run: Option<Child>,
@@ -53,7 +53,7 @@ struct UnderWay {
     ended: bool,
 }
 
-impl UnderWay {
+impl RunningCampaign {
     fn new(options: &[&'static str]) -> Self {
         let directory = tempfile::tempdir().expect("a directory for temporary files");
         fs::write(directory.path().join("campaign.toml"), text()).expect("a file that can be written");
@@ -69,7 +69,7 @@ impl UnderWay {
             self.signal(Signal::CONT);
         }
         let run = self.run.as_mut().expect("it was started above");
-        while !self.ended && begun.elapsed() < TURN {
+        while !self.ended && begun.elapsed() < TIME_SLICE {
             std::thread::sleep(POLL_INTERVAL);
             if let Some(status) = run.try_wait().expect("a child of this process") {
                 assert!(status.success());

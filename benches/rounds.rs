@@ -24,13 +24,14 @@ use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
 /// Default steps per assignment, as in `configs/`.
-const TURN_STEPS: u64 = 250;
+const STEPS_PER_ASSIGNMENT: u64 = 250;
 
 fn main() {
-    let turn_steps = std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(TURN_STEPS);
-    println!("turns of {turn_steps} steps");
+    let assignment_steps =
+        std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(STEPS_PER_ASSIGNMENT);
+    println!("turns of {assignment_steps} steps");
     println!("{:<16} {:>10} {:>10} {:>12} {:>14}", "", "candidates", "accepted", "seconds", "walkers busy");
-    let [live, rounds] = [Mode::Live, Mode::Reproducible].map(|mode| Campaign::run(mode, turn_steps));
+    let [live, rounds] = [Mode::Live, Mode::Reproducible].map(|mode| Campaign::run(mode, assignment_steps));
     let rate = |campaign: &Campaign| f64::from(campaign.candidates) / campaign.time.as_secs_f64();
     println!("candidates an hour, live over rounds: {:.2}", rate(&live) / rate(&rounds));
 }
@@ -47,17 +48,17 @@ struct Campaign {
 }
 
 /// A running assignment: when it ends, the order of start for ties, and its report.
-struct Turn(Duration, u64, Report);
+struct RunningAssignment(Duration, u64, Report);
 
 impl Campaign {
-    fn run(mode: Mode, turn_steps: u64) -> Self {
+    fn run(mode: Mode, assignment_steps: u64) -> Self {
         let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
         let context = WalkContext {
             model: Arc::clone(&model),
             threads: Threads::default(),
             settings: Arc::new(walk_settings()),
         };
-        let mut selector = selector(mode, turn_steps, &model);
+        let mut selector = selector(mode, assignment_steps, &model);
         selector.begin_walks();
         let (mut campaign, mut turns, mut begun) = (Self::default(), BinaryHeap::new(), 0);
         loop {
@@ -69,9 +70,9 @@ impl Campaign {
                 campaign.work += taken;
                 begun += 1;
                 let report = report.map_candidate(|candidate| CandidateBlock::encode(&candidate));
-                turns.push(Reverse(Turn(campaign.time + taken, begun, report)));
+                turns.push(Reverse(RunningAssignment(campaign.time + taken, begun, report)));
             }
-            let Some(Reverse(Turn(ended, _, report))) = turns.pop() else { break };
+            let Some(Reverse(RunningAssignment(ended, _, report))) = turns.pop() else { break };
             campaign.time = ended;
             campaign.candidates += u32::from(matches!(report.outcome, Outcome::Candidate(_)));
             let commit = selector.report(report).unwrap().unwrap_or_default();
@@ -96,12 +97,12 @@ fn processor_time() -> Duration {
     Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap()
 }
 
-fn selector(mode: Mode, turn_steps: u64, model: &GraceModel) -> Selector {
+fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
     let rule = "rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nleast = 3\n";
     let settings = Settings {
         mode,
         walks_per_round: seeds().len(),
-        turn_steps,
+        turn_steps: assignment_steps,
         update: UpdateProtocol::Carried,
         search: UpdateSettings {
             combination: calm::CovarianceUpdateKind::Convex,
@@ -166,27 +167,27 @@ fn data(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/data").join(path)
 }
 
-impl Turn {
+impl RunningAssignment {
     fn order(&self) -> (Duration, u64) {
         (self.0, self.1)
     }
 }
 
-impl PartialEq for Turn {
+impl PartialEq for RunningAssignment {
     fn eq(&self, other: &Self) -> bool {
         self.order() == other.order()
     }
 }
 
-impl Eq for Turn {}
+impl Eq for RunningAssignment {}
 
-impl PartialOrd for Turn {
+impl PartialOrd for RunningAssignment {
     fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
         Some(self.cmp(other))
     }
 }
 
-impl Ord for Turn {
+impl Ord for RunningAssignment {
     fn cmp(&self, other: &Self) -> std::cmp::Ordering {
         self.order().cmp(&other.order())
     }

@@ -188,7 +188,7 @@ fn an_artifact_must_belong_to_the_model() {
     let desk = Desk::new();
     let silicon = path("data/si_sw_1l/gmm_artifacts.npz");
     let expected =
-        ["calm.artifact: ", &silicon, "another model: its list of elements is Si, that of the model Al"];
+        ["calm.artifact: ", &silicon, "another model: its list of elements is Si, the model's is Al"];
     desk.refused_with(&path(ARTIFACT), &silicon, &expected);
 }
 

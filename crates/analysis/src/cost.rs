@@ -7,7 +7,7 @@
 //! linearly and cubically; β₂ = 1 ± 0.25; β₀ is uninformative, so the first label determines it and later
 //! labels refine the rest. The noise follows a Student t distribution with four degrees of freedom, so a label
 //! that took a hundred times longer than similar ones has little weight. Its scale is estimated too; the prior
-//! scale is [`SCATTER`].
+//! scale is [`PRIOR_NOISE_SCALE`].
 
 mod fit;
 #[cfg(test)]
@@ -58,13 +58,13 @@ pub struct CostModel {
 }
 
 /// Priors of β₁ and β₂: mean and standard deviation.
-const EXPONENTS: [Normal; 2] = [Normal { mean: 2.0, sd: 0.75 }, Normal { mean: 1.0, sd: 0.25 }];
+const EXPONENT_PRIORS: [Normal; 2] = [Normal { mean: 2.0, sd: 0.75 }, Normal { mean: 1.0, sd: 0.25 }];
 
 /// Prior scale of the noise: a factor of 1.3.
-const SCATTER: f64 = 0.26;
+const PRIOR_NOISE_SCALE: f64 = 0.26;
 
 /// Standard deviation of a user's estimate, on the logarithmic scale.
-const GUESS: f64 = 1.098_612_288_668_109_8;
+const GUESS_SIGMA: f64 = 1.098_612_288_668_109_8;
 
 /// 95 % quantile of Student's t distribution with four degrees of freedom.
 const STUDENT_95: f64 = 2.131_846_786_326_649;

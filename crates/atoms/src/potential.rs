@@ -46,7 +46,7 @@ impl Evaluation {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PotentialError {
     /// The potential has no parameters for an element.
-    #[error("atom {atom} is {species}, which the potential does not know (it knows {known})")]
+    #[error("atom {atom} is {species}, which the potential does not support (it supports {known})")]
     Species {
         /// Index of the atom.
         atom: usize,

@@ -50,7 +50,7 @@ pub enum StructureError {
         limit: f64,
     },
     /// The cell is so thin that the neighbour search would not end.
-    #[error("the cell is {height:.3e} Å high, far too thin to find the neighbours within {reach:.3} Å")]
+    #[error("the cell is {height:.3e} Å high, too thin to search neighbours within {reach:.3} Å")]
     CellThin {
         /// Smallest height of the cell along periodic directions, Å.
         height: f64,

@@ -1,4 +1,4 @@
-//! File formats against ASE, real files, and whatever else may stand in a file.
+//! File formats against ASE, real files, and arbitrary input.
 
 use std::fs::File;
 use std::io::Write as _;
@@ -22,7 +22,7 @@ fn shared(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/data").join(name)
 }
 
-/// What ASE reads from files, one after another, if an interpreter is named.
+/// What ASE reads from files, if an interpreter is configured.
 fn ase_reads(paths: &[PathBuf]) -> Option<Vec<Json>> {
     let Some(python) = std::env::var_os("CALMWALK_PYTHON") else {
         eprintln!("CALMWALK_PYTHON is not set: no comparison with ASE");
@@ -58,7 +58,7 @@ fn to_json(value: &Value) -> Json {
     }
 }
 
-/// Whether JSON holds what has no value here and stays text.
+/// Whether JSON has content without a value here, which stays text.
 fn is_foreign(json: &Json) -> bool {
     match json {
         Json::Null | Json::Object(_) => true,
@@ -83,7 +83,7 @@ fn column_to_json(column: &Column) -> Json {
     if column.width == 1 { items.into() } else { items.chunks(column.width).map(Json::from).collect() }
 }
 
-/// The same bits, the same types, nothing more and nothing less.
+/// Asserts the same bits and types, and nothing else.
 fn assert_same(frame: &Frame, ase: &Json) {
     let structure = &frame.structure;
     let numbers: Vec<u8> = structure.species.iter().map(|species| species.atomic_number()).collect();
@@ -137,7 +137,7 @@ fn written(frames: &[Frame]) -> Vec<u8> {
     text
 }
 
-/// Frames with their line numbers left out.
+/// Frames without their line numbers.
 fn unnumbered(mut frames: Vec<Frame>) -> Vec<Frame> {
     frames.iter_mut().for_each(|frame| frame.line = 0);
     frames
@@ -198,7 +198,7 @@ fn real_files_are_read_completely() {
         (shared("silicon_seeds.extxyz"), None),
     ];
     if let Some(peer) = std::env::var_os("CALMWALK_PEER_DATA") {
-        // Frames, atoms, and frames without a stress, as the sources tell.
+        // Frames, atoms, and frames without a stress, as documented by the sources.
         for (name, counts) in [
             ("Cu_mlearn_test", (31, 3178, 0)),
             ("Mo_mlearn_test", (23, 1189, 0)),

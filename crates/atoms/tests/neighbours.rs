@@ -1,9 +1,9 @@
-//! The linked-cell list against all pairs of all images.
+//! The linked-cell list against a brute-force search over all images.
 
 use atoms::{Cell, Neighbour, NeighbourList, Species, Structure, StructureError, Vec3, shortest_distance};
 use proptest::prelude::*;
 
-/// All directed pairs within `reach`, in canonical order, by looking at every image that could matter.
+/// All directed pairs within `reach`, in canonical order, by testing every relevant image.
 fn all_pairs(structure: &Structure, reach: f64) -> Vec<Vec<Neighbour>> {
     let lattice = structure.cell.completed(structure.periodic);
     let reciprocal = lattice.reciprocal();
@@ -58,7 +58,7 @@ fn matrix(range: f64) -> impl Strategy<Value = [[f64; 3]; 3]> {
     prop::array::uniform3(prop::array::uniform3(-range..range))
 }
 
-/// Triclinic cells of edge about `edge`, any periodicity, atoms up to `far` cells outside.
+/// Triclinic cells with edges of about `edge`, any periodicity, and atoms up to `far` cells outside.
 fn structures(edge: f64, atoms: usize, far: f64) -> impl Strategy<Value = Structure> {
     let positions = prop::collection::vec(prop::array::uniform3(-far..far + 1.0), 1..=atoms);
     (matrix(0.35 * edge), positions, prop::array::uniform3(any::<bool>()), any::<bool>()).prop_map(
@@ -132,7 +132,7 @@ proptest! {
         is_complete(&structure, 5.0, 1.0)?;
     }
 
-    /// After any moves and strains the list is complete within the cutoff, rebuilt or not.
+    /// After any displacement and strain the list is complete within the cutoff, rebuilt or not.
     #[test]
     fn skin_keeps_the_list_complete(
         structure in structures(9.0, 16, 2.0),

@@ -51,7 +51,7 @@ pub struct Projection {
 
 /// Why an artifact does not belong to a model.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("the CALM artifact belongs to another model: its {what} is {artifact}, that of the model {model}")]
+#[error("the CALM artifact belongs to another model: its {what} is {artifact}, the model's is {model}")]
 pub struct ProjectionMismatch {
     /// What differs.
     pub what: &'static str,
@@ -307,7 +307,7 @@ fn as_count(file: &Archive, key: &str, found: f64) -> Result<usize, ArtifactErro
     if found.fract() == 0.0 && (0.0..=u32::MAX as f64).contains(&found) {
         return Ok(found as usize);
     }
-    Err(invalid(file, key, found, "a whole number that is not negative"))
+    Err(invalid(file, key, found, "a whole number, 0 or more"))
 }
 
 fn check_schema(file: &Archive, key: &str) -> Result<(), ArtifactError> {

@@ -51,7 +51,7 @@ pub enum ComponentBytesError {
         found: usize,
     },
     /// Numbers that are not a valid component.
-    #[error("the bytes hold no valid component: {0}")]
+    #[error("the bytes are not a valid component: {0}")]
     Component(#[from] ComponentError),
 }
 

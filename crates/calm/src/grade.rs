@@ -1,7 +1,7 @@
 //! σ, γ and the gradient of γ with respect to the feature vector.
 
 use crate::component::Component;
-use crate::linear::{TOGETHER, dot, squared_distance, symmetric_products};
+use crate::linear::{VECTORS_PER_PASS, dot, squared_distance, symmetric_products};
 use crate::mixture::Mixture;
 
 /// Added under the square root of σ.
@@ -149,7 +149,9 @@ impl Grades {
         order.clear();
         order.extend(0..elements.len());
         order.sort_unstable_by_key(|&atom| (place(atom), atom));
-        for atoms in order.chunk_by(|&a, &b| place(a) == place(b)).flat_map(|atoms| atoms.chunks(TOGETHER)) {
+        for atoms in
+            order.chunk_by(|&a, &b| place(a) == place(b)).flat_map(|atoms| atoms.chunks(VECTORS_PER_PASS))
+        {
             let component = component(mixture, place(atoms[0]));
             delta.clear();
             for atom in atoms {

@@ -194,10 +194,10 @@ pub(crate) fn regularised(covariance: &[f64], dimension: usize) -> Vec<f64> {
 }
 
 /// Number of vectors to pass to [`symmetric_products`] at once: as many as fit the L1 cache beside a panel.
-pub(crate) const TOGETHER: usize = 16;
+pub(crate) const VECTORS_PER_PASS: usize = 16;
 
 /// Columns of a panel: two of the widest common vector registers.
-const PANEL: usize = 8;
+const PANEL_COLUMNS: usize = 8;
 
 /// S v for each of several vectors and a symmetric row-major S; `vectors` and `out` are `[vectors × D]`.
 ///
@@ -222,11 +222,11 @@ impl pulp::WithSimd for SymmetricProducts<'_> {
 
     #[inline(always)]
     fn with_simd<S: pulp::Simd>(mut self, _: S) {
-        match self.dimension.checked_sub(PANEL) {
+        match self.dimension.checked_sub(PANEL_COLUMNS) {
             // The last panel overlaps the one before and computes the same sums again.
-            Some(last) => {
-                (0..self.dimension).step_by(PANEL).for_each(|first| self.panel::<PANEL>(first.min(last)))
-            }
+            Some(last) => (0..self.dimension)
+                .step_by(PANEL_COLUMNS)
+                .for_each(|first| self.panel::<PANEL_COLUMNS>(first.min(last))),
             None => (0..self.dimension).for_each(|column| self.panel::<1>(column)),
         }
     }

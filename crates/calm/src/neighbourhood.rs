@@ -25,7 +25,7 @@ impl Pair {
 
 /// A pair with the index of an atom that has no grade.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-#[error("pair ({i}, {j}) names an atom beyond the {atoms} that were graded")]
+#[error("pair ({i}, {j}) names an atom beyond the {atoms} graded atoms")]
 pub struct PairError {
     /// Central atom.
     pub i: usize,

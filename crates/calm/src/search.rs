@@ -16,7 +16,7 @@ pub const INFLATION_ROUNDS: usize = 3;
 pub const INFLATION_AIM: f64 = 0.95;
 
 /// Where a grade of a fast trial is relatively closer to a threshold than this, the direct inverse decides.
-const UNDECIDED: f64 = 1e-5;
+const DECISION_MARGIN: f64 = 1e-5;
 
 /// The grades of the collected structure for one α.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -172,7 +172,7 @@ fn trial(
     alpha: f64,
     thresholds: [f64; 2],
 ) -> Result<Vec<f64>, UpdateError> {
-    let near = |grade: f64| thresholds.iter().any(|limit| (grade - limit).abs() <= UNDECIDED * limit);
+    let near = |grade: f64| thresholds.iter().any(|limit| (grade - limit).abs() <= DECISION_MARGIN * limit);
     match ladder.gamma(alpha) {
         Some(gamma) if !gamma.iter().any(|&grade| near(grade)) => Ok(gamma),
         _ => Ok(batch.gamma_under(&batch.updated(update)?)),

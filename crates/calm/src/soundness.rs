@@ -16,7 +16,7 @@ use crate::component::Component;
 use crate::linear::{LinearError, REGULARISATION, cholesky, eigenvalues, regularised, view};
 
 /// Files store single precision: the relative rounding of a number, with a margin for sums of rounded numbers.
-const STORED: f64 = 1.0 / (1 << 22) as f64;
+const STORAGE_ROUNDING: f64 = 1.0 / (1 << 22) as f64;
 
 /// Largest deviation of tr(S (C + εI))/D from 1 apart from rounding; builds deviate by 10⁻⁴.
 const TRACE_TOLERANCE: f64 = 0.05;
@@ -25,16 +25,16 @@ const TRACE_TOLERANCE: f64 = 0.05;
 const CONDITION_LIMIT: f64 = 1e15;
 
 /// The σ histograms of builds start here, so no threshold is smaller.
-const LEAST_THRESHOLD: f64 = 0.01;
+const MIN_THRESHOLD: f64 = 0.01;
 
 /// Largest θ/√⟨σ²⟩: fewer than 1 in 10⁴ environments exceed it (Markov). Builds: 1 to 3.
-const THRESHOLD_SPAN: f64 = 100.0;
+const MAX_THRESHOLD_RATIO: f64 = 100.0;
 
 /// Smallest θ/√⟨σ²⟩, even for heavy tails of σ.
-const THRESHOLD_SHARE: f64 = 1e-3;
+const MIN_THRESHOLD_RATIO: f64 = 1e-3;
 
 /// Tolerance for centroids that exceed the bound of the features by rounding.
-const REACH: f64 = 1.01;
+const CENTROID_TOLERANCE: f64 = 1.01;
 
 /// A component that no training data can produce.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -71,8 +71,8 @@ pub enum ComponentFault {
     },
     /// S is larger than the regularisation allows.
     #[error(
-        "its inverse covariance has {found:.3e} on the diagonal; expected at most {:.0e}, as 1e-6 is added to every \
-         variance",
+        "its inverse covariance has {found:.3e} on the diagonal; expected at most {:.0e}, because 1e-6 is \
+         added to every variance",
         1.0 / REGULARISATION
     )]
     TooLarge {
@@ -91,7 +91,8 @@ pub enum ComponentFault {
     },
     /// Data without weight or weight without data.
     #[error(
-        "it has {count} environments of weight {effective_count} in sum; expected both to be positive, or both 0"
+        "it has {count} environments with a total weight of {effective_count}; expected both to be \
+         positive, or both 0"
     )]
     Counts {
         /// Number of environments.
@@ -101,7 +102,7 @@ pub enum ComponentFault {
     },
     /// S is not the inverse of C + εI.
     #[error(
-        "its inverse covariance does not belong to its scatter and count: their product has a mean eigenvalue of \
+        "its inverse covariance does not match its scatter and count: their product has a mean eigenvalue of \
          {found:.3e}; expected 1"
     )]
     Inconsistent {
@@ -134,7 +135,7 @@ pub enum ComponentFault {
         most: f64,
     },
     /// Two components have the same centroid.
-    #[error("it has the centroid of component {first}; expected one of its own")]
+    #[error("it shares the centroid of component {first}; expected a distinct one")]
     Duplicate {
         /// The first of the two.
         first: usize,
@@ -259,7 +260,7 @@ fn check_statistics(component: &Component) -> Result<(), ComponentFault> {
     }
     let found = mean_square(component, &regularised) / dimension as f64;
     let absolute: f64 = component.inverse().iter().zip(&regularised).map(|(a, b)| (a * b).abs()).sum();
-    let tolerance = TRACE_TOLERANCE + STORED * absolute / dimension as f64;
+    let tolerance = TRACE_TOLERANCE + STORAGE_ROUNDING * absolute / dimension as f64;
     if (found - 1.0).abs() > tolerance {
         return Err(ComponentFault::Inconsistent { found });
     }
@@ -267,8 +268,8 @@ fn check_statistics(component: &Component) -> Result<(), ComponentFault> {
 }
 
 fn check_threshold(found: f64, spread: &Spread) -> Result<(), ComponentFault> {
-    let least = LEAST_THRESHOLD.max(THRESHOLD_SHARE * spread.least);
-    let most = THRESHOLD_SPAN * spread.largest;
+    let least = MIN_THRESHOLD.max(MIN_THRESHOLD_RATIO * spread.least);
+    let most = MAX_THRESHOLD_RATIO * spread.largest;
     if (least..=most).contains(&found) {
         Ok(())
     } else {
@@ -285,7 +286,7 @@ fn check_centroid(component: &Component, reach: &[f64]) -> Result<(), ComponentF
         return Err(ComponentFault::NoCentroid);
     }
     // Features without a bound from the projection must be smaller than the fill value of unused slots.
-    let bounds = reach.iter().map(|reach| REACH * reach).chain(std::iter::repeat(SENTINEL));
+    let bounds = reach.iter().map(|reach| CENTROID_TOLERANCE * reach).chain(std::iter::repeat(SENTINEL));
     let mut beyond = centroid.iter().zip(bounds).enumerate();
     match beyond.find(|(_, (value, most))| value.abs() > *most) {
         Some((feature, (&found, most))) => Err(ComponentFault::Centroid { feature, found, most }),
@@ -299,7 +300,7 @@ fn is_used(component: &Component) -> bool {
     if component.statistics().is_some() {
         return has_data(component);
     }
-    let stand_in = |value: f64| (value * REGULARISATION - 1.0).abs() < STORED;
+    let stand_in = |value: f64| (value * REGULARISATION - 1.0).abs() < STORAGE_ROUNDING;
     !diagonal(component.inverse(), component.dimension()).all(stand_in)
 }
 
@@ -326,5 +327,5 @@ fn extremes(matrix: &[f64], dimension: usize) -> Result<(f64, f64), LinearError>
 
 /// Upper bound of the shift of the eigenvalues by the rounding of a stored matrix: the norm of the error.
 fn rounding(largest: f64, dimension: usize) -> f64 {
-    STORED * largest * dimension as f64
+    STORAGE_ROUNDING * largest * dimension as f64
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use crate::component::{Component, Statistics};
 use crate::grade::{DISTANCE_FLOOR, GradeError, Grades, THRESHOLD_FLOOR};
-use crate::linear::{LinearError, TOGETHER, dot, product, symmetric_products, symmetrised, view};
+use crate::linear::{LinearError, VECTORS_PER_PASS, dot, product, symmetric_products, symmetrised, view};
 use crate::mixture::{ChangedComponent, Mixture};
 
 /// How the new covariance of a touched component follows from the old one and that of the batch.
@@ -240,7 +240,7 @@ impl Group {
     fn grades_under(&self, component: &Component) -> Vec<f64> {
         let dimension = component.dimension();
         let mut products = vec![0.0; self.deltas.len()];
-        let several = TOGETHER * dimension;
+        let several = VECTORS_PER_PASS * dimension;
         for (deltas, products) in self.deltas.chunks(several).zip(products.chunks_mut(several)) {
             symmetric_products(component.inverse(), dimension, deltas, products);
         }

@@ -31,7 +31,7 @@ fn the_alarm_compares_live_with_original() {
     assert!(toml::from_str::<ForgettingAlarm>("share = 0.3").is_err());
 }
 
-/// Training atoms of known second moment, and a batch far away in one direction.
+/// Training atoms with a known second moment, and a batch far away along one direction.
 fn trained() -> (Mixture, Vec<f64>) {
     let mut random = Random(3);
     let features: Vec<f64> =
@@ -63,8 +63,8 @@ fn the_forgetting_factor_is_that_of_the_features() {
         assert_close("original", &[factor.original], &[mean_square(&original).sqrt()], 1e-6);
         assert_close("live", &[factor.live], &[mean_square(&live).sqrt()], 1e-6);
         assert_eq!(factor.factor, factor.live / factor.original);
-        // The third direction is not visited and forgotten. A small α widens the others by more than that, so the
-        // average does not tell.
+        // The third direction is not visited and is forgotten. A small α widens the others by more, so the
+        // average does not show it.
         assert_eq!(factor.factor > 1.0, alpha > 0.6);
         assert!(factor.worst_direction > 1.0 && factor.worst_direction < 1.001 / (1.0 - alpha).sqrt());
 
@@ -95,7 +95,7 @@ fn the_worst_direction_is_found() {
     }
 }
 
-/// The stored histogram of σ was made from the training atoms themselves; its bins are 1.2 % wide.
+/// The stored histogram of σ comes from the training atoms; its bins are 1.2 % wide.
 #[test]
 fn the_root_mean_square_is_that_of_the_stored_histogram() {
     for name in ["al_eam_1l", "si_sw_1l"] {
@@ -108,7 +108,7 @@ fn the_root_mean_square_is_that_of_the_stored_histogram() {
         let theta = mixture.component(0, 0).unwrap().threshold();
         assert_close(name, &[factor.original], &[mean.sqrt() / theta], 2e-3);
     }
-    // Elements without data have nothing to forget.
+    // Elements without data cannot be forgotten.
     let niobium = niobium().mixture;
     assert_eq!(forgetting_factors(&niobium, &niobium).unwrap().len(), 2);
 }
@@ -128,11 +128,12 @@ fn training_features_agree_with_the_statistics() {
             .map(|(_, grade)| grade * grade)
             .collect();
         let mean = squares.iter().sum::<f64>() / squares.len() as f64;
-        // The scatter in the file is rounded to f32, and so is the inverse.
+        // Scatter and inverse in the file are rounded to f32.
         assert_close("root mean square", &[factor.original], &[mean.sqrt()], 1e-3);
     }
     let distribution = grade_distribution(&mixture, &elements, &features).unwrap();
-    // Thresholds of thin components are borrowed from others, so this small model leaves more outside than the paper's.
+    // Components with few data have thresholds from others, so this small model leaves more atoms outside than
+    // the paper's.
     assert!((0.02..0.1).contains(&distribution.share_above_one), "{distribution:?}");
 }
 

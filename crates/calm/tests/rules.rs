@@ -155,10 +155,10 @@ fn the_count_rule_falls_back_twice() {
         let text = format!("ladder = [0.05, 0.4, 1.0]\nstop = {{ rule = 'atom_count', {text} }}");
         update(&round(), &[0; 3], &features(radius), &settings(&text)).unwrap()
     };
-    // 2 / √(1 + 3·0.4) = 1.35, 1 at α = 1.
+    // 2 / √(1 + 3·0.4) = 1.35; 1 at α = 1.
     let outcome = run(2.0, "threshold = 1.3");
     assert_eq!((outcome.end, outcome.alpha, outcome.trials[1].above), (UpdateEnd::CountBelowLimit, 1.0, 3));
-    // No α brings them below 0.9, the middle one below 1.5.
+    // No α brings them below 0.9; the middle one brings them below 1.5.
     let outcome = run(2.0, "threshold = 0.9, target = 1.5");
     assert_eq!((outcome.end, outcome.alpha), (UpdateEnd::FallbackMaximum, 0.4));
     assert_close("after", &outcome.gamma_after, &[2.0 / 2.2_f64.sqrt(); 3], 1e-6);

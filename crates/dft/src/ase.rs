@@ -71,8 +71,8 @@ impl Settings {
             expected: format!("a Python file that defines calculator(), but: {error}"),
         })?;
         let environment = version_query::environment(&self.environment);
-        let who = Versions::ask(&self.command, &environment, passed, &calculator)?;
-        Ok(Ase { settings: self.clone(), environment, calculator, who })
+        let versions = Versions::ask(&self.command, &environment, passed, &calculator)?;
+        Ok(Ase { settings: self.clone(), environment, calculator, versions })
     }
 }
 
@@ -93,7 +93,7 @@ impl Versions {
         let files = [(SCRIPT_FILE, SCRIPT.as_bytes()), (CALCULATOR_FILE, calculator)];
         let said = version_query::run(command, &[SCRIPT_FILE], environment, passed, &files)?;
         said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
-            let reason = format!("is no Python with ASE: it does not say its version but {:?}", said.trim());
+            let reason = format!("is not a Python with ASE: expected its version, found {:?}", said.trim());
             version_query::wrong_program(command, reason)
         })
     }
@@ -105,7 +105,7 @@ pub struct Ase {
     settings: Settings,
     environment: BTreeMap<String, String>,
     calculator: Vec<u8>,
-    who: Versions,
+    versions: Versions,
 }
 
 impl DftBackend for Ase {
@@ -113,7 +113,7 @@ impl DftBackend for Ase {
         // Destructure, so that a new setting cannot be forgotten here.
         let Settings { command: _, environment: _, calculator: _, moments } = &self.settings;
         json!({
-            "code": "ase", "ase": self.who.ase, "recipe": INPUT_VERSION, "version": self.who.version,
+            "code": "ase", "ase": self.versions.ase, "recipe": INPUT_VERSION, "version": self.versions.version,
             "calculator": blake3::hash(&self.calculator).to_hex().to_string(), "moments": moments,
         })
     }
@@ -152,7 +152,7 @@ impl DftBackend for Ase {
     }
 
     fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
-        let by = [("ase", self.who.ase.as_str()), ("version", self.who.version.as_str())];
+        let by = [("ase", self.versions.ase.as_str()), ("version", self.versions.version.as_str())];
         match script_output::read(structure, directory, &by)? {
             Some(calculated) => Ok(calculated),
             None => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),

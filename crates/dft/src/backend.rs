@@ -79,11 +79,9 @@ impl Exit {
         match self {
             Self::Code(code) => FailureClass::Crashed.with_message(format!("ended with exit code {code}")),
             Self::Signal(signal) => FailureClass::Crashed.with_message(format!("ended by signal {signal}")),
-            Self::TimeLimit => FailureClass::TimeLimit.with_message("ended because its time was over"),
-            Self::OutOfMemory => {
-                FailureClass::OutOfMemory.with_message("ended because it used too much memory")
-            }
-            Self::LostNode => FailureClass::LostNode.with_message("the machine that it ran on was lost"),
+            Self::TimeLimit => FailureClass::TimeLimit.with_message("exceeded its time limit"),
+            Self::OutOfMemory => FailureClass::OutOfMemory.with_message("exceeded its memory limit"),
+            Self::LostNode => FailureClass::LostNode.with_message("the node it ran on was lost"),
         }
     }
 }

@@ -77,11 +77,9 @@ impl Settings {
             let content = std::fs::read(path)
                 .map_err(|error| fault(format!("a file that can be read, but: {error}")))?;
             let name = path.file_name().and_then(|name| name.to_str());
-            let name = name.ok_or_else(|| fault("a file whose name is text".to_owned()))?;
+            let name = name.ok_or_else(|| fault("a file with a UTF-8 name".to_owned()))?;
             if RESERVED.contains(&name) || files.insert(name.to_owned(), content).is_some() {
-                return Err(fault(format!(
-                    "another name: there are others of the name '{name}' in the directory"
-                )));
+                return Err(fault(format!("another name: the directory has another file '{name}'")));
             }
         }
         Ok(Command { command: self.command.clone(), files, version: self.version.clone() })
@@ -119,10 +117,14 @@ impl DftBackend for Command {
         match exit {
             Exit::Code(0) => read::label(structure, &directory.join(LABEL)),
             Exit::Code(3) => {
-                Err(FailureClass::NotConverged.with_message("the command says so (exit code 3)"))
+                Err(FailureClass::NotConverged.with_message("reported by the command (exit code 3)"))
             }
-            Exit::Code(4) => Err(FailureClass::OutOfMemory.with_message("the command says so (exit code 4)")),
-            Exit::Code(5) => Err(FailureClass::BadInput.with_message("the command says so (exit code 5)")),
+            Exit::Code(4) => {
+                Err(FailureClass::OutOfMemory.with_message("reported by the command (exit code 4)"))
+            }
+            Exit::Code(5) => {
+                Err(FailureClass::BadInput.with_message("reported by the command (exit code 5)"))
+            }
             _ => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),
         }
     }

@@ -15,13 +15,15 @@ pub(crate) fn find(name: &str) -> Result<PathBuf, SetupError> {
         return if file.is_file() { Ok(file) } else { Err(fault("there is no such file")) };
     }
     if name.is_empty() || name.contains('/') {
-        return Err(fault("expected an absolute path, or a name that is sought in PATH"));
+        return Err(fault("expected an absolute path, or a name to look up in PATH"));
     }
     let directories = std::env::var_os("PATH").unwrap_or_default();
     std::env::split_paths(&directories)
         .map(|directory| directory.join(name))
         .find(|file| file.is_file())
         .ok_or_else(|| {
-            fault("not found in any directory of PATH; install it, load its module, or give its whole path")
+            fault(
+                "not found in any directory of PATH; install it, load its module, or give its absolute path",
+            )
         })
 }

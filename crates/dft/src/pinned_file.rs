@@ -58,8 +58,8 @@ impl PinnedFile {
             return Ok(content);
         }
         Err(Error::other(format!(
-            "its content has changed: BLAKE3 {}…, where the protocol of the labels has {}…; put the file of the protocol \
-             back, or have labels made by the new one with calmwalk relabel",
+            "its content has changed: BLAKE3 {}…, where the protocol of the labels has {}…; restore the file \
+             of the protocol, or make labels with the new one with calmwalk relabel",
             &found[..SHORT_HASH_DIGITS],
             &self.hash[..SHORT_HASH_DIGITS]
         )))
@@ -97,16 +97,16 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("Si.psp8");
         fs::write(&path, "first").unwrap();
-        let (original, content) = PinnedFile::open(path.clone()).unwrap();
+        let (pinned, content) = PinnedFile::open(path.clone()).unwrap();
         assert_eq!(
-            (content.as_slice(), original.content().unwrap().as_slice()),
+            (content.as_slice(), pinned.content().unwrap().as_slice()),
             (&b"first"[..], &b"first"[..])
         );
 
         // Same length and same name.
         fs::write(directory.path().join("new"), "other").unwrap();
         fs::rename(directory.path().join("new"), &path).unwrap();
-        let error = original.content().unwrap_err().to_string();
+        let error = pinned.content().unwrap_err().to_string();
         let [found, expected] = ["other", "first"].map(|content| hash(content.as_bytes())[..12].to_owned());
         let begin = format!(
             "its content has changed: BLAKE3 {found}…, where the protocol of the labels has {expected}…;"
@@ -114,9 +114,9 @@ mod tests {
         assert!(error.starts_with(&begin) && error.contains("calmwalk relabel"), "{error}");
 
         fs::write(&path, "first").unwrap();
-        assert_eq!(original.content().unwrap(), b"first");
+        assert_eq!(pinned.content().unwrap(), b"first");
         fs::remove_file(&path).unwrap();
-        assert_eq!(original.content().unwrap_err().kind(), ErrorKind::NotFound);
+        assert_eq!(pinned.content().unwrap_err().kind(), ErrorKind::NotFound);
     }
 
     #[test]
@@ -127,8 +127,8 @@ mod tests {
             let mut packed = GzEncoder::new(Vec::new(), level);
             packed.write_all(&b"setup ".repeat(1000)).unwrap();
             fs::write(&path, packed.finish().unwrap()).unwrap();
-            let (original, content) = PinnedFile::open(path.clone()).unwrap();
-            assert_eq!((content, original.hash()), (b"setup ".repeat(1000), &*hash(&b"setup ".repeat(1000))));
+            let (pinned, content) = PinnedFile::open(path.clone()).unwrap();
+            assert_eq!((content, pinned.hash()), (b"setup ".repeat(1000), &*hash(&b"setup ".repeat(1000))));
         }
         fs::write(&path, "no archive").unwrap();
         assert!(PinnedFile::open(path).is_err());

@@ -51,7 +51,7 @@ impl RetryAdjustment {
 }
 
 /// The adjustments that each further failure of a class adds.
-fn ladder(class: FailureClass) -> &'static [&'static [RetryAdjustment]] {
+fn escalation(class: FailureClass) -> &'static [&'static [RetryAdjustment]] {
     use RetryAdjustment::*;
     match class {
         FailureClass::NotConverged => &[&[MoreSteps, SlowerMixing], &[OtherAlgorithm], &[OtherMoments]],
@@ -73,7 +73,7 @@ pub fn adjustments(failures: &[FailureClass]) -> Option<BTreeSet<RetryAdjustment
             continue;
         }
         let rungs = failures.iter().filter(|failure| *failure == class).count();
-        changes.extend(ladder(*class).get(..rungs)?.iter().copied().flatten());
+        changes.extend(escalation(*class).get(..rungs)?.iter().copied().flatten());
     }
     Some(changes)
 }
@@ -83,7 +83,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_class_has_its_own_ladder() {
+    fn each_class_has_its_own_escalation() {
         use FailureClass::*;
         assert_eq!(adjustments(&[]), Some(BTreeSet::new()));
         assert_eq!(adjustments(&[BadInput]), None);

@@ -17,7 +17,7 @@ pub(crate) fn check_same_structure(
     tolerance: f64,
 ) -> Result<(), Failure> {
     let other = |message: String| {
-        let rest = "the calculation is not of the structure that was asked for";
+        let rest = "the calculation is not of the requested structure";
         Err(FailureClass::Implausible.with_message(format!("{message}: {rest}")))
     };
     if found.len() != asked.len() || found.positions.len() != asked.positions.len() {

@@ -14,11 +14,12 @@ pub(crate) fn failure_without_result(exit: Exit, directory: &Path, logs: &[&str]
     let Failure { class, message } = exit.failure();
     let (class, message) = match exit {
         // If we did not send the signal, the kernel did; shells and launchers return 128 + 9.
-        Exit::Signal(9) | Exit::Code(137) => {
-            (FailureClass::OutOfMemory, "killed, as the kernel does where memory is exhausted".to_owned())
-        }
+        Exit::Signal(9) | Exit::Code(137) => (
+            FailureClass::OutOfMemory,
+            "killed, probably by the kernel because memory was exhausted".to_owned(),
+        ),
         Exit::Code(_) | Exit::Signal(_) if mentions_memory(&told) => (FailureClass::OutOfMemory, message),
-        Exit::Code(0) => (class, format!("{message}, but left no whole result")),
+        Exit::Code(0) => (class, format!("{message}, but left no complete result")),
         _ => (class, message),
     };
     class.with_message(if told.is_empty() { message } else { format!("{message}; {told}") })
@@ -77,7 +78,7 @@ pub(crate) fn unreadable(name: &str, error: &ResultFileError) -> Failure {
 /// [`FailureClass::OtherProgram`]
 pub(crate) fn check_version(program: &str, found: &str, expected: &str) -> Result<(), Failure> {
     let another = || {
-        let message = format!("calculated by {program} {found}, where the protocol is of {expected}");
+        let message = format!("calculated by {program} {found}, but the protocol requires {expected}");
         FailureClass::OtherProgram.with_message(message)
     };
     if found == expected { Ok(()) } else { Err(another()) }

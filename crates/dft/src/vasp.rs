@@ -162,7 +162,8 @@ pub struct Vasp {
 impl Vasp {
     fn potcar(&self, species: Species) -> Result<&Potcar, SetupError> {
         self.potcars.get(&species).ok_or_else(|| {
-            let reason = format!("none is chosen; name one in `variants`, such as {species} = \"{species}\"");
+            let reason =
+                format!("none is selected; name one in `variants`, such as {species} = \"{species}\"");
             SetupError::Pseudopotential { species, reason }
         })
     }

@@ -52,7 +52,7 @@ pub(crate) fn run(
                 // It may have just ended.
                 let _ = child.kill();
                 let _ = child.wait();
-                return Err(wrong(format!("gave no answer in {} s", TIMEOUT.as_secs())));
+                return Err(wrong(format!("did not answer within {} s", TIMEOUT.as_secs())));
             }
             None => std::thread::sleep(Duration::from_millis(5)),
         }
@@ -63,7 +63,7 @@ pub(crate) fn run(
     }
     let mut lines = stdout.lines().chain(stderr.lines()).filter(|line| !line.trim().is_empty());
     let last = lines.next_back().unwrap_or("nothing");
-    Err(wrong(format!("{status}, and says: {last}")))
+    Err(wrong(format!("{status}; its last output is: {last}")))
 }
 
 /// Reads to the end, so that the program never blocks on a full pipe.

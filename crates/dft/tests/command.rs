@@ -1,4 +1,4 @@
-//! A shell script that makes labels, from the structure to the numbers.
+//! A shell script as labelling command, from the structure to the results.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -10,14 +10,14 @@ use dft::{
     SetupError,
 };
 
-/// Takes the columns of the structure and adds the label; the words after `exit` are its code.
+/// Copies the columns of the structure and adds the label; exits with the given code.
 const SCRIPT: &str = r#"
 { head -n 1 structure.extxyz
   sed -n 2p structure.extxyz | sed 's/pos:R:3/pos:R:3:forces:R:3:magmoms:R:1/' | tr '\n' ' '
   cat more; echo
   tail -n +3 structure.extxyz | while read -r line; do echo "$line 0.5 -0.25 1e-3 2.0"; done
 } > label.extxyz
-echo "$CALMWALK_REMEDIES" > adjustments
+echo "$CALMWALK_REMEDIES" > remedies
 exit "$(cat code)"
 "#;
 
@@ -44,7 +44,7 @@ fn settings(directory: &Path, info: &str, code: u8) -> dft::command::Settings {
     }
 }
 
-/// Writes the input, runs the command, reads what it left.
+/// Writes the input, runs the command and reads the output.
 fn run(
     code: &dyn DftBackend,
     structure: &Structure,
@@ -171,7 +171,7 @@ fn calculations_read_the_files_that_were_hashed() {
     let home = tempfile::tempdir().unwrap();
     let more = |code: &dyn DftBackend| code.input(&oxide(), &BTreeSet::new()).unwrap().files["more"].clone();
     let code = settings(home.path(), "energy=1", 0).prepare().unwrap();
-    // Who has begun goes on with what there was; who begins now is of another protocol.
+    // A running campaign keeps the files it started with; a new one has another protocol.
     let new = settings(home.path(), "energy=2", 0).prepare().unwrap();
     assert_eq!([more(&code), more(&new)], [b"energy=1", b"energy=2"]);
     assert_ne!(new.identity(), code.identity());

@@ -66,9 +66,9 @@ pub enum Marker {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Text {
     /// Position on the baseline.
-    pub at: Point,
+    pub position: Point,
     /// The text.
-    pub words: String,
+    pub markup: String,
     /// Font size, points.
     pub size: f64,
     /// Which part of the text is at the position.
@@ -76,7 +76,7 @@ pub struct Text {
     /// Bold.
     pub bold: bool,
     /// Rotated to read from bottom to top.
-    pub upwards: bool,
+    pub rotated: bool,
     /// Colour.
     pub colour: Colour,
 }
@@ -113,14 +113,14 @@ impl Figure {
     }
 
     /// Draws text.
-    pub fn text(&mut self, at: Point, words: &str, anchor: Anchor) -> &mut Text {
+    pub fn text(&mut self, position: Point, markup: &str, anchor: Anchor) -> &mut Text {
         self.items.push(Item::Text(Text {
-            at,
-            words: words.into(),
+            position,
+            markup: markup.into(),
             size: Text::SIZE,
             anchor,
             bold: false,
-            upwards: false,
+            rotated: false,
             colour: Colour::INK,
         }));
         match self.items.last_mut() {

@@ -172,7 +172,7 @@ impl Panel {
         }
         if self.y.has_labels() {
             let middle = self.area.y + 0.5 * self.area.height;
-            figure.text([left - widest - 10.0, middle], &self.y.title, Anchor::Middle).upwards = true;
+            figure.text([left - widest - 10.0, middle], &self.y.title, Anchor::Middle).rotated = true;
         }
     }
 

@@ -7,14 +7,14 @@ use crate::rich_text::runs;
 use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text, font, width};
 
 /// Points per inch.
-const POINTS: f64 = 72.0;
+const POINTS_PER_INCH: f64 = 72.0;
 const METRES: f64 = 0.0254;
 
 /// Why a figure cannot be rendered.
 #[derive(Debug, thiserror::Error)]
 pub enum PngError {
     /// The image would be empty or too large.
-    #[error("a figure of {0} × {1} points has no image at {2} dots an inch")]
+    #[error("a figure of {0} × {1} points cannot be rendered at {2} dots per inch")]
     Size(f64, f64, f64),
     /// The encoder reports an error.
     #[error("a figure cannot be written as PNG: {0}")]
@@ -23,7 +23,7 @@ pub enum PngError {
 
 /// Renders a figure as PNG at this resolution.
 pub fn to_png(figure: &Figure, dots_per_inch: f64) -> Result<Vec<u8>, PngError> {
-    let scale = dots_per_inch / POINTS;
+    let scale = dots_per_inch / POINTS_PER_INCH;
     let size = || PngError::Size(figure.width, figure.height, dots_per_inch);
     let pixels = |length: f64| (scale * length).round() as u32;
     let pixmap = Pixmap::new(pixels(figure.width), pixels(figure.height)).ok_or_else(size)?;
@@ -115,17 +115,17 @@ impl Sheet {
     }
 
     fn text(&mut self, text: &Text) {
-        let Text { at: [x, y], words, size, anchor, bold, upwards, colour } = text;
-        let length = size * width(words, *bold);
+        let Text { position: [x, y], markup, size, anchor, bold, rotated, colour } = text;
+        let length = size * width(markup, *bold);
         let mut pen = match anchor {
             Anchor::Start => 0.0,
             Anchor::Middle => -0.5 * length,
             Anchor::End => -length,
         };
-        let turn = if *upwards { -90.0 } else { 0.0 };
-        let place = Transform::from_translate(*x as f32, *y as f32).pre_rotate(turn);
+        let angle = if *rotated { -90.0 } else { 0.0 };
+        let place = Transform::from_translate(*x as f32, *y as f32).pre_rotate(angle);
         let mut builder = Glyphs { builder: PathBuilder::new(), place, scale: 0.0, at: [0.0; 2] };
-        for run in runs(words) {
+        for run in runs(markup) {
             let size = size * run.script.scale();
             builder.scale = size / font::units();
             for character in run.text.chars() {

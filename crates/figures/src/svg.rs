@@ -48,28 +48,28 @@ impl Svg<'_> {
     }
 
     fn text(&mut self, text: &Text) {
-        let Text { at: [x, y], words, size, anchor, bold, upwards, colour } = text;
+        let Text { position: [x, y], markup, size, anchor, bold, rotated, colour } = text;
         let anchor = match anchor {
             Anchor::Start => "start",
             Anchor::Middle => "middle",
             Anchor::End => "end",
         };
-        let place = match upwards {
+        let place = match rotated {
             true => format!("transform=\"translate({} {}) rotate(-90)\"", short(*x), short(*y)),
             false => format!("x=\"{}\" y=\"{}\"", short(*x), short(*y)),
         };
         let weight = if *bold { " font-weight=\"bold\"" } else { "" };
-        let (mut spans, mut lowered) = (String::new(), 0.0);
-        for run in runs(words) {
-            let drop = run.script.baseline_shift() * size;
+        let (mut spans, mut shifted) = (String::new(), 0.0);
+        for run in runs(markup) {
+            let shift = run.script.baseline_shift() * size;
             let _ = write!(
                 spans,
                 "<tspan dy=\"{}\" font-size=\"{}\">{}</tspan>",
-                short(drop - lowered),
+                short(shift - shifted),
                 short(run.script.scale() * size),
                 escape(run.text)
             );
-            lowered = drop;
+            shifted = shift;
         }
         self.push(&format!(
             "<text {place} text-anchor=\"{anchor}\" fill=\"{}\"{weight}>{spans}</text>",

@@ -1,4 +1,4 @@
-//! Reading sound archives, and what is said when an array is not the one that was hoped for.
+//! Reading valid archives, and the errors for unexpected arrays.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use proptest::prelude::*;
 
 use crate::common::{archive, array, file};
 
-/// Reads an archive whose only array is `a`.
+/// Reads an archive with the single array `a`.
 fn read<T>(bytes: Vec<u8>, read: impl FnOnce(&Archive<std::io::Cursor<&[u8]>>) -> T) -> T {
     read(&Archive::from_bytes("a.npz", &archive(&[("a", bytes)])).unwrap())
 }

@@ -109,7 +109,7 @@ impl<'a> Lines<'a> {
         }
         if values.len() > count {
             return Err(self.error(
-                format!("{} values of {what} or more", values.len()),
+                format!("{} or more values of {what}", values.len()),
                 format!("{count}, the last at the end of its line"),
             ));
         }

@@ -127,9 +127,9 @@ impl Grid {
             if value > 0.0 { Ok(value) } else { Err(lines.error(value.to_string(), what)) }
         };
         let grid = Self {
-            densities: points(0, "nrho, the points of F(ρ)")?,
+            densities: points(0, "nrho, the number of points of F(ρ)")?,
             density_spacing: length(1, "drho, a positive spacing of ρ")?,
-            distances: points(2, "nr, the points of ρ(r) and r φ(r)")?,
+            distances: points(2, "nr, the number of points of ρ(r) and r φ(r)")?,
             distance_spacing: length(3, "dr, a positive spacing of r in Å")?,
             cutoff: length(4, "a positive cutoff in Å")?,
         };

@@ -66,7 +66,7 @@ struct Entry {
     parameters: Parameters,
 }
 
-const WORDS: usize = 14;
+const ENTRY_WORDS: usize = 14;
 const ENTRY: &str = "element1 element2 element3 epsilon sigma a lambda gamma costheta0 A B p q tol";
 
 impl Entries {
@@ -102,12 +102,12 @@ impl Entries {
 fn read_entry(lines: &mut Lines<'_>) -> Result<Option<Entry>, PotentialFileError> {
     let mut words: Vec<&str> = Vec::new();
     let mut first_line = 0;
-    while words.len() < WORDS {
+    while words.len() < ENTRY_WORDS {
         let Some(line) = lines.next() else {
             if words.is_empty() {
                 return Ok(None);
             }
-            let found = format!("the end of the file after {} of {WORDS} words", words.len());
+            let found = format!("the end of the file after {} of {ENTRY_WORDS} words", words.len());
             return Err(lines.error(found, format!("'{ENTRY}'")));
         };
         if words.is_empty() {
@@ -115,8 +115,10 @@ fn read_entry(lines: &mut Lines<'_>) -> Result<Option<Entry>, PotentialFileError
         }
         words.extend(line.split('#').next().unwrap_or_default().split_whitespace());
     }
-    if words.len() > WORDS {
-        return Err(lines.error(format!("{} words", words.len()), format!("the {WORDS} words '{ENTRY}'")));
+    if words.len() > ENTRY_WORDS {
+        return Err(
+            lines.error(format!("{} words", words.len()), format!("the {ENTRY_WORDS} words '{ENTRY}'"))
+        );
     }
     let element = |index: usize| {
         words[index].parse::<Species>().map_err(|_| {
@@ -157,7 +159,7 @@ fn check_symmetry(lines: &Lines<'_>, entries: &[Entry]) -> Result<(), PotentialF
         let [i, j, k] = entry.triplet;
         for other in entries {
             if j == k && other.triplet == [j, i, i] && !same_pair(&entry.parameters, &other.parameters) {
-                let found = format!("other two-body parameters or another reach than in line {}", entry.line);
+                let found = format!("other two-body parameters or another range than in line {}", entry.line);
                 return Err(lines.error_at(other.line, found, format!("the same for {i}–{j} and {j}–{i}")));
             }
             if other.triplet == [i, k, j] && !same_angle(&entry.parameters, &other.parameters) {

@@ -40,7 +40,7 @@ const SCREENING: [(f64, f64); 4] =
 /// An invalid switch.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[error(
-    "the ZBL repulsion would be switched off from {inner} Å to {outer} Å, but 0 ≤ inner < outer is needed"
+    "the ZBL repulsion cannot be switched off between {inner} Å and {outer} Å: expected 0 ≤ inner < outer"
 )]
 pub struct ZblRangeError {
     /// Where the switch starts, Å.

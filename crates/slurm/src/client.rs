@@ -25,7 +25,7 @@ pub struct SlurmClient {
 #[derive(Debug, thiserror::Error)]
 pub enum SlurmError {
     /// The command does not exist.
-    #[error("cannot start {program}: {source}; Slurm's commands have to be on the PATH")]
+    #[error("cannot start {program}: {source}; Slurm's commands must be on the PATH")]
     Missing {
         /// The command.
         program: &'static str,
@@ -33,7 +33,9 @@ pub enum SlurmError {
         source: io::Error,
     },
     /// It exceeded its time limit.
-    #[error("{program} has given no answer for {seconds} s: is slurmctld at work? ('scontrol ping' says so)")]
+    #[error(
+        "{program} did not answer within {seconds} s: is slurmctld running? (check with 'scontrol ping')"
+    )]
     TimedOut {
         /// The command.
         program: &'static str,
@@ -49,7 +51,7 @@ pub enum SlurmError {
         stderr: String,
     },
     /// Its output has an unexpected format.
-    #[error("{program} wrote {found:?}, and {expected} was expected")]
+    #[error("{program} wrote {found:?}, expected {expected}")]
     UnexpectedOutput {
         /// The command.
         program: &'static str,
@@ -118,7 +120,7 @@ impl SlurmClient {
         let text = self.run(SBATCH, [OsStr::new("--parsable")].into_iter().chain(arguments)).await?;
         // With several clusters the name of the cluster follows.
         let id = text.trim().split(';').next().and_then(|id| id.parse().ok());
-        let expected = "the number of a job";
+        let expected = "a job id";
         id.ok_or_else(|| SlurmError::UnexpectedOutput {
             program: SBATCH,
             found: text.trim().to_owned(),

@@ -1,6 +1,6 @@
 //! Linear regression with a normal prior and Student t noise.
 
-use super::{EXPONENTS, GUESS, SCATTER};
+use super::{EXPONENT_PRIORS, GUESS_SIGMA, PRIOR_NOISE_SCALE};
 
 type Matrix3 = [[f64; 3]; 3];
 
@@ -38,14 +38,15 @@ impl Fit {
         if points.is_empty() && guess.is_none() {
             return None;
         }
-        let (mut weights, mut scale) = (vec![1.0; points.len()], SCATTER);
+        let (mut weights, mut scale) = (vec![1.0; points.len()], PRIOR_NOISE_SCALE);
         let (mut coefficients, mut covariance) = solve(points, &weights, scale, guess)?;
         for _ in 0..ITERATIONS {
             let squares = |(point, weight): (&Point, &f64)| weight * residual(&coefficients, point).powi(2);
             let left_over: f64 = points.iter().zip(&weights).map(squares).sum();
             // A single label always fits and carries no information on the scale.
             let freedom = points.len().saturating_sub(1) as f64;
-            scale = ((DEGREES_OF_FREEDOM * SCATTER * SCATTER + left_over) / (DEGREES_OF_FREEDOM + freedom))
+            scale = ((DEGREES_OF_FREEDOM * PRIOR_NOISE_SCALE * PRIOR_NOISE_SCALE + left_over)
+                / (DEGREES_OF_FREEDOM + freedom))
                 .sqrt();
             for (weight, point) in weights.iter_mut().zip(points) {
                 let away = residual(&coefficients, point) / scale;
@@ -93,12 +94,12 @@ fn residual(coefficients: &[f64; 3], (row, cost): &Point) -> f64 {
 /// Most probable coefficients and their covariance.
 fn solve(points: &[Point], weights: &[f64], scale: f64, guess: Option<Point>) -> Option<([f64; 3], Matrix3)> {
     let (mut precision, mut right) = ([[0.0; 3]; 3], [0.0; 3]);
-    for (k, prior) in EXPONENTS.iter().enumerate() {
+    for (k, prior) in EXPONENT_PRIORS.iter().enumerate() {
         precision[k + 1][k + 1] = prior.sd.powi(-2);
         right[k + 1] = prior.mean * prior.sd.powi(-2);
     }
     let measured = points.iter().zip(weights).map(|(point, weight)| (point, weight / (scale * scale)));
-    let guessed = guess.iter().map(|point| (point, GUESS.powi(-2)));
+    let guessed = guess.iter().map(|point| (point, GUESS_SIGMA.powi(-2)));
     for ((row, cost), weight) in measured.chain(guessed) {
         for i in 0..3 {
             (0..3).for_each(|k| precision[i][k] += weight * row[i] * row[k]);
@@ -142,7 +143,7 @@ mod tests {
         let fit = Fit::new(&points, None).unwrap();
         // Scale of three points without noise: σ² = 4 · 0.26² / 6. The prior of the slope, 2 ± 0.75, competes
         // with two points at distance 1 of weight 5/4: (2.5 · 1.5 / σ² + 2 / 0.75²) / (2.5 / σ² + 1 / 0.75²).
-        let (data, prior) = (2.5 / (4.0 * SCATTER * SCATTER / 6.0), 0.75_f64.powi(-2));
+        let (data, prior) = (2.5 / (4.0 * PRIOR_NOISE_SCALE * PRIOR_NOISE_SCALE / 6.0), 0.75_f64.powi(-2));
         let expected = (1.5 * data + 2.0 * prior) / (data + prior);
         assert!((fit.coefficients[0] - 5.0).abs() < 1e-9);
         assert!((fit.coefficients[1] - expected).abs() < 0.01, "{} {expected}", fit.coefficients[1]);

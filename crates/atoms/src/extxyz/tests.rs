@@ -268,8 +268,8 @@ fn what_cannot_be_read_again_is_not_written() {
     let column = |entries| Column { width: 1, entries };
     for (entries, fault) in [
         (ColumnData::Int(vec![1 << 31]), "has integers of more than 32 bits, which ASE cannot read"),
-        (ColumnData::Text(vec!["a b".to_owned()]), "has texts that are empty or have white space"),
-        (ColumnData::Real(vec![]), "has not one row of the same width for each atom"),
+        (ColumnData::Text(vec!["a b".to_owned()]), "has text that is empty or contains white space"),
+        (ColumnData::Real(vec![]), "does not have one row of the same width for each atom"),
     ] {
         let message = refused(&|frame| drop(frame.arrays.insert("x".to_owned(), column(entries.clone()))));
         assert_eq!(message, format!("the column 'x' {fault}"));

@@ -88,7 +88,7 @@ fn info(key: &str, value: &Value) -> Result<String, &'static str> {
     }
     if is_verbatim(key) {
         let plain = |text: &&str| !text.is_empty() && !text.contains(char::is_control);
-        return value.text().filter(plain).map(str::to_owned).ok_or("needs a text in one line");
+        return value.text().filter(plain).map(str::to_owned).ok_or("must be a single line of text");
     }
     value.to_text().ok_or("has nested lists of different lengths or with numbers that are not finite")
 }
@@ -111,7 +111,7 @@ fn kind(name: &str, column: &Column, atoms: usize) -> Result<char, &'static str>
         return Err("needs a name without colons and control characters");
     }
     if column.width == 0 || column.width.checked_mul(atoms) != Some(column.entries.len()) {
-        return Err("has not one row of the same width for each atom");
+        return Err("does not have one row of the same width for each atom");
     }
     match &column.entries {
         ColumnData::Real(_) => Ok('R'),
@@ -119,7 +119,7 @@ fn kind(name: &str, column: &Column, atoms: usize) -> Result<char, &'static str>
         ColumnData::Int(values) if values.iter().all(|value| i32::try_from(*value).is_ok()) => Ok('I'),
         ColumnData::Int(_) => Err("has integers of more than 32 bits, which ASE cannot read"),
         ColumnData::Text(words) if words.iter().all(|word| is_word(word)) => Ok('S'),
-        ColumnData::Text(_) => Err("has texts that are empty or have white space"),
+        ColumnData::Text(_) => Err("has text that is empty or contains white space"),
     }
 }
 

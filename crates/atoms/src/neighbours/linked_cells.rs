@@ -5,13 +5,13 @@ use crate::cell::{self, Cell, Vec3};
 use crate::structure::{Structure, StructureError};
 
 /// Largest distance from the cell in lattice vectors (in Å along non-periodic directions).
-const FARTHEST: f64 = 1e8;
+const MAX_DISTANCE: f64 = 1e8;
 
 /// Largest number of bins that the search for one atom may visit.
-const MOST_BINS_VISITED: f64 = 1e6;
+const MAX_BINS_VISITED: f64 = 1e6;
 
 /// Relative margin of the reach for atoms on the edge of a bin or of the sphere.
-const HAIR: f64 = 1e-6;
+const RELATIVE_MARGIN: f64 = 1e-6;
 
 /// All atoms, in the bins of their images inside the cell.
 pub(super) struct LinkedCells {
@@ -46,7 +46,7 @@ impl LinkedCells {
         let heights = lattice.heights();
         let widths: Vec3 = std::array::from_fn(|k| extent[k] * heights[k]);
         let counts = bin_counts(widths, reach, fractional.len());
-        let spans = bin_spans(widths, reach * (1.0 + HAIR), counts, periodic)?;
+        let spans = bin_spans(widths, reach * (1.0 + RELATIVE_MARGIN), counts, periodic)?;
         let in_bins =
             |f: &Vec3| std::array::from_fn(|k| (f[k] - origin[k]) / extent[k] * f64::from(counts[k]));
         let coordinates: Vec<Vec3> = fractional.iter().map(in_bins).collect();
@@ -66,7 +66,8 @@ impl LinkedCells {
         mut visit: impl FnMut(Neighbour, bool) -> Result<(), E>,
     ) -> Result<(), E> {
         let runs = self.runs(i);
-        let (outer, inner) = ((self.reach * (1.0 + HAIR)).powi(2), (self.reach * (1.0 - HAIR)).powi(2));
+        let (outer, inner) =
+            ((self.reach * (1.0 + RELATIVE_MARGIN)).powi(2), (self.reach * (1.0 - RELATIVE_MARGIN)).powi(2));
         near.resize(self.members.len(), (0, 0.0));
         for (a, image_a) in self.nearby(i, 0) {
             for (b, image_b) in self.nearby(i, 1) {
@@ -142,8 +143,8 @@ fn fractional(structure: &Structure, lattice: &Cell) -> Result<(Vec<Vec3>, Vec<[
     let mut wraps = Vec::with_capacity(structure.len());
     for (atom, position) in structure.positions.iter().enumerate() {
         let f = reciprocal.map(|b| cell::dot(b, *position));
-        if !f.iter().all(|x| x.abs() <= FARTHEST) {
-            return Err(StructureError::FarAway { atom, limit: FARTHEST });
+        if !f.iter().all(|x| x.abs() <= MAX_DISTANCE) {
+            return Err(StructureError::FarAway { atom, limit: MAX_DISTANCE });
         }
         let wrap: Vec3 = std::array::from_fn(|k| if structure.periodic[k] { f[k].floor() } else { 0.0 });
         fractional.push(cell::sub(f, wrap));
@@ -190,7 +191,7 @@ fn bin_spans(
             f64::from(counts[k]).min(2.0 * spans[k].ceil() + 1.0)
         }
     };
-    if (0..3).map(visited).product::<f64>() > MOST_BINS_VISITED {
+    if (0..3).map(visited).product::<f64>() > MAX_BINS_VISITED {
         let height = (0..3).filter(|k| periodic[*k]).map(|k| widths[k]).fold(f64::INFINITY, f64::min);
         return Err(StructureError::CellThin { height, reach });
     }

@@ -28,7 +28,7 @@ pub(super) fn write(
     structure(&mut text, padded, &pseudopotentials);
     let copies: Vec<_> = pseudopotentials.iter().map(|(species, one)| one.copy(*species)).collect();
     text += &format!("pp_dirpath \"{DATA_DIRECTORY}\"\npseudos \"{}\"\n", copies.join(", "));
-    let originals = pseudopotentials.values().map(|one| one.original.clone());
+    let originals = pseudopotentials.values().map(|one| one.pinned.clone());
     Ok(Input {
         files: [(NAME.to_owned(), text.into_bytes())].into(),
         command: abinit.settings.command.iter().cloned().chain([NAME.to_owned()]).collect(),

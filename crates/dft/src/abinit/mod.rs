@@ -128,7 +128,7 @@ fn version(
     version.map(str::to_owned).ok_or_else(|| {
         version_query::wrong_program(
             command,
-            format!("is not ABINIT: it says {:?} of its version", said.trim()),
+            format!("is not ABINIT: as its version it reports {:?}", said.trim()),
         )
     })
 }
@@ -154,9 +154,10 @@ impl Abinit {
             let one = self.pseudopotentials.get(species);
             let one = one.ok_or_else(|| pseudopotentials::missing(*species, directory, variants))?;
             if let Some((other, before)) = chosen.iter().find(|(_, before)| before.paw != one.paw) {
-                let [file, before] = [one, before].map(|one| one.original.path().display());
-                let reason =
-                    format!("{file} cannot go with {before} of {other}: one is PAW, the other is not");
+                let [file, before] = [one, before].map(|one| one.pinned.path().display());
+                let reason = format!(
+                    "{file} cannot be combined with {before} of {other}: one is PAW, the other is not"
+                );
                 return Err(SetupError::Pseudopotential { species: *species, reason });
             }
             chosen.insert(*species, one);
@@ -168,7 +169,7 @@ impl Abinit {
 impl DftBackend for Abinit {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, &str> =
-            self.pseudopotentials.iter().map(|(species, p)| (species.symbol(), p.original.hash())).collect();
+            self.pseudopotentials.iter().map(|(species, p)| (species.symbol(), p.pinned.hash())).collect();
         // Destructure, so that a new setting cannot be forgotten here.
         let Settings {
             command: _,

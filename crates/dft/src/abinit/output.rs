@@ -10,7 +10,7 @@ use crate::structure_check::check_same_structure;
 use crate::{Failure, FailureClass, Results, validation};
 
 /// Lattice vectors have seven decimals, bohr.
-const DIGITS: f64 = 1e-6;
+const CELL_PRECISION: f64 = 1e-6;
 
 /// Reads the calculation of `structure` in `directory`, made by this version; `None` if the output is
 /// incomplete.
@@ -57,9 +57,9 @@ pub(super) fn parse(
         );
     }
     let unreadable =
-        || FailureClass::Implausible.with_message("run.abo is whole, but its numbers cannot be read");
+        || FailureClass::Implausible.with_message("run.abo is complete, but its numbers cannot be read");
     calculated_by.ok_or_else(unreadable)?;
-    check_same_structure(structure, &found(output).ok_or_else(unreadable)?, DIGITS)?;
+    check_same_structure(structure, &found(output).ok_or_else(unreadable)?, CELL_PRECISION)?;
     let calculated = numbers(output, &steps, smearing).ok_or_else(unreadable)?;
     validation::check_numbers(&calculated, structure.len())?;
     match last_step(printed).contains("The minimal occupation factor is") {

@@ -11,7 +11,7 @@ use crate::{PinnedFile, SetupError, paw};
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Pseudopotential {
     /// Its file.
-    pub original: PinnedFile,
+    pub pinned: PinnedFile,
     /// Number of valence electrons.
     pub valence: f64,
     /// Whether it is a PAW setup.
@@ -56,8 +56,8 @@ pub(super) fn missing(
     let sought =
         variants.get(&species).cloned().unwrap_or_else(|| format!("{species}.psp8 or {species}.xml"));
     let reason = format!(
-        "no {sought} in {}: get one for PBE, and name its directory in `pseudopotentials` and, if it is called \
-         otherwise, its file in `variants`",
+        "no {sought} in {}: get one for PBE and set `pseudopotentials` to its directory; if its \
+         name differs, set its file in `variants`",
         directory.display()
     );
     SetupError::Pseudopotential { species, reason }
@@ -68,12 +68,12 @@ fn read(species: Species, path: PathBuf) -> Result<Pseudopotential, SetupError> 
     let wrong =
         |reason: String| SetupError::Pseudopotential { species, reason: format!("{shown}: {reason}") };
     let paw = path.extension().is_some_and(|extension| extension == "xml");
-    let (original, content) = PinnedFile::open(path).map_err(|error| wrong(error.to_string()))?;
+    let (pinned, content) = PinnedFile::open(path).map_err(|error| wrong(error.to_string()))?;
     let valence = match paw {
         true => paw::valence(&content, species),
         false => valence(&content, species),
     };
-    Ok(Pseudopotential { original, valence: valence.map_err(wrong)?, paw })
+    Ok(Pseudopotential { pinned, valence: valence.map_err(wrong)?, paw })
 }
 
 /// Valence electrons of a `psp8` file: Z and the valence start its second line, format and functional its
@@ -84,16 +84,16 @@ fn valence(file: &[u8], species: Species) -> Result<f64, String> {
     let head = String::from_utf8_lossy(&file[..file.len().min(4096)]);
     let mut lines = head.lines().skip(1).map(str::split_whitespace);
     let mut word = || Some((lines.next()?, lines.next()?));
-    let (mut second, mut third) = word().ok_or("has no head")?;
+    let (mut second, mut third) = word().ok_or("has no header")?;
     let mut number = || second.next().and_then(|word| word.parse::<f64>().ok());
     let (charge, valence) = (number(), number());
     if third.next() != Some("8") || charge != Some(f64::from(species.atomic_number())) {
-        return Err(format!("is no psp8 file of {species}"));
+        return Err(format!("is not a psp8 file of {species}"));
     }
     match (third.next(), valence) {
         (Some(functional), Some(valence)) if PBE.contains(&functional) && valence >= 0.0 => Ok(valence),
         (functional, _) => {
-            Err(format!("is of the functional {}, not of PBE (11)", functional.unwrap_or("?")))
+            Err(format!("is for the functional {}, not for PBE (11)", functional.unwrap_or("?")))
         }
     }
 }
@@ -109,11 +109,14 @@ mod tests {
     fn the_head_says_what_a_file_is() {
         let silicon = "Si".parse().unwrap();
         assert_eq!(valence(SILICON.as_bytes(), silicon), Ok(4.0));
-        assert_eq!(valence(SILICON.as_bytes(), "Al".parse().unwrap()), Err("is no psp8 file of Al".into()));
+        assert_eq!(
+            valence(SILICON.as_bytes(), "Al".parse().unwrap()),
+            Err("is not a psp8 file of Al".into())
+        );
         let lda = SILICON.replace("   11   2", "   -1012   2").replace("      11   2", "      -1012   2");
         assert_eq!(
             valence(lda.as_bytes(), silicon),
-            Err("is of the functional -1012, not of PBE (11)".into())
+            Err("is for the functional -1012, not for PBE (11)".into())
         );
         for end in 0..SILICON.find(" 11").unwrap() + 2 {
             assert!(valence(&SILICON.as_bytes()[..end], silicon).is_err(), "cut at {end}");

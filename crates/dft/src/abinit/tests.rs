@@ -20,8 +20,8 @@ fn silicon() -> Structure {
 fn abinit(settings: Settings) -> Abinit {
     let known = [("Si", 4.0, false), ("Fe", 16.0, true)].map(|(symbol, valence, paw)| {
         let path = format!("/{symbol}.{}", if paw { "xml" } else { "psp8" });
-        let original = PinnedFile::fake(&path, &symbol.to_lowercase());
-        (symbol.parse().unwrap(), Pseudopotential { original, valence, paw })
+        let pinned = PinnedFile::fake(&path, &symbol.to_lowercase());
+        (symbol.parse().unwrap(), Pseudopotential { pinned, valence, paw })
     });
     let environment = version_query::environment(&settings.environment);
     Abinit { settings, environment, version: "9.6.2".into(), pseudopotentials: known.into() }
@@ -85,7 +85,7 @@ fn paw_setups_get_a_fine_grid_and_do_not_go_with_others() {
     let error = code.supports(&both).unwrap_err().to_string();
     assert_eq!(
         error,
-        "pseudopotential of Fe: /Fe.xml cannot go with /Si.psp8 of Si: one is PAW, the other is not"
+        "pseudopotential of Fe: /Fe.xml cannot be combined with /Si.psp8 of Si: one is PAW, the other is not"
     );
     let error = code.supports(&BTreeSet::from(["U".parse().unwrap()])).unwrap_err().to_string();
     assert!(error.starts_with("pseudopotential of U: no U.psp8 or U.xml in /usr/share/abinit"), "{error}");

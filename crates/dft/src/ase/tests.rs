@@ -15,9 +15,9 @@ fn copper() -> Structure {
 }
 
 fn ase(moments: Moments) -> Ase {
-    let who = Versions { ase: "3.22.1".into(), version: "mine".into() };
+    let versions = Versions { ase: "3.22.1".into(), version: "mine".into() };
     let settings = Settings { moments, ..Settings::default() };
-    Ase { environment: BTreeMap::new(), settings, calculator: b"def calculator(): ...".to_vec(), who }
+    Ase { environment: BTreeMap::new(), settings, calculator: b"def calculator(): ...".to_vec(), versions }
 }
 
 fn task(code: &Ase, adjustments: &[RetryAdjustment]) -> Value {

@@ -26,7 +26,7 @@ fn whole_frame(path: &Path) -> Result<Frame, String> {
     let text = result_file::read(path).map_err(|error| error.to_string())?;
     // Without a line break at the end, the last number may be truncated.
     if text.last() != Some(&b'\n') {
-        return Err("does not end with a line break: it is not whole".to_owned());
+        return Err("does not end with a line break: it is incomplete".to_owned());
     }
     let mut frames = Reader::new(text.as_slice());
     let frame = frames.next().ok_or("is empty")?.map_err(|error| error.to_string())?;
@@ -46,7 +46,7 @@ fn numbers(mut frame: Frame) -> Result<Results, String> {
     let free = match frame.info.get("free_energy") {
         None => None,
         Some(value) => {
-            Some(value.number().filter(|x| x.is_finite()).ok_or("free_energy is no finite number")?)
+            Some(value.number().filter(|x| x.is_finite()).ok_or("free_energy is not a finite number")?)
         }
     };
     let magnetic_moments = match frame.arrays.get("magmoms") {

@@ -45,7 +45,7 @@ const OUTPUT: &str = "run.out";
 const INPUT_VERSION: u32 = 1;
 
 /// Smaller cutoffs, eV, cannot represent any pseudopotential: the value was meant in Rydberg.
-const LEAST_CUTOFF: f64 = 1000.0;
+const MIN_CUTOFF: f64 = 1000.0;
 
 /// The settings of `[label.method.cp2k]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -108,7 +108,7 @@ impl Settings {
     /// # Errors
     /// A program that does not answer, an invalid setting, missing data files.
     pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Cp2k, SetupError> {
-        at_least("cutoff", self.cutoff, LEAST_CUTOFF)?;
+        at_least("cutoff", self.cutoff, MIN_CUTOFF)?;
         positive("cutoff", self.cutoff)?;
         positive("relative_cutoff", self.relative_cutoff)?;
         positive("k_spacing", self.k_spacing)?;
@@ -131,9 +131,9 @@ fn version(
 ) -> Result<String, SetupError> {
     let said = version_query::run(command, &["--version"], environment, passed, &[])?;
     let version = said.split("CP2K version ").nth(1).and_then(|rest| rest.split_whitespace().next());
-    version.map(str::to_owned).ok_or_else(|| {
-        version_query::wrong_program(command, "is not CP2K: it does not say its version".into())
-    })
+    version
+        .map(str::to_owned)
+        .ok_or_else(|| version_query::wrong_program(command, "is not CP2K: it reports no version".into()))
 }
 
 /// A configured CP2K.

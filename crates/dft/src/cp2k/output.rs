@@ -10,10 +10,10 @@ use crate::structure_check::check_same_structure;
 use crate::{Failure, FailureClass, Results, validation};
 
 /// Lattice vectors have three decimals, Å, positions six.
-const CELL_DIGITS: f64 = 1e-3;
-const POSITION_DIGITS: f64 = 2e-6;
+const CELL_PRECISION: f64 = 1e-3;
+const POSITION_PRECISION: f64 = 2e-6;
 /// The volume has six decimals, Å³.
-const VOLUME_DIGITS: f64 = 1e-5;
+const VOLUME_PRECISION: f64 = 1e-5;
 
 /// Reads the calculation of `structure` in `directory`, made by this version; `None` if the output is
 /// incomplete.
@@ -46,15 +46,15 @@ pub(super) fn parse(structure: &Structure, output: &str, version: &str) -> Resul
         return Ok(None);
     }
     if !output.contains("*** SCF run converged in") {
-        return Err(FailureClass::NotConverged.with_message("it does not say that it converged"));
+        return Err(FailureClass::NotConverged.with_message("it does not report convergence"));
     }
     let implausible = |message: String| FailureClass::Implausible.with_message(message);
-    let unreadable = || implausible(format!("{OUTPUT} is whole, but its numbers cannot be read"));
+    let unreadable = || implausible(format!("{OUTPUT} is complete, but its numbers cannot be read"));
     calculated_by.ok_or_else(unreadable)?;
     let (found, volume) = found(output).ok_or_else(unreadable)?;
-    check_same_structure(structure, &found, CELL_DIGITS)?;
-    check_same_structure(structure, &Structure { cell: structure.cell, ..found }, POSITION_DIGITS)?;
-    if (volume - structure.cell.volume()).abs() > VOLUME_DIGITS {
+    check_same_structure(structure, &found, CELL_PRECISION)?;
+    check_same_structure(structure, &Structure { cell: structure.cell, ..found }, POSITION_PRECISION)?;
+    if (volume - structure.cell.volume()).abs() > VOLUME_PRECISION {
         return Err(implausible(format!("the cell has {volume} Å³, not {}", structure.cell.volume())));
     }
     if last_step(output, &steps).contains("includes the last MO") {

@@ -40,7 +40,7 @@ pub(super) fn write(
     for species in BTreeSet::from_iter(structure.species.iter().copied()) {
         let setup =
             gpaw.setup(species).map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
-        data.insert(setups::name(species, &settings.variants), setup.original.clone());
+        data.insert(setups::name(species, &settings.variants), setup.pinned.clone());
     }
     let task = Task {
         species: &structure.species,

@@ -106,9 +106,9 @@ impl Settings {
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
         let environment = self.environment();
-        let who = Versions::ask(&self.command, &environment, passed)?;
-        let setups = setups::find(&who.setup_paths, &self.variants)?;
-        Ok(Gpaw { settings: self.clone(), environment, who, setups })
+        let versions = Versions::ask(&self.command, &environment, passed)?;
+        let setups = setups::find(&versions.setup_paths, &self.variants)?;
+        Ok(Gpaw { settings: self.clone(), environment, versions, setups })
     }
 
     fn environment(&self) -> BTreeMap<String, String> {
@@ -137,7 +137,7 @@ impl Versions {
         let files = [(input::SCRIPT_FILE, SCRIPT.as_bytes())];
         let said = version_query::run(command, &[input::SCRIPT_FILE], environment, passed, &files)?;
         said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
-            let reason = format!("is no Python with GPAW: it does not say its version but {:?}", said.trim());
+            let reason = format!("is not a Python with GPAW: expected its version, found {:?}", said.trim());
             version_query::wrong_program(command, reason)
         })
     }
@@ -148,7 +148,7 @@ impl Versions {
 pub struct Gpaw {
     settings: Settings,
     environment: BTreeMap<String, String>,
-    who: Versions,
+    versions: Versions,
     setups: BTreeMap<Species, Setup>,
 }
 
@@ -156,7 +156,7 @@ impl Gpaw {
     fn setup(&self, species: Species) -> Result<&Setup, SetupError> {
         self.setups
             .get(&species)
-            .ok_or_else(|| setups::missing(species, &self.who.setup_paths, &self.settings.variants))
+            .ok_or_else(|| setups::missing(species, &self.versions.setup_paths, &self.settings.variants))
     }
 
     /// Valence electrons of a structure; elements without a setup count none.
@@ -173,7 +173,7 @@ impl Gpaw {
 impl DftBackend for Gpaw {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, &str> =
-            self.setups.iter().map(|(species, setup)| (species.symbol(), setup.original.hash())).collect();
+            self.setups.iter().map(|(species, setup)| (species.symbol(), setup.pinned.hash())).collect();
         // Destructure, so that a new setting cannot be forgotten here.
         let Settings {
             command: _,
@@ -192,7 +192,7 @@ impl DftBackend for Gpaw {
             vacuum,
         } = &self.settings;
         json!({
-            "code": "gpaw", "version": self.who.gpaw, "ase": self.who.ase, "recipe": INPUT_VERSION, "functional": "PBE",
+            "code": "gpaw", "version": self.versions.gpaw, "ase": self.versions.ase, "recipe": INPUT_VERSION, "functional": "PBE",
             "cutoff": cutoff, "k_spacing": k_spacing, "smearing": smearing, "smearing_width": smearing_width,
             "spin": spin, "moments": moments, "energy_tolerance": energy_tolerance,
             "force_tolerance": force_tolerance, "vacuum": vacuum, "pseudopotentials": hashes,
@@ -224,7 +224,7 @@ impl DftBackend for Gpaw {
 
     fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
         let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
-        let by = [("gpaw", self.who.gpaw.as_str()), ("ase", self.who.ase.as_str())];
+        let by = [("gpaw", self.versions.gpaw.as_str()), ("ase", self.versions.ase.as_str())];
         match script_output::read(&padded.structure, directory, &by)? {
             Some(calculated) => Ok(padded.without_padding_stress(calculated)),
             None => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),

@@ -11,7 +11,7 @@ use crate::{PinnedFile, SetupError, paw};
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Setup {
     /// Its file.
-    pub original: PinnedFile,
+    pub pinned: PinnedFile,
     /// Number of valence electrons.
     pub valence: f64,
 }
@@ -66,8 +66,8 @@ pub(super) fn name(species: Species, variants: &BTreeMap<Species, String>) -> St
 }
 
 fn read(species: Species, path: PathBuf) -> Result<Setup, String> {
-    let (original, content) = PinnedFile::open(path).map_err(|error| format!("cannot be read: {error}"))?;
-    Ok(Setup { original, valence: paw::valence(&content, species)? })
+    let (pinned, content) = PinnedFile::open(path).map_err(|error| format!("cannot be read: {error}"))?;
+    Ok(Setup { pinned, valence: paw::valence(&content, species)? })
 }
 
 #[cfg(test)]
@@ -95,11 +95,11 @@ mod tests {
         std::fs::write(paths[0].join("Si.PBE"), HEAD.replace("valence=\"4\"", "valence=\"12\"")).unwrap();
         let first = find(&paths, &none).unwrap();
         assert_eq!(first[&species("Si")].valence, 12.0);
-        assert_ne!(first[&species("Si")].original.hash(), setups[&species("Si")].original.hash());
+        assert_ne!(first[&species("Si")].pinned.hash(), setups[&species("Si")].pinned.hash());
 
         std::fs::write(paths[0].join("Al.PBE"), HEAD).unwrap();
         let error = find(&paths, &none).unwrap_err().to_string();
-        assert!(error.contains("is no PAW setup of Al"), "{error}");
+        assert!(error.contains("is not a PAW setup of Al"), "{error}");
     }
 
     #[test]

@@ -20,10 +20,11 @@ fn silicon() -> Structure {
 }
 
 fn gpaw(settings: Settings) -> Gpaw {
-    let who = Versions { gpaw: "22.8.0".into(), ase: "3.22.1".into(), setup_paths: vec!["/setups".into()] };
-    let setup = Setup { original: PinnedFile::fake("/setups/Si.PBE", "abc"), valence: 4.0 };
+    let versions =
+        Versions { gpaw: "22.8.0".into(), ase: "3.22.1".into(), setup_paths: vec!["/setups".into()] };
+    let setup = Setup { pinned: PinnedFile::fake("/setups/Si.PBE", "abc"), valence: 4.0 };
     let setups = BTreeMap::from([("Si".parse().unwrap(), setup)]);
-    Gpaw { environment: settings.environment(), settings, who, setups }
+    Gpaw { environment: settings.environment(), settings, versions, setups }
 }
 
 fn task(code: &Gpaw, adjustments: &[RetryAdjustment]) -> Value {
@@ -165,7 +166,7 @@ fn a_result_of_another_version_is_of_another_program() {
     };
     assert!(with(by("22.8.0")).is_ok());
     let failure = with(by("23.9.1")).unwrap_err();
-    let expected = "another program: calculated by gpaw 23.9.1, where the protocol is of 22.8.0";
+    let expected = "another program: calculated by gpaw 23.9.1, but the protocol requires 22.8.0";
     assert_eq!((failure.class, failure.to_string().as_str()), (FailureClass::OtherProgram, expected));
     assert_eq!(with(json!({ "gpaw": "22.8.0" })).unwrap_err().class, FailureClass::OtherProgram);
     let told = json!({ "failure": { "class": "not_converged", "message": "why" }, "by": by("23.9.1") });

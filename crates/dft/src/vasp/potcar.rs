@@ -87,10 +87,10 @@ fn missing(directory: &Path, candidates: &[PathBuf], species: Species) -> String
         entries.filter_map(|entry| entry.file_name().into_string().ok()).filter(of_element).collect();
     there.sort();
     let there = match there.is_empty() {
-        true => format!("{} has nothing of {species}", directory.display()),
+        true => format!("{} has no POTCAR of {species}", directory.display()),
         false => format!("{} has {}; choose one in `variants`", directory.display(), there.join(", ")),
     };
-    format!("there is none of {}; {there}", sought.join(", "))
+    format!("none of {} exists; {there}", sought.join(", "))
 }
 
 #[cfg(test)]
@@ -133,7 +133,7 @@ mod tests {
         assert!(message.contains("/Al/POTCAR"), "{message}");
         assert!(message.ends_with("has Al_GW, Al_pv; choose one in `variants`"), "{message}");
         let nowhere = Potcar::find(Path::new("/no/such/place"), aluminium(), "Al").unwrap_err().to_string();
-        assert!(nowhere.ends_with("/no/such/place has nothing of Al"), "{nowhere}");
+        assert!(nowhere.ends_with("/no/such/place has no POTCAR of Al"), "{nowhere}");
     }
 
     #[test]

@@ -39,7 +39,7 @@ pub(super) fn read(
     };
     check(&output, &in_file_order, version)?;
     if denied {
-        return Err(FailureClass::NotConverged.with_message("OUTCAR does not say that EDIFF was reached"));
+        return Err(FailureClass::NotConverged.with_message("OUTCAR does not report that EDIFF was reached"));
     }
     let calculated = Results {
         energy: output.energy,
@@ -60,8 +60,7 @@ pub(super) fn read(
 fn check(output: &Output, asked: &Structure, version: &str) -> Result<(), Failure> {
     if !is_version(&output.version, version) {
         let found = &output.version;
-        let message =
-            format!("calculated by VASP {found}, but `version` says {version}: correct one of them");
+        let message = format!("calculated by VASP {found}, but `version` is {version}: correct one of them");
         return Err(FailureClass::OtherProgram.with_message(message));
     }
     if output.steps >= output.most_steps {
@@ -112,7 +111,7 @@ fn without_output(exit: Exit, directory: &Path, xml: &str, outcar: &str) -> Fail
     let from_outside = matches!(exit, Exit::TimeLimit | Exit::OutOfMemory | Exit::LostNode);
     let said = if from_outside { String::new() } else { end_of(&directory.join("stdout")) };
     if let Some((words, class)) = ERROR_MESSAGES.iter().find(|(words, _)| said.contains(words)) {
-        return class.with_message(format!("VASP gave up: {words}"));
+        return class.with_message(format!("VASP stopped: {words}"));
     }
     let failure = validation::failure_without_result(exit, directory, &["stdout", "stderr"]);
     failure.class.with_message(format!("{}; vasprun.xml {xml}; OUTCAR {outcar}", failure.message))

@@ -1,4 +1,4 @@
-//! ASE calculators, run for real: EMT, which comes with ASE, and GPAW; with the Python that `CALMWALK_PYTHON` names, or Debian's.
+//! Real ASE calculators: EMT, which is part of ASE, and GPAW, with the Python in `CALMWALK_PYTHON` or Debian's.
 
 use std::collections::BTreeSet;
 use std::os::unix::process::ExitStatusExt;
@@ -25,7 +25,7 @@ fn prepared(calculator: &str) -> Ase {
     settings(&TempDir::new().unwrap(), calculator).prepare(&PassedEnvironment::default()).unwrap()
 }
 
-/// Writes the input, runs the script, reads what it left.
+/// Writes the input, runs the script and reads the output.
 fn run(
     code: &dyn DftBackend,
     structure: &Structure,
@@ -49,7 +49,7 @@ fn run(
     code.read(structure, place.path(), exit)
 }
 
-/// A distorted, sheared alloy whose elements are mixed up.
+/// A distorted, sheared alloy with mixed order of elements.
 fn alloy() -> Structure {
     let mut positions = Vec::new();
     for i in 0..8_u8 {
@@ -71,7 +71,7 @@ fn alloy() -> Structure {
 const EMT: &str =
     "from ase.calculators.emt import EMT\nversion = 'EMT of ASE'\ndef calculator():\n    return EMT()\n";
 
-/// What ASE says of a structure without our script.
+/// ASE's results without our script.
 fn emt_alone(structure: &Structure) -> (f64, Vec<Vec3>, [f64; 6]) {
     let script = "import json, sys\nfrom ase import Atoms\nfrom ase.calculators.emt import EMT\n\
                   s, x, c = json.load(sys.stdin)\na = Atoms(s, positions=x, cell=c, pbc=True, calculator=EMT())\n\
@@ -96,7 +96,7 @@ fn emt_gives_the_numbers_that_ase_gives() {
     assert!(forces.iter().flatten().any(|force| force.abs() > 0.5));
 }
 
-/// As docs/dft-codes.md has it.
+/// As in docs/dft-codes.md.
 const LABEL: &str = "from ase.io import read, write\nfrom ase.calculators.emt import EMT\natoms = read('structure.extxyz')\n\
                      atoms.calc = EMT()\natoms.get_forces(), atoms.get_stress()\nwrite('label.extxyz', atoms)\n";
 
@@ -162,7 +162,7 @@ fn open_directions_stay_open_and_have_no_stress() {
     assert_ne!(found.energy, emt_alone(&alloy()).0);
 }
 
-/// EMT with something added.
+/// EMT with a modification.
 fn class_of(calculator: &str) -> FailureClass {
     run(&prepared(&format!("{EMT}{calculator}")), &alloy(), &[]).unwrap_err().class
 }
@@ -243,7 +243,7 @@ fn what_is_missing_is_found_before_anything_is_calculated() {
     assert!(matches!(fault, SetupError::Program { .. }), "{fault}");
 }
 
-/// Plane waves for silicon, as few as there can be; with few steps at first.
+/// A minimal plane-wave basis for silicon, with few steps at first.
 const GPAW: &str = "from gpaw import GPAW, PW\nimport gpaw\nversion = 'GPAW ' + gpaw.__version__\n\
                     def calculator(adjustments):\n    return GPAW(mode=PW(200), xc='PBE', kpts={'size': (2, 2, 2), 'gamma': True},\n        \
                     occupations={'name': 'fermi-dirac', 'width': 0.1}, convergence={'energy': 1e-7, 'density': 1e-6},\n        \

@@ -1,4 +1,4 @@
-//! A calculation reads the data that was hashed, whatever has become of the files meanwhile.
+//! A calculation reads the data that was hashed, even if the original files change afterwards.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -18,7 +18,8 @@ fn copies(from: &str, names: &[&str]) -> TempDir {
     directory
 }
 
-/// Compares a label of silicon, whose data is gone when the program begins, with one whose data stays.
+/// Compares a label of silicon whose data files are deleted before the program starts with one whose files
+/// remain.
 fn needs_no_files(code: &dyn DftBackend, data: TempDir) {
     let (structure, place) = (structures::silicon(), TempDir::new().unwrap());
     let expected = label(code, &structure);

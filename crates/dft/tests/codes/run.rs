@@ -1,4 +1,4 @@
-//! Runs calculations as a labeller does, but here.
+//! Runs calculations like a labeller, in this process.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -9,7 +9,7 @@ use std::process::{Command, Stdio};
 use atoms::Structure;
 use dft::{DftBackend, Exit, Failure, FailureClass, Input, Results, RetryAdjustment, adjustments};
 
-/// One calculation from its input to its judgement.
+/// One calculation from its input to its result.
 pub fn attempt(
     code: &dyn DftBackend,
     structure: &Structure,
@@ -20,7 +20,7 @@ pub fn attempt(
     calculate(code, structure, input, place.path())
 }
 
-/// Writes the input into folders of this directory.
+/// Writes the input to folders of this directory.
 pub fn prepared(
     code: &dyn DftBackend,
     structure: &Structure,
@@ -39,7 +39,7 @@ pub fn prepared(
     Ok(input)
 }
 
-/// Runs what was prepared, and judges it.
+/// Runs a prepared calculation and reads its result.
 pub fn calculate(
     code: &dyn DftBackend,
     structure: &Structure,
@@ -71,7 +71,7 @@ pub fn label(code: &dyn DftBackend, structure: &Structure) -> Results {
         .unwrap_or_else(|failure| panic!("{}: {failure}", structure.formula()))
 }
 
-/// Tries until the calculation is a label, as the ladders say; how often it failed before.
+/// Retries with the adjustments until the calculation succeeds; returns the number of failures.
 pub fn climb(code: &dyn DftBackend, structure: &Structure) -> (Results, Vec<FailureClass>) {
     let mut failures = Vec::new();
     loop {

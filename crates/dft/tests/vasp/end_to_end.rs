@@ -1,4 +1,4 @@
-//! A program that does what VASP does with its files, but has calculated beforehand.
+//! A stand-in for VASP that handles its files but returns precomputed results.
 
 use std::collections::BTreeSet;
 use std::os::unix::fs::PermissionsExt;
@@ -75,7 +75,7 @@ fn the_mesh_is_that_of_the_spacing_with_two_pi() {
         cell: Cell::orthorhombic(4.05, 4.05, 8.1),
         periodic: [true; 3],
     };
-    // 2π / 4.05 / 0.125 = 12.41, 2π / 8.1 / 0.125 = 6.21; VASP's KSPACING counts alike.
+    // 2π / 4.05 / 0.125 = 12.41, 2π / 8.1 / 0.125 = 6.21; VASP's KSPACING gives the same.
     let kpoints = file(&input(&aluminium, &[]), "KPOINTS");
     assert_eq!(kpoints.lines().skip(1).collect::<Vec<_>>(), ["0", "Gamma", "13 13 7", "0 0 0"]);
     let slab = Structure { periodic: [true, true, false], ..aluminium };
@@ -84,7 +84,7 @@ fn the_mesh_is_that_of_the_spacing_with_two_pi() {
 
 #[test]
 fn a_left_handed_cell_is_turned_and_its_numbers_are_the_same() {
-    // Turned, it is the cell of the files.
+    // Rotated, it is the cell of the files.
     let mut left = alumina();
     left.cell.0.swap(1, 2);
     assert!(left.cell.signed_volume() < 0.0);
@@ -113,6 +113,6 @@ fn an_element_without_a_potential_is_bad_input() {
     let code = settings(home.path(), "5.4.4", &["Al"]).prepare().unwrap();
     let failure = code.input(&alumina(), &BTreeSet::new()).unwrap_err();
     assert_eq!(failure.class, FailureClass::BadInput);
-    assert!(failure.message.contains("of O: none is chosen"), "{failure}");
+    assert!(failure.message.contains("of O: none is selected"), "{failure}");
     assert!(Path::new(&settings(home.path(), "5.4.4", &["Al"]).pseudopotentials).exists());
 }

@@ -1,4 +1,5 @@
-//! VASP's files, written and read: small ones of our own (`tests/data/vasp`). Real ones: `src/vasp/real.rs`.
+//! VASP's files, written and read: small ones of our own (`tests/data/vasp`). Real ones:
+//! `src/vasp/real_output_tests.rs`.
 
 mod end_to_end;
 mod faults;
@@ -20,7 +21,7 @@ fn text(name: &str) -> String {
     std::fs::read_to_string(data(name)).unwrap()
 }
 
-/// What `tests/data/vasp` is of: in its files both atoms of Al stand before that of O.
+/// The structure of `tests/data/vasp`, whose files list both atoms of Al before that of O.
 fn alumina() -> Structure {
     let cell = Cell([[4.1, 0.0, 0.0], [0.4, 4.3, 0.0], [0.0, 0.3, 4.6]]);
     let fractional = [[0.05, 0.1, 0.2], [0.5, 0.55, 0.6], [0.45, 0.15, 0.75]];
@@ -32,7 +33,7 @@ fn alumina() -> Structure {
     }
 }
 
-/// The numbers of `tests/data/vasp`, as it was written.
+/// The results in `tests/data/vasp`.
 fn expected() -> Results {
     let kilobar = [[-120.5, 3.25, -7.125], [3.25, 80.0, 12.5], [-7.125, 12.5, -12345.678]];
     Results {
@@ -72,7 +73,7 @@ fn potcar(title: &str, element: &str, valence: f64) -> String {
     )
 }
 
-/// Settings for these elements, whose POTCAR files stand in `directory`.
+/// Settings for these elements, with POTCAR files in `directory`.
 fn settings(directory: &Path, version: &str, elements: &[&str]) -> Settings {
     for element in elements {
         let potcar = potcar(&format!("PAW_PBE {element} 01Jan2000"), element, 3.0);
@@ -88,7 +89,7 @@ fn settings(directory: &Path, version: &str, elements: &[&str]) -> Settings {
     }
 }
 
-/// Judges these files as the calculation of [`alumina`].
+/// Reads these files as the calculation of [`alumina`].
 fn read(files: &[(&str, &[u8])], exit: Exit) -> Result<Results, Failure> {
     let directory = TempDir::new().unwrap();
     for (name, content) in files {

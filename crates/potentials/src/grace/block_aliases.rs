@@ -34,8 +34,7 @@ impl BlockAliases {
             _ => Err(unsupported(
                 archive,
                 format!(
-                    "'reduce_names' lists {}, where two-layer models are known to have I1, I, B and the invariants \
-                     of each layer",
+                    "'reduce_names' lists {}, expected I1, I, B and the invariants of each layer",
                     names.join(", ")
                 ),
             )),
@@ -64,7 +63,7 @@ pub(super) fn ignore_aliases(archive: &Archive, names: &BlockAliases) -> Result<
         let originals: Vec<String> =
             of_norm.chain(of_reduction).filter(|original| archive.contains(original)).collect();
         if !originals.is_empty() && !originals.iter().any(|original| same(archive, &key, original)) {
-            let reason = format!("array '{key}' is not the same as {}", originals.join(" or "));
+            let reason = format!("array '{key}' differs from {}", originals.join(" or "));
             return Err(unsupported(archive, reason));
         }
     }

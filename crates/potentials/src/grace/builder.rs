@@ -126,7 +126,7 @@ fn feature_map<V: Vector>(
             archive,
             "uq_schema_version",
             version.to_string(),
-            format!("{expected}, which its flags mean"),
+            format!("{expected}, as its flags imply"),
         ));
     }
     let layers = places::<V>(sources, block_order);

@@ -30,7 +30,7 @@ pub enum GraceError {
         reason: String,
     },
     /// An array is missing.
-    #[error("{}: array '{key}' is missing: not a kokkos.npz export of a GRACE model, or cut short", path.display())]
+    #[error("{}: array '{key}' is missing: not a kokkos.npz export of a GRACE model, or truncated", path.display())]
     Missing {
         /// The model file.
         path: PathBuf,

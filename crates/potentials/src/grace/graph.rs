@@ -222,7 +222,7 @@ impl<'a, V: Vector> Graph<'a, V> {
     pub(super) fn named(&self, name: &str) -> Result<Tensor, GraceError> {
         let found = self.named.iter().find(|(known, _)| known == name);
         found.map(|(_, tensor)| *tensor).ok_or_else(|| {
-            unsupported(self.archive, format!("the energy takes '{name}', which the graph does not make"))
+            unsupported(self.archive, format!("the energy uses '{name}', which the graph does not produce"))
         })
     }
 

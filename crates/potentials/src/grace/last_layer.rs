@@ -14,7 +14,7 @@ use super::sweeps::{Scratch, begin_returns, gradients_of, lock_scratch};
 use super::vector::Vector;
 
 /// Maximum number of layers before the last.
-const BEFORE: usize = 2;
+const MAX_EARLIER_LAYERS: usize = 2;
 
 /// Data shared by all threads.
 struct Pass<'a, V: Vector> {
@@ -34,7 +34,7 @@ struct Results<'a, V> {
     /// `None` without grading.
     projected: Option<Projected<'a, V>>,
     /// The bases of the earlier layers. With two cotangents, the cotangents from the features overwrite them.
-    bases: [ChunkedSlice<'a, V>; BEFORE],
+    bases: [ChunkedSlice<'a, V>; MAX_EARLIER_LAYERS],
 }
 
 impl<V: Send> SplitByChunk for Results<'_, V> {
@@ -77,7 +77,7 @@ impl<V: Vector> Evaluator<V> {
             densities: ChunkedSlice::new(Layout::Even(of_densities), 0, &mut self.density_cotangents[..]),
             gradients: gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns),
             projected: map.map(|map| projection.parts(map)),
-            bases: [(); BEFORE].map(|()| ChunkedSlice::empty()),
+            bases: [(); MAX_EARLIER_LAYERS].map(|()| ChunkedSlice::empty()),
         };
         for (bases, (work, layer)) in results.bases.iter_mut().zip(before.iter_mut().zip(&network.layers)) {
             *bases = work.trace.bases_mut(layer);

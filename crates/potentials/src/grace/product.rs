@@ -38,18 +38,18 @@ pub(super) struct Term<V: Vector> {
 }
 
 /// Lanes summed together, so that each term is decoded once for all of them.
-const TOGETHER: usize = 4;
+const LANES_PER_PASS: usize = 4;
 
 impl<V: Vector> Product<V> {
     #[inline(always)]
     pub fn forward(&self, atoms: usize, tape: &mut [V]) {
         let lanes = self.width * atoms;
-        let whole = lanes / TOGETHER * TOGETHER;
+        let whole = lanes / LANES_PER_PASS * LANES_PER_PASS;
         for output in &self.outputs {
             let out = output.row * atoms;
-            for c in (0..whole).step_by(TOGETHER) {
-                let [sums] = couple::<V, 1, TOGETHER>(&output.terms, tape, 0, tape, atoms, c);
-                tape[out + c..][..TOGETHER].copy_from_slice(&sums);
+            for c in (0..whole).step_by(LANES_PER_PASS) {
+                let [sums] = couple::<V, 1, LANES_PER_PASS>(&output.terms, tape, 0, tape, atoms, c);
+                tape[out + c..][..LANES_PER_PASS].copy_from_slice(&sums);
             }
             for c in whole..lanes {
                 let [[sum]] = couple::<V, 1, 1>(&output.terms, tape, 0, tape, atoms, c);
@@ -62,12 +62,12 @@ impl<V: Vector> Product<V> {
     #[inline(always)]
     pub fn backward<const N: usize>(&self, atoms: usize, tape: &[V], cotangent: &mut [V]) {
         let lanes = self.width * atoms;
-        let whole = lanes / TOGETHER * TOGETHER;
+        let whole = lanes / LANES_PER_PASS * LANES_PER_PASS;
         for input in &self.inputs {
             let out = input.row * N * atoms;
-            for c in (0..whole).step_by(TOGETHER) {
-                let sums = couple::<V, N, TOGETHER>(&input.terms, cotangent, lanes, tape, atoms, c);
-                add::<V, N, TOGETHER>(&mut cotangent[out + c..], lanes, &sums);
+            for c in (0..whole).step_by(LANES_PER_PASS) {
+                let sums = couple::<V, N, LANES_PER_PASS>(&input.terms, cotangent, lanes, tape, atoms, c);
+                add::<V, N, LANES_PER_PASS>(&mut cotangent[out + c..], lanes, &sums);
             }
             for c in whole..lanes {
                 let sums = couple::<V, N, 1>(&input.terms, cotangent, lanes, tape, atoms, c);

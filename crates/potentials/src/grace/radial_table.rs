@@ -141,11 +141,17 @@ impl<V: Vector> RadialTable<V> {
     ) {
         let n = self.lanes;
         let rows = &self.coefficients[interval * n..][..SUPPORT * n];
-        let whole = n / TOGETHER * TOGETHER;
+        let whole = n / LANES_PER_PASS * LANES_PER_PASS;
         let knots_per_length = V::Number::round(self.knots_per_length);
         let weights = (weights.map(|w| w[bond]), slopes.map(|s| s[bond] * knots_per_length));
-        for c in (0..whole).step_by(TOGETHER) {
-            sum_of_rows::<V, TOGETHER>(&rows[c..], n, &weights, &mut values[c..], &mut derivatives[c..]);
+        for c in (0..whole).step_by(LANES_PER_PASS) {
+            sum_of_rows::<V, LANES_PER_PASS>(
+                &rows[c..],
+                n,
+                &weights,
+                &mut values[c..],
+                &mut derivatives[c..],
+            );
         }
         for c in whole..n {
             sum_of_rows::<V, 1>(&rows[c..], n, &weights, &mut values[c..], &mut derivatives[c..]);
@@ -181,7 +187,7 @@ impl<V: Vector> Pass for One<'_, V> {
 }
 
 /// Adjacent lanes of a row that are summed together.
-const TOGETHER: usize = 4;
+const LANES_PER_PASS: usize = 4;
 
 /// Σ_k weights\[k\] of row k, for `L` lanes of rows that are `n` lanes apart, with two sets of weights.
 #[inline(always)]

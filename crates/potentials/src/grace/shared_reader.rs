@@ -29,7 +29,7 @@ pub(super) fn reject_unsupported_variants(
 ) -> Result<(), GraceError> {
     for (key, supported, meaning) in switches {
         if archive.contains(key) && archive.count(key, 0, usize::MAX)? != *supported {
-            return Err(unsupported(archive, format!("'{key}' asks for {meaning}, which is not supported")));
+            return Err(unsupported(archive, format!("'{key}' selects {meaning}, which is not supported")));
         }
     }
     Ok(())
@@ -44,7 +44,7 @@ pub(super) fn reject_unsupported_radial_variants(
     reject_unsupported_variants(
         archive,
         &[
-            ("nn_dtype", 0, "another arithmetic than double precision"),
+            ("nn_dtype", 0, "an arithmetic other than double precision"),
             (&format!("{network}_has_chem_emb"), 0, "a chemical embedding in the radial network"),
             (&format!("{network}_embed_i"), 0, "an embedding of the central element in the radial network"),
             (
@@ -68,7 +68,7 @@ pub(super) fn reject_unread_arrays(archive: &Archive, depth: &str) -> Result<(),
     Err(unsupported(
         archive,
         format!(
-            "arrays that a {depth}-layer model is not known to have, and that may change its energy: {}",
+            "arrays that are unknown for a {depth}-layer model and may change its energy: {}",
             left_over.join(", ")
         ),
     ))

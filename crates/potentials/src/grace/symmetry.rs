@@ -39,8 +39,8 @@ pub(super) fn require_invariance(archive: &Archive, model: GraceModel) -> Result
         let change = here.iter().zip(&there).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         if change.is_nan() || change > TOLERANCE * largest {
             let reason = format!(
-                "energies change by {change:.1e} eV when a cluster is turned: the parts of this model are not \
-                 connected as in the models that are known"
+                "energies change by {change:.1e} eV when a cluster is rotated: the parts of this \
+                 model are not connected as in the supported models"
             );
             return Err(unsupported(archive, reason));
         }

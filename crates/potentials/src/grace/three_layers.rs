@@ -28,7 +28,7 @@ pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Mod
     reject_unsupported_variants(
         archive,
         &[
-            ("nn_dtype", 0, "another arithmetic than double precision"),
+            ("nn_dtype", 0, "an arithmetic other than double precision"),
             ("has_bond_specific_cutoff", 0, "cutoffs for pairs of elements in a three-layer model"),
         ],
     )?;

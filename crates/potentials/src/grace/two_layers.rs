@@ -218,7 +218,7 @@ pub(super) fn expect_list(archive: &Archive, key: &str, mut expected: Vec<String
     Err(unsupported(
         archive,
         format!(
-            "'{key}' lists {}, where models of this depth are known to have {}",
+            "'{key}' lists {}, but supported models of this depth have {}",
             found.join(", "),
             expected.join(", ")
         ),
