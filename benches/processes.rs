@@ -1,11 +1,11 @@
-//! What it costs to have walkers and labellers in processes of their own: the aluminium campaign of `configs/`, lengthened,
-//! all in one process and in processes. Both make the same steps, to the last bit.
+//! The overhead of walkers and labellers in separate processes: the aluminium campaign of `configs/`,
+//! lengthened, run once in a single process and once in several. Both make the same steps, bit for bit.
 //!
-//! Both campaigns of a pair are under way together, and have the machine in turn: one is stopped while the other runs,
-//! for a fraction of a second. So both see the same weather, which from one minute to the next changes the speed of a
-//! virtual machine by more than what is to be measured.
+//! Both campaigns of a pair run concurrently and alternate: one is stopped while the other runs for a fraction
+//! of a second. Both therefore see the same machine load. The speed of a virtual machine varies from minute to
+//! minute by more than the difference to be measured.
 //!
-//! `cargo bench --bench processes`; a number behind `--` is how many pairs are run.
+//! `cargo bench --bench processes`; a number after `--` sets the number of pairs.
 
 use std::fs;
 use std::path::Path;
@@ -16,20 +16,20 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// Pairs of campaigns, if not given.
+/// Default number of pairs.
 const PAIRS: usize = 5;
-/// For so long a campaign has the machine at a time.
-const TURN: Duration = Duration::from_millis(500);
-/// How often it is looked whether it has ended.
-const LOOK: Duration = Duration::from_millis(1);
+/// Time slice of a campaign.
+const TIME_SLICE: Duration = Duration::from_millis(500);
+/// How often the bench checks whether a campaign has ended.
+const POLL_INTERVAL: Duration = Duration::from_millis(1);
 
 fn main() {
     let pairs = std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(PAIRS);
     println!("campaign steps a second (all in one process, in processes of their own), and their ratio");
     let mut ratios = Vec::new();
     for pair in 0..pairs {
-        let mut both = [UnderWay::new(&["--in-process"]), UnderWay::new(&[])];
-        // Whichever goes first in one pair goes second in the next.
+        let mut both = [RunningCampaign::new(&["--in-process"]), RunningCampaign::new(&[])];
+        // Alternate which campaign of a pair goes first.
         let mut turn = pair % 2;
         while both.iter().any(|campaign| !campaign.ended) {
             both[turn].advance();
@@ -43,24 +43,24 @@ fn main() {
     println!("median ratio {:.3}", ratios[ratios.len() / 2]);
 }
 
-/// A whole campaign, start and end included.
-struct UnderWay {
+/// A complete campaign, including start and end.
+struct RunningCampaign {
     directory: TempDir,
     options: Vec<&'static str>,
     run: Option<Child>,
-    /// For so long it had the machine.
+    /// Time during which it ran.
     time: Duration,
     ended: bool,
 }
 
-impl UnderWay {
+impl RunningCampaign {
     fn new(options: &[&'static str]) -> Self {
         let directory = tempfile::tempdir().expect("a directory for temporary files");
         fs::write(directory.path().join("campaign.toml"), text()).expect("a file that can be written");
         Self { directory, options: options.to_vec(), run: None, time: Duration::ZERO, ended: false }
     }
 
-    /// Gives it the machine for a turn.
+    /// Runs it for one time slice.
     fn advance(&mut self) {
         let begun = Instant::now();
         if self.run.is_none() {
@@ -69,8 +69,8 @@ impl UnderWay {
             self.signal(Signal::CONT);
         }
         let run = self.run.as_mut().expect("it was started above");
-        while !self.ended && begun.elapsed() < TURN {
-            std::thread::sleep(LOOK);
+        while !self.ended && begun.elapsed() < TIME_SLICE {
+            std::thread::sleep(POLL_INTERVAL);
             if let Some(status) = run.try_wait().expect("a child of this process") {
                 assert!(status.success());
                 self.ended = true;
@@ -86,13 +86,13 @@ impl UnderWay {
         command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("the program")
     }
 
-    /// Signals each of its processes: they are those that work in its directory.
+    /// Signals all of its processes, which are those that work in its directory.
     fn signal(&self, signal: Signal) {
         for entry in fs::read_dir("/proc").expect("/proc").flatten() {
             let number = entry.file_name().to_str().and_then(|name| name.parse().ok());
             let Some(pid) = number.and_then(Pid::from_raw) else { continue };
             if fs::read_link(entry.path().join("cwd")).is_ok_and(|cwd| cwd == self.directory.path()) {
-                // One that is gone needs no signal.
+                // A process that has exited needs no signal.
                 let _ = kill_process(pid, signal);
             }
         }
@@ -112,7 +112,7 @@ fn calmwalk(directory: &Path) -> Command {
     command
 }
 
-/// The demo with longer walks, so that starting takes a small part of the time.
+/// The demo with longer walks, so that the start takes a small part of the time.
 fn text() -> String {
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
     let text = fs::read_to_string(configs.join("aluminium.toml")).expect("a file of the project");

@@ -1,8 +1,10 @@
-//! What it costs walks to wait for each other: the walks of the aluminium campaign of `configs/`, each on a walker of its
-//! own, in live mode and in rounds. Real dynamics and real decisions, one after the other on this machine; what they
-//! would take side by side is told by a clock that goes by the processor time of each turn.
+//! The time that walks spend waiting for each other: the walks of the aluminium campaign of `configs/`, one
+//! walker each, in live mode and in rounds. Dynamics and decisions are real and run one after another on this
+//! machine; a simulated clock that advances by the processor time of each assignment gives the time they would
+//! take in parallel.
 //!
-//! `cargo bench --bench rounds`; a number behind `--` is the steps of a turn. The figures are in `docs/benchmarks.md`.
+//! `cargo bench --bench rounds`; a number after `--` sets the steps per assignment. The results are in
+//! `docs/benchmarks.md`.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -10,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use calm::watch::ForgettingAlarm;
+use calm::forgetting::ForgettingAlarm;
 use calm::{Artifact, UpdateSettings};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{Mode, Next, SeedStructure, Selector, Settings, Snapshot, UpdateProtocol};
@@ -21,45 +23,46 @@ use wire::{CampaignId, CandidateBlock};
 use workers::settings::{GuardSettings, ThermostatKind, WalkSettings};
 use workers::walk::{WalkContext, advance};
 
-/// Steps of a turn, if not given: as in `configs/`.
-const TURN_STEPS: u64 = 250;
+/// Default steps per assignment, as in `configs/`.
+const STEPS_PER_ASSIGNMENT: u64 = 250;
 
 fn main() {
-    let turn_steps = std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(TURN_STEPS);
-    println!("turns of {turn_steps} steps");
+    let assignment_steps =
+        std::env::args().skip(1).find_map(|text| text.parse().ok()).unwrap_or(STEPS_PER_ASSIGNMENT);
+    println!("turns of {assignment_steps} steps");
     println!("{:<16} {:>10} {:>10} {:>12} {:>14}", "", "candidates", "accepted", "seconds", "walkers busy");
-    let [live, rounds] = [Mode::Live, Mode::Reproducible].map(|mode| Campaign::run(mode, turn_steps));
+    let [live, rounds] = [Mode::Live, Mode::Reproducible].map(|mode| Campaign::run(mode, assignment_steps));
     let rate = |campaign: &Campaign| f64::from(campaign.candidates) / campaign.time.as_secs_f64();
     println!("candidates an hour, live over rounds: {:.2}", rate(&live) / rate(&rounds));
 }
 
-/// What a campaign came to.
+/// Result of a campaign.
 #[derive(Default)]
 struct Campaign {
     candidates: u32,
     accepted: u32,
-    /// By the clock of walkers side by side.
+    /// Time on the simulated clock of parallel walkers.
     time: Duration,
-    /// Of all walkers together.
+    /// Total processor time of all walkers.
     work: Duration,
 }
 
-/// A turn under way: when it ends, in which order turns that end at the same time were begun, what comes of it.
-struct Turn(Duration, u64, Report);
+/// A running assignment: when it ends, the order of start for ties, and its report.
+struct RunningAssignment(Duration, u64, Report);
 
 impl Campaign {
-    fn run(mode: Mode, turn_steps: u64) -> Self {
+    fn run(mode: Mode, assignment_steps: u64) -> Self {
         let model = Arc::new(GraceModel::load(&data("al_eam_1l/kokkos.npz")).unwrap());
         let context = WalkContext {
             model: Arc::clone(&model),
             threads: Threads::default(),
             settings: Arc::new(walk_settings()),
         };
-        let mut selector = selector(mode, turn_steps, &model);
+        let mut selector = selector(mode, assignment_steps, &model);
         selector.begin_walks();
         let (mut campaign, mut turns, mut begun) = (Self::default(), BinaryHeap::new(), 0);
         loop {
-            // As many walkers as walks: whoever has a turn begins it now.
+            // There are as many walkers as walks, so every assignment starts at once.
             while let Next::Turn(assignment) = selector.next_turn() {
                 let used = processor_time();
                 let report = advance(&context, &assignment, Arc::clone(selector.mixture()), || false, |_| {});
@@ -67,9 +70,9 @@ impl Campaign {
                 campaign.work += taken;
                 begun += 1;
                 let report = report.map_candidate(|candidate| CandidateBlock::encode(&candidate));
-                turns.push(Reverse(Turn(campaign.time + taken, begun, report)));
+                turns.push(Reverse(RunningAssignment(campaign.time + taken, begun, report)));
             }
-            let Some(Reverse(Turn(ended, _, report))) = turns.pop() else { break };
+            let Some(Reverse(RunningAssignment(ended, _, report))) = turns.pop() else { break };
             campaign.time = ended;
             campaign.candidates += u32::from(matches!(report.outcome, Outcome::Candidate(_)));
             let commit = selector.report(report).unwrap().unwrap_or_default();
@@ -89,20 +92,20 @@ impl Campaign {
     }
 }
 
-/// Processor time of this thread: what else is at work on the machine does not count.
+/// Processor time of this thread, which other load on the machine does not affect.
 fn processor_time() -> Duration {
     Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap()
 }
 
-fn selector(mode: Mode, turn_steps: u64, model: &GraceModel) -> Selector {
+fn selector(mode: Mode, assignment_steps: u64, model: &GraceModel) -> Selector {
     let rule = "rule = 'atom_count'\nthreshold = 1.3\nfraction = 0.15\nleast = 3\n";
     let settings = Settings {
         mode,
         walks_per_round: seeds().len(),
-        turn_steps,
+        turn_steps: assignment_steps,
         update: UpdateProtocol::Carried,
         search: UpdateSettings {
-            combination: calm::Combination::Convex,
+            combination: calm::CovarianceUpdateKind::Convex,
             ladder: None,
             stop: toml::from_str(&format!("{rule}target = 1.25")).unwrap(),
         },
@@ -164,27 +167,27 @@ fn data(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/data").join(path)
 }
 
-impl Turn {
+impl RunningAssignment {
     fn order(&self) -> (Duration, u64) {
         (self.0, self.1)
     }
 }
 
-impl PartialEq for Turn {
+impl PartialEq for RunningAssignment {
     fn eq(&self, other: &Self) -> bool {
         self.order() == other.order()
     }
 }
 
-impl Eq for Turn {}
+impl Eq for RunningAssignment {}
 
-impl PartialOrd for Turn {
+impl PartialOrd for RunningAssignment {
     fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
         Some(self.cmp(other))
     }
 }
 
-impl Ord for Turn {
+impl Ord for RunningAssignment {
     fn cmp(&self, other: &Self) -> std::cmp::Ordering {
         self.order().cmp(&other.order())
     }

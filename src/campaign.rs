@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use calm::Artifact;
-use calm::watch::ForgettingAlarm;
+use calm::forgetting::ForgettingAlarm;
 use orchestrator::grader::Grader;
 use orchestrator::selector::{self, Mode, SeedStructure, TrainingFrames};
 use potentials::grace::{GraceModel, Precision};

@@ -1,6 +1,6 @@
 //! Errors of the potential's energies against labels, after removing element offsets.
 
-use analysis::{EnergyOffsets, Thinned, TooFewLabels, quantile};
+use analysis::{EnergyOffsets, SystematicSample, TooFewLabels, quantile};
 use atoms::{Species, Structure};
 use serde::Serialize;
 use store::{Store, StoreError};
@@ -47,7 +47,7 @@ pub struct OffsetEntry {
 pub struct EnergyErrors {
     reference: EnergyReference,
     /// Absolute errors, eV/atom.
-    errors: Thinned<f64>,
+    errors: SystematicSample<f64>,
     sum: f64,
     largest: f64,
     left_out: u64,
@@ -147,14 +147,14 @@ impl EnergyReference {
 impl EnergyErrors {
     /// Starts without errors.
     pub fn new(reference: EnergyReference) -> Self {
-        Self { reference, errors: Thinned::new(MAX_SAMPLES), sum: 0.0, largest: 0.0, left_out: 0 }
+        Self { reference, errors: SystematicSample::new(MAX_SAMPLES), sum: 0.0, largest: 0.0, left_out: 0 }
     }
 
     /// Adds a labelled structure with its energies, eV.
     pub fn add(&mut self, structure: &Structure, model: f64, label: f64) {
         match self.reference.error_per_atom(structure, model, label) {
             Some(error) => {
-                self.errors.push(error.abs());
+                self.errors.add(error.abs());
                 self.sum += error.abs();
                 self.largest = self.largest.max(error.abs());
             }
@@ -164,9 +164,9 @@ impl EnergyErrors {
 
     /// Summarizes the errors.
     pub fn summary(&self) -> EnergySummary {
-        let mut sorted: Vec<f64> = self.errors.kept().copied().collect();
+        let mut sorted: Vec<f64> = self.errors.items().copied().collect();
         sorted.sort_by(f64::total_cmp);
-        let structures = self.errors.seen();
+        let structures = self.errors.total();
         let any = |x: f64| (structures > 0).then_some(x);
         EnergySummary {
             structures,

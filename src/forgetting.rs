@@ -1,6 +1,6 @@
 //! The alarm for a mixture that forgets its training data.
 
-use calm::rules::Combination;
+use calm::rules::CovarianceUpdateKind;
 
 use crate::config::CalmSection;
 
@@ -12,7 +12,7 @@ const HYSTERESIS: f64 = 0.9;
 pub struct ForgettingRule {
     /// Share of the training atoms above which the alarm is raised.
     limit: f64,
-    combination: Combination,
+    combination: CovarianceUpdateKind,
 }
 
 /// State of the alarm in a run.
@@ -37,10 +37,10 @@ impl ForgettingRule {
     /// Message when the alarm is raised, with advice.
     pub fn raised_message(&self, share: f64) -> String {
         let other = match self.combination {
-            Combination::Convex => {
+            CovarianceUpdateKind::Convex => {
                 "combination = \"additive\", which forgets nothing, or with smaller values of ladder"
             }
-            Combination::Additive => "smaller values of ladder",
+            CovarianceUpdateKind::Additive => "smaller values of ladder",
         };
         format!(
             "the mixture forgets its training data: {:.1} % of the training atoms have γ > 1 (calm.forgetting_alarm: {:.1} %), \
@@ -83,7 +83,7 @@ mod tests {
 
     #[test]
     fn an_alarm_is_reported_when_it_begins_and_when_it_ends() {
-        let forgetting = ForgettingRule { limit: 0.2, combination: Combination::Convex };
+        let forgetting = ForgettingRule { limit: 0.2, combination: CovarianceUpdateKind::Convex };
         let mut alarm = AlarmState::new(forgetting);
         let said: Vec<_> = [0.1, 0.21, 0.3, 0.19, 0.21, 0.17, 0.1, 0.25]
             .into_iter()

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use atoms::Species;
-use dft::Code;
+use dft::DftBackend;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use store::{Protocol, Store};
@@ -76,7 +76,7 @@ pub fn protocol(name: &str, settings: Value) -> Protocol {
 }
 
 /// Protocol settings of a program's labels.
-pub fn code_identity(method: &str, code: &dyn Code) -> Value {
+pub fn code_identity(method: &str, code: &dyn DftBackend) -> Value {
     json!({ "method": method, "settings": code.identity() })
 }
 

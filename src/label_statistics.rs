@@ -55,8 +55,8 @@ pub async fn read(store: &Store, protocol: ContentHash) -> Result<LabelStatistic
         control: ErrorsByGrade::new(),
         energies: EnergyErrors::new(EnergyReference::fit(store, protocol).await?),
         shared: 0,
-        by_gamma: Completion::new(Bins::of_grades()),
-        by_expansion: Completion::new(Bins::of_expansion()),
+        by_gamma: Completion::new(Bins::for_grades()),
+        by_expansion: Completion::new(Bins::for_volume_ratio()),
     };
     let shared = store.structures_of_both_origins().await?;
     let filter = ExportFilter { protocol, biased: true, control: true, imported: false };
@@ -103,8 +103,8 @@ impl LabelStatistics {
             [(&mut self.by_gamma, candidate.gamma), (&mut self.by_expansion, candidate.relative_volume)]
         {
             match candidate.labelled {
-                true => completion.labelled(value),
-                false => completion.failed(value, candidate.candidate.clone()),
+                true => completion.add_labelled(value),
+                false => completion.add_failed(value, candidate.candidate.clone()),
             }
         }
         if let Some(grades) = &candidate.unlabelled {
@@ -115,19 +115,19 @@ impl LabelStatistics {
 
 impl ErrorsByGrade {
     fn new() -> Self {
-        let errors = ForceErrors::new(Bins::of_grades(), LARGE_FORCE_ERROR, MAX_SAMPLES);
+        let errors = ForceErrors::new(Bins::for_grades(), LARGE_FORCE_ERROR, MAX_SAMPLES);
         Self { structures: 0, gamma: errors.clone(), gamma_nbr: errors }
     }
 
     fn labelled(&mut self, original: &AtomGrades, errors: &[f64]) {
         self.structures += 1;
         for (by, grades) in [(&mut self.gamma, &original.gamma), (&mut self.gamma_nbr, &original.gamma_nbr)] {
-            grades.iter().zip(errors).for_each(|(grade, error)| by.push(*grade, *error));
+            grades.iter().zip(errors).for_each(|(grade, error)| by.add(*grade, *error));
         }
     }
 
     fn unlabelled(&mut self, original: &AtomGrades) {
-        original.gamma.iter().for_each(|grade| self.gamma.push_unlabelled(*grade));
-        original.gamma_nbr.iter().for_each(|grade| self.gamma_nbr.push_unlabelled(*grade));
+        original.gamma.iter().for_each(|grade| self.gamma.add_unlabelled(*grade));
+        original.gamma_nbr.iter().for_each(|grade| self.gamma_nbr.add_unlabelled(*grade));
     }
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use calm::movement::{self, Movement};
+use calm::drift::{self, Drift};
 use calm::{Artifact, Component, LinearError, Mixture};
 use serde::Serialize;
 use serde_json::Value;
@@ -106,9 +106,9 @@ impl ComponentStatus {
         now: &Arc<Component>,
     ) -> Result<Self, LinearError> {
         let moved = !before.is_some_and(|before| Arc::ptr_eq(before, now));
-        let movement = match before {
-            Some(before) if moved => movement::movement(before, now)?,
-            _ => Some(Movement { grown: 1.0, shrunk: 1.0, distance: 0.0 }),
+        let drift = match before {
+            Some(before) if moved => drift::drift(before, now)?,
+            _ => Some(Drift { grown: 1.0, shrunk: 1.0, distance: 0.0 }),
         };
         let count = |component: &Component| component.statistics().map(|statistics| statistics.count);
         Ok(Self {
@@ -118,11 +118,11 @@ impl ComponentStatus {
             environments_before: before.and_then(|before| count(before)),
             environments: count(now),
             weighted: now.statistics().map(|statistics| statistics.effective_count),
-            condition_number: movement::condition_number(now)?,
+            condition_number: drift::condition_number(now)?,
             moved,
-            grown: movement.map(|movement| movement.grown),
-            shrunk: movement.map(|movement| movement.shrunk),
-            distance: movement.map(|movement| movement.distance),
+            grown: drift.map(|drift| drift.grown),
+            shrunk: drift.map(|drift| drift.shrunk),
+            distance: drift.map(|drift| drift.distance),
         })
     }
 }

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use calm::watch::GradeDistribution;
+use calm::forgetting::GradeDistribution;
 use store::{Status, Store, StoreError, Unlabelled};
 use wire::ContentHash;
 
@@ -127,8 +127,8 @@ fn line(grades: &ErrorsByGrade) -> String {
         "{:>5}   {} eV/Å   {:>4} %      {:>4} %   {:>11}   {:>15}   {:>10}   {:>14}",
         gamma.atoms(),
         decimals(gamma.mean(), 3),
-        percent(gamma.share_above(1.0)),
-        percent(gamma_nbr.share_above(1.0)),
+        percent(gamma.fraction_above(1.0)),
+        percent(gamma_nbr.fraction_above(1.0)),
         decimals(gamma.spearman(), 2),
         decimals(gamma_nbr.spearman(), 2),
         decimals(gamma.roc_auc(), 2),

@@ -45,7 +45,7 @@ impl Iterator for XyzReader {
         Some(frame.map_err(|error| FileError::Extxyz {
             path: self.path.clone(),
             line: error.line,
-            fault: error.fault,
+            fault: error.kind,
         }))
     }
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use atoms::extxyz::{Frame, Keys, Labels, Value};
+use atoms::extxyz::{Frame, LabelKeys, Labels, Value};
 use atoms::{Evaluation, NeighbourList, Potential, read_extxyz};
 use potentials::{Eam, EamStyle};
 use serde_json::Value as Json;
@@ -151,7 +151,7 @@ fn an_export_holds_labels_and_grades_in_decision_order() {
     }
     check_grades(here, &frames);
 
-    for (keys, name) in [("mace", Keys::Mace), ("grace", Keys::Grace)] {
+    for (keys, name) in [("mace", LabelKeys::Mace), ("grace", LabelKeys::Grace)] {
         succeed(here, ["export", "small", "--output", "other.extxyz", "--keys", keys]);
         let others = read_extxyz(&here.join("other.extxyz")).unwrap();
         for (frame, other) in frames.iter().zip(&others) {
@@ -289,7 +289,7 @@ fn labelled_structures_are_imported_once() {
     assert_eq!(succeed(here, ["import", "small", "new.extxyz", "own.extxyz"]), counts(0, 0, 7, "reference"));
     let mut other = seeds[..1].to_vec();
     let labels = Labels { energy: Some(-364.0), ..other[0].labels().unwrap() };
-    other[0].set_labels(&labels, Keys::Mace);
+    other[0].set_labels(&labels, LabelKeys::Mace);
     write_frames(&here.join("other.extxyz"), &other);
     assert_eq!(succeed(here, ["import", "small", "other.extxyz"]), counts(0, 1, 0, "reference"));
     succeed(here, ["export", "small", "--output", "all.extxyz", "--imported"]);

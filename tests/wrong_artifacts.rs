@@ -45,23 +45,23 @@ fn artifacts_that_are_nonsense_are_refused() {
         ("inv_cov_0", 0.0, "expected a positive definite matrix"),
         ("inv_cov_0", -1.0, "expected a positive definite matrix"),
         ("inv_cov_0", 1e6, "on the diagonal; expected at most 1e6"),
-        ("inv_cov_0", 1e-6, "does not belong to its scatter and count"),
+        ("inv_cov_0", 1e-6, "does not match its scatter and count"),
         ("eff_interp_thresholds", 0.0, "its threshold is 0.000e0; expected 1.0e-2 to"),
         ("eff_interp_thresholds", 1e6, "its threshold is 1.412e7; expected"),
         ("centroids_0", 0.0, "its centroid is zero"),
         ("centroids_0", 1e3, "its centroid is"),
-        ("scatter_0", 0.0, "does not belong to its scatter and count"),
+        ("scatter_0", 0.0, "does not match its scatter and count"),
         ("scatter_0", -1.0, "its scatter has a negative eigenvalue"),
-        ("scatter_0", 1e3, "does not belong to its scatter and count"),
-        ("effective_count_0", 0.0, "5400 environments of weight 0 in sum"),
-        ("effective_count_0", 1e-3, "does not belong to its scatter and count"),
+        ("scatter_0", 1e3, "does not match its scatter and count"),
+        ("effective_count_0", 0.0, "5400 environments with a total weight of 0"),
+        ("effective_count_0", 1e-3, "does not match its scatter and count"),
     ] {
         tester.write("bad.npz", scaled(array, factor));
         tester.refused_with(&path(ARTIFACT), "bad.npz", &[&at, words]);
     }
     for array in ["scatter_0", "inv_cov_0"] {
         tester.write("bad.npz", of_silicon(array));
-        tester.refused_with(&path(ARTIFACT), "bad.npz", &[&at, inverse, "does not belong"]);
+        tester.refused_with(&path(ARTIFACT), "bad.npz", &[&at, inverse, "does not match"]);
     }
     tester.write(
         "bad.npz",
@@ -127,7 +127,7 @@ fn score_refuses_nonsense_and_info_shows_it() {
     let arguments = ["--model", &model, "--artifact", "bad.npz", &frames, "--output", "out.extxyz"];
     let message = refuse(tester.path(), ["calm", "score"].into_iter().chain(arguments));
     assert!(
-        message.contains("bad.npz: component 0 of Al: its inverse covariance does not belong"),
+        message.contains("bad.npz: component 0 of Al: its inverse covariance does not match"),
         "{message}"
     );
     let shown = succeed(tester.path(), ["calm", "info", "bad.npz"]);

@@ -85,7 +85,7 @@ fn structures_that_no_walk_can_start_from_are_refused() {
     for (content, words) in [
         (
             good.replace("Al 2.8 2.8 2.8", "Cu 2.8 2.8 2.8"),
-            ":1: atom 13 is Cu, which the potential does not know (it knows Al)",
+            ":1: atom 13 is Cu, which the potential does not support (it supports Al)",
         ),
         (
             good.replace("Al 2.8 2.8 2.8", "Al 2.8 2.8 0.1"),

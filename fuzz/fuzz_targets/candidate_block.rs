@@ -1,10 +1,10 @@
-//! Any bytes are a candidate block or an error, and a block gives back its bytes.
+//! Any bytes parse as a candidate block or give an error, and a block re-encodes to the same bytes.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
 use wire::CandidateBlock;
 
-/// Magic, version, checksum and length come first.
+/// Magic, version, checksum and length precede.
 const CHECKED_FROM: usize = 16;
 const COUNTED_FROM: usize = 24;
 
@@ -23,7 +23,7 @@ fn read(bytes: &[u8]) {
     }
 }
 
-/// The bytes behind a beginning that fits them, so that what lies behind the checksum is reached.
+/// Prepends a valid header, so that the fuzzer reaches the code behind the checksum.
 fn sealed(bytes: &[u8]) -> Vec<u8> {
     let length = (COUNTED_FROM + bytes.len()) as u64;
     let rest = [&length.to_le_bytes(), bytes].concat();
@@ -34,7 +34,7 @@ fn sealed(bytes: &[u8]) -> Vec<u8> {
     with_content_hash(sealed)
 }
 
-/// The block with the hash of the structure that it holds, if it holds one.
+/// Sets the content hash to that of the structure in the block, if it holds one.
 fn with_content_hash(mut bytes: Vec<u8>) -> Vec<u8> {
     const CONTENT: std::ops::Range<usize> = 56..88;
     if let Err(wire::BlockError::Field { field: "content hash", .. }) = CandidateBlock::from_bytes(&bytes) {

@@ -1,4 +1,5 @@
-//! Any bytes are a message between walker and orchestrator or are refused, and a message comes back from its own bytes.
+//! Any bytes parse as a message between walker and orchestrator or are rejected, and a message re-encodes to
+//! the same bytes.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -12,12 +13,12 @@ fuzz_target!(|bytes: &[u8]| {
 fn read(bytes: &[u8]) {
     for (role, echoed) in echo(bytes).into_iter().enumerate() {
         let Some(echoed) = echoed else { continue };
-        // Numbers may be NaN, which is not equal to itself: compare what is sent.
+        // NaN is not equal to itself, so compare the encoded messages.
         assert_eq!(echo(&echoed)[role].as_ref(), Some(&echoed));
     }
 }
 
-/// The bytes behind a beginning that fits them, so that what lies behind the checksum is reached.
+/// Prepends a valid header, so that the fuzzer reaches the code behind the checksum.
 fn framed(bytes: &[u8]) -> Vec<u8> {
     let control = [b"CALM\x02".as_slice(), &crc32fast::hash(bytes).to_le_bytes(), bytes].concat();
     let mut framed = [(control.len() as u64).to_le_bytes().as_slice(), &control].concat();

@@ -1,4 +1,4 @@
-//! Any text is a list of frames or an error with its line, and what was read can be used.
+//! Any text parses as frames or gives an error with its line, and parsed frames can be used.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;

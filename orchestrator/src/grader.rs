@@ -72,12 +72,12 @@ impl Grader {
         let mut directed = 0;
         for i in 0..list.len() {
             next.push(directed);
-            directed += list.of(i).len();
+            directed += list.neighbours_of(i).len();
         }
         pairs.resize(directed, Pair { i: 0, j: 0, weight: 0.0 });
         for i in 0..list.len() {
-            let below = list.of(i).partition_point(|neighbour| (neighbour.atom as usize) < i);
-            for images in list.of(i)[below..].chunk_by(|a, b| a.atom == b.atom) {
+            let below = list.neighbours_of(i).partition_point(|neighbour| (neighbour.atom as usize) < i);
+            for images in list.neighbours_of(i)[below..].chunk_by(|a, b| a.atom == b.atom) {
                 let j = images[0].atom as usize;
                 for (k, neighbour) in images.iter().enumerate() {
                     let distance = cell::norm(neighbour.displacement(structure, i));
@@ -147,7 +147,7 @@ mod tests {
             list.update(&structure).unwrap();
             let (mut expected, mut shortest) = (Vec::new(), f64::INFINITY);
             for i in 0..structure.len() {
-                for neighbour in list.of(i) {
+                for neighbour in list.neighbours_of(i) {
                     let (j, r) = (neighbour.atom as usize, cell::norm(neighbour.displacement(&structure, i)));
                     expected.push(Pair::new(i, j, r, cutoffs[i % 2 * 2 + j % 2]));
                     shortest = f64::min(shortest, r);

@@ -1,6 +1,6 @@
 //! What is submitted and cancelled: by hand, then whoever launches how often while jobs begin, end and come back.
 
-use orchestrator::slurm::{Job, JobNames, Phase, Plan, Role, Submission, Wanted, plan};
+use orchestrator::slurm::{Job, JobNames, JobPhase, Plan, Role, Submission, Wanted, plan};
 use proptest::prelude::*;
 
 const WANTED: Wanted = Wanted { agents: 2, walkers: 4, labellers: 1 };
@@ -121,26 +121,26 @@ impl System {
         if let Some(known) = self.jobs.iter_mut().find(|known| known.job.id == id) {
             known.requeue = false;
             match known.job.phase() {
-                Phase::Pending => known.job.state = "CANCELLED".into(),
-                Phase::Running => known.job.state = "COMPLETING".into(),
-                Phase::Completing | Phase::Over => {}
+                JobPhase::Pending => known.job.state = "CANCELLED".into(),
+                JobPhase::Running => known.job.state = "COMPLETING".into(),
+                JobPhase::Completing | JobPhase::Over => {}
             }
         }
     }
 
-    fn phase(&self, id: u64) -> Phase {
-        self.jobs.iter().find(|known| known.job.id == id).map_or(Phase::Over, |known| known.job.phase())
+    fn phase(&self, id: u64) -> JobPhase {
+        self.jobs.iter().find(|known| known.job.id == id).map_or(JobPhase::Over, |known| known.job.phase())
     }
 
     fn may_begin(&self, known: &Known) -> bool {
         let before = |other: &&Known| {
             other.job.role == known.job.role
-                && (other.job.phase() == Phase::Running
-                    || other.job.phase() == Phase::Pending && other.job.id < known.job.id)
+                && (other.job.phase() == JobPhase::Running
+                    || other.job.phase() == JobPhase::Pending && other.job.id < known.job.id)
         };
-        known.job.phase() == Phase::Pending
+        known.job.phase() == JobPhase::Pending
             && !self.jobs.iter().any(|other| before(&other))
-            && known.after.iter().all(|id| self.phase(*id) == Phase::Over)
+            && known.after.iter().all(|id| self.phase(*id) == JobPhase::Over)
     }
 
     /// What the system does by itself to the job at a place.
@@ -149,13 +149,13 @@ impl System {
         let begins = self.may_begin(known);
         let known = &mut self.jobs[place % self.last as usize];
         known.job.state = match (known.job.phase(), choice % 3) {
-            (Phase::Pending, _) if begins => "RUNNING".into(),
-            (Phase::Running, 0 | 1) => {
+            (JobPhase::Pending, _) if begins => "RUNNING".into(),
+            (JobPhase::Running, 0 | 1) => {
                 known.requeue = choice.is_multiple_of(3);
                 "COMPLETING".into()
             }
-            (Phase::Completing, _) if known.requeue => "PENDING".into(),
-            (Phase::Completing, _) => "COMPLETED".into(),
+            (JobPhase::Completing, _) if known.requeue => "PENDING".into(),
+            (JobPhase::Completing, _) => "COMPLETED".into(),
             _ => return,
         };
     }
@@ -166,14 +166,14 @@ impl System {
 
     fn check(&self, most: &Wanted) {
         let running = |role: Role| {
-            let running = self.jobs.iter().filter(move |known| known.job.phase() == Phase::Running);
+            let running = self.jobs.iter().filter(move |known| known.job.phase() == JobPhase::Running);
             running.filter(move |known| known.job.role == role).count()
         };
         assert!(running(Role::Orchestrator) <= 1, "{self:#?}");
         let agents: Vec<_> = self
             .jobs
             .iter()
-            .filter(|known| known.job.phase() == Phase::Running && known.job.walkers.is_some())
+            .filter(|known| known.job.phase() == JobPhase::Running && known.job.walkers.is_some())
             .collect();
         let walkers: u32 = agents.iter().filter_map(|known| known.job.walkers).sum();
         assert!(walkers <= most.agents * most.walkers, "{self:#?}");
@@ -229,7 +229,7 @@ proptest! {
         // Whatever there was, a launch that nobody disturbs leaves what it asks for, and another has nothing to do.
         let wanted = asked[0];
         for known in &mut system.jobs {
-            if known.job.phase() == Phase::Completing {
+            if known.job.phase() == JobPhase::Completing {
                 known.job.state = "COMPLETED".into();
             }
         }
@@ -240,7 +240,7 @@ proptest! {
         prop_assert_eq!(plan(&wanted, &system.shown()), Plan::default());
         for role in wanted.roles() {
             let living = system.jobs.iter().filter(|known| known.job.role == role);
-            let living = living.filter(|k| matches!(k.job.phase(), Phase::Pending | Phase::Running)).count();
+            let living = living.filter(|k| matches!(k.job.phase(), JobPhase::Pending | JobPhase::Running)).count();
             prop_assert_eq!(living, 1);
         }
     }

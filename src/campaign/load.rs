@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use atoms::{NeighbourList, Structure, read_structures};
-use calm::watch::grade_distribution;
+use calm::forgetting::grade_distribution;
 use calm::{Artifact, ArtifactError, Mixture};
 use orchestrator::selector::TrainingFrames;
 use potentials::grace::{Grace, GraceModel, RadialPath};

@@ -63,7 +63,8 @@ impl Loader<'_> {
                  here"
             ));
         }
-        let alone = (0..structure.len()).find(|i| structure.len() > 1 && neighbours.of(*i).is_empty());
+        let alone =
+            (0..structure.len()).find(|i| structure.len() > 1 && neighbours.neighbours_of(*i).is_empty());
         if let Some(atom) = alone {
             let cutoff = model.cutoff();
             return Err(format!(

@@ -1,6 +1,6 @@
 //! The decision about a candidate: its numbers and its consequences for other candidates.
 
-use calm::watch::GradeDistribution;
+use calm::forgetting::GradeDistribution;
 use calm::{Trial, UpdateEnd, UpdateRule};
 use orchestrator::selector::{STALENESS, Staleness};
 use serde::{Deserialize, Serialize};

@@ -210,7 +210,7 @@ fn grades_as_json(grades: &ErrorsByGrade) -> Value {
     let one = |errors: &analysis::ForceErrors| {
         json!({
             "spearman": errors.spearman(), "roc_auc": errors.roc_auc(), "left_out": errors.left_out(),
-            "sampled_atoms": errors.sampled(), "share_above_one": errors.share_above(1.0),
+            "sampled_atoms": errors.sampled(), "share_above_one": errors.fraction_above(1.0),
             "bins": errors.bins().iter().map(bin_as_json).collect::<Vec<_>>(),
         })
     };

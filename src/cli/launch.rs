@@ -8,7 +8,7 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use orchestrator::slurm::{JobNames, Phase, Plan, Slurm, SlurmError, Wanted, plan};
+use orchestrator::slurm::{JobNames, JobPhase, Plan, Slurm, SlurmError, Wanted, plan};
 use store::Location;
 
 use self::job_specs::JobSpecs;
@@ -174,7 +174,7 @@ impl Launch {
         specs.write()?;
         let jobs = slurm.jobs(names).await.or_else(jobs)?;
         let Plan { cancel, submit } = plan(&wanted, &jobs);
-        for job in jobs.iter().filter(|job| job.phase() != Phase::Over) {
+        for job in jobs.iter().filter(|job| job.phase() != JobPhase::Over) {
             let action = if cancel.contains(&job.id) { "cancelled" } else { "kept" };
             print(|out| writeln!(out, "{}: job {} ({}) {action}", job.role, job.id, job.state))?;
         }

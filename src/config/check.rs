@@ -87,7 +87,7 @@ pub fn check_label(label: &LabelSection) -> Vec<Wrong> {
 }
 
 fn check_pass_environment(label: &LabelSection) -> Result<(), Wrong> {
-    let Some(pattern) = label.pass_environment.fault() else { return Ok(()) };
+    let Some(pattern) = label.pass_environment.invalid_pattern() else { return Ok(()) };
     let expected = "names of environment variables, or their beginnings with a * behind them: [\"MYCODE_*\"]";
     wrong("label.pass_environment", format!("{pattern:?}"), expected)
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use atoms::Species;
-use calm::Combination;
+use calm::CovarianceUpdateKind;
 use serde_json::{Value, json};
 
 use super::Config;
@@ -80,7 +80,7 @@ fn keys_that_are_commented_out_show_their_defaults() {
         for (key, before, after) in differ {
             let expected = match key.as_str() {
                 // These have no default value: what holds without them is the same as this value here …
-                "calm.ladder" => json!(Combination::Convex.default_ladder()),
+                "calm.ladder" => json!(CovarianceUpdateKind::Convex.default_alphas()),
                 "walk.time_step" => json!(md::default_time_step(&["Al".parse::<Species>().unwrap()])),
                 // … or said in words.
                 _ => {

@@ -18,7 +18,7 @@ mod warning;
 use std::num::{NonZeroU32, NonZeroU64, NonZeroUsize};
 use std::path::{Path, PathBuf};
 
-use calm::rules::{Combination, Fraction, Positive};
+use calm::rules::{CovarianceUpdateKind, Fraction, Positive};
 use calm::{CollectionRule, UpdateSettings};
 use dft::PassedEnvironment;
 use orchestrator::selector::{Mode, UpdateProtocol};
@@ -114,10 +114,10 @@ pub struct CalmSection {
     pub update: UpdateProtocol,
     /// Convex or additive.
     #[serde(default)]
-    pub combination: Combination,
+    pub combination: CovarianceUpdateKind,
     /// The α to try; left out, those of the paper.
     #[serde(default)]
-    pub ladder: Option<calm::rules::AlphaLadder>,
+    pub ladder: Option<calm::rules::AlphaValues>,
 }
 
 /// `[seeds]`

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use analysis::Thinned;
+use analysis::SystematicSample;
 use atoms::cell::{norm, sub};
 use atoms::{NeighbourList, Species, Structure, shortest_distance};
 use store::{Collected, JobState, SeedStructure, Store, StoreError};
@@ -38,15 +38,15 @@ pub struct Collections {
 /// The collected structures of one origin.
 pub struct OriginCollection {
     /// Sizes of structures.
-    pub structures: Thinned<StructureSize>,
+    pub structures: SystematicSample<StructureSize>,
     /// Grades and errors of atoms.
-    pub atoms: Thinned<Atom>,
+    pub atoms: SystematicSample<Atom>,
     /// Number of atoms of each element.
     pub elements: BTreeMap<Species, u64>,
     /// Numbers of structures by seed structure and status of their labels.
     pub labels: BTreeMap<u32, Counts>,
     /// Decisions about the structures whose features are read.
-    sampled: Thinned<i64>,
+    sampled: SystematicSample<i64>,
 }
 
 /// Numbers of structures by status of their labels.
@@ -109,7 +109,7 @@ impl Collections {
         let elements = Features::most_frequent(&biased.elements, &control.elements);
         let mut features = Features::new(&elements);
         for (origin, collection) in [(Origin::Biased, &biased), (Origin::Control, &control)] {
-            for decision in collection.sampled.kept() {
+            for decision in collection.sampled.items() {
                 let found = store.candidates(decision - 1, true, 1).await?;
                 let Some(found) = found.first().filter(|found| found.decision == *decision) else { continue };
                 if let Some(numbers) = &found.features {
@@ -140,11 +140,11 @@ impl Collections {
 impl OriginCollection {
     fn new() -> Self {
         Self {
-            structures: Thinned::new(MAX_STRUCTURES),
-            atoms: Thinned::new(MAX_ATOMS),
+            structures: SystematicSample::new(MAX_STRUCTURES),
+            atoms: SystematicSample::new(MAX_ATOMS),
             elements: BTreeMap::new(),
             labels: BTreeMap::new(),
-            sampled: Thinned::new(MAX_WITH_FEATURES),
+            sampled: SystematicSample::new(MAX_WITH_FEATURES),
         }
     }
 
@@ -160,14 +160,14 @@ impl OriginCollection {
         let structure = view.structure();
         let periodic = structure.periodic == [true; 3];
         let volume = structure.cell.signed_volume().abs() / structure.len() as f64;
-        self.structures.push(StructureSize {
+        self.structures.add(StructureSize {
             relative_volume: view.relative_volume(),
             volume_per_atom: periodic.then_some(volume),
         });
         for species in &structure.species {
             *self.elements.entry(*species).or_default() += 1;
         }
-        self.sampled.push(row.decision);
+        self.sampled.add(row.decision);
         self.add_atoms(row, view.forces, &structure, shortest);
     }
 
@@ -182,7 +182,7 @@ impl OriginCollection {
         let stretches = shortest.filter(|_| is_labelled).map(|shortest| stretches(structure, shortest));
         for (k, gamma) in row.original.gamma.iter().enumerate() {
             let label = row.label_forces.as_ref().and_then(|label| label.get(k));
-            self.atoms.push(Atom {
+            self.atoms.add(Atom {
                 gamma: *gamma,
                 gamma_nbr: row.original.gamma_nbr.get(k).copied().unwrap_or(f64::NAN),
                 error: label.zip(forces.get(k)).map(|(label, model)| norm(sub(*model, *label))),

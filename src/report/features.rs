@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use analysis::{PrincipalAxes, Thinned};
+use analysis::{PrincipalAxes, SystematicSample};
 use atoms::Species;
 use wire::Origin;
 
@@ -16,7 +16,7 @@ pub struct Features(BTreeMap<Species, [FeatureSample; 2]>);
 
 /// Features of one element and origin.
 pub struct FeatureSample {
-    atoms: Thinned<Vec<f64>>,
+    atoms: SystematicSample<Vec<f64>>,
     /// Mean over the atoms of each structure.
     centroids: Vec<Vec<f64>>,
 }
@@ -47,7 +47,7 @@ pub struct Points {
 impl Features {
     /// Starts empty, for these elements.
     pub fn new(elements: &[Species]) -> Self {
-        let sample = || FeatureSample { atoms: Thinned::new(MAX_ATOMS), centroids: Vec::new() };
+        let sample = || FeatureSample { atoms: SystematicSample::new(MAX_ATOMS), centroids: Vec::new() };
         Self(elements.iter().map(|element| (*element, [sample(), sample()])).collect())
     }
 
@@ -74,7 +74,7 @@ impl Features {
             let rows: Vec<_> = rows.filter(|(of, _)| *of == element).map(|(_, row)| row.to_vec()).collect();
             if !rows.is_empty() {
                 sample.centroids.push(mean(&rows));
-                rows.into_iter().for_each(|row| sample.atoms.push(row));
+                rows.into_iter().for_each(|row| sample.atoms.add(row));
             }
         }
     }
@@ -87,18 +87,18 @@ impl Features {
 
 impl Plane {
     fn fit(element: Species, [biased, control]: &[FeatureSample; 2]) -> Option<Self> {
-        let first = biased.atoms.kept().chain(control.atoms.kept()).next()?;
-        let rows = biased.atoms.kept().chain(control.atoms.kept());
+        let first = biased.atoms.items().chain(control.atoms.items()).next()?;
+        let rows = biased.atoms.items().chain(control.atoms.items());
         let rows: Vec<_> = rows.filter(|row| row.len() == first.len()).flatten().copied().collect();
-        let axes = PrincipalAxes::of(&rows, first.len(), 2)?;
+        let axes = PrincipalAxes::fit(&rows, first.len(), 2)?;
         let shares = [axes.shares[0], axes.shares[1]];
         let place = |row: &Vec<f64>| -> [f64; 2] {
             let along = axes.project(row);
             [along[0], along[1]]
         };
         let points = |sample: &FeatureSample| Points {
-            seen: sample.atoms.seen(),
-            atoms: sample.atoms.kept().map(place).collect(),
+            seen: sample.atoms.total(),
+            atoms: sample.atoms.items().map(place).collect(),
             centroids: sample.centroids.iter().map(place).collect(),
         };
         Some(Self { element, shares, biased: points(biased), control: points(control) })

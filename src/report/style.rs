@@ -1,7 +1,7 @@
 //! Common style of the figures.
 
 use analysis::quantile;
-use figures::{Axis, Colour, Figure, Key, Marker, Scale, Stroke, legend};
+use figures::{Axis, Colour, Figure, LegendKey, Marker, Scale, Stroke, legend};
 use wire::Origin;
 
 /// Width of a two-column figure of a journal: 180 mm, in points.
@@ -42,7 +42,7 @@ pub fn origin_style(origin: Origin) -> OriginStyle {
 pub fn origins(figure: &mut Figure, shown: &[Origin]) {
     let keys: Vec<_> = shown
         .iter()
-        .map(|origin| (Key::Line(origin_style(*origin).line), origin_style(*origin).name))
+        .map(|origin| (LegendKey::Line(origin_style(*origin).line), origin_style(*origin).name))
         .collect();
     legend(figure, [WIDTH - 8.0, 12.0], &keys);
 }

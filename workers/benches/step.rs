@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use atoms::{Evaluation, NeighbourList, Structure};
-use calm::{Artifact, GradesInParts, Mixture};
+use calm::{Artifact, BatchedGrades, Mixture};
 use common::{Turn, crystal, quartiles};
 use potentials::grace::{Grace, GraceModel, PullBack};
 
@@ -67,7 +67,7 @@ struct Call {
     structure: Structure,
     neighbours: NeighbourList,
     elements: Vec<usize>,
-    grades: GradesInParts,
+    grades: BatchedGrades,
     pull_back: PullBack,
     out: Evaluation,
 }
@@ -83,7 +83,7 @@ impl Call {
             structure,
             neighbours,
             elements,
-            grades: GradesInParts::default(),
+            grades: BatchedGrades::default(),
             pull_back: PullBack::default(),
             out: Evaluation::default(),
         }

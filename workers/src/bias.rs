@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3, cell};
-use calm::{GradeError, Grades, GradesInParts, Mixture};
+use calm::{BatchedGrades, GradeError, Grades, Mixture};
 use potentials::Zbl;
 use potentials::grace::{Grace, PullBack};
 use serde::{Deserialize, Serialize};
@@ -60,7 +60,7 @@ pub struct BiasedPotential {
     average_steps: u64,
     pull_back: PullBack,
     /// With the bias on.
-    parts: GradesInParts,
+    parts: BatchedGrades,
     /// With the bias off.
     grades: Grades,
     physical: Evaluation,
@@ -88,7 +88,7 @@ impl BiasedPotential {
             state: BiasState::default(),
             average_steps,
             pull_back: PullBack::default(),
-            parts: GradesInParts::default(),
+            parts: BatchedGrades::default(),
             grades: Grades::default(),
             physical: Evaluation::default(),
         })

@@ -38,7 +38,7 @@ pub fn blown_up(
         // The list itself also holds pairs within its skin, and those depend on when it was built.
         let lost = (0..structure.len()).find(|i| {
             let distance = |neighbour: &Neighbour| cell::norm(neighbour.displacement(structure, *i));
-            !neighbours.of(*i).iter().any(|neighbour| distance(neighbour) < neighbours.cutoff())
+            !neighbours.neighbours_of(*i).iter().any(|neighbour| distance(neighbour) < neighbours.cutoff())
         });
         return lost.map(|atom| format!("atom {atom} has no neighbour within {:.2} Å", neighbours.cutoff()));
     }

@@ -114,7 +114,7 @@ impl<'a> Walk<'a> {
             }
         };
         potential.state = state.bias;
-        let collection = settings.collection.raised(assignment.raised);
+        let collection = settings.collection.with_threshold_factor(assignment.raised);
         let mut walk =
             Self { settings, assignment, model, mixture_version, collection, dynamics, potential, state };
         walk.take_verdict();

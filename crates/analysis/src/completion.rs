@@ -1,9 +1,9 @@
-//! Which part of what was attempted got its label.
+//! The fraction of attempted labels that succeeded.
 
-use crate::{Bins, wilson};
+use crate::{Bins, wilson_interval};
 
-/// Counts labels that were made and labels that finally failed, by a number that is known of either: a grade, an
-/// expansion. A failed label is censored, not absent: it counts among the attempted, and its structure stays known.
+/// Counts labels and final label failures in bins of a quantity known for both, such as the grade or the
+/// volume. A failed label is censored, not absent: it counts as attempted, and its structure is listed.
 #[derive(Clone, Debug)]
 pub struct Completion<T> {
     bins: Bins,
@@ -11,41 +11,41 @@ pub struct Completion<T> {
     unknown: (u64, Vec<T>),
 }
 
-/// What was attempted in one bin.
+/// The attempts in one bin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CompletionBin<T> {
-    /// Values above this; `None` from the lowest on.
+    /// Lower edge; `None` for the first bin.
     pub above: Option<f64>,
-    /// Up to this; `None` without an end.
+    /// Upper edge, inclusive; `None` for the last bin.
     pub up_to: Option<f64>,
-    /// Structures that have their labels.
+    /// Labelled structures.
     pub labelled: u64,
-    /// Those whose labels finally failed.
+    /// Structures whose label finally failed.
     pub failed: Vec<T>,
-    /// Labelled of attempted; `None` if nothing was.
+    /// Labelled / attempted; `None` without attempts.
     pub share: Option<f64>,
-    /// Where the probability of a label is, with 95 % ([`wilson`]).
+    /// 95 % confidence interval of the probability of a label ([`wilson_interval`]).
     pub interval: Option<(f64, f64)>,
 }
 
 impl<T: Clone> Completion<T> {
-    /// Sorts into `bins`.
+    /// An empty table with these bins.
     pub fn new(bins: Bins) -> Self {
-        let counts = vec![(0, Vec::new()); bins.number()];
+        let counts = vec![(0, Vec::new()); bins.count()];
         Self { bins, counts, unknown: (0, Vec::new()) }
     }
 
-    /// A structure that has its label.
-    pub fn labelled(&mut self, value: Option<f64>) {
+    /// Counts a labelled structure.
+    pub fn add_labelled(&mut self, value: Option<f64>) {
         self.place(value).0 += 1;
     }
 
-    /// A structure, called `name`, whose label finally failed.
-    pub fn failed(&mut self, value: Option<f64>, name: T) {
+    /// Counts the structure `name`, whose label finally failed.
+    pub fn add_failed(&mut self, value: Option<f64>, name: T) {
         self.place(value).1.push(name);
     }
 
-    /// By bin, also those where nothing was attempted; and last what has no finite value, if there is something.
+    /// The table, including empty bins. A last row holds structures without a finite value, if there are any.
     pub fn bins(&self) -> Vec<CompletionBin<T>> {
         let sorted = self.counts.iter().enumerate();
         let mut bins: Vec<_> = sorted.map(|(place, counts)| bin(self.bins.edges(place), counts)).collect();
@@ -57,7 +57,7 @@ impl<T: Clone> Completion<T> {
 
     fn place(&mut self, value: Option<f64>) -> &mut (u64, Vec<T>) {
         match value.filter(|value| value.is_finite()) {
-            Some(value) => &mut self.counts[self.bins.place(value)],
+            Some(value) => &mut self.counts[self.bins.index_of(value)],
             None => &mut self.unknown,
         }
     }
@@ -74,7 +74,7 @@ fn bin<T: Clone>(
         labelled: *labelled,
         failed: failed.clone(),
         share: (attempted > 0).then(|| *labelled as f64 / attempted as f64),
-        interval: wilson(*labelled, attempted),
+        interval: wilson_interval(*labelled, attempted),
     }
 }
 
@@ -84,29 +84,29 @@ mod tests {
 
     #[test]
     fn failures_count_among_the_attempted() {
-        let mut completion = Completion::new(Bins::of_expansion());
+        let mut completion = Completion::new(Bins::for_volume_ratio());
         for _ in 0..3 {
-            completion.labelled(Some(1.0));
+            completion.add_labelled(Some(1.0));
         }
-        completion.labelled(Some(1.4));
-        completion.failed(Some(1.42), "a");
-        completion.failed(Some(1.38), "b");
-        completion.failed(Some(1.5), "c");
+        completion.add_labelled(Some(1.4));
+        completion.add_failed(Some(1.42), "a");
+        completion.add_failed(Some(1.38), "b");
+        completion.add_failed(Some(1.5), "c");
         let bins = completion.bins();
         assert_eq!(bins.len(), 7);
         assert_eq!((bins[1].labelled, bins[1].share, &bins[1].failed), (3, Some(1.0), &vec![]));
         assert_eq!((bins[5].above, bins[5].up_to), (Some(1.35), Some(1.45)));
         assert_eq!((bins[5].labelled, bins[5].share), (1, Some(1.0 / 3.0)));
-        assert_eq!((&bins[5].failed, bins[5].interval), (&vec!["a", "b"], wilson(1, 3)));
+        assert_eq!((&bins[5].failed, bins[5].interval), (&vec!["a", "b"], wilson_interval(1, 3)));
         assert_eq!((bins[6].share, bins[6].up_to), (Some(0.0), None));
         assert_eq!((bins[0].share, bins[0].interval), (None, None));
     }
 
     #[test]
     fn what_has_no_value_is_not_lost() {
-        let mut completion = Completion::new(Bins::of_grades());
-        completion.labelled(None);
-        completion.failed(Some(f64::INFINITY), "a");
+        let mut completion = Completion::new(Bins::for_grades());
+        completion.add_labelled(None);
+        completion.add_failed(Some(f64::INFINITY), "a");
         let last = completion.bins().pop().unwrap();
         assert_eq!((last.above, last.up_to, last.labelled, last.failed), (None, None, 1, vec!["a"]));
     }

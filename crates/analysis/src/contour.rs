@@ -1,14 +1,15 @@
-//! Lines of one density (marching squares).
+//! Contour lines of a density (marching squares).
 
 use std::collections::BTreeMap;
 
-use crate::PlaneDensity;
+use crate::Density2d;
 
-/// Where a line crosses the side of a square: the side that begins at a place of the grid, to the right or upwards.
-type Side = (usize, usize, bool);
+/// The edge of a grid square that a line crosses: it starts at grid point (column, row) and runs right if true,
+/// up if false.
+type GridEdge = (usize, usize, bool);
 
-/// The closed lines on which the density is `level`. What reaches the edge of the grid is closed beyond it.
-pub fn contours(density: &PlaneDensity, level: f64) -> Vec<Vec<[f64; 2]>> {
+/// The closed contour lines at `level`. Lines that reach the edge of the grid are closed outside it.
+pub fn contours(density: &Density2d, level: f64) -> Vec<Vec<[f64; 2]>> {
     let mut next = segments(density, level);
     let mut lines = Vec::new();
     while let Some((first, mut side)) = next.pop_first() {
@@ -25,8 +26,9 @@ pub fn contours(density: &PlaneDensity, level: f64) -> Vec<Vec<[f64; 2]>> {
     lines
 }
 
-/// From side to side, with what is above the level on the left: each side is left by one line at most.
-fn segments(density: &PlaneDensity, level: f64) -> BTreeMap<Side, Side> {
+/// Maps the edge on which a line segment starts to the edge on which it ends, with the higher side on the left.
+/// At most one segment starts on each edge.
+fn segments(density: &Density2d, level: f64) -> BTreeMap<GridEdge, GridEdge> {
     let mut next = BTreeMap::new();
     for row in 0..=density.size() {
         for column in 0..=density.size() {
@@ -37,13 +39,13 @@ fn segments(density: &PlaneDensity, level: f64) -> BTreeMap<Side, Side> {
                 (column, row + 1, true),
                 (column, row, false),
             ];
-            // Corners from the lower left one against the clock; each side lies between a corner and the next.
+            // Corners anticlockwise from the lower left. Side k lies between corners k and k + 1.
             let corners = [corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1)];
             let sides = [bottom, right, top, left];
             let falls = |k: usize| corners[k] && !corners[(k + 1) % 4];
             let rises = |k: usize| !corners[k] && corners[(k + 1) % 4];
-            // A line goes from a side where the density falls to the one before it where it rises. Where opposite corners are above
-            // there are two lines: those corners are taken for apart.
+            // A segment runs from a side where the density falls to the preceding side where it rises. If
+            // opposite corners are above the level (a saddle), two segments separate them.
             for from in (0..4).filter(|k| falls(*k)) {
                 if let Some(to) = (1..4).map(|k| (from + 4 - k) % 4).find(|k| rises(*k)) {
                     next.insert(sides[from], sides[to]);
@@ -54,13 +56,13 @@ fn segments(density: &PlaneDensity, level: f64) -> BTreeMap<Side, Side> {
     next
 }
 
-/// The density with a border of nothing around the grid, whose places are counted from that border.
-fn value(density: &PlaneDensity, column: usize, row: usize) -> f64 {
+/// The density on the grid with a border of −∞. Indices count from the border.
+fn value(density: &Density2d, column: usize, row: usize) -> f64 {
     let is_inside = |k: usize| k >= 1 && k <= density.size();
     if is_inside(column) && is_inside(row) { density.value(column - 1, row - 1) } else { f64::NEG_INFINITY }
 }
 
-fn crossing(density: &PlaneDensity, level: f64, (column, row, is_horizontal): Side) -> [f64; 2] {
+fn crossing(density: &Density2d, level: f64, (column, row, is_horizontal): GridEdge) -> [f64; 2] {
     let (right, up) = if is_horizontal { (1, 0) } else { (0, 1) };
     let (from, to) = (value(density, column, row), value(density, column + right, row + up));
     let part = (level - from) / (to - from);
@@ -74,7 +76,7 @@ mod tests {
 
     fn cloud(centre: [f64; 2]) -> impl Iterator<Item = [f64; 2]> {
         (0..400).map(move |k| {
-            // Evenly over a disc of radius 1, by the golden angle.
+            // Uniform points on the unit disc, by the golden angle.
             let (radius, angle) = ((f64::from(k) / 400.0).sqrt(), 2.399_963_23 * f64::from(k));
             [centre[0] + radius * angle.cos(), centre[1] + radius * angle.sin()]
         })
@@ -88,21 +90,21 @@ mod tests {
     #[test]
     fn a_disc_has_a_round_contour_through_its_level() {
         let points: Vec<_> = cloud([2.0, -1.0]).collect();
-        let density = PlaneDensity::of(&points, 96).unwrap();
+        let density = Density2d::from_points(&points, 96).unwrap();
         let level = density.level(&points, 0.95).unwrap();
         let lines = contours(&density, level);
         assert_eq!(lines.len(), 1);
         for point in &lines[0] {
             assert!((density.at(*point) / level - 1.0).abs() < 0.02, "{point:?}");
         }
-        // With the clock or against it, its area is about that of the disc.
+        // The area, up to orientation, is about that of the disc.
         assert!((area(&lines[0]).abs() / std::f64::consts::PI - 1.0).abs() < 0.15, "{}", area(&lines[0]));
     }
 
     #[test]
     fn two_clouds_have_two() {
         let points: Vec<_> = cloud([0.0, 0.0]).chain(cloud([9.0, 9.0])).collect();
-        let density = PlaneDensity::of(&points, 96).unwrap();
+        let density = Density2d::from_points(&points, 96).unwrap();
         let lines = contours(&density, density.level(&points, 0.95).unwrap());
         assert_eq!(lines.len(), 2);
         assert!(area(&lines[0]) * area(&lines[1]) > 0.0, "both turn the same way");
@@ -111,7 +113,7 @@ mod tests {
     #[test]
     fn what_reaches_the_edge_is_closed() {
         let points: Vec<_> = cloud([0.0, 0.0]).collect();
-        let density = PlaneDensity::of(&points, 32).unwrap();
+        let density = Density2d::from_points(&points, 32).unwrap();
         let lines = contours(&density, 0.0);
         assert_eq!(lines.len(), 1);
         assert_eq!(lines[0].len(), 4 * 32);

@@ -1,12 +1,13 @@
-//! What labels cost, learned from those that were made.
+//! A regression model of label costs, fitted to the labels made so far:
 //!
 //! ln t = β₀ + β₁ ln x + β₂ ln k + noise,
 //!
-//! t in core-seconds, x the electrons (the atoms if electrons are not known of every label), k the points of the mesh. Before
-//! anything is measured β₁ is taken for 2 ± 0.75, since plane-wave codes are between linear and cubic, and β₂ for 1 ± 0.25;
-//! about β₀ nothing is assumed. The first label settles β₀, later ones settle the rest. The noise has a
-//! Student distribution with four degrees of freedom, so a label that took a hundred times as long as its like is
-//! believed little; its scale is learned as well, and taken for [`SCATTER`] before.
+//! where t is in core-seconds, x is the number of electrons (of atoms if the electrons of any label are
+//! unknown), and k the number of k-points. Priors: β₁ = 2 ± 0.75, because plane-wave codes scale between
+//! linearly and cubically; β₂ = 1 ± 0.25; β₀ is uninformative, so the first label determines it and later
+//! labels refine the rest. The noise follows a Student t distribution with four degrees of freedom, so a label
+//! that took a hundred times longer than similar ones has little weight. Its scale is estimated too; the prior
+//! scale is [`PRIOR_NOISE_SCALE`].
 
 mod fit;
 #[cfg(test)]
@@ -17,38 +18,38 @@ use fit::{Fit, Normal};
 /// What the cost of a label depends on.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Size {
-    /// Atoms.
+    /// Number of atoms.
     pub atoms: f64,
-    /// Electrons that are treated; `None` if that is not known.
+    /// Number of electrons treated; `None` if unknown.
     pub electrons: Option<f64>,
-    /// Points of the k-point mesh.
+    /// Number of k-points.
     pub k_points: f64,
 }
 
-/// A label that was made.
+/// A finished label and its cost.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Measured {
-    /// Of what size.
+    /// Size of the calculation.
     pub size: Size,
-    /// What it took.
+    /// Its cost.
     pub core_seconds: f64,
 }
 
-/// What somebody expects of a label before there is any: believed within a factor of three.
+/// A user's estimate before any label exists; trusted within a factor of three.
 pub type Guess = Measured;
 
-/// What a label, or several together, will take, core-seconds.
+/// Predicted cost of one label or of several together, core-seconds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Predicted {
-    /// On average.
+    /// Expected cost.
     pub core_seconds: f64,
-    /// With 90 % it is more than this …
+    /// Lower end of the 90 % prediction interval.
     pub low: f64,
-    /// … and less than this.
+    /// Upper end of the interval.
     pub high: f64,
 }
 
-/// What is known of the cost of labels.
+/// The fitted cost model.
 #[derive(Clone, Debug)]
 pub struct CostModel {
     by_electrons: bool,
@@ -56,23 +57,23 @@ pub struct CostModel {
     fit: Fit,
 }
 
-/// Prior of β₁ and β₂: mean and standard deviation.
-const EXPONENTS: [Normal; 2] = [Normal { mean: 2.0, sd: 0.75 }, Normal { mean: 1.0, sd: 0.25 }];
+/// Priors of β₁ and β₂: mean and standard deviation.
+const EXPONENT_PRIORS: [Normal; 2] = [Normal { mean: 2.0, sd: 0.75 }, Normal { mean: 1.0, sd: 0.25 }];
 
-/// Scale of the noise before anything is known of it: a factor of 1.3.
-const SCATTER: f64 = 0.26;
+/// Prior scale of the noise: a factor of 1.3.
+const PRIOR_NOISE_SCALE: f64 = 0.26;
 
-/// What a guess is believed to, as a logarithm.
-const GUESS: f64 = 1.098_612_288_668_109_8;
+/// Standard deviation of a user's estimate, on the logarithmic scale.
+const GUESS_SIGMA: f64 = 1.098_612_288_668_109_8;
 
-/// Of Student's distribution with four degrees of freedom, 95 % lie below so many scales.
+/// 95 % quantile of Student's t distribution with four degrees of freedom.
 const STUDENT_95: f64 = 2.131_846_786_326_649;
-/// The same of a normal distribution.
+/// 95 % quantile of the normal distribution.
 const NORMAL_95: f64 = 1.644_853_626_951_472_2;
 
 impl CostModel {
-    /// From labels that were made, and from what was guessed. `None` if there is neither: then nothing is known. Labels
-    /// whose size or cost is not above 0 are left out.
+    /// Fits the model to finished labels and a user's estimate; `None` without either. Labels whose size or
+    /// cost is not positive are ignored.
     pub fn fit(measured: &[Measured], guess: Option<Guess>) -> Option<Self> {
         let is_usable = |label: &&Measured| label.size.is_usable() && is_positive(label.core_seconds);
         let labels: Vec<_> = measured.iter().filter(is_usable).collect();
@@ -90,16 +91,16 @@ impl CostModel {
             ([1.0, x - centre[0], k - centre[1]], label.core_seconds.ln())
         };
         let points: Vec<_> = labels.iter().map(|label| point(label)).collect();
-        let fit = Fit::of(&points, guess.as_ref().map(point))?;
+        let fit = Fit::new(&points, guess.as_ref().map(point))?;
         Some(Self { by_electrons, centre, fit })
     }
 
-    /// Labels that it has learned from.
+    /// Number of labels in the fit.
     pub fn labels(&self) -> usize {
         self.fit.points
     }
 
-    /// One label of that size; `None` if the size is not above 0.
+    /// Predicts one label; `None` if the size is not positive.
     pub fn predict(&self, size: &Size) -> Option<Predicted> {
         let row = self.row(size)?;
         let middle = self.fit.at(&row);
@@ -108,8 +109,8 @@ impl CostModel {
         Some(Predicted { core_seconds, low: (middle - away).exp(), high: (middle + away).exp() })
     }
 
-    /// Labels of these sizes together, so many of each; those without a usable size are taken for what the others take
-    /// on average. `None` if none has one.
+    /// Predicts the total of labels, given as (size, number). Labels without a usable size are assumed to cost
+    /// the mean of the others; `None` if no size is usable.
     pub fn predict_all(&self, sizes: impl IntoIterator<Item = (Size, u64)>) -> Option<Predicted> {
         let (mut sum, mut noise, mut gradient) = (0.0, 0.0, [0.0; 3]);
         let (mut known, mut all) = (0.0, 0.0);
@@ -120,7 +121,7 @@ impl CostModel {
             known += number;
             let each = self.fit.at(&row).exp() * self.fit.mean_factor;
             sum += number * each;
-            // Each differs from its expectation by itself; all differ alike by what is not known of β.
+            // The noise of each label is independent; the uncertainty of β is common to all.
             noise += number * each * each * self.fit.relative_variance();
             gradient.iter_mut().zip(row).for_each(|(total, x)| *total += number * each * x);
         }

@@ -1,17 +1,17 @@
-//! How a grade foretells the force error of atoms.
+//! How well a grade predicts the force error of atoms.
 
 use crate::quantiles::quantile;
-use crate::ranks::{roc_auc, spearman};
-use crate::{Bins, Thinned};
+use crate::rank_statistics::{roc_auc, spearman};
+use crate::{Bins, SystematicSample};
 
-/// Gathers grades with the force errors of labelled atoms, and the grades of atoms whose label failed: those have an
-/// error too, which nobody knows. Counts are exact; ranks and quantiles come from the atoms that there is room for, a
-/// sample if there were more.
+/// Collects the grades and force errors of labelled atoms, and the grades of atoms whose label failed and whose
+/// error is therefore unknown. Counts are exact. Rank statistics and quantiles use a sample if there are more
+/// atoms than the capacity.
 #[derive(Clone, Debug)]
 pub struct ForceErrors {
     bins: Bins,
     threshold: f64,
-    pairs: Thinned<(f64, f64)>,
+    pairs: SystematicSample<(f64, f64)>,
     counts: Vec<Counts>,
     sum: f64,
     left_out: u64,
@@ -24,71 +24,73 @@ struct Counts {
     unlabelled: u64,
 }
 
-/// The force errors of the atoms whose grades are in one bin.
+/// Force errors of the atoms in one bin of the grade.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ErrorBin {
-    /// Grades above this; `None` from the lowest on.
+    /// Lower edge; `None` for the first bin.
     pub above: Option<f64>,
-    /// Up to this; `None` without an end.
+    /// Upper edge, inclusive; `None` for the last bin.
     pub up_to: Option<f64>,
     /// Labelled atoms.
     pub atoms: u64,
-    /// Of all labelled atoms, so many are here.
+    /// Fraction of all labelled atoms that are in this bin.
     pub share: f64,
     /// Atoms of structures whose label failed.
     pub unlabelled: u64,
-    /// Median force error, eV/Å; `None` in an empty bin, as are those that follow.
+    /// Median force error, eV/Å; `None` in an empty bin, like the following fields.
     pub median: Option<f64>,
-    /// 90 % are smaller, eV/Å.
+    /// 90 % quantile, eV/Å.
     pub p90: Option<f64>,
-    /// 99 % are smaller, eV/Å.
+    /// 99 % quantile, eV/Å.
     pub p99: Option<f64>,
-    /// Share of the labelled atoms with an error above the threshold.
+    /// Fraction of the labelled atoms with an error above the threshold.
     pub large: Option<f64>,
-    /// That share if every unlabelled atom were below, and if every one were above: whatever they are, it is between.
+    /// Bounds of that fraction over all atoms: no, or every, unlabelled atom is above the threshold.
     pub large_between: Option<(f64, f64)>,
 }
 
 impl ForceErrors {
-    /// Sorts grades into `bins`; errors above `threshold`, eV/Å, are large. Keeps `room` atoms at most, 24 bytes each.
+    /// An empty collection. Errors above `threshold`, eV/Å, count as large. Keeps at most `room` atoms, 24
+    /// bytes each.
     pub fn new(bins: Bins, threshold: f64, room: usize) -> Self {
-        let counts = vec![Counts::default(); bins.number()];
-        Self { bins, threshold, pairs: Thinned::new(room), counts, sum: 0.0, left_out: 0 }
+        let counts = vec![Counts::default(); bins.count()];
+        Self { bins, threshold, pairs: SystematicSample::new(room), counts, sum: 0.0, left_out: 0 }
     }
 
-    /// A labelled atom: its grade, and |F_model − F_label|, eV/Å. What is not finite is counted and left out.
-    pub fn push(&mut self, grade: f64, error: f64) {
+    /// Adds a labelled atom with its grade and |F_model − F_label|, eV/Å. Values that are not finite are only
+    /// counted.
+    pub fn add(&mut self, grade: f64, error: f64) {
         if !(grade.is_finite() && error.is_finite()) {
             self.left_out += 1;
             return;
         }
-        let counts = &mut self.counts[self.bins.place(grade)];
+        let counts = &mut self.counts[self.bins.index_of(grade)];
         counts.labelled += 1;
         counts.above += u64::from(error > self.threshold);
         self.sum += error;
-        self.pairs.push((grade, error));
+        self.pairs.add((grade, error));
     }
 
-    /// An atom of a structure whose label failed.
-    pub fn push_unlabelled(&mut self, grade: f64) {
+    /// Adds an atom of a structure whose label failed.
+    pub fn add_unlabelled(&mut self, grade: f64) {
         if grade.is_finite() {
-            self.counts[self.bins.place(grade)].unlabelled += 1;
+            self.counts[self.bins.index_of(grade)].unlabelled += 1;
         } else {
             self.left_out += 1;
         }
     }
 
-    /// Labelled atoms.
+    /// Number of labelled atoms.
     pub fn atoms(&self) -> u64 {
-        self.pairs.seen()
+        self.pairs.total()
     }
 
-    /// Of them, those that ranks and quantiles come from.
+    /// Number of labelled atoms in the sample for rank statistics and quantiles.
     pub fn sampled(&self) -> usize {
-        self.pairs.kept().len()
+        self.pairs.items().len()
     }
 
-    /// Atoms without a finite grade or error.
+    /// Number of atoms without a finite grade or error.
     pub fn left_out(&self) -> u64 {
         self.left_out
     }
@@ -98,10 +100,10 @@ impl ForceErrors {
         (self.atoms() > 0).then(|| self.sum / self.atoms() as f64)
     }
 
-    /// Share of the labelled atoms in the bins that begin at `edge` or above it.
-    pub fn share_above(&self, edge: f64) -> Option<f64> {
-        let is_above = |place: &usize| self.bins.edges(*place).0.is_some_and(|above| above >= edge);
-        let above = (0..self.bins.number()).filter(is_above).map(|place| self.counts[place].labelled);
+    /// Fraction of the labelled atoms in the bins whose lower edge is at least `edge`.
+    pub fn fraction_above(&self, edge: f64) -> Option<f64> {
+        let is_above = |index: &usize| self.bins.edges(*index).0.is_some_and(|above| above >= edge);
+        let above = (0..self.bins.count()).filter(is_above).map(|index| self.counts[index].labelled);
         (self.atoms() > 0).then(|| above.sum::<u64>() as f64 / self.atoms() as f64)
     }
 
@@ -111,25 +113,25 @@ impl ForceErrors {
         spearman(&grades, &errors)
     }
 
-    /// Area under the receiver operating characteristic of the grade as a test for large errors.
+    /// Area under the ROC curve of the grade as a classifier of large errors.
     pub fn roc_auc(&self) -> Option<f64> {
         let (grades, errors) = self.rows();
         roc_auc(&grades, &errors, self.threshold)
     }
 
-    /// The force errors by bin of the grade, also of those in which there is none.
+    /// The force errors by bin, including empty bins.
     pub fn bins(&self) -> Vec<ErrorBin> {
-        let mut errors = vec![Vec::new(); self.bins.number()];
-        for (grade, error) in self.pairs.kept() {
-            errors[self.bins.place(*grade)].push(*error);
+        let mut errors = vec![Vec::new(); self.bins.count()];
+        for (grade, error) in self.pairs.items() {
+            errors[self.bins.index_of(*grade)].push(*error);
         }
         errors.iter_mut().for_each(|errors| errors.sort_by(f64::total_cmp));
-        (0..self.bins.number()).map(|place| self.bin(place, &errors[place])).collect()
+        (0..self.bins.count()).map(|index| self.bin(index, &errors[index])).collect()
     }
 
-    fn bin(&self, place: usize, errors: &[f64]) -> ErrorBin {
-        let Counts { labelled, above: large, unlabelled } = self.counts[place];
-        let (above, up_to) = self.bins.edges(place);
+    fn bin(&self, index: usize, errors: &[f64]) -> ErrorBin {
+        let Counts { labelled, above: large, unlabelled } = self.counts[index];
+        let (above, up_to) = self.bins.edges(index);
         let part = |part: u64, of: u64| (of > 0).then(|| part as f64 / of as f64);
         let all = labelled + unlabelled;
         ErrorBin {
@@ -147,7 +149,7 @@ impl ForceErrors {
     }
 
     fn rows(&self) -> (Vec<f64>, Vec<f64>) {
-        self.pairs.kept().copied().unzip()
+        self.pairs.items().copied().unzip()
     }
 }
 
@@ -159,23 +161,23 @@ mod tests {
 
     #[test]
     fn a_table_by_hand() {
-        let mut errors = ForceErrors::new(Bins::of_grades(), 1.0, 1000);
+        let mut errors = ForceErrors::new(Bins::for_grades(), 1.0, 1000);
         for (grade, error) in [(0.2, 0.1), (0.5, 0.3), (0.4, 0.2), (3.0, 1.0), (4.0, 2.0), (f64::NAN, 1.0)] {
-            errors.push(grade, error);
+            errors.add(grade, error);
         }
-        [3.5, 4.5, 9.0].into_iter().for_each(|grade| errors.push_unlabelled(grade));
+        [3.5, 4.5, 9.0].into_iter().for_each(|grade| errors.add_unlabelled(grade));
         let bins = errors.bins();
         assert_eq!((errors.atoms(), errors.left_out(), bins.len()), (5, 1, 7));
         assert_eq!((bins[0].atoms, bins[0].median, bins[0].large), (3, Some(0.2), Some(0.0)));
         assert_eq!((bins[0].share, bins[0].large_between), (0.6, Some((0.0, 0.0))));
-        // One error of 1 is not above 1; two atoms failed, so between ¼ and ¾ of four are.
+        // An error of exactly 1 is not above 1. Two labels failed, so the fraction of four is between ¼ and ¾.
         let far = bins[5];
         assert_eq!((far.above, far.up_to, far.atoms, far.unlabelled), (Some(2.0), Some(5.0), 2, 2));
         assert_eq!((far.median, far.large, far.large_between), (Some(1.5), Some(0.5), Some((0.25, 0.75))));
-        // Nothing is known where every label failed, and that is not the same as where there was nothing.
+        // Every label failed in one bin, and nothing was attempted in the other: these differ.
         assert_eq!((bins[6].median, bins[6].large, bins[6].large_between), (None, None, Some((0.0, 1.0))));
         assert_eq!((bins[1].atoms, bins[1].large_between), (0, None));
-        assert_eq!((errors.mean(), errors.share_above(1.0)), (Some(3.6 / 5.0), Some(0.4)));
+        assert_eq!((errors.mean(), errors.fraction_above(1.0)), (Some(3.6 / 5.0), Some(0.4)));
         // Grades 0.2 0.5 0.4 3 4 against 0.1 0.3 0.2 1 2: the same order.
         assert!((errors.spearman().unwrap() - 1.0).abs() < 1e-14);
         assert_eq!(errors.roc_auc(), Some(1.0));
@@ -186,14 +188,14 @@ mod tests {
         fn nothing_is_lost_and_a_sample_is_near(seed in 0_u64..1000) {
             let number = |k: u64| ((k * 2_654_435_761 + seed) % 1_000_003) as f64 / 1_000_003.0;
             let (mut all, mut some) = (
-                ForceErrors::new(Bins::of_grades(), 1.0, 100_000),
-                ForceErrors::new(Bins::of_grades(), 1.0, 2_000),
+                ForceErrors::new(Bins::for_grades(), 1.0, 100_000),
+                ForceErrors::new(Bins::for_grades(), 1.0, 2_000),
             );
             for k in 0..6_000 {
                 let grade = 3.0 * number(k);
                 let error = grade * number(7 * k + 1);
-                all.push(grade, error);
-                some.push(grade, error);
+                all.add(grade, error);
+                some.add(grade, error);
             }
             prop_assert!(all.sampled() == 6_000 && some.sampled() <= 2_000);
             let counts = |errors: &ForceErrors| -> Vec<_> {
@@ -201,7 +203,7 @@ mod tests {
             };
             prop_assert_eq!(counts(&all), counts(&some));
             prop_assert_eq!(all.bins().iter().map(|bin| bin.atoms).sum::<u64>(), 6_000);
-            // A correlation of n pairs has an error of about 1 / √n, here 1/31 at most.
+            // The correlation of n pairs has an error of about 1 / √n, here at most 1/31.
             let (exact, sampled) = (all.spearman().unwrap(), some.spearman().unwrap());
             prop_assert!((exact - sampled).abs() < 0.16, "{} {}", exact, sampled);
         }

@@ -1,6 +1,7 @@
-//! How many values lie where.
+//! Histograms.
 
-/// Counts values between edges that ascend: each bin has its lower edge, the last one its upper edge as well.
+/// Counts values between ascending edges. A bin includes its lower edge; the last bin also includes its upper
+/// edge.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Histogram {
     edges: Vec<f64>,
@@ -9,32 +10,32 @@ pub struct Histogram {
 }
 
 impl Histogram {
-    /// Between these edges.
+    /// An empty histogram with these edges.
     ///
     /// # Panics
-    /// If there are not two, or they do not ascend: an error of the caller, not of input.
+    /// If there are fewer than two edges or they do not ascend, which is a bug of the caller.
     pub fn new(edges: Vec<f64>) -> Self {
         assert!(edges.len() > 1 && edges.is_sorted_by(|a, b| a < b), "edges ascend");
         let counts = vec![0; edges.len() - 1];
         Self { edges, counts, outside: 0 }
     }
 
-    /// Of values that are at hand.
-    pub fn of(edges: Vec<f64>, values: impl IntoIterator<Item = f64>) -> Self {
+    /// The histogram of these values.
+    pub fn from_values(edges: Vec<f64>, values: impl IntoIterator<Item = f64>) -> Self {
         let mut histogram = Self::new(edges);
-        values.into_iter().for_each(|value| histogram.push(value));
+        values.into_iter().for_each(|value| histogram.add(value));
         histogram
     }
 
-    /// Counts one.
-    pub fn push(&mut self, value: f64) {
-        match place(&self.edges, value) {
-            Some(place) => self.counts[place] += 1,
+    /// Counts a value.
+    pub fn add(&mut self, value: f64) {
+        match bin_index(&self.edges, value) {
+            Some(index) => self.counts[index] += 1,
             None => self.outside += 1,
         }
     }
 
-    /// Edges, one more than bins.
+    /// The edges, one more than there are bins.
     pub fn edges(&self) -> &[f64] {
         &self.edges
     }
@@ -44,20 +45,20 @@ impl Histogram {
         &self.counts
     }
 
-    /// Values that are in no bin.
+    /// Number of values outside all bins.
     pub fn outside(&self) -> u64 {
         self.outside
     }
 
-    /// Of all values, the share in each bin.
-    pub fn shares(&self) -> Vec<f64> {
+    /// Fraction of all values in each bin, including values outside in the total.
+    pub fn fractions(&self) -> Vec<f64> {
         let all = self.outside + self.counts.iter().sum::<u64>();
         self.counts.iter().map(|count| *count as f64 / all.max(1) as f64).collect()
     }
 }
 
-/// The bin between `edges` that holds a value: it has its lower edge, the last one both.
-pub(crate) fn place(edges: &[f64], value: f64) -> Option<usize> {
+/// Index of the bin that holds a value: bins include their lower edge, the last bin both edges.
+pub(crate) fn bin_index(edges: &[f64], value: f64) -> Option<usize> {
     let bins = edges.len().checked_sub(1)?;
     if value.is_nan() || value < edges[0] || value > edges[bins] {
         return None;
@@ -65,14 +66,14 @@ pub(crate) fn place(edges: &[f64], value: f64) -> Option<usize> {
     Some((edges.partition_point(|edge| *edge <= value) - 1).min(bins - 1))
 }
 
-/// Edges of `bins` bins of one width.
-pub fn even_edges(low: f64, high: f64, bins: usize) -> Vec<f64> {
+/// Edges of `bins` bins of equal width.
+pub fn linear_edges(low: f64, high: f64, bins: usize) -> Vec<f64> {
     (0..=bins).map(|k| low + (high - low) * k as f64 / bins as f64).collect()
 }
 
-/// Edges of `bins` bins that are as wide on a logarithmic scale; `low` and `high` above 0.
+/// Edges of `bins` bins of equal width on a logarithmic scale; `low` and `high` must be positive.
 pub fn logarithmic_edges(low: f64, high: f64, bins: usize) -> Vec<f64> {
-    even_edges(low.ln(), high.ln(), bins).into_iter().map(f64::exp).collect()
+    linear_edges(low.ln(), high.ln(), bins).into_iter().map(f64::exp).collect()
 }
 
 #[cfg(test)]
@@ -82,10 +83,10 @@ mod tests {
     #[test]
     fn each_bin_has_its_lower_edge() {
         let values = [0.0, 0.9, 1.0, 2.9, 3.0, 3.1, -0.1, f64::NAN];
-        let histogram = Histogram::of(even_edges(0.0, 3.0, 3), values);
+        let histogram = Histogram::from_values(linear_edges(0.0, 3.0, 3), values);
         assert_eq!((histogram.counts(), histogram.outside()), (&[2, 1, 2][..], 3));
-        assert_eq!(histogram.shares(), [0.25, 0.125, 0.25]);
-        assert_eq!(Histogram::new(vec![0.0, 1.0]).shares(), [0.0]);
+        assert_eq!(histogram.fractions(), [0.25, 0.125, 0.25]);
+        assert_eq!(Histogram::new(vec![0.0, 1.0]).fractions(), [0.0]);
     }
 
     #[test]

@@ -1,7 +1,8 @@
-//! What is learned from the numbers of a campaign: how grades foretell force errors, what labels cost, by how much zeros of
-//! energy differ, how what was collected is distributed. Plain numbers in and out; where they come from, and how they are shown, is not known here.
+//! Statistics of a campaign: force errors by grade, label costs, energy offsets between potential and labels,
+//! and distributions of what was collected. Functions take and return plain numbers; reading data and drawing
+//! results happens elsewhere.
 
-mod bands;
+mod binned_quantiles;
 mod bins;
 mod completion;
 mod contour;
@@ -12,21 +13,21 @@ mod histogram;
 mod offsets;
 mod principal;
 mod quantiles;
-mod ranks;
-mod share;
-mod thinned;
+mod rank_statistics;
+mod systematic_sample;
+mod wilson;
 
-pub use bands::{Band, bands};
+pub use binned_quantiles::{QuantileBin, binned_quantiles};
 pub use bins::Bins;
 pub use completion::{Completion, CompletionBin};
 pub use contour::contours;
 pub use cost::{CostModel, Guess, Measured, Predicted, Size};
-pub use density::{PlaneDensity, density};
+pub use density::{Density2d, kernel_density};
 pub use errors::{ErrorBin, ForceErrors};
-pub use histogram::{Histogram, even_edges, logarithmic_edges};
+pub use histogram::{Histogram, linear_edges, logarithmic_edges};
 pub use offsets::{ElementOffset, EnergyOffsets, LabelledEnergy, TooFewLabels};
 pub use principal::PrincipalAxes;
 pub use quantiles::quantile;
-pub use ranks::{roc_auc, spearman};
-pub use share::wilson;
-pub use thinned::Thinned;
+pub use rank_statistics::{roc_auc, spearman};
+pub use systematic_sample::SystematicSample;
+pub use wilson::wilson_interval;

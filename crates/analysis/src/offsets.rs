@@ -1,4 +1,4 @@
-//! Energy offsets of elements: by how much the zero of the labels' energies differs from that of a potential.
+//! Per-element energy offsets between the labels and a potential.
 
 use std::collections::BTreeSet;
 
@@ -6,43 +6,45 @@ use faer::{Mat, Side};
 
 use crate::quantiles::quantile;
 
-/// Differences beyond this come from no calculation, eV an atom: an all-electron calculation of the heaviest element has
-/// 1.5 · 10⁶.
-const IMPOSSIBLE: f64 = 1e7;
-/// A structure is left out of the fit if it is further from it than this, eV an atom …
-const LEAST_CUT: f64 = 1.0;
-/// … and than so many standard deviations, as the median absolute residual gives them for normal noise.
+/// Larger differences are unphysical, eV/atom: an all-electron calculation of the heaviest element has 1.5 ·
+/// 10⁶.
+const MAX_PLAUSIBLE: f64 = 1e7;
+/// Minimum residual of an outlier, eV/atom. An outlier exceeds this …
+const MIN_CUT: f64 = 1.0;
+/// … and this many standard deviations, estimated from the median absolute residual.
 const CUT: f64 = 10.0;
-const SCALE_OF_MEDIAN: f64 = 1.4826;
-/// Eigenvalues below this part of the largest are zero but for rounding.
-const RANK: f64 = 1e-12;
-/// Residuals above these have a bounded influence on the robust start, eV an atom. The large one comes first: elements whose zeros are
-/// far from the others' are found while none of their structures weighs nothing.
-const KNEES: [f64; 2] = [1.0, 0.01];
-/// Rounds of the robust start, if its offsets do not settle earlier: they change by less than this, eV.
-const ROUNDS: usize = 50;
-const SETTLED: f64 = 1e-4;
-/// Rounds in which structures may still be left out or taken in again.
-const SELECTIONS: usize = 10;
-/// A composition whose part outside of the fit's space, squared, is larger than this part of it is not described.
-const OUTSIDE: f64 = 1e-9;
+const MAD_TO_SIGMA: f64 = 1.4826;
+/// Eigenvalues below this fraction of the largest count as zero.
+const RANK_TOLERANCE: f64 = 1e-12;
+/// Huber thresholds of the robust start, eV/atom. The large one comes first, so that elements whose offsets
+/// differ strongly from the others' are found while all of their structures still have weight.
+const HUBER_THRESHOLDS: [f64; 2] = [1.0, 0.01];
+/// Maximum number of iterations per threshold. They stop earlier once offsets change by less than
+/// [`CONVERGENCE`], eV.
+const MAX_ITERATIONS: usize = 50;
+const CONVERGENCE: f64 = 1e-4;
+/// Maximum number of times that outliers are selected anew.
+const MAX_SELECTIONS: usize = 10;
+/// A composition is outside the fit if the squared norm of its component outside the fitted space exceeds this
+/// fraction of its squared norm.
+const OUTSIDE_TOLERANCE: f64 = 1e-9;
 
-/// A labelled structure as the fit sees it.
+/// A labelled structure.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelledEnergy {
-    /// Atomic numbers, each once, with the numbers of atoms.
+    /// Number of atoms of each element, by atomic number; each element once.
     pub composition: Vec<(u8, u32)>,
-    /// Energy by the potential, eV.
+    /// Energy of the potential, eV.
     pub model: f64,
     /// Energy of the label, eV.
     pub label: f64,
 }
 
-/// Offsets μ of elements such that E_label ≈ E_model + Σ n μ, by least squares of the differences an atom over labelled
-/// structures.
+/// Offsets μ of elements such that E_label ≈ E_model + Σ n μ, fitted by least squares to the energy differences
+/// per atom of labelled structures.
 ///
-/// Where compositions do not tell elements apart, the offsets with the smallest sum of squares are taken, and only their sums over
-/// such compositions mean something. Structures that are far from all others are left out of the fit.
+/// Where compositions do not distinguish elements, the minimum-norm solution is taken; then only sums over such
+/// compositions are meaningful. Outliers are left out of the fit.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EnergyOffsets {
     /// Atomic numbers, ascending.
@@ -51,7 +53,7 @@ pub struct EnergyOffsets {
     offsets: Vec<f64>,
     /// Pseudo-inverse of Σ x xᵀ over the structures used, with the fractions x of elements.
     inverse: Mat<f64>,
-    /// Projection on the space of their compositions.
+    /// Projection on the space spanned by their compositions.
     projection: Mat<f64>,
     structures: usize,
     left_out: usize,
@@ -62,24 +64,25 @@ pub struct EnergyOffsets {
 pub struct ElementOffset {
     /// Atomic number.
     pub element: u8,
-    /// eV an atom.
+    /// eV/atom.
     pub offset: f64,
-    /// Whether the compositions tell the element apart from the others. If not, the number by itself means nothing.
+    /// Whether the compositions determine this element's offset by itself. If not, the number alone is
+    /// meaningless.
     pub is_separate: bool,
 }
 
-/// Fewer labelled structures than a fit needs.
+/// There are fewer labelled structures than a fit needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TooFewLabels {
-    /// Labelled structures.
+    /// Number of labelled structures.
     pub structures: usize,
-    /// At least so many are needed: one more than there are elements.
+    /// The minimum: one more than there are elements.
     pub needed: usize,
 }
 
-/// Fractions of elements, and the difference of energies an atom.
+/// Element fractions and energy difference per atom of a structure.
 struct Row {
-    /// Index of the element, and its fraction.
+    /// Index of the element and its fraction.
     fractions: Vec<(usize, f64)>,
     difference: f64,
 }
@@ -89,19 +92,19 @@ impl LabelledEnergy {
         self.composition.iter().map(|(_, number)| f64::from(*number)).sum()
     }
 
-    /// (E_label − E_model) an atom, eV.
+    /// (E_label − E_model) per atom, eV.
     fn difference_per_atom(&self) -> f64 {
         (self.label - self.model) / self.atoms()
     }
 }
 
 impl EnergyOffsets {
-    /// Fits offsets. What is not finite, or beyond any calculation, is left out.
+    /// Fits offsets. Energies that are not finite or are unphysical are ignored.
     ///
     /// # Errors
-    /// [`TooFewLabels`] unless there is one more structure than elements.
+    /// [`TooFewLabels`] unless there is at least one more structure than elements.
     pub fn fit(labels: &[LabelledEnergy]) -> Result<Self, TooFewLabels> {
-        let is_possible = |label: &&LabelledEnergy| label.difference_per_atom().abs() <= IMPOSSIBLE;
+        let is_possible = |label: &&LabelledEnergy| label.difference_per_atom().abs() <= MAX_PLAUSIBLE;
         let possible: Vec<_> = labels.iter().filter(is_possible).collect();
         let elements =
             possible.iter().flat_map(|label| label.composition.iter().map(|(element, _)| *element));
@@ -110,33 +113,33 @@ impl EnergyOffsets {
         if possible.len() < needed {
             return Err(TooFewLabels { structures: possible.len(), needed });
         }
-        let rows: Vec<_> = possible.iter().map(|label| Row::of(label, &elements)).collect();
+        let rows: Vec<_> = possible.iter().map(|label| Row::new(label, &elements)).collect();
         let mut used = within_cut(&residuals(&rows, &robust_start(&rows, elements.len())));
-        let mut solved = Solved::of(&rows, &weights(&used), elements.len());
-        for _ in 0..SELECTIONS {
+        let mut solved = Solved::solve(&rows, &weights(&used), elements.len());
+        for _ in 0..MAX_SELECTIONS {
             let again = within_cut(&residuals(&rows, &solved.offsets));
             if again == used {
                 break;
             }
             used = again;
-            solved = Solved::of(&rows, &weights(&used), elements.len());
+            solved = Solved::solve(&rows, &weights(&used), elements.len());
         }
         let Solved { offsets, inverse, projection } = solved;
         let structures = used.iter().filter(|used| **used).count();
         Ok(Self { elements, offsets, inverse, projection, structures, left_out: labels.len() - structures })
     }
 
-    /// Structures that the fit used.
+    /// Number of structures in the fit.
     pub fn structures(&self) -> usize {
         self.structures
     }
 
-    /// Labelled structures that it did not use: they are too far from the others.
+    /// Number of labelled structures that were left out as outliers.
     pub fn left_out(&self) -> usize {
         self.left_out
     }
 
-    /// The offsets, by atomic number.
+    /// The offsets by ascending atomic number.
     pub fn elements(&self) -> impl Iterator<Item = ElementOffset> + '_ {
         self.elements.iter().zip(&self.offsets).map(|(element, offset)| ElementOffset {
             element: *element,
@@ -145,8 +148,8 @@ impl EnergyOffsets {
         })
     }
 
-    /// For how many structures of this composition those of the fit stand: the inverse of its leverage. 0 where the compositions of
-    /// the fit do not say what this one's offset is.
+    /// The effective number of structures that support the offset of this composition: the inverse of its
+    /// leverage. 0 if the fitted compositions do not determine it.
     pub fn support(&self, composition: &[(u8, u32)]) -> f64 {
         let Some(row) = self.row(composition) else { return 0.0 };
         let size: f64 = row.iter().map(|x| x * x).sum();
@@ -155,15 +158,15 @@ impl EnergyOffsets {
         }
         let inside = form(&self.projection, &row);
         let leverage = form(&self.inverse, &row);
-        if size - inside > OUTSIDE * size || leverage <= 0.0 { 0.0 } else { 1.0 / leverage }
+        if size - inside > OUTSIDE_TOLERANCE * size || leverage <= 0.0 { 0.0 } else { 1.0 / leverage }
     }
 
-    /// (E_model − E_label) an atom without the offsets, eV. `None` where fewer than `least_support` structures speak for the
-    /// composition.
-    pub fn error_per_atom(&self, label: &LabelledEnergy, least_support: f64) -> Option<f64> {
+    /// (E_model − E_label) per atom after removing the offsets, eV. `None` if fewer than `min_support`
+    /// structures support the composition.
+    pub fn error_per_atom(&self, label: &LabelledEnergy, min_support: f64) -> Option<f64> {
         let support = self.support(&label.composition);
-        // Rounding must not decide about whole numbers.
-        if support <= 0.0 || support < least_support * (1.0 - 1e-6) {
+        // Tolerate rounding where the support is a whole number.
+        if support <= 0.0 || support < min_support * (1.0 - 1e-6) {
             return None;
         }
         let row = self.row(&label.composition)?;
@@ -171,7 +174,7 @@ impl EnergyOffsets {
         Some(offset - label.difference_per_atom())
     }
 
-    /// Fractions of the elements of the fit; `None` if there is another element.
+    /// Fractions of the fitted elements; `None` if the composition has another element.
     fn row(&self, composition: &[(u8, u32)]) -> Option<Vec<f64>> {
         let atoms: f64 = composition.iter().map(|(_, number)| f64::from(*number)).sum();
         let mut row = vec![0.0; self.elements.len()];
@@ -183,7 +186,7 @@ impl EnergyOffsets {
 }
 
 impl Row {
-    fn of(label: &LabelledEnergy, elements: &[u8]) -> Self {
+    fn new(label: &LabelledEnergy, elements: &[u8]) -> Self {
         let atoms = label.atoms();
         let fraction = |(element, number): &(u8, u32)| {
             let index = elements.binary_search(element).expect("the elements of all rows are known");
@@ -198,18 +201,18 @@ impl Row {
     }
 }
 
-/// Offsets that few outliers hardly move (Huber's estimator, by weights).
+/// Offsets that are insensitive to outliers (Huber's estimator by reweighting).
 fn robust_start(rows: &[Row], elements: usize) -> Vec<f64> {
     let mut differences: Vec<_> = rows.iter().map(|row| row.difference).collect();
     differences.sort_by(f64::total_cmp);
     let median = quantile(&differences, 0.5).unwrap_or(0.0);
     let mut offsets = vec![median; elements];
-    for knee in KNEES {
-        for _ in 0..ROUNDS {
+    for knee in HUBER_THRESHOLDS {
+        for _ in 0..MAX_ITERATIONS {
             let residuals = residuals(rows, &offsets);
             let weights: Vec<_> = residuals.iter().map(|residual| knee / residual.abs().max(knee)).collect();
-            let before = std::mem::replace(&mut offsets, Solved::of(rows, &weights, elements).offsets);
-            if before.iter().zip(&offsets).all(|(before, now)| (before - now).abs() < SETTLED) {
+            let before = std::mem::replace(&mut offsets, Solved::solve(rows, &weights, elements).offsets);
+            if before.iter().zip(&offsets).all(|(before, now)| (before - now).abs() < CONVERGENCE) {
                 break;
             }
         }
@@ -221,11 +224,11 @@ fn residuals(rows: &[Row], offsets: &[f64]) -> Vec<f64> {
     rows.iter().map(|row| row.residual(offsets)).collect()
 }
 
-/// Which residuals are no outliers.
+/// Which residuals are not outliers.
 fn within_cut(residuals: &[f64]) -> Vec<bool> {
     let mut sizes: Vec<_> = residuals.iter().map(|residual| residual.abs()).collect();
     sizes.sort_by(f64::total_cmp);
-    let cut = (CUT * SCALE_OF_MEDIAN * quantile(&sizes, 0.5).unwrap_or(0.0)).max(LEAST_CUT);
+    let cut = (CUT * MAD_TO_SIGMA * quantile(&sizes, 0.5).unwrap_or(0.0)).max(MIN_CUT);
     residuals.iter().map(|residual| residual.abs() <= cut).collect()
 }
 
@@ -233,7 +236,7 @@ fn weights(used: &[bool]) -> Vec<f64> {
     used.iter().map(|used| f64::from(u8::from(*used))).collect()
 }
 
-/// Weighted least squares of minimum norm.
+/// Minimum-norm weighted least squares.
 struct Solved {
     offsets: Vec<f64>,
     inverse: Mat<f64>,
@@ -241,7 +244,7 @@ struct Solved {
 }
 
 impl Solved {
-    fn of(rows: &[Row], weights: &[f64], elements: usize) -> Self {
+    fn solve(rows: &[Row], weights: &[f64], elements: usize) -> Self {
         let mut normal = Mat::<f64>::zeros(elements, elements);
         let mut right = vec![0.0; elements];
         for (row, weight) in rows.iter().zip(weights) {
@@ -256,8 +259,8 @@ impl Solved {
     }
 }
 
-/// Of a symmetric matrix without negative eigenvalues; with the projection on its range. Both are zero if the eigenvalues do not
-/// converge.
+/// Pseudo-inverse of a positive semidefinite matrix, and the projection on its range. Both are zero if the
+/// eigenvalues do not converge.
 fn pseudo_inverse(matrix: &Mat<f64>) -> (Mat<f64>, Mat<f64>) {
     let n = matrix.nrows();
     let mut inverse = Mat::zeros(n, n);
@@ -265,7 +268,7 @@ fn pseudo_inverse(matrix: &Mat<f64>) -> (Mat<f64>, Mat<f64>) {
     let Ok(eigen) = matrix.self_adjoint_eigen(Side::Lower) else { return (inverse, projection) };
     let (values, vectors) = (eigen.S(), eigen.U());
     let largest = (0..n).map(|k| values[k]).fold(0.0, f64::max);
-    for column in (0..n).filter(|column| values[*column] > RANK * largest) {
+    for column in (0..n).filter(|column| values[*column] > RANK_TOLERANCE * largest) {
         for i in 0..n {
             for k in 0..n {
                 let product = vectors[(i, column)] * vectors[(k, column)];

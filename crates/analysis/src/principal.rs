@@ -1,25 +1,25 @@
-//! The directions in which rows of numbers differ most.
+//! Principal component analysis.
 
 use faer::{Mat, Side};
 
-/// Rows that differ by less than this from their mean, both squared, do not differ but by rounding.
+/// Relative squared deviation from the mean below which rows differ only by rounding.
 const ROUNDING: f64 = 1e-24;
 
 /// Mean and leading principal axes of rows of `dimension` numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PrincipalAxes {
     mean: Vec<f64>,
-    /// Unit vectors, the one with the largest variance first.
+    /// Unit vectors, by descending variance.
     axes: Vec<Vec<f64>>,
-    /// Of the whole variance, the share along each.
+    /// Fraction of the total variance along each axis.
     pub shares: Vec<f64>,
 }
 
 impl PrincipalAxes {
-    /// The first `number` axes of rows that follow each other in `rows`: eigenvectors of their covariance. An axis points
-    /// to where its largest component is positive, so that the same rows give the same numbers. `None` of fewer than two
-    /// rows, of rows that do not differ, of numbers that are not finite, or if the eigenvalues do not converge.
-    pub fn of(rows: &[f64], dimension: usize, number: usize) -> Option<Self> {
+    /// Finds the first `number` axes, the eigenvectors of the covariance of rows stored consecutively in
+    /// `rows`. The largest component of each axis is positive, so that the result is reproducible. `None` for
+    /// fewer than two rows, identical rows, numbers that are not finite, or eigenvalues that do not converge.
+    pub fn fit(rows: &[f64], dimension: usize, number: usize) -> Option<Self> {
         let count = rows.len().checked_div(dimension)?;
         if count < 2 || number > dimension || !rows.iter().all(|x| x.is_finite()) {
             return None;
@@ -39,12 +39,14 @@ impl PrincipalAxes {
         }
         // Eigenvalues ascend.
         let last = (0..number).map(|k| dimension - 1 - k);
-        let axes = last.clone().map(|column| turned((0..dimension).map(|k| vectors[(k, column)]).collect()));
+        let axes = last
+            .clone()
+            .map(|column| with_fixed_sign((0..dimension).map(|k| vectors[(k, column)]).collect()));
         let shares = last.clone().map(|column| values[column].max(0.0) / trace);
         Some(Self { axes: axes.collect(), shares: shares.collect(), mean })
     }
 
-    /// A row by its components along the axes, from the mean of all.
+    /// Components of a row along the axes, relative to the mean.
     pub fn project(&self, row: &[f64]) -> Vec<f64> {
         let along = |axis: &Vec<f64>| {
             let parts = axis.iter().zip(row).zip(&self.mean);
@@ -54,7 +56,7 @@ impl PrincipalAxes {
     }
 }
 
-fn turned(mut axis: Vec<f64>) -> Vec<f64> {
+fn with_fixed_sign(mut axis: Vec<f64>) -> Vec<f64> {
     let largest =
         axis.iter().copied().fold(0.0, |largest: f64, x| if x.abs() > largest.abs() { x } else { largest });
     if largest < 0.0 {
@@ -75,22 +77,22 @@ mod tests {
         for (a, b) in [(3.0, 0.0), (-3.0, 0.0), (0.0, 1.0), (0.0, -1.0)] {
             (0..3).for_each(|k| rows.push([1.0, 2.0, 3.0][k] + a * long[k] + b * thin[k]));
         }
-        let axes = PrincipalAxes::of(&rows, 3, 2).unwrap();
+        let axes = PrincipalAxes::fit(&rows, 3, 2).unwrap();
         for (found, expected) in axes.shares.iter().zip([0.9, 0.1]) {
             assert!((found - expected).abs() < 1e-12, "{:?}", axes.shares);
         }
-        // The second axis points to where x grows.
+        // The second axis points towards growing x.
         let point = axes.project(&[1.0 + 0.6 - 0.8, 2.0 + 0.8 + 0.6, 7.0]);
         assert!((point[0] - 1.0).abs() < 1e-12 && (point[1] + 1.0).abs() < 1e-12, "{point:?}");
     }
 
     #[test]
     fn nothing_is_said_of_nothing() {
-        assert_eq!(PrincipalAxes::of(&[], 3, 2), None);
-        assert_eq!(PrincipalAxes::of(&[1.0, 2.0], 2, 2), None, "one row");
-        assert_eq!(PrincipalAxes::of(&[1.0, 2.0, 1.0, 2.0], 2, 2), None, "the same row twice");
-        assert_eq!(PrincipalAxes::of(&[7.1; 40], 2, 2), None, "they differ from their mean by rounding");
-        assert_eq!(PrincipalAxes::of(&[1.0, f64::NAN, 1.0, 2.0], 2, 2), None);
-        assert_eq!(PrincipalAxes::of(&[1.0], 0, 0), None);
+        assert_eq!(PrincipalAxes::fit(&[], 3, 2), None);
+        assert_eq!(PrincipalAxes::fit(&[1.0, 2.0], 2, 2), None, "one row");
+        assert_eq!(PrincipalAxes::fit(&[1.0, 2.0, 1.0, 2.0], 2, 2), None, "the same row twice");
+        assert_eq!(PrincipalAxes::fit(&[7.1; 40], 2, 2), None, "they differ from their mean by rounding");
+        assert_eq!(PrincipalAxes::fit(&[1.0, f64::NAN, 1.0, 2.0], 2, 2), None);
+        assert_eq!(PrincipalAxes::fit(&[1.0], 0, 0), None);
     }
 }

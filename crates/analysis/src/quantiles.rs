@@ -1,7 +1,7 @@
 //! Quantiles.
 
-/// The quantile `q` (0 to 1) of values in ascending order, between neighbours linearly: at the place q (n − 1) of them,
-/// counted from 0 (type 7 of Hyndman and Fan, what NumPy gives by default). `None` without values.
+/// The quantile `q` (0 to 1) of ascending values, interpolated linearly at index q (n − 1), counted from 0
+/// (type 7 of Hyndman and Fan, the default of NumPy). `None` without values.
 pub fn quantile(ascending: &[f64], q: f64) -> Option<f64> {
     let last = ascending.len().checked_sub(1)?;
     let place = q.clamp(0.0, 1.0) * last as f64;

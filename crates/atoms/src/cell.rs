@@ -1,4 +1,4 @@
-//! The triclinic cell and the few 3×3 operations that go with it.
+//! The triclinic cell and the 3×3 operations it needs.
 
 use serde::{Deserialize, Serialize};
 
@@ -52,16 +52,16 @@ impl Cell {
         std::array::from_fn(|k| fractional[0] * a[k] + fractional[1] * b[k] + fractional[2] * c[k])
     }
 
-    /// The cell with unit vectors, orthogonal to all others, in the directions that do not repeat.
+    /// The cell with non-periodic lattice vectors replaced by unit vectors orthogonal to all others.
     ///
-    /// What the lattice vectors of these directions were (often zero) does not matter.
+    /// Ignores the given vectors of those directions, which are often zero.
     pub fn completed(&self, periodic: [bool; 3]) -> Self {
         let mut rows = self.0;
         match periodic {
             [true, true, true] => {}
             [false, false, false] => rows = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             _ => {
-                // Seen cyclically, the first vector that repeats stands at k and a gap follows or precedes it.
+                // In cyclic order, the first periodic vector is at k and a gap precedes or follows it.
                 let k = (0..3).find(|k| periodic[*k] && !periodic[(k + 2) % 3]).unwrap_or(0);
                 let (second, third) = ((k + 1) % 3, (k + 2) % 3);
                 if !periodic[second] {

@@ -1,18 +1,18 @@
-//! Extended XYZ, read and written as ASE does (`ase.io.extxyz`).
+//! Reads and writes extended XYZ compatibly with ASE (`ase.io.extxyz`).
 //!
-//! A frame is a line with the number of atoms, a comment line of `key=value` pairs and a line per
-//! atom whose columns the key `Properties` describes. What this reader does otherwise than ASE:
-//! a 6-component `stress` or `virial` is taken (Voigt: xx yy zz yz xz xy), a bare `[[…],[…]]` is a
-//! matrix, frames after a blank line are read, and what contradicts itself is an error (a key given
-//! twice with different values, more fields than `Properties` tell of, an unclosed quote).
+//! A frame is a line with the number of atoms, a comment line of `key=value` pairs, and a line per atom whose
+//! columns the key `Properties` describes. Differences from ASE: a 6-component `stress` or `virial` is accepted
+//! (Voigt: xx yy zz yz xz xy); a bare `[[…],[…]]` is a matrix; frames after a blank line are read;
+//! contradictions are errors (a key with two different values, more fields than in `Properties`, an unclosed
+//! quote).
 //!
-//! Real numbers are written with the fewest digits that give the same bits back.
+//! Real numbers are written with the fewest digits that preserve their bits.
 //!
-//! The kept crates do not do this job: `extxyz` 0.2 only reads, knows no escapes, and its errors
-//! have no line (a column count beyond 64 bits ends in a panic).
+//! No maintained crate fits: `extxyz` 0.2 only reads, does not support escapes, and its errors have no line
+//! numbers (a column count beyond 64 bits panics).
 
 mod comment;
-mod fault;
+mod error;
 mod labels;
 mod read;
 mod table;
@@ -23,22 +23,22 @@ use std::collections::BTreeMap;
 
 use crate::structure::Structure;
 
-pub use fault::{ExtxyzError, Fault};
-pub use labels::{Keys, LabelError, Labels};
+pub use error::{ExtxyzError, ExtxyzErrorKind};
+pub use labels::{LabelError, LabelKeys, Labels};
 pub use read::Reader;
 pub use value::Value;
 pub use write::{WriteError, write_frame};
 
-/// One configuration with what the file tells of it.
+/// A structure with the other data of its frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
     /// Species, positions, cell (zero where the file has none) and periodicity.
     pub structure: Structure,
-    /// What the comment line says beside `Lattice`, `Properties` and `pbc`, by key.
+    /// The keys of the comment line except `Lattice`, `Properties` and `pbc`.
     pub info: BTreeMap<String, Value>,
-    /// The columns beside species and positions, by the name they have in the file.
+    /// The columns except species and positions, by their name in the file.
     pub arrays: BTreeMap<String, Column>,
-    /// The line of the file where the frame starts, from 1; 0 for a frame that no file gave.
+    /// The line at which the frame starts, from 1; 0 if it did not come from a file.
     pub line: usize,
 }
 
@@ -48,30 +48,30 @@ impl From<Structure> for Frame {
     }
 }
 
-/// A quantity per atom, [n × width].
+/// A per-atom quantity, `[n × width]`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Column {
-    /// Entries per atom.
+    /// Values per atom.
     pub width: usize,
-    /// The entries, atom by atom.
-    pub entries: Entries,
+    /// The values, atom by atom.
+    pub entries: ColumnData,
 }
 
-/// Entries of one type, [n · width].
+/// Values of one type, `[n · width]`.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Entries {
+pub enum ColumnData {
     /// `R`
     Real(Vec<f64>),
     /// `I` (ASE reads 32 bits only)
     Int(Vec<i64>),
-    /// `L`
+    /// `L`.
     Bool(Vec<bool>),
-    /// `S`, words without white space
+    /// `S`: words without white space.
     Text(Vec<String>),
 }
 
-impl Entries {
-    /// Number of entries.
+impl ColumnData {
+    /// Number of values.
     pub fn len(&self) -> usize {
         match self {
             Self::Real(values) => values.len(),
@@ -81,24 +81,24 @@ impl Entries {
         }
     }
 
-    /// Whether there are none.
+    /// Whether there are no values.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 }
 
 impl Column {
-    /// A column of vectors, [n × 3].
+    /// A column of vectors, `[n × 3]`.
     pub fn vectors(vectors: &[[f64; 3]]) -> Self {
-        Self { width: 3, entries: Entries::Real(vectors.concat()) }
+        Self { width: 3, entries: ColumnData::Real(vectors.concat()) }
     }
 
-    /// The entries as reals, if they are numbers.
+    /// The values as reals, if they are numbers.
     pub fn reals(&self) -> Option<Vec<f64>> {
         match &self.entries {
-            Entries::Real(values) => Some(values.clone()),
-            Entries::Int(values) => Some(values.iter().map(|value| *value as f64).collect()),
-            Entries::Bool(_) | Entries::Text(_) => None,
+            ColumnData::Real(values) => Some(values.clone()),
+            ColumnData::Int(values) => Some(values.iter().map(|value| *value as f64).collect()),
+            ColumnData::Bool(_) | ColumnData::Text(_) => None,
         }
     }
 }

@@ -1,7 +1,6 @@
-//! Atoms and what every other part needs to speak of them: species, cell, structure, neighbour
-//! list, the [`Potential`] trait and the file formats at the edges.
+//! Atomic structures: species, cell, neighbour list, the [`Potential`] trait, and file formats.
 //!
-//! Units inside: eV, Å, fs, u, K. Conversion happens in the module that knows a foreign format.
+//! Internal units: eV, Å, fs, u, K. The module of a foreign format converts its units.
 
 pub mod cell;
 pub mod extxyz;

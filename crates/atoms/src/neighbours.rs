@@ -8,15 +8,15 @@ use crate::structure::{Structure, StructureError};
 use linked_cells::LinkedCells;
 use sites::Sites;
 
-/// More neighbours than this of one atom mean that atoms overlap or the cell has collapsed.
-const MOST_NEIGHBOURS: usize = 20_000;
+/// An atom with more neighbours means overlapping atoms or a collapsed cell.
+const MAX_NEIGHBOURS: usize = 20_000;
 
 /// A directed bond i → j + image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Neighbour {
     /// Index of the neighbour.
     pub atom: u32,
-    /// Which periodic image of it, in lattice vectors, relative to the positions as they stand.
+    /// Its periodic image, in lattice vectors relative to the unwrapped positions.
     pub image: [i32; 3],
 }
 
@@ -41,26 +41,26 @@ pub struct Bond {
     pub r: f64,
 }
 
-/// Every directed pair within cutoff + skin, periodic images and self-images included.
+/// All directed pairs within cutoff + skin, including periodic images and self-images.
 ///
-/// The neighbours of an atom stand in canonical order (atom, then image), so that sums over those
-/// within the cutoff give the same bits whenever the list was built. Lattice vectors of directions
-/// that do not repeat are never looked at, and positions are never wrapped.
+/// The neighbours of an atom are in canonical order (atom, then image), so sums over those within the cutoff
+/// have the same bits whenever the list was built. Non-periodic lattice vectors are ignored, and positions are
+/// never wrapped.
 #[derive(Clone, Debug)]
 pub struct NeighbourList {
     cutoff: f64,
     skin: f64,
-    /// The structure the list was built for.
+    /// The structure for which the list was built.
     reference: Option<Structure>,
     offsets: Vec<usize>,
-    /// Where the later neighbours of each atom begin.
+    /// Index of the first later neighbour of each atom.
     later: Vec<usize>,
     neighbours: Vec<Neighbour>,
     sites: Sites,
 }
 
 impl NeighbourList {
-    /// An empty list that [`NeighbourList::update`] fills. `cutoff` and `skin` in Å.
+    /// An empty list; [`NeighbourList::update`] fills it. `cutoff` and `skin` in Å.
     pub fn new(cutoff: f64, skin: f64) -> Self {
         Self {
             cutoff,
@@ -73,11 +73,11 @@ impl NeighbourList {
         }
     }
 
-    /// Makes the list valid for `structure`; true if it had to be built anew.
+    /// Makes the list valid for `structure`. Returns true if it was rebuilt.
     ///
     /// # Errors
-    /// If the structure is not valid, if an atom is absurdly far away or has absurdly many
-    /// neighbours, or if the cell is too thin. The list is then empty.
+    /// If the structure is invalid, an atom is extremely far away or has extremely many neighbours, or the cell
+    /// is too thin. The list is then empty.
     pub fn update(&mut self, structure: &Structure) -> Result<bool, StructureError> {
         let valid = structure.validate();
         if valid.is_ok() && self.reference.as_ref().is_some_and(|old| self.still_complete(old, structure)) {
@@ -93,7 +93,7 @@ impl NeighbourList {
         Ok(true)
     }
 
-    /// Pairs up to this distance are complete, Å.
+    /// All pairs within this distance are in the list, Å.
     pub fn cutoff(&self) -> f64 {
         self.cutoff
     }
@@ -108,32 +108,33 @@ impl NeighbourList {
         self.len() == 0
     }
 
-    /// Neighbours of atom `i` within cutoff + skin (a few may be farther than the cutoff).
+    /// Neighbours of atom `i` within cutoff + skin, of which some are beyond the cutoff.
     #[inline]
-    pub fn of(&self, i: usize) -> &[Neighbour] {
+    pub fn neighbours_of(&self, i: usize) -> &[Neighbour] {
         &self.neighbours[self.offsets[i]..self.offsets[i + 1]]
     }
 
-    /// Those neighbours of atom `i` that come later than `i` itself in canonical order: over all atoms each pair once.
+    /// The neighbours of atom `i` that follow `i` in canonical order (half list): over all atoms each pair
+    /// once.
     #[inline]
-    pub fn later(&self, i: usize) -> &[Neighbour] {
+    pub fn later_neighbours_of(&self, i: usize) -> &[Neighbour] {
         &self.neighbours[self.later[i]..self.offsets[i + 1]]
     }
 
-    /// Where each neighbour [of](Self::of) atom `i` stands in [`NeighbourList::site_positions`].
+    /// The index of each [neighbour](Self::neighbours_of) of atom `i` in [`NeighbourList::site_positions`].
     #[inline]
     pub fn sites_of(&self, i: usize) -> &[u32] {
         &self.sites.of_neighbour[self.offsets[i]..self.offsets[i + 1]]
     }
 
-    /// The same of its [later](Self::later) neighbours.
+    /// The indices of its [later neighbours](Self::later_neighbours_of).
     #[inline]
-    pub fn later_sites(&self, i: usize) -> &[u32] {
+    pub fn later_sites_of(&self, i: usize) -> &[u32] {
         &self.sites.of_neighbour[self.later[i]..self.offsets[i + 1]]
     }
 
-    /// Writes the positions of all atoms, Å, and after them those of all periodic images that are neighbours: each is
-    /// worked out once instead of once a bond.
+    /// Writes the positions of all atoms, Å, followed by those of all periodic images that are neighbours. Each
+    /// is computed once instead of once per bond.
     pub fn site_positions(&self, structure: &Structure, positions: &mut Vec<Vec3>) {
         self.sites.positions(structure, positions);
     }
@@ -142,7 +143,7 @@ impl NeighbourList {
     #[inline]
     pub fn bonds_within(&self, structure: &Structure, i: usize, cutoff: f64, bonds: &mut Vec<Bond>) {
         bonds.clear();
-        for neighbour in self.of(i) {
+        for neighbour in self.neighbours_of(i) {
             let d = neighbour.displacement(structure, i);
             let square = cell::dot(d, d);
             if square < cutoff * cutoff {
@@ -175,8 +176,8 @@ impl NeighbourList {
                 if (certain || is_within(neighbour)) && neighbour != own {
                     found.push(neighbour);
                 }
-                if found.len() - start > MOST_NEIGHBOURS {
-                    return Err(StructureError::Crowded { atom: i, limit: MOST_NEIGHBOURS, reach });
+                if found.len() - start > MAX_NEIGHBOURS {
+                    return Err(StructureError::Crowded { atom: i, limit: MAX_NEIGHBOURS, reach });
                 }
                 Ok(())
             })?;
@@ -185,17 +186,19 @@ impl NeighbourList {
         self.sort(&found, &ends);
         for i in 0..structure.len() {
             let own = Neighbour { atom: i as u32, image: [0; 3] };
-            self.later.push(self.offsets[i] + self.of(i).partition_point(|neighbour| *neighbour < own));
+            self.later
+                .push(self.offsets[i] + self.neighbours_of(i).partition_point(|neighbour| *neighbour < own));
         }
         self.sites.number(&self.offsets, &self.neighbours);
         Ok(())
     }
 
-    /// Fills the list with the reverse of each bond found: of i → j + image that is j → i − image.
+    /// Fills the list with the reverse of each bond found: for i → j + image, j → i − image.
     ///
-    /// With each bond its reverse was found too, since d of one is −d of the other to the last bit. Going through the
-    /// atoms in order leaves the reverse bonds of each atom in order of their neighbours, and going backwards through
-    /// the images, which were found in ascending order, leaves these in order: the canonical order, without comparing.
+    /// The reverse of each bond was found too, because the two displacements are exactly opposite. Visiting
+    /// atoms in ascending order yields the reverse bonds of each atom ordered by neighbour. Images were found
+    /// in ascending order, so visiting them backwards orders these too. This gives the canonical order without
+    /// comparisons.
     fn sort(&mut self, found: &[Neighbour], ends: &[usize]) {
         let mut next = vec![0; ends.len() + 1];
         found.iter().for_each(|neighbour| next[neighbour.atom as usize + 1] += 1);
@@ -215,11 +218,11 @@ impl NeighbourList {
         }
     }
 
-    /// Whether no pair outside the list can have come within the cutoff.
+    /// Whether no pair outside the list can be within the cutoff.
     ///
-    /// With the deformation gradient F of the cell and the displacement u of each atom from its
-    /// affinely moved reference position, d = d₀ F + u_j − u_i, so that |d| ≥ s_min(F) |d₀| − 2 max|u|.
-    /// Holds for any F that moves the periodic lattice vectors rightly.
+    /// With the deformation gradient F of the cell and the displacement u of each atom from its affinely
+    /// deformed reference position, d = d₀ F + u_j − u_i, so |d| ≥ s_min(F) |d₀| − 2 max|u|. This holds for any
+    /// F that maps the periodic lattice vectors correctly.
     fn still_complete(&self, reference: &Structure, structure: &Structure) -> bool {
         if reference == structure {
             return true;
@@ -238,19 +241,19 @@ impl NeighbourList {
             .map(|(old, new)| cell::sub(*new, cell::row_times(*old, &f)))
             .map(|u| cell::dot(u, u))
             .fold(0.0, f64::max);
-        let least = least_singular_value(&f) * (self.cutoff + self.skin) - 2.0 * largest.sqrt();
-        // The margin is for the rounding of the singular value.
+        let least = min_singular_value(&f) * (self.cutoff + self.skin) - 2.0 * largest.sqrt();
+        // Margin for rounding in the singular value.
         least > self.cutoff * (1.0 + 1e-7)
     }
 }
 
-/// The shortest pair (i ≤ j, distance in Å), the lowest indices first among equals; i = j for an atom
-/// and its own image. `None` if no two atoms are within the reach of the list.
+/// The shortest pair (i ≤ j, distance in Å); of equals, the one with the lowest indices. i = j for an atom and
+/// its own image. `None` if no pair is in the list.
 pub fn shortest_distance(structure: &Structure, neighbours: &NeighbourList) -> Option<(usize, usize, f64)> {
     let mut shortest = None;
     let mut least = f64::INFINITY;
     for i in 0..neighbours.len() {
-        for neighbour in neighbours.later(i) {
+        for neighbour in neighbours.later_neighbours_of(i) {
             let d = neighbour.displacement(structure, i);
             let squared = cell::dot(d, d);
             if squared < least {
@@ -262,7 +265,7 @@ pub fn shortest_distance(structure: &Structure, neighbours: &NeighbourList) -> O
     shortest.map(|(i, j)| (i, j, least.sqrt()))
 }
 
-/// F with h = h₀ F, for lattice vectors as rows; directions that do not repeat only turn with the others.
+/// F with h = h₀ F for lattice vectors as rows. Non-periodic directions only rotate with the others.
 fn deformation_gradient(reference: &Structure, structure: &Structure) -> Matrix3 {
     let from = reference.cell.completed(reference.periodic).reciprocal();
     let to = structure.cell.completed(structure.periodic).0;
@@ -271,9 +274,9 @@ fn deformation_gradient(reference: &Structure, structure: &Structure) -> Matrix3
     })
 }
 
-/// Square root of the least eigenvalue of F Fᵀ, by the trigonometric solution of the cubic
-/// (Smith, Commun. ACM 4, 168 (1961)).
-fn least_singular_value(f: &Matrix3) -> f64 {
+/// Square root of the smallest eigenvalue of F Fᵀ, by the trigonometric solution of the cubic (Smith, Commun.
+/// ACM 4, 168 (1961)).
+fn min_singular_value(f: &Matrix3) -> f64 {
     let c: Matrix3 = std::array::from_fn(|i| std::array::from_fn(|j| cell::dot(f[i], f[j])));
     let mean = (c[0][0] + c[1][1] + c[2][2]) / 3.0;
     let deviator: Matrix3 =
@@ -295,15 +298,15 @@ mod tests {
     #[test]
     fn least_singular_value_of_known_deformations() {
         let stretch = [[1.1, 0.0, 0.0], [0.0, 0.93, 0.0], [0.0, 0.0, 1.02]];
-        assert!((least_singular_value(&stretch) - 0.93).abs() < 1e-9);
+        assert!((min_singular_value(&stretch) - 0.93).abs() < 1e-9);
         let (s, c) = 0.7_f64.sin_cos();
         let turned = stretch.map(|row| cell::row_times(row, &[[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]));
-        assert!((least_singular_value(&turned) - 0.93).abs() < 1e-9);
-        assert_eq!(least_singular_value(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 1.0);
+        assert!((min_singular_value(&turned) - 0.93).abs() < 1e-9);
+        assert_eq!(min_singular_value(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 1.0);
         // Simple shear g: s² − g s − 1 = 0 has the roots s_max and −s_min.
         let g: f64 = 0.3;
         let sheared = [[1.0, 0.0, 0.0], [g, 1.0, 0.0], [0.0, 0.0, 1.0]];
         let exact = ((g * g + 4.0).sqrt() - g) / 2.0;
-        assert!((least_singular_value(&sheared) - exact).abs() < 1e-9);
+        assert!((min_singular_value(&sheared) - exact).abs() < 1e-9);
     }
 }

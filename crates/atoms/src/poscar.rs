@@ -1,59 +1,59 @@
-//! VASP POSCAR (version 5, with a line of element symbols), read and written.
+//! Reads and writes VASP POSCAR files (version 5, with a line of element symbols).
 //!
-//! The kept crate `vasp-poscar` 0.3 rests on `failure`, which is retired (RUSTSEC-2020-0036).
+//! The existing crate `vasp-poscar` 0.3 depends on `failure`, which is unmaintained (RUSTSEC-2020-0036).
 
 use std::fmt;
 use std::io::{BufRead, ErrorKind, Write};
 
 use crate::cell::{Cell, Vec3};
-use crate::extxyz::{Column, Entries, Frame};
+use crate::extxyz::{Column, ColumnData, Frame};
 use crate::species::{Species, UnknownSpecies};
 use crate::structure::{Structure, StructureError};
 
-/// What is wrong with a file, and where.
+/// An error with its line.
 #[derive(Debug, thiserror::Error)]
-#[error("line {line}: {fault}")]
+#[error("line {line}: {kind}")]
 pub struct PoscarError {
     /// Line of the file, from 1.
     pub line: usize,
-    /// What is wrong with it.
+    /// What is wrong.
     #[source]
-    pub fault: Fault,
+    pub kind: PoscarErrorKind,
 }
 
 /// What is wrong with a line.
 #[derive(Debug, thiserror::Error)]
-pub enum Fault {
+pub enum PoscarErrorKind {
     /// The stream cannot be read.
     #[error("cannot be read: {0}")]
     Io(std::io::Error),
     /// The stream ends too early.
     #[error("the file ends here, expected {0}")]
-    End(Part),
-    /// A line of another kind.
+    End(PoscarSection),
+    /// A line has the wrong format.
     #[error("found '{found}', expected {expected}")]
     Line {
         /// The line.
         found: String,
-        /// What it should be.
-        expected: Part,
+        /// The expected content.
+        expected: PoscarSection,
     },
-    /// A file of VASP 4, which does not say what its atoms are.
+    /// A file of VASP 4, which does not name its elements.
     #[error(
         "found '{0}', expected element symbols: this is a file of VASP 4; insert a line such as 'Al Si' above it"
     )]
     NoSymbols(String),
-    /// A symbol of no element.
+    /// An unknown element symbol.
     #[error(transparent)]
     Species(#[from] UnknownSpecies),
-    /// The structure as a whole.
+    /// The structure is invalid.
     #[error(transparent)]
     Structure(#[from] StructureError),
 }
 
-/// A part of the file.
+/// A section of the file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Part {
+pub enum PoscarSection {
     /// Line 1.
     Comment,
     /// Line 2.
@@ -66,13 +66,13 @@ pub enum Part {
     Counts,
     /// `Direct` or `Cartesian`.
     Mode,
-    /// A line of an atom.
+    /// An atom line.
     Position,
-    /// A line of an atom with selective dynamics.
+    /// An atom line with selective dynamics.
     PositionAndFlags,
 }
 
-impl fmt::Display for Part {
+impl fmt::Display for PoscarSection {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Comment => "a comment",
@@ -89,21 +89,21 @@ impl fmt::Display for Part {
 
 /// Reads one structure, periodic in all directions.
 ///
-/// The comment becomes the text `comment` of `info`, the flags of selective dynamics the array
-/// `move_mask` [n × 3] (true: free to move), as ASE calls it. What follows the positions
-/// (velocities, predictor–corrector data) is ignored.
+/// The comment becomes the text `comment` of `info`; the flags of selective dynamics become the array
+/// `move_mask` `[n × 3]` (true: free to move), as in ASE. Data after the positions (velocities,
+/// predictor–corrector data) are ignored.
 pub fn read_poscar(input: impl BufRead) -> Result<Frame, PoscarError> {
     let mut lines = Lines { input, number: 0, text: String::new() };
     let frame = frame(&mut lines);
-    frame.map_err(|fault| PoscarError { line: lines.number, fault })
+    frame.map_err(|fault| PoscarError { line: lines.number, kind: fault })
 }
 
-fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, Fault> {
-    let comment = lines.take(Part::Comment)?.to_owned();
-    let factors = lines.parse(Part::Scale, factors)?;
+fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, PoscarErrorKind> {
+    let comment = lines.take(PoscarSection::Comment)?.to_owned();
+    let factors = lines.parse(PoscarSection::Scale, factors)?;
     let mut lattice = [[0.0; 3]; 3];
     for vector in &mut lattice {
-        *vector = lines.parse(Part::LatticeVector, vector3)?;
+        *vector = lines.parse(PoscarSection::LatticeVector, vector3)?;
     }
     let factors = match factors {
         Scale::Factors(factors) => factors,
@@ -111,23 +111,23 @@ fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, Fault> {
     };
     let stretch = |x: Vec3| -> Vec3 { std::array::from_fn(|k| x[k] * factors[k]) };
     let cell = Cell(lattice.map(stretch));
-    let symbols = symbols(lines.take(Part::Symbols)?)?;
-    let counts = lines.parse(Part::Counts, |text| counts(text, symbols.len()))?;
-    let mut mode = lines.parse(Part::Mode, mode)?;
+    let symbols = symbols(lines.take(PoscarSection::Symbols)?)?;
+    let counts = lines.parse(PoscarSection::Counts, |text| counts(text, symbols.len()))?;
+    let mut mode = lines.parse(PoscarSection::Mode, mode)?;
     let selective = mode == Mode::Selective;
     if selective {
-        mode = lines.parse(Part::Mode, mode_of_positions)?;
+        mode = lines.parse(PoscarSection::Mode, mode_of_positions)?;
     }
     let mut structure = Structure { species: vec![], positions: vec![], cell, periodic: [true; 3] };
     let mut flags = Vec::new();
     for (species, count) in symbols.into_iter().zip(counts) {
         for _ in 0..count {
             let position = if selective {
-                let (position, free) = lines.parse(Part::PositionAndFlags, position_and_flags)?;
+                let (position, free) = lines.parse(PoscarSection::PositionAndFlags, position_and_flags)?;
                 flags.extend(free);
                 position
             } else {
-                lines.parse(Part::Position, vector3)?
+                lines.parse(PoscarSection::Position, vector3)?
             };
             structure.species.push(species);
             let cartesian = mode == Mode::Cartesian;
@@ -140,7 +140,7 @@ fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, Fault> {
         frame.info.insert("comment".to_owned(), comment.into());
     }
     if selective {
-        let entries = Entries::Bool(flags);
+        let entries = ColumnData::Bool(flags);
         frame.arrays.insert("move_mask".to_owned(), Column { width: 3, entries });
     }
     Ok(frame)
@@ -149,20 +149,20 @@ fn frame(lines: &mut Lines<impl BufRead>) -> Result<Frame, Fault> {
 /// Why a structure cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
-    /// The stream does not take it.
+    /// The stream reports an error.
     #[error("cannot be written: {0}")]
     Io(#[from] std::io::Error),
-    /// The structure is not one, or its cell has no volume.
+    /// The structure is invalid or its cell has no volume.
     #[error(transparent)]
     Structure(#[from] StructureError),
 }
 
-/// Writes a structure in Cartesian coordinates and returns the order of its atoms: the k-th position
-/// of the file is that of atom `order[k]`.
+/// Writes a structure in Cartesian coordinates. Returns the order of its atoms: position k of the file belongs
+/// to atom `order[k]`.
 ///
-/// Atoms of one element stand together, elements in the order of their first atom. The format has no
-/// word for directions that are not periodic: the cell must span space whatever `periodic` says.
-/// Only the first line of `comment` is written.
+/// Atoms are grouped by element, elements in the order of their first atom. The format cannot express
+/// non-periodic directions, so the cell must span space in any case. Only the first line of `comment` is
+/// written.
 pub fn write_poscar(
     out: &mut impl Write,
     structure: &Structure,
@@ -213,22 +213,26 @@ struct Lines<R> {
 }
 
 impl<R: BufRead> Lines<R> {
-    fn take(&mut self, expected: Part) -> Result<&str, Fault> {
+    fn take(&mut self, expected: PoscarSection) -> Result<&str, PoscarErrorKind> {
         self.text.clear();
         self.number += 1;
         match self.input.read_line(&mut self.text) {
-            Ok(0) => Err(Fault::End(expected)),
+            Ok(0) => Err(PoscarErrorKind::End(expected)),
             Ok(_) => Ok(self.text.trim()),
             Err(error) if error.kind() == ErrorKind::InvalidData => {
-                Err(Fault::Line { found: "bytes that are not text".to_owned(), expected })
+                Err(PoscarErrorKind::Line { found: "bytes that are not text".to_owned(), expected })
             }
-            Err(error) => Err(Fault::Io(error)),
+            Err(error) => Err(PoscarErrorKind::Io(error)),
         }
     }
 
-    fn parse<T>(&mut self, expected: Part, parse: impl Fn(&str) -> Option<T>) -> Result<T, Fault> {
+    fn parse<T>(
+        &mut self,
+        expected: PoscarSection,
+        parse: impl Fn(&str) -> Option<T>,
+    ) -> Result<T, PoscarErrorKind> {
         let text = self.take(expected)?;
-        parse(text).ok_or_else(|| Fault::Line { found: text.chars().take(60).collect(), expected })
+        parse(text).ok_or_else(|| PoscarErrorKind::Line { found: text.chars().take(60).collect(), expected })
     }
 }
 
@@ -238,7 +242,7 @@ enum Scale {
     Volume(f64),
 }
 
-/// One factor or three; what follows them is a remark.
+/// One factor or three; the rest of the line is a comment.
 fn factors(text: &str) -> Option<Scale> {
     let numbers: Vec<f64> = text.split_whitespace().map_while(|word| word.parse().ok()).take(3).collect();
     match *numbers {
@@ -250,7 +254,7 @@ fn factors(text: &str) -> Option<Scale> {
     }
 }
 
-/// Three numbers; what follows them is a remark.
+/// Three numbers; the rest of the line is a comment.
 fn vector3(text: &str) -> Option<Vec3> {
     let numbers =
         text.split_whitespace().take(3).map(|word| word.parse().ok().filter(|x: &f64| x.is_finite()));
@@ -268,12 +272,12 @@ fn position_and_flags(text: &str) -> Option<(Vec3, Vec<bool>)> {
 }
 
 /// Element symbols; VASP may add the potential's name and a hash: `Al_pv/6a2f54`.
-fn symbols(text: &str) -> Result<Vec<Species>, Fault> {
+fn symbols(text: &str) -> Result<Vec<Species>, PoscarErrorKind> {
     if text.is_empty() {
-        return Err(Fault::Line { found: String::new(), expected: Part::Symbols });
+        return Err(PoscarErrorKind::Line { found: String::new(), expected: PoscarSection::Symbols });
     }
     if text.split_whitespace().all(|word| word.parse::<u64>().is_ok()) {
-        return Err(Fault::NoSymbols(text.chars().take(60).collect()));
+        return Err(PoscarErrorKind::NoSymbols(text.chars().take(60).collect()));
     }
     let species = |word: &str| word.split(['_', '/']).next().unwrap_or(word).parse::<Species>();
     Ok(text
@@ -296,7 +300,7 @@ enum Mode {
     Cartesian,
 }
 
-/// Only the first letter counts.
+/// Only the first letter is significant.
 fn mode(text: &str) -> Option<Mode> {
     match text.chars().next()? {
         'S' | 's' => Some(Mode::Selective),

@@ -1,4 +1,4 @@
-//! What every interatomic potential gives.
+//! The interface of interatomic potentials.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,16 +10,16 @@ use crate::structure::Structure;
 /// Energy and its derivatives for one structure.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Evaluation {
-    /// Energy of each atom, [n], eV.
+    /// Energy of each atom, `[n]`, eV.
     pub atomic_energies: Vec<f64>,
-    /// −∂E/∂r, [n], eV/Å.
+    /// −∂E/∂r, `[n]`, eV/Å.
     pub forces: Vec<Vec3>,
     /// −∂E/∂ε, eV (symmetric; stress = −virial / volume, tension positive).
     pub virial: Matrix3,
 }
 
 impl Evaluation {
-    /// Sets the arrays to `n` atoms and zero.
+    /// Resizes the arrays to `n` atoms and sets them to zero.
     pub fn reset(&mut self, n: usize) {
         self.atomic_energies.clear();
         self.atomic_energies.resize(n, 0.0);
@@ -33,8 +33,8 @@ impl Evaluation {
         self.atomic_energies.iter().sum()
     }
 
-    /// Stress = −virial / volume, eV/Å³, tension positive. For a slab or wire that of its whole cell, vacuum included;
-    /// `None` where nothing repeats or the lattice vectors do not span space.
+    /// Stress = −virial / volume, eV/Å³, tension positive. For a slab or wire it refers to the whole cell
+    /// including vacuum. `None` without periodic directions or if the lattice vectors do not span space.
     pub fn stress(&self, structure: &Structure) -> Option<Matrix3> {
         let volume = structure.cell.volume();
         let defined = structure.periodic != [false; 3] && volume > 0.0;
@@ -45,17 +45,17 @@ impl Evaluation {
 /// Why a potential cannot evaluate a structure.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PotentialError {
-    /// An element the potential has no parameters for.
-    #[error("atom {atom} is {species}, which the potential does not know (it knows {known})")]
+    /// The potential has no parameters for an element.
+    #[error("atom {atom} is {species}, which the potential does not support (it supports {known})")]
     Species {
         /// Index of the atom.
         atom: usize,
         /// Its element.
         species: Species,
-        /// Symbols the potential knows.
+        /// Elements of the potential.
         known: String,
     },
-    /// The neighbour list reaches less far than the potential.
+    /// The cutoff of the neighbour list is too short.
     #[error("the neighbour list reaches {list} Å, the potential needs {needed} Å")]
     Cutoff {
         /// Cutoff of the list, Å.
@@ -65,17 +65,17 @@ pub enum PotentialError {
     },
 }
 
-/// An interatomic potential. `&mut self` lets an implementation keep its work arrays between steps.
+/// An interatomic potential. `&mut self` lets implementations keep scratch arrays between steps.
 pub trait Potential: Send {
-    /// The largest pair distance that matters, Å.
+    /// The largest relevant pair distance, Å.
     fn cutoff(&self) -> f64;
 
-    /// The elements it knows.
+    /// The supported elements.
     fn species(&self) -> &[Species];
 
-    /// Writes energies, forces and virial of `structure` into `out` (whatever it held before).
+    /// Writes energies, forces and virial of `structure` to `out`, replacing its content.
     ///
-    /// `neighbours` must be up to date for `structure` and reach at least [`Potential::cutoff`].
+    /// `neighbours` must be up to date for `structure` and extend at least to [`Potential::cutoff`].
     fn evaluate(
         &mut self,
         structure: &Structure,

@@ -1,4 +1,4 @@
-//! Reading structures from a file of any format that is known here.
+//! Reads structures from a file of any supported format.
 
 use std::fs::File;
 use std::io::{self, BufReader};
@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 use crate::extxyz::{self, Frame, Reader};
 use crate::poscar;
 
-/// Extensions of what other programs write, which `ase convert` reads.
+/// Extensions of other programs' formats that `ase convert` reads.
 const OTHER_FORMATS: [&str; 14] =
     ["cif", "vasp", "poscar", "pdb", "traj", "xsf", "cfg", "gen", "cell", "res", "lmp", "data", "in", "json"];
 
-/// A file that cannot be used.
+/// A file that cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
     /// It cannot be opened.
@@ -22,20 +22,20 @@ pub enum FileError {
         /// Why.
         source: std::io::Error,
     },
-    /// Its name tells no format.
+    /// Its name does not indicate a format.
     #[error(
         "{}: unknown format: expected a name ending in .extxyz, .xyz, .poscar or .vasp, or beginning with POSCAR or CONTCAR; {}",
         .0.display(),
         conversion(.0)
     )]
     Format(PathBuf),
-    /// It is of another format than extended XYZ, where only that is read.
+    /// Only extended XYZ is accepted here, and the file has another format.
     #[error("{}: expected extended XYZ; {}", .0.display(), conversion(.0))]
     NotExtxyz(PathBuf),
-    /// It has no frame.
+    /// It has no frames.
     #[error("{}: the file has no structures, expected at least one", .0.display())]
     Empty(PathBuf),
-    /// It is not the extended XYZ that its name tells.
+    /// Invalid extended XYZ.
     #[error("{}:{line}: {fault}", path.display())]
     Extxyz {
         /// The file.
@@ -44,9 +44,9 @@ pub enum FileError {
         line: usize,
         /// What is wrong with it.
         #[source]
-        fault: extxyz::Fault,
+        fault: extxyz::ExtxyzErrorKind,
     },
-    /// It is not the POSCAR that its name tells.
+    /// Invalid POSCAR.
     #[error("{}:{line}: {fault}", path.display())]
     Poscar {
         /// The file.
@@ -55,17 +55,17 @@ pub enum FileError {
         line: usize,
         /// What is wrong with it.
         #[source]
-        fault: poscar::Fault,
+        fault: poscar::PoscarErrorKind,
     },
 }
 
-/// How to make extended XYZ of a file.
+/// How to convert a file to extended XYZ.
 fn conversion(path: &Path) -> String {
     format!("convert it with `ase convert {} {}`", path.display(), path.with_extension("extxyz").display())
 }
 
-/// All structures of a file, at least one: POSCAR (`POSCAR*`, `CONTCAR*`, `*.poscar`, `*.vasp`) or
-/// extended XYZ (`*.xyz`, `*.extxyz`), by its name in any case.
+/// Reads all structures of a file, at least one. The name determines the format, in any letter case: POSCAR
+/// (`POSCAR*`, `CONTCAR*`, `*.poscar`, `*.vasp`) or extended XYZ (`*.xyz`, `*.extxyz`).
 pub fn read_structures(path: &Path) -> Result<Vec<Frame>, FileError> {
     let lower = |name: Option<&std::ffi::OsStr>| name.unwrap_or_default().to_string_lossy().to_lowercase();
     let name = lower(path.file_name());
@@ -80,10 +80,10 @@ pub fn read_structures(path: &Path) -> Result<Vec<Frame>, FileError> {
     }
 }
 
-/// Opens a file in extended XYZ that is to be read frame by frame.
+/// Opens an extended XYZ file for reading frame by frame.
 ///
 /// # Errors
-/// One that cannot be opened, a directory, a name of another format.
+/// The file cannot be opened, is a directory, or its name indicates another format.
 pub fn open_extxyz(path: &Path) -> Result<File, FileError> {
     // A pipe has no extension.
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
@@ -97,22 +97,22 @@ pub fn open_extxyz(path: &Path) -> Result<File, FileError> {
     }
 }
 
-/// All frames of a file in extended XYZ, at least one.
+/// Reads all frames of an extended XYZ file, at least one.
 pub fn read_extxyz(path: &Path) -> Result<Vec<Frame>, FileError> {
     let frames: Result<Vec<_>, _> = Reader::new(open(path)?).collect();
     match frames {
         Ok(frames) if frames.is_empty() => Err(FileError::Empty(path.to_owned())),
         Ok(frames) => Ok(frames),
-        Err(error) => Err(FileError::Extxyz { path: path.to_owned(), line: error.line, fault: error.fault }),
+        Err(error) => Err(FileError::Extxyz { path: path.to_owned(), line: error.line, fault: error.kind }),
     }
 }
 
-/// The structure of a POSCAR file.
+/// Reads a POSCAR file.
 pub fn read_poscar(path: &Path) -> Result<Frame, FileError> {
     poscar::read_poscar(open(path)?).map_err(|error| FileError::Poscar {
         path: path.to_owned(),
         line: error.line,
-        fault: error.fault,
+        fault: error.kind,
     })
 }
 
@@ -120,7 +120,7 @@ fn open(path: &Path) -> Result<BufReader<File>, FileError> {
     open_file(path).map(BufReader::new)
 }
 
-/// A directory can be opened, and not read.
+/// Directories can be opened but not read.
 fn open_file(path: &Path) -> Result<File, FileError> {
     if path.is_dir() {
         return Err(directory(path));

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 #[serde(try_from = "String", into = "String")]
 pub struct Species(u8);
 
-/// A symbol or atomic number that names no element.
+/// A symbol or atomic number of no element.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("unknown element '{0}' (expected a symbol such as Al, or an atomic number from 1 to 118)")]
 pub struct UnknownSpecies(pub String);
@@ -37,8 +37,8 @@ impl Species {
         self.element().atomic_weight().into()
     }
 
-    /// Empirical radius (Slater), Å: the sum of two is about the distance of bonded neighbours. `None` for noble gases, which
-    /// form no bonds, and where none is known.
+    /// Empirical radius (Slater), Å: bonded neighbours are about the sum of their radii apart. `None` for noble
+    /// gases, which form no bonds, and where unknown.
     pub fn radius(self) -> Option<f64> {
         const NOBLE: [u8; 7] = [2, 10, 18, 36, 54, 86, 118];
         let radius = self.element().atomic_radius().filter(|_| !NOBLE.contains(&self.0))?;
@@ -46,7 +46,7 @@ impl Species {
     }
 
     fn element(self) -> Element {
-        // The constructor admits 1 … 118 only, which is what the table holds, in order.
+        // The constructor admits only 1 … 118, the range of the table.
         mendeleev::ALL_ELEMENTS[usize::from(self.0) - 1]
     }
 }
@@ -59,7 +59,7 @@ impl FromStr for Species {
             .iter()
             .position(|element| element.symbol() == symbol)
             .map(|index| Self(index as u8 + 1))
-            // It may be a line of a file that is none.
+            // The text may be a whole line of an invalid file.
             .ok_or_else(|| UnknownSpecies(symbol.chars().take(60).collect()))
     }
 }

@@ -5,23 +5,23 @@ use serde::{Deserialize, Serialize};
 use crate::cell::{self, Cell, Vec3};
 use crate::species::Species;
 
-/// A piece of matter: what a potential is evaluated on.
+/// An atomic structure, the input of a potential.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Structure {
-    /// The element of each atom, [n].
+    /// The element of each atom, `[n]`.
     pub species: Vec<Species>,
-    /// Cartesian positions, [n], Å. They are not wrapped into the cell.
+    /// Cartesian positions, `[n]`, Å; not wrapped into the cell.
     pub positions: Vec<Vec3>,
     /// Lattice vectors.
     pub cell: Cell,
-    /// Whether each lattice direction repeats.
+    /// Which lattice directions are periodic.
     pub periodic: [bool; 3],
 }
 
 /// Why a structure cannot be used.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum StructureError {
-    /// No atoms at all.
+    /// There are no atoms.
     #[error("the structure has no atoms")]
     Empty,
     /// Arrays of different lengths.
@@ -41,7 +41,7 @@ pub enum StructureError {
     /// A periodic direction without extent.
     #[error("the cell is periodic but its volume is {0:.3e} Å³: its lattice vectors must span space")]
     CellVolume(f64),
-    /// An atom so far away that its lattice translation loses all digits.
+    /// An atom is so far away that its lattice translation has no significant digits.
     #[error("atom {atom} is more than {limit:.0e} lattice vectors (or Å) away from the cell")]
     FarAway {
         /// Index of the atom.
@@ -49,15 +49,15 @@ pub enum StructureError {
         /// The limit.
         limit: f64,
     },
-    /// A cell so thin that the search for neighbours would not end.
-    #[error("the cell is {height:.3e} Å high, far too thin to find the neighbours within {reach:.3} Å")]
+    /// The cell is so thin that the neighbour search would not end.
+    #[error("the cell is {height:.3e} Å high, too thin to search neighbours within {reach:.3} Å")]
     CellThin {
-        /// Least height of the cell among the directions that repeat, Å.
+        /// Smallest height of the cell along periodic directions, Å.
         height: f64,
         /// Cutoff + skin, Å.
         reach: f64,
     },
-    /// Far more neighbours than matter has.
+    /// Far more neighbours than any material has.
     #[error(
         "atom {atom} has more than {limit} neighbours within {reach:.3} Å: atoms overlap, or the cell is too small"
     )]
@@ -78,7 +78,7 @@ pub enum StructureError {
         second: usize,
         /// Their distance, Å.
         distance: f64,
-        /// The least distance allowed, Å.
+        /// The minimum distance, Å.
         least: f64,
     },
 }
@@ -111,7 +111,7 @@ impl Structure {
         if self.cell.0.iter().flatten().any(|x| !x.is_finite()) {
             return Err(StructureError::CellEntry);
         }
-        // Directions that do not repeat may have any lattice vector, also none.
+        // Non-periodic directions may have any lattice vector, including zero.
         let lattice = self.cell.completed(self.periodic);
         let spanned: f64 = lattice.0.iter().map(|a| cell::norm(*a)).product();
         if lattice.volume().partial_cmp(&(1e-6 * spanned)) != Some(std::cmp::Ordering::Greater) {

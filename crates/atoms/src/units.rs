@@ -1,4 +1,4 @@
-//! Physical constants in the units used inside: eV, Å, fs, u, K, elementary charge (CODATA 2018).
+//! Physical constants in internal units: eV, Å, fs, u, K, elementary charge (CODATA 2018).
 
 /// Boltzmann constant, eV/K.
 pub const BOLTZMANN: f64 = 8.617_333_262e-5;

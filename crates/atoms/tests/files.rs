@@ -1,11 +1,11 @@
-//! File formats against ASE, real files, and whatever else may stand in a file.
+//! File formats against ASE, real files, and arbitrary input.
 
 use std::fs::File;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use atoms::extxyz::{Column, Entries, Frame, Reader, Value, write_frame};
+use atoms::extxyz::{Column, ColumnData, Frame, Reader, Value, write_frame};
 use atoms::poscar::write_poscar;
 use atoms::{Cell, Species, Structure, read_extxyz, read_structures};
 use proptest::collection::{btree_map, vec};
@@ -22,7 +22,7 @@ fn shared(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/data").join(name)
 }
 
-/// What ASE reads from files, one after another, if an interpreter is named.
+/// What ASE reads from files, if an interpreter is configured.
 fn ase_reads(paths: &[PathBuf]) -> Option<Vec<Json>> {
     let Some(python) = std::env::var_os("CALMWALK_PYTHON") else {
         eprintln!("CALMWALK_PYTHON is not set: no comparison with ASE");
@@ -58,7 +58,7 @@ fn to_json(value: &Value) -> Json {
     }
 }
 
-/// Whether JSON holds what has no value here and stays text.
+/// Whether JSON has content without a value here, which stays text.
 fn is_foreign(json: &Json) -> bool {
     match json {
         Json::Null | Json::Object(_) => true,
@@ -75,15 +75,15 @@ fn info_to_json(value: &Value) -> Json {
 
 fn column_to_json(column: &Column) -> Json {
     let items: Vec<Json> = match &column.entries {
-        Entries::Real(values) => values.iter().map(|value| real(*value)).collect(),
-        Entries::Int(values) => values.iter().map(|value| json!(value)).collect(),
-        Entries::Bool(values) => values.iter().map(|value| json!(value)).collect(),
-        Entries::Text(values) => values.iter().map(|value| json!(value)).collect(),
+        ColumnData::Real(values) => values.iter().map(|value| real(*value)).collect(),
+        ColumnData::Int(values) => values.iter().map(|value| json!(value)).collect(),
+        ColumnData::Bool(values) => values.iter().map(|value| json!(value)).collect(),
+        ColumnData::Text(values) => values.iter().map(|value| json!(value)).collect(),
     };
     if column.width == 1 { items.into() } else { items.chunks(column.width).map(Json::from).collect() }
 }
 
-/// The same bits, the same types, nothing more and nothing less.
+/// Asserts the same bits and types, and nothing else.
 fn assert_same(frame: &Frame, ase: &Json) {
     let structure = &frame.structure;
     let numbers: Vec<u8> = structure.species.iter().map(|species| species.atomic_number()).collect();
@@ -95,7 +95,7 @@ fn assert_same(frame: &Frame, ase: &Json) {
     let (mut given, mut results) = (serde_json::Map::new(), serde_json::Map::new());
     for (name, column) in &frame.arrays {
         match (name.as_str(), &column.entries) {
-            ("move_mask", Entries::Bool(flags)) => {
+            ("move_mask", ColumnData::Bool(flags)) => {
                 let row = |atom: usize| &flags[atom * column.width..(atom + 1) * column.width];
                 free = (0..structure.len())
                     .map(|i| if let [a, b, c] = *row(i) { [a, b, c] } else { [row(i)[0]; 3] })
@@ -137,7 +137,7 @@ fn written(frames: &[Frame]) -> Vec<u8> {
     text
 }
 
-/// Frames with their line numbers left out.
+/// Frames without their line numbers.
 fn unnumbered(mut frames: Vec<Frame>) -> Vec<Frame> {
     frames.iter_mut().for_each(|frame| frame.line = 0);
     frames
@@ -198,7 +198,7 @@ fn real_files_are_read_completely() {
         (shared("silicon_seeds.extxyz"), None),
     ];
     if let Some(peer) = std::env::var_os("CALMWALK_PEER_DATA") {
-        // Frames, atoms, and frames without a stress, as the sources tell.
+        // Frames, atoms, and frames without a stress, as documented by the sources.
         for (name, counts) in [
             ("Cu_mlearn_test", (31, 3178, 0)),
             ("Mo_mlearn_test", (23, 1189, 0)),
@@ -332,10 +332,10 @@ fn any_column(atoms: usize) -> impl Strategy<Value = Column> {
     (1..5_usize).prop_flat_map(move |width| {
         let length = width * atoms;
         let entries = prop_oneof![
-            vec(real.clone(), length).prop_map(Entries::Real),
-            vec(any::<i32>().prop_map(i64::from), length).prop_map(Entries::Int),
-            vec(any::<bool>(), length).prop_map(Entries::Bool),
-            vec("[!-~é]{1,8}", length).prop_map(Entries::Text),
+            vec(real.clone(), length).prop_map(ColumnData::Real),
+            vec(any::<i32>().prop_map(i64::from), length).prop_map(ColumnData::Int),
+            vec(any::<bool>(), length).prop_map(ColumnData::Bool),
+            vec("[!-~é]{1,8}", length).prop_map(ColumnData::Text),
         ];
         entries.prop_map(move |entries| Column { width, entries })
     })

@@ -1,4 +1,4 @@
-//! Tests of neighbour lists and of what files are read and written.
+//! Tests of neighbour lists and file formats.
 
 mod files;
 mod neighbours;

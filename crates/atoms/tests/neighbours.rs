@@ -1,9 +1,9 @@
-//! The linked-cell list against all pairs of all images.
+//! The linked-cell list against a brute-force search over all images.
 
 use atoms::{Cell, Neighbour, NeighbourList, Species, Structure, StructureError, Vec3, shortest_distance};
 use proptest::prelude::*;
 
-/// All directed pairs within `reach`, in canonical order, by looking at every image that could matter.
+/// All directed pairs within `reach`, in canonical order, by testing every relevant image.
 fn all_pairs(structure: &Structure, reach: f64) -> Vec<Vec<Neighbour>> {
     let lattice = structure.cell.completed(structure.periodic);
     let reciprocal = lattice.reciprocal();
@@ -42,7 +42,7 @@ fn all_pairs(structure: &Structure, reach: f64) -> Vec<Vec<Neighbour>> {
 fn within(structure: &Structure, list: &NeighbourList, cutoff: f64) -> Vec<Vec<Neighbour>> {
     (0..structure.len())
         .map(|i| {
-            let mut kept = list.of(i).to_vec();
+            let mut kept = list.neighbours_of(i).to_vec();
             kept.retain(|n| atoms::cell::norm(n.displacement(structure, i)) <= cutoff);
             kept
         })
@@ -58,7 +58,7 @@ fn matrix(range: f64) -> impl Strategy<Value = [[f64; 3]; 3]> {
     prop::array::uniform3(prop::array::uniform3(-range..range))
 }
 
-/// Triclinic cells of edge about `edge`, any periodicity, atoms up to `far` cells outside.
+/// Triclinic cells with edges of about `edge`, any periodicity, and atoms up to `far` cells outside.
 fn structures(edge: f64, atoms: usize, far: f64) -> impl Strategy<Value = Structure> {
     let positions = prop::collection::vec(prop::array::uniform3(-far..far + 1.0), 1..=atoms);
     (matrix(0.35 * edge), positions, prop::array::uniform3(any::<bool>()), any::<bool>()).prop_map(
@@ -82,7 +82,7 @@ fn is_complete(structure: &Structure, cutoff: f64, skin: f64) -> Result<(), Test
     }
     prop_assert_eq!(list.update(structure), Ok(false));
     for (i, expected) in all_pairs(structure, cutoff + skin).iter().enumerate() {
-        prop_assert_eq!(list.of(i), expected.as_slice());
+        prop_assert_eq!(list.neighbours_of(i), expected.as_slice());
     }
     each_pair_comes_once_and_stands_at_its_site(structure, &list)
 }
@@ -96,19 +96,20 @@ fn each_pair_comes_once_and_stands_at_its_site(
     prop_assert_eq!(&sites[..structure.len()], &structure.positions[..]);
     let mut pairs = 0;
     for i in 0..structure.len() {
-        for (neighbour, site) in list.of(i).iter().zip(list.sites_of(i)) {
+        for (neighbour, site) in list.neighbours_of(i).iter().zip(list.sites_of(i)) {
             let d = atoms::cell::sub(sites[*site as usize], structure.positions[i]);
             let off = atoms::cell::norm(atoms::cell::sub(d, neighbour.displacement(structure, i)));
             prop_assert!(off < 1e-10, "site {} of atom {} is off by {} Å", site, i, off);
         }
         let own = Neighbour { atom: i as u32, image: [0; 3] };
-        let later: Vec<Neighbour> = list.of(i).iter().copied().filter(|neighbour| *neighbour > own).collect();
-        prop_assert_eq!(list.later(i), later.as_slice());
-        prop_assert!(list.sites_of(i).ends_with(list.later_sites(i)));
-        prop_assert_eq!(list.later_sites(i).len(), later.len());
+        let later: Vec<Neighbour> =
+            list.neighbours_of(i).iter().copied().filter(|neighbour| *neighbour > own).collect();
+        prop_assert_eq!(list.later_neighbours_of(i), later.as_slice());
+        prop_assert!(list.sites_of(i).ends_with(list.later_sites_of(i)));
+        prop_assert_eq!(list.later_sites_of(i).len(), later.len());
         pairs += later.len();
     }
-    let directed: usize = (0..structure.len()).map(|i| list.of(i).len()).sum();
+    let directed: usize = (0..structure.len()).map(|i| list.neighbours_of(i).len()).sum();
     prop_assert_eq!(2 * pairs, directed);
     Ok(())
 }
@@ -131,7 +132,7 @@ proptest! {
         is_complete(&structure, 5.0, 1.0)?;
     }
 
-    /// After any moves and strains the list is complete within the cutoff, rebuilt or not.
+    /// After any displacement and strain the list is complete within the cutoff, rebuilt or not.
     #[test]
     fn skin_keeps_the_list_complete(
         structure in structures(9.0, 16, 2.0),
@@ -170,7 +171,7 @@ fn face_centred_cubic_shells() {
     let mut list = NeighbourList::new(1.3 * a, 0.0);
     list.update(&structure).unwrap();
     // 12 at a/√2, 6 at a, 24 at a √(3/2).
-    assert_eq!(list.of(0).len(), 42);
+    assert_eq!(list.neighbours_of(0).len(), 42);
     let mut bonds = Vec::new();
     list.bonds_within(&structure, 0, 0.9 * a, &mut bonds);
     assert_eq!(bonds.len(), 12);

@@ -11,24 +11,24 @@ use crate::mixture::{Mixture, MixtureError};
 /// Schema versions that can be read: 3 (linear features), 4 (asinh), 6 (normalised, with density channels).
 pub const SCHEMAS: [usize; 3] = [3, 4, 6];
 
-/// Centroids of unused slots are filled with 10¹⁰; no feature comes near this.
+/// Centroids of unused slots are filled with 10¹⁰; no real feature is this large.
 pub(crate) const SENTINEL: f64 = 1e9;
 
-/// A stored matrix is symmetric if no two numbers differ by more than this share of the largest.
+/// A stored matrix counts as symmetric if its asymmetry is at most this fraction of the largest element.
 const ASYMMETRY: f64 = 1e-3;
 
-/// A mixture as loaded, with what ties it to a potential.
+/// A loaded mixture with the data that tie it to a potential.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Artifact {
     /// Chemical symbols, in the order of the element indices.
     pub symbols: Vec<String>,
-    /// The mixture, version 0. Loaded from an export alone it can grade but not be updated.
+    /// The mixture, version 0. A mixture from an export alone can grade but cannot be updated.
     pub mixture: Mixture,
-    /// The projection that its features were made with.
+    /// The projection of its features.
     pub projection: Projection,
 }
 
-/// How features are made of the invariant basis: what must agree between an artifact and a potential.
+/// How features are computed from the invariant basis: this must agree between an artifact and a potential.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Projection {
     /// Random projection matrix R, `[rows × columns]`, row-major, as stored.
@@ -51,7 +51,7 @@ pub struct Projection {
 
 /// Why an artifact does not belong to a model.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("the CALM artifact belongs to another model: its {what} is {artifact}, that of the model {model}")]
+#[error("the CALM artifact belongs to another model: its {what} is {artifact}, the model's is {model}")]
 pub struct ProjectionMismatch {
     /// What differs.
     pub what: &'static str,
@@ -83,7 +83,7 @@ pub enum ArtifactError {
         /// Its missing key.
         key: String,
     },
-    /// An array is not as it should be.
+    /// An array has an unexpected type, shape or value.
     #[error("{}: array '{key}': found {found}, expected {expected}", path.display())]
     Invalid {
         /// The file.
@@ -95,7 +95,7 @@ pub enum ArtifactError {
         /// What it should hold.
         expected: String,
     },
-    /// The numbers of a slot do not make a component.
+    /// The numbers of a slot are not a valid component.
     #[error("{}: component {slot} of element {element}: {source}", path.display())]
     Component {
         /// The file.
@@ -107,7 +107,7 @@ pub enum ArtifactError {
         /// What is wrong with it.
         source: ComponentError,
     },
-    /// The components do not make a mixture.
+    /// The components are not a valid mixture.
     #[error("{}: {source}", path.display())]
     Mixture {
         /// The file.
@@ -138,13 +138,14 @@ impl From<Error> for ArtifactError {
 }
 
 impl Artifact {
-    /// Loads `gmm_artifacts.npz`: a mixture that can be graded with and updated.
+    /// Loads `gmm_artifacts.npz`: a mixture that can grade and can be updated.
     ///
-    /// Of two sets of thresholds the weighted ones are used. Slots at the end that can never be the nearest are left
-    /// out. Elements that the artifact does not hold get [`Component::unknown_element`].
+    /// Prefers the weighted thresholds where the file has both. Trailing slots that can never be the nearest
+    /// are dropped. Elements that the artifact does not hold get [`Component::unknown_element`].
     ///
     /// # Errors
-    /// Missing or ill-shaped arrays and unknown schema versions, with file, key, what was found and expected.
+    /// Missing or ill-shaped arrays and unknown schema versions, with file, key, what was found and what was
+    /// expected.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, ArtifactError> {
         let path = path.as_ref();
         let file = &Archive::open(path)?;
@@ -165,7 +166,7 @@ impl Artifact {
             let place = place.ok_or_else(|| {
                 invalid(file, "elements", element, format!("an index below {}", symbols.len()))
             })?;
-            let slots = Slots::read(file, element, thresholds.get(element))?;
+            let slots = ElementComponents::read(file, element, thresholds.get(element))?;
             dimension = slots.dimension;
             *place = Some(slots.components(path, element)?);
         }
@@ -186,7 +187,7 @@ impl Artifact {
         finish(path, file, symbols, elements, asinh)
     }
 
-    /// Loads the CALM arrays (`uq_*`) of an exported model: a mixture to grade with, which cannot be updated.
+    /// Loads the CALM arrays (`uq_*`) of an exported model: a mixture that can grade but cannot be updated.
     ///
     /// # Errors
     /// As [`Artifact::load`].
@@ -200,9 +201,9 @@ impl Artifact {
             return Err(invalid(file, "uq_n_elements", element_count, symbols.len()));
         }
         let (slots, dimension) = (count(file, "uq_max_clusters")?, count(file, "uq_feature_dim")?);
-        let centroids = file.numbers("uq_centroids")?.shaped(&[element_count, slots, dimension])?;
+        let centroids = file.numbers("uq_centroids")?.with_shape(&[element_count, slots, dimension])?;
         let inverses = symmetric(file, "uq_inv_cov", &[element_count, slots, dimension, dimension])?;
-        let thresholds = file.numbers("uq_interp_thresholds")?.shaped(&[element_count, slots])?;
+        let thresholds = file.numbers("uq_interp_thresholds")?.with_shape(&[element_count, slots])?;
         if slots == 0 || dimension == 0 {
             return Err(invalid(file, "uq_centroids", "no centroid", "at least one an element"));
         }
@@ -210,7 +211,7 @@ impl Artifact {
         let rows = thresholds.chunks_exact(slots).zip(centroids.chunks_exact(slots * dimension));
         let rows = rows.zip(inverses.chunks_exact(slots * dimension * dimension));
         for (element, ((thresholds, centroids), inverses)) in rows.enumerate() {
-            let slots = Slots {
+            let slots = ElementComponents {
                 dimension,
                 thresholds: thresholds.to_vec(),
                 centroids: centroids.to_vec(),
@@ -226,11 +227,11 @@ impl Artifact {
         finish(path, file, symbols, elements, asinh == 1.0)
     }
 
-    /// Checks that this artifact belongs to a model, itself known by its export: same elements in the same order
+    /// Checks that this artifact belongs to a model, given the model's export: same elements in the same order
     /// and the same projection.
     ///
     /// # Errors
-    /// The first thing that differs.
+    /// The first difference.
     pub fn check_belongs_to(
         &self,
         symbols: &[String],
@@ -242,10 +243,10 @@ impl Artifact {
 }
 
 impl Projection {
-    /// Checks that features made with the two are the same.
+    /// Checks that both artifacts describe the same features.
     ///
     /// # Errors
-    /// The first thing that differs; `self` is called the artifact, `model` the model.
+    /// The first difference; `self` is called the artifact, `model` the model.
     pub fn check_same(&self, model: &Self) -> Result<(), ProjectionMismatch> {
         differs("feature dimension", self.feature_dimension, model.feature_dimension)?;
         differs("basis size", self.rows, model.rows)?;
@@ -269,7 +270,7 @@ impl Projection {
         }
     }
 
-    /// All of it as bytes in a fixed order (sizes, flags, scale, matrix; little-endian), to be hashed.
+    /// The projection as bytes in a fixed order (sizes, flags, scale, matrix; little-endian), for hashing.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut out = Vec::new();
         for size in [self.rows, self.columns, self.feature_dimension] {
@@ -297,7 +298,7 @@ fn invalid(file: &Archive, key: &str, found: impl ToString, expected: impl ToStr
     file.invalid(key, found, expected).into()
 }
 
-/// One number that counts something; some builds store it as a floating-point number.
+/// A count; some builds store it as a floating-point number.
 fn count(file: &Archive, key: &str) -> Result<usize, ArtifactError> {
     as_count(file, key, file.scalar(key)?)
 }
@@ -306,7 +307,7 @@ fn as_count(file: &Archive, key: &str, found: f64) -> Result<usize, ArtifactErro
     if found.fract() == 0.0 && (0.0..=u32::MAX as f64).contains(&found) {
         return Ok(found as usize);
     }
-    Err(invalid(file, key, found, "a whole number that is not negative"))
+    Err(invalid(file, key, found, "a whole number, 0 or more"))
 }
 
 fn check_schema(file: &Archive, key: &str) -> Result<(), ArtifactError> {
@@ -317,7 +318,7 @@ fn check_schema(file: &Archive, key: &str) -> Result<(), ArtifactError> {
     Err(invalid(file, key, format!("schema version {schema}"), "version 3, 4 or 6; build the artifact again"))
 }
 
-/// θ, `[elements][slots]`: the weighted thresholds where there are some.
+/// θ, `[elements][slots]`: the weighted thresholds if present.
 fn thresholds(file: &Archive, elements: usize) -> Result<Vec<Vec<f64>>, ArtifactError> {
     let weighted = file.contains("eff_interp_thresholds");
     let key = if weighted { "eff_interp_thresholds" } else { "interp_thresholds" };
@@ -330,9 +331,9 @@ fn thresholds(file: &Archive, elements: usize) -> Result<Vec<Vec<f64>>, Artifact
     }
 }
 
-/// Square matrices of this shape, one after the other, each the same as its transpose but for rounding.
+/// Consecutive square matrices of this shape, each symmetric up to rounding.
 fn symmetric(file: &Archive, key: &str, shape: &[usize]) -> Result<Vec<f64>, ArtifactError> {
-    let numbers = file.numbers(key)?.shaped(shape)?;
+    let numbers = file.numbers(key)?.with_shape(shape)?;
     let dimension = shape.last().copied().unwrap_or_default();
     for (index, matrix) in numbers.chunks_exact((dimension * dimension).max(1)).enumerate() {
         let largest = matrix.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
@@ -347,7 +348,7 @@ fn symmetric(file: &Archive, key: &str, shape: &[usize]) -> Result<Vec<f64>, Art
 }
 
 /// The arrays of one element, slot by slot.
-struct Slots {
+struct ElementComponents {
     dimension: usize,
     thresholds: Vec<f64>,
     centroids: Vec<f64>,
@@ -355,7 +356,7 @@ struct Slots {
     statistics: Vec<Statistics>,
 }
 
-impl Slots {
+impl ElementComponents {
     fn read(file: &Archive, element: usize, thresholds: Option<&Vec<f64>>) -> Result<Self, ArtifactError> {
         let key = format!("centroids_{element}");
         let centroids = file.numbers(&key)?;
@@ -371,10 +372,10 @@ impl Slots {
         let square = [slots, dimension, dimension];
         let inverses = symmetric(file, &format!("inv_cov_{element}"), &square)?;
         let scatters = symmetric(file, &format!("scatter_{element}"), &square)?;
-        let counts = file.numbers(&format!("counts_{element}"))?.shaped(&[slots])?;
+        let counts = file.numbers(&format!("counts_{element}"))?.with_shape(&[slots])?;
         let weighted = format!("effective_count_{element}");
         let effective = if file.contains(&weighted) {
-            file.numbers(&weighted)?.shaped(&[slots])?
+            file.numbers(&weighted)?.with_shape(&[slots])?
         } else {
             counts.clone()
         };
@@ -389,8 +390,8 @@ impl Slots {
         Ok(Self { dimension, thresholds, centroids: centroids.data, inverses, statistics })
     }
 
-    /// The components of the slots up to the last that can be the nearest or has data: trailing sentinels and
-    /// repetitions of the first centroid (an element that the artifact does not hold) are left out, indices stay.
+    /// The components up to the last slot that can be the nearest or has data. Drops trailing sentinels and
+    /// repetitions of the first centroid (an element that the artifact does not hold); indices do not change.
     fn components(&self, path: &Path, element: usize) -> Result<Vec<Arc<Component>>, ArtifactError> {
         let centroids: Vec<&[f64]> = self.centroids.chunks_exact(self.dimension).collect();
         let has_data = |slot: usize| self.statistics.get(slot).is_some_and(|found| found.count > 0.0);
@@ -412,7 +413,7 @@ impl Slots {
     }
 }
 
-/// Reads the projection, whose keys both files share, and puts all together.
+/// Reads the projection, whose keys both file formats share, and assembles the artifact.
 fn finish(
     path: &Path,
     file: &Archive,

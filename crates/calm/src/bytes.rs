@@ -1,9 +1,9 @@
-//! A component as bytes, for the store, the wire and blocks of shared memory.
+//! The serialized form of a component, for the store, the wire and shared memory.
 //!
-//! Little-endian: magic `CALMCOMP`, format version (u32), D (u32), flags (u64, bit 0: statistics present), θ, then
-//! **μ** `[D]`, the lower triangle of S by rows `[D(D+1)/2]`, and with statistics count, effective count and the
-//! lower triangle of the scatter. Everything after the flags is `f64`. S and scatter are exactly symmetric, so the
-//! triangle holds all of them and a round trip keeps every bit.
+//! Little-endian: magic `CALMCOMP`, format version (u32), D (u32), flags (u64, bit 0: statistics present), θ,
+//! then **μ** `[D]`, the lower triangle of S by rows `[D(D+1)/2]`, and with statistics count, effective count
+//! and the lower triangle of the scatter. Everything after the flags is `f64`. S and scatter are exactly
+//! symmetric, so the triangles are complete and a round trip preserves every bit.
 
 use crate::component::{Component, ComponentError, Statistics};
 
@@ -21,13 +21,13 @@ pub enum ComponentBytesError {
         /// Bytes found.
         found: usize,
     },
-    /// Other data.
+    /// Not a component.
     #[error("these bytes are not a mixture component: they start with {found:02x?}, expected {MAGIC:02x?}")]
     Magic {
         /// The first eight bytes.
         found: [u8; 8],
     },
-    /// A format of another program version.
+    /// The format of another program version.
     #[error("component format {found}, this program reads {FORMAT}")]
     Format {
         /// Format version found.
@@ -39,7 +39,7 @@ pub enum ComponentBytesError {
         /// Flags found.
         found: u64,
     },
-    /// A length that does not fit the header.
+    /// A length that contradicts the header.
     #[error("a component of {dimension} features {} statistics does not have {found} bytes",
         if *.statistics { "with" } else { "without" })]
     Length {
@@ -50,8 +50,8 @@ pub enum ComponentBytesError {
         /// Bytes found.
         found: usize,
     },
-    /// Numbers that do not make a component.
-    #[error("the bytes hold no valid component: {0}")]
+    /// Numbers that are not a valid component.
+    #[error("the bytes are not a valid component: {0}")]
     Component(#[from] ComponentError),
 }
 
@@ -61,7 +61,7 @@ impl Component {
         self.bytes_with(self.statistics())
     }
 
-    /// The component without its statistics: enough to grade with, and half as long.
+    /// The component without its statistics: enough for grading, and half as long.
     pub fn to_bytes_without_statistics(&self) -> Vec<u8> {
         self.bytes_with(None)
     }
@@ -86,10 +86,11 @@ impl Component {
         out
     }
 
-    /// Reads what [`Component::to_bytes`] wrote.
+    /// Reads the output of [`Component::to_bytes`].
     ///
     /// # Errors
-    /// Other data, another format, a length that does not fit the header, numbers that do not make a component.
+    /// Other data, another format, a length that contradicts the header, numbers that are not a valid
+    /// component.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, ComponentBytesError> {
         let (dimension, statistics) = header(bytes)?;
         if Some(bytes.len()) != expected_length(dimension, statistics) {
@@ -109,7 +110,7 @@ impl Component {
     }
 }
 
-/// The rest of some bytes as little-endian numbers; not a number beyond their end.
+/// Reads little-endian numbers from the front of a slice; `None` at its end.
 struct Numbers<'a>(&'a [u8]);
 
 impl Numbers<'_> {

@@ -1,11 +1,11 @@
-//! One Gaussian of the mixture: immutable, shared by reference counting.
+//! One Gaussian of the mixture: immutable and reference counted.
 
 use std::sync::Arc;
 
 use crate::linear::{self, LinearError, regularised_inverse, symmetrised, view};
-use crate::numbers::{Lender, Numbers};
+use crate::storage::{SharedNumbers, Storage};
 
-/// A component, as slices: what the grade needs. Made from a [`Component`] or from a block of shared memory.
+/// The slices of a component that grading needs, from a [`Component`] or from a block of shared memory.
 #[derive(Debug, Clone, Copy)]
 pub struct ComponentView<'a> {
     /// Centroid **μ**, `[D]`.
@@ -16,7 +16,7 @@ pub struct ComponentView<'a> {
     pub threshold: f64,
 }
 
-/// What an update needs to know of the data behind a component.
+/// What an update needs to know about the data behind a component.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Statistics {
     /// Scatter Σ w δδᵀ about the fixed centroid, `[D × D]`, exactly symmetric.
@@ -38,15 +38,15 @@ impl Statistics {
     }
 }
 
-/// One Gaussian of the mixture, of one species. Immutable: an update makes a new one.
+/// One Gaussian of the mixture, for one species. Immutable: an update makes a new one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Component {
-    numbers: Numbers,
+    numbers: Storage,
     threshold: f64,
     statistics: Option<Statistics>,
 }
 
-/// Numbers that do not make a component.
+/// Numbers that are not a valid component.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ComponentError {
     /// A feature dimension of zero.
@@ -75,12 +75,14 @@ pub enum ComponentError {
 }
 
 impl Component {
-    /// Checks and takes the numbers of a component; inverse and scatter are made exactly symmetric, (M + Mᵀ)/2.
+    /// Checks the numbers of a component and takes ownership. Makes inverse and scatter exactly symmetric, (M +
+    /// Mᵀ)/2.
     ///
-    /// For a symmetric S, S**δ** equals (S + Sᵀ)**δ**/2 and **δ**ᵀS**δ** is unchanged, so nothing of the grade is lost.
+    /// For a symmetric S, S**δ** equals (S + Sᵀ)**δ**/2, and **δ**ᵀS**δ** does not change, so the grade keeps
+    /// its exact value.
     ///
     /// # Errors
-    /// Lengths that do not fit, numbers that are not finite, negative counts or threshold.
+    /// Wrong lengths, numbers that are not finite, negative counts or threshold.
     pub fn new(
         centroid: Vec<f64>,
         inverse: Vec<f64>,
@@ -95,46 +97,51 @@ impl Component {
         not_negative("threshold", threshold)?;
         let inverse = symmetric("inverse covariance", &inverse, dimension)?;
         let statistics = statistics.map(|found| checked_statistics(found, dimension)).transpose()?;
-        Ok(Self { numbers: Numbers::Owned { centroid, inverse }, threshold, statistics })
+        Ok(Self { numbers: Storage::Owned { centroid, inverse }, threshold, statistics })
     }
 
-    /// A component of dimension D evaluated in place: `lender` has S, `[D × D]`, and behind it **μ**, `[D]`. It has no
-    /// statistics.
+    /// A component of dimension D that is evaluated in place: `shared` holds S, `[D × D]`, followed by **μ**,
+    /// `[D]`. It has no statistics.
     ///
-    /// The numbers themselves are taken as they are, since looking at all of them would cost as much as a copy: the
-    /// lender vouches that they come from a component made by [`Component::new`]. Others give grades of no meaning,
-    /// or [`crate::GradeError::Distance`].
+    /// The numbers are not checked, because reading all of them would cost as much as a copy. The provider
+    /// guarantees that they come from a component made by [`Component::new`]. Other numbers give meaningless
+    /// grades or [`crate::GradeError::Distance`].
     ///
     /// # Errors
     /// A dimension of zero, a length that is not D² + D, a threshold that is negative or not finite.
-    pub fn lent(lender: Arc<Lender>, dimension: usize, threshold: f64) -> Result<Self, ComponentError> {
+    pub fn from_shared(
+        shared: Arc<SharedNumbers>,
+        dimension: usize,
+        threshold: f64,
+    ) -> Result<Self, ComponentError> {
         if dimension == 0 {
             return Err(ComponentError::Empty);
         }
         not_negative("threshold", threshold)?;
         let (found, expected) =
-            ((*lender).as_ref().len(), dimension.saturating_mul(dimension.saturating_add(1)));
+            ((*shared).as_ref().len(), dimension.saturating_mul(dimension.saturating_add(1)));
         if found != expected {
             return Err(ComponentError::Length { what: "lent component", found, expected });
         }
-        Ok(Self { numbers: Numbers::Lent { lender, dimension }, threshold, statistics: None })
+        Ok(Self { numbers: Storage::Shared { shared, dimension }, threshold, statistics: None })
     }
 
-    /// The stand-in for an element that the artifact does not hold: **μ** = 0, S = 10⁶ I, θ = 1, no data.
+    /// The placeholder for an element that the artifact does not hold: **μ** = 0, S = 10⁶ I, θ = 1, no data.
     ///
-    /// Its grade is enormous, so structures with the element are collected, and an update can learn it.
+    /// Its grade is huge, so structures with the element are collected and updates can learn it.
     pub fn unknown_element(dimension: usize) -> Self {
         let mut inverse = vec![0.0; dimension * dimension];
         inverse.iter_mut().step_by(dimension + 1).for_each(|value| *value = 1.0 / linear::REGULARISATION);
         let scatter = vec![0.0; dimension * dimension];
         Self {
-            numbers: Numbers::Owned { centroid: vec![0.0; dimension], inverse },
+            numbers: Storage::Owned { centroid: vec![0.0; dimension], inverse },
             threshold: 1.0,
             statistics: Some(Statistics { scatter, count: 0.0, effective_count: 0.0 }),
         }
     }
 
-    /// The same centroid and threshold with a new covariance: statistics and the regularised inverse follow it.
+    /// The same centroid and threshold with a new covariance and the statistics and regularised inverse that
+    /// follow from it.
     pub(crate) fn with_covariance(
         &self,
         covariance: &[f64],
@@ -144,7 +151,7 @@ impl Component {
         let inverse = regularised_inverse(covariance, self.dimension())?;
         let scatter = covariance.iter().map(|value| value * effective_count).collect();
         Ok(Self {
-            numbers: Numbers::Owned { centroid: self.centroid().to_vec(), inverse },
+            numbers: Storage::Owned { centroid: self.centroid().to_vec(), inverse },
             threshold: self.threshold,
             statistics: Some(Statistics { scatter, count, effective_count }),
         })
@@ -155,7 +162,7 @@ impl Component {
         self.numbers.dimension()
     }
 
-    /// Centroid **μ**, `[D]`: fixed for the whole campaign.
+    /// Centroid **μ**, `[D]`; constant during a campaign.
     pub fn centroid(&self) -> &[f64] {
         self.numbers.centroid()
     }
@@ -165,17 +172,18 @@ impl Component {
         self.numbers.inverse()
     }
 
-    /// Calibrated threshold θ: fixed for the whole campaign.
+    /// Calibrated threshold θ; constant during a campaign.
     pub fn threshold(&self) -> f64 {
         self.threshold
     }
 
-    /// Scatter and counts; `None` when the mixture came from an export alone, or is lent, and cannot be updated.
+    /// Scatter and counts; `None` if the mixture came from an export alone or is in shared memory, so that it
+    /// cannot be updated.
     pub fn statistics(&self) -> Option<&Statistics> {
         self.statistics.as_ref()
     }
 
-    /// The slices that the grade needs.
+    /// The slices for grading.
     pub fn view(&self) -> ComponentView<'_> {
         ComponentView { centroid: self.centroid(), inverse: self.inverse(), threshold: self.threshold }
     }

@@ -1,16 +1,16 @@
 //! σ, γ and the gradient of γ with respect to the feature vector.
 
 use crate::component::Component;
-use crate::linear::{TOGETHER, dot, squared_distance, symmetric_products};
+use crate::linear::{VECTORS_PER_PASS, dot, squared_distance, symmetric_products};
 use crate::mixture::Mixture;
 
 /// Added under the square root of σ.
 pub const DISTANCE_FLOOR: f64 = 1e-8;
 
-/// The least threshold that γ is divided by.
+/// Lower limit of the threshold that γ is divided by.
 pub const THRESHOLD_FLOOR: f64 = 1e-10;
 
-/// Grades of the atoms of a structure, with buffers that are reused from call to call.
+/// Grades of the atoms of a structure, with buffers that are reused between calls.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Grades {
     /// Mahalanobis distance σ = √(**δ**ᵀS**δ** + 10⁻⁸) to the nearest component, `[atoms]`.
@@ -19,7 +19,7 @@ pub struct Grades {
     pub gamma: Vec<f64>,
     /// Index of the nearest component among those of the atom's element, `[atoms]`.
     pub component: Vec<usize>,
-    /// The atoms, those of a component together.
+    /// The atoms, sorted by component.
     order: Vec<usize>,
     delta: Vec<f64>,
     product: Vec<f64>,
@@ -28,7 +28,7 @@ pub struct Grades {
 /// Why a grade could not be computed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum GradeError {
-    /// Features or gradient that do not fit the atoms.
+    /// Arrays whose length does not match the atoms.
     #[error("{what} has {found} numbers; {atoms} atoms of {dimension} features need {}", atoms * dimension)]
     Length {
         /// Which array.
@@ -68,8 +68,8 @@ pub enum GradeError {
 }
 
 impl GradeError {
-    /// Of a call for some atoms of a structure: with the number that the atom has there.
-    pub(crate) fn of_atoms(mut self, atoms: &[u32]) -> Self {
+    /// Translates the atom index from a batch of atoms to the whole structure.
+    pub(crate) fn with_atom_indices(mut self, atoms: &[u32]) -> Self {
         match &mut self {
             Self::Length { .. } => {}
             Self::Element { atom, .. } | Self::Distance { atom, .. } => *atom = atoms[*atom] as usize,
@@ -77,7 +77,7 @@ impl GradeError {
         self
     }
 
-    /// The atom that it is about, if it is one.
+    /// The atom that caused the error, if one did.
     pub(crate) fn atom(&self) -> Option<usize> {
         match self {
             Self::Length { .. } => None,
@@ -87,14 +87,14 @@ impl GradeError {
 }
 
 impl Grades {
-    /// Grades every atom, and if asked writes ∂γ_a/∂**z**_a, `[atoms × D]`.
+    /// Grades every atom and, on request, writes ∂γ_a/∂**z**_a, `[atoms × D]`.
     ///
-    /// `elements` holds an element index for each atom, `features` is `[atoms × D]`. The nearest component and θ
-    /// are held fixed in the gradient (paper, Methods), S**δ**/(σθ); γ jumps where the nearest component changes.
-    /// An atom's result does not depend on the other atoms of the call, to the last bit.
+    /// `elements` has the element index of each atom, `features` is `[atoms × D]`. The gradient S**δ**/(σθ)
+    /// holds the nearest component and θ fixed (paper, Methods); γ jumps where the nearest component changes.
+    /// The bits of an atom's result do not depend on the other atoms of the call.
     ///
     /// # Errors
-    /// Lengths that do not fit, an unknown element, σ² negative or not finite. The content is then of no use.
+    /// Wrong lengths, an unknown element, σ² negative or not finite. The contents are then unspecified.
     pub fn evaluate(
         &mut self,
         mixture: &Mixture,
@@ -131,9 +131,9 @@ impl Grades {
         Ok(())
     }
 
-    /// Leaves **δ**ᵀS**δ** of each atom in `sigma`, and S**δ** in the gradient.
+    /// Writes **δ**ᵀS**δ** of each atom to `sigma` and S**δ** to the gradient.
     ///
-    /// Some atoms of the same component at a time, which share the reading of its matrix.
+    /// Processes several atoms of a component at a time, so that its matrix is read once for all of them.
     fn measure(
         &mut self,
         mixture: &Mixture,
@@ -149,7 +149,9 @@ impl Grades {
         order.clear();
         order.extend(0..elements.len());
         order.sort_unstable_by_key(|&atom| (place(atom), atom));
-        for atoms in order.chunk_by(|&a, &b| place(a) == place(b)).flat_map(|atoms| atoms.chunks(TOGETHER)) {
+        for atoms in
+            order.chunk_by(|&a, &b| place(a) == place(b)).flat_map(|atoms| atoms.chunks(VECTORS_PER_PASS))
+        {
             let component = component(mixture, place(atoms[0]));
             delta.clear();
             for atom in atoms {
@@ -168,7 +170,7 @@ impl Grades {
         }
     }
 
-    /// Makes σ and γ of **δ**ᵀS**δ**, and ∂γ/∂**z** of S**δ**.
+    /// Converts **δ**ᵀS**δ** to σ and γ, and S**δ** to ∂γ/∂**z**.
     fn scale(
         &mut self,
         mixture: &Mixture,
@@ -199,14 +201,15 @@ impl Grades {
     }
 }
 
-/// The largest of some grades; 0 for none.
+/// The largest of these grades; 0 without any.
 pub fn maximum(gamma: &[f64]) -> f64 {
     gamma.iter().copied().fold(0.0, f64::max)
 }
 
-/// Index of the centroid nearest to **z** by Euclidean distance, the first of equals (paper, Methods).
+/// Index of the centroid nearest to **z** by Euclidean distance, the first if several are equally near (paper,
+/// Methods).
 ///
-/// The sentinel centroids of unused slots (all 10¹⁰) are never the nearest beside a real one.
+/// The sentinel centroids of unused slots (all 10¹⁰) are never the nearest if there is a real one.
 pub fn nearest<'a>(centroids: impl Iterator<Item = &'a [f64]>, z: &[f64]) -> usize {
     let (mut best, mut least) = (0, f64::INFINITY);
     for (slot, centroid) in centroids.enumerate() {
@@ -218,7 +221,7 @@ pub fn nearest<'a>(centroids: impl Iterator<Item = &'a [f64]>, z: &[f64]) -> usi
     best
 }
 
-/// The component at a place that has been looked up before.
+/// A component whose index is known to be valid.
 fn component(mixture: &Mixture, (element, slot): (usize, usize)) -> &Component {
     mixture.component(element, slot).expect("the nearest component is one of the mixture")
 }

@@ -11,10 +11,10 @@ use faer::{Accum, Mat, MatRef, Par};
 /// Added to the diagonal of every covariance before it is inverted (paper, Methods): ε = 10⁻⁶.
 pub const REGULARISATION: f64 = 1e-6;
 
-/// Eigenvalues with |w| ≤ this times max |w| are left out of the pseudo-inverse.
+/// The pseudo-inverse drops eigenvalues with |w| ≤ this times max |w|.
 pub const TRUNCATION: f64 = 1e-15;
 
-/// A matrix on which the linear algebra failed.
+/// A matrix for which the linear algebra failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum LinearError {
     /// The slice is not a square matrix of the stated dimension.
@@ -47,7 +47,7 @@ pub(crate) struct Eigen {
     pub vectors: Mat<f64>,
 }
 
-/// A row-major slice as a faer view; for a symmetric matrix the order does not matter.
+/// A row-major slice as a faer view; the order is irrelevant for a symmetric matrix.
 pub(crate) fn view(matrix: &[f64], rows: usize, columns: usize) -> MatRef<'_, f64> {
     MatRef::from_row_major_slice(matrix, rows, columns)
 }
@@ -69,7 +69,7 @@ pub(crate) fn symmetrised(matrix: MatRef<'_, f64>) -> Vec<f64> {
     out
 }
 
-/// Eigen-decomposition of a symmetric matrix, of which the lower triangle is read.
+/// Eigendecomposition of a symmetric matrix; reads the lower triangle.
 pub(crate) fn eigen(matrix: MatRef<'_, f64>) -> Result<Eigen, LinearError> {
     let dimension = matrix.nrows();
     let mut values = faer::diag::Diag::zeros(dimension);
@@ -89,7 +89,7 @@ pub(crate) fn eigen(matrix: MatRef<'_, f64>) -> Result<Eigen, LinearError> {
     Ok(Eigen { values, vectors })
 }
 
-/// Its eigenvalues alone, ascending.
+/// The eigenvalues of a symmetric matrix, ascending.
 pub(crate) fn eigenvalues(matrix: MatRef<'_, f64>) -> Result<Vec<f64>, LinearError> {
     let dimension = matrix.nrows();
     let mut values = faer::diag::Diag::zeros(dimension);
@@ -115,7 +115,7 @@ pub(crate) fn cholesky(matrix: &[f64], dimension: usize) -> Option<Mat<f64>> {
     factorised.is_ok().then_some(factor)
 }
 
-/// Replaces X by L⁻¹X.
+/// Replaces X with L⁻¹X.
 pub(crate) fn solve_lower(factor: &Mat<f64>, right: &mut Mat<f64>) {
     solve_lower_triangular_in_place(factor.as_ref(), right.as_mut(), Par::Seq);
 }
@@ -140,8 +140,8 @@ pub fn pseudo_inverse(matrix: &[f64], dimension: usize) -> Result<Vec<f64>, Line
 
 /// The regularised inverse (C + εI)⁺ of a covariance, ε = 10⁻⁶ (paper, Methods).
 ///
-/// It is (C + εI)⁻¹ by Cholesky factors, at a third of the cost of eigenvalues, unless some of those could be so small
-/// beside others that the pseudo-inverse leaves them out.
+/// Computes (C + εI)⁻¹ by Cholesky factorisation, at a third of the cost of an eigendecomposition, unless an
+/// eigenvalue could be so small that the pseudo-inverse drops it.
 ///
 /// # Errors
 /// Those of [`pseudo_inverse`].
@@ -152,7 +152,8 @@ pub fn regularised_inverse(covariance: &[f64], dimension: usize) -> Result<Vec<f
     factor.map_or_else(|| pseudo_inverse(&matrix, dimension), |factor| Ok(inverse_of(&factor)))
 }
 
-/// Whether no eigenvalue of a regularised covariance of this trace can be so small that the pseudo-inverse leaves it out.
+/// Whether no eigenvalue of a regularised covariance with this trace can be so small that the pseudo-inverse
+/// drops it.
 pub(crate) fn is_positive(trace: f64) -> bool {
     TRUNCATION * trace < REGULARISATION
 }
@@ -171,13 +172,13 @@ fn check(matrix: &[f64], dimension: usize) -> Result<(), LinearError> {
     }
 }
 
-/// A⁻¹ = L⁻ᵀL⁻¹ of A = LLᵀ, exactly symmetric.
+/// A⁻¹ = L⁻ᵀL⁻¹ for A = LLᵀ, exactly symmetric.
 fn inverse_of(factor: &Mat<f64>) -> Vec<f64> {
     let dimension = factor.nrows();
     let mut out = Mat::zeros(dimension, dimension);
     let scratch = inverse_scratch::<f64>(dimension, Par::Seq);
     inverse(out.as_mut(), factor.as_ref(), Par::Seq, MemStack::new(&mut MemBuffer::new(scratch)));
-    // The lower triangle is all that was computed.
+    // Only the lower triangle was computed.
     let mut full = Vec::with_capacity(dimension * dimension);
     for row in 0..dimension {
         full.extend((0..dimension).map(|column| out[(row.max(column), row.min(column))]));
@@ -192,19 +193,19 @@ pub(crate) fn regularised(covariance: &[f64], dimension: usize) -> Vec<f64> {
     out
 }
 
-/// Vectors worth handing to [`symmetric_products`] at once: as many as stay in the first-level cache beside a panel.
-pub(crate) const TOGETHER: usize = 16;
+/// Number of vectors to pass to [`symmetric_products`] at once: as many as fit the L1 cache beside a panel.
+pub(crate) const VECTORS_PER_PASS: usize = 16;
 
 /// Columns of a panel: two of the widest common vector registers.
-const PANEL: usize = 8;
+const PANEL_COLUMNS: usize = 8;
 
-/// S v of each of some vectors, for a symmetric row-major S of this dimension; `vectors` and `out` are `[vectors × D]`.
+/// S v for each of several vectors and a symmetric row-major S; `vectors` and `out` are `[vectors × D]`.
 ///
-/// The matrix does not fit into the first-level cache, a panel of some columns does: every vector goes through it before
-/// the next is read, two at a time, and their sums stay in registers. Rows are summed four at a time in a fixed order.
-/// Every sum adds the same terms in the same order in any company and whatever the vector width, without fused
-/// multiply-add, so the bits depend neither on the other vectors nor on the processor; the widest vectors that it has
-/// are used.
+/// The matrix does not fit the L1 cache, but a panel of a few columns does: all vectors pass through a panel
+/// before the next is read, two at a time, with their sums in registers. Rows are summed four at a time in a
+/// fixed order. Each sum adds the same terms in the same order, independent of the other vectors and of the
+/// vector width, and without fused multiply-add. The bits therefore depend neither on the other vectors nor on
+/// the processor, and the widest available vectors are used.
 pub(crate) fn symmetric_products(matrix: &[f64], dimension: usize, vectors: &[f64], out: &mut [f64]) {
     pulp::Arch::new().dispatch(SymmetricProducts { matrix, dimension, vectors, out });
 }
@@ -221,18 +222,18 @@ impl pulp::WithSimd for SymmetricProducts<'_> {
 
     #[inline(always)]
     fn with_simd<S: pulp::Simd>(mut self, _: S) {
-        match self.dimension.checked_sub(PANEL) {
-            // The last panel overlaps the one before: the same sums once more.
-            Some(last) => {
-                (0..self.dimension).step_by(PANEL).for_each(|first| self.panel::<PANEL>(first.min(last)))
-            }
+        match self.dimension.checked_sub(PANEL_COLUMNS) {
+            // The last panel overlaps the one before and computes the same sums again.
+            Some(last) => (0..self.dimension)
+                .step_by(PANEL_COLUMNS)
+                .for_each(|first| self.panel::<PANEL_COLUMNS>(first.min(last))),
             None => (0..self.dimension).for_each(|column| self.panel::<1>(column)),
         }
     }
 }
 
 impl SymmetricProducts<'_> {
-    /// The products in `W` columns, of every vector.
+    /// The products of `W` columns with every vector.
     #[inline(always)]
     fn panel<const W: usize>(&mut self, first: usize) {
         let &mut Self { matrix, dimension, vectors, ref mut out } = self;
@@ -262,7 +263,7 @@ fn panel_products<const W: usize, const N: usize>(
     let mut sums = [[0.0; W]; N];
     let mut blocks = matrix.chunks_exact(4 * dimension);
     for (block, rows) in blocks.by_ref().enumerate() {
-        // Slices of one known length: the loops over them become vector instructions.
+        // Slices of one known length let the compiler vectorise the loops.
         let rows: [&[f64]; 4] = std::array::from_fn(|k| &rows[k * dimension + first..][..W]);
         for (sums, vector) in sums.iter_mut().zip(vectors) {
             let factors = &vector[4 * block..][..4];
@@ -316,7 +317,7 @@ pub(crate) fn squared_distance(left: &[f64], right: &[f64]) -> f64 {
 mod tests {
     use super::*;
 
-    /// S v as its documentation says, one number after the other.
+    /// Reference implementation of S v.
     fn plain_product(matrix: &[f64], vector: &[f64]) -> Vec<f64> {
         let dimension = vector.len();
         let term = |row: usize, column: usize| matrix[row * dimension + column] * vector[row];
@@ -333,7 +334,7 @@ mod tests {
 
     #[test]
     fn a_product_keeps_its_bits_in_any_company() {
-        // Numbers of many magnitudes, so that another order of additions or a fused one shows.
+        // Numbers of many magnitudes reveal another order of additions or a fused multiply-add.
         let number = |k: usize| ((k * k + 7 * k) as f64).sin() * 10_f64.powi((k * 31 % 9) as i32 - 4);
         let bits = |numbers: &[f64]| numbers.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
         for dimension in (1..40).chain([63, 64, 65, 130, 131]) {

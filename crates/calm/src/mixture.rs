@@ -1,19 +1,19 @@
-//! The mixture: for every element its components, under a version number.
+//! The mixture: the components of every element, with a version number.
 
 use std::sync::Arc;
 
 use crate::component::Component;
 
-/// The components of every element of a model. Cloning copies a reference an element, not matrices.
+/// The components of every element of a model. A clone copies one reference per element, not matrices.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mixture {
     version: u64,
     dimension: usize,
-    /// A version shares the elements that did not change with the one before.
+    /// Consecutive versions share the elements that did not change.
     elements: Vec<Arc<Vec<Arc<Component>>>>,
 }
 
-/// A new component and the place it takes.
+/// A new component and the index at which it replaces another.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChangedComponent {
     /// Element index.
@@ -24,10 +24,10 @@ pub struct ChangedComponent {
     pub component: Arc<Component>,
 }
 
-/// Components that do not make a mixture.
+/// Components that are not a valid mixture.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum MixtureError {
-    /// No element at all.
+    /// There are no elements.
     #[error("a mixture needs at least one element")]
     NoElement,
     /// An element without components.
@@ -47,10 +47,10 @@ pub enum MixtureError {
         slot: usize,
         /// Its dimension.
         found: usize,
-        /// That of the mixture.
+        /// The dimension of the mixture.
         expected: usize,
     },
-    /// A place that the mixture does not have.
+    /// An index that the mixture does not have.
     #[error("the mixture has no component {slot} of element {element}")]
     NoPlace {
         /// Element index.
@@ -61,7 +61,7 @@ pub enum MixtureError {
 }
 
 impl Mixture {
-    /// Makes version `version` of a mixture from the components of each element.
+    /// Version `version` of a mixture, from the components of each element.
     ///
     /// # Errors
     /// No element, an element without components, unequal feature dimensions.
@@ -84,10 +84,10 @@ impl Mixture {
         Ok(Self { version, dimension, elements })
     }
 
-    /// The next version, with some components replaced; all others are shared with this one.
+    /// The next version, with some components replaced. It shares all others with this one.
     ///
     /// # Errors
-    /// A place that does not exist or a component of another feature dimension.
+    /// An invalid index, or a component of another feature dimension.
     pub fn with_changes(&self, changed: &[ChangedComponent]) -> Result<Self, MixtureError> {
         let mut next = self.clone();
         next.version += 1;

@@ -2,30 +2,30 @@
 
 use std::f64::consts::PI;
 
-/// One directed bond, image bonds included: `i` sees `j`.
+/// A directed bond from `i` to `j`, including bonds to periodic images.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pair {
     /// Central atom.
     pub i: usize,
-    /// Neighbour (the atom whose image it is); may equal `i`.
+    /// Neighbour (the original of the image); may equal `i`.
     pub j: usize,
-    /// How much `j` counts at `i`, 0 to 1.
+    /// Weight of `j` at `i`, 0 to 1.
     pub weight: f64,
 }
 
 impl Pair {
     /// The pair with its weight w_ij = ½[1 + cos(π r_ij / r_c,ij)] (paper, Eq. 3), 0 at or beyond the cutoff.
     ///
-    /// `distance` is r_ij, `cutoff` the r_c,ij of this pair of species, Å.
+    /// `distance` is r_ij and `cutoff` is r_c,ij of this pair of species, Å.
     pub fn new(i: usize, j: usize, distance: f64, cutoff: f64) -> Self {
         let weight = if distance < cutoff { 0.5 * (1.0 + (PI * distance / cutoff).cos()) } else { 0.0 };
         Self { i, j, weight }
     }
 }
 
-/// A pair that names an atom which has no grade.
+/// A pair with the index of an atom that has no grade.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-#[error("pair ({i}, {j}) names an atom beyond the {atoms} that were graded")]
+#[error("pair ({i}, {j}) names an atom beyond the {atoms} graded atoms")]
 pub struct PairError {
     /// Central atom.
     pub i: usize,
@@ -37,10 +37,11 @@ pub struct PairError {
 
 /// γ_nbr,i = (γ_i + Σ_j w_ij γ_j) / (1 + Σ_j w_ij), w_ij = ½[1 + cos(π r_ij / r_c,ij)] (paper, Eq. 3).
 ///
-/// `gamma` is `[atoms]` and so is the result. The sum runs in the order of the pairs: give them in a fixed order.
+/// `gamma` and the result are `[atoms]`. The sum follows the order of the pairs; pass them in a fixed order for
+/// reproducible bits.
 ///
 /// # Errors
-/// A pair that names an atom without a grade.
+/// A pair with the index of an atom that has no grade.
 pub fn neighbourhood_average(
     gamma: &[f64],
     pairs: impl IntoIterator<Item = Pair>,

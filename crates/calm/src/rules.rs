@@ -1,4 +1,4 @@
-//! When a structure is collected, and when an update of the mixture has done enough.
+//! Rules for collecting a structure and for ending an update of the mixture.
 
 use std::num::NonZeroUsize;
 
@@ -12,17 +12,17 @@ use crate::update::CovarianceUpdate;
 #[serde(try_from = "f64", into = "f64")]
 pub struct Positive(f64);
 
-/// A number above 0 and not above 1.
+/// A number above 0 and at most 1.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
 #[serde(try_from = "f64", into = "f64")]
 pub struct Fraction(f64);
 
-/// The values of α to try, ascending, each above 0 and not above 1.
+/// The values of α to try: ascending, each above 0 and at most 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<f64>", into = "Vec<f64>")]
-pub struct AlphaLadder(Vec<f64>);
+pub struct AlphaValues(Vec<f64>);
 
-/// A setting out of its range.
+/// A setting out of range.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RuleError {
     /// Not a positive number.
@@ -31,7 +31,7 @@ pub enum RuleError {
     /// Not a fraction.
     #[error("found {0}, expected a number above 0 and not above 1")]
     NotFraction(f64),
-    /// Not a ladder.
+    /// Not a valid list of α.
     #[error("found α = {0:?}, expected at least one value, ascending, each above 0 and not above 1")]
     NotLadder(Vec<f64>),
 }
@@ -52,7 +52,7 @@ impl Fraction {
     }
 }
 
-impl AlphaLadder {
+impl AlphaValues {
     /// The values, ascending.
     pub fn values(&self) -> &[f64] {
         &self.0
@@ -73,7 +73,7 @@ impl TryFrom<f64> for Fraction {
     }
 }
 
-impl TryFrom<Vec<f64>> for AlphaLadder {
+impl TryFrom<Vec<f64>> for AlphaValues {
     type Error = RuleError;
     fn try_from(found: Vec<f64>) -> Result<Self, RuleError> {
         let within = found.iter().all(|&alpha| alpha > 0.0 && alpha <= 1.0);
@@ -97,8 +97,8 @@ impl From<Fraction> for f64 {
     }
 }
 
-impl From<AlphaLadder> for Vec<f64> {
-    fn from(ladder: AlphaLadder) -> Vec<f64> {
+impl From<AlphaValues> for Vec<f64> {
+    fn from(ladder: AlphaValues) -> Vec<f64> {
         ladder.0
     }
 }
@@ -118,93 +118,94 @@ pub enum CollectionRule {
         /// Grade above which an atom counts (paper: 1.3).
         #[serde(default = "atom_threshold")]
         threshold: Positive,
-        /// Share of the atoms (paper: 0.15).
+        /// Fraction of the atoms (paper: 0.15).
         #[serde(default = "atom_fraction")]
         fraction: Fraction,
-        /// Least number of atoms (paper: 3).
+        /// Minimum number of atoms (paper: 3).
         #[serde(default = "atom_least")]
         least: NonZeroUsize,
     },
 }
 
-/// Which α is chosen.
+/// How α is chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "rule", rename_all = "snake_case", deny_unknown_fields)]
 pub enum UpdateRule {
-    /// The smallest α with γ_max below the target, else the last and a bounded inflation (paper, aluminium and silicon).
+    /// The smallest α with γ_max below the target. If there is none: the last α, followed by a bounded
+    /// inflation (paper, aluminium and silicon).
     MaximumGrade {
         /// Update target (paper: 1.25).
         #[serde(default = "update_target")]
         target: Positive,
     },
-    /// The smallest α that leaves fewer than max[`least`, ⌈`fraction` N⌉] atoms above the threshold, else the smallest
-    /// with γ_max below the target, else the last (paper, foundation model).
+    /// The smallest α that leaves fewer than max[`least`, ⌈`fraction` N⌉] atoms above the threshold; if there
+    /// is none, the smallest with γ_max below the target; otherwise the last (paper, foundation model).
     AtomCount {
         /// Grade above which an atom counts (paper: 1.3).
         #[serde(default = "atom_threshold")]
         threshold: Positive,
-        /// Share of the atoms (paper: 0.15).
+        /// Fraction of the atoms (paper: 0.15).
         #[serde(default = "atom_fraction")]
         fraction: Fraction,
-        /// Least number of atoms (paper: 3).
+        /// Minimum number of atoms (paper: 3).
         #[serde(default = "atom_least")]
         least: NonZeroUsize,
-        /// Update target of the fallback (paper: 1.25).
+        /// Target of the fallback (paper: 1.25).
         #[serde(default = "update_target")]
         target: Positive,
     },
 }
 
-/// How old and new covariance are combined.
+/// How the old covariance and that of the batch are combined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Combination {
-    /// (1 − α) C + α C_batch, the paper's.
+pub enum CovarianceUpdateKind {
+    /// (1 − α) C + α C_batch (paper).
     #[default]
     Convex,
-    /// C + α C_batch, which forgets nothing.
+    /// C + α C_batch; forgets nothing.
     Additive,
 }
 
-impl Combination {
-    /// This combination with a weight α.
-    pub fn with(self, alpha: f64) -> CovarianceUpdate {
+impl CovarianceUpdateKind {
+    /// The update of this kind with the weight α.
+    pub fn with_alpha(self, alpha: f64) -> CovarianceUpdate {
         match self {
             Self::Convex => CovarianceUpdate::Convex { alpha },
             Self::Additive => CovarianceUpdate::Additive { alpha },
         }
     }
 
-    /// The α to try unless others are given.
+    /// The default values of α.
     ///
-    /// Convex: the paper's six. Additive: from 0.0005 to 1 in steps of about two (1, 2, 5 a decade), since without
-    /// the factor 1 − α already a very small α can suffice, and a larger one than needed covers too much.
-    pub fn default_ladder(self) -> AlphaLadder {
-        AlphaLadder(match self {
+    /// Convex: the six of the paper. Additive: from 0.0005 to 1 in steps of about two (1, 2, 5 per decade).
+    /// Without the factor 1 − α a very small α can suffice, and a larger one than needed covers too much.
+    pub fn default_alphas(self) -> AlphaValues {
+        AlphaValues(match self {
             Self::Convex => vec![0.05, 0.1, 0.2, 0.4, 0.7, 1.0],
             Self::Additive => vec![0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0],
         })
     }
 }
 
-/// How the mixture is updated after a collection.
+/// How the mixture is updated after a structure was collected.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct UpdateSettings {
     /// Convex or additive.
     #[serde(default)]
-    pub combination: Combination,
-    /// The α to try; left out, [`Combination::default_ladder`].
+    pub combination: CovarianceUpdateKind,
+    /// The α to try. Default: [`CovarianceUpdateKind::default_alphas`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub ladder: Option<AlphaLadder>,
-    /// Which α is chosen.
+    pub ladder: Option<AlphaValues>,
+    /// How α is chosen.
     pub stop: UpdateRule,
 }
 
 impl UpdateSettings {
-    /// The α to try, ascending.
+    /// The values of α to try, ascending.
     pub fn alphas(&self) -> Vec<f64> {
-        self.ladder.clone().unwrap_or_else(|| self.combination.default_ladder()).into()
+        self.ladder.clone().unwrap_or_else(|| self.combination.default_alphas()).into()
     }
 }
 
@@ -216,15 +217,15 @@ impl CollectionRule {
         }
     }
 
-    /// The same rule with its threshold times `factor`, which is finite and above 0.
-    pub fn raised(mut self, factor: f64) -> Self {
+    /// The same rule with its threshold multiplied by `factor`, which must be finite and positive.
+    pub fn with_threshold_factor(mut self, factor: f64) -> Self {
         match &mut self {
             Self::MaximumGrade { threshold } | Self::AtomCount { threshold, .. } => threshold.0 *= factor,
         }
         self
     }
 
-    /// Whether a structure with these grades, `[atoms]`, is to be collected.
+    /// Whether a structure with these grades, `[atoms]`, meets the rule.
     pub fn is_met(&self, gamma: &[f64]) -> bool {
         match *self {
             Self::MaximumGrade { threshold } => maximum(gamma) > threshold.0,
@@ -240,7 +241,7 @@ pub fn count_above(gamma: &[f64], threshold: f64) -> usize {
     gamma.iter().filter(|&&grade| grade > threshold).count()
 }
 
-/// max[least, ⌈fraction · atoms⌉], where a product that is whole but for rounding counts as whole.
+/// max[least, ⌈fraction · atoms⌉]; products that are integers up to rounding count as integers.
 pub fn atom_limit(atoms: usize, fraction: Fraction, least: NonZeroUsize) -> usize {
     let share = (fraction.0 * atoms as f64 * (1.0 - 1e-12)).ceil() as usize;
     share.max(least.get())

@@ -1,79 +1,80 @@
-//! The search for the update: trials of α, the stop rule, and the inflation after it.
+//! The search for the update: trials of α, the stop rule, and the inflation that may follow.
 
 use serde::{Deserialize, Serialize};
 
+use crate::alpha_scan::AlphaScan;
 use crate::grade::maximum;
-use crate::ladder::TrialLadder;
 use crate::mixture::{ChangedComponent, Mixture};
-use crate::rules::{Combination, UpdateRule, UpdateSettings, atom_limit, count_above};
+use crate::rules::{CovarianceUpdateKind, UpdateRule, UpdateSettings, atom_limit, count_above};
 use crate::update::{Batch, CovarianceUpdate, UpdateError};
 
-/// Inflation multiplies a scatter by this at most, each round.
+/// Maximum factor of a scatter in one round of inflation.
 pub const INFLATION_LIMIT: f64 = 4.0;
-/// Rounds of inflation.
+/// Maximum number of rounds of inflation.
 pub const INFLATION_ROUNDS: usize = 3;
-/// Inflation aims at this share of the target.
+/// Inflation aims at this fraction of the target.
 pub const INFLATION_AIM: f64 = 0.95;
 
-/// A fast trial with a grade closer than this (relative) to a threshold is decided by the direct inverse.
-const UNDECIDED: f64 = 1e-5;
+/// Where a grade of a fast trial is relatively closer to a threshold than this, the direct inverse decides.
+const DECISION_MARGIN: f64 = 1e-5;
 
-/// The grades of the collected structure under one α.
+/// The grades of the collected structure for one α.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Trial {
     /// Weight of the batch.
     pub alpha: f64,
     /// Largest grade.
     pub gamma_max: f64,
-    /// Number of atoms above the rule's threshold (of the maximum rule: its target).
+    /// Number of atoms above the rule's threshold (for the maximum rule: its target).
     pub above: usize,
 }
 
-/// What ended an update.
+/// How an update ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum UpdateEnd {
     /// A trial brought γ_max below the target.
     MaximumBelowTarget,
-    /// No trial did, the inflation of the last one did.
+    /// No trial did, but the inflation of the last one did.
     Inflated,
-    /// Neither did; the bounded inflation is used up and γ_max still is not below the target.
+    /// Neither did: after the bounded inflation γ_max is still not below the target.
     InflationExhausted,
     /// A trial left few enough atoms above the threshold.
     CountBelowLimit,
-    /// None did; a trial brought γ_max below the target.
+    /// No trial did, but one brought γ_max below the target.
     FallbackMaximum,
-    /// Neither; the last α was taken.
+    /// Neither: the last α was used.
     FallbackLast,
 }
 
-/// A found update: what the log needs to know, and the components to put into the mixture.
+/// A completed update: its record for the log, and the components that change.
 #[derive(Debug, Clone, PartialEq)]
 pub struct UpdateOutcome {
     /// Version of the mixture that the trials started from.
     pub base_version: u64,
     /// Convex or additive.
-    pub combination: Combination,
+    pub combination: CovarianceUpdateKind,
     /// The chosen α.
     pub alpha: f64,
-    /// The trials in order, up to the one that decided.
+    /// The trials in order, up to the decisive one.
     pub trials: Vec<Trial>,
-    /// What ended the search.
+    /// How the search ended.
     pub end: UpdateEnd,
-    /// Factors of the scatter in each round of inflation; mostly none.
+    /// Factor of the scatter in each round of inflation; usually empty.
     pub inflations: Vec<f64>,
-    /// The touched components after the update, for [`Mixture::with_changes`].
+    /// The changed components, for [`Mixture::with_changes`].
     pub changed: Vec<ChangedComponent>,
-    /// γ of the structure's atoms before, `[atoms]`.
+    /// γ of the structure's atoms before the update, `[atoms]`.
     pub gamma_before: Vec<f64>,
-    /// γ of the structure's atoms after, with the real inverses, `[atoms]`.
+    /// γ of the structure's atoms after the update, from the actual inverses, `[atoms]`.
     pub gamma_after: Vec<f64>,
 }
 
-/// Finds the update of a mixture for a collected structure; every trial starts from the covariance before it.
+/// Finds the update of a mixture for a collected structure. Every trial starts from the covariance before the
+/// update.
 ///
-/// `elements` holds an element index for each atom, `features` is `[atoms × D]`. Trials use [`TrialLadder`] where it
-/// is accurate; the decision is always the one that direct inverses would give.
+/// `elements` has the element index of each atom, `features` is `[atoms × D]`. Trials use [`AlphaScan`] where
+/// it is accurate; the result always equals that of direct inverses.
 ///
 /// # Errors
 /// Those of [`Batch::new`] and [`Batch::updated`].
@@ -85,7 +86,7 @@ pub fn update(
 ) -> Result<UpdateOutcome, UpdateError> {
     let batch = Batch::new(mixture, elements, features)?;
     let (trials, alpha, mut end) = choose(&batch, settings)?;
-    let mut changed = batch.updated(settings.combination.with(alpha))?;
+    let mut changed = batch.updated(settings.combination.with_alpha(alpha))?;
     let mut inflations = Vec::new();
     if let (UpdateEnd::InflationExhausted, UpdateRule::MaximumGrade { target }) = (end, settings.stop) {
         (changed, inflations) = inflate(&batch, changed, target.get())?;
@@ -106,10 +107,10 @@ pub fn update(
     })
 }
 
-/// The bounded inflation: at most three rounds of scatter ← min(4, (γ_max / 0.95 target)²) · scatter, on every
+/// The bounded inflation: at most three rounds of scatter ← min(4, (γ_max / 0.95 target)²) · scatter on every
 /// component that the structure touches, while γ_max ≥ target.
 ///
-/// `changed` are the components after the last trial. Gives the inflated ones and the factors.
+/// `changed` are the components after the last trial. Returns the inflated components and the factors.
 ///
 /// # Errors
 /// Those of [`Batch::inflated`].
@@ -131,7 +132,7 @@ pub fn inflate(
     Ok((changed, factors))
 }
 
-/// Tries α in order until the rule is satisfied. Without success the maximum rule says `InflationExhausted`.
+/// Tries α in order until the rule is met. If none meets it, the maximum rule gives `InflationExhausted`.
 fn choose(batch: &Batch, settings: &UpdateSettings) -> Result<(Vec<Trial>, f64, UpdateEnd), UpdateError> {
     let atoms = batch.gamma().len();
     let (threshold, limit, target) = match settings.stop {
@@ -140,10 +141,11 @@ fn choose(batch: &Batch, settings: &UpdateSettings) -> Result<(Vec<Trial>, f64, 
             (threshold.get(), Some(atom_limit(atoms, fraction, least)), target.get())
         }
     };
-    let ladder = TrialLadder::new(batch, settings.combination);
+    let ladder = AlphaScan::new(batch, settings.combination);
     let mut trials = Vec::new();
     for alpha in settings.alphas() {
-        let gamma = trial(batch, &ladder, settings.combination.with(alpha), alpha, [threshold, target])?;
+        let gamma =
+            trial(batch, &ladder, settings.combination.with_alpha(alpha), alpha, [threshold, target])?;
         let trial = Trial { alpha, gamma_max: maximum(&gamma), above: count_above(&gamma, threshold) };
         trials.push(trial);
         match limit {
@@ -162,15 +164,15 @@ fn choose(batch: &Batch, settings: &UpdateSettings) -> Result<(Vec<Trial>, f64, 
     }
 }
 
-/// γ of the batch under one α: from the ladder, unless that is inaccurate or a grade lies too near a threshold.
+/// γ of the batch for one α. Uses the scan, unless it is inaccurate or a grade is too close to a threshold.
 fn trial(
     batch: &Batch,
-    ladder: &TrialLadder<'_>,
+    ladder: &AlphaScan<'_>,
     update: CovarianceUpdate,
     alpha: f64,
     thresholds: [f64; 2],
 ) -> Result<Vec<f64>, UpdateError> {
-    let near = |grade: f64| thresholds.iter().any(|limit| (grade - limit).abs() <= UNDECIDED * limit);
+    let near = |grade: f64| thresholds.iter().any(|limit| (grade - limit).abs() <= DECISION_MARGIN * limit);
     match ladder.gamma(alpha) {
         Some(gamma) if !gamma.iter().any(|&grade| near(grade)) => Ok(gamma),
         _ => Ok(batch.gamma_under(&batch.updated(update)?)),

@@ -1,40 +1,42 @@
-//! Whether the numbers of a mixture can have come from training data.
+//! Checks whether training data can have produced the numbers of a mixture.
 //!
-//! A mixture loads as soon as its arrays fit together, and any inverse covariance gives grades: one that is a million times
-//! too small grades everything 0.001, so that nothing is ever collected. A build leaves traces that cannot be faked by
-//! accident, and they are what is checked here:
+//! A mixture loads if its arrays fit together, and any inverse covariance gives grades: one that is a million
+//! times too small grades everything 0.001, so that nothing is ever collected. A build satisfies relations that
+//! wrong numbers do not satisfy by accident:
 //!
-//! - S = (C + εI)⁻¹ with ε = 10⁻⁶, so S is positive definite, none of its eigenvalues is above 1/ε, and
-//!   tr(S (C + εI)) = D. The last holds for covariances of any rank.
-//! - The mean of σ² over the training data of a component is tr(SC), and θ is a quantile of σ or a multiple of one.
-//! - Features of a normalised basis are no longer than the columns of the projection, and so are their means.
+//! - S = (C + εI)⁻¹ with ε = 10⁻⁶, so S is positive definite, no eigenvalue exceeds 1/ε, and tr(S (C + εI)) =
+//!   D. The last holds for covariances of any rank.
+//! - The mean of σ² over the training data of a component is tr(SC), and θ is a quantile of σ or a multiple of
+//!   one.
+//! - Features of a normalised basis are no longer than the columns of the projection, and neither are their
+//!   means.
 
 use crate::artifact::{Artifact, SENTINEL};
 use crate::component::Component;
 use crate::linear::{LinearError, REGULARISATION, cholesky, eigenvalues, regularised, view};
 
-/// Numbers are stored in single precision: relative rounding of each, with room for sums that were rounded too.
-const STORED: f64 = 1.0 / (1 << 22) as f64;
+/// Files store single precision: the relative rounding of a number, with a margin for sums of rounded numbers.
+const STORAGE_ROUNDING: f64 = 1.0 / (1 << 22) as f64;
 
-/// Largest deviation of tr(S (C + εI))/D from 1, besides rounding; builds deviate by 10⁻⁴.
+/// Largest deviation of tr(S (C + εI))/D from 1 apart from rounding; builds deviate by 10⁻⁴.
 const TRACE_TOLERANCE: f64 = 0.05;
 
-/// Largest condition number of S: beyond it the build's pseudo-inverse leaves directions out.
+/// Largest condition number of S: above it the build's pseudo-inverse drops directions.
 const CONDITION_LIMIT: f64 = 1e15;
 
-/// σ histograms of builds begin here, so no threshold is below.
-const LEAST_THRESHOLD: f64 = 0.01;
+/// The σ histograms of builds start here, so no threshold is smaller.
+const MIN_THRESHOLD: f64 = 0.01;
 
-/// Thresholds are at most this multiple of √⟨σ²⟩: fewer than 1 in 10⁴ environments are beyond it (Markov). Builds: 1 to 3.
-const THRESHOLD_SPAN: f64 = 100.0;
+/// Largest θ/√⟨σ²⟩: fewer than 1 in 10⁴ environments exceed it (Markov). Builds: 1 to 3.
+const MAX_THRESHOLD_RATIO: f64 = 100.0;
 
-/// Thresholds are at least this share of √⟨σ²⟩, however heavy the tail of σ is.
-const THRESHOLD_SHARE: f64 = 1e-3;
+/// Smallest θ/√⟨σ²⟩, even for heavy tails of σ.
+const MIN_THRESHOLD_RATIO: f64 = 1e-3;
 
-/// Centroids may exceed the length of the features by this factor, for rounding.
-const REACH: f64 = 1.01;
+/// Tolerance for centroids that exceed the bound of the features by rounding.
+const CENTROID_TOLERANCE: f64 = 1.01;
 
-/// A component that no training data can have made.
+/// A component that no training data can produce.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("component {slot} of {element}: {fault}")]
 pub struct UnsoundComponent {
@@ -64,13 +66,13 @@ pub enum ComponentFault {
         "its inverse covariance has a condition number of at least {found:.1e}; expected at most {CONDITION_LIMIT:.0e}"
     )]
     Condition {
-        /// A lower bound of the condition number.
+        /// Lower bound of the condition number.
         found: f64,
     },
     /// S is larger than the regularisation allows.
     #[error(
-        "its inverse covariance has {found:.3e} on the diagonal; expected at most {:.0e}, as 1e-6 is added to every \
-         variance",
+        "its inverse covariance has {found:.3e} on the diagonal; expected at most {:.0e}, because 1e-6 is \
+         added to every variance",
         1.0 / REGULARISATION
     )]
     TooLarge {
@@ -87,9 +89,10 @@ pub enum ComponentFault {
         /// Largest eigenvalue.
         largest: f64,
     },
-    /// Data without weight, or weight without data.
+    /// Data without weight or weight without data.
     #[error(
-        "it has {count} environments of weight {effective_count} in sum; expected both to be positive, or both 0"
+        "it has {count} environments with a total weight of {effective_count}; expected both to be \
+         positive, or both 0"
     )]
     Counts {
         /// Number of environments.
@@ -99,60 +102,60 @@ pub enum ComponentFault {
     },
     /// S is not the inverse of C + εI.
     #[error(
-        "its inverse covariance does not belong to its scatter and count: their product has a mean eigenvalue of \
+        "its inverse covariance does not match its scatter and count: their product has a mean eigenvalue of \
          {found:.3e}; expected 1"
     )]
     Inconsistent {
         /// tr(S (C + εI))/D.
         found: f64,
     },
-    /// θ is beyond what σ can be.
+    /// θ is outside the range of σ.
     #[error("its threshold is {found:.3e}; expected {least:.1e} to {most:.1e}")]
     Threshold {
         /// θ.
         found: f64,
-        /// The least that makes sense.
+        /// Smallest plausible value.
         least: f64,
-        /// The most that makes sense.
+        /// Largest plausible value.
         most: f64,
     },
-    /// **μ** = 0 of a component that has data.
+    /// **μ** = 0 for a component with data.
     #[error("its centroid is zero; expected the mean of its features")]
     NoCentroid,
-    /// **μ** is where no feature vector is.
+    /// **μ** is outside the range of the features.
     #[error(
         "its centroid is {found:.3e} in feature {feature}, where the model's features are between ±{most:.3e}"
     )]
     Centroid {
         /// Index of the feature.
         feature: usize,
-        /// The number there.
+        /// Its value.
         found: f64,
-        /// The largest that a feature can be.
+        /// The largest possible value.
         most: f64,
     },
-    /// The same centroid twice.
-    #[error("it has the centroid of component {first}; expected one of its own")]
+    /// Two components have the same centroid.
+    #[error("it shares the centroid of component {first}; expected a distinct one")]
     Duplicate {
-        /// The component that has it too.
+        /// The first of the two.
         first: usize,
     },
-    /// A matrix that linear algebra fails on.
+    /// A matrix for which the linear algebra failed.
     #[error(transparent)]
     Linear(#[from] LinearError),
 }
 
 impl Artifact {
-    /// The components that no training data can have made, in order, each with the first thing that is wrong with it.
+    /// The components that no training data can produce, in order, each with its first fault.
     ///
-    /// Stand-ins of elements without data, and unused slots, are sound. A matrix that is positive definite but for the
-    /// rounding of its storage is sound.
+    /// Placeholders of elements without data and unused slots are valid. So is a matrix that is positive
+    /// definite up to the rounding of its storage.
     pub fn unsound_components(&self) -> Vec<UnsoundComponent> {
         let reach = self.reach();
         let elements = self.symbols.iter().enumerate();
         let of_element = elements.filter_map(|(element, symbol)| {
             let components: Vec<_> = self.mixture.components(element)?.iter().map(AsRef::as_ref).collect();
-            let spread = Spread::of(&components);
+            let spread = Spread::new(&components);
             let faults = components.iter().enumerate().filter_map(|(slot, component)| {
                 let fault = check(component, &spread, &reach)
                     .and_then(|()| unlike(&components[..slot], component))
@@ -164,7 +167,7 @@ impl Artifact {
         of_element.flatten().collect()
     }
 
-    /// The largest value of each projected feature: the length of its column, if the basis has length 1 at most.
+    /// The largest value of each projected feature: the norm of its column, since the basis has at most norm 1.
     fn reach(&self) -> Vec<f64> {
         let projection = &self.projection;
         if !projection.normalised {
@@ -185,15 +188,16 @@ struct Spread {
 }
 
 impl Spread {
-    /// Without statistics ⟨σ²⟩ is at most D. A component with few data has the largest threshold of its element.
-    fn of(components: &[&Component]) -> Self {
+    /// Without statistics, ⟨σ²⟩ is at most D. A component with few data gets the largest threshold of its
+    /// element.
+    fn new(components: &[&Component]) -> Self {
         let spread = |component: &&Component| match component.statistics() {
             Some(statistics) => mean_square(component, &statistics.covariance()).max(0.0).sqrt(),
             None => (component.dimension() as f64).sqrt(),
         };
         let with_data = components.iter().filter(|component| has_data(component)).map(spread);
         let (least, largest) = with_data.fold((f64::INFINITY, 0.0_f64), |(a, b), x| (a.min(x), b.max(x)));
-        // A component whose data are all the same has θ = 1.
+        // A component whose data are all equal has θ = 1.
         Self { least: if least.is_finite() { least } else { 0.0 }, largest: largest.max(1.0) }
     }
 }
@@ -222,7 +226,7 @@ fn check_inverse(component: &Component) -> Result<(), ComponentFault> {
     }
     match cholesky(inverse, dimension) {
         Some(factor) => {
-            // No pivot is less than the least eigenvalue.
+            // No pivot is smaller than the smallest eigenvalue.
             let least = (0..dimension).map(|k| factor[(k, k)].powi(2)).fold(f64::INFINITY, f64::min);
             match found / least {
                 found if found > CONDITION_LIMIT => Err(ComponentFault::Condition { found }),
@@ -256,7 +260,7 @@ fn check_statistics(component: &Component) -> Result<(), ComponentFault> {
     }
     let found = mean_square(component, &regularised) / dimension as f64;
     let absolute: f64 = component.inverse().iter().zip(&regularised).map(|(a, b)| (a * b).abs()).sum();
-    let tolerance = TRACE_TOLERANCE + STORED * absolute / dimension as f64;
+    let tolerance = TRACE_TOLERANCE + STORAGE_ROUNDING * absolute / dimension as f64;
     if (found - 1.0).abs() > tolerance {
         return Err(ComponentFault::Inconsistent { found });
     }
@@ -264,8 +268,8 @@ fn check_statistics(component: &Component) -> Result<(), ComponentFault> {
 }
 
 fn check_threshold(found: f64, spread: &Spread) -> Result<(), ComponentFault> {
-    let least = LEAST_THRESHOLD.max(THRESHOLD_SHARE * spread.least);
-    let most = THRESHOLD_SPAN * spread.largest;
+    let least = MIN_THRESHOLD.max(MIN_THRESHOLD_RATIO * spread.least);
+    let most = MAX_THRESHOLD_RATIO * spread.largest;
     if (least..=most).contains(&found) {
         Ok(())
     } else {
@@ -281,8 +285,8 @@ fn check_centroid(component: &Component, reach: &[f64]) -> Result<(), ComponentF
     if centroid.iter().all(|value| *value == 0.0) {
         return Err(ComponentFault::NoCentroid);
     }
-    // Features that no projection bounds have to be below the fill of unused slots.
-    let bounds = reach.iter().map(|reach| REACH * reach).chain(std::iter::repeat(SENTINEL));
+    // Features without a bound from the projection must be smaller than the fill value of unused slots.
+    let bounds = reach.iter().map(|reach| CENTROID_TOLERANCE * reach).chain(std::iter::repeat(SENTINEL));
     let mut beyond = centroid.iter().zip(bounds).enumerate();
     match beyond.find(|(_, (value, most))| value.abs() > *most) {
         Some((feature, (&found, most))) => Err(ComponentFault::Centroid { feature, found, most }),
@@ -290,16 +294,17 @@ fn check_centroid(component: &Component, reach: &[f64]) -> Result<(), ComponentF
     }
 }
 
-/// Whether a component stands for data: neither an unused slot nor the stand-in of an element without any.
+/// Whether a component represents data: it is neither an unused slot nor the placeholder of an element without
+/// data.
 fn is_used(component: &Component) -> bool {
     if component.statistics().is_some() {
         return has_data(component);
     }
-    let stand_in = |value: f64| (value * REGULARISATION - 1.0).abs() < STORED;
+    let stand_in = |value: f64| (value * REGULARISATION - 1.0).abs() < STORAGE_ROUNDING;
     !diagonal(component.inverse(), component.dimension()).all(stand_in)
 }
 
-/// Of two components with the same centroid the second is never the nearest.
+/// If two components share a centroid, the second is never the nearest.
 fn unlike(before: &[&Component], component: &Component) -> Result<(), ComponentFault> {
     if !is_used(component) {
         return Ok(());
@@ -314,13 +319,13 @@ fn diagonal(matrix: &[f64], dimension: usize) -> impl Iterator<Item = f64> {
     matrix.iter().step_by(dimension + 1).copied()
 }
 
-/// The least and the largest eigenvalue.
+/// The smallest and the largest eigenvalue.
 fn extremes(matrix: &[f64], dimension: usize) -> Result<(f64, f64), LinearError> {
     let values = eigenvalues(view(matrix, dimension, dimension))?;
     Ok((values.first().copied().unwrap_or_default(), values.last().copied().unwrap_or_default()))
 }
 
-/// How far the eigenvalues of a stored matrix move by rounding, at most: by the length of the error.
+/// Upper bound of the shift of the eigenvalues by the rounding of a stored matrix: the norm of the error.
 fn rounding(largest: f64, dimension: usize) -> f64 {
-    STORED * largest * dimension as f64
+    STORAGE_ROUNDING * largest * dimension as f64
 }

@@ -1,16 +1,16 @@
-//! Updating the covariances with a collected structure, about fixed centroids.
+//! Updates of the covariances from a collected structure, about fixed centroids.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::component::{Component, Statistics};
 use crate::grade::{DISTANCE_FLOOR, GradeError, Grades, THRESHOLD_FLOOR};
-use crate::linear::{LinearError, TOGETHER, dot, product, symmetric_products, symmetrised, view};
+use crate::linear::{LinearError, VECTORS_PER_PASS, dot, product, symmetric_products, symmetrised, view};
 use crate::mixture::{ChangedComponent, Mixture};
 
-/// How the covariance of a touched component follows from the old one and that of the batch.
+/// How the new covariance of a touched component follows from the old one and that of the batch.
 ///
-/// C_batch = Σ **δδ**ᵀ / n is taken about the fixed centroid, so it also carries the batch's distance from it.
+/// C_batch = Σ **δδ**ᵀ / n is taken about the fixed centroid, so it includes the distance of the batch from it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CovarianceUpdate {
     /// C ← (1 − α) C + α C_batch (paper, Methods). Directions that the batch does not visit shrink.
@@ -18,12 +18,12 @@ pub enum CovarianceUpdate {
         /// Weight of the batch, 0 < α ≤ 1.
         alpha: f64,
     },
-    /// C ← C + α C_batch: nothing shrinks.
+    /// C ← C + α C_batch. Nothing shrinks.
     Additive {
         /// Weight of the batch, α > 0.
         alpha: f64,
     },
-    /// Scatter and counts are added, as if the batch had been among the training data.
+    /// Adds scatter and counts as if the batch had been in the training data.
     Accumulate,
 }
 
@@ -36,7 +36,7 @@ pub enum UpdateError {
     /// A structure without atoms.
     #[error("a structure without atoms cannot update a mixture")]
     Empty,
-    /// A mixture that only grades.
+    /// The mixture has no statistics and can only grade.
     #[error(
         "component {slot} of element {element} has no scatter and counts, so it cannot be updated; \
          load gmm_artifacts.npz instead of the exported model"
@@ -59,7 +59,7 @@ pub enum UpdateError {
     },
 }
 
-/// A structure about to update a mixture: its atoms by the components they touch.
+/// The atoms of a structure that updates a mixture, grouped by the components they touch.
 #[derive(Debug, Clone)]
 pub struct Batch {
     atoms: usize,
@@ -77,7 +77,7 @@ pub(crate) struct Group {
     pub atoms: Vec<usize>,
     /// z − μ, `[atoms × D]`.
     pub deltas: Vec<f64>,
-    /// Covariance before the collection.
+    /// Covariance before the update.
     pub old: Vec<f64>,
     /// Covariance of the batch about the centroid.
     pub batch: Vec<f64>,
@@ -87,10 +87,10 @@ pub(crate) struct Group {
 impl Batch {
     /// Assigns the atoms of a structure to their nearest components.
     ///
-    /// `elements` holds an element index for each atom, `features` is `[atoms × D]`.
+    /// `elements` has the element index of each atom, `features` is `[atoms × D]`.
     ///
     /// # Errors
-    /// A structure without atoms or that cannot be graded, a component without statistics.
+    /// A structure that has no atoms or cannot be graded, a component without statistics.
     pub fn new(mixture: &Mixture, elements: &[usize], features: &[f64]) -> Result<Self, UpdateError> {
         let mut grades = Grades::default();
         grades.evaluate(mixture, elements, features, None)?;
@@ -113,12 +113,13 @@ impl Batch {
         &self.gamma
     }
 
-    /// The touched components after an update, each with its real regularised inverse.
+    /// The touched components after an update, each with its actual regularised inverse.
     ///
-    /// New effective count = old + batch, new scatter = C · new effective count; centroids and thresholds stay.
+    /// New effective count = old + batch, new scatter = C · new effective count. Centroids and thresholds do
+    /// not change.
     ///
     /// # Errors
-    /// A covariance whose eigenvalues cannot be found.
+    /// A covariance whose eigenvalues do not converge.
     pub fn updated(&self, update: CovarianceUpdate) -> Result<Vec<ChangedComponent>, UpdateError> {
         let changed = self.groups.iter().map(|group| {
             let covariance = group.updated_covariance(update);
@@ -149,7 +150,8 @@ impl Batch {
         inflated.collect()
     }
 
-    /// γ of each atom under updated components (its assignment stays, as centroids do), `[atoms]`.
+    /// γ of each atom under updated components, `[atoms]`. Centroids are fixed, so the assignment does not
+    /// change.
     ///
     /// `changed` comes from [`Batch::updated`] or [`Batch::inflated`] of the same batch.
     pub fn gamma_under(&self, changed: &[ChangedComponent]) -> Vec<f64> {
@@ -157,7 +159,7 @@ impl Batch {
         self.spread(groups.map(|(group, ChangedComponent { component, .. })| group.grades_under(component)))
     }
 
-    /// Spreads a grade for each atom of each group over the atoms of the batch.
+    /// Reorders the grades of the atoms of each group to the order of the batch.
     pub(crate) fn spread(&self, grades: impl Iterator<Item = Vec<f64>>) -> Vec<f64> {
         let mut out = vec![0.0; self.atoms];
         for (group, grades) in self.groups.iter().zip(grades) {
@@ -238,7 +240,7 @@ impl Group {
     fn grades_under(&self, component: &Component) -> Vec<f64> {
         let dimension = component.dimension();
         let mut products = vec![0.0; self.deltas.len()];
-        let several = TOGETHER * dimension;
+        let several = VECTORS_PER_PASS * dimension;
         for (deltas, products) in self.deltas.chunks(several).zip(products.chunks_mut(several)) {
             symmetric_products(component.inverse(), dimension, deltas, products);
         }
@@ -246,7 +248,8 @@ impl Group {
         rows.map(|(delta, product)| self.grade(dot(delta, product))).collect()
     }
 
-    /// γ from σ² without its floor. An inverse so bad that σ² is negative gives γ = ∞: no trial passes by it.
+    /// γ from σ² without its floor. σ² < 0 from an ill-conditioned inverse gives γ = ∞, so that the trial
+    /// fails.
     pub(crate) fn grade(&self, squared: f64) -> f64 {
         let sigma = (squared + DISTANCE_FLOOR).sqrt();
         let gamma = sigma / self.component.threshold().max(THRESHOLD_FLOOR);

@@ -1,4 +1,4 @@
-//! Loading artifacts and exports, and what is wrong with broken ones.
+//! Loading artifacts and exports, and the errors of broken ones.
 
 use std::path::Path;
 
@@ -33,7 +33,7 @@ fn an_artifact_does_not_belong_to_another_model() {
     let message = |artifact: &Artifact, model: &Artifact| {
         artifact.check_belongs_to(&model.symbols, &model.projection).unwrap_err().to_string()
     };
-    assert!(message(&aluminium, &silicon).contains("list of elements is Al, that of the model Si"));
+    assert!(message(&aluminium, &silicon).contains("list of elements is Al, the model's is Si"));
     let mut other = aluminium.clone();
     other.projection.matrix[77] += 1.0;
     assert!(message(&aluminium, &other).contains("projection matrix"));
@@ -70,7 +70,7 @@ fn broken_files_say_what_is_wrong() {
     write(&path, &[("__schema_version__", &[5.0], &[1])]);
     assert!(message(Artifact::load(&path)).contains("found schema version 5, expected version 3, 4 or 6"));
     write(&path, &[("__schema_version__", &[6.5], &[1])]);
-    assert!(message(Artifact::load(&path)).contains("found 6.5, expected a whole number"));
+    assert!(message(Artifact::load(&path)).contains("found 6.5, expected a whole number, 0 or more"));
     write(&path, &[("__schema_version__", &[6.0, 6.0], &[2])]);
     assert!(message(Artifact::load(&path)).contains("found shape [2], expected a single number"));
 }
@@ -103,7 +103,7 @@ fn a_broken_array_is_named() {
     text("'uq_n_elements': found 2, expected 1");
 }
 
-/// Cutting a file anywhere gives an error, never a panic.
+/// Truncating a file anywhere gives an error, never a panic.
 #[test]
 fn truncated_files_are_errors() {
     let folder = tempfile::tempdir().unwrap();
@@ -113,7 +113,7 @@ fn truncated_files_are_errors() {
         std::fs::write(&path, &whole[..whole.len() * part / 40]).unwrap();
         assert!(Artifact::load(&path).is_err());
     }
-    // Damage inside: every error names the file.
+    // Corruption inside: every error names the file.
     for start in (0..whole.len() - 64).step_by(whole.len() / 60) {
         let mut damaged = whole.clone();
         damaged[start..start + 64].iter_mut().for_each(|byte| *byte ^= 0x5a);
@@ -126,7 +126,7 @@ fn truncated_files_are_errors() {
 
 type Entry<'a> = (&'a str, &'a [f64], &'a [u64]);
 
-/// A tiny export with one element "Al", D = 2, some arrays replaced.
+/// A minimal export with one element "Al" and D = 2, with some arrays replaced.
 fn write_export(path: &Path, changed: &[Entry<'_>]) {
     let valid: [Entry<'_>; 11] = [
         ("uq_schema_version", &[3.0], &[1]),

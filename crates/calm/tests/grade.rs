@@ -86,7 +86,7 @@ fn element_indices(artifact: &Artifact, atomic_numbers: &[usize]) -> Vec<usize> 
     atomic_numbers.iter().map(index).collect()
 }
 
-/// Every pair within its cutoff by trying all images, periodic in all directions unless there is no cell.
+/// Every pair within its cutoff by testing all images; periodic in all directions unless there is no cell.
 fn brute_force_pairs(golden: &Path, structure: &str, elements: &[usize], element_count: usize) -> Vec<Pair> {
     let positions = numbers(golden, &format!("{structure}_positions"));
     let cell = numbers(golden, &format!("{structure}_cell"));
@@ -183,7 +183,7 @@ fn a_pair_counts_by_its_cosine_weight() {
     assert_eq!((error.i, error.j, error.atoms), (0, 1, 1));
 }
 
-/// Numbers lent by somebody else give the same bits, and are equal to owned ones.
+/// Shared numbers give the same bits as owned ones and compare equal.
 #[test]
 fn a_lent_component_is_as_good_as_an_owned_one() {
     struct Block(Vec<f64>);
@@ -195,7 +195,7 @@ fn a_lent_component_is_as_good_as_an_owned_one() {
     let owned = niobium().mixture;
     let block = |component: &Component| Block([component.inverse(), component.centroid()].concat());
     let lend = |component: &Arc<Component>| {
-        let lent = Component::lent(Arc::new(block(component)), 130, component.threshold()).unwrap();
+        let lent = Component::from_shared(Arc::new(block(component)), 130, component.threshold()).unwrap();
         assert_eq!(lent.view().centroid, component.centroid());
         Arc::new(lent)
     };
@@ -213,7 +213,7 @@ fn a_lent_component_is_as_good_as_an_owned_one() {
     assert_eq!(grade(&lent), grade(&owned));
 
     let lent = |length: usize, dimension, threshold| {
-        Component::lent(Arc::new(Block(vec![0.0; length])), dimension, threshold)
+        Component::from_shared(Arc::new(Block(vec![0.0; length])), dimension, threshold)
     };
     assert_eq!(lent(0, 0, 1.0), Err(ComponentError::Empty));
     let length = |found| ComponentError::Length { what: "lent component", found, expected: 12 };

@@ -3,9 +3,9 @@
 mod common;
 
 mod artifact;
+mod forgetting;
 mod grade;
 mod properties;
 mod rules;
 mod soundness;
 mod update;
-mod watch;

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use calm::{
-    Batch, Combination, Component, CovarianceUpdate, Grades, Mixture, Statistics, TrialLadder,
+    AlphaScan, Batch, Component, CovarianceUpdate, CovarianceUpdateKind, Grades, Mixture, Statistics,
     regularised_inverse,
 };
 use proptest::prelude::*;
@@ -69,11 +69,11 @@ proptest! {
         let (mixture, features) = case(seed, dimension, atoms, distance);
         let batch = Batch::new(&mixture, &vec![0; atoms], &features).unwrap();
         for (combination, update) in [
-            (Combination::Convex, CovarianceUpdate::Convex { alpha }),
-            (Combination::Additive, CovarianceUpdate::Additive { alpha }),
+            (CovarianceUpdateKind::Convex, CovarianceUpdate::Convex { alpha }),
+            (CovarianceUpdateKind::Additive, CovarianceUpdate::Additive { alpha }),
         ] {
             let direct = batch.gamma_under(&batch.updated(update).unwrap());
-            if let Some(fast) = TrialLadder::new(&batch, combination).gamma(alpha) {
+            if let Some(fast) = AlphaScan::new(&batch, combination).gamma(alpha) {
                 let deviation = common::deviation(&fast, &direct);
                 prop_assert!(deviation < 1e-7, "{combination:?}: {deviation:e}");
             }

@@ -3,10 +3,10 @@
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
-use calm::rules::{AlphaLadder, Fraction, Positive, atom_limit};
+use calm::rules::{AlphaValues, Fraction, Positive, atom_limit};
 use calm::{
-    CollectionRule, Combination, Component, Mixture, Statistics, UpdateEnd, UpdateRule, UpdateSettings,
-    update,
+    CollectionRule, Component, CovarianceUpdateKind, Mixture, Statistics, UpdateEnd, UpdateRule,
+    UpdateSettings, update,
 };
 
 use crate::common;
@@ -27,11 +27,11 @@ fn the_papers_values_are_the_defaults() {
     assert_eq!(collection("rule = 'atom_count'"), rule);
     let settings: UpdateSettings = toml::from_str("stop = { rule = 'atom_count' }").unwrap();
     let stop = UpdateRule::AtomCount { threshold, fraction, least, target: positive(1.25) };
-    assert_eq!(settings, UpdateSettings { combination: Combination::Convex, ladder: None, stop });
+    assert_eq!(settings, UpdateSettings { combination: CovarianceUpdateKind::Convex, ladder: None, stop });
     assert_eq!(settings.alphas(), [0.05, 0.1, 0.2, 0.4, 0.7, 1.0]);
-    for combination in [Combination::Convex, Combination::Additive] {
-        let ladder = combination.default_ladder();
-        assert_eq!(AlphaLadder::try_from(ladder.values().to_vec()).unwrap(), ladder);
+    for combination in [CovarianceUpdateKind::Convex, CovarianceUpdateKind::Additive] {
+        let ladder = combination.default_alphas();
+        assert_eq!(AlphaValues::try_from(ladder.values().to_vec()).unwrap(), ladder);
     }
 }
 
@@ -155,10 +155,10 @@ fn the_count_rule_falls_back_twice() {
         let text = format!("ladder = [0.05, 0.4, 1.0]\nstop = {{ rule = 'atom_count', {text} }}");
         update(&round(), &[0; 3], &features(radius), &settings(&text)).unwrap()
     };
-    // 2 / √(1 + 3·0.4) = 1.35, 1 at α = 1.
+    // 2 / √(1 + 3·0.4) = 1.35; 1 at α = 1.
     let outcome = run(2.0, "threshold = 1.3");
     assert_eq!((outcome.end, outcome.alpha, outcome.trials[1].above), (UpdateEnd::CountBelowLimit, 1.0, 3));
-    // No α brings them below 0.9, the middle one below 1.5.
+    // No α brings them below 0.9; the middle one brings them below 1.5.
     let outcome = run(2.0, "threshold = 0.9, target = 1.5");
     assert_eq!((outcome.end, outcome.alpha), (UpdateEnd::FallbackMaximum, 0.4));
     assert_close("after", &outcome.gamma_after, &[2.0 / 2.2_f64.sqrt(); 3], 1e-6);

@@ -1,4 +1,4 @@
-//! Mixtures that no training data can have made are told from real ones.
+//! Mixtures that training data cannot produce are detected; real ones are not.
 
 use std::sync::Arc;
 
@@ -6,7 +6,7 @@ use calm::{Artifact, Component, Mixture, Statistics};
 
 use crate::common::{model, niobium, peer};
 
-/// Numbers of a component, to be spoilt.
+/// Numbers of a component, to be corrupted.
 #[derive(Clone)]
 struct Parts {
     centroid: Vec<f64>,
@@ -105,14 +105,14 @@ fn nonsense_is_told() {
     told("eigenvalues from 0.000e0 to 0.000e0", &|p| p.inverse.fill(0.0));
     told("its inverse covariance has eigenvalues from -", &|p| scaled(&mut p.inverse, -1.0));
     told("expected at most 1e6", &|p| scaled(&mut p.inverse, 1e6));
-    told("does not belong to its scatter and count", &|p| scaled(&mut p.inverse, 1e-6));
-    told("does not belong to its scatter and count", &|p| scaled(&mut p.inverse, 0.8));
+    told("does not match its scatter and count", &|p| scaled(&mut p.inverse, 1e-6));
+    told("does not match its scatter and count", &|p| scaled(&mut p.inverse, 0.8));
     told("mean eigenvalue", &|p| statistics(p, &|s| s.scatter.fill(0.0)));
     told("its scatter has a negative eigenvalue", &|p| statistics(p, &|s| scaled(&mut s.scatter, -1.0)));
-    told("does not belong", &|p| statistics(p, &|s| s.scatter.clone_from(&silicon.scatter)));
-    told("does not belong", &|p| statistics(p, &|s| s.effective_count = 1.0));
-    told("5400 environments of weight 0", &|p| statistics(p, &|s| s.effective_count = 0.0));
-    told("0 environments of weight 5400", &|p| statistics(p, &|s| s.count = 0.0));
+    told("does not match", &|p| statistics(p, &|s| s.scatter.clone_from(&silicon.scatter)));
+    told("does not match", &|p| statistics(p, &|s| s.effective_count = 1.0));
+    told("5400 environments with a total weight of 0", &|p| statistics(p, &|s| s.effective_count = 0.0));
+    told("0 environments with a total weight of 5400", &|p| statistics(p, &|s| s.count = 0.0));
     told("its threshold is 0.000e0; expected 1.0e-2 to", &|p| p.threshold = 0.0);
     told("its threshold is 1.412e7", &|p| p.threshold *= 1e6);
     told("its threshold is 1.412e-5", &|p| p.threshold *= 1e-6);
@@ -173,6 +173,6 @@ fn a_centroid_that_is_there_twice_is_told() {
     artifact.mixture = artifact.mixture.with_changes(&changed).unwrap();
     assert_eq!(
         faults(&artifact),
-        ["component 1 of Nb: it has the centroid of component 0; expected one of its own"]
+        ["component 1 of Nb: it shares the centroid of component 0; expected a distinct one"]
     );
 }

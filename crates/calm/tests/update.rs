@@ -1,4 +1,4 @@
-//! Updates and trial ladders against gracemaker and against the definition.
+//! Updates and α scans against gracemaker and against the definition.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -6,20 +6,20 @@ use std::sync::Arc;
 use calm::grade::maximum;
 use calm::search::inflate;
 use calm::{
-    Artifact, Batch, ChangedComponent, Combination, Component, CovarianceUpdate, Grades, Mixture, Statistics,
-    TrialLadder, UpdateError, pseudo_inverse, regularised_inverse, update,
+    AlphaScan, Artifact, Batch, ChangedComponent, Component, CovarianceUpdate, CovarianceUpdateKind, Grades,
+    Mixture, Statistics, UpdateError, pseudo_inverse, regularised_inverse, update,
 };
 
 use crate::common;
 use crate::common::{Random, assert_close, data, indices, niobium, numbers, peer};
 
-/// Inverses are eigen-decompositions of matrices with condition numbers up to 10⁵ in both programs: their elements
-/// agree to about 10⁵ roundings.
+/// Inverses come from eigendecompositions of matrices with condition numbers up to 10⁵ in both programs, so
+/// their elements agree to about 10⁵ roundings.
 const INVERSE: f64 = 1e-9;
-/// Grades after an update inherit that, through small eigenvalues.
+/// Grades after an update have the same error, through small eigenvalues.
 const GRADE: f64 = 1e-9;
-/// The ladder against direct inverses (see the estimate that the ladder itself trusts).
-const LADDER: f64 = 1e-8;
+/// The scan against direct inverses (see the scan's own error estimate).
+const SCAN: f64 = 1e-8;
 
 const CASES: [(&str, CovarianceUpdate); 5] = [
     ("convex_0.1", CovarianceUpdate::Convex { alpha: 0.1 }),
@@ -78,14 +78,15 @@ fn every_reference_update_is_reproduced() {
         let counts: Vec<f64> = changed.iter().map(|changed| statistics(changed).count).collect();
         assert_eq!(counts, expected("counts"));
         assert_close(case, &batch.gamma_under(&changed), &expected("gamma_after"), GRADE);
-        // The mixture with the changes grades the same, by the ordinary way.
+        // The updated mixture gives the same grades through the normal path.
         let mut grades = Grades::default();
         grades.evaluate(&mixture.with_changes(&changed).unwrap(), &elements, &features, None).unwrap();
         assert_eq!(grades.gamma, batch.gamma_under(&changed));
     }
 }
 
-/// Relative to the largest element: small elements are differences of large ones. The additive case stores diagonals.
+/// Relative to the largest element, because small elements are differences of large ones. The additive case
+/// stores diagonals.
 fn check_inverses(case: &str, found: &[f64], expected: &[f64]) {
     let found = match found.len() == expected.len() {
         true => found.to_vec(),
@@ -114,11 +115,11 @@ fn the_reference_search_is_reproduced() {
             );
             toml::from_str(&text).unwrap()
         };
-        // A target below all trials makes it try all six.
+        // With a target below all trials it tries all six.
         let outcome = update(&mixture, &elements, &features, &settings(0.2)).unwrap();
         let trials: Vec<f64> = outcome.trials.iter().map(|trial| trial.gamma_max).collect();
         let key = |name: &str| numbers(&file, &format!("{name}_{combination}"));
-        assert_close("trial gammas", &trials, &key("trial_gamma"), LADDER);
+        assert_close("trial gammas", &trials, &key("trial_gamma"), SCAN);
         let outcome = update(&mixture, &elements, &features, &settings(1.25)).unwrap();
         let reference = key("alpha_search");
         assert_eq!(outcome.alpha, reference[0]);
@@ -126,7 +127,7 @@ fn the_reference_search_is_reproduced() {
         let gammas = numbers(&file, &format!("alpha_search_{combination}_gamma"));
         assert_close("alpha search", &outcome.gamma_after, &gammas, GRADE);
 
-        // The reference inflates what this search found, towards a target that is out of its reach.
+        // The reference inflates the result of this search towards an unreachable target.
         let inflation = numbers(&file, &format!("inflate_{combination}_target0.2"));
         let batch = Batch::new(&mixture, &elements, &features).unwrap();
         let (changed, factors) = inflate(&batch, outcome.changed, 0.2).unwrap();
@@ -137,14 +138,15 @@ fn the_reference_search_is_reproduced() {
     }
 }
 
-/// Ladder and direct grades of a batch, as the largest relative deviation over all α that the ladder trusts.
-fn ladder_deviation(batch: &Batch, combination: Combination) -> (f64, usize) {
-    let ladder = TrialLadder::new(batch, combination);
+/// The largest relative deviation between scanned and direct grades of a batch over all α that the scan
+/// accepts.
+fn scan_deviation(batch: &Batch, combination: CovarianceUpdateKind) -> (f64, usize) {
+    let ladder = AlphaScan::new(batch, combination);
     let (mut worst, mut trusted) = (0.0_f64, 0);
-    for alpha in Vec::from(combination.default_ladder()) {
+    for alpha in Vec::from(combination.default_alphas()) {
         let update = match combination {
-            Combination::Convex => CovarianceUpdate::Convex { alpha },
-            Combination::Additive => CovarianceUpdate::Additive { alpha },
+            CovarianceUpdateKind::Convex => CovarianceUpdate::Convex { alpha },
+            CovarianceUpdateKind::Additive => CovarianceUpdate::Additive { alpha },
         };
         let direct = batch.gamma_under(&batch.updated(update).unwrap());
         if let Some(fast) = ladder.gamma(alpha) {
@@ -164,10 +166,10 @@ fn the_ladder_gives_the_direct_grades() {
     let features = numbers(&data("niobium_reference.npz"), "features");
     let elements = vec![1; features.len() / 130];
     let batch = Batch::new(&mixture, &elements, &features).unwrap();
-    let (convex, trusted) = ladder_deviation(&batch, Combination::Convex);
-    assert!(convex < LADDER && trusted >= 5, "{convex:e}, {trusted} of 6");
-    let (additive, trusted) = ladder_deviation(&batch, Combination::Additive);
-    assert!(additive < LADDER && trusted == 11, "{additive:e}, {trusted} of 11");
+    let (convex, trusted) = scan_deviation(&batch, CovarianceUpdateKind::Convex);
+    assert!(convex < SCAN && trusted >= 5, "{convex:e}, {trusted} of 6");
+    let (additive, trusted) = scan_deviation(&batch, CovarianceUpdateKind::Additive);
+    assert!(additive < SCAN && trusted == 11, "{additive:e}, {trusted} of 11");
 }
 
 #[test]
@@ -181,14 +183,14 @@ fn the_ladder_gives_the_direct_grades_far_outside() {
             .collect();
         let batch = Batch::new(&mixture, &[0; 108], &features).unwrap();
         println!("{model}, γ_max before {:.1}", maximum(batch.gamma()));
-        for combination in [Combination::Convex, Combination::Additive] {
-            let (worst, trusted) = ladder_deviation(&batch, combination);
-            assert!(worst < LADDER && trusted >= 5, "{model} {scale} {combination:?}: {worst:e}, {trusted}");
+        for combination in [CovarianceUpdateKind::Convex, CovarianceUpdateKind::Additive] {
+            let (worst, trusted) = scan_deviation(&batch, combination);
+            assert!(worst < SCAN && trusted >= 5, "{model} {scale} {combination:?}: {worst:e}, {trusted}");
         }
     }
 }
 
-/// D = 4, diagonal covariance: everything can be written down.
+/// D = 4 with diagonal covariance: everything has a closed form.
 fn analytic() -> Mixture {
     let variances = [4.0, 1.0, 0.25, 0.0];
     let (mut scatter, mut inverse) = (vec![0.0; 16], vec![0.0; 16]);
@@ -203,7 +205,7 @@ fn analytic() -> Mixture {
 
 #[test]
 fn a_single_atom_updates_as_written_down() {
-    // δ = (2, 0, 0, 0): C_batch has the single element 4 and leaves C there as it is for every convex α.
+    // δ = (2, 0, 0, 0): C_batch has the single element 4, and every convex α keeps C there.
     let batch = Batch::new(&analytic(), &[0], &[3.0, 0.0, -1.0, 0.0]).unwrap();
     let grade = |variance: f64| ((4.0 / (variance + 1e-6) + 1e-8_f64).sqrt()) / 2.0;
     assert_close("before", batch.gamma(), &[grade(4.0)], 1e-14);

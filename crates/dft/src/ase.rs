@@ -1,11 +1,12 @@
-//! Any calculator of the Atomic Simulation Environment, in the user's Python, run by a script of ours ([`SCRIPT`]).
+//! Any calculator of the Atomic Simulation Environment, in the user's Python, run by our script ([`SCRIPT`]).
 //!
-//! The script finds `input.json` and the user's `calculator.py` in its directory and leaves `result.json`, whole or not at
-//! all. `input.json` has `species`, `positions` and `cell` (Å), `periodic`, `moments` (μ_B, or null) and the names of the
-//! `remedies`. `result.json` is either `{"converged": {…}}` with `species`, `positions`, `cell`, `energy` (eV, the one whose
-//! derivative the forces are), `energy_without_smearing`, `forces` (eV/Å), `stress` (eV/Å³, xx yy zz yz xz xy), `moments`,
-//! `magnetisation` (μ_B) and `steps`, null where there is none; or `{"failure": {"class": …, "message": …}}`. In either case `by`
-//! has the versions of ASE and of the calculator's file, which must be those of the protocol.
+//! The script reads `input.json` and the user's `calculator.py` in its directory and writes `result.json`
+//! atomically. `input.json` has `species`, `positions` and `cell` (Å), `periodic`, `moments` (μ_B, or null) and
+//! `remedies`, the names of the retry adjustments. `result.json` is either `{"converged": {…}}` with `species`,
+//! `positions`, `cell`, `energy` (eV, the one consistent with the forces), `energy_without_smearing`, `forces`
+//! (eV/Å), `stress` (eV/Å³, xx yy zz yz xz xy), `moments`, `magnetisation` (μ_B) and `steps`, null where
+//! absent; or `{"failure": {"class": …, "message": …}}`. In both cases `by` has the versions of ASE and of the
+//! calculator's file, which must match the protocol.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -16,32 +17,34 @@ use serde_json::{Value, json};
 
 use crate::moments::{self, Moments};
 use crate::{
-    Calculated, Code, Exit, Failure, FailureClass, Input, PassedEnvironment, Remedy, SetupError, Size, judge,
-    program, script_result,
+    DftBackend, Exit, Failure, FailureClass, Input, PassedEnvironment, Results, RetryAdjustment, SetupError,
+    Size, script_output, validation, version_query,
 };
 
-/// The script that a calculator is run by.
+/// The script that runs the calculator.
 pub const SCRIPT: &str = concat!(include_str!("script.py"), include_str!("ase/job.py"));
 
 const SCRIPT_FILE: &str = "job.py";
 const CALCULATOR_FILE: &str = "calculator.py";
 
-/// Counts changes of the script that change a label's value.
-const RECIPE: u32 = 1;
+/// Version of the script; raised when a change affects label values.
+const INPUT_VERSION: u32 = 1;
 
-/// `[label.method.ase]`
+/// The settings of `[label.method.ase]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
-    /// A Python that has ASE, and what it is started by: `["mpirun", "-np", "4", "gpaw", "python"]`.
+    /// A Python with ASE and its launcher: `["mpirun", "-np", "4", "gpaw", "python"]`.
     pub command: Vec<String>,
-    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
     pub environment: BTreeMap<String, String>,
-    /// A Python file that defines `calculator()`, which returns an ASE calculator; if it has a parameter, that is the set
-    /// of names of the remedies. It may define a text `version` of what the labels depend on beside this file, and
-    /// `converged(calculator)`. It is read once, at the start, and stands alone in each calculation's directory. Needed.
+    /// A Python file that defines `calculator()`, which returns an ASE calculator. If the function has a
+    /// parameter, it receives the set of retry adjustments by name. The file may define a string `version` for
+    /// everything else that labels depend on, and `converged(calculator)`. It is read once at the start and
+    /// copied alone into each calculation's directory. Required.
     pub calculator: PathBuf,
-    /// Initial magnetic moment by element, μ_B, 1 for all others; if there are none, no atom gets one.
+    /// Initial magnetic moment of each element, μ_B. Default: 1 for the elements not listed; without this table
+    /// no atom has a moment.
     pub moments: Moments,
 }
 
@@ -57,30 +60,30 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Reads the calculator's file and asks for the versions.
+    /// Reads the calculator's file and queries the versions.
     ///
     /// # Errors
-    /// No such file, a program that is no Python with ASE, a file that Python cannot load.
+    /// A missing file, a program that is not Python with ASE, a file that Python cannot load.
     pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Ase, SetupError> {
         let calculator = std::fs::read(&self.calculator).map_err(|error| SetupError::Setting {
             key: "calculator",
             found: self.calculator.display().to_string(),
             expected: format!("a Python file that defines calculator(), but: {error}"),
         })?;
-        let environment = program::environment(&self.environment);
-        let who = Who::ask(&self.command, &environment, passed, &calculator)?;
-        Ok(Ase { settings: self.clone(), environment, calculator, who })
+        let environment = version_query::environment(&self.environment);
+        let versions = Versions::ask(&self.command, &environment, passed, &calculator)?;
+        Ok(Ase { settings: self.clone(), environment, calculator, versions })
     }
 }
 
-/// What the script says of ASE and of the calculator's file.
+/// The versions of ASE and of the calculator's file, as the script reports them.
 #[derive(Clone, Debug, Deserialize)]
-struct Who {
+struct Versions {
     ase: String,
     version: String,
 }
 
-impl Who {
+impl Versions {
     fn ask(
         command: &[String],
         environment: &BTreeMap<String, String>,
@@ -88,48 +91,52 @@ impl Who {
         calculator: &[u8],
     ) -> Result<Self, SetupError> {
         let files = [(SCRIPT_FILE, SCRIPT.as_bytes()), (CALCULATOR_FILE, calculator)];
-        let said = program::ask(command, &[SCRIPT_FILE], environment, passed, &files)?;
+        let said = version_query::run(command, &[SCRIPT_FILE], environment, passed, &files)?;
         said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
-            let reason = format!("is no Python with ASE: it does not say its version but {:?}", said.trim());
-            program::another(command, reason)
+            let reason = format!("is not a Python with ASE: expected its version, found {:?}", said.trim());
+            version_query::wrong_program(command, reason)
         })
     }
 }
 
-/// A calculator, ready to be used.
+/// A configured calculator.
 #[derive(Clone, Debug)]
 pub struct Ase {
     settings: Settings,
     environment: BTreeMap<String, String>,
     calculator: Vec<u8>,
-    who: Who,
+    versions: Versions,
 }
 
-impl Code for Ase {
+impl DftBackend for Ase {
     fn identity(&self) -> Value {
-        // Destructured, so that a new setting is not forgotten here.
+        // Destructure, so that a new setting cannot be forgotten here.
         let Settings { command: _, environment: _, calculator: _, moments } = &self.settings;
         json!({
-            "code": "ase", "ase": self.who.ase, "recipe": RECIPE, "version": self.who.version,
+            "code": "ase", "ase": self.versions.ase, "recipe": INPUT_VERSION, "version": self.versions.version,
             "calculator": blake3::hash(&self.calculator).to_hex().to_string(), "moments": moments,
         })
     }
 
     fn supports(&self, _: &BTreeSet<Species>) -> Result<(), SetupError> {
-        // Only the calculator knows, and only when it calculates.
+        // Only the calculator knows, and only while it calculates.
         Ok(())
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-        structure.validate().map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
+        structure.validate().map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         let table = &self.settings.moments;
         let task = json!({
             "species": structure.species,
             "positions": structure.positions,
             "cell": structure.cell.0,
             "periodic": structure.periodic,
-            "moments": (!table.is_empty()).then(|| moments::initial(structure, table, remedies)),
-            "remedies": remedies.iter().map(|remedy| remedy.name()).collect::<Vec<_>>(),
+            "moments": (!table.is_empty()).then(|| moments::initial(structure, table, adjustments)),
+            "remedies": adjustments.iter().map(|remedy| remedy.name()).collect::<Vec<_>>(),
         });
         let files = [
             (SCRIPT_FILE, SCRIPT.into()),
@@ -144,11 +151,11 @@ impl Code for Ase {
         })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
-        let by = [("ase", self.who.ase.as_str()), ("version", self.who.version.as_str())];
-        match script_result::read(structure, directory, &by)? {
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+        let by = [("ase", self.versions.ase.as_str()), ("version", self.versions.version.as_str())];
+        match script_output::read(structure, directory, &by)? {
             Some(calculated) => Ok(calculated),
-            None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+            None => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),
         }
     }
 

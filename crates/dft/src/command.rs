@@ -1,13 +1,14 @@
-//! A program of the user's that is given a structure as a file and leaves its label as a file.
+//! A user's program that reads a structure from a file and writes its label to a file.
 //!
-//! It is run in a directory of its own, where it finds `structure.extxyz` (Å) and copies of the settings' `files`. It
-//! leaves `label.extxyz`: one frame with the same atoms in the same order at the same places in the same cell, `energy`
-//! (eV), `forces` (eV/Å) and, if it has them, `stress` (eV/Å³, tension positive) and the column `magmoms` (μ_B). If there
-//! is a `free_energy` as well, this is the one whose derivative the forces are. Exit code 0 says that the calculation
-//! converged and the file is whole. Any other says that it is no label: 3 not converged, 4 out of memory, 5 the structure
-//! cannot be calculated, everything else crashed. What it prints is kept with the failure. After a failure the variable
-//! `CALMWALK_REMEDIES` holds what to do otherwise, separated by commas (`more_steps`, `slower_mixing`, `other_algorithm`,
-//! `other_moments`, `more_memory`, `more_time`, `other_node`): nothing of it may change the converged numbers.
+//! It runs in its own directory with `structure.extxyz` (Å) and copies of the settings' `files`. It writes
+//! `label.extxyz`: one frame with the same atoms in the same order at the same positions in the same cell,
+//! `energy` (eV), `forces` (eV/Å) and optionally `stress` (eV/Å³, tension positive) and the column `magmoms`
+//! (μ_B). If `free_energy` is present, it is the one consistent with the forces. Exit code 0 states that the
+//! calculation converged and the file is complete. Other codes are failures: 3 not converged, 4 out of memory,
+//! 5 the structure cannot be calculated, any other: crashed. Its output is kept with the failure. After a
+//! failure the variable `CALMWALK_REMEDIES` lists the adjustments of the retry, separated by commas
+//! (`more_steps`, `slower_mixing`, `other_algorithm`, `other_moments`, `more_memory`, `more_time`,
+//! `other_node`). None of them may change the converged numbers.
 
 mod read;
 
@@ -19,30 +20,35 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use crate::{Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, SetupError, Size, find, judge};
+use crate::{
+    DftBackend, Exit, Failure, FailureClass, Input, Results, RetryAdjustment, SetupError, Size, executable,
+    validation,
+};
 
 const STRUCTURE: &str = "structure.extxyz";
 const LABEL: &str = "label.extxyz";
 
-/// Names in the directory that are not the user's.
+/// File names that the user cannot choose.
 const RESERVED: [&str; 4] = [STRUCTURE, LABEL, "stdout", "stderr"];
 
-/// What to run.
+/// The settings of `[label.method.command]`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
-    /// The program and its arguments, a word each; not for a shell. The program is an absolute path or a name that is
-    /// sought in PATH. Scripts among `files` are given to their interpreter: `["python3", "label.py"]`.
+    /// The program and its arguments, one word each, without a shell. The program is an absolute path or a name
+    /// to look up in PATH. Pass scripts among `files` to their interpreter: `["python3", "label.py"]`.
     pub command: Vec<String>,
-    /// Files that the program needs: they are read once, at the start, are part of the protocol's identity, and stand as
-    /// copies in the directory of each calculation. What is too large for that stays where it is, and `version` tells it.
+    /// Files that the program needs. They are read once at the start, belong to the protocol's identity, and
+    /// are copied into the directory of each calculation. Describe files that are too large for that in
+    /// `version`.
     #[serde(default)]
     pub files: Vec<PathBuf>,
-    /// What distinguishes the labels beside the command and the files, in the user's words: versions of programs, models.
+    /// What determines the labels beside the command and the files, in the user's words: versions of programs
+    /// and models.
     pub version: String,
 }
 
-/// A program that is ready to be run.
+/// A configured command.
 #[derive(Debug)]
 pub struct Command {
     command: Vec<String>,
@@ -54,13 +60,13 @@ impl Settings {
     /// Finds the program and reads the files.
     ///
     /// # Errors
-    /// No such program, a file that cannot be read, two files of the same name.
+    /// A missing program, a file that cannot be read, two files of the same name.
     pub fn prepare(&self) -> Result<Command, SetupError> {
         let Some(program) = self.command.first() else {
             let expected = "a program and its arguments, such as [\"python3\", \"label.py\"]".to_owned();
             return Err(SetupError::Setting { key: "command", found: "nothing".to_owned(), expected });
         };
-        find::program(program)?;
+        executable::find(program)?;
         let mut files = BTreeMap::new();
         for path in &self.files {
             let fault = |expected: String| SetupError::Setting {
@@ -71,18 +77,16 @@ impl Settings {
             let content = std::fs::read(path)
                 .map_err(|error| fault(format!("a file that can be read, but: {error}")))?;
             let name = path.file_name().and_then(|name| name.to_str());
-            let name = name.ok_or_else(|| fault("a file whose name is text".to_owned()))?;
+            let name = name.ok_or_else(|| fault("a file with a UTF-8 name".to_owned()))?;
             if RESERVED.contains(&name) || files.insert(name.to_owned(), content).is_some() {
-                return Err(fault(format!(
-                    "another name: there are others of the name '{name}' in the directory"
-                )));
+                return Err(fault(format!("another name: the directory has another file '{name}'")));
             }
         }
         Ok(Command { command: self.command.clone(), files, version: self.version.clone() })
     }
 }
 
-impl Code for Command {
+impl DftBackend for Command {
     fn identity(&self) -> serde_json::Value {
         let hash =
             |(name, content): (&String, &Vec<u8>)| (name.clone(), blake3::hash(content).to_hex().to_string());
@@ -94,24 +98,34 @@ impl Code for Command {
         Ok(())
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
         let mut text = Vec::new();
         write_frame(&mut text, &Frame::from(structure.clone()))
-            .map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+            .map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         let mut files = self.files.clone();
         files.insert(STRUCTURE.to_owned(), text);
-        let names: Vec<_> = remedies.iter().map(|remedy| remedy.name()).collect();
+        let names: Vec<_> = adjustments.iter().map(|remedy| remedy.name()).collect();
         let environment = BTreeMap::from([("CALMWALK_REMEDIES".to_owned(), names.join(","))]);
         Ok(Input { files, command: self.command.clone(), environment, ..Input::default() })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
         match exit {
             Exit::Code(0) => read::label(structure, &directory.join(LABEL)),
-            Exit::Code(3) => Err(FailureClass::NotConverged.because("the command says so (exit code 3)")),
-            Exit::Code(4) => Err(FailureClass::OutOfMemory.because("the command says so (exit code 4)")),
-            Exit::Code(5) => Err(FailureClass::BadInput.because("the command says so (exit code 5)")),
-            _ => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+            Exit::Code(3) => {
+                Err(FailureClass::NotConverged.with_message("reported by the command (exit code 3)"))
+            }
+            Exit::Code(4) => {
+                Err(FailureClass::OutOfMemory.with_message("reported by the command (exit code 4)"))
+            }
+            Exit::Code(5) => {
+                Err(FailureClass::BadInput.with_message("reported by the command (exit code 5)"))
+            }
+            _ => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),
         }
     }
 

@@ -1,14 +1,15 @@
-//! Which environment a program gets that makes labels.
+//! The environment of a program that makes labels.
 //!
-//! Labellers have the environment of the shell or batch job that started them, with passwords of databases and tokens of
-//! services in it. A program that makes labels gets what programs of this kind are known to need, and what the user names.
+//! Labellers inherit the environment of the shell or batch job that started them, including database passwords
+//! and service tokens. A program that makes labels receives only the variables that such programs are known to
+//! need and those that the user names.
 
 use std::env;
 use std::ffi::{OsStr, OsString};
 
 use serde::{Deserialize, Serialize};
 
-/// Variables that every program gets.
+/// Variables that every program receives.
 const NAMES: &[&str] = &[
     "BASH_ENV",
     "CC",
@@ -46,8 +47,8 @@ const NAMES: &[&str] = &[
     "_LMFILES_",
 ];
 
-/// Beginnings of the names of further variables that every program gets.
-const BEGINNINGS: &[&[&str]] = &[
+/// Prefixes of further variables that every program receives.
+const PREFIXES: &[&[&str]] = &[
     // Programs that make labels.
     &[
         "ABINIT",
@@ -70,7 +71,7 @@ const BEGINNINGS: &[&[&str]] = &[
         "WANNIER",
         "XTB",
     ],
-    // Languages and what is installed for them.
+    // Languages and their packages.
     &[
         "CONDA",
         "JULIA",
@@ -117,14 +118,14 @@ const BEGINNINGS: &[&[&str]] = &[
         "FI_", "HCOLL", "HPCX", "HYDRA_", "IBV_", "I_MPI_", "MPI", "MV2_", "MVAPICH", "MVP_", "OMPI_",
         "OPAL_", "OPENMPI", "ORTE_", "PALS_", "PMI", "PRTE_", "PSM", "RDMAV_", "UCC_", "UCX_",
     ],
-    // Accelerators and what learns on them.
+    // Accelerators and machine-learning frameworks.
     &[
         "ACC_", "AMD_", "CUDA", "CUDNN", "CUPY_", "GPU_", "HF_", "HIP", "HSA_", "JAX_", "NCCL_", "NV",
         "PYTORCH", "ROCBLAS", "ROCM", "ROCR_", "SYCL", "TF_", "TORCH", "TRITON_", "XLA_", "ZE_",
     ],
     // Batch systems.
     &["ALPS_", "LSB_", "LSF_", "PBS_", "SGE_", "SLURM"],
-    // Modules and containers; functions that a shell has exported for them.
+    // Modules and containers; shell functions exported for them.
     &[
         "APPTAINER",
         "BASH_FUNC_",
@@ -141,7 +142,7 @@ const BEGINNINGS: &[&[&str]] = &[
     ],
 ];
 
-/// What is found in the names of variables that hold secrets.
+/// Substrings of the names of variables that hold secrets.
 const SECRETS: [&str; 10] = [
     "PASSWORD",
     "PASSWD",
@@ -155,27 +156,27 @@ const SECRETS: [&str; 10] = [
     "PRIVATE_KEY",
 ];
 
-/// The variables of its environment that a labeller gives to programs beside those that all of them get.
+/// The environment variables that a labeller passes to programs in addition to the standard ones.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(transparent)]
 pub struct PassedEnvironment {
-    /// Names, and beginnings of names with a `*` behind them.
+    /// Names, and prefixes followed by `*`.
     patterns: Vec<String>,
 }
 
 impl PassedEnvironment {
-    /// These names; `MYCODE_*` stands for all that begin with `MYCODE_`.
+    /// Passes these variables; `MYCODE_*` matches all names with the prefix `MYCODE_`.
     pub fn new(patterns: Vec<String>) -> Self {
         Self { patterns }
     }
 
-    /// Whether there are none.
+    /// Whether there are no patterns.
     pub fn is_empty(&self) -> bool {
         self.patterns.is_empty()
     }
 
-    /// The first that is neither a name nor the beginning of one.
-    pub fn fault(&self) -> Option<&str> {
+    /// The first pattern that is neither a name nor a prefix.
+    pub fn invalid_pattern(&self) -> Option<&str> {
         let is_name = |pattern: &str| {
             let name = pattern.strip_suffix('*').unwrap_or(pattern);
             !name.is_empty() && !name.contains(['*', '=', '\0', ' '])
@@ -183,19 +184,18 @@ impl PassedEnvironment {
         self.patterns.iter().map(String::as_str).find(|pattern| !is_name(pattern))
     }
 
-    /// What a program gets of the environment of this process.
-    pub fn of_this_process(&self) -> impl Iterator<Item = (OsString, OsString)> {
+    /// The variables of the current process that a program receives.
+    pub fn from_current_process(&self) -> impl Iterator<Item = (OsString, OsString)> {
         env::vars_os().filter(|(name, _)| self.passes(name))
     }
 
-    /// Whether programs get the variable of this name. One that looks as if it held a secret has to be named in full.
+    /// Whether programs receive this variable. A name that suggests a secret must be listed in full.
     fn passes(&self, name: &OsStr) -> bool {
-        // None of ours has another name.
+        // All known names are UTF-8.
         let Some(name) = name.to_str() else { return false };
         let begins = |begin: &str| name.starts_with(begin);
         let mut named = self.patterns.iter();
-        let allowed =
-            NAMES.contains(&name) || BEGINNINGS.iter().copied().flatten().any(|begin| begins(begin));
+        let allowed = NAMES.contains(&name) || PREFIXES.iter().copied().flatten().any(|begin| begins(begin));
         let matched = self.patterns.iter().filter_map(|pattern| pattern.strip_suffix('*')).any(begins);
         named.any(|pattern| pattern == name) || ((allowed || matched) && !is_secret(name))
     }
@@ -255,8 +255,9 @@ mod tests {
         assert!(passes(&["MY_SITE"], "MY_SITE") && !passes(&["MY_SITE"], "MY_SITES"));
         assert!(passes(&["MY_*"], "MY_SITE") && !passes(&["MY_*"], "MY_TOKEN"));
         assert!(passes(&["MY_TOKEN"], "MY_TOKEN"));
-        let fault =
-            |pattern: &str| PassedEnvironment::new(vec![pattern.to_owned()]).fault().map(str::to_owned);
+        let fault = |pattern: &str| {
+            PassedEnvironment::new(vec![pattern.to_owned()]).invalid_pattern().map(str::to_owned)
+        };
         assert_eq!((fault("MY_*"), fault("A")), (None, None));
         for wrong in ["", "*", "A*B", "A=1", "A B"] {
             assert_eq!(fault(wrong).as_deref(), Some(wrong));

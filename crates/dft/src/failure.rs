@@ -1,41 +1,41 @@
-//! Why a calculation is no label.
+//! Why a calculation gives no label.
 
 use std::fmt;
 
-/// Kind of a failure: what is tried next depends on it ([`crate::remedies`]).
+/// Class of a failure; it determines the next attempt ([`crate::adjustments`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum FailureClass {
-    /// The program ended by an error or a signal that says nothing more.
+    /// An error or a signal without further information ended the program.
     Crashed,
-    /// It needed more memory than there was.
+    /// The memory did not suffice.
     OutOfMemory,
-    /// It was not done in time.
+    /// It exceeded its time limit.
     TimeLimit,
     /// The electronic steps did not converge.
     NotConverged,
-    /// The structure cannot be calculated as it is: another attempt would fail alike.
+    /// The structure cannot be calculated; another attempt would fail too.
     BadInput,
-    /// The machine that it ran on is gone.
+    /// The node was lost.
     LostNode,
-    /// It says that all is well, but its numbers cannot be believed.
+    /// The program reports success, but its numbers are wrong.
     Implausible,
-    /// What was run is not the program of the protocol, or another version of it. That is a fault of where it ran, and not of
-    /// the structure.
+    /// Another program, or another version, than the protocol's ran. The fault is in the host, not in the
+    /// structure.
     OtherProgram,
 }
 
-/// A failure with what is known of it.
+/// A failure with its message.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{class}: {message}")]
 pub struct Failure {
-    /// Its kind.
+    /// Its class.
     pub class: FailureClass,
-    /// What happened, for people: a line.
+    /// What happened, in one line.
     pub message: String,
 }
 
 impl FailureClass {
-    /// All of them.
+    /// All classes.
     pub const ALL: [Self; 8] = [
         Self::Crashed,
         Self::OutOfMemory,
@@ -47,7 +47,7 @@ impl FailureClass {
         Self::OtherProgram,
     ];
 
-    /// Short name, as the store keeps it.
+    /// Name in the store.
     pub fn name(self) -> &'static str {
         match self {
             Self::Crashed => "crashed",
@@ -61,13 +61,13 @@ impl FailureClass {
         }
     }
 
-    /// The class of that name.
-    pub fn named(name: &str) -> Option<Self> {
+    /// The class with this name.
+    pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|class| class.name() == name)
     }
 
-    /// A failure of this class.
-    pub fn because(self, message: impl Into<String>) -> Failure {
+    /// A failure of this class with a message.
+    pub fn with_message(self, message: impl Into<String>) -> Failure {
         Failure { class: self, message: message.into() }
     }
 }

@@ -1,38 +1,39 @@
-//! What calmwalk knows of the programs that make labels: their inputs, how to tell that a calculation is good, and
-//! where its numbers stand. Files and numbers only; who runs the programs, and where, is not known here.
+//! Interfaces to the programs that make labels: their inputs, the validation of their outputs, and the
+//! adjustments of a retry. This crate handles files and numbers only and runs no calculations.
 //!
-//! Units: eV, Å, eV/Å, eV/Å³ (tension positive), μ_B. What a program writes in others is converted by its module.
+//! Units: eV, Å, eV/Å, eV/Å³ (tension positive), μ_B. The module of each program converts from the program's
+//! own units.
 
 pub mod abinit;
 pub mod ase;
-mod code;
+mod backend;
+mod checks;
 pub mod command;
 pub mod cp2k;
 mod environment;
+mod executable;
 mod failure;
-mod find;
 pub mod gpaw;
-mod judge;
-mod lattice;
-pub mod mesh;
+pub mod k_mesh;
 mod moments;
-mod original;
+mod padded_structure;
 mod paw;
-mod program;
-mod remedy;
+mod pinned_file;
 pub mod result_file;
-mod same;
-mod script_result;
-mod setting;
+mod retry_adjustment;
+mod script_output;
 mod settings;
 mod smearing;
+mod structure_check;
+mod validation;
 pub mod vasp;
+mod version_query;
 
-pub use code::{Calculated, Code, Exit, Input, SetupError, Size};
+pub use backend::{DftBackend, Exit, Input, Results, SetupError, Size};
 pub use environment::PassedEnvironment;
 pub use failure::{Failure, FailureClass};
 pub use moments::Moments;
-pub use original::Original;
-pub use remedy::{Remedy, remedies};
+pub use pinned_file::PinnedFile;
+pub use retry_adjustment::{RetryAdjustment, adjustments};
 pub use settings::Settings;
 pub use smearing::Smearing;

@@ -1,11 +1,11 @@
-//! The head of PAW setups in the XML that GPAW and ABINIT share.
+//! The header of PAW setups in the XML format that GPAW and ABINIT share.
 
 use atoms::Species;
 
-/// How far into a file its head reaches, bytes.
+/// Bytes of a file that contain the header.
 const HEAD: usize = 8192;
 
-/// Valence electrons that a setup states, if it is of this element and of PBE; otherwise what is wrong.
+/// Number of valence electrons of a PBE setup of this element, or what is wrong with the file.
 pub(crate) fn valence(setup: &[u8], species: Species) -> Result<f64, String> {
     let head = String::from_utf8_lossy(&setup[..setup.len().min(HEAD)]);
     let valence = attribute(&head, "atom", "valence").and_then(|valence| valence.trim().parse::<f64>().ok());
@@ -14,11 +14,13 @@ pub(crate) fn valence(setup: &[u8], species: Species) -> Result<f64, String> {
         (Some(symbol), Some(valence), Some(_)) if symbol == species.symbol() && valence >= 0.0 => {
             match functional.is_some_and(|name| ["PBE", "GGA_X_PBE+GGA_C_PBE"].contains(&name.trim())) {
                 true => Ok(valence),
-                false => Err(format!("is of the functional {}, not of PBE", functional.unwrap_or_default())),
+                false => {
+                    Err(format!("is for the functional {}, not for PBE", functional.unwrap_or_default()))
+                }
             }
         }
         _ => Err(format!(
-            "is no PAW setup of {species}: expected <atom symbol=\"{species}\" … valence=\"…\"/> and <xc_functional … \
+            "is not a PAW setup of {species}: expected <atom symbol=\"{species}\" … valence=\"…\"/> and <xc_functional … \
              name=\"…\"/> at its beginning"
         )),
     }
@@ -40,10 +42,12 @@ mod tests {
         let head = "<atom symbol=\"Fe\" Z=\"26.00\" core=\"10.00\" valence=\"16.00\"/>\n<xc_functional type=\"GGA\" name=\"PBE\"/>";
         assert_eq!(valence(head.as_bytes(), iron), Ok(16.0));
         assert!(
-            valence(head.as_bytes(), "Co".parse().unwrap()).unwrap_err().starts_with("is no PAW setup of Co")
+            valence(head.as_bytes(), "Co".parse().unwrap())
+                .unwrap_err()
+                .starts_with("is not a PAW setup of Co")
         );
         let other = head.replace("PBE", "PW");
-        assert_eq!(valence(other.as_bytes(), iron), Err("is of the functional PW, not of PBE".into()));
+        assert_eq!(valence(other.as_bytes(), iron), Err("is for the functional PW, not for PBE".into()));
         for end in 0..head.len() - 5 {
             assert!(valence(&head.as_bytes()[..end], iron).is_err(), "cut at {end}");
         }

@@ -1,8 +1,8 @@
-//! Files that a program has left in its directory.
+//! Reads files that a program left in its directory.
 //!
-//! Under the name of a result there may be anything: a pipe that nobody writes to, a link to a device that never ends, a
-//! sparse file that is larger than the memory. All files that a program has left are therefore opened here: without waiting
-//! and without following a link, regular files only, and up to a size.
+//! Anything may stand under the name of a result: a pipe without a writer, a link to an endless device, a
+//! sparse file larger than the memory. This module opens all such files: regular files only, up to a size
+//! limit, without blocking and without following links.
 
 use std::fs::{File, FileType};
 use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Take};
@@ -12,69 +12,69 @@ use std::path::Path;
 use rustix::fs::{Mode, OFlags};
 use rustix::io::Errno;
 
-/// Bytes of the largest file that is read into memory as a whole: 256 MiB.
-pub const LARGEST: u64 = 256 << 20;
-/// Bytes of the largest file that is read piece by piece, as VASP's: 16 GiB.
-pub const LARGEST_IN_PIECES: u64 = 16 << 30;
-/// Bytes of the longest piece of such a file: 1 MiB.
-pub const LONGEST_PIECE: usize = 1 << 20;
+/// Size limit of a file that is read into memory: 256 MiB.
+pub const MAX_BYTES: u64 = 256 << 20;
+/// Size limit of a file that is streamed, such as VASP's: 16 GiB.
+pub const MAX_STREAMED_BYTES: u64 = 16 << 30;
+/// Size limit of a record in a streamed file: 1 MiB.
+pub const MAX_RECORD_BYTES: usize = 1 << 20;
 
-/// Why a file is not read. It completes a sentence that begins with the name of the file.
+/// Why a file is not read. The message continues a sentence that starts with the file's name.
 #[derive(Debug, thiserror::Error)]
 pub enum ResultFileError {
-    /// There is none.
+    /// The file does not exist.
     #[error("is missing")]
     Missing,
-    /// Reading it might never end.
+    /// Not a regular file; reading it might never end.
     #[error("is {found}, expected a regular file")]
     NotRegular {
         /// What it is.
         found: &'static str,
     },
-    /// It might fill the memory.
+    /// Too large for the memory.
     #[error("has {bytes} bytes, expected at most {most}")]
     TooLarge {
         /// Its size.
         bytes: u64,
-        /// The bound.
+        /// The limit.
         most: u64,
     },
-    /// The system refuses.
+    /// The system reports an error.
     #[error("cannot be read: {0}")]
     Io(#[from] io::Error),
 }
 
 impl ResultFileError {
-    /// Whether there is no such file.
+    /// Whether the file does not exist.
     pub fn is_missing(&self) -> bool {
         matches!(self, Self::Missing)
     }
 }
 
-/// The last part of a file.
+/// The end of a file.
 #[derive(Debug)]
 pub struct Tail {
-    /// Bytes of the whole file.
+    /// Size of the whole file, bytes.
     pub length: u64,
-    /// The last of them.
+    /// Its last bytes.
     pub bytes: Vec<u8>,
 }
 
-/// The whole content, of at most [`LARGEST`] bytes.
+/// Reads a file of at most [`MAX_BYTES`] bytes.
 ///
 /// # Errors
 /// See [`ResultFileError`].
 pub fn read(path: &Path) -> Result<Vec<u8>, ResultFileError> {
     let (file, length) = open(path)?;
-    within(length, LARGEST)?;
+    within(length, MAX_BYTES)?;
     let mut content = Vec::new();
-    // It may grow while it is read.
-    let read = file.take(LARGEST + 1).read_to_end(&mut content)?;
-    within(read as u64, LARGEST)?;
+    // The file may grow while it is read.
+    let read = file.take(MAX_BYTES + 1).read_to_end(&mut content)?;
+    within(read as u64, MAX_BYTES)?;
     Ok(content)
 }
 
-/// The last `bytes` of a file, however large it is.
+/// Reads the last `bytes` of a file of any size.
 ///
 /// # Errors
 /// See [`ResultFileError`].
@@ -86,24 +86,25 @@ pub fn tail(path: &Path, bytes: u64) -> Result<Tail, ResultFileError> {
     Ok(Tail { length, bytes: end })
 }
 
-/// A reader of a file of at most [`LARGEST_IN_PIECES`] bytes. It fails where more than [`LONGEST_PIECE`] bytes come without
-/// the byte `mark`, so that a parser that keeps what stands between two of them needs no more memory.
+/// Opens a file of at most [`MAX_STREAMED_BYTES`] bytes for streaming. Reading fails if more than
+/// [`MAX_RECORD_BYTES`] bytes come without a `delimiter`, which bounds the memory of a parser that keeps one
+/// record.
 ///
 /// # Errors
 /// See [`ResultFileError`].
-pub fn pieces(path: &Path, mark: u8) -> Result<Pieces, ResultFileError> {
+pub fn open_delimited(path: &Path, delimiter: u8) -> Result<DelimitedReader, ResultFileError> {
     let (file, length) = open(path)?;
-    within(length, LARGEST_IN_PIECES)?;
-    Ok(Pieces { file: BufReader::new(file.take(LARGEST_IN_PIECES)), mark, since_mark: 0 })
+    within(length, MAX_STREAMED_BYTES)?;
+    Ok(DelimitedReader { file: BufReader::new(file.take(MAX_STREAMED_BYTES)), delimiter, since_delimiter: 0 })
 }
 
 fn within(bytes: u64, most: u64) -> Result<(), ResultFileError> {
     if bytes > most { Err(ResultFileError::TooLarge { bytes, most }) } else { Ok(()) }
 }
 
-/// The file with its size, if it is a regular one.
+/// Opens a regular file; also returns its size.
 fn open(path: &Path) -> Result<(File, u64), ResultFileError> {
-    // NONBLOCK: to open a pipe waits for somebody who writes to it otherwise.
+    // Without NONBLOCK, opening a pipe waits for a writer.
     let flags = OFlags::RDONLY | OFlags::NONBLOCK | OFlags::NOFOLLOW | OFlags::NOCTTY | OFlags::CLOEXEC;
     let file = match rustix::fs::open(path, flags, Mode::empty()) {
         Ok(file) => File::from(file),
@@ -127,15 +128,15 @@ fn describe(kind: FileType) -> &'static str {
     }
 }
 
-/// See [`pieces`].
+/// See [`open_delimited`].
 #[derive(Debug)]
-pub struct Pieces {
+pub struct DelimitedReader {
     file: BufReader<Take<File>>,
-    mark: u8,
-    since_mark: usize,
+    delimiter: u8,
+    since_delimiter: usize,
 }
 
-impl Read for Pieces {
+impl Read for DelimitedReader {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let read = self.fill_buf()?.read(buffer)?;
         self.consume(read);
@@ -143,11 +144,11 @@ impl Read for Pieces {
     }
 }
 
-impl BufRead for Pieces {
+impl BufRead for DelimitedReader {
     fn fill_buf(&mut self) -> io::Result<&[u8]> {
-        if self.since_mark > LONGEST_PIECE {
-            let what = if self.mark == b'\n' { "line" } else { "text without a tag" };
-            let message = format!("has a {what} of more than {LONGEST_PIECE} bytes");
+        if self.since_delimiter > MAX_RECORD_BYTES {
+            let what = if self.delimiter == b'\n' { "line" } else { "text without a tag" };
+            let message = format!("has a {what} of more than {MAX_RECORD_BYTES} bytes");
             return Err(io::Error::new(io::ErrorKind::InvalidData, message));
         }
         self.file.fill_buf()
@@ -155,9 +156,9 @@ impl BufRead for Pieces {
 
     fn consume(&mut self, bytes: usize) {
         let consumed = self.file.buffer().get(..bytes).unwrap_or_default();
-        match consumed.iter().rposition(|byte| *byte == self.mark) {
-            Some(place) => self.since_mark = bytes - place,
-            None => self.since_mark += bytes,
+        match consumed.iter().rposition(|byte| *byte == self.delimiter) {
+            Some(place) => self.since_delimiter = bytes - place,
+            None => self.since_delimiter += bytes,
         }
         self.file.consume(bytes);
     }
@@ -180,10 +181,10 @@ mod tests {
         assert_eq!(read(&path).unwrap(), b"one\ntwo\n");
         let Tail { length, bytes } = tail(&path, 3).unwrap();
         assert_eq!((length, bytes.as_slice()), (8, &b"wo\n"[..]));
-        assert_eq!(pieces(&path, b'\n').unwrap().lines().count(), 2);
+        assert_eq!(open_delimited(&path, b'\n').unwrap().lines().count(), 2);
     }
 
-    /// All of these are refused by whoever reads, at once.
+    /// Every reader rejects all of these at once.
     #[test]
     fn nothing_but_a_regular_file_is_read() {
         let home = tempfile::tempdir().unwrap();
@@ -204,7 +205,7 @@ mod tests {
             let expected = format!("is {found}, expected a regular file");
             assert_eq!(read(&at(name)).unwrap_err().to_string(), expected);
             assert_eq!(tail(&at(name), 10).unwrap_err().to_string(), expected);
-            assert_eq!(pieces(&at(name), b'\n').unwrap_err().to_string(), expected);
+            assert_eq!(open_delimited(&at(name), b'\n').unwrap_err().to_string(), expected);
         }
         assert_eq!(
             read(Path::new("/dev/zero")).unwrap_err().to_string(),
@@ -217,16 +218,17 @@ mod tests {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("sparse");
         let file = File::create(&path).unwrap();
-        file.set_len(LARGEST + 1).unwrap();
+        file.set_len(MAX_BYTES + 1).unwrap();
         let message = read(&path).unwrap_err().to_string();
         assert_eq!(message, "has 268435457 bytes, expected at most 268435456");
         assert_eq!(tail(&path, 5).unwrap().bytes, [0; 5]);
-        // One line without an end.
+        // A line without an end.
         let mut line = Vec::new();
-        let message = pieces(&path, b'\n').unwrap().read_until(b'\n', &mut line).unwrap_err().to_string();
+        let message =
+            open_delimited(&path, b'\n').unwrap().read_until(b'\n', &mut line).unwrap_err().to_string();
         assert_eq!(message, "has a line of more than 1048576 bytes");
-        assert!(line.len() < 2 * LONGEST_PIECE);
-        file.set_len(LARGEST_IN_PIECES + 1).unwrap();
-        assert!(matches!(pieces(&path, b'\n'), Err(ResultFileError::TooLarge { .. })));
+        assert!(line.len() < 2 * MAX_RECORD_BYTES);
+        file.set_len(MAX_STREAMED_BYTES + 1).unwrap();
+        assert!(matches!(open_delimited(&path, b'\n'), Err(ResultFileError::TooLarge { .. })));
     }
 }

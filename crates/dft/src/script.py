@@ -1,4 +1,4 @@
-"""What the scripts of both methods do with a result. The script itself stands below."""
+"""Code shared by the scripts of both methods. The script itself follows."""
 
 import json
 import math
@@ -25,7 +25,7 @@ def say(result):
 
 
 def leave(result, by):
-    """The result, and the versions of what has made it."""
+    """The result with the versions of the programs that made it."""
     if world.rank == 0:
         with open("result.json.part", "w") as file:
             json.dump({**result, "by": by}, file)

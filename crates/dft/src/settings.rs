@@ -1,20 +1,20 @@
-//! The programs that can be chosen, each with its settings.
+//! The settings of each supported program.
 
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Code, PassedEnvironment, SetupError, abinit, ase, command, cp2k, gpaw, vasp};
+use crate::{DftBackend, PassedEnvironment, SetupError, abinit, ase, command, cp2k, gpaw, vasp};
 
-/// Which program makes labels, and how: `[label.method.<name>]` of a campaign.
+/// Which program makes labels, with its settings: `[label.method.<name>]` of a campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Settings {
     /// ABINIT.
     Abinit(abinit::Settings),
-    /// A calculator of ASE's.
+    /// An ASE calculator.
     Ase(ase::Settings),
-    /// A program of the user's.
+    /// A user's program.
     Command(command::Settings),
     /// CP2K.
     Cp2k(cp2k::Settings),
@@ -25,10 +25,10 @@ pub enum Settings {
 }
 
 impl Settings {
-    /// Name of each.
+    /// Names of the programs.
     pub const NAMES: [&str; 6] = ["abinit", "ase", "command", "cp2k", "gpaw", "vasp"];
 
-    /// The program's name, as a configuration writes it.
+    /// The program's name in the configuration.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Abinit(_) => "abinit",
@@ -40,7 +40,7 @@ impl Settings {
         }
     }
 
-    /// Every path among the settings, to be resolved from the directory of the configuration.
+    /// All paths in the settings, to be resolved relative to the configuration.
     pub fn paths(&mut self) -> Vec<&mut PathBuf> {
         match self {
             Self::Abinit(settings) => vec![&mut settings.pseudopotentials],
@@ -52,12 +52,12 @@ impl Settings {
         }
     }
 
-    /// Finds the program, its version and its pseudopotentials. A program that is asked gets these variables of the environment
-    /// of this process.
+    /// Finds the program, its version and its pseudopotentials. Queries run with the variables `passed` from
+    /// the current environment.
     ///
     /// # Errors
-    /// What is missing or impossible, before anything is run.
-    pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Box<dyn Code>, SetupError> {
+    /// Missing programs or files and invalid settings, before any calculation runs.
+    pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Box<dyn DftBackend>, SetupError> {
         Ok(match self {
             Self::Abinit(settings) => Box::new(settings.prepare(passed)?),
             Self::Ase(settings) => Box::new(settings.prepare(passed)?),

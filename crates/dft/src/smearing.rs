@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// How states near the Fermi level are occupied.
+/// Occupation function of the states near the Fermi level.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Smearing {

@@ -1,24 +1,24 @@
 //! VASP with the user's own POTCAR files.
 //!
-//! Spin-polarised PBE with PAW potentials; the defaults are the protocol of calmwalk's paper. The energy is the free
-//! energy. Numbers are read from `vasprun.xml` or, where that is cut off, from an `OUTCAR` that is whole; moments from
-//! `OUTCAR`. Atoms of an element stand together in VASP's files, and come back in the structure's order. Directions of a
-//! structure that do not repeat get vacuum, and no stress is given then.
+//! Spin-polarised PBE with PAW potentials; the defaults are the protocol of the paper. The energy is the free
+//! energy. Numbers come from `vasprun.xml` or, if that is truncated, from a complete `OUTCAR`; moments always
+//! come from `OUTCAR`. VASP's files group atoms by element; results are returned in the structure's order.
+//! Non-periodic directions get vacuum; such structures have no stress.
 //!
-//! Remedies:
+//! Adjustments of a retry:
 //! - more steps: three times as many;
 //! - slower mixing: almost linear (`BMIX` 0.0001) with a tenth of the new density;
-//! - another algorithm: conjugate gradients for all bands at once (`ALGO = All`), which mix nothing;
-//! - other moments: half of them to start from;
-//! - more memory: all processors share each k-point (`KPAR = 1`).
+//! - another algorithm: conjugate gradients for all bands at once (`ALGO = All`), without mixing;
+//! - other moments: half of the initial moments;
+//! - more memory: all processes share each k-point (`KPAR = 1`).
 
+mod fixed_width;
 mod incar;
-mod numbers;
 mod outcar;
 mod output;
 mod potcar;
 #[cfg(test)]
-mod real;
+mod real_output_tests;
 mod result;
 mod vasprun;
 
@@ -30,54 +30,56 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::{self, Enclosed};
+use crate::checks::{at_least, positive};
 use crate::moments::{self, Moments};
-use crate::setting::{at_least, positive};
+use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, SetupError, Size, Smearing, find, program,
+    DftBackend, Exit, Failure, FailureClass, Input, Results, RetryAdjustment, SetupError, Size, Smearing,
+    executable, version_query,
 };
 use potcar::Potcar;
 
-/// Counts changes of what is written here that change a label's value.
-const RECIPE: u32 = 1;
+/// Version of the generated input; raised when a change affects label values.
+const INPUT_VERSION: u32 = 1;
 
-/// `[label.method.vasp]`
+/// The settings of `[label.method.vasp]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
-    /// VASP, and what it is started by: `["mpirun", "-np", "16", "vasp_std"]`.
+    /// VASP with its launcher: `["mpirun", "-np", "16", "vasp_std"]`.
     pub command: Vec<String>,
-    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
     pub environment: BTreeMap<String, String>,
-    /// Version of VASP, `"5.4.4"`: it cannot be asked, and each output is compared with this. Needed.
+    /// Version of VASP, `"5.4.4"`. VASP cannot report it before a calculation; each output is checked against
+    /// it. Required.
     pub version: String,
-    /// Directory of the POTCAR files: `Al_pv/POTCAR`, `POTCAR.Al_pv` or `Al_pv`. Needed.
+    /// Directory of the POTCAR files: `Al_pv/POTCAR`, `POTCAR.Al_pv` or `Al_pv`. Required.
     pub pseudopotentials: PathBuf,
-    /// The potential of each element that may occur: `{ Al = "Al", Fe = "Fe_pv" }`. Needed.
+    /// The potential of each element that may occur: `{ Al = "Al", Fe = "Fe_pv" }`. Required.
     pub variants: BTreeMap<Species, String>,
-    /// Kinetic energy of the fastest plane wave, eV (`ENCUT`).
+    /// Plane-wave cutoff, eV (`ENCUT`).
     pub cutoff: f64,
-    /// Largest distance of k-points, Å⁻¹, 2π included; the mesh is Γ-centred.
+    /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
     pub k_spacing: f64,
-    /// Occupation of states near the Fermi level (`ISMEAR`).
+    /// Occupation function of the electronic states (`ISMEAR`).
     pub smearing: Smearing,
-    /// Its width, eV (`SIGMA`).
+    /// Width of the smearing, eV (`SIGMA`).
     pub smearing_width: f64,
-    /// Whether the two spins have their own densities (`ISPIN`).
+    /// Whether the calculation is spin-polarised (`ISPIN`).
     pub spin: bool,
-    /// Initial magnetic moment by element, μ_B; 1 for all others (`MAGMOM`).
+    /// Initial magnetic moment of each element, μ_B (`MAGMOM`). Default: 1.
     pub moments: Moments,
-    /// Largest change of the energy in the last electronic step, eV (`EDIFF`).
+    /// Tolerance of the energy in the last electronic step, eV (`EDIFF`).
     pub energy_tolerance: f64,
-    /// Most electronic steps (`NELM`).
+    /// Maximum number of electronic steps (`NELM`).
     pub steps: u32,
-    /// Space between images in directions that do not repeat, Å.
+    /// Vacuum along non-periodic directions, Å.
     pub vacuum: f64,
-    /// Groups of processors that share the k-points (`KPAR`).
+    /// Number of process groups that share the k-points (`KPAR`).
     pub k_groups: u32,
-    /// Processors that share a band (`NCORE`).
+    /// Number of processes that share a band (`NCORE`).
     pub cores_per_band: u32,
-    /// Further tags of INCAR, part of the protocol: `{ LASPH = ".TRUE." }`.
+    /// Further INCAR tags, part of the protocol: `{ LASPH = ".TRUE." }`.
     pub tags: BTreeMap<String, String>,
 }
 
@@ -109,7 +111,7 @@ impl Settings {
     /// Finds the program and reads the POTCAR files.
     ///
     /// # Errors
-    /// No such program, no such POTCAR or another than its name says, a setting with an impossible value.
+    /// A missing program, a POTCAR file that is missing or does not match its name, an invalid setting.
     pub fn prepare(&self) -> Result<Vasp, SetupError> {
         positive("cutoff", self.cutoff)?;
         positive("k_spacing", self.k_spacing)?;
@@ -142,7 +144,7 @@ impl Settings {
             "VASP, such as [\"mpirun\", \"-np\", \"16\", \"vasp_std\"]",
         )?;
         incar::check(self)?;
-        find::program(&self.command[0])?;
+        executable::find(&self.command[0])?;
         let potcars = self.variants.iter().map(|(species, variant)| {
             Ok((*species, Potcar::find(&self.pseudopotentials, *species, variant)?))
         });
@@ -150,7 +152,7 @@ impl Settings {
     }
 }
 
-/// VASP, ready to be used.
+/// A configured VASP.
 #[derive(Clone, Debug)]
 pub struct Vasp {
     settings: Settings,
@@ -160,19 +162,20 @@ pub struct Vasp {
 impl Vasp {
     fn potcar(&self, species: Species) -> Result<&Potcar, SetupError> {
         self.potcars.get(&species).ok_or_else(|| {
-            let reason = format!("none is chosen; name one in `variants`, such as {species} = \"{species}\"");
+            let reason =
+                format!("none is selected; name one in `variants`, such as {species} = \"{species}\"");
             SetupError::Pseudopotential { species, reason }
         })
     }
 }
 
-impl Code for Vasp {
+impl DftBackend for Vasp {
     fn identity(&self) -> Value {
         let potcar = |(species, potcar): (&Species, &Potcar)| {
             (species.symbol(), json!({ "title": potcar.title, "hash": potcar.hash }))
         };
         let pseudopotentials: BTreeMap<&str, Value> = self.potcars.iter().map(potcar).collect();
-        // Destructured, so that a new setting is not forgotten here.
+        // Destructure, so that a new setting cannot be forgotten here.
         let Settings {
             command: _,
             environment: _,
@@ -193,7 +196,7 @@ impl Code for Vasp {
             tags,
         } = &self.settings;
         json!({
-            "code": "vasp", "version": version, "recipe": RECIPE, "functional": "PBE", "precision": "Accurate",
+            "code": "vasp", "version": version, "recipe": INPUT_VERSION, "functional": "PBE", "precision": "Accurate",
             "cutoff": cutoff, "k_spacing": k_spacing, "smearing": smearing, "smearing_width": smearing_width,
             "spin": spin, "moments": moments, "energy_tolerance": energy_tolerance, "vacuum": vacuum, "tags": tags,
             "pseudopotentials": pseudopotentials,
@@ -204,49 +207,55 @@ impl Code for Vasp {
         species.iter().try_for_each(|species| self.potcar(*species).map(drop))
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        let (poscar, order) = poscar(&enclosed.structure)?;
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
+        let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
+        let (poscar, order) = poscar(&padded.structure)?;
         let mut potcar = Vec::new();
         for species in order.chunk_by(|a, b| structure.species[*a] == structure.species[*b]) {
             let part = self.potcar(structure.species[species[0]]);
-            potcar.extend(&part.map_err(|error| FailureClass::BadInput.because(error.to_string()))?.content);
+            potcar.extend(
+                &part.map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?.content,
+            );
         }
-        let moments = moments::initial(structure, &self.settings.moments, remedies);
+        let moments = moments::initial(structure, &self.settings.moments, adjustments);
         let moments: Vec<f64> = order.iter().map(|atom| moments[*atom]).collect();
         let k_spacing = self.settings.k_spacing;
         let files = [
             ("POSCAR", poscar),
             ("POTCAR", potcar),
-            ("INCAR", incar::incar(&self.settings, &moments, remedies).into_bytes()),
-            ("KPOINTS", incar::kpoints(enclosed.mesh(k_spacing), k_spacing).into_bytes()),
+            ("INCAR", incar::incar(&self.settings, &moments, adjustments).into_bytes()),
+            ("KPOINTS", incar::kpoints(padded.mesh(k_spacing), k_spacing).into_bytes()),
         ];
         Ok(Input {
             files: files.map(|(name, content)| (name.to_owned(), content)).into(),
             command: self.settings.command.clone(),
-            environment: program::environment(&self.settings.environment),
+            environment: version_query::environment(&self.settings.environment),
             ..Input::default()
         })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
-        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        let (_, order) = poscar(&enclosed.structure)?;
-        let calculated = result::read(&enclosed.structure, &order, &self.settings.version, directory, exit)?;
-        Ok(enclosed.seen_from_outside(calculated))
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+        let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
+        let (_, order) = poscar(&padded.structure)?;
+        let calculated = result::read(&padded.structure, &order, &self.settings.version, directory, exit)?;
+        Ok(padded.without_padding_stress(calculated))
     }
 
     fn size(&self, structure: &Structure) -> Size {
         let Settings { vacuum, k_spacing, .. } = self.settings;
         let potcars = structure.species.iter().filter_map(|species| self.potcars.get(species));
-        lattice::size(structure, vacuum, k_spacing, potcars.map(|potcar| potcar.valence).sum())
+        padded_structure::size(structure, vacuum, k_spacing, potcars.map(|potcar| potcar.valence).sum())
     }
 }
 
-/// POSCAR and the order of its atoms.
+/// POSCAR, and the order of its atoms.
 fn poscar(structure: &Structure) -> Result<(Vec<u8>, Vec<usize>), Failure> {
     let mut text = Vec::new();
     let order = write_poscar(&mut text, structure, &structure.formula())
-        .map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+        .map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
     Ok((text, order))
 }

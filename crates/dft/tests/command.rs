@@ -1,13 +1,16 @@
-//! A shell script that makes labels, from the structure to the numbers.
+//! A shell script as labelling command, from the structure to the results.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use atoms::{Cell, Structure};
-use dft::{Calculated, Code, Exit, Failure, FailureClass, PassedEnvironment, Remedy, Settings, SetupError};
+use dft::{
+    DftBackend, Exit, Failure, FailureClass, PassedEnvironment, Results, RetryAdjustment, Settings,
+    SetupError,
+};
 
-/// Takes the columns of the structure and adds the label; the words after `exit` are its code.
+/// Copies the columns of the structure and adds the label; exits with the given code.
 const SCRIPT: &str = r#"
 { head -n 1 structure.extxyz
   sed -n 2p structure.extxyz | sed 's/pos:R:3/pos:R:3:forces:R:3:magmoms:R:1/' | tr '\n' ' '
@@ -41,14 +44,14 @@ fn settings(directory: &Path, info: &str, code: u8) -> dft::command::Settings {
     }
 }
 
-/// Writes the input, runs the command, reads what it left.
+/// Writes the input, runs the command and reads the output.
 fn run(
-    code: &dyn Code,
+    code: &dyn DftBackend,
     structure: &Structure,
-    remedies: &[Remedy],
+    adjustments: &[RetryAdjustment],
     place: &Path,
-) -> Result<Calculated, Failure> {
-    let input = code.input(structure, &BTreeSet::from_iter(remedies.iter().copied()))?;
+) -> Result<Results, Failure> {
+    let input = code.input(structure, &BTreeSet::from_iter(adjustments.iter().copied()))?;
     for (name, content) in &input.files {
         std::fs::write(place.join(name), content).unwrap();
     }
@@ -58,7 +61,7 @@ fn run(
     code.read(structure, place, Exit::Code(status.code().unwrap()))
 }
 
-fn label(info: &str, code: u8) -> Result<Calculated, Failure> {
+fn label(info: &str, code: u8) -> Result<Results, Failure> {
     let (home, place) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     run(&settings(home.path(), info, code).prepare().unwrap(), &oxide(), &[], place.path())
 }
@@ -67,9 +70,9 @@ fn label(info: &str, code: u8) -> Result<Calculated, Failure> {
 fn a_script_makes_a_label() {
     let (home, place) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let code = settings(home.path(), INFO, 0).prepare().unwrap();
-    let remedies = [Remedy::OtherMoments, Remedy::MoreSteps];
-    let calculated = run(&code, &oxide(), &remedies, place.path()).unwrap();
-    let expected = Calculated {
+    let adjustments = [RetryAdjustment::OtherMoments, RetryAdjustment::MoreSteps];
+    let calculated = run(&code, &oxide(), &adjustments, place.path()).unwrap();
+    let expected = Results {
         energy: -1.625,
         energy_without_smearing: Some(-1.5),
         forces: vec![[0.5, -0.25, 1e-3]; 3],
@@ -166,9 +169,9 @@ fn the_identity_is_that_of_command_files_and_version() {
 #[test]
 fn calculations_read_the_files_that_were_hashed() {
     let home = tempfile::tempdir().unwrap();
-    let more = |code: &dyn Code| code.input(&oxide(), &BTreeSet::new()).unwrap().files["more"].clone();
+    let more = |code: &dyn DftBackend| code.input(&oxide(), &BTreeSet::new()).unwrap().files["more"].clone();
     let code = settings(home.path(), "energy=1", 0).prepare().unwrap();
-    // Who has begun goes on with what there was; who begins now is of another protocol.
+    // A running campaign keeps the files it started with; a new one has another protocol.
     let new = settings(home.path(), "energy=2", 0).prepare().unwrap();
     assert_eq!([more(&code), more(&new)], [b"energy=1", b"energy=2"]);
     assert_ne!(new.identity(), code.identity());

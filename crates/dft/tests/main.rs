@@ -1,4 +1,4 @@
-//! Tests of DFT codes that need none of them.
+//! Tests that need no DFT code.
 
 mod command;
 mod vasp;

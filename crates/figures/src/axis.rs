@@ -1,108 +1,110 @@
-//! An axis: from where to where, how, and what its values are.
+//! The axes of a panel.
 
 use crate::ticks::{self, Tick};
 
-/// How values are laid out.
+/// The mapping of values to positions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scale {
-    /// Evenly.
+    /// Linear.
     Linear,
-    /// By their logarithms.
+    /// Logarithmic.
     Logarithmic,
 }
 
-/// One side of a panel.
+/// An axis with its range and ticks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Axis {
-    /// What its values are, with their unit.
+    /// The quantity with its unit.
     pub title: String,
-    /// How they are laid out.
+    /// The mapping of values to positions.
     pub scale: Scale,
-    /// Least.
+    /// Lower end.
     pub low: f64,
-    /// Largest.
+    /// Upper end.
     pub high: f64,
     ticks: Vec<Tick>,
-    speaks: bool,
+    has_labels: bool,
 }
 
-/// Ticks that have words, about.
-const TICKS: usize = 5;
+/// Approximate number of labelled ticks.
+const DEFAULT_TICKS: usize = 5;
 
 impl Axis {
-    /// An axis with even ticks. What is not a range of finite numbers, above zero if the scale is logarithmic, becomes one.
+    /// An axis with automatic ticks. Replaces an invalid range: not finite, empty, or not positive on a
+    /// logarithmic scale.
     pub fn new(title: &str, scale: Scale, low: f64, high: f64) -> Self {
         let (low, high) = range(scale, low, high);
-        let ticks = ticks::of(scale, low, high, TICKS);
-        Self { title: title.into(), scale, low, high, ticks, speaks: true }
+        let ticks = ticks::choose(scale, low, high, DEFAULT_TICKS);
+        Self { title: title.into(), scale, low, high, ticks, has_labels: true }
     }
 
-    /// An axis of things that have names and no order: the first is at ½, the next at 1½ and so on.
-    pub fn of_names(title: &str, names: &[String]) -> Self {
-        let tick = |(k, name): (usize, &String)| Tick { at: k as f64 + 0.5, words: name.clone() };
+    /// A categorical axis: the first category is centred at ½, the next at 1½, and so on.
+    pub fn categorical(title: &str, names: &[String]) -> Self {
+        let tick = |(k, name): (usize, &String)| Tick { position: k as f64 + 0.5, label: name.clone() };
         let ticks = names.iter().enumerate().map(tick).collect();
         let high = names.len().max(1) as f64;
-        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, speaks: true }
+        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, has_labels: true }
     }
 
-    /// An axis of bins, each as wide as the next, with words at these places: 1 is the end of the first bin.
-    pub fn of_bins(title: &str, bins: usize, words: impl IntoIterator<Item = (f64, String)>) -> Self {
-        let ticks = words.into_iter().map(|(at, words)| Tick { at, words }).collect();
+    /// An axis of equally wide bins with labels at these positions; 1 is the end of the first bin.
+    pub fn binned(title: &str, bins: usize, words: impl IntoIterator<Item = (f64, String)>) -> Self {
+        let ticks = words.into_iter().map(|(position, label)| Tick { position, label }).collect();
         let high = bins.max(1) as f64;
-        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, speaks: true }
+        Self { title: title.into(), scale: Scale::Linear, low: 0.0, high, ticks, has_labels: true }
     }
 
-    /// The same with about so many ticks.
+    /// Sets the approximate number of ticks.
     pub fn with_ticks(mut self, number: usize) -> Self {
-        self.ticks = ticks::of(self.scale, self.low, self.high, number);
+        self.ticks = ticks::choose(self.scale, self.low, self.high, number);
         self
     }
 
-    /// The same with another title.
-    pub fn titled(mut self, title: &str) -> Self {
+    /// Sets the title.
+    pub fn with_title(mut self, title: &str) -> Self {
         title.clone_into(&mut self.title);
         self
     }
 
-    /// The same without ticks.
-    pub fn bare(mut self) -> Self {
+    /// Removes the ticks.
+    pub fn without_ticks(mut self) -> Self {
         self.ticks.clear();
         self
     }
 
-    /// The same without words: another panel has the same axis.
-    pub fn silent(mut self) -> Self {
-        self.speaks = false;
+    /// Removes title and tick labels, for an axis shared with another panel.
+    pub fn without_labels(mut self) -> Self {
+        self.has_labels = false;
         self
     }
 
-    /// Where a value is: 0 at the beginning, 1 at the end. What has no place is far before the beginning.
-    pub fn place(&self, value: f64) -> f64 {
+    /// Relative position of a value: 0 at the start, 1 at the end. Values without a position are far before the
+    /// start.
+    pub fn position(&self, value: f64) -> f64 {
         let of = |x: f64| if self.scale == Scale::Linear { x } else { x.ln() };
-        let place = (of(value) - of(self.low)) / (of(self.high) - of(self.low));
-        if place.is_nan() { -FAR } else { place.clamp(-FAR, FAR) }
+        let position = (of(value) - of(self.low)) / (of(self.high) - of(self.low));
+        if position.is_nan() { -MAX_POSITION } else { position.clamp(-MAX_POSITION, MAX_POSITION) }
     }
 
-    /// Its ticks.
+    /// The ticks.
     pub(crate) fn ticks(&self) -> &[Tick] {
         &self.ticks
     }
 
-    /// Whether it has words.
-    pub(crate) fn speaks(&self) -> bool {
-        self.speaks
+    /// Whether title and tick labels are drawn.
+    pub(crate) fn has_labels(&self) -> bool {
+        self.has_labels
     }
 }
 
-/// What is farther outside than so many lengths of the axis is there.
-const FAR: f64 = 10.0;
+/// Positions are clamped to this many axis lengths.
+const MAX_POSITION: f64 = 10.0;
 
 fn range(scale: Scale, low: f64, high: f64) -> (f64, f64) {
     let is_usable = |x: f64| x.is_finite() && (scale == Scale::Linear || x > 0.0);
     match (is_usable(low), is_usable(high)) {
         (true, true) if low < high => (low, high),
         (true, true) if low == high && scale == Scale::Logarithmic => (low / 2.0, low * 2.0),
-        // A single value: where it is zero, nothing says on which side others would be, and quantities are rarely negative.
+        // A single value at zero has no scale; assume positive values, because quantities are rarely negative.
         (true, true) if low == 0.0 && high == 0.0 => (0.0, 1.0),
         (true, true) if low == high => (low - 0.1 * low.abs(), low + 0.1 * low.abs()),
         _ if scale == Scale::Logarithmic => (0.1, 10.0),
@@ -117,10 +119,13 @@ mod tests {
     #[test]
     fn places_are_shares_of_the_axis() {
         let axis = Axis::new("x", Scale::Linear, -1.0, 3.0);
-        assert_eq!([-1.0, 0.0, 3.0, 5.0].map(|x| axis.place(x)), [0.0, 0.25, 1.0, 1.5]);
+        assert_eq!([-1.0, 0.0, 3.0, 5.0].map(|x| axis.position(x)), [0.0, 0.25, 1.0, 1.5]);
         let axis = Axis::new("x", Scale::Logarithmic, 0.01, 100.0);
-        assert!((axis.place(1.0) - 0.5).abs() < 1e-12 && (axis.place(0.1) - 0.25).abs() < 1e-12);
-        assert_eq!([0.0, -1.0, f64::NAN, f64::INFINITY].map(|x| axis.place(x)), [-FAR, -FAR, -FAR, FAR]);
+        assert!((axis.position(1.0) - 0.5).abs() < 1e-12 && (axis.position(0.1) - 0.25).abs() < 1e-12);
+        assert_eq!(
+            [0.0, -1.0, f64::NAN, f64::INFINITY].map(|x| axis.position(x)),
+            [-MAX_POSITION, -MAX_POSITION, -MAX_POSITION, MAX_POSITION]
+        );
     }
 
     #[test]

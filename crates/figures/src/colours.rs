@@ -1,10 +1,10 @@
-//! Colours that are told apart by everyone, and in what is printed without colour.
+//! Colours that remain distinguishable with colour blindness and in black-and-white print.
 
 /// Red, green and blue.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Colour(pub u8, pub u8, pub u8);
 
-/// Vermillion, blue and the others are those of Okabe and Ito (2008), which differ also in lightness.
+/// The colours of Okabe and Ito (2008), which also differ in lightness.
 impl Colour {
     /// Vermillion.
     pub const VERMILLION: Self = Self(0xd5, 0x5e, 0x00);
@@ -18,20 +18,20 @@ impl Colour {
     pub const SKY: Self = Self(0x56, 0xb4, 0xe9);
     /// Reddish purple.
     pub const PURPLE: Self = Self(0xcc, 0x79, 0xa7);
-    /// Of words and axes.
+    /// For text and axes.
     pub const INK: Self = Self(0x22, 0x22, 0x22);
-    /// Of lines that only help the eye.
+    /// For guide lines.
     pub const GREY: Self = Self(0x80, 0x80, 0x80);
-    /// The sheet.
+    /// The background.
     pub const WHITE: Self = Self(0xff, 0xff, 0xff);
 }
 
-/// A colour through which what is below is seen.
+/// A colour with opacity.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Paint {
     /// The colour.
     pub colour: Colour,
-    /// From 0 (nothing) to 1 (nothing is seen through it).
+    /// From 0 (invisible) to 1 (opaque).
     pub opacity: f64,
 }
 
@@ -42,7 +42,7 @@ pub struct Stroke {
     pub paint: Paint,
     /// Its width, points.
     pub width: f64,
-    /// Lengths of dashes and gaps by turns, points; empty for a solid line.
+    /// Alternating lengths of dashes and gaps, points; empty for a solid line.
     pub dashes: &'static [f64],
 }
 
@@ -53,7 +53,7 @@ impl From<Colour> for Paint {
 }
 
 impl Colour {
-    /// The same, seen through.
+    /// The colour with this opacity.
     pub fn faint(self, opacity: f64) -> Paint {
         Paint { colour: self, opacity }
     }

@@ -1,59 +1,59 @@
-//! What stands on a sheet.
+//! The items of a figure.
 
-use crate::words::Anchor;
+use crate::rich_text::Anchor;
 use crate::{Colour, Paint, Point, Stroke};
 
-/// A sheet with what was drawn on it, in that order.
+/// A sheet with its items in drawing order.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Figure {
-    /// Its name: letters, digits and hyphens; what is named in an SVG file begins with it.
+    /// Letters, digits and hyphens; the prefix of all identifiers in an SVG file.
     pub name: String,
-    /// Said to those who cannot see it.
+    /// Alternative text for accessibility.
     pub description: String,
-    /// Points.
+    /// Width, points.
     pub width: f64,
-    /// Points.
+    /// Height, points.
     pub height: f64,
-    /// From the bottom up.
+    /// From bottom to top.
     pub items: Vec<Item>,
 }
 
-/// One thing on a sheet.
+/// An item of a figure.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Item {
-    /// Lines from point to point, and what they enclose (by the even-odd rule).
+    /// Polylines and the area they enclose (even-odd rule).
     Shape {
-        /// Several lines make one shape, with holes where they enclose each other.
+        /// Several lines form one shape, with holes where they enclose each other.
         lines: Vec<Vec<Point>>,
-        /// Whether each ends where it begins.
+        /// Whether each line is closed.
         closed: bool,
-        /// What is inside.
+        /// Paint of the area.
         fill: Option<Paint>,
-        /// The lines themselves.
+        /// Stroke of the lines.
         stroke: Option<Stroke>,
-        /// Nothing is seen outside of it.
+        /// Clips the item to this rectangle.
         clip: Option<Rectangle>,
     },
-    /// The same mark at many places.
+    /// One marker at many points.
     Dots {
-        /// Places.
+        /// Where the markers are.
         centres: Vec<Point>,
-        /// Form.
+        /// Shape of the marker.
         marker: Marker,
-        /// Half of its width, points.
+        /// Half its width, points.
         radius: f64,
-        /// Inside.
+        /// Paint of the interior.
         fill: Paint,
-        /// Edge.
+        /// Stroke of the edge.
         stroke: Option<Stroke>,
-        /// Nothing is seen outside of it.
+        /// Clips the item to this rectangle.
         clip: Option<Rectangle>,
     },
-    /// Words.
+    /// Text.
     Text(Text),
 }
 
-/// Form of a mark.
+/// Shape of a marker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Marker {
     /// A disc.
@@ -62,26 +62,26 @@ pub enum Marker {
     Square,
 }
 
-/// A line of words, with `_{below}` and `^{above}`.
+/// A line of text with `_{subscript}` and `^{superscript}`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Text {
-    /// Where it stands: on the base line.
-    pub at: Point,
-    /// What it says.
-    pub words: String,
-    /// Height of the font, points.
+    /// Position on the baseline.
+    pub position: Point,
+    /// The text.
+    pub markup: String,
+    /// Font size, points.
     pub size: f64,
-    /// Which part of it stands at that place.
+    /// Which part of the text is at the position.
     pub anchor: Anchor,
     /// Bold.
     pub bold: bool,
-    /// Turned to be read from below upwards.
-    pub upwards: bool,
+    /// Rotated to read from bottom to top.
+    pub rotated: bool,
     /// Colour.
     pub colour: Colour,
 }
 
-/// A part of a sheet, points.
+/// A rectangle on the sheet, points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rectangle {
     /// Left edge.
@@ -100,27 +100,27 @@ impl Figure {
         Self { name: name.into(), description: description.into(), width, height, items: Vec::new() }
     }
 
-    /// A line from point to point.
+    /// Draws a polyline.
     pub fn line(&mut self, points: Vec<Point>, stroke: Stroke) {
         let lines = vec![points];
         self.items.push(Item::Shape { lines, closed: false, fill: None, stroke: Some(stroke), clip: None });
     }
 
-    /// A filled rectangle.
+    /// Draws a filled rectangle.
     pub fn rectangle(&mut self, place: Rectangle, fill: Paint) {
         let lines = vec![place.corners()];
         self.items.push(Item::Shape { lines, closed: true, fill: Some(fill), stroke: None, clip: None });
     }
 
-    /// Words.
-    pub fn text(&mut self, at: Point, words: &str, anchor: Anchor) -> &mut Text {
+    /// Draws text.
+    pub fn text(&mut self, position: Point, markup: &str, anchor: Anchor) -> &mut Text {
         self.items.push(Item::Text(Text {
-            at,
-            words: words.into(),
+            position,
+            markup: markup.into(),
             size: Text::SIZE,
             anchor,
             bold: false,
-            upwards: false,
+            rotated: false,
             colour: Colour::INK,
         }));
         match self.items.last_mut() {
@@ -131,12 +131,12 @@ impl Figure {
 }
 
 impl Text {
-    /// Of words that do not say otherwise, points.
+    /// Default font size, points.
     pub const SIZE: f64 = 8.0;
 }
 
 impl Rectangle {
-    /// From the upper left one, clockwise.
+    /// The corners, clockwise from the upper left.
     pub fn corners(&self) -> Vec<Point> {
         let Self { x, y, width, height } = *self;
         vec![[x, y], [x + width, y], [x + width, y + height], [x, y + height]]

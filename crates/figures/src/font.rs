@@ -1,4 +1,4 @@
-//! The font: widths of words for the layout, outlines for PNG.
+//! The font: text widths for the layout and outlines for PNG.
 
 use std::sync::LazyLock;
 
@@ -6,10 +6,10 @@ use ttf_parser::{Face, GlyphId, OutlineBuilder};
 
 /// The regular font, TrueType (fonts/README.md).
 pub const REGULAR: &[u8] = include_bytes!("../fonts/report-sans-regular.ttf");
-/// The bold one.
+/// The bold font.
 pub const BOLD: &[u8] = include_bytes!("../fonts/report-sans-bold.ttf");
 
-/// Font families for SVG and HTML: those after the first have the same widths.
+/// Font families for SVG and HTML; the fallbacks have the same widths.
 pub const FAMILY: &str = "'Report Sans', 'Liberation Sans', Arial, Helvetica, sans-serif";
 
 static FACES: LazyLock<[Face<'static>; 2]> =
@@ -19,26 +19,26 @@ fn face(bold: bool) -> &'static Face<'static> {
     &FACES[usize::from(bold)]
 }
 
-/// The glyph of a character; of one that the font does not have, the empty box that fonts have for it.
+/// The glyph of a character, or the font's placeholder box.
 fn glyph(face: &Face<'_>, character: char) -> GlyphId {
     face.glyph_index(character).unwrap_or(GlyphId(0))
 }
 
-/// Width of a character in a font of height 1.
+/// Width of a character at font size 1.
 pub fn advance(character: char, bold: bool) -> f64 {
     let face = face(bold);
     let advance = face.glyph_hor_advance(glyph(face, character)).unwrap_or_default();
     f64::from(advance) / f64::from(face.units_per_em())
 }
 
-/// Draws the outline of a character in units of [`units`].
+/// Draws the outline of a character, in font units ([`units`]).
 pub fn outline(character: char, bold: bool, builder: &mut dyn OutlineBuilder) {
     let face = face(bold);
-    // A space has none.
+    // A space has no outline.
     let _ = face.outline_glyph(glyph(face, character), builder);
 }
 
-/// Height of the font in the units of its outlines.
+/// Font units per font size.
 pub fn units() -> f64 {
     f64::from(face(false).units_per_em())
 }
@@ -56,7 +56,7 @@ mod tests {
 
     #[test]
     fn widths_are_those_of_arial() {
-        // Widths of the metrics that Helvetica, Arial and Liberation Sans share, in thousandths of the height.
+        // Widths shared by Helvetica, Arial and Liberation Sans, in thousandths of the font size.
         for (character, bold, width) in
             [('a', false, 556), ('i', false, 222), ('W', false, 944), (' ', false, 278), ('a', true, 556)]
         {

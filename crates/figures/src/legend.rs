@@ -1,24 +1,24 @@
-//! What marks and colours mean.
+//! Legends.
 
 use crate::{Anchor, Figure, Item, Marker, Paint, Rectangle, Stroke, Text, width};
 
-/// A sample of what is explained.
+/// The sample of a legend entry.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Key {
+pub enum LegendKey {
     /// A filled box.
     Area(Paint),
     /// A line.
     Line(Stroke),
-    /// A mark.
+    /// A marker.
     Dot(Marker, Paint),
 }
 
-/// Width of a sample, and the gap behind words, points.
+/// Width of a sample and gap between entries, points.
 const SAMPLE: f64 = 14.0;
 const GAP: f64 = 12.0;
 
-/// Samples and their words in a row that ends at `right`; `base` is the line on which the words stand.
-pub fn legend(figure: &mut Figure, [right, base]: [f64; 2], keys: &[(Key, &str)]) {
+/// Draws entries in a row that ends at `right`, with the text on the baseline `base`.
+pub fn legend(figure: &mut Figure, [right, base]: [f64; 2], keys: &[(LegendKey, &str)]) {
     let of = |words: &str| SAMPLE + 4.0 + Text::SIZE * width(words, false);
     let whole =
         keys.iter().map(|(_, words)| of(words)).sum::<f64>() + GAP * keys.len().saturating_sub(1) as f64;
@@ -30,12 +30,12 @@ pub fn legend(figure: &mut Figure, [right, base]: [f64; 2], keys: &[(Key, &str)]
     }
 }
 
-fn draw(figure: &mut Figure, key: Key, place: Rectangle) {
+fn draw(figure: &mut Figure, key: LegendKey, place: Rectangle) {
     let middle = place.y + 0.5 * place.height;
     match key {
-        Key::Area(paint) => figure.rectangle(place, paint),
-        Key::Line(stroke) => figure.line(vec![[place.x, middle], [place.right(), middle]], stroke),
-        Key::Dot(marker, fill) => {
+        LegendKey::Area(paint) => figure.rectangle(place, paint),
+        LegendKey::Line(stroke) => figure.line(vec![[place.x, middle], [place.right(), middle]], stroke),
+        LegendKey::Dot(marker, fill) => {
             let centres = vec![[place.x + 0.5 * place.width, middle]];
             figure.items.push(Item::Dots { centres, marker, radius: 2.2, fill, stroke: None, clip: None });
         }

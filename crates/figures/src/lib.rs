@@ -1,6 +1,6 @@
-//! Figures for print: a [`Figure`] is a list of shapes and words on a sheet measured in points (1/72 inch), which becomes SVG
-//! with words as words, or PNG. [`Panel`] draws data between two axes onto it. Nothing here knows what the data mean, reads a
-//! file or looks for a font: the one that PNG needs is in the program.
+//! Figures for print. A [`Figure`] is a list of shapes and texts on a sheet measured in points (1/72 inch); it
+//! is written as SVG, where text stays text, or as PNG. [`Panel`] draws data between two axes onto it. The
+//! crate reads no files: the font that PNG needs is built in.
 
 mod axis;
 mod colours;
@@ -9,19 +9,19 @@ mod font;
 mod legend;
 mod panel;
 mod png;
+mod rich_text;
 mod svg;
 mod ticks;
-mod words;
 
 pub use axis::{Axis, Scale};
 pub use colours::{Colour, Paint, Stroke};
 pub use figure::{Figure, Item, Marker, Rectangle, Text};
 pub use font::{BOLD, FAMILY, REGULAR};
-pub use legend::{Key, legend};
+pub use legend::{LegendKey, legend};
 pub use panel::{Panel, Side};
 pub use png::{PngError, to_png};
+pub use rich_text::{Anchor, escape, plain, to_html, width};
 pub use svg::to_svg;
-pub use words::{Anchor, escape, plain, to_html, width};
 
-/// A place on a sheet or among data: x, y.
+/// A point on a sheet or in data coordinates: x, y.
 pub type Point = [f64; 2];

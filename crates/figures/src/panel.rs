@@ -1,45 +1,45 @@
-//! Data between two axes.
+//! Plots data between two axes.
 
 use crate::axis::Axis;
 use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text};
 
-/// Length of a tick, and of a small one, points.
+/// Length of a major and of a minor tick, points.
 const TICK: f64 = 3.0;
 const SMALL_TICK: f64 = 1.7;
 /// Width of axes and ticks, points.
 const AXIS: f64 = 0.6;
 
-/// A part of a sheet with a horizontal and a vertical axis. What is drawn outside of it is not seen.
+/// A plotting area with a horizontal and a vertical axis. Data outside the area are clipped.
 #[derive(Clone, Debug)]
 pub struct Panel {
-    /// Where it is, without the words at its axes.
-    pub place: Rectangle,
-    /// Horizontal.
+    /// The area without axis labels.
+    pub area: Rectangle,
+    /// Horizontal axis.
     pub x: Axis,
-    /// Vertical.
+    /// Vertical axis.
     pub y: Axis,
     data: Vec<Item>,
 }
 
 impl Panel {
-    /// An empty one.
-    pub fn new(place: Rectangle, x: Axis, y: Axis) -> Self {
-        Self { place, x, y, data: Vec::new() }
+    /// An empty panel.
+    pub fn new(area: Rectangle, x: Axis, y: Axis) -> Self {
+        Self { area, x, y, data: Vec::new() }
     }
 
-    /// Where a pair of values is on the sheet.
-    pub fn at(&self, [x, y]: Point) -> Point {
-        let Rectangle { x: left, width, height, .. } = self.place;
-        [left + width * self.x.place(x), self.place.bottom() - height * self.y.place(y)]
+    /// Converts data coordinates to sheet coordinates.
+    pub fn to_sheet(&self, [x, y]: Point) -> Point {
+        let Rectangle { x: left, width, height, .. } = self.area;
+        [left + width * self.x.position(x), self.area.bottom() - height * self.y.position(y)]
     }
 
-    /// A line through pairs of values.
+    /// Draws a polyline.
     pub fn line(&mut self, points: impl IntoIterator<Item = Point>, stroke: Stroke) {
         self.shape([points], false, None, Some(stroke));
     }
 
-    /// Lines that end where they begin, and what is inside of them.
-    pub fn rings<L: IntoIterator<Item = Point>>(
+    /// Draws closed polygons with their interior.
+    pub fn polygons<L: IntoIterator<Item = Point>>(
         &mut self,
         lines: impl IntoIterator<Item = L>,
         fill: Option<Paint>,
@@ -48,19 +48,19 @@ impl Panel {
         self.shape(lines, true, fill, stroke);
     }
 
-    /// What is between two lines that have the same x: (x, low, high).
+    /// Draws the band between two curves with the same x, given as (x, low, high).
     pub fn band(&mut self, points: &[(f64, f64, f64)], fill: Paint) {
         let upper = points.iter().map(|(x, _, high)| [*x, *high]);
         let lower = points.iter().rev().map(|(x, low, _)| [*x, *low]);
-        self.rings([upper.chain(lower)], Some(fill), None);
+        self.polygons([upper.chain(lower)], Some(fill), None);
     }
 
-    /// A filled box from one pair of values to another.
+    /// Draws a filled box between two corners.
     pub fn bar(&mut self, [x, y]: Point, [to_x, to_y]: Point, fill: Paint) {
-        self.rings([[[x, y], [to_x, y], [to_x, to_y], [x, to_y]]], Some(fill), None);
+        self.polygons([[[x, y], [to_x, y], [to_x, to_y], [x, to_y]]], Some(fill), None);
     }
 
-    /// Marks.
+    /// Draws markers.
     pub fn dots(
         &mut self,
         points: impl IntoIterator<Item = Point>,
@@ -69,28 +69,28 @@ impl Panel {
         fill: impl Into<Paint>,
         stroke: Option<Stroke>,
     ) {
-        let centres: Vec<_> = points.into_iter().map(|point| self.at(point)).collect();
+        let centres: Vec<_> = points.into_iter().map(|point| self.to_sheet(point)).collect();
         if !centres.is_empty() {
-            let (fill, clip) = (fill.into(), Some(self.place));
+            let (fill, clip) = (fill.into(), Some(self.area));
             self.data.push(Item::Dots { centres, marker, radius, fill, stroke, clip });
         }
     }
 
-    /// A dashed line where x has this value.
-    pub fn vertical(&mut self, x: f64) {
+    /// Draws a dashed vertical line at x.
+    pub fn vertical_line(&mut self, x: f64) {
         let (low, high) = (self.y.low, self.y.high);
         self.line([[x, low], [x, high]], Colour::GREY.dashed(0.7));
     }
 
-    /// The same where y has it.
-    pub fn horizontal(&mut self, y: f64) {
+    /// Draws a dashed horizontal line at y.
+    pub fn horizontal_line(&mut self, y: f64) {
         let (low, high) = (self.x.low, self.x.high);
         self.line([[low, y], [high, y]], Colour::GREY.dashed(0.7));
     }
 
-    /// Words at a pair of values, moved by so many points.
-    pub fn words(&mut self, at: Point, [right, down]: Point, words: &str, anchor: Anchor) -> &mut Text {
-        let [x, y] = self.at(at);
+    /// Draws text at data coordinates with an offset in points.
+    pub fn text(&mut self, at: Point, [right, down]: Point, words: &str, anchor: Anchor) -> &mut Text {
+        let [x, y] = self.to_sheet(at);
         let mut sheet = Figure::new("", "", 0.0, 0.0);
         sheet.text([x + right, y + down], words, anchor).size = Text::SIZE - 1.0;
         self.data.append(&mut sheet.items);
@@ -100,32 +100,32 @@ impl Panel {
         }
     }
 
-    /// Says in the middle that there is nothing, and why.
-    pub fn says(&mut self, why: &str) {
-        let Rectangle { x, y, width, height } = self.place;
+    /// Draws a message in the middle of a panel without data.
+    pub fn placeholder(&mut self, why: &str) {
+        let Rectangle { x, y, width, height } = self.area;
         let mut sheet = Figure::new("", "", 0.0, 0.0);
         sheet.text([x + 0.5 * width, y + 0.5 * height], why, Anchor::Middle).colour = Colour::GREY;
         self.data.append(&mut sheet.items);
     }
 
-    /// A letter above the upper left corner, as captions name it.
-    pub fn letter(&mut self, letter: char) {
+    /// Draws the panel letter above the upper left corner.
+    pub fn panel_letter(&mut self, letter: char) {
         let mut sheet = Figure::new("", "", 0.0, 0.0);
-        let text = sheet.text([self.place.x - 24.0, self.place.y - 6.0], &letter.to_string(), Anchor::Start);
+        let text = sheet.text([self.area.x - 24.0, self.area.y - 6.0], &letter.to_string(), Anchor::Start);
         (text.bold, text.size) = (true, 10.0);
         self.data.append(&mut sheet.items);
     }
 
-    /// Draws it: data, then axes with all four sides.
+    /// Draws the data, then the axes with a frame.
     pub fn draw(self, figure: &mut Figure) {
-        let sides = vec![self.place.corners()];
+        let sides = vec![self.area.corners()];
         let stroke = Some(Colour::INK.line(AXIS));
         self.draw_with(figure, Item::Shape { lines: sides, closed: true, fill: None, stroke, clip: None });
     }
 
-    /// Draws it with its lower side only, as the margin of another panel.
+    /// Draws the panel as a marginal plot, with one axis line only.
     pub fn draw_as_margin(self, figure: &mut Figure, side: Side) {
-        let corners = self.place.corners();
+        let corners = self.area.corners();
         let line = match side {
             Side::Below => vec![corners[3], corners[2]],
             Side::Left => vec![corners[3], corners[0]],
@@ -143,36 +143,36 @@ impl Panel {
     }
 
     fn draw_horizontal(&self, figure: &mut Figure) {
-        let bottom = self.place.bottom();
+        let bottom = self.area.bottom();
         for tick in self.x.ticks() {
-            let x = self.place.x + self.place.width * self.x.place(tick.at);
-            let length = if tick.words.is_empty() { SMALL_TICK } else { TICK };
+            let x = self.area.x + self.area.width * self.x.position(tick.position);
+            let length = if tick.label.is_empty() { SMALL_TICK } else { TICK };
             figure.line(vec![[x, bottom], [x, bottom + length]], Colour::INK.line(AXIS));
-            if self.x.speaks() && !tick.words.is_empty() {
-                figure.text([x, bottom + 11.0], &tick.words, Anchor::Middle);
+            if self.x.has_labels() && !tick.label.is_empty() {
+                figure.text([x, bottom + 11.0], &tick.label, Anchor::Middle);
             }
         }
-        if self.x.speaks() {
-            let middle = self.place.x + 0.5 * self.place.width;
+        if self.x.has_labels() {
+            let middle = self.area.x + 0.5 * self.area.width;
             let below = if self.x.ticks().is_empty() { 12.0 } else { 23.0 };
             figure.text([middle, bottom + below], &self.x.title, Anchor::Middle);
         }
     }
 
     fn draw_vertical(&self, figure: &mut Figure) {
-        let (left, mut widest) = (self.place.x, 0.0_f64);
+        let (left, mut widest) = (self.area.x, 0.0_f64);
         for tick in self.y.ticks() {
-            let y = self.place.bottom() - self.place.height * self.y.place(tick.at);
-            let length = if tick.words.is_empty() { SMALL_TICK } else { TICK };
+            let y = self.area.bottom() - self.area.height * self.y.position(tick.position);
+            let length = if tick.label.is_empty() { SMALL_TICK } else { TICK };
             figure.line(vec![[left, y], [left - length, y]], Colour::INK.line(AXIS));
-            if self.y.speaks() && !tick.words.is_empty() {
-                figure.text([left - 5.0, y + 0.35 * Text::SIZE], &tick.words, Anchor::End);
-                widest = widest.max(Text::SIZE * crate::width(&tick.words, false));
+            if self.y.has_labels() && !tick.label.is_empty() {
+                figure.text([left - 5.0, y + 0.35 * Text::SIZE], &tick.label, Anchor::End);
+                widest = widest.max(Text::SIZE * crate::width(&tick.label, false));
             }
         }
-        if self.y.speaks() {
-            let middle = self.place.y + 0.5 * self.place.height;
-            figure.text([left - widest - 10.0, middle], &self.y.title, Anchor::Middle).upwards = true;
+        if self.y.has_labels() {
+            let middle = self.area.y + 0.5 * self.area.height;
+            figure.text([left - widest - 10.0, middle], &self.y.title, Anchor::Middle).rotated = true;
         }
     }
 
@@ -183,19 +183,19 @@ impl Panel {
         fill: Option<Paint>,
         stroke: Option<Stroke>,
     ) {
-        let line = |line: L| -> Vec<Point> { line.into_iter().map(|point| self.at(point)).collect() };
+        let line = |line: L| -> Vec<Point> { line.into_iter().map(|point| self.to_sheet(point)).collect() };
         let lines: Vec<_> = lines.into_iter().map(line).filter(|line| line.len() > 1).collect();
         if !lines.is_empty() {
-            self.data.push(Item::Shape { lines, closed, fill, stroke, clip: Some(self.place) });
+            self.data.push(Item::Shape { lines, closed, fill, stroke, clip: Some(self.area) });
         }
     }
 }
 
-/// The side on which a margin has its line.
+/// The axis line of a marginal plot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Side {
-    /// Below: the margin stands above its panel.
+    /// The lower one, for a plot above its panel.
     Below,
-    /// Left: it stands at the right.
+    /// The left one, for a plot to the right of its panel.
     Left,
 }

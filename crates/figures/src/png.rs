@@ -1,29 +1,29 @@
-//! A figure as PNG: the same items, drawn by tiny-skia with the font of the program.
+//! Writes a figure as PNG with tiny-skia and the built-in font.
 
 use tiny_skia::{FillRule, LineJoin, Mask, PathBuilder, Pixmap, StrokeDash, Transform};
 use ttf_parser::OutlineBuilder;
 
-use crate::words::runs;
+use crate::rich_text::runs;
 use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text, font, width};
 
-/// Points an inch has.
-const POINTS: f64 = 72.0;
+/// Points per inch.
+const POINTS_PER_INCH: f64 = 72.0;
 const METRES: f64 = 0.0254;
 
-/// Why a figure became no image.
+/// Why a figure cannot be rendered.
 #[derive(Debug, thiserror::Error)]
 pub enum PngError {
-    /// Nothing, or more than there is room for.
-    #[error("a figure of {0} × {1} points has no image at {2} dots an inch")]
+    /// The image would be empty or too large.
+    #[error("a figure of {0} × {1} points cannot be rendered at {2} dots per inch")]
     Size(f64, f64, f64),
-    /// The encoder.
+    /// The encoder reports an error.
     #[error("a figure cannot be written as PNG: {0}")]
     Encoding(#[from] png::EncodingError),
 }
 
-/// The bytes of a PNG file with so many dots an inch.
+/// Renders a figure as PNG at this resolution.
 pub fn to_png(figure: &Figure, dots_per_inch: f64) -> Result<Vec<u8>, PngError> {
-    let scale = dots_per_inch / POINTS;
+    let scale = dots_per_inch / POINTS_PER_INCH;
     let size = || PngError::Size(figure.width, figure.height, dots_per_inch);
     let pixels = |length: f64| (scale * length).round() as u32;
     let pixmap = Pixmap::new(pixels(figure.width), pixels(figure.height)).ok_or_else(size)?;
@@ -42,7 +42,7 @@ fn encode(pixmap: &Pixmap, dots_per_inch: f64) -> Result<Vec<u8>, PngError> {
     let per_metre = (dots_per_inch / METRES).round() as u32;
     let unit = png::Unit::Meter;
     encoder.set_pixel_dims(Some(png::PixelDimensions { xppu: per_metre, yppu: per_metre, unit }));
-    // The sheet is white, so nothing is seen through it.
+    // The white background is opaque.
     let colours: Vec<u8> = pixmap.pixels().iter().flat_map(|p| [p.red(), p.green(), p.blue()]).collect();
     encoder.write_header()?.write_image_data(&colours)?;
     Ok(bytes)
@@ -51,7 +51,7 @@ fn encode(pixmap: &Pixmap, dots_per_inch: f64) -> Result<Vec<u8>, PngError> {
 struct Sheet {
     pixmap: Pixmap,
     transform: Transform,
-    /// The last one, since many items have the same.
+    /// The last clip mask, because consecutive items often share one.
     clip: Option<(Rectangle, Mask)>,
 }
 
@@ -85,7 +85,7 @@ impl Sheet {
         self.set_clip(clip);
         let mask = self.clip.as_ref().filter(|_| clip.is_some()).map(|(_, mask)| mask);
         if let Some(paint) = fill {
-            let (rule, paint) = (FillRule::EvenOdd, of(paint));
+            let (rule, paint) = (FillRule::EvenOdd, to_skia_paint(paint));
             self.pixmap.fill_path(&path, &paint, rule, self.transform, mask);
         }
         if let Some(Stroke { paint, width, dashes }) = stroke {
@@ -96,7 +96,7 @@ impl Sheet {
                 dash: StrokeDash::new(dashes, 0.0),
                 ..tiny_skia::Stroke::default()
             };
-            self.pixmap.stroke_path(&path, &of(paint), &stroke, self.transform, mask);
+            self.pixmap.stroke_path(&path, &to_skia_paint(paint), &stroke, self.transform, mask);
         }
     }
 
@@ -115,31 +115,31 @@ impl Sheet {
     }
 
     fn text(&mut self, text: &Text) {
-        let Text { at: [x, y], words, size, anchor, bold, upwards, colour } = text;
-        let length = size * width(words, *bold);
+        let Text { position: [x, y], markup, size, anchor, bold, rotated, colour } = text;
+        let length = size * width(markup, *bold);
         let mut pen = match anchor {
             Anchor::Start => 0.0,
             Anchor::Middle => -0.5 * length,
             Anchor::End => -length,
         };
-        let turn = if *upwards { -90.0 } else { 0.0 };
-        let place = Transform::from_translate(*x as f32, *y as f32).pre_rotate(turn);
+        let angle = if *rotated { -90.0 } else { 0.0 };
+        let place = Transform::from_translate(*x as f32, *y as f32).pre_rotate(angle);
         let mut builder = Glyphs { builder: PathBuilder::new(), place, scale: 0.0, at: [0.0; 2] };
-        for run in runs(words) {
-            let size = size * run.level.scale();
+        for run in runs(markup) {
+            let size = size * run.script.scale();
             builder.scale = size / font::units();
             for character in run.text.chars() {
-                builder.at = [pen, run.level.drop() * text.size];
+                builder.at = [pen, run.script.baseline_shift() * text.size];
                 font::outline(character, *bold, &mut builder);
                 pen += size * font::advance(character, *bold);
             }
         }
-        // Letters overlap nowhere, and their holes are turned the other way: either rule fills them alike.
+        // Glyphs do not overlap and their holes have the opposite orientation, so both fill rules agree.
         self.path(builder.builder, Some((*colour).into()), None, None);
     }
 }
 
-/// Puts outlines of characters where they stand on the sheet.
+/// Transforms glyph outlines to sheet coordinates.
 struct Glyphs {
     builder: PathBuilder,
     place: Transform,
@@ -203,7 +203,7 @@ fn add_mark(builder: &mut PathBuilder, marker: Marker, [x, y]: Point, radius: f6
     }
 }
 
-fn of(Paint { colour: Colour(red, green, blue), opacity }: Paint) -> tiny_skia::Paint<'static> {
+fn to_skia_paint(Paint { colour: Colour(red, green, blue), opacity }: Paint) -> tiny_skia::Paint<'static> {
     let mut paint = tiny_skia::Paint { anti_alias: true, ..tiny_skia::Paint::default() };
     paint.set_color_rgba8(red, green, blue, (255.0 * opacity).round() as u8);
     paint

@@ -1,12 +1,12 @@
-//! A figure as SVG 1.1: words stay words, one unit is a point.
+//! Writes a figure as SVG 1.1. Text stays text, and one unit is a point.
 
 use std::fmt::Write;
 
 use crate::font::FAMILY;
-use crate::words::{escape, runs};
+use crate::rich_text::{escape, runs};
 use crate::{Anchor, Colour, Figure, Item, Marker, Paint, Point, Rectangle, Stroke, Text};
 
-/// The SVG element, which may stand in a file or in HTML.
+/// The SVG element, for a file or for HTML.
 pub fn to_svg(figure: &Figure) -> String {
     let Figure { name, description, width, height, items } = figure;
     let (width, height) = (short(*width), short(*height));
@@ -48,28 +48,28 @@ impl Svg<'_> {
     }
 
     fn text(&mut self, text: &Text) {
-        let Text { at: [x, y], words, size, anchor, bold, upwards, colour } = text;
+        let Text { position: [x, y], markup, size, anchor, bold, rotated, colour } = text;
         let anchor = match anchor {
             Anchor::Start => "start",
             Anchor::Middle => "middle",
             Anchor::End => "end",
         };
-        let place = match upwards {
+        let place = match rotated {
             true => format!("transform=\"translate({} {}) rotate(-90)\"", short(*x), short(*y)),
             false => format!("x=\"{}\" y=\"{}\"", short(*x), short(*y)),
         };
         let weight = if *bold { " font-weight=\"bold\"" } else { "" };
-        let (mut spans, mut lowered) = (String::new(), 0.0);
-        for run in runs(words) {
-            let drop = run.level.drop() * size;
+        let (mut spans, mut shifted) = (String::new(), 0.0);
+        for run in runs(markup) {
+            let shift = run.script.baseline_shift() * size;
             let _ = write!(
                 spans,
                 "<tspan dy=\"{}\" font-size=\"{}\">{}</tspan>",
-                short(drop - lowered),
-                short(run.level.scale() * size),
+                short(shift - shifted),
+                short(run.script.scale() * size),
                 escape(run.text)
             );
-            lowered = drop;
+            shifted = shift;
         }
         self.push(&format!(
             "<text {place} text-anchor=\"{anchor}\" fill=\"{}\"{weight}>{spans}</text>",
@@ -151,7 +151,7 @@ fn hexadecimal(Colour(red, green, blue): Colour) -> String {
     format!("#{red:02x}{green:02x}{blue:02x}")
 }
 
-/// Two decimals, and none that say nothing.
+/// At most two decimals, without trailing zeros.
 fn short(number: f64) -> String {
     let text = format!("{number:.2}");
     let text = text.trim_end_matches('0').trim_end_matches('.');

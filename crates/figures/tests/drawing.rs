@@ -1,7 +1,7 @@
-//! A figure with everything in it, as SVG and as PNG.
+//! A figure with every kind of item, as SVG and as PNG.
 
 use figures::{
-    Anchor, Axis, Colour, Figure, Key, Marker, Panel, Rectangle, Scale, Side, legend, to_png, to_svg,
+    Anchor, Axis, Colour, Figure, LegendKey, Marker, Panel, Rectangle, Scale, Side, legend, to_png, to_svg,
 };
 use quick_xml::Reader;
 use quick_xml::events::Event;
@@ -17,14 +17,14 @@ fn figure() -> Figure {
     panel.dots([[1.0, 1.0], [2.0, 1.2]], Marker::Disc, 2.0, Colour::VERMILLION, None);
     panel.dots([[3.0, 1.0]], Marker::Square, 2.0, Colour::BLUE, Some(Colour::WHITE.line(0.5)));
     panel.bar([0.2, 0.0], [0.3, 1.0], Colour::GREEN.into());
-    panel.vertical(1.0);
-    panel.words([1.0, 1.0], [2.0, -2.0], "γ = 1", Anchor::Start);
-    panel.letter('a');
+    panel.vertical_line(1.0);
+    panel.text([1.0, 1.0], [2.0, -2.0], "γ = 1", Anchor::Start);
+    panel.panel_letter('a');
     panel.draw(&mut figure);
     let margin = Rectangle { x: 50.0, y: 20.0, width: 120.0, height: 18.0 };
-    let bare = Axis::new("", Scale::Linear, 0.0, 1.0).bare().silent();
+    let bare = Axis::new("", Scale::Linear, 0.0, 1.0).without_ticks().without_labels();
     Panel::new(margin, bare.clone(), bare).draw_as_margin(&mut figure, Side::Below);
-    legend(&mut figure, [170.0, 12.0], &[(Key::Line(Colour::BLUE.dashed(1.0)), "control & more")]);
+    legend(&mut figure, [170.0, 12.0], &[(LegendKey::Line(Colour::BLUE.dashed(1.0)), "control & more")]);
     figure
 }
 
@@ -59,7 +59,7 @@ fn svg_is_xml_whose_words_are_words() {
     );
 }
 
-/// Colours of a decoded image, by row.
+/// The colours of a decoded image, by row.
 fn decoded(bytes: &[u8]) -> (u32, u32, Vec<[u8; 3]>) {
     let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
     let mut colours = vec![0; reader.output_buffer_size().unwrap()];
@@ -75,13 +75,13 @@ fn png_shows_the_same_and_needs_no_font() {
     let (width, height, pixels) = decoded(&image);
     assert_eq!((width, height), (400, 300));
     let at = |x: f64, y: f64| pixels[(2.0 * y) as usize * 400 + (2.0 * x) as usize];
-    // γ = 1 is in the middle of the axis; the first disc is there, half way up.
+    // γ = 1 is in the middle of the axis, and so is the first disc, halfway up.
     assert_eq!(at(110.0, 75.0), [0xd5, 0x5e, 0x00]);
     assert_eq!(at(2.0, 2.0), [0xff; 3]);
-    // The band is seen through, and ends at the upper side of the panel.
+    // The band is translucent and ends at the upper edge of the panel.
     let band = at(165.0, 45.0);
     assert!(band[2] > band[0] && band[0] > 0x80 && at(165.0, 39.0) == [0xff; 3], "{band:?}");
-    // Words: what is dark left of the axis, and below it, beyond the ticks.
+    // Text: dark pixels left of the axis and below it, beyond the ticks.
     let dark = |x: std::ops::Range<u32>, y: std::ops::Range<u32>| {
         let dark = |x, y| pixels[(y * 400 + x) as usize].iter().all(|c| *c < 0x60);
         y.flat_map(|y| x.clone().map(move |x| (x, y))).filter(|(x, y)| dark(*x, *y)).count()

@@ -1,18 +1,18 @@
-//! Everything that determines how a run goes on.
+//! The complete state of a run.
 
 use atoms::Evaluation;
 use serde::{Deserialize, Serialize};
 
 use crate::dynamics::DynamicsError;
-use crate::ramp::VolumeRamp;
 use crate::random::Stream;
 use crate::state::State;
 use crate::thermostat::Thermostat;
+use crate::volume_ramp::VolumeRamp;
 
 /// A run between two steps.
 ///
-/// The last evaluation is part of it, so that going on evaluates nothing twice: a potential with memory
-/// sees each structure once. Encodings must keep every bit of a number (a JSON reader may not).
+/// Includes the last evaluation, so that resuming evaluates nothing twice and a potential with memory sees each
+/// structure once. Encodings must preserve every bit of a number, which JSON readers may not.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Checkpoint {
     /// Structure, velocities, step.
@@ -21,19 +21,19 @@ pub struct Checkpoint {
     pub evaluation: Evaluation,
     /// The thermostat with its dynamical variables.
     pub thermostat: Thermostat,
-    /// The volume ramp, if there is one.
+    /// The volume ramp, if any.
     pub ramp: Option<VolumeRamp>,
     /// fs.
     pub time_step: f64,
-    /// Whose random numbers are used. A walk that goes back here gives it a new segment.
+    /// The random stream. A walk that rolls back to this checkpoint gets a new segment.
     pub stream: Stream,
 }
 
 impl Checkpoint {
-    /// Checks lengths and numbers, as a checkpoint may come from a file.
+    /// Checks lengths and values, because a checkpoint may come from a file.
     ///
     /// # Errors
-    /// The first fault found.
+    /// The first fault.
     pub fn validate(&self) -> Result<(), DynamicsError> {
         self.state.structure.validate()?;
         let n = self.state.structure.len();
@@ -49,7 +49,7 @@ impl Checkpoint {
         if !(self.time_step.is_finite() && self.time_step > 0.0) {
             return Err(DynamicsError::TimeStep(self.time_step));
         }
-        if let Some(fault) = self.thermostat.fault(n) {
+        if let Some(fault) = self.thermostat.invalid_setting(n) {
             return Err(DynamicsError::Thermostat(fault));
         }
         match self.ramp {

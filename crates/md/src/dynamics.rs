@@ -5,36 +5,36 @@ use atoms::units::ACCELERATION;
 use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, StructureError};
 
 use crate::checkpoint::Checkpoint;
-use crate::ramp::VolumeRamp;
 use crate::random::Stream;
 use crate::state::{self, State};
 use crate::thermostat::Thermostat;
+use crate::volume_ramp::VolumeRamp;
 
-/// How a run is made, beside where it starts.
+/// The settings of a run, apart from its initial state.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// fs; see [`default_time_step`].
+    /// Time step, fs; see [`default_time_step`].
     pub time_step: f64,
     /// The thermostat.
     pub thermostat: Thermostat,
     /// The volume ramp, if any.
     pub ramp: Option<VolumeRamp>,
-    /// Whose random numbers are used.
+    /// The random stream.
     pub stream: Stream,
-    /// Skin of the neighbour list, Å; has no influence on the numbers.
+    /// Skin of the neighbour list, Å; does not affect the results.
     pub skin: f64,
 }
 
-/// Why a run cannot start or go on. After an error in a step, go back to a checkpoint.
+/// Why a run cannot start or continue. After an error in a step, continue from a checkpoint.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum DynamicsError {
-    /// The structure became unusable.
+    /// The structure became invalid.
     #[error(transparent)]
     Structure(#[from] StructureError),
     /// The potential failed.
     #[error(transparent)]
     Potential(#[from] PotentialError),
-    /// NaN or infinity from the potential.
+    /// The potential returned NaN or infinity.
     #[error("the potential gives an energy or force that is not finite on atom {atom} at step {step}")]
     NotFinite {
         /// Index of the atom.
@@ -55,10 +55,10 @@ pub enum DynamicsError {
     /// A time step that is not positive.
     #[error("the time step is {0} fs: it must be positive and finite")]
     TimeStep(f64),
-    /// Numbers of the thermostat that make no sense.
+    /// Invalid thermostat settings.
     #[error("thermostat: {0}")]
     Thermostat(&'static str),
-    /// Numbers of the volume ramp that make no sense.
+    /// Invalid settings of the volume ramp.
     #[error("the volume ramp goes from {from} V₀ to {to} V₀: both, and V₀, must be positive and finite")]
     Ramp {
         /// V/V₀ at the start.
@@ -70,8 +70,8 @@ pub enum DynamicsError {
 
 /// A running simulation.
 ///
-/// Velocity Verlet (Swope et al., J. Chem. Phys. 76, 637 (1982)), with a Nosé–Hoover chain round it, or BAOAB
-/// with Langevin. The volume ramp acts between drift and evaluation, so that each step has one evaluation.
+/// Velocity Verlet (Swope et al., J. Chem. Phys. 76, 637 (1982)), optionally with a Nosé–Hoover chain, or BAOAB
+/// with Langevin. The volume ramp acts between drift and evaluation, so each step has one evaluation.
 #[derive(Clone, Debug)]
 pub struct Dynamics {
     now: Checkpoint,
@@ -80,10 +80,10 @@ pub struct Dynamics {
 }
 
 impl Dynamics {
-    /// Starts a run, with one evaluation of `potential`.
+    /// Starts a run with one evaluation of `potential`.
     ///
     /// # Errors
-    /// If state or settings make no sense or the potential cannot evaluate the structure.
+    /// If state or settings are invalid or the potential cannot evaluate the structure.
     pub fn new(
         state: State,
         settings: Settings,
@@ -98,10 +98,10 @@ impl Dynamics {
         Ok(dynamics)
     }
 
-    /// Goes on from a checkpoint without any evaluation. `cutoff` of the potential and `skin` in Å.
+    /// Resumes from a checkpoint without an evaluation. `cutoff` of the potential and `skin` in Å.
     ///
     /// # Errors
-    /// If the checkpoint is not consistent, see [`Checkpoint::validate`].
+    /// If the checkpoint is inconsistent, see [`Checkpoint::validate`].
     pub fn resume(checkpoint: Checkpoint, cutoff: f64, skin: f64) -> Result<Self, DynamicsError> {
         checkpoint.validate()?;
         let masses = state::masses(&checkpoint.state.structure.species);
@@ -110,10 +110,10 @@ impl Dynamics {
         Ok(Self { now: checkpoint, masses, neighbours })
     }
 
-    /// Makes one step, with one evaluation of `potential`.
+    /// Makes one step with one evaluation of `potential`.
     ///
     /// # Errors
-    /// If the structure or the forces became unusable. The state is then between two steps.
+    /// If the structure or the forces became invalid. The state is then between two steps.
     pub fn step(&mut self, potential: &mut dyn Potential) -> Result<(), DynamicsError> {
         let half = 0.5 * self.now.time_step;
         self.thermostat_half_step();
@@ -134,7 +134,7 @@ impl Dynamics {
         Ok(())
     }
 
-    /// Everything needed to go on from here.
+    /// The state from which the run can resume.
     pub fn checkpoint(&self) -> &Checkpoint {
         &self.now
     }
@@ -159,7 +159,7 @@ impl Dynamics {
         &self.neighbours
     }
 
-    /// Masses, [n], u.
+    /// Masses, `[n]`, u.
     pub fn masses(&self) -> &[f64] {
         &self.masses
     }
@@ -169,7 +169,7 @@ impl Dynamics {
         state::kinetic_energy(&self.now.state.velocities, &self.masses)
     }
 
-    /// Degrees of freedom of the kinetic energy under the thermostat in use.
+    /// Degrees of freedom of the kinetic energy for this thermostat.
     pub fn degrees_of_freedom(&self) -> usize {
         self.now.thermostat.degrees_of_freedom(self.masses.len())
     }
@@ -179,14 +179,14 @@ impl Dynamics {
         state::temperature(self.kinetic_energy(), self.degrees_of_freedom())
     }
 
-    /// What stays constant without a volume ramp, eV: K + E, with a Nosé–Hoover chain its energy too;
-    /// `None` with Langevin.
+    /// The quantity conserved without a volume ramp, eV: K + E plus the energy of a Nosé–Hoover chain; `None`
+    /// with Langevin.
     pub fn conserved_energy(&self) -> Option<f64> {
         let thermostat = self.now.thermostat.energy(self.degrees_of_freedom())?;
         Some(self.kinetic_energy() + self.now.evaluation.energy() + thermostat)
     }
 
-    /// Scales all velocities, to put heat in or take it out.
+    /// Scales all velocities to add or remove heat.
     pub fn scale_velocities(&mut self, factor: f64) {
         self.now.state.velocities.iter_mut().for_each(|v| *v = scale(*v, factor));
     }

@@ -1,5 +1,5 @@
-//! Molecular dynamics: velocity Verlet, Langevin (BAOAB) and Nosé–Hoover chains, counter-based random
-//! numbers, the volume ramp, and checkpoints from which a run continues bit for bit.
+//! Molecular dynamics: velocity Verlet, Langevin (BAOAB) and Nosé–Hoover chains, counter-based random numbers,
+//! volume ramps, and checkpoints from which a run resumes bit for bit.
 //!
 //! ```text
 //!  Checkpoint ──resume──▶ Dynamics ──step(potential)──▶ Dynamics ──checkpoint()──▶ Checkpoint
@@ -10,15 +10,15 @@
 mod checkpoint;
 mod dynamics;
 mod nose_hoover;
-mod ramp;
 mod random;
 mod state;
 mod thermostat;
+mod volume_ramp;
 
 pub use checkpoint::Checkpoint;
 pub use dynamics::{Dynamics, DynamicsError, Settings, default_time_step};
 pub use nose_hoover::NoseHooverChain;
-pub use ramp::{VolumeRamp, scale_volume};
-pub use random::{Purpose, Stream, philox};
+pub use random::{Stream, StreamId, philox};
 pub use state::{State, kinetic_energy, masses, maxwell_boltzmann, momentum, temperature};
 pub use thermostat::{Langevin, Thermostat};
+pub use volume_ramp::{VolumeRamp, scale_volume};

@@ -6,13 +6,13 @@ use serde::{Deserialize, Serialize};
 /// Weights of the fourth-order Suzuki–Yoshida factorisation, w = 1 / (2 − 2^(1/3)).
 const SUZUKI_YOSHIDA: [f64; 3] = [1.351_207_191_959_657_8, -1.702_414_383_919_315_3, 1.351_207_191_959_657_8];
 
-/// A chain of thermostats, each on the one before it, the first on the atoms.
+/// A chain of thermostats: the first acts on the atoms, each other on its predecessor.
 ///
-/// Masses Q₁ = g k_B T t², Q_k = k_B T t² with the damping time t and g degrees of freedom
-/// (Martyna, Klein & Tuckerman, J. Chem. Phys. 97, 2635 (1992)).
+/// Masses Q₁ = g k_B T t², Q_k = k_B T t² with the damping time t and g degrees of freedom (Martyna, Klein &
+/// Tuckerman, J. Chem. Phys. 97, 2635 (1992)).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NoseHooverChain {
-    /// K.
+    /// Temperature, K.
     pub temperature: f64,
     /// Damping time t, fs.
     pub damping_time: f64,
@@ -31,10 +31,10 @@ impl NoseHooverChain {
         Self { temperature, damping_time, positions: vec![0.0; length], velocities: vec![0.0; length] }
     }
 
-    /// Moves the chain by half of `time_step` (fs) and returns the factor that scales the atoms' velocities.
+    /// Propagates the chain by half of `time_step` (fs). Returns the factor for the atoms' velocities.
     ///
-    /// `kinetic_energy` of the atoms in eV. The symmetric factorisation of Martyna, Tuckerman, Tobias & Klein,
-    /// Mol. Phys. 87, 1117 (1996), with the Suzuki–Yoshida weights above.
+    /// `kinetic_energy` of the atoms in eV. Uses the symmetric factorisation of Martyna, Tuckerman, Tobias &
+    /// Klein, Mol. Phys. 87, 1117 (1996), with the Suzuki–Yoshida weights above.
     pub fn half_step(&mut self, kinetic_energy: f64, degrees_of_freedom: usize, time_step: f64) -> f64 {
         let mut factor = 1.0;
         for weight in SUZUKI_YOSHIDA {
@@ -49,7 +49,8 @@ impl NoseHooverChain {
         factor
     }
 
-    /// The chain's part of the conserved energy, eV: Σ ½ Q_k (dη_k/dt)² + g k_B T η₁ + k_B T Σ_{k≥2} η_k.
+    /// The energy of the chain, eV: Σ ½ Q_k (dη_k/dt)² + g k_B T η₁ + k_B T Σ_{k≥2} η_k. Part of the conserved
+    /// energy.
     pub fn energy(&self, degrees_of_freedom: usize) -> f64 {
         let thermal = BOLTZMANN * self.temperature;
         let positions = self.positions.iter().zip(&self.velocities).enumerate();
@@ -73,7 +74,7 @@ impl NoseHooverChain {
         }
     }
 
-    /// Half of `time` for the velocity of link `k`: friction from the next link round the force G_k.
+    /// Advances the velocity of link `k` by half of `time`: friction from the next link around the force G_k.
     fn kick(&mut self, k: usize, kinetic_energy: f64, degrees_of_freedom: usize, time: f64) {
         let friction = self.velocities.get(k + 1).map_or(1.0, |next| (-0.25 * time * next).exp());
         let acceleration =

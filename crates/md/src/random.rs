@@ -1,26 +1,26 @@
-//! Counter-based random numbers: each is a pure function of what it is for, so that nothing has to
-//! be stored to repeat or continue a sequence.
+//! Counter-based random numbers: pure functions of their counters, so that repeating or continuing a sequence
+//! needs no stored state.
 
 use serde::{Deserialize, Serialize};
 
-/// What a random number is for; different purposes never share numbers.
+/// The use of a random number; different uses never share numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[repr(u32)]
-pub enum Purpose {
+pub enum StreamId {
     /// Maxwell–Boltzmann velocities at the start of a walk.
     InitialVelocities = 0,
     /// The random force of the Langevin thermostat.
     Langevin = 1,
 }
 
-/// The random numbers of one segment of one walk.
+/// The random stream of one segment of a walk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stream {
     /// The campaign's random seed.
     pub rng_seed: u64,
     /// The walk.
     pub walk: u32,
-    /// The segment of the walk, raised when it goes back to a checkpoint.
+    /// The segment of the walk, incremented by each return to a checkpoint.
     pub segment: u32,
 }
 
@@ -32,12 +32,12 @@ impl Stream {
 
     /// Three independent standard normal numbers.
     ///
-    /// Walk and segment are enciphered with the random seed into the 64-bit key of the stream: two of
-    /// n streams share a key with probability n²/2⁶⁵. Within a stream no two numbers are the same draw.
-    pub fn normals(&self, step: u64, atom: u32, purpose: Purpose) -> [f64; 3] {
+    /// The random seed encrypts walk and segment into the 64-bit key of the stream: two of n streams share a
+    /// key with probability n²/2⁶⁵. Within a stream no two calls share a draw.
+    pub fn normals(&self, step: u64, atom: u32, id: StreamId) -> [f64; 3] {
         let [k0, k1, ..] = philox([self.walk, self.segment, 0, 0], words(self.rng_seed));
         let [low, high] = words(step);
-        let block = |b: u32| philox([low, high, atom, 2 * purpose as u32 + b], [k0, k1]);
+        let block = |b: u32| philox([low, high, atom, 2 * id as u32 + b], [k0, k1]);
         let ([x, y], [z, _]) = (box_muller(block(0)), box_muller(block(1)));
         [x, y, z]
     }
@@ -70,7 +70,7 @@ pub fn philox(counter: [u32; 4], key: [u32; 2]) -> [u32; 4] {
     x
 }
 
-/// Low and high half.
+/// Lower and upper half.
 fn words(x: u64) -> [u32; 2] {
     [x as u32, (x >> 32) as u32]
 }
@@ -98,7 +98,7 @@ mod tests {
         let mut sums = [0.0; 4];
         let mut correlation = 0.0;
         for step in 0..n {
-            let [x, y, z] = stream.normals(step, 5, Purpose::Langevin);
+            let [x, y, z] = stream.normals(step, 5, StreamId::Langevin);
             for value in [x, y, z] {
                 (1..=4).for_each(|power| sums[power as usize - 1] += value.powi(power));
             }
@@ -115,17 +115,17 @@ mod tests {
 
     #[test]
     fn each_part_of_the_address_changes_the_numbers() {
-        let base = Stream::new(1, 2, 3).normals(4, 5, Purpose::Langevin);
-        assert_eq!(base, Stream::new(1, 2, 3).normals(4, 5, Purpose::Langevin));
+        let base = Stream::new(1, 2, 3).normals(4, 5, StreamId::Langevin);
+        assert_eq!(base, Stream::new(1, 2, 3).normals(4, 5, StreamId::Langevin));
         for other in [
-            Stream::new(2, 2, 3).normals(4, 5, Purpose::Langevin),
-            Stream::new(1 << 32 | 1, 2, 3).normals(4, 5, Purpose::Langevin),
-            Stream::new(1, 3, 3).normals(4, 5, Purpose::Langevin),
-            Stream::new(1, 2, 4).normals(4, 5, Purpose::Langevin),
-            Stream::new(1, 2, 3).normals(5, 5, Purpose::Langevin),
-            Stream::new(1, 2, 3).normals(1 << 32 | 4, 5, Purpose::Langevin),
-            Stream::new(1, 2, 3).normals(4, 6, Purpose::Langevin),
-            Stream::new(1, 2, 3).normals(4, 5, Purpose::InitialVelocities),
+            Stream::new(2, 2, 3).normals(4, 5, StreamId::Langevin),
+            Stream::new(1 << 32 | 1, 2, 3).normals(4, 5, StreamId::Langevin),
+            Stream::new(1, 3, 3).normals(4, 5, StreamId::Langevin),
+            Stream::new(1, 2, 4).normals(4, 5, StreamId::Langevin),
+            Stream::new(1, 2, 3).normals(5, 5, StreamId::Langevin),
+            Stream::new(1, 2, 3).normals(1 << 32 | 4, 5, StreamId::Langevin),
+            Stream::new(1, 2, 3).normals(4, 6, StreamId::Langevin),
+            Stream::new(1, 2, 3).normals(4, 5, StreamId::InitialVelocities),
         ] {
             assert!((0..3).all(|k| base[k] != other[k]));
         }

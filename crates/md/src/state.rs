@@ -1,20 +1,20 @@
-//! Positions, velocities, and the kinetic energy and temperature they give.
+//! Positions and velocities, with kinetic energy and temperature.
 
 use atoms::cell::{add, dot, scale, sub};
 use atoms::units::{ACCELERATION, BOLTZMANN};
 use atoms::{Species, Structure, Vec3};
 use serde::{Deserialize, Serialize};
 
-use crate::random::{Purpose, Stream};
+use crate::random::{Stream, StreamId};
 
 /// A point in phase space.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct State {
     /// Species, positions (never wrapped), cell.
     pub structure: Structure,
-    /// Velocities, [n], Å/fs.
+    /// Velocities, `[n]`, Å/fs.
     pub velocities: Vec<Vec3>,
-    /// Number of steps made.
+    /// Number of completed steps.
     pub step: u64,
 }
 
@@ -26,7 +26,7 @@ impl State {
     }
 }
 
-/// Standard atomic weights, [n], u.
+/// Standard atomic weights, `[n]`, u.
 pub fn masses(species: &[Species]) -> Vec<f64> {
     species.iter().map(|species| species.mass()).collect()
 }
@@ -49,10 +49,10 @@ pub fn temperature(kinetic_energy: f64, degrees_of_freedom: usize) -> f64 {
     2.0 * kinetic_energy / (degrees_of_freedom as f64 * BOLTZMANN)
 }
 
-/// Velocities (Å/fs) from the Maxwell–Boltzmann distribution at `temperature` (K), without motion of the
-/// centre of mass and scaled to exactly that temperature with 3n − 3 degrees of freedom.
+/// Velocities (Å/fs) from the Maxwell–Boltzmann distribution at `temperature` (K), without centre-of-mass
+/// motion and scaled to exactly that temperature with 3n − 3 degrees of freedom.
 ///
-/// A single atom is left at rest.
+/// A single atom is at rest.
 pub fn maxwell_boltzmann(species: &[Species], temperature: f64, stream: &Stream) -> Vec<Vec3> {
     let masses = masses(species);
     let mut velocities: Vec<Vec3> = masses
@@ -60,7 +60,7 @@ pub fn maxwell_boltzmann(species: &[Species], temperature: f64, stream: &Stream)
         .enumerate()
         .map(|(atom, mass)| {
             let width = (BOLTZMANN * temperature * ACCELERATION / mass).sqrt();
-            scale(stream.normals(0, atom as u32, Purpose::InitialVelocities), width)
+            scale(stream.normals(0, atom as u32, StreamId::InitialVelocities), width)
         })
         .collect();
     let drift = scale(momentum(&velocities, &masses), 1.0 / masses.iter().sum::<f64>());
@@ -86,7 +86,7 @@ mod tests {
         let energy = kinetic_energy(&velocities, &masses);
         assert!((temperature(energy, 3 * 3999) - 750.0).abs() < 1e-9);
         assert!(momentum(&velocities, &masses).iter().all(|p| p.abs() < 1e-9));
-        // Each element holds half of the energy; a sum of 6000 squares scatters by √(2/6000).
+        // Each element has half of the energy; a sum of 6000 squares fluctuates by √(2/6000).
         let hydrogen: f64 =
             (0..4000).step_by(2).map(|i| kinetic_energy(&velocities[i..=i], &masses[i..=i])).sum();
         assert!((2.0 * hydrogen / energy - 1.0).abs() < 5.0 * f64::sqrt(2.0 / 6000.0));

@@ -1,26 +1,26 @@
-//! What keeps the temperature.
+//! Thermostats.
 
 use atoms::units::{ACCELERATION, BOLTZMANN};
 use atoms::{Vec3, cell};
 use serde::{Deserialize, Serialize};
 
 use crate::nose_hoover::NoseHooverChain;
-use crate::random::{Purpose, Stream};
+use crate::random::{Stream, StreamId};
 
-/// The thermostat, with its dynamical variables.
+/// The thermostat with its dynamical variables.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub enum Thermostat {
     /// Constant energy.
     #[default]
     None,
-    /// Friction and random force, integrated by BAOAB.
+    /// Friction and a random force, integrated by BAOAB.
     Langevin(Langevin),
     /// Deterministic, canonical for ergodic systems.
     NoseHooverChain(NoseHooverChain),
 }
 
 impl Thermostat {
-    /// Degrees of freedom of the kinetic energy of `atoms` atoms: 3n, less 3 where momentum is conserved.
+    /// Degrees of freedom of the kinetic energy of `atoms` atoms: 3n, minus 3 where momentum is conserved.
     pub fn degrees_of_freedom(&self, atoms: usize) -> usize {
         match self {
             Self::Langevin(_) => 3 * atoms,
@@ -28,7 +28,7 @@ impl Thermostat {
         }
     }
 
-    /// Moves a Nosé–Hoover chain by half of `time_step` (fs); returns the factor for the velocities.
+    /// Propagates a Nosé–Hoover chain by half of `time_step` (fs). Returns the factor for the velocities.
     pub fn half_step(&mut self, kinetic_energy: f64, degrees_of_freedom: usize, time_step: f64) -> f64 {
         match self {
             Self::NoseHooverChain(chain) => chain.half_step(kinetic_energy, degrees_of_freedom, time_step),
@@ -36,7 +36,7 @@ impl Thermostat {
         }
     }
 
-    /// The thermostat's part of the conserved energy, eV; `None` where nothing is conserved.
+    /// The thermostat's contribution to the conserved energy, eV; `None` where nothing is conserved.
     pub fn energy(&self, degrees_of_freedom: usize) -> Option<f64> {
         match self {
             Self::None => Some(0.0),
@@ -45,8 +45,8 @@ impl Thermostat {
         }
     }
 
-    /// What is wrong with the numbers for `atoms` atoms, if anything is.
-    pub(crate) fn fault(&self, atoms: usize) -> Option<&'static str> {
+    /// The first invalid setting for `atoms` atoms.
+    pub(crate) fn invalid_setting(&self, atoms: usize) -> Option<&'static str> {
         let positive = |x: f64| x.is_finite() && x > 0.0;
         match self {
             Self::None => None,
@@ -76,15 +76,15 @@ impl Thermostat {
 /// m dv = F dt − m Γ v dt + √(2 m Γ k_B T) dW.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Langevin {
-    /// K.
+    /// Temperature, K.
     pub temperature: f64,
     /// Γ, 1/fs.
     pub friction: f64,
 }
 
 impl Langevin {
-    /// The exact Ornstein–Uhlenbeck move over `time_step` (fs), the O of BAOAB
-    /// (Leimkuhler & Matthews, Appl. Math. Res. Express 2013, 34): v ← e^(−Γt) v + √((1 − e^(−2Γt)) k_B T / m) ξ.
+    /// The exact Ornstein–Uhlenbeck step over `time_step` (fs), the O of BAOAB (Leimkuhler & Matthews, Appl.
+    /// Math. Res. Express 2013, 34): v ← e^(−Γt) v + √((1 − e^(−2Γt)) k_B T / m) ξ.
     pub fn exchange(
         &self,
         velocities: &mut [Vec3],
@@ -96,7 +96,7 @@ impl Langevin {
         let kept = (-self.friction * time_step).exp();
         let heat = -(-2.0 * self.friction * time_step).exp_m1() * BOLTZMANN * self.temperature * ACCELERATION;
         for (atom, (v, mass)) in velocities.iter_mut().zip(masses).enumerate() {
-            let noise = stream.normals(step, atom as u32, Purpose::Langevin);
+            let noise = stream.normals(step, atom as u32, StreamId::Langevin);
             *v = cell::add(cell::scale(*v, kept), cell::scale(noise, (heat / mass).sqrt()));
         }
     }

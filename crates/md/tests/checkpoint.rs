@@ -1,4 +1,4 @@
-//! A run that stops and goes on is the run that never stopped, bit for bit.
+//! A run that stops and resumes equals one that never stopped, bit for bit.
 
 use md::{
     Checkpoint, Dynamics, DynamicsError, Langevin, NoseHooverChain, Settings, State, Thermostat, VolumeRamp,
@@ -45,7 +45,7 @@ fn resumed_runs_are_the_same_bit_for_bit() {
             assert_eq!(potential.evaluations, 201);
 
             let mut potential = LennardJones::argon();
-            // Another skin: the list is built at other times.
+            // Another skin, so that the list is rebuilt at other times.
             let mut resumed = Dynamics::resume(postcard::from_bytes(&stored).unwrap(), 7.0, 0.25).unwrap();
             assert_eq!(potential.evaluations, 0);
             (97..200).for_each(|_| resumed.step(&mut potential).unwrap());

@@ -1,4 +1,4 @@
-//! What an integrator must keep: energy to second order, momentum, and the way back.
+//! Properties that an integrator must conserve: energy to second order, momentum, and time reversal.
 
 use md::{Checkpoint, Dynamics, NoseHooverChain, Thermostat, VolumeRamp};
 
@@ -69,7 +69,7 @@ fn reversed_velocities_lead_back() {
     }
 }
 
-/// Velocities stay as the cell grows, so that the energy changes by dE = −Σ_kk virial_kk dε alone.
+/// Velocities do not change as the cell grows, so the energy changes by dE = −Σ_kk virial_kk dε only.
 #[test]
 fn expansion_changes_the_energy_by_the_work_of_the_virial() {
     let (start, mut potential) = warm_argon(2, 20.0, settings(1.0, Thermostat::None), 300);

@@ -35,9 +35,9 @@ fn nose_hoover_kinetic_energy_is_canonical() {
     kinetic_energy_is_canonical(120.0, Thermostat::NoseHooverChain(NoseHooverChain::new(120.0, 200.0, 3)));
 }
 
-/// In a harmonic well BAOAB samples positions exactly at any stable time step, ⟨x²⟩ = k_B T / k, while the
-/// velocities at the end of a step are cold by 1 − (ω Δt)²/4 (Leimkuhler & Matthews, J. Chem. Phys. 138,
-/// 174102 (2013)). Each oscillator is an independent sample, whatever its correlation in time.
+/// In a harmonic well BAOAB samples positions exactly at any stable time step, ⟨x²⟩ = k_B T / k, while
+/// velocities at the end of a step are too cold by 1 − (ω Δt)²/4 (Leimkuhler & Matthews, J. Chem. Phys. 138,
+/// 174102 (2013)). Each oscillator is an independent sample, for any correlation time.
 #[test]
 fn baoab_is_exact_for_harmonic_positions() {
     let (temperature, stiffness) = (300.0, 2.0);

@@ -1,4 +1,4 @@
-//! Opening an archive and reading its arrays.
+//! Opens archives and reads their arrays.
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;
@@ -10,25 +10,25 @@ use npyz::npz::{NpzArchive, file_name_from_array_name};
 use npyz::{DType, Deserialize, TypeChar, TypeRead};
 
 use crate::array::Array;
-use crate::error::{Error, Place};
+use crate::error::{ArrayName, Error};
 use crate::header::Header;
 
-/// Larger arrays than this are taken for damage, bytes.
-const LARGEST: u64 = 1 << 32;
+/// Larger arrays count as corrupt, bytes.
+const MAX_ARRAY_BYTES: u64 = 1 << 32;
 
-/// An open archive. Arrays are read when asked for, and the archive remembers which ones were.
+/// An open archive. Arrays are read on demand, and the archive records which ones were read.
 pub struct Archive<R: Read + Seek = BufReader<File>> {
     path: PathBuf,
     names: BTreeSet<String>,
     zip: RefCell<NpzArchive<R>>,
-    asked: RefCell<BTreeSet<String>>,
+    requested: RefCell<BTreeSet<String>>,
 }
 
 impl Archive {
     /// Opens a file.
     ///
     /// # Errors
-    /// If it cannot be opened or is no archive.
+    /// If it cannot be opened or is not an archive.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let opened = match path.is_dir() {
             true => Err(ErrorKind::IsADirectory.into()),
@@ -40,10 +40,10 @@ impl Archive {
 }
 
 impl<'a> Archive<Cursor<&'a [u8]>> {
-    /// Reads an archive in memory; errors call it `name`.
+    /// Reads an archive in memory; errors refer to it as `name`.
     ///
     /// # Errors
-    /// If the bytes are no archive.
+    /// If the bytes are not an archive.
     pub fn from_bytes(name: impl AsRef<Path>, bytes: &'a [u8]) -> Result<Self, Error> {
         Self::read(name.as_ref(), Cursor::new(bytes))
     }
@@ -54,15 +54,15 @@ impl<R: Read + Seek> Archive<R> {
         let zip = NpzArchive::new(source)
             .map_err(|source| Error::NotAnArchive { path: path.to_owned(), source })?;
         let names = zip.array_names().map(str::to_owned).collect();
-        Ok(Self { path: path.to_owned(), names, zip: zip.into(), asked: RefCell::default() })
+        Ok(Self { path: path.to_owned(), names, zip: zip.into(), requested: RefCell::default() })
     }
 
-    /// The file, as errors name it.
+    /// The path, as used in errors.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Whether there is an array of that name.
+    /// Whether the archive has this array.
     pub fn contains(&self, key: &str) -> bool {
         self.names.contains(key)
     }
@@ -72,26 +72,26 @@ impl<R: Read + Seek> Archive<R> {
         self.names.iter().map(String::as_str)
     }
 
-    /// Names of the arrays that were neither asked for nor ignored.
-    pub fn not_asked(&self) -> Vec<&str> {
-        let asked = self.asked.borrow();
-        self.names().filter(|name| !asked.contains(*name)).collect()
+    /// Names of the arrays that were neither read nor ignored.
+    pub fn unread(&self) -> Vec<&str> {
+        let requested = self.requested.borrow();
+        self.names().filter(|name| !requested.contains(*name)).collect()
     }
 
-    /// Notes that an array needs no reading.
+    /// Marks an array as not needed.
     pub fn ignore(&self, key: &str) {
-        self.asked.borrow_mut().insert(key.to_owned());
+        self.requested.borrow_mut().insert(key.to_owned());
     }
 
     /// An error about the values of an array.
     pub fn invalid(&self, key: &str, found: impl ToString, expected: impl ToString) -> Error {
-        self.place(key).wrong_value(found, expected)
+        self.array_name(key).wrong_value(found, expected)
     }
 
-    /// Floating-point numbers, integers and truth values of any usual type, as `f64`.
+    /// Numbers of any common type (floats, integers, booleans) as `f64`.
     ///
     /// # Errors
-    /// If there is no such array, or it is damaged or of another type.
+    /// If the array is missing, corrupt or of another type.
     pub fn numbers(&self, key: &str) -> Result<Array<f64>, Error> {
         let entry = self.entry(key)?;
         match entry.kind() {
@@ -117,11 +117,11 @@ impl<R: Read + Seek> Archive<R> {
         }
     }
 
-    /// Single-precision numbers as stored.
+    /// Single-precision numbers.
     ///
     /// # Errors
     /// As [`Archive::numbers`].
-    pub fn singles(&self, key: &str) -> Result<Array<f32>, Error> {
+    pub fn floats_f32(&self, key: &str) -> Result<Array<f32>, Error> {
         let entry = self.entry(key)?;
         match entry.kind() {
             (TypeChar::Float, 4) => entry.decode(|value: f32| value),
@@ -129,7 +129,7 @@ impl<R: Read + Seek> Archive<R> {
         }
     }
 
-    /// Texts, stored as bytes (`S`) or as characters (`U`), without their NUL padding.
+    /// Strings, stored as bytes (`S`) or characters (`U`), without NUL padding.
     ///
     /// # Errors
     /// As [`Archive::numbers`].
@@ -144,37 +144,37 @@ impl<R: Read + Seek> Archive<R> {
         Ok(array?.data)
     }
 
-    fn place(&self, key: &str) -> Place {
-        Place { path: self.path.clone(), key: key.to_owned() }
+    fn array_name(&self, key: &str) -> ArrayName {
+        ArrayName { path: self.path.clone(), key: key.to_owned() }
     }
 
-    /// Header and data of an array, the length of the data being what the header announces.
+    /// Header and data of an array; the length of the data matches the header.
     ///
-    /// The header is compared with the size that the archive announces before any of the data are read, and these are
-    /// read to their end, where the archive compares their checksum.
+    /// Compares the header with the size in the archive before reading any data, and reads the data to their
+    /// end, where the archive verifies the checksum.
     fn entry(&self, key: &str) -> Result<Entry, Error> {
-        let place = self.place(key);
+        let name = self.array_name(key);
         if !self.contains(key) {
-            return Err(place.missing());
+            return Err(name.missing());
         }
         self.ignore(key);
-        let readable = |error: &dyn ToString| place.damaged(error.to_string(), "a readable array");
+        let readable = |error: &dyn ToString| name.damaged(error.to_string(), "a readable array");
         let mut zip = self.zip.borrow_mut();
         let file = zip.zip_archive().by_name(&file_name_from_array_name(key));
         let mut file = file.map_err(|error| readable(&error))?;
         let stored = file.size();
-        if stored > LARGEST {
-            return Err(place.damaged(format!("{stored} bytes"), "at most 4 GiB"));
+        if stored > MAX_ARRAY_BYTES {
+            return Err(name.damaged(format!("{stored} bytes"), "at most 4 GiB"));
         }
         let header =
-            Header::read(&mut file).map_err(|found| place.damaged(found, "a plain array in .npy format"))?;
+            Header::read(&mut file).map_err(|found| name.damaged(found, "a plain array in .npy format"))?;
         if header.kind.num_bytes().is_none() {
-            return Err(place.wrong_type(header.kind, "numbers or text"));
+            return Err(name.wrong_type(header.kind, "numbers or text"));
         }
         let stored = stored.saturating_sub(header.length);
         let wrong_length = |stored: u64| {
             let found = format!("{stored} bytes of data for shape {:?} of {}", header.shape, header.kind);
-            place.damaged(found, "as many as shape and type need")
+            name.damaged(found, "as many as shape and type need")
         };
         let (items, needed) = header.size().ok_or_else(|| wrong_length(stored))?;
         if needed != stored || (needed == 0 && items > 0) {
@@ -186,15 +186,15 @@ impl<R: Read + Seek> Archive<R> {
             return Err(wrong_length(data.len() as u64));
         }
         if header.fortran_order && header.shape.len() > 1 {
-            return Err(place.wrong_shape(format!("{:?} in Fortran order", header.shape), "C order"));
+            return Err(name.wrong_shape(format!("{:?} in Fortran order", header.shape), "C order"));
         }
-        Ok(Entry { place, header, items, data })
+        Ok(Entry { name, header, items, data })
     }
 }
 
 /// An array as stored.
 struct Entry {
-    place: Place,
+    name: ArrayName,
     header: Header,
     items: usize,
     data: Vec<u8>,
@@ -206,17 +206,17 @@ impl Entry {
     }
 
     fn wrong_type(&self, expected: &str) -> Error {
-        self.place.wrong_type(&self.header.kind, expected)
+        self.name.wrong_type(&self.header.kind, expected)
     }
 
     fn decode<T: Deserialize, U>(self, convert: impl Fn(T) -> U) -> Result<Array<U>, Error> {
-        let Self { place, header, items, data } = self;
-        let readable = |error: &dyn ToString| place.damaged(error.to_string(), "readable data");
+        let Self { name, header, items, data } = self;
+        let readable = |error: &dyn ToString| name.damaged(error.to_string(), "readable data");
         let reader = T::reader(&DType::Plain(header.kind)).map_err(|error| readable(&error))?;
         let mut rest = &data[..];
         let values: Result<Vec<U>, _> =
             (0..items).map(|_| reader.read_one(&mut rest).map(&convert)).collect();
         let data = values.map_err(|error| readable(&error))?;
-        Ok(Array { shape: header.shape, data, place })
+        Ok(Array { shape: header.shape, data, name })
     }
 }

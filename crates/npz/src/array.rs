@@ -1,33 +1,33 @@
-//! An array and what can be asked of it.
+//! An array of an archive.
 
-use crate::error::{Error, Place};
+use crate::error::{ArrayName, Error};
 
-/// An array that was read. The product of the shape is the length of the data.
+/// An array. The product of the shape equals the length of the data.
 #[derive(Debug, Clone)]
 pub struct Array<T> {
-    /// Extents, the last one running fastest; empty for a scalar.
+    /// Dimensions, last one fastest; empty for a scalar.
     pub shape: Vec<usize>,
     /// All values.
     pub data: Vec<T>,
-    pub(crate) place: Place,
+    pub(crate) name: ArrayName,
 }
 
 impl<T> Array<T> {
-    /// The values, if the shape is this one.
+    /// The values, if the array has this shape.
     ///
     /// # Errors
-    /// If the shape is another.
-    pub fn shaped(self, expected: &[usize]) -> Result<Vec<T>, Error> {
+    /// If it has another shape.
+    pub fn with_shape(self, expected: &[usize]) -> Result<Vec<T>, Error> {
         if self.shape == expected {
             return Ok(self.data);
         }
         Err(self.wrong_shape(format!("shape {expected:?}")))
     }
 
-    /// Extents and values of an array of `N` dimensions.
+    /// Shape and values of an array with `N` dimensions.
     ///
     /// # Errors
-    /// If there are more or fewer dimensions, or nothing in them.
+    /// If it has another number of dimensions or is empty.
     pub fn tensor<const N: usize>(self) -> Result<([usize; N], Vec<T>), Error> {
         match <[usize; N]>::try_from(&self.shape[..]) {
             Ok(shape) if !self.data.is_empty() => Ok((shape, self.data)),
@@ -35,11 +35,11 @@ impl<T> Array<T> {
         }
     }
 
-    /// The only value, stored with shape `()` or `(1,)`.
+    /// The only value, of shape `()` or `(1,)`.
     ///
     /// # Errors
-    /// If there are more or none.
-    pub fn single(mut self) -> Result<T, Error> {
+    /// If there is not exactly one value.
+    pub fn into_scalar(mut self) -> Result<T, Error> {
         match (self.data.pop(), self.data.is_empty()) {
             (Some(value), true) => Ok(value),
             _ => Err(self.wrong_shape("a single number")),
@@ -47,18 +47,18 @@ impl<T> Array<T> {
     }
 
     fn wrong_shape(&self, expected: impl ToString) -> Error {
-        self.place.wrong_shape(format!("{:?}", self.shape), expected)
+        self.name.wrong_shape(format!("{:?}", self.shape), expected)
     }
 }
 
 impl<T: Copy + Into<f64>> Array<T> {
-    /// The array itself, if all its numbers are finite.
+    /// The array, if all values are finite.
     ///
     /// # Errors
-    /// Names the first that is not.
+    /// Names the first value that is not finite.
     pub fn finite(self) -> Result<Self, Error> {
         match self.data.iter().map(|&value| value.into()).find(|value| !value.is_finite()) {
-            Some(value) => Err(self.place.wrong_value(format!("partly {value}"), "finite numbers")),
+            Some(value) => Err(self.name.wrong_value(format!("partly {value}"), "finite numbers")),
             None => Ok(self),
         }
     }

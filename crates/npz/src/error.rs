@@ -1,8 +1,8 @@
-//! Why an archive, or one of its arrays, cannot be used.
+//! Errors of archives and arrays.
 
 use std::path::PathBuf;
 
-/// An archive that cannot be opened, or an array that is not as it should be.
+/// An archive that cannot be opened, or an unexpected array.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file cannot be opened or read.
@@ -10,10 +10,10 @@ pub enum Error {
     Open {
         /// The file.
         path: PathBuf,
-        /// What the operating system says.
+        /// The error of the operating system.
         source: std::io::Error,
     },
-    /// The file is no archive, or one that was cut short.
+    /// The file is not an archive, or is truncated.
     #[error("{}: {source}; expected a NumPy .npz archive", path.display())]
     NotAnArchive {
         /// The file.
@@ -21,7 +21,7 @@ pub enum Error {
         /// What is wrong with it.
         source: std::io::Error,
     },
-    /// An array is absent.
+    /// An array is missing.
     #[error("{}: no array '{key}'", path.display())]
     Missing {
         /// The file.
@@ -29,7 +29,7 @@ pub enum Error {
         /// Name of the array.
         key: String,
     },
-    /// An array cannot be read: its checksum, its header or its length is wrong.
+    /// An array is corrupt: wrong checksum, header or length.
     #[error("{}: array '{key}': found {found}, expected {expected}", path.display())]
     Damaged {
         /// The file.
@@ -38,10 +38,10 @@ pub enum Error {
         key: String,
         /// What was found.
         found: String,
-        /// What a sound file would hold.
+        /// What a valid file has.
         expected: String,
     },
-    /// An array has another type.
+    /// An array has an unexpected type.
     #[error("{}: array '{key}': found type {found}, expected {expected}", path.display())]
     Type {
         /// The file.
@@ -50,10 +50,10 @@ pub enum Error {
         key: String,
         /// The type as NumPy writes it, such as `<f8`.
         found: String,
-        /// What would be right.
+        /// The expected type.
         expected: String,
     },
-    /// An array has another shape.
+    /// An array has an unexpected shape.
     #[error("{}: array '{key}': found shape {found}, expected {expected}", path.display())]
     Shape {
         /// The file.
@@ -62,31 +62,31 @@ pub enum Error {
         key: String,
         /// Its shape, such as `[2, 3]`.
         found: String,
-        /// What would be right.
+        /// The expected shape.
         expected: String,
     },
-    /// An array holds other values.
+    /// An array has an invalid value.
     #[error("{}: array '{key}': found {found}, expected {expected}", path.display())]
     Value {
         /// The file.
         path: PathBuf,
         /// Name of the array.
         key: String,
-        /// The value at fault.
+        /// The invalid value.
         found: String,
-        /// What would be right.
+        /// The valid values.
         expected: String,
     },
 }
 
-/// The array that an error is about.
+/// Path and name of the array that an error is about.
 #[derive(Debug, Clone)]
-pub(crate) struct Place {
+pub(crate) struct ArrayName {
     pub path: PathBuf,
     pub key: String,
 }
 
-impl Place {
+impl ArrayName {
     pub fn missing(&self) -> Error {
         let Self { path, key } = self.clone();
         Error::Missing { path, key }

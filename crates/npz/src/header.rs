@@ -1,14 +1,15 @@
-//! The header of an `.npy` file, as NumPy's format specification (NEP 1) gives it.
+//! Parses the header of an `.npy` file as specified by NumPy (NEP 1).
 //!
-//! `npyz` has a parser too, but that one multiplies extents unchecked and takes any Python literal, of which deeply
-//! nested ones overflow the stack. This one takes what NumPy writes: a dictionary of exactly three entries.
+//! `npyz` has a parser too, but it multiplies dimensions without overflow checks and accepts any Python
+//! literal, and deeply nested ones overflow the stack. This parser accepts what NumPy writes: a dictionary of
+//! exactly three entries.
 
 use std::io::Read;
 
 use npyz::TypeStr;
 
-/// Longest header text, bytes. NumPy itself warns of those above 10 000.
-const LONGEST: usize = 1 << 16;
+/// Longest header text, bytes. NumPy warns above 10 000.
+const MAX_HEADER_BYTES: usize = 1 << 16;
 
 /// Type and shape of an array.
 #[derive(Debug)]
@@ -16,12 +17,12 @@ pub(crate) struct Header {
     pub kind: TypeStr,
     pub fortran_order: bool,
     pub shape: Vec<usize>,
-    /// Bytes from the beginning of the file to that of the data.
+    /// Offset of the data in the file, bytes.
     pub length: u64,
 }
 
 impl Header {
-    /// Reads as far as the data begin.
+    /// Reads up to the start of the data.
     pub fn read(mut source: impl Read) -> Result<Self, String> {
         let mut fixed = [0; 8];
         source.read_exact(&mut fixed).map_err(|error| error.to_string())?;
@@ -34,7 +35,7 @@ impl Header {
             2 | 3 => (4, u32::from_le_bytes(bytes(&mut source)?)),
             _ => return Err(format!(".npy format version {major}")),
         };
-        if text_length as usize > LONGEST {
+        if text_length as usize > MAX_HEADER_BYTES {
             return Err(format!("a header of {text_length} bytes"));
         }
         let mut text = vec![0; text_length as usize];
@@ -44,9 +45,9 @@ impl Header {
         Dictionary(&text).header(length)
     }
 
-    /// Number of items and of the bytes they take; none if these do not fit 64 bits.
+    /// Number of items and of bytes; `None` if these overflow 64 bits.
     ///
-    /// Extents of zero count as one on the way, so that no product of a part of the shape overflows either.
+    /// Dimensions of zero count as one in between, so that no partial product overflows.
     pub fn size(&self) -> Option<(usize, u64)> {
         let item = self.kind.num_bytes()?.max(1);
         self.shape.iter().try_fold(item, |product, &extent| product.checked_mul(extent.max(1)))?;
@@ -61,7 +62,7 @@ fn bytes<const N: usize>(source: &mut impl Read) -> Result<[u8; N], String> {
     Ok(bytes)
 }
 
-/// What is left to parse of the text of a header.
+/// The part of the header's text that is not yet parsed.
 struct Dictionary<'a>(&'a str);
 
 impl<'a> Dictionary<'a> {
@@ -108,7 +109,7 @@ impl<'a> Dictionary<'a> {
         Err(format!("a header with '{}' where '{token}' should be", beginning(self.0)))
     }
 
-    /// A quoted text without escapes.
+    /// A quoted string without escapes.
     fn text(&mut self) -> Result<&'a str, String> {
         let quote = if self.take("\"") { '"' } else { '\'' };
         if quote == '\'' {
@@ -160,7 +161,7 @@ impl<'a> Dictionary<'a> {
     }
 }
 
-/// Enough of a text to know it by.
+/// The start of a text, for messages.
 fn beginning(text: &str) -> String {
     text.chars().take(24).collect::<String>().escape_debug().to_string()
 }

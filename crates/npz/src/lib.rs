@@ -1,4 +1,4 @@
-//! Arrays of NumPy `.npz` archives, with every size checked against the data before it is used.
+//! Reads arrays of NumPy `.npz` archives and checks every size against the data before using it.
 //!
 //! ```no_run
 //! # fn read() -> Result<(), npz::Error> {
@@ -11,9 +11,9 @@
 
 mod archive;
 mod array;
+mod checked;
 mod error;
 mod header;
-mod numbers;
 
 pub use archive::Archive;
 pub use array::Array;

@@ -1,4 +1,4 @@
-//! Reading sound archives, and what is said when an array is not the one that was hoped for.
+//! Reading valid archives, and the errors for unexpected arrays.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use proptest::prelude::*;
 
 use crate::common::{archive, array, file};
 
-/// Reads an archive whose only array is `a`.
+/// Reads an archive with the single array `a`.
 fn read<T>(bytes: Vec<u8>, read: impl FnOnce(&Archive<std::io::Cursor<&[u8]>>) -> T) -> T {
     read(&Archive::from_bytes("a.npz", &archive(&[("a", bytes)])).unwrap())
 }
@@ -30,7 +30,7 @@ fn numbers_of_every_type_are_widened() {
         assert_eq!((found.shape, found.data), (vec![2, 1], vec![1.0, 0.0]));
     }
     read(array(&[2], &[1.5_f32, 0.5]), |archive| {
-        assert_eq!(archive.singles("a").unwrap().shaped(&[2]).unwrap(), [1.5, 0.5]);
+        assert_eq!(archive.floats_f32("a").unwrap().with_shape(&[2]).unwrap(), [1.5, 0.5]);
         assert_eq!(archive.floats("a", &[2]).unwrap(), [1.5, 0.5]);
         assert_eq!(archive.tensor("a").unwrap(), ([2], vec![1.5, 0.5]));
     });
@@ -68,7 +68,7 @@ fn an_archive_knows_its_names_and_what_was_asked() {
     assert!(archive.contains("a") && !archive.contains("d"));
     archive.scalar("a").unwrap();
     archive.ignore("c");
-    assert_eq!(archive.not_asked(), ["b"]);
+    assert_eq!(archive.unread(), ["b"]);
 }
 
 #[test]
@@ -91,16 +91,19 @@ fn errors_name_file_key_found_and_expected() {
         for (found, expected) in [
             (message(archive.integers("a")), "found type <f8, expected an array of integers (i4 or i8)"),
             (
-                message(archive.singles("a")),
+                message(archive.floats_f32("a")),
                 "found type <f8, expected an array of single-precision numbers (f4)",
             ),
             (message(archive.strings("a")), "found type <f8, expected text (S or U)"),
-            (message(archive.numbers("a").unwrap().shaped(&[3])), "found shape [2], expected shape [3]"),
+            (message(archive.numbers("a").unwrap().with_shape(&[3])), "found shape [2], expected shape [3]"),
             (
                 message(archive.numbers("a").unwrap().tensor::<2>()),
                 "found shape [2], expected 2 dimensions, none of them empty",
             ),
-            (message(archive.numbers("a").unwrap().single()), "found shape [2], expected a single number"),
+            (
+                message(archive.numbers("a").unwrap().into_scalar()),
+                "found shape [2], expected a single number",
+            ),
             (message(archive.floats("a", &[2])), "found partly NaN, expected finite numbers"),
         ] {
             assert_eq!(found, format!("a.npz: array 'a': {expected}"));
@@ -131,7 +134,7 @@ proptest! {
         let values = &values[..(rows * columns).min(16)];
         prop_assume!(values.len() == rows * columns);
         let bytes = array(&[rows as u64, columns as u64], values);
-        let found = read(bytes, |archive| archive.numbers("a").unwrap().shaped(&[rows, columns]).unwrap());
+        let found = read(bytes, |archive| archive.numbers("a").unwrap().with_shape(&[rows, columns]).unwrap());
         let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
         prop_assert_eq!(bits(&found), bits(values));
     }

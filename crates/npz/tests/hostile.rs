@@ -1,11 +1,11 @@
-//! Archives with sound checksums and hostile headers give errors: no panic, no memory for what is not there.
+//! Archives with valid checksums and hostile headers give errors, without panics or excessive allocation.
 
 use npz::{Archive, Error};
 use proptest::prelude::*;
 
 use crate::common::{archive, array, file};
 
-/// What is said of a file that neither numbers nor texts can be read from.
+/// The error for a file that can be read neither as numbers nor as strings.
 fn refused(bytes: Vec<u8>) -> Option<String> {
     let bytes = archive(&[("a", bytes)]);
     let archive = Archive::from_bytes("hostile.npz", &bytes).unwrap();
@@ -13,7 +13,7 @@ fn refused(bytes: Vec<u8>) -> Option<String> {
         archive.numbers("a").err(),
         archive.strings("a").err(),
         archive.integers("a").err(),
-        archive.singles("a").err(),
+        archive.floats_f32("a").err(),
     ]
     .map(|error| error.as_ref().map(Error::to_string));
     for error in errors.iter().flatten() {
@@ -64,7 +64,7 @@ fn absurd_types_are_errors() {
     }
 }
 
-/// What a parser of all Python literals would take, and how it would end.
+/// Input that a parser of all Python literals would accept or crash on.
 #[test]
 fn other_headers_are_errors() {
     let nested = |open: &str| format!("{{'descr': {}", open.repeat(60_000));
@@ -107,7 +107,7 @@ fn headers_longer_than_their_files_are_errors() {
     assert!(refused([sound, vec![0]].concat()).is_some());
 }
 
-/// The size in the archive's own list agrees with the header; the data do not.
+/// The size in the archive's directory agrees with the header, but the data do not.
 #[test]
 fn archives_that_announce_more_than_they_hold_are_errors() {
     for items in [2_000_000_000_u32, u32::MAX - 100] {
@@ -122,7 +122,7 @@ fn archives_that_announce_more_than_they_hold_are_errors() {
     }
 }
 
-/// Dictionaries that are nearly right.
+/// Dictionaries that are almost valid.
 fn nearly_a_header() -> impl Strategy<Value = String> {
     let extent = prop_oneof![
         (0..12_u64).prop_map(|n| n.to_string()),
@@ -153,7 +153,7 @@ proptest! {
         prop_assert!(refused(file(text.as_bytes(), &[0; 80])).is_some());
     }
 
-    /// Where one is taken, there is as much data as its shape says.
+    /// If a header is accepted, the data match its shape.
     #[test]
     fn near_misses_are_errors_or_harmless(text in nearly_a_header(), length in 0..200_usize) {
         let bytes = archive(&[("a", file(text.as_bytes(), &vec![0; length]))]);

@@ -14,13 +14,13 @@ use crate::setfl::{EamStyle, Setfl};
 
 /// An embedded-atom potential from a setfl file.
 ///
-/// E = Σ_i F_i(ρ_i) + ½ Σ_{i≠j} φ_ij(r_ij) with ρ_i = Σ_{j≠i} ρ_ij(r_ij), where ρ_ij depends on
-/// the element of j (alloy style) or on those of i and j (Finnis–Sinclair style).
-/// Source: M. S. Daw and M. I. Baskes, Phys. Rev. B 29, 6443 (1984); M. W. Finnis and
-/// J. E. Sinclair, Philos. Mag. A 50, 45 (1984).
+/// E = Σ_i F_i(ρ_i) + ½ Σ_{i≠j} φ_ij(r_ij) with ρ_i = Σ_{j≠i} ρ_ij(r_ij),
+/// where ρ_ij depends on the element of j (alloy style) or on those of i and j (Finnis–Sinclair style). Source:
+/// M. S. Daw and M. I. Baskes, Phys. Rev. B 29, 6443 (1984); M. W. Finnis and J. E. Sinclair, Philos. Mag. A
+/// 50, 45 (1984).
 ///
-/// Beyond the largest tabulated density F goes on as a straight line; so do φ and ρ in the last
-/// interval before the cutoff where a table ends short of it.
+/// F is extrapolated linearly beyond the largest tabulated density, and so are φ and ρ in the last interval
+/// before the cutoff where a table ends short of it.
 #[derive(Clone, Debug)]
 pub struct Eam {
     elements: Elements,
@@ -31,7 +31,7 @@ pub struct Eam {
     embedding: Vec<Vec<Cubic>>,
     instructions: Instructions,
     near: NearPairs,
-    /// The element of each atom.
+    /// Element index of each atom.
     kinds: Vec<usize>,
     /// Pair energy, eV, and density at each atom.
     sums: Vec<[f64; 2]>,
@@ -49,7 +49,7 @@ impl Eam {
         Self::load_as(path, style)
     }
 
-    /// Reads a setfl file of a known style, whatever its name.
+    /// Reads a setfl file of the given style, independent of its name.
     pub fn load_as(path: impl AsRef<Path>, style: EamStyle) -> Result<Self, PotentialFileError> {
         Setfl::read(path.as_ref(), style).map(|tables| Self::new(tables, style))
     }
@@ -69,7 +69,7 @@ impl Eam {
         }
     }
 
-    /// F(ρ_i) into the energies, F′(ρ_i) into `embedding_slopes`.
+    /// Adds F(ρ_i) to the energies and writes F′(ρ_i) to `embedding_slopes`.
     fn embed(&mut self, energies: &mut [f64]) {
         self.embedding_slopes.clear();
         for ((energy, kind), [pair_energy, density]) in energies.iter_mut().zip(&self.kinds).zip(&self.sums) {

@@ -1,4 +1,4 @@
-//! The pair terms of the embedded-atom method: densities and pair energies, and, once F′(ρ) is known, forces.
+//! The pair terms of the embedded-atom method: densities and pair energies, and, given F′(ρ), forces.
 
 use atoms::{Evaluation, NeighbourList};
 
@@ -10,19 +10,19 @@ use crate::setfl::{EamStyle, Setfl};
 /// φ(r) and ρ(r) of each ordered pair of elements.
 #[derive(Clone, Debug)]
 pub(crate) struct Functions {
-    /// Å
+    /// Cutoff, Å.
     pub cutoff: f64,
     /// 1 / spacing of r, 1/Å.
     scale: f64,
     elements: usize,
-    /// Intervals of one pair of elements.
+    /// Number of intervals per pair of elements.
     intervals: usize,
-    /// `[(host * elements + source) * intervals + interval]`, and after them one that is zero.
+    /// `[(host * elements + source) * intervals + interval]`, followed by one that is zero.
     pieces: Vec<Piece>,
 }
 
-/// The coefficients of r φ(r), eV Å, and of the density ρ(r) of the source on the host within one interval: what is
-/// needed together lies together.
+/// The coefficients of r φ(r), eV Å, and of the density ρ(r) of the source on the host within one interval,
+/// stored together because they are used together.
 type Piece = [[f64; 2]; 4];
 
 impl Functions {
@@ -44,13 +44,13 @@ impl Functions {
         Self { cutoff: tables.cutoff, scale: 1.0 / tables.distance_spacing, elements, intervals, pieces }
     }
 
-    /// Where those of a host and a source begin.
+    /// Index of the first piece of a host and a source.
     #[inline(always)]
     fn start(&self, host: usize, source: usize) -> usize {
         (host * self.elements + source) * self.intervals
     }
 
-    /// One of the two functions (0: r φ, 1: ρ) in the pieces of eight pairs, at p: its values and derivatives by p.
+    /// Values and derivatives by p of one function (0: r φ, 1: ρ) for eight pairs, each at its piece and p.
     #[inline(always)]
     fn evaluate(&self, function: usize, pieces: &[usize; LANES], p: &Lanes) -> (Lanes, Lanes) {
         let mut c = [NONE; 4];
@@ -69,24 +69,24 @@ impl Functions {
 
 const NONE: Lanes = [0.0; LANES];
 
-/// All pairs within the cutoff, eight together, kept until the densities are known.
+/// All pairs within the cutoff in blocks of eight, kept until the densities are known.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Bonds {
     blocks: Vec<Block>,
-    /// Where the blocks of each atom end.
+    /// End of each atom's blocks.
     ends: Vec<usize>,
 }
 
-/// Eight pairs of an atom; where there are fewer, all is zero and the other atom is itself.
+/// Eight pairs of an atom. Unused lanes are zero and point to the atom itself.
 #[derive(Clone, Copy, Debug)]
 struct Block {
     atoms: [u32; LANES],
     d: [Lanes; 3],
     /// φ′(r) / r, eV/Å².
     pair_slope: Lanes,
-    /// ρ′(r) / r of the other on this atom, 1/Å².
+    /// ρ′(r) / r of the neighbour on this atom, 1/Å².
     slope_here: Lanes,
-    /// ρ′(r) / r of this atom on the other, 1/Å².
+    /// ρ′(r) / r of this atom on the neighbour, 1/Å².
     slope_there: Lanes,
 }
 
@@ -97,7 +97,7 @@ impl Bonds {
     }
 }
 
-/// Pair energies and densities into `sums`, and the list of bonds.
+/// Adds pair energies and densities to `sums` and records the bonds.
 pub(crate) struct AddPairs<'a> {
     pub neighbours: &'a NeighbourList,
     pub functions: &'a Functions,
@@ -115,12 +115,12 @@ impl Pass for AddPairs<'_> {
 }
 
 impl AddPairs<'_> {
-    /// `ONE`: all atoms are of one element.
+    /// `ONE`: all atoms have the same element.
     #[inline(always)]
     fn add<const ONE: bool>(self) {
         let squared_cutoff = self.functions.cutoff * self.functions.cutoff;
         for i in 0..self.kinds.len() {
-            let (later, sites) = (self.neighbours.later(i), self.neighbours.later_sites(i));
+            let (later, sites) = (self.neighbours.later_neighbours_of(i), self.neighbours.later_sites_of(i));
             let (near, atoms) = self.near.collect(i, later, sites, squared_cutoff);
             let mut here = [NONE; 2];
             for (near, atoms) in near.chunks(LANES).zip(atoms.chunks(LANES)) {
@@ -155,11 +155,11 @@ fn columns(i: usize, near: &[[f64; 4]], atoms: &[u32]) -> ([u32; LANES], [Lanes;
     (others, d, squared)
 }
 
-/// Where the functions of eight pairs are looked up.
+/// Table lookups for eight pairs.
 struct Pieces {
-    /// Of the other on this atom.
+    /// Of the neighbour on this atom.
     here: [usize; LANES],
-    /// Of this atom on the other.
+    /// Of this atom on the neighbour.
     there: [usize; LANES],
     p: Lanes,
     /// 1 / r, 1/Å.
@@ -167,7 +167,7 @@ struct Pieces {
 }
 
 impl Pieces {
-    /// Those of `count` pairs; the others are looked up where everything is zero.
+    /// The lookups of `count` pairs; unused lanes point to the zero piece.
     #[inline(always)]
     fn new<const ONE: bool>(
         functions: &Functions,
@@ -200,7 +200,8 @@ impl Pieces {
     }
 }
 
-/// Eight pairs: what forces need of them, half of each one's energy, and the densities here and there.
+/// Processes eight pairs: the data that forces need, half of each pair's energy, and the densities on both
+/// atoms.
 #[inline(always)]
 fn add_block<const ONE: bool>(
     functions: &Functions,
@@ -224,14 +225,14 @@ fn add_block<const ONE: bool>(
     (block, energies, [density_here, density_there])
 }
 
-/// Forces and virial of all bonds, from F′(ρ) of each atom.
+/// Adds forces and virial of all bonds, given F′(ρ) of each atom.
 pub(crate) struct AddForces<'a> {
     pub bonds: &'a Bonds,
     pub embedding_slopes: &'a [f64],
     pub out: &'a mut Evaluation,
 }
 
-/// The components of a symmetric matrix that are summed.
+/// The independent components of a symmetric matrix.
 const UPPER: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)];
 
 impl Pass for AddForces<'_> {

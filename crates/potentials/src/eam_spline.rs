@@ -1,14 +1,13 @@
-//! Piecewise cubic interpolation of the tables of the embedded-atom method.
+//! Piecewise cubic interpolation of embedded-atom tables.
 
-/// Coefficients of c₀ + c₁ p + c₂ p² + c₃ p³, where p counts from a point to the next.
+/// Coefficients of c₀ + c₁ p + c₂ p² + c₃ p³; p is the fraction of the interval.
 pub(crate) type Cubic = [f64; 4];
 
-/// The cubic Hermite pieces through `values` (at least five), one from each value on; from the
-/// last value on a straight line.
+/// The cubic Hermite pieces through `values` (at least five), one per value; the last is a straight line.
 ///
-/// Continuous with its first derivative. The derivative at a point is the five-point difference
-/// f′ = (f₋₂ − 8 f₋₁ + 8 f₊₁ − f₊₂) / 12, next to the ends the three-point one, at the ends the
-/// two-point one: the interpolation for which setfl tables are published.
+/// Continuous with its first derivative. The derivative at a point is the five-point difference f′ = (f₋₂ − 8
+/// f₋₁ + 8 f₊₁ − f₊₂) / 12, next to the ends the three-point one, and at the ends the two-point one. Setfl
+/// tables are published for this interpolation.
 pub(crate) fn cubic_pieces(values: &[f64]) -> Vec<Cubic> {
     let last = values.len() - 1;
     let derivative = |k: usize| match k {
@@ -25,7 +24,7 @@ pub(crate) fn cubic_pieces(values: &[f64]) -> Vec<Cubic> {
     between.chain([[values[last], derivative(last), 0.0, 0.0]]).collect()
 }
 
-/// Which of `pieces` pieces holds `x` (in units of the spacing), and p in it.
+/// The piece that contains `x` (in units of the spacing), and p.
 #[inline]
 pub(crate) fn locate(x: f64, pieces: usize) -> (usize, f64) {
     let k = (x as usize).min(pieces - 1);
@@ -48,7 +47,7 @@ pub(crate) fn slope(c: &Cubic, p: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// Five-point derivatives are exact for quartics, so cubics come back to the last digits.
+    /// Five-point derivatives are exact for quartics, so cubics are reproduced to rounding.
     #[test]
     fn a_cubic_is_reproduced_away_from_the_ends() {
         let f = |x: f64| 1.0 + x * (-0.5 + x * (0.25 - 0.125 * x));

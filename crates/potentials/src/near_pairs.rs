@@ -1,12 +1,12 @@
-//! Neighbours within the cutoff, side by side for vector instructions.
+//! Neighbours within the cutoff, packed for vector instructions.
 
 use atoms::cell::{dot, sub};
 use atoms::{Neighbour, Vec3};
 
-/// How many pairs are worked on together.
+/// Number of pairs that are processed together.
 pub(crate) const LANES: usize = 8;
 
-/// A number of each of eight pairs.
+/// One number for each of eight pairs.
 pub(crate) type Lanes = [f64; LANES];
 
 /// The sum over eight pairs, always in the same order.
@@ -15,10 +15,10 @@ pub(crate) fn sum(x: &Lanes) -> f64 {
     ((x[0] + x[4]) + (x[1] + x[5])) + ((x[2] + x[6]) + (x[3] + x[7]))
 }
 
-/// Which of an atom's neighbours are within the cutoff, found without a branch for each.
+/// Selects the neighbours within the cutoff without a branch per neighbour.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct NearPairs {
-    /// Of all sites of the neighbour list, Å.
+    /// Positions of all sites of the neighbour list, Å.
     pub positions: Vec<Vec3>,
     /// d and d², Å and Å².
     found: Vec<[f64; 4]>,
@@ -26,8 +26,8 @@ pub(crate) struct NearPairs {
 }
 
 impl NearPairs {
-    /// The neighbours of atom `i` closer than the square root of `squared_cutoff`, Å²: d and d², and who they are. They
-    /// stay in the order of the list, so that sums do not depend on what else is in it.
+    /// The neighbours of atom `i` closer than the square root of `squared_cutoff`, Å²: d, d² and their indices.
+    /// They keep the order of the list, so that sums do not depend on what else is in it.
     #[inline(always)]
     pub fn collect(
         &mut self,
@@ -46,7 +46,7 @@ impl NearPairs {
         for (neighbour, site) in neighbours.iter().zip(sites) {
             let d = sub(self.positions[*site as usize], centre);
             let squared = dot(d, d);
-            // Written in any case and counted if it is near: a branch would be guessed wrongly every few pairs.
+            // Write always and count only if near: a branch would be mispredicted every few pairs.
             found[count] = [d[0], d[1], d[2], squared];
             atoms[count] = neighbour.atom;
             count += usize::from(squared < squared_cutoff);

@@ -1,8 +1,8 @@
-//! What the classical potentials share: the elements they know, and pair forces.
+//! Code shared by the classical potentials: supported elements and pair forces.
 
 use atoms::{Evaluation, Neighbour, NeighbourList, PotentialError, Species, Structure, Vec3};
 
-/// The elements of a potential and the place of each in its tables.
+/// The elements of a potential and their indices in its tables.
 #[derive(Clone, Debug)]
 pub(crate) struct Elements {
     species: Vec<Species>,
@@ -26,24 +26,24 @@ impl Elements {
         &self.species
     }
 
-    /// How many there are.
+    /// Number of elements.
     pub(crate) fn len(&self) -> usize {
         self.species.len()
     }
 
-    /// Place of a known element in the tables.
+    /// Index of a supported element in the tables.
     #[inline]
     pub(crate) fn index(&self, species: Species) -> usize {
         usize::from(self.by_atomic_number[usize::from(species.atomic_number())])
     }
 
-    /// The places of all atoms' elements, which must be known.
+    /// The indices of all atoms' elements, which must be supported.
     pub(crate) fn indices(&self, structure: &Structure, indices: &mut Vec<usize>) {
         indices.clear();
         indices.extend(structure.species.iter().map(|species| self.index(*species)));
     }
 
-    /// Whether a potential of these elements and this cutoff (Å) can evaluate the structure.
+    /// Checks that a potential with these elements and this cutoff (Å) can evaluate the structure.
     pub(crate) fn check(
         &self,
         structure: &Structure,
@@ -65,7 +65,7 @@ impl Elements {
     }
 }
 
-/// Whether the bond from `i` stands for the pair: each pair has two directed bonds, one of them does.
+/// Whether the bond from `i` represents the pair: exactly one of the two directed bonds does.
 #[inline]
 pub(crate) fn represents_pair(i: usize, neighbour: &Neighbour) -> bool {
     let j = neighbour.atom as usize;
@@ -82,7 +82,7 @@ pub(crate) fn add_pair_force(out: &mut Evaluation, i: usize, j: usize, d: Vec3, 
         out.forces[i][k] += force;
         out.forces[j][k] -= force;
         for l in 0..3 {
-            // In this order the virial is symmetric to the last bit.
+            // This order makes the virial exactly symmetric.
             out.virial[k][l] -= slope * (d[k] * d[l]);
         }
     }

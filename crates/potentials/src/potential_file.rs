@@ -1,4 +1,4 @@
-//! Reading the text files in which interatomic potentials are published.
+//! Reads the text files in which interatomic potentials are published.
 
 use std::fs;
 use std::io;
@@ -7,24 +7,24 @@ use std::path::{Path, PathBuf};
 /// Why a potential file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum PotentialFileError {
-    /// The file cannot be read at all.
+    /// The file cannot be read.
     #[error("cannot read {}: {source}", path.display())]
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// The file does not say what it should.
+    /// The file has an invalid line.
     #[error("{}, line {line}: found {found}, expected {expected}", path.display())]
     Content {
         /// The file.
         path: PathBuf,
         /// Line number from 1.
         line: usize,
-        /// What stands there.
+        /// What the line has.
         found: String,
-        /// What should stand there.
+        /// What it should have.
         expected: String,
     },
 }
@@ -43,13 +43,13 @@ impl PotentialFile {
         Ok(Self { path: path.to_owned(), text: String::from_utf8_lossy(&bytes).into_owned() })
     }
 
-    /// Its lines, from the first.
+    /// Its lines, from the start.
     pub(crate) fn lines(&self) -> Lines<'_> {
         Lines { path: &self.path, lines: self.text.lines(), number: 0 }
     }
 }
 
-/// A position in a potential file.
+/// A cursor in a potential file.
 pub(crate) struct Lines<'a> {
     path: &'a Path,
     lines: std::str::Lines<'a>,
@@ -109,7 +109,7 @@ impl<'a> Lines<'a> {
         }
         if values.len() > count {
             return Err(self.error(
-                format!("{} values of {what} or more", values.len()),
+                format!("{} or more values of {what}", values.len()),
                 format!("{count}, the last at the end of its line"),
             ));
         }

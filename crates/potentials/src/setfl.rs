@@ -1,10 +1,9 @@
-//! The setfl file of the embedded-atom method, in its two styles.
+//! The setfl file of the embedded-atom method, in both styles.
 //!
-//! Three comment lines; the elements; `nrho drho nr dr cutoff`; then for each element a line
-//! `atomic-number mass lattice-constant lattice`, its embedding energy F(ρ) and its densities ρ(r);
-//! then r φ(r) for each pair of elements (1,1), (2,1), (2,2), (3,1), …
-//! Source: M. S. Daw, S. M. Foiles, M. I. Baskes, Mater. Sci. Rep. 9, 251 (1993), and the
-//! description of `pair_style eam/alloy` and `eam/fs` in the LAMMPS manual.
+//! Three comment lines; the elements; `nrho drho nr dr cutoff`; then for each element a line `atomic-number
+//! mass lattice-constant lattice`, its embedding energy F(ρ) and its densities ρ(r); then r φ(r) for each pair
+//! of elements (1,1), (2,1), (2,2), (3,1), … Source: M. S. Daw, S. M. Foiles, M. I. Baskes, Mater. Sci. Rep. 9,
+//! 251 (1993), and the description of `pair_style eam/alloy` and `eam/fs` in the LAMMPS manual.
 
 use std::path::Path;
 
@@ -12,17 +11,17 @@ use atoms::Species;
 
 use crate::potential_file::{Lines, PotentialFile, PotentialFileError};
 
-/// Which densities a setfl file holds. For one element both are the same.
+/// Which densities a setfl file has. For a single element both styles agree.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EamStyle {
-    /// `eam/alloy`: one density for each element, whatever atom it falls on.
+    /// `eam/alloy`: one density per element, independent of the atom it acts on.
     Alloy,
-    /// `eam/fs` (Finnis–Sinclair): one density for each ordered pair of elements.
+    /// `eam/fs` (Finnis–Sinclair): one density per ordered pair of elements.
     FinnisSinclair,
 }
 
-/// Fewest points of a table: the interpolation differentiates over five of them.
-const FEWEST_POINTS: usize = 5;
+/// Minimum number of points of a table: the interpolation uses five-point differences.
+const MIN_POINTS: usize = 5;
 
 /// The tables of a setfl file.
 #[derive(Debug)]
@@ -40,7 +39,7 @@ pub(crate) struct Setfl {
     /// ρ(r) of the element `source` on an atom of the element `host` at `[source][host]`
     /// (Finnis–Sinclair), or at `[source][0]` for any host (alloy); point k at r = k `distance_spacing`.
     pub(crate) density: Vec<Vec<Vec<f64>>>,
-    /// r φ(r), eV Å, at `[a][b]` for b ≤ a; points as those of the density.
+    /// r φ(r), eV Å, at `[a][b]` for b ≤ a; grid as for the density.
     pub(crate) pair: Vec<Vec<Vec<f64>>>,
 }
 
@@ -68,7 +67,7 @@ impl Setfl {
             let what = format!("the pair energy r φ(r) of {element}");
             pair.push(read_tables(&mut lines, a + 1, grid.distances, &what)?);
         }
-        refuse_rest(&mut lines)?;
+        reject_trailing(&mut lines)?;
         Ok(Self {
             species,
             density_spacing: grid.density_spacing,
@@ -116,10 +115,10 @@ impl Grid {
         let line = lines.require("'nrho drho nr dr cutoff'")?;
         let tokens: Vec<&str> = line.split_whitespace().collect();
         let points = |index: usize, what: &str| {
-            let expected = format!("{what}, a whole number of at least {FEWEST_POINTS}");
+            let expected = format!("{what}, a whole number of at least {MIN_POINTS}");
             let token = tokens.get(index).copied().unwrap_or("the end of the line");
             match token.parse::<usize>() {
-                Ok(count) if count >= FEWEST_POINTS => Ok(count),
+                Ok(count) if count >= MIN_POINTS => Ok(count),
                 _ => Err(lines.error(format!("'{token}'"), expected)),
             }
         };
@@ -128,13 +127,13 @@ impl Grid {
             if value > 0.0 { Ok(value) } else { Err(lines.error(value.to_string(), what)) }
         };
         let grid = Self {
-            densities: points(0, "nrho, the points of F(ρ)")?,
+            densities: points(0, "nrho, the number of points of F(ρ)")?,
             density_spacing: length(1, "drho, a positive spacing of ρ")?,
-            distances: points(2, "nr, the points of ρ(r) and r φ(r)")?,
+            distances: points(2, "nr, the number of points of ρ(r) and r φ(r)")?,
             distance_spacing: length(3, "dr, a positive spacing of r in Å")?,
             cutoff: length(4, "a positive cutoff in Å")?,
         };
-        // Files count the cutoff as nr dr or (nr − 1) dr and round it; what lies beyond is a mistake.
+        // Files define the cutoff as nr dr or (nr − 1) dr and round it; anything beyond is a mistake.
         let reach = grid.distances as f64 * grid.distance_spacing;
         if grid.cutoff > reach * (1.0 + 1e-6) {
             let expected = format!("at most nr dr = {reach} Å");
@@ -144,7 +143,7 @@ impl Grid {
     }
 }
 
-/// `atomic-number mass lattice-constant lattice`: numbers that the potential itself does not need.
+/// `atomic-number mass lattice-constant lattice`: numbers that the potential does not use.
 fn read_element_line(
     lines: &mut Lines<'_>,
     element: Species,
@@ -170,7 +169,7 @@ fn read_tables(
 }
 
 /// Values after the last table mean that the counts in the header are wrong.
-fn refuse_rest(lines: &mut Lines<'_>) -> Result<(), PotentialFileError> {
+fn reject_trailing(lines: &mut Lines<'_>) -> Result<(), PotentialFileError> {
     while let Some(line) = lines.next() {
         if !line.trim().is_empty() {
             return Err(lines.error(format!("'{}'", line.trim()), "the end of the file"));

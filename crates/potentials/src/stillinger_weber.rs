@@ -9,16 +9,16 @@ use crate::pairs::{self, Elements};
 use crate::potential_file::PotentialFileError;
 use crate::stillinger_weber_file::{Entries, Parameters};
 
-/// The Stillinger–Weber potential, of one element or several.
+/// The Stillinger–Weber potential for one or several elements.
 ///
 /// E = Σ_{i<j} φ₂(r_ij) + Σ_i Σ_{j<k} φ₃(r_ij, r_ik, θ_jik),
 /// φ₂ = A ε [B (σ/r)^p − (σ/r)^q] exp(σ / (r − aσ)),
 /// φ₃ = λ ε (cos θ − cos θ₀)² exp(γσ / (r_ij − aσ)) exp(γσ / (r_ik − aσ)).
 /// Source: F. H. Stillinger and T. A. Weber, Phys. Rev. B 31, 5262 (1985).
 ///
-/// In a mixture φ₂, and σ, a and γ of an arm i–j, are those of the entry `i j j`; λ ε and cos θ₀
-/// those of the entry `i j k` with the centre i. An entry's `tol` shortens the reach of its pair
-/// to where exp(min(γ, 1) σ / (r − aσ)) = tol, as in the LAMMPS manual; 0 leaves it at a σ.
+/// In a mixture the entry `i j j` gives φ₂ and the σ, a and γ of an arm i–j; the entry `i j k` with the centre
+/// i gives λ ε and cos θ₀. An entry's `tol` shortens the range of its pair to where exp(min(γ, 1) σ / (r − aσ))
+/// = tol, as in the LAMMPS manual; 0 keeps a σ.
 #[derive(Clone, Debug)]
 pub struct StillingerWeber {
     elements: Elements,
@@ -40,7 +40,7 @@ struct PairTerm {
     gamma_sigma: f64,
     /// a σ, Å.
     end: f64,
-    /// The square of where the pair is cut, Å².
+    /// Square of the pair's cutoff, Å².
     squared_cutoff: f64,
     big_b: f64,
     p: Exponent,
@@ -55,7 +55,7 @@ struct AngleTerm {
     cosine: f64,
 }
 
-/// A neighbour as the centre of the angles sees it.
+/// A neighbour in the angular terms of an atom.
 #[derive(Clone, Copy, Debug)]
 struct Arm {
     atom: usize,
@@ -74,7 +74,7 @@ struct Arm {
     gradient: Vec3,
 }
 
-/// x^n, quickly where n is a small whole number, as it is in most files.
+/// x^n, fast for the small integers n in most files.
 #[derive(Clone, Copy, Debug)]
 enum Exponent {
     Whole(i32),
@@ -125,7 +125,7 @@ impl PairTerm {
         (strength * difference, -strength * slope * per_r)
     }
 
-    /// The arm to a neighbour at d, its angles still to be added.
+    /// The arm to a neighbour at d, before its angles are added.
     #[inline]
     fn arm(&self, atom: usize, element: usize, d: Vec3, r: f64, per_r: f64) -> Arm {
         let to_end = 1.0 / (r - self.end);
@@ -143,14 +143,14 @@ impl PairTerm {
 }
 
 impl StillingerWeber {
-    /// Reads a parameter file (`.sw`); it must hold an entry for each ordered triplet of its elements.
+    /// Reads a parameter file (`.sw`), which must have an entry for each ordered triplet of its elements.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, PotentialFileError> {
         let Entries { species, parameters } = Entries::read(path.as_ref())?;
         let n = species.len();
         let pair_entry = |i: usize, j: usize| &parameters[(i * n + j) * n + j];
         let pair_terms: Vec<PairTerm> =
             (0..n * n).map(|pair| PairTerm::new(pair_entry(pair / n, pair % n))).collect();
-        // j–i–k and k–i–j are one angle: the entry whose second element comes first stands for both.
+        // j–i–k and k–i–j are the same angle; the entry whose second element comes first represents both.
         let angle_entry = |i: usize, j: usize, k: usize| &parameters[(i * n + j.min(k)) * n + j.max(k)];
         let angle_terms = (0..n * n * n).map(|triplet| {
             let entry = angle_entry(triplet / (n * n), triplet / n % n, triplet % n);
@@ -176,7 +176,7 @@ impl StillingerWeber {
     ) {
         self.arms.clear();
         let row = self.elements.index(structure.species[i]) * self.elements.len();
-        for neighbour in neighbours.of(i) {
+        for neighbour in neighbours.neighbours_of(i) {
             let d = neighbour.displacement(structure, i);
             let squared = dot(d, d);
             let j = neighbour.atom as usize;
@@ -197,7 +197,7 @@ impl StillingerWeber {
         }
     }
 
-    /// Adds the angles at atom `i`: energies, and gradients into the arms.
+    /// Adds the angles at atom `i`: energies, and gradients to the arms.
     fn add_angles(&mut self, element_i: usize) -> f64 {
         let n = self.elements.len();
         let mut energy = 0.0;
@@ -253,7 +253,7 @@ impl Potential for StillingerWeber {
                 }
             }
         }
-        // Rounding leaves the sum over three-body gradients not quite symmetric.
+        // Rounding leaves the sum over three-body gradients slightly asymmetric.
         for x in 0..3 {
             for y in 0..x {
                 let mean = 0.5 * (out.virial[x][y] + out.virial[y][x]);

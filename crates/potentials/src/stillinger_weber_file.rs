@@ -1,8 +1,8 @@
 //! The parameter file of the Stillinger–Weber potential.
 //!
-//! Entries of fourteen words, over one or more lines: `element₁ element₂ element₃ ε σ a λ γ cosθ₀
-//! A B p q tol`; `#` begins a comment. Each ordered triplet of the elements has one entry.
-//! Source: the description of `pair_style sw` in the LAMMPS manual.
+//! Entries of fourteen words, over one or more lines: `element₁ element₂ element₃ ε σ a λ γ cosθ₀ A B p q tol`;
+//! `#` starts a comment. Each ordered triplet of the elements has one entry. Source: the description of
+//! `pair_style sw` in the LAMMPS manual.
 
 use std::path::Path;
 
@@ -17,7 +17,7 @@ pub(crate) struct Parameters {
     pub(crate) epsilon: f64,
     /// σ, Å.
     pub(crate) sigma: f64,
-    /// a: the pair reaches to a σ.
+    /// a: the range of the pair is a σ.
     pub(crate) a: f64,
     /// λ, strength of the three-body energy.
     pub(crate) lambda: f64,
@@ -27,18 +27,18 @@ pub(crate) struct Parameters {
     pub(crate) cosine: f64,
     /// A, strength of the two-body energy.
     pub(crate) big_a: f64,
-    /// B, share of its repulsion.
+    /// B, relative strength of the repulsion.
     pub(crate) big_b: f64,
-    /// p, power of the repulsion.
+    /// p, exponent of the repulsion.
     pub(crate) p: f64,
-    /// q, power of the attraction.
+    /// q, exponent of the attraction.
     pub(crate) q: f64,
-    /// Where the exponentials are so small that the pair may be left out; 0: nowhere.
+    /// The value of the exponentials below which the pair is neglected; 0: never.
     pub(crate) tolerance: f64,
 }
 
 impl Parameters {
-    /// Where the pair ends, Å: a σ, or where exp(min(γ, 1) σ / (r − aσ)) has fallen to the tolerance.
+    /// The range of the pair, Å: a σ, or where exp(min(γ, 1) σ / (r − aσ)) equals the tolerance.
     ///
     /// This is the manual's virtual cutoff; a tolerance above 0.01 counts as 0.01.
     pub(crate) fn reach(&self) -> f64 {
@@ -54,7 +54,7 @@ impl Parameters {
 /// The entries of a file.
 #[derive(Debug)]
 pub(crate) struct Entries {
-    /// Every element of the file, in the order of appearance.
+    /// All elements of the file, in order of appearance.
     pub(crate) species: Vec<Species>,
     /// `[(i * elements + j) * elements + k]`, i the centre.
     pub(crate) parameters: Vec<Parameters>,
@@ -66,7 +66,7 @@ struct Entry {
     parameters: Parameters,
 }
 
-const WORDS: usize = 14;
+const ENTRY_WORDS: usize = 14;
 const ENTRY: &str = "element1 element2 element3 epsilon sigma a lambda gamma costheta0 A B p q tol";
 
 impl Entries {
@@ -98,16 +98,16 @@ impl Entries {
     }
 }
 
-/// The next fourteen words that are no comment; `None` at the end of the file.
+/// The next fourteen words outside comments; `None` at the end of the file.
 fn read_entry(lines: &mut Lines<'_>) -> Result<Option<Entry>, PotentialFileError> {
     let mut words: Vec<&str> = Vec::new();
     let mut first_line = 0;
-    while words.len() < WORDS {
+    while words.len() < ENTRY_WORDS {
         let Some(line) = lines.next() else {
             if words.is_empty() {
                 return Ok(None);
             }
-            let found = format!("the end of the file after {} of {WORDS} words", words.len());
+            let found = format!("the end of the file after {} of {ENTRY_WORDS} words", words.len());
             return Err(lines.error(found, format!("'{ENTRY}'")));
         };
         if words.is_empty() {
@@ -115,8 +115,10 @@ fn read_entry(lines: &mut Lines<'_>) -> Result<Option<Entry>, PotentialFileError
         }
         words.extend(line.split('#').next().unwrap_or_default().split_whitespace());
     }
-    if words.len() > WORDS {
-        return Err(lines.error(format!("{} words", words.len()), format!("the {WORDS} words '{ENTRY}'")));
+    if words.len() > ENTRY_WORDS {
+        return Err(
+            lines.error(format!("{} words", words.len()), format!("the {ENTRY_WORDS} words '{ENTRY}'"))
+        );
     }
     let element = |index: usize| {
         words[index].parse::<Species>().map_err(|_| {
@@ -149,7 +151,7 @@ fn read_parameters(lines: &Lines<'_>, words: &[&str]) -> Result<Parameters, Pote
     })
 }
 
-/// A pair has one energy and an angle too: entries that mean the same must say the same.
+/// Checks that entries which describe the same pair or angle agree.
 ///
 /// The product λ ε may differ by the rounding of its factors in the file.
 fn check_symmetry(lines: &Lines<'_>, entries: &[Entry]) -> Result<(), PotentialFileError> {
@@ -157,7 +159,7 @@ fn check_symmetry(lines: &Lines<'_>, entries: &[Entry]) -> Result<(), PotentialF
         let [i, j, k] = entry.triplet;
         for other in entries {
             if j == k && other.triplet == [j, i, i] && !same_pair(&entry.parameters, &other.parameters) {
-                let found = format!("other two-body parameters or another reach than in line {}", entry.line);
+                let found = format!("other two-body parameters or another range than in line {}", entry.line);
                 return Err(lines.error_at(other.line, found, format!("the same for {i}–{j} and {j}–{i}")));
             }
             if other.triplet == [i, k, j] && !same_angle(&entry.parameters, &other.parameters) {

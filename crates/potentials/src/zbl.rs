@@ -1,4 +1,4 @@
-//! The universal screened nuclear repulsion, as a guard against close pairs.
+//! The universal screened nuclear repulsion, a guard against close pairs.
 
 use atoms::cell::dot;
 use atoms::units::COULOMB;
@@ -6,15 +6,15 @@ use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Struc
 
 use crate::pairs::{self, Elements};
 
-/// The Ziegler–Biersack–Littmark repulsion, switched off smoothly.
+/// The Ziegler–Biersack–Littmark repulsion with a smooth switch.
 ///
 /// E = Σ_{i<j} S(x) Z_i Z_j e² / (4πε₀ r) Φ(r / a), a = 0.46850 Å / (Z_i^0.23 + Z_j^0.23),
 /// Φ(y) = 0.18175 e^(−3.19980 y) + 0.50986 e^(−0.94229 y) + 0.28022 e^(−0.40290 y) + 0.02817 e^(−0.20162 y).
-/// Source: J. F. Ziegler, J. P. Biersack, U. Littmark, The Stopping and Range of Ions in Solids
-/// (Pergamon, 1985).
+/// Source: J. F. Ziegler, J. P. Biersack, U. Littmark, The Stopping and Range of Ions in Solids (Pergamon,
+/// 1985).
 ///
-/// S(x) = 1 − 10 x³ + 15 x⁴ − 6 x⁵ with x = (r − inner) / (outer − inner) between `inner` and
-/// `outer` has no jump up to its second derivative; S = 1 below and 0 above.
+/// S(x) = 1 − 10 x³ + 15 x⁴ − 6 x⁵ with x = (r − inner) / (outer − inner) between `inner` and `outer`; it is
+/// continuous up to its second derivative. S = 1 below and 0 above.
 #[derive(Clone, Debug)]
 pub struct Zbl {
     elements: Elements,
@@ -24,7 +24,7 @@ pub struct Zbl {
     repulsions: Vec<Repulsion>,
 }
 
-/// What a pair of elements contributes.
+/// The contribution of a pair of elements.
 #[derive(Clone, Copy, Debug)]
 struct Repulsion {
     /// Z_i Z_j e² / (4πε₀), eV Å.
@@ -37,15 +37,15 @@ struct Repulsion {
 const SCREENING: [(f64, f64); 4] =
     [(0.18175, -3.19980), (0.50986, -0.94229), (0.28022, -0.40290), (0.02817, -0.20162)];
 
-/// A switch that is none.
+/// An invalid switch.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[error(
-    "the ZBL repulsion would be switched off from {inner} Å to {outer} Å, but 0 ≤ inner < outer is needed"
+    "the ZBL repulsion cannot be switched off between {inner} Å and {outer} Å: expected 0 ≤ inner < outer"
 )]
 pub struct ZblRangeError {
-    /// Where the switch would begin, Å.
+    /// Where the switch starts, Å.
     pub inner: f64,
-    /// Where the repulsion would end, Å.
+    /// Where the repulsion ends, Å.
     pub outer: f64,
 }
 
@@ -71,7 +71,7 @@ impl Zbl {
         Ok(Self { elements: Elements::new(species), inner, outer, repulsions })
     }
 
-    /// Adds energies, forces and virial of the repulsion to those in `out`, which must be of as many atoms.
+    /// Adds energies, forces and virial of the repulsion to `out`, which must have as many atoms.
     pub fn add(
         &self,
         structure: &Structure,
@@ -81,7 +81,7 @@ impl Zbl {
         self.elements.check(structure, neighbours, self.outer)?;
         for i in 0..structure.len() {
             let row = self.elements.index(structure.species[i]) * self.elements.len();
-            for neighbour in neighbours.later(i) {
+            for neighbour in neighbours.later_neighbours_of(i) {
                 let d = neighbour.displacement(structure, i);
                 let squared = dot(d, d);
                 if squared >= self.outer * self.outer {

@@ -1,4 +1,4 @@
-//! What EAM, Stillinger–Weber and ZBL must obey, whatever their numbers are.
+//! Properties of EAM, Stillinger–Weber and ZBL that hold for any parameters.
 
 use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure};
 use potentials::{Eam, EamStyle, StillingerWeber, Zbl};
@@ -33,7 +33,7 @@ fn repulsion() -> Zbl {
     Zbl::new(&species(&["Al", "Si"]), 1.2, 2.9).unwrap()
 }
 
-/// A crystal of `corner` in skewed cubes of edge `a`, rattled by up to ±`width`, elements in turn.
+/// A crystal of `corner` in skewed cubes of edge `a`, rattled by up to ±`width`, with alternating elements.
 fn crystal(symbols: &[&str], corner: &[[f64; 3]], a: f64, width: f64, cells: [usize; 3]) -> Structure {
     let mut random = TestRng::from_seed(RngAlgorithm::ChaCha, &[7; 32]);
     let mut shake = || width * (f64::from(random.next_u32()) / f64::from(u32::MAX) * 2.0 - 1.0);
@@ -70,13 +70,13 @@ fn diamond(symbols: &[&str], a: f64, cells: [usize; 3]) -> Structure {
     crystal(symbols, &[FCC, second].concat(), a, 0.15, cells)
 }
 
-/// `structure` without its periodicity along the third lattice vector: two free surfaces.
+/// `structure` without periodicity along the third lattice vector: two free surfaces.
 fn slab(mut structure: Structure) -> Structure {
     structure.periodic[2] = false;
     structure
 }
 
-/// A potential, a structure it can evaluate, and how to differentiate it there.
+/// A potential with a structure, and the step for finite differences.
 struct Subject {
     name: &'static str,
     potential: Box<dyn Potential>,
@@ -86,10 +86,10 @@ struct Subject {
     tolerance: f64,
 }
 
-/// Small cells see their own images.
+/// Small cells contain their own images.
 ///
-/// The second derivative of a table jumps at each of its points (every 6.5e-4 Å in that of Al), so
-/// steps must be short there; the analytic potentials allow the best one.
+/// The second derivative of a table jumps at each point (every 6.5e-4 Å for Al), so steps must be short there;
+/// analytic potentials allow the optimal step.
 fn subjects() -> Vec<Subject> {
     let table = |name, potential: Eam, structure| Subject {
         name,
@@ -148,7 +148,7 @@ fn momentum_is_conserved_and_the_virial_symmetric() {
     }
 }
 
-/// A list built with another skin holds other pairs beyond the cutoff; the sums must not notice.
+/// A list with another skin has other pairs beyond the cutoff, which must not affect the sums.
 #[test]
 fn the_skin_changes_no_bit() {
     for Subject { name, mut potential, structure, .. } in subjects() {
@@ -197,7 +197,7 @@ fn what_a_potential_cannot_evaluate_is_an_error() {
     assert_eq!(error, PotentialError::Cutoff { list: 5.0, needed: 6.5 });
 }
 
-/// One element has one density: the two styles are the same file.
+/// With one element there is one density, so both styles are the same file.
 #[test]
 fn the_style_matters_for_several_elements_only() {
     let path = format!("{HERE}/../../configs/data/Al_mm.eam.fs");
@@ -230,7 +230,7 @@ fn the_repulsion_is_added_to_what_is_there() {
     }
 }
 
-/// Energy and its first two derivatives meet those of the plain repulsion and of nothing.
+/// Energy and first two derivatives match those of the plain repulsion and of zero.
 #[test]
 fn the_switch_of_the_repulsion_is_smooth() {
     let (inner, outer) = (1.2, 2.4);
@@ -265,7 +265,7 @@ fn a_switch_must_have_a_width() {
     }
 }
 
-/// The lattice constant and cohesive energy for which each potential is known.
+/// The published lattice constant and cohesive energy of each potential.
 #[test]
 fn the_perfect_crystals_have_their_published_energies() {
     let energy = |potential: &mut dyn Potential, corner: &[[f64; 3]], symbol: &str, a: f64| {
@@ -278,7 +278,7 @@ fn the_perfect_crystals_have_their_published_energies() {
         common::evaluate(potential, &structure).energy() / corner.len() as f64
     };
     let diamond = [FCC, FCC.map(|atom| atom.map(|x| x + 0.25))].concat();
-    // Stillinger and Weber chose epsilon for −2 ε an atom at r = 2^(1/6) σ.
+    // Stillinger and Weber chose epsilon to give −2 ε per atom at r = 2^(1/6) σ.
     let a = 4.0 / 3.0_f64.sqrt() * 2.0_f64.powf(1.0 / 6.0) * 2.0951;
     assert!((energy(&mut silicon(), &diamond, "Si", a) + 2.0 * 2.1683).abs() < 1e-6);
     // Mendelev et al., Philos. Mag. 88, 1723 (2008): 4.045 Å at 0 K.

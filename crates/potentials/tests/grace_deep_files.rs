@@ -1,4 +1,4 @@
-//! Files of models of two and three layers that are damaged, or that mean another graph, are refused.
+//! Two- and three-layer model files that are corrupt or describe another graph are rejected.
 
 use proptest::prelude::*;
 
@@ -6,15 +6,15 @@ use crate::common::model_file::{array, changed_of, deep, floats_of, integers_of,
 
 const FILES: [&str; 2] = ["two_layers.npz", "three_layers.npz"];
 
-/// Arrays that may be absent, or that hold what is not needed.
+/// Arrays that may be absent or are not needed.
 fn is_optional(name: &str) -> bool {
     let copied = ["I_out_0_", "I_out_1_", "I_1_LN_", "rho_LN_"];
     let known = ["shift_values", "output_scale", "nn_dtype", "chem_embedding_size", "embedding_size"];
-    // Without its version the feature map is passed over, and its flags may be left out.
+    // Without its version the feature map is ignored, so its flags may be absent.
     let features = ["uq_schema_version", "uq_rp_density_scale", "uq_rp_normalize"].contains(&name);
     let switches = ["_has_chem_emb", "_embed_i", "_embed_j", "_indicator_l_depend", "_sum_neighbors"];
     let unused = ["_lmax", "_Lmax", "_w_tile_left"];
-    // Switches whose absence means the usual thing, and placeholders of three-layer models.
+    // Switches whose absence means the default, and placeholders of three-layer models.
     let placeholders =
         ["nradbase", "rcut", "radial_basis_p", "energy_mlp_activation", "has_bond_specific_cutoff"];
     copied.iter().any(|prefix| name.starts_with(prefix))
@@ -34,14 +34,14 @@ fn every_array_is_missed_and_called_by_its_name() {
         for name in names(&model) {
             match changed_of(&model, &[(&name, None)]) {
                 Ok(_) => assert!(is_optional(&name), "{file}: {name} was not missed"),
-                // A model whose depth cannot be seen is taken for another.
+                // A model whose depth cannot be detected is taken for another.
                 Err(_) if name == "spb_names" || name == "spbf_names" => {}
                 // Without one of its flags a feature map contradicts its version or its dimension.
                 Err(error) if name.starts_with("uq_rp_") => assert!(error.to_string().contains("'uq_")),
                 Err(error) => {
                     let error = error.to_string();
-                    // Without an array that may be absent its copy is left over.
-                    let of_copy = is_optional(&name) && error.contains("is not known to have");
+                    // If an optional array is absent, its alias remains unread.
+                    let of_copy = is_optional(&name) && error.contains("unknown for a");
                     assert!(error.contains(&name) || of_copy, "{file}: {error} is not about {name}");
                 }
             }
@@ -53,7 +53,7 @@ fn every_array_is_missed_and_called_by_its_name() {
 fn every_array_that_is_not_known_is_refused() {
     for (file, depth) in FILES.into_iter().zip(["two", "three"]) {
         let error = changed_of(&deep(file), &[("eq9_norm_map", array(&[], &[2.0]))]).unwrap_err().to_string();
-        assert!(error.contains(&format!("a {depth}-layer model is not known to have")), "{error}");
+        assert!(error.contains(&format!("unknown for a {depth}-layer model")), "{error}");
         assert!(error.ends_with("may change its energy: eq9_norm_map"), "{error}");
     }
 }
@@ -61,7 +61,7 @@ fn every_array_that_is_not_known_is_refused() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(96))]
 
-    /// As many or as few other numbers as one likes in place of any array are an error, never a panic.
+    /// Any other numbers in place of any array give an error, never a panic.
     #[test]
     fn another_size_is_an_error(
         file in 0..2_usize,
@@ -84,19 +84,15 @@ proptest! {
 fn a_graph_of_another_kind_is_refused() {
     let two: &[(&str, Option<Vec<u8>>, &str)] = &[
         ("fc_names", strings(&["A1", "AA1", "B1", "BB1", "BB3"]), "'fc_names' lists A1, AA1, B1, BB1, BB3"),
-        ("spb_names", strings(&["A", "C0"]), "are known to have A, B0"),
-        (
-            "reduce_names",
-            strings(&["I1", "I", "B", "I_out_1"]),
-            "two-layer models are known to have I1, I, B",
-        ),
+        ("spb_names", strings(&["A", "C0"]), "supported models of this depth have A, B0"),
+        ("reduce_names", strings(&["I1", "I", "B", "I_out_1"]), "expected I1, I, B"),
         ("rms_names", strings(&["I_1_LN"]), "array 'rms_names' is a list of 1"),
         (
             "I_out_0_reduce_A_norm",
             array(&[], &[0.5]),
-            "'I_out_0_reduce_A_norm' is not the same as rho_reduce_A_norm",
+            "'I_out_0_reduce_A_norm' differs from rho_reduce_A_norm",
         ),
-        ("I_1_LN_type", array(&[1], &[2_i64]), "array 'I_1_LN_type' is not the same as"),
+        ("I_1_LN_type", array(&[1], &[2_i64]), "array 'I_1_LN_type' differs from"),
         ("I_nl_LN_type", array(&[1], &[3_i64]), "array 'I_nl_LN_type' is 3, expected a number from 0 to 2"),
         ("mlp_rad_R1_embed_j", array(&[1], &[1_i64]), "an embedding of the neighbour's element"),
         ("YI_m_sum_ind", array(&[80], &[99_i64; 80]), "array 'YI_m_sum_ind' is a list with the index 99"),
@@ -128,7 +124,7 @@ fn a_graph_of_another_kind_is_refused() {
     }
 }
 
-/// All names and shapes are right, but components of different orders are coupled.
+/// Names and shapes are right, but components of different orders are coupled.
 #[test]
 fn a_model_that_knows_directions_is_refused() {
     for (file, name) in [
@@ -142,7 +138,7 @@ fn a_model_that_knows_directions_is_refused() {
         let half = data.len() / 4 * 2;
         data.rotate_left(half);
         let error = changed_of(&model, &[(name, array(&shape, &data))]).unwrap_err().to_string();
-        assert!(error.contains("eV when a cluster is turned"), "{name}: {error}");
+        assert!(error.contains("eV when a cluster is rotated"), "{name}: {error}");
     }
 }
 

@@ -1,4 +1,4 @@
-//! GRACE derivatives against finite differences, and that results depend on nothing but the structure.
+//! GRACE derivatives against finite differences; results depend on the structure only.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ fn model(name: &str, path: RadialPath) -> Arc<GraceModel> {
     Arc::new(GraceModel::load_with(&file, path).unwrap())
 }
 
-/// Numbers in [−½, ½), the same in every run.
+/// Reproducible numbers in [−½, ½).
 fn noise(seed: u64) -> impl FnMut() -> f64 {
     let mut state = seed;
     move || {
@@ -30,7 +30,7 @@ fn noise(seed: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// Four atoms in a skewed cell much smaller than the cutoff, periodic in the directions given.
+/// Four atoms in a skewed cell much smaller than the cutoff, periodic along the given directions.
 fn small(symbol: &str, spacing: f64, periodic: [bool; 3]) -> Structure {
     let a = spacing;
     let mut noise = noise(7);
@@ -43,7 +43,7 @@ fn small(symbol: &str, spacing: f64, periodic: [bool; 3]) -> Structure {
     }
 }
 
-/// Two elements, and neighbours that have neighbours out of the atom's own sight.
+/// Two elements, and second neighbours beyond the cutoff.
 fn alloy(periodic: [bool; 3]) -> Structure {
     let mut structure = small("W", 3.7, periodic);
     structure.species[1] = "Mo".parse().unwrap();
@@ -101,7 +101,7 @@ fn the_pull_back_is_the_gradient_of_any_linear_function_of_the_features() {
         let virial = strain_gradient(&structure, 1e-4, &mut linear);
         assert_close("virial", pull_back.virial.as_flattened(), virial.as_flattened(), 1e-8);
 
-        // The energy's derivatives are the same bits with and without a second cotangent.
+        // The derivatives of the energy have the same bits with and without a second cotangent.
         assert_eq!(energy, common::evaluate(&mut grace, &structure));
     }
 }
@@ -159,7 +159,7 @@ fn everything(grace: &mut Grace, structure: &Structure) -> (Vec<f64>, Evaluation
     (z, energy, pull_back)
 }
 
-/// The same in one call.
+/// The same in a single call.
 fn at_once(grace: &mut Grace, structure: &Structure) -> (Vec<f64>, Evaluation, PullBack) {
     let mut neighbours = NeighbourList::new(grace.cutoff(), 0.0);
     neighbours.update(structure).unwrap();
@@ -242,7 +242,7 @@ fn what_cannot_be_evaluated_is_refused() {
     let mut neighbours = NeighbourList::new(grace.cutoff(), 0.0);
     neighbours.update(&copper).unwrap();
     let error = grace.forward(&copper, &neighbours).unwrap_err();
-    assert_eq!(error.to_string(), "atom 0 is Cu, which the potential does not know (it knows Al)");
+    assert_eq!(error.to_string(), "atom 0 is Cu, which the potential does not support (it supports Al)");
     let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
     grace.backward(None, &mut energy, &mut pull_back);
     assert!(energy.forces.is_empty());
@@ -266,7 +266,7 @@ fn a_model_describes_itself() {
     let other = GraceModel::load(&committed("al_eam_1l").join("kokkos.npz")).unwrap();
     let fingerprint = |model: &GraceModel| model.projection().unwrap().fingerprint();
     assert_eq!(fingerprint(&model), fingerprint(&model.clone()));
-    // Both were made with the same seed and the same shape of basis.
+    // Both have the same random seed and basis shape.
     assert_eq!(fingerprint(&model), fingerprint(&other));
 }
 
@@ -283,7 +283,7 @@ fn deeper_models_describe_themselves() {
     }
 }
 
-/// Atom 0 hears of atom 2 only through atom 1, and of atom 3 through both, which takes three layers.
+/// Atom 2 affects atom 0 only through atom 1, and atom 3 only through both, which takes three layers.
 #[test]
 fn messages_carry_as_far_as_there_are_layers() {
     let chain = |end: f64| Structure {
@@ -301,7 +301,7 @@ fn messages_carry_as_far_as_there_are_layers() {
     }
 }
 
-/// The energy of an atom is the same in any orientation, mirrored, and in any order of atoms.
+/// Atomic energies do not depend on orientation, reflection or the order of atoms.
 #[test]
 fn deeper_models_do_not_change_under_rotation_and_permutation() {
     let structure = alloy([false; 3]);

@@ -1,4 +1,4 @@
-//! Model files that are damaged, or that claim what is not supported, give errors and never a panic.
+//! Corrupt or unsupported model files give errors, never a panic.
 
 use std::path::Path;
 
@@ -27,7 +27,7 @@ proptest! {
         prop_assert!(load(&BYTES[..length]).is_err());
     }
 
-    /// Checksums find a changed byte in an array; one in the archive's own bookkeeping may not matter.
+    /// Checksums detect a changed byte in an array; one in the archive's metadata may be irrelevant.
     #[test]
     fn a_changed_byte_is_an_error_or_harmless(part in 0.0..1.0_f64, change in 1_u8..) {
         let mut bytes = BYTES.clone();

@@ -8,7 +8,7 @@ use potentials::grace::{Grace, GraceModel, PullBack, RadialPath};
 
 use crate::common::golden::{Golden, Mixture, committed, golden, peer, six};
 
-/// The largest deviations met in a model; relative ones to the largest value of a structure.
+/// The largest deviations for a model; relative ones refer to the largest value of a structure.
 #[derive(Debug, Default)]
 struct Deviations {
     energy_per_atom: f64,
@@ -30,7 +30,7 @@ fn absolute(found: &[f64], expected: &[f64]) -> f64 {
         .fold(0.0, |a, b| if b.is_nan() { b } else { a.max(b) })
 }
 
-/// Relative to the largest expected value; values that should vanish are measured against `floor`.
+/// Relative to the largest expected value; values that should vanish are compared with `floor`.
 fn relative(found: &[f64], expected: &[f64], floor: f64) -> f64 {
     absolute(found, expected) / expected.iter().fold(floor, |m: f64, x| m.max(x.abs()))
 }

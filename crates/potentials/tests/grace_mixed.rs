@@ -15,12 +15,12 @@ fn model(file: &Path, precision: Precision) -> Arc<GraceModel> {
     Arc::new(model)
 }
 
-/// A model of several layers that is there for tests.
+/// A multi-layer test model.
 fn deep(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/data/{name}.npz"))
 }
 
-/// Numbers in [−½, ½), the same in every run.
+/// Reproducible numbers in [−½, ½).
 fn noise(seed: u64) -> impl FnMut() -> f64 {
     let mut state = seed;
     move || {
@@ -29,7 +29,7 @@ fn noise(seed: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// A hot fcc crystal of 32 atoms, elements in turn.
+/// A hot fcc crystal of 32 atoms with alternating elements.
 fn crystal(model: &GraceModel, edge: f64, seed: u64) -> Structure {
     const SITES: [Vec3; 4] = [[0.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]];
     let (mut noise, mut positions) = (noise(seed), Vec::new());
@@ -48,7 +48,7 @@ fn crystal(model: &GraceModel, edge: f64, seed: u64) -> Structure {
     }
 }
 
-/// What is compared.
+/// The compared quantities.
 #[derive(Debug, PartialEq)]
 struct Results {
     energy: Evaluation,
@@ -76,8 +76,8 @@ fn error(found: &[f64], expected: &[f64]) -> f64 {
     (squares / expected.iter().map(|e| e * e).sum::<f64>()).sqrt()
 }
 
-/// Root mean squares relative to those of double precision, and the energies of atoms, eV: each below `most`, that of features
-/// below 10⁻⁵.
+/// Compares root mean squares relative to double precision and the energies of atoms, eV: each below `most`,
+/// features below 10⁻⁵.
 fn compare(file: &Path, edge: f64, most: f64) {
     let [mut double, mut mixed] =
         [Precision::Double, Precision::Mixed].map(|precision| Grace::new(model(file, precision)));
@@ -95,7 +95,7 @@ fn compare(file: &Path, edge: f64, most: f64) {
             "{}: energies {energy:.1e} eV, forces {forces:.1e}, virial {virial:.1e}, z {features:.1e}, pull-back {gradient:.1e}",
             file.display()
         );
-        // The same numbers would be double precision again.
+        // Identical numbers would mean that double precision was used.
         assert!(forces > 1e-9 && features > 1e-9);
         assert!(energy < most && forces < most && virial < most && features < 1e-5 && gradient < most);
     }
@@ -114,11 +114,11 @@ fn two_layers() {
 
 #[test]
 fn three_layers() {
-    // Random weights, which amplify what is rounded from layer to layer.
+    // Random weights, which amplify rounding from layer to layer.
     compare(&deep("three_layers"), 3.9, 1e-3);
 }
 
-/// Grades of the structures that the framework that made the models has graded.
+/// Compares grades of the structures that the original framework has graded.
 fn compare_grades(folder: &Path) {
     let mixture = Mixture::read(folder);
     let mut grace = Grace::new(model(&folder.join("kokkos.npz"), Precision::Mixed));
@@ -171,7 +171,7 @@ fn instructions_and_threads_change_no_bits() {
     }
 }
 
-/// Two atoms as they leave each other: nothing jumps, and what is left near the cutoff is as small as in double precision.
+/// Two atoms that separate: nothing jumps, and near the cutoff values are as small as in double precision.
 #[test]
 fn nothing_jumps_at_the_cutoff() {
     let file = committed("al_eam_1l").join("kokkos.npz");
@@ -199,7 +199,7 @@ fn nothing_jumps_at_the_cutoff() {
 
 /// Velocity Verlet of a hot crystal: the total energies of all steps, eV per atom.
 fn total_energies(precision: Precision, steps: usize) -> Vec<f64> {
-    /// u Å²/fs² in eV
+    /// u Å²/fs² in eV.
     const MASS_UNIT: f64 = 103.642_696_5;
     let file = committed("al_eam_1l").join("kokkos.npz");
     let mut grace = Grace::new(model(&file, precision));
@@ -255,7 +255,7 @@ fn the_energy_is_conserved_as_in_double_precision() {
         spread(&double),
         spread(&mixed)
     );
-    // The integrator's own error is much the larger.
+    // The integrator's own error is much larger.
     assert!((drift(&mixed) - drift(&double)).abs() < 0.1 * spread(&double));
     assert!((spread(&mixed) / spread(&double) - 1.0).abs() < 0.2);
 }

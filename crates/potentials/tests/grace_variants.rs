@@ -1,4 +1,4 @@
-//! Variants of the model format that no model at hand uses, each made to mean the same as one that is tested
+//! Variants of the model format that no available model uses, each made equivalent to one that is tested
 //! against the framework, or compared with its definition.
 
 use std::sync::Arc;
@@ -50,7 +50,7 @@ fn zeros(name: &str) -> Option<Vec<u8>> {
     array(&shape, &vec![0.0_f64; data.len()])
 }
 
-/// Takes away what only products of higher order than `order` need, and the features.
+/// Removes what only products above order `order` need, and the features.
 fn without_orders_above(order: usize) -> Changes<'static> {
     let mut changes = vec![
         ("rho_instruction_names", strings(&["A", "AA", "AAA", "AAAA"][..order])),
@@ -169,7 +169,7 @@ fn a_readout_with_tanh_has_the_right_derivatives() {
     assert!((common::evaluate(&mut grace, &structure()).atomic_energies[0] - silu).abs() > 1e-6);
 }
 
-/// Features without normalisation or densities: p = B R, so that those of the committed model are p / ‖B‖.
+/// Features without normalisation or densities: p = B R, so the features of the committed model are p / ‖B‖.
 #[test]
 fn features_of_the_older_schemas_follow_their_definition() {
     check_older_schemas(&BYTES, 128, 2);

@@ -44,7 +44,7 @@ fn case(value: &Value) -> Case {
     }
 }
 
-/// The cases computed with the potential called so.
+/// The cases of the potential with this name.
 fn cases(potential: &str) -> Vec<Case> {
     let text = std::fs::read_to_string(format!("{HERE}/tests/data/lammps_reference.json")).unwrap();
     let all: Value = serde_json::from_str(&text).unwrap();
@@ -79,7 +79,7 @@ fn deviation(what: &str, found: &[Vec3], expected: &[Vec3], scale: f64) -> f64 {
     let largest = expected.iter().fold(0.0_f64, |m, x| m.max(x.abs()));
     let error = found.iter().zip(&expected).fold(0.0_f64, |m, (f, e)| m.max((f - e).abs()));
     if largest < 1e-3 {
-        // By symmetry or at the cutoff next to nothing: only rounding errors could be compared.
+        // Nearly zero by symmetry or at the cutoff; only rounding errors could be compared.
         assert!(error < 1e-12, "{what}: {error}");
         return 0.0;
     }
@@ -95,7 +95,7 @@ fn made_up(name: &str) -> PathBuf {
     Path::new(HERE).join("tests/data").join(name)
 }
 
-/// Directory of potentials that are too large for the project.
+/// Directory of potentials that are too large for the repository.
 fn further(name: &str) -> Option<PathBuf> {
     let directory = std::env::var_os("CALMWALK_PEER_DATA");
     if directory.is_none() {
@@ -144,7 +144,7 @@ fn stillinger_weber_mixture() {
     compare(&mut StillingerWeber::load(made_up(name)).unwrap(), name, 1.0);
 }
 
-/// LAMMPS has e²/(4πε₀) = 14.399645 eV Å, rounded; it switches where nothing is left of the repulsion.
+/// LAMMPS uses e²/(4πε₀) = 14.399645 eV Å, rounded; it switches where the repulsion has vanished.
 #[test]
 fn zbl() {
     let species = ["Al", "Si"].map(|symbol| symbol.parse().unwrap());

@@ -1,4 +1,4 @@
-//! Broken files of EAM and Stillinger–Weber: each gives an error that says what is wrong and where.
+//! Broken EAM and Stillinger–Weber files: each error states what is wrong and where.
 
 use std::fs;
 
@@ -35,7 +35,7 @@ fn with_line(text: &str, number: usize, line: &str) -> String {
     lines.join("\n")
 }
 
-/// The error, which must name this line and contain these words.
+/// Asserts an error that names this line and contains these words.
 fn assert_error<T>(result: Result<T, PotentialFileError>, line: usize, words: &[&str]) {
     let Err(error) = result else { panic!("no error, expected {words:?} in line {line}") };
     let message = error.to_string();
@@ -118,7 +118,8 @@ fn wrong_values_of_a_setfl_file_are_refused() {
     assert!(load_eam(&text.replace("Made-up", "\u{fffd}")).is_ok());
 }
 
-/// Densities of other pairs stand where an alloy file has the next element, and the reverse.
+/// An alloy file has the next element where a Finnis–Sinclair file has densities of other pairs, and vice
+/// versa.
 #[test]
 fn the_wrong_style_is_found_out() {
     let path = format!("{HERE}/tests/data/two_elements.eam.fs");

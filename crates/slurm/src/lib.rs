@@ -1,9 +1,10 @@
-//! The batch system Slurm, by its own commands.
+//! Access to the batch system Slurm through its commands.
 //!
-//! What does not answer has said nothing: an error here is never a word about a job.
+//! A command that fails or times out carries no information about a job: an error never means that a job has
+//! ended.
 
-mod commands;
-mod phase;
+mod client;
+mod job_phase;
 
-pub use commands::{Commands, SlurmError};
-pub use phase::Phase;
+pub use client::{SlurmClient, SlurmError};
+pub use job_phase::JobPhase;

@@ -3,9 +3,9 @@
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use calm::forgetting::ForgettingAlarm;
 use calm::rules::Positive;
-use calm::watch::ForgettingAlarm;
-use calm::{CollectionRule, Combination, UpdateRule, UpdateSettings};
+use calm::{CollectionRule, CovarianceUpdateKind, UpdateRule, UpdateSettings};
 use orchestrator::reactor::{Notice, Reactor};
 use orchestrator::selector::{Mode, SeedStructure, Selector, Settings, Snapshot, UpdateProtocol};
 use store::{Campaign, Fate, Location, Protocol, Store};
@@ -30,7 +30,7 @@ pub fn settings(threshold: f64) -> Settings {
         turn_steps: 1000,
         update: UpdateProtocol::Carried,
         search: UpdateSettings {
-            combination: Combination::Convex,
+            combination: CovarianceUpdateKind::Convex,
             ladder: None,
             stop: UpdateRule::MaximumGrade { target: positive(1.25) },
         },

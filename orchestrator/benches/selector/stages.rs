@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use calm::Mixture;
-use calm::watch::grade_distribution;
+use calm::forgetting::grade_distribution;
 use orchestrator::reactor::group;
 use orchestrator::selector::{Next, Settings};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};

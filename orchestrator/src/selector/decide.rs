@@ -5,8 +5,8 @@ use std::panic::resume_unwind;
 use std::sync::Arc;
 use std::thread::{self, available_parallelism};
 
+use calm::forgetting::{GradeDistribution, grade_distribution};
 use calm::grade::maximum;
-use calm::watch::{GradeDistribution, grade_distribution};
 use calm::{GradeError, Grades, Mixture, UpdateOutcome};
 use serde_json::json;
 use store::records::{CandidateRecord, Commit, ComponentRecord, Decision, Fate};
@@ -53,7 +53,7 @@ impl TrainingFrames {
             gammas.collect::<Result<Vec<_>, _>>()
         });
         let gamma = gamma.map_err(|source| SelectorError::Training { source })?;
-        Ok(GradeDistribution::of(&gamma.concat()))
+        Ok(GradeDistribution::from_grades(&gamma.concat()))
     }
 }
 
@@ -133,7 +133,8 @@ impl Judge {
         });
         if self.raised > 1.0 {
             detail["raised_by"] = json!(self.raised);
-            detail["threshold"] = json!(self.settings.collection.raised(self.raised).threshold());
+            detail["threshold"] =
+                json!(self.settings.collection.with_threshold_factor(self.raised).threshold());
         }
         let (fate, verdict) = match self.reason_to_decline(id, candidate.content, &graded) {
             Some(reason) => {
@@ -217,7 +218,8 @@ impl Judge {
             Some(Decline::Budget)
         } else if !self.settings.collection.is_met(&graded.selector.gamma) {
             Some(Decline::Covered)
-        } else if !self.settings.collection.raised(self.raised).is_met(&graded.selector.gamma) {
+        } else if !self.settings.collection.with_threshold_factor(self.raised).is_met(&graded.selector.gamma)
+        {
             Some(Decline::Backlog)
         } else {
             None

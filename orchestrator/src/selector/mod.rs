@@ -24,7 +24,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use atoms::Structure;
-use calm::watch::ForgettingAlarm;
+use calm::forgetting::ForgettingAlarm;
 use calm::{Mixture, MixtureError};
 use serde::{Deserialize, Serialize};
 use store::records::{Commit, ComponentRecord, WalkRecord};

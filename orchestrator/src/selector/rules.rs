@@ -1,8 +1,8 @@
 //! Rules that may change while a campaign lasts. The decision log says when: decisions follow from it and from nothing
 //! else.
 
+use calm::forgetting::ForgettingAlarm;
 use calm::rules::Fraction;
-use calm::watch::ForgettingAlarm;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 

@@ -4,7 +4,7 @@ use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use ::slurm::{Commands, SlurmError};
+use ::slurm::{SlurmClient, SlurmError};
 
 use super::job::{Job, JobNames, Role, comment};
 use super::plan::Submission;
@@ -12,7 +12,7 @@ use super::plan::Submission;
 /// Slurm, as far as this host can reach it.
 #[derive(Clone, Debug)]
 pub struct Slurm {
-    commands: Commands,
+    commands: SlurmClient,
 }
 
 /// Everything about a submission that is the same for all jobs of a kind.
@@ -35,7 +35,7 @@ pub struct Request<'a> {
 impl Slurm {
     /// Who does not wait for an answer for longer than this.
     pub fn with_patience(patience: Duration) -> Self {
-        Self { commands: Commands::with_patience(patience) }
+        Self { commands: SlurmClient::with_timeout(patience) }
     }
 
     /// The jobs of a campaign that this user has: all that wait or run, and those that have ended within the last minutes
@@ -44,7 +44,7 @@ impl Slurm {
         let text = self.commands.queue(Job::FORMAT, &["--states=all"]).await?;
         let job = |line: &str| {
             let (found, expected) = (line.to_owned(), "what --format asks for");
-            let unreadable = |()| SlurmError::Unreadable { program: "squeue", found, expected };
+            let unreadable = |()| SlurmError::UnexpectedOutput { program: "squeue", found, expected };
             Job::parse(line, names).map_err(unreadable).transpose()
         };
         text.lines().filter_map(job).collect()

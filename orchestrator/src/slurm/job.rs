@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use ::slurm::Phase;
+use ::slurm::JobPhase;
 
 /// What a job of a campaign does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -118,8 +118,8 @@ impl Job {
     }
 
     /// Where it stands.
-    pub fn phase(&self) -> Phase {
-        Phase::of(&self.state)
+    pub fn phase(&self) -> JobPhase {
+        JobPhase::from_state(&self.state)
     }
 }
 
@@ -151,11 +151,11 @@ mod tests {
         let names = JobNames::new("1a");
         let line = "12|RUNNING|calmwalk-1a-agent-3|node7|2026-11-21T20:15:00|1-02:00:00|walkers=16|None";
         let job = Job::parse(line, &names).unwrap().unwrap();
-        assert_eq!((job.id, job.role, job.phase()), (12, Role::Agent(3), Phase::Running));
+        assert_eq!((job.id, job.role, job.phase()), (12, Role::Agent(3), JobPhase::Running));
         assert_eq!((job.walkers, job.reason), (Some(16), None));
         let line = "13|PENDING|calmwalk-1a-orchestrator||N/A|2:00|(null)|launch failed | requeued held";
         let job = Job::parse(line, &names).unwrap().unwrap();
-        assert_eq!((job.role, job.phase(), job.walkers), (Role::Orchestrator, Phase::Pending, None));
+        assert_eq!((job.role, job.phase(), job.walkers), (Role::Orchestrator, JobPhase::Pending, None));
         assert_eq!(job.reason.as_deref(), Some("launch failed | requeued held"));
     }
 

@@ -13,7 +13,7 @@ mod job;
 mod plan;
 mod stop;
 
-pub use ::slurm::{Phase, SlurmError};
+pub use ::slurm::{JobPhase, SlurmError};
 pub use commands::{Request, Slurm};
 pub use job::{Job, JobNames, Role};
 pub use plan::{Plan, Submission, Wanted, plan};

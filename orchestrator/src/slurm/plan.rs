@@ -2,7 +2,7 @@
 
 use std::cmp::Reverse;
 
-use ::slurm::Phase;
+use ::slurm::JobPhase;
 
 use super::job::{Job, Role};
 
@@ -59,14 +59,14 @@ impl Wanted {
 /// The same is decided for the same jobs, so that two who launch at the same moment agree about which of two jobs is to stay.
 pub fn plan(wanted: &Wanted, jobs: &[Job]) -> Plan {
     let mut plan = Plan::default();
-    let mut living: Vec<_> = jobs.iter().filter(|job| job.phase() != Phase::Over).collect();
+    let mut living: Vec<_> = jobs.iter().filter(|job| job.phase() != JobPhase::Over).collect();
     // Those that run before those that wait, and of these the first.
-    living.sort_by_key(|job| (Reverse(job.phase() == Phase::Running), job.id));
+    living.sort_by_key(|job| (Reverse(job.phase() == JobPhase::Running), job.id));
     for role in wanted.roles() {
         let (of_role, others): (Vec<_>, Vec<_>) = living.into_iter().partition(|job| job.role == role);
         living = others;
         // One that ends may come back, or may not: in its place another waits for its end.
-        let staying: Vec<_> = of_role.iter().filter(|job| job.phase() != Phase::Completing).collect();
+        let staying: Vec<_> = of_role.iter().filter(|job| job.phase() != JobPhase::Completing).collect();
         let kept = staying.iter().find(|job| wanted.fits(job)).map(|job| job.id);
         plan.cancel.extend(staying.iter().map(|job| job.id).filter(|id| Some(*id) != kept));
         if kept.is_none() {
@@ -74,7 +74,7 @@ pub fn plan(wanted: &Wanted, jobs: &[Job]) -> Plan {
             plan.submit.push(Submission { role, after_end_of });
         }
     }
-    let left = living.iter().filter(|job| job.phase() != Phase::Completing);
+    let left = living.iter().filter(|job| job.phase() != JobPhase::Completing);
     plan.cancel.extend(left.map(|job| job.id));
     plan
 }

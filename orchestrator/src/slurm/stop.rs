@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use ::slurm::{Phase, SlurmError};
+use ::slurm::{JobPhase, SlurmError};
 use tokio::time::sleep;
 
 use super::commands::Slurm;
@@ -24,7 +24,7 @@ impl Slurm {
             let jobs = self.jobs(names).await?;
             let (leading, working): (Vec<_>, Vec<_>) = jobs
                 .iter()
-                .filter(|job| job.phase() != Phase::Over && Some(job.id) != own)
+                .filter(|job| job.phase() != JobPhase::Over && Some(job.id) != own)
                 .partition(|job| job.role == Role::Orchestrator);
             let last = working.is_empty() || begun.elapsed() > PATIENCE;
             let now = if last { leading } else { working };
@@ -42,7 +42,7 @@ impl Slurm {
     /// Takes away the jobs that have not begun.
     pub async fn withdraw(&self, names: &JobNames) -> Result<usize, SlurmError> {
         let jobs = self.jobs(names).await?;
-        let waiting = jobs.iter().filter(|job| job.phase() == Phase::Pending);
+        let waiting = jobs.iter().filter(|job| job.phase() == JobPhase::Pending);
         let ids: Vec<_> = waiting.map(|job| job.id).collect();
         self.cancel(&ids).await?;
         Ok(ids.len())
@@ -51,5 +51,5 @@ impl Slurm {
 
 /// Whether it has not been asked to end, or was and is requeued.
 fn is_left(job: &Job) -> bool {
-    job.phase() != Phase::Completing
+    job.phase() != JobPhase::Completing
 }

@@ -6,9 +6,11 @@ pub mod scripted;
 use std::sync::Arc;
 
 use atoms::{Cell, Species, Structure};
+use calm::forgetting::ForgettingAlarm;
 use calm::rules::Positive;
-use calm::watch::ForgettingAlarm;
-use calm::{CollectionRule, Combination, Component, Mixture, Statistics, UpdateRule, UpdateSettings};
+use calm::{
+    CollectionRule, Component, CovarianceUpdateKind, Mixture, Statistics, UpdateRule, UpdateSettings,
+};
 use orchestrator::grader::Grader;
 use orchestrator::selector::{
     Mode, Next, SeedStructure, Selector, Settings, Snapshot, TrainingFrames, UpdateProtocol,
@@ -74,7 +76,7 @@ pub fn settings(mode: Mode) -> Settings {
         turn_steps: 10,
         update: UpdateProtocol::Carried,
         search: UpdateSettings {
-            combination: Combination::Convex,
+            combination: CovarianceUpdateKind::Convex,
             ladder: None,
             stop: UpdateRule::MaximumGrade { target: positive(1.25) },
         },

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use atoms::FileError;
-use atoms::extxyz::{Column, Entries, Frame, Value, write_frame};
+use atoms::extxyz::{Column, ColumnData, Frame, Value, write_frame};
 use calm::Artifact;
 use npyz::{NpyWriter, WriterBuilder};
 use potentials::grace::GraceModel;
@@ -130,14 +130,14 @@ fn write_scores(frame: &mut Frame, scorer: &Scorer, gradient: bool) {
     if let Some(stress) = evaluation.stress(&frame.structure) {
         frame.info.insert("stress".into(), stress.into());
     }
-    let scalars = |values: &[f64]| Column { width: 1, entries: Entries::Real(values.to_vec()) };
+    let scalars = |values: &[f64]| Column { width: 1, entries: ColumnData::Real(values.to_vec()) };
     let component = scorer.grades.component.iter().map(|slot| *slot as i64).collect();
     let mut insert = |name: &str, column| frame.arrays.insert(name.to_owned(), column);
     insert("forces", Column::vectors(&evaluation.forces));
     insert("gamma", scalars(&scorer.grades.gamma));
     insert("gamma_nbr", scalars(&scorer.gamma_nbr));
     insert("sigma", scalars(&scorer.grades.sigma));
-    insert("component", Column { width: 1, entries: Entries::Int(component) });
+    insert("component", Column { width: 1, entries: ColumnData::Int(component) });
     if gradient {
         insert("gamma_gradient", Column::vectors(&scorer.pull_back.gradient));
     }

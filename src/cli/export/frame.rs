@@ -1,6 +1,6 @@
 //! A labelled structure as a frame with its origin, and its quantities for filters.
 
-use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, Value};
+use atoms::extxyz::{Column, ColumnData, Frame, LabelKeys, Labels, Value};
 use store::{ExportRow, ExportSource};
 
 use crate::filter::StructureProperties;
@@ -37,12 +37,12 @@ pub fn facts(row: &ExportRow) -> StructureProperties<'_> {
 }
 
 /// The frame of a labelled structure.
-pub fn frame(row: ExportRow, keys: Keys, campaign: &str) -> Frame {
+pub fn frame(row: ExportRow, keys: LabelKeys, campaign: &str) -> Frame {
     let mut frame = Frame::from(row.structure);
     let label = row.label;
     let labels = Labels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
     frame.set_labels(&labels, keys);
-    let scalars = |values| Column { width: 1, entries: Entries::Real(values) };
+    let scalars = |values| Column { width: 1, entries: ColumnData::Real(values) };
     let details = label.details;
     if let Some(moments) = details.magnetic_moments {
         frame.arrays.insert("magmoms".to_owned(), scalars(moments));

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
 use std::path::PathBuf;
 
-use atoms::extxyz::{Keys, write_frame};
+use atoms::extxyz::{LabelKeys, write_frame};
 use store::records::Protocol;
 use store::{DATABASE, ExportFilter, ExportPlace, ExportRow, ExportSource, JobState, LOCK, Store};
 
@@ -303,7 +303,7 @@ impl Export {
     }
 }
 
-impl From<KeyNames> for Keys {
+impl From<KeyNames> for LabelKeys {
     fn from(names: KeyNames) -> Self {
         match names {
             KeyNames::Ase => Self::Ase,
@@ -319,7 +319,7 @@ impl Part {
         &mut self,
         row: ExportRow,
         seed: Option<u32>,
-        keys: Keys,
+        keys: LabelKeys,
         campaign: &str,
     ) -> Result<(), Failure> {
         self.count.frames += 1;

@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use orchestrator::slurm::{Job, JobNames, Phase, Plan, Request, Role, Wanted};
+use orchestrator::slurm::{Job, JobNames, JobPhase, Plan, Request, Role, Wanted};
 use wire::net::Tls;
 
 use super::templates::{self, AGENT, COMMON, LABELLER, ORCHESTRATOR, Values, fill, quoted, template};
@@ -101,7 +101,7 @@ impl JobSpecs {
 
     /// The existing job of the orchestrator that is not cancelled, if there is one.
     pub fn orchestrator_job(&self, jobs: &[Job], cancelled: &[u64]) -> Option<u64> {
-        let is_active = |job: &&Job| matches!(job.phase(), Phase::Pending | Phase::Running);
+        let is_active = |job: &&Job| matches!(job.phase(), JobPhase::Pending | JobPhase::Running);
         let mut active = jobs.iter().filter(|job| job.role == Role::Orchestrator).filter(is_active);
         active.find(|job| !cancelled.contains(&job.id)).map(|job| job.id)
     }

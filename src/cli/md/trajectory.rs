@@ -3,7 +3,7 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use atoms::extxyz::{Column, Frame, Keys, Labels, write_frame};
+use atoms::extxyz::{Column, Frame, LabelKeys, Labels, write_frame};
 use atoms::units::ACCELERATION;
 use md::Dynamics;
 
@@ -52,7 +52,7 @@ fn frame(dynamics: &Dynamics) -> Frame {
     let momenta = state.velocities.iter().zip(dynamics.masses());
     let momenta: Vec<_> = momenta.map(|(v, mass)| v.map(|v| mass * v / unit)).collect();
     let mut frame = Frame::from(state.structure.clone());
-    frame.set_labels(&labels, Keys::Ase);
+    frame.set_labels(&labels, LabelKeys::Ase);
     frame.arrays.insert("momenta".into(), Column::vectors(&momenta));
     frame.info.insert("step".into(), i64::try_from(state.step).unwrap_or(i64::MAX).into());
     frame.info.insert("time_fs".into(), time(dynamics).into());

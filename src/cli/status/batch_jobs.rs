@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::io::{self, Write};
 use std::time::Duration;
 
-use orchestrator::slurm::{Job, Phase, Role, Slurm, SlurmError};
+use orchestrator::slurm::{Job, JobPhase, Role, Slurm, SlurmError};
 use serde_json::{Value, json};
 use store::Location;
 use tokio::time::timeout;
@@ -63,7 +63,7 @@ impl BatchJobs {
             Self::Unknown(why) => return writeln!(out, "\njobs        no answer from Slurm: {why}"),
             Self::Known(jobs) => jobs,
         };
-        let runs = |job: &Job| job.role != Role::Orchestrator && job.phase() == Phase::Running;
+        let runs = |job: &Job| job.role != Role::Orchestrator && job.phase() == JobPhase::Running;
         let mut shown: Vec<_> = jobs.iter().collect();
         if shown.len() > page.others {
             shown.sort_by_key(|(job, _)| (runs(job), job.role));
@@ -84,15 +84,15 @@ async fn query_slurm(location: &Location) -> Result<Vec<(Job, Option<String>)>, 
     let mut jobs = slurm.jobs(&job_names(location)).await?;
     let mut last: BTreeMap<Role, (bool, u64)> = BTreeMap::new();
     for job in &jobs {
-        let found = (job.phase() != Phase::Over, job.id);
+        let found = (job.phase() != JobPhase::Over, job.id);
         let last = last.entry(job.role).or_insert(found);
         *last = found.max(*last);
     }
-    jobs.retain(|job| job.phase() != Phase::Over || last.get(&job.role) == Some(&(false, job.id)));
+    jobs.retain(|job| job.phase() != JobPhase::Over || last.get(&job.role) == Some(&(false, job.id)));
     jobs.sort_by_key(|job| (job.role, job.id));
     let mut known = Vec::new();
     for job in jobs {
-        let failed = job.phase() == Phase::Over && job.state != "COMPLETED";
+        let failed = job.phase() == JobPhase::Over && job.state != "COMPLETED";
         // Slurm may no longer know the job.
         let code = if failed { slurm.exit_code(job.id).await.ok().flatten() } else { None };
         known.push((job, code));
@@ -101,10 +101,10 @@ async fn query_slurm(location: &Location) -> Result<Vec<(Job, Option<String>)>, 
 }
 
 fn line(job: &Job, code: Option<&str>) -> Vec<String> {
-    let has_started = job.phase() != Phase::Pending;
+    let has_started = job.phase() != JobPhase::Pending;
     let reason = job.reason.clone().unwrap_or_default();
     let remark = match (job.phase(), code) {
-        (Phase::Pending, _) if job.start != "N/A" => format!("{reason}; expected start {}", job.start),
+        (JobPhase::Pending, _) if job.start != "N/A" => format!("{reason}; expected start {}", job.start),
         (_, Some(code)) if reason.is_empty() => format!("exit code {code}"),
         (_, Some(code)) => format!("exit code {code}, {reason}"),
         _ => reason,
@@ -115,7 +115,7 @@ fn line(job: &Job, code: Option<&str>) -> Vec<String> {
         job.state.to_lowercase(),
         job.nodes.clone(),
         if has_started { job.start.clone() } else { String::new() },
-        if job.phase() == Phase::Over { String::new() } else { job.time_left.clone() },
+        if job.phase() == JobPhase::Over { String::new() } else { job.time_left.clone() },
         remark,
     ]
 }

@@ -44,15 +44,15 @@ fn draw_fates(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Rectangl
     let names: Vec<_> = fates.iter().map(|(name, _)| (*name).to_owned()).collect();
     let largest = fates.iter().map(|(_, count)| *count).max().unwrap_or(0).max(1) as f64;
     let x = Axis::new("candidates", Scale::Linear, 0.0, 1.25 * largest).with_ticks(4);
-    let mut panel = Panel::new(place, x, Axis::of_names("", &names));
+    let mut panel = Panel::new(place, x, Axis::categorical("", &names));
     for (k, (name, count)) in fates.iter().enumerate() {
         let (low, high) = (k as f64 + 0.18, k as f64 + 0.82);
         let colour = if *name == "accepted" { Colour::VERMILLION } else { Colour::GREY };
         panel.bar([0.0, low], [*count as f64, high], colour.faint(0.75));
-        panel.words([*count as f64, k as f64 + 0.5], [4.0, 2.5], &grouped(*count), Anchor::Start);
+        panel.text([*count as f64, k as f64 + 0.5], [4.0, 2.5], &grouped(*count), Anchor::Start);
         numbers.push(&["a".to_owned(), (*name).to_owned(), count.to_string(), String::new()]);
     }
-    panel.letter('a');
+    panel.panel_letter('a');
     panel.draw(figure);
 }
 
@@ -71,6 +71,6 @@ fn draw_progress(figure: &mut Figure, numbers: &mut Csv, place: ::figures::Recta
     let mut panel = Panel::new(place, x, y);
     panel.line([[0.0, 0.0], [seen as f64, seen as f64]], Colour::GREY.dashed(0.7));
     panel.line(line, Colour::VERMILLION.line(1.5));
-    panel.letter('b');
+    panel.panel_letter('b');
     panel.draw(figure);
 }

@@ -55,7 +55,7 @@ fn draw_bins(
         _ => None,
     });
     let y = Axis::new("labelled (%)", Scale::Linear, 0.0, 118.0);
-    let mut panel = Panel::new(place, Axis::of_bins(title, bins.len(), ends), y);
+    let mut panel = Panel::new(place, Axis::binned(title, bins.len(), ends), y);
     for (k, bin) in bins.iter().enumerate() {
         let x = k as f64 + 0.5;
         let failed = bin.failed.len() as u64;
@@ -67,13 +67,13 @@ fn draw_bins(
             panel.dots([[x, 100.0 * share]], Marker::Disc, 2.6, Colour::BLUE, None);
         }
         let all = grouped(bin.labelled + failed);
-        panel.words([x, 108.0], [0.0, 2.5], &all, ::figures::Anchor::Middle).colour = Colour::GREY;
+        panel.text([x, 108.0], [0.0, 2.5], &all, ::figures::Anchor::Middle).colour = Colour::GREY;
         let (low, high) = bin.interval.unzip();
         let mut cells = vec![letter.to_string(), csv::number(bin.above), csv::number(bin.up_to)];
         cells.extend([bin.labelled.to_string(), failed.to_string()]);
         cells.extend([bin.share, low, high].map(csv::number));
         numbers.push(&cells);
     }
-    panel.letter(letter);
+    panel.panel_letter(letter);
     panel.draw(figure);
 }

@@ -32,24 +32,24 @@ pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
     for ((letter, title, of), place) in panels.into_iter().zip(places) {
         let values = |origin: Origin| -> Vec<f64> {
             let (_, collection) = collections.both()[usize::from(origin == Origin::Control)];
-            collection.atoms.kept().filter_map(of).filter(|x| x.is_finite()).collect()
+            collection.atoms.items().filter_map(of).filter(|x| x.is_finite()).collect()
         };
         let all: Vec<f64> = shown.iter().flat_map(|origin| values(*origin)).collect();
         let x = axis(title, Scale::Logarithmic, &all, (letter != 'c').then_some(1.0)).with_ticks(4);
         let edges = logarithmic_edges(x.low, x.high, BINS);
         let known = |origin: &Origin| !values(*origin).is_empty();
-        let histogram = |origin: &Origin| (*origin, Histogram::of(edges.clone(), values(*origin)));
+        let histogram = |origin: &Origin| (*origin, Histogram::from_values(edges.clone(), values(*origin)));
         let histograms: Vec<_> = shown.iter().filter(|origin| known(origin)).map(histogram).collect();
         let y = share_axis("atoms (%)", &histograms);
-        let mut panel = Panel::new(place, x, if letter == 'a' { y } else { y.titled("") });
+        let mut panel = Panel::new(place, x, if letter == 'a' { y } else { y.with_title("") });
         if histograms.is_empty() {
-            panel.says("no labels yet");
+            panel.placeholder("no labels yet");
         }
         draw_histograms(&mut panel, &histograms);
         if letter != 'c' {
-            panel.vertical(1.0);
+            panel.vertical_line(1.0);
         }
-        panel.letter(letter);
+        panel.panel_letter(letter);
         push_histograms(&mut numbers, &letter.to_string(), &histograms);
         panel.draw(&mut figure);
     }
@@ -61,23 +61,23 @@ fn caption(collections: &Collections, shown: &[Origin]) -> String {
     let of = |origin: &Origin| {
         let (_, collection) = collections.both()[usize::from(*origin == Origin::Control)];
         let atoms = &collection.atoms;
-        let mut grades: Vec<_> = atoms.kept().map(|atom| atom.gamma_nbr).filter(|x| x.is_finite()).collect();
+        let mut grades: Vec<_> = atoms.items().map(|atom| atom.gamma_nbr).filter(|x| x.is_finite()).collect();
         grades.sort_by(f64::total_cmp);
         let median = quantile(&grades, 0.5).map_or("unknown".to_owned(), |x| format!("{x:.2}"));
-        let errors: Vec<_> = atoms.kept().filter_map(|atom| atom.error).filter(|x| x.is_finite()).collect();
+        let errors: Vec<_> = atoms.items().filter_map(|atom| atom.error).filter(|x| x.is_finite()).collect();
         let mean = match errors.len() {
             0 => "no labels".to_owned(),
             n => format!("mean force error {:.3} eV Å^{{−1}}", errors.iter().sum::<f64>() / n as f64),
         };
-        let drawn = match (atoms.kept().len() as u64) < atoms.seen() {
-            true => format!(", of which a sample of {} is shown", grouped(atoms.kept().len() as u64)),
+        let drawn = match (atoms.items().len() as u64) < atoms.total() {
+            true => format!(", of which a sample of {} is shown", grouped(atoms.items().len() as u64)),
             false => String::new(),
         };
         format!(
             "{}: {} structures with {} atoms{drawn}, {} structures labelled, median γ_{{nbr}} {median}, {mean}",
             origin.name(),
-            grouped(collection.structures.seen()),
-            grouped(atoms.seen()),
+            grouped(collection.structures.total()),
+            grouped(atoms.total()),
             grouped(collection.labelled()),
         )
     };

@@ -1,7 +1,7 @@
 //! Force error against γ_nbr and against the relative nearest-neighbour distance, with marginal densities (the paper's Fig. 8).
 
 use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale, Side};
-use analysis::{Band, bands, density, even_edges, quantile};
+use analysis::{QuantileBin, binned_quantiles, kernel_density, linear_edges, quantile};
 use wire::Origin;
 
 use super::super::collections::{Atom, Collections};
@@ -62,11 +62,11 @@ fn draw_panel(
     let x = axis(against.title, against.scale, &all(0), Some(1.0));
     let y = axis("force error (eV Å^{−1})", Scale::Logarithmic, &all(1), None);
     let mut panel = Panel::new(place, x.clone(), y.clone());
-    panel.vertical(1.0);
+    panel.vertical_line(1.0);
     let edges = edges(&x);
     let found: Vec<_> = of
         .iter()
-        .map(|(origin, pairs)| (*origin, bands(&edges, pairs.iter().map(|[x, y]| (*x, *y)))))
+        .map(|(origin, pairs)| (*origin, binned_quantiles(&edges, pairs.iter().map(|[x, y]| (*x, *y)))))
         .collect();
     for (origin, bands) in &found {
         draw_bands(&mut panel, *origin, bands);
@@ -75,7 +75,7 @@ fn draw_panel(
     for (origin, bands) in &found {
         draw_medians(&mut panel, *origin, bands);
     }
-    panel.letter(against.letter);
+    panel.panel_letter(against.letter);
     panel.draw(figure);
     draw_margins(figure, &of, place, &x, &y);
 }
@@ -83,13 +83,13 @@ fn draw_panel(
 /// Edges of the bins of a panel, equally wide on its axis.
 fn edges(x: &Axis) -> Vec<f64> {
     match x.scale {
-        Scale::Linear => even_edges(x.low, x.high, BINS),
+        Scale::Linear => linear_edges(x.low, x.high, BINS),
         Scale::Logarithmic => analysis::logarithmic_edges(x.low, x.high, BINS),
     }
 }
 
 /// Midpoint of a bin on the axis of a panel.
-pub fn middle(panel: &Panel, band: &Band) -> f64 {
+pub fn middle(panel: &Panel, band: &QuantileBin) -> f64 {
     match panel.x.scale {
         Scale::Linear => 0.5 * (band.low + band.high),
         Scale::Logarithmic => (band.low * band.high).sqrt(),
@@ -97,7 +97,7 @@ pub fn middle(panel: &Panel, band: &Band) -> f64 {
 }
 
 /// Draws the band between two quantiles over runs of bins with enough atoms.
-pub fn ribbons(panel: &mut Panel, bands: &[Band], [low, high]: [usize; 2], paint: ::figures::Paint) {
+pub fn ribbons(panel: &mut Panel, bands: &[QuantileBin], [low, high]: [usize; 2], paint: ::figures::Paint) {
     for run in bands.split(|band| band.number < MIN_ATOMS) {
         let points: Vec<_> = run
             .iter()
@@ -107,16 +107,16 @@ pub fn ribbons(panel: &mut Panel, bands: &[Band], [low, high]: [usize; 2], paint
     }
 }
 
-fn draw_bands(panel: &mut Panel, origin: Origin, bands: &[Band]) {
+fn draw_bands(panel: &mut Panel, origin: Origin, bands: &[QuantileBin]) {
     let colour = origin_style(origin).colour;
     ribbons(panel, bands, [1, 5], colour.faint(0.14));
     ribbons(panel, bands, [2, 4], colour.faint(0.22));
 }
 
-fn draw_medians(panel: &mut Panel, origin: Origin, bands: &[Band]) {
+fn draw_medians(panel: &mut Panel, origin: Origin, bands: &[QuantileBin]) {
     let style = origin_style(origin);
     for run in bands.split(|band| band.number < MIN_ATOMS) {
-        let median = |band: &Band| Some([middle(panel, band), band.quantiles?[3]]);
+        let median = |band: &QuantileBin| Some([middle(panel, band), band.quantiles?[3]]);
         let points: Vec<_> = run.iter().filter_map(median).collect();
         panel.line(points.clone(), style.line);
         panel.dots(points, style.marker, 1.9, style.colour, Some(Colour::WHITE.line(0.4)));
@@ -128,16 +128,18 @@ fn draw_margins(figure: &mut Figure, of: &[(Origin, Vec<[f64; 2]>)], place: Rect
     let above = Rectangle { y: place.y - 31.0, height: 28.0, ..place };
     let right = Rectangle { x: place.right() + 3.0, width: 30.0, ..place };
     let along = |axis: &Axis, k: usize| -> Vec<(Origin, Vec<(f64, f64)>)> {
-        let on = |pairs: &Vec<[f64; 2]>| pairs.iter().map(|pair| axis.place(pair[k])).collect::<Vec<_>>();
-        of.iter().map(|(origin, pairs)| (*origin, density(&on(pairs), 0.0, 1.0, GRID_POINTS))).collect()
+        let on = |pairs: &Vec<[f64; 2]>| pairs.iter().map(|pair| axis.position(pair[k])).collect::<Vec<_>>();
+        of.iter()
+            .map(|(origin, pairs)| (*origin, kernel_density(&on(pairs), 0.0, 1.0, GRID_POINTS)))
+            .collect()
     };
     let (horizontal, vertical) = (along(x, 0), along(y, 1));
     let (places, densities) = (
-        || Axis::new("", Scale::Linear, 0.0, 1.0).bare(),
+        || Axis::new("", Scale::Linear, 0.0, 1.0).without_ticks(),
         |lines: &[(Origin, Vec<(f64, f64)>)]| {
             let largest =
                 lines.iter().flat_map(|(_, line)| line).map(|(_, density)| *density).fold(0.0, f64::max);
-            Axis::new("", Scale::Linear, 0.0, 1.05 * largest).bare()
+            Axis::new("", Scale::Linear, 0.0, 1.05 * largest).without_ticks()
         },
     );
     let mut panel = Panel::new(above, places(), densities(&horizontal));
@@ -157,7 +159,7 @@ fn draw_density(panel: &mut Panel, origin: Origin, line: &[(f64, f64)], at: fn(f
     let style = origin_style(origin);
     let points: Vec<_> = line.iter().map(|(place, density)| at(*place, *density)).collect();
     let ring = [at(first.0, 0.0)].into_iter().chain(points.clone()).chain([at(last.0, 0.0)]);
-    panel.rings([ring], Some(style.colour.faint(0.15)), None);
+    panel.polygons([ring], Some(style.colour.faint(0.15)), None);
     panel.line(points, ::figures::Stroke { width: 1.0, ..style.line });
 }
 
@@ -165,11 +167,11 @@ fn draw_density(panel: &mut Panel, origin: Origin, line: &[(f64, f64)], at: fn(f
 fn pairs(collections: &Collections, origin: Origin, of: fn(&Atom) -> Option<f64>) -> Vec<[f64; 2]> {
     let (_, collection) = collections.both()[usize::from(origin == Origin::Control)];
     let pair = |atom: &Atom| Some([of(atom)?, atom.error?]).filter(|[x, y]| x.is_finite() && y.is_finite());
-    collection.atoms.kept().filter_map(pair).collect()
+    collection.atoms.items().filter_map(pair).collect()
 }
 
 /// Writes the bins to the figure's data: panel, origin, edges, number of atoms and five quantiles.
-pub fn push_bands(numbers: &mut Csv, panel: &str, origin: &str, bands: &[Band]) {
+pub fn push_bands(numbers: &mut Csv, panel: &str, origin: &str, bands: &[QuantileBin]) {
     for band in bands {
         let mut cells =
             vec![panel.to_owned(), origin.to_owned(), csv::number(band.low), csv::number(band.high)];

@@ -1,7 +1,7 @@
 //! Force error against either grade, for all labelled atoms, with nested percentile bands (as the paper's Fig. 2).
 
-use ::figures::{Colour, Figure, Key, Panel, Scale, legend};
-use analysis::{bands, logarithmic_edges, spearman};
+use ::figures::{Colour, Figure, LegendKey, Panel, Scale, legend};
+use analysis::{binned_quantiles, logarithmic_edges, spearman};
 use wire::Origin;
 
 use super::super::collections::{Atom, Collections};
@@ -17,7 +17,7 @@ type AtomQuantity = fn(&Atom) -> f64;
 const BINS: usize = 18;
 
 pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
-    let atoms = |origin: Origin| collections.both()[usize::from(origin == Origin::Control)].1.atoms.kept();
+    let atoms = |origin: Origin| collections.both()[usize::from(origin == Origin::Control)].1.atoms.items();
     let labelled = atoms(Origin::Biased).chain(atoms(Origin::Control)).filter(|atom| atom.error.is_some());
     let labelled: Vec<Atom> = labelled.copied().collect();
     if labelled.is_empty() {
@@ -37,18 +37,18 @@ pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
         let x = axis(title, Scale::Logarithmic, &grades, Some(1.0));
         let y = axis("force error (eV Å^{−1})", Scale::Logarithmic, &errors, None);
         let edges = logarithmic_edges(x.low, x.high, BINS);
-        let found = bands(&edges, pairs);
+        let found = binned_quantiles(&edges, pairs);
         let mut panel = Panel::new(place, x, y);
-        panel.vertical(1.0);
+        panel.vertical_line(1.0);
         for (ends, opacity) in [([0, 6], 0.13), ([1, 5], 0.2), ([2, 4], 0.3)] {
             ribbons(&mut panel, &found, ends, Colour::BLUE.faint(opacity));
         }
         for run in found.split(|band| band.number < MIN_ATOMS) {
-            let median = |band: &analysis::Band| Some([middle(&panel, band), band.quantiles?[3]]);
+            let median = |band: &analysis::QuantileBin| Some([middle(&panel, band), band.quantiles?[3]]);
             let points: Vec<_> = run.iter().filter_map(median).collect();
             panel.line(points, Colour::INK.dashed(1.3));
         }
-        panel.letter(letter);
+        panel.panel_letter(letter);
         panel.draw(&mut figure);
         for band in &found {
             let mut cells = vec![letter.to_string(), csv::number(band.low), csv::number(band.high)];
@@ -61,10 +61,10 @@ pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
             .push(format!("{letter}, n = {} atoms, Spearman’s ρ = {rho}", grouped(grades.len() as u64)));
     }
     let keys = [
-        (Key::Line(Colour::INK.dashed(1.3)), "median"),
-        (Key::Area(Colour::BLUE.faint(0.5)), "P_{25}–P_{75}"),
-        (Key::Area(Colour::BLUE.faint(0.3)), "P_{10}–P_{90}"),
-        (Key::Area(Colour::BLUE.faint(0.13)), "P_{5}–P_{95}"),
+        (LegendKey::Line(Colour::INK.dashed(1.3)), "median"),
+        (LegendKey::Area(Colour::BLUE.faint(0.5)), "P_{25}–P_{75}"),
+        (LegendKey::Area(Colour::BLUE.faint(0.3)), "P_{10}–P_{90}"),
+        (LegendKey::Area(Colour::BLUE.faint(0.13)), "P_{5}–P_{95}"),
     ];
     legend(&mut figure, [WIDTH - 8.0, 12.0], &keys);
     let caption = format!(

@@ -37,20 +37,20 @@ pub fn all(data: &ReportData) -> Vec<FigureEntry> {
 fn draw_histograms(panel: &mut Panel, histograms: &[(Origin, Histogram)]) {
     for (origin, histogram) in histograms {
         let style = origin_style(*origin);
-        let (edges, shares) = (histogram.edges(), histogram.shares());
+        let (edges, fractions) = (histogram.edges(), histogram.fractions());
         let mut outline = vec![[edges[0], 0.0]];
-        for (edges, share) in edges.windows(2).zip(&shares) {
-            outline.extend([[edges[0], 100.0 * share], [edges[1], 100.0 * share]]);
+        for (edges, fraction) in edges.windows(2).zip(&fractions) {
+            outline.extend([[edges[0], 100.0 * fraction], [edges[1], 100.0 * fraction]]);
         }
         outline.push([edges[edges.len() - 1], 0.0]);
-        panel.rings([outline.clone()], Some(style.colour.faint(0.18)), None);
+        panel.polygons([outline.clone()], Some(style.colour.faint(0.18)), None);
         panel.line(outline, style.line);
     }
 }
 
 /// The vertical axis of histograms.
 fn share_axis(title: &str, histograms: &[(Origin, Histogram)]) -> Axis {
-    let largest = histograms.iter().flat_map(|(_, histogram)| histogram.shares()).fold(0.0, f64::max);
+    let largest = histograms.iter().flat_map(|(_, histogram)| histogram.fractions()).fold(0.0, f64::max);
     Axis::new(title, Scale::Linear, 0.0, 108.0 * largest.max(1e-6))
 }
 
@@ -68,7 +68,7 @@ fn push_histograms(numbers: &mut Csv, panel: &str, histograms: &[(Origin, Histog
 /// The origins with collected structures.
 fn origins_of(collections: &Collections) -> Vec<Origin> {
     let both = collections.both().into_iter();
-    both.filter(|(_, of)| of.structures.seen() > 0).map(|(origin, _)| origin).collect()
+    both.filter(|(_, of)| of.structures.total() > 0).map(|(origin, _)| origin).collect()
 }
 
 /// Rectangles of `number` panels side by side, with room for axis labels.

@@ -1,7 +1,7 @@
 //! Features projected onto their first two principal components, with 95 % contours (the paper's Fig. 7a).
 
 use ::figures::{Axis, Colour, Figure, Panel, Rectangle, Scale};
-use analysis::{PlaneDensity, contours};
+use analysis::{Density2d, contours};
 use wire::Origin;
 
 use super::super::collections::Collections;
@@ -20,7 +20,7 @@ const MAX_DRAWN: usize = 1500;
 const MIN_ATOMS: usize = 50;
 
 pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
-    if collections.both().iter().all(|(_, of)| of.structures.seen() == 0) {
+    if collections.both().iter().all(|(_, of)| of.structures.total() == 0) {
         return Err(NOTHING_COLLECTED.into());
     }
     let planes = collections.features.planes();
@@ -92,7 +92,7 @@ fn draw_plane(figure: &mut Figure, numbers: &mut Csv, plane: &Plane, place: Rect
     for (origin, lines) in &lines {
         let style = origin_style(*origin);
         let closed = lines.iter().map(|line| line.iter().chain(line.first()).copied());
-        panel.rings(closed.clone(), None, Some(style.line));
+        panel.polygons(closed.clone(), None, Some(style.line));
         let numbered =
             lines.iter().enumerate().flat_map(|(k, line)| line.iter().map(move |point| (k, *point)));
         push(numbers, plane, *origin, "contour", numbered);
@@ -104,14 +104,16 @@ fn draw_plane(figure: &mut Figure, numbers: &mut Csv, plane: &Plane, place: Rect
         push(numbers, plane, origin, "centroid", points.centroids.iter().map(|point| (0, *point)));
     }
     let corner = [panel.x.low, panel.y.high];
-    panel.words(corner, [6.0, 11.0], plane.element.symbol(), ::figures::Anchor::Start).bold = true;
-    panel.letter(letter);
+    panel.text(corner, [6.0, 11.0], plane.element.symbol(), ::figures::Anchor::Start).bold = true;
+    panel.panel_letter(letter);
     panel.draw(figure);
 }
 
 fn contours_of(atoms: &[[f64; 2]]) -> Vec<Vec<[f64; 2]>> {
     let density = Some(atoms).filter(|atoms| atoms.len() >= MIN_ATOMS);
-    let Some(density) = density.and_then(|atoms| PlaneDensity::of(atoms, GRID)) else { return Vec::new() };
+    let Some(density) = density.and_then(|atoms| Density2d::from_points(atoms, GRID)) else {
+        return Vec::new();
+    };
     density.level(atoms, CONTOUR_SHARE).map_or(Vec::new(), |level| contours(&density, level))
 }
 

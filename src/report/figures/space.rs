@@ -1,7 +1,7 @@
 //! Volumes and composition of the collected structures.
 
 use ::figures::{Axis, Figure, Panel, Rectangle, Scale};
-use analysis::{Histogram, even_edges};
+use analysis::{Histogram, linear_edges};
 use wire::Origin;
 
 use super::super::collections::{Collections, StructureSize};
@@ -38,7 +38,7 @@ pub fn draw(collections: &Collections) -> Result<FigureContent, String> {
     let of = |origin: &Origin| {
         let (_, collection) = collections.both()[usize::from(*origin == Origin::Control)];
         let atoms: u64 = collection.elements.values().sum();
-        let structures = grouped(collection.structures.seen());
+        let structures = grouped(collection.structures.total());
         format!("{}: {structures} structures, {} atoms", origin.name(), grouped(atoms))
     };
     let both: Vec<_> = shown.iter().map(of).collect();
@@ -64,21 +64,21 @@ fn draw_volumes(
 ) {
     let values = |origin: &Origin| -> Vec<f64> {
         let (_, collection) = collections.both()[usize::from(*origin == Origin::Control)];
-        collection.structures.kept().filter_map(of).filter(|x| x.is_finite()).collect()
+        collection.structures.items().filter_map(of).filter(|x| x.is_finite()).collect()
     };
     let all: Vec<_> = shown.iter().flat_map(values).collect();
     let x = axis(title, Scale::Linear, &all, None).with_ticks(4);
-    let edges = even_edges(x.low, x.high, BINS);
+    let edges = linear_edges(x.low, x.high, BINS);
     let shown = shown.iter().filter(|origin| !values(origin).is_empty());
-    let histogram = |origin: &Origin| (*origin, Histogram::of(edges.clone(), values(origin)));
+    let histogram = |origin: &Origin| (*origin, Histogram::from_values(edges.clone(), values(origin)));
     let histograms: Vec<_> = shown.map(histogram).collect();
     let y = share_axis(if letter == 'a' { "structures (%)" } else { "" }, &histograms);
     let mut panel = Panel::new(place, x, y);
     if histograms.is_empty() {
-        panel.says("no periodic cell");
+        panel.placeholder("no periodic cell");
     }
     draw_histograms(&mut panel, &histograms);
-    panel.letter(letter);
+    panel.panel_letter(letter);
     push_histograms(numbers, &letter.to_string(), &histograms);
     panel.draw(figure);
 }
@@ -113,7 +113,7 @@ fn draw_elements(
     let names: Vec<_> = elements.iter().map(|element| element.symbol().to_owned()).collect();
     let shares = elements.iter().flat_map(|element| shown.iter().map(|origin| of(element, *origin).1));
     let y = Axis::new("atoms (%)", Scale::Linear, 0.0, 1.08 * shares.fold(0.0, f64::max));
-    let mut panel = Panel::new(place, Axis::of_names("element", &names), y);
+    let mut panel = Panel::new(place, Axis::categorical("element", &names), y);
     let width = 0.7 / shown.len() as f64;
     for (k, element) in elements.iter().enumerate() {
         for (n, origin) in shown.iter().enumerate() {
@@ -123,6 +123,6 @@ fn draw_elements(
             panel.line([[left, 0.0], [left, share], [left + width, share], [left + width, 0.0]], style.line);
         }
     }
-    panel.letter('c');
+    panel.panel_letter('c');
     panel.draw(figure);
 }

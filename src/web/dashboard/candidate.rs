@@ -1,7 +1,7 @@
 //! One candidate or imported structure: its details, its atoms, and files to download.
 
 use atoms::Structure;
-use atoms::extxyz::{Column, Entries, Frame, Keys, Labels, write_frame};
+use atoms::extxyz::{Column, ColumnData, Frame, LabelKeys, Labels, write_frame};
 use atoms::poscar::write_poscar;
 use axum::extract::{Path, State};
 use axum::http::{StatusCode, header};
@@ -83,7 +83,7 @@ async fn frame(store: &Store, found: StructureRecord) -> Result<Frame, StoreErro
     if let Some(labelled) = labels.into_iter().find(|label| label.record.standing == Standing::Label) {
         let label = labelled.record.label;
         let labels = Labels { energy: Some(label.energy), forces: Some(label.forces), stress: label.stress };
-        frame.set_labels(&labels, Keys::Ase);
+        frame.set_labels(&labels, LabelKeys::Ase);
         frame.info.insert("protocol".to_owned(), labelled.protocol.name.into());
     }
     frame.info.insert("campaign".to_owned(), store.campaign().await?.id.to_string().into());
@@ -94,7 +94,7 @@ async fn frame(store: &Store, found: StructureRecord) -> Result<Frame, StoreErro
     frame.info.insert("relative_volume".to_owned(), view.relative_volume().into());
     let grades = [("gamma", candidate.original.gamma), ("gamma_nbr", candidate.original.gamma_nbr)];
     for (name, values) in grades.into_iter().filter(|(_, values)| values.len() == frame.structure.len()) {
-        frame.arrays.insert(name.to_owned(), Column { width: 1, entries: Entries::Real(values) });
+        frame.arrays.insert(name.to_owned(), Column { width: 1, entries: ColumnData::Real(values) });
     }
     Ok(frame)
 }

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use atoms::Structure;
-use dft::{Code, Failure, FailureClass, Size};
+use dft::{DftBackend, Failure, FailureClass, Size};
 use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::sync::OnceCell;
@@ -30,7 +30,7 @@ const LAST_READING: Duration = Duration::from_secs(5);
 
 /// Another program, and how it is run.
 pub struct CodeMethod {
-    code: Arc<dyn Code>,
+    code: Arc<dyn DftBackend>,
     running: Running,
     keeper: KeeperCommand,
     /// Where the calculations of this campaign are.
@@ -63,7 +63,7 @@ enum Ready {
 }
 
 impl CodeMethod {
-    pub(super) fn new(keeper: KeeperCommand, code: Box<dyn Code>, running: Running) -> Self {
+    pub(super) fn new(keeper: KeeperCommand, code: Box<dyn DftBackend>, running: Running) -> Self {
         let (home, in_hand, slurm) =
             (OnceCell::new(), Mutex::default(), Slurm::new(&running.pass_environment));
         Self { code: code.into(), running, keeper, home, in_hand, slurm }
@@ -150,9 +150,9 @@ impl CodeMethod {
 
     /// Everything that is known before anything is started.
     async fn prepare(&self, structure: Structure, failures: Vec<FailureClass>) -> Result<Prepared, Failure> {
-        let Some(remedies) = dft::remedies(&failures) else {
+        let Some(remedies) = dft::adjustments(&failures) else {
             let class = failures.last().copied().unwrap_or(FailureClass::Crashed);
-            return Err(class.because("there is nothing left to try"));
+            return Err(class.with_message("there is nothing left to try"));
         };
         let (code, running) = (Arc::clone(&self.code), self.running.clone());
         blocking(move || prepare(&*code, &running, &structure, &remedies)).await
@@ -290,7 +290,7 @@ impl CodeMethod {
         let reading = blocking(move || (read(&*code, &structure, &directory, exit), log::tail(&directory)));
         let (mut result, log) = tokio::time::timeout(limit, reading).await.unwrap_or_else(|_| {
             let message = format!("its results could not be read within {:.0} s", limit.as_secs_f64());
-            (Err(FailureClass::TimeLimit.because(message)), String::new())
+            (Err(FailureClass::TimeLimit.with_message(message)), String::new())
         });
         if let Err(Failure { class: FailureClass::OtherProgram, message }) = &result {
             // Whatever the structure: no calculation here would be one of the protocol.
@@ -310,7 +310,8 @@ impl CodeMethod {
     async fn broken_off(&self, begun: Begun) -> Result<Made, StoreError> {
         begun.clear(&self.slurm).await?;
         self.reap();
-        let result = Err(FailureClass::LostNode.because("the process that kept the calculation was killed"));
+        let result =
+            Err(FailureClass::LostNode.with_message("the process that kept the calculation was killed"));
         Ok(Made { result, ended: None })
     }
 
@@ -374,7 +375,7 @@ impl CodeMethod {
 
 /// The classes of the failures of a job so far.
 pub(super) fn classes(lease: &Lease) -> Vec<FailureClass> {
-    lease.failures.iter().filter_map(|name| FailureClass::named(name)).collect()
+    lease.failures.iter().filter_map(|name| FailureClass::from_name(name)).collect()
 }
 
 /// Nodes on which a job failed, where another may help.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use analysis::{EnergyOffsets, LabelledEnergy, TooFewLabels};
 use atoms::Structure;
-use dft::Calculated;
+use dft::Results;
 use store::records::{Lease, Protocol};
 use store::{Store, StoreError};
 use wire::ContentHash;
@@ -58,7 +58,7 @@ impl Offsets {
         store: &Store,
         protocol: &Protocol,
         lease: &Lease,
-        result: &Result<Calculated, dft::Failure>,
+        result: &Result<Results, dft::Failure>,
         closing: &Closing,
     ) -> Result<Option<Expected<'_>>, StoreError> {
         let Some(model) = lease.model_energy.filter(|_| result.is_ok()) else { return Ok(None) };

@@ -43,7 +43,7 @@ impl Ready {
     pub fn start(calculation: Calculation) -> io::Result<Self> {
         let mut keeper = calculation.keeper.command();
         // It outlives this process, speaks to no database, and gives its environment to the program.
-        keeper.env_clear().envs(calculation.pass_environment.of_this_process());
+        keeper.env_clear().envs(calculation.pass_environment.from_current_process());
         keeper.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null());
         let mut child = keeper.spawn()?;
         let stdin = child.stdin.take().ok_or(io::ErrorKind::BrokenPipe)?;

@@ -3,7 +3,7 @@
 use analysis::EnergyOffsets;
 use atoms::cell::norm;
 use atoms::{Matrix3, Structure, Vec3};
-use dft::{Calculated, Failure, FailureClass};
+use dft::{Failure, FailureClass, Results};
 use serde::{Deserialize, Serialize};
 
 use super::energies::labelled_energy;
@@ -87,30 +87,30 @@ pub(super) struct Expected<'a> {
 /// # Errors
 /// [`FailureClass::Implausible`], with what is wrong.
 pub(super) fn judge(
-    made: Calculated,
+    made: Results,
     structure: &Structure,
     bounds: &LabelBounds,
     expected: Option<Expected<'_>>,
-) -> Result<Calculated, Failure> {
+) -> Result<Results, Failure> {
     let problem = wrong_number(&made, structure.len())
         .or_else(|| not_finite(&made))
         .or_else(|| bounds.refuses(made.energy, &made.forces, made.stress.as_ref()))
         .or_else(|| bounds.refuses_energy(made.energy_without_smearing?, structure.len()))
         .or_else(|| too_far(&made, structure, bounds, expected?));
     match problem {
-        Some(problem) => Err(FailureClass::Implausible.because(problem)),
+        Some(problem) => Err(FailureClass::Implausible.with_message(problem)),
         None => Ok(made),
     }
 }
 
-fn wrong_number(made: &Calculated, atoms: usize) -> Option<String> {
+fn wrong_number(made: &Results, atoms: usize) -> Option<String> {
     let moments = made.magnetic_moments.as_ref().map_or(atoms, Vec::len);
     let lists = [("forces", made.forces.len()), ("magnetic moments", moments)];
     let (name, found) = lists.into_iter().find(|(_, found)| *found != atoms)?;
     Some(format!("{found} {name} for {atoms} atoms"))
 }
 
-fn not_finite(made: &Calculated) -> Option<String> {
+fn not_finite(made: &Results) -> Option<String> {
     let energies = [Some(made.energy), made.energy_without_smearing];
     let moments = made.magnetic_moments.iter().flatten().chain(&made.magnetisation);
     let find = |name, mut numbers: &mut dyn Iterator<Item = f64>| {
@@ -124,7 +124,7 @@ fn not_finite(made: &Calculated) -> Option<String> {
 }
 
 fn too_far(
-    made: &Calculated,
+    made: &Results,
     structure: &Structure,
     bounds: &LabelBounds,
     expected: Expected<'_>,

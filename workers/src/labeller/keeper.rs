@@ -248,7 +248,7 @@ impl Calculation {
             .command()
             .current_dir(&work)
             .env_clear()
-            .envs(self.pass_environment.of_this_process())
+            .envs(self.pass_environment.from_current_process())
             .envs(self.environment.iter().map(|(name, value)| (name, value)))
             .env(MARK, &self.directory)
             .stdin(Stdio::piped())

@@ -4,7 +4,7 @@ use std::panic;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use atoms::{Potential, Structure};
-use dft::{Calculated, Code, Failure, Size};
+use dft::{DftBackend, Failure, Results, Size};
 use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::task::spawn_blocking;
@@ -23,7 +23,7 @@ pub enum Method {
 
 /// A result.
 pub(super) struct Made {
-    pub result: Result<Calculated, Failure>,
+    pub result: Result<Results, Failure>,
     /// The calculation behind it, if it was a process of its own.
     pub ended: Option<Ended>,
 }
@@ -43,12 +43,12 @@ impl Method {
     }
 
     /// Labels by another program.
-    pub fn code(code: Box<dyn Code>, running: Running) -> Self {
+    pub fn code(code: Box<dyn DftBackend>, running: Running) -> Self {
         Self::kept_by(KeeperCommand::default(), code, running)
     }
 
     /// The same with keepers ([`super::keep`]) that are started so.
-    pub fn kept_by(keeper: KeeperCommand, code: Box<dyn Code>, running: Running) -> Self {
+    pub fn kept_by(keeper: KeeperCommand, code: Box<dyn DftBackend>, running: Running) -> Self {
         Self::Code(Box::new(CodeMethod::new(keeper, code, running)))
     }
 
@@ -145,7 +145,7 @@ impl Method {
             Self::Reference(_) => false,
             Self::Code(_) => {
                 let failures = classes(lease).into_iter().chain([failure.class]);
-                dft::remedies(&failures.collect::<Vec<_>>()).is_none()
+                dft::adjustments(&failures.collect::<Vec<_>>()).is_none()
             }
         }
     }
@@ -155,7 +155,7 @@ impl Method {
 pub(super) async fn evaluate(
     method: Arc<Mutex<ReferenceMethod>>,
     structure: Structure,
-) -> Result<Calculated, Failure> {
+) -> Result<Results, Failure> {
     // One that panicked has taken everybody with it who could see it.
     let label = move || method.lock().unwrap_or_else(PoisonError::into_inner).label(&structure);
     spawn_blocking(label).await.unwrap_or_else(|crash| panic::resume_unwind(crash.into_panic()))

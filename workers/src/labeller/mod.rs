@@ -30,7 +30,7 @@ mod tree;
 use std::pin::pin;
 use std::time::{Duration, Instant};
 
-use dft::{Calculated, Failure, FailureClass};
+use dft::{Failure, FailureClass, Results};
 use store::records::{Label, LabelDetails, Lease, Protocol};
 use store::{Store, StoreError, Whereabouts};
 use tracing::{debug, info, warn};
@@ -227,7 +227,7 @@ async fn work(
 
 /// A result that the store has.
 struct Brought {
-    judged: Result<Calculated, Failure>,
+    judged: Result<Results, Failure>,
     became: Became,
     ended: Option<Ended>,
 }
@@ -385,7 +385,7 @@ async fn end_of_grace(grace: Option<Duration>, closing: &Closing) {
 async fn deliver(
     store: &Store,
     lease: &Lease,
-    judged: &Result<Calculated, Failure>,
+    judged: &Result<Results, Failure>,
     log: &str,
     attempts: u32,
     now: i64,
@@ -405,7 +405,7 @@ async fn deliver(
 }
 
 /// A result as the store keeps it.
-fn label(made: &Calculated) -> Label {
+fn label(made: &Results) -> Label {
     Label {
         energy: made.energy,
         forces: made.forces.clone(),

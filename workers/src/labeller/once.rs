@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use atoms::Structure;
-use dft::{Calculated, Failure};
+use dft::{Failure, Results};
 use store::StoreError;
 
 use super::judge::{LabelBounds, judge};
@@ -14,7 +14,7 @@ use super::method::{Method, evaluate};
 #[derive(Clone, Debug)]
 pub struct Once {
     /// Its numbers, judged as those of a campaign are.
-    pub result: Result<Calculated, Failure>,
+    pub result: Result<Results, Failure>,
     /// The end of what the program said; empty for a potential.
     pub log: String,
     /// Cores times the time that it took, s.

@@ -6,7 +6,7 @@ use std::io;
 use std::path::Path;
 
 use atoms::Structure;
-use dft::{Calculated, Code, Exit, Failure, Input, Original, Remedy};
+use dft::{DftBackend, Exit, Failure, Input, PinnedFile, Results, RetryAdjustment};
 use store::{CalculationRecord, StoreError};
 
 use super::Running;
@@ -34,10 +34,10 @@ pub(super) struct Prepared {
 
 /// Everything that is known before anything is started.
 pub(super) fn prepare(
-    code: &dyn Code,
+    code: &dyn DftBackend,
     running: &Running,
     structure: &Structure,
-    remedies: &BTreeSet<Remedy>,
+    remedies: &BTreeSet<RetryAdjustment>,
 ) -> Result<Prepared, Failure> {
     let input = code.input(structure, remedies)?;
     let (size, mut record) = (code.size(structure), CalculationRecord::default());
@@ -51,14 +51,14 @@ pub(super) fn prepare(
         record.difference = Some(difference(&code.input(structure, &BTreeSet::new())?, &input));
     }
     let twice = |remedy| if remedies.contains(&remedy) { 2.0 } else { 1.0 };
-    let memory = running.memory.map(|gigabytes| twice(Remedy::MoreMemory) * GIGABYTE * gigabytes);
+    let memory = running.memory.map(|gigabytes| twice(RetryAdjustment::MoreMemory) * GIGABYTE * gigabytes);
     Ok(Prepared {
         input,
         record,
-        time_limit: twice(Remedy::MoreTime) * running.time_limit,
+        time_limit: twice(RetryAdjustment::MoreTime) * running.time_limit,
         // The conversion saturates.
         memory_limit: memory.map(|bytes| bytes as u64),
-        avoids_nodes: remedies.contains(&Remedy::OtherNode),
+        avoids_nodes: remedies.contains(&RetryAdjustment::OtherNode),
     })
 }
 
@@ -67,7 +67,7 @@ pub(super) fn prepare(
 /// # Errors
 /// It cannot be written, or a file of which it gets a copy is not the one of the protocol any more.
 pub(super) fn write(directory: &Path, input: &Input) -> Result<(), StoreError> {
-    let copy = |(name, original): (&String, &Original)| match original.content() {
+    let copy = |(name, original): (&String, &PinnedFile)| match original.content() {
         Ok(content) => Ok((name.clone(), content)),
         Err(error) => Err(file(original.path(), error)),
     };
@@ -90,11 +90,11 @@ fn fill(folder: &Path, files: &BTreeMap<String, Vec<u8>>) -> io::Result<()> {
 /// Judges a calculation that ended so, and reads its numbers. Where a limit has ended it, that is why it failed, whatever
 /// its files look like.
 pub(super) fn read(
-    code: &dyn Code,
+    code: &dyn DftBackend,
     structure: &Structure,
     work: &Path,
     exit: Exit,
-) -> Result<Calculated, Failure> {
+) -> Result<Results, Failure> {
     code.read(structure, work, exit).map_err(|failure| match exit {
         Exit::TimeLimit | Exit::OutOfMemory | Exit::LostNode => exit.failure(),
         Exit::Code(_) | Exit::Signal(_) => failure,

@@ -1,7 +1,7 @@
 //! Labels from a potential in place of DFT, as in the paper's own tests.
 
 use atoms::{Evaluation, NeighbourList, Potential, Structure};
-use dft::{Calculated, Failure, FailureClass};
+use dft::{Failure, FailureClass, Results};
 
 /// A reference potential.
 pub struct ReferenceMethod {
@@ -19,17 +19,19 @@ impl ReferenceMethod {
     ///
     /// # Errors
     /// [`FailureClass::BadInput`] for a structure that the potential cannot evaluate.
-    pub fn label(&mut self, structure: &Structure) -> Result<Calculated, Failure> {
+    pub fn label(&mut self, structure: &Structure) -> Result<Results, Failure> {
         let mut neighbours = NeighbourList::new(self.potential.cutoff(), 0.0);
-        neighbours.update(structure).map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+        neighbours
+            .update(structure)
+            .map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         let evaluated = self.potential.evaluate(structure, &neighbours, &mut self.evaluation);
-        evaluated.map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+        evaluated.map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         let evaluation = &self.evaluation;
-        Ok(Calculated {
+        Ok(Results {
             energy: evaluation.energy(),
             forces: evaluation.forces.clone(),
             stress: evaluation.stress(structure),
-            ..Calculated::default()
+            ..Results::default()
         })
     }
 }

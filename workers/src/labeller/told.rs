@@ -1,6 +1,6 @@
 //! What came of a leased job, as a line for people.
 
-use dft::{Calculated, Failure};
+use dft::{Failure, Results};
 use store::records::Lease;
 use store::{Completed, Failed};
 
@@ -13,7 +13,7 @@ pub(super) enum Became {
 /// The line. One for a label begins with `labelled`.
 pub(super) fn line(
     lease: &Lease,
-    judged: &Result<Calculated, Failure>,
+    judged: &Result<Results, Failure>,
     became: &Became,
     seconds: f64,
 ) -> String {

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use dft::Original;
+use dft::PinnedFile;
 use store::JobState;
 use workers::labeller::{Keep, LabelBounds, label_once};
 
@@ -41,7 +41,7 @@ async fn a_file_that_is_replaced_between_two_labels_ends_the_labeller() {
     let place = Place::with_setup(2, script, "-7.5\n").await;
     let error = place.labeller().await.ended().await.unwrap_err().to_string();
     let path = place.setup_path().display().to_string();
-    let (new, _) = Original::hashed(place.setup_path()).unwrap();
+    let (new, _) = PinnedFile::open(place.setup_path()).unwrap();
     let [found, expected] = [&new, place.setup.as_ref().unwrap()].map(|original| &original.hash()[..12]);
     let begin = format!(
         "cannot use {path} (its content has changed: BLAKE3 {found}…, where the protocol of the labels has {expected}…;"

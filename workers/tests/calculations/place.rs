@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 
 use atoms::{Species, Structure};
 use dft::{
-    Calculated, Code, Exit, Failure, FailureClass, Input, Original, Remedy, SetupError, Size, result_file,
+    DftBackend, Exit, Failure, FailureClass, Input, PinnedFile, Results, RetryAdjustment, SetupError, Size,
+    result_file,
 };
 use serde_json::json;
 use store::{Attempt, JobDetails, LabelRecord, ProcessRecord, Store, StoreError, unix_milliseconds};
@@ -31,12 +32,12 @@ pub fn keeper_command() -> KeeperCommand {
 pub struct Script {
     text: String,
     /// A file of which it gets a copy.
-    setup: Option<Original>,
+    setup: Option<PinnedFile>,
     /// As long as there is a file of this name, reading results takes.
     slow: PathBuf,
 }
 
-impl Code for Script {
+impl DftBackend for Script {
     fn identity(&self) -> serde_json::Value {
         json!(self.text)
     }
@@ -45,7 +46,7 @@ impl Code for Script {
         Ok(())
     }
 
-    fn input(&self, _: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
+    fn input(&self, _: &Structure, remedies: &BTreeSet<RetryAdjustment>) -> Result<Input, Failure> {
         let names: Vec<_> = remedies.iter().map(|remedy| remedy.name()).collect();
         let files = [("job.sh", self.text.clone()), ("remedies", format!("first\n{}\n", names.join(" ")))];
         let command = match self.text.split_once(' ') {
@@ -60,12 +61,12 @@ impl Code for Script {
         })
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
         match exit {
             Exit::Code(0) => {}
-            Exit::Code(3) => return Err(FailureClass::NotConverged.because("the script says so")),
+            Exit::Code(3) => return Err(FailureClass::NotConverged.with_message("the script says so")),
             Exit::Code(4) => {
-                return Err(FailureClass::OtherProgram.because("calculated by script 2, and not 1"));
+                return Err(FailureClass::OtherProgram.with_message("calculated by script 2, and not 1"));
             }
             exit => return Err(exit.failure()),
         }
@@ -77,13 +78,13 @@ impl Code for Script {
         let energy = String::from_utf8_lossy(&text)
             .trim()
             .parse()
-            .map_err(|_| FailureClass::Crashed.because("no energy"))?;
-        Ok(Calculated {
+            .map_err(|_| FailureClass::Crashed.with_message("no energy"))?;
+        Ok(Results {
             energy,
             forces: vec![[0.0; 3]; structure.len()],
             magnetic_moments: Some(vec![0.5; structure.len()]),
             electronic_steps: Some(7),
-            ..Calculated::default()
+            ..Results::default()
         })
     }
 
@@ -99,7 +100,7 @@ pub struct Place {
     pub candidates: Vec<String>,
     pub running: Running,
     pub script: String,
-    pub setup: Option<Original>,
+    pub setup: Option<PinnedFile>,
 }
 
 impl Place {
@@ -120,7 +121,7 @@ impl Place {
     pub async fn with_setup(structures: u64, script: &str, content: &str) -> Self {
         let place = Self::new(structures, script).await;
         fs::write(place.setup_path(), content).unwrap();
-        let (original, _) = Original::hashed(place.setup_path()).unwrap();
+        let (original, _) = PinnedFile::open(place.setup_path()).unwrap();
         Self { setup: Some(original), ..place }
     }
 

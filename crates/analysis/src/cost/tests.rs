@@ -1,20 +1,20 @@
-//! Whether what is predicted comes true: on numbers that are made by the model, on such as are not, and on real ones.
+//! Predictions against data from the model, data that violate it, and measured data.
 
 use proptest::prelude::*;
 
 use super::*;
 
-/// Numbers that are as good as random, the same in each run.
+/// A reproducible pseudo-random generator.
 struct Random(u64);
 
 impl Random {
-    /// Even between 0 and 1, without both.
+    /// Uniform in (0, 1).
     fn even(&mut self) -> f64 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         ((self.0 >> 11) as f64 + 0.5) / (1_u64 << 53) as f64
     }
 
-    /// Normal, by Box and Muller.
+    /// Normal (Box and Muller).
     fn normal(&mut self) -> f64 {
         (-2.0 * self.even().ln()).sqrt() * (std::f64::consts::TAU * self.even()).cos()
     }
@@ -24,7 +24,7 @@ fn size(atoms: f64, k_points: f64) -> Size {
     Size { atoms, electrons: Some(4.0 * atoms), k_points }
 }
 
-/// A campaign: cells of 8 to 128 atoms whose meshes shrink as they grow.
+/// A campaign of cells with 8 to 128 atoms, whose k-point meshes shrink as the cells grow.
 fn campaign(labels: usize, exponent: f64, scatter: f64, seed: u64) -> Vec<Measured> {
     let mut random = Random(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x1234_5678);
     let mut label = || {
@@ -41,7 +41,7 @@ fn total(labels: &[Measured]) -> f64 {
     labels.iter().map(|label| label.core_seconds).sum()
 }
 
-/// The last third as predicted from the first two, by what it was.
+/// Prediction of the last third from the first two thirds / its actual cost.
 fn ratio(labels: &[Measured]) -> f64 {
     let (known, rest) = labels.split_at(labels.len() * 2 / 3);
     let model = CostModel::fit(known, None).unwrap();
@@ -61,11 +61,11 @@ fn one_label_is_enough_to_begin_with() {
     let model = CostModel::fit(&[Measured { size: size(8.0, 27.0), core_seconds: 100.0 }], None).unwrap();
     let same = model.predict(&size(8.0, 27.0)).unwrap();
     assert!((80.0..125.0).contains(&same.core_seconds) && same.low < 100.0 && same.high > 100.0);
-    // Twice the atoms: 2² times as much by the prior, and linear and cubic codes are within reach.
+    // Twice the atoms: 2² times the cost by the prior, with linear and cubic codes within the interval.
     let twice = model.predict(&size(16.0, 27.0)).unwrap();
     assert!((twice.core_seconds / same.core_seconds - 4.0).abs() < 1e-9);
     assert!(twice.low < 200.0 && twice.high > 800.0, "{twice:?}");
-    // One point of the mesh: 1/27 of it.
+    // A single k-point: 1/27 of the cost.
     let gamma = model.predict(&size(8.0, 1.0)).unwrap();
     assert!((gamma.core_seconds / same.core_seconds - 1.0 / 27.0).abs() < 1e-9);
 }
@@ -97,7 +97,7 @@ fn without_all_electrons_atoms_count() {
     let model = CostModel::fit(&labels, None).unwrap();
     let unknown = Size { electrons: None, ..size(20.0, 4.0) };
     assert_eq!(model.predict(&unknown), model.predict(&size(20.0, 4.0)));
-    // And the other way round: a model of electrons says nothing of what has none.
+    // Conversely, a model of electrons predicts nothing where electrons are unknown.
     let model = CostModel::fit(&campaign(50, 2.0, 0.0, 1), None).unwrap();
     assert_eq!(model.predict(&unknown), None);
     let all = model.predict_all([(unknown, 3), (size(20.0, 4.0), 1)]).unwrap();
@@ -106,8 +106,8 @@ fn without_all_electrons_atoms_count() {
     assert_eq!(model.predict_all([(unknown, 3)]), None);
 }
 
-/// (atoms, electrons, k-points, core-seconds) of labels that ABINIT 9.6 made of rattled and stretched silicon, one after
-/// the other: 8 Ha, a Γ-centred mesh of 0.55 Å⁻¹ before symmetry.
+/// (atoms, electrons, k-points, core-seconds) of labels that ABINIT 9.6 made of rattled and strained silicon,
+/// in order: 8 Ha, Γ-centred mesh of 0.55 Å⁻¹ before symmetry.
 const ABINIT: [(u32, u32, u32, f64); 24] = [
     (2, 8, 64, 1.8),
     (4, 16, 18, 1.99),
@@ -144,13 +144,13 @@ fn the_last_third_of_real_labels_is_within_a_factor_of_two() {
     let labels: Vec<_> = ABINIT.iter().map(label).collect();
     let found = ratio(&labels);
     assert!((0.5..2.0).contains(&found), "{found}");
-    // The other way round the first third is what is foretold.
+    // In reverse order the first third is predicted.
     let reversed: Vec<_> = labels.into_iter().rev().collect();
     let found = ratio(&reversed);
     assert!((0.5..2.0).contains(&found), "{found}");
 }
 
-/// A label that hung on a sick node, one that was read from a file in no time.
+/// One label that hung on a faulty node, and one that was read from a file in no time.
 #[test]
 fn outliers_do_not_lead() {
     let mut labels = campaign(30, 2.0, 0.2, 3);
@@ -170,7 +170,7 @@ fn nine_of_ten_labels_are_within_the_interval() {
         (predicted.low..predicted.high).contains(&label.core_seconds)
     });
     let share = within.count() as f64 / 2960.0;
-    // 40 labels know the scale to about a tenth.
+    // 40 labels determine the scale to about a tenth.
     assert!((0.85..0.97).contains(&share), "{share}");
 }
 

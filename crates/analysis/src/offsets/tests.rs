@@ -7,7 +7,7 @@ const O: u8 = 8;
 const SI: u8 = 14;
 const GE: u8 = 32;
 
-/// A label whose energy is that of the model, with these offsets and `error` eV an atom.
+/// A label with the energy of the model plus these offsets and an error of `error` eV/atom.
 fn label(composition: &[(u8, u32)], offsets: &[(u8, f64)], error: f64) -> LabelledEnergy {
     let atoms: u32 = composition.iter().map(|(_, number)| number).sum();
     let offset = |element: u8| offsets.iter().find(|(other, _)| *other == element).unwrap().1;
@@ -36,10 +36,10 @@ fn the_offset_of_one_element_is_the_mean_difference() {
     assert_eq!((fit.structures(), fit.left_out()), (3, 0));
     let [(SI, offset, true)] = offsets(&fit)[..] else { panic!("{:?}", offsets(&fit)) };
     assert_near(offset, -107.24, 1e-10);
-    // The label is 0.05 eV above the model and the zeros together, 0.04 above the fit.
+    // The label is 0.05 eV above model plus true offsets, and 0.04 eV above the fit.
     assert_near(fit.error_per_atom(&labels[2], 2.0).unwrap(), -0.04, 1e-10);
     assert_near(fit.support(&[(SI, 64)]), 3.0, 1e-10);
-    // Of another element nothing is known.
+    // Another element has no support.
     assert_eq!(fit.support(&[(GE, 1)]), 0.0);
     assert_eq!(fit.error_per_atom(&label(&[(GE, 1)], &[(GE, 0.0)], 0.0), 0.0), None);
 }
@@ -73,7 +73,7 @@ fn too_few_labels_give_no_fit() {
     assert_eq!(EnergyOffsets::fit(&[one]), Err(TooFewLabels { structures: 1, needed: 2 }));
 }
 
-/// All structures are SiO₂: only O₂ + Si is known, and the offsets with the least squares that add up to it are in the ratio 2 : 1.
+/// With only SiO₂, only O₂ + Si is determined; the minimum-norm offsets that add up to it have the ratio 2 : 1.
 #[test]
 fn where_compositions_are_all_the_same_only_their_sum_is_known() {
     let zeros = [(O, -432.0), (SI, -107.0)];
@@ -84,7 +84,7 @@ fn where_compositions_are_all_the_same_only_their_sum_is_known() {
     assert_near(oxygen, 2.0 * silicon, 1e-9);
     assert_near(fit.error_per_atom(&label(&[(O, 40), (SI, 20)], &zeros, 0.25), 2.0).unwrap(), -0.25, 1e-9);
     assert_near(fit.support(&[(O, 2), (SI, 1)]), 4.0, 1e-9);
-    // Another stoichiometry cannot be foretold.
+    // Another stoichiometry cannot be predicted.
     assert_eq!(fit.support(&[(O, 1), (SI, 1)]), 0.0);
     assert_eq!(fit.error_per_atom(&label(&[(O, 1), (SI, 1)], &zeros, 0.0), 0.0), None);
 }
@@ -122,7 +122,7 @@ fn an_outlier_does_not_move_the_fit() {
     }
 }
 
-/// Two of five: as many as can be borne.
+/// Two outliers of five: the breakdown point.
 #[test]
 fn as_long_as_most_labels_are_good_the_fit_is() {
     let zeros = [(SI, -107.0)];
@@ -133,7 +133,8 @@ fn as_long_as_most_labels_are_good_the_fit_is() {
     assert_near(offsets(&fit)[0].1, -107.0, 1e-9);
 }
 
-/// The only structure with an element may be wrong, and nobody can know: nothing is said of the element, and the others stay.
+/// The only structure with an element may be wrong, which is undetectable: the element is undetermined, the
+/// others unaffected.
 #[test]
 fn what_a_single_structure_says_of_an_element_is_not_believed() {
     let zeros = [(SI, -107.0), (GE, -2000.0)];
@@ -146,7 +147,7 @@ fn what_a_single_structure_says_of_an_element_is_not_believed() {
     assert!(fit.error_per_atom(&labels[0], 2.0).is_some());
 }
 
-/// Some of few structures with a rare element, whose zero is far away.
+/// Outliers among few structures with a rare element whose offset differs strongly.
 #[test]
 fn a_rare_element_is_no_outlier() {
     let zeros = [(SI, -107.0), (GE, -56_000.0)];
@@ -160,7 +161,7 @@ fn a_rare_element_is_no_outlier() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
-    /// Whatever the zeros are, errors are those of labels with the zeros of the model.
+    /// Errors do not depend on the offsets: they equal those of labels with the model's own zero.
     #[test]
     fn zeros_of_elements_do_not_change_errors(
         seed in 0_u32..1000,

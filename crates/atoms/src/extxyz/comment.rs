@@ -1,26 +1,26 @@
-//! The comment line: `key=value` pairs with quotes, brackets and escapes.
+//! Parses the comment line: `key=value` pairs with quotes, brackets and escapes.
 
-use super::fault::Fault;
+use super::error::ExtxyzErrorKind;
 use super::value::Value;
 
-/// Keys whose value stays text whatever it looks like.
+/// Keys whose value always stays text.
 pub(super) fn is_verbatim(key: &str) -> bool {
     key.eq_ignore_ascii_case("uid")
 }
 
 /// The pairs of a comment line, in order.
 ///
-/// Between `"…"`, `'…'`, `{…}` and `[…]` white space belongs to the word, a backslash takes the next
-/// character as it is, spaces may stand round `=`, and a key without `=` is true. A line without any
-/// `=` is free text: its words are true keys, and a lone apostrophe does not matter.
-pub(super) fn parse(line: &str) -> Result<Vec<(String, Value)>, Fault> {
+/// Inside `"…"`, `'…'`, `{…}` and `[…]` white space belongs to the word. A backslash escapes the next
+/// character. Spaces may surround `=`. A key without `=` is true. A line without any `=` is free text: its
+/// words are keys with the value true, and a single apostrophe is allowed.
+pub(super) fn parse(line: &str) -> Result<Vec<(String, Value)>, ExtxyzErrorKind> {
     let mut cursor = Cursor { line, at: 0, lenient: !line.contains('=') };
     let mut pairs = Vec::new();
     loop {
         cursor.skip_space();
         let Some(first) = cursor.peek() else { return Ok(pairs) };
         if first == '=' {
-            return Err(Fault::NoKey { column: cursor.column(cursor.at) });
+            return Err(ExtxyzErrorKind::NoKey { column: cursor.column(cursor.at) });
         }
         let key = cursor.word(true)?;
         cursor.skip_space();
@@ -35,7 +35,7 @@ pub(super) fn parse(line: &str) -> Result<Vec<(String, Value)>, Fault> {
     }
 }
 
-/// A word in quotes with escapes where the bare word would be read as something else.
+/// Quotes and escapes a word that would not be read back as it is.
 pub(super) fn quote(word: &str) -> String {
     let bare = |c: char| c.is_ascii_graphic() && !r#""'{}[]\=,"#.contains(c);
     if !word.is_empty() && word.chars().all(bare) {
@@ -48,7 +48,7 @@ struct Cursor<'a> {
     line: &'a str,
     /// Byte offset of the next character.
     at: usize,
-    /// Whether the end of the line closes what is open.
+    /// Whether the end of the line closes open quotes.
     lenient: bool,
 }
 
@@ -71,13 +71,13 @@ impl Cursor<'_> {
         self.at += self.rest().len() - self.rest().trim_start().len();
     }
 
-    /// Column of the character at a byte offset, from 1. For errors only: it counts from the start of the line.
+    /// Column of the character at a byte offset, from 1. Linear in the line's length; for errors only.
     fn column(&self, at: usize) -> usize {
         self.line.get(..at).unwrap_or("").chars().count() + 1
     }
 
     /// A word up to white space (or an equals sign).
-    fn word(&mut self, ends_at_equals: bool) -> Result<String, Fault> {
+    fn word(&mut self, ends_at_equals: bool) -> Result<String, ExtxyzErrorKind> {
         let mut word = String::new();
         while let Some(c) = self.peek().filter(|c| !(c.is_whitespace() || ends_at_equals && *c == '=')) {
             self.next();
@@ -92,8 +92,8 @@ impl Cursor<'_> {
         Ok(word)
     }
 
-    /// What stands between the delimiter that was just taken and the closing one, which is taken too.
-    fn delimited(&mut self, open: char, close: char, word: &mut String) -> Result<(), Fault> {
+    /// Reads up to and including the closing delimiter.
+    fn delimited(&mut self, open: char, close: char, word: &mut String) -> Result<(), ExtxyzErrorKind> {
         let start = self.at.saturating_sub(open.len_utf8());
         loop {
             match self.next() {
@@ -101,12 +101,14 @@ impl Cursor<'_> {
                 Some(c) if c == close => return Ok(()),
                 Some(c) => word.push(c),
                 None if self.lenient => return Ok(()),
-                None => return Err(Fault::Unclosed { column: self.column(start), delimiter: open }),
+                None => {
+                    return Err(ExtxyzErrorKind::Unclosed { column: self.column(start), delimiter: open });
+                }
             }
         }
     }
 
-    fn value(&mut self, key: &str) -> Result<Value, Fault> {
+    fn value(&mut self, key: &str) -> Result<Value, ExtxyzErrorKind> {
         if self.rest().starts_with("[[") {
             return self.matrix(key);
         }
@@ -115,7 +117,7 @@ impl Cursor<'_> {
     }
 
     /// `[[…], […]]` without quotes, up to the bracket that closes the first one.
-    fn matrix(&mut self, key: &str) -> Result<Value, Fault> {
+    fn matrix(&mut self, key: &str) -> Result<Value, ExtxyzErrorKind> {
         let start = self.at;
         let mut depth = 0_usize;
         while let Some(c) = self.next() {
@@ -126,9 +128,10 @@ impl Cursor<'_> {
             }
             if depth == 0 {
                 let text = self.line.get(start..self.at).unwrap_or("");
-                return Value::parse_json(text).ok_or_else(|| Fault::key(key, text, "rows of numbers"));
+                return Value::parse_json(text)
+                    .ok_or_else(|| ExtxyzErrorKind::key(key, text, "rows of numbers"));
             }
         }
-        Err(Fault::Unclosed { column: self.column(start), delimiter: '[' })
+        Err(ExtxyzErrorKind::Unclosed { column: self.column(start), delimiter: '[' })
     }
 }

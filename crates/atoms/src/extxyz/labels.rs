@@ -1,9 +1,9 @@
-//! Energy, forces and stress under the names that other programs give them.
+//! Energy, forces and stress under the names that other programs use.
 
 use super::{Column, Frame, Value};
 use crate::cell::{Matrix3, Vec3};
 
-/// The labels of a frame: what a calculation, usually DFT, says of it.
+/// The labels of a frame: the results of a calculation, usually DFT.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Labels {
     /// Total energy, eV.
@@ -14,21 +14,21 @@ pub struct Labels {
     pub stress: Option<Matrix3>,
 }
 
-/// The names under which labels are written.
+/// The naming convention for labels in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Keys {
-    /// `energy`, `forces`, `stress`: ASE makes them the results of the frame's calculator.
+pub enum LabelKeys {
+    /// `energy`, `forces`, `stress`: ASE reads them as calculator results.
     Ase,
-    /// `REF_energy`, `REF_forces`, `REF_stress` (9 numbers), which MACE trains on by default.
+    /// `REF_energy`, `REF_forces`, `REF_stress` (9 numbers): MACE's default keys for training.
     Mace,
-    /// As [`Keys::Ase`] with the same energy also as `free_energy`: gracemaker reads through ASE and
-    /// prefers the free energy. If one frame of a file lacks the stress, it uses no stress of that file.
+    /// As [`LabelKeys::Ase`], plus the same energy as `free_energy`: gracemaker reads through ASE and prefers
+    /// the free energy. If one frame of a file lacks the stress, gracemaker ignores all stresses of the file.
     Grace,
-    /// `energy`, `force`, `virial` (eV, 9 numbers; −volume × stress): what `gap_fit` of QUIP reads by default.
+    /// `energy`, `force`, `virial` (eV, 9 numbers; −volume × stress): the default keys of QUIP's `gap_fit`.
     Gap,
 }
 
-/// A label that cannot be used.
+/// An invalid label.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error("the frame at line {line}: {key} is {found}, expected {expected}")]
 pub struct LabelError {
@@ -36,19 +36,20 @@ pub struct LabelError {
     pub line: usize,
     /// The key or column.
     pub key: String,
-    /// What it holds.
+    /// Its value.
     pub found: String,
-    /// What it should hold.
+    /// The valid values.
     pub expected: &'static str,
 }
 
 impl Frame {
     /// The labels of the frame.
     ///
-    /// If it has any of `REF_energy`, `REF_free_energy`, `REF_forces`, `REF_stress` and `REF_virial`,
-    /// only these count (the plain ones may then be a model's); otherwise the same names without
-    /// `REF_`. `energy` goes before `free_energy`, as in ASE, and `stress` before `virial` (eV), with
-    /// stress = −virial / volume, and `forces` before `force`, which QUIP writes. Of a stress that is not symmetric the upper triangle counts, as in ASE.
+    /// If the frame has any of `REF_energy`, `REF_free_energy`, `REF_forces`, `REF_stress` and `REF_virial`,
+    /// only these are used (the plain ones may be a model's); otherwise the same names without `REF_`. `energy`
+    /// takes precedence over `free_energy`, as in ASE; `stress` over `virial` (eV), with stress = −virial /
+    /// volume; and `forces` over `force`, which QUIP writes. Of an asymmetric stress the upper triangle is
+    /// used, as in ASE.
     pub fn labels(&self) -> Result<Labels, LabelError> {
         let reference = QUANTITIES.map(|quantity| format!("REF_{quantity}"));
         let given = |key: &String| self.info.contains_key(key) || self.arrays.contains_key(key);
@@ -68,31 +69,31 @@ impl Frame {
         Ok(Labels { energy, forces, stress })
     }
 
-    /// Replaces all labels of the frame, whatever their names.
-    pub fn set_labels(&mut self, labels: &Labels, keys: Keys) {
+    /// Replaces all labels of the frame, under any names.
+    pub fn set_labels(&mut self, labels: &Labels, keys: LabelKeys) {
         for quantity in QUANTITIES {
             for key in [quantity.to_owned(), format!("REF_{quantity}")] {
                 self.info.remove(&key);
                 self.arrays.remove(&key);
             }
         }
-        let prefix = if keys == Keys::Mace { "REF_" } else { "" };
+        let prefix = if keys == LabelKeys::Mace { "REF_" } else { "" };
         if let Some(energy) = labels.energy {
             self.info.insert(format!("{prefix}energy"), energy.into());
-            if keys == Keys::Grace {
+            if keys == LabelKeys::Grace {
                 self.info.insert("free_energy".to_owned(), energy.into());
             }
         }
         if let Some(forces) = &labels.forces {
-            let key = if keys == Keys::Gap { "force".to_owned() } else { format!("{prefix}forces") };
+            let key = if keys == LabelKeys::Gap { "force".to_owned() } else { format!("{prefix}forces") };
             self.arrays.insert(key, Column::vectors(forces));
         }
-        if let (Some(stress), Keys::Gap) = (labels.stress, keys) {
+        if let (Some(stress), LabelKeys::Gap) = (labels.stress, keys) {
             let volume = self.structure.cell.volume();
             let virial = stress.concat().into_iter().map(|s| -s * volume);
             self.info.insert("virial".to_owned(), virial.collect::<Vec<_>>().into());
         } else if let Some(stress) = labels.stress {
-            let value = if keys == Keys::Mace { stress.concat().into() } else { stress.into() };
+            let value = if keys == LabelKeys::Mace { stress.concat().into() } else { stress.into() };
             self.info.insert(format!("{prefix}stress"), value);
         }
     }

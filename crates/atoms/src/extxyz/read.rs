@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 use std::io::{BufRead, ErrorKind};
 
-use super::fault::{ExtxyzError, Fault, excerpt};
+use super::error::{ExtxyzError, ExtxyzErrorKind, excerpt};
 use super::table::Table;
 use super::{Frame, Value, comment};
 use crate::cell::{Cell, Matrix3};
 use crate::structure::Structure;
 
-/// The frames of a stream, one after another. The first error is the last item.
+/// Iterates over the frames of a stream. Ends after the first error.
 pub struct Reader<R> {
     input: R,
     /// Number of the line in `text`, from 1.
@@ -24,14 +24,16 @@ impl<R: BufRead> Reader<R> {
         Self { input, line: 0, text: String::new(), ended: false }
     }
 
-    /// Takes the next line into `text`; false at the end of the stream.
+    /// Reads the next line into `text`; false at the end of the stream.
     fn advance(&mut self) -> Result<bool, ExtxyzError> {
         self.text.clear();
         self.line += 1;
         match self.input.read_line(&mut self.text) {
             Ok(bytes) => Ok(bytes > 0),
-            Err(error) if error.kind() == ErrorKind::InvalidData => Err(Fault::Encoding.at(self.line)),
-            Err(error) => Err(Fault::Io(error).at(self.line)),
+            Err(error) if error.kind() == ErrorKind::InvalidData => {
+                Err(ExtxyzErrorKind::Encoding.at(self.line))
+            }
+            Err(error) => Err(ExtxyzErrorKind::Io(error).at(self.line)),
         }
     }
 
@@ -41,29 +43,29 @@ impl<R: BufRead> Reader<R> {
                 continue;
             }
             let Ok(count) = self.text.trim().parse() else {
-                return Err(Fault::Count { found: excerpt(&self.text) }.at(self.line));
+                return Err(ExtxyzErrorKind::Count { found: excerpt(&self.text) }.at(self.line));
             };
             return self.body(count, self.line).map(Some);
         }
         Ok(None)
     }
 
-    /// The frame of `count` atoms whose first line, `start`, has been read.
+    /// Reads the atoms of a frame with `count` atoms whose first line, `start`, has been read.
     fn body(&mut self, count: u64, start: usize) -> Result<Frame, ExtxyzError> {
         if !self.advance()? {
-            return Err(Fault::Truncated { found: 0, expected: count, start }.at(self.line));
+            return Err(ExtxyzErrorKind::Truncated { found: 0, expected: count, start }.at(self.line));
         }
         let Header { info, cell, periodic, mut table } =
             Header::new(&self.text).map_err(|fault| fault.at(self.line))?;
         for atom in 0..count {
             if !self.advance()? {
-                return Err(Fault::Truncated { found: atom, expected: count, start }.at(self.line));
+                return Err(ExtxyzErrorKind::Truncated { found: atom, expected: count, start }.at(self.line));
             }
             table.push(&self.text).map_err(|fault| fault.at(self.line))?;
         }
         let (species, positions, arrays) = table.finish();
         let structure = Structure { species, positions, cell, periodic };
-        structure.validate().map_err(|fault| Fault::from(fault).at(start))?;
+        structure.validate().map_err(|fault| ExtxyzErrorKind::from(fault).at(start))?;
         Ok(Frame { structure, info, arrays, line: start })
     }
 }
@@ -81,7 +83,7 @@ impl<R: BufRead> Iterator for Reader<R> {
     }
 }
 
-/// What the comment line says.
+/// The parsed comment line.
 struct Header {
     info: BTreeMap<String, Value>,
     cell: Cell,
@@ -90,14 +92,14 @@ struct Header {
 }
 
 impl Header {
-    fn new(line: &str) -> Result<Self, Fault> {
+    fn new(line: &str) -> Result<Self, ExtxyzErrorKind> {
         let mut info = BTreeMap::new();
         for (key, mut value) in comment::parse(line)? {
             if key == "stress" || key == "virial" {
                 value = matrix(&value).ok_or_else(|| fault(&key, &value, "9 numbers (or 6)"))?.into();
             }
             if info.get(&key).is_some_and(|other| *other != value) {
-                return Err(Fault::Repeated { key: excerpt(&key) });
+                return Err(ExtxyzErrorKind::Repeated { key: excerpt(&key) });
             }
             info.insert(key, value);
         }
@@ -117,11 +119,11 @@ impl Header {
     }
 }
 
-fn fault(key: &str, value: &Value, expected: &'static str) -> Fault {
-    Fault::key(key, &value.to_string(), expected)
+fn fault(key: &str, value: &Value, expected: &'static str) -> ExtxyzErrorKind {
+    ExtxyzErrorKind::key(key, &value.to_string(), expected)
 }
 
-fn lattice(value: &Value) -> Result<Cell, Fault> {
+fn lattice(value: &Value) -> Result<Cell, ExtxyzErrorKind> {
     match value.numbers().as_deref() {
         Some(&[a, b, c, d, e, f, g, h, i]) => Ok(Cell([[a, b, c], [d, e, f], [g, h, i]])),
         _ => Err(fault("Lattice", value, "9 numbers")),
@@ -137,7 +139,7 @@ fn matrix(value: &Value) -> Option<Matrix3> {
     }
 }
 
-fn periodic(value: &Value) -> Result<[bool; 3], Fault> {
+fn periodic(value: &Value) -> Result<[bool; 3], ExtxyzErrorKind> {
     let flag = |value: &Value| match value {
         Value::Bool(flag) => Some(*flag),
         Value::Int(0) => Some(false),

@@ -2,16 +2,16 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::fault::{Fault, excerpt};
+use super::error::{ExtxyzErrorKind, excerpt};
 use super::value::logical;
-use super::{Column, Entries};
+use super::{Column, ColumnData};
 use crate::cell::Vec3;
 use crate::species::{Species, UnknownSpecies};
 
-/// The atoms of a frame as they are read.
+/// The atoms of a frame while it is read.
 pub(super) struct Table {
     columns: Vec<TableColumn>,
-    /// Fields of a line.
+    /// Fields per line.
     width: usize,
     /// Whether more fields are an error.
     exact: bool,
@@ -30,14 +30,14 @@ enum Content {
     AtomicNumber,
     Position,
     Array(Column),
-    /// Symbols where atomic numbers are given too: ASE takes the numbers.
+    /// Symbols beside atomic numbers: ASE uses the numbers.
     Ignored,
 }
 
 impl Table {
     /// Columns as `Properties` describes them: `name:type:columns` triples.
-    pub(super) fn new(properties: &str, exact: bool) -> Result<Self, Fault> {
-        let fault = |expected| Fault::key("Properties", properties, expected);
+    pub(super) fn new(properties: &str, exact: bool) -> Result<Self, ExtxyzErrorKind> {
+        let fault = |expected| ExtxyzErrorKind::key("Properties", properties, expected);
         let fields: Vec<&str> = properties.split(':').collect();
         let (triples, rest) = fields.as_chunks::<3>();
         if !rest.is_empty() {
@@ -52,7 +52,7 @@ impl Table {
             let (total, width) = columns.ok_or_else(|| fault("a positive number of columns"))?;
             let content = content(name, kind, width, numbered).map_err(fault)?;
             if !names.insert(*name) {
-                return Err(Fault::Repeated { key: format!("column {}", excerpt(name)) });
+                return Err(ExtxyzErrorKind::Repeated { key: format!("column {}", excerpt(name)) });
             }
             table.width = total;
             table.columns.push(TableColumn { name: (*name).to_owned(), width, content });
@@ -68,10 +68,10 @@ impl Table {
     }
 
     /// Reads one atom line.
-    pub(super) fn push(&mut self, line: &str) -> Result<(), Fault> {
+    pub(super) fn push(&mut self, line: &str) -> Result<(), ExtxyzErrorKind> {
         let fields: Vec<&str> = line.split_whitespace().collect();
         if fields.len() < self.width || (self.exact && fields.len() > self.width) {
-            return Err(Fault::Fields { found: fields.len(), expected: self.width });
+            return Err(ExtxyzErrorKind::Fields { found: fields.len(), expected: self.width });
         }
         let mut fields = fields.into_iter().enumerate();
         for column in &mut self.columns {
@@ -109,7 +109,7 @@ impl Table {
     }
 }
 
-/// What a column is for; on failure what was expected.
+/// The use of a column; on failure, what was expected.
 fn content(name: &str, kind: &str, width: usize, numbered: bool) -> Result<Content, &'static str> {
     match (name, kind, width) {
         ("species" | "symbols", "S", 1) if numbered => Ok(Content::Ignored),
@@ -120,34 +120,35 @@ fn content(name: &str, kind: &str, width: usize, numbered: bool) -> Result<Conte
         ("pos" | "positions", "R", 3) => Ok(Content::Position),
         ("pos" | "positions", ..) => Err("pos:R:3"),
         ("", ..) => Err("a name for each column"),
-        (_, "R", _) => Ok(Content::Array(Column { width, entries: Entries::Real(vec![]) })),
-        (_, "I", _) => Ok(Content::Array(Column { width, entries: Entries::Int(vec![]) })),
-        (_, "L", _) => Ok(Content::Array(Column { width, entries: Entries::Bool(vec![]) })),
-        (_, "S", _) => Ok(Content::Array(Column { width, entries: Entries::Text(vec![]) })),
+        (_, "R", _) => Ok(Content::Array(Column { width, entries: ColumnData::Real(vec![]) })),
+        (_, "I", _) => Ok(Content::Array(Column { width, entries: ColumnData::Int(vec![]) })),
+        (_, "L", _) => Ok(Content::Array(Column { width, entries: ColumnData::Bool(vec![]) })),
+        (_, "S", _) => Ok(Content::Array(Column { width, entries: ColumnData::Text(vec![]) })),
         _ => Err("one of the types R, I, S and L"),
     }
 }
 
-fn field_fault(index: usize, name: &str, found: &str, expected: &'static str) -> Fault {
-    Fault::Field { field: index + 1, name: excerpt(name), found: excerpt(found), expected }
+fn field_fault(index: usize, name: &str, found: &str, expected: &'static str) -> ExtxyzErrorKind {
+    ExtxyzErrorKind::Field { field: index + 1, name: excerpt(name), found: excerpt(found), expected }
 }
 
-/// A symbol in any case: `AL` is aluminium.
-fn symbol((index, field): (usize, &str)) -> Result<Species, Fault> {
+/// A symbol in any letter case: `AL` is aluminium.
+fn symbol((index, field): (usize, &str)) -> Result<Species, ExtxyzErrorKind> {
     let (first, rest) = field.split_at_checked(1).unwrap_or((field, ""));
     let capitalised = first.to_ascii_uppercase() + &rest.to_ascii_lowercase();
     capitalised
         .parse()
-        .map_err(|_| Fault::Species { field: index + 1, source: UnknownSpecies(excerpt(field)) })
+        .map_err(|_| ExtxyzErrorKind::Species { field: index + 1, source: UnknownSpecies(excerpt(field)) })
 }
 
-fn atomic_number((index, field): (usize, &str)) -> Result<Species, Fault> {
+fn atomic_number((index, field): (usize, &str)) -> Result<Species, ExtxyzErrorKind> {
     let species = field.parse().ok().and_then(|number| Species::from_atomic_number(number).ok());
-    species.ok_or_else(|| Fault::Species { field: index + 1, source: UnknownSpecies(excerpt(field)) })
+    species
+        .ok_or_else(|| ExtxyzErrorKind::Species { field: index + 1, source: UnknownSpecies(excerpt(field)) })
 }
 
-impl Entries {
-    /// Adds a field; on failure what was expected.
+impl ColumnData {
+    /// Adds a field; on failure, returns what was expected.
     fn push(&mut self, field: &str) -> Result<(), &'static str> {
         match self {
             Self::Real(values) => values.push(field.parse().map_err(|_| "a number")?),

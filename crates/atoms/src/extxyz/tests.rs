@@ -15,7 +15,7 @@ fn info(comment: &str) -> BTreeMap<String, Value> {
     only(&format!("1\n{comment}\nAl 0 0 0\n")).info
 }
 
-/// Frames, read and written again.
+/// Writes frames, reads them and writes them again.
 fn rewritten(frame: &Frame) -> String {
     let mut text = Vec::new();
     write_frame(&mut text, frame).unwrap();
@@ -39,9 +39,9 @@ fn columns_of_every_type_in_any_order() {
     assert_eq!(frame.structure.formula(), "Si");
     assert_eq!(frame.structure.cell.0, [[1.0, 2.0, 3.0], [0.0, 5.0, 6.0], [0.0, 0.0, 9.0]]);
     assert_eq!(frame.structure.periodic, [true; 3]);
-    assert_eq!(frame.arrays["tags"], Column { width: 1, entries: Entries::Int(vec![-7]) });
-    assert_eq!(frame.arrays["mask"], Column { width: 2, entries: Entries::Bool(vec![true, false]) });
-    assert_eq!(frame.arrays["site"].entries, Entries::Text(vec!["a1".to_owned()]));
+    assert_eq!(frame.arrays["tags"], Column { width: 1, entries: ColumnData::Int(vec![-7]) });
+    assert_eq!(frame.arrays["mask"], Column { width: 2, entries: ColumnData::Bool(vec![true, false]) });
+    assert_eq!(frame.arrays["site"].entries, ColumnData::Text(vec!["a1".to_owned()]));
     let reals = frame.arrays["v"].reals().unwrap();
     assert!(reals[0] == 1e-3 && reals[1].is_nan());
     assert_eq!(frame.arrays.len(), 4);
@@ -92,7 +92,7 @@ fn values_of_every_type() {
     assert_eq!(info["commas"], vec![1, 2].into());
 }
 
-/// Each of these takes minutes where the time grows with the square of the length.
+/// With quadratic run time each of these would take minutes.
 #[test]
 fn long_comment_lines_take_time_in_proportion() {
     let letters = "k".repeat(10_000_000);
@@ -242,10 +242,10 @@ fn labels_replace_those_of_any_name() {
     };
     let mut frame = only("1\nenergy=1 REF_virial=\"1 2 3 4 5 6\" Lattice=\"3 0 0 0 3 0 0 0 3\"\nAl 0 0 0\n");
     for (keys, names) in [
-        (Keys::Grace, &["energy", "free_energy", "stress"][..]),
-        (Keys::Mace, &["REF_energy", "REF_stress"]),
-        (Keys::Gap, &["energy", "virial"]),
-        (Keys::Ase, &["energy", "stress"]),
+        (LabelKeys::Grace, &["energy", "free_energy", "stress"][..]),
+        (LabelKeys::Mace, &["REF_energy", "REF_stress"]),
+        (LabelKeys::Gap, &["energy", "virial"]),
+        (LabelKeys::Ase, &["energy", "stress"]),
     ] {
         frame.set_labels(&labels, keys);
         assert!(frame.info.keys().eq(names));
@@ -267,9 +267,9 @@ fn what_cannot_be_read_again_is_not_written() {
     };
     let column = |entries| Column { width: 1, entries };
     for (entries, fault) in [
-        (Entries::Int(vec![1 << 31]), "has integers of more than 32 bits, which ASE cannot read"),
-        (Entries::Text(vec!["a b".to_owned()]), "has texts that are empty or have white space"),
-        (Entries::Real(vec![]), "has not one row of the same width for each atom"),
+        (ColumnData::Int(vec![1 << 31]), "has integers of more than 32 bits, which ASE cannot read"),
+        (ColumnData::Text(vec!["a b".to_owned()]), "has text that is empty or contains white space"),
+        (ColumnData::Real(vec![]), "does not have one row of the same width for each atom"),
     ] {
         let message = refused(&|frame| drop(frame.arrays.insert("x".to_owned(), column(entries.clone()))));
         assert_eq!(message, format!("the column 'x' {fault}"));

@@ -6,9 +6,9 @@ use serde_json::Value as Json;
 
 use crate::cell::Matrix3;
 
-/// What a key of the comment line stands for.
+/// The value of a key in the comment line.
 ///
-/// JSON objects and nulls (`_JSON {…}`) stay the text they came as, and are written back as such.
+/// JSON objects and nulls (`_JSON {…}`) are kept as text and written back unchanged.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Value {
     /// `T` or `F`; a key without a value is true.
@@ -33,7 +33,7 @@ impl Value {
         }
     }
 
-    /// All numbers of a vector, or of a matrix row by row.
+    /// The numbers of a vector, or of a matrix row by row.
     pub fn numbers(&self) -> Option<Vec<f64>> {
         match self {
             Self::List(values) => {
@@ -52,10 +52,10 @@ impl Value {
         }
     }
 
-    /// Reads what stands after `=`, quotes and escapes already resolved.
+    /// Parses the text after `=`, with quotes and escapes already resolved.
     ///
-    /// Integers if all words (separated by white space or commas) are integers, otherwise reals,
-    /// otherwise booleans, otherwise JSON after `_JSON `, otherwise text.
+    /// The first that applies: integers (separated by white space or commas), reals, booleans, JSON after
+    /// `_JSON `, text.
     pub(super) fn parse(text: &str) -> Self {
         let words = || text.split(|c: char| c.is_whitespace() || c == ',').filter(|word| !word.is_empty());
         all(words(), |word| word.parse().ok().map(Self::Int))
@@ -72,8 +72,8 @@ impl Value {
 
     /// The text, before quotes and escapes, that [`Value::parse`] and ASE read as this value.
     ///
-    /// None for a list whose rows differ in length, or with numbers that are not finite below its
-    /// first level: JSON or ASE cannot hold them.
+    /// `None` for a list whose rows differ in length, or that contains numbers that are not finite below its
+    /// first level: JSON or ASE cannot represent them.
     pub(super) fn to_text(&self) -> Option<String> {
         match self {
             Self::Text(text) if !stays_text(text) => Some(format!("_JSON {}", json_string(text))),
@@ -85,7 +85,7 @@ impl Value {
         }
     }
 
-    /// Lengths of a list and of the lists in it; none if they differ.
+    /// Lengths of nested lists; `None` if they are ragged.
     fn shape(&self) -> Option<Vec<usize>> {
         let Self::List(values) = self else { return Some(vec![]) };
         let mut shape = vec![values.len()];
@@ -104,7 +104,7 @@ impl Value {
     }
 }
 
-/// As in the comment line, before quotes; lists and what is in them as in JSON.
+/// As in the comment line, before quotes; lists as in JSON.
 impl fmt::Display for Value {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -128,7 +128,7 @@ fn json_item(value: &Value) -> String {
     }
 }
 
-/// One value for a single word, a list for several, none if a word is of another type.
+/// One value for a single word, a list for several; `None` if a word has another type.
 fn all<'a>(words: impl Iterator<Item = &'a str>, parse: impl Fn(&str) -> Option<Value>) -> Option<Value> {
     let mut values = words.map(parse).collect::<Option<Vec<_>>>()?;
     match values.len() {
@@ -137,7 +137,7 @@ fn all<'a>(words: impl Iterator<Item = &'a str>, parse: impl Fn(&str) -> Option<
     }
 }
 
-/// The ways to write a truth value.
+/// Parses a boolean in any of its spellings.
 pub(super) fn logical(word: &str) -> Option<bool> {
     match word {
         "T" | "true" | "True" | "TRUE" => Some(true),
@@ -157,7 +157,7 @@ fn from_json(json: &Json) -> Option<Value> {
     }
 }
 
-/// At least two numbers or booleans of one type: what needs no JSON.
+/// At least two numbers or booleans of one type, which need no JSON.
 fn is_plain_vector(values: &[Value]) -> bool {
     values.len() > 1
         && (values.iter().all(|value| matches!(value, Value::Bool(_)))
@@ -165,9 +165,9 @@ fn is_plain_vector(values: &[Value]) -> bool {
             || values.iter().all(|value| matches!(value, Value::Real(_))))
 }
 
-/// Whether a text, written as it stands, is read as the same text, by ASE as well.
+/// Whether the bare text is read back as the same text, also by ASE.
 ///
-/// Python takes `1_000` for a number, and files that are not ASCII depend on the locale.
+/// Python parses `1_000` as a number, and non-ASCII files depend on the locale.
 fn stays_text(text: &str) -> bool {
     let printable = text.bytes().all(|byte| (b' '..=b'~').contains(&byte));
     let number =

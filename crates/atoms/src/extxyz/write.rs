@@ -3,19 +3,19 @@
 use std::io::Write;
 
 use super::comment::{is_verbatim, quote};
-use super::{Column, Entries, Frame, Value};
+use super::{Column, ColumnData, Frame, Value};
 use crate::structure::StructureError;
 
-/// Why a frame cannot be written so that this reader and ASE read the same back.
+/// Why a frame cannot be written so that this reader and ASE read it back.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
-    /// The stream does not take it.
+    /// The stream reports an error.
     #[error("cannot be written: {0}")]
     Io(#[from] std::io::Error),
-    /// The structure is not one.
+    /// The structure is invalid.
     #[error(transparent)]
     Structure(#[from] StructureError),
-    /// A key or its value.
+    /// A key or its value cannot be written.
     #[error("the info key '{key}' {fault}")]
     Key {
         /// The key.
@@ -23,7 +23,7 @@ pub enum WriteError {
         /// What is wrong.
         fault: &'static str,
     },
-    /// A column.
+    /// A column cannot be written.
     #[error("the column '{name}' {fault}")]
     Column {
         /// Its name.
@@ -33,9 +33,9 @@ pub enum WriteError {
     },
 }
 
-/// Writes one frame; nothing if it cannot be written.
+/// Writes one frame, or nothing if it cannot be written.
 ///
-/// Keys and columns stand in alphabetical order: the same frame gives the same bytes.
+/// Keys and columns are in alphabetical order, so equal frames give equal bytes.
 pub fn write_frame(out: &mut impl Write, frame: &Frame) -> Result<(), WriteError> {
     frame.structure.validate()?;
     let mut text = Vec::new();
@@ -76,7 +76,7 @@ fn comment(frame: &Frame) -> Result<String, WriteError> {
     Ok(words.join(" "))
 }
 
-/// The value as text; on failure what is wrong.
+/// The value as text; on failure, what is wrong.
 fn info(key: &str, value: &Value) -> Result<String, &'static str> {
     match key {
         "Lattice" | "Properties" | "pbc" => return Err("belongs to the structure"),
@@ -88,7 +88,7 @@ fn info(key: &str, value: &Value) -> Result<String, &'static str> {
     }
     if is_verbatim(key) {
         let plain = |text: &&str| !text.is_empty() && !text.contains(char::is_control);
-        return value.text().filter(plain).map(str::to_owned).ok_or("needs a text in one line");
+        return value.text().filter(plain).map(str::to_owned).ok_or("must be a single line of text");
     }
     value.to_text().ok_or("has nested lists of different lengths or with numbers that are not finite")
 }
@@ -102,7 +102,7 @@ fn matrix(value: &Value) -> Option<String> {
     }
 }
 
-/// The letter for the type of a column; on failure what is wrong.
+/// The type letter of a column; on failure, what is wrong.
 fn kind(name: &str, column: &Column, atoms: usize) -> Result<char, &'static str> {
     if matches!(name, "species" | "symbols" | "Z" | "numbers" | "pos" | "positions") {
         return Err("belongs to the structure");
@@ -111,15 +111,15 @@ fn kind(name: &str, column: &Column, atoms: usize) -> Result<char, &'static str>
         return Err("needs a name without colons and control characters");
     }
     if column.width == 0 || column.width.checked_mul(atoms) != Some(column.entries.len()) {
-        return Err("has not one row of the same width for each atom");
+        return Err("does not have one row of the same width for each atom");
     }
     match &column.entries {
-        Entries::Real(_) => Ok('R'),
-        Entries::Bool(_) => Ok('L'),
-        Entries::Int(values) if values.iter().all(|value| i32::try_from(*value).is_ok()) => Ok('I'),
-        Entries::Int(_) => Err("has integers of more than 32 bits, which ASE cannot read"),
-        Entries::Text(words) if words.iter().all(|word| is_word(word)) => Ok('S'),
-        Entries::Text(_) => Err("has texts that are empty or have white space"),
+        ColumnData::Real(_) => Ok('R'),
+        ColumnData::Bool(_) => Ok('L'),
+        ColumnData::Int(values) if values.iter().all(|value| i32::try_from(*value).is_ok()) => Ok('I'),
+        ColumnData::Int(_) => Err("has integers of more than 32 bits, which ASE cannot read"),
+        ColumnData::Text(words) if words.iter().all(|word| is_word(word)) => Ok('S'),
+        ColumnData::Text(_) => Err("has text that is empty or contains white space"),
     }
 }
 
@@ -130,14 +130,18 @@ fn is_word(text: &str) -> bool {
 fn write_entries(text: &mut Vec<u8>, column: &Column, atom: usize) -> std::io::Result<()> {
     let row = atom * column.width..(atom + 1) * column.width;
     match &column.entries {
-        Entries::Real(values) => {
+        ColumnData::Real(values) => {
             values.get(row).into_iter().flatten().try_for_each(|x| write!(text, " {x:?}"))
         }
-        Entries::Int(values) => values.get(row).into_iter().flatten().try_for_each(|i| write!(text, " {i}")),
-        Entries::Bool(values) => {
+        ColumnData::Int(values) => {
+            values.get(row).into_iter().flatten().try_for_each(|i| write!(text, " {i}"))
+        }
+        ColumnData::Bool(values) => {
             values.get(row).into_iter().flatten().try_for_each(|b| write!(text, " {}", flag(*b)))
         }
-        Entries::Text(words) => words.get(row).into_iter().flatten().try_for_each(|s| write!(text, " {s}")),
+        ColumnData::Text(words) => {
+            words.get(row).into_iter().flatten().try_for_each(|s| write!(text, " {s}"))
+        }
     }
 }
 

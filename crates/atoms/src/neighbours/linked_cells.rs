@@ -1,38 +1,38 @@
-//! Linked cells: atoms sorted into bins, so that the search for neighbours looks nearby only.
+//! Linked cells: bins of atoms that limit the neighbour search to nearby atoms.
 
 use super::Neighbour;
 use crate::cell::{self, Cell, Vec3};
 use crate::structure::{Structure, StructureError};
 
-/// Atoms farther than this many lattice vectors (Å where nothing repeats) from the cell are refused.
-const FARTHEST: f64 = 1e8;
+/// Largest distance from the cell in lattice vectors (in Å along non-periodic directions).
+const MAX_DISTANCE: f64 = 1e8;
 
-/// A search that would visit more bins than this for one atom is refused.
-const MOST_BINS_VISITED: f64 = 1e6;
+/// Largest number of bins that the search for one atom may visit.
+const MAX_BINS_VISITED: f64 = 1e6;
 
-/// Relative to the reach: covers what rounding does to atoms on the edge of a bin or of the sphere.
-const HAIR: f64 = 1e-6;
+/// Relative margin of the reach for atoms on the edge of a bin or of the sphere.
+const RELATIVE_MARGIN: f64 = 1e-6;
 
-/// Every atom in the bin of its image inside the cell.
+/// All atoms, in the bins of their images inside the cell.
 pub(super) struct LinkedCells {
     periodic: [bool; 3],
-    /// With unit vectors where nothing repeats.
+    /// The cell with unit vectors along non-periodic directions.
     lattice: Cell,
     /// Å
     reach: f64,
     /// Number of bins in each direction.
     counts: [i32; 3],
-    /// How many bins away the reach extends.
+    /// Number of bins within the reach.
     spans: Vec3,
-    /// Where each atom lies, in bins.
+    /// Coordinates of each atom in units of bins.
     coordinates: Vec<Vec3>,
     /// Lattice translation of each atom from its image inside the cell.
     wraps: Vec<[i32; 3]>,
     /// The image of each atom inside the cell, Å.
     wrapped: Vec<Vec3>,
-    /// Where each bin starts in `members`.
+    /// Index of each bin's first atom in `members`.
     starts: Vec<usize>,
-    /// Atoms, bin by bin, and their images inside the cell.
+    /// Atoms by bin, with their images inside the cell.
     members: Vec<(u32, Vec3)>,
 }
 
@@ -46,7 +46,7 @@ impl LinkedCells {
         let heights = lattice.heights();
         let widths: Vec3 = std::array::from_fn(|k| extent[k] * heights[k]);
         let counts = bin_counts(widths, reach, fractional.len());
-        let spans = bin_spans(widths, reach * (1.0 + HAIR), counts, periodic)?;
+        let spans = bin_spans(widths, reach * (1.0 + RELATIVE_MARGIN), counts, periodic)?;
         let in_bins =
             |f: &Vec3| std::array::from_fn(|k| (f[k] - origin[k]) / extent[k] * f64::from(counts[k]));
         let coordinates: Vec<Vec3> = fractional.iter().map(in_bins).collect();
@@ -56,8 +56,9 @@ impl LinkedCells {
         Ok(Self { periodic, lattice, reach, counts, spans, coordinates, wraps, wrapped, starts, members })
     }
 
-    /// Shows `visit` every pair that may lie within the reach of atom `i`, each once, `i` itself included, the images
-    /// of the same neighbour in ascending order; and whether it is sure to. `near` is working memory.
+    /// Calls `visit` for every pair that may be within the reach of atom `i`, each once, including `i` itself,
+    /// with the images of a neighbour in ascending order; the flag says whether it certainly is. `near` is
+    /// scratch memory.
     pub fn candidates<E>(
         &self,
         i: usize,
@@ -65,7 +66,8 @@ impl LinkedCells {
         mut visit: impl FnMut(Neighbour, bool) -> Result<(), E>,
     ) -> Result<(), E> {
         let runs = self.runs(i);
-        let (outer, inner) = ((self.reach * (1.0 + HAIR)).powi(2), (self.reach * (1.0 - HAIR)).powi(2));
+        let (outer, inner) =
+            ((self.reach * (1.0 + RELATIVE_MARGIN)).powi(2), (self.reach * (1.0 - RELATIVE_MARGIN)).powi(2));
         near.resize(self.members.len(), (0, 0.0));
         for (a, image_a) in self.nearby(i, 0) {
             for (b, image_b) in self.nearby(i, 1) {
@@ -85,26 +87,26 @@ impl LinkedCells {
         Ok(())
     }
 
-    /// The bins along direction `k` within the reach of atom `i`, from the first to the last, counted on beyond the cell.
+    /// First and last bin along direction `k` within the reach of atom `i`, not wrapped into the cell.
     fn range(&self, i: usize, k: usize) -> (i32, i32) {
         let (own, span) = (self.coordinates[i][k], self.spans[k]);
         let (low, high) = ((own - span).floor() as i32, (own + span).floor() as i32);
         if self.periodic[k] { (low, high) } else { (low.max(0), high.min(self.counts[k] - 1)) }
     }
 
-    /// These bins one by one, each with the lattice translation to it from the cell.
+    /// These bins, each with its lattice translation.
     fn nearby(&self, i: usize, k: usize) -> impl Iterator<Item = (i32, i32)> {
         let ((low, high), count) = (self.range(i, k), self.counts[k]);
         let first = (low.rem_euclid(count), low.div_euclid(count));
-        // Counted on, since a division for each bin would take longer than the rest of the search.
+        // Incremented, because a division per bin would dominate the search.
         let next = move |&(bin, image): &(i32, i32)| {
             Some(if bin + 1 == count { (0, image + 1) } else { (bin + 1, image) })
         };
         std::iter::successors(Some(first), next).take((high - low + 1).max(0) as usize)
     }
 
-    /// These bins along the last direction, where neighbours in space are neighbours in memory: the first and the last
-    /// bin inside each image of the cell, and the lattice translation to it.
+    /// These bins along the last direction, where adjacent bins are adjacent in memory: first and last bin
+    /// inside each image of the cell, with its lattice translation.
     fn runs(&self, i: usize) -> Vec<(usize, usize, i32)> {
         let ((low, high), count) = (self.range(i, 2), self.counts[2]);
         let images = low.div_euclid(count)..=high.div_euclid(count);
@@ -116,7 +118,7 @@ impl LinkedCells {
     }
 }
 
-/// The members closer to the centre than the square root of `outer`, and their squared distances, Å².
+/// The members with squared distance below `outer`, and these squared distances, Å².
 fn select<'a>(
     members: &[(u32, Vec3)],
     centre: Vec3,
@@ -127,22 +129,22 @@ fn select<'a>(
     for &(atom, r) in members {
         let d = cell::sub(r, centre);
         let square = cell::dot(d, d);
-        // Written in any case and counted if it is near: a branch would be guessed wrongly every few atoms.
+        // Write always and count only if near: a branch would be mispredicted every few atoms.
         near[count] = (atom, square);
         count += usize::from(square <= outer);
     }
     &near[..count]
 }
 
-/// Fractional coordinates brought into the cell where it repeats, and the translations taken off.
+/// Fractional coordinates wrapped into the cell along periodic directions, and the translations removed.
 fn fractional(structure: &Structure, lattice: &Cell) -> Result<(Vec<Vec3>, Vec<[i32; 3]>), StructureError> {
     let reciprocal = lattice.reciprocal();
     let mut fractional = Vec::with_capacity(structure.len());
     let mut wraps = Vec::with_capacity(structure.len());
     for (atom, position) in structure.positions.iter().enumerate() {
         let f = reciprocal.map(|b| cell::dot(b, *position));
-        if !f.iter().all(|x| x.abs() <= FARTHEST) {
-            return Err(StructureError::FarAway { atom, limit: FARTHEST });
+        if !f.iter().all(|x| x.abs() <= MAX_DISTANCE) {
+            return Err(StructureError::FarAway { atom, limit: MAX_DISTANCE });
         }
         let wrap: Vec3 = std::array::from_fn(|k| if structure.periodic[k] { f[k].floor() } else { 0.0 });
         fractional.push(cell::sub(f, wrap));
@@ -151,7 +153,7 @@ fn fractional(structure: &Structure, lattice: &Cell) -> Result<(Vec<Vec3>, Vec<[
     Ok((fractional, wraps))
 }
 
-/// Origin and extent of the bins in fractional coordinates: the cell where it repeats, else the atoms.
+/// Origin and extent of the bins in fractional coordinates: the cell along periodic directions, else the atoms.
 fn bounds(fractional: &[Vec3], periodic: [bool; 3]) -> (Vec3, Vec3) {
     let mut origin = [0.0; 3];
     let mut extent = [1.0; 3];
@@ -164,7 +166,7 @@ fn bounds(fractional: &[Vec3], periodic: [bool; 3]) -> (Vec3, Vec3) {
     (origin, extent)
 }
 
-/// Bins of at least half the reach, and not many more bins than atoms.
+/// Bins of at least half the reach, and not many more than there are atoms.
 fn bin_counts(widths: Vec3, reach: f64, atoms: usize) -> [i32; 3] {
     let mut counts = widths.map(|width| (2.0 * width / reach).floor().clamp(1.0, 1e6));
     while counts.iter().product::<f64>() > 4.0 * atoms as f64 + 64.0 {
@@ -174,7 +176,7 @@ fn bin_counts(widths: Vec3, reach: f64, atoms: usize) -> [i32; 3] {
     counts.map(|count| (count as i32).max(1))
 }
 
-/// How many bins away the reach extends in each direction.
+/// Number of bins within the reach in each direction.
 fn bin_spans(
     widths: Vec3,
     reach: f64,
@@ -189,14 +191,14 @@ fn bin_spans(
             f64::from(counts[k]).min(2.0 * spans[k].ceil() + 1.0)
         }
     };
-    if (0..3).map(visited).product::<f64>() > MOST_BINS_VISITED {
+    if (0..3).map(visited).product::<f64>() > MAX_BINS_VISITED {
         let height = (0..3).filter(|k| periodic[*k]).map(|k| widths[k]).fold(f64::INFINITY, f64::min);
         return Err(StructureError::CellThin { height, reach });
     }
     Ok(spans)
 }
 
-/// Counting sort of the atoms by bin: the start of each bin, and the atoms bin by bin.
+/// Counting sort of the atoms by bin: start of each bin and the atoms in order.
 fn sort_into(coordinates: &[Vec3], wrapped: &[Vec3], counts: [i32; 3]) -> (Vec<usize>, Vec<(u32, Vec3)>) {
     let bin = |x: &Vec3| flat(std::array::from_fn(|k| (x[k] as i32).clamp(0, counts[k] - 1)), counts);
     let mut starts = vec![0; counts.iter().map(|count| *count as usize).product::<usize>() + 1];

@@ -1,14 +1,14 @@
-//! Where neighbours are: atoms, and those of their images that are somebody's neighbour, each once.
+//! The distinct positions of neighbours: atoms and periodic images, each once.
 
 use super::Neighbour;
 use crate::cell::{self, Vec3};
 use crate::structure::Structure;
 
-/// The places that the neighbours of a list stand at: of n atoms the first n are the atoms themselves, then come images.
+/// The sites of a list: the first n are the n atoms, the rest are images.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Sites {
     images: Vec<Neighbour>,
-    /// The site of each neighbour in the list.
+    /// The site of each neighbour.
     pub of_neighbour: Vec<u32>,
 }
 
@@ -18,10 +18,10 @@ impl Sites {
         self.of_neighbour.clear();
     }
 
-    /// Numbers the sites of a list, where the neighbours of atom i stand from `offsets[i]` on.
+    /// Assigns site numbers. The neighbours of atom i start at `offsets[i]`.
     ///
-    /// Of i → j + image the list holds the reverse, j → i − image: the images of an atom that anybody sees are those
-    /// that its own neighbours have, reversed.
+    /// For each bond i → j + image the list holds the reverse, j → i − image. The images of an atom that occur
+    /// in the list are therefore those of its own neighbours, negated.
     pub fn number(&mut self, offsets: &[usize], neighbours: &[Neighbour]) {
         self.clear();
         let atoms = offsets.len() - 1;
@@ -49,7 +49,7 @@ impl Sites {
         }));
     }
 
-    /// Writes the positions of all sites, Å, for the structure as it stands.
+    /// Writes the positions of all sites, Å, for the current structure.
     pub fn positions(&self, structure: &Structure, positions: &mut Vec<Vec3>) {
         positions.clear();
         positions.extend_from_slice(&structure.positions);

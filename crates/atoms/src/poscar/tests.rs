@@ -17,7 +17,7 @@ fn direct_coordinates_with_selective_dynamics() {
     assert_eq!(frame.structure.cell.0, [[0.0, 2.0, 2.0], [2.0, 0.0, 2.0], [2.0, 2.0, 0.0]]);
     assert_eq!(frame.structure.positions, [[0.0; 3], [1.0; 3]]);
     assert_eq!(frame.structure.periodic, [true; 3]);
-    let flags = Entries::Bool(vec![true, true, false, false, true, true]);
+    let flags = ColumnData::Bool(vec![true, true, false, false, true, true]);
     assert_eq!(frame.arrays["move_mask"], Column { width: 3, entries: flags });
     assert_eq!(frame.info["comment"].text(), Some("Gallium arsenide, it says"));
 }

@@ -1,4 +1,4 @@
-//! Helpers that the tests of this crate share.
+//! Shared helpers.
 use std::path::{Path, PathBuf};
 
 use calm::Artifact;
@@ -8,12 +8,12 @@ pub fn data(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
 }
 
-/// A file of the models that the campaigns of `configs/` use.
+/// A file of the models in `configs/`.
 pub fn model(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/data").join(name)
 }
 
-/// A file of the large reference data, or nothing (said aloud) where they are not at hand.
+/// A file of the large reference data; prints a note and returns `None` if it is unavailable.
 pub fn peer(name: &str) -> Option<PathBuf> {
     let Some(root) = std::env::var_os("CALMWALK_PEER_DATA") else {
         eprintln!("CALMWALK_PEER_DATA is not set: {name} is not tested");
@@ -22,7 +22,7 @@ pub fn peer(name: &str) -> Option<PathBuf> {
     Some(Path::new(&root).join(name))
 }
 
-/// Numbers of an array, whatever their type.
+/// The numbers of an array of any type.
 pub fn numbers(path: &Path, key: &str) -> Vec<f64> {
     optional(path, key).unwrap_or_else(|| panic!("{} has no {key}", path.display()))
 }
@@ -65,7 +65,7 @@ pub fn niobium() -> Artifact {
     Artifact::load(data("niobium_artifact.npz")).unwrap()
 }
 
-/// A small generator of numbers in (−1, 1), for tests that need the same numbers everywhere.
+/// A reproducible generator of numbers in (−1, 1).
 pub struct Random(pub u64);
 
 impl Random {

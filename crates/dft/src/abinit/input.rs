@@ -1,4 +1,4 @@
-//! `run.abi`.
+//! Writes `run.abi`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -7,28 +7,28 @@ use atoms::{Species, Vec3};
 
 use super::pseudopotentials::Pseudopotential;
 use super::{Abinit, Settings};
-use crate::lattice::Enclosed;
-use crate::original::COPIES;
-use crate::{Failure, FailureClass, Input, Remedy, Smearing, moments};
+use crate::padded_structure::PaddedStructure;
+use crate::pinned_file::DATA_DIRECTORY;
+use crate::{Failure, FailureClass, Input, RetryAdjustment, Smearing, moments};
 
-/// Name of the input; ABINIT calls its output after it.
+/// Name of the input file; ABINIT derives the name of its output from it.
 const NAME: &str = "run.abi";
 
 pub(super) fn write(
     abinit: &Abinit,
-    enclosed: &Enclosed,
-    remedies: &BTreeSet<Remedy>,
+    padded: &PaddedStructure,
+    adjustments: &BTreeSet<RetryAdjustment>,
 ) -> Result<Input, Failure> {
-    let bad = |error: crate::SetupError| FailureClass::BadInput.because(error.to_string());
-    let species = BTreeSet::from_iter(enclosed.structure.species.iter().copied());
-    let pseudopotentials = abinit.of_one_kind(&species).map_err(bad)?;
+    let bad = |error: crate::SetupError| FailureClass::BadInput.with_message(error.to_string());
+    let species = BTreeSet::from_iter(padded.structure.species.iter().copied());
+    let pseudopotentials = abinit.matching_pseudopotentials(&species).map_err(bad)?;
     let mut text = fixed(&abinit.settings);
-    electrons(&mut text, &abinit.settings, enclosed, &pseudopotentials, remedies);
-    steps(&mut text, &abinit.settings, pseudopotentials.values().any(|p| p.paw), remedies);
-    structure(&mut text, enclosed, &pseudopotentials);
+    electrons(&mut text, &abinit.settings, padded, &pseudopotentials, adjustments);
+    steps(&mut text, &abinit.settings, pseudopotentials.values().any(|p| p.paw), adjustments);
+    structure(&mut text, padded, &pseudopotentials);
     let copies: Vec<_> = pseudopotentials.iter().map(|(species, one)| one.copy(*species)).collect();
-    text += &format!("pp_dirpath \"{COPIES}\"\npseudos \"{}\"\n", copies.join(", "));
-    let originals = pseudopotentials.values().map(|one| one.original.clone());
+    text += &format!("pp_dirpath \"{DATA_DIRECTORY}\"\npseudos \"{}\"\n", copies.join(", "));
+    let originals = pseudopotentials.values().map(|one| one.pinned.clone());
     Ok(Input {
         files: [(NAME.to_owned(), text.into_bytes())].into(),
         command: abinit.settings.command.iter().cloned().chain([NAME.to_owned()]).collect(),
@@ -37,7 +37,8 @@ pub(super) fn write(
     })
 }
 
-/// What no structure changes: PBE, forces and stress, no symmetry but time reversal, no files beside the output.
+/// Keywords that do not depend on the structure: PBE, forces and stress, no symmetry but time reversal, no
+/// files beside the output.
 fn fixed(settings: &Settings) -> String {
     let occupation = match settings.smearing {
         Smearing::FermiDirac => 3,
@@ -54,18 +55,18 @@ fn fixed(settings: &Settings) -> String {
 fn electrons(
     text: &mut String,
     settings: &Settings,
-    enclosed: &Enclosed,
+    padded: &PaddedStructure,
     pseudopotentials: &BTreeMap<Species, &Pseudopotential>,
-    remedies: &BTreeSet<Remedy>,
+    adjustments: &BTreeSet<RetryAdjustment>,
 ) {
-    let structure = &enclosed.structure;
-    // Without spin, no moments: bands are counted with those of the first attempt, so that all have as many.
+    let structure = &padded.structure;
+    // Bands are counted with the moments of the first attempt, so that every attempt has the same number.
     let counted =
         if settings.spin { moments::initial(structure, &settings.moments, &BTreeSet::new()) } else { vec![] };
     let moment: f64 = counted.iter().map(|moment| moment.abs()).sum();
     let electrons: f64 =
         structure.species.iter().filter_map(|s| pseudopotentials.get(s)).map(|p| p.valence).sum();
-    // A fifth more than are full, and some for small cells: the highest must be empty.
+    // A fifth more bands than are occupied, and a few for small cells: the highest band must be empty.
     let bands = (0.6 * (electrons + moment)).ceil() as u64 + 4;
     *text += &format!("nband {bands}\n");
     if pseudopotentials.values().any(|p| p.paw) {
@@ -73,33 +74,37 @@ fn electrons(
     }
     if settings.spin {
         *text += "nsppol 2\nspinat\n";
-        for moment in moments::initial(structure, &settings.moments, remedies) {
+        for moment in moments::initial(structure, &settings.moments, adjustments) {
             *text += &format!("  0 0 {moment:?}\n");
         }
     }
-    let [x, y, z] = enclosed.mesh(settings.k_spacing);
+    let [x, y, z] = padded.mesh(settings.k_spacing);
     *text += &format!("ngkpt {x} {y} {z}\nnshiftk 1\nshiftk 0 0 0\n");
 }
 
-fn steps(text: &mut String, settings: &Settings, paw: bool, remedies: &BTreeSet<Remedy>) {
-    let factor = if remedies.contains(&Remedy::MoreSteps) { 3 } else { 1 };
+fn steps(text: &mut String, settings: &Settings, paw: bool, adjustments: &BTreeSet<RetryAdjustment>) {
+    let factor = if adjustments.contains(&RetryAdjustment::MoreSteps) { 3 } else { 1 };
     *text += &format!("nstep {}\n", settings.steps.saturating_mul(factor));
-    if remedies.contains(&Remedy::SlowerMixing) {
+    if adjustments.contains(&RetryAdjustment::SlowerMixing) {
         *text += "diemix 0.25\nnpulayit 15\n";
     }
-    if remedies.contains(&Remedy::OtherAlgorithm) {
-        // 7 mixes potentials, 17 densities: each is the default of the other kind of pseudopotential.
+    if adjustments.contains(&RetryAdjustment::OtherAlgorithm) {
+        // 7 mixes potentials, 17 densities; each is the default of the other kind of pseudopotential.
         *text += &format!("iscf {}\nnline 8\nnnsclo 2\n", if paw { 7 } else { 17 });
     }
 }
 
-fn structure(text: &mut String, enclosed: &Enclosed, pseudopotentials: &BTreeMap<Species, &Pseudopotential>) {
-    let structure = &enclosed.structure;
+fn structure(
+    text: &mut String,
+    padded: &PaddedStructure,
+    pseudopotentials: &BTreeMap<Species, &Pseudopotential>,
+) {
+    let structure = &padded.structure;
     let numbers: Vec<_> =
         pseudopotentials.keys().map(|species| species.atomic_number().to_string()).collect();
     *text +=
         &format!("natom {}\nntypat {}\nznucl {}\ntypat\n", structure.len(), numbers.len(), numbers.join(" "));
-    // ABINIT cuts long lines off.
+    // ABINIT truncates long lines.
     for atoms in structure.species.chunks(20) {
         for species in atoms {
             let kind = pseudopotentials.keys().position(|other| other == species).unwrap_or_default() + 1;
@@ -114,7 +119,7 @@ fn structure(text: &mut String, enclosed: &Enclosed, pseudopotentials: &BTreeMap
     *text += "  Angstrom\n";
 }
 
-/// With all digits.
+/// Writes a vector with all digits.
 fn vector(text: &mut String, [x, y, z]: Vec3) {
     // Writing to a string cannot fail.
     let _ = writeln!(text, "  {x:?} {y:?} {z:?}");

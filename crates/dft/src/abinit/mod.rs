@@ -1,15 +1,16 @@
 //! ABINIT with plane waves and norm-conserving pseudopotentials (psp8) or PAW setups (xml).
 //!
-//! Spin-polarised PBE, no symmetry but time reversal. The energy is the free energy; with PAW it is that of the
-//! double-counting expression, as in ABINIT's own summary. Directions of a structure that do not repeat get vacuum, and
-//! no stress is given then.
+//! Spin-polarised PBE, no symmetry but time reversal. The energy is the free energy; with PAW it is the
+//! double-counting expression, as in ABINIT's own summary. Non-periodic directions get vacuum; such structures
+//! have no stress.
 //!
-//! Remedies:
+//! Adjustments of a retry:
 //! - more steps: three times as many;
-//! - slower mixing: a quarter of the residual is mixed in at first (0.7 otherwise), and 15 old steps count instead of 7;
-//! - another algorithm: densities are mixed instead of potentials (with PAW the other way round), and wave functions are
-//!   brought nearer to convergence in each step;
-//! - other moments: half of them to start from.
+//! - slower mixing: mixes a quarter of the residual at first (default 0.7) with a history of 15 steps (default
+//!   7);
+//! - another algorithm: mixes densities instead of potentials (with PAW the reverse) and converges wave
+//!   functions further in each step;
+//! - other moments: half of the initial moments.
 
 mod input;
 mod output;
@@ -24,52 +25,52 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::{self, Enclosed};
+use crate::checks::{at_least, positive};
 use crate::moments::Moments;
-use crate::setting::{at_least, positive};
+use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    Calculated, Code, Exit, Failure, Input, PassedEnvironment, Remedy, SetupError, Size, Smearing, judge,
-    program,
+    DftBackend, Exit, Failure, Input, PassedEnvironment, Results, RetryAdjustment, SetupError, Size,
+    Smearing, validation, version_query,
 };
 use pseudopotentials::Pseudopotential;
 
 /// eV (CODATA 2018).
 const HARTREE: f64 = 27.211_386_245_988;
 
-/// Counts changes of what is written here that change a label's value.
-const RECIPE: u32 = 1;
+/// Version of the generated input; raised when a change affects label values.
+const INPUT_VERSION: u32 = 1;
 
-/// `[label.method.abinit]`
+/// The settings of `[label.method.abinit]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
-    /// ABINIT, and what it is started by: `["mpirun", "-np", "4", "abinit"]`.
+    /// ABINIT with its launcher: `["mpirun", "-np", "4", "abinit"]`.
     pub command: Vec<String>,
-    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
     pub environment: BTreeMap<String, String>,
     /// Directory of the pseudopotentials, `Si.psp8` or `Si.xml`.
     pub pseudopotentials: PathBuf,
-    /// File of an element where it has another name: `{ Zn = "Zn-sp.psp8" }`.
+    /// File names that differ from that pattern: `{ Zn = "Zn-sp.psp8" }`.
     pub variants: BTreeMap<Species, String>,
-    /// Kinetic energy of the fastest plane wave, eV.
+    /// Plane-wave cutoff, eV.
     pub cutoff: f64,
-    /// That of the fine grid of PAW, eV; twice `cutoff` if there is none.
+    /// Cutoff of the fine PAW grid, eV. Default: twice `cutoff`.
     pub fine_cutoff: Option<f64>,
-    /// Largest distance of k-points, Å⁻¹, 2π included; the mesh is Γ-centred.
+    /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
     pub k_spacing: f64,
-    /// Occupation of states near the Fermi level.
+    /// Occupation function of the electronic states.
     pub smearing: Smearing,
-    /// Its width, eV.
+    /// Width of the smearing, eV.
     pub smearing_width: f64,
-    /// Whether the two spins have their own densities.
+    /// Whether the calculation is spin-polarised.
     pub spin: bool,
-    /// Initial magnetic moment by element, μ_B; 1 for all others.
+    /// Initial magnetic moment of each element, μ_B. Default: 1.
     pub moments: Moments,
-    /// Largest change of the energy in an electronic step, twice in a row, eV.
+    /// Tolerance of the energy between electronic steps, met twice in a row, eV.
     pub energy_tolerance: f64,
-    /// Most electronic steps.
+    /// Maximum number of electronic steps.
     pub steps: u32,
-    /// Space between images in directions that do not repeat, Å.
+    /// Vacuum along non-periodic directions, Å.
     pub vacuum: f64,
 }
 
@@ -95,10 +96,10 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Asks ABINIT for its version and finds the pseudopotentials.
+    /// Queries ABINIT's version and finds the pseudopotentials.
     ///
     /// # Errors
-    /// A program that does not answer, a setting with an impossible value, a file that is not what its name says.
+    /// A program that does not answer, an invalid setting, a file that does not match its name.
     pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Abinit, SetupError> {
         positive("cutoff", self.cutoff)?;
         at_least("fine_cutoff", self.fine_cutoff.unwrap_or(self.cutoff), self.cutoff)?;
@@ -107,29 +108,32 @@ impl Settings {
         positive("energy_tolerance", self.energy_tolerance)?;
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
-        let environment = program::environment(&self.environment);
+        let environment = version_query::environment(&self.environment);
         let version = version(&self.command, &environment, passed)?;
         let pseudopotentials = pseudopotentials::find(&self.pseudopotentials, &self.variants)?;
         Ok(Abinit { settings: self.clone(), environment, version, pseudopotentials })
     }
 }
 
-/// `9.6.2`
+/// The version, such as `9.6.2`.
 fn version(
     command: &[String],
     environment: &BTreeMap<String, String>,
     passed: &PassedEnvironment,
 ) -> Result<String, SetupError> {
-    let said = program::ask(command, &["--version"], environment, passed, &[])?;
-    // Each process of a parallel run may say it.
+    let said = version_query::run(command, &["--version"], environment, passed, &[])?;
+    // Each process of a parallel run may print it.
     let version =
         said.split_whitespace().next().filter(|word| word.starts_with(|c: char| c.is_ascii_digit()));
     version.map(str::to_owned).ok_or_else(|| {
-        program::another(command, format!("is not ABINIT: it says {:?} of its version", said.trim()))
+        version_query::wrong_program(
+            command,
+            format!("is not ABINIT: as its version it reports {:?}", said.trim()),
+        )
     })
 }
 
-/// ABINIT, ready to be used.
+/// A configured ABINIT.
 #[derive(Clone, Debug)]
 pub struct Abinit {
     settings: Settings,
@@ -139,8 +143,8 @@ pub struct Abinit {
 }
 
 impl Abinit {
-    /// The pseudopotentials of these elements, which ABINIT wants to be all norm-conserving or all PAW.
-    fn of_one_kind(
+    /// The pseudopotentials of these elements. ABINIT requires that all are norm-conserving or all are PAW.
+    fn matching_pseudopotentials(
         &self,
         species: &BTreeSet<Species>,
     ) -> Result<BTreeMap<Species, &Pseudopotential>, SetupError> {
@@ -150,9 +154,10 @@ impl Abinit {
             let one = self.pseudopotentials.get(species);
             let one = one.ok_or_else(|| pseudopotentials::missing(*species, directory, variants))?;
             if let Some((other, before)) = chosen.iter().find(|(_, before)| before.paw != one.paw) {
-                let [file, before] = [one, before].map(|one| one.original.path().display());
-                let reason =
-                    format!("{file} cannot go with {before} of {other}: one is PAW, the other is not");
+                let [file, before] = [one, before].map(|one| one.pinned.path().display());
+                let reason = format!(
+                    "{file} cannot be combined with {before} of {other}: one is PAW, the other is not"
+                );
                 return Err(SetupError::Pseudopotential { species: *species, reason });
             }
             chosen.insert(*species, one);
@@ -161,11 +166,11 @@ impl Abinit {
     }
 }
 
-impl Code for Abinit {
+impl DftBackend for Abinit {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, &str> =
-            self.pseudopotentials.iter().map(|(species, p)| (species.symbol(), p.original.hash())).collect();
-        // Destructured, so that a new setting is not forgotten here.
+            self.pseudopotentials.iter().map(|(species, p)| (species.symbol(), p.pinned.hash())).collect();
+        // Destructure, so that a new setting cannot be forgotten here.
         let Settings {
             command: _,
             environment: _,
@@ -183,7 +188,7 @@ impl Code for Abinit {
             vacuum,
         } = &self.settings;
         json!({
-            "code": "abinit", "version": self.version, "recipe": RECIPE, "functional": "PBE", "cutoff": cutoff,
+            "code": "abinit", "version": self.version, "recipe": INPUT_VERSION, "functional": "PBE", "cutoff": cutoff,
             "fine_cutoff": fine_cutoff, "k_spacing": k_spacing, "smearing": smearing,
             "smearing_width": smearing_width, "spin": spin, "moments": moments, "energy_tolerance": energy_tolerance,
             "vacuum": vacuum, "pseudopotentials": hashes,
@@ -191,24 +196,28 @@ impl Code for Abinit {
     }
 
     fn supports(&self, species: &BTreeSet<Species>) -> Result<(), SetupError> {
-        self.of_one_kind(species).map(|_| ())
+        self.matching_pseudopotentials(species).map(|_| ())
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-        input::write(self, &Enclosed::new(structure, self.settings.vacuum)?, remedies)
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
+        input::write(self, &PaddedStructure::new(structure, self.settings.vacuum)?, adjustments)
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
-        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        match output::read(&enclosed.structure, directory, &self.version, self.settings.smearing)? {
-            Some(calculated) => Ok(enclosed.seen_from_outside(calculated)),
-            None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+        let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
+        match output::read(&padded.structure, directory, &self.version, self.settings.smearing)? {
+            Some(calculated) => Ok(padded.without_padding_stress(calculated)),
+            None => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),
         }
     }
 
     fn size(&self, structure: &Structure) -> Size {
         let Settings { vacuum, k_spacing, .. } = self.settings;
         let valence = structure.species.iter().filter_map(|species| self.pseudopotentials.get(species));
-        lattice::size(structure, vacuum, k_spacing, valence.map(|p| p.valence).sum())
+        padded_structure::size(structure, vacuum, k_spacing, valence.map(|p| p.valence).sum())
     }
 }

@@ -1,4 +1,4 @@
-//! `run.abo`, and the errors among what ABINIT prints.
+//! Reads `run.abo` and the errors that ABINIT prints.
 
 use std::path::Path;
 
@@ -6,37 +6,38 @@ use atoms::cell::{Matrix3, Vec3};
 use atoms::{Cell, Species, Structure, units};
 
 use super::{HARTREE, Smearing};
-use crate::same::same_structure;
-use crate::{Calculated, Failure, FailureClass, judge};
+use crate::structure_check::check_same_structure;
+use crate::{Failure, FailureClass, Results, validation};
 
 /// Lattice vectors have seven decimals, bohr.
-const DIGITS: f64 = 1e-6;
+const CELL_PRECISION: f64 = 1e-6;
 
-/// The calculation of `structure` that was run in `directory` by this version; `None` if there is no whole output.
+/// Reads the calculation of `structure` in `directory`, made by this version; `None` if the output is
+/// incomplete.
 pub(super) fn read(
     structure: &Structure,
     directory: &Path,
     version: &str,
     smearing: Smearing,
-) -> Result<Option<Calculated>, Failure> {
+) -> Result<Option<Results>, Failure> {
     let text = |name| {
-        let content = judge::left(directory, name)?.unwrap_or_default();
+        let content = validation::read_output_file(directory, name)?.unwrap_or_default();
         Ok::<_, Failure>(String::from_utf8_lossy(&content).into_owned())
     };
     parse(structure, &text("run.abo")?, &text("stdout")?, version, smearing)
 }
 
-/// As [`read`].
+/// As [`read`], from the text of the output.
 pub(super) fn parse(
     structure: &Structure,
     output: &str,
     printed: &str,
     version: &str,
     smearing: Smearing,
-) -> Result<Option<Calculated>, Failure> {
+) -> Result<Option<Results>, Failure> {
     let calculated_by = stated_version(output);
     if let Some(found) = calculated_by {
-        judge::same_version("ABINIT", found, version)?;
+        validation::check_version("ABINIT", found, version)?;
     }
     if let Some(message) = error(printed) {
         let class = match message.to_lowercase() {
@@ -44,53 +45,57 @@ pub(super) fn parse(
             words if words.contains("memory") || words.contains("allocat") => FailureClass::OutOfMemory,
             _ => FailureClass::Crashed,
         };
-        return Err(class.because(format!("ABINIT says: {message}")));
+        return Err(class.with_message(format!("ABINIT says: {message}")));
     }
     if !is_whole(output) {
         return Ok(None);
     }
     let steps = energies(output);
     if output.contains("was not enough SCF cycles to converge") || !output.contains(" is converged :") {
-        return Err(FailureClass::NotConverged.because(format!("not in {} electronic steps", steps.len())));
+        return Err(
+            FailureClass::NotConverged.with_message(format!("not in {} electronic steps", steps.len()))
+        );
     }
-    let unreadable = || FailureClass::Implausible.because("run.abo is whole, but its numbers cannot be read");
+    let unreadable =
+        || FailureClass::Implausible.with_message("run.abo is complete, but its numbers cannot be read");
     calculated_by.ok_or_else(unreadable)?;
-    same_structure(structure, &found(output).ok_or_else(unreadable)?, DIGITS)?;
+    check_same_structure(structure, &found(output).ok_or_else(unreadable)?, CELL_PRECISION)?;
     let calculated = numbers(output, &steps, smearing).ok_or_else(unreadable)?;
-    judge::numbers(&calculated, structure.len())?;
+    validation::check_numbers(&calculated, structure.len())?;
     match last_step(printed).contains("The minimal occupation factor is") {
         true => {
-            Err(FailureClass::Implausible.because("the highest band is occupied: there are too few bands"))
+            Err(FailureClass::Implausible
+                .with_message("the highest band is occupied: there are too few bands"))
         }
         false => Ok(Some(calculated)),
     }
 }
 
-/// `9.6.2` of `.Version 9.6.2 of ABINIT`; nothing where that is cut off.
+/// `9.6.2` from `.Version 9.6.2 of ABINIT`; `None` if the line is truncated.
 fn stated_version(output: &str) -> Option<&str> {
     let (_, rest) = output.split_once(".Version ")?;
     rest.split_once(" of ABINIT").map(|(version, _)| version.trim())
 }
 
-/// Whether it says that it is completed and ends with the time that it took.
+/// Whether the output states that the calculation completed and ends with its timing.
 fn is_whole(output: &str) -> bool {
     let last = output.ends_with('\n').then(|| output.lines().next_back()).flatten().unwrap_or_default();
     output.contains("Calculation completed.") && last.starts_with("+Overall time at end")
 }
 
-fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<Calculated> {
+fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<Results> {
     let results = document(output, "ResultsGS")?;
     let free = *energies.last()?;
-    // The summary has fewer digits, but must be of the same calculation.
+    // The summary has fewer digits but must belong to the same calculation.
     let total = value(results, "etotal")?;
     if (free - total).abs() > 2e-8 * total.abs() {
         return None;
     }
-    // −TS, Hartree; between U and F, the limit of no smearing depends on the order of the smearing.
+    // −TS, Hartree. Where the zero-smearing limit lies between U and F depends on the order of the smearing.
     let entropy = value(document(output, "EnergyTerms")?, "'-kT*entropy'")?;
     let order = if smearing == Smearing::MethfesselPaxton { 1.0 } else { 0.0 };
     let force = HARTREE / units::BOHR;
-    Some(Calculated {
+    Some(Results {
         energy: free * HARTREE,
         energy_without_smearing: Some((free - entropy / (2.0 + order)) * HARTREE),
         forces: rows(results, "cartesian_forces").map(|row| vector(row, force)).collect::<Option<_>>()?,
@@ -104,7 +109,7 @@ fn numbers(output: &str, energies: &[f64], smearing: Smearing) -> Option<Calcula
     })
 }
 
-/// The structure at the end.
+/// The structure at the end of the output.
 fn found(output: &str) -> Option<Structure> {
     let results = document(output, "ResultsGS")?;
     let species = rows(results, "xred")
@@ -129,7 +134,7 @@ fn energies(output: &str) -> Vec<f64> {
     steps.filter_map(|step| step.split_whitespace().nth(1)?.parse().ok()).collect()
 }
 
-/// Last column of the table of spheres, which with spin is the difference of the two, μ_B.
+/// Last column of the table of atomic spheres, with spin the difference of the two spins, μ_B.
 fn moments(output: &str) -> Option<Vec<f64>> {
     let (_, table) =
         output.rsplit_once(" Integrated electronic and magnetization densities in atomic spheres:")?;
@@ -150,7 +155,7 @@ fn value(document: &str, key: &str) -> Option<f64> {
     line.trim_start().strip_prefix(':')?.trim().parse().ok()
 }
 
-/// The list under a key of a document, a row each.
+/// The rows of the list under a key.
 fn rows<'a>(document: &'a str, key: &str) -> impl Iterator<Item = &'a str> {
     let lines = document.lines().skip_while(move |line| !line.starts_with(key)).skip(1);
     lines.map_while(|line| line.strip_prefix("- ["))
@@ -171,12 +176,12 @@ fn numbers_of<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Vec3> {
     Some([next()?, next()?, next()?])
 }
 
-/// What is printed from the last electronic step on.
+/// The output from the last electronic step on.
 fn last_step(printed: &str) -> &str {
     printed.rsplit_once("ITER STEP NUMBER").map_or("", |(_, rest)| rest)
 }
 
-/// The message of the first error that is printed, as one line.
+/// The message of the first error, as one line.
 fn error(printed: &str) -> Option<String> {
     let (_, rest) = printed.split_once("--- !ERROR\n").or_else(|| printed.split_once("--- !BUG\n"))?;
     let (_, message) = rest.split_once("message: |\n")?;

@@ -5,27 +5,27 @@ use std::path::{Path, PathBuf};
 
 use atoms::Species;
 
-use crate::{Original, SetupError, paw};
+use crate::{PinnedFile, SetupError, paw};
 
-/// What is known of a pseudopotential.
+/// A pseudopotential.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Pseudopotential {
     /// Its file.
-    pub original: Original,
-    /// Electrons that it treats.
+    pub pinned: PinnedFile,
+    /// Number of valence electrons.
     pub valence: f64,
     /// Whether it is a PAW setup.
     pub paw: bool,
 }
 
 impl Pseudopotential {
-    /// Name of the copy that a calculation reads: ABINIT goes by its ending.
+    /// File name of the copy for a calculation: ABINIT depends on the extension.
     pub fn copy(&self, species: Species) -> String {
         format!("{species}.{}", if self.paw { "xml" } else { "psp8" })
     }
 }
 
-/// All that are in the directory.
+/// All pseudopotentials in the directory.
 pub(super) fn find(
     directory: &Path,
     variants: &BTreeMap<Species, String>,
@@ -47,7 +47,7 @@ pub(super) fn find(
     Ok(found)
 }
 
-/// The error for an element that has none.
+/// The error for an element without a pseudopotential.
 pub(super) fn missing(
     species: Species,
     directory: &Path,
@@ -56,8 +56,8 @@ pub(super) fn missing(
     let sought =
         variants.get(&species).cloned().unwrap_or_else(|| format!("{species}.psp8 or {species}.xml"));
     let reason = format!(
-        "no {sought} in {}: get one for PBE, and name its directory in `pseudopotentials` and, if it is called \
-         otherwise, its file in `variants`",
+        "no {sought} in {}: get one for PBE and set `pseudopotentials` to its directory; if its \
+         name differs, set its file in `variants`",
         directory.display()
     );
     SetupError::Pseudopotential { species, reason }
@@ -68,31 +68,32 @@ fn read(species: Species, path: PathBuf) -> Result<Pseudopotential, SetupError> 
     let wrong =
         |reason: String| SetupError::Pseudopotential { species, reason: format!("{shown}: {reason}") };
     let paw = path.extension().is_some_and(|extension| extension == "xml");
-    let (original, content) = Original::hashed(path).map_err(|error| wrong(error.to_string()))?;
+    let (pinned, content) = PinnedFile::open(path).map_err(|error| wrong(error.to_string()))?;
     let valence = match paw {
         true => paw::valence(&content, species),
         false => valence(&content, species),
     };
-    Ok(Pseudopotential { original, valence: valence.map_err(wrong)?, paw })
+    Ok(Pseudopotential { pinned, valence: valence.map_err(wrong)?, paw })
 }
 
-/// Valence electrons of a `psp8` file: Z and the valence begin its second line, format and functional the third.
+/// Valence electrons of a `psp8` file: Z and the valence start its second line, format and functional its
+/// third.
 fn valence(file: &[u8], species: Species) -> Result<f64, String> {
-    // 11 is ABINIT's own PBE, the other that of libxc.
+    // 11 is ABINIT's own PBE, the other is libxc's.
     const PBE: [&str; 2] = ["11", "-101130"];
     let head = String::from_utf8_lossy(&file[..file.len().min(4096)]);
     let mut lines = head.lines().skip(1).map(str::split_whitespace);
     let mut word = || Some((lines.next()?, lines.next()?));
-    let (mut second, mut third) = word().ok_or("has no head")?;
+    let (mut second, mut third) = word().ok_or("has no header")?;
     let mut number = || second.next().and_then(|word| word.parse::<f64>().ok());
     let (charge, valence) = (number(), number());
     if third.next() != Some("8") || charge != Some(f64::from(species.atomic_number())) {
-        return Err(format!("is no psp8 file of {species}"));
+        return Err(format!("is not a psp8 file of {species}"));
     }
     match (third.next(), valence) {
         (Some(functional), Some(valence)) if PBE.contains(&functional) && valence >= 0.0 => Ok(valence),
         (functional, _) => {
-            Err(format!("is of the functional {}, not of PBE (11)", functional.unwrap_or("?")))
+            Err(format!("is for the functional {}, not for PBE (11)", functional.unwrap_or("?")))
         }
     }
 }
@@ -108,11 +109,14 @@ mod tests {
     fn the_head_says_what_a_file_is() {
         let silicon = "Si".parse().unwrap();
         assert_eq!(valence(SILICON.as_bytes(), silicon), Ok(4.0));
-        assert_eq!(valence(SILICON.as_bytes(), "Al".parse().unwrap()), Err("is no psp8 file of Al".into()));
+        assert_eq!(
+            valence(SILICON.as_bytes(), "Al".parse().unwrap()),
+            Err("is not a psp8 file of Al".into())
+        );
         let lda = SILICON.replace("   11   2", "   -1012   2").replace("      11   2", "      -1012   2");
         assert_eq!(
             valence(lda.as_bytes(), silicon),
-            Err("is of the functional -1012, not of PBE (11)".into())
+            Err("is for the functional -1012, not for PBE (11)".into())
         );
         for end in 0..SILICON.find(" 11").unwrap() + 2 {
             assert!(valence(&SILICON.as_bytes()[..end], silicon).is_err(), "cut at {end}");

@@ -1,16 +1,16 @@
-//! Without ABINIT: what is written, and what is made of outputs that ABINIT left (`tests/data/abinit`).
+//! Tests that do not need ABINIT: the input, and the parsing of stored outputs (`tests/data/abinit`).
 
 use proptest::prelude::*;
 
 use super::*;
-use crate::{FailureClass, Original};
+use crate::{FailureClass, PinnedFile};
 
 const INPUT: &str = include_str!("../../tests/data/abinit/run.abi");
 const OUTPUT: &str = include_str!("../../tests/data/abinit/run.abo");
-/// Of the same input with three electronic steps.
+/// The same input with only three electronic steps.
 const SHORT: &str = include_str!("../../tests/data/abinit/short.abo");
 
-/// What the outputs are of.
+/// The structure of the outputs.
 fn silicon() -> Structure {
     let cell = atoms::Cell([[0.0, 2.75, 2.7], [2.72, 0.05, 2.75], [2.68, 2.72, -0.04]]);
     let positions = vec![[0.0; 3], [1.43, 1.33, 1.3]];
@@ -20,31 +20,31 @@ fn silicon() -> Structure {
 fn abinit(settings: Settings) -> Abinit {
     let known = [("Si", 4.0, false), ("Fe", 16.0, true)].map(|(symbol, valence, paw)| {
         let path = format!("/{symbol}.{}", if paw { "xml" } else { "psp8" });
-        let original = Original::pretended(&path, &symbol.to_lowercase());
-        (symbol.parse().unwrap(), Pseudopotential { original, valence, paw })
+        let pinned = PinnedFile::fake(&path, &symbol.to_lowercase());
+        (symbol.parse().unwrap(), Pseudopotential { pinned, valence, paw })
     });
-    let environment = program::environment(&settings.environment);
+    let environment = version_query::environment(&settings.environment);
     Abinit { settings, environment, version: "9.6.2".into(), pseudopotentials: known.into() }
 }
 
-/// The settings of `INPUT`.
+/// The settings that give `INPUT`.
 fn settings() -> Settings {
     Settings { cutoff: 200.0, k_spacing: 1.2, steps: 60, ..Settings::default() }
 }
 
-fn input(settings: Settings, remedies: &[Remedy]) -> String {
-    let remedies = BTreeSet::from_iter(remedies.iter().copied());
-    let input = abinit(settings.clone()).input(&silicon(), &remedies).unwrap();
-    assert_eq!(input, abinit(settings).input(&silicon(), &remedies).unwrap());
+fn input(settings: Settings, adjustments: &[RetryAdjustment]) -> String {
+    let adjustments = BTreeSet::from_iter(adjustments.iter().copied());
+    let input = abinit(settings.clone()).input(&silicon(), &adjustments).unwrap();
+    assert_eq!(input, abinit(settings).input(&silicon(), &adjustments).unwrap());
     assert_eq!(input.command, ["abinit", "run.abi"]);
     String::from_utf8(input.files["run.abi"].clone()).unwrap()
 }
 
-fn parse(structure: &Structure, output: &str) -> Result<Option<Calculated>, Failure> {
+fn parse(structure: &Structure, output: &str) -> Result<Option<Results>, Failure> {
     output::parse(structure, output, "", "9.6.2", Smearing::Gaussian)
 }
 
-/// Keywords with their values, words in one row.
+/// Keywords with their values as one list of words.
 fn words(input: &str) -> Vec<&str> {
     input.split_whitespace().collect()
 }
@@ -52,7 +52,7 @@ fn words(input: &str) -> Vec<&str> {
 #[test]
 fn the_input_is_the_one_that_the_output_is_of() {
     let mut written = input(settings(), &[]);
-    // The output was made with the keywords in another order.
+    // The stored output came from the keywords in another order.
     let mut expected = INPUT.to_owned();
     for text in [&mut written, &mut expected] {
         let mut sorted = words(text);
@@ -64,7 +64,7 @@ fn the_input_is_the_one_that_the_output_is_of() {
 
 #[test]
 fn remedies_change_nothing_that_the_accuracy_depends_on() {
-    let (plain, changed) = (input(settings(), &[]), input(settings(), &Remedy::ALL));
+    let (plain, changed) = (input(settings(), &[]), input(settings(), &RetryAdjustment::ALL));
     let added = ["diemix 0.25\n", "npulayit 15\n", "iscf 17\n", "nline 8\n", "nnsclo 2\n"];
     let mut restored = changed.replace("nstep 180\n", "nstep 60\n").replace("  0 0 0.5\n", "  0 0 1.0\n");
     for keyword in added {
@@ -85,7 +85,7 @@ fn paw_setups_get_a_fine_grid_and_do_not_go_with_others() {
     let error = code.supports(&both).unwrap_err().to_string();
     assert_eq!(
         error,
-        "pseudopotential of Fe: /Fe.xml cannot go with /Si.psp8 of Si: one is PAW, the other is not"
+        "pseudopotential of Fe: /Fe.xml cannot be combined with /Si.psp8 of Si: one is PAW, the other is not"
     );
     let error = code.supports(&BTreeSet::from(["U".parse().unwrap()])).unwrap_err().to_string();
     assert!(error.starts_with("pseudopotential of U: no U.psp8 or U.xml in /usr/share/abinit"), "{error}");
@@ -124,16 +124,16 @@ fn what_changes_a_value_is_in_the_identity_and_nothing_else() {
 #[test]
 fn an_output_is_a_label() {
     let label = parse(&silicon(), OUTPUT).unwrap().unwrap();
-    // Hartree and bohr of the file.
+    // Hartree and bohr from the file.
     assert!((label.energy / 27.211386246 - -8.3613573076736).abs() < 1e-9);
     assert!(label.energy_without_smearing.unwrap() > label.energy);
     assert_eq!(label.electronic_steps, Some(10));
     assert_eq!(label.forces.len(), 2);
-    // ABINIT writes its own conversion as well.
+    // ABINIT also prints its own conversion.
     let (_, own) = OUTPUT.split_once(" cartesian forces (eV/Angstrom) at end:\n").unwrap();
     let own: Vec<f64> = own.split_whitespace().skip(1).take(3).map(|x| x.parse().unwrap()).collect();
     (0..3).for_each(|k| assert!((label.forces[0][k] - own[k]).abs() < 1e-6, "{label:?}"));
-    // ABINIT's pressure, GPa, is minus a third of the trace of a stress with tension positive.
+    // ABINIT's pressure, GPa, is −⅓ of the trace of the stress (tension positive).
     let stress = label.stress.unwrap();
     let pressure = -(stress[0][0] + stress[1][1] + stress[2][2]) / 3.0 * atoms::units::GPA_PER_EV_A3;
     assert!((pressure - 6.0701).abs() < 1e-4, "{pressure}");

@@ -1,7 +1,7 @@
-# A single point with an ASE calculator: input.json and calculator.py in, result.json out.
+# A single point with an ASE calculator: reads input.json and calculator.py, writes result.json.
 #
-# result.json appears whole, as the last thing that is done, or not at all; what the calculator says goes to stdout. Without
-# input.json, the versions of ASE and of calculator.py go to stdout.
+# result.json is written atomically at the end. The output of the calculator goes to stdout. Without input.json, the
+# script prints the versions of ASE and of calculator.py.
 
 import importlib.util
 import inspect
@@ -13,7 +13,7 @@ from ase import Atoms
 from ase.calculators.calculator import PropertyNotImplementedError
 from ase.parallel import world
 
-# A property that a calculator does not have.
+# A property that the calculator does not implement.
 ABSENT = (PropertyNotImplementedError, NotImplementedError, AttributeError)
 
 
@@ -50,12 +50,12 @@ def load(name):
 
 def calculate(atoms, user):
     energy = atoms.get_potential_energy()
-    # The forces are derivatives of the free energy, where the calculator tells the two apart.
+    # Forces are derivatives of the free energy, if the calculator distinguishes the two energies.
     free = optional(lambda: atoms.get_potential_energy(force_consistent=True))
     forces = atoms.get_forces()
     stress = optional(lambda: atoms.get_stress()) if atoms.pbc.all() else None
     if converged(atoms.calc, user) is False:
-        return failure("not_converged", "the calculator gives numbers, but says that it did not converge")
+        return failure("not_converged", "the calculator returns numbers but reports that it did not converge")
     calculated = getattr(atoms.calc, "atoms", None) or atoms
     results = getattr(atoms.calc, "results", None) or {}
     moments, magnetisation = results.get("magmoms"), results.get("magmom")
@@ -84,7 +84,7 @@ def optional(value):
 
 
 def converged(calculator, user):
-    """What is known of it: True, False or None. The user's own function converged(calculator) is asked first."""
+    """True, False or None (unknown). The user's own function converged(calculator) takes precedence."""
     if hasattr(user, "converged"):
         return bool(user.converged(calculator))
     for owner in (calculator, getattr(calculator, "scf", None)):
@@ -96,7 +96,7 @@ def converged(calculator, user):
 
 
 def kind(error):
-    """Class of the failure that an exception means. Calculators have their own exceptions, known by their names."""
+    """The failure class of an exception. Exceptions of calculators are recognised by their names."""
     names = {parent.__name__ for parent in type(error).__mro__}
     if "SCFError" in names or any("Convergence" in name for name in names):
         return "not_converged"

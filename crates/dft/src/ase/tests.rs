@@ -1,4 +1,5 @@
-//! Without Python: what is written, and what is made of a result. With it: `tests/ase.rs`.
+//! Tests that do not need Python: the input, and the parsing of a result. Tests with Python:
+//! `tests/codes/ase.rs`.
 
 use atoms::Cell;
 
@@ -14,13 +15,13 @@ fn copper() -> Structure {
 }
 
 fn ase(moments: Moments) -> Ase {
-    let who = Who { ase: "3.22.1".into(), version: "mine".into() };
+    let versions = Versions { ase: "3.22.1".into(), version: "mine".into() };
     let settings = Settings { moments, ..Settings::default() };
-    Ase { environment: BTreeMap::new(), settings, calculator: b"def calculator(): ...".to_vec(), who }
+    Ase { environment: BTreeMap::new(), settings, calculator: b"def calculator(): ...".to_vec(), versions }
 }
 
-fn task(code: &Ase, remedies: &[Remedy]) -> Value {
-    let input = code.input(&copper(), &BTreeSet::from_iter(remedies.iter().copied())).unwrap();
+fn task(code: &Ase, adjustments: &[RetryAdjustment]) -> Value {
+    let input = code.input(&copper(), &BTreeSet::from_iter(adjustments.iter().copied())).unwrap();
     assert_eq!(input.command, ["python3", "job.py"]);
     assert_eq!(input.files["calculator.py"], b"def calculator(): ...");
     serde_json::from_slice(&input.files["input.json"]).unwrap()
@@ -37,14 +38,16 @@ fn the_task_is_the_structure_with_its_moments_and_remedies() {
         "remedies": [],
     });
     assert_eq!(task(&ase(Moments::new()), &[]), plain);
-    let changed =
-        task(&ase([("Cu".parse().unwrap(), 3.0)].into()), &[Remedy::SlowerMixing, Remedy::OtherMoments]);
+    let changed = task(
+        &ase([("Cu".parse().unwrap(), 3.0)].into()),
+        &[RetryAdjustment::SlowerMixing, RetryAdjustment::OtherMoments],
+    );
     assert_eq!(changed["moments"], json!([1.5, 0.5]));
     assert_eq!(changed["remedies"], json!(["slower_mixing", "other_moments"]));
 }
 
-/// What is read of this result; its structure is [`copper`] in any case.
-fn read(mut converged: Value) -> Result<Calculated, Failure> {
+/// Reads this result for the structure [`copper`].
+fn read(mut converged: Value) -> Result<Results, Failure> {
     let structure = task(&ase(Moments::new()), &[]);
     for key in ["species", "positions", "cell"] {
         converged[key] = structure[key].clone();
@@ -63,7 +66,7 @@ fn a_calculator_need_not_give_more_than_energy_and_forces() {
         "energy": -1.5, "energy_without_smearing": null, "forces": forces, "stress": null, "moments": null,
         "magnetisation": null, "steps": null,
     });
-    let expected = Calculated { energy: -1.5, forces: forces.to_vec(), ..Calculated::default() };
+    let expected = Results { energy: -1.5, forces: forces.to_vec(), ..Results::default() };
     assert_eq!(read(least.clone()), Ok(expected));
     for (key, value) in
         [("energy", json!(null)), ("forces", json!([[0.1, -0.2, 0.3]])), ("stress", json!([1.0]))]

@@ -1,32 +1,32 @@
-//! The label that a command left.
+//! Reads the label that a command wrote.
 
 use std::path::Path;
 
 use atoms::Structure;
 use atoms::extxyz::{Frame, Reader};
 
-use crate::same::same_structure;
-use crate::{Calculated, Failure, FailureClass, result_file};
+use crate::structure_check::check_same_structure;
+use crate::{Failure, FailureClass, Results, result_file};
 
-/// What the digits allow that ASE writes.
+/// The precision of the digits that ASE writes.
 const TOLERANCE: f64 = 1e-6;
 
-/// The numbers of the file, if it is whole and of this structure.
-pub(super) fn label(structure: &Structure, path: &Path) -> Result<Calculated, Failure> {
+/// The results in the file, if it is complete and describes this structure.
+pub(super) fn label(structure: &Structure, path: &Path) -> Result<Results, Failure> {
     let frame = whole_frame(path).map_err(|fault| {
         let name = path.file_name().unwrap_or_default().display();
-        FailureClass::Crashed.because(format!("the command ended with 0, but {name} {fault}"))
+        FailureClass::Crashed.with_message(format!("the command ended with 0, but {name} {fault}"))
     })?;
-    same_structure(structure, &frame.structure, TOLERANCE)?;
-    numbers(frame).map_err(|message| FailureClass::Implausible.because(message))
+    check_same_structure(structure, &frame.structure, TOLERANCE)?;
+    numbers(frame).map_err(|message| FailureClass::Implausible.with_message(message))
 }
 
-/// The one frame of a file; or what is wrong with it.
+/// The only frame of a file, or what is wrong with it.
 fn whole_frame(path: &Path) -> Result<Frame, String> {
     let text = result_file::read(path).map_err(|error| error.to_string())?;
-    // A number that was cut off would be taken for another.
+    // Without a line break at the end, the last number may be truncated.
     if text.last() != Some(&b'\n') {
-        return Err("does not end with a line break: it is not whole".to_owned());
+        return Err("does not end with a line break: it is incomplete".to_owned());
     }
     let mut frames = Reader::new(text.as_slice());
     let frame = frames.next().ok_or("is empty")?.map_err(|error| error.to_string())?;
@@ -36,8 +36,8 @@ fn whole_frame(path: &Path) -> Result<Frame, String> {
     }
 }
 
-fn numbers(mut frame: Frame) -> Result<Calculated, String> {
-    // Names with this prefix would go before the plain ones.
+fn numbers(mut frame: Frame) -> Result<Results, String> {
+    // Keys with this prefix would take precedence over the plain ones.
     frame.info.retain(|key, _| !key.starts_with("REF_"));
     frame.arrays.retain(|key, _| !key.starts_with("REF_"));
     let labels = frame.labels().map_err(|error| error.to_string())?;
@@ -46,7 +46,7 @@ fn numbers(mut frame: Frame) -> Result<Calculated, String> {
     let free = match frame.info.get("free_energy") {
         None => None,
         Some(value) => {
-            Some(value.number().filter(|x| x.is_finite()).ok_or("free_energy is no finite number")?)
+            Some(value.number().filter(|x| x.is_finite()).ok_or("free_energy is not a finite number")?)
         }
     };
     let magnetic_moments = match frame.arrays.get("magmoms") {
@@ -58,7 +58,7 @@ fn numbers(mut frame: Frame) -> Result<Calculated, String> {
         }
     };
     let extended = frame.structure.periodic != [false; 3];
-    Ok(Calculated {
+    Ok(Results {
         energy: free.unwrap_or(energy),
         energy_without_smearing: free.map(|_| energy),
         forces,

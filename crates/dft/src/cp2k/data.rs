@@ -1,4 +1,4 @@
-//! GTH pseudopotentials and MOLOPT basis sets, entries of CP2K's data files.
+//! GTH pseudopotentials and MOLOPT basis sets from CP2K's data files.
 
 use std::collections::BTreeMap;
 
@@ -7,25 +7,25 @@ use atoms::Species;
 use super::Settings;
 use crate::SetupError;
 
-/// File of the basis sets.
+/// The file of the basis sets.
 pub(super) const BASES: &str = "BASIS_MOLOPT";
-/// File of the pseudopotentials.
+/// The file of the pseudopotentials.
 pub(super) const POTENTIALS: &str = "GTH_POTENTIALS";
-/// Pseudopotentials of other functionals have other names.
+/// Prefix of the PBE pseudopotentials.
 const FUNCTIONAL: &str = "GTH-PBE";
 
-/// What is known of an element.
+/// Pseudopotential and basis set of an element.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Kind {
     /// Name of the pseudopotential.
     pub potential: String,
-    /// Electrons that it treats.
+    /// Number of valence electrons.
     pub valence: f64,
-    /// Their entries.
+    /// The entries of both.
     pub entries: Entries,
 }
 
-/// Entries of data files.
+/// Entries of the data files.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Entries {
     pub potential: String,
@@ -96,7 +96,7 @@ fn kind(
     let Some(valence) = valence(potential) else {
         return Err(format!("{name} in {POTENTIALS} does not begin with its electrons"));
     };
-    // Basis sets are made for a number of electrons, which one of their names may tell.
+    // Basis sets are made for a number of electrons, which one of their names may state.
     let charged = format!("{}-q{valence}", settings.basis);
     let fits = |names: &[&str]| {
         names.contains(&charged.as_str())
@@ -107,7 +107,8 @@ fn kind(
     Ok(Some(Kind { potential: name.to_owned(), valence, entries }))
 }
 
-/// The lines of the first entry of this element whose names fit. An entry begins with a symbol and ends before the next.
+/// The lines of the first entry of this element whose names match. An entry starts with a symbol and ends
+/// before the next.
 fn entry(file: &str, species: Species, fits: impl Fn(&[&str]) -> bool) -> Option<&str> {
     let mut begin = None;
     let mut offset = 0;
@@ -125,7 +126,7 @@ fn entry(file: &str, species: Species, fits: impl Fn(&[&str]) -> bool) -> Option
     begin.map(|begin| file[begin..].trim_end())
 }
 
-/// Sum of the electrons by angular momentum, an entry's second line.
+/// Sum of the electrons by angular momentum, in an entry's second line.
 fn valence(potential: &str) -> Option<f64> {
     let electrons: Vec<u32> =
         potential.lines().nth(1)?.split_whitespace().map(|n| n.parse().ok()).collect::<Option<_>>()?;

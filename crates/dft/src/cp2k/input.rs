@@ -1,4 +1,4 @@
-//! `run.inp`.
+//! Writes `run.inp`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -6,30 +6,35 @@ use std::fmt::Write;
 use atoms::Structure;
 
 use super::{Cp2k, OUTPUT, Settings, data};
-use crate::lattice::Enclosed;
-use crate::{Failure, FailureClass, Input, Remedy, moments};
+use crate::padded_structure::PaddedStructure;
+use crate::{Failure, FailureClass, Input, RetryAdjustment, moments};
 
-/// Name of the input.
+/// Name of the input file.
 const NAME: &str = "run.inp";
 
-pub(super) fn write(cp2k: &Cp2k, enclosed: &Enclosed, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-    let species = BTreeSet::from_iter(enclosed.structure.species.iter().copied());
-    // The entries that the identity holds, and no others.
+pub(super) fn write(
+    cp2k: &Cp2k,
+    padded: &PaddedStructure,
+    adjustments: &BTreeSet<RetryAdjustment>,
+) -> Result<Input, Failure> {
+    let species = BTreeSet::from_iter(padded.structure.species.iter().copied());
+    // Only the entries that the identity contains.
     let (mut potentials, mut bases) = (String::new(), String::new());
     for species in species {
-        let kind = cp2k.kind(species).map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+        let kind =
+            cp2k.kind(species).map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
         potentials += &format!("{}\n", kind.entries.potential);
         bases += &format!("{}\n", kind.entries.basis);
     }
-    let spins = Spins::new(cp2k, &enclosed.structure, remedies);
+    let spins = Spins::new(cp2k, &padded.structure, adjustments);
     let text = format!(
         "&GLOBAL\n  PROJECT run\n  RUN_TYPE ENERGY_FORCE\n  PRINT_LEVEL MEDIUM\n&END GLOBAL\n&FORCE_EVAL\n  METHOD \
          QUICKSTEP\n  STRESS_TENSOR ANALYTICAL\n  &PRINT\n    &FORCES\n    &END FORCES\n    &STRESS_TENSOR\n    &END \
          STRESS_TENSOR\n  &END PRINT\n  &DFT\n{}{}{}  &END DFT\n  &SUBSYS\n{}  &END SUBSYS\n&END FORCE_EVAL\n",
         method(&cp2k.settings, &spins),
-        k_points(enclosed.mesh(cp2k.settings.k_spacing)),
-        steps(&cp2k.settings, &spins, remedies),
-        structure(cp2k, &enclosed.structure, remedies),
+        k_points(padded.mesh(cp2k.settings.k_spacing)),
+        steps(&cp2k.settings, &spins, adjustments),
+        structure(cp2k, &padded.structure, adjustments),
     );
     let arguments = ["-i", NAME, "-o", OUTPUT].map(str::to_owned);
     Ok(Input {
@@ -42,25 +47,26 @@ pub(super) fn write(cp2k: &Cp2k, enclosed: &Enclosed, remedies: &BTreeSet<Remedy
     })
 }
 
-/// What CP2K is told of the number of electrons and orbitals.
+/// Electrons and orbitals in CP2K's input.
 struct Spins {
-    /// 2 S + 1 to start from; smearing lets the moment go where it wants.
+    /// Initial 2 S + 1; smearing lets the moment relax.
     multiplicity: u64,
     /// Empty orbitals of each spin.
     empty: [u64; 2],
 }
 
 impl Spins {
-    fn new(cp2k: &Cp2k, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Self {
+    fn new(cp2k: &Cp2k, structure: &Structure, adjustments: &BTreeSet<RetryAdjustment>) -> Self {
         let electrons = cp2k.electrons(structure).round() as u64;
-        let initial = |remedies| moments::initial(structure, &cp2k.settings.moments, remedies);
+        let initial = |adjustments| moments::initial(structure, &cp2k.settings.moments, adjustments);
         let sum =
             |moments: Vec<f64>| if cp2k.settings.spin { moments.iter().sum::<f64>().abs() } else { 0.0 };
         let parity = electrons % 2;
-        // The nearest that as many electrons can have.
-        let unpaired = 2 * ((sum(initial(remedies)) - parity as f64) / 2.0).round().max(0.0) as u64 + parity;
+        // The nearest value that this number of electrons allows.
+        let unpaired =
+            2 * ((sum(initial(adjustments)) - parity as f64) / 2.0).round().max(0.0) as u64 + parity;
         let unpaired = if cp2k.settings.spin { unpaired.min(electrons) } else { 0 };
-        // As many orbitals with every remedy.
+        // The same number of orbitals for every retry adjustment.
         let orbitals = (0.6 * (electrons as f64 + sum(initial(&BTreeSet::new())))).ceil() as u64 + 4;
         let occupied = [electrons.div_ceil(2) + unpaired / 2, (electrons / 2).saturating_sub(unpaired / 2)];
         Self { multiplicity: unpaired + 1, empty: occupied.map(|n| orbitals.saturating_sub(n).max(1)) }
@@ -84,7 +90,7 @@ fn method(settings: &Settings, spins: &Spins) -> String {
     )
 }
 
-/// Γ alone needs no section. MacDonald's shift brings meshes of even size to Γ.
+/// Γ alone needs no section. MacDonald's shift puts Γ on meshes of even size.
 fn k_points(mesh: [u32; 3]) -> String {
     if mesh == [1; 3] {
         return String::new();
@@ -96,13 +102,14 @@ fn k_points(mesh: [u32; 3]) -> String {
     )
 }
 
-fn steps(settings: &Settings, spins: &Spins, remedies: &BTreeSet<Remedy>) -> String {
-    let has = |remedy| remedies.contains(&remedy);
-    let steps = settings.steps.saturating_mul(if has(Remedy::MoreSteps) { 3 } else { 1 });
-    // Broyden's method stagnates with less than 0.2. It stays Broyden's: Pulay's oscillates or ends by a bad condition
-    // number even where nothing is difficult, and Kerker's looks converged to CP2K long before it is.
-    let careful = has(Remedy::SlowerMixing) || has(Remedy::OtherAlgorithm);
-    let (alpha, memory) = (if careful { 0.2 } else { 0.4 }, if has(Remedy::OtherAlgorithm) { 4 } else { 8 });
+fn steps(settings: &Settings, spins: &Spins, adjustments: &BTreeSet<RetryAdjustment>) -> String {
+    let has = |remedy| adjustments.contains(&remedy);
+    let steps = settings.steps.saturating_mul(if has(RetryAdjustment::MoreSteps) { 3 } else { 1 });
+    // Broyden's method stagnates below 0.2. Pulay's oscillates or stops at a bad condition number even in
+    // simple cases, and with Kerker's CP2K reports convergence far too early.
+    let careful = has(RetryAdjustment::SlowerMixing) || has(RetryAdjustment::OtherAlgorithm);
+    let (alpha, memory) =
+        (if careful { 0.2 } else { 0.4 }, if has(RetryAdjustment::OtherAlgorithm) { 4 } else { 8 });
     let mixing = format!("METHOD BROYDEN_MIXING\n        ALPHA {alpha:?}\n        NBROYDEN {memory}");
     let [up, down] = spins.empty;
     let empty = if settings.spin { format!("{up} {down}") } else { up.to_string() };
@@ -115,7 +122,7 @@ fn steps(settings: &Settings, spins: &Spins, remedies: &BTreeSet<Remedy>) -> Str
     )
 }
 
-fn structure(cp2k: &Cp2k, structure: &Structure, remedies: &BTreeSet<Remedy>) -> String {
+fn structure(cp2k: &Cp2k, structure: &Structure, adjustments: &BTreeSet<RetryAdjustment>) -> String {
     let mut text = "    &CELL\n".to_owned();
     // Writing to a string cannot fail.
     for (name, [x, y, z]) in ["A", "B", "C"].iter().zip(structure.cell.0) {
@@ -126,7 +133,7 @@ fn structure(cp2k: &Cp2k, structure: &Structure, remedies: &BTreeSet<Remedy>) ->
         let _ = writeln!(text, "      {species} {x:?} {y:?} {z:?}");
     }
     text += "    &END COORD\n";
-    let initial = moments::initial(structure, &cp2k.settings.moments, remedies);
+    let initial = moments::initial(structure, &cp2k.settings.moments, adjustments);
     let moments = BTreeMap::from_iter(structure.species.iter().zip(initial));
     for (species, moment) in moments {
         let potential = cp2k.kind(*species).map_or("", |kind| kind.potential.as_str());

@@ -1,14 +1,14 @@
-//! CP2K (Quickstep) with Gaussian basis sets (MOLOPT) and GTH pseudopotentials: for large cells.
+//! CP2K (Quickstep) with Gaussian basis sets (MOLOPT) and GTH pseudopotentials, for large cells.
 //!
-//! Spin-polarised PBE with Fermi–Dirac occupations. The energy is the free energy. The magnetic moment of the cell is
-//! free; moments of atoms are Mulliken's. Directions of a structure that do not repeat get vacuum, and no stress is given
-//! then.
+//! Spin-polarised PBE with Fermi–Dirac occupations. The energy is the free energy. The magnetic moment of the
+//! cell is unconstrained; moments of atoms are Mulliken's. Non-periodic directions get vacuum; such structures
+//! have no stress.
 //!
-//! Remedies:
+//! Adjustments of a retry:
 //! - more steps: three times as many;
-//! - slower mixing: a fifth of the new density is mixed in instead of two;
-//! - another algorithm: Broyden's mixing forgets all but 4 old densities, instead of 8, which leads elsewhere;
-//! - other moments: half of them to start from.
+//! - slower mixing: mixes one fifth of the new density instead of two fifths;
+//! - another algorithm: Broyden mixing with a history of 4 densities instead of 8, which takes another path;
+//! - other moments: half of the initial moments.
 
 mod data;
 mod input;
@@ -23,60 +23,61 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::{self, Enclosed};
+use crate::checks::{at_least, positive};
 use crate::moments::Moments;
-use crate::setting::{at_least, positive};
+use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    Calculated, Code, Exit, Failure, Input, PassedEnvironment, Remedy, SetupError, Size, judge, program,
+    DftBackend, Exit, Failure, Input, PassedEnvironment, Results, RetryAdjustment, SetupError, Size,
+    validation, version_query,
 };
 use data::Kind;
 
-/// eV, as CP2K has it (CODATA 2006).
+/// eV, the value in CP2K (CODATA 2006).
 const HARTREE: f64 = 27.211_383_856_556_3;
 
-/// Å, as CP2K has it (CODATA 2006).
+/// Å, the value in CP2K (CODATA 2006).
 const BOHR: f64 = 0.529_177_208_59;
 
-/// Name of the output.
+/// Name of the output file.
 const OUTPUT: &str = "run.out";
 
-/// Counts changes of what is written here that change a label's value.
-const RECIPE: u32 = 1;
+/// Version of the generated input; raised when a change affects label values.
+const INPUT_VERSION: u32 = 1;
 
-/// Grids of less than this, eV, hold no pseudopotential: the number was meant in Rydberg.
-const LEAST_CUTOFF: f64 = 1000.0;
+/// Smaller cutoffs, eV, cannot represent any pseudopotential: the value was meant in Rydberg.
+const MIN_CUTOFF: f64 = 1000.0;
 
-/// `[label.method.cp2k]`
+/// The settings of `[label.method.cp2k]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
-    /// CP2K, and what it is started by: `["mpirun", "-np", "4", "cp2k"]`.
+    /// CP2K with its launcher: `["mpirun", "-np", "4", "cp2k"]`.
     pub command: Vec<String>,
-    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
     pub environment: BTreeMap<String, String>,
     /// Directory with `BASIS_MOLOPT` and `GTH_POTENTIALS`.
     pub pseudopotentials: PathBuf,
-    /// Pseudopotential of an element where it is not `GTH-PBE`: `{ W = "GTH-PBE-q6" }`.
+    /// Pseudopotentials other than `GTH-PBE`: `{ W = "GTH-PBE-q6" }`.
     pub variants: BTreeMap<Species, String>,
     /// Basis set of all elements.
     pub basis: String,
     /// Cutoff of the finest grid, eV (8163 eV are 600 Ry).
     pub cutoff: f64,
-    /// Cutoff that a Gaussian of exponent 1 needs, eV (816 eV are 60 Ry).
+    /// Cutoff for a Gaussian of exponent 1, eV (816 eV are 60 Ry).
     pub relative_cutoff: f64,
-    /// Largest distance of k-points, Å⁻¹, 2π included; the mesh is Γ-centred.
+    /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
     pub k_spacing: f64,
     /// k_B T of the Fermi–Dirac occupation, eV.
     pub smearing_width: f64,
-    /// Whether the two spins have their own densities.
+    /// Whether the calculation is spin-polarised.
     pub spin: bool,
-    /// Initial magnetic moment by element, μ_B; 1 for all others.
+    /// Initial magnetic moment of each element, μ_B. Default: 1.
     pub moments: Moments,
-    /// CP2K's `EPS_SCF`: largest change of the density in an electronic step.
+    /// CP2K's `EPS_SCF`: tolerance of the density between electronic steps.
     pub density_tolerance: f64,
-    /// Most electronic steps.
+    /// Maximum number of electronic steps.
     pub steps: u32,
-    /// Space between images in directions that do not repeat, Å.
+    /// Vacuum along non-periodic directions, Å.
     pub vacuum: f64,
 }
 
@@ -102,12 +103,12 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Asks CP2K for its version and finds pseudopotentials and basis sets.
+    /// Queries CP2K's version and finds pseudopotentials and basis sets.
     ///
     /// # Errors
-    /// A program that does not answer, a setting with an impossible value, data files that are missing.
+    /// A program that does not answer, an invalid setting, missing data files.
     pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Cp2k, SetupError> {
-        at_least("cutoff", self.cutoff, LEAST_CUTOFF)?;
+        at_least("cutoff", self.cutoff, MIN_CUTOFF)?;
         positive("cutoff", self.cutoff)?;
         positive("relative_cutoff", self.relative_cutoff)?;
         positive("k_spacing", self.k_spacing)?;
@@ -116,26 +117,26 @@ impl Settings {
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
         let kinds = data::find(self)?;
-        let environment = program::environment(&self.environment);
+        let environment = version_query::environment(&self.environment);
         let version = version(&self.command, &environment, passed)?;
         Ok(Cp2k { settings: self.clone(), environment, version, kinds })
     }
 }
 
-/// `2023.1`
+/// The version, such as `2023.1`.
 fn version(
     command: &[String],
     environment: &BTreeMap<String, String>,
     passed: &PassedEnvironment,
 ) -> Result<String, SetupError> {
-    let said = program::ask(command, &["--version"], environment, passed, &[])?;
+    let said = version_query::run(command, &["--version"], environment, passed, &[])?;
     let version = said.split("CP2K version ").nth(1).and_then(|rest| rest.split_whitespace().next());
     version
         .map(str::to_owned)
-        .ok_or_else(|| program::another(command, "is not CP2K: it does not say its version".into()))
+        .ok_or_else(|| version_query::wrong_program(command, "is not CP2K: it reports no version".into()))
 }
 
-/// CP2K, ready to be used.
+/// A configured CP2K.
 #[derive(Clone, Debug)]
 pub struct Cp2k {
     settings: Settings,
@@ -149,17 +150,17 @@ impl Cp2k {
         self.kinds.get(&species).ok_or_else(|| data::missing(species, &self.settings))
     }
 
-    /// Valence electrons of a structure; unknown elements have none.
+    /// Valence electrons of a structure; unknown elements count none.
     fn electrons(&self, structure: &Structure) -> f64 {
         structure.species.iter().filter_map(|species| self.kinds.get(species)).map(|kind| kind.valence).sum()
     }
 }
 
-impl Code for Cp2k {
+impl DftBackend for Cp2k {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, String> =
             self.kinds.iter().map(|(species, kind)| (species.symbol(), kind.entries.hash())).collect();
-        // Destructured, so that a new setting is not forgotten here.
+        // Destructure, so that a new setting cannot be forgotten here.
         let Settings {
             command: _,
             environment: _,
@@ -177,7 +178,7 @@ impl Code for Cp2k {
             vacuum,
         } = &self.settings;
         json!({
-            "code": "cp2k", "version": self.version, "recipe": RECIPE, "functional": "PBE", "basis": basis,
+            "code": "cp2k", "version": self.version, "recipe": INPUT_VERSION, "functional": "PBE", "basis": basis,
             "cutoff": cutoff, "relative_cutoff": relative_cutoff, "k_spacing": k_spacing,
             "smearing": "fermi_dirac", "smearing_width": smearing_width, "spin": spin, "moments": moments,
             "density_tolerance": density_tolerance, "vacuum": vacuum, "pseudopotentials": hashes,
@@ -188,20 +189,24 @@ impl Code for Cp2k {
         species.iter().try_for_each(|species| self.kind(*species).map(|_| ()))
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-        input::write(self, &Enclosed::new(structure, self.settings.vacuum)?, remedies)
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
+        input::write(self, &PaddedStructure::new(structure, self.settings.vacuum)?, adjustments)
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
-        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        match output::read(&enclosed.structure, directory, &self.version)? {
-            Some(calculated) => Ok(enclosed.seen_from_outside(calculated)),
-            None => Err(judge::without_result(exit, directory, &[OUTPUT, "stdout", "stderr"])),
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+        let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
+        match output::read(&padded.structure, directory, &self.version)? {
+            Some(calculated) => Ok(padded.without_padding_stress(calculated)),
+            None => Err(validation::failure_without_result(exit, directory, &[OUTPUT, "stdout", "stderr"])),
         }
     }
 
     fn size(&self, structure: &Structure) -> Size {
         let Settings { vacuum, k_spacing, .. } = self.settings;
-        lattice::size(structure, vacuum, k_spacing, self.electrons(structure))
+        padded_structure::size(structure, vacuum, k_spacing, self.electrons(structure))
     }
 }

@@ -1,4 +1,4 @@
-//! `run.out`.
+//! Reads `run.out`.
 
 use std::path::Path;
 
@@ -6,88 +6,87 @@ use atoms::cell::{Matrix3, Vec3};
 use atoms::{Cell, Species, Structure, units};
 
 use super::{BOHR, HARTREE, OUTPUT};
-use crate::same::same_structure;
-use crate::{Calculated, Failure, FailureClass, judge};
+use crate::structure_check::check_same_structure;
+use crate::{Failure, FailureClass, Results, validation};
 
 /// Lattice vectors have three decimals, Å, positions six.
-const CELL_DIGITS: f64 = 1e-3;
-const POSITION_DIGITS: f64 = 2e-6;
+const CELL_PRECISION: f64 = 1e-3;
+const POSITION_PRECISION: f64 = 2e-6;
 /// The volume has six decimals, Å³.
-const VOLUME_DIGITS: f64 = 1e-5;
+const VOLUME_PRECISION: f64 = 1e-5;
 
-/// The calculation of `structure` that was run in `directory` by this version; `None` if there is no whole output.
+/// Reads the calculation of `structure` in `directory`, made by this version; `None` if the output is
+/// incomplete.
 pub(super) fn read(
     structure: &Structure,
     directory: &Path,
     version: &str,
-) -> Result<Option<Calculated>, Failure> {
-    let output = judge::left(directory, OUTPUT)?.unwrap_or_default();
+) -> Result<Option<Results>, Failure> {
+    let output = validation::read_output_file(directory, OUTPUT)?.unwrap_or_default();
     parse(structure, &String::from_utf8_lossy(&output), version)
 }
 
-/// As [`read`].
-pub(super) fn parse(
-    structure: &Structure,
-    output: &str,
-    version: &str,
-) -> Result<Option<Calculated>, Failure> {
+/// As [`read`], from the text of the output.
+pub(super) fn parse(structure: &Structure, output: &str, version: &str) -> Result<Option<Results>, Failure> {
     let calculated_by = stated_version(output);
     if let Some(found) = calculated_by {
-        judge::same_version("CP2K", found, version)?;
+        validation::check_version("CP2K", found, version)?;
     }
     let steps = steps(output);
-    // Newer versions abort then.
+    // Newer versions abort in this case.
     if output.contains("SCF run NOT converged") {
-        return Err(FailureClass::NotConverged.because(format!("not in {} electronic steps", steps.len())));
+        return Err(
+            FailureClass::NotConverged.with_message(format!("not in {} electronic steps", steps.len()))
+        );
     }
     if let Some(message) = abort(output) {
-        return Err(FailureClass::Crashed.because(format!("CP2K says: {message}")));
+        return Err(FailureClass::Crashed.with_message(format!("CP2K says: {message}")));
     }
     if !is_whole(output) {
         return Ok(None);
     }
     if !output.contains("*** SCF run converged in") {
-        return Err(FailureClass::NotConverged.because("it does not say that it converged"));
+        return Err(FailureClass::NotConverged.with_message("it does not report convergence"));
     }
-    let implausible = |message: String| FailureClass::Implausible.because(message);
-    let unreadable = || implausible(format!("{OUTPUT} is whole, but its numbers cannot be read"));
+    let implausible = |message: String| FailureClass::Implausible.with_message(message);
+    let unreadable = || implausible(format!("{OUTPUT} is complete, but its numbers cannot be read"));
     calculated_by.ok_or_else(unreadable)?;
     let (found, volume) = found(output).ok_or_else(unreadable)?;
-    same_structure(structure, &found, CELL_DIGITS)?;
-    same_structure(structure, &Structure { cell: structure.cell, ..found }, POSITION_DIGITS)?;
-    if (volume - structure.cell.volume()).abs() > VOLUME_DIGITS {
+    check_same_structure(structure, &found, CELL_PRECISION)?;
+    check_same_structure(structure, &Structure { cell: structure.cell, ..found }, POSITION_PRECISION)?;
+    if (volume - structure.cell.volume()).abs() > VOLUME_PRECISION {
         return Err(implausible(format!("the cell has {volume} Å³, not {}", structure.cell.volume())));
     }
     if last_step(output, &steps).contains("includes the last MO") {
         return Err(implausible("the highest orbital is occupied: there are too few orbitals".into()));
     }
     let calculated = numbers(output, steps.len() as u32).ok_or_else(unreadable)?;
-    judge::numbers(&calculated, structure.len())?;
+    validation::check_numbers(&calculated, structure.len())?;
     Ok(Some(calculated))
 }
 
-/// `2023.1`; nothing where its line is cut off.
+/// `2023.1`; `None` if the line is truncated.
 fn stated_version(output: &str) -> Option<&str> {
     let (line, _) = output.split_once("CP2K| version string:")?.1.split_once('\n')?;
     line.split_whitespace().next_back()
 }
 
-/// Whether it says that it ended, in its last line.
+/// Whether the last line states that the program ended.
 fn is_whole(output: &str) -> bool {
     let last =
         output.ends_with('\n').then(|| output.trim_end().lines().next_back()).flatten().unwrap_or_default();
     output.contains("PROGRAM ENDED AT") && last.contains("PROGRAM STOPPED IN")
 }
 
-fn numbers(output: &str, steps: u32) -> Option<Calculated> {
+fn numbers(output: &str, steps: u32) -> Option<Results> {
     let energy: f64 = word_after(output, "ENERGY| Total FORCE_EVAL ( QS ) energy [a.u.]:")?.parse().ok()?;
-    // −TS: the limit of no smearing is in the middle of free and internal energy.
+    // −TS. The zero-smearing limit is halfway between free and internal energy.
     let entropy: f64 = word_after(output, "Electronic entropic energy:")?.parse().ok()?;
     let (_, forces) = output.rsplit_once("ATOMIC FORCES in [a.u.]")?;
     let forces = forces.lines().skip_while(|line| !line.trim_start().starts_with('#')).skip(1);
     let forces = forces.take_while(|line| !line.trim_start().starts_with("SUM"));
     let moments = moments(output);
-    Some(Calculated {
+    Some(Results {
         energy: energy * HARTREE,
         energy_without_smearing: Some((energy - 0.5 * entropy) * HARTREE),
         forces: forces
@@ -109,7 +108,7 @@ fn stress(output: &str) -> Option<Matrix3> {
     Some(rows.map(|row| row.map(|x| -x / units::GPA_PER_EV_A3)))
 }
 
-/// Mulliken's, if there is a column for them, μ_B.
+/// Mulliken's moments, if the table has their column, μ_B.
 fn moments(output: &str) -> Option<Vec<f64>> {
     let (_, table) = output.rsplit_once("Mulliken Population Analysis")?;
     let mut lines = table.lines().skip_while(|line| !line.trim_start().starts_with('#'));
@@ -151,26 +150,26 @@ fn steps(output: &str) -> Vec<&str> {
     table[..end].lines().filter(is_step).collect()
 }
 
-/// What is printed between the last two electronic steps.
+/// The output between the last two electronic steps.
 fn last_step<'a>(output: &'a str, steps: &[&str]) -> &'a str {
     let [.., before, last] = steps else { return "" };
     let begin = output.find(before).unwrap_or_default();
     output[begin..].split_once(last).map_or("", |(between, _)| between)
 }
 
-/// Three numbers of a line, from this word on.
+/// Three numbers of a line, from word `skip` on.
 fn vector(line: &str, skip: usize) -> Option<Vec3> {
     let mut words = line.lines().next()?.split_whitespace().skip(skip);
     let mut next = || words.next()?.parse().ok();
     Some([next()?, next()?, next()?])
 }
 
-/// The last word of the line with the last of these keys.
+/// The last word of the last line with this key.
 fn word_after<'a>(output: &'a str, key: &str) -> Option<&'a str> {
     output.rsplit_once(key)?.1.lines().next()?.split_whitespace().next_back()
 }
 
-/// What stands in the box of an abort, as one line.
+/// The text in the box of an abort, as one line.
 fn abort(output: &str) -> Option<String> {
     let (_, rest) = output.split_once("[ABORT]")?;
     let lines = rest.lines().take_while(|line| !line.trim_start().starts_with("***"));

@@ -1,4 +1,4 @@
-//! Without CP2K: what is written, and what is made of outputs that CP2K left (`tests/data/cp2k`).
+//! Tests that do not need CP2K: the input, and the parsing of stored outputs (`tests/data/cp2k`).
 
 use proptest::prelude::*;
 
@@ -8,10 +8,10 @@ use crate::FailureClass;
 
 const INPUT: &str = include_str!("../../tests/data/cp2k/run.inp");
 const OUTPUT: &str = include_str!("../../tests/data/cp2k/run.out");
-/// Of the same input with two electronic steps.
+/// The same input with only two electronic steps.
 const SHORT: &str = include_str!("../../tests/data/cp2k/short.out");
 
-/// What the outputs are of.
+/// The structure of the outputs.
 fn silicon() -> Structure {
     let cell = atoms::Cell([[0.0, 2.75, 2.7], [2.72, 0.05, 2.75], [2.68, 2.72, -0.04]]);
     let positions = vec![[0.0; 3], [1.43, 1.33, 1.3]];
@@ -21,12 +21,12 @@ fn silicon() -> Structure {
 fn cp2k(settings: Settings) -> Cp2k {
     let entries = Entries { potential: "Si GTH-PBE".into(), basis: "Si SZV".into() };
     let kind = Kind { potential: "GTH-PBE".into(), valence: 4.0, entries };
-    let environment = program::environment(&settings.environment);
+    let environment = version_query::environment(&settings.environment);
     let kinds = BTreeMap::from([("Si".parse().unwrap(), kind)]);
     Cp2k { settings, environment, version: "2023.1".into(), kinds }
 }
 
-/// The settings of `INPUT`.
+/// The settings that give `INPUT`.
 fn settings() -> Settings {
     Settings {
         basis: "SZV-MOLOPT-SR-GTH".into(),
@@ -38,15 +38,15 @@ fn settings() -> Settings {
     }
 }
 
-fn input(settings: Settings, remedies: &[Remedy]) -> String {
-    let remedies = BTreeSet::from_iter(remedies.iter().copied());
-    let input = cp2k(settings.clone()).input(&silicon(), &remedies).unwrap();
-    assert_eq!(input, cp2k(settings).input(&silicon(), &remedies).unwrap());
+fn input(settings: Settings, adjustments: &[RetryAdjustment]) -> String {
+    let adjustments = BTreeSet::from_iter(adjustments.iter().copied());
+    let input = cp2k(settings.clone()).input(&silicon(), &adjustments).unwrap();
+    assert_eq!(input, cp2k(settings).input(&silicon(), &adjustments).unwrap());
     assert_eq!(input.command, ["cp2k", "-i", "run.inp", "-o", "run.out"]);
     String::from_utf8(input.files["run.inp"].clone()).unwrap()
 }
 
-fn parse(structure: &Structure, output: &str) -> Result<Option<Calculated>, Failure> {
+fn parse(structure: &Structure, output: &str) -> Result<Option<Results>, Failure> {
     output::parse(structure, output, "2023.1")
 }
 
@@ -57,9 +57,9 @@ fn the_input_is_the_one_that_the_output_is_of() {
 
 #[test]
 fn remedies_change_nothing_that_the_accuracy_depends_on() {
-    let slower = input(settings(), &[Remedy::SlowerMixing]);
+    let slower = input(settings(), &[RetryAdjustment::SlowerMixing]);
     assert_eq!(slower.replace("ALPHA 0.2", "ALPHA 0.4"), INPUT);
-    let changed = input(settings(), &Remedy::ALL);
+    let changed = input(settings(), &RetryAdjustment::ALL);
     let restored = changed
         .replace("MAX_SCF 600", "MAX_SCF 200")
         .replace("ALPHA 0.2", "ALPHA 0.4")
@@ -102,7 +102,7 @@ fn calculations_read_the_entries_that_were_hashed() {
     assert_eq!(entries(&code), [format!("{potential}\n"), format!("{basis}\n")]);
     let hash = blake3::hash(format!("{potential}\n{basis}").as_bytes()).to_hex().to_string();
     assert_eq!(code.identity()["pseudopotentials"]["Si"], hash);
-    // Who has begun goes on with what there was; who begins now is of another protocol.
+    // A running campaign keeps the entries it started with; a new one has another protocol.
     write("-6.28");
     assert_eq!(entries(&code)[0], format!("{potential}\n"));
     assert_eq!(entries(&prepared())[0], format!("{}\n", potential.replace("-6.27", "-6.28")));
@@ -130,7 +130,7 @@ fn an_output_is_a_label() {
     assert!((label.energy / HARTREE - total).abs() < 1e-9, "{label:?}");
     assert!(label.energy_without_smearing.unwrap() > label.energy);
     assert_eq!(label.forces.len(), 2);
-    // CP2K's trace, GPa, is that of a pressure.
+    // CP2K prints the trace of a pressure, GPa.
     let trace = OUTPUT.split("1/3 Trace").nth(1).unwrap().split_whitespace().next().unwrap();
     let stress = label.stress.unwrap();
     let pressure = -(stress[0][0] + stress[1][1] + stress[2][2]) / 3.0 * atoms::units::GPA_PER_EV_A3;

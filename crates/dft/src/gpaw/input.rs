@@ -1,4 +1,4 @@
-//! What the script is told.
+//! Writes the input of the script.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,10 +8,10 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::{Gpaw, SCRIPT, Settings, setups};
-use crate::lattice::Enclosed;
 use crate::moments;
-use crate::original::COPIES;
-use crate::{Failure, FailureClass, Input, Remedy, Smearing};
+use crate::padded_structure::PaddedStructure;
+use crate::pinned_file::DATA_DIRECTORY;
+use crate::{Failure, FailureClass, Input, RetryAdjustment, Smearing};
 
 /// Name of the script in the directory of a calculation.
 pub(super) const SCRIPT_FILE: &str = "job.py";
@@ -30,29 +30,34 @@ struct Task<'a> {
     parameters: Value,
 }
 
-pub(super) fn write(gpaw: &Gpaw, enclosed: &Enclosed, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-    let (settings, structure) = (&gpaw.settings, &enclosed.structure);
+pub(super) fn write(
+    gpaw: &Gpaw,
+    padded: &PaddedStructure,
+    adjustments: &BTreeSet<RetryAdjustment>,
+) -> Result<Input, Failure> {
+    let (settings, structure) = (&gpaw.settings, &padded.structure);
     let mut data = BTreeMap::new();
     for species in BTreeSet::from_iter(structure.species.iter().copied()) {
-        let setup = gpaw.setup(species).map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
-        data.insert(setups::name(species, &settings.variants), setup.original.clone());
+        let setup =
+            gpaw.setup(species).map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
+        data.insert(setups::name(species, &settings.variants), setup.pinned.clone());
     }
     let task = Task {
         species: &structure.species,
         positions: &structure.positions,
         cell: &structure.cell.0,
-        moments: settings.spin.then(|| moments::initial(structure, &settings.moments, remedies)),
-        setups: COPIES,
+        moments: settings.spin.then(|| moments::initial(structure, &settings.moments, adjustments)),
+        setups: DATA_DIRECTORY,
         cutoff: settings.cutoff,
         parameters: parameters(
             settings,
-            enclosed.mesh(settings.k_spacing),
+            padded.mesh(settings.k_spacing),
             gpaw.electrons(structure),
-            remedies,
+            adjustments,
         ),
     };
     let task = serde_json::to_vec_pretty(&task)
-        .map_err(|error| FailureClass::BadInput.because(error.to_string()))?;
+        .map_err(|error| FailureClass::BadInput.with_message(error.to_string()))?;
     Ok(Input {
         files: [(SCRIPT_FILE.to_owned(), SCRIPT.into()), ("input.json".to_owned(), task)].into(),
         command: settings.command.iter().cloned().chain([SCRIPT_FILE.to_owned()]).collect(),
@@ -61,7 +66,12 @@ pub(super) fn write(gpaw: &Gpaw, enclosed: &Enclosed, remedies: &BTreeSet<Remedy
     })
 }
 
-fn parameters(settings: &Settings, mesh: [u32; 3], electrons: f64, remedies: &BTreeSet<Remedy>) -> Value {
+fn parameters(
+    settings: &Settings,
+    mesh: [u32; 3],
+    electrons: f64,
+    adjustments: &BTreeSet<RetryAdjustment>,
+) -> Value {
     let mut parameters = json!({
         "xc": "PBE",
         "setups": settings.variants,
@@ -69,20 +79,20 @@ fn parameters(settings: &Settings, mesh: [u32; 3], electrons: f64, remedies: &BT
         "symmetry": { "point_group": false },
         "spinpol": settings.spin,
         "occupations": occupations(settings.smearing, settings.smearing_width),
-        // GPAW counts the energy per valence electron.
+        // GPAW's criterion is per valence electron.
         "convergence": {
             "energy": settings.energy_tolerance / electrons.max(1.0),
             "forces": settings.force_tolerance,
         },
         "maxiter": settings.steps,
     });
-    if remedies.contains(&Remedy::MoreSteps) {
+    if adjustments.contains(&RetryAdjustment::MoreSteps) {
         parameters["maxiter"] = json!(settings.steps.saturating_mul(3));
     }
-    if remedies.contains(&Remedy::SlowerMixing) {
+    if adjustments.contains(&RetryAdjustment::SlowerMixing) {
         parameters["mixer"] = json!({ "beta": 0.02, "nmaxold": 8, "weight": 100.0 });
     }
-    if remedies.contains(&Remedy::OtherAlgorithm) {
+    if adjustments.contains(&RetryAdjustment::OtherAlgorithm) {
         parameters["eigensolver"] = json!({ "name": "cg" });
     }
     parameters
@@ -90,7 +100,7 @@ fn parameters(settings: &Settings, mesh: [u32; 3], electrons: f64, remedies: &BT
 
 fn occupations(smearing: Smearing, width: f64) -> Value {
     match smearing {
-        // Of order 0, Methfessel and Paxton's function is the Gaussian.
+        // Methfessel–Paxton of order 0 is the Gaussian.
         Smearing::Gaussian => json!({ "name": "methfessel-paxton", "order": 0, "width": width }),
         Smearing::MethfesselPaxton => json!({ "name": "methfessel-paxton", "order": 1, "width": width }),
         Smearing::FermiDirac => json!({ "name": "fermi-dirac", "width": width }),

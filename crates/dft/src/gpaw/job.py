@@ -1,7 +1,7 @@
-# A plane-wave single point with GPAW: input.json in, result.json out.
+# A plane-wave single point with GPAW: reads input.json, writes result.json.
 #
-# result.json appears whole, as the last thing that is done, or not at all; what the program says goes to stdout. Without
-# input.json, who GPAW is and where it looks for setups goes to stdout.
+# result.json is written atomically at the end. The output of GPAW goes to stdout. Without input.json, the script prints
+# the version of GPAW and its search path for setups.
 
 import ase
 import gpaw
@@ -38,10 +38,10 @@ def main():
 
 def calculate(atoms, spin):
     calculator = atoms.calc
-    # The forces are derivatives of the free energy.
+    # Forces are derivatives of the free energy.
     result = {"energy": calculator.get_potential_energy(atoms, force_consistent=True)}
     if not calculator.scf.converged:
-        return failure("not_converged", "GPAW gives an energy, but does not say that it converged")
+        return failure("not_converged", "GPAW returns an energy but does not report convergence")
     result["energy_without_smearing"] = calculator.get_potential_energy(atoms, force_consistent=False)
     result["forces"] = calculator.get_forces(atoms).tolist()
     result["stress"] = calculator.get_stress(atoms).tolist()

@@ -1,14 +1,14 @@
-//! GPAW with plane waves and PAW setups, run by a script of ours ([`SCRIPT`]).
+//! GPAW with plane waves and PAW setups, run by our script ([`SCRIPT`]).
 //!
-//! Spin-polarised PBE, no symmetry but time reversal. The energy is the free energy. Directions of a structure that do
-//! not repeat get vacuum, and no stress is given then.
+//! Spin-polarised PBE, no symmetry but time reversal. The energy is the free energy. Non-periodic directions
+//! get vacuum; such structures have no stress.
 //!
-//! Remedies:
+//! Adjustments of a retry:
 //! - more steps: three times as many;
-//! - slower mixing: Pulay mixing with β 0.02 instead of 0.05, 8 old densities instead of 5, and twice the weight of long
-//!   waves;
-//! - another algorithm: conjugate gradients instead of Davidson's;
-//! - other moments: half of them to start from.
+//! - slower mixing: Pulay mixing with β 0.02 instead of 0.05, a history of 8 densities instead of 5, and twice
+//!   the weight of long waves;
+//! - another algorithm: conjugate gradients instead of Davidson;
+//! - other moments: half of the initial moments.
 
 mod input;
 mod setups;
@@ -22,52 +22,52 @@ use atoms::{Species, Structure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::lattice::{self, Enclosed};
+use crate::checks::{at_least, positive};
 use crate::moments::Moments;
-use crate::setting::{at_least, positive};
+use crate::padded_structure::{self, PaddedStructure};
 use crate::{
-    Calculated, Code, Exit, Failure, Input, PassedEnvironment, Remedy, SetupError, Size, Smearing, judge,
-    program, script_result,
+    DftBackend, Exit, Failure, Input, PassedEnvironment, Results, RetryAdjustment, SetupError, Size,
+    Smearing, script_output, validation, version_query,
 };
 use setups::Setup;
 
-/// The script that GPAW is run by.
+/// The script that runs GPAW.
 pub const SCRIPT: &str = concat!(include_str!("../script.py"), include_str!("job.py"));
 
-/// Counts changes of what is written here that change a label's value.
-const RECIPE: u32 = 1;
+/// Version of the generated input; raised when a change affects label values.
+const INPUT_VERSION: u32 = 1;
 
-/// `[label.method.gpaw]`
+/// The settings of `[label.method.gpaw]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
-    /// A Python that has GPAW, and what it is started by: `["mpirun", "-np", "4", "gpaw", "python"]`.
+    /// A Python with GPAW and its launcher: `["mpirun", "-np", "4", "gpaw", "python"]`.
     pub command: Vec<String>,
-    /// Added to the environment; `OMP_NUM_THREADS` is 1 unless it stands here.
+    /// Additional environment variables. Default: `OMP_NUM_THREADS=1`.
     pub environment: BTreeMap<String, String>,
-    /// Directory of the setups; where GPAW itself looks if there is none.
+    /// Directory of the setups. Default: GPAW's own search path.
     pub pseudopotentials: Option<PathBuf>,
-    /// Setup of an element where it is not the one without a name: `{ Ni = "10" }`.
+    /// Setups other than the default one of an element: `{ Ni = "10" }`.
     pub variants: BTreeMap<Species, String>,
-    /// Kinetic energy of the fastest plane wave, eV.
+    /// Plane-wave cutoff, eV.
     pub cutoff: f64,
-    /// Largest distance of k-points, Å⁻¹, 2π included; the mesh is Γ-centred.
+    /// Largest spacing of k-points, Å⁻¹, including 2π; the mesh is Γ-centred.
     pub k_spacing: f64,
-    /// Occupation of states near the Fermi level.
+    /// Occupation function of the electronic states.
     pub smearing: Smearing,
-    /// Its width, eV.
+    /// Width of the smearing, eV.
     pub smearing_width: f64,
-    /// Whether the two spins have their own densities.
+    /// Whether the calculation is spin-polarised.
     pub spin: bool,
-    /// Initial magnetic moment by element, μ_B; 1 for all others.
+    /// Initial magnetic moment of each element, μ_B. Default: 1.
     pub moments: Moments,
-    /// Largest change of the energy in the last three electronic steps, eV.
+    /// Tolerance of the energy over the last three electronic steps, eV.
     pub energy_tolerance: f64,
-    /// Largest change of a force in the last electronic step, eV/Å.
+    /// Tolerance of the forces in the last electronic step, eV/Å.
     pub force_tolerance: f64,
-    /// Most electronic steps.
+    /// Maximum number of electronic steps.
     pub steps: u32,
-    /// Space between images in directions that do not repeat, Å.
+    /// Vacuum along non-periodic directions, Å.
     pub vacuum: f64,
 }
 
@@ -93,10 +93,10 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Asks GPAW for its version and finds the setups.
+    /// Queries GPAW's version and finds the setups.
     ///
     /// # Errors
-    /// A program that does not answer, a setting with an impossible value.
+    /// A program that does not answer, an invalid setting.
     pub fn prepare(&self, passed: &PassedEnvironment) -> Result<Gpaw, SetupError> {
         positive("cutoff", self.cutoff)?;
         positive("k_spacing", self.k_spacing)?;
@@ -106,13 +106,13 @@ impl Settings {
         positive("vacuum", self.vacuum)?;
         at_least("steps", self.steps, 1)?;
         let environment = self.environment();
-        let who = Who::ask(&self.command, &environment, passed)?;
-        let setups = setups::find(&who.setup_paths, &self.variants)?;
-        Ok(Gpaw { settings: self.clone(), environment, who, setups })
+        let versions = Versions::ask(&self.command, &environment, passed)?;
+        let setups = setups::find(&versions.setup_paths, &self.variants)?;
+        Ok(Gpaw { settings: self.clone(), environment, versions, setups })
     }
 
     fn environment(&self) -> BTreeMap<String, String> {
-        let mut environment = program::environment(&self.environment);
+        let mut environment = version_query::environment(&self.environment);
         if let Some(directory) = &self.pseudopotentials {
             environment.insert("GPAW_SETUP_PATH".into(), directory.to_string_lossy().into_owned());
         }
@@ -120,35 +120,35 @@ impl Settings {
     }
 }
 
-/// What GPAW says of itself.
+/// The versions and paths that GPAW reports.
 #[derive(Clone, Debug, Deserialize)]
-struct Who {
+struct Versions {
     gpaw: String,
     ase: String,
     setup_paths: Vec<PathBuf>,
 }
 
-impl Who {
+impl Versions {
     fn ask(
         command: &[String],
         environment: &BTreeMap<String, String>,
         passed: &PassedEnvironment,
     ) -> Result<Self, SetupError> {
         let files = [(input::SCRIPT_FILE, SCRIPT.as_bytes())];
-        let said = program::ask(command, &[input::SCRIPT_FILE], environment, passed, &files)?;
+        let said = version_query::run(command, &[input::SCRIPT_FILE], environment, passed, &files)?;
         said.lines().rev().find_map(|line| serde_json::from_str(line).ok()).ok_or_else(|| {
-            let reason = format!("is no Python with GPAW: it does not say its version but {:?}", said.trim());
-            program::another(command, reason)
+            let reason = format!("is not a Python with GPAW: expected its version, found {:?}", said.trim());
+            version_query::wrong_program(command, reason)
         })
     }
 }
 
-/// GPAW, ready to be used.
+/// A configured GPAW.
 #[derive(Clone, Debug)]
 pub struct Gpaw {
     settings: Settings,
     environment: BTreeMap<String, String>,
-    who: Who,
+    versions: Versions,
     setups: BTreeMap<Species, Setup>,
 }
 
@@ -156,10 +156,10 @@ impl Gpaw {
     fn setup(&self, species: Species) -> Result<&Setup, SetupError> {
         self.setups
             .get(&species)
-            .ok_or_else(|| setups::missing(species, &self.who.setup_paths, &self.settings.variants))
+            .ok_or_else(|| setups::missing(species, &self.versions.setup_paths, &self.settings.variants))
     }
 
-    /// Valence electrons of a structure; elements without a setup have none.
+    /// Valence electrons of a structure; elements without a setup count none.
     fn electrons(&self, structure: &Structure) -> f64 {
         structure
             .species
@@ -170,11 +170,11 @@ impl Gpaw {
     }
 }
 
-impl Code for Gpaw {
+impl DftBackend for Gpaw {
     fn identity(&self) -> Value {
         let hashes: BTreeMap<&str, &str> =
-            self.setups.iter().map(|(species, setup)| (species.symbol(), setup.original.hash())).collect();
-        // Destructured, so that a new setting is not forgotten here.
+            self.setups.iter().map(|(species, setup)| (species.symbol(), setup.pinned.hash())).collect();
+        // Destructure, so that a new setting cannot be forgotten here.
         let Settings {
             command: _,
             environment: _,
@@ -192,7 +192,7 @@ impl Code for Gpaw {
             vacuum,
         } = &self.settings;
         json!({
-            "code": "gpaw", "version": self.who.gpaw, "ase": self.who.ase, "recipe": RECIPE, "functional": "PBE",
+            "code": "gpaw", "version": self.versions.gpaw, "ase": self.versions.ase, "recipe": INPUT_VERSION, "functional": "PBE",
             "cutoff": cutoff, "k_spacing": k_spacing, "smearing": smearing, "smearing_width": smearing_width,
             "spin": spin, "moments": moments, "energy_tolerance": energy_tolerance,
             "force_tolerance": force_tolerance, "vacuum": vacuum, "pseudopotentials": hashes,
@@ -214,21 +214,25 @@ impl Code for Gpaw {
         Ok(())
     }
 
-    fn input(&self, structure: &Structure, remedies: &BTreeSet<Remedy>) -> Result<Input, Failure> {
-        input::write(self, &Enclosed::new(structure, self.settings.vacuum)?, remedies)
+    fn input(
+        &self,
+        structure: &Structure,
+        adjustments: &BTreeSet<RetryAdjustment>,
+    ) -> Result<Input, Failure> {
+        input::write(self, &PaddedStructure::new(structure, self.settings.vacuum)?, adjustments)
     }
 
-    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Calculated, Failure> {
-        let enclosed = Enclosed::new(structure, self.settings.vacuum)?;
-        let by = [("gpaw", self.who.gpaw.as_str()), ("ase", self.who.ase.as_str())];
-        match script_result::read(&enclosed.structure, directory, &by)? {
-            Some(calculated) => Ok(enclosed.seen_from_outside(calculated)),
-            None => Err(judge::without_result(exit, directory, &["stdout", "stderr"])),
+    fn read(&self, structure: &Structure, directory: &Path, exit: Exit) -> Result<Results, Failure> {
+        let padded = PaddedStructure::new(structure, self.settings.vacuum)?;
+        let by = [("gpaw", self.versions.gpaw.as_str()), ("ase", self.versions.ase.as_str())];
+        match script_output::read(&padded.structure, directory, &by)? {
+            Some(calculated) => Ok(padded.without_padding_stress(calculated)),
+            None => Err(validation::failure_without_result(exit, directory, &["stdout", "stderr"])),
         }
     }
 
     fn size(&self, structure: &Structure) -> Size {
         let Settings { vacuum, k_spacing, .. } = self.settings;
-        lattice::size(structure, vacuum, k_spacing, self.electrons(structure))
+        padded_structure::size(structure, vacuum, k_spacing, self.electrons(structure))
     }
 }

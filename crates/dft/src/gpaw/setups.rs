@@ -1,22 +1,22 @@
-//! PAW setups, found as GPAW finds them: `Si.PBE` or `Si.PBE.gz` in the first of the directories that has one.
+//! PAW setups, found as GPAW does: `Si.PBE` or `Si.PBE.gz` in the first directory that has one.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use atoms::Species;
 
-use crate::{Original, SetupError, paw};
+use crate::{PinnedFile, SetupError, paw};
 
-/// What is known of a setup.
+/// A setup.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Setup {
     /// Its file.
-    pub original: Original,
-    /// Electrons that it treats.
+    pub pinned: PinnedFile,
+    /// Number of valence electrons.
     pub valence: f64,
 }
 
-/// All setups that are there.
+/// All available setups.
 pub(super) fn find(
     directories: &[PathBuf],
     variants: &BTreeMap<Species, String>,
@@ -24,7 +24,7 @@ pub(super) fn find(
     let mut setups = BTreeMap::new();
     for species in (1..=118).filter_map(|number| Species::from_atomic_number(number).ok()) {
         let name = name(species, variants);
-        // GPAW takes the last by name of a directory's candidates.
+        // Of the candidates in a directory GPAW takes the last by name.
         let candidates = |directory: &PathBuf| [directory.join(format!("{name}.gz")), directory.join(&name)];
         let Some(path) = directories.iter().flat_map(candidates).find(|path| path.is_file()) else {
             if variants.contains_key(&species) {
@@ -42,7 +42,7 @@ pub(super) fn find(
     Ok(setups)
 }
 
-/// The error for an element that has none.
+/// The error for an element without a setup.
 pub(super) fn missing(
     species: Species,
     directories: &[PathBuf],
@@ -66,8 +66,8 @@ pub(super) fn name(species: Species, variants: &BTreeMap<Species, String>) -> St
 }
 
 fn read(species: Species, path: PathBuf) -> Result<Setup, String> {
-    let (original, content) = Original::hashed(path).map_err(|error| format!("cannot be read: {error}"))?;
-    Ok(Setup { original, valence: paw::valence(&content, species)? })
+    let (pinned, content) = PinnedFile::open(path).map_err(|error| format!("cannot be read: {error}"))?;
+    Ok(Setup { pinned, valence: paw::valence(&content, species)? })
 }
 
 #[cfg(test)]
@@ -95,11 +95,11 @@ mod tests {
         std::fs::write(paths[0].join("Si.PBE"), HEAD.replace("valence=\"4\"", "valence=\"12\"")).unwrap();
         let first = find(&paths, &none).unwrap();
         assert_eq!(first[&species("Si")].valence, 12.0);
-        assert_ne!(first[&species("Si")].original.hash(), setups[&species("Si")].original.hash());
+        assert_ne!(first[&species("Si")].pinned.hash(), setups[&species("Si")].pinned.hash());
 
         std::fs::write(paths[0].join("Al.PBE"), HEAD).unwrap();
         let error = find(&paths, &none).unwrap_err().to_string();
-        assert!(error.contains("is no PAW setup of Al"), "{error}");
+        assert!(error.contains("is not a PAW setup of Al"), "{error}");
     }
 
     #[test]

@@ -1,13 +1,13 @@
-//! Without GPAW: what is written, and what is made of a result that GPAW left (`tests/data/gpaw`).
+//! Tests that do not need GPAW: the input, and the parsing of a stored result (`tests/data/gpaw`).
 
 use std::collections::BTreeSet;
 
 use super::*;
-use crate::{FailureClass, Original};
+use crate::{FailureClass, PinnedFile};
 
 const RESULT: &[u8] = include_bytes!("../../tests/data/gpaw/result.json");
 
-/// What `RESULT` was made from.
+/// The structure of `RESULT`.
 fn silicon() -> Structure {
     let task: Value = serde_json::from_slice(include_bytes!("../../tests/data/gpaw/input.json")).unwrap();
     let take = |key: &str| task[key].clone();
@@ -20,25 +20,26 @@ fn silicon() -> Structure {
 }
 
 fn gpaw(settings: Settings) -> Gpaw {
-    let who = Who { gpaw: "22.8.0".into(), ase: "3.22.1".into(), setup_paths: vec!["/setups".into()] };
-    let setup = Setup { original: Original::pretended("/setups/Si.PBE", "abc"), valence: 4.0 };
+    let versions =
+        Versions { gpaw: "22.8.0".into(), ase: "3.22.1".into(), setup_paths: vec!["/setups".into()] };
+    let setup = Setup { pinned: PinnedFile::fake("/setups/Si.PBE", "abc"), valence: 4.0 };
     let setups = BTreeMap::from([("Si".parse().unwrap(), setup)]);
-    Gpaw { environment: settings.environment(), settings, who, setups }
+    Gpaw { environment: settings.environment(), settings, versions, setups }
 }
 
-fn task(code: &Gpaw, remedies: &[Remedy]) -> Value {
-    let input = code.input(&silicon(), &BTreeSet::from_iter(remedies.iter().copied())).unwrap();
+fn task(code: &Gpaw, adjustments: &[RetryAdjustment]) -> Value {
+    let input = code.input(&silicon(), &BTreeSet::from_iter(adjustments.iter().copied())).unwrap();
     serde_json::from_slice(&input.files["input.json"]).unwrap()
 }
 
-/// What GPAW left, in a directory of its own.
+/// A directory with GPAW's result.
 fn left(result: &[u8]) -> tempfile::TempDir {
     let directory = tempfile::tempdir().unwrap();
     std::fs::write(directory.path().join("result.json"), result).unwrap();
     directory
 }
 
-fn read(structure: &Structure, result: &[u8]) -> Result<Calculated, Failure> {
+fn read(structure: &Structure, result: &[u8]) -> Result<Results, Failure> {
     gpaw(Settings::default()).read(structure, left(result).path(), Exit::Code(0))
 }
 
@@ -65,7 +66,7 @@ fn the_protocol_of_the_paper_is_written() {
 #[test]
 fn remedies_change_nothing_that_the_accuracy_depends_on() {
     let code = gpaw(Settings::default());
-    let (plain, mut changed) = (task(&code, &[]), task(&code, &Remedy::ALL));
+    let (plain, mut changed) = (task(&code, &[]), task(&code, &RetryAdjustment::ALL));
     assert_ne!(plain, changed);
     assert_eq!(changed["moments"], json!([0.5, 0.5]));
     changed["moments"] = plain["moments"].clone();
@@ -88,7 +89,7 @@ fn calculations_read_copies_of_what_was_hashed() {
     let code = Gpaw { setups, ..gpaw(Settings { variants, ..Settings::default() }) };
     assert_eq!(task(&code, &[])["setups"], json!("../data"));
     let data = code.input(&silicon(), &BTreeSet::new()).unwrap().data;
-    // By the name that GPAW looks for.
+    // Under the name that GPAW looks for.
     assert_eq!(data.keys().collect::<Vec<_>>(), ["Si.mine.PBE"]);
     let hash = blake3::hash(before.as_bytes()).to_hex().to_string();
     assert_eq!(code.identity()["pseudopotentials"], json!({ "Si": hash }));
@@ -165,7 +166,7 @@ fn a_result_of_another_version_is_of_another_program() {
     };
     assert!(with(by("22.8.0")).is_ok());
     let failure = with(by("23.9.1")).unwrap_err();
-    let expected = "another program: calculated by gpaw 23.9.1, where the protocol is of 22.8.0";
+    let expected = "another program: calculated by gpaw 23.9.1, but the protocol requires 22.8.0";
     assert_eq!((failure.class, failure.to_string().as_str()), (FailureClass::OtherProgram, expected));
     assert_eq!(with(json!({ "gpaw": "22.8.0" })).unwrap_err().class, FailureClass::OtherProgram);
     let told = json!({ "failure": { "class": "not_converged", "message": "why" }, "by": by("23.9.1") });

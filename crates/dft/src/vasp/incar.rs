@@ -1,13 +1,13 @@
-//! `INCAR` and `KPOINTS`.
+//! Writes `INCAR` and `KPOINTS`.
 
 use std::collections::BTreeSet;
 use std::fmt::Write;
 
 use super::Settings;
-use crate::{Remedy, SetupError, Smearing};
+use crate::{RetryAdjustment, SetupError, Smearing};
 
-/// What is written here, or would undo it, and cannot be a further tag.
-const OWN: [&str; 37] = [
+/// Tags that are written here or would override those; users cannot set them.
+const RESERVED_TAGS: [&str; 37] = [
     "ALGO",
     "AMIX",
     "AMIX_MAG",
@@ -47,7 +47,7 @@ const OWN: [&str; 37] = [
     "LSTOP",
 ];
 
-/// Checks the further tags of the settings.
+/// Checks the further tags in the settings.
 pub(super) fn check(settings: &Settings) -> Result<(), SetupError> {
     for (tag, value) in &settings.tags {
         let found = format!("{tag} = {value:?}");
@@ -56,7 +56,7 @@ pub(super) fn check(settings: &Settings) -> Result<(), SetupError> {
         if tag.is_empty() || !tag.chars().all(|c| c.is_ascii_uppercase() || c.is_ascii_digit() || c == '_') {
             return wrong("a tag of INCAR in capital letters");
         }
-        if OWN.contains(&tag.as_str()) {
+        if RESERVED_TAGS.contains(&tag.as_str()) {
             return wrong("another tag: this one is written from the other settings");
         }
         if value.is_empty()
@@ -68,9 +68,9 @@ pub(super) fn check(settings: &Settings) -> Result<(), SetupError> {
     Ok(())
 }
 
-/// `INCAR` for atoms with these moments, in the order of POSCAR.
-pub(super) fn incar(settings: &Settings, moments: &[f64], remedies: &BTreeSet<Remedy>) -> String {
-    let has = |remedy| remedies.contains(&remedy);
+/// `INCAR` for these initial moments, in the order of POSCAR.
+pub(super) fn incar(settings: &Settings, moments: &[f64], adjustments: &BTreeSet<RetryAdjustment>) -> String {
+    let has = |remedy| adjustments.contains(&remedy);
     let mut lines = vec![
         ("PREC", "Accurate".to_owned()),
         ("ENCUT", format!("{:?}", settings.cutoff)),
@@ -84,22 +84,25 @@ pub(super) fn incar(settings: &Settings, moments: &[f64], remedies: &BTreeSet<Re
         ("ISIF", "2".to_owned()),
         ("LWAVE", ".FALSE.".to_owned()),
         ("LCHARG", ".FALSE.".to_owned()),
-        ("NELM", (settings.steps.saturating_mul(if has(Remedy::MoreSteps) { 3 } else { 1 })).to_string()),
-        ("ALGO", if has(Remedy::OtherAlgorithm) { "All" } else { "Normal" }.to_owned()),
+        (
+            "NELM",
+            (settings.steps.saturating_mul(if has(RetryAdjustment::MoreSteps) { 3 } else { 1 })).to_string(),
+        ),
+        ("ALGO", if has(RetryAdjustment::OtherAlgorithm) { "All" } else { "Normal" }.to_owned()),
         ("ISPIN", if settings.spin { "2" } else { "1" }.to_owned()),
     ];
     if settings.spin {
         lines.push(("MAGMOM", runs(moments)));
         lines.push(("LORBIT", "10".to_owned()));
     }
-    if has(Remedy::SlowerMixing) {
+    if has(RetryAdjustment::SlowerMixing) {
         lines.extend([("AMIX", "0.1".to_owned()), ("BMIX", "0.0001".to_owned())]);
         if settings.spin {
             lines.extend([("AMIX_MAG", "0.4".to_owned()), ("BMIX_MAG", "0.0001".to_owned())]);
         }
     }
-    // Each group of processors that has k-points of its own keeps all that is not distributed by k-points once more.
-    let k_groups = if has(Remedy::MoreMemory) { 1 } else { settings.k_groups };
+    // Each group of processes with its own k-points holds a copy of all data not distributed by k-points.
+    let k_groups = if has(RetryAdjustment::MoreMemory) { 1 } else { settings.k_groups };
     lines.extend([("KPAR", k_groups.to_string()), ("NCORE", settings.cores_per_band.to_string())]);
     let further = settings.tags.iter().map(|(tag, value)| (tag.as_str(), value.clone()));
     lines.into_iter().chain(further).fold(String::new(), |mut text, (tag, value)| {
@@ -117,7 +120,7 @@ fn ismear(smearing: Smearing) -> i32 {
     }
 }
 
-/// Lines of INCAR are not long: `8*1.0 4*5.0`.
+/// Run-length encoding, because lines of INCAR are short: `8*1.0 4*5.0`.
 fn runs(moments: &[f64]) -> String {
     let run = |run: &[f64]| format!("{}*{:?}", run.len(), run[0]);
     moments.chunk_by(|a, b| a == b).map(run).collect::<Vec<_>>().join(" ")
@@ -132,9 +135,9 @@ pub(super) fn kpoints([a, b, c]: [u32; 3], spacing: f64) -> String {
 mod tests {
     use super::*;
 
-    fn lines(moments: &[f64], remedies: &[Remedy]) -> BTreeSet<String> {
+    fn lines(moments: &[f64], adjustments: &[RetryAdjustment]) -> BTreeSet<String> {
         let settings = Settings { k_groups: 4, ..Settings::default() };
-        incar(&settings, moments, &remedies.iter().copied().collect()).lines().map(str::to_owned).collect()
+        incar(&settings, moments, &adjustments.iter().copied().collect()).lines().map(str::to_owned).collect()
     }
 
     #[test]
@@ -163,7 +166,7 @@ mod tests {
 
     #[test]
     fn no_remedy_touches_accuracy() {
-        let (plain, remedied) = (lines(&[1.0], &[]), lines(&[1.0], &Remedy::ALL));
+        let (plain, remedied) = (lines(&[1.0], &[]), lines(&[1.0], &RetryAdjustment::ALL));
         let changed: BTreeSet<&str> =
             plain.symmetric_difference(&remedied).map(|line| line.split(" = ").next().unwrap()).collect();
         let free = ["NELM", "ALGO", "AMIX", "BMIX", "AMIX_MAG", "BMIX_MAG", "KPAR"];

@@ -1,30 +1,30 @@
-//! `OUTCAR`: what stands only there, and all that matters where `vasprun.xml` is cut off.
+//! Reads `OUTCAR`: data that only this file has, and everything needed if `vasprun.xml` is truncated.
 
 use std::io::BufRead;
 
 use atoms::cell::{Matrix3, Vec3};
 use atoms::{Cell, Species, Structure};
 
-use super::numbers::numbers;
+use super::fixed_width::numbers;
 use super::output::{self, Output};
 
 /// Positions have five decimals.
 const RESOLUTION: f64 = 1e-4;
 
-/// What a file tells, of the last step if the atoms moved; whole or not.
+/// The content of a complete or truncated file; of the last ionic step if the atoms moved.
 #[derive(Debug, Default)]
 pub(super) struct Outcar {
     version: Option<String>,
-    /// Elements, in the order of POTCAR.
+    /// Elements in the order of POTCAR.
     elements: Vec<Option<Species>>,
-    /// The same and more, where the file says less of them.
+    /// The elements from a second list, for files in which the first is incomplete.
     listed: Vec<Option<Species>>,
-    /// Atoms of each.
+    /// Number of atoms of each element.
     counts: Vec<usize>,
     most_steps: Option<u32>,
     ionic_steps: u32,
     steps: u32,
-    /// Whether the last electronic step was small enough.
+    /// Whether the last electronic step met the tolerance.
     converged: bool,
     energy: Option<f64>,
     energy_without_smearing: Option<f64>,
@@ -40,7 +40,7 @@ pub(super) struct Outcar {
     complete: bool,
 }
 
-/// The table that the lines which follow belong to.
+/// The table to which the next lines belong.
 #[derive(Clone, Copy, PartialEq)]
 enum Table {
     None,
@@ -50,14 +50,14 @@ enum Table {
 }
 
 impl Outcar {
-    /// Reads whatever is there; what cannot be read is not there.
+    /// Reads what is there and ignores what cannot be read.
     pub fn read(mut input: impl BufRead) -> Self {
         let mut outcar = Self::default();
         let (mut table, mut bytes) = (Table::None, Vec::new());
         loop {
             bytes.clear();
             match input.read_until(b'\n', &mut bytes) {
-                // A line that was cut off may end within a number.
+                // A truncated line may end within a number.
                 Ok(_) if bytes.last() == Some(&b'\n') => {}
                 _ => return outcar,
             }
@@ -69,7 +69,7 @@ impl Outcar {
         }
     }
 
-    /// A line of no table; returns the table that begins after it.
+    /// Reads a line outside tables; returns the table that starts after it.
     fn line(&mut self, line: &str) -> Table {
         let after = |mark: &str| line.split_once(mark).map(|(_, rest)| rest.trim_start());
         if self.version.is_none()
@@ -115,7 +115,7 @@ impl Outcar {
         Table::None
     }
 
-    /// `   1(  13)  -----`: an electronic step begins.
+    /// `   1(  13)  -----`: the start of an electronic step.
     fn step(&mut self, numbers: &str) {
         let ionic =
             numbers.split('(').next().and_then(|word| word.trim().parse().ok()).unwrap_or(self.ionic_steps);
@@ -126,7 +126,7 @@ impl Outcar {
         self.converged = false;
     }
 
-    /// A line in a table; returns the table that the next one belongs to.
+    /// Reads a line in a table; returns the table of the next line.
     fn row(&mut self, line: &str, table: Table) -> Table {
         let ruled = line.trim_start().starts_with("-----");
         match table {
@@ -158,15 +158,15 @@ impl Outcar {
         }
     }
 
-    /// Whether it is whole, and does not say that the electrons converged.
+    /// Whether the file is complete and does not state that the electrons converged.
     pub fn denies_convergence(&self) -> bool {
         self.complete && !self.converged
     }
 
-    /// The whole of a calculation that came to its end, converged or not.
+    /// The output of a calculation that ran to its end, converged or not.
     ///
     /// # Errors
-    /// What is missing, for people.
+    /// A message that names what is missing.
     pub fn output(self) -> Result<Output, String> {
         if !self.complete {
             return Err("ends before its timings".to_owned());
@@ -183,7 +183,7 @@ impl Outcar {
             resolution: RESOLUTION,
             ionic_steps: self.ionic_steps,
             most_steps,
-            // The program stops there whether it has converged or not.
+            // The program stops at this limit whether it has converged or not.
             steps: if self.converged { self.steps } else { self.steps.max(most_steps) },
             energy,
             energy_without_smearing: self.energy_without_smearing.ok_or("has no energy without smearing")?,
@@ -202,14 +202,14 @@ impl Outcar {
         let mut species = Vec::new();
         for (element, count) in elements.iter().zip(&self.counts) {
             let element = element.ok_or("has a title of POTCAR without an element")?;
-            // More than there are atoms is wrong in any case, and may be far too many.
+            // More than the number of atoms is wrong in any case and could exhaust the memory.
             species.extend(std::iter::repeat_n(element, (*count).min(self.atoms.len() + 1)));
         }
         Ok(species)
     }
 }
 
-/// The element of a title: `PAW_PBE Fe_pv 06Sep2000`.
+/// The element in a title: `PAW_PBE Fe_pv 06Sep2000`.
 fn element(title: &str) -> Option<Species> {
     output::element(title.split_whitespace().nth(1)?.split(['_', '.']).next()?)
 }

@@ -1,4 +1,4 @@
-//! POTCAR files, which are the user's own.
+//! POTCAR files of the user.
 
 use std::path::{Path, PathBuf};
 
@@ -7,7 +7,7 @@ use atoms::Species;
 use super::output;
 use crate::SetupError;
 
-/// What the title begins with: the PBE sets for the projector augmented-wave method.
+/// First word of the title: the PBE sets for the projector augmented-wave method.
 const SET: &str = "PAW_PBE";
 
 /// The POTCAR of one element.
@@ -15,7 +15,7 @@ const SET: &str = "PAW_PBE";
 pub(super) struct Potcar {
     /// `PAW_PBE Al_pv 06Sep2000`
     pub title: String,
-    /// Electrons that it treats.
+    /// Number of valence electrons.
     pub valence: f64,
     /// BLAKE3 of the file.
     pub hash: String,
@@ -24,8 +24,8 @@ pub(super) struct Potcar {
 }
 
 impl Potcar {
-    /// Finds `variant` of `species` under `directory`, as `<variant>/POTCAR`, `POTCAR.<variant>` or `<variant>`, and checks
-    /// that it is what its name says.
+    /// Finds `variant` of `species` under `directory`, as `<variant>/POTCAR`, `POTCAR.<variant>` or
+    /// `<variant>`, and checks that the content matches the name.
     ///
     /// # Errors
     /// [`SetupError::Pseudopotential`]
@@ -70,12 +70,12 @@ impl Potcar {
     }
 }
 
-/// What follows `name =` in the first line that has it.
+/// The text after `name =` in the first line that has it.
 fn after<'a>(text: &'a str, name: &str) -> Option<&'a str> {
     text.lines().find_map(|line| Some(line.split_once(name)?.1.trim_start().strip_prefix('=')?.trim_start()))
 }
 
-/// Says where there is nothing, and what there is for this element.
+/// Lists the paths that were tried and what exists for this element.
 fn missing(directory: &Path, candidates: &[PathBuf], species: Species) -> String {
     let sought: Vec<String> = candidates.iter().map(|path| path.display().to_string()).collect();
     let of_element = |name: &String| {
@@ -87,10 +87,10 @@ fn missing(directory: &Path, candidates: &[PathBuf], species: Species) -> String
         entries.filter_map(|entry| entry.file_name().into_string().ok()).filter(of_element).collect();
     there.sort();
     let there = match there.is_empty() {
-        true => format!("{} has nothing of {species}", directory.display()),
+        true => format!("{} has no POTCAR of {species}", directory.display()),
         false => format!("{} has {}; choose one in `variants`", directory.display(), there.join(", ")),
     };
-    format!("there is none of {}; {there}", sought.join(", "))
+    format!("none of {} exists; {there}", sought.join(", "))
 }
 
 #[cfg(test)]
@@ -133,7 +133,7 @@ mod tests {
         assert!(message.contains("/Al/POTCAR"), "{message}");
         assert!(message.ends_with("has Al_GW, Al_pv; choose one in `variants`"), "{message}");
         let nowhere = Potcar::find(Path::new("/no/such/place"), aluminium(), "Al").unwrap_err().to_string();
-        assert!(nowhere.ends_with("/no/such/place has nothing of Al"), "{nowhere}");
+        assert!(nowhere.ends_with("/no/such/place has no POTCAR of Al"), "{nowhere}");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! `vasprun.xml`
+//! Reads `vasprun.xml`.
 
 use std::io::BufRead;
 
@@ -7,22 +7,22 @@ use atoms::{Cell, Species, Structure};
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
-use super::numbers::{numbers, vector};
+use super::fixed_width::{numbers, vector};
 use super::output::{self, Output};
 
 /// Decimals of lengths, forces and stresses.
 const DECIMALS: usize = 8;
 
-/// Fractional coordinates of eight decimals, in a cell of 100 Å.
+/// Precision of fractional coordinates with eight decimals, in a cell of 100 Å.
 const RESOLUTION: f64 = 1e-5;
 
-/// Long parts without interest.
+/// Long sections that are not needed.
 const SKIPPED: [&str; 5] = ["eigenvalues", "dos", "projected", "kpoints", "symmetry"];
 
-/// Reads a file that goes to its end.
+/// Reads a complete file.
 ///
 /// # Errors
-/// What is missing or damaged, for people.
+/// A message that names what is missing or damaged.
 pub(super) fn read(input: impl BufRead) -> Result<Output, String> {
     let mut reader = Reader::from_reader(input);
     let mut file = File::default();
@@ -44,10 +44,10 @@ pub(super) fn read(input: impl BufRead) -> Result<Output, String> {
     file.output()
 }
 
-/// What has been read so far.
+/// The state of the parser.
 #[derive(Default)]
 struct File {
-    /// Of each element that is open its attribute `name`, or else its tag.
+    /// The attribute `name`, or else the tag, of each open element.
     path: Vec<String>,
     /// Text of the innermost element.
     text: String,
@@ -55,17 +55,17 @@ struct File {
     version: String,
     most_steps: Option<u32>,
     species: Vec<Species>,
-    /// Entries of the table row that is open.
+    /// Entries in the open table row.
     row: usize,
     ionic_steps: u32,
     last: Calculation,
 }
 
-/// What stands in `<calculation>`.
+/// The content of `<calculation>`.
 #[derive(Default)]
 struct Calculation {
     steps: u32,
-    /// Of the last electronic step: free energy and its extrapolation to no smearing, eV.
+    /// Free energy of the last electronic step and its extrapolation to zero smearing, eV.
     step_energies: [Option<f64>; 2],
     /// Free energy, eV.
     energy: Option<f64>,
@@ -104,7 +104,7 @@ impl File {
         match path.as_slice() {
             ["modeling", "calculation", path @ ..] => self.last.take(path, text).ok_or_else(wrong)?,
             ["modeling", "generator", "version"] => text.clone_into(&mut self.version),
-            // It stands several times, and only the first is that of the calculation.
+            // NELM appears several times; only the first belongs to the calculation.
             [.., "NELM"] if self.most_steps.is_none() => {
                 self.most_steps = Some(text.parse().map_err(|_| wrong())?);
             }
@@ -128,7 +128,7 @@ impl File {
         let energy = last.energy.ok_or("has no energy")?;
         let cell = Cell(matrix(last.cell).ok_or("has no cell")?);
         let positions = last.positions.iter().map(|fractional| cell.cartesian(*fractional)).collect();
-        // The final one of these is 0 in files of some versions; in the last electronic step it is right.
+        // In files of some versions the final value is 0; that of the last electronic step is right.
         let [free, without_smearing] = last.step_energies;
         let correction = free.zip(without_smearing).map(|(free, without)| without - free);
         Ok(Output {
@@ -147,7 +147,7 @@ impl File {
 }
 
 impl Calculation {
-    /// Takes the text of an element if it matters; `None` if that is not what it should be.
+    /// Stores the text of an element if it is needed; `None` if it is invalid.
     fn take(&mut self, path: &[&str], text: &str) -> Option<()> {
         match path {
             ["structure", "crystal", "basis", "v"] => self.cell.push(vector(text, DECIMALS)?),

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use dft::abinit::Settings;
-use dft::{Code, FailureClass, PassedEnvironment, Remedy, Smearing};
+use dft::{DftBackend, FailureClass, PassedEnvironment, RetryAdjustment, Smearing};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
@@ -14,7 +14,7 @@ fn settings() -> Settings {
 
 #[test]
 fn the_forces_and_the_stress_of_silicon_are_derivatives_of_its_energy() {
-    // That the plane waves change with the cell adds some 2e-5 eV/Å³ at this cutoff.
+    // The number of plane waves changes with the cell, which adds some 2e-5 eV/Å³ at this cutoff.
     let code = Settings { cutoff: 600.0, ..settings() }.prepare(&PassedEnvironment::default()).unwrap();
     let structure = structures::silicon();
     let calculated = label(&code, &structure);
@@ -48,8 +48,8 @@ fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
     assert_eq!(failures, [FailureClass::NotConverged]);
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();
     assert_eq!(few.identity(), enough.identity());
-    // Whatever the remedies, the energy is the same.
-    let every = attempt(&enough, &structures::silicon(), &Remedy::ALL.into()).unwrap();
+    // No adjustment changes the energy.
+    let every = attempt(&enough, &structures::silicon(), &RetryAdjustment::ALL.into()).unwrap();
     for other in [label(&enough, &structures::silicon()), every] {
         assert!((calculated.energy - other.energy).abs() < 1e-5, "{calculated:?} {other:?}");
     }

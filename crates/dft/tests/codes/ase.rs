@@ -1,4 +1,4 @@
-//! ASE calculators, run for real: EMT, which comes with ASE, and GPAW; with the Python that `CALMWALK_PYTHON` names, or Debian's.
+//! Real ASE calculators: EMT, which is part of ASE, and GPAW, with the Python in `CALMWALK_PYTHON` or Debian's.
 
 use std::collections::BTreeSet;
 use std::os::unix::process::ExitStatusExt;
@@ -8,7 +8,7 @@ use std::process::Command;
 use atoms::cell::{Vec3, add};
 use atoms::{Cell, Structure};
 use dft::ase::{Ase, Settings};
-use dft::{Calculated, Code, Exit, Failure, FailureClass, PassedEnvironment, Remedy, SetupError};
+use dft::{DftBackend, Exit, Failure, FailureClass, PassedEnvironment, Results, RetryAdjustment, SetupError};
 use tempfile::TempDir;
 
 fn python() -> String {
@@ -25,10 +25,14 @@ fn prepared(calculator: &str) -> Ase {
     settings(&TempDir::new().unwrap(), calculator).prepare(&PassedEnvironment::default()).unwrap()
 }
 
-/// Writes the input, runs the script, reads what it left.
-fn run(code: &dyn Code, structure: &Structure, remedies: &[Remedy]) -> Result<Calculated, Failure> {
+/// Writes the input, runs the script and reads the output.
+fn run(
+    code: &dyn DftBackend,
+    structure: &Structure,
+    adjustments: &[RetryAdjustment],
+) -> Result<Results, Failure> {
     let place = TempDir::new().unwrap();
-    let input = code.input(structure, &remedies.iter().copied().collect::<BTreeSet<_>>())?;
+    let input = code.input(structure, &adjustments.iter().copied().collect::<BTreeSet<_>>())?;
     for (name, content) in &input.files {
         std::fs::write(place.path().join(name), content).unwrap();
     }
@@ -45,7 +49,7 @@ fn run(code: &dyn Code, structure: &Structure, remedies: &[Remedy]) -> Result<Ca
     code.read(structure, place.path(), exit)
 }
 
-/// A distorted, sheared alloy whose elements are mixed up.
+/// A distorted, sheared alloy with mixed order of elements.
 fn alloy() -> Structure {
     let mut positions = Vec::new();
     for i in 0..8_u8 {
@@ -67,7 +71,7 @@ fn alloy() -> Structure {
 const EMT: &str =
     "from ase.calculators.emt import EMT\nversion = 'EMT of ASE'\ndef calculator():\n    return EMT()\n";
 
-/// What ASE says of a structure without our script.
+/// ASE's results without our script.
 fn emt_alone(structure: &Structure) -> (f64, Vec<Vec3>, [f64; 6]) {
     let script = "import json, sys\nfrom ase import Atoms\nfrom ase.calculators.emt import EMT\n\
                   s, x, c = json.load(sys.stdin)\na = Atoms(s, positions=x, cell=c, pbc=True, calculator=EMT())\n\
@@ -92,7 +96,7 @@ fn emt_gives_the_numbers_that_ase_gives() {
     assert!(forces.iter().flatten().any(|force| force.abs() > 0.5));
 }
 
-/// As docs/dft-codes.md has it.
+/// As in docs/dft-codes.md.
 const LABEL: &str = "from ase.io import read, write\nfrom ase.calculators.emt import EMT\natoms = read('structure.extxyz')\n\
                      atoms.calc = EMT()\natoms.get_forces(), atoms.get_stress()\nwrite('label.extxyz', atoms)\n";
 
@@ -108,7 +112,7 @@ fn a_command_that_uses_ase_gives_the_same_but_for_the_digits_of_its_file() {
     };
     let found = run(&settings.prepare(&PassedEnvironment::default()).unwrap(), &alloy(), &[]).unwrap();
     let expected = run(&prepared(EMT), &alloy(), &[]).unwrap();
-    let numbers = |label: &Calculated| {
+    let numbers = |label: &Results| {
         let energies = [label.energy, label.energy_without_smearing.unwrap()];
         [energies.as_slice(), &label.forces.concat(), &label.stress.unwrap().concat()].concat()
     };
@@ -158,7 +162,7 @@ fn open_directions_stay_open_and_have_no_stress() {
     assert_ne!(found.energy, emt_alone(&alloy()).0);
 }
 
-/// EMT with something added.
+/// EMT with a modification.
 fn class_of(calculator: &str) -> FailureClass {
     run(&prepared(&format!("{EMT}{calculator}")), &alloy(), &[]).unwrap_err().class
 }
@@ -190,7 +194,7 @@ fn what_goes_wrong_is_told() {
 #[test]
 fn remedies_and_moments_reach_the_calculator() {
     let text = format!(
-        "{EMT}def calculator(remedies):\n    assert remedies == {{'more_steps', 'other_moments'}}, remedies\n    return C()\n\
+        "{EMT}def calculator(adjustments):\n    assert adjustments == {{'more_steps', 'other_moments'}}, adjustments\n    return C()\n\
          class C(EMT):\n    def calculate(self, atoms, *a):\n        super().calculate(atoms, *a)\n        \
          self.results['magmoms'] = atoms.get_initial_magnetic_moments()\n        self.results['magmom'] = 4.5\n"
     );
@@ -198,7 +202,7 @@ fn remedies_and_moments_reach_the_calculator() {
     let mut settings = settings(&place, &text);
     settings.moments = [("Cu".parse().unwrap(), 3.0)].into();
     let code = settings.prepare(&PassedEnvironment::default()).unwrap();
-    let found = run(&code, &alloy(), &[Remedy::OtherMoments, Remedy::MoreSteps]).unwrap();
+    let found = run(&code, &alloy(), &[RetryAdjustment::OtherMoments, RetryAdjustment::MoreSteps]).unwrap();
     assert_eq!(found.magnetic_moments, Some(vec![0.5, 1.5, 0.5, 1.5, 0.5, 0.5, 1.5, 0.5]));
     assert_eq!(found.magnetisation, Some(4.5));
     assert!(run(&code, &alloy(), &[]).is_err());
@@ -239,11 +243,11 @@ fn what_is_missing_is_found_before_anything_is_calculated() {
     assert!(matches!(fault, SetupError::Program { .. }), "{fault}");
 }
 
-/// Plane waves for silicon, as few as there can be; with few steps at first.
+/// A minimal plane-wave basis for silicon, with few steps at first.
 const GPAW: &str = "from gpaw import GPAW, PW\nimport gpaw\nversion = 'GPAW ' + gpaw.__version__\n\
-                    def calculator(remedies):\n    return GPAW(mode=PW(200), xc='PBE', kpts={'size': (2, 2, 2), 'gamma': True},\n        \
+                    def calculator(adjustments):\n    return GPAW(mode=PW(200), xc='PBE', kpts={'size': (2, 2, 2), 'gamma': True},\n        \
                     occupations={'name': 'fermi-dirac', 'width': 0.1}, convergence={'energy': 1e-7, 'density': 1e-6},\n        \
-                    symmetry={'point_group': False}, maxiter=60 if 'more_steps' in remedies else 3, txt='-')\n";
+                    symmetry={'point_group': False}, maxiter=60 if 'more_steps' in adjustments else 3, txt='-')\n";
 
 fn silicon() -> Structure {
     Structure {
@@ -259,7 +263,7 @@ fn gpaw_converges_with_more_steps_and_its_forces_are_derivatives_of_its_free_ene
     let code = prepared(GPAW);
     assert!(code.identity()["version"].as_str().unwrap().starts_with("GPAW "));
     assert_eq!(run(&code, &silicon(), &[]).unwrap_err().class, FailureClass::NotConverged);
-    let calculate = |structure: &Structure| run(&code, structure, &[Remedy::MoreSteps]).unwrap();
+    let calculate = |structure: &Structure| run(&code, structure, &[RetryAdjustment::MoreSteps]).unwrap();
     let found = calculate(&silicon());
     assert_ne!(Some(found.energy), found.energy_without_smearing);
     assert!(found.electronic_steps.is_some_and(|steps| steps > 3), "{found:?}");

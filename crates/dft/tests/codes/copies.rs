@@ -1,9 +1,9 @@
-//! A calculation reads the data that was hashed, whatever has become of the files meanwhile.
+//! A calculation reads the data that was hashed, even if the original files change afterwards.
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use dft::{Code, PassedEnvironment, abinit, cp2k, gpaw};
+use dft::{DftBackend, PassedEnvironment, abinit, cp2k, gpaw};
 use tempfile::TempDir;
 
 use crate::run::{calculate, label, prepared};
@@ -18,8 +18,9 @@ fn copies(from: &str, names: &[&str]) -> TempDir {
     directory
 }
 
-/// Compares a label of silicon, whose data is gone when the program begins, with one whose data stays.
-fn needs_no_files(code: &dyn Code, data: TempDir) {
+/// Compares a label of silicon whose data files are deleted before the program starts with one whose files
+/// remain.
+fn needs_no_files(code: &dyn DftBackend, data: TempDir) {
     let (structure, place) = (structures::silicon(), TempDir::new().unwrap());
     let expected = label(code, &structure);
     let input = prepared(code, &structure, &BTreeSet::new(), place.path()).unwrap();

@@ -1,7 +1,7 @@
-//! CP2K. Coarse grids and the smallest basis, with which it stays itself.
+//! CP2K, with coarse grids and the smallest basis, which keep it consistent.
 
 use dft::cp2k::Settings;
-use dft::{Code, FailureClass, PassedEnvironment, Remedy};
+use dft::{DftBackend, FailureClass, PassedEnvironment, RetryAdjustment};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
@@ -30,7 +30,7 @@ fn the_oxygen_molecule_is_a_magnet_in_its_own_vacuum() {
 
 #[test]
 fn the_stress_of_silicon_is_a_derivative_of_its_energy() {
-    // At Γ alone: what is checked is sign, unit and order.
+    // At Γ only: this checks sign, unit and order.
     let code = Settings { spin: false, cutoff: 2000.0, relative_cutoff: 400.0, ..settings() }
         .prepare(&PassedEnvironment::default())
         .unwrap();
@@ -46,8 +46,8 @@ fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
     assert_eq!(failures, [FailureClass::NotConverged]);
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();
     assert_eq!(few.identity(), enough.identity());
-    // Whatever the remedies, the energy is the same.
-    let every = attempt(&enough, &structures::oxygen(), &Remedy::ALL.into()).unwrap();
+    // No adjustment changes the energy.
+    let every = attempt(&enough, &structures::oxygen(), &RetryAdjustment::ALL.into()).unwrap();
     for other in [label(&enough, &structures::oxygen()), every] {
         assert!((calculated.energy - other.energy).abs() < 1e-4, "{calculated:?} {other:?}");
     }

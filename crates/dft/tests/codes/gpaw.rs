@@ -1,7 +1,7 @@
-//! GPAW. Real-space grids for densities make an egg-box of some 1e-4 eV/Å.
+//! GPAW. Real-space grids for densities cause an egg-box error of some 1e-4 eV/Å.
 
 use dft::gpaw::Settings;
-use dft::{Code, FailureClass, PassedEnvironment, Remedy};
+use dft::{DftBackend, FailureClass, PassedEnvironment, RetryAdjustment};
 
 use crate::run::{attempt, climb, label};
 use crate::{checks, structures};
@@ -12,7 +12,7 @@ fn settings() -> Settings {
 
 #[test]
 fn the_stress_of_silicon_is_a_derivative_of_the_energy() {
-    // That the plane waves change with the cell adds some 1e-4 eV/Å³ at this cutoff and mesh.
+    // The number of plane waves changes with the cell, which adds some 1e-4 eV/Å³ at this cutoff and mesh.
     let code = Settings { cutoff: 400.0, k_spacing: 0.8, ..settings() }
         .prepare(&PassedEnvironment::default())
         .unwrap();
@@ -51,8 +51,8 @@ fn too_few_steps_are_not_converged_and_the_next_rung_converges() {
     assert_eq!(failures, [FailureClass::NotConverged]);
     let enough = settings().prepare(&PassedEnvironment::default()).unwrap();
     assert_eq!(few.identity(), enough.identity());
-    // Whatever the remedies, the energy is the same.
-    let every = attempt(&enough, &structures::silicon(), &Remedy::ALL.into()).unwrap();
+    // No adjustment changes the energy.
+    let every = attempt(&enough, &structures::silicon(), &RetryAdjustment::ALL.into()).unwrap();
     for other in [label(&enough, &structures::silicon()), every] {
         assert!((calculated.energy - other.energy).abs() < 1e-5, "{calculated:?} {other:?}");
     }

@@ -1,5 +1,5 @@
-//! Labels of real programs, checked against themselves: forces and stress are derivatives of the energy, a magnet has
-//! its moment, and a limit on electronic steps that is too low is judged so and climbed over.
+//! Labels of real programs, checked for consistency: forces and stress are derivatives of the energy, a magnet
+//! has its moment, and a limit on electronic steps that is too low is detected and overcome.
 //!
 //! Needs Debian's packages gpaw, gpaw-data, abinit, abinit-data, cp2k and cp2k-data, and fails without them:
 //! `CALMWALK_PYTHON=/usr/bin/python3 cargo test -p dft --test codes`.

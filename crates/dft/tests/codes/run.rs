@@ -1,4 +1,4 @@
-//! Runs calculations as a labeller does, but here.
+//! Runs calculations like a labeller, in this process.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -7,27 +7,27 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use atoms::Structure;
-use dft::{Calculated, Code, Exit, Failure, FailureClass, Input, Remedy, remedies};
+use dft::{DftBackend, Exit, Failure, FailureClass, Input, Results, RetryAdjustment, adjustments};
 
-/// One calculation from its input to its judgement.
+/// One calculation from its input to its result.
 pub fn attempt(
-    code: &dyn Code,
+    code: &dyn DftBackend,
     structure: &Structure,
-    remedies: &BTreeSet<Remedy>,
-) -> Result<Calculated, Failure> {
+    adjustments: &BTreeSet<RetryAdjustment>,
+) -> Result<Results, Failure> {
     let place = tempfile::tempdir().unwrap();
-    let input = prepared(code, structure, remedies, place.path())?;
+    let input = prepared(code, structure, adjustments, place.path())?;
     calculate(code, structure, input, place.path())
 }
 
-/// Writes the input into folders of this directory.
+/// Writes the input to folders of this directory.
 pub fn prepared(
-    code: &dyn Code,
+    code: &dyn DftBackend,
     structure: &Structure,
-    remedies: &BTreeSet<Remedy>,
+    adjustments: &BTreeSet<RetryAdjustment>,
     place: &Path,
 ) -> Result<Input, Failure> {
-    let input = code.input(structure, remedies)?;
+    let input = code.input(structure, adjustments)?;
     let [work, data] = ["work", "data"].map(|folder| place.join(folder));
     [&work, &data].into_iter().for_each(|folder| std::fs::create_dir(folder).unwrap());
     for (name, content) in &input.files {
@@ -39,13 +39,13 @@ pub fn prepared(
     Ok(input)
 }
 
-/// Runs what was prepared, and judges it.
+/// Runs a prepared calculation and reads its result.
 pub fn calculate(
-    code: &dyn Code,
+    code: &dyn DftBackend,
     structure: &Structure,
     input: Input,
     place: &Path,
-) -> Result<Calculated, Failure> {
+) -> Result<Results, Failure> {
     let directory = place.join("work");
     let output = |name| Stdio::from(File::create(directory.join(name)).unwrap());
     let status = Command::new(&input.command[0])
@@ -66,16 +66,16 @@ pub fn calculate(
 }
 
 /// A calculation that must succeed.
-pub fn label(code: &dyn Code, structure: &Structure) -> Calculated {
+pub fn label(code: &dyn DftBackend, structure: &Structure) -> Results {
     attempt(code, structure, &BTreeSet::new())
         .unwrap_or_else(|failure| panic!("{}: {failure}", structure.formula()))
 }
 
-/// Tries until the calculation is a label, as the ladders say; how often it failed before.
-pub fn climb(code: &dyn Code, structure: &Structure) -> (Calculated, Vec<FailureClass>) {
+/// Retries with the adjustments until the calculation succeeds; returns the number of failures.
+pub fn climb(code: &dyn DftBackend, structure: &Structure) -> (Results, Vec<FailureClass>) {
     let mut failures = Vec::new();
     loop {
-        let changes = remedies(&failures).unwrap_or_else(|| panic!("given up after {failures:?}"));
+        let changes = adjustments(&failures).unwrap_or_else(|| panic!("given up after {failures:?}"));
         match attempt(code, structure, &changes) {
             Ok(calculated) => return (calculated, failures),
             Err(failure) => failures.push(failure.class),

@@ -21,13 +21,13 @@ pub fn silicon() -> Structure {
     structure("Si", cell, &[[0.0; 3], [1.43, 1.33, 1.30]])
 }
 
-/// A stretched molecule that nothing repeats.
+/// A stretched molecule without periodicity.
 pub fn oxygen() -> Structure {
     let molecule = structure("O", [[0.0; 3]; 3], &[[0.0; 3], [0.3, 0.2, 1.26]]);
     Structure { periodic: [false; 3], ..molecule }
 }
 
-/// The primitive cell of bcc iron, a little strained.
+/// The primitive cell of bcc iron, slightly strained.
 pub fn iron() -> Structure {
     let half = 2.83 / 2.0;
     let cell = [[-half, half, half], [half, -half, half + 0.03], [half, half + 0.02, -half]];

@@ -1,4 +1,4 @@
-//! A program that does what VASP does with its files, but has calculated beforehand.
+//! A stand-in for VASP that handles its files but returns precomputed results.
 
 use std::collections::BTreeSet;
 use std::os::unix::fs::PermissionsExt;
@@ -6,17 +6,17 @@ use std::path::Path;
 use std::process::Command;
 
 use atoms::{Cell, Structure, read_poscar};
-use dft::{Code, Exit, FailureClass, Input, Remedy};
+use dft::{DftBackend, Exit, FailureClass, Input, RetryAdjustment};
 use tempfile::TempDir;
 
 use super::{alumina, assert_close, data, expected, settings, text};
 
-fn input(structure: &Structure, remedies: &[Remedy]) -> Input {
+fn input(structure: &Structure, adjustments: &[RetryAdjustment]) -> Input {
     let directory = TempDir::new().unwrap();
     let mut settings = settings(directory.path(), "5.4.4", &["Al", "O"]);
     settings.moments = [("O".parse().unwrap(), 0.25)].into();
     let code = settings.prepare().unwrap();
-    code.input(structure, &BTreeSet::from_iter(remedies.iter().copied())).unwrap()
+    code.input(structure, &BTreeSet::from_iter(adjustments.iter().copied())).unwrap()
 }
 
 fn file(input: &Input, name: &str) -> String {
@@ -75,7 +75,7 @@ fn the_mesh_is_that_of_the_spacing_with_two_pi() {
         cell: Cell::orthorhombic(4.05, 4.05, 8.1),
         periodic: [true; 3],
     };
-    // 2π / 4.05 / 0.125 = 12.41, 2π / 8.1 / 0.125 = 6.21; VASP's KSPACING counts alike.
+    // 2π / 4.05 / 0.125 = 12.41, 2π / 8.1 / 0.125 = 6.21; VASP's KSPACING gives the same.
     let kpoints = file(&input(&aluminium, &[]), "KPOINTS");
     assert_eq!(kpoints.lines().skip(1).collect::<Vec<_>>(), ["0", "Gamma", "13 13 7", "0 0 0"]);
     let slab = Structure { periodic: [true, true, false], ..aluminium };
@@ -84,7 +84,7 @@ fn the_mesh_is_that_of_the_spacing_with_two_pi() {
 
 #[test]
 fn a_left_handed_cell_is_turned_and_its_numbers_are_the_same() {
-    // Turned, it is the cell of the files.
+    // Rotated, it is the cell of the files.
     let mut left = alumina();
     left.cell.0.swap(1, 2);
     assert!(left.cell.signed_volume() < 0.0);
@@ -98,7 +98,7 @@ fn a_left_handed_cell_is_turned_and_its_numbers_are_the_same() {
 
 #[test]
 fn remedies_leave_all_files_but_incar_alone() {
-    let (plain, mut remedied) = (input(&alumina(), &[]), input(&alumina(), &Remedy::ALL));
+    let (plain, mut remedied) = (input(&alumina(), &[]), input(&alumina(), &RetryAdjustment::ALL));
     let incar = file(&remedied, "INCAR");
     assert!(incar.contains("\nMAGMOM = 2*0.5 1*0.125\n"), "{incar}");
     assert!(incar.contains("\nNELM = 300\nALGO = All\n"), "{incar}");
@@ -113,6 +113,6 @@ fn an_element_without_a_potential_is_bad_input() {
     let code = settings(home.path(), "5.4.4", &["Al"]).prepare().unwrap();
     let failure = code.input(&alumina(), &BTreeSet::new()).unwrap_err();
     assert_eq!(failure.class, FailureClass::BadInput);
-    assert!(failure.message.contains("of O: none is chosen"), "{failure}");
+    assert!(failure.message.contains("of O: none is selected"), "{failure}");
     assert!(Path::new(&settings(home.path(), "5.4.4", &["Al"]).pseudopotentials).exists());
 }

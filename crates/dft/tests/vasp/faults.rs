@@ -1,4 +1,4 @@
-//! What faults leave is no label, or the same one.
+//! Faulty output gives no label, or the same one.
 
 use dft::{Exit, FailureClass};
 use proptest::prelude::*;
@@ -11,7 +11,7 @@ fn whole_files_are_read() {
     let both =
         read(&[("vasprun.xml", xml.as_bytes()), ("OUTCAR", outcar.as_bytes())], Exit::Code(0)).unwrap();
     assert_close(&both, &expected(), 1e-12);
-    // A whole file counts however the program ended afterwards.
+    // A complete file is valid however the program ended afterwards.
     let killed = read(&[("vasprun.xml", xml.as_bytes()), ("OUTCAR", outcar.as_bytes())], Exit::TimeLimit);
     assert_eq!(killed, Ok(both.clone()));
     let xml_only = read(&[("vasprun.xml", xml.as_bytes())], Exit::Code(0)).unwrap();
@@ -40,7 +40,7 @@ fn without_any_file_the_end_of_the_program_tells_the_class() {
     assert_eq!(read(&[("stdout", words)], Exit::TimeLimit).unwrap_err().class, FailureClass::TimeLimit);
 }
 
-/// What a file says after one change, judged without the other file.
+/// The failure after one change to a file, without the other file.
 fn changed(name: &str, from: &str, to: &str) -> FailureClass {
     let text = text(name);
     assert!(text.contains(from), "{name} has no {from:?}");
@@ -90,7 +90,7 @@ fn changes_in_vasprun_are_seen() {
 
 #[test]
 fn outcar_is_asked_whether_it_converged() {
-    // As if something had stopped the electronic steps before there were too many.
+    // As if something had ended the electronic steps before the limit.
     let outcar = text("OUTCAR").replace("because EDIFF is reached", "EDIFF was not reached");
     let files = [("vasprun.xml", text("vasprun.xml")), ("OUTCAR", outcar)];
     let failure =
@@ -128,7 +128,7 @@ proptest! {
     #[test]
     fn files_cut_at_any_byte_are_no_label(xml in 0.0..1.0, outcar in 0.0..1.0) {
         let (xml_whole, outcar_whole) = (text("vasprun.xml"), text("OUTCAR"));
-        // Up to the last thing that must be there.
+        // Up to the last required element.
         let xml_end = xml_whole.trim_end().len();
         let outcar_end = outcar_whole.find("General timing").unwrap();
         let xml = &xml_whole.as_bytes()[..(xml_end as f64 * xml) as usize];
@@ -137,7 +137,7 @@ proptest! {
             let failure = read(&[("vasprun.xml", xml), ("OUTCAR", outcar)], exit).unwrap_err();
             prop_assert_eq!(failure.class, FailureClass::Crashed);
         }
-        // The other file, where it is whole, has the label.
+        // The other file has the label if it is complete.
         let from_outcar =
             read(&[("vasprun.xml", xml), ("OUTCAR", outcar_whole.as_bytes())], Exit::Code(0)).unwrap();
         assert_close(&from_outcar, &expected(), 6e-7);
@@ -152,7 +152,7 @@ proptest! {
             let mut bytes = text(name).into_bytes();
             let at = (bytes.len() as f64 * at) as usize;
             bytes[at] = byte;
-            // Most bytes do not matter; what is read is finite and of these atoms.
+            // Most bytes are irrelevant; whatever is read is finite and of these atoms.
             if let Ok(calculated) = read(&[(name, &bytes)], Exit::Code(0)) {
                 prop_assert_eq!(calculated.forces.len(), 3);
                 prop_assert!(calculated.forces.iter().flatten().all(|x| x.is_finite()));

@@ -1,4 +1,5 @@
-//! VASP's files, written and read: small ones of our own (`tests/data/vasp`). Real ones: `src/vasp/real.rs`.
+//! VASP's files, written and read: small ones of our own (`tests/data/vasp`). Real ones:
+//! `src/vasp/real_output_tests.rs`.
 
 mod end_to_end;
 mod faults;
@@ -9,7 +10,7 @@ use std::sync::LazyLock;
 
 use atoms::{Cell, Structure};
 use dft::vasp::{Settings, Vasp};
-use dft::{Calculated, Code, Exit, Failure};
+use dft::{DftBackend, Exit, Failure, Results};
 use tempfile::TempDir;
 
 fn data(name: &str) -> PathBuf {
@@ -20,7 +21,7 @@ fn text(name: &str) -> String {
     std::fs::read_to_string(data(name)).unwrap()
 }
 
-/// What `tests/data/vasp` is of: in its files both atoms of Al stand before that of O.
+/// The structure of `tests/data/vasp`, whose files list both atoms of Al before that of O.
 fn alumina() -> Structure {
     let cell = Cell([[4.1, 0.0, 0.0], [0.4, 4.3, 0.0], [0.0, 0.3, 4.6]]);
     let fractional = [[0.05, 0.1, 0.2], [0.5, 0.55, 0.6], [0.45, 0.15, 0.75]];
@@ -32,10 +33,10 @@ fn alumina() -> Structure {
     }
 }
 
-/// The numbers of `tests/data/vasp`, as it was written.
-fn expected() -> Calculated {
+/// The results in `tests/data/vasp`.
+fn expected() -> Results {
     let kilobar = [[-120.5, 3.25, -7.125], [3.25, 80.0, 12.5], [-7.125, 12.5, -12345.678]];
-    Calculated {
+    Results {
         energy: -24.30612345,
         energy_without_smearing: Some(-24.20612345),
         forces: vec![[0.12345678, -0.2, 0.03], [0.37654322, -0.05, -1.78], [-0.5, 0.25, 1.75]],
@@ -47,8 +48,8 @@ fn expected() -> Calculated {
 }
 
 #[track_caller]
-fn assert_close(found: &Calculated, expected: &Calculated, tolerance: f64) {
-    let numbers = |calculated: &Calculated| {
+fn assert_close(found: &Results, expected: &Results, tolerance: f64) {
+    let numbers = |calculated: &Results| {
         let mut numbers = calculated.forces.concat();
         numbers.extend(calculated.stress.iter().flatten().flatten());
         numbers.extend(calculated.magnetic_moments.iter().flatten());
@@ -72,7 +73,7 @@ fn potcar(title: &str, element: &str, valence: f64) -> String {
     )
 }
 
-/// Settings for these elements, whose POTCAR files stand in `directory`.
+/// Settings for these elements, with POTCAR files in `directory`.
 fn settings(directory: &Path, version: &str, elements: &[&str]) -> Settings {
     for element in elements {
         let potcar = potcar(&format!("PAW_PBE {element} 01Jan2000"), element, 3.0);
@@ -88,8 +89,8 @@ fn settings(directory: &Path, version: &str, elements: &[&str]) -> Settings {
     }
 }
 
-/// Judges these files as the calculation of [`alumina`].
-fn read(files: &[(&str, &[u8])], exit: Exit) -> Result<Calculated, Failure> {
+/// Reads these files as the calculation of [`alumina`].
+fn read(files: &[(&str, &[u8])], exit: Exit) -> Result<Results, Failure> {
     let directory = TempDir::new().unwrap();
     for (name, content) in files {
         std::fs::write(directory.path().join(name), content).unwrap();

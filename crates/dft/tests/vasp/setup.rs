@@ -1,10 +1,10 @@
-//! What is wrong is found before anything is run.
+//! Errors in the setup are found before anything runs.
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
 use dft::vasp::Settings;
-use dft::{Code, SetupError};
+use dft::{DftBackend, SetupError};
 use tempfile::TempDir;
 
 use super::{alumina, potcar, settings};
@@ -46,14 +46,14 @@ fn the_identity_holds_what_changes_a_label() {
 fn calculations_read_the_potentials_that_were_hashed() {
     let home = TempDir::new().unwrap();
     let settings = settings(home.path(), "5.4.4", &["Al", "O"]);
-    let potcar_of = |code: &dyn Code| {
+    let potcar_of = |code: &dyn DftBackend| {
         let files = code.input(&alumina(), &BTreeSet::new()).unwrap().files;
         String::from_utf8(files["POTCAR"].clone()).unwrap()
     };
     let code = settings.prepare().unwrap();
     let expected = ["Al", "O"].map(|element| potcar(&format!("PAW_PBE {element} 01Jan2000"), element, 3.0));
     assert_eq!(potcar_of(&code), expected.concat());
-    // Who has begun goes on with what there was; who begins now is of another protocol.
+    // A running campaign keeps the files it started with; a new one has another protocol.
     std::fs::write(home.path().join("O/POTCAR"), potcar("PAW_PBE O 02Jan2000", "O", 6.0)).unwrap();
     assert_eq!(potcar_of(&code), expected.concat());
     let new = settings.prepare().unwrap();

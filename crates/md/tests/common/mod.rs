@@ -1,4 +1,4 @@
-//! Two potentials simple enough to know everything about them, and statistics of time series.
+//! Two analytically tractable potentials, and statistics of time series.
 use atoms::{Cell, Evaluation, NeighbourList, Potential, PotentialError, Species, Structure, Vec3};
 use md::{Dynamics, Settings, State, Stream, Thermostat};
 
@@ -62,7 +62,7 @@ impl Potential for LennardJones {
     }
 }
 
-/// Each atom on a spring to its own site.
+/// Each atom on a spring attached to its own site.
 pub struct Springs {
     species: [Species; 1],
     pub sites: Vec<Vec3>,
@@ -123,7 +123,7 @@ pub fn settings(time_step: f64, thermostat: Thermostat) -> Settings {
     Settings { time_step, thermostat, ramp: None, stream: Stream::new(2024, 1, 0), skin: 0.6 }
 }
 
-/// Argon at `temperature` after `steps` steps that take it out of the perfect crystal.
+/// Argon at `temperature` after `steps` steps away from the perfect crystal.
 pub fn warm_argon(n: usize, temperature: f64, settings: Settings, steps: usize) -> (Dynamics, LennardJones) {
     let state = State::thermal(argon_crystal(n), temperature, &settings.stream);
     let mut potential = LennardJones::argon();
@@ -132,8 +132,8 @@ pub fn warm_argon(n: usize, temperature: f64, settings: Settings, steps: usize) 
     (dynamics, potential)
 }
 
-/// Mean and variance of a correlated series, each with its standard error from the scatter of blocks
-/// (Flyvbjerg & Petersen, J. Chem. Phys. 91, 461 (1989)): blocks must be much longer than the correlation time.
+/// Mean and variance of a correlated series with standard errors from block averages (Flyvbjerg & Petersen, J.
+/// Chem. Phys. 91, 461 (1989)). Blocks must be much longer than the correlation time.
 pub fn mean_and_variance(series: &[f64], blocks: usize) -> ([f64; 2], [f64; 2]) {
     let (mean, mean_error) = block_average(series, blocks);
     let squares: Vec<f64> = series.iter().map(|x| (x - mean).powi(2)).collect();

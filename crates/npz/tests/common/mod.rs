@@ -1,11 +1,11 @@
-//! Archives to read.
+//! Archives for tests.
 
 use std::io::{Cursor, Write};
 
 use npyz::WriterBuilder;
 use npyz::npz::{NpzWriter, file_name_from_array_name};
 
-/// The bytes of an archive of these array files.
+/// The bytes of an archive with these arrays.
 pub fn archive(entries: &[(&str, Vec<u8>)]) -> Vec<u8> {
     let mut out = NpzWriter::new(Cursor::new(Vec::new()));
     for (name, bytes) in entries {
@@ -15,7 +15,7 @@ pub fn archive(entries: &[(&str, Vec<u8>)]) -> Vec<u8> {
     out.zip_writer().finish().unwrap().into_inner()
 }
 
-/// The bytes of an array file of a type that follows from the values.
+/// The bytes of an array file, with the type of the values.
 #[allow(dead_code)] // each test binary uses a part of this module
 pub fn array<T: npyz::AutoSerialize + Copy>(shape: &[u64], data: &[T]) -> Vec<u8> {
     let mut bytes = Vec::new();
@@ -26,7 +26,7 @@ pub fn array<T: npyz::AutoSerialize + Copy>(shape: &[u64], data: &[T]) -> Vec<u8
     bytes
 }
 
-/// The bytes of an array file with a header of format version 1 of one's own.
+/// The bytes of an array file with a custom header of format version 1.
 pub fn file(header: &[u8], data: &[u8]) -> Vec<u8> {
     [b"\x93NUMPY\x01\x00", &(header.len() as u16).to_le_bytes()[..], header, data].concat()
 }

@@ -1,4 +1,4 @@
-//! Models and crystals that are measured.
+//! Models and crystals of the benchmark.
 
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
@@ -6,18 +6,18 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use atoms::{Cell, Evaluation, NeighbourList, Potential, Structure};
-use calm::{Artifact, GradesInParts, Mixture};
+use calm::{Artifact, BatchedGrades, Mixture};
 use potentials::grace::{Grace, GraceModel, Instructions, Precision, PullBack, RadialPath, Threads};
 
-/// A model, and how gracemaker gets one like it.
+/// A model, and how gracemaker obtains an equivalent one.
 pub struct Model {
     pub name: &'static str,
-    /// Where it is below the repository; below `CALMWALK_PEER_DATA` otherwise.
+    /// Its path in the repository; otherwise under `CALMWALK_PEER_DATA`.
     committed: Option<&'static str>,
     peer_data: &'static str,
     /// Edge of a cubic cell of four atoms, Å.
     edge: f64,
-    /// Preset and its arguments as JSON; without one there is a checkpoint beside the model's peer data.
+    /// Preset and its arguments as JSON; without a preset there is a checkpoint beside the model's peer data.
     pub preset: Option<(&'static str, &'static str)>,
 }
 
@@ -52,7 +52,7 @@ pub const MODELS: [Model; 3] = [
 ];
 
 impl Model {
-    /// Where it is, if anywhere.
+    /// The folder of the model, if available.
     pub fn folder(&self) -> Option<PathBuf> {
         match self.committed {
             Some(path) => Some(Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path)),
@@ -60,17 +60,17 @@ impl Model {
         }
     }
 
-    /// Where gracemaker finds its checkpoint and its mixture.
+    /// The folder of gracemaker's checkpoint and mixture.
     pub fn peer_folder(&self) -> Option<PathBuf> {
         std::env::var_os("CALMWALK_PEER_DATA").map(|data| Path::new(&data).join(self.peer_data))
     }
 }
 
-/// What is asked of the model.
+/// The quantities to compute.
 #[derive(Clone, Copy)]
 pub enum Call {
     Plain,
-    /// With γ, without its gradient.
+    /// With γ but without its gradient.
     Gamma,
     Graded,
 }
@@ -82,7 +82,7 @@ pub struct Case {
     neighbours: NeighbourList,
     elements: Vec<usize>,
     mixture: Mixture,
-    grades: GradesInParts,
+    grades: BatchedGrades,
     pull_back: PullBack,
     out: Evaluation,
 }
@@ -108,13 +108,13 @@ impl Case {
             neighbours,
             elements,
             mixture,
-            grades: GradesInParts::default(),
+            grades: BatchedGrades::default(),
             pull_back: PullBack::default(),
             out: Evaluation::default(),
         }
     }
 
-    /// Makes a call; its seconds.
+    /// Runs a call and returns its time in seconds.
     pub fn seconds(&mut self, call: Call) -> f64 {
         let start = Instant::now();
         match call {
@@ -129,7 +129,7 @@ impl Case {
         start.elapsed().as_secs_f64()
     }
 
-    /// Energy and forces, γ and, if asked for, ∇Σγ with its virial.
+    /// Energy and forces with γ and, on request, ∇Σγ with its virial.
     fn graded(&mut self, with_gradient: bool) {
         let Self { structure, grace, neighbours, elements, mixture, grades, pull_back, out } = self;
         grades.begin(elements.len());
@@ -141,23 +141,23 @@ impl Case {
         grades.finish().expect("finite features");
     }
 
-    /// Multiply-adds of the projection and of the quadratic form, for all atoms.
+    /// Multiply-adds of the projection and the quadratic form for all atoms.
     pub fn of_gamma(&self) -> u64 {
         let projection = self.grace.model().projection().map_or(0, |projection| projection.matrix.len());
         (self.structure.len() * (projection + self.mixture.dimension().pow(2))) as u64
     }
 
-    /// Å
+    /// Cutoff, Å.
     pub fn cutoff(&self) -> f64 {
         self.grace.cutoff()
     }
 
-    /// Symbols of the model's elements, in order.
+    /// Symbols of the model's elements in order.
     pub fn symbols(&self) -> Vec<&'static str> {
         self.grace.species().iter().map(|species| species.symbol()).collect()
     }
 
-    /// Of one call, for all atoms, plain or graded.
+    /// Multiply-adds of one call for all atoms, plain or graded.
     pub fn multiply_adds(&self, call: Call) -> u64 {
         self.grace.multiply_adds(matches!(call, Call::Graded))
     }
@@ -168,7 +168,7 @@ impl Case {
         let within = |i: usize| {
             let d = |n: &atoms::Neighbour| n.displacement(&self.structure, i);
             self.neighbours
-                .of(i)
+                .neighbours_of(i)
                 .iter()
                 .filter(|n| d(n).iter().map(|x| x * x).sum::<f64>() < cutoff * cutoff)
                 .count()
@@ -177,7 +177,7 @@ impl Case {
     }
 }
 
-/// fcc with elements in turn, every atom moved by up to 0.15 Å along each axis.
+/// fcc with alternating elements, every atom displaced by up to 0.15 Å along each axis.
 fn crystal(model: &GraceModel, cells: usize, edge: f64) -> Structure {
     const SITES: [[f64; 3]; 4] = [[0.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]];
     let mut state = 1_u64;

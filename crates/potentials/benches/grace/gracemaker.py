@@ -29,7 +29,7 @@ tf.config.threading.set_inter_op_parallelism_threads(1)
 
 
 def model_files(request, dtype, folder):
-    """Paths of model.yaml and checkpoint. A checkpoint is in double precision: in single its weights are random too."""
+    """Paths of model.yaml and checkpoint. A checkpoint is in double precision; in single precision its weights are random too."""
     if "checkpoint" in request:
         model = request["checkpoint"] + "/model.yaml"
         if dtype == tf.float64:
@@ -58,7 +58,7 @@ def plain_calculator(model, checkpoint, dtype):
 
 
 class Case:
-    """A structure, whose positions differ a little from call to call."""
+    """A structure whose positions differ slightly from call to call."""
 
     def __init__(self, structure, calculators):
         self.atoms = Atoms(structure["symbols"], positions=structure["positions"], cell=structure["cell"], pbc=True)
@@ -67,7 +67,7 @@ class Case:
         self.compiled = set()
 
     def seconds(self, name):
-        """Of one call, after those that compile; a short one is made twice, so that its data are in the caches."""
+        """Time of one call after compilation. Short calls run twice, so that their data are in the caches."""
         if name not in self.compiled:
             self.compiled.add(name)
             for _ in range(4):

@@ -1,9 +1,9 @@
-//! GRACE measured: energy and forces, and with them γ and ∇Σγ, on one thread, in double and in mixed precision; against
-//! gracemaker's own calculator in double and in single where `CALMWALK_GRACEMAKER_PYTHON` names a Python that has it: in turn, on
-//! one core, to which `taskset` (util-linux) ties both.
+//! Benchmarks GRACE on one thread in double and mixed precision: energy and forces, with and without γ and ∇Σγ.
+//! If `CALMWALK_GRACEMAKER_PYTHON` names a Python with gracemaker, compares with gracemaker's calculator in
+//! double and single precision, alternating on one core to which `taskset` (util-linux) pins both.
 //!
-//! `cargo bench -p potentials --bench grace [-- MODEL…]`; the larger models are those of `CALMWALK_PEER_DATA`. With `scale` before
-//! the models it is time and memory of crystals from 108 to 19 652 atoms.
+//! `cargo bench -p potentials --bench grace [-- MODEL…]`; the larger models are in `CALMWALK_PEER_DATA`. With
+//! `scale` before the models, measures time and memory of crystals from 108 to 19 652 atoms.
 
 mod case;
 mod peak;
@@ -18,13 +18,13 @@ use peak::{Peak, Rates};
 use peer::Peer;
 use potentials::grace::Precision;
 
-/// Atoms along an edge of the crystals, four in a cell: 108 and 500 atoms.
+/// Unit cells along an edge of the crystals, four atoms each: 108 and 500 atoms.
 const EDGES: [usize; 2] = [3, 5];
 
-/// Seconds that each crystal is measured for.
+/// Duration of each measurement, s.
 const SECONDS: f64 = 4.0;
 
-/// Rounds of ours and gracemaker's.
+/// Number of alternations between our code and gracemaker.
 const ROUNDS: usize = 9;
 
 fn main() {
@@ -97,18 +97,18 @@ fn report_cases(mut cases: Vec<Case>, mut peer: Option<Peer>, rates: Rates) {
     }
 }
 
-/// Seconds of calls that were made in turn.
+/// Times of the calls in each round, s.
 #[derive(Default)]
 struct Found {
     plain: Vec<f64>,
     gamma: Vec<f64>,
     graded: Vec<f64>,
-    /// Those of gracemaker, one a round, and how many times the median of ours in the round they are.
+    /// Times of gracemaker, one per round, with their ratio to our median in the same round.
     peer_plain: Vec<(f64, f64)>,
     peer_graded: Vec<(f64, f64)>,
 }
 
-/// In every round ours for a while, then one plain and one graded call of the peer.
+/// In every round, measures our calls for a while, then one plain and one graded call of the peer.
 fn measure(case: &mut Case, mut peer: impl FnMut(Call) -> Option<f64>) -> Found {
     let mut found = Found::default();
     for _ in 0..2 {

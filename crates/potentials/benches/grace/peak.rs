@@ -1,4 +1,4 @@
-//! What the core can do: multiply-adds a second of matrix products, on one thread.
+//! Peak performance of the core: multiply-adds per second of matrix products on one thread.
 
 use std::time::Instant;
 
@@ -7,18 +7,18 @@ use faer::traits::ComplexField;
 use faer::{Accum, Mat, Par};
 use potentials::grace::Precision;
 
-/// Rows, inner and outer dimension: a large product, and those of a map of channels and of the projection.
+/// Rows, inner and outer dimension of a large product, of a channel map and of the projection.
 const SHAPES: [[usize; 3]; 3] = [[512, 512, 512], [36, 64, 64], [108, 5664, 128]];
 
-/// Multiply-adds a second.
+/// Multiply-adds per second.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Rates {
     pub highest: f64,
-    /// With the shape of the projection.
+    /// For the shape of the projection.
     pub projection: f64,
 }
 
-/// Those of each precision.
+/// The rates of each precision.
 #[derive(Clone, Copy, Default)]
 pub struct Peak {
     double: Rates,
@@ -26,7 +26,7 @@ pub struct Peak {
 }
 
 impl Peak {
-    /// Those of the numbers which a precision has for each channel.
+    /// The rates for the per-channel numbers of this precision.
     pub fn of(self, precision: Precision) -> Rates {
         match precision {
             Precision::Double => self.double,
@@ -51,7 +51,7 @@ pub fn report() -> Peak {
     Peak { double: of(rates.map(|(double, _)| double)), single: of(rates.map(|(_, single)| single)) }
 }
 
-/// The highest rate met in half a second.
+/// The highest rate within half a second.
 fn rate<T: ComplexField + From<i8>>([rows, inner, columns]: [usize; 3]) -> f64 {
     let small = |k: usize, n: usize| T::from((k % n) as i8 - n as i8 / 2);
     let a = Mat::from_fn(rows, inner, |i, j| small(i + 2 * j, 7));

@@ -9,10 +9,10 @@ use tempfile::NamedTempFile;
 
 use crate::case::{Call, Case, Model};
 
-/// The core that both are tied to while they are compared.
+/// The core to which both programs are pinned during the comparison.
 const CORE: &str = "0";
 
-/// gracemaker with a model, waiting for calls.
+/// A gracemaker process with a model that waits for calls.
 pub struct Peer {
     process: Child,
     input: ChildStdin,
@@ -22,7 +22,7 @@ pub struct Peer {
 }
 
 impl Peer {
-    /// In single precision beside our mixed; none without gracemaker or its data.
+    /// Starts gracemaker, in single precision for our mixed precision; `None` without gracemaker or its data.
     pub fn start(model: &Model, precision: Precision, cases: &[Case]) -> Option<Self> {
         let python = std::env::var_os("CALMWALK_GRACEMAKER_PYTHON")?;
         let folder = model.peer_folder()?;
@@ -32,7 +32,7 @@ impl Peer {
         let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/grace/gracemaker.py");
         let mut command = Command::new(python);
         command.arg(script).arg(file.path()).stdin(Stdio::piped()).stdout(Stdio::piped());
-        // A process is tied as the thread that starts it.
+        // A process inherits the pinning of the thread that starts it.
         tie(CORE);
         let mut process = command.spawn().expect("python starts");
         let input = process.stdin.take().expect("its input");
@@ -40,7 +40,7 @@ impl Peer {
         Some(Self { process, input, lines, grades: request.get("artifact").is_some(), _request: file })
     }
 
-    /// Of one call with a crystal; none where it has no mixture for the model.
+    /// Time of one call for a crystal, s; `None` if there is no mixture for the model.
     pub fn seconds(&mut self, case: usize, call: Call) -> Option<f64> {
         let name = match call {
             Call::Plain => "plain",
@@ -56,14 +56,14 @@ impl Peer {
 
 impl Drop for Peer {
     fn drop(&mut self) {
-        // It may have ended by itself.
+        // It may have exited already.
         let _ = self.process.kill();
         let _ = self.process.wait();
         tie("0-1023");
     }
 }
 
-/// Ties this thread to some cores.
+/// Pins this thread to these cores.
 fn tie(cores: &str) {
     let mut command = Command::new("taskset");
     command.args(["--cpu-list", "--pid", cores, &std::process::id().to_string()]);

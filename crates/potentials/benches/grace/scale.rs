@@ -1,4 +1,4 @@
-//! Whether time and memory grow in proportion to the number of atoms.
+//! Checks that time and memory grow linearly with the number of atoms.
 
 use potentials::grace::Precision;
 
@@ -8,8 +8,8 @@ use crate::{measure, quantiles};
 /// Cells along an edge of the crystals, four atoms in a cell: 108 to 19 652 atoms.
 const EDGES: [usize; 5] = [3, 5, 8, 12, 17];
 
-/// Time and memory an atom of crystals that grow. Memory is what a case occupies after its calls: the model with its mixture,
-/// the structure, its neighbour list and all work arrays, which are kept from one call to the next.
+/// Time and memory per atom of growing crystals. Memory is the resident size after the calls: the model with
+/// its mixture, the structure, its neighbour list and all scratch arrays, which are reused between calls.
 pub fn report(model: &Model) {
     println!("\n{}, growing crystals", model.name);
     for edge in EDGES {
@@ -32,7 +32,7 @@ pub fn report(model: &Model) {
     }
 }
 
-/// What of this process is in memory, kB; NaN where the system does not say.
+/// Resident memory of this process, kB; NaN if unavailable.
 fn resident_kilobytes() -> f64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));

@@ -1,5 +1,5 @@
-//! Two threads against one on the larger crystal, and against two copies of it side by side: what two cores give at that time,
-//! which on a virtual machine may be little more than one.
+//! Two threads against one on the larger crystal, and against two concurrent copies of it, which show what two
+//! cores yield at that time; on a virtual machine this may be little more than one.
 
 use std::time::Instant;
 
@@ -8,7 +8,7 @@ use potentials::grace::{Precision, Threads};
 use crate::case::{Call, Case, Model};
 use crate::{SECONDS, quantiles};
 
-/// Prints how many times as fast two threads are; all are called in turn.
+/// Prints the speed-up of two threads; all variants alternate.
 pub fn report(model: &Model, cells: usize) {
     let [mut one, mut two, mut copy] = [1, 2, 1].map(|n| {
         Case::with_threads(model, cells, Precision::Double, Threads::new(n).expect("the system has threads"))
@@ -27,7 +27,7 @@ pub fn report(model: &Model, cells: usize) {
     }
 }
 
-/// Seconds for each of two calls at the same time.
+/// Time of each of two concurrent calls, s.
 fn side_by_side(a: &mut Case, b: &mut Case, call: Call) -> f64 {
     let start = Instant::now();
     std::thread::scope(|scope| {

@@ -1,4 +1,4 @@
-//! Potentials and crystals that are measured.
+//! Potentials and crystals of the benchmark.
 
 use std::path::{Path, PathBuf};
 
@@ -6,22 +6,22 @@ use atoms::{Cell, Potential, Species, Structure};
 use md::{State, Stream};
 use potentials::{Eam, StillingerWeber};
 
-/// Å, of both neighbour lists.
+/// Skin of both neighbour lists, Å.
 pub const SKIN: f64 = 1.0;
 
-/// K, of the velocities at the start, half of which goes into the positions.
+/// Initial temperature, K; half of the kinetic energy goes into the positions.
 const TEMPERATURE: f64 = 600.0;
 
 const FCC: [[f64; 3]; 4] = [[0.0; 3], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]];
 
-/// What is simulated.
+/// A system to simulate.
 pub struct Case {
     pub name: &'static str,
-    /// Pair styles of LAMMPS for it.
+    /// The corresponding pair styles of LAMMPS.
     pub styles: [&'static str; 2],
     pub file: PathBuf,
     pub start: State,
-    /// fs
+    /// Time step, fs.
     pub time_step: f64,
 }
 
@@ -67,7 +67,7 @@ fn data(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/data").join(name)
 }
 
-/// `cells` cubes of edge `a`, Å, with thermal velocities.
+/// `cells` cubic cells of edge `a`, Å, with thermal velocities.
 fn crystal(symbol: &str, sites: &[[f64; 3]], a: f64, cells: [usize; 3]) -> State {
     let mut positions = Vec::new();
     for x in 0..cells[0] {

@@ -1,4 +1,4 @@
-"""Runs LAMMPS at constant energy when it is told to: python lammps_peer.py
+"""Runs LAMMPS at constant energy on request: python lammps_peer.py
 
 The first line of the standard input is the run as JSON (angstrom, fs, u); the answer is the potential energy, eV. Each further
 line is a number of steps; the answer is how many seconds they took.

@@ -1,7 +1,8 @@
-//! Molecular dynamics with EAM and Stillinger–Weber measured, on one thread, in turn with LAMMPS: the same crystal, velocities,
-//! time step and skin of the neighbour list, at constant energy.
+//! Benchmarks molecular dynamics with EAM and Stillinger–Weber on one thread, alternating with LAMMPS: same
+//! crystal, velocities, time step and skin, at constant energy.
 //!
-//! `CALMWALK_LAMMPS_PYTHON=…/bin/python cargo bench -p potentials --bench lammps`; without LAMMPS only our steps are measured.
+//! `CALMWALK_LAMMPS_PYTHON=…/bin/python cargo bench -p potentials --bench lammps`; without LAMMPS only our
+//! steps are measured.
 
 mod case;
 mod peer;
@@ -13,10 +14,10 @@ use case::Case;
 use md::{Dynamics, Settings, Stream, Thermostat};
 use peer::Lammps;
 
-/// Times that each program is measured for a crystal.
+/// Number of measurements per program and crystal.
 const ROUNDS: usize = 15;
 
-/// Seconds that ours takes in a round.
+/// Duration of our part of a round, s.
 const SECONDS: f64 = 0.25;
 
 fn main() {
@@ -48,14 +49,14 @@ fn main() {
     }
 }
 
-/// Steps a second in each round: ours, and those of each peer. Whoever begins a round ends the next one.
+/// Steps per second in each round, for us and for each peer. The order reverses from round to round.
 fn in_turn(ours: &mut Ours, theirs: &mut [Lammps], steps: u64) -> Vec<Vec<f64>> {
     let mut rates = vec![Vec::new(); 1 + theirs.len()];
     for round in 0..=ROUNDS {
         for turn in 0..rates.len() {
             let whose = if round % 2 == 0 { turn } else { rates.len() - 1 - turn };
             let seconds = if whose == 0 { ours.run(steps) } else { theirs[whose - 1].run(steps) };
-            // The first round warms up.
+            // The first round is a warm-up.
             if round > 0 {
                 rates[whose].push(steps as f64 / seconds);
             }
@@ -75,12 +76,12 @@ fn quartiles(values: &[f64]) -> [f64; 3] {
     [1, 2, 3].map(|quarter| sorted[(sorted.len() - 1) * quarter / 4])
 }
 
-/// Our own run.
+/// Our simulation.
 struct Ours {
     potential: Box<dyn Potential>,
     dynamics: Dynamics,
     start_energy: f64,
-    /// Of potential and motion, at the start.
+    /// Initial conserved energy, eV.
     conserved: f64,
 }
 
@@ -100,7 +101,7 @@ impl Ours {
         Self { potential, dynamics, start_energy, conserved }
     }
 
-    /// Seconds that these steps take.
+    /// Time of these steps, s.
     fn run(&mut self, steps: u64) -> f64 {
         let start = Instant::now();
         for _ in 0..steps {
@@ -109,7 +110,7 @@ impl Ours {
         start.elapsed().as_secs_f64()
     }
 
-    /// How many steps it makes in so many seconds, about.
+    /// Approximate number of steps in this time.
     fn steps_in(&mut self, seconds: f64) -> u64 {
         let mut steps = 10;
         loop {
@@ -121,7 +122,7 @@ impl Ours {
         }
     }
 
-    /// By how much the conserved energy has changed, eV.
+    /// Change of the conserved energy, eV.
     fn drift(&self) -> f64 {
         self.dynamics.conserved_energy().expect("no thermostat") - self.conserved
     }

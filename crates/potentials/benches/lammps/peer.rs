@@ -1,4 +1,4 @@
-//! LAMMPS in a process of its own, which runs when it is told to.
+//! LAMMPS in a separate process that runs on request.
 
 use std::ffi::OsString;
 use std::io::{BufRead, BufReader, Write};
@@ -17,7 +17,7 @@ pub struct Lammps {
 }
 
 impl Lammps {
-    /// A run of the case with a pair style, before its first step.
+    /// Starts LAMMPS for a case and a pair style, before its first step.
     pub fn start(python: &OsString, case: &Case, style: &str) -> Self {
         let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/lammps/lammps_peer.py");
         let mut process = Command::new(python)
@@ -47,7 +47,7 @@ impl Lammps {
         peer
     }
 
-    /// Seconds that these steps take.
+    /// Time of these steps, s.
     pub fn run(&mut self, steps: u64) -> f64 {
         writeln!(self.orders, "{steps}").expect("LAMMPS listens");
         self.answer()

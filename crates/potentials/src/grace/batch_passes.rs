@@ -1,4 +1,4 @@
-//! What is done with a batch, or with some places, compiled for the processor's vector instructions.
+//! Passes over a batch or a range of atoms, compiled for the processor's vector instructions.
 
 use std::ops::Range;
 
@@ -6,22 +6,22 @@ use atoms::Vec3;
 
 use super::batches::Placed;
 use super::bonds::BondWork;
+use super::chunked_slices::ChunkedSlice;
 use super::instructions::{Instructions, Pass};
-use super::layer_work::{
-    BackwardWork, Cotangents, Here, Traced, TracedBonds, backward_bonds, backward_tape, forward,
+use super::layer_passes::{
+    BackwardWork, Cotangents, LayerInput, Traced, TracedBonds, backward_bonds, backward_tape, forward,
 };
-use super::messages::Returns;
-use super::parts::Parts;
+use super::messages::ReturnedCotangents;
 use super::projection::{FeatureMap, Projected};
 use super::readout::{Readout, ReadoutWork};
 use super::vector::Vector;
 
-/// A batch forwards through one layer.
+/// The forward pass of a batch through one layer.
 pub(super) struct Forward<'a, 'b, V: Vector> {
-    pub here: Here<'a, V>,
+    pub here: LayerInput<'a, V>,
     pub placed: Placed,
     pub trace: &'a mut Traced<'b, V>,
-    /// Where the tape goes to, and work arrays.
+    /// The tape to write, and scratch arrays.
     pub work: (&'a mut Vec<V>, &'a mut BondWork<V>),
 }
 
@@ -32,7 +32,7 @@ impl<V: Vector> Pass for Forward<'_, '_, V> {
     }
 }
 
-/// A batch from its bases to energies, and to ∂E/∂(W B).
+/// Energies of a batch and ∂E/∂(W B) from its bases.
 pub(super) struct Energies<'a, V, B> {
     pub readout: &'a Readout<V>,
     pub placed: Placed,
@@ -56,15 +56,15 @@ impl<'b, V: Vector, B: Fn(usize) -> &'b [V]> Pass for Energies<'_, V, B> {
     }
 }
 
-/// A batch backwards through one layer, with `N` cotangents.
+/// The reverse pass of a batch through one layer, with `N` cotangents.
 pub(super) struct Backward<'a, 'b, 'c, V: Vector, const N: usize> {
-    pub here: Here<'a, V>,
+    pub here: LayerInput<'a, V>,
     pub placed: Placed,
     pub tape: &'a [V],
     pub bonds: &'a mut TracedBonds<'b, V>,
     pub from: Cotangents<'a, V>,
-    pub to: &'a mut [Parts<'c, Vec3>; 2],
-    pub returns: Option<&'a mut Returns<V>>,
+    pub to: &'a mut [ChunkedSlice<'c, Vec3>; 2],
+    pub returns: Option<&'a mut ReturnedCotangents<V>>,
     pub work: (&'a mut BackwardWork<V>, &'a mut BondWork<V>),
 }
 
@@ -78,7 +78,7 @@ impl<V: Vector, const N: usize> Pass for Backward<'_, '_, '_, V, N> {
     }
 }
 
-/// From the bases of some atoms to their features.
+/// Features of a range of atoms from their bases.
 pub(super) struct Project<'a, 'b, V, B> {
     pub map: &'a FeatureMap<V>,
     pub places: &'a Range<usize>,
@@ -94,7 +94,7 @@ impl<'c, V: Vector, B: Fn(usize) -> &'c [V]> Pass for Project<'_, '_, V, B> {
     }
 }
 
-/// From the cotangents of features to those of their projections.
+/// Cotangents of the projections from those of the features.
 pub(super) struct BeginProjectBack<'a, 'b, V> {
     pub map: &'a FeatureMap<V>,
     pub places: &'a Range<usize>,
@@ -109,7 +109,7 @@ impl<V: Vector> Pass for BeginProjectBack<'_, '_, V> {
     }
 }
 
-/// From there to those of the bases of one layer, in place of these.
+/// Cotangents of one layer's bases from those of the projections; overwrites the bases.
 pub(super) struct ProjectBack<'a, 'b, V> {
     pub map: &'a FeatureMap<V>,
     pub layer: usize,

@@ -1,49 +1,49 @@
-//! Which atoms are evaluated together.
+//! Groups atoms that are evaluated together.
 
 use std::ops::Range;
 
 use super::instructions::Instructions;
 use super::tape::Batch;
 
-/// Most atoms of a batch.
-const MOST: usize = 16;
+/// Maximum number of atoms in a batch.
+const MAX_BATCH_ATOMS: usize = 16;
 
-/// What the tape of a batch and that of one cotangent may take in memory, bytes: about the second cache.
+/// Memory for the tape of a batch and that of one cotangent, bytes: about the L2 cache.
 const TAPE_BYTES: usize = 1 << 20;
 
-/// Places that a thread takes at once, about: enough for the projection to be read seldom, few enough for their tapes to stay in
-/// the third cache.
-const CHUNK: usize = 64;
+/// Approximate number of atoms that a thread processes at once: enough to read the projection rarely, few
+/// enough for their tapes to stay in the L3 cache.
+const CHUNK_ATOMS: usize = 64;
 
-/// Chunks of a small structure, so that two threads have something to do.
-const FEWEST_CHUNKS: usize = 2;
+/// Minimum number of chunks, so that two threads share even a small structure.
+const MIN_CHUNKS: usize = 2;
 
-/// Batches behind one another that one thread evaluates.
+/// Consecutive batches that one thread evaluates.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Chunk {
-    /// How many there are before it.
+    /// Index of the chunk.
     pub number: usize,
     pub batches: Range<usize>,
     pub places: Range<usize>,
 }
 
-/// The atoms of a structure in the order in which they are evaluated: those of an element behind one another, divided into
-/// batches, and these into chunks. All of it follows from the elements alone.
+/// The evaluation order of a structure's atoms: grouped by element, divided into batches, and these into
+/// chunks. It depends on the elements only. The *place* of an atom is its index in this order.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Batches {
     /// The atom at each place.
     pub order: Vec<u32>,
     /// The place of each atom.
     pub places: Vec<u32>,
-    /// Places, and the element of all atoms there.
+    /// The places of each batch, and the element of its atoms.
     pub batches: Vec<(Range<usize>, usize)>,
     pub chunks: Vec<Chunk>,
 }
 
 impl Batches {
-    /// For atoms of the elements given, each of which takes so many bytes of tape.
+    /// Orders atoms of these elements, each of which needs `tape_bytes` of tape.
     pub fn update(&mut self, elements: &[usize], tape_bytes: usize) {
-        let size = (TAPE_BYTES / tape_bytes.max(1)).clamp(1, MOST);
+        let size = (TAPE_BYTES / tape_bytes.max(1)).clamp(1, MAX_BATCH_ATOMS);
         self.order.clear();
         self.order.extend(0..elements.len() as u32);
         self.order.sort_unstable_by_key(|atom| (elements[*atom as usize], *atom));
@@ -65,7 +65,7 @@ impl Batches {
     fn divide(&mut self) {
         self.chunks.clear();
         let n = self.order.len();
-        let chunks = n.div_ceil(CHUNK).max(FEWEST_CHUNKS);
+        let chunks = n.div_ceil(CHUNK_ATOMS).max(MIN_CHUNKS);
         let (mut first, mut start) = (0, 0);
         for (k, (places, _)) in self.batches.iter().enumerate() {
             if places.end * chunks >= n * (self.chunks.len() + 1) {
@@ -84,7 +84,7 @@ impl Batches {
     }
 }
 
-/// A batch, and where it stands.
+/// A batch with its places.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Placed {
     pub batch: Batch,
@@ -115,7 +115,10 @@ mod tests {
             let mut end = 0;
             for (places, element) in &batches.batches {
                 assert_eq!(places.start, end);
-                assert!(places.len() * tape_bytes <= TAPE_BYTES.max(tape_bytes) && places.len() <= MOST);
+                assert!(
+                    places.len() * tape_bytes <= TAPE_BYTES.max(tape_bytes)
+                        && places.len() <= MAX_BATCH_ATOMS
+                );
                 assert!(
                     batches.order[places.clone()].iter().all(|atom| elements[*atom as usize] == *element)
                 );

@@ -6,12 +6,12 @@
 use atoms::{Matrix3, NeighbourList, Structure, Vec3};
 
 use super::batches::Batches;
+use super::chunked_slices::{ChunkedSlice, Layout, PerChunk};
 use super::layer::Layer;
-use super::parts::{Layout, OfChunks, Parts};
 use super::radial_network::RadialWork;
 use super::tape::Slot;
 use super::threads::Threads;
-use super::vector::{MOST_LANES, Number, Vector};
+use super::vector::{MAX_LANES, Number, Vector};
 
 /// Keeps r differentiable at d = 0, Å².
 const SQUARE_FLOOR: f64 = 1e-10;
@@ -23,29 +23,28 @@ pub(super) struct Bond {
     pub neighbour: u32,
     /// Its element index.
     pub element: u32,
-    /// d, Å
+    /// d, Å.
     pub d: Vec3,
-    /// r, Å
+    /// r, Å.
     pub r: f64,
 }
 
-/// The bonds of all atoms, those of an atom in the order of the neighbour list. Atoms stand in the order in which they are
-/// evaluated.
+/// The bonds of all atoms, atoms in evaluation order, the bonds of each in the order of the neighbour list.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Bonds {
     pub offsets: Vec<usize>,
     pub bonds: Vec<Bond>,
-    /// First block of bonds of each atom, as many as a vector has lanes.
+    /// First block of each atom; a block has as many bonds as a vector has lanes.
     pub block_offsets: Vec<usize>,
     incoming_offsets: Vec<usize>,
-    /// The bonds of which an atom is the neighbour, in ascending order.
+    /// The bonds that end at each atom, ascending.
     incoming: Vec<u32>,
-    /// The bonds of each chunk, before they stand behind one another.
+    /// The bonds of each chunk, before concatenation.
     found: Vec<Vec<Bond>>,
 }
 
 impl Bonds {
-    /// Collects the bonds that are shorter than the cutoff of their pair; to be called within [`Threads::run`].
+    /// Collects the bonds within the cutoff of their pair. Call it within [`Threads::run`].
     pub fn update<V: Vector>(
         &mut self,
         layer: &Layer<V>,
@@ -59,16 +58,16 @@ impl Bonds {
         offsets.clear();
         offsets.resize(n + 1, 0);
         found.resize_with(batches.chunks.len().max(found.len()), Vec::new);
-        let counts = Parts::new(Layout::Even(1), 0, &mut offsets[1..]);
-        let work = (counts, OfChunks::within(&batches.chunks, found));
-        threads.each(&batches.chunks, work, &|chunk, (mut counts, mut found), _| {
+        let counts = ChunkedSlice::new(Layout::Even(1), 0, &mut offsets[1..]);
+        let work = (counts, PerChunk::within(&batches.chunks, found));
+        threads.for_each_chunk(&batches.chunks, work, &|chunk, (mut counts, mut found), _| {
             let Some(found) = found.only() else { return };
             found.clear();
             for place in chunk.places.clone() {
                 let before = found.len();
                 let atom = batches.order[place] as usize;
                 found.extend(bonds_of(atom, layer, structure, neighbours, elements, batches));
-                counts.of(&(place..place + 1))[0] = found.len() - before;
+                counts.slice(&(place..place + 1))[0] = found.len() - before;
             }
         });
         block_offsets.clear();
@@ -78,16 +77,16 @@ impl Bonds {
             offsets[place + 1] += offsets[place];
         }
         bonds.resize(offsets[n], Bond { neighbour: 0, element: 0, d: [0.0; 3], r: 0.0 });
-        let all = Parts::new(Layout::Ragged(offsets, 1), 0, &mut bonds[..]);
-        threads.each(&batches.chunks, all, &|chunk, mut all, _| {
-            all.of(&chunk.places).copy_from_slice(&found[chunk.number]);
+        let all = ChunkedSlice::new(Layout::Ragged(offsets, 1), 0, &mut bonds[..]);
+        threads.for_each_chunk(&batches.chunks, all, &|chunk, mut all, _| {
+            all.slice(&chunk.places).copy_from_slice(&found[chunk.number]);
         });
         self.find_incoming();
     }
 
     fn find_incoming(&mut self) {
         let n = self.offsets.len() - 1;
-        // The bonds of a place are counted two behind it, so that the sums of these are where the next one of it goes.
+        // Counts are stored two places ahead, so that their prefix sums serve as insertion points.
         self.incoming_offsets.clear();
         self.incoming_offsets.resize(n + 2, 0);
         for bond in &self.bonds {
@@ -106,11 +105,12 @@ impl Bonds {
 
     /// The bonds of the atom at a place.
     #[inline(always)]
-    pub fn of(&self, place: usize) -> &[Bond] {
+    pub fn at(&self, place: usize) -> &[Bond] {
         &self.bonds[self.offsets[place]..self.offsets[place + 1]]
     }
 
-    /// With g = ∂H/∂d of each bond: adds −∂H/∂r of the atom at a place to `force`, and gives Σ g ⊗ d over its own bonds.
+    /// With g = ∂H/∂d of each bond: adds −∂H/∂r of the atom at a place to `force` and returns Σ g ⊗ d over its
+    /// own bonds.
     #[inline(always)]
     pub fn gather(&self, place: usize, gradients: &[Vec3], force: &mut Vec3) -> Matrix3 {
         let own = self.offsets[place]..self.offsets[place + 1];
@@ -121,7 +121,7 @@ impl Bonds {
             subtract(force, &gradients[*k as usize]);
         }
         for (bond, g) in self.bonds[own.clone()].iter().zip(&gradients[own.clone()]) {
-            // The force of an atom on an image of itself is also one of the image on the atom.
+            // The force of an atom on its own image cancels that of the image on the atom.
             if bond.neighbour as usize != place {
                 (0..3).for_each(|a| force[a] += g[a]);
             }
@@ -136,7 +136,7 @@ impl Bonds {
     }
 }
 
-/// The bonds of an atom that are shorter than the cutoff of their pair.
+/// The bonds of an atom within the cutoff of their pair.
 fn bonds_of<V: Vector>(
     atom: usize,
     layer: &Layer<V>,
@@ -145,7 +145,7 @@ fn bonds_of<V: Vector>(
     elements: &[usize],
     batches: &Batches,
 ) -> impl Iterator<Item = Bond> {
-    neighbours.of(atom).iter().filter_map(move |neighbour| {
+    neighbours.neighbours_of(atom).iter().filter_map(move |neighbour| {
         let j = neighbour.atom as usize;
         let d = neighbour.displacement(structure, atom);
         let r = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + SQUARE_FLOOR).sqrt();
@@ -159,7 +159,7 @@ fn subtract(sum: &mut Vec3, x: &Vec3) {
     (0..3).for_each(|a| sum[a] -= x[a]);
 }
 
-/// Work arrays for one block of bonds.
+/// Scratch arrays for one block of bonds.
 #[derive(Clone, Debug, Default)]
 pub(super) struct BondWork<V> {
     /// Y_lm, \[lm\]\[bond\]
@@ -188,7 +188,7 @@ impl<V: Vector> BondWork<V> {
         }
     }
 
-    /// R_nl(r) ζ_n and derivatives of a block, zero where it is not full.
+    /// R_nl(r) ζ_n and derivatives of a block; unused lanes are zero.
     #[inline(always)]
     fn radial(&mut self, layer: &Layer<V>, centre: usize, bonds: &[Bond]) {
         let (lanes, distances) = (layer.radial.output_lanes(), distances(layer, centre, bonds));
@@ -211,8 +211,8 @@ pub(super) fn distances<V: Vector>(
     layer: &Layer<V>,
     centre: usize,
     bonds: &[Bond],
-) -> [(usize, f64); MOST_LANES] {
-    let mut distances = [(0, 0.0); MOST_LANES];
+) -> [(usize, f64); MAX_LANES] {
+    let mut distances = [(0, 0.0); MAX_LANES];
     for (distance, bond) in distances.iter_mut().zip(bonds) {
         *distance = (layer.radial.pair(centre, bond.element as usize), bond.r);
     }
@@ -241,10 +241,10 @@ fn transpose<V: Vector>(rows: &[V], columns: &mut [V]) {
     }
 }
 
-/// v and r of a block; v is zero where it is not full. Both are rounded after the division.
+/// v and r of a block; v is zero in unused lanes. Both are rounded after the division.
 #[inline(always)]
 pub(super) fn directions<V: Vector>(bonds: &[Bond]) -> ([V; 3], V) {
-    let (mut ds, mut rs) = ([[0.0; MOST_LANES]; 3], [1.0; MOST_LANES]);
+    let (mut ds, mut rs) = ([[0.0; MAX_LANES]; 3], [1.0; MAX_LANES]);
     for (b, bond) in bonds.iter().enumerate() {
         rs[b] = bond.r;
         for (axis, d) in ds.iter_mut().zip(bond.d) {
@@ -261,17 +261,17 @@ pub(super) fn directions<V: Vector>(bonds: &[Bond]) -> ([V; 3], V) {
     (v, r)
 }
 
-/// The bonds of one atom, with what the forward pass leaves of them for the reverse sweep.
+/// The bonds of one atom with the data that the forward pass leaves for the reverse pass.
 pub(super) struct OwnBonds<'a, V> {
     pub bonds: &'a [Bond],
     /// R_nl ζ_n, \[block\]\[l\]\[channel\]\[bond\]; in later layers R_nl, \[block\]\[bond\]\[l\]\[channel\].
     pub values: &'a mut [V],
-    /// The same of dR_nl/dr.
+    /// dR_nl/dr in the same layout.
     pub derivatives: &'a mut [V],
 }
 
 impl<'a, V: Vector> OwnBonds<'a, V> {
-    /// As many bonds at a time as a vector has lanes, with their values and derivatives.
+    /// The bonds in blocks of a vector's lanes, with their values and derivatives.
     #[inline(always)]
     pub fn blocks(
         self,
@@ -305,10 +305,10 @@ pub(super) fn accumulate<V: Vector>(
     }
 }
 
-/// ∂/∂d of Σ A·Ā for each bond of an atom and for `N` cotangents Ā of its density at once.
+/// ∂/∂d of Σ A·Ā for each bond of an atom, for `N` cotangents Ā of its density at once.
 ///
-/// With c_lm = Σ_n Ā_lm,n R_nl ζ_n and c′_lm from dR/dr it is g v + (G − (G·v) v)/r, where
-/// g = Σ c′_lm Y_lm and G = Σ c_lm ∂Y_lm/∂v.
+/// With c_lm = Σ_n Ā_lm,n R_nl ζ_n, and c′_lm from dR/dr, it is g v + (G − (G·v) v)/r, where g = Σ c′_lm Y_lm
+/// and G = Σ c_lm ∂Y_lm/∂v.
 #[inline(always)]
 pub(super) fn reverse<V: Vector, const N: usize>(
     layer: &Layer<V>,
@@ -328,7 +328,7 @@ pub(super) fn reverse<V: Vector, const N: usize>(
     }
 }
 
-/// The gradients of a block, bond by bond.
+/// Writes the gradients of a block bond by bond.
 #[inline(always)]
 pub(super) fn put<V: Vector>(of_block: &[V; 3], gradients: &mut [Vec3]) {
     for (b, gradient) in gradients.iter_mut().enumerate() {
@@ -376,7 +376,7 @@ fn slopes<V: Vector, const N: usize>(
     slopes
 }
 
-/// Adds to g and G what `M` harmonics from `lm` say, with c_lm = Σ_n Ā_lm,n R_nl ζ_n and c′_lm.
+/// Adds the contributions of `M` harmonics from `lm` to g and G, with c_lm = Σ_n Ā_lm,n R_nl ζ_n and c′_lm.
 #[inline(always)]
 fn add_slopes<V: Vector, const N: usize, const M: usize>(
     layer: &Layer<V>,

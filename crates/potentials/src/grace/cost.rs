@@ -1,4 +1,4 @@
-//! How much arithmetic a call is.
+//! Counts arithmetic operations.
 
 use super::evaluate::Evaluator;
 use super::layer::Layer;

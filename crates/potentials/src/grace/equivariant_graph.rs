@@ -1,4 +1,4 @@
-//! The steps of a graph that only models of three layers have.
+//! Graph operations that only three-layer models use.
 
 use super::equivariant_norm::EquivariantNorm;
 use super::error::{GraceError, mismatch};
@@ -9,8 +9,8 @@ use super::vector::{Vector, to_lanes};
 use super::weights::Weights;
 
 impl<V: Vector> Graph<'_, V> {
-    /// The product of left and right whose channels have been mixed with weights U and V, which are those of the
-    /// group of each component.
+    /// The product of left and right after mixing their channels with the weights U and V of each component's
+    /// group.
     pub fn mixed_product(&mut self, name: &str, left: Tensor, right: Tensor) -> Result<Tensor, GraceError> {
         let archive = self.archive;
         let key = |suffix: &str| format!("{name}_{suffix}");
@@ -56,7 +56,7 @@ impl<V: Vector> Graph<'_, V> {
         Ok(out)
     }
 
-    /// The norm `name` of a tensor.
+    /// Applies the norm `name` to a tensor.
     pub fn equivariant_norm(&mut self, name: &str, from: Tensor) -> Result<Tensor, GraceError> {
         let (archive, key) = (self.archive, |suffix: &str| format!("{name}_{suffix}"));
         let ([groups, channels], weights) = archive.tensor::<2>(&key("affine_weight"))?;

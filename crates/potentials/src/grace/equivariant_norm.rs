@@ -1,17 +1,17 @@
-//! The normalisation of an equivariant tensor before it is sent to neighbours.
+//! Normalisation of an equivariant tensor before it is sent to neighbours.
 
 use super::tape::{Slot, Tensor};
 use super::vector::{Number, Vector};
 
-/// y_w,n = a_w,n x′_w,n / √(mean_n Σ_w d_w x′² + ε), where x′ is x, or x without its mean over channels in the
-/// components that do not change under rotation.
+/// y_w,n = a_w,n x′_w,n / √(mean_n Σ_w d_w x′² + ε), where x′ is x, minus its mean over channels in the
+/// rotationally invariant components.
 #[derive(Clone, Debug)]
 pub(super) struct EquivariantNorm<V> {
     /// x
     pub from: Tensor,
     /// y, of the same shape
     pub to: Tensor,
-    /// 1 for components whose mean is taken away, 0 for others.
+    /// 1 for components whose mean is subtracted, 0 for others.
     pub centred: Vec<f64>,
     /// d
     pub degree_weights: Vec<f64>,
@@ -22,7 +22,7 @@ pub(super) struct EquivariantNorm<V> {
 }
 
 impl<V: Vector> EquivariantNorm<V> {
-    /// Rows of x with the mean over channels that is taken away.
+    /// Rows of x with the mean over channels to subtract.
     #[inline(always)]
     fn rows<'a>(&'a self, x: &'a [V], slot: Slot) -> impl Iterator<Item = (usize, &'a [V], f64)> {
         self.centred.iter().enumerate().map(move |(w, centred)| {
@@ -76,8 +76,8 @@ impl<V: Vector> EquivariantNorm<V> {
         }
     }
 
-    /// Adds to the cotangents of x: with the inverse root i,
-    /// x̄′ = i a ȳ − i³ d_w x′/n_channels Σ a ȳ x′, from which the mean over channels is taken away as it was from x.
+    /// Adds to the cotangents of x. With the inverse root i, x̄′ = i a ȳ − i³ d_w x′/n_channels Σ a ȳ x′, minus
+    /// its mean over channels where the mean of x was subtracted.
     #[inline(always)]
     pub fn backward<const N: usize>(&self, atoms: usize, tape: &[V], cotangent: &mut [V]) {
         for k in 0..N * atoms {
@@ -116,7 +116,7 @@ impl<V: Vector> EquivariantNorm<V> {
         }
     }
 
-    /// As [`super::tape::Operation::keep`]: the components are needed together.
+    /// As [`super::tape::Operation::keep`]; the components are needed together.
     pub fn keep(&self, needed: &mut [bool]) {
         if self.to.rows().any(|row| needed[row]) {
             self.from.rows().for_each(|row| needed[row] = true);

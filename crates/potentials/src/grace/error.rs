@@ -1,4 +1,4 @@
-//! Why a model file cannot be used.
+//! Errors of GRACE model files.
 
 use std::path::PathBuf;
 
@@ -12,10 +12,10 @@ pub enum GraceError {
     Read {
         /// The model file.
         path: PathBuf,
-        /// What the operating system says.
+        /// The error of the operating system.
         source: std::io::Error,
     },
-    /// Not an npz archive, or a damaged one.
+    /// Not an npz archive, or a corrupt one.
     #[error(
         "{}: {}damaged, or not an npz archive ({reason}); export the model again or copy the file again",
         path.display(),
@@ -24,20 +24,20 @@ pub enum GraceError {
     Damaged {
         /// The model file.
         path: PathBuf,
-        /// The array at fault, if it is one.
+        /// The invalid array, if it is an array.
         key: Option<String>,
         /// What is wrong.
         reason: String,
     },
-    /// An array is absent.
-    #[error("{}: array '{key}' is missing: not a kokkos.npz export of a GRACE model, or cut short", path.display())]
+    /// An array is missing.
+    #[error("{}: array '{key}' is missing: not a kokkos.npz export of a GRACE model, or truncated", path.display())]
     Missing {
         /// The model file.
         path: PathBuf,
         /// The array's name.
         key: String,
     },
-    /// An array has another type, shape or value than the rest of the model needs.
+    /// The type, shape or value of an array contradicts the rest of the model.
     #[error("{}: array '{key}' is {found}, expected {expected}", path.display())]
     Mismatch {
         /// The model file.
@@ -46,7 +46,7 @@ pub enum GraceError {
         key: String,
         /// What the file holds.
         found: String,
-        /// What would be right.
+        /// What the rest of the model needs.
         expected: String,
     },
     /// A valid model that is not supported.
@@ -54,7 +54,7 @@ pub enum GraceError {
     Unsupported {
         /// The model file.
         path: PathBuf,
-        /// The feature that is not supported.
+        /// The unsupported feature.
         reason: String,
     },
 }
@@ -81,7 +81,7 @@ impl From<Error> for GraceError {
     }
 }
 
-/// An array does not go with the rest of the model.
+/// The error for an array that contradicts the rest of the model.
 pub(super) fn mismatch(
     archive: &Archive,
     key: &str,
@@ -91,7 +91,7 @@ pub(super) fn mismatch(
     archive.invalid(key, found, expected).into()
 }
 
-/// The model is of a kind that is not supported.
+/// The error for an unsupported kind of model.
 pub(super) fn unsupported(archive: &Archive, reason: impl Into<String>) -> GraceError {
     GraceError::Unsupported { path: archive.path().to_owned(), reason: reason.into() }
 }

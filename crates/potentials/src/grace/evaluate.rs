@@ -1,4 +1,4 @@
-//! Energy, features and their derivatives for one structure.
+//! Energy, features and derivatives of a structure.
 
 use std::sync::{Arc, Mutex};
 
@@ -6,25 +6,25 @@ use atoms::{Evaluation, Matrix3, NeighbourList, PotentialError, Structure, Vec3}
 
 use super::batches::Batches;
 use super::instructions::Instructions;
-use super::layer_work::LayerWork;
+use super::layer_passes::LayerState;
 use super::model::GraceModel;
 use super::network::Network;
-use super::passes::Scratch;
 use super::projection::ProjectionWork;
+use super::sweeps::Scratch;
 use super::threads::Threads;
 use super::vector::Vector;
 
 /// The derivatives of a function H of the features: its cotangent ∂H/∂z pulled back to the atoms.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PullBack {
-    /// +∂H/∂r, [n].
+    /// +∂H/∂r, `[n]`.
     pub gradient: Vec<Vec3>,
     /// +∂H/∂ε, symmetric.
     pub virial: Matrix3,
 }
 
 impl PullBack {
-    /// Sets the gradient to `n` atoms and zero.
+    /// Resizes the gradient to `n` atoms and sets it to zero.
     pub fn reset(&mut self, n: usize) {
         self.gradient.clear();
         self.gradient.resize(n, [0.0; 3]);
@@ -32,30 +32,30 @@ impl PullBack {
     }
 }
 
-/// Takes some atoms and their features z, [atoms, D], and writes ∂H/∂z of each, to no numbers where that is not asked for; is
-/// called by several threads at a time.
+/// Receives some atoms and their features z, `[atoms, D]`, and writes ∂H/∂z of each unless the output is empty.
+/// Several threads call it concurrently.
 pub type Grade<'a> = dyn Fn(&[u32], &[f64], &mut [f64]) + Sync + 'a;
 
-/// A network with its work arrays.
+/// A network with its scratch arrays.
 #[derive(Debug)]
 pub(super) struct Evaluator<V: Vector> {
     model: Arc<GraceModel>,
-    /// That of the model.
+    /// The network of the model.
     pub(super) network: Arc<Network<V>>,
     pub(super) instructions: Instructions,
     pub(super) threads: Threads,
     /// Element of each atom.
     elements: Vec<usize>,
     pub(super) batches: Batches,
-    pub(super) layers: Vec<LayerWork<V>>,
+    pub(super) layers: Vec<LayerState<V>>,
     /// One for each thread.
     pub(super) scratch: Vec<Mutex<Scratch<V>>>,
     // In the order of evaluation:
-    /// E, [n]
+    /// E, `[n]`.
     pub(super) energies: Vec<f64>,
-    /// ∂E/∂(W B), [n, layers, lanes]
+    /// ∂E/∂(W B), `[n, layers, lanes]`.
     pub(super) density_cotangents: Vec<V>,
-    /// −∂E/∂r and −∂H/∂r, [n]
+    /// −∂E/∂r and −∂H/∂r, `[n]`.
     pub(super) forces: [Vec<Vec3>; 2],
     /// ∂E/∂ε and ∂H/∂ε of each chunk.
     pub(super) virials: Vec<[Matrix3; 2]>,
@@ -65,7 +65,7 @@ pub(super) struct Evaluator<V: Vector> {
     features: Vec<f64>,
     /// ∂H/∂z, in the order of evaluation.
     feature_cotangent: Vec<f64>,
-    /// A number for each atom, for whoever needs it.
+    /// A scratch number per atom.
     numbers: Vec<u32>,
 }
 
@@ -82,7 +82,7 @@ impl<V: Vector> Evaluator<V> {
             threads,
             elements: Vec::new(),
             batches: Batches::default(),
-            layers: network.layers.iter().map(|_| LayerWork::default()).collect(),
+            layers: network.layers.iter().map(|_| LayerState::default()).collect(),
             scratch,
             energies: Vec::new(),
             density_cotangents: Vec::new(),
@@ -115,8 +115,8 @@ impl<V: Vector> Evaluator<V> {
             self.project();
             Ok(())
         })?;
-        self.put_energies();
-        self.put_features();
+        self.scatter_energies();
+        self.scatter_features();
         Ok(())
     }
 
@@ -135,16 +135,16 @@ impl<V: Vector> Evaluator<V> {
             true => self.pass::<2>(structure, neighbours, grade),
             false => self.pass::<1>(structure, neighbours, grade),
         })?;
-        self.put_energies();
-        self.put_features();
-        self.put_forces(energy);
+        self.scatter_energies();
+        self.scatter_features();
+        self.scatter_forces(energy);
         if let Some(pull_back) = pull_back {
-            self.put_pull_back(both, pull_back);
+            self.scatter_pull_back(both, pull_back);
         }
         Ok(())
     }
 
-    /// Elements and bonds of a structure; results of an earlier one are dropped.
+    /// Takes over elements and bonds of a structure; discards earlier results.
     fn take(&mut self, structure: &Structure, neighbours: &NeighbourList) -> Result<(), PotentialError> {
         self.elements.clear();
         self.atomic_energies.clear();
@@ -192,7 +192,7 @@ impl<V: Vector> Evaluator<V> {
         }
         let cotangent = feature_cotangent.filter(|_| self.network.feature_map.is_some());
         self.begin_derivatives();
-        // There are no bonds of a structure that was refused.
+        // A rejected structure has no bonds.
         let layers = if self.batches.order.is_empty() { 0 } else { self.layers.len() };
         self.threads.clone().run(|| match cotangent {
             Some(cotangent) => {
@@ -201,11 +201,11 @@ impl<V: Vector> Evaluator<V> {
             }
             None => self.backward_layers::<1>(layers),
         });
-        self.put_forces(energy);
-        self.put_pull_back(cotangent.is_some(), pull_back);
+        self.scatter_forces(energy);
+        self.scatter_pull_back(cotangent.is_some(), pull_back);
     }
 
-    /// The cotangents of the bases of all atoms from those of their features, [n, D] in the order of the structure.
+    /// The cotangents of all bases from those of the features, `[n, D]` in the order of the structure.
     fn pull_back_features(&mut self, cotangent: &[f64]) {
         let Some(projection) = self.network.projection() else { return };
         let width = projection.feature_dimension();
@@ -218,7 +218,7 @@ impl<V: Vector> Evaluator<V> {
         self.feature_cotangent = in_order;
     }
 
-    /// All atoms backwards through the first `layers`.
+    /// The reverse pass of all atoms through the first `layers`.
     fn backward_layers<const N: usize>(&mut self, layers: usize) {
         for k in (0..layers).rev() {
             self.backward_layer::<N>(k);
@@ -226,7 +226,7 @@ impl<V: Vector> Evaluator<V> {
         }
     }
 
-    /// All that is asked of a structure, of whose last layer nothing is kept.
+    /// Evaluates a structure without storing its last layer.
     fn pass<const N: usize>(
         &mut self,
         structure: &Structure,
@@ -250,21 +250,21 @@ impl<V: Vector> Evaluator<V> {
         out: &mut Evaluation,
     ) -> Result<(), PotentialError> {
         self.threads.clone().run(|| self.pass::<1>(structure, neighbours, None))?;
-        self.put_energies();
-        self.put_forces(out);
+        self.scatter_energies();
+        self.scatter_forces(out);
         Ok(())
     }
 
-    // From the order of evaluation to that of the structure.
+    // From evaluation order to the order of the structure:
 
-    fn put_energies(&mut self) {
+    fn scatter_energies(&mut self) {
         self.atomic_energies.resize(self.elements.len(), 0.0);
         for (atom, energy) in self.batches.order.iter().zip(&self.energies) {
             self.atomic_energies[*atom as usize] = *energy;
         }
     }
 
-    fn put_features(&mut self) {
+    fn scatter_features(&mut self) {
         let Some(projection) = self.network.projection() else { return };
         let width = projection.feature_dimension();
         self.features.resize(self.elements.len() * width, 0.0);
@@ -273,7 +273,7 @@ impl<V: Vector> Evaluator<V> {
         }
     }
 
-    fn put_forces(&self, energy: &mut Evaluation) {
+    fn scatter_forces(&self, energy: &mut Evaluation) {
         energy.reset(self.elements.len());
         energy.atomic_energies.copy_from_slice(&self.atomic_energies);
         for (atom, force) in self.batches.order.iter().zip(&self.forces[0]) {
@@ -282,7 +282,7 @@ impl<V: Vector> Evaluator<V> {
         energy.virial = self.strain_derivative(0).map(|row| row.map(|x| -x));
     }
 
-    fn put_pull_back(&self, is_computed: bool, pull_back: &mut PullBack) {
+    fn scatter_pull_back(&self, is_computed: bool, pull_back: &mut PullBack) {
         pull_back.reset(self.elements.len());
         if is_computed {
             for (atom, force) in self.batches.order.iter().zip(&self.forces[1]) {
@@ -292,7 +292,7 @@ impl<V: Vector> Evaluator<V> {
         }
     }
 
-    /// ∂E/∂ε or ∂H/∂ε, the chunks' added in their order.
+    /// ∂E/∂ε or ∂H/∂ε, summed over chunks in order.
     fn strain_derivative(&self, k: usize) -> Matrix3 {
         let mut sum = [[0.0; 3]; 3];
         for virials in &self.virials {
@@ -308,7 +308,8 @@ pub(super) fn add(sum: &mut Matrix3, x: &Matrix3) {
     }
 }
 
-/// The tensor is symmetric because energy and features do not change under rotation; this removes rounding.
+/// Symmetrises the tensor, which is symmetric up to rounding because energy and features are rotationally
+/// invariant.
 fn symmetric(tensor: &Matrix3) -> Matrix3 {
     std::array::from_fn(|a| std::array::from_fn(|b| 0.5 * (tensor[a][b] + tensor[b][a])))
 }

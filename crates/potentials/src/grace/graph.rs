@@ -1,4 +1,4 @@
-//! Builds the tape of an atom in one layer from the index lists of a model file.
+//! Builds the operations of one layer from the index lists of a model file.
 
 use std::collections::BTreeMap;
 
@@ -6,27 +6,27 @@ use npz::Archive;
 
 use super::error::{GraceError, mismatch, unsupported};
 use super::linear::{Linear, LinearPart};
-use super::placement::place;
 use super::product::{Combination, Combined, Coupled, Product, Term};
+use super::register_allocation::allocate;
 use super::schedule::depth_first;
-use super::steps::Steps;
 use super::tape::{Operation, Tensor};
+use super::tape_program::TapeProgram;
 use super::vector::{Number, Vector, lanes_for};
 use super::weights::Weights;
 
-/// A longer tape than this is taken for damage (64 MiB an atom).
-const LONGEST_TAPE: usize = 1 << 20;
+/// A longer tape indicates a corrupt file (64 MiB per atom).
+const MAX_TAPE_LANES: usize = 1 << 20;
 
 /// A graph under construction.
 pub(super) struct Graph<'a, V: Vector> {
     pub(super) archive: &'a Archive,
-    /// All tensors, as they stand on the tape.
+    /// All tensors, in their order on the tape.
     tensors: Vec<Tensor>,
-    /// Tensors that a reduction may name.
+    /// Tensors that reductions may refer to by name.
     named: Vec<(String, Tensor)>,
     end: usize,
     pub(super) operations: Vec<Operation<V>>,
-    /// First lane and number of lanes of each row that goes into the basis B.
+    /// First lane and number of lanes of each row of the basis B.
     pub(super) basis: Vec<(usize, usize)>,
     /// Components and channels of each source of the basis.
     pub(super) sources: Vec<(usize, usize)>,
@@ -36,7 +36,7 @@ pub(super) struct Graph<'a, V: Vector> {
 }
 
 impl<'a, V: Vector> Graph<'a, V> {
-    /// A graph that holds the sum over neighbours alone; errors call it `name`.
+    /// A graph with only the sum over neighbours; errors call it `name`.
     pub fn new(
         archive: &'a Archive,
         name: &str,
@@ -70,7 +70,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         channels: usize,
     ) -> Result<Tensor, GraceError> {
         let tensor = Tensor { start: self.end, components, channels, width: lanes_for::<V>(channels) };
-        if components.saturating_mul(tensor.width) > LONGEST_TAPE - self.end {
+        if components.saturating_mul(tensor.width) > MAX_TAPE_LANES - self.end {
             return Err(unsupported(
                 self.archive,
                 format!("'{name}' has {components} components of {channels}"),
@@ -82,8 +82,8 @@ impl<'a, V: Vector> Graph<'a, V> {
         Ok(tensor)
     }
 
-    /// FC: out_k,w = f_w (Σ_n W^left_kn x^left_n,w + Σ_c:to(c)=w Σ_n W^right_kn x^right_n,from(c)), the weights
-    /// of each component chosen by the tile lists.
+    /// FC: out_k,w = f_w (Σ_n W^left_kn x^left_n,w + Σ_c:to(c)=w Σ_n W^right_kn x^right_n,from(c)); the tile
+    /// lists select the weights of each component.
     pub fn linear(&mut self, name: &str, left: Tensor, right: Tensor) -> Result<Tensor, GraceError> {
         let (archive, key) = (self.archive, |suffix: &str| format!("fc_{name}_{suffix}"));
         let channels = archive.count(&key("n_out"), 1, 1 << 16)?;
@@ -149,7 +149,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         Ok(ChannelWeights { inputs, tiles, weights })
     }
 
-    /// The product left × right, coupled by Clebsch–Gordan coefficients channel by channel.
+    /// The product left × right, coupled by Clebsch–Gordan coefficients per channel.
     pub fn product(&mut self, name: &str, left: Tensor, right: Tensor) -> Result<Tensor, GraceError> {
         let (archive, key) = (self.archive, |suffix: &str| format!("prod_{name}_{suffix}"));
         if left.channels != right.channels {
@@ -168,7 +168,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         Ok(out)
     }
 
-    /// The tensor `name` from factors of equally many channels, by the lists whose names begin with `prefix`.
+    /// The tensor `name` from factors with equal numbers of channels, by the lists with the prefix `prefix`.
     pub(super) fn coupled(
         &mut self,
         name: &str,
@@ -179,7 +179,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         let (archive, key) = (self.archive, |suffix: &str| format!("{prefix}_{suffix}"));
         let lefts = archive.indices(&key("left_ind"), left.components)?;
         let rights = archive.exactly_indices(&key("right_ind"), lefts.len(), right.components)?;
-        let sums = archive.exactly_indices(&key("m_sum_ind"), lefts.len(), LONGEST_TAPE)?;
+        let sums = archive.exactly_indices(&key("m_sum_ind"), lefts.len(), MAX_TAPE_LANES)?;
         let coefficients = archive.floats(&key(coefficients), &[lefts.len()])?;
         let components = sums.iter().max().map_or(0, |last| last + 1);
 
@@ -196,7 +196,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         Ok(out)
     }
 
-    /// Rows of `tensor` combined by a list of (row of the result, row of the tensor, factor).
+    /// Combines rows of `tensor` by a list of (row of the result, row of the tensor, factor).
     pub fn combination(
         &mut self,
         name: &str,
@@ -214,7 +214,7 @@ impl<'a, V: Vector> Graph<'a, V> {
         Ok(out)
     }
 
-    /// Gives a tensor a name that reductions may use.
+    /// Makes a tensor available to reductions under this name.
     pub fn name(&mut self, name: &str, tensor: Tensor) {
         self.named.push((name.to_owned(), tensor));
     }
@@ -222,13 +222,13 @@ impl<'a, V: Vector> Graph<'a, V> {
     pub(super) fn named(&self, name: &str) -> Result<Tensor, GraceError> {
         let found = self.named.iter().find(|(known, _)| known == name);
         found.map(|(_, tensor)| *tensor).ok_or_else(|| {
-            unsupported(self.archive, format!("the energy takes '{name}', which the graph does not make"))
+            unsupported(self.archive, format!("the energy uses '{name}', which the graph does not produce"))
         })
     }
 
-    /// The operations without results that neither the basis nor `message` needs, whose rows get their places on the tapes;
-    /// those of `message` too.
-    pub fn finish(mut self, message: Option<&mut Tensor>) -> Steps<V> {
+    /// Removes operations whose results neither the basis nor `message` needs, and allocates lanes on the
+    /// tapes, also for `message`.
+    pub fn finish(mut self, message: Option<&mut Tensor>) -> TapeProgram<V> {
         let mut needed = vec![false; self.end];
         self.basis.iter().for_each(|(row, _)| needed[*row] = true);
         let mut fixed = vec![self.density()];
@@ -239,11 +239,11 @@ impl<'a, V: Vector> Graph<'a, V> {
         for tensor in &self.tensors {
             tensor.rows().for_each(|row| widths[row] = tensor.width);
         }
-        place(depth_first(self.operations), &widths, fixed, &self.basis, message)
+        allocate(depth_first(self.operations), &widths, fixed, &self.basis, message)
     }
 }
 
-/// One part in place of those that take the same rows to the same rows.
+/// Merges parts that map the same rows to the same rows.
 fn merged<V: Vector>(parts: Vec<LinearPart<V>>) -> Vec<LinearPart<V>> {
     let mut found: Vec<LinearPart<V>> = Vec::new();
     for part in parts {
@@ -255,7 +255,7 @@ fn merged<V: Vector>(parts: Vec<LinearPart<V>>) -> Vec<LinearPart<V>> {
     found
 }
 
-/// Weights [k, n, tile] that mix channels.
+/// Weights `[k, n, tile]` that mix channels.
 struct ChannelWeights {
     inputs: usize,
     tiles: usize,

@@ -1,16 +1,16 @@
-//! Real spherical harmonics as polynomials in Cartesian components, with their gradients.
+//! Real spherical harmonics as polynomials in Cartesian components, and their gradients.
 
 use super::vector::{Number, Vector};
 
-/// Y_lm for l = 0 … lmax at index l² + l + m, normalised so that Y_00 = 1 (√4π times orthonormal):
+/// Y_lm for l = 0 … lmax at index l² + l + m, normalised to Y_00 = 1 (√4π times orthonormal):
 ///
 /// Y_l,m = Re\[(x + iy)^m\] Q_lm(z), Y_l,−m = Im\[(x + iy)^m\] Q_lm(z) for m ≥ 0, with the associated Legendre
-/// recursion Q_lm = a_lm (z Q_(l−1)m + b_lm Q_(l−2)m). They are evaluated as these polynomials also where
-/// (x, y, z) is not quite of unit length.
+/// recursion Q_lm = a_lm (z Q_(l−1)m + b_lm Q_(l−2)m). They are evaluated as these polynomials also where (x,
+/// y, z) is not exactly of unit length.
 #[derive(Clone, Debug)]
 pub(super) struct Harmonics {
     lmax: usize,
-    /// Q_mm, constants; √2 included for m > 0. [lmax + 1]
+    /// Q_mm, constants; √2 included for m > 0. `[lmax + 1]`
     diagonal: Vec<f64>,
     /// (a_lm, b_lm) for m = 0 … lmax, l = m + 1 … lmax, in this order.
     recursion: Vec<(f64, f64)>,
@@ -45,8 +45,8 @@ impl Harmonics {
         (self.lmax + 1) * (self.lmax + 1)
     }
 
-    /// Y_lm at directions v = [x, y, z], one in each lane, into `values` [lm]; with `GRADIENT` also
-    /// ∂Y_lm/∂v into `gradients` [lm].
+    /// Writes Y_lm at directions v = (x, y, z), one per lane, to `values`, `[lm]`; with `GRADIENT` also
+    /// ∂Y_lm/∂v to `gradients`, `[lm]`.
     #[inline(always)]
     pub fn evaluate<V: Vector, const GRADIENT: bool>(
         &self,
@@ -129,7 +129,7 @@ mod tests {
         }
     }
 
-    /// The addition theorem at coinciding directions: Σ_m Y_lm² = 2l + 1.
+    /// The addition theorem for equal directions: Σ_m Y_lm² = 2l + 1.
     #[test]
     fn squares_of_one_order_sum_to_its_degeneracy() {
         let (values, _) = at(&Harmonics::new(6), [0.48, 0.6, 0.64]);

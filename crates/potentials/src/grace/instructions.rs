@@ -1,48 +1,50 @@
-//! Which vector instructions the passes over atoms are compiled for.
+//! The vector instructions for which the passes over atoms are compiled.
 
-/// A choice of vector instructions that this processor has.
+/// A set of vector instructions that this processor supports.
 ///
-/// Products are added with one rounding, and in the same order whatever the width of vectors, so that results have the same
-/// bits on all of them. A processor without fused multiply-adds works them out in software, very slowly.
+/// Products are accumulated by fused multiply-add in the same order for every vector width, so results have the
+/// same bits with all sets. Without hardware support, fused multiply-add is emulated and very slow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Instructions(Set);
+pub struct Instructions(InstructionSet);
 
-/// Made by [`Instructions::best`] and [`Instructions::all`] alone, which ask the processor first.
+/// Only [`Instructions::best`] and [`Instructions::all`], which query the processor, construct this.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Set {
+enum InstructionSet {
     #[cfg(target_arch = "x86_64")]
     Avx512,
     #[cfg(target_arch = "x86_64")]
     Avx2,
-    /// What every processor of the architecture has.
+    /// The baseline of the architecture.
     Baseline,
 }
 
-/// Some work; what it calls must be `inline(always)`, or it is compiled for the baseline.
+/// A pass. Functions that it calls must be `inline(always)`; others are compiled for the baseline.
 pub(crate) trait Pass {
-    /// `wide` says whether there are 32 registers of eight numbers.
+    /// `wide` states that there are 32 registers of eight numbers.
     fn run(self, wide: bool);
 }
 
 impl Instructions {
-    /// The fastest that this processor has.
+    /// The fastest supported set.
     pub fn best() -> Self {
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
             let wide = is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vl");
-            return Self(if wide { Set::Avx512 } else { Set::Avx2 });
+            return Self(if wide { InstructionSet::Avx512 } else { InstructionSet::Avx2 });
         }
-        Self(Set::Baseline)
+        Self(InstructionSet::Baseline)
     }
 
-    /// All that this processor has, the fastest first.
+    /// All supported sets, fastest first.
     pub fn all() -> Vec<Self> {
         let sets = match Self::best().0 {
             #[cfg(target_arch = "x86_64")]
-            Set::Avx512 => vec![Set::Avx512, Set::Avx2, Set::Baseline],
+            InstructionSet::Avx512 => {
+                vec![InstructionSet::Avx512, InstructionSet::Avx2, InstructionSet::Baseline]
+            }
             #[cfg(target_arch = "x86_64")]
-            Set::Avx2 => vec![Set::Avx2, Set::Baseline],
-            Set::Baseline => vec![Set::Baseline],
+            InstructionSet::Avx2 => vec![InstructionSet::Avx2, InstructionSet::Baseline],
+            InstructionSet::Baseline => vec![InstructionSet::Baseline],
         };
         sets.into_iter().map(Self).collect()
     }
@@ -52,10 +54,10 @@ impl Instructions {
     pub(crate) fn run(self, pass: impl Pass) {
         match self.0 {
             #[cfg(target_arch = "x86_64")]
-            Set::Avx512 => unsafe { x86::with_avx512(pass) },
+            InstructionSet::Avx512 => unsafe { x86::with_avx512(pass) },
             #[cfg(target_arch = "x86_64")]
-            Set::Avx2 => unsafe { x86::with_avx2(pass) },
-            Set::Baseline => pass.run(false),
+            InstructionSet::Avx2 => unsafe { x86::with_avx2(pass) },
+            InstructionSet::Baseline => pass.run(false),
         }
     }
 }

@@ -1,14 +1,14 @@
-//! The normalisation of a layer's invariants before they are summed over layers.
+//! Normalisation of a layer's invariants before the sum over layers.
 
 use super::vector::Number;
 
 /// Keeps the norm differentiable where all invariants vanish.
 const SQUARE_FLOOR: f64 = 1e-10;
 
-/// y_k = s_k x_k / √(mean x² + 10⁻¹⁰), the mean over the same channels; channel 0 may stay out of it.
+/// y_k = s_k x_k / √(mean x² + 10⁻¹⁰), with the mean over the same channels; channel 0 may be excluded.
 #[derive(Clone, Debug)]
 pub(super) struct InvariantNorm {
-    /// The factor of channel 0 where it is not normalised.
+    /// The factor of channel 0 if it is excluded.
     pub linear: Option<f64>,
     /// s of the other channels.
     pub scale: Vec<f64>,
@@ -19,7 +19,7 @@ impl InvariantNorm {
         usize::from(self.linear.is_some())
     }
 
-    /// Channels that are normalised, and (mean x² + 10⁻¹⁰)^(−1/2).
+    /// The normalised channels, and (mean x² + 10⁻¹⁰)^(−1/2).
     #[inline(always)]
     fn inverse<'a, T: Number>(&self, x: &'a [T]) -> (&'a [T], f64) {
         let x = &x[self.first()..][..self.scale.len()];
@@ -40,8 +40,8 @@ impl InvariantNorm {
         }
     }
 
-    /// The cotangent of x from that of y, in place:
-    /// x̄_k = i s_k ȳ_k − i³ x_k/n Σ_j s_j ȳ_j x_j with the inverse root i.
+    /// Replaces the cotangent of y with that of x: x̄_k = i s_k ȳ_k − i³ x_k/n Σ_j s_j ȳ_j x_j with the inverse
+    /// root i.
     #[inline(always)]
     pub fn backward<T: Number>(&self, x: &[T], cotangent: &mut [T]) {
         if let Some(factor) = self.linear {

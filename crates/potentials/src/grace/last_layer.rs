@@ -1,47 +1,47 @@
-//! The last layer, forwards and backwards while what is needed of it is in the cache.
+//! Forward and reverse pass of the last layer while its data are in the cache.
 
 use std::ops::Range;
 
 use super::batch_passes::{Backward, BeginProjectBack, Energies, Forward, Project, ProjectBack};
 use super::batches::{Batches, Chunk, Placed};
+use super::chunked_slices::{ChunkedSlice, Layout, SplitByChunk};
 use super::evaluate::{Evaluator, Grade};
 use super::instructions::Instructions;
-use super::layer_work::{Cotangents, Gradients, Here, LayerWork};
+use super::layer_passes::{Cotangents, Gradients, LayerInput, LayerState};
 use super::network::Network;
-use super::parts::{Divide, Layout, Parts};
-use super::passes::{Scratch, begin_returns, gradients_of, of_thread};
 use super::projection::Projected;
+use super::sweeps::{Scratch, begin_returns, gradients_of, lock_scratch};
 use super::vector::Vector;
 
-/// The most layers before the last one.
-const BEFORE: usize = 2;
+/// Maximum number of layers before the last.
+const MAX_EARLIER_LAYERS: usize = 2;
 
-/// What all threads read.
+/// Data shared by all threads.
 struct Pass<'a, V: Vector> {
     network: &'a Network<V>,
     instructions: Instructions,
     batches: &'a Batches,
-    here: Here<'a, V>,
+    here: LayerInput<'a, V>,
     grade: Option<&'a Grade<'a>>,
 }
 
-/// What it leaves of atoms, to be divided.
+/// Output arrays, split by chunk.
 struct Results<'a, V> {
-    energies: Parts<'a, f64>,
+    energies: ChunkedSlice<'a, f64>,
     /// ∂E/∂(W B)
-    densities: Parts<'a, V>,
+    densities: ChunkedSlice<'a, V>,
     gradients: Gradients<'a, V>,
-    /// None where nothing is graded.
+    /// `None` without grading.
     projected: Option<Projected<'a, V>>,
-    /// The bases of the layers before, in whose place two cotangents leave those from the features.
-    bases: [Parts<'a, V>; BEFORE],
+    /// The bases of the earlier layers. With two cotangents, the cotangents from the features overwrite them.
+    bases: [ChunkedSlice<'a, V>; MAX_EARLIER_LAYERS],
 }
 
-impl<V: Send> Divide for Results<'_, V> {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        let (energies, densities) = (self.energies.divide(chunk), self.densities.divide(chunk));
-        let (gradients, projected) = (self.gradients.divide(chunk), self.projected.divide(chunk));
-        let bases = self.bases.divide(chunk);
+impl<V: Send> SplitByChunk for Results<'_, V> {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
+        let (energies, densities) = (self.energies.split(chunk), self.densities.split(chunk));
+        let (gradients, projected) = (self.gradients.split(chunk), self.projected.split(chunk));
+        let bases = self.bases.split(chunk);
         (
             Self {
                 energies: energies.0,
@@ -62,29 +62,29 @@ impl<V: Send> Divide for Results<'_, V> {
 }
 
 impl<V: Vector> Evaluator<V> {
-    /// All atoms through the last layer, forwards and backwards, with `N` cotangents: of the energy, and of what `grade` makes
-    /// of the features.
+    /// The forward and reverse pass of all atoms through the last layer with `N` cotangents: of the energy, and
+    /// of what `grade` computes from the features.
     pub(super) fn pass_last_layer<const N: usize>(&mut self, grade: Option<&Grade>) {
         let Self { network, instructions, batches, scratch, projection, .. } = self;
         let last = self.layers.len() - 1;
         let (before, here) = self.layers.split_at_mut(last);
-        let LayerWork { bonds, messages, gradients, returns, rows, .. } = &mut here[0];
-        let here = Here::new(network, last, (bonds, messages, rows));
+        let LayerState { bonds, messages, gradients, returns, rows, .. } = &mut here[0];
+        let here = LayerInput::new(network, last, (bonds, messages, rows));
         let of_densities = network.readout.blocks.len() * network.readout.density_lanes();
         let map = network.feature_map.as_ref().filter(|_| grade.is_some());
         let mut results = Results {
-            energies: Parts::new(Layout::Even(1), 0, &mut self.energies[..]),
-            densities: Parts::new(Layout::Even(of_densities), 0, &mut self.density_cotangents[..]),
+            energies: ChunkedSlice::new(Layout::Even(1), 0, &mut self.energies[..]),
+            densities: ChunkedSlice::new(Layout::Even(of_densities), 0, &mut self.density_cotangents[..]),
             gradients: gradients_of::<V, N>(here.layer, bonds, &batches.chunks, gradients, returns),
             projected: map.map(|map| projection.parts(map)),
-            bases: [(); BEFORE].map(|()| Parts::empty()),
+            bases: [(); MAX_EARLIER_LAYERS].map(|()| ChunkedSlice::empty()),
         };
         for (bases, (work, layer)) in results.bases.iter_mut().zip(before.iter_mut().zip(&network.layers)) {
             *bases = work.trace.bases_mut(layer);
         }
         let pass = Pass { network, instructions: *instructions, batches, here, grade };
-        self.threads.each(&batches.chunks, results, &|chunk, mut results, thread| {
-            let scratch = &mut of_thread(scratch, thread);
+        self.threads.for_each_chunk(&batches.chunks, results, &|chunk, mut results, thread| {
+            let scratch = &mut lock_scratch(scratch, thread);
             if let Some(returns) = results.gradients.returns.only() {
                 begin_returns::<V, N>(here.layer, returns);
             }
@@ -98,23 +98,24 @@ impl<V: Vector> Evaluator<V> {
 }
 
 impl<V: Vector> Pass<'_, V> {
-    /// One cotangent goes back while the tape of its batch is in the first caches; two wait for the features.
+    /// With one cotangent, the reverse pass runs while the tape of the batch is in the cache; with two it waits
+    /// for the features.
     fn run<const N: usize>(&self, chunk: &Chunk, results: &mut Results<V>, scratch: &mut Scratch<V>) {
-        let Here { layer, bonds, .. } = self.here;
+        let LayerInput { layer, bonds, .. } = self.here;
         let batches = chunk.batches.clone().map(|batch| self.batches.placed(batch, self.instructions));
-        scratch.trace.hold_bases(layer, &chunk.places);
+        scratch.trace.reserve_bases(layer, &chunk.places);
         if N == 1 {
             for placed in batches {
                 if self.grade.is_none() {
-                    scratch.trace.hold_bases(layer, &placed.places());
+                    scratch.trace.reserve_bases(layer, &placed.places());
                 }
-                scratch.trace.hold(layer, bonds, &placed.places(), false);
+                scratch.trace.reserve(layer, bonds, &placed.places(), false);
                 self.forward::<N>(placed, results, scratch);
                 self.backward::<N>(placed, results, scratch);
             }
             self.grade::<N>(&chunk.places, results, scratch);
         } else {
-            scratch.trace.hold(layer, bonds, &chunk.places, true);
+            scratch.trace.reserve(layer, bonds, &chunk.places, true);
             batches.clone().for_each(|placed| self.forward::<N>(placed, results, scratch));
             self.grade::<N>(&chunk.places, results, scratch);
             batches.for_each(|placed| self.backward::<N>(placed, results, scratch));
@@ -123,22 +124,22 @@ impl<V: Vector> Pass<'_, V> {
 
     fn forward<const N: usize>(&self, placed: Placed, results: &mut Results<V>, scratch: &mut Scratch<V>) {
         let (last, places) = (self.network.layers.len() - 1, placed.places());
-        let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
+        let mut traced = scratch.trace.slices(self.here.layer, self.here.bonds);
         let (here, trace) = (self.here, &mut traced);
         let work = (&mut scratch.tape, &mut scratch.bonds[last]);
         self.instructions.run(Forward { here, placed, trace, work });
         if N == 2 {
             trace.keep(&places, &scratch.tape);
         }
-        let own = &*traced.bases.of(&places);
-        let before = results.bases.each_mut().map(|bases| &*bases.of(&places));
+        let own = &*traced.bases.slice(&places);
+        let before = results.bases.each_mut().map(|bases| &*bases.slice(&places));
         let basis = |k: usize| if k == last { own } else { before[k] };
-        let (energies, cotangents) = (results.energies.of(&places), results.densities.of(&places));
+        let (energies, cotangents) = (results.energies.slice(&places), results.densities.slice(&places));
         let (readout, work) = (&self.network.readout, &mut scratch.readout);
         self.instructions.run(Energies { readout, placed, basis, energies, cotangents, work });
     }
 
-    /// From the bases of some atoms to their features, and with two cotangents back to those of the bases.
+    /// Computes features from bases and, with two cotangents, goes back to the cotangents of the bases.
     fn grade<const N: usize>(
         &self,
         places: &Range<usize>,
@@ -148,12 +149,12 @@ impl<V: Vector> Pass<'_, V> {
         let (Some(map), Some(work)) = (&self.network.feature_map, &mut results.projected) else { return };
         let Some(grade) = self.grade else { return };
         let (instructions, last) = (self.instructions, self.network.layers.len() - 1);
-        let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
-        let own = traced.bases.of(places);
-        let mut before = results.bases.each_mut().map(|bases| bases.of(places));
+        let mut traced = scratch.trace.slices(self.here.layer, self.here.bonds);
+        let own = traced.bases.slice(places);
+        let mut before = results.bases.each_mut().map(|bases| bases.slice(places));
         let bases = |k: usize| if k == last { &*own } else { &*before[k] };
         instructions.run(Project { map, places, bases, work, instructions });
-        let (features, cotangent) = (work.features.of(places), &mut scratch.feature_cotangent);
+        let (features, cotangent) = (work.features.slice(places), &mut scratch.feature_cotangent);
         cotangent.resize(if N == 2 { features.len() } else { 0 }, 0.0);
         grade(&self.batches.order[places.clone()], features, cotangent);
         if N == 1 {
@@ -169,10 +170,10 @@ impl<V: Vector> Pass<'_, V> {
     fn backward<const N: usize>(&self, placed: Placed, results: &mut Results<V>, scratch: &mut Scratch<V>) {
         let (readout, places) = (&self.network.readout, placed.places());
         let (last, lanes) = (readout.blocks.len() - 1, readout.density_lanes());
-        let mut traced = scratch.trace.held(self.here.layer, self.here.bonds);
-        let densities = (&results.densities.of(&places)[last * lanes..], readout.blocks.len() * lanes);
-        let from = Cotangents { densities, basis: traced.bases.of(&places), returned: None };
-        let tape = if N == 1 { &scratch.tape[..] } else { traced.tapes.of(&places) };
+        let mut traced = scratch.trace.slices(self.here.layer, self.here.bonds);
+        let densities = (&results.densities.slice(&places)[last * lanes..], readout.blocks.len() * lanes);
+        let from = Cotangents { densities, basis: traced.bases.slice(&places), returned: None };
+        let tape = if N == 1 { &scratch.tape[..] } else { traced.tapes.slice(&places) };
         let (here, bonds, to) = (self.here, &mut traced.bonds, &mut results.gradients.bonds);
         let (returns, work) =
             (results.gradients.returns.only(), (&mut scratch.backward, &mut scratch.bonds[last]));

@@ -1,11 +1,11 @@
-//! Channels mixed with weights.
+//! Linear mixing of channels.
 
 use super::matrix::Rows;
 use super::tape::Batch;
 use super::vector::Vector;
 use super::weights::Weights;
 
-/// out_k,w = Σ over parts, Σ_n W_kn x_n,w′.
+/// out_k,w = Σ over parts of Σ_n W_kn x_n,w′.
 #[derive(Clone, Debug)]
 pub(super) struct Linear<V> {
     /// Rows that share weights.
@@ -15,21 +15,21 @@ pub(super) struct Linear<V> {
 /// Rows of one or more tensors multiplied by the same weights.
 #[derive(Clone, Debug)]
 pub(super) struct LinearPart<V> {
-    /// [n_in × n_out]
+    /// `[n_in × n_out]`
     pub weights: Weights<V>,
-    /// Lanes where each row is read, and where each is added.
+    /// Lanes at which each row is read and to which it is added.
     pub tape: [Vec<u32>; 2],
-    /// The same on the tape of cotangents. Made by [`Linear::rename`].
+    /// The same on the cotangents' tape; set by [`Linear::rename`].
     cotangents: [Vec<u32>; 2],
 }
 
 impl<V: Vector> LinearPart<V> {
-    /// From lanes where each row is read, and where each is added.
+    /// From the lanes at which each row is read and to which it is added.
     pub fn new(weights: Weights<V>, (from, to): (Vec<u32>, Vec<u32>)) -> Self {
         Self { weights, tape: [from, to], cotangents: Default::default() }
     }
 
-    /// Rows of inputs and of outputs at the lanes given.
+    /// Input and output rows at these lanes.
     #[inline(always)]
     fn rows<'a>(&self, [from, to]: &'a [Vec<u32>; 2], slots: usize) -> (Rows<'a>, Rows<'a>) {
         let weights = self.weights.forward(0);
@@ -39,7 +39,7 @@ impl<V: Vector> LinearPart<V> {
 }
 
 impl<V: Vector> Linear<V> {
-    /// Adds to its results.
+    /// Adds the results to their rows.
     #[inline(always)]
     pub fn forward(&self, batch: &Batch, tape: &mut [V]) {
         for part in &self.parts {
@@ -49,7 +49,7 @@ impl<V: Vector> Linear<V> {
         }
     }
 
-    /// Adds to `N` cotangents of what it read.
+    /// Adds to `N` cotangents of the inputs.
     #[inline(always)]
     pub fn backward<const N: usize>(&self, batch: &Batch, cotangent: &mut [V]) {
         for part in &self.parts {

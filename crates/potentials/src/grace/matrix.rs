@@ -1,21 +1,21 @@
-//! The one matrix product that everything dense goes through.
+//! The matrix product behind all dense operations.
 
 use std::ops::Range;
 
 use super::instructions::{Instructions, Pass};
 use super::vector::{Number, Vector, lanes_for};
 
-/// A matrix [inputs × outputs], its outputs in panels of [`Vector::LANES`] columns.
+/// A matrix `[inputs × outputs]` whose outputs are stored in panels of [`Vector::LANES`] columns.
 #[derive(Clone, Debug)]
 pub(super) struct Matrix<V> {
     inputs: usize,
     outputs: usize,
-    /// [panels × inputs]
+    /// `[panels × inputs]`
     panels: Vec<V>,
 }
 
 impl<V: Vector> Matrix<V> {
-    /// From `element(input, output)`, rounded.
+    /// From rounded values of `element(input, output)`.
     pub fn from_fn(inputs: usize, outputs: usize, element: impl Fn(usize, usize) -> f64) -> Self {
         let mut panels = vec![V::ZERO; lanes_for::<V>(outputs) * inputs];
         for output in 0..outputs {
@@ -49,13 +49,13 @@ impl<V: Vector> Matrix<V> {
         }
     }
 
-    /// Adds x M to the rows `to`, x being the rows `from`, as many.
+    /// Adds x M to the rows `to` for the rows x in `from`.
     pub fn multiply_add(&self, lanes: impl Lanes<V>, from: Rows, to: Rows, instructions: Instructions) {
         assert_eq!(from.len(), to.len());
         instructions.run(Multiply { matrix: self, lanes, from, to, factors: None });
     }
 
-    /// The same, the rows `to` having been multiplied by the factor of each.
+    /// The same after multiplying each row of `to` by its factor.
     pub fn scale_multiply_add(
         &self,
         lanes: impl Lanes<V>,
@@ -67,7 +67,7 @@ impl<V: Vector> Matrix<V> {
         instructions.run(Multiply { matrix: self, lanes, from, to, factors: Some(factors) });
     }
 
-    /// `PANELS` panels at a time, which stay in the first cache for all rows.
+    /// Processes `PANELS` panels at a time, which stay in the L1 cache for all rows.
     #[inline(always)]
     fn multiply_panels<const ROWS: usize, const PANELS: usize>(
         &self,
@@ -90,7 +90,7 @@ impl<V: Vector> Matrix<V> {
     }
 }
 
-/// x M, compiled once for all who need it.
+/// x M, compiled once for all callers.
 struct Multiply<'a, V, L> {
     matrix: &'a Matrix<V>,
     lanes: L,
@@ -100,7 +100,7 @@ struct Multiply<'a, V, L> {
 }
 
 impl<V: Vector, L: Lanes<V>> Pass for Multiply<'_, V, L> {
-    /// Blocks are larger where there are registers for them, which changes no bits.
+    /// Uses larger blocks if there are registers for them, which changes no bits.
     #[inline(always)]
     fn run(self, wide: bool) {
         let Self { matrix, mut lanes, from, to, factors } = self;
@@ -116,15 +116,15 @@ impl<V: Vector, L: Lanes<V>> Pass for Multiply<'_, V, L> {
     }
 }
 
-/// A number for each row.
+/// A number per row.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Factors<'a> {
     pub numbers: &'a [f64],
-    /// From that of one row to that of the next.
+    /// Distance between the numbers of consecutive rows.
     pub stride: usize,
 }
 
-/// The array that rows are read from and the one that they are added to, which may be the same.
+/// The arrays to read rows from and to add rows to, which may be the same.
 pub(super) trait Lanes<V> {
     fn read(&self) -> &[V];
     fn write(&mut self) -> &mut [V];
@@ -154,25 +154,24 @@ impl<V> Lanes<V> for &mut [V] {
     }
 }
 
-/// Inputs that are worked on before the results are written: few enough for a pair of panels to stay in the first
-/// cache.
+/// Number of inputs between writes of the results, so that a pair of panels stays in the L1 cache.
 const INNER_BLOCK: usize = 256;
 
-/// Rows of an array: that of component r and slot s begins at lane `starts[r]` · `slots` + s · `stride` + `shift`.
+/// Rows of an array: component r of slot s starts at lane `starts[r]` · `slots` + s · `stride` + `shift`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Rows<'a> {
-    /// Where each component begins if there is one slot.
+    /// Where each component starts for a single slot.
     pub starts: &'a [u32],
     /// Number of atoms (times cotangents).
     pub slots: usize,
-    /// Lanes from one atom's row to the next.
+    /// Lanes between the rows of consecutive atoms.
     pub stride: usize,
-    /// Lanes to be left out at the beginning.
+    /// Lanes to skip at the start.
     pub shift: usize,
 }
 
 impl Rows<'static> {
-    /// A row for each of `slots` atoms.
+    /// One row for each of `slots` atoms.
     #[inline(always)]
     pub fn of_atoms(slots: usize, stride: usize) -> Self {
         Self { starts: &[0], slots, stride, shift: 0 }
@@ -206,7 +205,7 @@ impl Rows<'_> {
     }
 }
 
-/// `ROWS` rows at a time, then fewer.
+/// Processes `ROWS` rows at a time, then the rest.
 #[inline(always)]
 fn multiply_rows<V: Vector, const ROWS: usize, const PANELS: usize>(
     panels: [&[V]; PANELS],
@@ -233,7 +232,7 @@ fn multiply_rows<V: Vector, const ROWS: usize, const PANELS: usize>(
     }
 }
 
-/// Some rows from the given one times some panels, the sums in registers.
+/// Multiplies a block of rows by a block of panels, with the sums in registers.
 #[inline(always)]
 fn multiply_block<V: Vector, const ROWS: usize, const PANELS: usize>(
     panels: [&[V]; PANELS],
@@ -305,7 +304,7 @@ mod tests {
                 for (r, o) in (0..2 * slots).flat_map(|r| (0..outputs).map(move |o| (r, o))) {
                     let row = &numbers[r * xl * V::LANES..];
                     let direct: f64 = (0..inputs).map(|i| row[i] * element(i, o)).sum();
-                    // The components change places.
+                    // Swap the components.
                     let to = (r + slots) % (2 * slots);
                     assert_eq!(V::flat(&out)[to * yl * V::LANES + o].into(), 1.0 + direct);
                 }

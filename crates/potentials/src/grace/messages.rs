@@ -12,20 +12,20 @@ use super::layer::Layer;
 use super::tape::Slot;
 use super::vector::Vector;
 
-/// What a chunk of atoms returns to those whose messages it got: up to two cotangents of the components that depend on the
-/// layer before. Every chunk sums its own, and the sums are added in the order of chunks, so that it does not matter who
-/// worked them out.
+/// The cotangents that a chunk of atoms returns to the senders of its messages: up to two, for the components
+/// that depend on the preceding layer. Each chunk sums its own, and the sums are added in the order of chunks,
+/// so the result does not depend on the assignment to threads.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Returns<V> {
-    /// Places of those, in ascending order.
+pub(super) struct ReturnedCotangents<V> {
+    /// Places of the senders, ascending.
     to: Vec<u32>,
-    /// A row for each of them.
+    /// One row per sender.
     cotangents: [Vec<V>; 2],
 }
 
-impl<V: Vector> Returns<V> {
-    /// Finds out to whom the chunk returns, and writes the row of each bond's neighbour. `row_of` has a number for each atom of
-    /// the structure, which is not read.
+impl<V: Vector> ReturnedCotangents<V> {
+    /// Finds the senders of a chunk and writes the row of each bond's neighbour. `row_of` is scratch memory
+    /// with a number per atom.
     pub fn find(&mut self, bonds: &Bonds, chunk: &Chunk, row_of: &mut [u32], rows: &mut [u32]) {
         const NONE: u32 = u32::MAX;
         row_of.fill(NONE);
@@ -47,7 +47,7 @@ impl<V: Vector> Returns<V> {
         }
     }
 
-    /// Sets `n` cotangents to zero, of so many lanes for each atom.
+    /// Sets `n` cotangents of this many lanes per atom to zero.
     #[inline(always)]
     pub fn begin(&mut self, n: usize, lanes: usize) {
         for cotangents in &mut self.cotangents[..n] {
@@ -56,7 +56,7 @@ impl<V: Vector> Returns<V> {
         }
     }
 
-    /// Adds what there is for some places to their cotangent number `k`.
+    /// Adds the contributions for these places to their cotangent number `k`.
     #[inline(always)]
     pub fn add_to(&self, k: usize, places: &Range<usize>, lanes: usize, sums: &mut [V]) {
         let first = self.to.partition_point(|place| (*place as usize) < places.start);
@@ -71,7 +71,7 @@ impl<V: Vector> Returns<V> {
     }
 }
 
-/// A block of bonds as the reverse sweep sees it.
+/// A block of bonds in the reverse pass.
 struct Block<'a, V> {
     bonds: &'a [Bond],
     /// R_nl and dR_nl/dr, \[bond\]\[l\]\[channel\]
@@ -101,8 +101,8 @@ pub(super) fn accumulate_messages<V: Vector>(
     }
 }
 
-/// As [`super::bonds::reverse`], from `N` ≤ 2 cotangents of T; adds to the cotangents of the neighbours' messages, whose
-/// rows stand in `rows`.
+/// As [`super::bonds::reverse`], from `N` ≤ 2 cotangents of T. Also adds to the cotangents of the neighbours'
+/// messages, at the rows in `rows`.
 #[inline(always)]
 pub(super) fn reverse_messages<V: Vector, const N: usize>(
     layer: &Layer<V>,
@@ -111,7 +111,7 @@ pub(super) fn reverse_messages<V: Vector, const N: usize>(
     (cotangent, slots): (&[V], [Slot; N]),
     work: &mut BondWork<V>,
     gradients: [&mut [Vec3]; N],
-    (rows, returns): (&[u32], &mut Returns<V>),
+    (rows, returns): (&[u32], &mut ReturnedCotangents<V>),
 ) {
     let blocks = own.blocks(layer).zip(rows.chunks(V::LANES));
     for (k, ((bonds, values, derivatives), rows)) in blocks.enumerate() {

@@ -1,9 +1,9 @@
-//! The graph atomic cluster expansion (GRACE) and its CALM features, in double precision or mostly in single
+//! The graph atomic cluster expansion (GRACE) and its CALM features, in double or mixed precision
 //! ([`Precision`]).
 //!
-//! Reads the `kokkos.npz` file that gracemaker exports for LAMMPS. The model's maths is that of
-//! Bochkarev, Lysogorskiy and Drautz, Phys. Rev. X 14, 021036 (2024); the feature map is that of the CALM paper
-//! (Methods, "Latent features and uncertainty models").
+//! Reads the `kokkos.npz` file that gracemaker exports for LAMMPS. The model is that of Bochkarev, Lysogorskiy
+//! and Drautz, Phys. Rev. X 14, 021036 (2024); the feature map is that of the CALM paper (Methods, "Latent
+//! features and uncertainty models").
 //!
 //! ```no_run
 //! # use std::{path::Path, sync::Arc};
@@ -15,31 +15,31 @@
 //! let mut grace = Grace::new(model);
 //! neighbours.update(structure)?;
 //! grace.forward(structure, &neighbours)?;
-//! let cotangent = vec![1.0; grace.features().len()]; // ∂H/∂z, here of H = Σ z
+//! let cotangent = vec![1.0; grace.features().len()]; // ∂H/∂z, here for H = Σ z
 //! let (mut energy, mut pull_back) = (Evaluation::default(), PullBack::default());
 //! grace.backward(Some(&cotangent), &mut energy, &mut pull_back);
 //! # Ok(())
 //! # }
 //! ```
 
-mod assembly;
 mod batch_passes;
 mod batches;
+mod block_aliases;
 mod bonds;
-mod copies;
+mod builder;
+mod chunked_slices;
 mod cost;
 mod equivariant_graph;
 mod equivariant_norm;
 mod error;
 mod evaluate;
-mod globals;
 mod graph;
 mod harmonics;
 mod instructions;
 mod invariant_norm;
 mod last_layer;
 mod layer;
-mod layer_work;
+mod layer_passes;
 mod linear;
 mod matrix;
 mod messages;
@@ -47,9 +47,6 @@ mod model;
 mod network;
 mod networks;
 mod one_layer;
-mod parts;
-mod passes;
-mod placement;
 mod potential;
 mod precision;
 mod product;
@@ -59,10 +56,13 @@ mod radial_network;
 mod radial_table;
 mod readout;
 mod reduction;
+mod register_allocation;
 mod schedule;
-mod steps;
+mod shared_reader;
+mod sweeps;
 mod symmetry;
 mod tape;
+mod tape_program;
 mod threads;
 mod three_layers;
 mod two_layers;

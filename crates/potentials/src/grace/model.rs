@@ -1,4 +1,4 @@
-//! A GRACE model: weights that never change, shared between threads.
+//! A GRACE model: immutable weights, shared between threads.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -6,7 +6,7 @@ use std::sync::Arc;
 use atoms::{PotentialError, Species};
 use npz::Archive;
 
-use super::assembly::Reading;
+use super::builder::ModelParts;
 use super::error::GraceError;
 use super::network::{AnyNetwork, Network};
 use super::precision::Precision;
@@ -16,7 +16,7 @@ use super::symmetry::require_invariance;
 use super::vector::Vector;
 use super::{one_layer, three_layers, two_layers};
 
-/// How many message-passing layers a model has.
+/// The number of message-passing layers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Architecture {
     /// GRACE-1L
@@ -28,7 +28,7 @@ pub enum Architecture {
 }
 
 impl Architecture {
-    /// In words.
+    /// The number of layers in words.
     pub(super) fn number_of_layers(self) -> &'static str {
         match self {
             Self::OneLayer => "one",
@@ -48,24 +48,24 @@ impl std::fmt::Display for Architecture {
     }
 }
 
-/// What a model is made of, for people.
+/// A summary of a model.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GraceDescription {
     /// Number of layers.
     pub architecture: Architecture,
     /// Symbols, in the order of element indices.
     pub elements: Vec<Species>,
-    /// The largest cutoff, Å; messages carry further, as many times as there are layers.
+    /// The largest cutoff, Å. Information travels as many cutoffs as there are layers.
     pub cutoff: f64,
-    /// Whether pairs of elements have cutoffs of their own.
+    /// Whether cutoffs depend on the pair of elements.
     pub pair_cutoffs: bool,
     /// The highest order l of the spherical harmonics.
     pub lmax: usize,
-    /// Chebyshev polynomials.
+    /// Number of Chebyshev polynomials.
     pub radial_basis_size: usize,
     /// Radial channels of the first layer.
     pub channels: usize,
-    /// The tensors the energy is made of, layer after layer: A, AA, AAA, AAAA.
+    /// The tensors in the energy, layer by layer: A, AA, AAA, AAAA.
     pub basis_functions: Vec<String>,
     /// D_basis, the number of invariants.
     pub basis_dimension: usize,
@@ -73,8 +73,8 @@ pub struct GraceDescription {
     pub feature_dimension: usize,
     /// Number of trained weights.
     pub weights: usize,
-    /// Tables of radial functions: number of intervals, and the measured errors of values and of
-    /// derivatives relative to the largest of each; empty on the exact path.
+    /// Tables of radial functions: number of intervals, and the measured relative errors of values and
+    /// derivatives; empty on the exact path.
     pub radial_tables: Vec<(usize, [f64; 2])>,
 }
 
@@ -82,21 +82,21 @@ pub struct GraceDescription {
 #[derive(Clone, Debug)]
 pub struct GraceModel {
     pub(super) network: AnyNetwork,
-    /// r_c for centre and neighbour element, [n_elements²], Å.
+    /// r_c for centre and neighbour element, `[n_elements²]`, Å.
     pair_cutoffs: Vec<f64>,
     description: GraceDescription,
 }
 
 impl GraceModel {
-    /// Reads a model, radial functions tabulated, to be evaluated in double precision.
+    /// Reads a model for double precision with tabulated radial functions.
     ///
     /// # Errors
-    /// Names the file, the array, what was found and what was expected.
+    /// With file, array, what was found and what was expected.
     pub fn load(path: &Path) -> Result<Self, GraceError> {
         Self::load_with(path, RadialPath::default())
     }
 
-    /// Reads a model; `radial` says how its radial functions are evaluated.
+    /// Reads a model with this evaluation of radial functions.
     ///
     /// # Errors
     /// As [`GraceModel::load`].
@@ -104,7 +104,7 @@ impl GraceModel {
         Self::load_in(path, Precision::Double, radial)
     }
 
-    /// Reads a model to be evaluated in this precision.
+    /// Reads a model for this precision.
     ///
     /// # Errors
     /// As [`GraceModel::load`].
@@ -122,7 +122,7 @@ impl GraceModel {
         any: fn(Arc<Network<V>>) -> AnyNetwork,
     ) -> Result<Self, GraceError> {
         let architecture = detect(archive);
-        let Reading { network, pair_cutoffs, description } = match architecture {
+        let ModelParts { network, pair_cutoffs, description } = match architecture {
             Architecture::OneLayer => one_layer::read(archive, path)?,
             Architecture::TwoLayer => two_layers::read(archive, path)?,
             Architecture::ThreeLayer => three_layers::read(archive, path)?,
@@ -134,12 +134,12 @@ impl GraceModel {
         }
     }
 
-    /// The precision in which it is evaluated.
+    /// The precision of the evaluation.
     pub fn precision(&self) -> Precision {
         self.network.precision()
     }
 
-    /// The elements it knows; an element's index is its position.
+    /// The supported elements, in the order of element indices.
     pub fn elements(&self) -> &[Species] {
         &self.description.elements
     }
@@ -149,10 +149,10 @@ impl GraceModel {
         self.description.cutoff
     }
 
-    /// The cutoff of a pair by element indices (centre, neighbour), Å.
+    /// The cutoff for the element indices (centre, neighbour), Å.
     ///
     /// # Panics
-    /// If an index is not below the number of elements.
+    /// If an index is out of range.
     pub fn pair_cutoff(&self, centre: usize, neighbour: usize) -> f64 {
         let n = self.elements().len();
         assert!(centre < n && neighbour < n, "element index out of range");
@@ -164,20 +164,20 @@ impl GraceModel {
         self.projection().map_or(0, Projection::feature_dimension)
     }
 
-    /// The feature map, if the file holds one.
+    /// The feature map, if the file has one.
     pub fn projection(&self) -> Option<&Projection> {
         self.network.projection()
     }
 
-    /// What the model is made of.
+    /// A summary of the model.
     pub fn description(&self) -> &GraceDescription {
         &self.description
     }
 
-    /// The element index of each species, [n].
+    /// The element index of each species, `[n]`.
     ///
     /// # Errors
-    /// [`PotentialError::Species`] for an element the model does not know.
+    /// [`PotentialError::Species`] for an element that the model does not support.
     pub fn element_indices(&self, species: &[Species]) -> Result<Vec<usize>, PotentialError> {
         let mut indices = Vec::new();
         self.write_element_indices(species, &mut indices)?;
@@ -204,7 +204,7 @@ impl GraceModel {
     }
 }
 
-/// The lists of single-particle basis functions that only deeper models have.
+/// Detects the depth by the lists of single-particle basis functions that only deeper models have.
 fn detect(archive: &Archive) -> Architecture {
     if archive.contains("spbf_names") {
         Architecture::ThreeLayer

@@ -1,4 +1,4 @@
-//! The weights of a model in the precision in which it is evaluated.
+//! The weights of a model in the precision of the evaluation.
 
 use std::sync::Arc;
 
@@ -8,17 +8,17 @@ use super::projection::{FeatureMap, Projection};
 use super::readout::Readout;
 use super::vector::{Double, Single, Vector};
 
-/// Everything that a pass over atoms reads of a model.
+/// The data of a model that the passes over atoms read.
 #[derive(Clone, Debug)]
 pub(super) struct Network<V: Vector> {
     pub layers: Vec<Layer<V>>,
     pub readout: Readout<V>,
-    /// None where the file has no feature arrays.
+    /// `None` if the file has no feature arrays.
     pub feature_map: Option<FeatureMap<V>>,
 }
 
 impl<V: Vector> Network<V> {
-    /// What an atom takes on the longest tapes, its own and one of cotangents, bytes.
+    /// Memory per atom for the longest tape and one of cotangents, bytes.
     pub fn tape_bytes(&self) -> usize {
         let steps = self.layers.iter().map(|layer| &layer.steps);
         let lanes = steps.map(|steps| steps.tape_lanes + steps.cotangent_lanes).max();
@@ -30,7 +30,7 @@ impl<V: Vector> Network<V> {
     }
 }
 
-/// A network in one of the precisions.
+/// A network in either precision.
 #[derive(Clone, Debug)]
 pub(super) enum AnyNetwork {
     Double(Arc<Network<Double>>),
@@ -52,7 +52,7 @@ impl AnyNetwork {
         }
     }
 
-    /// Energy of an atom on which nothing depends, by element, eV.
+    /// Energy of an isolated atom by element, eV.
     pub fn shifts(&self) -> &[f64] {
         match self {
             Self::Double(network) => &network.readout.shifts,

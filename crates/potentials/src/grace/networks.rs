@@ -1,17 +1,17 @@
-//! Reads the perceptrons of a model: those of radial functions and that of the energy.
+//! Reads the perceptrons of a model: those of the radial functions and of the energy.
 
 use npz::Archive;
 
 use super::error::{GraceError, mismatch};
-use super::globals::Embedding;
 use super::matrix::Matrix;
 use super::radial::column_by_order;
 use super::radial_network::RadialNetwork;
 use super::readout::{Activation, Block, Readout};
+use super::shared_reader::Embedding;
 use super::vector::{Double, Vector, to_lanes};
 use super::weights::with_transpose;
 
-/// The network `prefix` for channels × (lmax + 1) radial functions, channels padded to whole vectors `V`.
+/// The network `prefix` for channels × (lmax + 1) radial functions, with channels padded to whole vectors `V`.
 pub(super) fn radial_network<V: Vector>(
     archive: &Archive,
     prefix: &str,
@@ -51,8 +51,8 @@ pub(super) fn radial_network<V: Vector>(
     })
 }
 
-/// The network of layer `name` in a model of three: its inputs are the polynomials and the embeddings of centre and
-/// neighbour, and all layers but the last have a bias.
+/// The network of layer `name` in a three-layer model. Its inputs are the polynomials and the embeddings of
+/// centre and neighbour; all layers but the last have a bias.
 pub(super) fn enveloped_network<V: Vector>(
     archive: &Archive,
     name: &str,
@@ -90,7 +90,8 @@ pub(super) fn enveloped_network<V: Vector>(
     Ok(RadialNetwork { basis_size, envelope_exponent, envelope_last: true, layers, biases, pair_biases })
 }
 
-/// The layer whose columns are radial functions, padded to whole vectors `V`; row-major [channel, l] in the file.
+/// The layer whose columns are radial functions, padded to whole vectors `V`; row-major `[channel, l]` in the
+/// file.
 fn last_radial_layer<V: Vector>(
     archive: &Archive,
     key: &str,
@@ -109,7 +110,7 @@ fn last_radial_layer<V: Vector>(
     }))
 }
 
-/// Number of outputs of a dense layer and its weights times their norm, row-major [inputs, outputs].
+/// Number of outputs of a dense layer, and its weights times their norm, row-major `[inputs, outputs]`.
 fn dense(archive: &Archive, prefix: &str, k: usize, inputs: usize) -> Result<(usize, Vec<f64>), GraceError> {
     let key = format!("{prefix}_W{k}");
     let ([rows, outputs], mut weights) = archive.tensor::<2>(&key)?;
@@ -121,7 +122,7 @@ fn dense(archive: &Archive, prefix: &str, k: usize, inputs: usize) -> Result<(us
     Ok((outputs, weights))
 }
 
-/// The readout of densities whose number each layer's `blocks` agree on.
+/// The readout of the densities of all layers' `blocks`, which must agree in number.
 pub(super) fn readout<V: Vector>(
     archive: &Archive,
     blocks: Vec<Block<V>>,
@@ -141,7 +142,7 @@ pub(super) fn readout<V: Vector>(
             let found = format!("{outputs} columns wide");
             return Err(mismatch(archive, &format!("energy_mlp_W{k}"), found, "one column"));
         }
-        // The first layer reads y as it stands, so y_0 gets weights of zero.
+        // The first layer reads y unchanged, so y_0 gets zero weights.
         let skipped = usize::from(k == 0);
         layers.push(with_transpose(inputs + skipped, outputs, |i, o| {
             i.checked_sub(skipped).map_or(0.0, |i| layer[i * outputs + o])

@@ -1,24 +1,25 @@
-//! Reads GRACE-1L and lays out its graph:
+//! Reads GRACE-1L and builds its graph:
 //!
-//! A → A1 = FC(A, A) → AA = A1 × A1 → AA1 = FC(AA, A) → AAA = AA1 × A1; AA2 = FC(AA, A) → AAAA = AA2 × AA2,
-//! of which the energy takes the invariants of as many as the model's maximum order says.
+//! A → A1 = FC(A, A) → AA = A1 × A1 → AA1 = FC(AA, A) → AAA = AA1 × A1; AA2 = FC(AA, A) → AAAA = AA2 × AA2.
+//!
+//! The energy uses the invariants up to the model's maximum order.
 
 use npz::Archive;
 
-use super::assembly::{Draft, Reading};
+use super::builder::{ModelBuilder, ModelParts};
 use super::error::GraceError;
-use super::globals::{Embedding, Powers, cutoffs, elements, refuse_other_radial_variants};
 use super::graph::Graph;
 use super::layer::{LayerDraft, Message};
 use super::model::Architecture;
 use super::networks::radial_network;
 use super::radial::{RadialFunctions, RadialPath};
 use super::readout::Block;
+use super::shared_reader::{Embedding, Powers, cutoffs, elements, reject_unsupported_radial_variants};
 use super::vector::Vector;
 
-pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Reading<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
-    refuse_other_radial_variants(archive, "mlp_rad", "A")?;
+    reject_unsupported_radial_variants(archive, "mlp_rad", "A")?;
     let lmax = archive.count("lmax", 0, 12)?;
     let channels = archive.count("mlp_rad_n_rad_max", 1, 4096)?;
     if archive.contains("nradmax") {
@@ -38,7 +39,7 @@ pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Rea
     let radial = RadialFunctions::new(network, elements.len(), cutoffs, path);
     let message = Message { from: None, components: 1, constants };
     let n_densities = archive.count("rho_n_out", 1, 4096)?;
-    Draft {
+    ModelBuilder {
         archive,
         architecture: Architecture::OneLayer,
         elements,

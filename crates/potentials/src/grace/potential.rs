@@ -1,4 +1,4 @@
-//! A GRACE model as a potential, in the precision of its weights.
+//! A GRACE model as a potential.
 
 use std::sync::Arc;
 
@@ -11,9 +11,9 @@ use super::network::AnyNetwork;
 use super::threads::Threads;
 use super::vector::{Double, Single};
 
-/// A GRACE model with its work arrays; after the first step it allocates no more.
+/// A GRACE model with its scratch arrays; it does not allocate after the first step.
 ///
-/// [`Grace::forward`] gives energies and features, then [`Grace::backward`] the derivatives at the same
+/// [`Grace::forward`] computes energies and features, then [`Grace::backward`] the derivatives for the same
 /// structure. Results do not depend on the number of threads.
 #[derive(Debug)]
 pub struct Grace(AnyEvaluator);
@@ -24,7 +24,7 @@ enum AnyEvaluator {
     Mixed(Evaluator<Single>),
 }
 
-/// The same of whichever evaluator it is.
+/// Applies an expression to either evaluator.
 macro_rules! either {
     ($any:expr, $evaluator:ident => $result:expr) => {
         match $any {
@@ -35,12 +35,12 @@ macro_rules! either {
 }
 
 impl Grace {
-    /// An evaluator of `model` on the calling thread; nothing is computed yet.
+    /// An evaluator of `model` on the calling thread.
     pub fn new(model: Arc<GraceModel>) -> Self {
         Self::with(model, Instructions::best(), Threads::default())
     }
 
-    /// As [`Grace::new`], with these vector instructions and threads; results do not depend on them.
+    /// An evaluator with these vector instructions and threads; results do not depend on them.
     pub fn with(model: Arc<GraceModel>, instructions: Instructions, threads: Threads) -> Self {
         Self(match model.network.clone() {
             AnyNetwork::Double(network) => {
@@ -52,7 +52,7 @@ impl Grace {
         })
     }
 
-    /// The weights.
+    /// The model.
     pub fn model(&self) -> &Arc<GraceModel> {
         either!(&self.0, evaluator => evaluator.model())
     }
@@ -62,7 +62,7 @@ impl Grace {
     /// `neighbours` must be up to date for it.
     ///
     /// # Errors
-    /// An element the model does not know, or a neighbour list shorter than [`GraceModel::cutoff`].
+    /// An unsupported element, or a neighbour list shorter than [`GraceModel::cutoff`].
     pub fn forward(
         &mut self,
         structure: &Structure,
@@ -71,9 +71,10 @@ impl Grace {
         either!(&mut self.0, evaluator => evaluator.forward(structure, neighbours))
     }
 
-    /// Energies, features and the derivatives of both (without `pull_back` those of the energy alone), as [`Grace::forward`] and
-    /// [`Grace::backward`] give them, with the same bits, where the cotangent ∂H/∂z of an atom depends on its own features alone: `grade` is called with some atoms at a
-    /// time, by all threads. Models of one layer need a bounded memory for it, deeper ones less than for the two calls.
+    /// Energies, features and the derivatives of both (without `pull_back` those of the energy only), with the
+    /// same bits as [`Grace::forward`] and [`Grace::backward`], for a cotangent ∂H/∂z of each atom that depends
+    /// on its own features only. All threads call `grade`, each time with some of the atoms. One-layer models
+    /// need bounded memory for this, deeper ones less than the two separate calls.
     ///
     /// # Errors
     /// As [`Grace::forward`].
@@ -90,19 +91,18 @@ impl Grace {
         })
     }
 
-    /// Energy of each atom at the last [`Grace::forward`], [n], eV.
+    /// Energy of each atom after [`Grace::forward`], `[n]`, eV.
     pub fn atomic_energies(&self) -> &[f64] {
         either!(&self.0, evaluator => evaluator.atomic_energies())
     }
 
-    /// Features z at the last [`Grace::forward`], [n, D] row-major; empty for a model without them.
+    /// Features z after [`Grace::forward`], `[n, D]` row-major; empty for a model without features.
     pub fn features(&self) -> &[f64] {
         either!(&self.0, evaluator => evaluator.features())
     }
 
-    /// The derivatives at the structure of the last [`Grace::forward`], in one reverse sweep: of the
-    /// energy into `energy`, and, where a cotangent ∂H/∂z [n, D] is given, of H into `pull_back`
-    /// (zero otherwise).
+    /// The derivatives for the structure of the last [`Grace::forward`], in one reverse sweep: those of the
+    /// energy go to `energy`, and, with a cotangent ∂H/∂z `[n, D]`, those of H to `pull_back` (zero otherwise).
     ///
     /// # Panics
     /// If the cotangent is not as long as [`Grace::features`].
@@ -115,9 +115,9 @@ impl Grace {
         either!(&mut self.0, evaluator => evaluator.backward(feature_cotangent, energy, pull_back));
     }
 
-    /// Multiply-adds of a call at the structure of the last one, for all atoms: energies and forces, or with them the
-    /// features and the pull-back of their cotangents. Counted are sums of products over channels, bonds and couplings
-    /// without padding and with tables of radial functions; spherical harmonics, norms and activations are not.
+    /// Number of multiply-adds for the last structure: energies and forces, optionally with features and the
+    /// pull-back of their cotangents. Counts sums of products over channels, bonds and couplings without
+    /// padding, with tables of radial functions; excludes spherical harmonics, norms and activations.
     pub fn multiply_adds(&self, with_features: bool) -> u64 {
         either!(&self.0, evaluator => evaluator.multiply_adds(with_features))
     }

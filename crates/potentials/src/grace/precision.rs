@@ -1,21 +1,21 @@
-//! In which precision a model is evaluated.
+//! The precision of a model's evaluation.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// How many digits the passes over atoms have.
+/// The precision of the passes over atoms.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
     /// Double precision throughout.
     #[default]
     Double,
-    /// Single precision for all that is done for each channel: weights, tables of radial functions (made and checked in
-    /// double precision, then rounded), densities, products, messages, their cotangents, and what the projection takes.
-    /// Double precision for positions, bonds and the place of a distance in its table, for the sums of forces, virials and
-    /// energies over atoms and bonds, for norms, activations, scale and shifts, and for features as they are given out. Twice
-    /// as many numbers go through a vector register and a cache.
+    /// Single precision for all per-channel data: weights, tables of radial functions (built and checked in
+    /// double precision, then rounded), densities, products, messages, their cotangents, and the input of the
+    /// projection. Double precision for positions, bonds and the position of a distance in its table; for sums
+    /// of forces, virials and energies over atoms and bonds; for norms, activations, scale and shifts; and for
+    /// the features returned. Vector registers and caches hold twice as many numbers.
     Mixed,
 }
 

@@ -1,24 +1,24 @@
-//! Tensors coupled channel by channel, and rows of one tensor combined.
+//! Tensor products per channel, and linear combinations of rows.
 
 use std::collections::BTreeMap;
 
 use super::vector::{Number, Vector};
 
-/// out_n,f = Σ_c C_c left_n,l(c) right_n,r(c), the sum over the terms c of f.
+/// out_n,f = Σ_c C_c left_n,l(c) right_n,r(c), summed over the terms c of f.
 #[derive(Clone, Debug)]
 pub(super) struct Product<V: Vector> {
     /// Lanes of a component, the same for result and factors.
     pub width: usize,
     /// Channels of a component.
     pub channels: usize,
-    /// Each component of the result that is needed.
+    /// The components of the result that are needed.
     pub outputs: Vec<Coupled<V>>,
-    /// Each component of the factors with the derivatives of the result: terms of the result's cotangent (left) and the other
-    /// factor (right). Made by [`Product::keep`].
+    /// The components of the factors with the derivatives of the result: terms of the result's cotangent (left)
+    /// and the other factor (right). Set by [`Product::keep`].
     pub inputs: Vec<Coupled<V>>,
 }
 
-/// One component, and what it sums.
+/// A component and the terms of its sum.
 #[derive(Clone, Debug)]
 pub(super) struct Coupled<V: Vector> {
     /// First lane on the tape.
@@ -37,19 +37,19 @@ pub(super) struct Term<V: Vector> {
     pub coefficient: V::Number,
 }
 
-/// Lanes that are summed together, so that a term is looked at once for all of them.
-const TOGETHER: usize = 4;
+/// Lanes summed together, so that each term is decoded once for all of them.
+const LANES_PER_PASS: usize = 4;
 
 impl<V: Vector> Product<V> {
     #[inline(always)]
     pub fn forward(&self, atoms: usize, tape: &mut [V]) {
         let lanes = self.width * atoms;
-        let whole = lanes / TOGETHER * TOGETHER;
+        let whole = lanes / LANES_PER_PASS * LANES_PER_PASS;
         for output in &self.outputs {
             let out = output.row * atoms;
-            for c in (0..whole).step_by(TOGETHER) {
-                let [sums] = couple::<V, 1, TOGETHER>(&output.terms, tape, 0, tape, atoms, c);
-                tape[out + c..][..TOGETHER].copy_from_slice(&sums);
+            for c in (0..whole).step_by(LANES_PER_PASS) {
+                let [sums] = couple::<V, 1, LANES_PER_PASS>(&output.terms, tape, 0, tape, atoms, c);
+                tape[out + c..][..LANES_PER_PASS].copy_from_slice(&sums);
             }
             for c in whole..lanes {
                 let [[sum]] = couple::<V, 1, 1>(&output.terms, tape, 0, tape, atoms, c);
@@ -62,12 +62,12 @@ impl<V: Vector> Product<V> {
     #[inline(always)]
     pub fn backward<const N: usize>(&self, atoms: usize, tape: &[V], cotangent: &mut [V]) {
         let lanes = self.width * atoms;
-        let whole = lanes / TOGETHER * TOGETHER;
+        let whole = lanes / LANES_PER_PASS * LANES_PER_PASS;
         for input in &self.inputs {
             let out = input.row * N * atoms;
-            for c in (0..whole).step_by(TOGETHER) {
-                let sums = couple::<V, N, TOGETHER>(&input.terms, cotangent, lanes, tape, atoms, c);
-                add::<V, N, TOGETHER>(&mut cotangent[out + c..], lanes, &sums);
+            for c in (0..whole).step_by(LANES_PER_PASS) {
+                let sums = couple::<V, N, LANES_PER_PASS>(&input.terms, cotangent, lanes, tape, atoms, c);
+                add::<V, N, LANES_PER_PASS>(&mut cotangent[out + c..], lanes, &sums);
             }
             for c in whole..lanes {
                 let sums = couple::<V, N, 1>(&input.terms, cotangent, lanes, tape, atoms, c);
@@ -102,14 +102,14 @@ impl<V: Vector> Product<V> {
         }
     }
 
-    /// Some of the results alone.
+    /// A product with only these results.
     pub fn with_outputs(&self, outputs: Vec<Coupled<V>>) -> Self {
         let mut product = Self { outputs, inputs: Vec::new(), ..*self };
         product.inputs = product.derivatives();
         product
     }
 
-    /// ∂out/∂x for every component x of the factors, with one term for each pair of result and other factor.
+    /// ∂out/∂x for every component x of the factors, with one term per pair of result and other factor.
     fn derivatives(&self) -> Vec<Coupled<V>> {
         let mut inputs: BTreeMap<u32, BTreeMap<(u32, u32), f64>> = BTreeMap::new();
         for output in &self.outputs {
@@ -133,8 +133,8 @@ impl<V: Vector> Product<V> {
     }
 }
 
-/// Σ C left_k right over some terms, for `L` lanes from lane `c` of their rows; the `N` left factors stand `apart` lanes
-/// from one another.
+/// Σ C left_k right over some terms, for `L` lanes from lane `c` of their rows; the `N` left factors are
+/// `apart` lanes from each other.
 #[inline(always)]
 fn couple<V: Vector, const N: usize, const L: usize>(
     terms: &[Term<V>],
@@ -158,7 +158,7 @@ fn couple<V: Vector, const N: usize, const L: usize>(
     sums
 }
 
-/// Adds sums to `N` rows `apart` lanes from one another.
+/// Adds sums to `N` rows that are `apart` lanes from each other.
 #[inline(always)]
 fn add<V: Vector, const N: usize, const L: usize>(rows: &mut [V], apart: usize, sums: &[[V; L]; N]) {
     for (k, sums) in sums.iter().enumerate() {
@@ -168,24 +168,24 @@ fn add<V: Vector, const N: usize, const L: usize>(rows: &mut [V], apart: usize, 
     }
 }
 
-/// out_n,f = Σ_c C_c x_n,r(c), the sum over the terms c of f.
+/// out_n,f = Σ_c C_c x_n,r(c), summed over the terms c of f.
 #[derive(Clone, Debug)]
 pub(super) struct Combination<V: Vector> {
     /// Lanes of a component.
     width: usize,
     /// Channels of a component.
     pub channels: usize,
-    /// Each component that is needed.
+    /// The components that are needed.
     pub outputs: Vec<Combined<V>>,
-    /// The same on the tape of cotangents. Made by [`Combination::rename`].
+    /// The same on the cotangents' tape; set by [`Combination::rename`].
     cotangents: Vec<Combined<V>>,
 }
 
-/// First lane of a component, and the first lane and factor of each that it sums.
+/// First lane of a component, and first lane and factor of each of its terms.
 pub(super) type Combined<V> = (u32, Vec<(u32, <V as Vector>::Number)>);
 
 impl<V: Vector> Combination<V> {
-    /// Of components with so many lanes and channels.
+    /// From components with these lanes and channels.
     pub fn new(width: usize, channels: usize, outputs: Vec<Combined<V>>) -> Self {
         Self { width, channels, outputs, cotangents: Vec::new() }
     }
@@ -204,7 +204,7 @@ impl<V: Vector> Combination<V> {
         }
     }
 
-    /// Adds to the cotangents of what it read.
+    /// Adds to the cotangents of the inputs.
     #[inline(always)]
     pub fn backward(&self, slots: usize, cotangent: &mut [V]) {
         for (row, terms) in &self.cotangents {

@@ -1,11 +1,11 @@
-//! The CALM feature z: the invariant basis, normalised, projected, with its norms.
+//! The CALM feature z: the invariant basis, normalised and projected, with its norms.
 
 use std::ops::Range;
 
 use super::batches::Chunk;
+use super::chunked_slices::{ChunkedSlice, Layout, SplitByChunk};
 use super::instructions::Instructions;
 use super::matrix::{Factors, Matrix, Rows};
-use super::parts::{Divide, Layout, Parts};
 use super::vector::{Number, Vector};
 use super::weights::with_transpose;
 
@@ -19,7 +19,7 @@ const SQUARE_FLOOR: f64 = 1e-30;
 /// B̂ = B / (‖B‖ + ε_0), ‖B‖ = √(Σ B² + 10⁻³⁰) and ε_0 = 10⁻¹².
 #[derive(Clone, Debug)]
 pub struct Projection {
-    /// R as stored, row-major [D_basis, d].
+    /// R as stored, row-major `[D_basis, d]`.
     pub matrix: Vec<f32>,
     /// d, the number of projected features.
     pub dimension: usize,
@@ -43,7 +43,7 @@ pub(super) struct ProjectionMaps<V> {
 }
 
 impl<V: Vector> ProjectionMaps<V> {
-    /// `row_of` gives the row of R for each place of the layer's padded basis, none for padding.
+    /// `row_of` gives the row of R for each index of the layer's padded basis, `None` for padding.
     pub fn new(matrix: &[f32], dimension: usize, row_of: &[Option<usize>]) -> Self {
         let element = |place: usize, column: usize| {
             row_of[place].map_or(0.0, |row| f64::from(matrix[row * dimension + column]))
@@ -53,27 +53,27 @@ impl<V: Vector> ProjectionMaps<V> {
     }
 }
 
-/// What the reverse sweep needs of the forward one, for all atoms in the order of evaluation; and z.
+/// The features z, and the forward data that the reverse pass needs, for all atoms in evaluation order.
 #[derive(Clone, Debug, Default)]
 pub(super) struct ProjectionWork<V> {
-    /// B̂ R before T, [n, lanes of d].
+    /// B̂ R before T, `[n, lanes of d]`.
     projected: Vec<V>,
-    /// ‖B‖ and ‖B_k‖ of each layer, [n, 1 + layers].
+    /// ‖B‖ and ‖B_k‖ of each layer, `[n, 1 + layers]`.
     norms: Vec<f64>,
-    /// [n, D]
+    /// z, `[n, D]`.
     pub features: Vec<f64>,
 }
 
-/// The part of it that belongs to some atoms.
+/// The slices that belong to some atoms.
 pub(super) struct Projected<'a, V> {
-    projected: Parts<'a, V>,
-    norms: Parts<'a, f64>,
-    /// z
-    pub features: Parts<'a, f64>,
+    projected: ChunkedSlice<'a, V>,
+    norms: ChunkedSlice<'a, f64>,
+    /// z.
+    pub features: ChunkedSlice<'a, f64>,
 }
 
 impl<V: Vector> ProjectionWork<V> {
-    /// Makes room for `n` atoms.
+    /// Resizes the arrays to `n` atoms.
     pub fn resize(&mut self, map: &FeatureMap<V>, n: usize) {
         let projection = &map.projection;
         self.projected.resize(n * map.lanes(), V::ZERO);
@@ -81,21 +81,21 @@ impl<V: Vector> ProjectionWork<V> {
         self.features.resize(n * projection.feature_dimension(), 0.0);
     }
 
-    /// Those of all atoms, to be divided.
+    /// The slices of all atoms, which can be split.
     pub fn parts(&mut self, map: &FeatureMap<V>) -> Projected<'_, V> {
         let (even, projection) = (Layout::Even, &map.projection);
         Projected {
-            projected: Parts::new(even(map.lanes()), 0, &mut self.projected[..]),
-            norms: Parts::new(even(projection.n_norms()), 0, &mut self.norms[..]),
-            features: Parts::new(even(projection.feature_dimension()), 0, &mut self.features[..]),
+            projected: ChunkedSlice::new(even(map.lanes()), 0, &mut self.projected[..]),
+            norms: ChunkedSlice::new(even(projection.n_norms()), 0, &mut self.norms[..]),
+            features: ChunkedSlice::new(even(projection.feature_dimension()), 0, &mut self.features[..]),
         }
     }
 }
 
-impl<V: Send> Divide for Projected<'_, V> {
-    fn divide(self, chunk: &Chunk) -> (Self, Self) {
-        let (projected, norms) = (self.projected.divide(chunk), self.norms.divide(chunk));
-        let features = self.features.divide(chunk);
+impl<V: Send> SplitByChunk for Projected<'_, V> {
+    fn split(self, chunk: &Chunk) -> (Self, Self) {
+        let (projected, norms) = (self.projected.split(chunk), self.norms.split(chunk));
+        let features = self.features.split(chunk);
         (
             Self { projected: projected.0, norms: norms.0, features: features.0 },
             Self { projected: projected.1, norms: norms.1, features: features.1 },
@@ -109,13 +109,12 @@ impl Projection {
         self.dimension + if self.density_channels { self.n_norms() } else { 0 }
     }
 
-    /// That of the whole basis and that of each block.
+    /// Number of norms: that of the whole basis and those of the blocks.
     fn n_norms(&self) -> usize {
         1 + self.blocks.len()
     }
 
-    /// Everything that distinguishes this map from another, as bytes: two models with equal bytes give
-    /// features that one mixture can grade.
+    /// The bytes that identify this map: a mixture can grade the features of all models with equal bytes.
     pub fn fingerprint(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(4 * self.matrix.len() + 24);
         bytes.extend((self.dimension as u64).to_le_bytes());
@@ -125,7 +124,7 @@ impl Projection {
         bytes
     }
 
-    /// Puts in place of ‖B_k‖ the factor of the basis of layer k in its cotangent.
+    /// Replaces ‖B_k‖ with the factor of layer k's basis in its cotangent.
     #[inline(always)]
     fn norm_cotangents(&self, norms: &mut [f64], along: f64, of_norms: &[f64]) {
         let (scale, density) = (f64::from(self.density_scale), |k: usize| of_norms.get(k).copied());
@@ -137,16 +136,16 @@ impl Projection {
     }
 }
 
-/// A projection with its matrix as the passes over atoms take it.
+/// A projection with its matrix in the layout of the passes over atoms.
 #[derive(Clone, Debug)]
 pub(super) struct FeatureMap<V> {
     pub projection: Projection,
-    /// Of the basis of each layer.
+    /// For the basis of each layer.
     pub maps: Vec<ProjectionMaps<V>>,
 }
 
 impl<V: Vector> FeatureMap<V> {
-    /// z of the atoms at some places from the bases of each layer, [places, lanes].
+    /// z of the atoms at these places from the bases of each layer, `[places, lanes]`.
     #[inline(always)]
     pub fn forward<'a>(
         &self,
@@ -157,7 +156,7 @@ impl<V: Vector> FeatureMap<V> {
     ) {
         let (map, n, lanes) = (&self.projection, places.len(), self.lanes());
         let width = map.feature_dimension();
-        let (all_norms, all_projected) = (work.norms.of(places), work.projected.of(places));
+        let (all_norms, all_projected) = (work.norms.slice(places), work.projected.slice(places));
         all_norms.fill(SQUARE_FLOOR);
         all_projected.fill(V::ZERO);
         for (layer, maps) in self.maps.iter().enumerate() {
@@ -172,7 +171,7 @@ impl<V: Vector> FeatureMap<V> {
         }
         all_norms.iter_mut().for_each(|square| *square = square.sqrt());
         let rows = all_projected.chunks_exact_mut(lanes).zip(all_norms.chunks_exact(map.n_norms()));
-        for (z, (projected, norms)) in work.features.of(places).chunks_exact_mut(width).zip(rows) {
+        for (z, (projected, norms)) in work.features.slice(places).chunks_exact_mut(width).zip(rows) {
             let scale = if map.normalize { 1.0 / (norms[0] + NORM_FLOOR) } else { 1.0 };
             let projected = &mut V::flat_mut(projected)[..map.dimension];
             for (z, p) in z.iter_mut().zip(projected) {
@@ -187,16 +186,16 @@ impl<V: Vector> FeatureMap<V> {
         }
     }
 
-    /// The first half of the way back, for the atoms at some places: the cotangents of B̂ R, and the factors of B, from those
-    /// of z, [places, D].
+    /// The first half of the reverse pass for the atoms at these places: the cotangents of B̂ R and the factors
+    /// of B from those of z, `[places, D]`.
     ///
-    /// B̄ = R p̄/(N + ε_0) + \[L̄/(N + ε_0) − (p̄ · p)/(N + ε_0)\] B/N with p = B̂ R, and in block k besides
-    /// L̄_k/(N_k + ε_0) B/N_k.
+    /// B̄ = R p̄/(N + ε_0) + \[L̄/(N + ε_0) − (p̄ · p)/(N + ε_0)\] B/N with p = B̂ R, and in block k
+    /// additionally L̄_k/(N_k + ε_0) B/N_k.
     #[inline(always)]
     pub fn begin_backward(&self, places: &Range<usize>, cotangent: &[f64], work: &mut Projected<V>) {
         let map = &self.projection;
-        let rows = work.projected.of(places).chunks_exact_mut(self.lanes());
-        let rows = rows.zip(work.norms.of(places).chunks_exact_mut(map.n_norms()));
+        let rows = work.projected.slice(places).chunks_exact_mut(self.lanes());
+        let rows = rows.zip(work.norms.slice(places).chunks_exact_mut(map.n_norms()));
         for (cotangent, (projected, norms)) in cotangent.chunks_exact(map.feature_dimension()).zip(rows) {
             let (of_projected, of_norms) = cotangent.split_at(map.dimension);
             let inverse = 1.0 / (norms[0] + NORM_FLOOR);
@@ -211,7 +210,7 @@ impl<V: Vector> FeatureMap<V> {
         }
     }
 
-    /// The second half: puts the cotangents of the bases of one layer, [places, lanes], in place of the bases.
+    /// The second half: replaces the bases of one layer, `[places, lanes]`, with their cotangents.
     #[inline(always)]
     pub fn backward(
         &self,
@@ -224,8 +223,8 @@ impl<V: Vector> FeatureMap<V> {
         let (maps, stride) = (&self.maps[layer], self.projection.n_norms());
         let from = Rows::of_atoms(places.len(), self.lanes());
         let to = Rows::of_atoms(places.len(), maps.forward.input_lanes());
-        let factors = Factors { numbers: &work.norms.of(places)[layer + 1..], stride };
-        let lanes = (&*work.projected.of(places), bases);
+        let factors = Factors { numbers: &work.norms.slice(places)[layer + 1..], stride };
+        let lanes = (&*work.projected.slice(places), bases);
         maps.transposed.scale_multiply_add(lanes, from, (to, factors), instructions);
     }
 
@@ -244,11 +243,11 @@ fn dot<V: Vector>(a: &[V], b: &[V]) -> f64 {
     sum.horizontal_sum().into()
 }
 
-/// Components and channels of the sources of one layer's basis.
+/// Components and channels of each source of a layer's basis.
 pub(super) type Sources = [(usize, usize)];
 
-/// The row of R for each place of the padded basis of one layer, whose first row is `first`: sources one after
-/// another, the file channel-major (row n · components + c), the evaluation \[component\]\[padded channel\].
+/// The row of R for each index of a layer's padded basis, whose first row is `first`. Sources follow one
+/// another; the file is channel-major (row n · components + c), the evaluation \[component\]\[padded channel\].
 pub(super) fn rows_of_projection<V: Vector>(mut first: usize, sources: &Sources) -> Vec<Option<usize>> {
     let mut rows = Vec::new();
     for (components, channels) in sources {

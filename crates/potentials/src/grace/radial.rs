@@ -2,19 +2,20 @@
 
 use super::radial_network::{RadialNetwork, RadialWork};
 use super::radial_table::{RadialTable, b_splines};
-use super::vector::{Double, MOST_LANES, Number, Vector, lanes_for};
+use super::vector::{Double, MAX_LANES, Number, Vector, lanes_for};
 
-/// Where each pair of elements needs a table, more bytes than this in all are not worth it.
-const LARGEST_TABLES: usize = 1 << 28;
+/// Limit of the total size of tables if every pair of elements needs its own, bytes.
+const MAX_TABLE_BYTES: usize = 1 << 28;
 
 /// How radial functions are evaluated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum RadialPath {
     /// The network itself, for every bond.
     Exact,
-    /// Splines of degree seven; the errors of values and of derivatives are at most 10⁻¹¹ of the largest, 10⁻⁸ in mixed
-    /// precision before coefficients are rounded, measured when a model is read. Where tables for every pair of elements
-    /// would take more than 256 MiB (three layers, tens of elements) the network itself is evaluated.
+    /// Splines of degree seven. The errors of values and derivatives, relative to the largest, are at most
+    /// 10⁻¹¹, in mixed precision 10⁻⁸ before coefficients are rounded; they are measured when a model is read.
+    /// If tables for every pair of elements would exceed 256 MiB (three layers, tens of elements), the network
+    /// itself is evaluated.
     #[default]
     Table,
 }
@@ -24,11 +25,11 @@ pub enum RadialPath {
 pub(super) struct RadialFunctions<V> {
     network: RadialNetwork,
     n_elements: usize,
-    /// r_c for centre and neighbour element, [n_elements²], Å.
+    /// r_c for centre and neighbour element, `[n_elements²]`, Å.
     cutoffs: Vec<f64>,
-    /// One table for each distinct cutoff, or for each pair where the elements matter; none for the exact path.
+    /// One table per distinct cutoff, or per pair if the elements matter; empty on the exact path.
     tables: Vec<RadialTable<V>>,
-    /// Which table belongs to centre and neighbour element, [n_elements²].
+    /// Index of the table for centre and neighbour element, `[n_elements²]`.
     table_of_pair: Vec<usize>,
 }
 
@@ -44,7 +45,7 @@ impl<V: Vector> RadialFunctions<V> {
             if known.is_none() {
                 tables.push(RadialTable::new(&network, *cutoff, pair, V::Number::TABLE_ERROR).rounded());
             }
-            if !network.pair_biases.is_empty() && tables[0].bytes() * cutoffs.len() > LARGEST_TABLES {
+            if !network.pair_biases.is_empty() && tables[0].bytes() * cutoffs.len() > MAX_TABLE_BYTES {
                 tables.clear();
                 break;
             }
@@ -79,13 +80,13 @@ impl<V: Vector> RadialFunctions<V> {
         self.network.basis_size
     }
 
-    /// The tables, for a description of the model.
+    /// The tables, for a summary of the model.
     pub fn tables(&self) -> &[RadialTable<V>] {
         &self.tables
     }
 
-    /// R_nl and dR_nl/dr of no more bonds than a vector has lanes, each \[bond\]\[l\]\[channel\], from the pair of elements
-    /// and the distance of each, within the cutoff of the pair.
+    /// R_nl and dR_nl/dr of at most as many bonds as a vector has lanes, each \[bond\]\[l\]\[channel\], from
+    /// the pair of elements and the distance of each, within the cutoff of the pair.
     #[inline(always)]
     pub fn evaluate(
         &self,
@@ -98,7 +99,7 @@ impl<V: Vector> RadialFunctions<V> {
             return self.evaluate_exactly(bonds, work, values, derivatives);
         }
         let (lanes, mut places) = (self.output_lanes(), V::ZERO);
-        let mut located = [(&self.tables[0], 0); MOST_LANES];
+        let mut located = [(&self.tables[0], 0); MAX_LANES];
         for (b, (pair, r)) in bonds.iter().enumerate() {
             let table = &self.tables[self.table_of_pair[*pair]];
             let (interval, t) = table.locate(*r);
@@ -136,8 +137,8 @@ fn round<V: Vector>(from: &[Double], to: &mut [V]) {
     }
 }
 
-/// Columns of the last layer, given as row-major [channel, l], put in the order \[l\]\[channel\] with
-/// whole lanes of channels: the column of the file at each place, if there is one.
+/// Maps the columns of the last layer, row-major `[channel, l]` in the file, to the order \[l\]\[channel\] with
+/// padded channels: the file's column for each index, if any.
 pub(super) fn column_by_order<V: Vector>(n_channels: usize, n_orders: usize, place: usize) -> Option<usize> {
     let width = lanes_for::<V>(n_channels) * V::LANES;
     let (l, n) = (place / width, place % width);
@@ -177,7 +178,7 @@ mod tests {
         }
         for order in 0..2 {
             let error = worst[order] / largest[order];
-            // The bound is measured where the error is largest, up to the variation within an interval.
+            // The bound is measured where the error is largest, up to its variation within an interval.
             assert!(error <= 1.2 * stated[order] + 1e-15, "{order}: {error:e}, stated {:e}", stated[order]);
         }
     }

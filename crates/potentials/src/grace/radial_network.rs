@@ -1,4 +1,4 @@
-//! The small network on a Chebyshev basis that gives the radial functions, with two derivatives, in double precision.
+//! The network on a Chebyshev basis that gives the radial functions, with two derivatives, in double precision.
 
 use super::instructions::Instructions;
 use super::matrix::{Matrix, Rows};
@@ -19,9 +19,9 @@ pub(super) struct RadialNetwork {
     pub envelope_last: bool,
     /// The last one gives \[l\]\[channel\], its channels padded as those of the layer.
     pub layers: Vec<Matrix<Double>>,
-    /// b of each layer after the first; empty where there is none.
+    /// b of each layer after the first; empty if absent.
     pub biases: Vec<Vec<Double>>,
-    /// b of the first layer for centre and neighbour element, [n_elements²]; empty where there is none.
+    /// b of the first layer for centre and neighbour element, `[n_elements²]`; empty if absent.
     pub pair_biases: Vec<Vec<Double>>,
 }
 
@@ -34,8 +34,8 @@ impl RadialNetwork {
         self.layers.last().map_or(0, Matrix::output_lanes)
     }
 
-    /// R_nl and its first two derivatives at distance `r` for the cutoff r_c, Å; the polynomials simply go
-    /// on beyond the cutoff, where no bond is.
+    /// R_nl and its first two derivatives at distance `r` for the cutoff r_c, Å. Beyond the cutoff, where there
+    /// are no bonds, the polynomials continue.
     pub fn evaluate<'a>(&self, r: f64, cutoff: f64, pair: usize, work: &'a mut RadialWork) -> &'a Jet {
         let instructions = Instructions::best();
         self.basis(r, cutoff, &mut work.input);
@@ -123,7 +123,7 @@ fn silu([values, first, second]: &mut Jet) {
     }
 }
 
-/// Work arrays of [`RadialNetwork::evaluate`].
+/// Scratch arrays of [`RadialNetwork::evaluate`].
 #[derive(Clone, Debug, Default)]
 pub(super) struct RadialWork {
     input: Jet,

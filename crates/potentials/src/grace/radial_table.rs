@@ -1,10 +1,10 @@
-//! Radial functions as splines of degree seven.
+//! Tables of radial functions: splines of degree seven.
 
 use super::instructions::{Instructions, Pass};
 use super::radial_network::{RadialNetwork, RadialWork};
 use super::vector::{Double, Number, Vector, to_lanes};
 
-/// Intervals to begin with, and the most that are tried.
+/// Initial and maximum number of intervals.
 const INTERVALS: std::ops::RangeInclusive<usize> = 256..=16384;
 
 /// Degree of the spline.
@@ -13,20 +13,20 @@ const DEGREE: usize = 7;
 /// DEGREE!
 const FACTORIAL: f64 = 5040.0;
 
-/// B-splines that are not zero within an interval.
+/// Number of B-splines that are nonzero within an interval.
 pub(super) const SUPPORT: usize = DEGREE + 1;
 
 /// Roots of the B-spline polynomial inside the unit circle (M. Unser, A. Aldroubi and M. Eden,
 /// IEEE Trans. Signal Process. 41, 821 (1993)).
 const POLES: [f64; 3] = [-0.535_280_430_796_438_2, -0.122_554_615_192_326_69, -0.009_148_694_809_608_277];
 
-/// Samples beyond both ends, over which the effect of the unknown end conditions decays: the largest pole
-/// to this power is 10⁻¹⁷.
+/// Number of samples beyond both ends, over which the effect of the unknown end conditions decays: the largest
+/// pole to this power is 10⁻¹⁷.
 const MARGIN: usize = 64;
 
-/// R_nl(r) for one cutoff as the spline Σ_k c_k β(r/h − k), β the cardinal B-spline of degree seven, through
-/// the exact values at the equidistant knots r = k h. It has six continuous derivatives, and its own
-/// derivative gives the forces, so energy is conserved.
+/// R_nl(r) for one cutoff as the spline Σ_k c_k β(r/h − k), where β is the cardinal B-spline of degree seven,
+/// through the exact values at the equidistant knots r = k h. It has six continuous derivatives, and forces use
+/// its own derivative, so energy is conserved.
 #[derive(Clone, Debug)]
 pub(super) struct RadialTable<V> {
     cutoff: f64,
@@ -34,14 +34,14 @@ pub(super) struct RadialTable<V> {
     /// 1/h, 1/Å
     knots_per_length: f64,
     errors: [f64; 2],
-    /// Lanes of one row: all R_nl of a bond.
+    /// Lanes of a row with all R_nl of a bond.
     lanes: usize,
-    /// c_k from k = −3, [intervals + 7, lanes].
+    /// c_k from k = −3, `[intervals + 7, lanes]`.
     coefficients: Vec<V>,
 }
 
 impl RadialTable<Double> {
-    /// Halves the spacing until the errors of values and of derivatives, each relative to the largest, are at most
+    /// Halves the spacing until the errors of values and derivatives, relative to the largest, are at most
     /// `target`.
     pub fn new(network: &RadialNetwork, cutoff: f64, pair: usize, target: f64) -> Self {
         let mut table = Self::with_intervals(network, cutoff, pair, *INTERVALS.start());
@@ -52,7 +52,7 @@ impl RadialTable<Double> {
         table
     }
 
-    /// The network is a smooth function beyond both ends too, so the samples simply go on there.
+    /// The network is smooth beyond both ends, so samples are taken there too.
     fn with_intervals(network: &RadialNetwork, cutoff: f64, pair: usize, intervals: usize) -> Self {
         let mut work = RadialWork::default();
         let (lanes, spacing) = (network.output_lanes(), cutoff / intervals as f64);
@@ -69,8 +69,8 @@ impl RadialTable<Double> {
         table
     }
 
-    /// The largest error of values and of derivatives between knots, relative to the largest of each. They
-    /// are largest near the middle and near the quarters of an interval.
+    /// The largest errors of values and derivatives between knots, relative to the largest of each. They occur
+    /// near the middle and near the quarters of an interval.
     fn measure(&self, network: &RadialNetwork, pair: usize) -> [f64; 2] {
         let mut work = RadialWork::default();
         let mut found = [vec![Double::ZERO; self.lanes], vec![Double::ZERO; self.lanes]];
@@ -91,7 +91,7 @@ impl RadialTable<Double> {
         [errors[0] / largest[0], errors[1] / largest[1]]
     }
 
-    /// The same with coefficients in another precision.
+    /// The table with coefficients in another precision.
     pub fn rounded<V: Vector>(&self) -> RadialTable<V> {
         let Self { cutoff, intervals, knots_per_length, errors, .. } = *self;
         let coefficients = to_lanes(Double::flat(&self.coefficients));
@@ -101,12 +101,12 @@ impl RadialTable<Double> {
 }
 
 impl<V: Vector> RadialTable<V> {
-    /// The cutoff it was made for, Å.
+    /// The cutoff of the table, Å.
     pub fn cutoff(&self) -> f64 {
         self.cutoff
     }
 
-    /// What it takes in memory.
+    /// Its size in memory.
     pub fn bytes(&self) -> usize {
         size_of_val(&self.coefficients[..])
     }
@@ -116,12 +116,12 @@ impl<V: Vector> RadialTable<V> {
         self.intervals
     }
 
-    /// The measured errors of values and of derivatives, relative to the largest of each.
+    /// The measured errors of values and derivatives, relative to the largest of each.
     pub fn errors(&self) -> [f64; 2] {
         self.errors
     }
 
-    /// The interval of r and the place within it, from 0 to 1; 0 ≤ r ≤ cutoff, Å.
+    /// The interval of r and the position in it, from 0 to 1; 0 ≤ r ≤ cutoff, Å.
     #[inline(always)]
     pub fn locate(&self, r: f64) -> (usize, f64) {
         let position = r * self.knots_per_length;
@@ -129,7 +129,7 @@ impl<V: Vector> RadialTable<V> {
         (interval, position - interval as f64)
     }
 
-    /// Σ_k weights\[k\]\[bond\] c_(interval + k), all R_nl of one bond, and dR_nl/dr in the same way.
+    /// Σ_k weights\[k\]\[bond\] c_(interval + k), all R_nl of one bond, and dR_nl/dr likewise.
     #[inline(always)]
     pub fn combine(
         &self,
@@ -141,11 +141,17 @@ impl<V: Vector> RadialTable<V> {
     ) {
         let n = self.lanes;
         let rows = &self.coefficients[interval * n..][..SUPPORT * n];
-        let whole = n / TOGETHER * TOGETHER;
+        let whole = n / LANES_PER_PASS * LANES_PER_PASS;
         let knots_per_length = V::Number::round(self.knots_per_length);
         let weights = (weights.map(|w| w[bond]), slopes.map(|s| s[bond] * knots_per_length));
-        for c in (0..whole).step_by(TOGETHER) {
-            sum_of_rows::<V, TOGETHER>(&rows[c..], n, &weights, &mut values[c..], &mut derivatives[c..]);
+        for c in (0..whole).step_by(LANES_PER_PASS) {
+            sum_of_rows::<V, LANES_PER_PASS>(
+                &rows[c..],
+                n,
+                &weights,
+                &mut values[c..],
+                &mut derivatives[c..],
+            );
         }
         for c in whole..n {
             sum_of_rows::<V, 1>(&rows[c..], n, &weights, &mut values[c..], &mut derivatives[c..]);
@@ -158,7 +164,7 @@ impl<V: Vector> RadialTable<V> {
     }
 }
 
-/// One bond, for whoever is compiled for the baseline.
+/// A single bond, for callers compiled for the baseline.
 struct One<'a, V> {
     table: &'a RadialTable<V>,
     r: f64,
@@ -180,10 +186,10 @@ impl<V: Vector> Pass for One<'_, V> {
     }
 }
 
-/// Lanes of a row that are summed together: they are neighbours in memory.
-const TOGETHER: usize = 4;
+/// Adjacent lanes of a row that are summed together.
+const LANES_PER_PASS: usize = 4;
 
-/// Σ_k weights\[k\] of row k, for `L` lanes of rows that stand `n` lanes from one another, with two sets of weights.
+/// Σ_k weights\[k\] of row k, for `L` lanes of rows that are `n` lanes apart, with two sets of weights.
 #[inline(always)]
 fn sum_of_rows<V: Vector, const L: usize>(
     rows: &[V],
@@ -204,8 +210,8 @@ fn sum_of_rows<V: Vector, const L: usize>(
     derivatives[..L].copy_from_slice(&slope_sums);
 }
 
-/// The B-splines of degree p = 7 within an interval and their derivatives, at the place t of a bond in each lane:
-/// p b_j^p = (p − j + t) b_(j−1)^(p−1) + (j + 1 − t) b_j^(p−1) and db_j^p/dt = b_(j−1)^(p−1) − b_j^(p−1).
+/// The B-splines of degree p = 7 within an interval and their derivatives, at position t of a bond in each
+/// lane: p b_j^p = (p − j + t) b_(j−1)^(p−1) + (j + 1 − t) b_j^(p−1) and db_j^p/dt = b_(j−1)^(p−1) − b_j^(p−1).
 #[inline(always)]
 pub(super) fn b_splines<V: Vector>(t: &V) -> ([V; SUPPORT], [V; SUPPORT]) {
     let round = V::Number::round;
@@ -227,8 +233,8 @@ pub(super) fn b_splines<V: Vector>(t: &V) -> ([V; SUPPORT], [V; SUPPORT]) {
     (b, slopes)
 }
 
-/// Turns samples at equidistant knots, [knots, lanes], into spline coefficients by the recursive filter of
-/// Unser, Aldroubi and Eden; near the ends they belong to some other end condition.
+/// Converts samples at equidistant knots, `[knots, lanes]`, to spline coefficients by the recursive filter of
+/// Unser, Aldroubi and Eden; near the ends they satisfy another end condition.
 fn to_coefficients(samples: &mut [Double], lanes: usize) {
     let gain: f64 = POLES.iter().map(|z| (1.0 - z) * (1.0 - 1.0 / z)).product();
     Double::flat_mut(samples).iter_mut().for_each(|x| *x *= gain);

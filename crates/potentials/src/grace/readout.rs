@@ -1,4 +1,4 @@
-//! From the invariant basis of atoms to their energies.
+//! From the invariant basis to atomic energies.
 
 use super::invariant_norm::InvariantNorm;
 use super::matrix::{Matrix, Rows};
@@ -6,7 +6,7 @@ use super::tape::Batch;
 use super::vector::{Number, Vector};
 use super::weights::Weights;
 
-/// Non-linearity of the readout.
+/// The readout's activation function.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Activation {
     /// x / (1 + e^−x)
@@ -32,16 +32,16 @@ impl Activation {
     }
 }
 
-/// E = s (y_0 + MLP(y_1, y_2, …)) + shift of the element, with the densities y = Σ over layers of norm(W B), B
-/// being the invariants of the layer.
+/// E = s (y_0 + MLP(y_1, y_2, …)) + shift of the element, with the densities y = Σ over layers of norm(W B),
+/// where B are the invariants of the layer.
 #[derive(Clone, Debug)]
 pub(super) struct Readout<V> {
     /// Densities of each layer.
     pub blocks: Vec<Block<V>>,
-    /// Layers of the perceptron with their transposes. The first has an input for y_0 as well, with
-    /// weights zero, so that it takes y as it stands.
+    /// Layers of the perceptron with their transposes. The first also has an input for y_0 with zero weights,
+    /// so that it can read y unchanged.
     pub layers: Vec<(Matrix<V>, Matrix<V>)>,
-    /// After every layer but the last.
+    /// Applied after every layer but the last.
     pub activation: Activation,
     /// s
     pub scale: f64,
@@ -49,12 +49,12 @@ pub(super) struct Readout<V> {
     pub shifts: Vec<f64>,
 }
 
-/// The densities that one layer adds.
+/// The densities of one layer.
 #[derive(Clone, Debug)]
 pub(super) struct Block<V> {
     /// W
     pub weights: Weights<V>,
-    /// Left out in models of one layer.
+    /// Absent in one-layer models.
     pub norm: Option<InvariantNorm>,
 }
 
@@ -66,7 +66,7 @@ impl<V: Vector> Block<V> {
     }
 }
 
-/// Work arrays for one batch of atoms; each array has a row for each atom.
+/// Scratch arrays for one batch; each has a row per atom.
 #[derive(Clone, Debug, Default)]
 pub(super) struct ReadoutWork<V> {
     /// W B of each layer.
@@ -85,7 +85,7 @@ impl<V: Vector> Readout<V> {
         self.blocks.first().map_or(0, Block::lanes)
     }
 
-    /// Begins with a batch of so many atoms.
+    /// Starts a batch of this many atoms.
     #[inline(always)]
     pub fn begin(&self, atoms: usize, work: &mut ReadoutWork<V>) {
         work.densities.resize(self.blocks.len(), Vec::new());
@@ -94,7 +94,7 @@ impl<V: Vector> Readout<V> {
         zeros(&mut work.values[0], atoms * self.density_lanes());
     }
 
-    /// Adds the densities of one layer to y, from its basis, a row of `stride` lanes for each atom.
+    /// Adds the densities of one layer to y, from its basis, one row of `stride` lanes per atom.
     #[inline(always)]
     pub fn add_densities(
         &self,
@@ -118,7 +118,7 @@ impl<V: Vector> Readout<V> {
         }
     }
 
-    /// The energies of the atoms, eV, when all layers have added their densities; leaves ∂E/∂y in `work`.
+    /// The energies of the atoms, eV, after all layers have added their densities; leaves ∂E/∂y in `work`.
     #[inline(always)]
     pub fn evaluate(&self, batch: &Batch, energies: &mut [f64], work: &mut ReadoutWork<V>) {
         let atoms = batch.atoms;
@@ -147,7 +147,7 @@ impl<V: Vector> Readout<V> {
         self.backward(batch, work);
     }
 
-    /// ∂E/∂y into `work.cotangent`.
+    /// Writes ∂E/∂y to `work.cotangent`.
     #[inline(always)]
     fn backward(&self, batch: &Batch, work: &mut ReadoutWork<V>) {
         let (atoms, lanes) = (batch.atoms, self.density_lanes());
@@ -172,7 +172,7 @@ impl<V: Vector> Readout<V> {
             .for_each(|cotangent| cotangent[0][0] += V::Number::round(self.scale));
     }
 
-    /// ∂E/∂(W B) of all layers after [`Readout::evaluate`], [atoms, layers, lanes].
+    /// ∂E/∂(W B) of all layers after [`Readout::evaluate`], `[atoms, layers, lanes]`.
     #[inline(always)]
     pub fn density_cotangents(&self, out: &mut [V], work: &ReadoutWork<V>) {
         let lanes = self.density_lanes();

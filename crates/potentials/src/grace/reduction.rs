@@ -1,4 +1,4 @@
-//! Reductions: several tensors summed into one with weights, which may be those of the central atom's element.
+//! Reductions: weighted sums of several tensors; the weights may depend on the central atom's element.
 
 use std::collections::BTreeMap;
 
@@ -9,19 +9,19 @@ use super::tape::{Operation, Tensor};
 use super::vector::Vector;
 use super::weights::Weights;
 
-/// What a reduction takes from one tensor.
+/// The part of a reduction that reads one tensor.
 struct Source {
     name: String,
     tensor: Tensor,
-    /// Its components,
+    /// The components to read,
     collect: Vec<usize>,
-    /// which weights each has,
+    /// the weights of each,
     tiles: Vec<usize>,
-    /// and to which component of the result it is added.
+    /// and the component of the result to which it is added.
     sums: Vec<usize>,
-    /// Number of different weights.
+    /// Number of distinct weights.
     n_tiles: usize,
-    /// Weights times their norms, [type, k, n, tile].
+    /// Weights times their norms, `[type, k, n, tile]`.
     weights: Vec<f64>,
 }
 
@@ -33,15 +33,15 @@ struct Reduction {
 }
 
 impl Reduction {
-    /// W_kn of the given tile for the central atom's element `t`.
+    /// W_kn of this tile for the central atom's element `t`.
     fn weight(&self, source: &Source, tile: usize, [t, n, k]: [usize; 3]) -> f64 {
         source.weights[((t * self.n_out + k) * source.tensor.channels + n) * source.n_tiles + tile]
     }
 }
 
 impl<V: Vector> Graph<'_, V> {
-    /// The invariant reduction `prefix`: gathers the basis B of its sources and returns the weights W of
-    /// y_k = Σ_b W_kb B_b.
+    /// The invariant reduction `prefix`: collects the basis B from its sources and returns the weights W of y_k
+    /// = Σ_b W_kb B_b.
     pub fn invariants(&mut self, prefix: &str, n_elements: usize) -> Result<Weights<V>, GraceError> {
         let key = format!("{prefix}_only_invar");
         if self.archive.contains(&key) {
@@ -49,7 +49,7 @@ impl<V: Vector> Graph<'_, V> {
             self.archive.expect_count(&format!("{prefix}_n_funcs"), 1)?;
         }
         let reduction = self.reduction(prefix, n_elements, 1)?;
-        // Source, tile and channel of each place of the padded basis; none for padding.
+        // Source, tile and channel of each index of the padded basis; `None` for padding.
         let mut places: Vec<Option<(&Source, usize, usize)>> = Vec::new();
         for source in &reduction.sources {
             for (component, tile) in source.collect.iter().zip(&source.tiles) {
@@ -71,8 +71,8 @@ impl<V: Vector> Graph<'_, V> {
         }))
     }
 
-    /// The reduction `prefix` to a tensor of that name:
-    /// out_k,f = Σ over sources and c with sum(c) = f of Σ_n W_kn x_n,collect(c).
+    /// The reduction `prefix` to a tensor of that name: out_k,f = Σ over sources and c with sum(c) = f of Σ_n
+    /// W_kn x_n,collect(c).
     pub fn reduce(&mut self, prefix: &str, n_elements: usize) -> Result<Tensor, GraceError> {
         let archive = self.archive;
         let components = archive.count(&format!("{prefix}_n_funcs"), 1, 1 << 16)?;

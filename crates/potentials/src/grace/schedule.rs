@@ -1,7 +1,7 @@
-//! The order in which operations run.
+//! The execution order of operations.
 //!
-//! An operation is divided into pieces that share no rows where they can be, and a piece runs right before what needs it: what
-//! it leaves is then still in the cache, in the reverse sweep as well.
+//! Operations are divided into pieces that share no rows where possible. A piece runs right before the piece
+//! that needs it, so that its results are still in the cache, also in the reverse pass.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use super::product::Term;
 use super::tape::Operation;
 use super::vector::Vector;
 
-/// The same operations in pieces, depth first from those whose results no other takes.
+/// The operations in pieces, depth first from those whose results no other piece reads.
 pub(super) fn depth_first<V: Vector>(operations: Vec<Operation<V>>) -> Vec<Operation<V>> {
     let pieces: Vec<Operation<V>> = operations.into_iter().flat_map(divided).collect();
     let needs = needs(&pieces);
@@ -24,7 +24,7 @@ pub(super) fn depth_first<V: Vector>(operations: Vec<Operation<V>>) -> Vec<Opera
     order.into_iter().filter_map(|k| pieces[k].take()).collect()
 }
 
-/// For each piece those whose rows it reads.
+/// For each piece, the pieces whose rows it reads.
 fn needs<V: Vector>(pieces: &[Operation<V>]) -> Vec<Vec<usize>> {
     let writes =
         pieces.iter().enumerate().flat_map(|(k, piece)| piece.writes().into_iter().map(move |row| (row, k)));
@@ -45,7 +45,8 @@ fn place(k: usize, needs: &[Vec<usize>], placed: &mut [bool], order: &mut Vec<us
     order.push(k);
 }
 
-/// Parts of a linear map that add to different rows, and groups of a product's results that share no factor.
+/// The parts of a linear map that add to different rows, and groups of a product's results that share no
+/// factor.
 fn divided<V: Vector>(operation: Operation<V>) -> Vec<Operation<V>> {
     match operation {
         Operation::Linear(Linear { parts }) => {
@@ -61,7 +62,7 @@ fn divided<V: Vector>(operation: Operation<V>) -> Vec<Operation<V>> {
     }
 }
 
-/// Groups of items that have rows in common, directly or through others, in the order of their first rows.
+/// Groups of items connected by common rows, ordered by their first rows.
 fn connected<T>(items: Vec<T>, rows: impl Fn(&T) -> Vec<u32>) -> Vec<Vec<T>> {
     let mut groups: Vec<(Vec<u32>, Vec<T>)> = Vec::new();
     for item in items {

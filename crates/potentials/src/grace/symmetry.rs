@@ -1,7 +1,7 @@
-//! A check of models whose files do not say how their parts are connected.
+//! A check of models whose files do not state how their parts are connected.
 //!
-//! Where a product takes another factor than the maker of the model meant, components of different orders meet, and
-//! energies change when a structure is turned.
+//! If a product uses another factor than the author of the model intended, components of different orders mix,
+//! and energies are not rotationally invariant.
 
 use std::sync::Arc;
 
@@ -12,11 +12,11 @@ use super::error::{GraceError, unsupported};
 use super::model::GraceModel;
 use super::potential::Grace;
 
-/// The largest change, relative to the largest energy without shifts: far beyond rounding, even of weights that were
-/// single-precision numbers once.
+/// The largest change relative to the largest energy without shifts: far above rounding, even for weights that
+/// were once in single precision.
 const TOLERANCE: f64 = 1e-3;
 
-/// Atoms of a cluster, as parts of the cutoff.
+/// Atoms of a cluster, in units of the cutoff.
 const SITES: [Vec3; 6] = [
     [0.0, 0.0, 0.0],
     [0.42, 0.05, 0.1],
@@ -26,7 +26,7 @@ const SITES: [Vec3; 6] = [
     [0.3, -0.45, -0.2],
 ];
 
-/// Refuses a model for which the energies of atoms change when a cluster is turned or mirrored.
+/// Rejects a model if atomic energies change when a cluster is rotated or reflected.
 pub(super) fn require_invariance(archive: &Archive, model: GraceModel) -> Result<GraceModel, GraceError> {
     let model = Arc::new(model);
     let mut grace = Grace::new(Arc::clone(&model));
@@ -39,8 +39,8 @@ pub(super) fn require_invariance(archive: &Archive, model: GraceModel) -> Result
         let change = here.iter().zip(&there).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         if change.is_nan() || change > TOLERANCE * largest {
             let reason = format!(
-                "energies change by {change:.1e} eV when a cluster is turned: the parts of this model are not \
-                 connected as in the models that are known"
+                "energies change by {change:.1e} eV when a cluster is rotated: the parts of this \
+                 model are not connected as in the supported models"
             );
             return Err(unsupported(archive, reason));
         }
@@ -49,7 +49,7 @@ pub(super) fn require_invariance(archive: &Archive, model: GraceModel) -> Result
     Ok(Arc::unwrap_or_clone(model))
 }
 
-/// Energies of the atoms without the shifts of their elements, eV.
+/// Atomic energies without the shifts of their elements, eV.
 fn energies(grace: &mut Grace, place: impl Fn(Vec3) -> Vec3) -> Vec<f64> {
     let model = Arc::clone(grace.model());
     let elements = (0..SITES.len()).map(|atom| atom % model.elements().len());

@@ -1,9 +1,10 @@
-//! The equivariant tensors of some atoms, and the operations that make one from others.
+//! The equivariant tensors of a batch of atoms, and the operations that compute one from others.
 //!
-//! All tensors stand behind one another on a tape, each \[component\]\[slot\]\[channel\], with a slot for each atom of a
-//! batch: weights are read once for all of them. An operation reads rows that stand before its result. Cotangents stand
-//! on a second tape of the same layout, which the operations walk backwards; its slots are \[cotangent\]\[atom\].
-//! Places on a tape are those for one slot; with more slots a component begins at that many times the lane.
+//! All tensors follow one another on a tape, each \[component\]\[slot\]\[channel\], with a slot per atom of a
+//! batch, so that weights are read once for all of them. An operation reads rows that precede its result.
+//! Cotangents are on a second tape of the same layout, which the operations traverse in reverse; its slots are
+//! \[cotangent\]\[atom\]. Lanes are given for one slot; with several slots a component starts at that multiple
+//! of its lane.
 
 use super::equivariant_norm::EquivariantNorm;
 use super::instructions::Instructions;
@@ -11,7 +12,7 @@ use super::linear::Linear;
 use super::product::{Combination, Product};
 use super::vector::Vector;
 
-/// Where a tensor stands on the tape.
+/// The lanes of a tensor on the tape.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Tensor {
     /// First lane.
@@ -42,21 +43,21 @@ impl Tensor {
     }
 }
 
-/// Atoms that pass a tape together.
+/// Atoms that are processed together.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Batch {
-    /// The element of all of them.
+    /// Their common element.
     pub element: usize,
-    /// How many they are.
+    /// Their number.
     pub atoms: usize,
     pub instructions: Instructions,
 }
 
-/// The place of one atom, or of one of its cotangents, on a tape.
+/// The slot of an atom, or of one of its cotangents, on a tape.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Slot {
     pub slot: usize,
-    /// How many there are.
+    /// Number of slots.
     pub slots: usize,
 }
 
@@ -68,16 +69,16 @@ impl Slot {
     }
 }
 
-/// One step along the tape.
+/// An operation on the tape.
 #[derive(Clone, Debug)]
 pub(super) enum Operation<V: Vector> {
-    /// Channels mixed with weights.
+    /// Mixes channels with weights.
     Linear(Linear<V>),
-    /// Components coupled, channel by channel.
+    /// Couples components, channel by channel.
     Product(Product<V>),
-    /// Components summed with factors.
+    /// Sums components with factors.
     Combination(Combination<V>),
-    /// Components divided by their norm.
+    /// Divides components by their norm.
     EquivariantNorm(EquivariantNorm<V>),
 }
 
@@ -92,7 +93,7 @@ impl<V: Vector> Operation<V> {
         }
     }
 
-    /// Adds to `N` cotangents of what it read.
+    /// Adds to `N` cotangents of the inputs.
     #[inline(always)]
     pub fn backward<const N: usize>(&self, batch: &Batch, tape: &[V], cotangent: &mut [V]) {
         match self {
@@ -121,7 +122,7 @@ impl<V: Vector> Operation<V> {
         }
     }
 
-    /// Those of them that the reverse sweep reads again.
+    /// Those of them that the reverse pass reads again.
     pub fn factors(&self) -> Vec<usize> {
         match self {
             Self::Product(_) | Self::EquivariantNorm(_) => self.reads(),
@@ -129,7 +130,7 @@ impl<V: Vector> Operation<V> {
         }
     }
 
-    /// First lanes of the rows that it makes.
+    /// First lanes of the rows that it produces.
     pub fn writes(&self) -> Vec<usize> {
         match self {
             Self::Linear(linear) => {
@@ -143,8 +144,8 @@ impl<V: Vector> Operation<V> {
         }
     }
 
-    /// Drops every result that nobody needs, and marks as needed what the others read;
-    /// `needed` says it for each lane of the tape at which a row begins.
+    /// Drops every result that is not needed and marks the inputs of the others as needed. `needed` has a flag
+    /// for each lane at which a row starts.
     pub fn keep(&mut self, needed: &mut [bool]) {
         match self {
             Self::Linear(linear) => linear.keep(needed),
@@ -154,7 +155,7 @@ impl<V: Vector> Operation<V> {
         }
     }
 
-    /// Puts lanes of the tape and of the tape of cotangents in place of those of the graph.
+    /// Replaces lanes of the graph with lanes of the tape and of the cotangents' tape.
     pub fn rename(&mut self, on_tape: impl Fn(u32) -> u32, of_cotangent: impl Fn(u32) -> u32) {
         match self {
             Self::Linear(linear) => linear.rename(on_tape, of_cotangent),

@@ -1,4 +1,4 @@
-//! Threads that evaluate a structure together.
+//! Threads that evaluate one structure in parallel.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -6,17 +6,17 @@ use std::sync::Arc;
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 
 use super::batches::Chunk;
-use super::parts::Divide;
+use super::chunked_slices::SplitByChunk;
 
-/// The calling thread alone, or a pool of threads. Results have the same bits whatever it is.
+/// The calling thread or a thread pool. Results have the same bits with either.
 #[derive(Clone, Debug, Default)]
 pub struct Threads(Option<Arc<ThreadPool>>);
 
 impl Threads {
-    /// `n` threads of their own; for less than two the calling thread.
+    /// A pool of `n` threads; the calling thread if `n` is less than two.
     ///
     /// # Errors
-    /// The system gives no more threads.
+    /// The system cannot create the threads.
     pub fn new(n: usize) -> Result<Self, ThreadPoolBuildError> {
         if n < 2 {
             return Ok(Self::default());
@@ -25,12 +25,12 @@ impl Threads {
         Ok(Self(Some(Arc::new(builder.build()?))))
     }
 
-    /// How many they are.
+    /// Number of threads.
     pub fn count(&self) -> usize {
         self.0.as_ref().map_or(1, |pool| pool.current_num_threads())
     }
 
-    /// Does some work as one of them, so that the others are there to help.
+    /// Runs `work` on a thread of the pool, so that the others can help.
     pub(super) fn run<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
         match &self.0 {
             Some(pool) => pool.install(work),
@@ -38,8 +38,9 @@ impl Threads {
         }
     }
 
-    /// Deals `work` out by chunks; to be called within [`Threads::run`]. `act` is told which thread does it.
-    pub(super) fn each<W: Divide>(
+    /// Splits `work` by chunks and runs `act` on each; call it within [`Threads::run`]. `act` receives the
+    /// index of its thread.
+    pub(super) fn for_each_chunk<W: SplitByChunk>(
         &self,
         chunks: &[Chunk],
         work: W,
@@ -52,8 +53,9 @@ impl Threads {
             }
             _ => {
                 let (before, after) = chunks.split_at(chunks.len() / 2);
-                let (first, second) = work.divide(&after[0]);
-                let (first, second) = (|| self.each(before, first, act), || self.each(after, second, act));
+                let (first, second) = work.split(&after[0]);
+                let (first, second) =
+                    (|| self.for_each_chunk(before, first, act), || self.for_each_chunk(after, second, act));
                 match &self.0 {
                     Some(_) => drop(rayon::join(first, second)),
                     None => (first(), second()).0,
@@ -62,17 +64,18 @@ impl Threads {
         }
     }
 
-    /// As [`Threads::each`], in as many pieces of about the same size as there are threads, so that each is as large as can be.
-    pub(super) fn share<W: Divide>(
+    /// As [`Threads::for_each_chunk`], but in as many parts of about equal size as there are threads, so that
+    /// parts are as large as possible.
+    pub(super) fn for_each_share<W: SplitByChunk>(
         &self,
         chunks: &[Chunk],
         work: W,
         act: &(impl Fn(&Range<usize>, W) + Sync),
     ) {
-        self.share_in(self.count(), chunks, work, act);
+        self.split_into_shares(self.count(), chunks, work, act);
     }
 
-    fn share_in<W: Divide>(
+    fn split_into_shares<W: SplitByChunk>(
         &self,
         pieces: usize,
         chunks: &[Chunk],
@@ -85,10 +88,10 @@ impl Threads {
             [only] => act(&only.places, work),
             _ => {
                 let (before, after) = chunks.split_at(chunks.len() * (pieces / 2) / pieces);
-                let (first, second) = work.divide(&after[0]);
+                let (first, second) = work.split(&after[0]);
                 rayon::join(
-                    || self.share_in(pieces / 2, before, first, act),
-                    || self.share_in(pieces - pieces / 2, after, second, act),
+                    || self.split_into_shares(pieces / 2, before, first, act),
+                    || self.split_into_shares(pieces - pieces / 2, after, second, act),
                 );
             }
         }

@@ -1,37 +1,38 @@
-//! Reads GRACE-3L and lays out its graph.
+//! Reads GRACE-3L and builds its graph.
 //!
-//! In layer L = 1, 2, 3 an atom sums A_L over its neighbours; in the second and third layer this is coupled with their
-//! message, the normalised eq_(L−1), and reduced. With the result x: x2 = x ∘ x → FC with x, twice → x3 = x2a ∘ x,
-//! x4 = x2b ∘ x2b, where ∘ mixes the channels of its factors first, and each product is reduced. eq_L and ρ_L are
-//! reductions of all four, with weights of the central element; the energy takes the sum of the normalised ρ.
+//! In layer L = 1, 2, 3 an atom sums A_L over its neighbours; in the second and third layer this is coupled
+//! with their message, the normalised eq_(L−1), and reduced. With the result x: x2 = x ∘ x → FC with x, twice →
+//! x3 = x2a ∘ x, x4 = x2b ∘ x2b, where ∘ first mixes the channels of its factors, and each product is reduced.
+//! eq_L and ρ_L are reductions of all four, with weights of the central element; the energy uses the sum of the
+//! normalised ρ.
 //!
-//! The file does not say what the factors are, so its lists of names must be those of this graph.
+//! The file does not state the factors, so its lists of names must match this graph.
 
 use npz::Archive;
 
-use super::assembly::{Draft, Reading};
+use super::builder::{ModelBuilder, ModelParts};
 use super::error::{GraceError, mismatch};
-use super::globals::{Embedding, elements, refuse_other_variants};
 use super::graph::Graph;
 use super::layer::{LayerDraft, Message};
 use super::model::Architecture;
 use super::networks::enveloped_network;
 use super::radial::{RadialFunctions, RadialPath};
 use super::readout::Block;
+use super::shared_reader::{Embedding, elements, reject_unsupported_variants};
 use super::tape::Tensor;
 use super::two_layers::{expect_list, invariant_norm};
 use super::vector::{Number, Vector};
 
-pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Reading<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
-    refuse_other_variants(
+    reject_unsupported_variants(
         archive,
         &[
-            ("nn_dtype", 0, "another arithmetic than double precision"),
+            ("nn_dtype", 0, "an arithmetic other than double precision"),
             ("has_bond_specific_cutoff", 0, "cutoffs for pairs of elements in a three-layer model"),
         ],
     )?;
-    // Those of the layers count.
+    // Those of the layers apply instead.
     ["nradbase", "rcut", "radial_basis_p"].iter().for_each(|key| archive.ignore(key));
     expect_lists(archive)?;
     let n_densities = archive.count("rho1_n_out", 1, 4096)?;
@@ -48,8 +49,16 @@ pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Rea
     }
     let architecture = Architecture::ThreeLayer;
     let block_order = vec![0, 1, 2];
-    Draft { archive, architecture, elements, layers, block_order, n_densities, weights: reader.weights }
-        .finish()
+    ModelBuilder {
+        archive,
+        architecture,
+        elements,
+        layers,
+        block_order,
+        n_densities,
+        weights: reader.weights,
+    }
+    .finish()
 }
 
 struct Reader<'a> {
@@ -62,7 +71,7 @@ struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    /// A layer from the message of the one before, and its own message.
+    /// A layer, from the message of the preceding layer, with its own message.
     fn layer<V: Vector>(
         &mut self,
         number: usize,
@@ -133,7 +142,8 @@ impl<'a> Reader<'a> {
         Ok(Message { from: None, components: 1, constants })
     }
 
-    /// The indicator of the layer before, and in its invariant components what the neighbour's element adds.
+    /// The indicator of the preceding layer, plus the contribution of the neighbour's element to its invariant
+    /// components.
     fn message<V: Vector>(
         &mut self,
         name: &str,
@@ -180,7 +190,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// The products of x with itself up to the fourth order, each reduced.
+/// The powers of x up to the fourth order, each reduced.
 fn powers<V: Vector>(
     graph: &mut Graph<V>,
     name: &str,
@@ -198,7 +208,7 @@ fn powers<V: Vector>(
     Ok(())
 }
 
-/// Whether the file lists the operations of this graph, and no other.
+/// Checks that the file lists exactly the operations of this graph.
 fn expect_lists(archive: &Archive) -> Result<(), GraceError> {
     let of_layers = |names: &[&str]| -> Vec<String> {
         (1..=3)

@@ -1,16 +1,15 @@
-//! Reads GRACE-2L and lays out its graph.
+//! Reads GRACE-2L and builds its graph.
 //!
-//! The first layer is that of GRACE-1L, except AAA = AA1 × A. From A, AA, AAA, AAAA it makes I1, with weights of the
-//! central element, and from this the message I. The second layer sums over neighbours B0, as A, and
-//! T_y,q = Σ_j R1 Y_y I_q(j), couples YI_f = Σ C T_y,q, reduces B = (YI, B0) and goes on with B as the first with A.
-//! The invariants of both layers are normalised and summed.
+//! The first layer is that of GRACE-1L, except that AAA = AA1 × A. It reduces A, AA, AAA, AAAA to I1 with
+//! weights of the central element, and I1 to the message I. The second layer sums B0 over neighbours, like A,
+//! and T_y,q = Σ_j R1 Y_y I_q(j), couples YI_f = Σ C T_y,q, reduces B = (YI, B0), and continues with B as the
+//! first layer does with A. The invariants of both layers are normalised and summed.
 
 use npz::Archive;
 
-use super::assembly::{Draft, Reading};
-use super::copies::{BlockNames, ignore_copies};
+use super::block_aliases::{BlockAliases, ignore_aliases};
+use super::builder::{ModelBuilder, ModelParts};
 use super::error::{GraceError, mismatch, unsupported};
-use super::globals::{Embedding, Powers, cutoffs, elements, refuse_other_radial_variants};
 use super::graph::Graph;
 use super::invariant_norm::InvariantNorm;
 use super::layer::{LayerDraft, Message};
@@ -18,15 +17,16 @@ use super::model::Architecture;
 use super::networks::radial_network;
 use super::radial::{RadialFunctions, RadialPath};
 use super::readout::Block;
+use super::shared_reader::{Embedding, Powers, cutoffs, elements, reject_unsupported_radial_variants};
 use super::tape::Tensor;
 use super::vector::Vector;
 
 const FIRST: Powers = Powers { letter: "A", third_with_mixed: false, taken_by: &["I1", "rho"] };
 const SECOND: Powers = Powers { letter: "B", third_with_mixed: false, taken_by: &["I2"] };
 
-pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Reading<V>, GraceError> {
+pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<ModelParts<V>, GraceError> {
     let elements = elements(archive)?;
-    let names = BlockNames::read(archive)?;
+    let names = BlockAliases::read(archive)?;
     let mut weights = 0;
     let embedding = Embedding::read(archive, elements.len(), &mut weights)?;
     let mut reader = Reader {
@@ -43,8 +43,8 @@ pub(super) fn read<V: Vector>(archive: &Archive, path: RadialPath) -> Result<Rea
     let (first, message, first_order) = reader.first_layer(n_densities)?;
     let (second, second_order) = reader.second_layer(message, n_densities)?;
     expect_lists(archive, [first_order, second_order])?;
-    ignore_copies(archive, &names)?;
-    Draft {
+    ignore_aliases(archive, &names)?;
+    ModelBuilder {
         archive,
         architecture: Architecture::TwoLayer,
         elements,
@@ -129,7 +129,7 @@ impl<'a> Reader<'a> {
         density: &str,
     ) -> Result<(usize, RadialFunctions<V>), GraceError> {
         let (archive, prefix) = (self.archive, format!("mlp_rad_{name}"));
-        refuse_other_radial_variants(archive, &prefix, density)?;
+        reject_unsupported_radial_variants(archive, &prefix, density)?;
         let channels = archive.count(&format!("{prefix}_n_rad_max"), 1, 4096)?;
         let network = radial_network::<V>(archive, &prefix, self.lmax, channels, &mut self.weights)?;
         Ok((channels, RadialFunctions::new(network, self.n_elements, self.cutoffs.clone(), self.path)))
@@ -168,7 +168,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// The norm `name` of as many densities.
+/// The norm `name` of this many densities.
 pub(super) fn invariant_norm(
     archive: &Archive,
     name: &str,
@@ -186,7 +186,7 @@ pub(super) fn invariant_norm(
     Ok(InvariantNorm { linear, scale })
 }
 
-/// Whether the file lists the operations that the graph has, and no other.
+/// Checks that the file lists exactly the operations of the graph.
 fn expect_lists(archive: &Archive, orders: [usize; 2]) -> Result<(), GraceError> {
     let [(mut maps, mut products), (more_maps, more_products)] =
         [FIRST.lists(orders[0]), SECOND.lists(orders[1])];
@@ -207,7 +207,7 @@ fn expect_lists(archive: &Archive, orders: [usize; 2]) -> Result<(), GraceError>
     }
 }
 
-/// Whether the list `key` holds the expected names, in any order.
+/// Checks that the list `key` has the expected names, in any order.
 pub(super) fn expect_list(archive: &Archive, key: &str, mut expected: Vec<String>) -> Result<(), GraceError> {
     let mut found = archive.strings(key)?;
     found.sort();
@@ -218,7 +218,7 @@ pub(super) fn expect_list(archive: &Archive, key: &str, mut expected: Vec<String
     Err(unsupported(
         archive,
         format!(
-            "'{key}' lists {}, where models of this depth are known to have {}",
+            "'{key}' lists {}, but supported models of this depth have {}",
             found.join(", "),
             expected.join(", ")
         ),

@@ -1,15 +1,15 @@
-//! Numbers in lanes, in double or in single precision.
+//! Vectors of numbers in double or single precision.
 //!
-//! Channels are the innermost index of every array, padded with zeros to whole vectors. Loops over a vector have a fixed
-//! length, so the compiler turns them into vector instructions; additions keep their written order whatever the width of
-//! the processor's vectors, so the bits do too. Products are added with one rounding.
+//! Channels are the innermost index of every array, padded with zeros to whole vectors. Loops over a vector
+//! have a fixed length, so the compiler vectorises them. Additions keep their order for any register width, so
+//! the bits do not depend on it. Products are accumulated by fused multiply-add.
 
 use std::fmt::Debug;
 use std::ops::{Add, AddAssign, Div, Index, IndexMut, Mul, MulAssign, Sub, SubAssign};
 
 use bytemuck::{Pod, Zeroable, must_cast_slice, must_cast_slice_mut};
 
-/// A number as the passes over atoms calculate with it.
+/// The number type of the passes over atoms.
 pub(super) trait Number:
     Copy
     + Debug
@@ -26,8 +26,8 @@ pub(super) trait Number:
     + SubAssign
     + MulAssign
 {
-    /// What tables of radial functions may be wrong by, relative to the largest value: less than rounding makes of it, and not
-    /// much less, since the finer a table is, the more of the digits of its coefficients cancel in derivatives.
+    /// Target of the relative error of tables of radial functions: below the rounding error, but not far below,
+    /// because finer tables lose more digits of their coefficients to cancellation in derivatives.
     const TABLE_ERROR: f64;
 
     /// The nearest number.
@@ -52,23 +52,23 @@ impl Number for f32 {
     }
 }
 
-/// Neighbouring channels (or, for spherical harmonics, bonds) that are worked on together: what a register of AVX-512
-/// holds.
+/// Adjacent channels (for spherical harmonics: bonds) that are processed together: as many as an AVX-512
+/// register holds.
 pub(super) trait Vector:
     Copy + Debug + Default + Send + Sync + 'static + Index<usize, Output = Self::Number> + IndexMut<usize>
 {
     type Number: Number;
 
-    /// How many numbers it has.
+    /// Number of lanes.
     const LANES: usize;
 
-    /// Nothing in any lane.
+    /// Zero in every lane.
     const ZERO: Self;
 
     /// The same in every lane.
     fn splat(x: Self::Number) -> Self;
 
-    /// The numbers of some vectors, one after another.
+    /// The numbers of consecutive vectors.
     fn flat(vectors: &[Self]) -> &[Self::Number];
 
     /// As [`Vector::flat`].
@@ -96,8 +96,8 @@ pub(super) trait Vector:
     fn horizontal_sum(&self) -> Self::Number;
 }
 
-/// Vectors are copied before they are worked on, which tells the compiler that it may use its own. Each is one line of the cache:
-/// what lies across two takes twice as long to be read.
+/// Vectors are copied before use, which tells the compiler that they do not alias. Each fills one cache line,
+/// because reads across two lines take twice as long.
 macro_rules! vector {
     ($(#[$doc:meta])* $vector:ident, $number:ty, $lanes:literal) => {
         $(#[$doc])*
@@ -205,15 +205,15 @@ vector!(
     16
 );
 
-/// The most lanes that a vector has.
-pub(super) const MOST_LANES: usize = 16;
+/// Largest number of lanes.
+pub(super) const MAX_LANES: usize = 16;
 
-/// How many vectors hold `channels` numbers.
+/// Number of vectors that hold `channels` numbers.
 pub(super) fn lanes_for<V: Vector>(channels: usize) -> usize {
     channels.div_ceil(V::LANES)
 }
 
-/// `channels` rounded, in whole vectors padded with zeros.
+/// `channels`, rounded and padded with zeros to whole vectors.
 pub(super) fn to_lanes<V: Vector>(channels: &[f64]) -> Vec<V> {
     let mut vectors = vec![V::ZERO; lanes_for::<V>(channels.len())];
     for (to, from) in V::flat_mut(&mut vectors).iter_mut().zip(channels) {

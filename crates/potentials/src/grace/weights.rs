@@ -1,15 +1,15 @@
-//! Matrices with their transposes, one for each element of the central atom where these differ.
+//! Matrices with their transposes, per element of the central atom where they differ.
 
 use super::matrix::Matrix;
 use super::vector::Vector;
 
-/// Weights W_kn of a linear map and of its reverse.
+/// Weights W_kn of a linear map and of its transpose.
 #[derive(Clone, Debug)]
 pub(super) struct Weights<V>(Vec<(Matrix<V>, Matrix<V>)>);
 
 impl<V: Vector> Weights<V> {
     /// From `element(type, input, output)` for `n_types` elements of the central atom, or for one type that
-    /// stands for all.
+    /// represents all.
     pub fn new(
         n_types: usize,
         inputs: usize,
@@ -19,19 +19,19 @@ impl<V: Vector> Weights<V> {
         Self((0..n_types).map(|t| with_transpose(inputs, outputs, |i, o| element(t, i, o))).collect())
     }
 
-    /// [inputs × outputs]
+    /// `[inputs × outputs]`
     #[inline(always)]
     pub fn forward(&self, element: usize) -> &Matrix<V> {
-        &self.of(element).0
+        &self.for_element(element).0
     }
 
-    /// [outputs × inputs]
+    /// `[outputs × inputs]`
     #[inline(always)]
     pub fn transposed(&self, element: usize) -> &Matrix<V> {
-        &self.of(element).1
+        &self.for_element(element).1
     }
 
-    /// Adds other weights of the same shape.
+    /// Adds weights of the same shape.
     pub fn add(&mut self, other: &Self) {
         for ((matrix, transposed), other) in self.0.iter_mut().zip(&other.0) {
             matrix.add(&other.0);
@@ -40,7 +40,7 @@ impl<V: Vector> Weights<V> {
     }
 
     #[inline(always)]
-    fn of(&self, element: usize) -> &(Matrix<V>, Matrix<V>) {
+    fn for_element(&self, element: usize) -> &(Matrix<V>, Matrix<V>) {
         &self.0[if self.0.len() == 1 { 0 } else { element }]
     }
 }

@@ -1,11 +1,11 @@
-//! Reference values of the framework that made the models.
+//! Reference values from the framework that made the models.
 
 use std::path::{Path, PathBuf};
 
 use atoms::{Cell, Matrix3, Species, Structure};
 use npyz::npz::NpzArchive;
 
-/// A model of this project.
+/// A model in this repository.
 pub fn committed(model: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/data").join(model)
 }
@@ -19,7 +19,7 @@ pub fn peer(model: &str) -> Option<PathBuf> {
     Some(Path::new(&data).join("grace").join(model))
 }
 
-/// An npz file whose arrays are known to be there.
+/// An npz file with known arrays.
 pub struct Npz(NpzArchive<std::io::BufReader<std::fs::File>>);
 
 impl Npz {
@@ -92,7 +92,7 @@ pub fn six(tensor: &Matrix3) -> [f64; 6] {
     [tensor[0][0], tensor[1][1], tensor[2][2], tensor[0][1], tensor[0][2], tensor[1][2]]
 }
 
-/// The mixture of a model file, as far as a gradient of Σγ needs it.
+/// The part of a model's mixture that a gradient of Σγ needs.
 pub struct Mixture {
     pub components: usize,
     pub dimension: usize,

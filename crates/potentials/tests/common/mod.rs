@@ -1,11 +1,11 @@
-//! Finite-difference checks that every potential must pass; golden data, and model files to damage.
+//! Finite-difference checks for every potential, reference data, and model files to corrupt.
 
 pub mod golden;
 pub mod model_file;
 
 use atoms::{Cell, Evaluation, Matrix3, NeighbourList, Potential, Structure, Vec3};
 
-/// Energies, forces and virial of `structure` with a neighbour list of its own.
+/// Energies, forces and virial of `structure`, with a new neighbour list.
 pub fn evaluate(potential: &mut dyn Potential, structure: &Structure) -> Evaluation {
     let mut neighbours = NeighbourList::new(potential.cutoff(), 0.0);
     neighbours.update(structure).unwrap();
@@ -40,7 +40,7 @@ pub fn strained(structure: &Structure, a: usize, b: usize, strain: f64) -> Struc
     }
 }
 
-/// The gradient of `f` with respect to positions, [n].
+/// The gradient of `f` with respect to positions, `[n]`.
 pub fn position_gradient(structure: &Structure, h: f64, mut f: impl FnMut(&Structure) -> f64) -> Vec<Vec3> {
     (0..structure.len())
         .map(|atom| {

@@ -1,4 +1,4 @@
-//! Variants of a model file of this project.
+//! Variants of a model file in this repository.
 
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
@@ -21,7 +21,7 @@ pub fn load(bytes: &[u8]) -> Result<GraceModel, GraceError> {
     GraceModel::load_with(file.path(), RadialPath::Exact)
 }
 
-/// A model of several layers that is there for tests.
+/// A multi-layer test model.
 pub fn deep(name: &str) -> Vec<u8> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name);
     std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
@@ -63,15 +63,15 @@ pub fn length(model: &[u8], name: &str) -> usize {
     NpyFile::new(&bytes[..]).unwrap().shape().iter().product::<u64>() as usize
 }
 
-/// Arrays to replace or add; `None` takes one away.
+/// Arrays to replace or add; `None` removes one.
 pub type Change<'a> = (&'a str, Option<Vec<u8>>);
 
-/// Reads the aluminium model with changes.
+/// Reads the modified aluminium model.
 pub fn changed(changes: &[Change]) -> Result<GraceModel, GraceError> {
     changed_of(&BYTES, changes)
 }
 
-/// Reads another model with changes.
+/// Reads another model with modifications.
 pub fn changed_of(model: &[u8], changes: &[Change]) -> Result<GraceModel, GraceError> {
     let mut names = names(model);
     names.extend(changes.iter().map(|(name, _)| (*name).to_owned()));

@@ -64,7 +64,7 @@ impl Lender {
         let threshold = f64::from_bits(word(offset_of!(BlockHeader, threshold)));
         let hold =
             Hold::new(&extent, &self.slot, self.layout.hold_at(self.slot.reader, index), at, &self.layout);
-        Ok(Arc::new(Component::lent(Arc::new(hold), self.layout.dimension as usize, threshold)?))
+        Ok(Arc::new(Component::from_shared(Arc::new(hold), self.layout.dimension as usize, threshold)?))
     }
 
     /// An extent, mapped when it is first needed.

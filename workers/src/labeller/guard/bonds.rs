@@ -49,7 +49,7 @@ pub(super) fn too_short(structure: &Structure, shortest: &BTreeMap<Pair, f64>) -
         return Some(error.to_string());
     }
     for i in 0..structure.len() {
-        for neighbour in neighbours.of(i) {
+        for neighbour in neighbours.neighbours_of(i) {
             let pair = Pair::new(structure.species[i], structure.species[neighbour.atom as usize]);
             let length = norm(neighbour.displacement(structure, i));
             if let Some(least) = shortest.get(&pair).filter(|least| length < **least) {

@@ -12,13 +12,13 @@ fn silicon(atoms: usize) -> Structure {
     }
 }
 
-fn good() -> Calculated {
-    Calculated {
+fn good() -> Results {
+    Results {
         energy: -215.0,
         forces: vec![[0.5, 0.0, 0.0]; 2],
         stress: Some([[0.1; 3]; 3]),
         magnetic_moments: Some(vec![1.0; 2]),
-        ..Calculated::default()
+        ..Results::default()
     }
 }
 
@@ -30,7 +30,7 @@ fn offsets(good: usize, bad: &[f64]) -> EnergyOffsets {
 }
 
 /// What is said of a result with this change; nothing of one that is believed.
-fn said(change: impl FnOnce(&mut Calculated), offsets: Option<&EnergyOffsets>) -> String {
+fn said(change: impl FnOnce(&mut Results), offsets: Option<&EnergyOffsets>) -> String {
     let mut made = good();
     change(&mut made);
     let expected = offsets.map(|offsets| Expected { model: -9.0, offsets });
@@ -85,7 +85,7 @@ fn what_is_beyond_a_bound_is_not_believed_whatever_else_is_known() {
 
 #[test]
 fn an_energy_is_held_against_the_potential_once_labels_speak_for_it() {
-    let far = |made: &mut Calculated| made.energy = -215.0 + 2.0 * 5e4;
+    let far = |made: &mut Results| made.energy = -215.0 + 2.0 * 5e4;
     assert_eq!(said(far, None), "");
     assert_eq!(said(far, Some(&offsets(4, &[]))), "", "four labels");
     let fitted = offsets(5, &[]);

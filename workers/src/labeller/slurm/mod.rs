@@ -18,7 +18,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use ::slurm::{Commands, Phase, SlurmError};
+use ::slurm::{JobPhase, SlurmClient, SlurmError};
 use dft::PassedEnvironment;
 use serde::{Deserialize, Serialize};
 use store::StoreError;
@@ -78,7 +78,7 @@ pub(super) struct Job {
 
 /// Slurm, as jobs of calculations need it.
 pub(super) struct Slurm {
-    commands: Commands,
+    commands: SlurmClient,
     cluster: OnceCell<String>,
 }
 
@@ -90,8 +90,8 @@ impl Slurm {
             name.starts_with("SBATCH_") || name == "SLURM_JWT"
         };
         let own = std::env::vars_os().filter(|(name, _)| of_slurm(name));
-        let environment = passed.of_this_process().chain(own).collect();
-        let commands = Commands::with_patience(PATIENCE).with_environment(environment);
+        let environment = passed.from_current_process().chain(own).collect();
+        let commands = SlurmClient::with_timeout(PATIENCE).with_environment(environment);
         Self { commands, cluster: OnceCell::new() }
     }
 
@@ -139,7 +139,7 @@ impl Slurm {
             return Ok(Found::Elsewhere);
         }
         let jobs = self.jobs(job).await?;
-        let lives = jobs.iter().any(|told| told.phase() != Phase::Over);
+        let lives = jobs.iter().any(|told| told.phase() != JobPhase::Over);
         match (lives, job.directory.is_dir()) {
             (true, true) => Ok(Found::Running),
             (true, false) => Err(cannot(
@@ -205,12 +205,12 @@ impl Slurm {
         let begun = Instant::now();
         loop {
             let jobs = self.ask(job).await.map_err(|error| cannot(job, error))?;
-            let living = jobs.iter().filter(|told| told.phase() != Phase::Over);
+            let living = jobs.iter().filter(|told| told.phase() != JobPhase::Over);
             // What ends was told so before.
             let ids: Vec<_> =
-                living.filter(|told| told.phase() != Phase::Completing).map(|told| told.id).collect();
+                living.filter(|told| told.phase() != JobPhase::Completing).map(|told| told.id).collect();
             self.commands.cancel(&ids).await.map_err(|error| cannot(job, error))?;
-            if jobs.iter().all(|told| told.phase() == Phase::Over) || begun.elapsed() > ENDING {
+            if jobs.iter().all(|told| told.phase() == JobPhase::Over) || begun.elapsed() > ENDING {
                 return Ok(());
             }
             sleep(SHORTEST_PAUSE * 4).await;
@@ -237,7 +237,7 @@ impl Slurm {
 
     async fn cluster(&self, directory: &Path) -> Result<&str, StoreError> {
         let ask = async || loop {
-            match self.commands.cluster().await {
+            match self.commands.cluster_name().await {
                 Err(error) if error.is_missing() => {
                     return Err(file(directory, io::Error::other(error.to_string())));
                 }

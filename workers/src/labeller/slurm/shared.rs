@@ -5,7 +5,7 @@
 use std::fs;
 use std::path::Path;
 
-use ::slurm::Commands;
+use ::slurm::SlurmClient;
 use dft::result_file;
 
 use super::{Job, LOOK};
@@ -14,7 +14,7 @@ use super::{Job, LOOK};
 const FILE: &str = "calmwalk-squeue";
 
 /// Whether the job was said to live lately, or nobody answers.
-pub(super) async fn lives(commands: &Commands, job: &Job) -> bool {
+pub(super) async fn lives(commands: &SlurmClient, job: &Job) -> bool {
     let path = job.directory.with_file_name(FILE);
     let names = match lately(&path) {
         Some(names) => names,

@@ -4,7 +4,7 @@ use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use ::slurm::{Phase, SlurmError};
+use ::slurm::{JobPhase, SlurmError};
 use dft::Exit;
 
 use super::super::keeper::{End, How};
@@ -30,7 +30,7 @@ impl Told {
     pub const FORMAT: &str = "%i|%T|%N|%M|%r";
 
     pub fn parse(line: &str) -> Result<Self, SlurmError> {
-        let unreadable = || SlurmError::Unreadable {
+        let unreadable = || SlurmError::UnexpectedOutput {
             program: "squeue",
             found: line.to_owned(),
             expected: "what --format asks for",
@@ -46,8 +46,8 @@ impl Told {
         })
     }
 
-    pub fn phase(&self) -> Phase {
-        Phase::of(&self.state)
+    pub fn phase(&self) -> JobPhase {
+        JobPhase::from_state(&self.state)
     }
 
     /// Whether its script has ended, and was not ended.
@@ -164,7 +164,7 @@ mod tests {
     #[test]
     fn lines_of_squeue_are_read() {
         let job = Told::parse("12|RUNNING|node7|1-02:03:04|Node | failure").unwrap();
-        assert_eq!((job.id, job.phase(), job.seconds), (12, Phase::Running, 93_784.0));
+        assert_eq!((job.id, job.phase(), job.seconds), (12, JobPhase::Running, 93_784.0));
         assert_eq!(job.to_string(), "job 12 is RUNNING on node7 (Node | failure)");
         assert!(Told::parse("12|RUNNING|node7").is_err() && Told::parse("x|RUNNING||0:00|None").is_err());
         for (time, expected) in

@@ -1,0 +1,84 @@
+//! A bounded sample of a stream of unknown length.
+
+/// Keeps items of a stream with equal probability: all of them up to the capacity, then a half, a quarter, and
+/// so on. The choice depends only on the index in the stream, so parallel streams keep the same indices.
+#[derive(Clone, Debug)]
+pub struct SystematicSample<T> {
+    kept: Vec<(u32, T)>,
+    room: usize,
+    /// An item is kept if the level of its index is at least this.
+    least: u32,
+    seen: u64,
+}
+
+impl<T> SystematicSample<T> {
+    /// A sample of at most `room` items (at least one).
+    pub fn new(room: usize) -> Self {
+        Self { kept: Vec::new(), room: room.max(1), least: 0, seen: 0 }
+    }
+
+    /// Offers the next item.
+    pub fn add(&mut self, item: T) {
+        let level = mixed(self.seen).trailing_zeros();
+        self.seen += 1;
+        if level < self.least {
+            return;
+        }
+        self.kept.push((level, item));
+        while self.kept.len() > self.room {
+            self.least += 1;
+            self.kept.retain(|(level, _)| *level >= self.least);
+        }
+    }
+
+    /// The sampled items, in order.
+    pub fn items(&self) -> impl ExactSizeIterator<Item = &T> {
+        self.kept.iter().map(|(_, item)| item)
+    }
+
+    /// Number of items offered.
+    pub fn total(&self) -> u64 {
+        self.seen
+    }
+}
+
+/// The finaliser of SplitMix64: pseudo-random bits for each index.
+fn mixed(place: u64) -> u64 {
+    let mut x = place.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(0x9e37_79b9_7f4a_7c15);
+    x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    x ^ (x >> 31)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_short_stream_is_kept_whole() {
+        let mut thinned = SystematicSample::new(100);
+        (0..100).for_each(|k| thinned.add(k));
+        assert!(thinned.items().copied().eq(0..100) && thinned.total() == 100);
+    }
+
+    #[test]
+    fn a_long_one_is_kept_evenly() {
+        let mut thinned = SystematicSample::new(4096);
+        (0..1_000_000).for_each(|k| thinned.add(k));
+        let kept: Vec<i64> = thinned.items().copied().collect();
+        // Between an eighth of the capacity and all of it: each halving keeps about half.
+        assert!((1024..=4096).contains(&kept.len()) && thinned.total() == 1_000_000);
+        // The mean of n uniform draws from 0..N is within five standard deviations, N / √(12 n).
+        let n = kept.len() as f64;
+        let mean = kept.iter().sum::<i64>() as f64 / n;
+        assert!((mean - 5e5).abs() < 5.0 * 1e6 / (12.0 * n).sqrt(), "{mean}");
+        assert!(kept.is_sorted());
+    }
+
+    #[test]
+    fn no_room_is_room_for_one() {
+        let mut thinned = SystematicSample::new(0);
+        (0..1000).for_each(|k| thinned.add(k));
+        assert!(thinned.items().len() <= 1 && thinned.total() == 1000);
+    }
+}

@@ -1,0 +1,100 @@
+//! Queries the version of a program.
+
+use std::collections::BTreeMap;
+use std::io::Read;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::{PassedEnvironment, SetupError};
+
+/// Programs answer at once, but a cold file system may be slow.
+const TIMEOUT: Duration = Duration::from_secs(120);
+
+/// Runs `command` with further arguments in a temporary directory with these files (name, content) and returns
+/// its output. Its environment consists of the `passed` variables of the current process and `environment`.
+///
+/// # Errors
+/// [`SetupError::Program`] if it does not start, fails, or does not end.
+pub(crate) fn run(
+    command: &[String],
+    arguments: &[&str],
+    environment: &BTreeMap<String, String>,
+    passed: &PassedEnvironment,
+    files: &[(&str, &[u8])],
+) -> Result<String, SetupError> {
+    let words = command.iter().map(String::as_str).chain(arguments.iter().copied());
+    let shown = words.collect::<Vec<_>>().join(" ");
+    let wrong = |reason: String| SetupError::Program { program: shown.clone(), reason };
+    let [program, first @ ..] = command else {
+        return Err(wrong(
+            "no command; name the program, as in command = [\"mpirun\", \"-np\", \"4\", \"abinit\"]".into(),
+        ));
+    };
+    let directory = working_directory(files).map_err(|error| wrong(error.to_string()))?;
+    let mut child = Command::new(program)
+        .args(first)
+        .args(arguments)
+        .env_clear()
+        .envs(passed.from_current_process())
+        .envs(environment)
+        .current_dir(directory.path())
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .map_err(|error| wrong(format!("does not start ({error}): install it, or correct `command`")))?;
+    let (stdout, stderr) = (drain(child.stdout.take()), drain(child.stderr.take()));
+    let begin = Instant::now();
+    let status = loop {
+        match child.try_wait().map_err(|error| wrong(error.to_string()))? {
+            Some(status) => break status,
+            None if begin.elapsed() > TIMEOUT => {
+                // It may have just ended.
+                let _ = child.kill();
+                let _ = child.wait();
+                return Err(wrong(format!("did not answer within {} s", TIMEOUT.as_secs())));
+            }
+            None => std::thread::sleep(Duration::from_millis(5)),
+        }
+    };
+    let (stdout, stderr) = (stdout.join().unwrap_or_default(), stderr.join().unwrap_or_default());
+    if status.success() {
+        return Ok(stdout);
+    }
+    let mut lines = stdout.lines().chain(stderr.lines()).filter(|line| !line.trim().is_empty());
+    let last = lines.next_back().unwrap_or("nothing");
+    Err(wrong(format!("{status}; its last output is: {last}")))
+}
+
+/// Reads to the end, so that the program never blocks on a full pipe.
+fn drain(pipe: Option<impl Read + Send + 'static>) -> std::thread::JoinHandle<String> {
+    std::thread::spawn(move || {
+        let mut bytes = Vec::new();
+        if let Some(mut pipe) = pipe {
+            // What was read before an error is still useful.
+            let _ = pipe.read_to_end(&mut bytes);
+        }
+        String::from_utf8_lossy(&bytes).into_owned()
+    })
+}
+
+/// The environment of a calculation: one thread unless the settings say otherwise.
+pub(crate) fn environment(settings: &BTreeMap<String, String>) -> BTreeMap<String, String> {
+    let mut environment = BTreeMap::from([("OMP_NUM_THREADS".to_owned(), "1".to_owned())]);
+    environment.extend(settings.iter().map(|(key, value)| (key.clone(), value.clone())));
+    environment
+}
+
+/// A temporary directory with these files.
+fn working_directory(files: &[(&str, &[u8])]) -> std::io::Result<tempfile::TempDir> {
+    let directory = tempfile::Builder::new().prefix("calmwalk-").tempdir()?;
+    for (name, content) in files {
+        std::fs::write(directory.path().join(name), content)?;
+    }
+    Ok(directory)
+}
+
+/// The error for a program that is not the expected one.
+pub(crate) fn wrong_program(command: &[String], reason: String) -> SetupError {
+    SetupError::Program { program: command.join(" "), reason }
+}

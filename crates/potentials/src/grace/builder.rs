@@ -1,0 +1,140 @@
+//! Assembles a model from its layers.
+
+use atoms::Species;
+use npz::Archive;
+
+use super::error::{GraceError, mismatch};
+use super::layer::LayerDraft;
+use super::model::{Architecture, GraceDescription};
+use super::network::Network;
+use super::networks::readout;
+use super::projection::{FeatureMap, Projection, ProjectionMaps, rows_of_projection};
+use super::shared_reader::reject_unread_arrays;
+use super::vector::Vector;
+
+/// What a reader has extracted from a file.
+pub(super) struct ModelBuilder<'a, V: Vector> {
+    pub archive: &'a Archive,
+    pub architecture: Architecture,
+    pub elements: Vec<Species>,
+    pub layers: Vec<LayerDraft<'a, V>>,
+    /// The layers in the order of their blocks in the file's basis B.
+    pub block_order: Vec<usize>,
+    /// Number of densities y.
+    pub n_densities: usize,
+    /// Number of trained weights outside the graphs.
+    pub weights: usize,
+}
+
+/// All parts of a model.
+pub(super) struct ModelParts<V: Vector> {
+    pub network: Network<V>,
+    /// The largest r_c over all layers for centre and neighbour element, `[n_elements²]`, Å.
+    pub pair_cutoffs: Vec<f64>,
+    pub description: GraceDescription,
+}
+
+impl<V: Vector> ModelBuilder<'_, V> {
+    /// Reads what follows the layers. Rejects the file if an array remains unread.
+    pub fn finish(mut self) -> Result<ModelParts<V>, GraceError> {
+        let archive = self.archive;
+        let blocks = self.layers.iter().map(|layer| layer.block.clone()).collect();
+        let readout = readout(archive, blocks, self.n_densities, self.elements.len(), &mut self.weights)?;
+        let sources: Vec<_> = self.layers.iter().map(|layer| layer.graph.sources.clone()).collect();
+        let feature_map = feature_map(archive, &sources, &self.block_order)?;
+        reject_unread_arrays(archive, self.architecture.number_of_layers())?;
+        let description = self.describe(basis_dimension(&sources), feature_map.as_ref())?;
+        let pairs = 0..self.elements.len() * self.elements.len();
+        let radial = self.layers.iter().map(|layer| &layer.radial);
+        let cutoff = |pair| radial.clone().map(|radial| radial.cutoff(pair)).fold(0.0, f64::max);
+        let pair_cutoffs = pairs.map(cutoff).collect();
+        let (mut layers, mut drafts) = (Vec::new(), self.layers.into_iter().peekable());
+        while let Some(draft) = drafts.next() {
+            let message = drafts.peek_mut().and_then(|next| next.message.from.as_mut());
+            layers.push(draft.finish(message));
+        }
+        let network = Network { layers, readout, feature_map };
+        Ok(ModelParts { network, pair_cutoffs, description })
+    }
+
+    fn describe(
+        &self,
+        basis_dimension: usize,
+        feature_map: Option<&FeatureMap<V>>,
+    ) -> Result<GraceDescription, GraceError> {
+        let radial = self.layers.iter().map(|layer| &layer.radial);
+        let first = &self.layers[0];
+        Ok(GraceDescription {
+            architecture: self.architecture,
+            elements: self.elements.clone(),
+            cutoff: radial.clone().map(|radial| radial.largest_cutoff()).fold(0.0, f64::max),
+            pair_cutoffs: self.archive.count("has_bond_specific_cutoff", 0, 1)? == 1,
+            lmax: first.lmax,
+            radial_basis_size: first.radial.basis_size(),
+            channels: first.graph.density().channels,
+            basis_functions: self.layers.iter().flat_map(|layer| layer.graph.source_names.clone()).collect(),
+            basis_dimension,
+            feature_dimension: feature_map.map_or(0, |map| map.projection.feature_dimension()),
+            weights: self.weights + self.layers.iter().map(|layer| layer.graph.weights).sum::<usize>(),
+            radial_tables: radial
+                .flat_map(|radial| radial.tables())
+                .map(|table| (table.intervals(), table.errors()))
+                .collect(),
+        })
+    }
+}
+
+/// D_basis
+fn basis_dimension(sources: &[Vec<(usize, usize)>]) -> usize {
+    sources.iter().flatten().map(|(components, channels)| components * channels).sum()
+}
+
+/// The row of the projection matrix for each index of each layer's padded basis.
+fn places<V: Vector>(sources: &[Vec<(usize, usize)>], block_order: &[usize]) -> Vec<Vec<Option<usize>>> {
+    let (mut firsts, mut first) = (vec![0; sources.len()], 0);
+    for layer in block_order {
+        firsts[*layer] = first;
+        first += basis_dimension(&sources[*layer..=*layer]);
+    }
+    firsts.into_iter().zip(sources).map(|(first, sources)| rows_of_projection::<V>(first, sources)).collect()
+}
+
+/// The feature map, if the file has one. `sources` describes each layer's basis, `block_order` gives the order
+/// of the layers' blocks in the file.
+fn feature_map<V: Vector>(
+    archive: &Archive,
+    sources: &[Vec<(usize, usize)>],
+    block_order: &[usize],
+) -> Result<Option<FeatureMap<V>>, GraceError> {
+    if !archive.contains("uq_schema_version") {
+        return Ok(None);
+    }
+    let version = archive.count("uq_schema_version", 0, usize::MAX)?;
+    let dimension = archive.count("uq_rp_dim", 1, 1 << 16)?;
+    let matrix =
+        archive.floats_f32("uq_rp_matrix")?.finite()?.with_shape(&[basis_dimension(sources), dimension])?;
+    let normalize = archive.flag_or("uq_rp_normalize", false)?;
+    let density_channels = archive.flag_or("uq_rp_add_density_channel", false)?;
+    let asinh = archive.flag_or("uq_feature_transform", false)?;
+    let expected = match (normalize || density_channels, asinh) {
+        (true, _) => 6,
+        (false, true) => 4,
+        (false, false) => 3,
+    };
+    if version != expected {
+        return Err(mismatch(
+            archive,
+            "uq_schema_version",
+            version.to_string(),
+            format!("{expected}, as its flags imply"),
+        ));
+    }
+    let layers = places::<V>(sources, block_order);
+    let maps = layers.iter().map(|rows| ProjectionMaps::new(&matrix, dimension, rows)).collect();
+    let blocks = block_order.to_vec();
+    let density_scale = archive.scalar_or("uq_rp_density_scale", 1.0)? as f32;
+    let projection =
+        Projection { matrix, dimension, normalize, density_channels, density_scale, asinh, blocks };
+    archive.expect_count("uq_feature_dim", projection.feature_dimension())?;
+    Ok(Some(FeatureMap { projection, maps }))
+}
