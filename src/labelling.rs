@@ -133,7 +133,7 @@ impl Labelling {
         let text = store.campaign().await?.configuration_in_force;
         let InForce { label: Limits { attempts, bounds, lease } } =
             serde_json::from_str(&text).map_err(unreadable)?;
-        let noted = store.note(LABEL_METHOD).await?.ok_or_else(|| {
+        let noted = store.metadata(LABEL_METHOD).await?.ok_or_else(|| {
             Failure::Failed(
                 "the store does not say how labels are made: the campaign was last run by an earlier version of this \
                  program; run it once with this one"

@@ -2,7 +2,7 @@
 
 use analysis::{Bins, Completion, ForceErrors};
 use atoms::cell::{norm, sub};
-use store::{AtomGrades, ExportFilter, ExportSource, Finished, Store, StoreError};
+use store::{AtomGrades, ExportFilter, ExportSource, FinishedCandidate, Store, StoreError};
 use wire::{ContentHash, Origin};
 
 use crate::energies::{EnergyErrors, Zeros};
@@ -63,7 +63,7 @@ pub async fn of(store: &Store, protocol: ContentHash) -> Result<Learned, StoreEr
     loop {
         let page = store.labelled(&filter, after, PAGE).await?;
         let Some(last) = page.last() else { break };
-        after = Some(last.place);
+        after = Some(last.cursor);
         for row in &page {
             let ExportSource::Candidate { origin, block, original, .. } = &row.source else { continue };
             let forces = block.view().forces;
@@ -97,7 +97,7 @@ impl Learned {
         [&mut self.all, of_origin].into_iter().for_each(&mut change);
     }
 
-    fn finished(&mut self, candidate: &Finished) {
+    fn finished(&mut self, candidate: &FinishedCandidate) {
         for (completion, value) in
             [(&mut self.by_gamma, candidate.gamma), (&mut self.by_expansion, candidate.relative_volume)]
         {

@@ -68,7 +68,7 @@ impl Origin {
 
     /// That of a campaign; none of one that began with an early version.
     pub async fn of(store: &Store) -> Result<Option<Self>, StoreError> {
-        let note = store.note(NOTE).await?;
+        let note = store.metadata(NOTE).await?;
         Ok(note.and_then(|note| serde_json::from_str(&note).ok()))
     }
 

@@ -17,7 +17,7 @@ use wire::mixture::SharedMixture;
 use wire::net::{self, Address, Joined, NetError, Parted, Tls, Uplink};
 use wire::place::Place;
 use wire::transport::Incoming;
-use workers::agent::{self, Agent, News};
+use workers::agent::{self, Agent, AgentEvent};
 
 use super::crew::all_given_up;
 use super::{CHANNEL, STOPPING, asked_to_stop};
@@ -65,15 +65,15 @@ pub async fn work(
     let (flag, asked) = (Arc::clone(&stopping), Arc::clone(&stop));
     let numbers = Arc::clone(&watched.numbers);
     let deal = |incoming| {
-        tokio::spawn(Agent { uplink, joined, incoming, stopping, patience, numbers }.run(move |news| match news {
-            News::Stop => {
+        tokio::spawn(Agent { uplink, joined, incoming, stopping, orchestrator_timeout: patience, metrics: numbers }.run(move |news| match news {
+            AgentEvent::Stop => {
                 flag.store(true, Ordering::Relaxed);
                 asked.notify_one();
             }
-            News::Silent { untold, idle } => warn(format_args!(
-                "the orchestrator does not answer: {untold} reports are kept for it, {idle} of {walkers} walkers wait"
+            AgentEvent::Unresponsive { unsent, idle } => warn(format_args!(
+                "the orchestrator does not answer: {unsent} reports are kept for it, {idle} of {walkers} walkers wait"
             )),
-            News::Back => say("the orchestrator answers again"),
+            AgentEvent::Recovered => say("the orchestrator answers again"),
         }))
     };
     let ended = work_in(&place, &setup, (walkers, threads), &mixture, deal, &stop, watched).await;
@@ -135,7 +135,7 @@ struct Host {
     given_up: Option<String>,
 }
 
-type Dealing = JoinHandle<Result<agent::Ended, Parted>>;
+type Dealing = JoinHandle<Result<agent::AgentExit, Parted>>;
 
 async fn work_in(
     place: &Place,
@@ -207,7 +207,7 @@ impl Host {
                 ended = &mut self.dealing, if dealt.is_none() => {
                     let ended = ended.map_err(Failure::failed)?;
                     match ended {
-                        Ok(agent::Ended::Done) => self.walkers.close(),
+                        Ok(agent::AgentExit::Done) => self.walkers.close(),
                         _ => self.walkers.stop(),
                     }
                     dealt = Some(ended.map_err(Failure::failed));
@@ -216,7 +216,7 @@ impl Host {
         }
         self.serving.await.map_err(Failure::failed)?.map_err(Failure::failed)?;
         match dealt.transpose()? {
-            Some(agent::Ended::Done) => Ok(Ended::Done),
+            Some(agent::AgentExit::Done) => Ok(Ended::Done),
             _ => match self.given_up {
                 Some(how) => Err(Failure::Failed(format!("no walker is left: {how}"))),
                 None => Ok(Ended::Interrupted),

@@ -44,6 +44,6 @@ pub async fn keep(store: &Store, limits: &Budget, over: &Notify) -> StoreError {
 
 /// Adds the time, and looks whether a limit is reached if there is one.
 async fn count(store: &Store, time: Duration, limited: bool) -> Result<Option<&'static str>, StoreError> {
-    store.add_time_under_way(time.as_millis() as u64).await?;
+    store.add_running_time(time.as_millis() as u64).await?;
     if limited { time_used_up(store).await } else { Ok(None) }
 }

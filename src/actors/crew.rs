@@ -9,7 +9,7 @@ use orchestrator::supervisor::Standing;
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::time::{Interval, MissedTickBehavior, interval};
 use wire::ipc::Handle;
-use workers::labeller::SIGN_OF_LIFE;
+use workers::labeller::HEARTBEAT_INTERVAL;
 
 use super::answers::Answers;
 use super::labellers::Labellers;
@@ -62,7 +62,7 @@ impl<'a> Crew<'a> {
         labellers: Labellers,
         stopping: Arc<AtomicBool>,
     ) -> Self {
-        let mut look = interval(SIGN_OF_LIFE);
+        let mut look = interval(HEARTBEAT_INTERVAL);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let records = Records::new(store, process, walkers.status().len());
         Self {
@@ -212,7 +212,7 @@ impl<'a> Crew<'a> {
     async fn look(&mut self) -> Result<(), StoreError> {
         self.records.look(self.line.traffic()).await?;
         // Also of those whose end could not be written down at once.
-        self.store.release_leases_of_gone_processes(unix_milliseconds()).await?;
+        self.store.release_leases_of_dead_processes(unix_milliseconds()).await?;
         self.labellers.look(self.store, PROVEN).await
     }
 

@@ -13,7 +13,7 @@ use tokio::sync::mpsc;
 use tokio::task::{JoinError, JoinSet};
 use wire::place::Place;
 use wire::transport::{InProcess, Incoming};
-use workers::labeller::{self, Closing, LabellerSettings, SIGN_OF_LIFE, Stay, Timing};
+use workers::labeller::{self, ExitPolicy, HEARTBEAT_INTERVAL, LabellerSettings, Shutdown, Timing};
 use workers::walk::WalkContext;
 use workers::walker;
 
@@ -44,7 +44,7 @@ pub async fn work(run: Run<'_>, selector: Selector) -> Result<reactor::Ended, Fa
 async fn say_alive(store: Store, mut process: ProcessRecord) {
     let mut answers = Answers::default();
     loop {
-        tokio::time::sleep(SIGN_OF_LIFE).await;
+        tokio::time::sleep(HEARTBEAT_INTERVAL).await;
         process.last_seen = unix_milliseconds();
         // A busy database can do without this one.
         answers.tried(&store.upsert_process(&process).await);
@@ -53,12 +53,12 @@ async fn say_alive(store: Store, mut process: ProcessRecord) {
 
 /// Walkers, reactor and labellers at work.
 struct Actors {
-    walkers: Vec<JoinHandle<walker::Ended>>,
+    walkers: Vec<JoinHandle<walker::WalkerExit>>,
     labellers: JoinSet<Result<(), StoreError>>,
     reactor: ReactorTask,
     /// Where labels of others are waited for, if nobody makes any here.
     labels_of_others: Option<Store>,
-    closing: Arc<Closing>,
+    closing: Arc<Shutdown>,
     stopping: Arc<AtomicBool>,
 }
 
@@ -66,7 +66,7 @@ impl Actors {
     /// Starts them all.
     fn start(run: Run<'_>, selector: Selector) -> Result<Self, Failure> {
         let stopping = Arc::new(AtomicBool::new(false));
-        let closing = Arc::new(Closing::default());
+        let closing = Arc::new(Shutdown::default());
         let asked = (Arc::clone(&stopping), Arc::clone(&closing));
         let stop = move || {
             asked.0.store(true, Ordering::Relaxed);
@@ -120,7 +120,7 @@ impl Actors {
 }
 
 /// Waits until no structure waits for a label, or somebody asks to stop.
-async fn wait_for_labels(store: &Store, closing: &Closing) -> Result<(), StoreError> {
+async fn wait_for_labels(store: &Store, closing: &Shutdown) -> Result<(), StoreError> {
     while !closing.is_stopping() {
         match store.awaits_labels(unix_milliseconds()).await {
             Ok(false) => break,
@@ -143,7 +143,7 @@ fn start_walkers(
     campaign: &Campaign,
     to_reactor: &mpsc::Sender<Incoming>,
     stopping: &Arc<AtomicBool>,
-) -> Result<Vec<JoinHandle<walker::Ended>>, Failure> {
+) -> Result<Vec<JoinHandle<walker::WalkerExit>>, Failure> {
     let (model, settings) = (Arc::clone(&campaign.model), Arc::new(campaign.walk_settings()));
     let start = |number| {
         let mut transport = InProcess::new(number, to_reactor.clone(), Arc::clone(stopping));
@@ -157,7 +157,10 @@ fn start_walkers(
     (0..wanted_walkers(campaign)).map(start).collect()
 }
 
-fn start_labellers(run: Run<'_>, closing: &Arc<Closing>) -> Result<JoinSet<Result<(), StoreError>>, Failure> {
+fn start_labellers(
+    run: Run<'_>,
+    closing: &Arc<Shutdown>,
+) -> Result<JoinSet<Result<(), StoreError>>, Failure> {
     let Run { campaign, store, process, .. } = run;
     let label = &campaign.config.label;
     let mut labellers = JoinSet::new();
@@ -168,7 +171,7 @@ fn start_labellers(run: Run<'_>, closing: &Arc<Closing>) -> Result<JoinSet<Resul
             protocol: campaign.protocol.clone(),
             attempts: label.attempts.get(),
             bounds: label.bounds(),
-            stay: Stay::UntilEmpty,
+            exit_policy: ExitPolicy::UntilEmpty,
             timing: Timing { lease: Duration::from_secs(label.lease.get().into()), ..Timing::default() },
         };
         let (store, closing) = (store.clone(), Arc::clone(closing));

@@ -45,7 +45,7 @@ impl<'a> Notifier<'a> {
     ) -> Result<Option<Self>, StoreError> {
         let settings = &config.notify;
         let Some(command) = settings.command.clone() else { return Ok(None) };
-        let told = store.note(NOTE).await?;
+        let told = store.metadata(NOTE).await?;
         let told = told.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
         let stall = Duration::from_secs_f64(60.0 * settings.stall.get());
         Ok(Some(Self {
@@ -86,7 +86,7 @@ impl<'a> Notifier<'a> {
         }
         // First, so that it is not told twice whatever happens now.
         let told = serde_json::to_string(self.watch.told()).map_err(Failure::failed)?;
-        self.store.leave_note(NOTE, &told).await?;
+        self.store.set_metadata(NOTE, &told).await?;
         let snapshot = status::Snapshot::of(self.store).await?;
         let state = snapshot.to_json().map_err(Failure::failed)?;
         due.into_iter().for_each(|due| self.tell(due, &state));

@@ -6,7 +6,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use orchestrator::reactor::Notice;
-use store::{Pace, Store, unix_milliseconds};
+use store::{Store, WalkProgress, unix_milliseconds};
 use tokio::time::{MissedTickBehavior, interval};
 use wire::WalkId;
 use wire::messages::Progress;
@@ -31,7 +31,7 @@ pub struct Paces {
 
 #[derive(Debug, Default)]
 struct Walk {
-    pace: Pace,
+    pace: WalkProgress,
     speed: Speed,
     /// Steps in this run, also those that were made twice.
     steps: u64,
@@ -82,7 +82,7 @@ impl Paces {
             self.steps += made;
         }
         entry.speed.at(entry.steps, now);
-        entry.pace = Pace {
+        entry.pace = WalkProgress {
             walk: walk.0,
             seen: now,
             segment: progress.segment,
@@ -97,7 +97,7 @@ impl Paces {
     }
 
     /// Those to be written down, and steps of all walks per second.
-    fn take(&mut self, now: i64) -> (Vec<Pace>, Option<f64>) {
+    fn take(&mut self, now: i64) -> (Vec<WalkProgress>, Option<f64>) {
         self.all.at(self.steps, now);
         let changed = std::mem::take(&mut self.changed);
         (changed.iter().map(|walk| self.walks[walk].pace.clone()).collect(), self.all.average)
@@ -112,7 +112,7 @@ pub async fn keep(store: &Store, paces: &Mutex<Paces>) -> Infallible {
         write.tick().await;
         let now = unix_milliseconds();
         let (changed, all) = paces.lock().unwrap_or_else(PoisonError::into_inner).take(now);
-        let _ = store.set_paces(&changed, all, now).await;
+        let _ = store.set_walk_progress(&changed, all, now).await;
     }
 }
 

@@ -10,7 +10,7 @@ use orchestrator::supervisor::{Limits, Standing};
 use store::{ProcessRecord, Store, StoreError, unix_milliseconds};
 use tokio::sync::Notify;
 use tokio::time::{MissedTickBehavior, interval};
-use workers::labeller::SIGN_OF_LIFE;
+use workers::labeller::HEARTBEAT_INTERVAL;
 
 use super::crew::{PROVEN, all_given_up};
 use super::labellers::Labellers;
@@ -55,7 +55,7 @@ pub async fn work(
         display: Display { bar: Bar::new(None, BAR), labels: 0, queue: String::new() },
         deaf: false,
     };
-    let mut look = interval(SIGN_OF_LIFE);
+    let mut look = interval(HEARTBEAT_INTERVAL);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut given_up = None;
     loop {

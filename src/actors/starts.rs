@@ -68,10 +68,10 @@ pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failur
     let mut adopted = BTreeMap::new();
     for found in left_by_runs(store).await? {
         let wanted = found.number.filter(|_| found.setup.as_ref() == Some(&hash) && found.state == "running");
-        match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.birth).is_ok()) {
+        match wanted.filter(|number| labellers.adopt(*number, found.pid, &found.start_time).is_ok()) {
             Some(number) => drop(adopted.insert(number, found.pid)),
             // One that ended meanwhile needs no asking.
-            None => drop(ask_to_end(found.pid, &found.birth)),
+            None => drop(ask_to_end(found.pid, &found.start_time)),
         }
     }
     Ok(Labellers::new(labellers, adopted, campaign.config.label.attempts.get()))
@@ -80,7 +80,7 @@ pub async fn labellers(run: Run<'_>, limits: Limits) -> Result<Labellers, Failur
 /// Asks the labellers that an earlier run left to end: this run makes its labels itself.
 pub async fn no_labellers(store: &Store) -> Result<(), Failure> {
     for found in left_by_runs(store).await? {
-        let _ = ask_to_end(found.pid, &found.birth);
+        let _ = ask_to_end(found.pid, &found.start_time);
     }
     Ok(())
 }
@@ -88,7 +88,7 @@ pub async fn no_labellers(store: &Store) -> Result<(), Failure> {
 /// The labellers here that an earlier run started. Those of `calmwalk label` have no number, and are their own masters.
 async fn left_by_runs(store: &Store) -> Result<Vec<ProcessRecord>, StoreError> {
     let mut labellers = store.processes(Some(ProcessRecord::LABELLER)).await?;
-    labellers.retain(|found| found.number.is_some() && found.is_local() && !found.is_gone());
+    labellers.retain(|found| found.number.is_some() && found.is_local() && !found.is_dead());
     Ok(labellers)
 }
 

@@ -1,7 +1,7 @@
 //! `calmwalk keep`
 
 use orchestrator::launcher;
-use workers::labeller::keep;
+use workers::labeller::run_calculation;
 
 use super::{Ended, Failure};
 
@@ -14,7 +14,7 @@ pub struct Keep {}
 impl Keep {
     pub fn run(self) -> Result<Ended, Failure> {
         launcher::be_called(c"calmwalk").map_err(Failure::failed)?;
-        keep().map_err(Failure::failed)?;
+        run_calculation().map_err(Failure::failed)?;
         Ok(Ended::Done)
     }
 }

@@ -7,7 +7,7 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 
 use serde_json::{Value, json};
-use store::{CampaignLock, Location, NewProtocol, Protocol, Requeued, Store, unix_milliseconds};
+use store::{CampaignLock, Location, NewProtocol, Protocol, RelabelCounts, Store, unix_milliseconds};
 
 use self::choice::Choice;
 use self::protocol::NewLabels;
@@ -68,7 +68,7 @@ struct Order {
     choice: Choice,
     bill: Again,
     /// `moved` is known before.
-    done: Requeued,
+    done: RelabelCounts,
     /// How the labels come to be made.
     next: String,
 }
@@ -107,7 +107,7 @@ impl Relabel {
         let moved = if new.is_some() { store.unlabelled_by_others(protocol.hash).await? } else { 0 };
         let bill = bill::again(&store, &in_force, &choice.sizes()).await?;
         let next = self.next(&store, &location).await?;
-        let mut done = Requeued { again: choice.structures().len() as u64, moved };
+        let mut done = RelabelCounts { again: choice.structures().len() as u64, moved };
         if !self.dry_run {
             done = self.carry_out(&store, new.as_ref(), &choice).await?;
         }
@@ -151,7 +151,7 @@ impl Relabel {
         store: &Store,
         new: Option<&NewLabels>,
         choice: &Choice,
-    ) -> Result<Requeued, Failure> {
+    ) -> Result<RelabelCounts, Failure> {
         let changes: Vec<_> = new.iter().flat_map(|new| &new.changes).map(|change| change.detail()).collect();
         let protocol = new.map(|new| NewProtocol {
             protocol: &new.protocol,
@@ -160,7 +160,7 @@ impl Relabel {
             notes: &new.notes,
         });
         let (structures, again) = (choice.structures(), self.again || !self.ids.is_empty());
-        let order = store::Relabel { structures: &structures, again, reason: &self.reason, protocol };
+        let order = store::RelabelRequest { structures: &structures, again, reason: &self.reason, protocol };
         Ok(store.relabel(&order, unix_milliseconds()).await?)
     }
 }

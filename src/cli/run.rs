@@ -14,7 +14,9 @@ use orchestrator::launcher::raise_descriptor_limit;
 use orchestrator::reactor;
 use orchestrator::selector::{Selector, Snapshot};
 use serde_json::json;
-use store::{DATABASE, Location, ProcessRecord, SERVER_AWAY, Store, StoreError, unix_milliseconds};
+use store::{
+    DATABASE, Location, ProcessRecord, SERVER_RECONNECT_TIMEOUT, Store, StoreError, unix_milliseconds,
+};
 use tokio::sync::Notify;
 use wire::net::{Endpoint, Tls};
 use workers::labeller::GUARD;
@@ -155,7 +157,7 @@ async fn run(
     let lock = lock::server(location, patience).await?;
     let origin = Origin::new(&campaign.path, &campaign.text, directory);
     let store = open_store(campaign, location, &origin, adopt).await?;
-    let store = lock.iter().fold(store, Store::led_by);
+    let store = lock.iter().fold(store, Store::fenced_by);
     if let Location::Directory(directory) = &location {
         warn_of_the_disk(campaign, directory, &store).await?;
     }
@@ -187,7 +189,7 @@ async fn run(
     serving.end().await;
     let ended = worked?;
     // Hours of work do not end as a failure because a server is away in the last second.
-    let store = store.patient(SERVER_AWAY);
+    let store = store.with_reconnect_timeout(SERVER_RECONNECT_TIMEOUT);
     loop {
         match leave(&store, &process, ended).await {
             Err(StoreError::Unreachable(_)) => {}
@@ -264,11 +266,11 @@ async fn open_store(
 async fn leave_notes(campaign: &Campaign, store: &Store) -> Result<(), Failure> {
     let text = |note: serde_json::Result<String>| note.map_err(Failure::failed);
     let method = campaign.method()?;
-    store.leave_note(LABEL_METHOD, &text(serde_json::to_string(&method))?).await?;
-    store.leave_note(GUARD, &text(serde_json::to_string(&campaign.config.label.guard))?).await?;
+    store.set_metadata(LABEL_METHOD, &text(serde_json::to_string(&method))?).await?;
+    store.set_metadata(GUARD, &text(serde_json::to_string(&campaign.config.label.guard))?).await?;
     let elements: Vec<_> = campaign.model.elements().iter().map(|species| species.symbol()).collect();
-    store.leave_note(story::ELEMENTS, &text(serde_json::to_string(&elements))?).await?;
-    store.leave_note(forecast::NOTE, &text(serde_json::to_string(&Forecast::of(campaign)))?).await?;
+    store.set_metadata(story::ELEMENTS, &text(serde_json::to_string(&elements))?).await?;
+    store.set_metadata(forecast::NOTE, &text(serde_json::to_string(&Forecast::of(campaign)))?).await?;
     Ok(())
 }
 
@@ -291,7 +293,7 @@ async fn warn_of_the_disk(campaign: &Campaign, directory: &Path, store: &Store) 
 /// Makes this process known, and takes back what dead ones held: the lock says that there is no other.
 async fn register(store: &Store) -> Result<ProcessRecord, StoreError> {
     let now = unix_milliseconds();
-    store.take_over(now).await?;
+    store.reclaim_leases(now).await?;
     let record = ProcessRecord::new(ProcessRecord::ORCHESTRATOR, None, std::process::id(), now);
     store.upsert_process(&record).await?;
     let detail = json!({ "process": record.id, "program_version": env!("CARGO_PKG_VERSION") });

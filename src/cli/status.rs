@@ -84,7 +84,7 @@ impl Snapshot {
 
     /// Reads it.
     pub async fn of(store: &Store) -> Result<Self, Failure> {
-        let forecast = store.note(forecast::NOTE).await?;
+        let forecast = store.metadata(forecast::NOTE).await?;
         let forecast = forecast.and_then(|text| serde_json::from_str(&text).ok());
         let (campaign, standing) = (store.campaign().await?, store.status().await?);
         let labels = LabelsSoFar::of(store, &standing).await?;

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use store::{LoggedDecision, Store, StoreError, StoredCandidate};
 
-use super::{Covered, Named};
+use super::{CandidateRef, CoveredCandidate};
 
 /// Under which name the leader of a campaign leaves the symbols of the model's elements.
 pub const ELEMENTS: &str = "elements";
@@ -74,10 +74,10 @@ pub struct FoundUpdate {
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Coverage {
     /// Of a candidate that was declined as covered: whose updates its walker had not seen, newest first.
-    pub by: Vec<Named>,
+    pub by: Vec<CandidateRef>,
     /// Of one that updated the mixture: later candidates that were declined as covered, and whose walkers had not seen
     /// that update. If `decided` − `seen` is 1 it was this update alone, otherwise this and others of those versions.
-    pub later: Vec<Covered>,
+    pub later: Vec<CoveredCandidate>,
     /// The last decision that was looked at for that, if there are more.
     pub looked_until: Option<i64>,
 }
@@ -135,7 +135,7 @@ impl Update {
 
 /// Symbols of the model's elements, in its order; none in campaigns of earlier versions.
 async fn elements(store: &Store) -> Result<Vec<String>, StoreError> {
-    let note = store.note(ELEMENTS).await?;
+    let note = store.metadata(ELEMENTS).await?;
     Ok(note.and_then(|note| serde_json::from_str(&note).ok()).unwrap_or_default())
 }
 

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use atoms::Structure;
 use serde::Serialize;
 use serde_json::Value;
-use store::{Covered, Named, Store, StoreError, StoredCandidate};
+use store::{CandidateRef, CoveredCandidate, Store, StoreError, StoredCandidate};
 use wire::ContentHash;
 
 pub use decision::{Coverage, Decided, ELEMENTS, Update};
@@ -52,7 +52,7 @@ pub struct Story {
     /// What was decided.
     pub decision: Option<Decided>,
     /// Other candidates with the very same structure.
-    pub same_structure: Vec<Named>,
+    pub same_structure: Vec<CandidateRef>,
     /// The import with the very same structure.
     pub same_import: Option<i64>,
     /// Its label jobs, one a protocol at most.
@@ -112,7 +112,7 @@ async fn of_import(store: &Store, id: &str, number: &str) -> Result<Story, Store
     Ok(story)
 }
 
-async fn of_candidate(store: &Store, named: Named) -> Result<Story, StoreError> {
+async fn of_candidate(store: &Store, named: CandidateRef) -> Result<Story, StoreError> {
     let stored = store.candidate(&named.candidate).await?;
     let stored = stored.ok_or_else(|| damaged(&named, "it is not there"))?;
     let logged = store.decisions(stored.decision..=stored.decision).await?.into_iter().next();
@@ -197,6 +197,6 @@ fn not_recorded(stored: &StoredCandidate) -> Vec<&'static str> {
     missing
 }
 
-fn damaged(named: &Named, problem: &str) -> StoreError {
+fn damaged(named: &CandidateRef, problem: &str) -> StoreError {
     StoreError::damaged("a candidate", format!("{}: {problem}", named.candidate))
 }

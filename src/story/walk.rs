@@ -3,7 +3,7 @@
 use atoms::{NeighbourList, Structure, shortest_distance};
 use serde::Serialize;
 use serde_json::Value;
-use store::{Named, Store, StoreError, StoredCandidate, WalkStatus};
+use store::{CandidateRef, Store, StoreError, StoredCandidate, WalkStatus};
 
 /// How far neighbours are looked for, Å: beyond it nothing is too near.
 const REACH: f64 = 8.0;
@@ -30,7 +30,7 @@ pub struct Found {
     /// The biased walk that this one controls, if it is a control.
     pub control_of: Option<u32>,
     /// The accepted candidate of that walk at the same step, if it is still of the same segment's steps.
-    pub partner: Option<Named>,
+    pub partner: Option<CandidateRef>,
     /// What the guards look at.
     pub distances: Distances,
     /// Where the walk stands now, with the refusals of its own guard.

@@ -9,7 +9,7 @@ use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use orchestrator::supervisor::{ChildStatus, Standing};
-use workers::agent::Numbers;
+use workers::agent::AgentMetrics;
 
 use super::exposition::{CONTENT_TYPE, Text};
 
@@ -17,7 +17,7 @@ use super::exposition::{CONTENT_TYPE, Text};
 #[derive(Clone, Debug, Default)]
 pub struct Watched {
     /// Its work and its line.
-    pub numbers: Arc<Mutex<Numbers>>,
+    pub numbers: Arc<Mutex<AgentMetrics>>,
     /// Its walkers.
     pub walkers: Arc<Mutex<Vec<ChildStatus>>>,
 }
@@ -33,7 +33,7 @@ async fn metrics(State(watched): State<Watched>) -> Response {
     ([(header::CONTENT_TYPE, CONTENT_TYPE)], text(&numbers, &walkers)).into_response()
 }
 
-fn text(numbers: &Numbers, walkers: &[ChildStatus]) -> String {
+fn text(numbers: &AgentMetrics, walkers: &[ChildStatus]) -> String {
     let mut text = Text::default();
     let host = store::this_host();
     let labels = [("host", host.as_str()), ("version", env!("CARGO_PKG_VERSION"))];
@@ -46,7 +46,7 @@ fn text(numbers: &Numbers, walkers: &[ChildStatus]) -> String {
     text.into_string()
 }
 
-fn of_walkers(text: &mut Text, numbers: &Numbers, walkers: &[ChildStatus]) {
+fn of_walkers(text: &mut Text, numbers: &AgentMetrics, walkers: &[ChildStatus]) {
     let mut states: BTreeMap<&str, u64> = BTreeMap::new();
     walkers.iter().for_each(|walker| *states.entry(state(walker.standing)).or_default() += 1);
     let labels: Vec<_> = states.keys().map(|state| [("state", *state)]).collect();
@@ -62,13 +62,13 @@ fn of_walkers(text: &mut Text, numbers: &Numbers, walkers: &[ChildStatus]) {
     text.gauge("calmwalk_agent_idle_walkers", "Walkers without a turn.", &[(&[], numbers.idle as f64)]);
 }
 
-fn of_turns(text: &mut Text, numbers: &Numbers) {
-    let taken = numbers.turns_taken as f64;
+fn of_turns(text: &mut Text, numbers: &AgentMetrics) {
+    let taken = numbers.assignments_received as f64;
     text.counter("calmwalk_agent_turns_taken_total", "Turns that the orchestrator gave.", &[(&[], taken)]);
-    let turns = &numbers.turns;
+    let turns = &numbers.assignments;
     let outcomes = [
         ("candidate", turns.candidate),
-        ("turn", turns.turn),
+        ("turn", turns.steps_done),
         ("paused", turns.paused),
         ("ended", turns.ended),
         ("lost", turns.lost),
@@ -85,7 +85,7 @@ fn of_turns(text: &mut Text, numbers: &Numbers) {
     text.counter("calmwalk_agent_steps_total", "Steps of the walkers of this host.", &[(&[], steps)]);
 }
 
-fn of_line(text: &mut Text, numbers: &Numbers) {
+fn of_line(text: &mut Text, numbers: &AgentMetrics) {
     let linked = f64::from(numbers.is_linked());
     text.gauge("calmwalk_agent_link_up", "Whether the orchestrator answers.", &[(&[], linked)]);
     gauge(
@@ -100,7 +100,7 @@ fn of_line(text: &mut Text, numbers: &Numbers) {
         "Time that the last question to the orchestrator took to be answered.",
         numbers.round_trip.map(|took| took.as_secs_f64()),
     );
-    let places = numbers.places as f64;
+    let places = numbers.joins as f64;
     text.counter(
         "calmwalk_agent_places_total",
         "Times that the orchestrator has let this agent join.",
@@ -109,7 +109,7 @@ fn of_line(text: &mut Text, numbers: &Numbers) {
     text.gauge(
         "calmwalk_agent_untold_reports",
         "Reports that the orchestrator has not taken yet.",
-        &[(&[], numbers.untold as f64)],
+        &[(&[], numbers.unsent as f64)],
     );
 }
 

@@ -7,14 +7,14 @@ use std::path::Path;
 
 use serde_json::json;
 
-use self::directory::Unfinished;
+use self::directory::StagedDirectory;
 use crate::Store;
 use crate::database::{Database, query};
 use crate::error::Result;
 use crate::sqlite::DatabaseFile;
 use crate::tables::logs::insert_operation;
 use crate::tables::processes::LEASED;
-use crate::tables::queue::{InVain, end_in_vain};
+use crate::tables::queue::{AttemptEnd, end_without_label};
 
 impl Store {
     /// Copies the campaign as it is at one instant into a new directory `target`, which appears when it is complete and on
@@ -24,7 +24,7 @@ impl Store {
     /// # Errors
     /// [`crate::StoreError::BackupExists`] if there is anything at `target`.
     pub async fn backup(&self, target: &Path, now: i64, tell: impl FnMut(u64, u64)) -> Result<()> {
-        let unfinished = Unfinished::beside(target)?;
+        let unfinished = StagedDirectory::beside(target)?;
         match &self.database {
             Database::Sqlite(file) => file.copy_into(unfinished.path(), tell).await?,
             Database::Postgres(server) => from_postgres::copy(server, unfinished.path(), tell).await?,
@@ -42,7 +42,7 @@ impl Store {
         let mut transaction = self.database.begin().await?;
         let leased: Vec<(i64, String)> = query(LEASED).fetch_all(&mut transaction).await?;
         for (job, _) in &leased {
-            end_in_vain(&mut transaction, *job, InVain::Lost("released"), now).await?;
+            end_without_label(&mut transaction, *job, AttemptEnd::Lost("released"), now).await?;
         }
         query("DELETE FROM process").execute(&mut transaction).await?;
         let detail = json!({ "leases": leased.len() });

@@ -9,7 +9,7 @@
 
 use crc32fast::Hasher;
 
-use crate::database::value::{Kind, without_zeros};
+use crate::database::value::{Kind, replace_nul};
 use crate::database::{Row, Value};
 use crate::error::{Result, StoreError};
 
@@ -156,7 +156,7 @@ pub static ORIGINAL_GRADES: CheckedColumn = CheckedColumn {
 };
 
 /// The long columns of a candidate, in the order of its checksums.
-pub static LONG: [&CheckedColumn; 3] = [&FEATURES, &SELECTOR_GRADES, &ORIGINAL_GRADES];
+pub static LONG_COLUMNS: [&CheckedColumn; 3] = [&FEATURES, &SELECTOR_GRADES, &ORIGINAL_GRADES];
 
 /// The checkpoint of a walk.
 pub static CHECKPOINT: CheckedColumn = CheckedColumn {
@@ -314,7 +314,7 @@ fn add(hasher: &mut Hasher, value: &Value) {
             number(hasher, b'r', value.map(f64::to_le_bytes));
         }
         Value::Text(Some(text)) if text.contains('\0') => {
-            add_bytes(hasher, Some(without_zeros(text.clone()).as_bytes()));
+            add_bytes(hasher, Some(replace_nul(text.clone()).as_bytes()));
         }
         Value::Text(text) => add_bytes(hasher, text.as_ref().map(String::as_bytes)),
         Value::Bytes(bytes) => add_bytes(hasher, bytes.as_deref()),

@@ -4,7 +4,7 @@ use serde_json::json;
 
 use crate::Store;
 use crate::checksum::CheckedColumn;
-use crate::database::{Database, for_rows, query};
+use crate::database::{Database, execute_rows, query};
 use crate::error::Result;
 use crate::tables::logs::insert_operation;
 
@@ -21,7 +21,7 @@ impl Store {
     /// [`crate::CampaignLock`]; whoever else writes waits.
     ///
     /// # Errors
-    /// [`crate::StoreError::NoRoom`] where the disk cannot hold the copy that this takes; a server does not tell.
+    /// [`crate::StoreError::InsufficientSpace`] where the disk cannot hold the copy that this takes; a server does not tell.
     pub async fn compact(&self) -> Result<()> {
         match &self.database {
             Database::Sqlite(file) => file.compact().await,
@@ -43,7 +43,7 @@ impl Store {
         let sql = "UPDATE candidate SET features_checksum = new.checksum FROM {rows}
                    WHERE candidate.decision = new.decision";
         let rows = with.iter().map(checksum).collect();
-        for_rows(&mut transaction, sql, &["decision", "checksum"], rows).await?;
+        execute_rows(&mut transaction, sql, &["decision", "checksum"], rows).await?;
         let sql = "UPDATE candidate_data SET features = NULL WHERE features IS NOT NULL
                    AND decision IN (SELECT decision FROM candidate WHERE fate = 'declined')";
         let dropped = query(sql).execute(&mut transaction).await?;

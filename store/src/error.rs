@@ -7,7 +7,7 @@ use sqlx::postgres::PgDatabaseError;
 use wire::{BlockError, WalkId};
 
 use crate::JobState;
-use crate::history::Named;
+use crate::candidate_history::CandidateRef;
 use crate::numbers::NumbersError;
 
 /// What the functions of this crate return.
@@ -45,7 +45,7 @@ pub enum StoreError {
         needed.div_ceil(1_000_000),
         directory = directory.display()
     )]
-    NoRoom {
+    InsufficientSpace {
         /// The directory on the disk.
         directory: PathBuf,
         /// Bytes that are free.
@@ -223,7 +223,7 @@ pub enum StoreError {
         /// What was asked for.
         id: String,
         /// The first and the last candidate.
-        range: Option<(Named, Named)>,
+        range: Option<(CandidateRef, CandidateRef)>,
     },
     /// No such imported structure.
     #[error(
@@ -378,7 +378,7 @@ fn neighbours(names: &[String]) -> String {
     if names.is_empty() { "the queue is empty".into() } else { format!("near it are {}", list(names)) }
 }
 
-fn candidates(range: Option<&(Named, Named)>) -> String {
+fn candidates(range: Option<&(CandidateRef, CandidateRef)>) -> String {
     let Some((first, last)) = range else { return "the campaign has none yet".into() };
     format!(
         "give the number of the decision about it, {} to {} (some of these are about walks), or the beginning of its name, as \

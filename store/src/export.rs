@@ -20,7 +20,7 @@ pub struct ExportFilter {
 
 /// Place of a row in the order of exports: candidates in decision order, then imports as they came.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum ExportPlace {
+pub enum ExportCursor {
     /// Number of the decision.
     Candidate(i64),
     /// Number of the import.
@@ -31,7 +31,7 @@ pub enum ExportPlace {
 #[derive(Clone, Debug)]
 pub struct ExportRow {
     /// Where it stands; the next page begins after it.
-    pub place: ExportPlace,
+    pub cursor: ExportCursor,
     /// Where it came from.
     pub source: ExportSource,
     /// The structure.

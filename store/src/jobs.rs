@@ -22,7 +22,7 @@ from_columns!(OldestLease { job, holder, started });
 
 /// What became of a result that was brought.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Completed {
+pub enum CompleteOutcome {
     /// It is the label.
     Label,
     /// There was a label already: it is kept beside it.
@@ -31,7 +31,7 @@ pub enum Completed {
 
 /// What became of a job whose attempt failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Failed {
+pub enum FailOutcome {
     /// It waits for another attempt.
     Requeued,
     /// It has used up its attempts.
@@ -42,7 +42,7 @@ pub enum Failed {
 
 /// What has become of a job whose lease was lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Whereabouts {
+pub enum LeaseStatus {
     /// The lease still lasts.
     Held,
     /// Somebody else has leased it.
@@ -80,7 +80,7 @@ pub struct Archive {
 
 /// How many of the frames of an import became what.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Imported {
+pub struct ImportCounts {
     /// Labels.
     pub labels: usize,
     /// Other numbers for structures that have a label: kept beside it.
@@ -214,13 +214,13 @@ pub struct JobDetails {
     /// Every attempt, oldest first.
     pub attempts_made: Vec<Attempt>,
     /// Energies of its structure's labels and checks, oldest first, eV.
-    pub energies: Vec<(Standing, f64)>,
+    pub energies: Vec<(LabelStatus, f64)>,
 }
 
 /// What a stored result is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Standing {
+pub enum LabelStatus {
     /// The label.
     Label,
     /// A further result, for comparison.
@@ -231,7 +231,7 @@ pub enum Standing {
     Excluded,
 }
 
-impl Standing {
+impl LabelStatus {
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Label => "label",
@@ -271,7 +271,7 @@ pub enum LabelSource {
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelRecord {
     /// What it is now.
-    pub standing: Standing,
+    pub status: LabelStatus,
     /// Its numbers.
     pub label: Label,
     /// Where it came from.
@@ -279,14 +279,14 @@ pub struct LabelRecord {
     /// When it came, ms since 1970.
     pub received: i64,
     /// When and why another came in its place.
-    pub superseded: Option<Superseded>,
+    pub superseded: Option<Supersession>,
     /// When and why it was taken out of the data set.
     pub excluded: Option<Exclusion>,
 }
 
 /// How a label was superseded.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Superseded {
+pub struct Supersession {
     /// When the label came that is in its place, ms since 1970.
     pub time: i64,
     /// Why another was asked for.

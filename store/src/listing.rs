@@ -15,7 +15,7 @@ pub enum ListOrder {
 
 /// Where a page ends: the value that it is ordered by, and the decision.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ListPlace {
+pub struct ListCursor {
     /// γ or V/V₀; of any other order, anything.
     pub value: f64,
     /// Number of the decision.

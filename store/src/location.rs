@@ -47,7 +47,7 @@ impl ServerUrl {
     }
 
     /// What tells its campaign from others: server, port, database and schema, however the URL says them, and whoever connects.
-    pub fn place(&self) -> String {
+    pub fn campaign_key(&self) -> String {
         let options = &self.options;
         let host = match options.get_socket() {
             Some(directory) => directory.display().to_string(),
@@ -90,7 +90,7 @@ impl FromStr for ServerUrl {
     type Err = StoreError;
 
     fn from_str(url: &str) -> Result<Self> {
-        let Parts { shown, plain, schema, has_password } = Parts::of(url)?;
+        let UrlParts { shown, plain, schema, has_password } = UrlParts::parse(url)?;
         if !Location::is_server(url) {
             let reason = "it must begin with postgres:// (a campaign in a directory has no run.store, and its name no ://)";
             return Err(StoreError::Url { url: shown, reason: reason.to_owned() });
@@ -110,13 +110,13 @@ impl FromStr for ServerUrl {
             reason: "it should look like postgres://user@host:5432/database?schema=name".into(),
         })?;
         let (options, is_unprotected) =
-            protection::settle(options).map_err(|reason| StoreError::Url { url: shown.clone(), reason })?;
+            protection::resolve(options).map_err(|reason| StoreError::Url { url: shown.clone(), reason })?;
         Ok(Self { options: Box::new(options), schema, shown, has_password, is_unprotected })
     }
 }
 
 /// A URL taken apart.
-struct Parts {
+struct UrlParts {
     /// Without password.
     shown: String,
     /// Without schema.
@@ -125,8 +125,8 @@ struct Parts {
     has_password: bool,
 }
 
-impl Parts {
-    fn of(url: &str) -> Result<Self> {
+impl UrlParts {
+    fn parse(url: &str) -> Result<Self> {
         let (begin, parameters) = url.split_once('?').unwrap_or((url, ""));
         let (scheme, rest) = begin.split_once("://").unwrap_or(("", begin));
         let (mut shown, mut plain) = (String::new(), begin.to_owned());
@@ -203,8 +203,8 @@ impl From<PathBuf> for Location {
 }
 
 impl From<&Self> for Location {
-    fn from(place: &Self) -> Self {
-        place.clone()
+    fn from(location: &Self) -> Self {
+        location.clone()
     }
 }
 
@@ -254,7 +254,7 @@ mod tests {
 
     #[test]
     fn a_place_is_the_same_however_it_is_written() {
-        let place = |url: &str| url.parse::<ServerUrl>().unwrap().place();
+        let place = |url: &str| url.parse::<ServerUrl>().unwrap().campaign_key();
         let expected = place("postgres://anna@localhost/lab?schema=alloy");
         for same in [
             "postgresql://localhost:5432/lab?schema=alloy",

@@ -35,7 +35,7 @@ struct DirectoryLock {
 }
 
 impl Drop for DirectoryLock {
-    /// Closing is not enough at once: a process that is just being started has the files too, until its program begins.
+    /// Shutdown is not enough at once: a process that is just being started has the files too, until its program begins.
     fn drop(&mut self) {
         for file in self.directory.iter().chain([&self.file]) {
             // What cannot be unlocked comes free with the last who has the file.

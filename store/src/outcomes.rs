@@ -36,7 +36,7 @@ pub struct LabelledEnergies {
 
 /// Jobs of one size that have no label yet.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Waiting {
+pub struct PendingJobs {
     /// Index of the seed structure.
     pub seed_structure: u32,
     /// Formula.
@@ -49,7 +49,7 @@ pub struct Waiting {
 
 /// What label attempts have used so far, and what is at work.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Work {
+pub struct LabelUsage {
     /// Core-seconds of all attempts that ended, also of those that brought nothing; `None` in a database of an earlier
     /// version, which keeps no such sum.
     pub core_seconds: Option<f64>,
@@ -74,7 +74,7 @@ pub struct FailureCount {
 
 /// Least and largest of some values; none of none.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Range {
+pub struct ValueRange {
     /// Least.
     pub low: Option<f64>,
     /// Largest.
@@ -93,19 +93,19 @@ pub struct Unlabelled {
     /// Those that have their labels.
     pub labelled: u64,
     /// Largest γ of the former, under the original mixture.
-    pub gamma: Range,
+    pub gamma: ValueRange,
     /// The same of the latter.
-    pub gamma_labelled: Range,
+    pub gamma_labelled: ValueRange,
     /// V/V₀ of the former.
-    pub relative_volume: Range,
+    pub relative_volume: ValueRange,
     /// The same of the latter.
-    pub relative_volume_labelled: Range,
+    pub relative_volume_labelled: ValueRange,
 }
 
 /// A candidate whose job has come to its end. Several have one job if they are the same structure, such as the first steps
 /// of a walk and of its control.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Finished {
+pub struct FinishedCandidate {
     /// Number of the decision about it; the next page begins after it.
     pub decision: i64,
     /// Name of the candidate.
@@ -132,7 +132,7 @@ pub struct Finished {
 
 /// A labelled structure that may be almost the same as another.
 #[derive(Clone, Debug, PartialEq)]
-pub struct NearLabel {
+pub struct NearDuplicate {
     /// Name of the candidate.
     pub candidate: String,
     /// Its features, [n × D].

@@ -26,7 +26,7 @@ pub struct Relabellable {
 
 /// What is to be labelled again.
 #[derive(Clone, Debug)]
-pub struct Relabel<'a> {
+pub struct RelabelRequest<'a> {
     /// Which structures.
     pub structures: &'a [ContentHash],
     /// Also those that have their label by the protocol in force.
@@ -46,13 +46,13 @@ pub struct NewProtocol<'a> {
     pub configuration: &'a str,
     /// What makes it another, JSON objects for the operations log.
     pub changes: &'a [Value],
-    /// What the leader leaves for others ([`crate::Store::leave_note`]): names and texts.
+    /// What the leader leaves for others ([`crate::Store::set_metadata`]): names and texts.
     pub notes: &'a [(&'a str, String)],
 }
 
 /// What came of it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Requeued {
+pub struct RelabelCounts {
     /// Structures that are labelled again.
     pub again: u64,
     /// Structures without a label that went over to another protocol.

@@ -13,7 +13,7 @@ use crate::tables::protocols;
 
 /// How long a server that is away is waited for by those who run a campaign, and by every commit. Whoever waits has nothing
 /// else to do; a campaign that failed goes on from here just as well, but somebody has to start it.
-pub const SERVER_AWAY: Duration = Duration::from_secs(3600);
+pub const SERVER_RECONNECT_TIMEOUT: Duration = Duration::from_secs(3600);
 
 /// The database of one campaign. Clones share its connections.
 #[derive(Clone, Debug)]
@@ -65,9 +65,9 @@ impl Store {
     }
 
     /// The same store for whoever holds `lock`: on a server, what leads the campaign ([`Self::commit`],
-    /// [`Self::take_over`], its configuration, protocols and seed structures) fails from the moment on at which another
+    /// [`Self::reclaim_leases`], its configuration, protocols and seed structures) fails from the moment on at which another
     /// process has the lock. On this host the system sees to it that there is no other.
-    pub fn led_by(mut self, lock: &CampaignLock) -> Self {
+    pub fn fenced_by(mut self, lock: &CampaignLock) -> Self {
         if let Database::Postgres(server) = &mut self.database {
             server.generation = lock.generation();
         }
@@ -76,16 +76,16 @@ impl Store {
 
     /// The same store, which waits for a server that is away for so long, and not some seconds, before it says so. What
     /// breaks in the middle of a transaction fails at once in any case, but for [`Self::commit`].
-    pub fn patient(mut self, patience: Duration) -> Self {
+    pub fn with_reconnect_timeout(mut self, timeout: Duration) -> Self {
         if let Database::Postgres(server) = &mut self.database {
-            server.patience = patience;
+            server.reconnect_timeout = timeout;
         }
         self
     }
 
     /// The same store, whose leases go by the times that callers give also on a server: to tell it what time it is.
     #[doc(hidden)]
-    pub fn by_the_callers_clock(mut self) -> Self {
+    pub fn with_caller_clock(mut self) -> Self {
         if let Database::Postgres(server) = &mut self.database {
             server.clock = Clock::Caller;
         }
@@ -102,7 +102,7 @@ impl Store {
     }
 
     /// Whether [`Self::wait_for_jobs`] is told of jobs.
-    pub fn tells_of_jobs(&self) -> bool {
+    pub fn has_job_notifications(&self) -> bool {
         matches!(self.database, Database::Postgres(_))
     }
 

@@ -43,7 +43,7 @@ async fn no_more_labels_are_begun_than_there_may_be() {
 #[tokio::test]
 async fn hours_are_those_of_all_attempts_and_of_all_runs() {
     let home = Home::new();
-    let store = home.create().await.by_the_callers_clock();
+    let store = home.create().await.with_caller_clock();
     accept(&store, 4).await;
     let lease = async |now| store.lease(protocol("dft").hash, "a", now, 100_000).await.unwrap().unwrap();
     let failed = lease(0).await;
@@ -61,9 +61,9 @@ async fn hours_are_those_of_all_attempts_and_of_all_runs() {
 
     limit(&store, Budget { wall_hours: Some(1.0), ..Budget::default() }).await;
     assert!(is_given(&store, 4 * HOUR).await);
-    store.add_time_under_way(HOUR as u64 / 2).await.unwrap();
+    store.add_running_time(HOUR as u64 / 2).await.unwrap();
     assert_eq!(store.status().await.unwrap().budget.used_up, None);
-    store.add_time_under_way(HOUR as u64 / 2).await.unwrap();
+    store.add_running_time(HOUR as u64 / 2).await.unwrap();
     assert!(!is_given(&store, 5 * HOUR).await);
     let status = store.status().await.unwrap();
     assert_eq!(

@@ -130,6 +130,6 @@ async fn leases_of_nobody_are_found() {
     assert!(
         found[0].to_string().contains("1 jobs are leased to processes that are gone (such as 2 to nobody)")
     );
-    store.release_leases_of_gone_processes(1).await.unwrap();
+    store.release_leases_of_dead_processes(1).await.unwrap();
     assert_eq!(check(&store).await, []);
 }

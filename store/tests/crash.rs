@@ -9,7 +9,7 @@ use std::thread;
 use std::time::Duration;
 
 use store::{
-    CampaignLock, Commit, Completed, ComponentRecord, ExportFilter, Fate, JobState, Store, StoreError,
+    CampaignLock, Commit, CompleteOutcome, ComponentRecord, ExportFilter, Fate, JobState, Store, StoreError,
 };
 use wire::Origin;
 use wire::messages::Decline;
@@ -46,7 +46,7 @@ async fn work(directory: &Path) {
         opened => opened.unwrap(),
     };
     store.add_protocol(&protocol("dft"), 0).await.unwrap();
-    store.release_leases_of_gone_processes(0).await.unwrap();
+    store.release_leases_of_dead_processes(0).await.unwrap();
     let mut next = commits(&store).await + 1;
     loop {
         store.commit(&numbered_commit(next)).await.unwrap();
@@ -58,7 +58,7 @@ async fn work(directory: &Path) {
                 continue;
             }
             let completed = store.complete(&lease, &label(-1.0), 0).await.unwrap();
-            assert_eq!(completed, Completed::Label);
+            assert_eq!(completed, CompleteOutcome::Label);
             tell("labelled", lease.job as u64);
         }
         next += 1;

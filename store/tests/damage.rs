@@ -98,7 +98,7 @@ impl Random {
 
 /// A campaign with some of everything, so many accepted candidates.
 async fn full(directory: &Path, accepted: u64) -> Store {
-    let store = create(directory).await.by_the_callers_clock();
+    let store = create(directory).await.with_caller_clock();
     for step in 1..=accepted {
         let kind = if step % 3 == 0 { Origin::Control } else { Origin::Biased };
         let mut records = vec![candidate(0, step, kind, Fate::Accepted)];
@@ -224,10 +224,10 @@ async fn read(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
     loop {
         let page = store.labelled(&filter, last, 7).await?;
         let Some(row) = page.last() else { break };
-        last = Some(row.place);
+        last = Some(row.cursor);
         for row in page {
-            missing.remove(&row.place);
-            rows.insert(format!("{:?}", row.place), format!("{row:?}"));
+            missing.remove(&row.cursor);
+            rows.insert(format!("{:?}", row.cursor), format!("{row:?}"));
         }
     }
     match missing.is_empty() {

@@ -2,8 +2,8 @@
 
 use serde_json::json;
 use store::{
-    Commit, Completed, ExclusionChange, ExportFilter, Fate, JobState, Lease, ListOrder, ListedCandidate,
-    Protocol, Relabel, Standing, Store, StoreError, WalkRecord,
+    Commit, CompleteOutcome, ExclusionChange, ExportFilter, Fate, JobState, LabelStatus, Lease, ListOrder,
+    ListedCandidate, Protocol, RelabelRequest, Store, StoreError, WalkRecord,
 };
 use wire::messages::Decline;
 use wire::{ContentHash, Origin};
@@ -16,7 +16,7 @@ async fn lease(store: &Store, now: i64) -> Lease {
 
 /// Candidates that all have their labels, with energies −1, −2, … Their names.
 async fn labelled(home: &Home, number: u64) -> (Store, Vec<String>) {
-    let store = home.create().await.by_the_callers_clock();
+    let store = home.create().await.with_caller_clock();
     let names = accept(&store, number).await;
     let walk = WalkRecord { accepted: number as u32, ..walk(0, 1) };
     store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
@@ -43,9 +43,9 @@ async fn exported(store: &Store, protocol: &Protocol) -> Vec<f64> {
 }
 
 /// Standing, energy, and why it is excluded of every label of a structure.
-async fn history(store: &Store, structure: ContentHash) -> Vec<(Standing, f64, Option<String>)> {
+async fn history(store: &Store, structure: ContentHash) -> Vec<(LabelStatus, f64, Option<String>)> {
     let labels = store.labels_of(structure).await.unwrap().into_iter().map(|label| label.record);
-    labels.map(|record| (record.standing, record.label.energy, record.excluded.map(|e| e.reason))).collect()
+    labels.map(|record| (record.status, record.label.energy, record.excluded.map(|e| e.reason))).collect()
 }
 
 async fn whole(store: &Store) {
@@ -82,7 +82,7 @@ async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
     assert_eq!((labels.labelled, labels.excluded), (3, 1));
     let shown = store.queue_show(second).await.unwrap();
     assert_eq!(shown.job.excluded.as_deref(), Some("it has a hole"));
-    assert_eq!(shown.energies, [(Standing::Excluded, -2.0)]);
+    assert_eq!(shown.energies, [(LabelStatus::Excluded, -2.0)]);
     let listed = store.queue_list(Some(JobState::Labelled), 9, 0).await.unwrap();
     assert_eq!(listed.iter().filter(|job| job.excluded.is_some()).count(), 1);
     let table = store.list_candidates(ListOrder::Decision, false, None, 9).await.unwrap();
@@ -100,9 +100,9 @@ async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
     assert_eq!(store.include(&ids, 400).await.unwrap(), [change(second, true, None)]);
     assert_eq!(store.include(&ids, 500).await.unwrap(), [change(second, false, None)]);
     assert_eq!(exported(&store, &dft).await, [-1.0, -2.0, -3.0]);
-    assert_eq!(history(&store, content(2)).await, [(Standing::Label, -2.0, None)]);
+    assert_eq!(history(&store, content(2)).await, [(LabelStatus::Label, -2.0, None)]);
     assert_eq!(store.status().await.unwrap().labels.excluded, 0);
-    let operations = store.done_by_hand(shown.job.job).await.unwrap();
+    let operations = store.manual_operations(shown.job.job).await.unwrap();
     let kinds: Vec<_> =
         operations.iter().map(|done| (done.kind.as_str(), done.time, &done.detail["reason"])).collect();
     assert_eq!(kinds, [("exclude", 100, &json!("it has a hole")), ("include", 400, &json!(null))]);
@@ -145,7 +145,7 @@ async fn all_that_are_named_are_excluded_or_none() {
 #[tokio::test]
 async fn only_a_label_that_was_asked_for_comes_in_its_place() {
     let home = Home::new();
-    let store = home.create().await.by_the_callers_clock();
+    let store = home.create().await.with_caller_clock();
     let (names, dft) = (accept(&store, 1).await, protocol("dft"));
     let walk = WalkRecord { accepted: 1, ..walk(0, 1) };
     store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
@@ -153,13 +153,13 @@ async fn only_a_label_that_was_asked_for_comes_in_its_place() {
     let first = lease(&store, 20_000).await;
     store.complete(&first, &label(-1.0), 20_001).await.unwrap();
     store.exclude(&names, "bad", 20_002).await.unwrap();
-    assert_eq!(store.complete(&late, &label(-9.0), 20_003).await.unwrap(), Completed::KeptAsCheck);
+    assert_eq!(store.complete(&late, &label(-9.0), 20_003).await.unwrap(), CompleteOutcome::KeptAsCheck);
     let frames = [(0, structure(1e-6), label(-8.0))];
     assert_eq!(store.import(dft.hash, "x", &frames, 20_004).await.unwrap().checks, 1);
     assert_eq!(exported(&store, &dft).await, [0.0; 0]);
     whole(&store).await;
 
-    let order = Relabel { structures: &[content(1)], again: true, reason: "better", protocol: None };
+    let order = RelabelRequest { structures: &[content(1)], again: true, reason: "better", protocol: None };
     assert_eq!(store.relabel(&order, 20_005).await.unwrap().again, 1);
     whole(&store).await;
     // Until it comes, the other stays excluded; in vain, it stays so as well.
@@ -169,11 +169,12 @@ async fn only_a_label_that_was_asked_for_comes_in_its_place() {
     assert_eq!(store.status().await.unwrap().labels.excluded, 1);
     store.relabel(&order, 20_008).await.unwrap();
     let again = lease(&store, 20_009).await;
-    assert_eq!(store.complete(&again, &label(-1.5), 20_010).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&again, &label(-1.5), 20_010).await.unwrap(), CompleteOutcome::Label);
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     let bad = Some("bad".to_owned());
-    let (superseded, check) = ((Standing::Superseded, -1.0, bad), |energy| (Standing::Check, energy, None));
-    let expected = [superseded, check(-9.0), check(-8.0), (Standing::Label, -1.5, None)];
+    let (superseded, check) =
+        ((LabelStatus::Superseded, -1.0, bad), |energy| (LabelStatus::Check, energy, None));
+    let expected = [superseded, check(-9.0), check(-8.0), (LabelStatus::Label, -1.5, None)];
     assert_eq!(history(&store, content(1)).await, expected);
     // There is nothing to take in again.
     assert_eq!(store.include(&names, 20_011).await.unwrap(), [change(&names[0], false, None)]);

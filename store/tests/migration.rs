@@ -116,8 +116,8 @@ async fn a_campaign_of_version_1_goes_on() {
     assert_eq!(job_counts(directory.path()).await, [("leased".into(), 1), ("queued".into(), 1)]);
     assert_eq!(store.processes(None).await.unwrap(), [old_process()]);
     // Its number is in use again, but the lock says that it cannot be the same process.
-    assert!(!old_process().is_gone());
-    assert_eq!(store.take_over(7).await.unwrap(), 1);
+    assert!(!old_process().is_dead());
+    assert_eq!(store.reclaim_leases(7).await.unwrap(), 1);
     assert_eq!(store.processes(None).await.unwrap(), []);
     let queued = store.queue_list(Some(JobState::Queued), 9, 0).await.unwrap();
     assert_eq!((queued.len(), queued[0].failures), (2, 0));

@@ -1,6 +1,6 @@
 //! Who works for a campaign, and what comes back of those who are gone.
 
-use store::{JobState, Lease, ProcessRecord, Store, process_birth};
+use store::{JobState, Lease, ProcessRecord, Store, process_start_time};
 
 use crate::common::*;
 
@@ -12,7 +12,7 @@ fn living(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
 /// Its number belongs to another process by now.
 fn gone(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
     let living = living(id, kind, number);
-    ProcessRecord { birth: format!("{}0", living.birth), ..living }
+    ProcessRecord { start_time: format!("{}0", living.start_time), ..living }
 }
 
 async fn names(store: &Store) -> Vec<String> {
@@ -36,7 +36,7 @@ async fn a_record_comes_back_as_it_was_written() {
     let home = Home::new();
     let store = home.create().await;
     let mut record = living("l", ProcessRecord::LABELLER, Some(7));
-    assert_eq!(Some(&record.birth), process_birth(std::process::id()).as_ref());
+    assert_eq!(Some(&record.start_time), process_start_time(std::process::id()).as_ref());
     record.restarts = 2;
     record.setup = Some("hash".into());
     record.remark = "killed by signal 9".into();
@@ -85,9 +85,9 @@ async fn leases_of_the_living_last_and_those_of_the_gone_come_back() {
     for holder in ["living", "gone", "gone/3", "leading/0", "without record"] {
         lease(&store, holder, 0).await;
     }
-    assert_eq!(store.release_leases_of_gone_processes(1).await.unwrap(), 3);
+    assert_eq!(store.release_leases_of_dead_processes(1).await.unwrap(), 3);
     assert_eq!(holders(&store).await, ["leading/0", "living"]);
-    assert_eq!(store.release_leases_of_gone_processes(1).await.unwrap(), 0);
+    assert_eq!(store.release_leases_of_dead_processes(1).await.unwrap(), 0);
     let waiting = store.queue_list(Some(JobState::Queued), 9, 0).await.unwrap();
     assert!(waiting.len() == 3 && waiting.iter().all(|job| job.failures == 0));
     let attempts = store.queue_show(&waiting[0].candidate).await.unwrap().attempts_made;
@@ -102,8 +102,8 @@ async fn a_lease_that_ran_out_is_kept_by_a_process_that_may_be_at_work() {
     accept(&store, 6).await;
     let elsewhere = |id: &str, last_seen| {
         let here = living(id, "labeller", Some(7));
-        let (place, ticks) = here.birth.rsplit_once('/').unwrap();
-        ProcessRecord { birth: format!("{place}0/{ticks}"), last_seen, ..here }
+        let (place, ticks) = here.start_time.rsplit_once('/').unwrap();
+        ProcessRecord { start_time: format!("{place}0/{ticks}"), last_seen, ..here }
     };
     let hangs = ProcessRecord { last_seen: -20 * HOUR, ..living("hangs", "labeller", Some(1)) };
     let processes = [
@@ -143,14 +143,14 @@ async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
     for holder in ["gone", "earlier/0", "earlier/1", "without record"] {
         lease(&store, holder, 0).await;
     }
-    assert_eq!(store.take_over(1).await.unwrap(), 4);
+    assert_eq!(store.reclaim_leases(1).await.unwrap(), 4);
     assert_eq!((names(&store).await, holders(&store).await), (vec!["living".into()], vec!["living".into()]));
     assert!(store.renew(&kept, 2, 600).await.unwrap());
     let logged = store.operations(0, 100).await.unwrap().pop().unwrap();
     assert_eq!((logged.time, logged.kind.as_str()), (1, "lost"));
     assert_eq!(logged.detail, serde_json::json!({ "processes": ["earlier", "gone"], "leases": 4 }));
     // Nothing more to take over, and nothing to tell.
-    assert_eq!(store.take_over(2).await.unwrap(), 0);
+    assert_eq!(store.reclaim_leases(2).await.unwrap(), 0);
     assert_eq!(store.operations(logged.number, 100).await.unwrap(), []);
 }
 

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
-use store::{Completed, ExportFilter, Failed, JobState, Lease, Store, StoreError};
+use store::{CompleteOutcome, ExportFilter, FailOutcome, JobState, Lease, Store, StoreError};
 
 use crate::common::*;
 
@@ -152,7 +152,7 @@ impl Run {
                 if job.state != JobState::Dropped {
                     job.change_to(JobState::Labelled);
                 }
-                let expected = if first { Completed::Label } else { Completed::KeptAsCheck };
+                let expected = if first { CompleteOutcome::Label } else { CompleteOutcome::KeptAsCheck };
                 let energy = -f64::from(lease.attempt);
                 assert_eq!(store.complete(&lease, &label(energy), now).await.unwrap(), expected);
             }
@@ -160,9 +160,9 @@ impl Run {
                 let Some((job, lease)) = self.pick(which) else { return };
                 let expected = if job.state == JobState::Leased && job.attempts == lease.attempt {
                     job.fail();
-                    if job.state == JobState::Failed { Failed::GivenUp } else { Failed::Requeued }
+                    if job.state == JobState::Failed { FailOutcome::GivenUp } else { FailOutcome::Requeued }
                 } else {
-                    Failed::LeaseLost
+                    FailOutcome::LeaseLost
                 };
                 assert_eq!(store.fail(&lease, "class", "log", LIMIT, now).await.unwrap(), expected);
             }
@@ -173,11 +173,11 @@ impl Run {
                 assert_eq!(store.release_all(&holder, now).await.unwrap(), held.len());
                 held.into_iter().for_each(ModelJob::lose);
             }
-            by_hand => self.by_hand(by_hand).await,
+            queue_admin => self.queue_admin(queue_admin).await,
         }
     }
 
-    async fn by_hand(&mut self, step: Step) {
+    async fn queue_admin(&mut self, step: Step) {
         use JobState::{Dropped, Failed, Labelled, Leased, Queued};
         let (Step::Drop(which) | Step::Retry(which) | Step::Prioritise(which, _)) = step else { return };
         let place = which % JOBS as usize;

@@ -2,21 +2,21 @@
 
 use serde_json::json;
 use store::{
-    Commit, Completed, ExportFilter, Failed, JobState, LabelSource, Lease, NewProtocol, Protocol, Relabel,
-    Requeued, Standing, Store, StoreError, WalkRecord, Whereabouts,
+    Commit, CompleteOutcome, ExportFilter, FailOutcome, JobState, LabelSource, LabelStatus, Lease,
+    LeaseStatus, NewProtocol, Protocol, RelabelCounts, RelabelRequest, Store, StoreError, WalkRecord,
 };
 use wire::ContentHash;
 
 use crate::common::*;
 
-const AGAIN: Requeued = Requeued { again: 1, moved: 0 };
+const AGAIN: RelabelCounts = RelabelCounts { again: 1, moved: 0 };
 
 async fn lease(store: &Store, protocol: &Protocol, now: i64) -> Option<Lease> {
     store.lease(protocol.hash, "host/a", now, 10).await.unwrap()
 }
 
 /// Leases what is next by a protocol, and labels it.
-async fn label_next(store: &Store, protocol: &Protocol, energy: f64, now: i64) -> Completed {
+async fn label_next(store: &Store, protocol: &Protocol, energy: f64, now: i64) -> CompleteOutcome {
     let lease = lease(store, protocol, now).await.unwrap();
     store.complete(&lease, &label(energy), now + 1).await.unwrap()
 }
@@ -28,28 +28,28 @@ async fn campaign_with(home: &Home, candidates: u64, labelled: u64) -> (Store, V
     let walk = WalkRecord { accepted: candidates as u32, ..walk(0, 1) };
     store.commit(&Commit { walks: vec![walk], ..Commit::default() }).await.unwrap();
     for energy in 1..=labelled {
-        assert_eq!(label_next(&store, &protocol("dft"), -(energy as f64), 0).await, Completed::Label);
+        assert_eq!(label_next(&store, &protocol("dft"), -(energy as f64), 0).await, CompleteOutcome::Label);
     }
     (store, (1..=candidates).map(|step| ContentHash::of(&structure(1e-6 * step as f64))).collect())
 }
 
-async fn again(store: &Store, structures: &[ContentHash], again: bool) -> Requeued {
-    let order = Relabel { structures, again, reason: "a sick node", protocol: None };
+async fn again(store: &Store, structures: &[ContentHash], again: bool) -> RelabelCounts {
+    let order = RelabelRequest { structures, again, reason: "a sick node", protocol: None };
     store.relabel(&order, 100).await.unwrap()
 }
 
-async fn change_to(store: &Store, to: &Protocol, structures: &[ContentHash]) -> Requeued {
+async fn change_to(store: &Store, to: &Protocol, structures: &[ContentHash]) -> RelabelCounts {
     let notes = [("label_method", format!("how {} is made", to.name))];
     let changes = [json!({ "key": "label.protocol", "before": "dft", "after": to.name })];
     let new = NewProtocol { protocol: to, configuration: "{\"new\":1}", changes: &changes, notes: &notes };
-    let order = Relabel { structures, again: false, reason: "cutoff", protocol: Some(new) };
+    let order = RelabelRequest { structures, again: false, reason: "cutoff", protocol: Some(new) };
     store.relabel(&order, 200).await.unwrap()
 }
 
 /// Standing, energy and protocol of every label of a structure.
-async fn history(store: &Store, structure: ContentHash) -> Vec<(Standing, f64, String)> {
+async fn history(store: &Store, structure: ContentHash) -> Vec<(LabelStatus, f64, String)> {
     let labels = store.labels_of(structure).await.unwrap().into_iter();
-    labels.map(|label| (label.record.standing, label.record.label.energy, label.protocol.name)).collect()
+    labels.map(|label| (label.record.status, label.record.label.energy, label.protocol.name)).collect()
 }
 
 /// Energies in an export.
@@ -77,9 +77,9 @@ async fn a_doubtful_label_stays_until_the_new_one_comes() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 2, 1).await;
     let dft = protocol("dft");
-    assert_eq!(again(&store, &structures, false).await, Requeued::default(), "it has its label");
+    assert_eq!(again(&store, &structures, false).await, RelabelCounts::default(), "it has its label");
     assert_eq!(again(&store, &structures, true).await, AGAIN);
-    assert_eq!(again(&store, &structures, true).await, Requeued::default(), "it waits already");
+    assert_eq!(again(&store, &structures, true).await, RelabelCounts::default(), "it waits already");
     assert_eq!(exported(&store, &dft).await, [-1.0]);
     let labels = store.status().await.unwrap().labels;
     assert_eq!((labels.queued, labels.labelled, labels.again, labels.again_in_vain), (2, 0, 1, 0));
@@ -90,9 +90,13 @@ async fn a_doubtful_label_stays_until_the_new_one_comes() {
     let found = lease(&store, &dft, 300).await.unwrap();
     assert_eq!(ContentHash::of(&found.structure), structures[0]);
     assert!(found.overruled && found.failures.is_empty() && found.attempt == 2);
-    assert_eq!(store.complete(&found, &label(-1.5), 400).await.unwrap(), Completed::Label);
-    assert_eq!(store.complete(&found, &label(-1.5), 500).await.unwrap(), Completed::Label, "brought twice");
-    let expected = [(Standing::Superseded, -1.0, "dft".into()), (Standing::Label, -1.5, "dft".into())];
+    assert_eq!(store.complete(&found, &label(-1.5), 400).await.unwrap(), CompleteOutcome::Label);
+    assert_eq!(
+        store.complete(&found, &label(-1.5), 500).await.unwrap(),
+        CompleteOutcome::Label,
+        "brought twice"
+    );
+    let expected = [(LabelStatus::Superseded, -1.0, "dft".into()), (LabelStatus::Label, -1.5, "dft".into())];
     assert_eq!(history(&store, structures[0]).await, expected);
     let old = store.label_history(structures[0], dft.hash).await.unwrap().remove(0);
     assert_eq!(old.superseded.map(|s| (s.time, s.reason)), Some((400, "a sick node".into())));
@@ -112,9 +116,9 @@ async fn a_label_that_cannot_be_made_again_stays_as_it_was() {
     let dft = protocol("dft");
     again(&store, &structures, true).await;
     let first = lease(&store, &dft, 300).await.unwrap();
-    assert_eq!(store.fail(&first, "crashed", "", 2, 301).await.unwrap(), Failed::Requeued);
+    assert_eq!(store.fail(&first, "crashed", "", 2, 301).await.unwrap(), FailOutcome::Requeued);
     let second = lease(&store, &dft, 302).await.unwrap();
-    assert_eq!(store.fail(&second, "crashed", "", 2, 303).await.unwrap(), Failed::GivenUp);
+    assert_eq!(store.fail(&second, "crashed", "", 2, 303).await.unwrap(), FailOutcome::GivenUp);
     assert_eq!(jobs(&store, structures[0]).await, [("dft".into(), JobState::Labelled)]);
     assert_eq!(exported(&store, &dft).await, [-1.0]);
     let labels = store.status().await.unwrap().labels;
@@ -125,7 +129,7 @@ async fn a_label_that_cannot_be_made_again_stays_as_it_was() {
     let third = lease(&store, &dft, 400).await.unwrap();
     assert!(third.failures.is_empty());
     assert_eq!(store.release_all("host", 401).await.unwrap(), 1);
-    assert_eq!(store.complete(&third, &label(-1.5), 402).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&third, &label(-1.5), 402).await.unwrap(), CompleteOutcome::Label);
     assert_eq!(store.status().await.unwrap().labels.again_in_vain, 0);
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     whole(&store).await;
@@ -137,14 +141,14 @@ async fn what_began_before_is_only_a_check() {
     let (store, structures) = campaign_with(&home, 1, 0).await;
     let dft = protocol("dft");
     let late = lease(&store, &dft, 0).await.unwrap();
-    assert_eq!(label_next(&store, &dft, -1.0, 20_000).await, Completed::Label);
+    assert_eq!(label_next(&store, &dft, -1.0, 20_000).await, CompleteOutcome::Label);
     again(&store, &structures, true).await;
-    assert_eq!(store.complete(&late, &label(-9.0), 30_000).await.unwrap(), Completed::KeptAsCheck);
+    assert_eq!(store.complete(&late, &label(-9.0), 30_000).await.unwrap(), CompleteOutcome::KeptAsCheck);
     let frames = [(0, structure(1e-6), label(-8.0))];
     assert_eq!(store.import(dft.hash, "x", &frames, 30_001).await.unwrap().checks, 1);
     assert_eq!(jobs(&store, structures[0]).await, [("dft".into(), JobState::Queued)], "it still waits");
     assert_eq!(exported(&store, &dft).await, [-1.0]);
-    assert_eq!(label_next(&store, &dft, -1.5, 30_002).await, Completed::Label);
+    assert_eq!(label_next(&store, &dft, -1.5, 30_002).await, CompleteOutcome::Label);
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     whole(&store).await;
 }
@@ -165,18 +169,18 @@ async fn another_protocol_takes_over_label_by_label() {
     );
     assert_eq!(store.unlabelled_by_others(fine.hash).await.unwrap(), 3);
 
-    for expected in [Requeued { again: 2, moved: 3 }, Requeued::default()] {
+    for expected in [RelabelCounts { again: 2, moved: 3 }, RelabelCounts::default()] {
         assert_eq!(change_to(&store, &fine, &structures).await, expected, "asking twice is asking once");
         assert_eq!(store.protocol_in_force().await.unwrap().unwrap(), fine);
         whole(&store).await;
     }
     assert_eq!(store.campaign().await.unwrap().configuration_in_force, "{\"new\":1}");
-    assert_eq!(store.note("label_method").await.unwrap().unwrap(), "how fine is made");
+    assert_eq!(store.metadata("label_method").await.unwrap().unwrap(), "how fine is made");
     assert!(store.is_in_force(fine.hash).await.unwrap() && !store.is_in_force(dft.hash).await.unwrap());
     // Nobody waits for what was under way, and nothing is begun by the old protocol.
     assert!(!store.renew(&under_way, 210, 10).await.unwrap());
-    assert_eq!(store.whereabouts(&under_way).await.unwrap(), Whereabouts::Over);
-    assert_eq!(store.complete(&under_way, &label(-7.0), 211).await.unwrap(), Completed::KeptAsCheck);
+    assert_eq!(store.lease_status(&under_way).await.unwrap(), LeaseStatus::Over);
+    assert_eq!(store.complete(&under_way, &label(-7.0), 211).await.unwrap(), CompleteOutcome::KeptAsCheck);
     assert!(lease(&store, &dft, 220).await.is_none());
     let old = ("dft".to_owned(), JobState::Labelled);
     assert_eq!(jobs(&store, structures[0]).await, [old.clone(), ("fine".into(), JobState::Queued)]);
@@ -185,13 +189,13 @@ async fn another_protocol_takes_over_label_by_label() {
     assert_eq!(exported(&store, &dft).await, [-1.0, -2.0]);
 
     // The first gets its label by the new protocol, the second finally fails.
-    assert_eq!(label_next(&store, &fine, -1.5, 300).await, Completed::Label);
+    assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
     let in_vain = lease(&store, &fine, 310).await.unwrap();
-    assert_eq!(store.fail(&in_vain, "crashed", "", 1, 311).await.unwrap(), Failed::GivenUp);
+    assert_eq!(store.fail(&in_vain, "crashed", "", 1, 311).await.unwrap(), FailOutcome::GivenUp);
     let superseded = ("dft".to_owned(), JobState::Superseded);
     assert_eq!(jobs(&store, structures[0]).await, [superseded, ("fine".into(), JobState::Labelled)]);
     assert_eq!(jobs(&store, structures[1]).await, [old, ("fine".into(), JobState::Failed)]);
-    let expected = [(Standing::Superseded, -1.0, "dft".into()), (Standing::Label, -1.5, "fine".into())];
+    let expected = [(LabelStatus::Superseded, -1.0, "dft".into()), (LabelStatus::Label, -1.5, "fine".into())];
     assert_eq!(history(&store, structures[0]).await, expected);
     assert_eq!((exported(&store, &dft).await, exported(&store, &fine).await), (vec![-2.0], vec![-1.5]));
     let labels = store.status().await.unwrap().labels;
@@ -200,10 +204,10 @@ async fn another_protocol_takes_over_label_by_label() {
 
     // Those without a label get their first by the new protocol; the one that failed is asked for once more.
     for energy in [-3.0, -4.0, -5.0] {
-        assert_eq!(label_next(&store, &fine, energy, 400).await, Completed::Label);
+        assert_eq!(label_next(&store, &fine, energy, 400).await, CompleteOutcome::Label);
     }
     assert_eq!(again(&store, &structures, false).await, AGAIN);
-    assert_eq!(label_next(&store, &fine, -2.5, 500).await, Completed::Label);
+    assert_eq!(label_next(&store, &fine, -2.5, 500).await, CompleteOutcome::Label);
     assert_eq!(exported(&store, &dft).await, [0.0; 0]);
     assert_eq!(exported(&store, &fine).await, [-1.5, -2.5, -3.0, -4.0, -5.0]);
     let labels = store.status().await.unwrap().labels;
@@ -217,7 +221,7 @@ async fn a_campaign_may_go_back_to_its_first_protocol() {
     let (store, structures) = campaign_with(&home, 3, 2).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
     change_to(&store, &fine, &structures).await;
-    assert_eq!(label_next(&store, &fine, -1.5, 300).await, Completed::Label);
+    assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
     // The second waits for its second label, the third for its first.
     assert_eq!(change_to(&store, &dft, &structures).await.again, 1);
     whole(&store).await;
@@ -226,15 +230,15 @@ async fn a_campaign_may_go_back_to_its_first_protocol() {
         [("dft".into(), JobState::Labelled), ("fine".into(), JobState::Superseded)]
     );
     for energy in [-1.0, -3.0] {
-        assert_eq!(label_next(&store, &dft, energy, 400).await, Completed::Label);
+        assert_eq!(label_next(&store, &dft, energy, 400).await, CompleteOutcome::Label);
     }
     assert!(lease(&store, &dft, 500).await.is_none() && lease(&store, &fine, 500).await.is_none());
     assert_eq!(exported(&store, &dft).await, [-1.0, -2.0, -3.0]);
     assert_eq!(exported(&store, &fine).await, [0.0; 0]);
     let expected = [
-        (Standing::Superseded, -1.0, "dft".into()),
-        (Standing::Label, -1.0, "dft".into()),
-        (Standing::Superseded, -1.5, "fine".into()),
+        (LabelStatus::Superseded, -1.0, "dft".into()),
+        (LabelStatus::Label, -1.0, "dft".into()),
+        (LabelStatus::Superseded, -1.5, "fine".into()),
     ];
     assert_eq!(history(&store, structures[0]).await, expected);
     whole(&store).await;
@@ -248,16 +252,16 @@ async fn what_was_dropped_is_left_alone() {
     change_to(&store, &fine, &structures).await;
     let lease = lease(&store, &fine, 300).await.unwrap();
     let name = store.drop_job("0.0.1", 301).await.unwrap();
-    assert_eq!(store.complete(&lease, &label(-1.5), 302).await.unwrap(), Completed::KeptAsCheck);
-    assert_eq!(again(&store, &structures, true).await, Requeued::default());
+    assert_eq!(store.complete(&lease, &label(-1.5), 302).await.unwrap(), CompleteOutcome::KeptAsCheck);
+    assert_eq!(again(&store, &structures, true).await, RelabelCounts::default());
     whole(&store).await;
     // Wanted again, it waits for the label that was asked for.
     store.retry_job(&name, 303).await.unwrap();
-    assert_eq!(label_next(&store, &fine, -1.6, 304).await, Completed::Label);
+    assert_eq!(label_next(&store, &fine, -1.6, 304).await, CompleteOutcome::Label);
     let expected = [
-        (Standing::Superseded, -1.0, "dft".into()),
-        (Standing::Check, -1.5, "fine".into()),
-        (Standing::Label, -1.6, "fine".into()),
+        (LabelStatus::Superseded, -1.0, "dft".into()),
+        (LabelStatus::Check, -1.5, "fine".into()),
+        (LabelStatus::Label, -1.6, "fine".into()),
     ];
     assert_eq!(history(&store, structures[0]).await, expected);
     whole(&store).await;
@@ -275,7 +279,7 @@ async fn an_imported_label_may_be_the_one_that_is_superseded_or_the_one_that_was
     import(&dft, 1.0, -1.0).await;
     import(&dft, 2.0, -2.0).await;
     assert_eq!(change_to(&store, &fine, &structures).await.again, 2);
-    assert_eq!(label_next(&store, &fine, -1.5, 300).await, Completed::Label);
+    assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
     assert_eq!(import(&fine, 2.0, -2.5).await.labels, 1);
     assert!(lease(&store, &fine, 400).await.is_none());
     assert_eq!((exported(&store, &dft).await, exported(&store, &fine).await), (vec![], vec![-1.5, -2.5]));
@@ -291,7 +295,7 @@ async fn two_protocols_do_not_share_a_name() {
     let mut other = protocol("other");
     other.name = "dft".into();
     let new = NewProtocol { protocol: &other, configuration: "{}", changes: &[], notes: &[] };
-    let order = Relabel { structures: &structures, again: false, reason: "", protocol: Some(new) };
+    let order = RelabelRequest { structures: &structures, again: false, reason: "", protocol: Some(new) };
     assert!(matches!(store.relabel(&order, 1).await, Err(StoreError::ProtocolName(_))));
     assert_eq!(store.protocol_in_force().await.unwrap().unwrap(), protocol("dft"));
     assert_eq!(store.status().await.unwrap().labels.again, 0, "all or nothing");

@@ -19,7 +19,7 @@ use wire::{Candidate, Origin};
 use crate::bias::{BiasedPotential, UngradedError};
 use crate::guard;
 use crate::settings::WalkSettings;
-use state::{Collected, WalkState, begin};
+use state::{CollectionPoint, WalkState, start};
 
 /// What every walk of a campaign shares.
 #[derive(Clone)]
@@ -56,10 +56,10 @@ pub fn advance(
     assignment: &Assignment,
     mixture: Arc<Mixture>,
     stopping: impl Fn() -> bool,
-    watch: impl Fn(Progress),
+    on_progress: impl Fn(Progress),
 ) -> Report<Candidate> {
     let (walk, turn) = (assignment.walk, assignment.turn);
-    let mut running = match Walk::open(context, assignment, mixture) {
+    let mut running = match Walk::start_or_resume(context, assignment, mixture) {
         Ok(running) => running,
         Err(error) => {
             let end = End::BadStart { reason: error.to_string() };
@@ -73,7 +73,7 @@ pub fn advance(
             };
         }
     };
-    let outcome = running.run(&stopping, &watch).unwrap_or_else(|error| {
+    let outcome = running.run(&stopping, &on_progress).unwrap_or_else(|error| {
         Outcome::Ended(End::BlewUp { reason: format!("at step {}: {error}", running.step()) })
     });
     Report { walk, turn, outcome, checkpoint: running.encode(), progress: running.progress() }
@@ -93,7 +93,7 @@ struct Walk<'a> {
 }
 
 impl<'a> Walk<'a> {
-    fn open(
+    fn start_or_resume(
         context: &'a WalkContext,
         assignment: &'a Assignment,
         mixture: Arc<Mixture>,
@@ -106,7 +106,7 @@ impl<'a> Walk<'a> {
         let grace = Grace::with(Arc::clone(model), Instructions::best(), threads.clone());
         let mut potential = BiasedPotential::new(grace, mixture, zbl, average_steps, species)?;
         let (dynamics, state) = match &assignment.checkpoint {
-            None => begin(settings, assignment, &mut potential)?,
+            None => start(settings, assignment, &mut potential)?,
             Some(bytes) => {
                 let state: WalkState = postcard::from_bytes(bytes)?;
                 let cutoff = atoms::Potential::cutoff(&potential);
@@ -117,17 +117,17 @@ impl<'a> Walk<'a> {
         let collection = settings.collection.raised(assignment.raised);
         let mut walk =
             Self { settings, assignment, model, mixture_version, collection, dynamics, potential, state };
-        walk.take_verdict();
+        walk.apply_verdict();
         Ok(walk)
     }
 
     /// After a collection the walk waits out the gap; after a refusal by the selector, a shorter one.
-    fn take_verdict(&mut self) {
+    fn apply_verdict(&mut self) {
         let step = self.step();
         match &self.assignment.verdict {
             None => {}
             Some(Verdict::Accepted) => {
-                self.state.collected.push(Collected { branch: step, beyond: 0 });
+                self.state.collected.push(CollectionPoint { branch: step, beyond: 0 });
                 self.state.next_offer = step + self.settings.gap;
             }
             Some(Verdict::Declined(_)) => self.state.next_offer = step + self.settings.declined_gap,
@@ -137,7 +137,7 @@ impl<'a> Walk<'a> {
     fn run(
         &mut self,
         stopping: &impl Fn() -> bool,
-        watch: &impl Fn(Progress),
+        on_progress: &impl Fn(Progress),
     ) -> Result<Outcome<Candidate>, WalkError> {
         let last = self.settings.equilibration + self.settings.steps;
         loop {
@@ -151,10 +151,10 @@ impl<'a> Walk<'a> {
                 return Ok(Outcome::Paused);
             }
             self.advance_one_step()?;
-            if let Some(outcome) = self.look()? {
+            if let Some(outcome) = self.inspect_step()? {
                 return Ok(outcome);
             }
-            watch(self.progress());
+            on_progress(self.progress());
         }
     }
 
@@ -179,7 +179,7 @@ impl<'a> Walk<'a> {
     }
 
     /// What the new step means: a wanted frame, a candidate, a refusal, or nothing.
-    fn look(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
+    fn inspect_step(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let step = self.step();
         if self.is_control() {
             let wanted = self.assignment.wanted.contains(&step);
@@ -193,7 +193,7 @@ impl<'a> Walk<'a> {
                 // From here on the start of the walk, which needs equilibration, is no place to go back to.
                 self.state.good.clear();
             }
-            self.keep_checkpoint();
+            self.save_checkpoint();
         }
         if biased_steps == 0 {
             return Ok(None);
@@ -203,7 +203,7 @@ impl<'a> Walk<'a> {
         let collects = step >= self.state.next_offer && self.collection.is_met(gamma);
         match (collects, too_close) {
             (false, _) => Ok(None),
-            (true, true) => self.refuse(),
+            (true, true) => self.record_refusal(),
             (true, false) => {
                 self.state.refusals_in_a_row = 0;
                 Ok(Some(Outcome::Candidate(self.candidate()?)))
@@ -216,12 +216,12 @@ impl<'a> Walk<'a> {
         guard::too_close(self.dynamics.structure(), self.dynamics.neighbours(), least)
     }
 
-    fn keep_checkpoint(&mut self) {
-        self.state.keep(self.dynamics.checkpoint(), self.potential.state);
+    fn save_checkpoint(&mut self) {
+        self.state.keep_checkpoint(self.dynamics.checkpoint(), self.potential.state);
     }
 
     /// Counts a refusal by the shortest-bond guard; after too many in a row the walk goes back, or ends.
-    fn refuse(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
+    fn record_refusal(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let guard = &self.settings.guard;
         self.state.refused += 1;
         self.state.refusals_in_a_row += 1;
@@ -232,12 +232,12 @@ impl<'a> Walk<'a> {
         if self.state.returns == guard.most_returns || self.state.good.is_empty() {
             return Ok(Some(Outcome::Ended(End::Trapped { guard: guard::SHORTEST_BOND.to_owned() })));
         }
-        self.go_back()?;
+        self.roll_back()?;
         Ok(None)
     }
 
     /// Goes back to the oldest good checkpoint as a new segment: smaller τ, new random numbers.
-    fn go_back(&mut self) -> Result<(), WalkError> {
+    fn roll_back(&mut self) -> Result<(), WalkError> {
         let (mut checkpoint, bias) = self.state.good.swap_remove(0);
         self.state.good.clear();
         self.state.segment += 1;
@@ -249,8 +249,8 @@ impl<'a> Walk<'a> {
         self.state.last_return = Some((self.step(), checkpoint.state.step));
         self.dynamics = Dynamics::resume(checkpoint, cutoff, self.settings.skin)?;
         self.potential.state = bias;
-        self.state.next_offer = self.state.offer_after_return(self.step(), self.settings);
-        self.keep_checkpoint();
+        self.state.next_offer = self.state.offer_after_rollback(self.step(), self.settings);
+        self.save_checkpoint();
         Ok(())
     }
 

@@ -10,10 +10,11 @@ use atoms::{Evaluation, NeighbourList, Potential, PotentialError, Species, Struc
 use sqlx::ConnectOptions;
 use sqlx::sqlite::SqliteConnectOptions;
 use store::{
-    DATABASE, JobState, LabelRecord, ProcessRecord, Standing, Store, StoreError, this_host, unix_milliseconds,
+    DATABASE, JobState, LabelRecord, LabelStatus, ProcessRecord, Store, StoreError, this_host,
+    unix_milliseconds,
 };
 use tokio::task::JoinHandle;
-use workers::labeller::{Closing, LabelBounds, LabellerSettings, Method, Stay, Timing, run, serve};
+use workers::labeller::{ExitPolicy, LabelBounds, LabellerSettings, Method, Shutdown, Timing, run, serve};
 
 use crate::common::*;
 
@@ -101,11 +102,11 @@ async fn labelled_with(energies: &[f64]) -> Vec<Result<f64, (String, String)>> {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
     let candidates = accept(&store, energies.len() as u64).await;
-    let closing = Closing::default();
-    closing.set_no_more_jobs(true);
+    let shutdown = Shutdown::default();
+    shutdown.set_no_more_jobs(true);
     let method = Method::reference(Box::new(Energies(Vec::from(energies).into_iter())));
     let settings = LabellerSettings { attempts: 1, ..settings("a/0") };
-    run(store.clone(), method, settings, &closing, unix_milliseconds, |_| ()).await.unwrap();
+    run(store.clone(), method, settings, &shutdown, unix_milliseconds, |_| ()).await.unwrap();
     let mut outcomes = Vec::new();
     for candidate in candidates {
         let mut details = store.queue_show(&candidate).await.unwrap();
@@ -131,11 +132,11 @@ fn settings(holder: &str) -> LabellerSettings {
         protocol: protocol("dft"),
         attempts: 3,
         bounds: LabelBounds::default(),
-        stay: Stay::UntilEmpty,
+        exit_policy: ExitPolicy::UntilEmpty,
         timing: Timing {
             lease: Duration::from_secs(1),
             idle: Duration::from_millis(5),
-            sign_of_life: Duration::from_millis(20),
+            heartbeat_interval: Duration::from_millis(20),
             grace: None,
         },
     }
@@ -150,11 +151,11 @@ fn living(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
 /// Its number belongs to another process by now.
 fn gone(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
     let living = living(id, kind, number);
-    ProcessRecord { birth: format!("{}0", living.birth), ..living }
+    ProcessRecord { start_time: format!("{}0", living.start_time), ..living }
 }
 
 struct Labeller {
-    closing: Arc<Closing>,
+    shutdown: Arc<Shutdown>,
     task: JoinHandle<Result<(), StoreError>>,
 }
 
@@ -166,11 +167,11 @@ impl Labeller {
 
     async fn with(directory: &Path, gate: &Gate, settings: LabellerSettings) -> Self {
         let store = Store::open(directory).await.unwrap();
-        let (method, closing) = (gate.method(), Arc::new(Closing::default()));
-        let (process, asked) = (living("l", ProcessRecord::LABELLER, Some(0)), Arc::clone(&closing));
+        let (method, shutdown) = (gate.method(), Arc::new(Shutdown::default()));
+        let (process, asked) = (living("l", ProcessRecord::LABELLER, Some(0)), Arc::clone(&shutdown));
         let task =
             async move { serve(store, method, settings, process, &asked, unix_milliseconds, |_| ()).await };
-        Self { closing, task: tokio::spawn(task) }
+        Self { shutdown, task: tokio::spawn(task) }
     }
 
     async fn ended(self) -> Result<(), StoreError> {
@@ -198,12 +199,12 @@ async fn a_lease_lasts_as_long_as_the_label_takes() {
     let store = create(directory.path()).await;
     let candidates = accept(&store, 1).await;
     let gate = Gate::default();
-    let closing = Closing::default();
-    closing.set_no_more_jobs(true);
+    let shutdown = Shutdown::default();
+    shutdown.set_no_more_jobs(true);
     let (method, own, mut settings) = (gate.method(), store.clone(), settings("a/0"));
     settings.timing.lease = Duration::from_secs(10);
     let labeller =
-        tokio::spawn(async move { run(own, method, settings, &closing, unix_milliseconds, |_| ()).await });
+        tokio::spawn(async move { run(own, method, settings, &shutdown, unix_milliseconds, |_| ()).await });
     gate.wait_for_labels(1).await;
     let begun = Instant::now();
     while begun.elapsed() < Duration::from_secs(15) {
@@ -263,8 +264,8 @@ async fn a_result_whose_lease_was_lost_becomes_a_check() {
     gate.open.store(true, Ordering::Relaxed);
     labeller.ended().await.unwrap();
     let history = history(&store).await;
-    let found: Vec<_> = history.iter().map(|record| (record.standing, record.label.energy)).collect();
-    assert_eq!(found, [(Standing::Label, -1.0), (Standing::Check, 0.0)]);
+    let found: Vec<_> = history.iter().map(|record| (record.status, record.label.energy)).collect();
+    assert_eq!(found, [(LabelStatus::Label, -1.0), (LabelStatus::Check, 0.0)]);
 }
 
 /// For longer than a connection waits for the database; the labeller is asked to stop meanwhile.
@@ -280,7 +281,7 @@ async fn a_label_is_not_lost_while_the_database_is_locked() {
     let mut other = other.connect().await.unwrap();
     sqlx::query("BEGIN IMMEDIATE").execute(&mut other).await.unwrap();
     gate.open.store(true, Ordering::Relaxed);
-    labeller.closing.stop();
+    labeller.shutdown.stop();
     tokio::time::sleep(Duration::from_secs(35)).await;
     assert!(!labeller.task.is_finished());
     assert_eq!(number(&store, JobState::Labelled).await, 0);
@@ -332,7 +333,7 @@ async fn a_stop_waits_for_the_label_in_hand_and_signs_of_life_go_on() {
     let gate = Gate::default();
     let labeller = Labeller::serving(directory.path(), &gate).await;
     gate.wait_for_labels(1).await;
-    labeller.closing.stop();
+    labeller.shutdown.stop();
     let own = async || store.processes(Some("labeller")).await.unwrap().remove(0);
     until("nobody can see that it stops", async || own().await.state == "stopping").await;
     let first = own().await.last_seen;
@@ -355,7 +356,7 @@ async fn a_label_that_takes_too_long_after_a_stop_is_given_back() {
     let labeller = Labeller::with(directory.path(), &gate, settings).await;
     gate.wait_for_labels(1).await;
     let begun = Instant::now();
-    labeller.closing.stop();
+    labeller.shutdown.stop();
     labeller.ended().await.unwrap();
     assert!(begun.elapsed() >= Duration::from_millis(300));
     assert_eq!((number(&store, JobState::Queued).await, names(&store).await), (1, vec![]));
@@ -368,7 +369,8 @@ async fn a_label_that_takes_too_long_after_a_stop_is_given_back() {
 async fn a_labeller_that_is_to_stay_waits_for_the_end_of_the_campaign() {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
-    let (gate, settings) = (Gate::opened(), LabellerSettings { stay: Stay::UntilFinished, ..settings("l") });
+    let (gate, settings) =
+        (Gate::opened(), LabellerSettings { exit_policy: ExitPolicy::UntilFinished, ..settings("l") });
     let labeller = Labeller::with(directory.path(), &gate, settings).await;
     for (labelled, walks) in [(2, vec![]), (4, vec![walk(0, 1)])] {
         store.commit(&store::Commit { walks, ..store::Commit::default() }).await.unwrap();

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use store::{Attempt, Exclusion, Job, Superseded, unix_milliseconds};
+use store::{Attempt, Exclusion, Job, Supersession, unix_milliseconds};
 
 use super::line;
 use crate::output::count;
@@ -86,7 +86,7 @@ fn write_label(out: &mut dyn Write, label: &StoryLabel, atoms: usize) -> io::Res
     if let Some(Exclusion { time, reason }) = &label.excluded {
         line(out, "", &format!("excluded from exports and statistics {} ago: {reason}", since(*time)))?;
     }
-    if let Some(Superseded { time, reason }) = &label.superseded {
+    if let Some(Supersession { time, reason }) = &label.superseded {
         line(out, "", &format!("superseded {} ago: {reason}", since(*time)))?;
     }
     let Some(model) = &label.model else { return Ok(()) };

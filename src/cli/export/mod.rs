@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 use atoms::extxyz::{Keys, write_frame};
 use store::records::Protocol;
-use store::{DATABASE, ExportFilter, ExportPlace, ExportRow, ExportSource, JobState, LOCK, Store};
+use store::{DATABASE, ExportCursor, ExportFilter, ExportRow, ExportSource, JobState, LOCK, Store};
 
 use self::split::Shares;
 use super::{CampaignLocation, Ended, Failure, block_on};
@@ -112,7 +112,7 @@ struct Part {
 async fn refuse_to_miss(
     store: &Store,
     filter: &ExportFilter,
-    mut missing: BTreeSet<ExportPlace>,
+    mut missing: BTreeSet<ExportCursor>,
 ) -> Result<(), Failure> {
     if missing.is_empty() {
         return Ok(());
@@ -122,8 +122,8 @@ async fn refuse_to_miss(
     missing.retain(|place| now.contains(place));
     let place = match missing.first() {
         None => return Ok(()),
-        Some(ExportPlace::Candidate(decision)) => format!("that of decision {decision}"),
-        Some(ExportPlace::Import(number)) => format!("import-{number}"),
+        Some(ExportCursor::Candidate(decision)) => format!("that of decision {decision}"),
+        Some(ExportCursor::Import(number)) => format!("import-{number}"),
     };
     Err(Failure::Failed(format!(
         "damaged database: {} of {} labelled structures cannot be found where they should be, the first is {place}; nothing was \
@@ -192,9 +192,9 @@ impl Export {
         loop {
             let page = store.labelled(&filter, last, PAGE).await?;
             let Some(row) = page.last() else { break };
-            last = Some(row.place);
+            last = Some(row.cursor);
             for row in page {
-                missing.remove(&row.place);
+                missing.remove(&row.cursor);
                 if self.condition.as_ref().is_some_and(|condition| !condition.is_met(&frame::facts(&row))) {
                     continue;
                 }

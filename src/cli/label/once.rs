@@ -9,7 +9,7 @@ use atoms::{Structure, read_structures};
 use serde::Serialize;
 use store::Protocol;
 use tokio::sync::Notify;
-use workers::labeller::{Once, label_once};
+use workers::labeller::{SingleLabel, label_structure};
 
 use super::{Ended, Failure};
 use crate::config::Config;
@@ -69,7 +69,7 @@ pub async fn label(task: Task<'_>, stop: &Notify) -> Result<Ended, Failure> {
         let structure = frame.structure;
         structure.validate().map_err(|error| Failure::Input(format!("{place}: {error}")))?;
         let once = tokio::select! {
-            once = label_once(&method, &structure, &bounds) => once?,
+            once = label_structure(&method, &structure, &bounds) => once?,
             () = stop.notified() => {
                 method.stop().await?;
                 return Ok(Ended::Interrupted);
@@ -90,8 +90,13 @@ pub async fn label(task: Task<'_>, stop: &Notify) -> Result<Ended, Failure> {
 }
 
 impl Labelled {
-    fn from(place: &str, structure: &Structure, protocol: &Protocol, once: Once) -> Result<Self, Failure> {
-        let Once { result, log, core_seconds } = once;
+    fn from(
+        place: &str,
+        structure: &Structure,
+        protocol: &Protocol,
+        once: SingleLabel,
+    ) -> Result<Self, Failure> {
+        let SingleLabel { result, log, core_seconds } = once;
         let made = result.map_err(|failure| {
             let log = log.trim_end();
             let end = if log.is_empty() { String::new() } else { format!("; it said last\n{log}") };

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use store::{ExportFilter, JobState, Relabellable, Store, Waiting};
+use store::{ExportFilter, JobState, PendingJobs, Relabellable, Store};
 use wire::ContentHash;
 
 use super::Failure;
@@ -67,13 +67,13 @@ impl Choice {
     }
 
     /// How many there are of each size.
-    pub fn sizes(&self) -> Vec<Waiting> {
+    pub fn sizes(&self) -> Vec<PendingJobs> {
         let mut sizes: BTreeMap<_, u64> = BTreeMap::new();
         for Relabellable { seed_structure, formula, atoms, .. } in &self.again {
             *sizes.entry((*seed_structure, formula.clone(), *atoms)).or_default() += 1;
         }
         let waiting =
-            |((seed_structure, formula, atoms), jobs)| Waiting { seed_structure, formula, atoms, jobs };
+            |((seed_structure, formula, atoms), jobs)| PendingJobs { seed_structure, formula, atoms, jobs };
         sizes.into_iter().map(waiting).collect()
     }
 
@@ -116,7 +116,7 @@ pub async fn meeting(
         loop {
             let page = store.labelled(&filter, last, PAGE).await?;
             let Some(row) = page.last() else { break };
-            last = Some(row.place);
+            last = Some(row.cursor);
             let met = page.iter().filter(|row| condition.is_met(&facts(row)));
             meeting.extend(met.map(|row| ContentHash::of(&row.structure).0));
         }

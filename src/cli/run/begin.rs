@@ -62,7 +62,7 @@ async fn in_force(store: &Store) -> Result<Value, Failure> {
 
 async fn record(store: &Store, origin: &Origin) -> Result<(), Failure> {
     let note = serde_json::to_string(origin).map_err(Failure::failed)?;
-    Ok(store.leave_note(origin::NOTE, &note).await?)
+    Ok(store.set_metadata(origin::NOTE, &note).await?)
 }
 
 /// Says where the campaign goes on.

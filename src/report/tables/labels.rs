@@ -1,7 +1,7 @@
 //! Force errors by grade, failures, and what has no label because of them.
 
 use analysis::ForceErrors;
-use store::{FailureCount, Range, Unlabelled};
+use store::{FailureCount, Unlabelled, ValueRange};
 
 use super::{Cell, Table, count, percent, real, text};
 use crate::learned::{LARGE, Learned};
@@ -150,6 +150,6 @@ pub fn unlabelled(unlabelled: &[Unlabelled]) -> Table {
     table
 }
 
-fn ends(range: &Range, decimals: usize) -> [Cell; 2] {
+fn ends(range: &ValueRange, decimals: usize) -> [Cell; 2] {
     [range.low, range.high].map(|end| real(end, decimals))
 }

@@ -7,7 +7,7 @@ use std::str::FromStr;
 use atoms::Species;
 use axum::extract::{RawQuery, State};
 use serde_json::json;
-use store::{JobState, ListOrder, ListPlace, ListedCandidate, Store, StoreError};
+use store::{JobState, ListCursor, ListOrder, ListedCandidate, Store, StoreError};
 
 use super::Dashboard;
 use super::answer::{Answer, Refusal, json};
@@ -27,7 +27,7 @@ struct Asked {
     fate: Option<String>,
     state: Option<JobState>,
     condition: Option<Condition>,
-    after: Option<ListPlace>,
+    after: Option<ListCursor>,
     limit: Option<u32>,
 }
 
@@ -47,7 +47,7 @@ enum Order {
 struct Page {
     lines: Vec<ListedCandidate>,
     /// Where the next page begins; none at the end.
-    next: Option<ListPlace>,
+    next: Option<ListCursor>,
     looked: usize,
 }
 
@@ -123,7 +123,7 @@ impl Asked {
     async fn lines(
         &self,
         store: &Store,
-        after: Option<ListPlace>,
+        after: Option<ListCursor>,
         limit: u32,
     ) -> Result<Vec<ListedCandidate>, StoreError> {
         let descending = !self.ascending;
@@ -148,14 +148,14 @@ impl Asked {
         store.list_candidates(order, descending, after, limit).await
     }
 
-    fn place_of(&self, line: &ListedCandidate) -> ListPlace {
+    fn place_of(&self, line: &ListedCandidate) -> ListCursor {
         let value = match self.order {
             Order::Decision => None,
             Order::Gamma => line.gamma,
             Order::Volume => line.relative_volume,
             Order::Queue => line.priority.map(f64::from),
         };
-        ListPlace { value: value.unwrap_or_default(), decision: line.decision }
+        ListCursor { value: value.unwrap_or_default(), decision: line.decision }
     }
 
     /// `elements`: those of formulas that were met before.
@@ -207,10 +207,10 @@ impl FromStr for Order {
     }
 }
 
-fn place(text: &str) -> Result<ListPlace, Refusal> {
+fn place(text: &str) -> Result<ListCursor, Refusal> {
     let read = |(value, decision): (&str, &str)| {
         let value = value.parse().ok().filter(|value: &f64| value.is_finite())?;
-        Some(ListPlace { value, decision: decision.parse().ok()? })
+        Some(ListCursor { value, decision: decision.parse().ok()? })
     };
     let wrong = || Refusal::wrong(format!("after is '{text}', expected what 'next' of the page before was"));
     text.split_once(':').and_then(read).ok_or_else(wrong)
@@ -234,7 +234,7 @@ mod tests {
         let asked = Asked::read("order=gamma&ascending=true&fate=&where=gamma+%3E+2&after=2.5:17").unwrap();
         assert!(asked.order == Order::Gamma && asked.ascending && asked.fate.is_none());
         assert_eq!(asked.condition.unwrap().to_string(), "gamma > 2.0");
-        assert_eq!(asked.after, Some(ListPlace { value: 2.5, decision: 17 }));
+        assert_eq!(asked.after, Some(ListCursor { value: 2.5, decision: 17 }));
         for (query, why) in [
             ("order=size", "expected one of decision"),
             ("order=queue", "give 'state'"),

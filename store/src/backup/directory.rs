@@ -11,11 +11,11 @@ use crate::error::{Result, StoreError};
 use crate::filesystem::check_directory;
 
 /// A directory beside the one that it is to be, under another name. Dropped before it is published, it is removed.
-pub(super) struct Unfinished {
+pub(super) struct StagedDirectory {
     path: PathBuf,
 }
 
-impl Unfinished {
+impl StagedDirectory {
     /// Makes it. What a killed process left under that name is removed.
     pub fn beside(target: &Path) -> Result<Self> {
         if target.symlink_metadata().is_ok() {
@@ -54,7 +54,7 @@ impl Unfinished {
     }
 }
 
-impl Drop for Unfinished {
+impl Drop for StagedDirectory {
     fn drop(&mut self) {
         // Under its own name no more, once it is published.
         let _ = fs::remove_dir_all(&self.path);

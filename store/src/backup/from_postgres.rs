@@ -5,11 +5,11 @@ use std::path::Path;
 use sqlx::{AssertSqlSafe, Executor, Postgres};
 
 use crate::database::value::Kind;
-use crate::database::{Database, Row, Transaction, Value, for_rows, query};
+use crate::database::{Database, Row, Transaction, Value, execute_rows, query};
 use crate::error::{Result, StoreError};
 use crate::postgres::Server;
 use crate::sqlite::DatabaseFile;
-use crate::tables::budget::sum_up;
+use crate::tables::budget::rebuild_totals;
 use crate::tables::checksums;
 
 /// Pages in a transaction of the copy.
@@ -107,7 +107,7 @@ pub(super) async fn copy(server: &Server, directory: &Path, mut tell: impl FnMut
             })
             .await?;
         }
-        sum_up(into).await?;
+        rebuild_totals(into).await?;
         if without_checksums {
             let mut transaction = into.begin().await?;
             checksums::fill(&mut transaction).await?;
@@ -146,7 +146,7 @@ async fn copy_table(
             let page = query(table.fetch).rows(&mut *from).await?;
             let (rows, end) = (page.len(), page.len() < table.page);
             let page = page.iter().map(|row| values(row, table)).collect::<Result<_>>()?;
-            for_rows(&mut transaction, table.insert, table.columns, page).await?;
+            execute_rows(&mut transaction, table.insert, table.columns, page).await?;
             told(rows as u64);
             if end {
                 return transaction.commit().await;

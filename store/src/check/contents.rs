@@ -5,7 +5,7 @@ use wire::{CandidateBlock, ContentHash};
 use super::Finding;
 use super::archives::Packed;
 use crate::checksum::{
-    CANDIDATE, CheckedColumn, CheckedTable, DECISION, LABEL, LONG, Names, PROTOCOL, STRUCTURE,
+    CANDIDATE, CheckedColumn, CheckedTable, DECISION, LABEL, LONG_COLUMNS, Names, PROTOCOL, STRUCTURE,
 };
 use crate::database::{FromRow, Row, Transaction, from_columns, query};
 use crate::encoding::decode_structure;
@@ -113,7 +113,7 @@ impl<'a> Contents<'a> {
         let all = query(ROWS).fetch_one(&mut *transaction).await?;
         let mut contents = Self { transaction, tell, read: 0, all, findings: Vec::new() };
         contents.table::<Structure>((&STRUCTURE, &[]), STRUCTURES).await?;
-        contents.table::<Candidate>((&CANDIDATE, &LONG), CANDIDATES).await?;
+        contents.table::<Candidate>((&CANDIDATE, &LONG_COLUMNS), CANDIDATES).await?;
         contents.table::<Label>((&LABEL, &[]), LABELS).await?;
         contents.table::<Text>((&DECISION, &[]), DECISIONS).await?;
         contents.table::<Text>((&PROTOCOL, &[]), PROTOCOLS).await?;

@@ -6,7 +6,7 @@ use super::{Finding, own_check_of, rules};
 use crate::Store;
 use crate::database::{Transaction, query};
 use crate::error::{Result, StoreError};
-use crate::export::{ExportFilter, ExportPlace};
+use crate::export::{ExportCursor, ExportFilter};
 use crate::tables::protocols;
 
 /// Rows read at a time.
@@ -47,9 +47,9 @@ impl Store {
 
     /// Where everything stands that [`Self::labelled`] should find, found in another way: labels and candidates are read apart, and
     /// not through the indexes that it uses.
-    pub async fn labelled_places(&self, filter: &ExportFilter) -> Result<BTreeSet<ExportPlace>> {
+    pub async fn labelled_places(&self, filter: &ExportFilter) -> Result<BTreeSet<ExportCursor>> {
         let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, filter.protocol).await?;
+        let protocol = protocols::protocol_id(&mut transaction, filter.protocol).await?;
         let labelled = labelled(&mut transaction, protocol).await?;
         let dropped: Vec<i64> = query(DROPPED).bind(protocol).fetch_all(&mut transaction).await?;
         let dropped: HashSet<_> = dropped.into_iter().collect();
@@ -63,7 +63,7 @@ impl Store {
                 of_candidates.insert(structure);
                 let wanted = if origin == "biased" { filter.biased } else { filter.control };
                 if wanted && labelled.contains(&structure) && !dropped.contains(&structure) {
-                    places.insert(ExportPlace::Candidate(decision));
+                    places.insert(ExportCursor::Candidate(decision));
                 }
             }
         }
@@ -71,7 +71,7 @@ impl Store {
             let imports: Vec<(i64, i64)> = query(IMPORTS).fetch_all(&mut transaction).await?;
             let only = |structure: &i64| labelled.contains(structure) && !of_candidates.contains(structure);
             let imports = imports.into_iter().filter(|(_, structure)| only(structure));
-            places.extend(imports.map(|(number, _)| ExportPlace::Import(number)));
+            places.extend(imports.map(|(number, _)| ExportCursor::Import(number)));
         }
         transaction.commit().await?;
         Ok(places)

@@ -173,7 +173,7 @@ macro_rules! disagreeing {
 
 /// Jobs that are labelled have a label; others have one only if another was asked for.
 pub(super) async fn labelled_jobs(transaction: &mut Transaction) -> Result<Vec<Finding>> {
-    let sql = match relabel::is_known(transaction).await? {
+    let sql = match relabel::has_relabel_columns(transaction).await? {
         true => disagreeing!(" AND NOT (state IN ('queued', 'leased') AND relabel IS NOT NULL)"),
         false => disagreeing!(""),
     };
@@ -205,7 +205,7 @@ pub(super) async fn counts(transaction: &mut Transaction) -> Result<Vec<Finding>
 
 /// The same of label jobs.
 pub(super) async fn job_counts(transaction: &mut Transaction) -> Result<Vec<Finding>> {
-    if !job_counts::are_kept(transaction).await? {
+    if !job_counts::have_counts(transaction).await? {
         return Ok(Vec::new());
     }
     let (count, example): (u64, Option<String>) =
@@ -220,7 +220,7 @@ pub(super) async fn job_counts(transaction: &mut Transaction) -> Result<Vec<Find
 pub(super) async fn leases(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let leased: Vec<(i64, String)> = query(LEASED).fetch_all(&mut *transaction).await?;
     let mut living = all(transaction).await?;
-    living.retain(|process: &ProcessRecord| !process.is_gone());
+    living.retain(|process: &ProcessRecord| !process.is_dead());
     let is_lost = |holder: &str| !living.iter().any(|process| process.is_holder(holder));
     let lost: Vec<_> = leased.iter().filter(|(_, holder)| is_lost(holder)).collect();
     let Some((job, holder)) = lost.first() else { return Ok(Vec::new()) };

@@ -15,7 +15,7 @@ use sqlx::{Postgres, Sqlite};
 pub use query::{Query, query};
 pub(crate) use row::from_columns;
 pub use row::{FromRow, Row};
-pub use rows::for_rows;
+pub use rows::execute_rows;
 pub use value::Value;
 
 use crate::error::{Result, StoreError};
@@ -83,7 +83,7 @@ impl Database {
     }
 
     /// Whether leases go by the clock of a server.
-    pub fn has_a_clock(&self) -> bool {
+    pub fn has_clock(&self) -> bool {
         matches!(self, Self::Postgres(server) if server.clock == Clock::Server)
     }
 
@@ -112,7 +112,7 @@ impl Transaction {
     }
 
     /// Whether leases go by the clock of a server.
-    pub fn has_a_clock(&self) -> bool {
+    pub fn has_clock(&self) -> bool {
         matches!(self, Self::Postgres(_, Clock::Server))
     }
 

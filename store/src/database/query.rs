@@ -9,7 +9,7 @@ use super::row::{FromRow, Row};
 use super::value::Value;
 use super::{Database, Target, Transaction, missing_row};
 use crate::error::{Result, StoreError};
-use crate::postgres::{PAUSE, Server};
+use crate::postgres::{RETRY_INTERVAL, Server};
 
 /// SQL with its values.
 #[derive(Clone)]
@@ -44,7 +44,7 @@ impl Query {
     }
 
     /// The same, and leaves out rows that somebody else has locked.
-    pub fn unless_locked(self) -> Self {
+    pub fn skip_locked(self) -> Self {
         Self { lock: " FOR NO KEY UPDATE SKIP LOCKED", ..self }
     }
 
@@ -100,8 +100,8 @@ impl Query {
                 Err(error) => Err(error),
             };
             match read {
-                Err(StoreError::Unreachable(_)) if begun.elapsed() < server.patience => {
-                    tokio::time::sleep(PAUSE).await
+                Err(StoreError::Unreachable(_)) if begun.elapsed() < server.reconnect_timeout => {
+                    tokio::time::sleep(RETRY_INTERVAL).await
                 }
                 read => return read,
             }

@@ -10,7 +10,7 @@ use sqlx::query::Query;
 use sqlx::{AssertSqlSafe, Postgres};
 
 use super::Transaction;
-use super::value::{Value, without_zeros};
+use super::value::{Value, replace_nul};
 use crate::error::{Result, StoreError};
 
 /// Bytes that go along at once, about: arrays of PostgreSQL hold 1 GB, and its server copies them.
@@ -19,7 +19,7 @@ const LOAD: usize = 1 << 25;
 /// Executes `sql` for every row: `{rows}` in it is a table named `new` of the rows, `{columns}` the names of its columns,
 /// separated by commas, `{excluded}` what takes over the new values of all columns but the first. Values of a column are
 /// all of one type. Returns the number of rows that were written.
-pub async fn for_rows(
+pub async fn execute_rows(
     transaction: &mut Transaction,
     sql: &'static str,
     columns: &'static [&'static str],
@@ -113,7 +113,7 @@ fn bind_column(query: PostgresQuery<'_>, column: Vec<Value>) -> Result<PostgresQ
         Some(Value::Real(_)) => query.bind(array!(Real)),
         Some(Value::Text(_)) => {
             let texts = array!(Text);
-            query.bind(texts.into_iter().map(|text| text.map(without_zeros)).collect::<Vec<_>>())
+            query.bind(texts.into_iter().map(|text| text.map(replace_nul)).collect::<Vec<_>>())
         }
         Some(Value::Bytes(_)) => query.bind(array!(Bytes)),
         None => query,

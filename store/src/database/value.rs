@@ -65,7 +65,7 @@ impl Value {
         match self {
             Self::Integer(value) => query.bind(value),
             Self::Real(value) => query.bind(value),
-            Self::Text(value) => query.bind(value.map(without_zeros)),
+            Self::Text(value) => query.bind(value.map(replace_nul)),
             Self::Bytes(value) => query.bind(value),
         }
     }
@@ -81,7 +81,7 @@ impl Value {
 }
 
 /// PostgreSQL takes no zero bytes in text; last words of processes may hold some.
-pub fn without_zeros(text: String) -> String {
+pub fn replace_nul(text: String) -> String {
     if text.contains('\0') { text.replace('\0', "\u{fffd}") } else { text }
 }
 

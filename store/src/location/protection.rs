@@ -46,7 +46,7 @@ pub fn check_parameters(url: &str) -> Result<(), String> {
 
 /// The options, and whether a connection leaves this host without protection because its user says so; an error if it would by
 /// default.
-pub fn settle(options: PgConnectOptions) -> Result<(PgConnectOptions, bool), String> {
+pub fn resolve(options: PgConnectOptions) -> Result<(PgConnectOptions, bool), String> {
     let by_default = matches!(options.get_ssl_mode(), PgSslMode::Allow | PgSslMode::Prefer);
     match (is_local(&options), by_default) {
         // Within a host it would cost time and protect nothing.

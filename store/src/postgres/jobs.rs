@@ -8,7 +8,7 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 /// Between two tries to reach a server that is away.
-const PAUSE: Duration = Duration::from_secs(1);
+const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The channel on which jobs are announced, see `migrations/postgres`.
 pub struct Jobs {
@@ -65,7 +65,7 @@ async fn listen(options: PgConnectOptions, channel: String, heard: watch::Sender
     loop {
         // Errors need no answer: without a listener a wait takes its longest time.
         let _ = hear(options.clone(), &channel, &heard).await;
-        tokio::time::sleep(PAUSE).await;
+        tokio::time::sleep(RETRY_INTERVAL).await;
     }
 }
 

@@ -25,17 +25,17 @@ use crate::tables::checksums;
 /// The newest of the migrations.
 const SCHEMA: i64 = 10;
 /// The first version whose rows have checksums.
-const WITH_CHECKSUMS: i64 = 9;
+const FIRST_WITH_CHECKSUMS: i64 = 9;
 /// Connections of a process, at most: one that writes and some that read.
-const CONNECTIONS: u32 = 5;
+const MAX_CONNECTIONS: u32 = 5;
 /// Connections that nobody needs are closed after this time: a server has few.
-const IDLE: Duration = Duration::from_secs(60);
+const IDLE_TIMEOUT: Duration = Duration::from_secs(60);
 /// How long a server may be away before what needs it fails, and how long a connection is waited for.
-const PATIENCE: Duration = Duration::from_secs(10);
+const RECONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a server is asked why there is no connection.
-const ANSWER: Duration = Duration::from_secs(3);
+const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
 /// Between two tries to reach a server that is away.
-pub const PAUSE: Duration = Duration::from_millis(100);
+pub const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
 /// The steps to the newest version.
 pub(crate) static STEPS: [Step; 9] = [
@@ -63,7 +63,7 @@ pub struct Server {
     /// That of the lock which its user holds, if it does.
     pub generation: Option<i64>,
     /// How long a server that is away is waited for.
-    pub patience: Duration,
+    pub reconnect_timeout: Duration,
     jobs: Arc<Jobs>,
 }
 
@@ -89,9 +89,9 @@ impl Server {
         };
         let found = version(url, &mut *server.connection().await?).await?.ok_or_else(missing)?;
         if found < SCHEMA && writes {
-            server.bring_up_to_date(url).await?;
+            server.migrate(url).await?;
         }
-        if found < WITH_CHECKSUMS && !writes {
+        if found < FIRST_WITH_CHECKSUMS && !writes {
             let views = checksums::views(&url.schema).into();
             server.pool = pool(options(url), Some(views));
         }
@@ -109,13 +109,13 @@ impl Server {
             writes,
             clock: Clock::Server,
             generation: None,
-            patience: PATIENCE,
+            reconnect_timeout: RECONNECT_TIMEOUT,
             jobs,
         }
     }
 
     /// Brings the tables to the newest version: all steps and the checksums of rows, or nothing. One process at a time does.
-    async fn bring_up_to_date(&self, url: &ServerUrl) -> Result<()> {
+    async fn migrate(&self, url: &ServerUrl) -> Result<()> {
         let mut transaction = self.begin().await?;
         let one = "SELECT 1::BIGINT FROM pg_advisory_xact_lock(hashtext($1))";
         let one = query(one).bind(format!("{}: new version", url.schema));
@@ -124,7 +124,7 @@ impl Server {
         let found = version(url, &mut *connection).await?;
         // What `run` calls. With a borrowed connection it makes no future that another thread may go on with.
         MIGRATIONS.run_direct(None, &mut **connection, false).await.map_err(schema_error)?;
-        if found < Some(WITH_CHECKSUMS) {
+        if found < Some(FIRST_WITH_CHECKSUMS) {
             checksums::fill(&mut transaction).await?;
         }
         transaction.commit().await
@@ -138,16 +138,16 @@ impl Server {
 
     /// A connection to read with, or to begin with.
     pub async fn connection(&self) -> Result<PoolConnection<Postgres>> {
-        self.told(self.pool.acquire().await).await
+        self.explain_timeout(self.pool.acquire().await).await
     }
 
     /// What came of waiting for a connection. The pool tries on where a server refuses one or has none left, and in the end says
     /// only that its time is over: the server itself is asked why.
-    async fn told<T>(&self, waited: sqlx::Result<T>) -> Result<T> {
+    async fn explain_timeout<T>(&self, waited: sqlx::Result<T>) -> Result<T> {
         let Err(sqlx::Error::PoolTimedOut) = waited else { return Ok(waited?) };
         let timed_out = |why: &str| sqlx::Error::Io(io::Error::new(ErrorKind::TimedOut, why));
         let connect = async { self.pool.connect_options().connect().await?.close().await };
-        Err(match timeout(ANSWER, connect).await {
+        Err(match timeout(PROBE_TIMEOUT, connect).await {
             Ok(Ok(())) => StoreError::Unreachable(timed_out(
                 "it takes new connections, but all of this process waited for it: for its disk, or for what somebody has locked",
             )),
@@ -171,8 +171,10 @@ impl Server {
     async fn begin_with(&self, statement: &'static str) -> Result<Transaction> {
         let begun = Instant::now();
         loop {
-            match self.told(self.pool.begin_with(statement).await).await {
-                Err(StoreError::Unreachable(_)) if begun.elapsed() < self.patience => sleep(PAUSE).await,
+            match self.explain_timeout(self.pool.begin_with(statement).await).await {
+                Err(StoreError::Unreachable(_)) if begun.elapsed() < self.reconnect_timeout => {
+                    sleep(RETRY_INTERVAL).await
+                }
                 begun => return Ok(Transaction::Postgres(begun?, self.clock)),
             }
         }
@@ -249,7 +251,10 @@ impl fmt::Debug for Server {
 
 /// Connections, which make these views first, if there are any.
 fn pool(options: PgConnectOptions, views: Option<Arc<str>>) -> PgPool {
-    let pool = PgPoolOptions::new().max_connections(CONNECTIONS).acquire_timeout(PATIENCE).idle_timeout(IDLE);
+    let pool = PgPoolOptions::new()
+        .max_connections(MAX_CONNECTIONS)
+        .acquire_timeout(RECONNECT_TIMEOUT)
+        .idle_timeout(IDLE_TIMEOUT);
     let pool = pool.after_connect(move |connection, _| {
         let views = views.clone();
         Box::pin(async move {

@@ -1,8 +1,8 @@
 //! The database in one SQLite file: making it and opening it.
 
-mod earlier;
-mod in_place;
-mod room;
+mod disk_space;
+mod file_identity;
+mod old_schema;
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read};
@@ -19,7 +19,7 @@ use sqlx::sqlite::{
 };
 use sqlx::{ConnectOptions, Connection, Executor};
 
-use self::in_place::InPlace;
+use self::file_identity::FileIdentity;
 use crate::database::{Database, Transaction};
 use crate::error::{Result, StoreError};
 use crate::filesystem::check_directory;
@@ -35,22 +35,22 @@ const APPLICATION: i64 = 0x4341_4c4d;
 /// `PRAGMA user_version` that the newest migration leaves behind.
 const SCHEMA: i64 = 10;
 /// The first version whose rows have checksums.
-const WITH_CHECKSUMS: i64 = 9;
+const FIRST_WITH_CHECKSUMS: i64 = 9;
 /// How long another connection may hold the database.
-const PATIENCE: Duration = Duration::from_secs(30);
-const READERS: u32 = 4;
+const BUSY_TIMEOUT: Duration = Duration::from_secs(30);
+const MAX_READERS: u32 = 4;
 /// How often a database of an earlier version is brought up to date, against others that try the same.
-const MIGRATION_TRIES: u32 = 50;
+const MIGRATION_ATTEMPTS: u32 = 50;
 /// Between two tries to open a database.
-const OPENING_PAUSE: Duration = Duration::from_millis(20);
+const OPEN_RETRY_INTERVAL: Duration = Duration::from_millis(20);
 /// Between two looks at how far a copy is.
-const LOOK: Duration = Duration::from_millis(200);
+const COPY_PROGRESS_INTERVAL: Duration = Duration::from_millis(200);
 /// Bytes of a page of a new database. A candidate with features is some 100 kB, and every page has its price; with
 /// larger ones short rows would cost too much.
-const PAGE: u32 = 1 << 14;
+const PAGE_SIZE: u32 = 1 << 14;
 /// Pages in the write-ahead log from which on they are copied into the database, with which commits wait: 64 MB, some
 /// 0.1 s. Pages that are written again until then, as those of walks, are copied once.
-const LOG_PAGES: u32 = 1 << 12;
+const WAL_PAGES: u32 = 1 << 12;
 
 /// The steps to the newest version.
 pub(crate) static STEPS: [Step; 10] = [
@@ -75,7 +75,7 @@ pub struct DatabaseFile {
     writer: Option<SqlitePool>,
     pub readers: SqlitePool,
     /// What every transaction that writes looks at first.
-    file: InPlace,
+    file: FileIdentity,
 }
 
 impl DatabaseFile {
@@ -92,7 +92,7 @@ impl DatabaseFile {
         make_private(&unfinished)?;
         let writer = writer(&unfinished).await?;
         MIGRATIONS.run(&writer).await.map_err(schema_error)?;
-        let file = InPlace::of(&unfinished)?;
+        let file = FileIdentity::read(&unfinished)?;
         let made = Self { readers: writer.clone(), writer: Some(writer), file };
         fill(&Database::Sqlite(made.clone())).await?;
         made.empty_log().await?;
@@ -107,8 +107,8 @@ impl DatabaseFile {
         loop {
             match Self::open_now(directory).await {
                 // Others that open or close it at this moment: SQLite does not always wait for those by itself.
-                Err(StoreError::Busy) if begun.elapsed() < PATIENCE => {
-                    tokio::time::sleep(OPENING_PAUSE).await;
+                Err(StoreError::Busy) if begun.elapsed() < BUSY_TIMEOUT => {
+                    tokio::time::sleep(OPEN_RETRY_INTERVAL).await;
                 }
                 opened => return opened,
             }
@@ -121,16 +121,16 @@ impl DatabaseFile {
         let found = identify(&path, false).await?;
         let writer = writer(&path).await?;
         let mut tries = 1;
-        while let Err(error) = bring_up_to_date(&writer).await {
+        while let Err(error) = migrate(&writer).await {
             // Others that opened it at the same time are at it: once they are done there is nothing left to do.
-            if found == SCHEMA || tries == MIGRATION_TRIES {
+            if found == SCHEMA || tries == MIGRATION_ATTEMPTS {
                 return Err(error);
             }
             tries += 1;
-            tokio::time::sleep(OPENING_PAUSE).await;
+            tokio::time::sleep(OPEN_RETRY_INTERVAL).await;
         }
         let readers = readers(options(&path).read_only(true), None);
-        Ok(Self { writer: Some(writer), readers, file: InPlace::of(&path)? })
+        Ok(Self { writer: Some(writer), readers, file: FileIdentity::read(&path)? })
     }
 
     /// Opens the database in `directory` to look at it, also where nothing may be written. Tables of an earlier
@@ -145,9 +145,9 @@ impl DatabaseFile {
         };
         identify(&path, immutable).await?;
         let options = options(&path).read_only(true).immutable(immutable);
-        let views = earlier::views(&options).await?;
+        let views = old_schema::views(&options).await?;
         let readers = readers(options, views);
-        Ok(Self { writer: None, readers, file: InPlace::of(&path)? })
+        Ok(Self { writer: None, readers, file: FileIdentity::read(&path)? })
     }
 
     pub async fn close(&self) {
@@ -158,7 +158,7 @@ impl DatabaseFile {
     }
 
     /// Moves the write-ahead log into the database: it bears the database's name and would be lost under another.
-    /// Closing does the same, but says nothing when the disk is full.
+    /// Shutdown does the same, but says nothing when the disk is full.
     pub async fn empty_log(&self) -> Result<()> {
         let writer = self.writer.as_ref().ok_or(StoreError::ReadOnly)?;
         let checkpoint = sqlx::query_as("PRAGMA wal_checkpoint(TRUNCATE)").fetch_one(writer);
@@ -178,7 +178,7 @@ impl DatabaseFile {
         loop {
             tokio::select! {
                 copied = &mut copying => break copied.map(drop)?,
-                () = tokio::time::sleep(LOOK) => {
+                () = tokio::time::sleep(COPY_PROGRESS_INTERVAL) => {
                     tell(fs::metadata(&unfinished).map_or(0, |file| file.len()).min(all), all);
                 }
             }
@@ -200,7 +200,7 @@ impl DatabaseFile {
     pub async fn compact(&self) -> Result<()> {
         let writer = self.writer.as_ref().ok_or(StoreError::ReadOnly)?;
         self.file.check()?;
-        room::check(self.file.path(), self.size()?)?;
+        disk_space::check(self.file.path(), self.size()?)?;
         sqlx::query("VACUUM").execute(writer).await?;
         self.empty_log().await
     }
@@ -215,15 +215,15 @@ impl DatabaseFile {
 }
 
 fn options(path: &Path) -> SqliteConnectOptions {
-    SqliteConnectOptions::new().filename(path).foreign_keys(true).busy_timeout(PATIENCE)
+    SqliteConnectOptions::new().filename(path).foreign_keys(true).busy_timeout(BUSY_TIMEOUT)
 }
 
 async fn writer(path: &Path) -> Result<SqlitePool> {
     let options = options(path)
         .create_if_missing(true)
-        .page_size(PAGE)
+        .page_size(PAGE_SIZE)
         .journal_mode(SqliteJournalMode::Wal)
-        .pragma("wal_autocheckpoint", LOG_PAGES.to_string())
+        .pragma("wal_autocheckpoint", WAL_PAGES.to_string())
         .synchronous(SqliteSynchronous::Full);
     let pool = SqlitePoolOptions::new().max_connections(1).idle_timeout(None).max_lifetime(None);
     // SQLite itself rolls back after a full disk or a failed write. The connection is then out of step with its
@@ -237,9 +237,9 @@ async fn writer(path: &Path) -> Result<SqlitePool> {
     Ok(pool.connect_with(options).await?)
 }
 
-/// `views` are made in each connection, see [`earlier`].
+/// `views` are made in each connection, see [`old_schema`].
 fn readers(options: SqliteConnectOptions, views: Option<&'static str>) -> SqlitePool {
-    let pool = SqlitePoolOptions::new().max_connections(READERS).max_lifetime(None);
+    let pool = SqlitePoolOptions::new().max_connections(MAX_READERS).max_lifetime(None);
     let pool = pool.after_connect(move |connection, _| {
         Box::pin(async move {
             match views {
@@ -252,13 +252,13 @@ fn readers(options: SqliteConnectOptions, views: Option<&'static str>) -> Sqlite
 }
 
 /// Brings the tables to the newest version: all steps and the checksums of rows, or nothing.
-async fn bring_up_to_date(writer: &SqlitePool) -> Result<()> {
+async fn migrate(writer: &SqlitePool) -> Result<()> {
     let mut transaction = writer.begin_with("BEGIN IMMEDIATE").await?;
     let found: i64 = sqlx::query_scalar("PRAGMA user_version").fetch_one(&mut *transaction).await?;
     // What `run` calls. With a borrowed connection it makes no future that another thread may go on with.
     MIGRATIONS.run_direct(None, &mut *transaction, false).await.map_err(schema_error)?;
     let mut transaction = Transaction::Sqlite(transaction);
-    if found < WITH_CHECKSUMS {
+    if found < FIRST_WITH_CHECKSUMS {
         checksums::fill(&mut transaction).await?;
     }
     transaction.commit().await

@@ -8,7 +8,8 @@ use crate::Store;
 use crate::check;
 use crate::records::{Campaign, Commit, ComponentRecord};
 use crate::tables::{
-    by_hand, exclude, export, history, job_counts, labels, listing, outcomes, queue, recent, status,
+    candidate_history, exclude, export, job_counts, labels, listing, outcomes, queue, queue_admin, recent,
+    status,
 };
 
 /// The store in a directory, and its file.
@@ -44,21 +45,21 @@ async fn what_is_asked_often_goes_through_indexes() {
         queue::HELD,
         queue::HELD_BY,
         queue::LOSSES,
-        by_hand::FIND,
+        queue_admin::FIND,
         export::CANDIDATES,
         export::IMPORTS,
-        history::NUMBERED,
-        history::BEGINNING,
-        history::FIRST,
-        history::LAST,
-        history::SAME_STRUCTURE,
-        history::JOBS,
-        history::LABELS,
-        history::AT_STEP,
-        history::BEFORE,
-        history::AFTER,
+        candidate_history::NUMBERED,
+        candidate_history::BEGINNING,
+        candidate_history::FIRST,
+        candidate_history::LAST,
+        candidate_history::SAME_STRUCTURE,
+        candidate_history::JOBS,
+        candidate_history::LABELS,
+        candidate_history::AT_STEP,
+        candidate_history::BEFORE,
+        candidate_history::AFTER,
         labels::CURRENT,
-        exclude::STANDING,
+        exclude::LABEL_STATUS,
         listing::NEWEST,
         listing::OLDEST,
         listing::NEWEST_OF_FATE,
@@ -68,8 +69,8 @@ async fn what_is_asked_often_goes_through_indexes() {
         listing::LARGEST_VOLUME,
         listing::LEAST_VOLUME,
         listing::OF_WALK,
-        job_counts::MADE_SINCE,
-        outcomes::AT_WORK,
+        job_counts::LABELS_SINCE,
+        outcomes::CORES_IN_USE,
         outcomes::FINISHED,
         recent::NEWEST,
     ] {
@@ -77,7 +78,7 @@ async fn what_is_asked_often_goes_through_indexes() {
         let plan = plan(&file, sql).await.replace("SCAN CONSTANT ROW", "").replace("SCAN page", "");
         assert!(!plan.contains("SCAN") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");
     }
-    for sql in [by_hand::LIST, listing::QUEUE] {
+    for sql in [queue_admin::LIST, listing::QUEUE] {
         let page = plan(&file, sql).await;
         assert!(page.contains("USING COVERING INDEX job_order (state=?"), "{page}");
     }
@@ -99,8 +100,8 @@ async fn connections_are_safe_against_a_loss_of_power_and_write_large_pages() {
     for (sql, expected) in [
         ("PRAGMA synchronous", 2),
         ("PRAGMA foreign_keys", 1),
-        ("PRAGMA page_size", i64::from(PAGE)),
-        ("PRAGMA wal_autocheckpoint", i64::from(LOG_PAGES)),
+        ("PRAGMA page_size", i64::from(PAGE_SIZE)),
+        ("PRAGMA wal_autocheckpoint", i64::from(WAL_PAGES)),
         ("PRAGMA application_id", APPLICATION),
         ("PRAGMA user_version", SCHEMA),
     ] {

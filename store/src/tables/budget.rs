@@ -9,7 +9,7 @@ use crate::error::{Result, StoreError};
 const MILLISECONDS_PER_HOUR: f64 = 3.6e6;
 
 /// The sums that the database keeps of attempts that ended (`migrations`): labels made, and milliseconds of cores.
-const KEPT: &str = "SELECT CAST((SELECT value FROM campaign WHERE key = 'labels_made') AS BIGINT),
+const TOTALS: &str = "SELECT CAST((SELECT value FROM campaign WHERE key = 'labels_made') AS BIGINT),
         CAST((SELECT value FROM campaign WHERE key = 'core_milliseconds') AS BIGINT)";
 
 /// Attempts under way, and milliseconds of their cores so far.
@@ -41,7 +41,7 @@ pub(crate) const SUMS: [(&str, &str); 3] = [
 ];
 
 /// Writes the sums anew, where attempts were copied.
-pub(crate) async fn sum_up(database: &Database) -> Result<()> {
+pub(crate) async fn rebuild_totals(database: &Database) -> Result<()> {
     let mut transaction = database.begin().await?;
     for (name, sum) in SUMS {
         let sum: String = query(sum).fetch_one(&mut transaction).await?;
@@ -68,7 +68,7 @@ impl Store {
     }
 
     /// The campaign was under way for so long again.
-    pub async fn add_time_under_way(&self, milliseconds: u64) -> Result<()> {
+    pub async fn add_running_time(&self, milliseconds: u64) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;
         let before = time_under_way(&mut transaction).await?;
         let now = before.saturating_add(milliseconds).to_string();
@@ -106,7 +106,7 @@ pub(super) async fn read(transaction: &mut Transaction, now: i64) -> Result<(Bud
 
 /// Labels made, attempts under way, and milliseconds of the cores of all attempts until `now`.
 async fn attempts(transaction: &mut Transaction, now: i64) -> Result<(u64, u64, u64)> {
-    let kept: (Option<u64>, Option<u64>) = query(KEPT).fetch_one(&mut *transaction).await?;
+    let kept: (Option<u64>, Option<u64>) = query(TOTALS).fetch_one(&mut *transaction).await?;
     let (Some(labels), Some(ended)) = kept else {
         return query(ATTEMPTS).bind(now).fetch_one(&mut *transaction).await;
     };

@@ -3,9 +3,9 @@
 use crate::Store;
 use crate::checksum::{
     ARCHIVE, CAMPAIGN, CANDIDATE, CHECKPOINT, COMPONENT, CheckedColumn, CheckedTable, DECISION, IMPORT,
-    LABEL, LONG, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, UNKNOWN, VALUE, WALK,
+    LABEL, LONG_COLUMNS, Names, PROTOCOL, SEED_STRUCTURE, STRUCTURE, UNKNOWN, VALUE, WALK,
 };
-use crate::database::{Row, Transaction, Value, for_rows, query};
+use crate::database::{Row, Transaction, Value, execute_rows, query};
 use crate::error::Result;
 
 /// Rows read at a time: one of a large structure has megabytes.
@@ -113,7 +113,7 @@ impl Paged {
             let Some(last) = page.last() else { return Ok(()) };
             after = last.get(self.key)?;
             let rows = page.iter().map(|row| self.checksums(row, long)).collect::<Result<_>>()?;
-            for_rows(transaction, self.update, self.columns, rows).await?;
+            execute_rows(transaction, self.update, self.columns, rows).await?;
         }
     }
 
@@ -139,14 +139,14 @@ impl Paged {
             let Some(last) = page.last() else { return Ok(()) };
             after = last.get(self.key)?;
             for row in &page {
-                note(self.table.verify(row, Names::Plain), faults);
-                long.iter().for_each(|column| note(column.verify(row), faults));
+                collect_fault(self.table.verify(row, Names::Plain), faults);
+                long.iter().for_each(|column| collect_fault(column.verify(row), faults));
             }
         }
     }
 }
 
-fn note(verified: Result<()>, faults: &mut Vec<String>) {
+fn collect_fault(verified: Result<()>, faults: &mut Vec<String>) {
     faults.extend(verified.err().map(|error| error.to_string()));
 }
 
@@ -156,7 +156,7 @@ pub(crate) async fn fill(transaction: &mut Transaction) -> Result<()> {
         paged.fill(transaction, &[]).await?;
     }
     WALKS.fill(transaction, &[&CHECKPOINT]).await?;
-    CANDIDATES.fill(transaction, &LONG).await?;
+    CANDIDATES.fill(transaction, &LONG_COLUMNS).await?;
     for key in CAMPAIGN_KEYS {
         for row in query(CAMPAIGN_VALUE).bind(key).rows(&mut *transaction).await? {
             let checksum = CAMPAIGN.compute(&row, Names::Plain)?;
@@ -205,15 +205,15 @@ pub(crate) async fn verify_others(transaction: &mut Transaction) -> Result<Vec<S
     WALKS.verify(transaction, &[&CHECKPOINT], &mut faults).await?;
     for key in CAMPAIGN_KEYS {
         for row in query(CAMPAIGN_VALUE).bind(key).rows(&mut *transaction).await? {
-            note(CAMPAIGN.verify(&row, Names::Plain), &mut faults);
+            collect_fault(CAMPAIGN.verify(&row, Names::Plain), &mut faults);
         }
     }
     for row in query(VALUES).rows(&mut *transaction).await? {
-        note(VALUE.verify(&row, Names::Plain), &mut faults);
+        collect_fault(VALUE.verify(&row, Names::Plain), &mut faults);
     }
     let mut last = (-1, -1);
     while let Some((row, key)) = next(transaction, NEXT_COMPONENT, ["element", "slot"], last).await? {
-        note(COMPONENT.verify(&row, Names::Plain), &mut faults);
+        collect_fault(COMPONENT.verify(&row, Names::Plain), &mut faults);
         last = key;
     }
     Ok(faults)

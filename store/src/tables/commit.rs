@@ -16,13 +16,13 @@ use self::rows::{
 use super::protocols;
 use crate::Store;
 use crate::checksum;
-use crate::database::{Transaction, for_rows, query};
+use crate::database::{Transaction, execute_rows, query};
 use crate::encoding::{encode_structure, integer};
 use crate::error::{Result, StoreError};
 use crate::records::Commit;
-use crate::store::SERVER_AWAY;
+use crate::store::SERVER_RECONNECT_TIMEOUT;
 
-const PAUSE: Duration = Duration::from_secs(1);
+const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
 const INSERT_DECISIONS: &str = "INSERT INTO decision ({columns}) SELECT * FROM {rows}";
 
@@ -66,23 +66,23 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::DuplicateCandidate`] and [`StoreError::Inconsistent`] are errors of the caller. Nothing is
-    /// written after any error. [`StoreError::LockLost`] if somebody else leads the campaign, see [`Store::led_by`].
+    /// written after any error. [`StoreError::LockLost`] if somebody else leads the campaign, see [`Store::fenced_by`].
     pub async fn commit(&self, commit: &Commit) -> Result<Range<i64>> {
         let mark = RandomState::new().hash_one("mark").cast_signed();
         let (begun, mut again) = (Instant::now(), false);
         loop {
             match self.commit_once(commit, mark, again).await {
-                Err(StoreError::Unreachable(_)) if begun.elapsed() < SERVER_AWAY => again = true,
+                Err(StoreError::Unreachable(_)) if begun.elapsed() < SERVER_RECONNECT_TIMEOUT => again = true,
                 done => return done,
             }
-            tokio::time::sleep(PAUSE).await;
+            tokio::time::sleep(RETRY_INTERVAL).await;
         }
     }
 
     /// One try; `again` if an earlier one may have come through.
     async fn commit_once(&self, commit: &Commit, mark: i64, again: bool) -> Result<Range<i64>> {
         // Everything is copied before anyone has to wait for the transaction.
-        let mut rows = Rows::of(commit)?;
+        let mut rows = Rows::from_commit(commit)?;
         let (mut transaction, made) = self.database.begin_to_commit(mark, again).await?;
         let last = query("SELECT coalesce(max(sequence), 0) FROM decision");
         let last: i64 = last.fetch_one(&mut transaction).await?;
@@ -101,21 +101,21 @@ impl Store {
 
 /// `last` is the number of the last decision before.
 async fn write(transaction: &mut Transaction, commit: &Commit, rows: Rows, last: i64) -> Result<()> {
-    for_rows(transaction, INSERT_DECISIONS, &DECISION, rows.decisions).await?;
-    for_rows(transaction, INSERT_STRUCTURES, &STRUCTURE, rows.structures).await?;
-    let written = for_rows(transaction, INSERT_CANDIDATES, &CANDIDATE, rows.candidates).await?;
+    execute_rows(transaction, INSERT_DECISIONS, &DECISION, rows.decisions).await?;
+    execute_rows(transaction, INSERT_STRUCTURES, &STRUCTURE, rows.structures).await?;
+    let written = execute_rows(transaction, INSERT_CANDIDATES, &CANDIDATE, rows.candidates).await?;
     if written < commit.candidates.len() as u64 {
         return Err(duplicate(transaction, commit, last).await?);
     }
-    for_rows(transaction, COUNT_CANDIDATES, &CANDIDATE_COUNT, rows.candidate_counts).await?;
-    for_rows(transaction, INSERT_CANDIDATE_DATA, &CANDIDATE_DATA, rows.candidate_data).await?;
-    for_rows(transaction, INSERT_JOBS, &JOB, rows.jobs).await?;
+    execute_rows(transaction, COUNT_CANDIDATES, &CANDIDATE_COUNT, rows.candidate_counts).await?;
+    execute_rows(transaction, INSERT_CANDIDATE_DATA, &CANDIDATE_DATA, rows.candidate_data).await?;
+    execute_rows(transaction, INSERT_JOBS, &JOB, rows.jobs).await?;
     if commit.restart_mixture {
         query("DELETE FROM component").execute(&mut *transaction).await?;
     }
-    for_rows(transaction, UPSERT_COMPONENTS, &COMPONENT, rows.components).await?;
-    for_rows(transaction, UPSERT_WALKS, &WALK, rows.walks).await?;
-    for_rows(transaction, UPSERT_VALUES, &VALUE, rows.values).await?;
+    execute_rows(transaction, UPSERT_COMPONENTS, &COMPONENT, rows.components).await?;
+    execute_rows(transaction, UPSERT_WALKS, &WALK, rows.walks).await?;
+    execute_rows(transaction, UPSERT_VALUES, &VALUE, rows.values).await?;
     Ok(())
 }
 
@@ -132,7 +132,7 @@ async fn duplicate(transaction: &mut Transaction, commit: &Commit, last: i64) ->
 
 /// Number of the structure's row, which is made if there is none. Until the end of the transaction nobody else adds a
 /// label or a job for it.
-pub(super) async fn structure_number(
+pub(super) async fn structure_id(
     transaction: &mut Transaction,
     structure: &Structure,
     hash: ContentHash,
@@ -159,7 +159,7 @@ pub(super) async fn enqueue(
     let row = |(hash, decision): &(Vec<u8>, i64)| {
         vec![hash.clone().into(), protocol.into(), (*decision).into(), priority.into()]
     };
-    for_rows(transaction, INSERT_JOBS, &JOB, candidates.iter().map(row).collect()).await?;
+    execute_rows(transaction, INSERT_JOBS, &JOB, candidates.iter().map(row).collect()).await?;
     Ok(())
 }
 

@@ -34,7 +34,7 @@ impl Store {
         limit: u32,
     ) -> Result<Vec<LabelledEnergies>> {
         let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let rows = query(ENERGIES).bind(protocol).bind(limit);
         let mut rows: Vec<EnergyRow> = rows.fetch_all(&mut transaction).await?;
         transaction.commit().await?;

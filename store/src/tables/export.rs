@@ -11,7 +11,7 @@ use crate::checksum::{CANDIDATE, DECISION, IMPORT, Names, ORIGINAL_GRADES, SEED_
 use crate::database::{FromRow, Row, query};
 use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
-use crate::export::{ExportFilter, ExportPlace, ExportRow, ExportSource};
+use crate::export::{ExportCursor, ExportFilter, ExportRow, ExportSource};
 
 pub(crate) const CANDIDATES: &str = concat!(
     "SELECT candidate.decision AS decision, original_checksum, block, original_grades, seed_structure.seed AS seed, ",
@@ -68,7 +68,7 @@ impl Store {
     pub async fn labelled(
         &self,
         filter: &ExportFilter,
-        after: Option<ExportPlace>,
+        after: Option<ExportCursor>,
         limit: u32,
     ) -> Result<Vec<ExportRow>> {
         let name = query("SELECT name FROM protocol WHERE hash = $1").bind(filter.protocol.0.to_vec());
@@ -79,8 +79,8 @@ impl Store {
         let number: i64 = number.fetch_one(&self.database).await?;
         let (decision, last_import) = match after {
             None => (Some(0), 0),
-            Some(ExportPlace::Candidate(decision)) => (Some(decision), 0),
-            Some(ExportPlace::Import(import)) => (None, import),
+            Some(ExportCursor::Candidate(decision)) => (Some(decision), 0),
+            Some(ExportCursor::Import(import)) => (None, import),
         };
         let mut rows = Vec::new();
         if let Some(decision) = decision {
@@ -125,24 +125,24 @@ fn candidate(row: &Row, protocol_name: &str, protocol: ContentHash) -> Result<Ex
         mixture_version_after: row.get("decision__mixture_version")?,
         original: grades(row.get::<Option<Vec<u8>>>("original_grades")?.as_deref())?,
     };
-    labelled(row, ExportPlace::Candidate(row.get("decision")?), source, protocol_name, protocol)
+    labelled(row, ExportCursor::Candidate(row.get("decision")?), source, protocol_name, protocol)
 }
 
 fn import(row: &Row, protocol_name: &str, protocol: ContentHash) -> Result<ExportRow> {
     IMPORT.verify(row, Names::Joined)?;
     let source = ExportSource::Import { file: row.get("import__file")?, frame: row.get("import__frame")? };
-    labelled(row, ExportPlace::Import(row.get("place")?), source, protocol_name, protocol)
+    labelled(row, ExportCursor::Import(row.get("place")?), source, protocol_name, protocol)
 }
 
 fn labelled(
     row: &Row,
-    place: ExportPlace,
+    cursor: ExportCursor,
     source: ExportSource,
     protocol_name: &str,
     protocol: ContentHash,
 ) -> Result<ExportRow> {
     Ok(ExportRow {
-        place,
+        cursor,
         source,
         structure: read_structure(row)?,
         label: LabelRow::from_row(row)?.into_record()?.label,

@@ -5,7 +5,7 @@ use crate::Store;
 use crate::database::{Transaction, query};
 use crate::error::{Result, StoreError};
 use crate::jobs::OldestLease;
-use crate::outcomes::Waiting;
+use crate::outcomes::PendingJobs;
 use crate::records::JobState;
 use wire::ContentHash;
 
@@ -37,7 +37,7 @@ const COUNTED_WAITING: &str = "SELECT seed_structure, formula, atoms, count(*)
 pub(crate) const OLDEST_LEASE: &str = "SELECT job, holder, started FROM attempt WHERE outcome IS NULL
     ORDER BY started, job LIMIT 1";
 
-pub(crate) const MADE_SINCE: &str = "SELECT count(*) FROM label WHERE job IS NOT NULL AND received > $1";
+pub(crate) const LABELS_SINCE: &str = "SELECT count(*) FROM label WHERE job IS NOT NULL AND received > $1";
 
 /// What is kept, against what is there.
 pub(crate) const WRONG: &str = "SELECT count(*), min(coalesce(found.state, kept.state))
@@ -47,13 +47,13 @@ pub(crate) const WRONG: &str = "SELECT count(*), min(coalesce(found.state, kept.
         AND kept.seed_structure = found.seed_structure AND kept.formula = found.formula AND kept.atoms = found.atoms
     WHERE coalesce(found.number, 0) <> coalesce(kept.number, 0)";
 
-pub(crate) async fn are_kept(transaction: &mut Transaction) -> Result<bool> {
+pub(crate) async fn have_counts(transaction: &mut Transaction) -> Result<bool> {
     transaction.has_table("job_count").await
 }
 
 /// Numbers of jobs by state.
 pub(super) async fn states(transaction: &mut Transaction) -> Result<Vec<(String, u64)>> {
-    let sql = if are_kept(transaction).await? { STATES } else { COUNTED_STATES };
+    let sql = if have_counts(transaction).await? { STATES } else { COUNTED_STATES };
     query(sql).fetch_all(transaction).await
 }
 
@@ -63,16 +63,16 @@ pub(super) async fn oldest_lease(transaction: &mut Transaction) -> Result<Option
 }
 
 /// Labels that were made within an hour before `now`.
-pub(super) async fn made_in_the_last_hour(transaction: &mut Transaction, now: i64) -> Result<u64> {
+pub(super) async fn labels_in_last_hour(transaction: &mut Transaction, now: i64) -> Result<u64> {
     let now = transaction.time(now).await?;
-    query(MADE_SINCE).bind(now - HOUR).fetch_one(transaction).await
+    query(LABELS_SINCE).bind(now - HOUR).fetch_one(transaction).await
 }
 
 impl Store {
     /// Numbers of label jobs by the name of their protocol and by state, in the order in which protocols came.
     pub async fn jobs_by_protocol(&self) -> Result<Vec<(String, JobState, u64)>> {
         let mut transaction = self.database.begin_to_read().await?;
-        let sql = if are_kept(&mut transaction).await? { PROTOCOLS } else { COUNTED_PROTOCOLS };
+        let sql = if have_counts(&mut transaction).await? { PROTOCOLS } else { COUNTED_PROTOCOLS };
         let rows: Vec<(String, String, u64)> = query(sql).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         let row = |(protocol, state, number): (String, String, u64)| {
@@ -84,15 +84,15 @@ impl Store {
     }
 
     /// The jobs of this protocol that have no label yet and may get one, by their sizes.
-    pub async fn waiting_jobs(&self, protocol: ContentHash) -> Result<Vec<Waiting>> {
+    pub async fn waiting_jobs(&self, protocol: ContentHash) -> Result<Vec<PendingJobs>> {
         let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
-        let sql = if are_kept(&mut transaction).await? { WAITING } else { COUNTED_WAITING };
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
+        let sql = if have_counts(&mut transaction).await? { WAITING } else { COUNTED_WAITING };
         let rows: Vec<(u32, String, u32, u64)> =
             query(sql).bind(protocol).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         let waiting =
-            |(seed_structure, formula, atoms, jobs)| Waiting { seed_structure, formula, atoms, jobs };
+            |(seed_structure, formula, atoms, jobs)| PendingJobs { seed_structure, formula, atoms, jobs };
         Ok(rows.into_iter().map(waiting).collect())
     }
 }

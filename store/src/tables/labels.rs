@@ -5,14 +5,14 @@ use atoms::Vec3;
 use wire::ContentHash;
 
 use super::queue::{end_attempt, job_row};
-use super::relabel::standing;
+use super::relabel::status_of_result;
 use crate::Store;
 use crate::checksum::{LABEL, Names};
 use crate::database::{FromRow, Row, Transaction, query};
 use crate::encoding::{decode_matrix, decode_vectors, encode_vectors, integer};
 use crate::error::{Result, StoreError};
 use crate::exclude::Exclusion;
-use crate::jobs::{Completed, LabelRecord, LabelSource, Standing, Superseded};
+use crate::jobs::{CompleteOutcome, LabelRecord, LabelSource, LabelStatus, Supersession};
 use crate::records::{Label, LabelDetails, Lease};
 
 /// Whether there is a label, excluded or not.
@@ -67,7 +67,7 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::InvalidLabel`] for a wrong number of forces, or numbers that are not finite.
-    pub async fn complete(&self, lease: &Lease, label: &Label, now: i64) -> Result<Completed> {
+    pub async fn complete(&self, lease: &Lease, label: &Label, now: i64) -> Result<CompleteOutcome> {
         let mut transaction = self.database.begin().await?;
         let structure = query("SELECT structure FROM job WHERE number = $1").bind(lease.job);
         let structure: Option<i64> = structure.fetch_optional(&mut transaction).await?;
@@ -82,18 +82,18 @@ impl Store {
         let before = before.bind(lease.job).bind(lease.attempt).fetch_optional(&mut transaction).await?;
         let before: Option<String> = before;
         if let Some(standing) = before {
-            let check = standing == Standing::Check.name();
-            return Ok(if check { Completed::KeptAsCheck } else { Completed::Label });
+            let check = standing == LabelStatus::Check.name();
+            return Ok(if check { CompleteOutcome::KeptAsCheck } else { CompleteOutcome::Label });
         }
         let source = LabelSource::Attempt { job: lease.job, attempt: lease.attempt };
-        let standing = add(&mut transaction, job.structure, job.protocol, label, &source, now).await?;
-        let outcome = if standing == Standing::Label { "labelled" } else { "check" };
+        let status = add(&mut transaction, job.structure, job.protocol, label, &source, now).await?;
+        let outcome = if status == LabelStatus::Label { "labelled" } else { "check" };
         let sql = "UPDATE attempt SET ended = $1, outcome = $2 WHERE job = $3 AND attempt = $4";
         let query = query(sql).bind(now).bind(outcome).bind(lease.job).bind(lease.attempt);
         query.execute(&mut transaction).await?;
         finish_job(&mut transaction, job.structure, job.protocol, now).await?;
         transaction.commit().await?;
-        Ok(if standing == Standing::Label { Completed::Label } else { Completed::KeptAsCheck })
+        Ok(if status == LabelStatus::Label { CompleteOutcome::Label } else { CompleteOutcome::KeptAsCheck })
     }
 
     /// Every label and check of a structure under a protocol, oldest first.
@@ -146,8 +146,8 @@ pub(super) async fn add(
     label: &Label,
     source: &LabelSource,
     now: i64,
-) -> Result<Standing> {
-    let standing = standing(transaction, structure, protocol, source, now).await?;
+) -> Result<LabelStatus> {
+    let status = status_of_result(transaction, structure, protocol, source, now).await?;
     let (mut job, mut attempt, mut file, mut frame) = (None, None, None, None);
     match source {
         LabelSource::Attempt { job: j, attempt: a } => (job, attempt) = (Some(*j), Some(*a)),
@@ -172,9 +172,9 @@ pub(super) async fn add(
         now.into(),
         encode_details(&label.details).into(),
     ];
-    let insert = query(sql).bind_all(LABEL.with_checksum(row)).bind(standing.name());
+    let insert = query(sql).bind_all(LABEL.with_checksum(row)).bind(status.name());
     insert.execute(&mut *transaction).await?;
-    Ok(standing)
+    Ok(status)
 }
 
 /// The structure has its label: its job, if it has one that was not dropped and waits for no other label, is done.
@@ -196,8 +196,8 @@ pub(super) async fn finish_job(
 
 impl LabelRow {
     /// None for an unknown standing.
-    pub(super) fn standing_and_energy(&self) -> Option<(Standing, f64)> {
-        Some((Standing::named(&self.standing)?, self.energy))
+    pub(super) fn status_and_energy(&self) -> Option<(LabelStatus, f64)> {
+        Some((LabelStatus::named(&self.standing)?, self.energy))
     }
 
     /// Forces, [n], eV/Å.
@@ -208,16 +208,16 @@ impl LabelRow {
 
     pub(super) fn into_record(self) -> Result<LabelRecord> {
         let unknown = || StoreError::damaged("a label", "unknown standing or source");
-        let standing = Standing::named(&self.standing).ok_or_else(unknown)?;
+        let status = LabelStatus::named(&self.standing).ok_or_else(unknown)?;
         let source = match (self.job, self.attempt, self.file, self.frame) {
             (Some(job), Some(attempt), None, None) => LabelSource::Attempt { job, attempt },
             (None, None, Some(file), Some(frame)) => LabelSource::Import { file, frame },
             _ => return Err(unknown()),
         };
         let label = decode_label(self.energy, &self.forces, self.stress.as_deref(), self.details.as_deref())?;
-        let superseded = self.superseded.zip(self.reason).map(|(time, reason)| Superseded { time, reason });
+        let superseded = self.superseded.zip(self.reason).map(|(time, reason)| Supersession { time, reason });
         let excluded = self.excluded.zip(self.exclusion).map(|(time, reason)| Exclusion { time, reason });
-        Ok(LabelRecord { standing, label, source, received: self.received, superseded, excluded })
+        Ok(LabelRecord { status, label, source, received: self.received, superseded, excluded })
     }
 }
 

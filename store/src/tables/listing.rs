@@ -5,7 +5,7 @@ use crate::Store;
 use crate::checksum::{CANDIDATE, DECISION, Names, joined};
 use crate::database::{FromRow, Row, query};
 use crate::error::Result;
-use crate::listing::{ListOrder, ListPlace, ListedCandidate};
+use crate::listing::{ListCursor, ListOrder, ListedCandidate};
 use crate::records::{JobState, Label};
 
 impl FromRow for ListedCandidate {
@@ -127,10 +127,10 @@ impl Store {
         &self,
         order: ListOrder,
         descending: bool,
-        after: Option<ListPlace>,
+        after: Option<ListCursor>,
         limit: u32,
     ) -> Result<Vec<ListedCandidate>> {
-        let ListPlace { value, decision } = after.unwrap_or(first(descending));
+        let ListCursor { value, decision } = after.unwrap_or(first(descending));
         let query = match (order, descending) {
             (ListOrder::Decision, true) => query(NEWEST),
             (ListOrder::Decision, false) => query(OLDEST),
@@ -181,9 +181,9 @@ impl Store {
 }
 
 /// Before everything.
-fn first(descending: bool) -> ListPlace {
+fn first(descending: bool) -> ListCursor {
     match descending {
-        true => ListPlace { value: f64::MAX, decision: i64::MAX },
-        false => ListPlace { value: f64::MIN, decision: 0 },
+        true => ListCursor { value: f64::MAX, decision: i64::MAX },
+        false => ListCursor { value: f64::MIN, decision: 0 },
     }
 }

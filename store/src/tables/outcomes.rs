@@ -8,7 +8,7 @@ use crate::Store;
 use crate::checksum::{CANDIDATE, Names, ORIGINAL_GRADES, joined};
 use crate::database::{FromRow, Row, query};
 use crate::error::Result;
-use crate::outcomes::{FailureCount, Finished, LabelCost, Range, Unlabelled, Work};
+use crate::outcomes::{FailureCount, FinishedCandidate, LabelCost, LabelUsage, Unlabelled, ValueRange};
 
 /// The newest first: what labels cost may change with the machine.
 pub(crate) const COSTS: &str =
@@ -17,7 +17,7 @@ pub(crate) const COSTS: &str =
     CROSS JOIN job ON job.number = label.job CROSS JOIN candidate ON candidate.decision = job.decision
     WHERE label.protocol = $1 ORDER BY label.number DESC LIMIT $2";
 
-pub(crate) const AT_WORK: &str =
+pub(crate) const CORES_IN_USE: &str =
     "SELECT attempt.* FROM job CROSS JOIN attempt ON attempt.job = job.number AND attempt.attempt = job.attempts
     WHERE job.state = 'leased'";
 
@@ -91,20 +91,20 @@ impl Store {
     /// What the newest labels took that were made by this protocol, `limit` at most.
     pub async fn label_costs(&self, protocol: ContentHash, limit: u32) -> Result<Vec<LabelCost>> {
         let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let costs = query(COSTS).bind(protocol).bind(limit).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
         Ok(costs)
     }
 
     /// What attempts have used, and how many cores are at work now.
-    pub async fn label_work(&self) -> Result<Work> {
+    pub async fn label_usage(&self) -> Result<LabelUsage> {
         let mut transaction = self.database.begin_to_read().await?;
         let kept =
             "SELECT key, value FROM campaign WHERE key IN ('core_milliseconds', 'label_core_milliseconds')";
         let kept: Vec<(String, String)> = query(kept).fetch_all(&mut transaction).await?;
         let mut cores = 0;
-        for row in query(AT_WORK).rows(&mut transaction).await? {
+        for row in query(CORES_IN_USE).rows(&mut transaction).await? {
             cores += row.get_or_default::<Option<u64>>("cores")?.unwrap_or(1);
         }
         transaction.commit().await?;
@@ -113,13 +113,13 @@ impl Store {
             Some(milliseconds.parse::<f64>().ok()? / 1000.0)
         };
         let label_core_seconds = seconds("label_core_milliseconds");
-        Ok(Work { core_seconds: seconds("core_milliseconds"), label_core_seconds, cores })
+        Ok(LabelUsage { core_seconds: seconds("core_milliseconds"), label_core_seconds, cores })
     }
 
     /// The failures that attempts of this protocol met, by class.
     pub async fn failures(&self, protocol: ContentHash) -> Result<Vec<FailureCount>> {
         let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let rows: Vec<(String, u64, u64, u64)> =
             query(CLASSES).bind(protocol).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
@@ -132,8 +132,8 @@ impl Store {
     /// those that have their labels no more rows are read than failed.
     pub async fn unlabelled(&self, protocol: ContentHash, ranges: bool) -> Result<Vec<Unlabelled>> {
         let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
-        let ranges = ranges || !job_counts::are_kept(&mut transaction).await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
+        let ranges = ranges || !job_counts::have_counts(&mut transaction).await?;
         let sql = if ranges { UNLABELLED } else { FAILED };
         let rows = query(sql).bind(protocol).fetch_all(&mut transaction).await?;
         transaction.commit().await?;
@@ -142,9 +142,14 @@ impl Store {
 
     /// At most `limit` candidates whose jobs of this protocol have come to their ends, labelled or failed, behind the decision
     /// `after` (0: from the first on). An empty page is the end.
-    pub async fn finished(&self, protocol: ContentHash, after: i64, limit: u32) -> Result<Vec<Finished>> {
+    pub async fn finished(
+        &self,
+        protocol: ContentHash,
+        after: i64,
+        limit: u32,
+    ) -> Result<Vec<FinishedCandidate>> {
         let mut transaction = self.database.begin_to_read().await?;
-        let protocol = protocols::number(&mut transaction, protocol).await?;
+        let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
         let page = query(FINISHED).bind(after).bind(protocol).bind(limit);
         let page = page.fetch_all(&mut transaction).await?;
         transaction.commit().await?;
@@ -171,7 +176,8 @@ impl FromRow for LabelCost {
 
 impl FromRow for Unlabelled {
     fn from_row(row: &Row) -> Result<Self> {
-        let range = |low, high| -> Result<Range> { Ok(Range { low: row.get(low)?, high: row.get(high)? }) };
+        let range =
+            |low, high| -> Result<ValueRange> { Ok(ValueRange { low: row.get(low)?, high: row.get(high)? }) };
         Ok(Self {
             seed_structure: row.get("seed_name")?,
             formula: row.get("formula")?,
@@ -185,7 +191,7 @@ impl FromRow for Unlabelled {
     }
 }
 
-impl FromRow for Finished {
+impl FromRow for FinishedCandidate {
     fn from_row(row: &Row) -> Result<Self> {
         CANDIDATE.verify(row, Names::Joined)?;
         let labelled = row.get::<String>("job_state")? == "labelled";

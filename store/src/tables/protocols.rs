@@ -3,7 +3,7 @@
 use wire::ContentHash;
 
 use super::checksums::CAMPAIGN_KEYS;
-use super::commit::{enqueue, structure_number};
+use super::commit::{enqueue, structure_id};
 use super::logs::insert_operation;
 use crate::Store;
 use crate::checksum::{CAMPAIGN, Names, PROTOCOL, SEED_STRUCTURE, joined};
@@ -107,14 +107,14 @@ impl Store {
     }
 
     /// What the leader of the campaign last left for others under that name.
-    pub async fn note(&self, name: &str) -> Result<Option<String>> {
+    pub async fn metadata(&self, name: &str) -> Result<Option<String>> {
         let note = query("SELECT value FROM campaign WHERE key = $1").bind(format!("note/{name}"));
         note.fetch_optional(&self.database).await
     }
 
     /// Leaves something for others.
-    pub async fn leave_note(&self, name: &str, note: &str) -> Result<()> {
-        if self.note(name).await?.as_deref() == Some(note) {
+    pub async fn set_metadata(&self, name: &str, note: &str) -> Result<()> {
+        if self.metadata(name).await?.as_deref() == Some(note) {
             return Ok(());
         }
         let mut transaction = self.database.begin_to_lead().await?;
@@ -168,9 +168,9 @@ impl Store {
     /// when they were found) get one; those with a job of an earlier protocol keep that.
     pub async fn add_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;
-        know(&mut transaction, protocol, now).await?;
+        insert_protocol(&mut transaction, protocol, now).await?;
         set_campaign_value(&mut transaction, "protocol", &protocol.hash.to_string()).await?;
-        let number = number(&mut transaction, protocol.hash).await?;
+        let number = protocol_id(&mut transaction, protocol.hash).await?;
         let sql = "SELECT content, min(decision) FROM candidate WHERE structure IS NOT NULL
                    AND NOT EXISTS (SELECT 1 FROM job WHERE job.structure = candidate.structure)
                    GROUP BY content ORDER BY min(decision)";
@@ -180,9 +180,9 @@ impl Store {
     }
 
     /// Adds a protocol by which no new label is made.
-    pub async fn know_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
+    pub async fn register_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;
-        know(&mut transaction, protocol, now).await?;
+        insert_protocol(&mut transaction, protocol, now).await?;
         transaction.commit().await
     }
 
@@ -210,7 +210,11 @@ impl FromRow for Protocol {
 }
 
 /// Adds a protocol, unless it is there.
-pub(super) async fn know(transaction: &mut Transaction, protocol: &Protocol, now: i64) -> Result<()> {
+pub(super) async fn insert_protocol(
+    transaction: &mut Transaction,
+    protocol: &Protocol,
+    now: i64,
+) -> Result<()> {
     let sql = "INSERT INTO protocol (hash, name, settings, checksum) VALUES ($1, $2, $3, $4)
                ON CONFLICT (hash) DO NOTHING";
     let row = vec![protocol.hash.0[..].into(), (&protocol.name).into(), protocol.settings.to_string().into()];
@@ -241,7 +245,7 @@ pub(super) async fn set_campaign_value(transaction: &mut Transaction, key: &str,
 }
 
 async fn insert_seed_structure(transaction: &mut Transaction, seed: &SeedStructure) -> Result<()> {
-    let structure = structure_number(transaction, &seed.structure, ContentHash::of(&seed.structure)).await?;
+    let structure = structure_id(transaction, &seed.structure, ContentHash::of(&seed.structure)).await?;
     let sql =
         "INSERT INTO seed_structure (seed, name, source, structure, checksum) VALUES ($1, $2, $3, $4, $5)
                ON CONFLICT (seed) DO UPDATE SET name = $2, source = $3, structure = $4, checksum = $5";
@@ -256,11 +260,11 @@ pub(super) async fn in_force(transaction: &mut Transaction) -> Result<Option<i64
     let hash: Option<String> = hash.fetch_optional(&mut *transaction).await?;
     let Some(hash) = hash else { return Ok(None) };
     let hash = hash.parse().map_err(|error| StoreError::damaged("the protocol in force", error))?;
-    number(transaction, hash).await.map(Some)
+    protocol_id(transaction, hash).await.map(Some)
 }
 
 /// Number of the protocol's row.
-pub(crate) async fn number(transaction: &mut Transaction, hash: ContentHash) -> Result<i64> {
+pub(crate) async fn protocol_id(transaction: &mut Transaction, hash: ContentHash) -> Result<i64> {
     let number = query("SELECT number FROM protocol WHERE hash = $1").bind(hash.0.to_vec());
     let number: Option<i64> = number.fetch_optional(&mut *transaction).await?;
     number.ok_or_else(|| StoreError::UnknownProtocol(hash.to_string()))

@@ -15,7 +15,7 @@ use crate::checksum::joined;
 use crate::database::{Transaction, from_columns, query};
 use crate::encoding::read_structure;
 use crate::error::{Result, StoreError};
-use crate::jobs::{CalculationRecord, Failed, Whereabouts};
+use crate::jobs::{CalculationRecord, FailOutcome, LeaseStatus};
 use crate::processes::ProcessRecord;
 use crate::records::{JobState, Lease};
 
@@ -48,7 +48,7 @@ const LOST_TOO_OFTEN: &str = "lost_too_often";
 
 /// How an attempt ended that brought nothing.
 #[derive(Clone, Copy)]
-pub(crate) enum InVain<'a> {
+pub(crate) enum AttemptEnd<'a> {
     /// It failed: the job is given up after `limit` of these.
     Failed { class: &'a str, log: &'a str, limit: u32 },
     /// Nobody works on it any longer: `released`, `lost` or `expired`.
@@ -95,14 +95,14 @@ impl Store {
         seconds: u32,
     ) -> Result<Option<Lease>> {
         let mut transaction = self.database.begin().await?;
-        let protocol_number = protocols::number(&mut transaction, protocol).await?;
+        let protocol_number = protocols::protocol_id(&mut transaction, protocol).await?;
         let now = transaction.time(now).await?;
         end_expired(&mut transaction, now, seconds).await?;
         if budget::allows_no_attempt(&mut transaction, now).await? {
             transaction.commit().await?;
             return Ok(None);
         }
-        let next = query(NEXT).bind(protocol_number).unless_locked();
+        let next = query(NEXT).bind(protocol_number).skip_locked();
         let next: Option<NextJob> = next.fetch_optional(&mut transaction).await?;
         let Some(next) = next else {
             transaction.commit().await?;
@@ -111,7 +111,7 @@ impl Store {
         let (job, attempt) = (next.number, next.attempts + 1);
         let sql =
             "UPDATE job SET state = 'leased', holder = $1, expires = $2, attempts = $3 WHERE number = $4";
-        let lease = query(sql).bind(holder).bind(end_of_lease(now, seconds)).bind(attempt).bind(job);
+        let lease = query(sql).bind(holder).bind(lease_expiry(now, seconds)).bind(attempt).bind(job);
         lease.execute(&mut transaction).await?;
         let sql = "INSERT INTO attempt (job, attempt, holder, started) VALUES ($1, $2, $3, $4)";
         let begun = query(sql).bind(job).bind(attempt).bind(holder).bind(now);
@@ -154,7 +154,7 @@ impl Store {
             query(HELD_BY).bind(holder).locked().fetch_all(&mut transaction).await?;
         found.retain(|lease| !is_stated(lease));
         for (job, _) in &found {
-            end_in_vain(&mut transaction, *job, InVain::Lost("lost"), now).await?;
+            end_without_label(&mut transaction, *job, AttemptEnd::Lost("lost"), now).await?;
         }
         transaction.commit().await?;
         Ok(found.len())
@@ -165,7 +165,7 @@ impl Store {
     pub async fn renew(&self, lease: &Lease, now: i64, seconds: u32) -> Result<bool> {
         let mut transaction = self.database.begin().await?;
         let sql = "UPDATE job SET expires = $1 WHERE number = $2 AND state = 'leased' AND attempts = $3";
-        let expires = end_of_lease(transaction.time(now).await?, seconds);
+        let expires = lease_expiry(transaction.time(now).await?, seconds);
         let renewed = query(sql).bind(expires).bind(lease.job).bind(lease.attempt);
         let renewed = renewed.execute(&mut transaction).await? > 0;
         transaction.commit().await?;
@@ -196,7 +196,7 @@ impl Store {
     }
 
     /// A calculation has ended: the core-seconds that it took, and the end of what it said.
-    pub async fn account(&self, lease: &Lease, core_seconds: f64, log: &str) -> Result<()> {
+    pub async fn record_cost(&self, lease: &Lease, core_seconds: f64, log: &str) -> Result<()> {
         let mut transaction = self.database.begin().await?;
         let sql = "UPDATE attempt SET core_seconds = $1, log = $2 WHERE job = $3 AND attempt = $4";
         let account = query(sql).bind(core_seconds).bind(log).bind(lease.job).bind(lease.attempt);
@@ -205,7 +205,7 @@ impl Store {
     }
 
     /// What has become of the job of a lease that was lost.
-    pub async fn whereabouts(&self, lease: &Lease) -> Result<Whereabouts> {
+    pub async fn lease_status(&self, lease: &Lease) -> Result<LeaseStatus> {
         let sql = "SELECT state, attempts, calculation FROM job
                    LEFT JOIN attempt ON attempt.job = job.number AND attempt.attempt = attempts
                    WHERE job.number = $1";
@@ -214,26 +214,28 @@ impl Store {
         let unknown = || StoreError::UnknownJob { id: lease.candidate.clone(), near: Vec::new() };
         let (state, attempts, calculation) = row.ok_or_else(unknown)?;
         Ok(match state.as_str() {
-            "leased" if attempts == lease.attempt => Whereabouts::Held,
-            "leased" => Whereabouts::LeasedAgain { calculation },
-            "queued" => Whereabouts::Queued,
-            _ => Whereabouts::Over,
+            "leased" if attempts == lease.attempt => LeaseStatus::Held,
+            "leased" => LeaseStatus::LeasedAgain { calculation },
+            "queued" => LeaseStatus::Queued,
+            _ => LeaseStatus::Over,
         })
     }
 
     /// An attempt was lost through no fault of the job, and it is known why: the job waits for another.
-    pub async fn lose(&self, lease: &Lease, class: &str, log: &str, now: i64) -> Result<Failed> {
+    pub async fn release_lost(&self, lease: &Lease, class: &str, log: &str, now: i64) -> Result<FailOutcome> {
         let mut transaction = self.database.begin().await?;
         let now = transaction.time(now).await?;
         let job = job_row(&mut transaction, lease.job).await?;
         let held = job.state == "leased" && job.attempts == lease.attempt;
         explain(&mut transaction, lease.job, lease.attempt, class, log).await?;
         let lost = match held {
-            false => Failed::LeaseLost,
-            true => match end_in_vain(&mut transaction, lease.job, InVain::Lost("lost"), now).await? {
-                JobState::Queued => Failed::Requeued,
-                _ => Failed::GivenUp,
-            },
+            false => FailOutcome::LeaseLost,
+            true => {
+                match end_without_label(&mut transaction, lease.job, AttemptEnd::Lost("lost"), now).await? {
+                    JobState::Queued => FailOutcome::Requeued,
+                    _ => FailOutcome::GivenUp,
+                }
+            }
         };
         transaction.commit().await?;
         Ok(lost)
@@ -248,19 +250,19 @@ impl Store {
         log: &str,
         attempt_limit: u32,
         now: i64,
-    ) -> Result<Failed> {
+    ) -> Result<FailOutcome> {
         let mut transaction = self.database.begin().await?;
         let now = transaction.time(now).await?;
         let job = job_row(&mut transaction, lease.job).await?;
         let failed = if job.state == "leased" && job.attempts == lease.attempt {
-            let how = InVain::Failed { class, log, limit: attempt_limit };
-            match end_in_vain(&mut transaction, lease.job, how, now).await? {
-                JobState::Queued => Failed::Requeued,
-                _ => Failed::GivenUp,
+            let how = AttemptEnd::Failed { class, log, limit: attempt_limit };
+            match end_without_label(&mut transaction, lease.job, how, now).await? {
+                JobState::Queued => FailOutcome::Requeued,
+                _ => FailOutcome::GivenUp,
             }
         } else {
             explain(&mut transaction, lease.job, lease.attempt, class, log).await?;
-            Failed::LeaseLost
+            FailOutcome::LeaseLost
         };
         transaction.commit().await?;
         Ok(failed)
@@ -269,7 +271,7 @@ impl Store {
     /// Gives back every lease of `holder` and of its parts (`holder/part`), at a stop in order. Does not count as failed
     /// attempts. Returns their number.
     pub async fn release_all(&self, holder: &str, now: i64) -> Result<usize> {
-        self.release(holder, InVain::Lost("released"), now).await
+        self.release(holder, AttemptEnd::Lost("released"), now).await
     }
 
     /// Takes back every lease of `process` and of its parts, which crashed with them in hand: each counts as a failed
@@ -283,21 +285,21 @@ impl Store {
         attempt_limit: u32,
         now: i64,
     ) -> Result<usize> {
-        self.release(process, InVain::Failed { class, log, limit: attempt_limit }, now).await
+        self.release(process, AttemptEnd::Failed { class, log, limit: attempt_limit }, now).await
     }
 
-    async fn release(&self, holder: &str, how: InVain<'_>, now: i64) -> Result<usize> {
+    async fn release(&self, holder: &str, how: AttemptEnd<'_>, now: i64) -> Result<usize> {
         let mut transaction = self.database.begin().await?;
         let now = transaction.time(now).await?;
         let jobs: Vec<i64> = query(HELD).bind(holder).locked().fetch_all(&mut transaction).await?;
         for job in &jobs {
             let how = match how {
-                InVain::Failed { .. } if has_calculation(&mut transaction, *job).await? => {
-                    InVain::Lost("lost")
+                AttemptEnd::Failed { .. } if has_calculation(&mut transaction, *job).await? => {
+                    AttemptEnd::Lost("lost")
                 }
                 how => how,
             };
-            end_in_vain(&mut transaction, *job, how, now).await?;
+            end_without_label(&mut transaction, *job, how, now).await?;
         }
         transaction.commit().await?;
         Ok(jobs.len())
@@ -323,14 +325,14 @@ async fn has_calculation(transaction: &mut Transaction, job: i64) -> Result<bool
     Ok(found > 0)
 }
 
-fn end_of_lease(now: i64, seconds: u32) -> i64 {
+fn lease_expiry(now: i64, seconds: u32) -> i64 {
     now.saturating_add(1000 * i64::from(seconds))
 }
 
 /// Ends the leases that ran out and whose holders cannot be at work.
 async fn end_expired(transaction: &mut Transaction, now: i64, seconds: u32) -> Result<()> {
     // Somebody else ends those that are locked.
-    let expired = query(EXPIRED).bind(now).unless_locked();
+    let expired = query(EXPIRED).bind(now).skip_locked();
     let expired: Vec<(i64, String)> = expired.fetch_all(&mut *transaction).await?;
     if expired.is_empty() {
         return Ok(());
@@ -340,7 +342,7 @@ async fn end_expired(transaction: &mut Transaction, now: i64, seconds: u32) -> R
     let at_work: Vec<_> = processes.iter().filter(holds_on).collect();
     for (job, holder) in expired {
         if !at_work.iter().any(|process| process.is_holder(&holder)) {
-            end_in_vain(transaction, job, InVain::Lost("expired"), now).await?;
+            end_without_label(transaction, job, AttemptEnd::Lost("expired"), now).await?;
         }
     }
     Ok(())
@@ -360,21 +362,21 @@ pub(super) async fn end_attempt(
 }
 
 /// Ends the attempt that is under way without a result: the job waits for another, or is given up. Returns its state.
-pub(crate) async fn end_in_vain(
+pub(crate) async fn end_without_label(
     transaction: &mut Transaction,
     job: i64,
-    how: InVain<'_>,
+    how: AttemptEnd<'_>,
     now: i64,
 ) -> Result<JobState> {
     let JobRow { structure, protocol, attempts, mut failures, .. } = job_row(transaction, job).await?;
     let given_up = match how {
-        InVain::Failed { class, log, limit } => {
+        AttemptEnd::Failed { class, log, limit } => {
             end_attempt(transaction, job, "failed", now).await?;
             explain(transaction, job, attempts, class, log).await?;
             failures += 1;
             failures >= limit
         }
-        InVain::Lost(outcome) => {
+        AttemptEnd::Lost(outcome) => {
             end_attempt(transaction, job, outcome, now).await?;
             let losses: u32 = query(LOSSES).bind(job).fetch_one(&mut *transaction).await?;
             if losses >= LOSS_LIMIT {

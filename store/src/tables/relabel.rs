@@ -11,14 +11,14 @@ use wire::ContentHash;
 
 use super::labels::CURRENT;
 use super::logs::insert_operation;
-use super::protocols::{in_force, know, number, set_campaign_value};
+use super::protocols::{in_force, insert_protocol, protocol_id, set_campaign_value};
 use crate::Store;
-use crate::database::{FromRow, Row, Transaction, Value, for_rows, from_columns, query};
+use crate::database::{FromRow, Row, Transaction, Value, execute_rows, from_columns, query};
 use crate::encoding::decode_hash;
 use crate::error::{Result, StoreError};
-use crate::jobs::{LabelSource, Standing};
+use crate::jobs::{LabelSource, LabelStatus};
 use crate::records::JobState;
-use crate::relabel::{NewProtocol, Relabel, Relabellable, Requeued};
+use crate::relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
 
 /// Jobs with their labels; of a structure that has labels by several protocols, all of them.
 pub(crate) const LABELLED: &str =
@@ -55,7 +55,7 @@ const REQUEST: &str = request!("'failed', 'superseded'");
 const REQUEST_AGAIN: &str = request!("'labelled', 'failed', 'superseded'");
 
 /// Other labels that were asked for by a protocol which is no longer in force: those that there are stay.
-const WITHDRAW: &str =
+const WITHDRAW_REQUESTS: &str =
     "UPDATE job SET state = 'labelled', relabel = NULL, relabel_after = NULL, holder = NULL,
         expires = NULL
     WHERE protocol <> $1 AND state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label
@@ -93,14 +93,14 @@ const SUPERSEDE_JOBS: &str =
 const ASKED: &str = "SELECT state, count(*) FROM job WHERE relabel IS NOT NULL GROUP BY state";
 
 /// A job, as far as it decides what a result is.
-struct Asked {
+struct RelabelRow {
     number: i64,
     state: String,
     relabel: Option<String>,
     relabel_after: Option<u32>,
 }
 
-from_columns!(Asked { number, state, relabel, relabel_after });
+from_columns!(RelabelRow { number, state, relabel, relabel_after });
 
 impl FromRow for Relabellable {
     fn from_row(row: &Row) -> Result<Self> {
@@ -158,12 +158,12 @@ impl Store {
     /// # Errors
     /// [`StoreError::ProtocolName`] if another protocol has the name of the new one. [`StoreError::LockLost`] if a protocol is to
     /// come into force and somebody else leads the campaign.
-    pub async fn relabel(&self, order: &Relabel<'_>, now: i64) -> Result<Requeued> {
+    pub async fn relabel(&self, order: &RelabelRequest<'_>, now: i64) -> Result<RelabelCounts> {
         let mut transaction = match order.protocol {
             Some(_) => self.database.begin_to_lead().await?,
             None => self.database.begin().await?,
         };
-        let mut requeued = Requeued::default();
+        let mut requeued = RelabelCounts::default();
         if let Some(new) = &order.protocol {
             requeued.moved = change_protocol(&mut transaction, new, now).await?;
         }
@@ -176,9 +176,9 @@ impl Store {
         let mut seen = HashSet::new();
         let rows = order.structures.iter().filter(|content| seen.insert(content.0)).map(row).collect();
         let sql = if order.again { REQUEST_AGAIN } else { REQUEST };
-        requeued.again = for_rows(&mut transaction, sql, &["hash", "protocol", "reason"], rows).await?;
+        requeued.again = execute_rows(&mut transaction, sql, &["hash", "protocol", "reason"], rows).await?;
         if order.protocol.is_some() || requeued.again > 0 {
-            let Requeued { again, moved } = requeued;
+            let RelabelCounts { again, moved } = requeued;
             let detail = json!({ "reason": order.reason, "again": again, "moved": moved });
             insert_operation(&mut transaction, now, "relabel", &detail).await?;
         }
@@ -188,13 +188,13 @@ impl Store {
 }
 
 /// Whether the tables are not those of an earlier version, in which nothing is labelled again.
-pub(crate) async fn is_known(transaction: &mut Transaction) -> Result<bool> {
+pub(crate) async fn has_relabel_columns(transaction: &mut Transaction) -> Result<bool> {
     transaction.has_column("job", "relabel").await
 }
 
 /// Numbers of jobs for which another label was asked and has not come, by state.
-pub(super) async fn asked(transaction: &mut Transaction) -> Result<Vec<(String, u64)>> {
-    if !is_known(transaction).await? {
+pub(super) async fn relabel_requests(transaction: &mut Transaction) -> Result<Vec<(String, u64)>> {
+    if !has_relabel_columns(transaction).await? {
         return Ok(Vec::new());
     }
     query(ASKED).fetch_all(transaction).await
@@ -202,7 +202,7 @@ pub(super) async fn asked(transaction: &mut Transaction) -> Result<Vec<(String, 
 
 /// Brings a protocol into force. Returns how many structures without a label went over to it.
 async fn change_protocol(transaction: &mut Transaction, new: &NewProtocol<'_>, now: i64) -> Result<u64> {
-    know(transaction, new.protocol, now).await?;
+    insert_protocol(transaction, new.protocol, now).await?;
     set_campaign_value(transaction, "protocol", &new.protocol.hash.to_string()).await?;
     set_campaign_value(transaction, "configuration_in_force", new.configuration).await?;
     for (name, note) in new.notes {
@@ -211,8 +211,8 @@ async fn change_protocol(transaction: &mut Transaction, new: &NewProtocol<'_>, n
     for change in new.changes {
         insert_operation(transaction, now, "configuration", change).await?;
     }
-    let protocol = number(transaction, new.protocol.hash).await?;
-    query(WITHDRAW).bind(protocol).execute(&mut *transaction).await?;
+    let protocol = protocol_id(transaction, new.protocol.hash).await?;
+    query(WITHDRAW_REQUESTS).bind(protocol).execute(&mut *transaction).await?;
     query(GO_OVER).bind(protocol).execute(&mut *transaction).await?;
     let moved = query(LEAVE_BEHIND).bind(protocol).execute(&mut *transaction).await?;
     let now = transaction.time(now).await?;
@@ -221,21 +221,21 @@ async fn change_protocol(transaction: &mut Transaction, new: &NewProtocol<'_>, n
 }
 
 /// What a result is. If it is the label that was asked for, those in whose place it comes are superseded.
-pub(super) async fn standing(
+pub(super) async fn status_of_result(
     transaction: &mut Transaction,
     structure: i64,
     protocol: i64,
     source: &LabelSource,
     now: i64,
-) -> Result<Standing> {
+) -> Result<LabelStatus> {
     let labelled: bool = query(CURRENT).bind(structure).bind(protocol).fetch_one(&mut *transaction).await?;
-    let first = if labelled { Standing::Check } else { Standing::Label };
+    let first = if labelled { LabelStatus::Check } else { LabelStatus::Label };
     let sql = "SELECT number, state, relabel, relabel_after FROM job WHERE structure = $1 AND protocol = $2";
     let job = query(sql).bind(structure).bind(protocol).locked();
-    let job: Option<Asked> = job.fetch_optional(&mut *transaction).await?;
-    let Some(Asked { number, state, relabel, relabel_after }) = job else { return Ok(first) };
+    let job: Option<RelabelRow> = job.fetch_optional(&mut *transaction).await?;
+    let Some(RelabelRow { number, state, relabel, relabel_after }) = job else { return Ok(first) };
     if state == JobState::Superseded.name() {
-        return Ok(Standing::Check);
+        return Ok(LabelStatus::Check);
     }
     let Some(reason) = relabel else { return Ok(first) };
     let began_since = match source {
@@ -244,12 +244,12 @@ pub(super) async fn standing(
         LabelSource::Import { .. } => !labelled,
     };
     if !began_since || state == JobState::Dropped.name() {
-        return Ok(Standing::Check);
+        return Ok(LabelStatus::Check);
     }
     query(SUPERSEDE).bind(structure).bind(now).bind(reason).execute(&mut *transaction).await?;
     let came = query("UPDATE job SET relabel = NULL, relabel_after = NULL WHERE number = $1");
     came.bind(number).execute(&mut *transaction).await?;
     query(SUPERSEDE_JOBS).bind(structure).bind(protocol).execute(&mut *transaction).await?;
     query(END_ATTEMPTS).bind(now).execute(&mut *transaction).await?;
-    Ok(Standing::Label)
+    Ok(LabelStatus::Label)
 }

@@ -5,7 +5,7 @@ use wire::{CandidateBlock, ContentHash, Origin, WalkId};
 
 use crate::Store;
 use crate::checksum::{
-    CANDIDATE, CHECKPOINT, COMPONENT, DECISION, LONG, Names, STRUCTURE, VALUE, WALK, joined,
+    CANDIDATE, CHECKPOINT, COMPONENT, DECISION, LONG_COLUMNS, Names, STRUCTURE, VALUE, WALK, joined,
 };
 use crate::database::{FromRow, Row, Target, from_columns, query};
 use crate::encoding::decode_hash;
@@ -224,7 +224,7 @@ impl WalkRow {
 impl FromRow for StoredCandidate {
     fn from_row(row: &Row) -> Result<Self> {
         CANDIDATE.verify(row, Names::Plain)?;
-        LONG.iter().try_for_each(|column| column.verify(row))?;
+        LONG_COLUMNS.iter().try_for_each(|column| column.verify(row))?;
         let (fate, reason): (String, Option<String>) = (row.get("fate")?, row.get("reason")?);
         let fate = match (fate.as_str(), reason.as_deref()) {
             ("accepted", None) => Some(Fate::Accepted),

@@ -61,15 +61,15 @@ impl Home {
 
     /// A campaign with one seed structure and the protocol "dft" in force, in which it is as late as the caller says.
     pub async fn create(&self) -> Store {
-        super::create_at(self.location()).await.by_the_callers_clock()
+        super::create_at(self.location()).await.with_caller_clock()
     }
 
     pub async fn open(&self) -> Store {
-        Store::open(self.location()).await.unwrap().by_the_callers_clock()
+        Store::open(self.location()).await.unwrap().with_caller_clock()
     }
 
     pub async fn open_read_only(&self) -> Store {
-        Store::open_read_only(self.location()).await.unwrap().by_the_callers_clock()
+        Store::open_read_only(self.location()).await.unwrap().with_caller_clock()
     }
 }
 

@@ -47,11 +47,11 @@ async fn who_waits_for_a_lock_is_not_told_that_the_server_is_away() {
     });
     let commits: Vec<_> = commits.collect();
     tokio::time::sleep(Duration::from_secs(1)).await;
-    let error = store.add_time_under_way(1).await.unwrap_err();
+    let error = store.add_running_time(1).await.unwrap_err();
     assert!(error.is_transient() && error.to_string().contains("locked"), "{error}");
     other.execute("ROLLBACK").await.unwrap();
     for commit in commits {
         commit.await.unwrap().unwrap();
     }
-    store.add_time_under_way(1).await.unwrap();
+    store.add_running_time(1).await.unwrap();
 }

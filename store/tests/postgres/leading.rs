@@ -44,7 +44,7 @@ async fn a_second_holder_is_told_the_first_and_the_lock_comes_free() {
 async fn a_lock_whose_connection_broke_is_taken_again() {
     let home = Home::new();
     let lock = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
-    let store = home.create().await.led_by(&lock);
+    let store = home.create().await.fenced_by(&lock);
     break_the_lock(&home).await;
     let lost = tokio::time::timeout(Duration::from_secs(4), lock.lost()).await;
     assert!(lost.is_err(), "nobody else took it: {lost:?}");
@@ -57,7 +57,7 @@ async fn a_lock_whose_connection_broke_is_taken_again() {
 async fn who_lost_the_lock_learns_it_and_writes_nothing_more() {
     let home = Home::new();
     let first = CampaignLock::acquire_at(home.location(), "first").await.unwrap();
-    let old = home.create().await.led_by(&first);
+    let old = home.create().await.fenced_by(&first);
     accept(&old, 1).await;
     let second = loop {
         break_the_lock(&home).await;
@@ -67,13 +67,13 @@ async fn who_lost_the_lock_learns_it_and_writes_nothing_more() {
             Err(error) => assert!(matches!(error, StoreError::Locked { .. }), "{error}"),
         }
     };
-    let new = home.open().await.led_by(&second);
+    let new = home.open().await.fenced_by(&second);
     let fresh = |step| commit_of(vec![candidate(0, step, Origin::Biased, Fate::Accepted)]);
     // Before it learns it, too.
     for error in [
         old.commit(&fresh(7)).await.unwrap_err(),
         old.add_protocol(&protocol("other"), 0).await.unwrap_err(),
-        old.take_over(0).await.unwrap_err(),
+        old.reclaim_leases(0).await.unwrap_err(),
         old.set_configuration_in_force("{}", &[], 0).await.unwrap_err(),
     ] {
         assert!(

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use sqlx::Executor;
-use store::{Completed, Fate, JobState, Lease, ProcessRecord, Store};
+use store::{CompleteOutcome, Fate, JobState, Lease, ProcessRecord, Store};
 use wire::Origin;
 
 use super::common::*;
@@ -37,7 +37,10 @@ async fn eight_labellers_at_once_never_get_the_same_job() {
                 assert_eq!(lease.attempt, 1);
                 jobs.push(lease.job);
                 if lease.job % 2 == 0 {
-                    assert_eq!(store.complete(&lease, &label(-1.0), 1).await.unwrap(), Completed::Label);
+                    assert_eq!(
+                        store.complete(&lease, &label(-1.0), 1).await.unwrap(),
+                        CompleteOutcome::Label
+                    );
                 }
             }
             jobs
@@ -82,14 +85,14 @@ async fn labellers_whose_clocks_are_an_hour_apart_respect_each_other() {
         let left = job.expires.unwrap() - now;
         assert!((590_000..700_000).contains(&left), "{left} ms left of {job:?}");
     }
-    assert_eq!(store.complete(&fast, &label(-1.0), now + HOUR).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&fast, &label(-1.0), now + HOUR).await.unwrap(), CompleteOutcome::Label);
 
     // Who is silent loses its lease whatever its clock shows: its record was written by the server's.
     let elsewhere = |id: &str, last_seen| {
         let here = ProcessRecord { id: id.into(), ..ProcessRecord::new("labeller", Some(7), 1, last_seen) };
-        let birth = store::process_birth(std::process::id()).unwrap();
-        let (place, ticks) = birth.rsplit_once('/').unwrap();
-        ProcessRecord { birth: format!("{place}0/{ticks}"), ..here }
+        let start_time = store::process_start_time(std::process::id()).unwrap();
+        let (place, ticks) = start_time.rsplit_once('/').unwrap();
+        ProcessRecord { start_time: format!("{place}0/{ticks}"), ..here }
     };
     assert!(store.renew(&slow, now - HOUR, 1).await.unwrap());
     let begun = Instant::now();
@@ -114,9 +117,9 @@ async fn a_label_that_comes_after_its_lease_went_to_another_counts_once() {
     let holds = lease(&store, "holds", 0, 600).await.unwrap();
     assert_eq!((holds.job, holds.attempt), (late.job, 2));
     assert!(!store.renew(&late, 0, 600).await.unwrap());
-    assert_eq!(store.complete(&late, &label(-1.0), 0).await.unwrap(), Completed::Label);
-    assert_eq!(store.complete(&holds, &label(-2.0), 0).await.unwrap(), Completed::KeptAsCheck);
-    assert_eq!(store.complete(&late, &label(-3.0), 0).await.unwrap(), Completed::Label);
+    assert_eq!(store.complete(&late, &label(-1.0), 0).await.unwrap(), CompleteOutcome::Label);
+    assert_eq!(store.complete(&holds, &label(-2.0), 0).await.unwrap(), CompleteOutcome::KeptAsCheck);
+    assert_eq!(store.complete(&late, &label(-3.0), 0).await.unwrap(), CompleteOutcome::Label);
     let details = store.queue_show(&late.candidate).await.unwrap();
     let energies: Vec<_> = details.energies.iter().map(|(_, energy)| *energy).collect();
     assert_eq!((details.job.state, energies), (JobState::Labelled, vec![-1.0, -2.0]));

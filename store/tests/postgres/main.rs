@@ -5,9 +5,9 @@
 #[path = "../common/mod.rs"]
 mod common;
 mod connections;
-mod earlier;
 mod leading;
 mod leases;
+mod old_schema;
 mod protection;
 mod restart;
 mod secrets;

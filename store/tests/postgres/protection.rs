@@ -38,7 +38,7 @@ async fn a_server_that_is_known_is_spoken_to_in_secret() {
     let location =
         at(&home, "calmwalk", "localhost", &format!("sslmode=verify-full&sslrootcert={}", root.display()));
     let lock = CampaignLock::acquire_at(&location, "protected").await.unwrap();
-    let store = Store::create(&location, &campaign(), &[], 0).await.unwrap().led_by(&lock);
+    let store = Store::create(&location, &campaign(), &[], 0).await.unwrap().fenced_by(&lock);
     store.status().await.unwrap();
     let (all, encrypted) = connections(&home).await;
     assert!(all >= 2, "the lock has one, and the store");

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use store::{CampaignLock, Commit, Completed, ComponentRecord, Fate, JobState, Store, StoreError};
+use store::{CampaignLock, Commit, CompleteOutcome, ComponentRecord, Fate, JobState, Store, StoreError};
 use wire::Origin;
 use wire::messages::Decline;
 
@@ -60,7 +60,7 @@ async fn label_all(store: Store, number: usize, no_more_jobs: Arc<AtomicBool>) -
             continue;
         };
         let made = label(-1.0);
-        if insist(|| store.complete(&lease, &made, 0)).await == Completed::Label {
+        if insist(|| store.complete(&lease, &made, 0)).await == CompleteOutcome::Label {
             labelled += 1;
         }
     }
@@ -71,7 +71,7 @@ async fn nothing_is_lost_or_doubled_when_the_server_is_restarted() {
     let home = Home::new();
     let lock = CampaignLock::acquire_at(home.location(), "restart test").await.unwrap();
     drop(home.create().await);
-    let store = Store::open(home.location()).await.unwrap().led_by(&lock);
+    let store = Store::open(home.location()).await.unwrap().fenced_by(&lock);
     let (done, committed) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
     let no_more_jobs = Arc::new(AtomicBool::new(false));
     let labellers: Vec<_> = (0..LABELLERS)
@@ -118,7 +118,7 @@ async fn nothing_is_lost_or_doubled_when_the_server_is_restarted() {
     for job in jobs {
         assert_eq!(job.state, JobState::Labelled);
         let details = store.queue_show(&job.candidate).await.unwrap();
-        let labels = details.energies.iter().filter(|(standing, _)| *standing == store::Standing::Label);
+        let labels = details.energies.iter().filter(|(standing, _)| *standing == store::LabelStatus::Label);
         assert_eq!(labels.count(), 1);
         assert_eq!(details.attempts_made.len() as u32, job.attempts);
         assert!(details.attempts_made.iter().all(|attempt| attempt.outcome.is_some()));

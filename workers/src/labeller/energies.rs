@@ -9,8 +9,8 @@ use store::records::{Lease, Protocol};
 use store::{Store, StoreError};
 use wire::ContentHash;
 
-use super::judge::Expected;
-use super::{Closing, insist};
+use super::validate::EnergyReference;
+use super::{Shutdown, retry_until_written};
 
 /// Labels that offsets are fitted to: the newest.
 const LABELS: u32 = 2_000;
@@ -59,14 +59,14 @@ impl Offsets {
         protocol: &Protocol,
         lease: &Lease,
         result: &Result<Calculated, dft::Failure>,
-        closing: &Closing,
-    ) -> Result<Option<Expected<'_>>, StoreError> {
+        shutdown: &Shutdown,
+    ) -> Result<Option<EnergyReference<'_>>, StoreError> {
         let Some(model) = lease.model_energy.filter(|_| result.is_ok()) else { return Ok(None) };
         if self.left == 0 {
-            self.fitted = insist(closing, || energy_offsets(store, protocol.hash)).await?.ok();
+            self.fitted = retry_until_written(shutdown, || energy_offsets(store, protocol.hash)).await?.ok();
             self.left = self.fitted.as_ref().map_or(0, |fitted| fitted.structures() / REFIT).max(1);
         }
         self.left -= 1;
-        Ok(self.fitted.as_ref().map(|offsets| Expected { model, offsets }))
+        Ok(self.fitted.as_ref().map(|offsets| EnergyReference { model, offsets }))
     }
 }

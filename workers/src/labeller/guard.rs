@@ -142,7 +142,7 @@ pub(super) async fn refusal(
     if lease.overruled {
         return Ok(None);
     }
-    let Some(text) = store.note(GUARD).await? else { return Ok(None) };
+    let Some(text) = store.metadata(GUARD).await? else { return Ok(None) };
     let guard: LabelGuard = serde_json::from_str(&text).map_err(damaged)?;
     if let Some(reason) = guard.refuses(&lease.structure) {
         return Ok(Some(reason));
@@ -151,7 +151,7 @@ pub(super) async fn refusal(
         return Ok(Some(reason));
     }
     let Some(bound) = guard.near_duplicate else { return Ok(None) };
-    let near = store.labelled_near(lease, COMPARED).await?;
+    let near = store.near_duplicates(lease, COMPARED).await?;
     let Some((own, others)) = near else { return Ok(None) };
     let like = others.iter().find(|other| is_near(&own, &other.features, lease.structure.len(), bound));
     Ok(like.map(|other| {

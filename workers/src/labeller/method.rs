@@ -9,9 +9,9 @@ use store::records::Lease;
 use store::{Store, StoreError};
 use tokio::task::spawn_blocking;
 
-use super::code::{CodeMethod, Ended, classes};
-use super::judge::{Expected, LabelBounds, judge};
-use super::{Closing, KeeperCommand, ReferenceMethod, Running};
+use super::code::{CodeMethod, EndedCalculation, failure_classes};
+use super::validate::{EnergyReference, LabelBounds, validate};
+use super::{ExecutionSettings, ReferenceMethod, RunnerCommand, Shutdown};
 
 /// A way to make labels.
 pub enum Method {
@@ -22,16 +22,21 @@ pub enum Method {
 }
 
 /// A result.
-pub(super) struct Made {
+pub(super) struct LabelAttempt {
     pub result: Result<Calculated, Failure>,
     /// The calculation behind it, if it was a process of its own.
-    pub ended: Option<Ended>,
+    pub ended: Option<EndedCalculation>,
 }
 
-impl Made {
+impl LabelAttempt {
     /// The same, if it can be believed; otherwise why not.
-    pub fn judged(self, lease: &Lease, bounds: &LabelBounds, expected: Option<Expected<'_>>) -> Self {
-        let result = self.result.and_then(|made| judge(made, &lease.structure, bounds, expected));
+    pub fn validated(
+        self,
+        lease: &Lease,
+        bounds: &LabelBounds,
+        expected: Option<EnergyReference<'_>>,
+    ) -> Self {
+        let result = self.result.and_then(|made| validate(made, &lease.structure, bounds, expected));
         Self { result, ..self }
     }
 }
@@ -43,17 +48,17 @@ impl Method {
     }
 
     /// Labels by another program.
-    pub fn code(code: Box<dyn Code>, running: Running) -> Self {
-        Self::kept_by(KeeperCommand::default(), code, running)
+    pub fn code(code: Box<dyn Code>, execution: ExecutionSettings) -> Self {
+        Self::with_runner(RunnerCommand::default(), code, execution)
     }
 
-    /// The same with keepers ([`super::keep`]) that are started so.
-    pub fn kept_by(keeper: KeeperCommand, code: Box<dyn Code>, running: Running) -> Self {
-        Self::Code(Box::new(CodeMethod::new(keeper, code, running)))
+    /// The same with keepers ([`super::run_calculation`]) that are started so.
+    pub fn with_runner(runner: RunnerCommand, code: Box<dyn Code>, execution: ExecutionSettings) -> Self {
+        Self::Code(Box::new(CodeMethod::new(runner, code, execution)))
     }
 
     /// Whether a calculation goes on without this labeller, and another finds it.
-    pub(super) fn outlives_its_labeller(&self) -> bool {
+    pub(super) fn outlives_labeller(&self) -> bool {
         matches!(self, Self::Code(_))
     }
 
@@ -64,15 +69,15 @@ impl Method {
     pub async fn stop(&self) -> Result<(), StoreError> {
         match self {
             Self::Reference(_) => Ok(()),
-            Self::Code(method) => method.abandon().await,
+            Self::Code(method) => method.cancel().await,
         }
     }
 
     /// Makes room for calculations, and clears away what killed labellers have left.
-    pub(super) async fn begin(&self, store: &Store, closing: &Closing) -> Result<(), StoreError> {
+    pub(super) async fn start(&self, store: &Store, shutdown: &Shutdown) -> Result<(), StoreError> {
         match self {
             Self::Reference(_) => Ok(()),
-            Self::Code(method) => method.home(store, closing).await.map(drop),
+            Self::Code(method) => method.scratch_root(store, shutdown).await.map(drop),
         }
     }
 
@@ -84,24 +89,24 @@ impl Method {
     }
 
     /// Leaves the calculation in hand to whoever waits for it as well.
-    pub(super) fn let_go(&self) {
+    pub(super) fn detach(&self) {
         if let Self::Code(method) = self {
-            method.let_go();
+            method.detach();
         }
     }
 
     /// The result of a job is where it belongs, and what was needed for it is put away.
-    pub(super) async fn put_away(
+    pub(super) async fn archive(
         &self,
         store: &Store,
         lease: &Lease,
-        closing: &Closing,
-        ended: Ended,
+        shutdown: &Shutdown,
+        ended: EndedCalculation,
         failed: bool,
     ) -> Result<(), StoreError> {
         match self {
             Self::Reference(_) => Ok(()),
-            Self::Code(method) => method.put_away(store, lease, closing, ended, failed).await,
+            Self::Code(method) => method.archive(store, lease, shutdown, ended, failed).await,
         }
     }
 
@@ -111,14 +116,14 @@ impl Method {
         &self,
         store: &Store,
         lease: &Lease,
-        closing: &Closing,
-    ) -> Result<Option<Made>, StoreError> {
+        shutdown: &Shutdown,
+    ) -> Result<Option<LabelAttempt>, StoreError> {
         match self {
             Self::Reference(method) => {
                 let result = evaluate(Arc::clone(method), lease.structure.clone()).await;
-                Ok(Some(Made { result, ended: None }))
+                Ok(Some(LabelAttempt { result, ended: None }))
             }
-            Self::Code(method) => method.make(store, lease, closing).await,
+            Self::Code(method) => method.make(store, lease, shutdown).await,
         }
     }
 
@@ -144,7 +149,7 @@ impl Method {
             // Every attempt would be like the one before.
             Self::Reference(_) => false,
             Self::Code(_) => {
-                let failures = classes(lease).into_iter().chain([failure.class]);
+                let failures = failure_classes(lease).into_iter().chain([failure.class]);
                 dft::remedies(&failures.collect::<Vec<_>>()).is_none()
             }
         }

@@ -2,66 +2,66 @@
 //!
 //! [`run`] is one of the tasks of a process, [`serve`] a process of its own, which outlives its orchestrator.
 
-mod begun;
-mod closing;
+mod calculation_handle;
+mod calculation_runner;
 mod code;
-mod difference;
 mod energies;
+mod execution;
 mod guard;
-mod here;
-mod insist;
-mod judge;
-mod keeper;
+mod heartbeat;
+mod input_diff;
+mod local;
 mod log;
 mod method;
-mod once;
 mod pack;
 mod prepare;
-mod presence;
-mod private;
+mod private_directory;
+mod process_tree;
 mod reference;
-mod running;
+mod remove_tree;
+mod report_line;
+mod retry;
 mod scratch;
-mod session;
+mod shutdown;
+mod single_label;
 mod slurm;
-mod told;
-mod tree;
+mod validate;
 
 use std::pin::pin;
 use std::time::{Duration, Instant};
 
 use dft::{Calculated, Failure, FailureClass};
 use store::records::{Label, LabelDetails, Lease, Protocol};
-use store::{Store, StoreError, Whereabouts};
+use store::{LeaseStatus, Store, StoreError};
 use tracing::{debug, info, warn};
 
-use closing::Wanted;
-use code::Ended;
+use code::EndedCalculation;
 use energies::Offsets;
-use method::Made;
-use told::Became;
+use method::LabelAttempt;
+use report_line::DeliveryOutcome;
+use shutdown::ShutdownState;
 
-pub use closing::Closing;
+pub use calculation_runner::{RunnerCommand, run_calculation};
 pub use code::CodeMethod;
 pub use energies::{energy_offsets, labelled_energy};
+pub use execution::{BatchSystem, ExecutionSettings, KeepDirectories};
 pub use guard::{GUARD, LabelGuard, Pair};
-pub use insist::insist;
-pub use judge::LabelBounds;
-pub use keeper::{KeeperCommand, keep};
+pub use heartbeat::{ExitPolicy, serve};
 pub use method::Method;
-pub use once::{Once, label_once};
-pub use presence::{Stay, serve};
 pub use reference::ReferenceMethod;
-pub use running::{BatchSystem, Keep, Running};
+pub use retry::retry_until_written;
+pub use shutdown::Shutdown;
+pub use single_label::{SingleLabel, label_structure};
+pub use validate::LabelBounds;
 
 /// Between two signs of life in the store, of every process that gives them there.
-pub const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
+pub const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(5);
 /// The longest time between two looks at the queue …
-const LONGEST_IDLE: Duration = Duration::from_secs(1);
+const MAX_POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// … and where the database tells of new jobs: only leases that ran out are not told of.
-const TOLD_IDLE: Duration = Duration::from_secs(5);
+const NOTIFIED_POLL_INTERVAL: Duration = Duration::from_secs(5);
 /// Which part of the time without work passes until the next look, and so how late work may be found.
-const IDLE_PART: u32 = 8;
+const IDLE_DIVISOR: u32 = 8;
 
 /// What a labeller needs to know.
 #[derive(Clone, Debug)]
@@ -75,7 +75,7 @@ pub struct LabellerSettings {
     /// What is believed of a label.
     pub bounds: LabelBounds,
     /// For how long it is of use, if it is a process of its own, while nobody leads the campaign.
-    pub stay: Stay,
+    pub exit_policy: ExitPolicy,
     /// How often it does what has to be done again and again.
     pub timing: Timing,
 }
@@ -91,7 +91,7 @@ pub struct Timing {
     /// longer it waits, up to a second: each look costs some tenths of a millisecond.
     pub idle: Duration,
     /// Between two signs of life of a labeller that is a process.
-    pub sign_of_life: Duration,
+    pub heartbeat_interval: Duration,
     /// How long the label in hand may go on when the labeller is asked to stop, before it is given back and its calculation
     /// ended. With none the label is finished, but a calculation that outlives the labeller is left to the next one after some
     /// seconds.
@@ -103,7 +103,7 @@ impl Default for Timing {
         Self {
             lease: Duration::from_secs(600),
             idle: Duration::from_millis(50),
-            sign_of_life: SIGN_OF_LIFE,
+            heartbeat_interval: HEARTBEAT_INTERVAL,
             grace: None,
         }
     }
@@ -116,19 +116,19 @@ impl Timing {
 }
 
 /// What a look at the queue finds.
-enum Found {
+enum QueuePoll {
     Job(Box<Lease>),
     Nothing,
     /// Nothing, and nothing will come.
-    TheEnd,
+    Finished,
 }
 
 /// After it was asked to stop, a labeller waits so long for a calculation that goes on without it.
-const LAST_LABEL: Duration = Duration::from_secs(5);
+const DETACH_DELAY: Duration = Duration::from_secs(5);
 
 /// Labels until there is nothing more to do. `now` is asked for ms since 1970; `tell` gets a line for each job.
 ///
-/// A database that is busy or full is no reason to end: the queue is looked at again later, and a label that was made is
+/// A database that is busy or full is no reason to end: the queue is polled at again later, and a label that was made is
 /// brought again and again, after `closing` asks to stop for a minute more.
 ///
 /// # Errors
@@ -137,20 +137,20 @@ pub async fn run(
     store: Store,
     method: Method,
     settings: LabellerSettings,
-    closing: &Closing,
+    shutdown: &Shutdown,
     now: impl Fn() -> i64,
     tell: impl Fn(&str),
 ) -> Result<(), StoreError> {
-    let done = work(&store, &method, &settings, closing, now, tell).await;
+    let done = label_jobs(&store, &method, &settings, shutdown, now, tell).await;
     method.end();
     done
 }
 
-async fn work(
+async fn label_jobs(
     store: &Store,
     method: &Method,
     settings: &LabellerSettings,
-    closing: &Closing,
+    shutdown: &Shutdown,
     now: impl Fn() -> i64,
     tell: impl Fn(&str),
 ) -> Result<(), StoreError> {
@@ -159,18 +159,18 @@ async fn work(
         tell(line);
     };
     let (mut idle, mut offsets) = (Duration::ZERO, Offsets::default());
-    method.begin(store, closing).await?;
+    method.start(store, shutdown).await?;
     loop {
-        let wanted = closing.wanted();
-        if wanted.stop {
+        let requested = shutdown.state();
+        if requested.stop {
             return Ok(());
         }
-        let lease = match look(store, settings, wanted.no_more_jobs, now()).await {
-            Ok(Found::Job(lease)) => lease,
-            Ok(Found::TheEnd) => return Ok(()),
+        let lease = match poll_queue(store, settings, requested.no_more_jobs, now()).await {
+            Ok(QueuePoll::Job(lease)) => lease,
+            Ok(QueuePoll::Finished) => return Ok(()),
             Err(error) if !error.is_transient() => return Err(error),
-            looked => {
-                idle += wait(store, idle, settings.timing.idle, looked.is_ok(), closing, wanted).await;
+            polled => {
+                idle += wait(store, idle, settings.timing.idle, polled.is_ok(), shutdown, requested).await;
                 continue;
             }
         };
@@ -178,41 +178,48 @@ async fn work(
         debug!(candidate = lease.candidate, job = lease.job, attempt = lease.attempt, "leased");
         let begun = Instant::now();
         let size = method.size(&lease.structure);
-        if let Some(reason) = insist(closing, || guard::refusal(store, &lease, size)).await? {
+        if let Some(reason) = retry_until_written(shutdown, || guard::refusal(store, &lease, size)).await? {
             // Whatever was tried before, another attempt would be refused as well.
-            insist(closing, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
+            retry_until_written(shutdown, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
             say(&format!("{} is refused: {reason}", lease.candidate));
             continue;
         }
-        let made = match make(store, method, &lease, &settings.timing, closing, &now).await? {
-            Work::Done(made) => *made,
-            Work::NotWanted => {
+        let made = match make(store, method, &lease, &settings.timing, shutdown, &now).await? {
+            LeaseOutcome::Done(made) => *made,
+            LeaseOutcome::NotWanted => {
                 method.stop().await?;
-                say(&format!("{} is given up here: it has its label, or is wanted no more", lease.candidate));
+                say(&format!(
+                    "{} is given up here: it has its label, or is requested no more",
+                    lease.candidate
+                ));
                 continue;
             }
-            Work::LetGo => {
-                method.let_go();
+            LeaseOutcome::Detached => {
+                method.detach();
                 say(&format!("{} is finished by somebody else here", lease.candidate));
                 continue;
             }
-            Work::LeftToOthers => {
-                method.let_go();
+            LeaseOutcome::LeftRunning => {
+                method.detach();
                 say(&format!("{} goes on and is left to the next labeller here", lease.candidate));
-                return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
+                return retry_until_written(shutdown, || store.release_all(&settings.holder, now()))
+                    .await
+                    .map(drop);
             }
-            Work::TooLate => {
+            LeaseOutcome::GraceExpired => {
                 method.stop().await?;
                 say(&format!("{} is given back: there is no time to finish it", lease.candidate));
-                return insist(closing, || store.release_all(&settings.holder, now())).await.map(drop);
+                return retry_until_written(shutdown, || store.release_all(&settings.holder, now()))
+                    .await
+                    .map(drop);
             }
         };
-        let expected = offsets.expected(store, &settings.protocol, &lease, &made.result, closing).await?;
-        let made = made.judged(&lease, &settings.bounds, expected);
-        let Brought { judged, became, ended } =
-            bring(store, method, &lease, settings, made, closing, &now).await?;
-        let line = told::line(&lease, &judged, &became, begun.elapsed().as_secs_f64());
-        match &judged {
+        let expected = offsets.expected(store, &settings.protocol, &lease, &made.result, shutdown).await?;
+        let made = made.validated(&lease, &settings.bounds, expected);
+        let Delivered { validated, became, ended } =
+            deliver_attempt(store, method, &lease, settings, made, shutdown, &now).await?;
+        let line = report_line::format_report(&lease, &validated, &became, begun.elapsed().as_secs_f64());
+        match &validated {
             Ok(_) => info!(job = lease.job, attempt = lease.attempt, "{line}"),
             Err(failure) => {
                 warn!(job = lease.job, attempt = lease.attempt, class = failure.class.name(), "{line}");
@@ -220,57 +227,58 @@ async fn work(
         }
         tell(&line);
         if let Some(ended) = ended {
-            method.put_away(store, &lease, closing, ended, judged.is_err()).await?;
+            method.archive(store, &lease, shutdown, ended, validated.is_err()).await?;
         }
     }
 }
 
 /// A result that the store has.
-struct Brought {
-    judged: Result<Calculated, Failure>,
-    became: Became,
-    ended: Option<Ended>,
+struct Delivered {
+    validated: Result<Calculated, Failure>,
+    became: DeliveryOutcome,
+    ended: Option<EndedCalculation>,
 }
 
 /// Brings what was made for a job and judged to the store, with what it has cost.
-async fn bring(
+async fn deliver_attempt(
     store: &Store,
     method: &Method,
     lease: &Lease,
     settings: &LabellerSettings,
-    made: Made,
-    closing: &Closing,
+    made: LabelAttempt,
+    shutdown: &Shutdown,
     now: impl Fn() -> i64,
-) -> Result<Brought, StoreError> {
-    let Made { result: judged, ended } = made;
+) -> Result<Delivered, StoreError> {
+    let LabelAttempt { result: validated, ended } = made;
     let log = ended.as_ref().map_or("", |ended| &ended.log);
     if let Some(ended) = &ended {
-        insist(closing, || store.account(lease, ended.core_seconds, log)).await?;
+        retry_until_written(shutdown, || store.record_cost(lease, ended.core_seconds, log)).await?;
     }
     // What no remedy helps against is not tried again.
-    let no_remedy = judged.as_ref().is_err_and(|failure| method.has_no_remedy(lease, failure));
+    let no_remedy = validated.as_ref().is_err_and(|failure| method.has_no_remedy(lease, failure));
     let attempts = if no_remedy { 1 } else { settings.attempts };
-    let became = insist(closing, || deliver(store, lease, &judged, log, attempts, now())).await?;
-    Ok(Brought { judged, became, ended })
+    let became =
+        retry_until_written(shutdown, || deliver(store, lease, &validated, log, attempts, now())).await?;
+    Ok(Delivered { validated, became, ended })
 }
 
-async fn look(
+async fn poll_queue(
     store: &Store,
     settings: &LabellerSettings,
-    last_look: bool,
+    no_more_jobs: bool,
     now: i64,
-) -> Result<Found, StoreError> {
+) -> Result<QueuePoll, StoreError> {
     // Its loop holds none now: leasing a job, working on it and the next look follow each other.
     give_back_unknown(store, &settings.holder, &[], now).await?;
     if !store.awaits_labels(now).await? {
-        return Ok(if last_look { Found::TheEnd } else { Found::Nothing });
+        return Ok(if no_more_jobs { QueuePoll::Finished } else { QueuePoll::Nothing });
     }
     let (protocol, seconds) = (settings.protocol.hash, settings.timing.lease_seconds());
     match store.lease(protocol, &settings.holder, now, seconds).await? {
-        Some(lease) => Ok(Found::Job(Box::new(lease))),
+        Some(lease) => Ok(QueuePoll::Job(Box::new(lease))),
         // What there is to do is for others.
-        None if !store.is_in_force(protocol).await? => Ok(Found::TheEnd),
-        None => Ok(Found::Nothing),
+        None if !store.is_in_force(protocol).await? => Ok(QueuePoll::Finished),
+        None => Ok(QueuePoll::Nothing),
     }
 }
 
@@ -289,31 +297,31 @@ async fn wait(
     idle: Duration,
     least: Duration,
     answers: bool,
-    closing: &Closing,
-    wanted: Wanted,
+    shutdown: &Shutdown,
+    requested: ShutdownState,
 ) -> Duration {
-    let wait = match answers && store.tells_of_jobs() {
-        true => TOLD_IDLE,
-        false => (idle / IDLE_PART).min(LONGEST_IDLE).max(least),
+    let wait = match answers && store.has_job_notifications() {
+        true => NOTIFIED_POLL_INTERVAL,
+        false => (idle / IDLE_DIVISOR).min(MAX_POLL_INTERVAL).max(least),
     };
     tokio::select! {
         () = store.wait_for_jobs(wait) => {}
-        () = closing.other_than(wanted) => {}
+        () = shutdown.changed_from(requested) => {}
     }
     wait
 }
 
 /// What came of a lease.
-enum Work {
-    Done(Box<Made>),
+enum LeaseOutcome {
+    Done(Box<LabelAttempt>),
     /// Nobody waits for the result any more.
     NotWanted,
     /// Somebody else waits for this very calculation.
-    LetGo,
+    Detached,
     /// Somebody asked to stop, and it goes on without this labeller, or waits to be read.
-    LeftToOthers,
+    LeftRunning,
     /// There was no time to end it.
-    TooLate,
+    GraceExpired,
 }
 
 /// Works on a job, and renews the lease meanwhile. A label whose lease was lost is made to its end: if another is first, it
@@ -323,15 +331,15 @@ async fn make(
     method: &Method,
     lease: &Lease,
     timing: &Timing,
-    closing: &Closing,
+    shutdown: &Shutdown,
     now: impl Fn() -> i64,
-) -> Result<Work, StoreError> {
-    let mut making = pin!(method.make(store, lease, closing));
-    let mut too_late = pin!(end_of_grace(timing.grace, closing));
+) -> Result<LeaseOutcome, StoreError> {
+    let mut making = pin!(method.make(store, lease, shutdown));
+    let mut too_late = pin!(end_of_grace(timing.grace, shutdown));
     // Who has no time of grace is followed by others, who find the calculation.
-    let leaves = timing.grace.is_none() && method.outlives_its_labeller();
+    let leaves = timing.grace.is_none() && method.outlives_labeller();
     let mut leave = pin!(async {
-        end_of_grace(leaves.then_some(LAST_LABEL), closing).await;
+        end_of_grace(leaves.then_some(DETACH_DELAY), shutdown).await;
         while method.calculation().is_none() {
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
@@ -341,10 +349,10 @@ async fn make(
     loop {
         tokio::select! {
             made = &mut making => {
-                return Ok(made?.map_or(Work::LeftToOthers, |made| Work::Done(Box::new(made))));
+                return Ok(made?.map_or(LeaseOutcome::LeftRunning, |made| LeaseOutcome::Done(Box::new(made))));
             }
-            () = &mut too_late => return Ok(Work::TooLate),
-            () = &mut leave => return Ok(Work::LeftToOthers),
+            () = &mut too_late => return Ok(LeaseOutcome::GraceExpired),
+            () = &mut leave => return Ok(LeaseOutcome::LeftRunning),
             () = tokio::time::sleep(Duration::from_secs(seconds.into()) / 3) => {}
         }
         if held {
@@ -360,10 +368,10 @@ async fn make(
             _ => {}
         }
         let Some(own) = method.calculation().filter(|_| !held) else { continue };
-        match store.whereabouts(lease).await {
-            Ok(Whereabouts::Over) => return Ok(Work::NotWanted),
-            Ok(Whereabouts::LeasedAgain { calculation: Some(other) }) if other == own => {
-                return Ok(Work::LetGo);
+        match store.lease_status(lease).await {
+            Ok(LeaseStatus::Over) => return Ok(LeaseOutcome::NotWanted),
+            Ok(LeaseStatus::LeasedAgain { calculation: Some(other) }) if other == own => {
+                return Ok(LeaseOutcome::Detached);
             }
             Ok(_) => {}
             Err(error) if error.is_transient() => {}
@@ -372,10 +380,10 @@ async fn make(
     }
 }
 
-async fn end_of_grace(grace: Option<Duration>, closing: &Closing) {
+async fn end_of_grace(grace: Option<Duration>, shutdown: &Shutdown) {
     match grace {
         Some(grace) => {
-            closing.stopped().await;
+            shutdown.stop_requested().await;
             tokio::time::sleep(grace).await;
         }
         None => std::future::pending().await,
@@ -385,23 +393,23 @@ async fn end_of_grace(grace: Option<Duration>, closing: &Closing) {
 async fn deliver(
     store: &Store,
     lease: &Lease,
-    judged: &Result<Calculated, Failure>,
+    validated: &Result<Calculated, Failure>,
     log: &str,
     attempts: u32,
     now: i64,
-) -> Result<Became, StoreError> {
-    let failure = match judged {
-        Ok(made) => return store.complete(lease, &label(made), now).await.map(Became::Completed),
+) -> Result<DeliveryOutcome, StoreError> {
+    let failure = match validated {
+        Ok(made) => return store.complete(lease, &label(made), now).await.map(DeliveryOutcome::Completed),
         Err(failure) => failure,
     };
     let (class, text) = (failure.class.name(), format!("{failure}\n{log}"));
     let text = text.trim_end();
     let failed = match failure.class {
         // That was no fault of the job.
-        FailureClass::LostNode => store.lose(lease, class, text, now).await,
+        FailureClass::LostNode => store.release_lost(lease, class, text, now).await,
         _ => store.fail(lease, class, text, attempts, now).await,
     };
-    failed.map(Became::Failed)
+    failed.map(DeliveryOutcome::Failed)
 }
 
 /// A result as the store keeps it.

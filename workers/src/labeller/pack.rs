@@ -12,17 +12,17 @@ use super::prepare::DATA;
 /// What VASP's licence lets nobody pass on.
 const LICENSED: &str = "POTCAR";
 /// Larger files stay out: charge densities and wave functions are of no use without the program, and are made again.
-const LARGEST_FILE: u64 = 16 << 20;
+const MAX_FILE_SIZE: u64 = 16 << 20;
 /// Bytes of all files together, before they are compressed, each with its header.
-const MOST: u64 = 64 << 20;
+const MAX_TOTAL_SIZE: u64 = 64 << 20;
 /// What a file takes beside its content.
 const HEADER: u64 = 1024;
 /// Directories within each other that are looked into. Paths of some thousand levels cannot be named any more.
-const DEEPEST: usize = 64;
+const MAX_DEPTH: usize = 64;
 /// Lines about what is left out.
-const LINES: usize = 1000;
+const MAX_LINES: usize = 1000;
 /// More would cost time and win little.
-const LEVEL: i32 = 3;
+const COMPRESSION_LEVEL: i32 = 3;
 
 /// A tar file, compressed.
 pub(super) struct Packed {
@@ -34,21 +34,21 @@ pub(super) struct Packed {
 /// Packs the files below a directory, in order of their names, each as long as it is not too large and there is room.
 /// Pseudopotentials stay out ([`DATA`], [`LICENSED`]): all calculations have the same. So does what cannot be read.
 pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
-    let mut encoder = zstd::Encoder::new(Vec::new(), LEVEL)?;
+    let mut encoder = zstd::Encoder::new(Vec::new(), COMPRESSION_LEVEL)?;
     encoder.include_checksum(true)?;
     let mut archive = tar::Builder::new(encoder);
     let mut left_out = LeftOut::default();
-    let mut room = MOST;
+    let mut room = MAX_TOTAL_SIZE;
     for path in files(directory, &mut left_out) {
         let name = path.strip_prefix(directory).unwrap_or(&path);
         let size = fs::symlink_metadata(&path).map_or(0, |file| file.len());
-        if name.starts_with(DATA) || name.ends_with(LICENSED) || size.max(HEADER) > LARGEST_FILE.min(room) {
-            left_out.note(name, &format!("{size} bytes"));
+        if name.starts_with(DATA) || name.ends_with(LICENSED) || size.max(HEADER) > MAX_FILE_SIZE.min(room) {
+            left_out.add(name, &format!("{size} bytes"));
             continue;
         }
         match append(&mut archive, &path, name) {
             Ok(()) => room = room.saturating_sub(size + HEADER),
-            Err(Unpacked::Unreadable(why)) => left_out.note(name, &why),
+            Err(Unpacked::Unreadable(why)) => left_out.add(name, &why),
             Err(Unpacked::Archive(error)) => return Err(error),
         }
     }
@@ -87,13 +87,13 @@ fn files(directory: &Path, left_out: &mut LeftOut) -> Vec<PathBuf> {
     while let Some((folder, depth)) = open.pop() {
         let name = folder.strip_prefix(directory).unwrap_or(&folder).to_owned();
         let entries = match fs::read_dir(&folder) {
-            Ok(entries) if depth <= DEEPEST => entries,
+            Ok(entries) if depth <= MAX_DEPTH => entries,
             Ok(_) => {
-                left_out.note(&name, &format!("more than {DEEPEST} directories deep"));
+                left_out.add(&name, &format!("more than {MAX_DEPTH} directories deep"));
                 continue;
             }
             Err(error) => {
-                left_out.note(&name, &error.to_string());
+                left_out.add(&name, &error.to_string());
                 continue;
             }
         };
@@ -101,7 +101,7 @@ fn files(directory: &Path, left_out: &mut LeftOut) -> Vec<PathBuf> {
             match entry.file_type() {
                 Ok(kind) if kind.is_dir() => open.push((entry.path(), depth + 1)),
                 Ok(kind) if kind.is_file() || kind.is_symlink() => files.push(entry.path()),
-                _ => left_out.note(&name.join(entry.file_name()), "no regular file"),
+                _ => left_out.add(&name.join(entry.file_name()), "no regular file"),
             }
         }
     }
@@ -117,8 +117,8 @@ struct LeftOut {
 }
 
 impl LeftOut {
-    fn note(&mut self, name: &Path, why: &str) {
-        if self.lines.len() == LINES {
+    fn add(&mut self, name: &Path, why: &str) {
+        if self.lines.len() == MAX_LINES {
             self.more += 1;
             return;
         }

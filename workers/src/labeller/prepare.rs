@@ -9,10 +9,10 @@ use atoms::Structure;
 use dft::{Calculated, Code, Exit, Failure, Input, Original, Remedy};
 use store::{CalculationRecord, StoreError};
 
-use super::Running;
+use super::ExecutionSettings;
+use super::calculation_runner::WORK;
 use super::code::file;
-use super::difference::difference;
-use super::keeper::WORK;
+use super::input_diff::input_diff;
 
 /// Beside [`WORK`], what the program reads and all calculations have alike.
 pub(super) const DATA: &str = "data";
@@ -35,27 +35,27 @@ pub(super) struct Prepared {
 /// Everything that is known before anything is started.
 pub(super) fn prepare(
     code: &dyn Code,
-    running: &Running,
+    execution: &ExecutionSettings,
     structure: &Structure,
     remedies: &BTreeSet<Remedy>,
 ) -> Result<Prepared, Failure> {
     let input = code.input(structure, remedies)?;
     let (size, mut record) = (code.size(structure), CalculationRecord::default());
-    record.cores = Some(running.cores);
+    record.cores = Some(execution.cores);
     record.atoms = u32::try_from(size.atoms).ok();
     record.electrons = Some(size.electrons).filter(|electrons| electrons.is_finite());
     record.k_points = u32::try_from(size.k_points).ok();
     if !remedies.is_empty() {
         let names: Vec<_> = remedies.iter().map(|remedy| remedy.name()).collect();
         record.remedies = Some(names.join(","));
-        record.difference = Some(difference(&code.input(structure, &BTreeSet::new())?, &input));
+        record.difference = Some(input_diff(&code.input(structure, &BTreeSet::new())?, &input));
     }
     let twice = |remedy| if remedies.contains(&remedy) { 2.0 } else { 1.0 };
-    let memory = running.memory.map(|gigabytes| twice(Remedy::MoreMemory) * GIGABYTE * gigabytes);
+    let memory = execution.memory.map(|gigabytes| twice(Remedy::MoreMemory) * GIGABYTE * gigabytes);
     Ok(Prepared {
         input,
         record,
-        time_limit: twice(Remedy::MoreTime) * running.time_limit,
+        time_limit: twice(Remedy::MoreTime) * execution.time_limit,
         // The conversion saturates.
         memory_limit: memory.map(|bytes| bytes as u64),
         avoids_nodes: remedies.contains(&Remedy::OtherNode),

@@ -2,7 +2,7 @@
 //!
 //! | | |
 //! | --- | --- |
-//! | `<scratch>/calmwalk-<campaign>-<random>/` | a campaign's, of this user alone: see [`private`]; whoever comes later finds it by its name and owner |
+//! | `<scratch>/calmwalk-<campaign>-<random>/` | a campaign's, of this user alone: see [`private_directory`]; whoever comes later finds it by its name and owner |
 //! | `<scratch>/calmwalk-<campaign>-<random>/<job>-<attempt>-<time>/` | a calculation's, with the folders `work` and `data` |
 
 use std::fs;
@@ -13,28 +13,28 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use store::{Store, StoreError};
 use wire::CampaignId;
 
-use super::begun::{Begun, Found};
+use super::calculation_handle::{CalculationHandle, CalculationState};
 use super::code::{blocking, file};
-use super::running::Keep;
+use super::execution::KeepDirectories;
 use super::slurm::{self, Slurm};
-use super::{Closing, here, insist, pack, private};
+use super::{Shutdown, local, pack, private_directory, retry_until_written};
 
 /// What was left behind is only cleared away when nobody can still be at it.
-const AGE: Duration = Duration::from_secs(60);
+const MIN_AGE: Duration = Duration::from_secs(60);
 /// How often it is tried to make a directory where somebody else clears away empty ones.
-const TRIES: u32 = 100;
+const MAX_ATTEMPTS: u32 = 100;
 
 /// Where all calculations of a campaign that this user makes with this scratch directory are.
 #[derive(Debug)]
-pub(super) struct Home {
+pub(super) struct ScratchRoot {
     scratch: PathBuf,
     /// What the names of its directories begin with. Several labellers that begin at once may make one each.
     prefix: String,
 }
 
-impl Home {
+impl ScratchRoot {
     /// That of a campaign.
-    pub fn of(scratch: &Path, campaign: CampaignId) -> Self {
+    pub fn for_campaign(scratch: &Path, campaign: CampaignId) -> Self {
         Self { scratch: scratch.to_owned(), prefix: format!("calmwalk-{campaign}") }
     }
 
@@ -43,12 +43,13 @@ impl Home {
     /// # Errors
     /// None can be made in which nobody else could change anything.
     pub fn prepare(&self) -> Result<PathBuf, StoreError> {
-        private::check(&self.scratch)?;
+        private_directory::check(&self.scratch)?;
         let prefix = format!("{}-", self.prefix);
-        let found = private::ours_in(&self.scratch, &prefix).map_err(|error| file(&self.scratch, error))?;
-        match found.into_iter().find(|path| private::is_closed(path)) {
-            Some(home) => Ok(home),
-            None => private::make(&self.scratch, &prefix),
+        let found =
+            private_directory::ours_in(&self.scratch, &prefix).map_err(|error| file(&self.scratch, error))?;
+        match found.into_iter().find(|path| private_directory::is_closed(path)) {
+            Some(root) => Ok(root),
+            None => private_directory::make(&self.scratch, &prefix),
         }
     }
 
@@ -59,29 +60,29 @@ impl Home {
     pub fn make(&self, job: i64, attempt: u32) -> Result<PathBuf, StoreError> {
         let mut tries = 0;
         loop {
-            let home = self.prepare()?;
+            let root = self.prepare()?;
             tries += 1;
-            match private::make_inside(&home, &name(job, attempt)) {
+            match private_directory::make_inside(&root, &name(job, attempt)) {
                 // Whoever ended last has cleared it away.
-                Err(error) if error.kind() == io::ErrorKind::NotFound && tries < TRIES => {}
-                made => return made.map_err(|error| file(&home, error)),
+                Err(error) if error.kind() == io::ErrorKind::NotFound && tries < MAX_ATTEMPTS => {}
+                made => return made.map_err(|error| file(&root, error)),
             }
         }
     }
 
     /// Clears away the directories that killed labellers have left, as far as nobody needs them: those of calculations whose
     /// keeper is gone and whose job waits for nothing.
-    pub async fn tidy(
+    pub async fn cleanup(
         &self,
         store: &Store,
-        keep: Keep,
+        keep: KeepDirectories,
         slurm: &Slurm,
-        closing: &Closing,
+        shutdown: &Shutdown,
     ) -> Result<(), StoreError> {
-        for home in self.all()? {
-            let entries = fs::read_dir(&home).map_err(|error| file(&home, error))?;
+        for root in self.all()? {
+            let entries = fs::read_dir(&root).map_err(|error| file(&root, error))?;
             for directory in entries.flatten().map(|entry| entry.path()).filter(|path| is_old(path)) {
-                tidy_one(store, &directory, keep, slurm, closing).await?;
+                cleanup_one(store, &directory, keep, slurm, shutdown).await?;
             }
         }
         Ok(())
@@ -89,25 +90,25 @@ impl Home {
 
     /// Removes directories in which no calculation is.
     pub fn remove_empty(&self) {
-        for home in self.all().unwrap_or_default() {
-            remove_empty(&home);
+        for root in self.all().unwrap_or_default() {
+            remove_empty(&root);
         }
     }
 
     /// All directories of this campaign, also those that an earlier version of this program has made.
     fn all(&self) -> Result<Vec<PathBuf>, StoreError> {
-        private::ours_in(&self.scratch, &self.prefix).map_err(|error| file(&self.scratch, error))
+        private_directory::ours_in(&self.scratch, &self.prefix).map_err(|error| file(&self.scratch, error))
     }
 }
 
 /// Removes the directory that holds those of calculations if there are none.
-pub(super) fn remove_empty(home: &Path) {
-    let is_calculation = |path: &Path| numbers(path).is_some();
-    let entries = fs::read_dir(home).into_iter().flatten().flatten();
+pub(super) fn remove_empty(root: &Path) {
+    let is_calculation = |path: &Path| job_and_attempt(path).is_some();
+    let entries = fs::read_dir(root).into_iter().flatten().flatten();
     if !entries.map(|entry| entry.path()).any(|path| is_calculation(&path)) {
-        slurm::forget(home);
+        slurm::remove_cache(root);
         // Another labeller may be making one there.
-        let _ = fs::remove_dir(home);
+        let _ = fs::remove_dir(root);
     }
 }
 
@@ -122,48 +123,48 @@ pub(super) async fn pack(
     store: &Store,
     job: i64,
     attempt: u32,
-    closing: &Closing,
+    shutdown: &Shutdown,
     directory: &Path,
 ) -> Result<(), StoreError> {
     let from = directory.to_owned();
     let packed = blocking(move || pack::pack(&from)).await.map_err(|error| file(directory, error))?;
-    insist(closing, || store.keep_archive(job, attempt, &packed.bytes, &packed.left_out)).await
+    retry_until_written(shutdown, || store.keep_archive(job, attempt, &packed.bytes, &packed.left_out)).await
 }
 
-async fn tidy_one(
+async fn cleanup_one(
     store: &Store,
     directory: &Path,
-    keep: Keep,
+    keep: KeepDirectories,
     slurm: &Slurm,
-    closing: &Closing,
+    shutdown: &Shutdown,
 ) -> Result<(), StoreError> {
-    let Some((job, attempt)) = numbers(directory) else { return Ok(()) };
-    let past = insist(closing, || store.past_calculation(job, attempt)).await?;
+    let Some((job, attempt)) = job_and_attempt(directory) else { return Ok(()) };
+    let past = retry_until_written(shutdown, || store.past_calculation(job, attempt)).await?;
     // Of a copy of this campaign.
     let Some(past) = past.filter(|past| !past.wanted) else { return Ok(()) };
-    let begun = past.calculation.as_deref().and_then(Begun::parse);
-    let is_over = match begun.filter(|begun| begun.directory() == directory) {
-        Some(begun) => !matches!(begun.look(slurm).await?, Found::Running),
+    let handle = past.calculation.as_deref().and_then(CalculationHandle::parse);
+    let is_over = match handle.filter(|handle| handle.directory() == directory) {
+        Some(handle) => !matches!(handle.inspect(slurm).await?, CalculationState::Running),
         // Whoever made it was killed before anything began.
         None => true,
     };
     if is_over && keep.keeps(past.failed) {
-        pack(store, job, attempt, closing, directory).await?;
+        pack(store, job, attempt, shutdown, directory).await?;
     }
     if is_over {
         let cleared = directory.to_owned();
-        blocking(move || here::clear(&cleared)).await.map_err(|error| file(directory, error))?;
+        blocking(move || local::clear(&cleared)).await.map_err(|error| file(directory, error))?;
     }
     Ok(())
 }
 
 /// Job and attempt of the directory of that name.
-fn numbers(directory: &Path) -> Option<(i64, u32)> {
+fn job_and_attempt(directory: &Path) -> Option<(i64, u32)> {
     let mut parts = directory.file_name()?.to_str()?.splitn(3, '-');
     Some((parts.next()?.parse().ok()?, parts.next()?.parse().ok()?))
 }
 
 fn is_old(directory: &Path) -> bool {
     let changed = fs::metadata(directory).and_then(|directory| directory.modified());
-    changed.is_ok_and(|changed| changed.elapsed().is_ok_and(|age| age > AGE))
+    changed.is_ok_and(|changed| changed.elapsed().is_ok_and(|age| age > MIN_AGE))
 }

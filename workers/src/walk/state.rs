@@ -12,7 +12,7 @@ use crate::guard;
 use crate::settings::{ThermostatKind, WalkSettings};
 
 /// Checkpoints to go back to that are kept; the oldest is used, so that a return leads out of the trap.
-const KEPT_CHECKPOINTS: usize = 2;
+const MAX_CHECKPOINTS: usize = 2;
 
 /// The checkpoint of a walk.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -29,7 +29,7 @@ pub(super) struct WalkState {
     /// First step at which a candidate may be offered again.
     pub next_offer: u64,
     /// Where structures were collected.
-    pub collected: Vec<Collected>,
+    pub collected: Vec<CollectionPoint>,
     /// The guard's shortest distance, Å.
     pub least_distance: f64,
     /// Places to go back to, oldest first.
@@ -39,15 +39,15 @@ pub(super) struct WalkState {
 
 /// A collection, seen from the piece of the walk that goes on: it lies `beyond` steps from step `branch`.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub(super) struct Collected {
+pub(super) struct CollectionPoint {
     pub branch: u64,
     pub beyond: u64,
 }
 
 impl WalkState {
     /// Keeps where the walk stands as a place to go back to.
-    pub fn keep(&mut self, checkpoint: &Checkpoint, bias: BiasState) {
-        if self.good.len() == KEPT_CHECKPOINTS {
+    pub fn keep_checkpoint(&mut self, checkpoint: &Checkpoint, bias: BiasState) {
+        if self.good.len() == MAX_CHECKPOINTS {
             self.good.remove(0);
         }
         self.good.push((checkpoint.clone(), bias));
@@ -55,7 +55,7 @@ impl WalkState {
 
     /// The first offer after a return to `step`. The gap to a collection counts along the path that joins the two: back
     /// from the collection, as far as it lies on an abandoned piece, and forward again.
-    pub fn offer_after_return(&mut self, step: u64, settings: &WalkSettings) -> u64 {
+    pub fn offer_after_rollback(&mut self, step: u64, settings: &WalkSettings) -> u64 {
         for collected in self.collected.iter_mut().filter(|collected| collected.branch > step) {
             collected.beyond += collected.branch - step;
             collected.branch = step;
@@ -66,7 +66,7 @@ impl WalkState {
 }
 
 /// The start of a walk: thermal velocities at the seed structure.
-pub(super) fn begin(
+pub(super) fn start(
     settings: &WalkSettings,
     assignment: &Assignment,
     potential: &mut BiasedPotential,

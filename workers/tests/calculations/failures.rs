@@ -5,12 +5,12 @@ use std::fs;
 use store::JobState;
 use workers::labeller::LabellerSettings;
 
-use super::place::*;
+use super::fixture::*;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn each_failure_climbs_its_ladder_with_everything_written_down() {
     let script = "cat remedies; grep -q other_algorithm remedies || exit 3; echo -7.5 > energy";
-    let place = Place::new(1, script).await;
+    let place = Fixture::new(1, script).await;
     place.work().await;
     let attempts = place.attempts().await;
     let failed = ("failed", Some("not_converged"));
@@ -31,7 +31,7 @@ async fn each_failure_climbs_its_ladder_with_everything_written_down() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_no_remedy_helps_against_is_given_up_and_others_go_on() {
-    let place = Place::new(2, "[ $(cat $HERE/begun | wc -l) -gt 4 ] || exit 3; echo -7.5 > energy").await;
+    let place = Fixture::new(2, "[ $(cat $HERE/begun | wc -l) -gt 4 ] || exit 3; echo -7.5 > energy").await;
     let attempts = |settings: &mut LabellerSettings| settings.attempts = 100;
     place.labeller_with(attempts).await.ended().await.unwrap();
     // Three rungs, and the first try.
@@ -50,7 +50,7 @@ async fn what_no_remedy_helps_against_is_given_up_and_others_go_on() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_time_limit_ends_everything_and_is_doubled_once() {
-    let mut place = Place::new(1, "sleep 1000 & setsid sleep 1000 & sleep 1000").await;
+    let mut place = Fixture::new(1, "sleep 1000 & setsid sleep 1000 & sleep 1000").await;
     place.running.time_limit = 0.4;
     place.work().await;
     let attempts = place.attempts().await;
@@ -65,7 +65,7 @@ async fn the_time_limit_ends_everything_and_is_doubled_once() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_has_to_end_is_asked_first_and_then_killed() {
     let script = "trap 'echo asked >> $HERE/asked' TERM; while true; do sleep 1000; done";
-    let mut place = Place::new(1, script).await;
+    let mut place = Fixture::new(1, script).await;
     place.running.time_limit = 0.4;
     place.work().await;
     assert_eq!(outcomes(&place.attempts().await), [("failed", Some("time_limit")); 2]);
@@ -77,7 +77,7 @@ async fn what_has_to_end_is_asked_first_and_then_killed() {
 async fn too_much_memory_of_all_processes_together_ends_it() {
     // `tail` keeps a line that never ends; two of them have twice as much.
     let hungry = "head -c 60000000 /dev/zero | tail -n 1 | { sleep 2; cat > /dev/null; }";
-    let mut place = Place::new(1, &format!("({hungry}) & ({hungry}) & wait; echo -7.5 > energy")).await;
+    let mut place = Fixture::new(1, &format!("({hungry}) & ({hungry}) & wait; echo -7.5 > energy")).await;
     place.running.memory = Some(0.09);
     place.work().await;
     let attempts = place.attempts().await;
@@ -88,7 +88,7 @@ async fn too_much_memory_of_all_processes_together_ends_it() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_program_that_cannot_be_started_is_the_hosts_fault_and_not_the_jobs() {
-    let mut place = Place::new(1, "").await;
+    let mut place = Fixture::new(1, "").await;
     place.script = "no-such-program at all".to_owned();
     let error = place.labeller().await.ended().await.unwrap_err();
     assert!(error.to_string().contains("cannot use no-such-program"), "{error}");
@@ -101,7 +101,7 @@ async fn a_program_that_cannot_be_started_is_the_hosts_fault_and_not_the_jobs() 
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn another_version_of_a_program_is_the_hosts_fault_and_not_the_jobs() {
-    let mut place = Place::new(1, "exit 4").await;
+    let mut place = Fixture::new(1, "exit 4").await;
     let error = place.labeller().await.ended().await.unwrap_err();
     assert_eq!(error.to_string(), "cannot use sh (calculated by script 2, and not 1)");
     let job = place.job().await;

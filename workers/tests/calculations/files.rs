@@ -4,17 +4,19 @@ use std::fs;
 
 use dft::Original;
 use store::JobState;
-use workers::labeller::{Keep, LabelBounds, label_once};
+use workers::labeller::{KeepDirectories, LabelBounds, label_structure};
 
-use super::place::*;
+use super::fixture::*;
 use crate::common::structure;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn directories_of_failures_are_kept_in_the_store() {
     let script =
         "mkdir deep; echo x > deep/file; head -c 20000000 /dev/zero > large; echo Zr > POTCAR; exit 3";
-    for (keep, archives) in [(Keep::Nothing, 0), (Keep::Failed, 4), (Keep::All, 4)] {
-        let mut place = Place::new(1, script).await;
+    for (keep, archives) in
+        [(KeepDirectories::Nothing, 0), (KeepDirectories::Failed, 4), (KeepDirectories::All, 4)]
+    {
+        let mut place = Fixture::new(1, script).await;
         place.running.keep = keep;
         place.work().await;
         let job = place.job().await.job.job;
@@ -38,7 +40,7 @@ async fn directories_of_failures_are_kept_in_the_store() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_file_that_is_replaced_between_two_labels_ends_the_labeller() {
     let script = "cat ../data/setup > energy; echo -8.5 > $HERE/new; mv $HERE/new $HERE/setup";
-    let place = Place::with_setup(2, script, "-7.5\n").await;
+    let place = Fixture::with_setup(2, script, "-7.5\n").await;
     let error = place.labeller().await.ended().await.unwrap_err().to_string();
     let path = place.setup_path().display().to_string();
     let (new, _) = Original::hashed(place.setup_path()).unwrap();
@@ -53,8 +55,10 @@ async fn a_file_that_is_replaced_between_two_labels_ends_the_labeller() {
     assert_eq!((job.job.state, job.job.failures), (JobState::Queued, 0));
     assert_eq!(job.attempts_made[0].calculation, None);
     place.nothing_is_left();
-    let once =
-        label_once(&place.method(), &structure(0.0), &LabelBounds::default()).await.map(drop).unwrap_err();
+    let once = label_structure(&place.method(), &structure(0.0), &LabelBounds::default())
+        .await
+        .map(drop)
+        .unwrap_err();
     assert_eq!(once.to_string(), error);
     // The file of the protocol comes back.
     fs::write(place.setup_path(), "-7.5\n").unwrap();
@@ -66,7 +70,7 @@ async fn a_file_that_is_replaced_between_two_labels_ends_the_labeller() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_is_under_way_has_a_copy_of_its_own() {
     let script = "while [ ! -e $HERE/go ]; do sleep 0.01; done; cat ../data/setup > energy";
-    let place = Place::with_setup(1, script, "-7.5\n").await;
+    let place = Fixture::with_setup(1, script, "-7.5\n").await;
     let labeller = place.labeller().await;
     place.wait_until_begun(1).await;
     labeller.kill(&place).await;
@@ -80,8 +84,8 @@ async fn what_is_under_way_has_a_copy_of_its_own() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn copies_of_files_are_not_kept_in_the_store() {
-    let mut place = Place::with_setup(1, "cat ../data/setup > energy", "-7.5\n").await;
-    place.running.keep = Keep::All;
+    let mut place = Fixture::with_setup(1, "cat ../data/setup > energy", "-7.5\n").await;
+    place.running.keep = KeepDirectories::All;
     place.work().await;
     let kept = place.store.archives(place.job().await.job.job).await.unwrap();
     assert_eq!(kept[0].left_out, "data/setup (5 bytes)\n");

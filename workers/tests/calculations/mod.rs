@@ -2,15 +2,15 @@
 
 mod failures;
 mod files;
-mod going_on;
-mod place;
+mod fixture;
+mod resumption;
 
 use std::fs;
 
 use dft::FailureClass;
-use place::*;
-use store::{Standing, unix_milliseconds};
-use workers::labeller::{LabelBounds, keep, label_once};
+use fixture::*;
+use store::{LabelStatus, unix_milliseconds};
+use workers::labeller::{LabelBounds, label_structure, run_calculation};
 
 use crate::common::{ATOMS, structure};
 
@@ -18,16 +18,16 @@ use crate::common::{ATOMS, structure};
 #[test]
 #[ignore = "keeps the calculations of the other tests"]
 fn keeper() {
-    keep().unwrap();
+    run_calculation().unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_label_comes_with_all_that_is_known_of_it() {
     let script = "echo said; echo warned >&2; echo $SCRIPT $CALMWALK_CORES; sleep 0.2; echo -7.5 > energy";
-    let place = Place::new(1, script).await;
+    let place = Fixture::new(1, script).await;
     place.work().await;
     let labels = place.labels().await;
-    assert_eq!((labels.len(), labels[0].standing, labels[0].label.energy), (1, Standing::Label, -7.5));
+    assert_eq!((labels.len(), labels[0].status, labels[0].label.energy), (1, LabelStatus::Label, -7.5));
     let details = &labels[0].label.details;
     assert_eq!(
         (details.magnetic_moments.as_deref(), details.electronic_steps),
@@ -54,8 +54,8 @@ async fn a_label_comes_with_all_that_is_known_of_it() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn one_structure_is_labelled_without_a_campaign() {
-    let place = Place::new(1, "echo said; sleep 0.1; echo -7.5 > energy").await;
-    let once = label_once(&place.method(), &structure(0.0), &LabelBounds::default()).await.unwrap();
+    let place = Fixture::new(1, "echo said; sleep 0.1; echo -7.5 > energy").await;
+    let once = label_structure(&place.method(), &structure(0.0), &LabelBounds::default()).await.unwrap();
     assert_eq!(once.result.unwrap().energy, -7.5);
     assert!(
         once.core_seconds >= 0.3 && said(Some(&once.log)) == "stdout:\nsaid\n",
@@ -63,8 +63,8 @@ async fn one_structure_is_labelled_without_a_campaign() {
         once.core_seconds,
         once.log
     );
-    let failing = Place::new(1, "echo said; exit 3").await;
-    let once = label_once(&failing.method(), &structure(0.0), &LabelBounds::default()).await.unwrap();
+    let failing = Fixture::new(1, "echo said; exit 3").await;
+    let once = label_structure(&failing.method(), &structure(0.0), &LabelBounds::default()).await.unwrap();
     assert_eq!(
         (once.result.unwrap_err().class, said(Some(&once.log)).as_str()),
         (FailureClass::NotConverged, "stdout:\nsaid\n")

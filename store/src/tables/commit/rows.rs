@@ -96,7 +96,7 @@ pub(super) struct Rows {
 }
 
 impl Rows {
-    pub fn of(commit: &Commit) -> Result<Self> {
+    pub fn from_commit(commit: &Commit) -> Result<Self> {
         let mut rows = Self {
             decisions: commit.decisions.iter().zip(1..).map(decision).collect::<Result<_>>()?,
             structures: Vec::new(),
@@ -223,18 +223,18 @@ fn candidate_counts(commit: &Commit) -> Vec<Row> {
 /// Candidates with the place of the decision about each, from 1.
 fn decided(commit: &Commit) -> Result<HashMap<String, i64>> {
     let mut decided = HashMap::new();
-    for (decision, place) in commit.decisions.iter().zip(1..) {
+    for (decision, number) in commit.decisions.iter().zip(1..) {
         let id = decision.candidate.map(|id| id.to_string());
-        if let Some(twice) = id.filter(|id| decided.insert(id.clone(), place).is_some()) {
+        if let Some(twice) = id.filter(|id| decided.insert(id.clone(), number).is_some()) {
             return Err(StoreError::Inconsistent(format!("two decisions about candidate {twice}")));
         }
     }
     Ok(decided)
 }
 
-fn decision((decision, place): (&Decision, i64)) -> Result<Row> {
+fn decision((decision, number): (&Decision, i64)) -> Result<Row> {
     Ok(vec![
-        place.into(),
+        number.into(),
         integer("round", decision.round)?.into(),
         decision.kind.into(),
         decision.walk.map(|walk| walk.0).into(),

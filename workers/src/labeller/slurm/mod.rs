@@ -9,8 +9,8 @@
 //! (`MinJobAge`): one that it does not know is over, and what Slurm wrote into the job's log before tells why.
 
 mod script;
-mod shared;
-mod told;
+mod squeue;
+mod squeue_cache;
 
 use std::ffi::OsStr;
 use std::fs;
@@ -25,40 +25,40 @@ use store::StoreError;
 use tokio::sync::OnceCell;
 use tokio::time::sleep;
 
-use super::begun::Found;
+use super::calculation_handle::CalculationState;
+use super::calculation_runner::CalculationEnd;
 use super::code::file;
-use super::keeper::End;
-use super::private;
-use told::{Told, Traces};
+use super::private_directory;
+use squeue::{SqueueJob, Traces};
 
-pub(super) use script::{Wanted, write};
-pub(super) use shared::forget;
+pub(super) use script::{JobRequirements, write};
+pub(super) use squeue_cache::remove_cache;
 
 /// Made in the directory by the job that calculates.
 const BEGUN: &str = "begun";
 /// What the job is told to do.
 const SCRIPT: &str = "job.sh";
 /// What its keeper reads.
-const ORDER: &str = "order.json";
+const REQUEST: &str = "order.json";
 /// What Slurm and the script say.
 const LOG: &str = "slurm.log";
 
 /// No answer is waited for for longer.
-const PATIENCE: Duration = Duration::from_secs(60);
+const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
 /// Between two looks at the directory of a calculation that has just begun …
-const SHORTEST_PAUSE: Duration = Duration::from_millis(50);
+const MIN_POLL_INTERVAL: Duration = Duration::from_millis(50);
 /// … and of one that has lasted for a while.
-const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+const MAX_POLL_INTERVAL: Duration = Duration::from_secs(2);
 /// Between two questions to Slurm.
-const LOOK: Duration = Duration::from_secs(20);
+const SQUEUE_INTERVAL: Duration = Duration::from_secs(20);
 /// What a node has written may be seen here so much later.
-const SETTLING: Duration = Duration::from_secs(2);
+const SETTLE_TIME: Duration = Duration::from_secs(2);
 /// Between two tries to submit …
-const PAUSE: Duration = Duration::from_secs(3);
+const RETRY_INTERVAL: Duration = Duration::from_secs(3);
 /// … of which so many may be refused, though Slurm answers.
-const TRIES: u32 = 3;
+const MAX_REFUSALS: u32 = 3;
 /// How long a cancelled job may take to end, before its directory is left for later.
-const ENDING: Duration = Duration::from_secs(5);
+const CANCEL_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// What finds a job again.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -85,13 +85,13 @@ pub(super) struct Slurm {
 impl Slurm {
     /// Slurm's commands, with the variables of this environment that programs get: `sbatch` gives its own to its job.
     pub fn new(passed: &PassedEnvironment) -> Self {
-        let of_slurm = |name: &OsStr| {
+        let is_slurm_variable = |name: &OsStr| {
             let name = name.to_string_lossy();
             name.starts_with("SBATCH_") || name == "SLURM_JWT"
         };
-        let own = std::env::vars_os().filter(|(name, _)| of_slurm(name));
+        let own = std::env::vars_os().filter(|(name, _)| is_slurm_variable(name));
         let environment = passed.of_this_process().chain(own).collect();
-        let commands = Commands::with_patience(PATIENCE).with_environment(environment);
+        let commands = Commands::with_patience(COMMAND_TIMEOUT).with_environment(environment);
         Self { commands, cluster: OnceCell::new() }
     }
 
@@ -118,84 +118,85 @@ impl Slurm {
             }
             refused += 1;
             // There may be no node beside those that are avoided.
-            let again = script::avoid_none(&job.directory).map_err(|error| file(&job.directory, error))?;
-            if refused >= TRIES && !again {
+            let again =
+                script::clear_excluded_nodes(&job.directory).map_err(|error| file(&job.directory, error))?;
+            if refused >= MAX_REFUSALS && !again {
                 return Err(cannot(job, format_args!("its job cannot be submitted: {error}")));
             }
-            sleep(PAUSE).await;
+            sleep(RETRY_INTERVAL).await;
         }
     }
 
-    pub async fn look(&self, job: &Job) -> Result<Found, StoreError> {
-        if job.directory.symlink_metadata().is_ok() && !private::is_own(&job.directory) {
+    pub async fn inspect(&self, job: &Job) -> Result<CalculationState, StoreError> {
+        if job.directory.symlink_metadata().is_ok() && !private_directory::is_own(&job.directory) {
             // Another user has made one of that name after it was gone, or has submitted the job.
-            return Ok(Found::Elsewhere);
+            return Ok(CalculationState::Elsewhere);
         }
-        if let Some(end) = End::read(&job.directory) {
-            return Ok(Found::Ended(end));
+        if let Some(end) = CalculationEnd::read(&job.directory) {
+            return Ok(CalculationState::Ended(end));
         }
         let others = job.user.is_some_and(|user| user != own_user());
         if others || self.cluster(&job.directory).await? != job.cluster {
-            return Ok(Found::Elsewhere);
+            return Ok(CalculationState::Elsewhere);
         }
         let jobs = self.jobs(job).await?;
-        let lives = jobs.iter().any(|told| told.phase() != Phase::Over);
+        let lives = jobs.iter().any(|reported| reported.phase() != Phase::Over);
         match (lives, job.directory.is_dir()) {
-            (true, true) => Ok(Found::Running),
+            (true, true) => Ok(CalculationState::Running),
             (true, false) => Err(cannot(
                 job,
                 format_args!(
-                    "job '{}' is at work there, and it cannot be seen from here: {SHARED}",
+                    "job '{}' is at work there, and it cannot be seen from here: {SCRATCH_NOT_SHARED}",
                     job.name
                 ),
             )),
-            (false, false) => Ok(Found::Gone),
-            (false, true) => self.over(job, &jobs).await,
+            (false, false) => Ok(CalculationState::Gone),
+            (false, true) => self.finished_job(job, &jobs).await,
         }
     }
 
     /// What is left of a job that is over, or that Slurm does not know.
-    async fn over(&self, job: &Job, jobs: &[Told]) -> Result<Found, StoreError> {
+    async fn finished_job(&self, job: &Job, jobs: &[SqueueJob]) -> Result<CalculationState, StoreError> {
         settle(&job.directory).await;
-        if let Some(end) = End::read(&job.directory) {
-            return Ok(Found::Ended(end));
+        if let Some(end) = CalculationEnd::read(&job.directory) {
+            return Ok(CalculationState::Ended(end));
         }
         let begun = job.directory.join(BEGUN).is_dir();
-        let told = told::last(jobs);
-        match told {
-            None if !begun => return Ok(Found::Ready),
-            Some(told) if !begun && told.ran_to_its_end() => {
-                let message = format!("{told}, where that is not seen: {SHARED}");
+        let reported = squeue::most_informative(jobs);
+        match reported {
+            None if !begun => return Ok(CalculationState::Ready),
+            Some(reported) if !begun && reported.ran_to_its_end() => {
+                let message = format!("{reported}, where that is not seen: {SCRATCH_NOT_SHARED}");
                 return Err(cannot(job, message));
             }
             _ => {}
         }
         // Slurm forgets it before long.
-        let end = told::end(told, &Traces::read(&job.directory));
+        let end = squeue::infer_end(reported, &Traces::read(&job.directory));
         end.write(&job.directory).map_err(|error| file(&job.directory, error))?;
-        Ok(Found::Ended(end))
+        Ok(CalculationState::Ended(end))
     }
 
     /// Waits for the end, and submits the job should Slurm not know it; `None` if it was cleared away.
-    pub async fn end(&self, job: &Job) -> Result<Option<End>, StoreError> {
-        let (mut pause, mut asked) = (SHORTEST_PAUSE, Instant::now());
+    pub async fn wait(&self, job: &Job) -> Result<Option<CalculationEnd>, StoreError> {
+        let (mut pause, mut asked) = (MIN_POLL_INTERVAL, Instant::now());
         loop {
-            if let Some(end) = End::read(&job.directory) {
+            if let Some(end) = CalculationEnd::read(&job.directory) {
                 return Ok(Some(end));
             }
-            if asked.elapsed() >= LOOK {
-                if !shared::lives(&self.commands, job).await {
-                    match self.look(job).await? {
-                        Found::Ended(end) => return Ok(Some(end)),
-                        Found::Ready => self.submit(job).await?,
-                        Found::Running => {}
-                        Found::Gone | Found::Elsewhere => return Ok(None),
+            if asked.elapsed() >= SQUEUE_INTERVAL {
+                if !squeue_cache::is_alive(&self.commands, job).await {
+                    match self.inspect(job).await? {
+                        CalculationState::Ended(end) => return Ok(Some(end)),
+                        CalculationState::Ready => self.submit(job).await?,
+                        CalculationState::Running => {}
+                        CalculationState::Gone | CalculationState::Elsewhere => return Ok(None),
                     }
                 }
                 asked = Instant::now();
             }
             sleep(pause).await;
-            pause = (pause * 5 / 4).min(LONGEST_PAUSE);
+            pause = (pause * 5 / 4).min(MAX_POLL_INTERVAL);
         }
     }
 
@@ -205,34 +206,37 @@ impl Slurm {
         let begun = Instant::now();
         loop {
             let jobs = self.ask(job).await.map_err(|error| cannot(job, error))?;
-            let living = jobs.iter().filter(|told| told.phase() != Phase::Over);
+            let living = jobs.iter().filter(|reported| reported.phase() != Phase::Over);
             // What ends was told so before.
-            let ids: Vec<_> =
-                living.filter(|told| told.phase() != Phase::Completing).map(|told| told.id).collect();
+            let ids: Vec<_> = living
+                .filter(|reported| reported.phase() != Phase::Completing)
+                .map(|reported| reported.id)
+                .collect();
             self.commands.cancel(&ids).await.map_err(|error| cannot(job, error))?;
-            if jobs.iter().all(|told| told.phase() == Phase::Over) || begun.elapsed() > ENDING {
+            if jobs.iter().all(|reported| reported.phase() == Phase::Over) || begun.elapsed() > CANCEL_TIMEOUT
+            {
                 return Ok(());
             }
-            sleep(SHORTEST_PAUSE * 4).await;
+            sleep(MIN_POLL_INTERVAL * 4).await;
         }
     }
 
     /// What Slurm says of the job, however long it takes to say something.
-    async fn jobs(&self, job: &Job) -> Result<Vec<Told>, StoreError> {
+    async fn jobs(&self, job: &Job) -> Result<Vec<SqueueJob>, StoreError> {
         loop {
             match self.ask(job).await {
                 Ok(jobs) => return Ok(jobs),
                 Err(error) if error.is_missing() => return Err(cannot(job, error)),
-                Err(_) => sleep(LOOK).await,
+                Err(_) => sleep(SQUEUE_INTERVAL).await,
             }
         }
     }
 
-    async fn ask(&self, job: &Job) -> Result<Vec<Told>, SlurmError> {
+    async fn ask(&self, job: &Job) -> Result<Vec<SqueueJob>, SlurmError> {
         let name = format!("--name={}", job.name);
-        let text = self.commands.queue(Told::FORMAT, &["--states=all", &name]).await?;
-        let jobs: Vec<_> = text.lines().map(Told::parse).collect::<Result<_, _>>()?;
-        Ok(jobs.into_iter().filter(|told| !told.was_refused()).collect())
+        let text = self.commands.queue(SqueueJob::FORMAT, &["--states=all", &name]).await?;
+        let jobs: Vec<_> = text.lines().map(SqueueJob::parse).collect::<Result<_, _>>()?;
+        Ok(jobs.into_iter().filter(|reported| !reported.was_refused()).collect())
     }
 
     async fn cluster(&self, directory: &Path) -> Result<&str, StoreError> {
@@ -241,7 +245,7 @@ impl Slurm {
                 Err(error) if error.is_missing() => {
                     return Err(file(directory, io::Error::other(error.to_string())));
                 }
-                Err(_) => sleep(PAUSE).await,
+                Err(_) => sleep(RETRY_INTERVAL).await,
                 Ok(cluster) => return Ok(cluster),
             }
         };
@@ -249,7 +253,8 @@ impl Slurm {
     }
 }
 
-const SHARED: &str = "label.scratch has to be a directory that this host and every node see by the same name";
+const SCRATCH_NOT_SHARED: &str =
+    "label.scratch has to be a directory that this host and every node see by the same name";
 
 fn own_user() -> u32 {
     rustix::process::getuid().as_raw()
@@ -261,7 +266,7 @@ fn cannot(job: &Job, why: impl ToString) -> StoreError {
 
 /// Lets what other hosts have written into a directory be seen: a network file system looks again where something was made.
 async fn settle(directory: &Path) {
-    sleep(SETTLING).await;
+    sleep(SETTLE_TIME).await;
     let new = directory.join("look");
     // A program may have left something of that name, and a pipe would hold this up.
     let _ = fs::File::create_new(&new).and_then(|_| fs::remove_file(&new));
@@ -281,6 +286,9 @@ mod tests {
             user: Some(own_user() + 1),
             node: None,
         };
-        assert_eq!(Slurm::new(&PassedEnvironment::default()).look(&job).await.unwrap(), Found::Elsewhere);
+        assert_eq!(
+            Slurm::new(&PassedEnvironment::default()).inspect(&job).await.unwrap(),
+            CalculationState::Elsewhere
+        );
     }
 }

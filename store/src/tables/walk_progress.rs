@@ -1,0 +1,78 @@
+//! How fast walks advance: written every few seconds by whoever leads the campaign, read by those who watch.
+
+use serde_json::{Value as Json, json};
+
+use super::protocols::set_campaign_value;
+use crate::Store;
+use crate::database::{Transaction, Value, execute_rows, query};
+use crate::error::Result;
+use crate::walk_progress::WalkProgress;
+
+/// A walk that has not been heard of for so long (ms) has no walk.
+const FRESH: i64 = 60_000;
+
+/// Under which name the campaign has the sum.
+const ALL: &str = "pace";
+
+const COLUMNS: [&str; 9] = [
+    "walk",
+    "seen",
+    "segment",
+    "step",
+    "steps_per_second",
+    "tau",
+    "temperature",
+    "relative_volume",
+    "gamma_max",
+];
+
+const UPSERT: &str = "INSERT INTO pace ({columns}) SELECT * FROM {rows} WHERE TRUE
+    ON CONFLICT (walk) DO UPDATE SET {excluded}";
+
+impl Store {
+    /// Says how these walks advance, and how many steps a second all of them together make.
+    pub async fn set_walk_progress(&self, walks: &[WalkProgress], all: Option<f64>, now: i64) -> Result<()> {
+        let row = |walk: &WalkProgress| {
+            let integer = |number: i64| Value::Integer(Some(number));
+            let step = i64::try_from(walk.step).unwrap_or(i64::MAX);
+            vec![
+                integer(walk.walk.into()),
+                integer(walk.seen),
+                integer(walk.segment.into()),
+                integer(step),
+                Value::Real(finite(walk.steps_per_second)),
+                Value::Real(finite(walk.tau)),
+                Value::Real(finite(walk.temperature)),
+                Value::Real(finite(walk.relative_volume)),
+                Value::Real(finite(walk.gamma_max)),
+            ]
+        };
+        let mut transaction = self.database.begin_to_lead().await?;
+        execute_rows(&mut transaction, UPSERT, &COLUMNS, walks.iter().map(row).collect()).await?;
+        let all = json!({ "time": now, "steps_per_second": all }).to_string();
+        set_campaign_value(&mut transaction, ALL, &all).await?;
+        transaction.commit().await
+    }
+}
+
+/// SQLite has no number that is none.
+fn finite(number: Option<f64>) -> Option<f64> {
+    number.filter(|number| number.is_finite())
+}
+
+/// Those of walks that were heard of within the last minute; none in tables of an earlier version.
+pub(super) async fn fresh(transaction: &mut Transaction, now: i64) -> Result<Vec<WalkProgress>> {
+    if !transaction.has_table("pace").await? {
+        return Ok(Vec::new());
+    }
+    query("SELECT * FROM pace WHERE seen > $1 ORDER BY walk").bind(now - FRESH).fetch_all(transaction).await
+}
+
+/// Steps that all walks together make a second; none if that was not heard of within the last minute.
+pub(super) async fn total_steps_per_second(transaction: &mut Transaction, now: i64) -> Result<Option<f64>> {
+    let found = query("SELECT value FROM campaign WHERE key = $1").bind(ALL);
+    let found: Option<String> = found.fetch_optional(transaction).await?;
+    let found: Json = found.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
+    let is_fresh = found["time"].as_i64().is_some_and(|time| time > now - FRESH);
+    Ok(found["steps_per_second"].as_f64().filter(|_| is_fresh))
+}

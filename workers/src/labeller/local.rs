@@ -1,0 +1,123 @@
+//! A calculation as a process on this host.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, Stdio};
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use store::{is_local, is_running, process_start_time, this_host};
+use tracing::warn;
+
+use super::calculation_handle::CalculationState;
+use super::calculation_runner::{self, Calculation, CalculationEnd, RunnerRequest};
+use super::remove_tree::remove_tree;
+use super::{private_directory, process_tree};
+
+/// Between two looks at a calculation that has just begun …
+const MIN_POLL_INTERVAL: Duration = Duration::from_millis(5);
+/// … and at one that has lasted for a while.
+const MAX_POLL_INTERVAL: Duration = Duration::from_millis(500);
+
+/// What finds a calculation again: its keeper, and where it works.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct LocalCalculation {
+    /// For people.
+    pub host: String,
+    pub directory: PathBuf,
+    pub pid: u32,
+    #[serde(rename = "birth")]
+    pub start_time: String,
+}
+
+/// A keeper that waits for its order.
+pub(super) struct PreparedRunner {
+    pub handle: LocalCalculation,
+    child: Child,
+    stdin: ChildStdin,
+    calculation: Calculation,
+}
+
+impl PreparedRunner {
+    /// Starts the keeper; the calculation itself only begins with [`Self::start`]. Dropped before that, it never does.
+    pub fn spawn(calculation: Calculation) -> io::Result<Self> {
+        let mut runner = calculation.runner.command();
+        // It outlives this process, speaks to no database, and gives its environment to the program.
+        runner.env_clear().envs(calculation.pass_environment.of_this_process());
+        runner.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null());
+        let mut child = runner.spawn()?;
+        let stdin = child.stdin.take().ok_or(io::ErrorKind::BrokenPipe)?;
+        let (pid, directory) = (child.id(), calculation.directory.clone());
+        let start_time =
+            process_start_time(pid).ok_or_else(|| io::Error::other("/proc does not show processes"))?;
+        let handle = LocalCalculation { host: this_host(), directory, pid, start_time };
+        Ok(Self { handle, child, stdin, calculation })
+    }
+
+    pub fn start(self) -> io::Result<Child> {
+        calculation_runner::send_request(self.stdin, &RunnerRequest::Run(self.calculation))?;
+        Ok(self.child)
+    }
+}
+
+impl LocalCalculation {
+    pub fn inspect(&self) -> CalculationState {
+        if is_local(&self.start_time) != Some(true) {
+            return CalculationState::Elsewhere;
+        }
+        if !private_directory::is_own(&self.directory) {
+            // Another user may have made one of that name after it was gone.
+            return if is_running(self.pid, &self.start_time) {
+                CalculationState::Running
+            } else {
+                CalculationState::Gone
+            };
+        }
+        // In this order: the last that a keeper does is to write how the calculation ended.
+        let runs = is_running(self.pid, &self.start_time);
+        match (CalculationEnd::read(&self.directory), runs) {
+            (Some(end), _) => CalculationState::Ended(end),
+            (None, true) => CalculationState::Running,
+            (None, false) => CalculationState::Gone,
+        }
+    }
+
+    /// Waits for the end; `None` if it was broken off.
+    pub async fn wait(&self) -> Option<CalculationEnd> {
+        let mut pause = MIN_POLL_INTERVAL;
+        loop {
+            match self.inspect() {
+                CalculationState::Ended(end) => return Some(end),
+                CalculationState::Running => tokio::time::sleep(pause).await,
+                CalculationState::Ready | CalculationState::Gone | CalculationState::Elsewhere => {
+                    return None;
+                }
+            }
+            pause = (pause * 5 / 4).min(MAX_POLL_INTERVAL);
+        }
+    }
+
+    /// Ends whatever is left of it, and removes its directory.
+    pub fn clear(&self) -> io::Result<()> {
+        process_tree::terminate_process(self.pid, &self.start_time)?;
+        clear(&self.directory)
+    }
+}
+
+/// The same for the directory of a calculation whose keeper is gone.
+pub(super) fn clear(directory: &Path) -> io::Result<()> {
+    process_tree::terminate_marked(directory)?;
+    remove(directory);
+    Ok(())
+}
+
+/// A directory that is gone already is no error. What cannot be removed, or is not this user's, stays: that is no reason for
+/// a labeller to end.
+pub(super) fn remove(directory: &Path) {
+    if fs::symlink_metadata(directory).is_ok() && !private_directory::is_own(directory) {
+        warn!("{} is not removed: it is no directory of this user", directory.display());
+    } else if let Err(error) = remove_tree(directory) {
+        warn!("{} cannot be removed: {error}", directory.display());
+    }
+}

@@ -1,0 +1,246 @@
+//! What Slurm says of a job.
+
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use ::slurm::{Phase, SlurmError};
+use dft::Exit;
+
+use super::super::calculation_runner::{CalculationEnd, EndReason};
+use super::super::log::last_lines;
+use super::{BEGUN, LOG};
+
+/// A job, as `squeue` shows it.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct SqueueJob {
+    pub id: u64,
+    /// In Slurm's words, as `RUNNING`.
+    state: String,
+    /// Where it runs or ran.
+    nodes: String,
+    /// For how long it has run.
+    seconds: f64,
+    /// Why it waits or how it ended.
+    reason: String,
+}
+
+impl SqueueJob {
+    /// What `squeue` is to write about a job.
+    pub const FORMAT: &str = "%i|%T|%N|%M|%r";
+
+    pub fn parse(line: &str) -> Result<Self, SlurmError> {
+        let unreadable = || SlurmError::Unreadable {
+            program: "squeue",
+            found: line.to_owned(),
+            expected: "what --format asks for",
+        };
+        let fields: Vec<_> = line.splitn(5, '|').collect();
+        let [id, state, nodes, time, reason] = fields[..] else { return Err(unreadable()) };
+        Ok(Self {
+            id: id.parse().map_err(|_| unreadable())?,
+            state: state.to_owned(),
+            nodes: nodes.to_owned(),
+            seconds: seconds(time),
+            reason: reason.to_owned(),
+        })
+    }
+
+    pub fn phase(&self) -> Phase {
+        Phase::of(&self.state)
+    }
+
+    /// Whether its script has ended, and was not ended.
+    pub fn ran_to_its_end(&self) -> bool {
+        matches!(self.state.as_str(), "COMPLETED" | "FAILED")
+    }
+
+    /// Whether this is only the trace of a call of `sbatch` that failed: such a job never was.
+    pub fn was_refused(&self) -> bool {
+        self.state == "FAILED" && self.nodes.is_empty()
+    }
+
+    /// What the state alone tells. Where memory is measured and not confined, Slurm calls what it kills for that `FAILED`.
+    fn exit(&self) -> Option<Exit> {
+        match self.state.as_str() {
+            "TIMEOUT" | "DEADLINE" => Some(Exit::TimeLimit),
+            "OUT_OF_MEMORY" => Some(Exit::OutOfMemory),
+            "NODE_FAIL" | "BOOT_FAIL" | "PREEMPTED" => Some(Exit::LostNode),
+            _ => None,
+        }
+    }
+
+    /// The node that may be to blame; those of jobs that somebody has ended are not.
+    fn node(&self) -> Option<String> {
+        let blamed = ["NODE_FAIL", "BOOT_FAIL", "LAUNCH_FAILED", "OUT_OF_MEMORY", "FAILED", "COMPLETED"];
+        let node = blamed.contains(&self.state.as_str()).then(|| self.nodes.clone());
+        node.filter(|node| !node.is_empty())
+    }
+}
+
+impl fmt::Display for SqueueJob {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "job {} is {}", self.id, self.state)?;
+        if !self.nodes.is_empty() {
+            write!(f, " on {}", self.nodes)?;
+        }
+        match self.reason.as_str() {
+            "" | "None" => Ok(()),
+            reason => write!(f, " ({reason})"),
+        }
+    }
+}
+
+/// The one that says most of several of one name: of those that were submitted twice one did nothing.
+pub(super) fn most_informative(jobs: &[SqueueJob]) -> Option<&SqueueJob> {
+    let said_more = jobs.iter().find(|reported| reported.state != "COMPLETED");
+    said_more.or_else(|| jobs.first())
+}
+
+/// What is left of a job in its directory.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Traces {
+    /// The end of what Slurm wrote into its log: why it has ended a job stands there.
+    log: String,
+    /// From its begin to the last words of the log.
+    seconds: f64,
+}
+
+impl Traces {
+    pub fn read(directory: &Path) -> Self {
+        let log = directory.join(LOG);
+        let changed = |path: &Path| fs::metadata(path).and_then(|file| file.modified()).ok();
+        let times = changed(&directory.join(BEGUN)).zip(changed(&log));
+        let lasted = times.and_then(|(begun, ended)| ended.duration_since(begun).ok());
+        Self { log: last_lines(&log), seconds: lasted.unwrap_or_default().as_secs_f64() }
+    }
+
+    fn exit(&self) -> Option<Exit> {
+        let speaks_of = |words: &[&str]| words.iter().any(|words| self.log.contains(words));
+        if speaks_of(&["memory limit", "oom_kill", "oom-kill", "OOM Killed"]) {
+            return Some(Exit::OutOfMemory);
+        }
+        speaks_of(&["DUE TO TIME LIMIT"]).then_some(Exit::TimeLimit)
+    }
+}
+
+/// How the calculation of a job ended that is over, or that Slurm has forgotten, and whose keeper has left no end.
+pub(super) fn infer_end(reported: Option<&SqueueJob>, traces: &Traces) -> CalculationEnd {
+    let mut remark = match reported {
+        Some(reported) => format!("Slurm says: {reported}; its keeper has left no end"),
+        None => "Slurm does not know its job any more, and its keeper has left no end".to_owned(),
+    };
+    if let Some(last) = traces.log.lines().next_back() {
+        remark += &format!("; the job's log ends with: {last}");
+    }
+    let exit = reported.and_then(SqueueJob::exit).or_else(|| traces.exit());
+    CalculationEnd {
+        how: EndReason::Ended(exit.unwrap_or(Exit::LostNode)),
+        program: PathBuf::new(),
+        seconds: reported.map_or(traces.seconds, |reported| reported.seconds),
+        memory: 0,
+        node: reported.and_then(SqueueJob::node),
+        remark: Some(remark),
+    }
+}
+
+/// `1-02:03:04`, `2:03:04` or `3:04`; 0 for what is none of these.
+fn seconds(time: &str) -> f64 {
+    let (days, time) = time.split_once('-').unwrap_or(("0", time));
+    let parts = time.split(':').map(|part| part.parse::<f64>().ok());
+    let sum = parts.reduce(|sum, part| Some(60.0 * sum? + part?)).flatten();
+    let days: Option<f64> = days.parse().ok();
+    sum.zip(days).map_or(0.0, |(sum, days)| 86_400.0 * days + sum)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn reported(state: &str) -> SqueueJob {
+        SqueueJob::parse(&format!("12|{state}|node7|1:01|None")).unwrap()
+    }
+
+    #[test]
+    fn lines_of_squeue_are_read() {
+        let job = SqueueJob::parse("12|RUNNING|node7|1-02:03:04|Node | failure").unwrap();
+        assert_eq!((job.id, job.phase(), job.seconds), (12, Phase::Running, 93_784.0));
+        assert_eq!(job.to_string(), "job 12 is RUNNING on node7 (Node | failure)");
+        assert!(
+            SqueueJob::parse("12|RUNNING|node7").is_err()
+                && SqueueJob::parse("x|RUNNING||0:00|None").is_err()
+        );
+        for (time, expected) in
+            [("0:00", 0.0), ("1:01", 61.0), ("2:03:04", 7384.0), ("INVALID", 0.0), ("", 0.0)]
+        {
+            assert_eq!(seconds(time), expected, "{time}");
+        }
+    }
+
+    #[test]
+    fn a_job_without_an_end_ends_as_slurm_says() {
+        use Exit::{LostNode, OutOfMemory, TimeLimit};
+        let expected = [
+            ("TIMEOUT", TimeLimit, None),
+            ("OUT_OF_MEMORY", OutOfMemory, Some("node7")),
+            ("NODE_FAIL", LostNode, Some("node7")),
+            ("FAILED", LostNode, Some("node7")),
+            ("CANCELLED", LostNode, None),
+            ("PREEMPTED", LostNode, None),
+        ];
+        for (state, exit, node) in expected {
+            let end = infer_end(Some(&reported(state)), &Traces::default());
+            assert_eq!((end.how, end.node.as_deref()), (EndReason::Ended(exit), node), "{state}");
+            assert_eq!(end.seconds, 61.0);
+            assert!(end.remark.unwrap().contains(state));
+        }
+    }
+
+    /// Lines of Slurm 22.05.
+    #[test]
+    fn the_log_tells_what_slurm_has_forgotten() {
+        use Exit::{LostNode, OutOfMemory, TimeLimit};
+        let cancelled = "slurmstepd-n1: error: *** JOB 1 ON n1 CANCELLED AT 2026-11-22T12:06:38";
+        let memory = "slurmstepd-n1: error: StepId=1.batch exceeded memory limit (434741248 > 104857600), being killed";
+        let killed = "slurmstepd: error: Detected 1 oom_kill event in StepId=1.batch. Some of the step tasks have been OOM Killed.";
+        let logs = [
+            (String::new(), LostNode),
+            (format!("{cancelled} ***"), LostNode),
+            (format!("{cancelled} DUE TO NODE FAILURE, SEE SLURMCTLD LOG FOR DETAILS ***"), LostNode),
+            (format!("{cancelled} DUE TO TIME LIMIT ***"), TimeLimit),
+            (format!("{memory}\n{cancelled} ***"), OutOfMemory),
+            (killed.to_owned(), OutOfMemory),
+        ];
+        for (log, exit) in logs {
+            let traces = Traces { log: log.clone(), seconds: 7.0 };
+            let forgotten = infer_end(None, &traces);
+            assert_eq!(
+                (forgotten.how, forgotten.seconds, forgotten.node),
+                (EndReason::Ended(exit), 7.0, None)
+            );
+            assert!(forgotten.remark.unwrap().ends_with(log.lines().last().unwrap_or("no end")));
+            // What Slurm itself has no word for.
+            assert_eq!(infer_end(Some(&reported("FAILED")), &traces).how, EndReason::Ended(exit), "{log}");
+            assert_eq!(
+                infer_end(Some(&reported("TIMEOUT")), &traces).how,
+                EndReason::Ended(TimeLimit),
+                "{log}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_job_that_slurm_refused_never_was() {
+        let refused = SqueueJob::parse("3|FAILED||0:00|BadConstraints").unwrap();
+        assert!(refused.was_refused() && !reported("FAILED").was_refused());
+        assert!(!SqueueJob::parse("3|CANCELLED||0:00|None").unwrap().was_refused());
+    }
+
+    #[test]
+    fn of_two_jobs_of_one_name_the_one_counts_that_did_something() {
+        let jobs = [reported("COMPLETED"), reported("TIMEOUT")];
+        assert_eq!(most_informative(&jobs), Some(&jobs[1]));
+        assert_eq!(most_informative(&jobs[..1]), Some(&jobs[0]));
+        assert_eq!(most_informative(&[]), None);
+    }
+}

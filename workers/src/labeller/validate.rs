@@ -1,0 +1,156 @@
+//! Which results are believed.
+
+use analysis::EnergyOffsets;
+use atoms::cell::norm;
+use atoms::{Matrix3, Structure, Vec3};
+use dft::{Calculated, Failure, FailureClass};
+use serde::{Deserialize, Serialize};
+
+use super::energies::labelled_energy;
+
+/// So many labelled structures have to speak for a composition before an energy is held against them.
+const LEAST_SUPPORT: f64 = 5.0;
+/// eV/Å³ in GPa.
+const GPA: f64 = 160.217_663_4;
+
+/// `[label]`: the largest values that are believed of a label.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct LabelBounds {
+    /// Force, eV/Å.
+    pub largest_force: f64,
+    /// Component of the stress, eV/Å³.
+    pub largest_stress: f64,
+    /// Energy, whatever its sign, eV an atom.
+    pub largest_energy: f64,
+    /// Difference from the potential's energy without the elements' offsets, eV an atom.
+    pub largest_energy_difference: f64,
+}
+
+impl Default for LabelBounds {
+    fn default() -> Self {
+        Self {
+            largest_force: 1000.0,
+            largest_stress: 10.0,
+            // No element's all-electron energy is larger.
+            largest_energy: 2e6,
+            largest_energy_difference: 100.0,
+        }
+    }
+}
+
+impl LabelBounds {
+    /// Which bound finite numbers of a label are beyond, in words: energy, eV; forces, [n], eV/Å; stress, eV/Å³.
+    pub fn refuses(&self, energy: f64, forces: &[Vec3], stress: Option<&Matrix3>) -> Option<String> {
+        let larger = |largest: f64, x: f64| if x.abs() > largest.abs() { x } else { largest };
+        let stress = stress.into_iter().flatten().flatten().copied().fold(0.0, larger);
+        let force = forces.iter().map(|force| norm(*force)).fold(0.0, f64::max);
+        self.refuses_energy(energy, forces.len())
+            .or_else(|| self.refuses_stress(stress))
+            .or_else(|| self.refuses_force(force))
+    }
+
+    fn refuses_energy(&self, energy: f64, atoms: usize) -> Option<String> {
+        let (energy, bound) = (energy / atoms.max(1) as f64, self.largest_energy);
+        let (found, largest) = (number(energy), number(bound));
+        (energy.abs() > bound)
+            .then(|| format!("an energy of {found} eV/atom, beyond label.largest_energy = {largest} eV/atom"))
+    }
+
+    fn refuses_stress(&self, stress: f64) -> Option<String> {
+        let bound = self.largest_stress;
+        let (gpa, found, largest) = (number(stress * GPA), number(stress), number(bound));
+        (stress.abs() > bound).then(|| {
+            format!("a stress component of {found} eV/Å³ ({gpa} GPa), beyond label.largest_stress = {largest} eV/Å³")
+        })
+    }
+
+    fn refuses_force(&self, force: f64) -> Option<String> {
+        let (found, largest) = (number(force), number(self.largest_force));
+        (force > self.largest_force)
+            .then(|| format!("a force of {found} eV/Å, beyond label.largest_force = {largest} eV/Å"))
+    }
+}
+
+/// What the energy of a label is compared with.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct EnergyReference<'a> {
+    /// Energy by the potential, eV.
+    pub model: f64,
+    /// Offsets of the elements, from the labels that there are.
+    pub offsets: &'a EnergyOffsets,
+}
+
+/// A result is believed only if its numbers are finite, belong to the atoms asked for and are within bounds. Where too few labels
+/// speak for its composition, its energy is compared with none.
+///
+/// # Errors
+/// [`FailureClass::Implausible`], with what is wrong.
+pub(super) fn validate(
+    made: Calculated,
+    structure: &Structure,
+    bounds: &LabelBounds,
+    expected: Option<EnergyReference<'_>>,
+) -> Result<Calculated, Failure> {
+    let problem = wrong_number(&made, structure.len())
+        .or_else(|| not_finite(&made))
+        .or_else(|| bounds.refuses(made.energy, &made.forces, made.stress.as_ref()))
+        .or_else(|| bounds.refuses_energy(made.energy_without_smearing?, structure.len()))
+        .or_else(|| too_far(&made, structure, bounds, expected?));
+    match problem {
+        Some(problem) => Err(FailureClass::Implausible.because(problem)),
+        None => Ok(made),
+    }
+}
+
+fn wrong_number(made: &Calculated, atoms: usize) -> Option<String> {
+    let moments = made.magnetic_moments.as_ref().map_or(atoms, Vec::len);
+    let lists = [("forces", made.forces.len()), ("magnetic moments", moments)];
+    let (name, found) = lists.into_iter().find(|(_, found)| *found != atoms)?;
+    Some(format!("{found} {name} for {atoms} atoms"))
+}
+
+fn not_finite(made: &Calculated) -> Option<String> {
+    let energies = [Some(made.energy), made.energy_without_smearing];
+    let moments = made.magnetic_moments.iter().flatten().chain(&made.magnetisation);
+    let find = |name, mut numbers: &mut dyn Iterator<Item = f64>| {
+        let found = (&mut numbers).find(|x| !x.is_finite())?;
+        Some(format!("{name} of {found}, which is not a finite number"))
+    };
+    find("an energy", &mut energies.into_iter().flatten())
+        .or_else(|| find("a force", &mut made.forces.iter().flatten().copied()))
+        .or_else(|| find("a stress component", &mut made.stress.iter().flatten().flatten().copied()))
+        .or_else(|| find("a magnetic moment", &mut moments.copied()))
+}
+
+fn too_far(
+    made: &Calculated,
+    structure: &Structure,
+    bounds: &LabelBounds,
+    expected: EnergyReference<'_>,
+) -> Option<String> {
+    let EnergyReference { model, offsets } = expected;
+    let label = labelled_energy(structure, model, made.energy);
+    let difference = -offsets.error_per_atom(&label, LEAST_SUPPORT)?;
+    let bound = bounds.largest_energy_difference;
+    (difference.abs() > bound).then(|| {
+        format!(
+            "an energy that differs by {} eV/atom from the potential's (offsets of the elements, from {} labels, taken out), beyond \
+             label.largest_energy_difference = {} eV/atom",
+            number(difference),
+            offsets.structures(),
+            number(bound)
+        )
+    })
+}
+
+/// A number in a few digits, however large it is.
+fn number(x: f64) -> String {
+    match x.abs() {
+        0.0 | 1e-2..1e7 => format!("{x:.2}").trim_end_matches('0').trim_end_matches('.').to_owned(),
+        _ => format!("{x:.3e}"),
+    }
+}
+
+#[cfg(test)]
+mod tests;
