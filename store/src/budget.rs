@@ -1,4 +1,4 @@
-//! What a campaign may use up, and what it has.
+//! Budgets of a campaign and their use.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,24 +8,24 @@ use serde::{Deserialize, Serialize};
 pub struct Budget {
     /// Labels that are made.
     pub labels: Option<u64>,
-    /// Hours of label attempts, each on one core.
+    /// Core-hours of label attempts.
     pub core_hours: Option<f64>,
-    /// Hours for which the campaign is under way.
+    /// Wall-clock hours of the campaign's runs.
     pub wall_hours: Option<f64>,
-    /// The key of the configuration that limits the number of structures; the selector sees to that.
+    /// The configuration key that limits the number of structures; the selector enforces that limit.
     pub structures_by: Option<String>,
 }
 
 /// What was used.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct BudgetUse {
-    /// Labels that were made, also such as came too late and were kept beside another.
+    /// Labels made, including late results that were stored as checks.
     pub labels: u64,
     /// Attempts that are under way.
     pub under_way: u64,
-    /// Hours of label attempts, those that are under way so far.
+    /// Core-hours of label attempts, including those in progress.
     pub core_hours: f64,
-    /// Hours for which the campaign was under way, summed over its runs.
+    /// Wall-clock hours, summed over all runs.
     pub wall_hours: f64,
 }
 
@@ -36,17 +36,17 @@ pub struct BudgetStatus {
     pub limits: Budget,
     /// What was used of them.
     pub used: BudgetUse,
-    /// The key of the configuration that ended the campaign.
+    /// The configuration key of the limit that ended the campaign.
     pub used_up: Option<String>,
 }
 
 impl Budget {
-    /// Whether labellers are free to begin what is queued.
+    /// Whether no limit applies to labels.
     pub fn is_none(&self) -> bool {
         self.labels.is_none() && self.core_hours.is_none() && self.wall_hours.is_none()
     }
 
-    /// The key of the limit of time that was reached: walks stop where they stand.
+    /// The configuration key of the time limit that was reached: walks stop where they are.
     pub fn time_used_up(&self, used: &BudgetUse) -> Option<&'static str> {
         let limits = [
             ("budget.wall_hours", self.wall_hours, used.wall_hours),
@@ -56,7 +56,7 @@ impl Budget {
         limits.into_iter().find(reached).map(|(key, ..)| key)
     }
 
-    /// Whether no further attempt may begin: one that is under way may still bring the last label.
+    /// Whether no further attempt may start. A running attempt may still deliver the last label.
     pub fn allows_no_attempt(&self, used: &BudgetUse) -> bool {
         let labels = used.labels + used.under_way;
         self.time_used_up(used).is_some() || self.labels.is_some_and(|limit| labels >= limit)

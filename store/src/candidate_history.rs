@@ -1,4 +1,4 @@
-//! What is told of one candidate or imported structure, as the store keeps it.
+//! What the store knows of one candidate or imported structure.
 
 use atoms::Structure;
 use serde::Serialize;
@@ -7,10 +7,10 @@ use wire::ContentHash;
 use crate::jobs::LabelRecord;
 use crate::records::Protocol;
 
-/// A candidate by its number and its name.
+/// A candidate, by decision and name.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct CandidateRef {
-    /// Number of the decision about it.
+    /// Sequence number of the decision on it.
     pub decision: i64,
     /// Its name.
     pub candidate: String,
@@ -19,7 +19,7 @@ pub struct CandidateRef {
 /// A structure that came with its label.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportedStructure {
-    /// Its number, from 1.
+    /// Its import number, from 1.
     pub number: i64,
     /// The file it came from.
     pub file: String,
@@ -31,7 +31,7 @@ pub struct ImportedStructure {
     pub content: ContentHash,
 }
 
-/// Where else the very same structure stands.
+/// Other occurrences of the same structure.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SameStructure {
     /// Accepted candidates and frames of control walks, in decision order.
@@ -49,7 +49,7 @@ pub struct StructureLabel {
     pub record: LabelRecord,
 }
 
-/// A candidate that was declined as covered under a newer mixture than its walker had seen.
+/// A candidate declined as covered under a newer mixture than its walker had seen.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct CoveredCandidate {
     /// The candidate.
@@ -61,11 +61,11 @@ pub struct CoveredCandidate {
     pub decided: u64,
 }
 
-/// Such candidates, as far as was looked.
+/// Candidates covered later, as far as the search went.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LaterCoveredCandidates {
     /// In decision order.
     pub candidates: Vec<CoveredCandidate>,
-    /// The last decision that was looked at, if there may be more behind it.
+    /// The last decision that was examined, if there may be more after it.
     pub looked_until: Option<i64>,
 }

@@ -1,4 +1,4 @@
-//! Giving space back.
+//! Reclaiming disk space.
 
 use serde_json::json;
 
@@ -9,7 +9,7 @@ use crate::error::Result;
 use crate::tables::logs::insert_operation;
 
 impl Store {
-    /// Bytes that the campaign takes, with its log in SQLite and with its indexes on a server.
+    /// Size of the campaign in bytes, with its write-ahead log in SQLite and with its indexes on a server.
     pub async fn size(&self) -> Result<u64> {
         match &self.database {
             Database::Sqlite(file) => file.size(),
@@ -17,11 +17,12 @@ impl Store {
         }
     }
 
-    /// Writes every table anew without the gaps that changed rows have left. The caller holds the
-    /// [`crate::CampaignLock`]; whoever else writes waits.
+    /// Rewrites every table without the gaps of changed rows. The caller holds the [`crate::CampaignLock`]; other
+    /// writers wait.
     ///
     /// # Errors
-    /// [`crate::StoreError::InsufficientSpace`] where the disk cannot hold the copy that this takes; a server does not tell.
+    /// [`crate::StoreError::InsufficientSpace`] if the disk cannot hold the copy that this needs. A server does not
+    /// report its free space.
     pub async fn compact(&self) -> Result<()> {
         match &self.database {
             Database::Sqlite(file) => file.compact().await,
@@ -29,11 +30,11 @@ impl Store {
         }
     }
 
-    /// Drops the features of declined candidates, which only a replay with other rules needs. The caller holds the
-    /// [`crate::CampaignLock`]. Returns of how many.
+    /// Deletes the features of declined candidates, which only a replay with other rules needs. The caller holds
+    /// the [`crate::CampaignLock`]. Returns the number of candidates.
     pub async fn drop_declined_features(&self, now: i64) -> Result<u64> {
         let mut transaction = self.database.begin_to_lead().await?;
-        // That of no features depends on the number of the candidate.
+        // The checksum of missing features depends on the candidate's number.
         let with = "SELECT candidate.decision FROM candidate CROSS JOIN candidate_data
                     ON candidate_data.decision = candidate.decision
                     WHERE fate = 'declined' AND features IS NOT NULL";

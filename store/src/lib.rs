@@ -1,8 +1,9 @@
-//! The database of a campaign: what was decided, what is queued, what was labelled.
+//! The database of a campaign: decisions, candidates, the mixture, the label queue and labels.
 //!
-//! One directory holds one campaign, or one schema of a server ([`Location`]). Whoever runs it holds the [`CampaignLock`]; anyone may open the [`Store`] beside
-//! it. Every writing function is one transaction that is on the disk when the function returns, so any process
-//! may be killed at any time. No function reads a clock: `now` is ms since 1970, see [`unix_milliseconds`].
+//! A campaign is kept in one directory or in one schema of a server ([`Location`]). The process that runs it holds
+//! the [`CampaignLock`]; any other process may open the [`Store`] at the same time. Every writing function is one
+//! transaction that is on disk when the function returns, so any process may be killed at any time. No function
+//! reads the wall clock: `now` is in ms since 1970, see [`unix_milliseconds`].
 
 mod backup;
 mod budget;
@@ -70,7 +71,7 @@ pub use status::{Candidates, Declined, Labels, Status, WalkStatus};
 pub use store::{SERVER_RECONNECT_TIMEOUT, Store};
 pub use walk_progress::WalkProgress;
 
-/// The time now, ms since 1970.
+/// The current time, ms since 1970.
 pub fn unix_milliseconds() -> i64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     i64::try_from(since.as_millis()).unwrap_or(i64::MAX)

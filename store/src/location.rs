@@ -1,4 +1,4 @@
-//! Where a campaign is kept: a directory of this host, or a server.
+//! Location of a campaign: a directory on this host, or a server.
 
 mod protection;
 
@@ -10,22 +10,23 @@ use sqlx::postgres::PgConnectOptions;
 
 use crate::error::{Result, StoreError};
 
-/// The schema of a database in which a campaign is kept, if the URL names none.
+/// Schema for URLs that name none.
 const SCHEMA: &str = "public";
-/// Longest name of a schema: with what is added to it, it is a name of PostgreSQL, of 63 bytes at most.
+/// Longest schema name: with prefixes it must fit the 63 bytes of a PostgreSQL identifier.
 const LONGEST_SCHEMA: usize = 50;
 
 /// Where a campaign is kept.
 #[derive(Clone, Debug)]
 pub enum Location {
-    /// A directory of this host, with SQLite.
+    /// A directory on this host, with SQLite.
     Directory(PathBuf),
-    /// A schema of a database on a server, with PostgreSQL.
+    /// A database schema on a server, with PostgreSQL.
     Server(ServerUrl),
 }
 
-/// `postgres://user@host:port/database?schema=name` and what libpq takes besides; user, password and so on may also
-/// come from the environment (`PGPASSWORD` and the like) and from `~/.pgpass`. It never shows its password.
+/// `postgres://user@host:port/database?schema=name`, with further libpq parameters. User, password and other
+/// settings may also come from the environment (such as `PGPASSWORD`) and from `~/.pgpass`. Neither `Display` nor
+/// `Debug` shows the password.
 #[derive(Clone)]
 pub struct ServerUrl {
     pub(crate) options: Box<PgConnectOptions>,
@@ -41,12 +42,13 @@ impl ServerUrl {
         &self.shown
     }
 
-    /// Whether a password stands in the URL itself, where it does not belong if the URL is written down.
+    /// Whether the URL itself contains a password. A URL that is written down should not.
     pub fn has_password(&self) -> bool {
         self.has_password
     }
 
-    /// What tells its campaign from others: server, port, database and schema, however the URL says them, and whoever connects.
+    /// Identifies the campaign by server, port, database and schema, independent of the form of the URL and of the
+    /// user.
     pub fn campaign_key(&self) -> String {
         let options = &self.options;
         let host = match options.get_socket() {
@@ -57,14 +59,14 @@ impl ServerUrl {
         format!("{host}:{}/{database}?schema={}", options.get_port(), self.schema)
     }
 
-    /// Whether what is said to the server crosses a network that others may read and change, since the URL says so.
+    /// Whether the connection crosses a network without protection because the URL asks for it.
     pub fn is_unprotected(&self) -> bool {
         self.is_unprotected
     }
 }
 
 impl Location {
-    /// Whether a text means a server rather than a directory.
+    /// Whether a text denotes a server rather than a directory.
     pub fn is_server(text: &str) -> bool {
         text.starts_with("postgres://") || text.starts_with("postgresql://")
     }
@@ -73,14 +75,14 @@ impl Location {
 impl FromStr for Location {
     type Err = StoreError;
 
-    /// A URL that begins with `postgres://` or `postgresql://`; anything else that is no URL is a directory.
+    /// Parses a URL that begins with `postgres://` or `postgresql://`. Any text that is no URL is a directory.
     fn from_str(text: &str) -> Result<Self> {
         let is_url = text.split_once("://").is_some_and(|(scheme, _)| is_scheme(scheme));
         if is_url { Ok(Self::Server(text.parse()?)) } else { Ok(Self::Directory(text.into())) }
     }
 }
 
-/// RFC 3986: a letter, then letters, digits, +, - and full stops.
+/// RFC 3986: a letter, then letters, digits, +, - and dots.
 fn is_scheme(text: &str) -> bool {
     text.starts_with(|c: char| c.is_ascii_alphabetic())
         && text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '+' | '-' | '.'))
@@ -104,7 +106,7 @@ impl FromStr for ServerUrl {
         }
         protection::check_parameters(&plain)
             .map_err(|reason| StoreError::Url { url: shown.clone(), reason })?;
-        // What its parser says may show a part of what it was given.
+        // The parser's own message may show a part of the URL.
         let options: PgConnectOptions = plain.parse().map_err(|_| StoreError::Url {
             url: shown.clone(),
             reason: "it should look like postgres://user@host:5432/database?schema=name".into(),
@@ -131,7 +133,7 @@ impl UrlParts {
         let (scheme, rest) = begin.split_once("://").unwrap_or(("", begin));
         let (mut shown, mut plain) = (String::new(), begin.to_owned());
         let mut has_password = false;
-        // A password may hold any character but '/', '?' and '#', which would end it.
+        // A password may contain any character except '/', '?' and '#', which end it.
         let (authority, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
         match authority.rsplit_once('@') {
             Some((user, host)) => {

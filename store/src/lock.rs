@@ -1,8 +1,8 @@
-//! One process runs a campaign: an advisory lock on the campaign's directory and on a file in it, or of the server. It is
-//! released when the process ends, however it ends.
+//! Only one process runs a campaign: it holds an advisory lock on the campaign's directory and on a file in it, or
+//! on the server. The lock is released when the process ends, in whatever way.
 //!
-//! The file says who holds the lock, and is all that earlier versions know. It can be deleted; the directory cannot be without
-//! the database.
+//! The file names the holder, and earlier versions lock only the file. It can be deleted; the directory cannot be
+//! deleted without the database.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Seek, Write};
@@ -13,10 +13,10 @@ use crate::error::{Result, StoreError};
 use crate::location::Location;
 use crate::postgres::leadership::Leadership;
 
-/// Name of the file that is locked, in the campaign's directory.
+/// Name of the lock file in the campaign's directory.
 pub const LOCK: &str = "campaign.lock";
 
-/// The right to run a campaign, until it is dropped.
+/// The right to run a campaign. Released on drop.
 #[derive(Debug)]
 pub struct CampaignLock(Held);
 
@@ -26,27 +26,27 @@ enum Held {
     Session(Leadership),
 }
 
-/// A directory and the file in it that are locked.
+/// A locked directory and the lock file in it.
 #[derive(Debug)]
 struct DirectoryLock {
     file: File,
-    /// None where directories cannot be locked (NFS): the file is what counts there.
+    /// `None` on file systems that cannot lock directories (NFS); there the file decides.
     directory: Option<File>,
 }
 
 impl Drop for DirectoryLock {
-    /// Shutdown is not enough at once: a process that is just being started has the files too, until its program begins.
+    /// Closing the files is not enough: a child that is being spawned inherits them until it executes its program.
     fn drop(&mut self) {
         for file in self.directory.iter().chain([&self.file]) {
-            // What cannot be unlocked comes free with the last who has the file.
+            // If unlocking fails, the lock is released with the last open file handle.
             let _ = file.unlock();
         }
     }
 }
 
 impl CampaignLock {
-    /// Takes the lock of the campaign in a directory (see [`Self::acquire`]) or on a server, where its tables are made
-    /// if they are not there yet.
+    /// Acquires the lock of a campaign in a directory (see [`Self::acquire`]) or on a server. Creates the tables on
+    /// the server if they do not exist.
     pub async fn acquire_at(location: impl Into<Location>, who: &str) -> Result<Self> {
         match location.into() {
             Location::Directory(directory) => Self::acquire(&directory, who),
@@ -54,8 +54,8 @@ impl CampaignLock {
         }
     }
 
-    /// Waits until the lock is not held any longer, and says who has it. On a server a connection may break; it is taken
-    /// again then, if nobody else had it meanwhile. A file stays locked for as long as its process lives.
+    /// Waits until the lock is lost, and names the new holder. A broken connection to a server is restored if no
+    /// other process took the lock meanwhile. A lock on a directory lasts as long as its process.
     pub async fn lost(&self) -> StoreError {
         match &self.0 {
             Held::Directory { .. } => std::future::pending().await,
@@ -63,7 +63,7 @@ impl CampaignLock {
         }
     }
 
-    /// What tells the transactions of this holder from those of earlier ones.
+    /// The fencing token: it distinguishes transactions of this holder from those of earlier ones.
     pub(crate) fn generation(&self) -> Option<i64> {
         match &self.0 {
             Held::Directory { .. } => None,
@@ -71,8 +71,8 @@ impl CampaignLock {
         }
     }
 
-    /// Takes the lock of the campaign in `directory`, or says who has it. `who` is written into the file beside
-    /// the process number, for the message that a second process gets.
+    /// Acquires the lock of the campaign in `directory`. Writes `who` and the process id into the lock file, for
+    /// the error message that a second process gets.
     pub fn acquire(directory: &Path, who: &str) -> Result<Self> {
         let path = directory.join(LOCK);
         let failed = |source: io::Error| match source.kind() {
@@ -135,7 +135,7 @@ mod tests {
         CampaignLock::acquire(directory.path(), "again").unwrap();
     }
 
-    /// A version that only knows the file.
+    /// An earlier version, which locks only the file.
     #[test]
     fn who_has_only_the_file_is_respected() {
         let directory = tempfile::tempdir().unwrap();

@@ -1,53 +1,53 @@
-//! Which process a process number belongs to: numbers are given out again, moments of birth are not.
+//! Tells processes with the same id apart: the system reuses process ids, but not start times.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
 
 use rustix::process::Pid;
 
-/// When and where the process `pid`, as this process numbers them, began: the boot of the system, the namespace of
-/// process numbers (two containers of one system have the same boot, and each its own numbers) and the clock ticks
-/// from the boot on, as `boot/namespace/ticks`. No other process with this number has the same. `None` where there is
-/// no such process, and where the system does not tell.
+/// When and where the process `pid` of this PID namespace started: boot id, PID namespace (containers of one system
+/// share the boot and number their processes separately) and clock ticks since boot, as `boot/namespace/ticks`. No
+/// other process with this id has the same value. `None` if there is no such process, or if the system does not
+/// tell.
 pub fn process_start_time(pid: u32) -> Option<String> {
     stat(pid).map(|stat| format!("{}/{}/{}", boot(), namespace(), stat.ticks))
 }
 
-/// Whether the process `pid` that began at `birth`, which [`is_local`], runs. Without a birth any process with that
-/// number is taken for it.
+/// Whether the process `pid` that started at `start_time` runs; `start_time` must be local, see [`is_local`]. If it
+/// is empty, any process with that id counts.
 pub fn is_running(pid: u32, start_time: &str) -> bool {
     match stat(pid) {
         Some(stat) => {
             !stat.ended
                 && StartTime::parse(start_time).is_none_or(|start| start.ticks == stat.ticks.to_string())
         }
-        // Not there, or hidden from this user.
+        // No such process, or it is hidden from this user.
         None => has_number(pid),
     }
 }
 
-/// Whether that birth was before the system was last started (or on another system): whatever was born then is gone.
+/// Whether that start time lies before the last boot (or on another system): such a process has ended.
 pub(crate) fn is_from_another_boot(start_time: &str) -> bool {
     let now = boot();
     StartTime::parse(start_time).is_some_and(|start| !now.is_empty() && start.boot != now)
 }
 
-/// Whether who was born then has its number from where this process has its own, so that the number means something
-/// here. `None` without a birth.
+/// Whether the start time is from this boot and this PID namespace, so that the process id is valid here. `None`
+/// without a start time.
 pub fn is_local(start_time: &str) -> Option<bool> {
     let StartTime { boot: then, namespace: then_namespace, .. } = StartTime::parse(start_time)?;
     Some(then == boot() && then_namespace.is_none_or(|then| then == namespace().to_string()))
 }
 
-/// How late somebody was born, of those of one boot; whatever the clock on the wall said.
+/// Clock ticks since boot. They order processes of one boot, whatever the wall clock said.
 pub(crate) fn ticks(start_time: &str) -> Option<u64> {
     StartTime::parse(start_time)?.ticks.parse().ok()
 }
 
-/// What a birth is made of.
+/// The parts of a start time.
 struct StartTime<'a> {
     boot: &'a str,
-    /// Not in births that were written before it was of interest.
+    /// Missing in start times that early versions wrote.
     namespace: Option<&'a str>,
     ticks: &'a str,
 }
@@ -61,20 +61,20 @@ impl<'a> StartTime<'a> {
     }
 }
 
-/// Identifier of the namespace of process numbers; 0 where there is none.
+/// Id of the PID namespace; 0 if there is none.
 fn namespace() -> u64 {
     fs::metadata("/proc/self/ns/pid").map_or(0, |namespace| namespace.ino())
 }
 
-/// Identifier of this boot of the system; empty where there is none.
+/// Id of this boot of the system; empty if there is none.
 fn boot() -> String {
     fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default().trim().to_owned()
 }
 
 struct Stat {
-    /// It ended, and only waits for its parent to notice.
+    /// A zombie: it has ended, and its parent has not reaped it yet.
     ended: bool,
-    /// Its beginning in clock ticks after the boot.
+    /// Start time in clock ticks since boot.
     ticks: u64,
 }
 
@@ -82,8 +82,8 @@ fn stat(pid: u32) -> Option<Stat> {
     parse(&fs::read_to_string(format!("/proc/{pid}/stat")).ok()?)
 }
 
-/// A line of /proc/pid/stat: the name of the program, field 2, may hold blanks and parentheses. The state is field 3,
-/// the beginning field 22.
+/// Parses a line of /proc/pid/stat. Field 2, the program name, may contain blanks and parentheses; field 3 is the
+/// state, field 22 the start time.
 fn parse(line: &str) -> Option<Stat> {
     let (_, fields) = line.rsplit_once(')')?;
     let mut fields = fields.split_whitespace();
@@ -93,7 +93,7 @@ fn parse(line: &str) -> Option<Stat> {
 
 fn has_number(pid: u32) -> bool {
     let pid = i32::try_from(pid).ok().and_then(Pid::from_raw);
-    // A process of another user answers EPERM: it is there.
+    // For a process of another user the answer is EPERM: it exists.
     pid.is_some_and(|pid| rustix::process::test_kill_process(pid) != Err(rustix::io::Errno::SRCH))
 }
 
@@ -117,7 +117,7 @@ mod tests {
                 && process_start_time(child.id()).as_ref() == Some(&start_time)
         );
         assert!(!is_from_another_boot(&start_time));
-        // It ends, and nobody has asked yet how.
+        // It ends, and its parent has not reaped it yet.
         drop(child.stdin.take());
         let begun = Instant::now();
         while is_running(child.id(), &start_time) {

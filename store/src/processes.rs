@@ -1,4 +1,4 @@
-//! Processes of a campaign, as far as this one can see them.
+//! Processes of a campaign, as this process sees them.
 
 use serde::Serialize;
 
@@ -6,44 +6,44 @@ use crate::database::{FromRow, Row};
 use crate::error::Result;
 use crate::process_start::{self, process_start_time};
 
-/// A process of this system may be silent for so long (ms) without having lost what it holds: the whole system slept,
-/// or its clock was put right. One that hangs for longer does not keep its jobs for ever.
+/// How long a process of this system may be silent (ms) and still keep its leases: the system may have been
+/// suspended, or its clock adjusted. A process that hangs for longer loses its jobs.
 const MAX_LOCAL_SILENCE: i64 = 24 * 3600 * 1000;
-/// A process of another host that has been silent for so long (ms) cannot be counted on. Signs of life are seconds apart.
+/// A process on another host counts as unresponsive after this silence (ms). Heartbeats are seconds apart.
 const UNRESPONSIVE_AFTER: i64 = 60 * 1000;
 
 /// A process that works for the campaign.
 ///
-/// What schema version 1 does not have is filled in when such a database is read.
+/// Columns that schema version 1 lacks are filled in when such a database is read.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ProcessRecord {
-    /// Its own name, never used twice and without `/`.
+    /// Unique name, never reused and without `/`.
     pub id: String,
     /// [`Self::ORCHESTRATOR`], [`Self::WALKER`], [`Self::AGENT`] or [`Self::LABELLER`].
     pub kind: String,
-    /// Which walker or labeller it is; an orchestrator has no number.
+    /// Index of the walker or labeller; `None` for an orchestrator.
     pub number: Option<u32>,
-    /// Process number on its host.
+    /// Process id on its host.
     pub pid: u32,
     /// See [`process_start_time`]; empty if unknown.
     #[serde(rename = "birth")]
     pub start_time: String,
-    /// Name of its host, for people.
+    /// Host name, for display only.
     pub host: String,
     /// When it started, ms since 1970.
     pub started: i64,
-    /// When it was last heard of, ms since 1970.
+    /// Last heartbeat, ms since 1970.
     pub last_seen: i64,
-    /// What is said of it (`running`, `stopping`, `pausing`, `given up` …), see [`crate::Store::status`].
+    /// Its state (`running`, `stopping`, `pausing`, `given up` …), see [`crate::Store::status`].
     pub state: String,
-    /// How often its predecessors were replaced in this run of the campaign.
+    /// How often it was restarted in this run of the campaign.
     pub restarts: u32,
-    /// Hash of what a labeller was started with: one that was started with something else is not adopted.
+    /// Hash of the setup that a labeller was started with. A run does not adopt labellers with another setup.
     pub setup: Option<String>,
-    /// What is worth knowing besides: the last failure, messages that were dropped.
+    /// A remark for the user: the last failure, rejected messages.
     pub remark: String,
-    /// How long it has been silent, ms by the clock of the database's server. None where the database serves one host; not
-    /// written.
+    /// Time since its last heartbeat, ms by the clock of the database server. `None` for a database of one host.
+    /// Not written.
     #[serde(skip)]
     pub silence: Option<i64>,
 }
@@ -69,16 +69,16 @@ impl FromRow for ProcessRecord {
 }
 
 impl ProcessRecord {
-    /// Kind of the process that runs a campaign.
+    /// The process that runs a campaign.
     pub const ORCHESTRATOR: &str = "orchestrator";
-    /// Kind of a process that advances walks. It ends with its orchestrator, which also writes its record.
+    /// A process that advances walks. It ends with its orchestrator, which also writes its record.
     pub const WALKER: &str = "walker";
-    /// Kind of a process that starts walkers on another host. The orchestrator writes its record.
+    /// A process that starts walkers on another host. The orchestrator writes its record.
     pub const AGENT: &str = "agent";
-    /// Kind of a process that makes labels. It outlives its orchestrator, and writes its own record.
+    /// A process that makes labels. It outlives its orchestrator and writes its own record.
     pub const LABELLER: &str = "labeller";
 
-    /// The process `pid`, as this process numbers them, `running` since `now`.
+    /// A record for the process `pid` in this process's PID namespace, `running` since `now`.
     pub fn new(kind: &str, number: Option<u32>, pid: u32, now: i64) -> Self {
         let host = this_host();
         Self {
@@ -95,15 +95,15 @@ impl ProcessRecord {
         }
     }
 
-    /// Whether its number is one that this process sees: both were born since the system was last started, and in the
-    /// same container. Names of hosts change, so they count only where there is no birth (written by version 1).
+    /// Whether its process id is valid here: both processes started since the last boot of this system and in the
+    /// same container. Host names may change, so they decide only if there is no start time (schema version 1).
     pub fn is_local(&self) -> bool {
         process_start::is_local(&self.start_time).unwrap_or_else(|| self.host == this_host())
     }
 
-    /// Whether it runs no longer, as far as can be seen from here. One without a birth is taken for whatever process has
-    /// its number now. Where several hosts share the database, a birth of another boot may be one of another host, and
-    /// only a day of silence says that it is gone.
+    /// Whether the process has ended, as far as this host can tell. Without a start time, any process with the same
+    /// id counts as this one. If several hosts share the database, a start time from another boot may belong to
+    /// another host; then only a day of silence counts as the end.
     pub fn is_dead(&self) -> bool {
         match (self.is_local(), self.silence) {
             (true, _) => !process_start::is_running(self.pid, &self.start_time),
@@ -112,12 +112,12 @@ impl ProcessRecord {
         }
     }
 
-    /// Whether nobody here can see it, and its host has not been heard of for a minute.
+    /// Whether it runs where this host cannot see it and has sent no heartbeat for a minute.
     pub fn is_unresponsive(&self) -> bool {
         !self.is_local() && self.silence.is_some_and(|silence| silence >= UNRESPONSIVE_AFTER)
     }
 
-    /// Whether it may be at work on something that it leased for `seconds`, although that time is over: see
+    /// Whether it may still work on something that it leased for `seconds` although the lease has expired, see
     /// [`crate::Store::lease`].
     pub(crate) fn may_be_at_work(&self, now: i64, seconds: u32) -> bool {
         let allowed = if self.is_local() { MAX_LOCAL_SILENCE } else { 1000 * i64::from(seconds) };
@@ -125,12 +125,12 @@ impl ProcessRecord {
         !self.is_dead() && silence < allowed
     }
 
-    /// Whether it runs the campaign, and is neither gone nor silent.
+    /// Whether it runs the campaign and is neither dead nor unresponsive.
     pub fn is_leading(&self) -> bool {
         self.kind == Self::ORCHESTRATOR && !self.is_dead() && !self.is_unresponsive()
     }
 
-    /// Whether it came after `other` to do the same here, and is not gone itself.
+    /// Whether it started after `other` with the same role on this host, and is alive.
     pub fn replaces(&self, other: &Self) -> bool {
         let place = |process: &Self| (process.kind.clone(), process.number, process.is_local());
         let age =
@@ -139,7 +139,7 @@ impl ProcessRecord {
         self.number.is_some() && self.is_local() && place(self) == place(other) && is_later && !self.is_dead()
     }
 
-    /// Whether a lease of `holder` is its own: `id`, or `id/part`.
+    /// Whether `holder` names a lease of this process: `id` or `id/part`.
     pub fn is_holder(&self, holder: &str) -> bool {
         holder.split('/').next() == Some(&self.id)
     }
@@ -158,7 +158,7 @@ mod tests {
         ProcessRecord::new(kind, Some(3), std::process::id(), 10)
     }
 
-    /// The same in another container of this system.
+    /// The same process in another container of this system.
     fn elsewhere(record: &ProcessRecord) -> ProcessRecord {
         let (boot, ticks) =
             (record.start_time.split('/').next().unwrap(), record.start_time.rsplit('/').next().unwrap());
@@ -206,7 +206,7 @@ mod tests {
         let first = own(ProcessRecord::LABELLER);
         let second = ProcessRecord { id: "later".into(), started: 11, ..first.clone() };
         assert!(second.replaces(&first) && !first.replaces(&second) && !first.replaces(&first));
-        // The clock was put back in between.
+        // The clock was set back in between.
         let (place, ticks) = first.start_time.rsplit_once('/').unwrap();
         let earlier = format!("{place}/{}", ticks.parse::<u64>().unwrap() - 1);
         let earlier = ProcessRecord { start_time: earlier, started: 3_600_000, ..first.clone() };

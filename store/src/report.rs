@@ -1,36 +1,36 @@
-//! What a report reads of all that was collected, labelled or not.
+//! Rows that a report reads: all collected structures, labelled or not.
 
 use atoms::Vec3;
 use wire::{CandidateBlock, Origin};
 
 use crate::records::{AtomGrades, JobState};
 
-/// A structure that was accepted, or a frame of a control walk.
+/// An accepted structure, or a frame of a control walk.
 #[derive(Clone, Debug)]
 pub struct CollectedStructure {
-    /// Number of the decision about it; the next page begins after it.
+    /// Sequence number of the decision on it; the next page starts after it.
     pub decision: i64,
     /// Biased or control.
     pub origin: Origin,
     /// Index of the seed structure.
     pub seed_structure: u32,
-    /// Everything that the walker knew, without features.
+    /// All data of the walker, without features.
     pub block: CandidateBlock,
     /// γ and γ_nbr under the original mixture.
     pub original: AtomGrades,
-    /// State of its label job; `None` if there is none.
+    /// State of its label job; `None` without a job.
     pub job: Option<JobState>,
-    /// Forces of its label, [n], eV/Å; `None` if it has none, or was dropped by hand.
+    /// Forces of its label, [n], eV/Å; `None` without a label, or if it was dropped by hand.
     pub label_forces: Option<Vec<Vec3>>,
 }
 
-/// How many candidates of biased walks came to one end.
+/// Number of candidates of biased walks with one fate.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FateCount {
-    /// The part of the decision log, or the seed structure, from 0.
+    /// Interval of the decision log or index of the seed structure, from 0.
     pub part: u64,
-    /// `accepted`, or why they were declined.
+    /// `accepted`, or the reason of the decline.
     pub fate: String,
-    /// How many.
+    /// Number of candidates.
     pub number: u64,
 }

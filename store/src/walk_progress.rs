@@ -1,21 +1,21 @@
-//! How fast walks advance.
+//! Progress and speed of walks between checkpoints.
 
 use serde::Serialize;
 
 use crate::database::from_columns;
 
-/// A walk between its checkpoints, as it was last heard of.
+/// The last reported progress of a walk.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct WalkProgress {
     /// Its number.
     pub walk: u32,
-    /// When its walker was last heard, ms since 1970.
+    /// When its walker last reported, ms since 1970.
     pub seen: i64,
     /// Segment.
     pub segment: u32,
     /// Step.
     pub step: u64,
-    /// Steps per second, with the time between its turns; none before they can be told.
+    /// Steps per second, including the time between assignments; `None` until it can be computed.
     pub steps_per_second: Option<f64>,
     /// τ.
     pub tau: Option<f64>,

@@ -1,7 +1,7 @@
-//! Many rows in one statement.
+//! Writes many rows with one statement.
 //!
-//! To PostgreSQL every statement is a journey, so all rows go along with the first, as one array a column. SQLite is in
-//! this process: there, one row after the other is the fastest.
+//! For PostgreSQL every statement is a round trip, so all rows travel together as one array per column. SQLite runs
+//! in this process, where one row after the other is fastest.
 
 use std::sync::Arc;
 
@@ -13,12 +13,12 @@ use super::Transaction;
 use super::value::{Value, replace_nul};
 use crate::error::{Result, StoreError};
 
-/// Bytes that go along at once, about: arrays of PostgreSQL hold 1 GB, and its server copies them.
+/// Approximate number of bytes sent at once: PostgreSQL arrays hold up to 1 GB, and the server copies them.
 const LOAD: usize = 1 << 25;
 
-/// Executes `sql` for every row: `{rows}` in it is a table named `new` of the rows, `{columns}` the names of its columns,
-/// separated by commas, `{excluded}` what takes over the new values of all columns but the first. Values of a column are
-/// all of one type. Returns the number of rows that were written.
+/// Executes `sql` for every row. In it, `{rows}` stands for a table `new` of the rows, `{columns}` for its column
+/// names, separated by commas, and `{excluded}` for the assignments that overwrite all columns except the first.
+/// The values of a column have one type. Returns the number of rows written.
 pub async fn execute_rows(
     transaction: &mut Transaction,
     sql: &'static str,
@@ -75,7 +75,7 @@ fn arrays(columns: &[&str], first: &[Value]) -> String {
     format!("unnest({}) AS new ({})", arrays.join(", "), columns.join(", "))
 }
 
-/// The next rows, as many as go along at once.
+/// The next rows to send at once.
 fn load(rows: &mut impl Iterator<Item = Vec<Value>>) -> Vec<Vec<Value>> {
     let (mut load, mut bytes) = (Vec::new(), 0);
     while bytes < LOAD
@@ -97,7 +97,7 @@ fn transpose(columns: usize, rows: Vec<Vec<Value>>) -> Vec<Vec<Value>> {
 
 type PostgresQuery<'q> = Query<'q, Postgres, PgArguments>;
 
-/// Binds a column as an array; its values are all of the type of the first.
+/// Binds a column as an array; its values have the type of the first.
 fn bind_column(query: PostgresQuery<'_>, column: Vec<Value>) -> Result<PostgresQuery<'_>> {
     macro_rules! array {
         ($variant:ident) => {{

@@ -1,18 +1,18 @@
-//! What goes to a server must not be read or changed on its way: TLS, or not a step outside this host. Words as in libpq, but
-//! no way by which a connection is protected only if it happens to be.
+//! Protects connections to a server: TLS, unless the traffic stays on this host. The terms are those of libpq,
+//! without the modes that protect a connection only if the server offers it.
 
 use std::fs::File;
 use std::net::IpAddr;
 
 use sqlx::postgres::{PgConnectOptions, PgSslMode};
 
-/// The parameter of a URL, and its variable in the environment, that say how a connection is protected.
+/// The URL parameter and the environment variable that select the protection.
 const MODE: &str = "sslmode";
 const ROOT: (&str, &str) = ("sslrootcert", "PGSSLROOTCERT");
 const MODES: &str = "disable, require and verify-full";
 
-/// Refuses what does not mean here what it means to libpq, and files that cannot be read: whoever connects would take that
-/// for a server that is away.
+/// Refuses parameters that have another meaning here than in libpq, and unreadable files: later, these would look
+/// like an unreachable server.
 pub fn check_parameters(url: &str) -> Result<(), String> {
     let parameters = url.split_once('?').unwrap_or_default().1;
     let (mut mode, mut has_root) = (std::env::var("PGSSLMODE").ok(), std::env::var_os(ROOT.1).is_some());
@@ -44,12 +44,12 @@ pub fn check_parameters(url: &str) -> Result<(), String> {
     }
 }
 
-/// The options, and whether a connection leaves this host without protection because its user says so; an error if it would by
-/// default.
+/// Returns the options, and whether a connection leaves this host unprotected because the user asks for it. Without
+/// such a request an unprotected connection is an error.
 pub fn resolve(options: PgConnectOptions) -> Result<(PgConnectOptions, bool), String> {
     let by_default = matches!(options.get_ssl_mode(), PgSslMode::Allow | PgSslMode::Prefer);
     match (is_local(&options), by_default) {
-        // Within a host it would cost time and protect nothing.
+        // Within a host, TLS costs time and protects nothing.
         (true, true) => Ok((options.ssl_mode(PgSslMode::Disable), false)),
         (true, false) => Ok((options, false)),
         (false, false) => {
@@ -65,7 +65,7 @@ pub fn resolve(options: PgConnectOptions) -> Result<(PgConnectOptions, bool), St
     }
 }
 
-/// A Unix socket, or this host by an address that no other one has.
+/// A Unix socket, or a loopback address of this host.
 fn is_local(options: &PgConnectOptions) -> bool {
     let host = options.get_host().trim_matches(['[', ']']);
     options.get_socket().is_some()
@@ -103,7 +103,7 @@ mod tests {
                 assert!(message.contains("sslmode=verify-full"), "{message}");
             }
         }
-        // The last word counts.
+        // The last value counts.
         assert!(unprotected("postgres://anna@localhost/lab?host=head").is_err());
     }
 

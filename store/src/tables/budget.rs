@@ -1,4 +1,4 @@
-//! Budgets: what was used up is found from what is there, and no further label is begun where there is nothing left.
+//! Budgets: use is computed from what is stored, and no label starts once a limit is reached.
 
 use super::protocols::set_campaign_value;
 use crate::Store;
@@ -8,22 +8,22 @@ use crate::error::{Result, StoreError};
 
 const MILLISECONDS_PER_HOUR: f64 = 3.6e6;
 
-/// The sums that the database keeps of attempts that ended (`migrations`): labels made, and milliseconds of cores.
+/// The totals of finished attempts that triggers keep (`migrations`): labels made, and core-milliseconds.
 const TOTALS: &str = "SELECT CAST((SELECT value FROM campaign WHERE key = 'labels_made') AS BIGINT),
         CAST((SELECT value FROM campaign WHERE key = 'core_milliseconds') AS BIGINT)";
 
-/// Attempts under way, and milliseconds of their cores so far.
+/// Running attempts, and their core-milliseconds so far.
 pub(crate) const UNDER_WAY: &str = "SELECT count(*),
         CAST(coalesce(sum(CASE WHEN $1 > started THEN ($1 - started) * coalesce(cores, 1) ELSE 0 END), 0) AS BIGINT)
     FROM attempt WHERE outcome IS NULL";
 
-/// All of it in tables of an earlier version, which are only looked at.
+/// All attempts, for tables of an earlier version that are opened read-only.
 const ATTEMPTS: &str = "SELECT CAST(coalesce(sum(CASE WHEN outcome IN ('labelled', 'check') THEN 1 ELSE 0 END), 0) AS BIGINT),
         CAST(coalesce(sum(CASE WHEN outcome IS NULL THEN 1 ELSE 0 END), 0) AS BIGINT),
         CAST(coalesce(sum(CASE WHEN coalesce(ended, $1) > started THEN coalesce(ended, $1) - started ELSE 0 END), 0) AS BIGINT)
     FROM attempt";
 
-/// What the kept sums have to be, by their names.
+/// The values that the totals must have, by name.
 pub(crate) const SUMS: [(&str, &str); 3] = [
     ("labels_made", "SELECT CAST(count(*) AS TEXT) FROM attempt WHERE outcome IN ('labelled', 'check')"),
     (
@@ -40,7 +40,7 @@ pub(crate) const SUMS: [(&str, &str); 3] = [
     ),
 ];
 
-/// Writes the sums anew, where attempts were copied.
+/// Recomputes the totals after attempts were copied.
 pub(crate) async fn rebuild_totals(database: &Database) -> Result<()> {
     let mut transaction = database.begin().await?;
     for (name, sum) in SUMS {
@@ -51,7 +51,7 @@ pub(crate) async fn rebuild_totals(database: &Database) -> Result<()> {
 }
 
 impl Store {
-    /// From now on these limits hold, for every labeller.
+    /// Sets the limits for every labeller from now on.
     pub async fn set_budget(&self, budget: &Budget) -> Result<()> {
         let text = serde_json::to_string(budget).expect("plain data becomes JSON");
         let mut transaction = self.database.begin_to_lead().await?;
@@ -59,7 +59,7 @@ impl Store {
         transaction.commit().await
     }
 
-    /// The limits, and what was used of them until `now`.
+    /// The limits, and their use until `now`.
     pub async fn budget(&self, now: i64) -> Result<(Budget, BudgetUse)> {
         let mut transaction = self.database.begin_to_read().await?;
         let read = read(&mut transaction, now).await?;
@@ -67,7 +67,7 @@ impl Store {
         Ok(read)
     }
 
-    /// The campaign was under way for so long again.
+    /// Adds to the running time of the campaign.
     pub async fn add_running_time(&self, milliseconds: u64) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;
         let before = time_under_way(&mut transaction).await?;
@@ -76,7 +76,7 @@ impl Store {
         transaction.commit().await
     }
 
-    /// Whether a label is being made, or waits to be and may be.
+    /// Whether a label is in progress, or waits and may be started.
     pub async fn awaits_labels(&self, now: i64) -> Result<bool> {
         let mut transaction = self.database.begin_to_read().await?;
         let some = |state: &'static str| {
@@ -90,7 +90,7 @@ impl Store {
     }
 }
 
-/// Limits and use. Where there is a server, its clock counts.
+/// Limits and use. On a server, its clock counts.
 pub(super) async fn read(transaction: &mut Transaction, now: i64) -> Result<(Budget, BudgetUse)> {
     let limits = limits(transaction).await?;
     let now = transaction.time(now).await?;
@@ -104,7 +104,7 @@ pub(super) async fn read(transaction: &mut Transaction, now: i64) -> Result<(Bud
     Ok((limits, used))
 }
 
-/// Labels made, attempts under way, and milliseconds of the cores of all attempts until `now`.
+/// Labels made, running attempts, and core-milliseconds of all attempts until `now`.
 async fn attempts(transaction: &mut Transaction, now: i64) -> Result<(u64, u64, u64)> {
     let kept: (Option<u64>, Option<u64>) = query(TOTALS).fetch_one(&mut *transaction).await?;
     let (Some(labels), Some(ended)) = kept else {
@@ -114,7 +114,7 @@ async fn attempts(transaction: &mut Transaction, now: i64) -> Result<(u64, u64, 
     Ok((labels, under_way, ended + so_far))
 }
 
-/// Whether no further attempt may begin. Attempts are counted only where there is a limit.
+/// Whether no further attempt may start. Attempts are counted only if there is a limit.
 pub(super) async fn allows_no_attempt(transaction: &mut Transaction, now: i64) -> Result<bool> {
     if limits(transaction).await?.is_none() {
         return Ok(false);

@@ -1,7 +1,7 @@
-//! Labels that people take out of the data set, and in again.
+//! Excludes labels from the data set and includes them again.
 //!
-//! An excluded label has the standing `excluded`: whatever asks for labels does not see it. Its job stays done, and a further result of the
-//! structure is a check; only a label that was asked for anew comes in its place.
+//! An excluded label has the status `excluded`, and no reader of labels sees it. Its job stays done, and further
+//! results for the structure are checks; only a requested new label replaces it.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ use crate::exclude::{ExcludedLabel, Exclusion, ExclusionChange};
 const STRUCTURE_OF_CANDIDATE: &str = "SELECT coalesce(structure, 0) FROM candidate WHERE decision = $1";
 const STRUCTURE_OF_IMPORT: &str = "SELECT structure FROM import WHERE number = $1";
 
-/// Labels of a structure that count, and those that are excluded.
+/// Labels of a structure that count or are excluded.
 pub(crate) const LABEL_STATUS: &str = "SELECT protocol.name AS protocol, standing, exclusion FROM label
     CROSS JOIN protocol ON protocol.number = label.protocol
     WHERE label.structure = $1 AND standing IN ('label', 'excluded')
@@ -61,24 +61,25 @@ struct ExcludedRow {
 from_columns!(LabelStatusRow { protocol, standing, exclusion });
 from_columns!(ExcludedRow { id, protocol, excluded, exclusion });
 
-/// A structure that somebody named.
+/// A structure named by the user.
 struct CandidateRef {
     structure: i64,
     id: String,
 }
 
 impl Store {
-    /// Takes the labels of structures out of the data set, of whatever protocol: nobody who asks for labels sees them until
-    /// [`Store::include`]. All of the structures or none; those whose labels are excluded already keep their reason. Structures are named as
-    /// [`Store::find_candidate`] takes them, or `import-N`. Leaves a line `exclude` in the operations log for each.
+    /// Excludes the labels of structures from the data set, under every protocol: readers of labels do not see them
+    /// until [`Store::include`]. Applies to all of the structures or to none; already excluded labels keep their
+    /// reason. Structures are named as for [`Store::find_candidate`], or `import-N`. Adds a line `exclude` to the
+    /// operations log for each.
     ///
     /// # Errors
-    /// [`StoreError::NoLabel`] for a structure without a label, and those of names that fit none or several.
+    /// [`StoreError::NoLabel`] for a structure without a label, and errors for names that fit none or several.
     pub async fn exclude(&self, ids: &[String], reason: &str, now: i64) -> Result<Vec<ExclusionChange>> {
         self.change_status(ids, Some(reason), now).await
     }
 
-    /// Takes excluded labels in again. Leaves a line `include` in the operations log for each structure.
+    /// Includes excluded labels again. Adds a line `include` to the operations log for each structure.
     ///
     /// # Errors
     /// As [`Store::exclude`].
@@ -86,7 +87,7 @@ impl Store {
         self.change_status(ids, None, now).await
     }
 
-    /// Every excluded label, in the order in which they were excluded.
+    /// Every excluded label, in order of exclusion.
     pub async fn excluded(&self) -> Result<Vec<ExcludedLabel>> {
         let mut transaction = self.database.begin_to_read().await?;
         if !has_exclusion_columns(&mut transaction).await? {
@@ -114,7 +115,7 @@ impl Store {
         }
         let mut transaction = self.database.begin().await?;
         let now = transaction.time(now).await?;
-        // Always in this order: two of these commands do not wait for each other.
+        // A fixed lock order, so that two of these commands do not deadlock.
         let mut structures: Vec<_> = named.iter().map(|named| named.structure).collect();
         structures.sort_unstable();
         for structure in structures {
@@ -129,7 +130,7 @@ impl Store {
         Ok(changes)
     }
 
-    /// The structure of that name.
+    /// The structure with that name.
     async fn named(&self, id: &str) -> Result<CandidateRef> {
         if let Some(number) = id.strip_prefix("import-") {
             let structure = match number.parse::<i64>() {
@@ -185,7 +186,7 @@ async fn change(
     Ok(ExclusionChange { id, protocols, changed, excluded })
 }
 
-/// Whether the tables are not those of an earlier version, in which nothing is excluded.
+/// Whether the tables have the columns for exclusions; those of an earlier version do not.
 async fn has_exclusion_columns(transaction: &mut Transaction) -> Result<bool> {
     transaction.has_column("label", "exclusion").await
 }
@@ -198,7 +199,7 @@ pub(super) async fn count(transaction: &mut Transaction) -> Result<u64> {
     }
 }
 
-/// Why labels are excluded, by the number of their job.
+/// Reasons of exclusions, by job id.
 pub(super) async fn by_job(transaction: &mut Transaction) -> Result<BTreeMap<i64, String>> {
     if !has_exclusion_columns(transaction).await? {
         return Ok(BTreeMap::new());

@@ -1,5 +1,5 @@
-//! Labels: the first valid result is the label, later ones are checks, and one that was asked for anew supersedes what was there.
-//! Nothing is overwritten. One that is excluded still is in the way of other results.
+//! Labels: the first valid result is the label, later results are checks, and a requested new label supersedes the
+//! old one. Nothing is overwritten. An excluded label still makes later results checks.
 
 use atoms::Vec3;
 use wire::ContentHash;
@@ -60,18 +60,19 @@ impl FromRow for LabelRow {
 }
 
 impl Store {
-    /// Brings the result of a leased job. The first valid one for structure and protocol is the label, whether or not
-    /// the lease still lasts; later ones are kept as checks. Where another was asked for ([`Store::relabel`]), the first of the
-    /// attempts that began since then is the label, and what was there is superseded. A job that was dropped or superseded
-    /// meanwhile stays so. Bringing the result of one attempt twice changes nothing.
+    /// Delivers the result of a leased job. The first valid result for structure and protocol becomes the label,
+    /// whether or not the lease is still held; later results are stored as checks. If a new label was requested
+    /// ([`Store::relabel`]), the first result of an attempt that began after the request becomes the label and
+    /// supersedes the old one. A job that was dropped or superseded meanwhile stays so. Delivering the result of an
+    /// attempt twice changes nothing.
     ///
     /// # Errors
-    /// [`StoreError::InvalidLabel`] for a wrong number of forces, or numbers that are not finite.
+    /// [`StoreError::InvalidLabel`] for a wrong number of forces, or for numbers that are not finite.
     pub async fn complete(&self, lease: &Lease, label: &Label, now: i64) -> Result<CompleteOutcome> {
         let mut transaction = self.database.begin().await?;
         let structure = query("SELECT structure FROM job WHERE number = $1").bind(lease.job);
         let structure: Option<i64> = structure.fetch_optional(&mut transaction).await?;
-        // First the structure, then its job: always in this order.
+        // Lock order: the structure first, then its job.
         if let Some(structure) = structure {
             check(&mut transaction, structure, label).await?;
         }
@@ -112,8 +113,8 @@ impl Store {
     }
 }
 
-/// Whether the label can be one of that structure. Until the end of the transaction nobody else adds a label or a job for
-/// the structure.
+/// Checks that the label fits the structure. Locks the structure: until the end of the transaction, no other label
+/// or job is added for it.
 pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: &Label) -> Result<()> {
     let atoms = query("SELECT atoms FROM structure WHERE number = $1").bind(structure);
     let atoms: u64 = atoms.locked().fetch_one(&mut *transaction).await?;
@@ -128,7 +129,7 @@ pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: 
     if label.forces.iter().chain(stress).flatten().any(|x| !x.is_finite()) {
         return invalid("forces or stress have entries that are not finite".into());
     }
-    // JSON knows no others, and they would come back as none.
+    // JSON cannot represent them; they would be read back as null.
     let LabelDetails { energy_without_smearing, magnetic_moments, magnetisation, .. } = &label.details;
     let details =
         energy_without_smearing.iter().chain(magnetisation).chain(magnetic_moments.iter().flatten());
@@ -138,7 +139,7 @@ pub(super) async fn check(transaction: &mut Transaction, structure: i64, label: 
     Ok(())
 }
 
-/// Adds a result: the label if there is none or another was asked for, otherwise a check.
+/// Adds a result: the label if there is none or a new one was requested, otherwise a check.
 pub(super) async fn add(
     transaction: &mut Transaction,
     structure: i64,
@@ -177,7 +178,7 @@ pub(super) async fn add(
     Ok(status)
 }
 
-/// The structure has its label: its job, if it has one that was not dropped and waits for no other label, is done.
+/// Marks the structure's job as done, unless it was dropped or waits for another label.
 pub(super) async fn finish_job(
     transaction: &mut Transaction,
     structure: i64,
@@ -195,7 +196,7 @@ pub(super) async fn finish_job(
 }
 
 impl LabelRow {
-    /// None for an unknown standing.
+    /// `None` for an unknown status.
     pub(super) fn status_and_energy(&self) -> Option<(LabelStatus, f64)> {
         Some((LabelStatus::named(&self.standing)?, self.energy))
     }
@@ -221,7 +222,7 @@ impl LabelRow {
     }
 }
 
-/// A label from its columns.
+/// Decodes a label from its columns.
 pub(crate) fn decode_label(
     energy: f64,
     forces: &[u8],

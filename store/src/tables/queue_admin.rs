@@ -1,4 +1,4 @@
-//! What people do to the label queue. Each change leaves a line in the operations log.
+//! Manual changes of the label queue. Each adds an entry to the operations log.
 
 use std::collections::BTreeMap;
 
@@ -16,17 +16,17 @@ use crate::error::{Result, StoreError};
 use crate::jobs::{Attempt, Job, JobDetails};
 use crate::records::JobState;
 
-/// Candidates shown when a name fits none or several.
+/// Number of candidates shown if a name fits none or several.
 const SHOWN: usize = 5;
 
-/// What is shown of a job besides its own columns.
+/// The columns shown of a job besides its own.
 macro_rules! columns {
     () => {
         concat!(joined!(candidate), ", protocol.name, coalesce(seed_structure.name, '') AS seed_name")
     };
 }
 
-/// A page is found in the index, and only its jobs are looked at.
+/// The index gives a page; only its jobs are read.
 pub(crate) const LIST: &str = concat!(
     "SELECT job.*, ",
     columns!(),
@@ -39,7 +39,7 @@ pub(crate) const LIST: &str = concat!(
     ORDER BY job.priority DESC, job.decision"
 );
 
-/// Jobs of all states are listed in this order: what is in work, what waits, what needs somebody, what is over.
+/// The order in which jobs of all states are listed: leased, queued, failed, dropped, finished.
 const STATES: [JobState; 6] = [
     JobState::Leased,
     JobState::Queued,
@@ -59,7 +59,7 @@ const SHOW: &str = concat!(
     WHERE job.number = $1"
 );
 
-/// Candidates of one beginning, with the newest job of their structure.
+/// Candidates whose names share a prefix, with the newest job of their structure.
 pub(crate) const FIND: &str = "SELECT id, max(job.number) FROM candidate
     CROSS JOIN job ON job.structure = candidate.structure
     WHERE id >= $1 AND id < $1 || '~' GROUP BY id ORDER BY id LIMIT $2";
@@ -120,8 +120,8 @@ impl FromRow for Row {
 }
 
 impl Store {
-    /// The jobs in a state, in the order in which they would be leased: by priority, and then as they came. Without a state those
-    /// of all, leased ones first, then those that wait, that failed, that were dropped, and those that are over.
+    /// Jobs in a state, in the order in which they would be leased: by priority, then in decision order. Without a
+    /// state, all jobs: leased first, then queued, failed, dropped and finished ones.
     pub async fn queue_list(&self, state: Option<JobState>, limit: u32, offset: u32) -> Result<Vec<Job>> {
         let mut transaction = self.database.begin_to_read().await?;
         let numbers = job_counts::states(&mut transaction).await?;
@@ -143,7 +143,7 @@ impl Store {
         Ok(jobs)
     }
 
-    /// A job by the name of its candidate or the beginning of it; the campaign's part of the name may be left out.
+    /// Finds a job by its candidate's name or a prefix of it. The campaign's part of the name may be omitted.
     pub async fn queue_show(&self, id: &str) -> Result<JobDetails> {
         let (job, _) = self.find(id).await?;
         self.job_details(job).await
@@ -165,7 +165,7 @@ impl Store {
         })
     }
 
-    /// Takes a candidate out of the queue and out of exports. Returns its full name.
+    /// Removes a candidate from the queue and from exports. Returns its full name.
     pub async fn drop_job(&self, id: &str, now: i64) -> Result<String> {
         use JobState::{Failed, Leased, Queued};
         let allowed = [Queued, Leased, Failed];
@@ -176,8 +176,8 @@ impl Store {
         change.log("drop", json!({}), now).await
     }
 
-    /// Puts a failed or dropped candidate back into the queue, with all its attempts before it, past any guard; a dropped
-    /// one that has its label by now is done. Returns its full name.
+    /// Requeues a failed or dropped candidate with all its attempts left and past any guard. A dropped candidate
+    /// that has a label meanwhile is done. Returns its full name.
     pub async fn retry_job(&self, id: &str, now: i64) -> Result<String> {
         let allowed = [JobState::Failed, JobState::Dropped];
         let mut change = self.change("retry", id, &allowed, "failed and dropped").await?;
@@ -189,8 +189,8 @@ impl Store {
         change.log("retry", json!({}), now).await
     }
 
-    /// Gives a candidate that waits another priority (higher first); one in work keeps it should it come back.
-    /// Returns its full name.
+    /// Changes the priority of a waiting candidate (higher first). A leased one keeps it if it returns to the
+    /// queue. Returns its full name.
     pub async fn prioritise_job(&self, id: &str, priority: i32, now: i64) -> Result<String> {
         let allowed = [JobState::Queued, JobState::Leased];
         let mut change = self.change("prioritise", id, &allowed, "queued and leased").await?;
@@ -216,7 +216,7 @@ impl Store {
         Ok(Change { transaction, job, candidate })
     }
 
-    /// Number of the job, and full name of the candidate.
+    /// Job id, and full name of the candidate.
     async fn find(&self, id: &str) -> Result<(i64, String)> {
         let campaign = self.campaign_value("id").await?;
         let campaign = campaign.get(..8).unwrap_or_default();
@@ -241,7 +241,7 @@ impl Store {
         query.fetch_all(&self.database).await
     }
 
-    /// The candidates whose names begin like `id` for as long as possible.
+    /// Candidates whose names share the longest prefix with `id`.
     async fn near(&self, campaign: &str, id: &str) -> Result<Vec<String>> {
         let full = if id.starts_with(campaign) { id.to_owned() } else { format!("{campaign}-{id}") };
         for (end, _) in full.char_indices().rev() {
@@ -254,7 +254,7 @@ impl Store {
     }
 }
 
-/// A change that is allowed, and not yet made.
+/// A permitted change that is not yet made.
 struct Change {
     transaction: Transaction,
     job: i64,

@@ -1,8 +1,9 @@
-//! Labels that are made anew: by the same protocol because they are doubtful, or by another that comes into force.
+//! Making labels again: under the same protocol because they are doubtful, or under another protocol that comes
+//! into force.
 //!
-//! A job whose `relabel` says why waits for another label while there is one. Until that comes nothing changes for anybody who
-//! reads labels; if it does not come, nothing has changed. A job by an earlier protocol is superseded when the label by the newer
-//! one is there, or if it has none itself, when the newer protocol comes into force.
+//! A job with a reason in `relabel` waits for a new label although there is one. Readers of labels see no change
+//! until the new label arrives, and none at all if it never does. A job of an earlier protocol is superseded when
+//! the newer protocol has a label for the structure, or at once if it has no label itself.
 
 use std::collections::HashSet;
 
@@ -20,7 +21,7 @@ use crate::jobs::{LabelSource, LabelStatus};
 use crate::records::JobState;
 use crate::relabel::{NewProtocol, RelabelCounts, RelabelRequest, Relabellable};
 
-/// Jobs with their labels; of a structure that has labels by several protocols, all of them.
+/// Jobs with their labels. A structure with labels under several protocols has several rows.
 pub(crate) const LABELLED: &str =
     "SELECT structure.hash AS hash, job.decision AS decision, protocol.name AS protocol, own.state AS state,
         candidate.seed_structure AS seed_structure, candidate.formula AS formula, candidate.atoms AS atoms
@@ -32,7 +33,7 @@ pub(crate) const LABELLED: &str =
     LEFT JOIN job AS own ON own.structure = job.structure AND own.protocol = $1
     WHERE job.state <> 'dropped' ORDER BY job.decision, job.number";
 
-/// Those that have no job by that protocol get one. `own` is the job by which the present label was made.
+/// Adds a job for structures that have none under that protocol. `own` is the job that made the present label.
 macro_rules! request {
     ($states:literal) => {
         concat!(
@@ -54,14 +55,15 @@ macro_rules! request {
 const REQUEST: &str = request!("'failed', 'superseded'");
 const REQUEST_AGAIN: &str = request!("'labelled', 'failed', 'superseded'");
 
-/// Other labels that were asked for by a protocol which is no longer in force: those that there are stay.
+/// Withdraws requests under protocols no longer in force: the existing labels stay.
 const WITHDRAW_REQUESTS: &str =
     "UPDATE job SET state = 'labelled', relabel = NULL, relabel_after = NULL, holder = NULL,
         expires = NULL
     WHERE protocol <> $1 AND state IN ('queued', 'leased') AND EXISTS (SELECT 1 FROM label
         WHERE label.structure = job.structure AND label.protocol = job.protocol AND standing IN ('label', 'excluded'))";
 
-/// What has no label by an earlier protocol goes over to the one in force, unless that has a job for it which says something else.
+/// Moves jobs of earlier protocols without a label to the protocol in force, unless that has a job for the
+/// structure in another state.
 const GO_OVER: &str = "INSERT INTO job (structure, protocol, decision, priority, state, overruled, relabel, relabel_after)
     SELECT structure, CAST($1 AS BIGINT), decision, priority, CASE WHEN EXISTS (SELECT 1 FROM label
             WHERE label.structure = job.structure AND label.protocol = $1 AND standing IN ('label', 'excluded'))
@@ -75,11 +77,11 @@ const LEAVE_BEHIND: &str =
         expires = NULL
     WHERE protocol <> $1 AND state IN ('queued', 'leased', 'failed')";
 
-/// Attempts at jobs that nobody has any more.
+/// Ends attempts at jobs that are no longer leased.
 const END_ATTEMPTS: &str = "UPDATE attempt SET ended = $1, outcome = 'dropped' WHERE outcome IS NULL
     AND EXISTS (SELECT 1 FROM job WHERE job.number = attempt.job AND state <> 'leased')";
 
-/// Labels that were made or taken in for a job of the structure; others belong to other data sets.
+/// Labels that belong to a job of the structure. Others belong to other data sets.
 const SUPERSEDE: &str = "UPDATE label SET standing = 'superseded', superseded = $2, reason = $3
     WHERE structure = $1 AND standing IN ('label', 'excluded') AND EXISTS (SELECT 1 FROM job
         WHERE job.structure = label.structure AND job.protocol = label.protocol)";
@@ -89,10 +91,10 @@ const SUPERSEDE_JOBS: &str =
         expires = NULL
     WHERE structure = $1 AND protocol <> $2 AND state NOT IN ('dropped', 'superseded')";
 
-/// Jobs for which another label was asked, by state.
+/// Number of jobs with a request for a new label, by state.
 const ASKED: &str = "SELECT state, count(*) FROM job WHERE relabel IS NOT NULL GROUP BY state";
 
-/// A job, as far as it decides what a result is.
+/// The columns of a job that decide the status of a result.
 struct RelabelRow {
     number: i64,
     state: String,
@@ -121,8 +123,8 @@ impl FromRow for Relabellable {
 }
 
 impl Store {
-    /// Every structure that has its label and was not dropped, in decision order, with its job by that protocol, which the campaign
-    /// need not know.
+    /// Every structure that has a label and was not dropped, in decision order, with its job under that protocol.
+    /// The campaign need not know the protocol.
     pub async fn relabellable(&self, protocol: ContentHash) -> Result<Vec<Relabellable>> {
         let mut transaction = self.database.begin_to_read().await?;
         let own = query("SELECT number FROM protocol WHERE hash = $1").bind(protocol.0.to_vec());
@@ -133,7 +135,7 @@ impl Store {
         let mut structures: Vec<Relabellable> = Vec::with_capacity(found.len());
         for one in found {
             match structures.last_mut().filter(|last| last.content == one.content) {
-                // The newest job is the one that counts.
+                // The newest job counts.
                 Some(last) => *last = one,
                 None => structures.push(one),
             }
@@ -141,8 +143,8 @@ impl Store {
         Ok(structures)
     }
 
-    /// Number of structures without a label whose jobs are of another protocol than this: they go over to it when it comes into
-    /// force.
+    /// Number of structures without a label whose jobs have another protocol. They move to this one when it comes
+    /// into force.
     pub async fn unlabelled_by_others(&self, protocol: ContentHash) -> Result<u64> {
         let sql = "SELECT count(*) FROM job WHERE state IN ('queued', 'leased', 'failed')
                    AND protocol <> coalesce((SELECT number FROM protocol WHERE hash = $1), 0)
@@ -151,13 +153,14 @@ impl Store {
         query(sql).bind(protocol.0.to_vec()).fetch_one(&self.database).await
     }
 
-    /// Asks for other labels of structures that have theirs: by the protocol in force, or by one that comes into force. In that
-    /// case all that has no label goes over to it, and calculations under way are for nothing. Structures that wait already, or were
-    /// dropped, are left alone, so asking twice is asking once. Leaves a line `relabel` in the operations log.
+    /// Requests new labels for labelled structures, under the protocol in force or under a new protocol that comes
+    /// into force. In the latter case all structures without a label move to the new protocol, and running
+    /// calculations are lost. Structures that wait already or were dropped stay as they are, so repeating a request
+    /// changes nothing. Adds a line `relabel` to the operations log.
     ///
     /// # Errors
-    /// [`StoreError::ProtocolName`] if another protocol has the name of the new one. [`StoreError::LockLost`] if a protocol is to
-    /// come into force and somebody else leads the campaign.
+    /// [`StoreError::ProtocolName`] if another protocol has the name of the new one. [`StoreError::LockLost`] if
+    /// there is a new protocol and another process leads the campaign.
     pub async fn relabel(&self, order: &RelabelRequest<'_>, now: i64) -> Result<RelabelCounts> {
         let mut transaction = match order.protocol {
             Some(_) => self.database.begin_to_lead().await?,
@@ -172,7 +175,7 @@ impl Store {
         let row = |content: &ContentHash| -> Vec<Value> {
             vec![content.0.to_vec().into(), protocol.into(), order.reason.into()]
         };
-        // One statement writes a row once.
+        // A statement may write a row only once.
         let mut seen = HashSet::new();
         let rows = order.structures.iter().filter(|content| seen.insert(content.0)).map(row).collect();
         let sql = if order.again { REQUEST_AGAIN } else { REQUEST };
@@ -187,12 +190,12 @@ impl Store {
     }
 }
 
-/// Whether the tables are not those of an earlier version, in which nothing is labelled again.
+/// Whether the tables have the columns for requests; those of an earlier version do not.
 pub(crate) async fn has_relabel_columns(transaction: &mut Transaction) -> Result<bool> {
     transaction.has_column("job", "relabel").await
 }
 
-/// Numbers of jobs for which another label was asked and has not come, by state.
+/// Number of jobs with an open request for a new label, by state.
 pub(super) async fn relabel_requests(transaction: &mut Transaction) -> Result<Vec<(String, u64)>> {
     if !has_relabel_columns(transaction).await? {
         return Ok(Vec::new());
@@ -200,7 +203,7 @@ pub(super) async fn relabel_requests(transaction: &mut Transaction) -> Result<Ve
     query(ASKED).fetch_all(transaction).await
 }
 
-/// Brings a protocol into force. Returns how many structures without a label went over to it.
+/// Brings a protocol into force. Returns the number of structures without a label that moved to it.
 async fn change_protocol(transaction: &mut Transaction, new: &NewProtocol<'_>, now: i64) -> Result<u64> {
     insert_protocol(transaction, new.protocol, now).await?;
     set_campaign_value(transaction, "protocol", &new.protocol.hash.to_string()).await?;
@@ -220,7 +223,7 @@ async fn change_protocol(transaction: &mut Transaction, new: &NewProtocol<'_>, n
     Ok(moved)
 }
 
-/// What a result is. If it is the label that was asked for, those in whose place it comes are superseded.
+/// Determines the status of a result. A requested label supersedes the labels that it replaces.
 pub(super) async fn status_of_result(
     transaction: &mut Transaction,
     structure: i64,
@@ -240,7 +243,7 @@ pub(super) async fn status_of_result(
     let Some(reason) = relabel else { return Ok(first) };
     let began_since = match source {
         LabelSource::Attempt { attempt, .. } => *attempt > relabel_after.unwrap_or(0),
-        // It may be the very one that is doubted.
+        // It may be the doubtful label itself.
         LabelSource::Import { .. } => !labelled,
     };
     if !began_since || state == JobState::Dropped.name() {

@@ -1,4 +1,4 @@
-//! The state of a campaign, from indexes.
+//! The state of a campaign, read from indexes.
 
 use wire::WalkId;
 
@@ -17,11 +17,12 @@ const END_BY_BUDGET: &str = "budget";
 
 const FATES: &str = "SELECT origin, fate, number FROM candidate_count";
 
-/// The same where nobody has kept count: in tables of an earlier version.
+/// The same for tables of an earlier version, which keep no counts.
 pub(crate) const COUNTED_FATES: &str =
     "SELECT origin, coalesce(reason, fate), count(*) FROM candidate GROUP BY origin, fate, reason";
 
-/// The question for [`WalkStatus`], ended by which walks are meant. The table has zeros before a walk begins, and where it is not graded.
+/// The query for [`WalkStatus`]; its end selects the walks. The table has zeros before a walk starts and where it
+/// is not graded.
 macro_rules! walks {
     ($which:literal) => {
         concat!(
@@ -39,11 +40,11 @@ macro_rules! walks {
 pub(super) use walks;
 
 impl Store {
-    /// Everything at one instant. Processes are in order of kind and number. A process that is gone has the
-    /// state `gone`, whatever was said of it before, unless it was `given up`, or is `pausing` and an orchestrator lives. One
-    /// of another host that has said nothing for a minute is `silent`.
-    /// A walk that a limit of time has stopped has the state `budget`. While nobody leads the campaign, walks stand at their
-    /// checkpoints and have no latest.
+    /// A snapshot of the campaign's state. Processes are ordered by kind and number. A dead process has the state
+    /// `gone`, whatever state it reported last, unless it was `given up`, or is `pausing` and an orchestrator
+    /// lives. A process on another host without a heartbeat for a minute is `silent`. A walk stopped by a time
+    /// limit has the state `budget`. While no process leads the campaign, walks are shown at their checkpoints and
+    /// have no speed.
     pub async fn status(&self) -> Result<Status> {
         let now = unix_milliseconds();
         let mut transaction = self.database.begin_to_read().await?;
@@ -98,7 +99,7 @@ impl Store {
     }
 }
 
-/// Says of walks under way how fast they are, and where they are between their checkpoints.
+/// Adds the speed of running walks, and their progress since the last checkpoint.
 fn advance(walks: &mut [WalkStatus], progress: &[WalkProgress]) {
     for walk in walks.iter_mut().filter(|walk| walk.is_under_way()) {
         let Ok(found) = progress.binary_search_by_key(&walk.walk, |latest| latest.walk) else { continue };
@@ -112,7 +113,7 @@ fn advance(walks: &mut [WalkStatus], progress: &[WalkProgress]) {
     }
 }
 
-/// Says of walks which budget has ended them. Those that are under way are stopped while a limit of time is reached.
+/// Sets the budget that ended walks. Running walks count as stopped while a time limit is reached.
 fn set_budget_reason(walks: &mut [WalkStatus], time: Option<&'static str>, limits: &Budget) {
     let structures = limits.structures_by.as_deref().unwrap_or("collect.total");
     for walk in walks {
@@ -125,7 +126,7 @@ fn set_budget_reason(walks: &mut [WalkStatus], time: Option<&'static str>, limit
     }
 }
 
-/// The limit that ended walks: of time, or what the walks say.
+/// The limit that ended walks: a time limit, or the one that the walks name.
 fn used_up(time: Option<&'static str>, walks: &[WalkStatus]) -> Option<String> {
     let ended = || walks.iter().rfind(|walk| walk.state == END_BY_BUDGET).map(|walk| walk.reason.clone());
     time.map(str::to_owned).or_else(ended)
@@ -172,8 +173,8 @@ fn labels(states: &[(String, u64)], asked: &[(String, u64)]) -> Labels {
     }
 }
 
-/// In order of kind and number. One that is gone has no other state, but for what the orchestrator says of those that it does not start again: they
-/// were given up, or their pause is not over.
+/// Orders processes by kind and number. A dead process keeps its own state only if the orchestrator has given it up
+/// or waits before it restarts it.
 fn with_visible_state(mut processes: Vec<ProcessRecord>) -> Vec<ProcessRecord> {
     let ranks = [ProcessRecord::ORCHESTRATOR, ProcessRecord::WALKER, ProcessRecord::LABELLER];
     let rank = |kind: &str| ranks.iter().position(|k| *k == kind).unwrap_or(ranks.len());
