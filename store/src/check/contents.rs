@@ -1,4 +1,4 @@
-//! What stands in the long columns: structures, candidates, labels, texts of JSON, packed directories.
+//! Checks the content of long columns: structures, candidates, labels, JSON texts, packed directories.
 
 use wire::{CandidateBlock, ContentHash};
 
@@ -16,7 +16,7 @@ use crate::tables::labels::decode_label;
 
 /// Rows read at a time: a row of a large structure has megabytes.
 const PAGE: u32 = 16;
-/// Findings of a kind that are told one by one.
+/// Number of findings of a kind that are listed one by one.
 const TOLD: usize = 5;
 
 const STRUCTURES: &str =
@@ -70,16 +70,16 @@ from_columns!(Candidate { id, content, block, features, selector_grades, origina
 from_columns!(Label { atoms, energy, forces, stress, details });
 from_columns!(Text { text });
 
-/// A row that can be looked into.
+/// A row whose content can be checked.
 trait Content: FromRow {
     /// What is wrong with it.
     fn fault(&self) -> Option<String>;
 }
 
-/// The table of rows, and which of their long columns have checksums of their own.
+/// The table of the rows, and its long columns that have checksums of their own.
 type Checked = (&'static CheckedTable, &'static [&'static CheckedColumn]);
 
-/// What is wrong with a row: what it holds, or that it is not what was written.
+/// The fault of a row: invalid content or a wrong checksum.
 fn fault<C: Content>(row: &Row, (table, columns): Checked) -> Option<String> {
     let content = match C::from_row(row) {
         Ok(content) => content.fault(),
@@ -96,7 +96,7 @@ fn fault<C: Content>(row: &Row, (table, columns): Checked) -> Option<String> {
     content.or_else(verify)
 }
 
-/// Looks into rows, and remembers what is wrong.
+/// Checks rows and collects findings.
 pub(super) struct Contents<'a> {
     transaction: &'a mut Transaction,
     tell: &'a mut dyn FnMut(u64, u64),
@@ -140,7 +140,7 @@ impl<'a> Contents<'a> {
         Ok(())
     }
 
-    /// One at a time: each may have as much as a calculation may leave.
+    /// One at a time: each may be as large as the work directory of a calculation.
     async fn archives(&mut self) -> Result<()> {
         let (mut last, mut faults) = ((0, 0), Vec::new());
         while let Some(packed) = Packed::after(self.transaction, last.0, last.1).await? {

@@ -1,4 +1,4 @@
-//! What holds between rows.
+//! Invariants between rows.
 
 use super::Finding;
 use crate::database::{Transaction, query};
@@ -9,7 +9,7 @@ use crate::tables::job_counts;
 use crate::tables::processes::{LEASED, all};
 use crate::tables::relabel;
 
-/// A query that counts what must not be, with an example.
+/// A query that counts violations, with an example.
 pub(super) struct Rule {
     pub finds: &'static str,
     pub what: &'static str,
@@ -28,7 +28,7 @@ const LOST: &str = "something was lost or changed by hand; restore the campaign 
 const QUEUE: &str =
     "the label queue was changed by hand; calmwalk queue shows the jobs, and a backup has them whole";
 
-/// What lets structures or labels be missing in an export, which does not see them itself.
+/// Violations that make structures or labels missing in an export without being noticed there.
 const LOSSES: [Rule; 7] = [
     Rule {
         finds: "SELECT count(*), CAST(min(sequence) AS TEXT) FROM decision WHERE sequence > 1
@@ -147,7 +147,7 @@ pub(super) fn all_rules() -> impl Iterator<Item = &'static Rule> {
     LOSSES.iter().chain(&RULES)
 }
 
-/// What is missing, whatever the rest of the campaign says.
+/// Checks for missing rows.
 pub(super) async fn losses(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let mut findings = Vec::new();
     for rule in &LOSSES {
@@ -159,7 +159,7 @@ pub(super) async fn losses(transaction: &mut Transaction) -> Result<Vec<Finding>
     Ok(findings)
 }
 
-/// Jobs that do not agree with their labels.
+/// Jobs that contradict their labels.
 macro_rules! disagreeing {
     ($but:literal) => {
         concat!(
@@ -171,7 +171,7 @@ macro_rules! disagreeing {
     };
 }
 
-/// Jobs that are labelled have a label; others have one only if another was asked for.
+/// Labelled jobs have a label; other jobs have one only if a new label was requested.
 pub(super) async fn labelled_jobs(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let sql = match relabel::has_relabel_columns(transaction).await? {
         true => disagreeing!(" AND NOT (state IN ('queued', 'leased') AND relabel IS NOT NULL)"),
@@ -185,13 +185,13 @@ pub(super) async fn labelled_jobs(transaction: &mut Transaction) -> Result<Vec<F
     Ok((count > 0).then(|| Finding { what: what(), then: QUEUE }).into_iter().collect())
 }
 
-/// What is counted of candidates, against what is there.
+/// Compares the counts of candidates with the rows.
 const COUNTS: &str = "SELECT count(*), min(coalesce(found.origin, kept.origin) || ' ' || coalesce(found.fate, kept.fate))
     FROM (SELECT origin, coalesce(reason, fate) AS fate, count(*) AS number FROM candidate GROUP BY 1, 2) AS found
     FULL JOIN candidate_count AS kept ON kept.origin = found.origin AND kept.fate = found.fate
     WHERE found.number IS DISTINCT FROM kept.number";
 
-/// Counts that are kept and are not those of the rows.
+/// Checks stored counts against the rows.
 pub(super) async fn counts(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     if !transaction.has_table("candidate_count").await? {
         return Ok(Vec::new());
@@ -216,7 +216,7 @@ pub(super) async fn job_counts(transaction: &mut Transaction) -> Result<Vec<Find
     Ok((count > 0).then(|| Finding { what: what(), then: QUEUE }).into_iter().collect())
 }
 
-/// Leases of processes that do not exist any more.
+/// Checks for leases of processes that no longer exist.
 pub(super) async fn leases(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let leased: Vec<(i64, String)> = query(LEASED).fetch_all(&mut *transaction).await?;
     let mut living = all(transaction).await?;
@@ -229,7 +229,7 @@ pub(super) async fn leases(transaction: &mut Transaction) -> Result<Vec<Finding>
     Ok(vec![Finding { what, then: "the next calmwalk run, or calmwalk label, takes them back" }])
 }
 
-/// The sums by which budgets are held. Tables of an earlier version have none.
+/// Checks the totals that budgets use. Tables of an earlier version have none.
 pub(super) async fn sums(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     let mut findings = Vec::new();
     for (name, sum) in SUMS {

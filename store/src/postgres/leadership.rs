@@ -1,8 +1,9 @@
-//! One process leads a campaign: an advisory lock of the server, which belongs to a connection.
+//! Leader election: an advisory lock of the server, which belongs to a connection.
 //!
-//! A connection may break while the process lives, and somebody else may have the lock then. So each who takes it adds one to
-//! the generation in the table `leader`, under which it writes ([`Server::begin_to_lead`]): nobody of an earlier generation
-//! writes any more. Who loses the connection takes the lock again if nobody had it meanwhile.
+//! A connection may break while its process lives, and another process may then take the lock. Each new holder
+//! therefore increments the generation in the table `leader`, a fencing token under which it writes
+//! ([`Server::begin_to_lead`]): holders of an earlier generation can no longer write. A process that loses the
+//! connection takes the lock again if nobody had it meanwhile.
 
 use std::time::{Duration, Instant};
 
@@ -18,15 +19,15 @@ use crate::location::ServerUrl;
 use crate::process_start::process_start_time;
 use crate::processes::this_host;
 
-/// Between two looks at the connection, and between two tries to have it again.
+/// Time between two checks of the connection, and between two tries to take the lock again.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
-/// Longest time for an answer.
+/// Longest time to wait for a reply.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long it may take until a server notices that the last holder has left.
+/// How long a server may take to notice that the last holder has left.
 const RELEASE_TIMEOUT: Duration = Duration::from_secs(1);
 const RELEASE_POLL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Returns whether the lock is this connection's now.
+/// Returns whether this connection now has the lock.
 const TRY_LOCK: &str = "SELECT pg_try_advisory_lock(hashtextextended('calmwalk ' || $1, 0))";
 
 /// The right to lead the campaign in one schema.
@@ -34,7 +35,7 @@ const TRY_LOCK: &str = "SELECT pg_try_advisory_lock(hashtextextended('calmwalk '
 pub struct Leadership {
     pub generation: i64,
     location: String,
-    /// Who leads it instead.
+    /// The new leader, if there is one.
     successor: watch::Receiver<Option<String>>,
     holder_task: JoinHandle<()>,
 }
@@ -87,7 +88,7 @@ async fn try_lock(connection: &mut PgConnection, schema: &str) -> Result<bool> {
     Ok(sqlx::query_scalar(TRY_LOCK).bind(schema).fetch_one(connection).await?)
 }
 
-/// Holds the lock until another process has it.
+/// Holds the lock until another process takes it.
 async fn hold(
     mut connection: PgConnection,
     options: PgConnectOptions,
@@ -103,11 +104,11 @@ async fn hold(
             match timeout(ANSWER_TIMEOUT, reacquire(&options, &schema, generation)).await {
                 Ok(Ok(Reacquired::Held(connection))) => break connection,
                 Ok(Ok(Reacquired::Lost(holder))) => {
-                    // Nobody may ask any more.
+                    // The receiver may be gone.
                     let _ = tell.send(Some(holder));
                     return;
                 }
-                // Not yet: the server is away, or has not noticed yet that the old connection broke.
+                // Not yet: the server cannot be reached, or has not noticed that the old connection broke.
                 _ => tokio::time::sleep(POLL_INTERVAL).await,
             }
         };

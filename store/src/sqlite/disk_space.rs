@@ -1,4 +1,4 @@
-//! Whether there is room to write a database anew.
+//! Checks the disk space needed to rewrite a database.
 
 use std::env;
 use std::os::unix::fs::MetadataExt;
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use crate::error::{Result, StoreError};
 use crate::filesystem::free_space;
 
-/// Checks that `bytes` are free for temporary files of SQLite, and as many beside `database` for its log.
+/// Checks that `bytes` are free for SQLite's temporary files, and as many beside `database` for its log.
 pub(super) fn check(database: &Path, bytes: u64) -> Result<()> {
     let beside = database.parent().unwrap_or(Path::new("."));
     let temporary = temporary_directory();
@@ -23,7 +23,7 @@ pub(super) fn check(database: &Path, bytes: u64) -> Result<()> {
     Ok(())
 }
 
-/// Where SQLite puts its temporary files, https://www.sqlite.org/tempfiles.html
+/// SQLite's directory for temporary files, https://www.sqlite.org/tempfiles.html
 fn temporary_directory() -> PathBuf {
     let named = ["SQLITE_TMPDIR", "TMPDIR"].into_iter().filter_map(env::var_os).map(PathBuf::from);
     let known = ["/var/tmp", "/usr/tmp", "/tmp", "."].into_iter().map(PathBuf::from);

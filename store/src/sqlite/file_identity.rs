@@ -1,4 +1,4 @@
-//! Whether the database still is the file that was opened.
+//! Detects whether the database file was replaced after it was opened.
 
 use std::fs;
 use std::io;
@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 
 use crate::error::{Result, StoreError};
 
-/// The file that was opened. What is written into one that was deleted or replaced would be lost without a word.
+/// The identity of the opened file. Anything written to a deleted or replaced file would be lost silently.
 #[derive(Clone, Debug)]
 pub(super) struct FileIdentity {
     path: PathBuf,
-    /// Device and number of the file on it.
+    /// Device and inode number.
     identity: (u64, u64),
 }
 

@@ -1,4 +1,4 @@
-//! Tables of an earlier version, which are looked at and stay as they are.
+//! Read-only access to tables of an earlier version.
 
 use std::sync::LazyLock;
 
@@ -8,10 +8,11 @@ use sqlx::sqlite::SqliteConnectOptions;
 use crate::error::Result;
 use crate::tables::checksums;
 
-/// Temporary views in the place of tables whose rows have no checksums: they say so, and are otherwise the same.
+/// Temporary views that replace tables without checksums. They mark the checksums as unknown and are otherwise the
+/// same.
 static VIEWS: LazyLock<String> = LazyLock::new(|| checksums::views("main"));
 
-/// What each connection to such a database executes first; none for tables with checksums.
+/// SQL that each connection to such a database executes first; `None` for tables with checksums.
 pub(super) async fn views(options: &SqliteConnectOptions) -> Result<Option<&'static str>> {
     let mut connection = options.connect().await?;
     let sql = "SELECT count(*) FROM pragma_table_info('label') WHERE name = 'checksum'";

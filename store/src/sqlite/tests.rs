@@ -1,4 +1,4 @@
-//! What cannot be seen from outside: plans of queries, settings of connections, a full disk.
+//! Tests of internals: query plans, connection settings, a full disk.
 
 use sqlx::AssertSqlSafe;
 use wire::CampaignId;
@@ -74,7 +74,7 @@ async fn what_is_asked_often_goes_through_indexes() {
         outcomes::FINISHED,
         recent::NEWEST,
     ] {
-        // A page is what an index found, and no longer than was asked for.
+        // A page is a result of an index and has a bounded length.
         let plan = plan(&file, sql).await.replace("SCAN CONSTANT ROW", "").replace("SCAN page", "");
         assert!(!plan.contains("SCAN") && !plan.contains("TEMP B-TREE"), "{sql}\n{plan}");
     }
@@ -120,7 +120,7 @@ async fn a_full_disk_says_so_and_loses_nothing() {
         ..Commit::default()
     };
     store.commit(&component(10)).await.unwrap();
-    // SQLite answers a limit on the size of the file as it answers a full disk.
+    // SQLite reports a limit on the file size like a full disk.
     let pool = file.writer.as_ref().unwrap();
     let pages: i64 = sqlx::query_scalar("PRAGMA page_count").fetch_one(pool).await.unwrap();
     sqlx::query(AssertSqlSafe(format!("PRAGMA max_page_count = {}", pages + 2))).execute(pool).await.unwrap();

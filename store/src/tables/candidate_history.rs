@@ -1,4 +1,5 @@
-//! One candidate or imported structure, and what stands around it: everything through indexes, or near in the decision log.
+//! One candidate or imported structure, and everything related to it. All queries use indexes or stay near it in
+//! the decision log.
 
 use wire::{ContentHash, WalkId};
 
@@ -16,12 +17,12 @@ use crate::jobs::JobDetails;
 use crate::records::{Operation, Protocol};
 use crate::status::WalkStatus;
 
-/// Candidates shown when a name fits none or several.
+/// Number of candidates shown if a name fits none or several.
 const SHOWN: u32 = 5;
-/// Decisions read at a time, and at most, when the log is followed from one decision on.
+/// Decisions read at a time when the log is followed from one decision on, and the most that are read.
 const PAGE: u32 = 1000;
 const FAR: i64 = 20_000;
-/// The same structure is rarely there more than twice: a candidate, and a frame of its control.
+/// A structure rarely occurs more than twice: as a candidate and as a frame of its control.
 const SAME: u32 = 100;
 
 pub(crate) const NUMBERED: &str = "SELECT decision, id AS candidate FROM candidate WHERE decision = $1";
@@ -51,7 +52,7 @@ pub(crate) const LABELS: &str =
     CROSS JOIN protocol ON protocol.number = label.protocol
     WHERE structure.hash = $1 ORDER BY label.protocol, label.number";
 
-/// The accepted candidate of a walk at a step: in the names of the walk.
+/// The accepted candidate of a walk at a step, found by the walk's names.
 pub(crate) const AT_STEP: &str = "SELECT decision, id AS candidate FROM candidate
     WHERE id >= $1 AND id < $1 || '~' AND step = $2 AND fate = 'accepted' ORDER BY id LIMIT 1";
 
@@ -71,7 +72,7 @@ const IMPORTED: &str = concat!(
     " FROM import CROSS JOIN structure ON structure.number = import.structure WHERE import.number = $1"
 );
 
-/// What people do is in the log of operations, which does not grow with the candidates.
+/// Manual changes are in the operations log, which does not grow with the candidates.
 const MANUAL_OPERATIONS: &str = "SELECT number, time, kind, detail FROM operation
     WHERE kind IN ('drop', 'retry', 'prioritise', 'exclude', 'include') ORDER BY number";
 
@@ -110,8 +111,8 @@ struct After {
 from_columns!(After { sequence, id, reason, seen, decided });
 
 impl Store {
-    /// A candidate by the number of the decision about it, by its name, or by the beginning of that; the campaign's part of
-    /// the name may be left out.
+    /// Finds a candidate by the sequence number of its decision, by its name or by a prefix of the name. The
+    /// campaign's part of the name may be omitted.
     pub async fn find_candidate(&self, id: &str) -> Result<CandidateRef> {
         if let Ok(decision) = id.parse::<i64>() {
             let found = query(NUMBERED).bind(decision).fetch_optional(&self.database).await?;
@@ -151,7 +152,7 @@ impl Store {
         Ok(StoreError::UnknownCandidate { id: id.into(), range: first.zip(last) })
     }
 
-    /// The imported structure of that number, from 1.
+    /// The imported structure with that number, from 1.
     pub async fn imported_structure(&self, number: i64) -> Result<Option<ImportedStructure>> {
         query(IMPORTED).bind(number).fetch_optional(&self.database).await
     }
@@ -161,7 +162,7 @@ impl Store {
         query("SELECT coalesce(max(number), 0) FROM import").fetch_one(&self.database).await
     }
 
-    /// Where this very structure stands.
+    /// Other occurrences of this structure.
     pub async fn same_structure(&self, content: ContentHash) -> Result<SameStructure> {
         let candidates = query(SAME_STRUCTURE).bind(&content.0[..]).bind(SAME);
         let import = query(
@@ -174,7 +175,7 @@ impl Store {
         })
     }
 
-    /// The label jobs of a structure, of whatever protocol, with their attempts, oldest first.
+    /// Label jobs of a structure under every protocol, with their attempts, oldest first.
     pub async fn jobs_of(&self, content: ContentHash) -> Result<Vec<JobDetails>> {
         let mut numbers: Vec<i64> = query(JOBS).bind(&content.0[..]).fetch_all(&self.database).await?;
         numbers.sort_unstable();
@@ -185,12 +186,12 @@ impl Store {
         Ok(jobs)
     }
 
-    /// Labels and checks of a structure, of whatever protocol, oldest first in each.
+    /// Labels and checks of a structure under every protocol, oldest first in each.
     pub async fn labels_of(&self, content: ContentHash) -> Result<Vec<StructureLabel>> {
         query(LABELS).bind(&content.0[..]).fetch_all(&self.database).await
     }
 
-    /// What people did to a job, oldest first.
+    /// Manual changes of a job, oldest first.
     pub async fn manual_operations(&self, job: i64) -> Result<Vec<Operation>> {
         let rows: Vec<(i64, i64, String, String)> =
             query(MANUAL_OPERATIONS).fetch_all(&self.database).await?;
@@ -212,7 +213,7 @@ impl Store {
         query(AT_STEP).bind(begin).bind(step).fetch_optional(&self.database).await
     }
 
-    /// Where a walk stands, and the biased walk that it matches, if it is a control.
+    /// The state of a walk, and for a control walk the biased walk that it matches.
     pub async fn walk(&self, walk: WalkId) -> Result<Option<(WalkStatus, Option<WalkId>)>> {
         let status = query(walks!("WHERE walk = $1"));
         let status: Option<WalkStatus> = status.bind(walk.0).fetch_optional(&self.database).await?;
@@ -223,8 +224,8 @@ impl Store {
         Ok(Some((status, u32::try_from(partner).ok().map(WalkId))))
     }
 
-    /// The candidates whose updates made the mixture newer than version `seen` before a decision, newest first; some
-    /// thousands of decisions before it at most are looked at.
+    /// Candidates whose updates made the mixture newer than version `seen` before a decision, newest first. Looks
+    /// back some thousands of decisions at most.
     pub async fn updates_since(&self, seen: u64, decision: i64) -> Result<Vec<CandidateRef>> {
         let (mut updates, mut first) = (Vec::new(), decision);
         while first > decision - FAR {
@@ -243,9 +244,9 @@ impl Store {
         Ok(updates)
     }
 
-    /// The candidates that were declined as covered after a decision, whose walkers had seen no mixture as new as
-    /// `version`. `staleness`: no walker has ever seen a mixture that was older by more versions; without it some
-    /// thousands of decisions are looked at.
+    /// Candidates declined as covered after a decision, whose walkers had seen only mixtures older than `version`.
+    /// `staleness` is the largest number of versions by which any walker's mixture was ever behind; without it the
+    /// search covers some thousands of decisions.
     pub async fn covered_since(
         &self,
         decision: i64,

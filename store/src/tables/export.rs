@@ -1,4 +1,4 @@
-//! Labelled structures, page by page.
+//! Pages of labelled structures.
 
 use std::collections::HashSet;
 
@@ -35,7 +35,7 @@ pub(crate) const CANDIDATES: &str = concat!(
     ORDER BY candidate.decision LIMIT $5"
 );
 
-/// Imported structures that are not rows of candidates already.
+/// Imported structures that are not exported as candidates.
 pub(crate) const IMPORTS: &str = concat!(
     "SELECT import.number AS place, ",
     joined!(import),
@@ -50,21 +50,21 @@ pub(crate) const IMPORTS: &str = concat!(
     ORDER BY import.number LIMIT $3"
 );
 
-/// Hashes of structures that were collected of biased walks and of controls.
+/// Hashes of structures collected from both biased and control walks.
 const OF_BOTH_ORIGINS: &str = "SELECT DISTINCT content FROM candidate WHERE origin = 'control'
     AND EXISTS (SELECT 1 FROM candidate other WHERE other.structure = candidate.structure AND other.origin = 'biased')";
 
 impl Store {
-    /// Structures that a biased walk and a control walk have both found: a control has the random numbers of its biased walk, and
-    /// is at the same place until the bias tells them apart. Such a structure has one label.
+    /// Structures found by both a biased walk and its control: the two share random numbers and agree until the
+    /// bias acts. Such a structure has one label.
     pub async fn structures_of_both_origins(&self) -> Result<HashSet<ContentHash>> {
         let hashes: Vec<Vec<u8>> = query(OF_BOTH_ORIGINS).fetch_all(&self.database).await?;
         hashes.iter().map(|hash| decode_hash(hash)).collect()
     }
 
-    /// At most `limit` labelled structures behind `after` (`None`: from the first on): candidates in decision order, then
-    /// imports as they came, whatever the order in which the labels came. An empty page is the end. What was dropped by
-    /// hand is left out.
+    /// At most `limit` labelled structures after `after` (`None`: from the first): candidates in decision order,
+    /// then imports in import order, independent of when labels arrived. Leaves out structures dropped by hand. An
+    /// empty page is the end.
     pub async fn labelled(
         &self,
         filter: &ExportFilter,

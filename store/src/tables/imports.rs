@@ -1,4 +1,4 @@
-//! Labelled structures that exist already.
+//! Import of labelled structures.
 
 use atoms::Structure;
 use wire::ContentHash;
@@ -15,9 +15,9 @@ use crate::jobs::{ImportCounts, LabelSource, LabelStatus};
 use crate::records::Label;
 
 impl Store {
-    /// Takes in frames of `file` that are labelled by `protocol` (see [`Store::add_protocol`]), each with its number
-    /// in the file. Numbers that are there already are left as they are, so an import can be repeated; other numbers
-    /// for a structure that has a label become checks. A job that waits for one of the labels is done. All frames or none.
+    /// Imports frames of `file` labelled under `protocol` (see [`Store::add_protocol`]), each with its index in the
+    /// file. An import can be repeated: identical results stay as they are. Different results for a structure with
+    /// a label become checks. Jobs that wait for one of the labels are done. All frames are imported, or none.
     pub async fn import(
         &self,
         protocol: ContentHash,
@@ -51,7 +51,7 @@ impl Store {
     }
 }
 
-/// Whether the very same numbers are there, as label, check or superseded.
+/// Whether identical results are stored already, as label, check or superseded label.
 async fn is_known(
     transaction: &mut Transaction,
     structure: i64,

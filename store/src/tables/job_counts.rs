@@ -1,4 +1,4 @@
-//! How many label jobs there are, from counts that the database keeps (`migrations`), and how many labels were made.
+//! Number of label jobs, from counts that triggers keep (`migrations`), and number of labels made.
 
 use super::protocols;
 use crate::Store;
@@ -13,14 +13,14 @@ const HOUR: i64 = 3_600_000;
 
 const STATES: &str = "SELECT state, CAST(sum(number) AS BIGINT) FROM job_count GROUP BY state";
 
-/// The same in tables of an earlier version.
+/// The same, counted, for tables of an earlier version.
 pub(crate) const COUNTED_STATES: &str = "SELECT state, count(*) FROM job GROUP BY state";
 
 const PROTOCOLS: &str = "SELECT protocol.name, state, CAST(sum(job_count.number) AS BIGINT) FROM job_count
     JOIN protocol ON protocol.number = job_count.protocol GROUP BY protocol.number, protocol.name, state
     HAVING sum(job_count.number) > 0 ORDER BY protocol.number, state";
 
-/// The same in tables of an earlier version.
+/// The same, counted, for tables of an earlier version.
 const COUNTED_PROTOCOLS: &str = "SELECT protocol.name, state, count(*) FROM job
     JOIN protocol ON protocol.number = job.protocol GROUP BY protocol.number, protocol.name, state
     ORDER BY protocol.number, state";
@@ -29,7 +29,7 @@ const WAITING: &str = "SELECT seed_structure, formula, atoms, CAST(sum(number) A
     WHERE state IN ('queued', 'leased') AND protocol = $1 GROUP BY seed_structure, formula, atoms
     HAVING sum(number) > 0";
 
-/// The same in tables of an earlier version.
+/// The same, counted, for tables of an earlier version.
 const COUNTED_WAITING: &str = "SELECT seed_structure, formula, atoms, count(*)
     FROM job CROSS JOIN candidate ON candidate.decision = job.decision
     WHERE job.state IN ('queued', 'leased') AND job.protocol = $1 GROUP BY seed_structure, formula, atoms";
@@ -39,7 +39,7 @@ pub(crate) const OLDEST_LEASE: &str = "SELECT job, holder, started FROM attempt 
 
 pub(crate) const LABELS_SINCE: &str = "SELECT count(*) FROM label WHERE job IS NOT NULL AND received > $1";
 
-/// What is kept, against what is there.
+/// Compares the stored counts with the rows.
 pub(crate) const WRONG: &str = "SELECT count(*), min(coalesce(found.state, kept.state))
     FROM (SELECT protocol, state, seed_structure, formula, atoms, count(*) AS number
           FROM job JOIN candidate ON candidate.decision = job.decision GROUP BY 1, 2, 3, 4, 5) AS found
@@ -57,19 +57,19 @@ pub(super) async fn states(transaction: &mut Transaction) -> Result<Vec<(String,
     query(sql).fetch_all(transaction).await
 }
 
-/// The attempt under way that began first.
+/// The running attempt that started first.
 pub(super) async fn oldest_lease(transaction: &mut Transaction) -> Result<Option<OldestLease>> {
     query(OLDEST_LEASE).fetch_optional(transaction).await
 }
 
-/// Labels that were made within an hour before `now`.
+/// Labels made within the hour before `now`.
 pub(super) async fn labels_in_last_hour(transaction: &mut Transaction, now: i64) -> Result<u64> {
     let now = transaction.time(now).await?;
     query(LABELS_SINCE).bind(now - HOUR).fetch_one(transaction).await
 }
 
 impl Store {
-    /// Numbers of label jobs by the name of their protocol and by state, in the order in which protocols came.
+    /// Number of label jobs by protocol name and state, in the order in which protocols were added.
     pub async fn jobs_by_protocol(&self) -> Result<Vec<(String, JobState, u64)>> {
         let mut transaction = self.database.begin_to_read().await?;
         let sql = if have_counts(&mut transaction).await? { PROTOCOLS } else { COUNTED_PROTOCOLS };
@@ -83,7 +83,7 @@ impl Store {
         rows.into_iter().map(row).collect()
     }
 
-    /// The jobs of this protocol that have no label yet and may get one, by their sizes.
+    /// Unfinished jobs of this protocol, by size.
     pub async fn waiting_jobs(&self, protocol: ContentHash) -> Result<Vec<PendingJobs>> {
         let mut transaction = self.database.begin_to_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;

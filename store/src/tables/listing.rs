@@ -1,4 +1,5 @@
-//! Pages of the table of candidates. Each goes through an index from its first row on, however many rows there are.
+//! Pages of the candidate table. Each query reads an index from the first row of the page, so its cost does not
+//! depend on the number of rows.
 
 use super::labels::LabelRow;
 use crate::Store;
@@ -105,10 +106,10 @@ pub(crate) const LARGEST_VOLUME: &str = page!(
 pub(crate) const LEAST_VOLUME: &str =
     page!("(relative_volume, candidate.decision) > ($1, $2)", "relative_volume, candidate.decision", "$3");
 
-/// Of one walk, in the order of their names.
+/// Candidates of a walk, ordered by name.
 pub(crate) const OF_WALK: &str = page!("id >= $1 AND id < $1 || '~'", "id", "$2");
 
-/// The jobs are found in the index, and only those of the page are looked at.
+/// The index gives the jobs; only those of the page are read.
 pub(crate) const QUEUE: &str = lines!(
     "FROM (SELECT number AS place FROM job WHERE state = $1 AND priority <= $2
               AND (priority < $2 OR decision > $3) ORDER BY priority DESC, decision LIMIT $4) AS page
@@ -122,7 +123,7 @@ pub(crate) const QUEUE: &str = lines!(
 );
 
 impl Store {
-    /// At most `limit` candidates behind a place (none: from the first on), the largest first if `descending`.
+    /// At most `limit` candidates after a cursor (`None`: from the first), in descending order if `descending`.
     pub async fn list_candidates(
         &self,
         order: ListOrder,
@@ -142,7 +143,7 @@ impl Store {
         query.bind(decision).bind(limit).fetch_all(&self.database).await
     }
 
-    /// The same in the order of decisions, only those of this origin and fate; `reason` belongs to `declined`.
+    /// The same in decision order, for one origin and fate. `reason` belongs to `declined`.
     pub async fn list_fate(
         &self,
         origin: &str,
@@ -157,7 +158,8 @@ impl Store {
         query.bind(reason).bind(limit).fetch_all(&self.database).await
     }
 
-    /// Those whose jobs are in a state, in the order in which they would be leased. `after`: priority and decision.
+    /// Candidates whose jobs have a state, in the order in which they would be leased. `after` holds priority and
+    /// decision.
     pub async fn list_queue(
         &self,
         state: JobState,
@@ -169,7 +171,7 @@ impl Store {
         query.bind(limit).fetch_all(&self.database).await
     }
 
-    /// Candidates of a walk in the order of its steps; of walks that offered more than `limit`, some.
+    /// Candidates of a walk, ordered by step. Returns only some if the walk has more than `limit`.
     pub async fn list_walk(&self, walk: u32, limit: u32) -> Result<Vec<ListedCandidate>> {
         let campaign = self.campaign_value("id").await?;
         let begin = format!("{}-{walk}.", campaign.get(..8).unwrap_or_default());

@@ -1,4 +1,4 @@
-//! What the functions of [`crate::Store`] do with its tables, a file a matter.
+//! The functions of [`crate::Store`] that access its tables, one file per topic.
 
 mod archives;
 pub mod budget;

@@ -1,4 +1,4 @@
-//! Structures that may be almost the same as one that waits for its label.
+//! Labelled structures that may nearly duplicate one that waits for its label.
 
 use atoms::Structure;
 
@@ -19,7 +19,7 @@ const OWN: &str = concat!(
     CROSS JOIN candidate_data ON candidate_data.decision = candidate.decision WHERE job.number = $1"
 );
 
-/// Only the nearest in energy are looked into: features that are almost the same have almost the same energy.
+/// Compares only the nearest in energy: nearly equal features have nearly equal energies.
 pub(crate) const NEAR: &str = concat!(
     "SELECT candidate.decision AS decision, id, features, features_checksum, ",
     joined!(structure),
@@ -68,8 +68,9 @@ impl FromRow for Near {
 }
 
 impl Store {
-    /// Features of the leased structure, [n × D], and of those with the same atoms in the same order that have their labels
-    /// by the same protocol: of the `limit` that are nearest in energy. `None` if its own were not kept.
+    /// Features of the leased structure, [n × D], and features of labelled structures under the same protocol with
+    /// the same atoms in the same order, among the `limit` nearest in energy. `None` if its own features were not
+    /// stored.
     pub async fn near_duplicates(
         &self,
         lease: &Lease,

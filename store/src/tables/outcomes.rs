@@ -1,4 +1,4 @@
-//! What became of label jobs: what the cost model, `status` and the table of force errors read.
+//! Results of label jobs, as the cost model, `status` and the table of force errors read them.
 
 use wire::ContentHash;
 
@@ -10,7 +10,7 @@ use crate::database::{FromRow, Row, query};
 use crate::error::Result;
 use crate::outcomes::{FailureCount, FinishedCandidate, LabelCost, LabelUsage, Unlabelled, ValueRange};
 
-/// The newest first: what labels cost may change with the machine.
+/// The newest first: the cost of labels may change with the machine.
 pub(crate) const COSTS: &str =
     "SELECT attempt.*, candidate.seed_structure, candidate.formula, candidate.atoms AS size
     FROM label CROSS JOIN attempt ON attempt.job = label.job AND attempt.attempt = label.attempt
@@ -48,7 +48,7 @@ pub(crate) const UNLABELLED: &str = "SELECT coalesce(name, '') AS seed_name, for
     HAVING sum(CASE WHEN state = 'failed' THEN 1 ELSE 0 END) > 0
     ORDER BY candidate.seed_structure, formula";
 
-/// The same without ranges of what is labelled.
+/// The same, without the ranges of labelled structures.
 const FAILED: &str = "SELECT coalesce(name, '') AS seed_name, candidate.formula AS formula, count(*) AS failed,
         (SELECT CAST(coalesce(sum(job_count.number), 0) AS BIGINT) FROM job_count
          WHERE job_count.protocol = $1 AND job_count.state = 'labelled'
@@ -84,11 +84,11 @@ pub(crate) const FINISHED: &str = concat!(
     ORDER BY candidate.decision LIMIT $3"
 );
 
-/// A label takes some time, whatever the clock says.
+/// Minimum duration of a label, whatever the clock says.
 const LEAST_MILLISECONDS: i64 = 1;
 
 impl Store {
-    /// What the newest labels took that were made by this protocol, `limit` at most.
+    /// Costs of the newest labels made under this protocol, at most `limit`.
     pub async fn label_costs(&self, protocol: ContentHash, limit: u32) -> Result<Vec<LabelCost>> {
         let mut transaction = self.database.begin_to_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
@@ -97,7 +97,7 @@ impl Store {
         Ok(costs)
     }
 
-    /// What attempts have used, and how many cores are at work now.
+    /// Resources used by attempts so far, and cores in use now.
     pub async fn label_usage(&self) -> Result<LabelUsage> {
         let mut transaction = self.database.begin_to_read().await?;
         let kept =
@@ -116,7 +116,7 @@ impl Store {
         Ok(LabelUsage { core_seconds: seconds("core_milliseconds"), label_core_seconds, cores })
     }
 
-    /// The failures that attempts of this protocol met, by class.
+    /// Failures of attempts under this protocol, by class.
     pub async fn failures(&self, protocol: ContentHash) -> Result<Vec<FailureCount>> {
         let mut transaction = self.database.begin_to_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
@@ -128,8 +128,8 @@ impl Store {
         Ok(rows.into_iter().map(count).collect())
     }
 
-    /// What is unlabelled because labels of this protocol finally failed, by seed structure and formula. Without `ranges` of
-    /// those that have their labels no more rows are read than failed.
+    /// Structures without a label because labelling under this protocol failed, by seed structure and formula.
+    /// Without `ranges` of the labelled ones, this reads only as many rows as there are failures.
     pub async fn unlabelled(&self, protocol: ContentHash, ranges: bool) -> Result<Vec<Unlabelled>> {
         let mut transaction = self.database.begin_to_read().await?;
         let protocol = protocols::protocol_id(&mut transaction, protocol).await?;
@@ -140,8 +140,8 @@ impl Store {
         Ok(rows)
     }
 
-    /// At most `limit` candidates whose jobs of this protocol have come to their ends, labelled or failed, behind the decision
-    /// `after` (0: from the first on). An empty page is the end.
+    /// At most `limit` candidates with finished jobs (labelled or failed) under this protocol, after decision
+    /// `after` (0: from the first). An empty page is the end.
     pub async fn finished(
         &self,
         protocol: ContentHash,

@@ -1,4 +1,4 @@
-//! The processes of a campaign, and what comes back of those that are gone.
+//! Processes of a campaign, and the leases of dead ones.
 
 use serde_json::json;
 
@@ -13,12 +13,12 @@ pub(crate) const LEASED: &str = "SELECT number, holder FROM job WHERE state = 'l
 
 const PROCESSES: &str = "SELECT * FROM process WHERE $1 IS NULL OR kind = $1 ORDER BY started, id";
 
-/// The same on a server, which knows how long each has been silent.
+/// The same on a server, which knows how long each process has been silent.
 const PROCESSES_WITH_SILENCE: &str = "SELECT process.*, server_clock() - heard AS silence FROM process
     WHERE $1 IS NULL OR kind = $1 ORDER BY started, id";
 
 impl Store {
-    /// The processes of a kind, or all, in the order in which they started.
+    /// Processes of a kind, or all, ordered by start.
     pub async fn processes(&self, kind: Option<&str>) -> Result<Vec<ProcessRecord>> {
         select_kind(kind, self.database.has_clock()).fetch_all(&self.database).await
     }
@@ -28,9 +28,8 @@ impl Store {
         self.upsert_processes(std::slice::from_ref(process)).await
     }
 
-    /// Says that these processes work for the campaign, or how they are now. Each takes the place of those of its
-    /// kind and number that are gone. A predecessor that still lives keeps its record, since its leases count
-    /// for as long as it has one.
+    /// Registers these processes or updates their records. Each replaces dead processes of its kind and number. A
+    /// predecessor that is alive keeps its record, since its leases count only as long as it has one.
     pub async fn upsert_processes(&self, processes: &[ProcessRecord]) -> Result<()> {
         let mut transaction = self.database.begin().await?;
         let known = all(&mut transaction).await?;
@@ -46,7 +45,7 @@ impl Store {
         transaction.commit().await
     }
 
-    /// A process ended in order. With an orchestrator go the walkers that it started.
+    /// Removes a process that ended in order. With an orchestrator, its walkers are removed as well.
     pub async fn remove_process(&self, id: &str) -> Result<()> {
         let mut transaction = self.database.begin().await?;
         let sql = "DELETE FROM process WHERE kind = 'walker'
@@ -56,9 +55,8 @@ impl Store {
         transaction.commit().await
     }
 
-    /// Takes back the leases whose holders are gone, or are no processes of this campaign at all: a process has its
-    /// record before it leases anything, and only one that is gone loses it. Does not count as failed attempts.
-    /// Returns their number.
+    /// Releases leases whose holders are dead or not registered: a process is registered before it leases anything,
+    /// and only a dead one loses its record. Does not count as failed attempts. Returns their number.
     pub async fn release_leases_of_dead_processes(&self, now: i64) -> Result<usize> {
         let mut transaction = self.database.begin().await?;
         let leased = leased(&mut transaction).await?;
@@ -69,10 +67,10 @@ impl Store {
         Ok(released)
     }
 
-    /// What a process does that begins to run the campaign: it holds the [`crate::CampaignLock`], and is not among the
-    /// processes yet. So none of them works for the campaign any longer but labellers that live on. The records of all
-    /// others are removed, and what they had leased comes back, see [`Self::release_leases_of_dead_processes`].
-    /// Returns the number of leases that came back.
+    /// Reclaims leases at the start of a run. The caller holds the [`crate::CampaignLock`] and is not registered
+    /// yet, so no registered process works for the campaign, except labellers that are alive. Removes the records
+    /// of all others and releases their leases, see [`Self::release_leases_of_dead_processes`]. Returns the number
+    /// of leases released.
     pub async fn reclaim_leases(&self, now: i64) -> Result<usize> {
         let mut transaction = self.database.begin_to_lead().await?;
         let leased = leased(&mut transaction).await?;
@@ -122,7 +120,7 @@ async fn remove(transaction: &mut Transaction, id: &str) -> Result<()> {
     Ok(())
 }
 
-/// Every lease, before anybody asks for processes: who leases something has its record already.
+/// Reads leases before processes: a holder is registered before it leases anything.
 async fn leased(transaction: &mut Transaction) -> Result<Vec<(i64, String)>> {
     query(LEASED).locked().fetch_all(transaction).await
 }

@@ -1,4 +1,4 @@
-//! The campaign itself, its seed structures, and the protocols of its labels.
+//! The campaign's properties, seed structures and label protocols.
 
 use wire::ContentHash;
 
@@ -12,7 +12,7 @@ use crate::encoding::{decode_hash, read_structure};
 use crate::error::{Result, StoreError};
 use crate::records::{Campaign, Protocol, SeedStructure};
 
-/// Priority of jobs that are made later than their candidate.
+/// Priority of jobs added later than their candidate.
 const LATE_PRIORITY: i32 = 0;
 
 macro_rules! seeds {
@@ -40,7 +40,7 @@ impl FromRow for SeedStructure {
     }
 }
 
-/// What a database begins with.
+/// Writes the initial rows of a database.
 pub(crate) async fn write_campaign(
     database: &Database,
     campaign: &Campaign,
@@ -67,7 +67,7 @@ pub(crate) async fn write_campaign(
 }
 
 impl Store {
-    /// What the campaign is.
+    /// The properties of the campaign.
     pub async fn campaign(&self) -> Result<Campaign> {
         let id = self.campaign_value("id").await?;
         Ok(Campaign {
@@ -90,8 +90,8 @@ impl Store {
         row.get("value")
     }
 
-    /// From now on the campaign runs by another configuration (JSON). Each of the changes (JSON objects) that make it
-    /// another gets a line `configuration` in the operations log.
+    /// Changes the configuration in force (JSON). Adds a line `configuration` to the operations log for each of the
+    /// changes (JSON objects).
     pub async fn set_configuration_in_force(
         &self,
         configuration: &str,
@@ -106,13 +106,13 @@ impl Store {
         transaction.commit().await
     }
 
-    /// What the leader of the campaign last left for others under that name.
+    /// Metadata that the leader of the campaign stored under that name.
     pub async fn metadata(&self, name: &str) -> Result<Option<String>> {
         let note = query("SELECT value FROM campaign WHERE key = $1").bind(format!("note/{name}"));
         note.fetch_optional(&self.database).await
     }
 
-    /// Leaves something for others.
+    /// Stores metadata for other processes.
     pub async fn set_metadata(&self, name: &str, note: &str) -> Result<()> {
         if self.metadata(name).await?.as_deref() == Some(note) {
             return Ok(());
@@ -130,7 +130,7 @@ impl Store {
         row.fetch_one(&mut transaction).await.map(Some)
     }
 
-    /// Where the leader of the campaign has the files that grades depend on, as it last said: a JSON object of paths.
+    /// Stores where the leader has the files that grades depend on: a JSON object of paths.
     pub async fn set_grade_files(&self, files: &serde_json::Value) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;
         set_campaign_value(&mut transaction, "grade_files", &files.to_string()).await?;
@@ -145,7 +145,7 @@ impl Store {
         Ok(files.map_err(|error| StoreError::damaged("the campaign's files", error))?.unwrap_or_default())
     }
 
-    /// Adds seed structures; those with the index of one that is there replace it.
+    /// Adds seed structures, or replaces those with the same index.
     pub async fn add_seed_structures(&self, seeds: &[SeedStructure]) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;
         for seed in seeds {
@@ -159,13 +159,13 @@ impl Store {
         query(seeds!("ORDER BY seed")).fetch_all(&self.database).await
     }
 
-    /// The seed structure of that index.
+    /// The seed structure with that index.
     pub async fn seed_structure(&self, index: u32) -> Result<Option<SeedStructure>> {
         query(seeds!("WHERE seed = $1")).bind(index).fetch_optional(&self.database).await
     }
 
-    /// Makes `protocol` the one of new label jobs. Accepted candidates that have no job at all (there was no protocol
-    /// when they were found) get one; those with a job of an earlier protocol keep that.
+    /// Makes `protocol` the protocol of new label jobs. Accepted candidates without any job (found before there was
+    /// a protocol) get one; existing jobs keep their protocol.
     pub async fn add_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;
         insert_protocol(&mut transaction, protocol, now).await?;
@@ -179,7 +179,7 @@ impl Store {
         transaction.commit().await
     }
 
-    /// Adds a protocol by which no new label is made.
+    /// Adds a protocol that is not used for new labels.
     pub async fn register_protocol(&self, protocol: &Protocol, now: i64) -> Result<()> {
         let mut transaction = self.database.begin_to_lead().await?;
         insert_protocol(&mut transaction, protocol, now).await?;
@@ -209,7 +209,7 @@ impl FromRow for Protocol {
     }
 }
 
-/// Adds a protocol, unless it is there.
+/// Adds a protocol if it does not exist.
 pub(super) async fn insert_protocol(
     transaction: &mut Transaction,
     protocol: &Protocol,
@@ -254,7 +254,7 @@ async fn insert_seed_structure(transaction: &mut Transaction, seed: &SeedStructu
     Ok(())
 }
 
-/// Number of the protocol of new jobs.
+/// Row number of the protocol of new jobs.
 pub(super) async fn in_force(transaction: &mut Transaction) -> Result<Option<i64>> {
     let hash = query("SELECT value FROM campaign WHERE key = 'protocol'");
     let hash: Option<String> = hash.fetch_optional(&mut *transaction).await?;
@@ -263,7 +263,7 @@ pub(super) async fn in_force(transaction: &mut Transaction) -> Result<Option<i64
     protocol_id(transaction, hash).await.map(Some)
 }
 
-/// Number of the protocol's row.
+/// Row number of the protocol.
 pub(crate) async fn protocol_id(transaction: &mut Transaction, hash: ContentHash) -> Result<i64> {
     let number = query("SELECT number FROM protocol WHERE hash = $1").bind(hash.0.to_vec());
     let number: Option<i64> = number.fetch_optional(&mut *transaction).await?;

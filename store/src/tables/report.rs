@@ -1,4 +1,4 @@
-//! Everything that was collected, page by page, and what became of candidates, for reports.
+//! Pages of collected structures, and the fates of candidates, for reports.
 
 use wire::ContentHash;
 
@@ -35,8 +35,8 @@ const BY_SEED_STRUCTURE: &str =
 const NO_PROTOCOL: i64 = -1;
 
 impl Store {
-    /// At most `limit` accepted candidates and frames of control walks behind decision number `after` (0: from the first on),
-    /// in decision order, with their labels of `protocol`. An empty page is the end.
+    /// At most `limit` accepted candidates and frames of control walks after decision `after` (0: from the first),
+    /// in decision order, with their labels under `protocol`. An empty page is the end.
     pub async fn collected(
         &self,
         protocol: Option<ContentHash>,
@@ -54,7 +54,7 @@ impl Store {
         Ok(page)
     }
 
-    /// What became of candidates of biased walks, by parts of the decision log: decisions 1 to `length` are part 0.
+    /// Fates of candidates of biased walks, by intervals of the decision log: decisions 1 to `length` are part 0.
     pub async fn fates_by_decision(&self, length: u32) -> Result<Vec<FateCount>> {
         query(BY_DECISION).bind(i64::from(length.max(1))).fetch_all(&self.database).await
     }

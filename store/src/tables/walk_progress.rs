@@ -1,4 +1,4 @@
-//! How fast walks advance: written every few seconds by whoever leads the campaign, read by those who watch.
+//! Progress of walks: the leader of the campaign writes it every few seconds, monitors read it.
 
 use serde_json::{Value as Json, json};
 
@@ -8,10 +8,10 @@ use crate::database::{Transaction, Value, execute_rows, query};
 use crate::error::Result;
 use crate::walk_progress::WalkProgress;
 
-/// A walk that has not been heard of for so long (ms) has no walk.
+/// Progress older than this (ms) is ignored.
 const FRESH: i64 = 60_000;
 
-/// Under which name the campaign has the sum.
+/// The campaign key of the total.
 const ALL: &str = "pace";
 
 const COLUMNS: [&str; 9] = [
@@ -30,7 +30,7 @@ const UPSERT: &str = "INSERT INTO pace ({columns}) SELECT * FROM {rows} WHERE TR
     ON CONFLICT (walk) DO UPDATE SET {excluded}";
 
 impl Store {
-    /// Says how these walks advance, and how many steps a second all of them together make.
+    /// Stores the progress of these walks and the steps per second of all walks together.
     pub async fn set_walk_progress(&self, walks: &[WalkProgress], all: Option<f64>, now: i64) -> Result<()> {
         let row = |walk: &WalkProgress| {
             let integer = |number: i64| Value::Integer(Some(number));
@@ -55,12 +55,12 @@ impl Store {
     }
 }
 
-/// SQLite has no number that is none.
+/// SQLite has no NaN.
 fn finite(number: Option<f64>) -> Option<f64> {
     number.filter(|number| number.is_finite())
 }
 
-/// Those of walks that were heard of within the last minute; none in tables of an earlier version.
+/// Progress reported within the last minute; empty for tables of an earlier version.
 pub(super) async fn fresh(transaction: &mut Transaction, now: i64) -> Result<Vec<WalkProgress>> {
     if !transaction.has_table("pace").await? {
         return Ok(Vec::new());
@@ -68,7 +68,7 @@ pub(super) async fn fresh(transaction: &mut Transaction, now: i64) -> Result<Vec
     query("SELECT * FROM pace WHERE seen > $1 ORDER BY walk").bind(now - FRESH).fetch_all(transaction).await
 }
 
-/// Steps that all walks together make a second; none if that was not heard of within the last minute.
+/// Steps per second of all walks together; `None` without a report in the last minute.
 pub(super) async fn total_steps_per_second(transaction: &mut Transaction, now: i64) -> Result<Option<f64>> {
     let found = query("SELECT value FROM campaign WHERE key = $1").bind(ALL);
     let found: Option<String> = found.fetch_optional(transaction).await?;
