@@ -25,7 +25,7 @@ pub fn encode_structure(structure: &Structure) -> Vec<u8> {
 pub fn decode_structure(bytes: &[u8], hash: &[u8]) -> Result<Structure> {
     parse_structure(bytes)
         .filter(|structure| ContentHash::of(structure).0 == hash)
-        .ok_or_else(|| StoreError::damaged("a structure", "its content does not have its hash"))
+        .ok_or_else(|| StoreError::damaged("a structure", "its content does not match its hash"))
 }
 
 /// Reads the structure of a row that selects `joined!(structure)`, and checks its checksum and hash.
@@ -71,7 +71,7 @@ pub fn decode_matrix(bytes: &[u8]) -> Option<Matrix3> {
 
 /// Converts a number for a signed database column.
 pub fn integer(what: &str, number: u64) -> Result<i64> {
-    i64::try_from(number).map_err(|_| StoreError::Inconsistent(format!("{what} {number} is absurd")))
+    i64::try_from(number).map_err(|_| StoreError::Inconsistent(format!("{what} {number} is out of range")))
 }
 
 /// A hash from a column.

@@ -11,7 +11,8 @@ use crate::error::{Result, StoreError};
 /// Checks that `directory` exists, is writable, is on a local disk and has a name that SQLite accepts.
 pub fn check_directory(directory: &Path) -> Result<()> {
     if directory.to_str().is_none() {
-        let source = io::Error::new(io::ErrorKind::InvalidInput, "its name is not UTF-8, as SQLite needs it");
+        let source =
+            io::Error::new(io::ErrorKind::InvalidInput, "its name is not UTF-8, which SQLite requires");
         return Err(StoreError::Directory { directory: directory.into(), source });
     }
     let denied = |source: rustix::io::Errno| StoreError::Directory {

@@ -94,13 +94,13 @@ impl FromStr for ServerUrl {
     fn from_str(url: &str) -> Result<Self> {
         let UrlParts { shown, plain, schema, has_password } = UrlParts::parse(url)?;
         if !Location::is_server(url) {
-            let reason = "it must begin with postgres:// (a campaign in a directory has no run.store, and its name no ://)";
+            let reason = "it must begin with postgres:// (a campaign in a directory needs no run.store, and the name of a directory contains no ://)";
             return Err(StoreError::Url { url: shown, reason: reason.to_owned() });
         }
         let valid = |c: char| matches!(c, 'a'..='z' | '0'..='9' | '_');
         if schema.is_empty() || schema.len() > LONGEST_SCHEMA || !schema.chars().all(valid) {
             let reason = format!(
-                "the schema '{schema}' must be a name of at most {LONGEST_SCHEMA} small letters, digits and underscores"
+                "the schema '{schema}' must consist of at most {LONGEST_SCHEMA} lower-case letters, digits and underscores"
             );
             return Err(StoreError::Url { url: shown, reason });
         }
@@ -158,7 +158,7 @@ impl UrlParts {
             }
         }
         if path.contains('@') {
-            let reason = "the '/' in its password must be written as %2F".to_owned();
+            let reason = "write the '/' in its password as %2F".to_owned();
             return Err(StoreError::Url { url: format!("{scheme}://…"), reason });
         }
         Ok(Self { shown, plain, schema: schema.to_owned(), has_password })

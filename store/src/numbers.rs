@@ -16,13 +16,13 @@ const WORD: usize = size_of::<u64>();
 #[derive(Debug, thiserror::Error)]
 pub enum NumbersError {
     /// Shorter than the leading count.
-    #[error("{0} bytes, too few to hold anything")]
+    #[error("{0} bytes, too few for an array")]
     Short(usize),
     /// zstd rejects them.
     #[error("zstd: {0}")]
     Zstd(#[from] io::Error),
     /// The length does not match the count.
-    #[error("{found} bytes or more, where {count} numbers were announced")]
+    #[error("{found} bytes or more, expected {count} numbers")]
     Length {
         /// Bytes that were found.
         found: usize,

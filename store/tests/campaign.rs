@@ -240,7 +240,7 @@ async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
         Ok::<_, StoreError>(changed.into_iter().map(|walk| walk.0).collect::<Vec<_>>())
     };
     let error = pause(&[0], true).await.unwrap_err();
-    assert_eq!(error.to_string(), "the campaign has no walk 0; none has begun yet");
+    assert_eq!(error.to_string(), "the campaign has no walk 0; no walk has started yet");
     let ended = WalkRecord { state: "blew_up".into(), ..walk(2, 1) };
     store.commit(&Commit { walks: vec![walk(0, 1), walk(1, 1), ended], ..Commit::default() }).await.unwrap();
     assert_eq!(pause(&[1, 0, 1], true).await.unwrap(), [1, 0]);
@@ -248,7 +248,7 @@ async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
     assert_eq!(pause(&[0, 2], false).await.unwrap(), [0]);
     // Nothing is changed where one of them cannot be.
     let error = pause(&[0, 2], true).await.unwrap_err().to_string();
-    assert_eq!(error, "walk 2 has ended (blew up): only those that have more steps to make can be paused");
+    assert_eq!(error, "walk 2 has ended (blew up): only running walks can be paused");
     let error = pause(&[0, 3], true).await.unwrap_err().to_string();
     assert_eq!(error, "the campaign has no walk 3; they are 0 to 2");
 

@@ -22,7 +22,7 @@ async fn other_files_and_versions_are_refused_with_what_was_found() {
     let path = directory.path().join(DATABASE);
     fs::write(&path, "units metal\natom_style atomic\n").unwrap();
     let message = Store::open(directory.path()).await.unwrap_err().to_string();
-    assert!(message.contains("no SQLite database") && message.contains("units metal"), "{message}");
+    assert!(message.contains("not an SQLite database") && message.contains("units metal"), "{message}");
     fs::write(&path, "").unwrap();
     assert!(matches!(Store::open(directory.path()).await, Err(StoreError::NotADatabase { .. })));
     fs::remove_file(&path).unwrap();
@@ -35,7 +35,8 @@ async fn other_files_and_versions_are_refused_with_what_was_found() {
     fs::write(&path, &newer).unwrap();
     let message = Store::open(directory.path()).await.unwrap_err().to_string();
     assert!(
-        message.contains(&format!("version {}; this program reads version {known}", newer[63])),
+        message
+            .contains(&format!("schema version {}, and this program reads up to version {known}", newer[63])),
         "{message}"
     );
     assert!(matches!(

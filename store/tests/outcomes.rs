@@ -61,7 +61,10 @@ async fn costs_are_those_of_the_attempts_that_brought_labels() {
     assert_eq!(store.label_usage().await.unwrap(), expected);
     // There are no walks here; but the sums are those of the attempts.
     let findings = store.check(|_, _| ()).await.unwrap();
-    assert!(findings.iter().all(|finding| finding.what.contains("walks that are not there")), "{findings:?}");
+    assert!(
+        findings.iter().all(|finding| finding.what.contains("candidates of missing walks")),
+        "{findings:?}"
+    );
     lease(&store, 30_000).await;
     assert_eq!(
         store.label_usage().await.unwrap(),

@@ -1,4 +1,4 @@
-//! The agent of a host: deals the turns of a campaign that is led from another host to the walkers here.
+//! The agent of a host: dispatches assignments of a campaign on another host to local walkers.
 
 mod metrics;
 mod pool;
@@ -22,90 +22,90 @@ use wire::transport::{Incoming, Work};
 pub use self::metrics::{AgentMetrics, AssignmentCounts};
 use self::pool::AssignmentPool;
 
-/// Between two questions whether the orchestrator wants its agents to stop.
+/// Time between two queries whether the orchestrator wants its agents to stop.
 const POLL_INTERVAL: Duration = Duration::from_secs(2);
-/// Between two pieces of news about a walk.
+/// Minimum time between two progress messages of a walk.
 const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
-/// An orchestrator that is there answers sooner.
+/// An orchestrator that has not replied for this time counts as unresponsive.
 const UNRESPONSIVE_AFTER: Duration = Duration::from_secs(5);
-/// What walkers delivered last may take so long on its way when the agent is asked to stop.
+/// How long an agent that is asked to stop waits for its last reports to be delivered.
 const FLUSH_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// How an agent's work ended.
+/// Why an agent ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum AgentExit {
     /// The campaign has no more work.
     Done,
-    /// It was asked to stop, or every walker is gone.
+    /// It was asked to stop, or has lost all its walkers.
     Stopped,
 }
 
-/// What an agent tells those who watch it.
+/// Events of an agent, for monitoring.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum AgentEvent {
     /// The orchestrator wants its agents to stop.
     Stop,
-    /// It does not answer.
+    /// The orchestrator does not respond.
     Unresponsive {
-        /// Reports that are kept for it.
+        /// Reports that wait to be delivered.
         unsent: usize,
-        /// Walkers that have nothing to do.
+        /// Walkers without an assignment.
         idle: usize,
     },
-    /// It answers again.
+    /// The orchestrator responds again.
     Recovered,
 }
 
-/// Deals turns.
+/// Runs the agent's part of a campaign.
 pub struct Agent {
-    /// The line to the orchestrator.
+    /// The connection to the orchestrator.
     pub uplink: Arc<Uplink>,
-    /// The place that it has been given there.
+    /// The registration with the orchestrator.
     pub joined: Joined,
-    /// What comes from the walkers of this host.
+    /// Messages from the walkers of this host.
     pub incoming: mpsc::Receiver<Incoming>,
-    /// Set from outside: walkers are sent home with their turns where they stand.
+    /// Set from outside to stop: walkers are dismissed, with their assignments as they are.
     pub stopping: Arc<AtomicBool>,
-    /// An orchestrator that has been silent for so long will not come back.
+    /// How long the orchestrator may be unresponsive before the agent gives up.
     pub orchestrator_timeout: Duration,
-    /// Kept for those who watch.
+    /// Updated for monitoring.
     pub metrics: Arc<Mutex<AgentMetrics>>,
 }
 
-/// What an exchange about a slot came to.
+/// The result of an exchange about a slot.
 type ExchangeResult = (Slot, Told, Result<Option<Work>, Parted>);
 
-/// The answer to the question whether to stop, and how long it took.
+/// The reply to the query whether to stop, and how long it took.
 type StopReply = (Result<Option<bool>, Parted>, Duration);
 
-/// What an agent has to say and to ask.
+/// State of the agent's exchange with the orchestrator.
 struct AgentState {
     uplink: Arc<Uplink>,
     joined: Arc<Joined>,
     pool: AssignmentPool,
     in_flight: FuturesUnordered<BoxFuture<'static, ExchangeResult>>,
-    /// Those of them that deliver something.
+    /// Number of exchanges in flight that deliver something.
     delivering: usize,
-    /// Whether the orchestrator wants its agents to stop.
+    /// The pending query whether to stop.
     stop_query: Option<BoxFuture<'static, StopReply>>,
-    /// A new place, when this one has been lost …
+    /// A new registration in progress, after this one was lost …
     joining: Option<BoxFuture<'static, Result<Joined, Parted>>>,
-    /// … which is taken when all that was asked from the old one has been answered.
+    /// … which takes effect when every exchange of the old one is complete.
     next_joined: Option<Joined>,
-    /// When the orchestrator was last heard.
+    /// When the orchestrator last replied.
     heard: Instant,
     metrics: Arc<Mutex<AgentMetrics>>,
-    /// What was told of its silence.
+    /// The last event reported about its silence.
     silence: Option<AgentEvent>,
-    /// When there was last news of a walk.
+    /// When progress of a walk was last sent.
     last_progress: BTreeMap<WalkId, Instant>,
 }
 
 impl Agent {
-    /// Works until there is no more work or it is asked to stop.
+    /// Runs until there is no more work or the agent is asked to stop.
     ///
     /// # Errors
-    /// The orchestrator is silent, or it and this program do not understand each other.
+    /// The orchestrator is unresponsive, or its program is incompatible with this one.
     pub async fn run(mut self, mut watch: impl FnMut(AgentEvent)) -> Result<AgentExit, Parted> {
         let slots = self.joined.slots();
         let uplink = Arc::clone(&self.uplink);
@@ -125,7 +125,7 @@ impl Agent {
                 joined = answer_to(&mut state.joining) => state.has_joined(joined?),
                 (told, took) = answer_to(&mut state.stop_query) => if state.handle_stop_reply(told, took)? { watch(AgentEvent::Stop) },
                 _ = ticks.tick() => state.poll(self.orchestrator_timeout)?.into_iter().for_each(&mut watch),
-                // Of this agent the orchestrator knew nothing any more, or it would have waited.
+                // The orchestrator no longer knew of this agent, or it would have waited.
                 () = &mut over => {
                     state.pool.dismiss_idle();
                     return Ok(AgentExit::Done);
@@ -137,21 +137,21 @@ impl Agent {
                     break;
                 }
             } else if state.pool.is_over() {
-                // Of a campaign that is over, or of one that is being stopped.
+                // The campaign is over or being stopped.
                 let stopped = matches!(state.joined.is_stopping().await, Ok(Some(true)));
                 state.pool.dismiss_idle();
                 state.joined.leave().await;
                 return Ok(if stopped { AgentExit::Stopped } else { AgentExit::Done });
             }
         }
-        // Not for ever: a line that is down must not keep a batch job beyond its time.
+        // With a timeout: a broken connection must not keep a batch job beyond its time limit.
         let _ = timeout(FLUSH_TIMEOUT, state.flush()).await;
         state.joined.leave().await;
         Ok(AgentExit::Stopped)
     }
 }
 
-/// The answer to a question, if one was asked.
+/// Waits for the reply to a pending query; never ends without one.
 async fn answer_to<T>(stop_query: &mut Option<BoxFuture<'static, T>>) -> T {
     match stop_query {
         Some(asked) => {
@@ -185,7 +185,7 @@ impl AgentState {
         self.metrics.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Somebody is there.
+    /// Notes that the orchestrator has replied.
     fn mark_heard(&mut self) {
         self.heard = Instant::now();
         self.metrics().heard = Some(self.heard);
@@ -199,7 +199,7 @@ impl AgentState {
         }
     }
 
-    /// Begins to deliver what came of a slot's turn, and to ask for the next.
+    /// Starts to deliver the result of a slot's assignment and to ask for the next one.
     fn exchange(&mut self, mut slot: Slot, told: Told) {
         self.delivering += usize::from(!matches!(told, Told::Nothing));
         let joined = Arc::clone(&self.joined);
@@ -230,13 +230,13 @@ impl AgentState {
         self.update_metrics();
     }
 
-    /// What is kept, and who waits.
+    /// Updates the number of waiting reports and idle walkers.
     fn update_metrics(&self) {
         let mut metrics = self.metrics();
         (metrics.unsent, metrics.idle) = (self.unsent(), self.pool.idle());
     }
 
-    /// Reports that the orchestrator has not taken yet.
+    /// Reports that the orchestrator has not accepted yet.
     fn unsent(&self) -> usize {
         self.delivering + self.pool.unsent()
     }
@@ -264,7 +264,8 @@ impl AgentState {
         Ok(())
     }
 
-    /// This agent was taken for dead, or the orchestrator was started again: what it has to tell it tells in a new place.
+    /// Registers again: this agent was taken for dead, or the orchestrator was restarted. Waiting reports are
+    /// delivered under the new registration.
     fn rejoin(&mut self) {
         if self.joining.is_none() && self.next_joined.is_none() {
             let uplink = Arc::clone(&self.uplink);
@@ -288,8 +289,8 @@ impl AgentState {
         }
     }
 
-    /// Asks whether to stop, unless the orchestrator has been silent for so long that it is of no use. Returns what is new
-    /// of its silence.
+    /// Queries whether to stop. Fails if the orchestrator has been unresponsive for longer than
+    /// `orchestrator_timeout`. Returns an event if its responsiveness changed.
     fn poll(&mut self, orchestrator_timeout: Duration) -> Result<Option<AgentEvent>, Parted> {
         let silence = self.heard.elapsed();
         if silence > orchestrator_timeout {
@@ -324,7 +325,7 @@ impl AgentState {
         Ok(matches!(told, Ok(Some(true))))
     }
 
-    /// Where a walk stands, once a second.
+    /// Sends the progress of a walk, once a second.
     fn forward_progress(&mut self, walk: WalkId, progress: Progress) {
         let now = Instant::now();
         if self.last_progress.get(&walk).is_some_and(|last| now.duration_since(*last) < PROGRESS_INTERVAL) {
@@ -336,8 +337,8 @@ impl AgentState {
         }
     }
 
-    /// Waits until everything that is to be told has been taken. From a place that is lost it is not told: as far as the
-    /// orchestrator knows nobody has those turns in hand, and they begin again where they began.
+    /// Waits until every report is delivered. Reports under a lost registration are not: the orchestrator treats
+    /// their assignments as not started, and they start again.
     async fn flush(&mut self) {
         while self.delivering > 0 {
             let Some((_, told, _)) = self.in_flight.next().await else { return };

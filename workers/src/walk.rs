@@ -1,7 +1,7 @@
-//! One turn of a walk: a function from an assignment to a report, with no state of its own.
+//! Runs one assignment of a walk: a function from an assignment to a report, without state.
 //!
-//! Whatever a walk remembers is in its [checkpoint](WalkState), so the same assignment gives the same report, whoever
-//! works on it and however often.
+//! Everything that a walk remembers is in its [checkpoint](WalkState), so the same assignment gives the same
+//! report, on any walker and any number of times.
 
 mod candidate;
 mod state;
@@ -21,12 +21,12 @@ use crate::guard;
 use crate::settings::WalkSettings;
 use state::{CollectionPoint, WalkState, start};
 
-/// What every walk of a campaign shares.
+/// Data shared by every walk of a campaign.
 #[derive(Clone)]
 pub struct WalkContext {
     /// The model.
     pub model: Arc<GraceModel>,
-    /// The threads that evaluate it.
+    /// The threads that evaluate the model.
     pub threads: Threads,
     /// The settings.
     pub settings: Arc<WalkSettings>,
@@ -49,8 +49,8 @@ enum WalkError {
     BlewUp(String),
 }
 
-/// Works on a turn until it ends: with a candidate, at its last step, with the walk itself, or when `stopping` says so.
-/// `watch` is told after each step where the walk stands.
+/// Runs an assignment until it ends: with a candidate, at its last step, with the end of the walk, or when
+/// `stopping` returns true. Calls `on_progress` with the progress after each step.
 pub fn advance(
     context: &WalkContext,
     assignment: &Assignment,
@@ -79,13 +79,13 @@ pub fn advance(
     Report { walk, turn, outcome, checkpoint: running.encode(), progress: running.progress() }
 }
 
-/// A walk in the hands of a walker.
+/// A walk during an assignment.
 struct Walk<'a> {
     settings: &'a WalkSettings,
     assignment: &'a Assignment,
     model: &'a GraceModel,
     mixture_version: u64,
-    /// When a structure is a candidate in this turn.
+    /// The collection rule of this assignment.
     collection: CollectionRule,
     dynamics: Dynamics,
     potential: BiasedPotential,
@@ -121,7 +121,8 @@ impl<'a> Walk<'a> {
         Ok(walk)
     }
 
-    /// After a collection the walk waits out the gap; after a refusal by the selector, a shorter one.
+    /// Sets the earliest step of the next candidate: after a collection the walk waits out the full interval, after
+    /// a decline a shorter one.
     fn apply_verdict(&mut self) {
         let step = self.step();
         match &self.assignment.verdict {
@@ -178,7 +179,7 @@ impl<'a> Walk<'a> {
         }
     }
 
-    /// What the new step means: a wanted frame, a candidate, a refusal, or nothing.
+    /// Evaluates the new step: a requested frame, a candidate, a refusal by the guard, or nothing.
     fn inspect_step(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let step = self.step();
         if self.is_control() {
@@ -190,7 +191,7 @@ impl<'a> Walk<'a> {
         let too_close = self.is_too_close();
         if biased_steps % self.settings.guard.checkpoint_interval == 0 && !too_close {
             if biased_steps == 0 {
-                // From here on the start of the walk, which needs equilibration, is no place to go back to.
+                // The start of the walk needs equilibration, so from here on it is no target for a roll back.
                 self.state.good.clear();
             }
             self.save_checkpoint();
@@ -220,7 +221,7 @@ impl<'a> Walk<'a> {
         self.state.keep_checkpoint(self.dynamics.checkpoint(), self.potential.state);
     }
 
-    /// Counts a refusal by the shortest-bond guard; after too many in a row the walk goes back, or ends.
+    /// Counts a refusal by the shortest-bond guard. After too many in a row the walk rolls back, or ends.
     fn record_refusal(&mut self) -> Result<Option<Outcome<Candidate>>, WalkError> {
         let guard = &self.settings.guard;
         self.state.refused += 1;
@@ -236,7 +237,7 @@ impl<'a> Walk<'a> {
         Ok(None)
     }
 
-    /// Goes back to the oldest good checkpoint as a new segment: smaller τ, new random numbers.
+    /// Rolls back to the oldest good checkpoint as a new segment, with smaller τ and new random numbers.
     fn roll_back(&mut self) -> Result<(), WalkError> {
         let (mut checkpoint, bias) = self.state.good.swap_remove(0);
         self.state.good.clear();
@@ -285,7 +286,7 @@ impl<'a> Walk<'a> {
     }
 }
 
-/// γ of each atom where the walk stands.
+/// γ of each atom at the current step.
 fn gamma<'a>(potential: &'a mut BiasedPotential, dynamics: &Dynamics) -> Result<&'a [f64], UngradedError> {
     Ok(&potential.grades(dynamics.structure(), dynamics.neighbours())?.gamma)
 }

@@ -1,4 +1,4 @@
-//! The bias on models whose atoms send messages: the grade's gradient, and a walk that does not know the difference.
+//! The bias on models with message passing: the gradient of the grade, and a walk that works as with any model.
 
 use std::path::Path;
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! Labellers: leases that last as long as the label takes, and processes that outlive their orchestrator.
+//! Labellers: leases that last as long as a label takes, and processes that outlive their orchestrator.
 
 use std::fs;
 use std::path::Path;
@@ -18,7 +18,7 @@ use workers::labeller::{ExitPolicy, LabelBounds, LabellerSettings, Method, Shutd
 
 use crate::common::*;
 
-/// A method that begins labels at once and ends them only while it is open.
+/// A method that starts labels at once and finishes them only while it is open.
 #[derive(Clone, Default)]
 struct Gate {
     open: Arc<AtomicBool>,
@@ -41,7 +41,7 @@ impl Gate {
     }
 }
 
-/// No runtime waits for a label that never ends.
+/// A label that never ends must not block the runtime.
 impl Drop for Gate {
     fn drop(&mut self) {
         self.open.store(true, Ordering::Relaxed);
@@ -72,7 +72,7 @@ impl Potential for Gate {
     }
 }
 
-/// A method whose energies (eV an atom) are given, one a label.
+/// A method with given energies, eV/atom, one per label.
 struct Energies(std::vec::IntoIter<f64>);
 
 impl Potential for Energies {
@@ -96,8 +96,8 @@ impl Potential for Energies {
     }
 }
 
-/// Has the first structures of a campaign labelled with these energies, eV an atom, each attempted once. Returns, in that order, energies of
-/// the labels that were believed and class and log of the others.
+/// Labels the first structures of a campaign with these energies, eV/atom, one attempt each. Returns, in that
+/// order, the energies of valid labels, and class and log of the others.
 async fn labelled_with(energies: &[f64]) -> Vec<Result<f64, (String, String)>> {
     let directory = tempfile::tempdir().unwrap();
     let store = create(directory.path()).await;
@@ -148,7 +148,7 @@ fn living(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
     ProcessRecord { id: id.into(), ..process }
 }
 
-/// Its number belongs to another process by now.
+/// Its process id belongs to another process now.
 fn gone(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
     let living = living(id, kind, number);
     ProcessRecord { start_time: format!("{}0", living.start_time), ..living }
@@ -160,7 +160,7 @@ struct Labeller {
 }
 
 impl Labeller {
-    /// A labeller "l" with number 0 and its own connections, as a process has them.
+    /// A labeller "l" with number 0 and its own connections, as in a process.
     async fn serving(directory: &Path, gate: &Gate) -> Self {
         Self::with(directory, gate, settings("l")).await
     }
@@ -233,7 +233,7 @@ async fn energies_beyond_all_bounds_are_failed_attempts_from_the_first_label_on(
     assert!(log.contains("an energy of inf, which is not a finite number"), "{log}");
 }
 
-/// The second is believed, since nothing is known by then, and spoils nothing.
+/// The second is accepted, since nothing is known at that point, and does no harm.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn energies_are_held_against_the_potential_when_its_zero_is_known() {
     let energies = [-106.0, 1e6, -106.1, -105.9, -106.0, -105.0, 1e4, -107.0, -206.5, -204.0];
@@ -259,7 +259,7 @@ async fn a_result_whose_lease_was_lost_becomes_a_check() {
     store.release_all("l", now).await.unwrap();
     let other = store.lease(protocol("dft").hash, "other", now, 600).await.unwrap().unwrap();
     store.complete(&other, &label(-1.0), now).await.unwrap();
-    // It has found out by now.
+    // It has noticed by now.
     tokio::time::sleep(Duration::from_millis(500)).await;
     gate.open.store(true, Ordering::Relaxed);
     labeller.ended().await.unwrap();
@@ -268,7 +268,7 @@ async fn a_result_whose_lease_was_lost_becomes_a_check() {
     assert_eq!(found, [(LabelStatus::Label, -1.0), (LabelStatus::Check, 0.0)]);
 }
 
-/// For longer than a connection waits for the database; the labeller is asked to stop meanwhile.
+/// Longer than a connection waits for the database; the labeller is asked to stop meanwhile.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_label_is_not_lost_while_the_database_is_locked() {
     let directory = tempfile::tempdir().unwrap();
@@ -314,7 +314,7 @@ async fn without_an_orchestrator_the_queue_is_emptied_first() {
     accept(&store, 4).await;
     let lost = [gone("o", ProcessRecord::ORCHESTRATOR, None), gone("dead", ProcessRecord::LABELLER, Some(1))];
     store.upsert_processes(&lost).await.unwrap();
-    // Longer than this test has time: they come back because their holders are gone.
+    // Longer than this test: they are released because their holders are dead.
     for holder in ["dead", "o/0"] {
         let now = unix_milliseconds();
         store.lease(protocol("dft").hash, holder, now, 86_400).await.unwrap().unwrap();
@@ -416,7 +416,7 @@ async fn a_labeller_ends_when_its_campaign_was_deleted() {
         }
         until("it is not known", async || names(&store).await.contains(&"l".to_owned())).await;
         fs::remove_dir_all(directory.path()).unwrap();
-        // Not even another campaign in the same place is its own.
+        // Another campaign in the same directory is not its own.
         fs::create_dir(directory.path()).unwrap();
         let other = create(directory.path()).await;
         let error = labeller.ended().await.unwrap_err();

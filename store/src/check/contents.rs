@@ -161,7 +161,7 @@ impl<'a> Contents<'a> {
     fn found(&mut self, faults: Vec<String>) {
         let then = "its content is damaged; restore the campaign from a backup";
         if faults.len() > TOLD {
-            let more = format!("{} more rows of the same table are like the following", faults.len() - TOLD);
+            let more = format!("{} more rows of the same table have such faults", faults.len() - TOLD);
             self.findings.push(Finding { what: more, then });
         }
         self.findings.extend(faults.into_iter().take(TOLD).map(|what| Finding { what, then }));
@@ -170,7 +170,7 @@ impl<'a> Contents<'a> {
 
 impl Content for Structure {
     fn fault(&self) -> Option<String> {
-        decode_structure(&self.data, &self.hash).err().map(|_| "it does not have its hash".to_owned())
+        decode_structure(&self.data, &self.hash).err().map(|_| "it does not match its hash".to_owned())
     }
 }
 
@@ -185,7 +185,7 @@ impl Content for Candidate {
             return Some(format!("its block is that of {}", view.id()));
         }
         if ContentHash::of(&view.structure()) != view.id().content {
-            return Some("its structure does not have its hash".to_owned());
+            return Some("its structure does not match its hash".to_owned());
         }
         let n = view.numbers.len();
         let numbers =
@@ -219,13 +219,13 @@ impl Content for Label {
         if moments as u64 != self.atoms {
             return Some(format!("{moments} magnetic moments for {} atoms", self.atoms));
         }
-        (!finite || !label.energy.is_finite()).then(|| "it has numbers that are not finite".to_owned())
+        (!finite || !label.energy.is_finite()).then(|| "it has non-finite numbers".to_owned())
     }
 }
 
 impl Content for Text {
     fn fault(&self) -> Option<String> {
         let parsed: serde_json::Result<serde_json::Value> = serde_json::from_str(&self.text);
-        parsed.err().map(|error| format!("its text is no JSON ({error})"))
+        parsed.err().map(|error| format!("its text is not valid JSON ({error})"))
     }
 }

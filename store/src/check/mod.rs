@@ -89,7 +89,7 @@ async fn own_check(transaction: &mut Transaction, findings: &mut Vec<Finding>) -
     let sql = "SELECT count(*), min(\"table\" || ' to ' || parent) FROM pragma_foreign_key_check";
     let (count, example): (u64, Option<String>) = query(sql).fetch_one(&mut *transaction).await?;
     if count > 0 {
-        let what = format!("{count} rows refer to rows that are not there ({})", example.unwrap_or_default());
+        let what = format!("{count} rows refer to missing rows ({})", example.unwrap_or_default());
         findings.push(Finding { what, then: RESTORE });
     }
     Ok(())

@@ -26,7 +26,7 @@ impl Rule {
 
 const LOST: &str = "something was lost or changed by hand; restore the campaign from a backup";
 const QUEUE: &str =
-    "the label queue was changed by hand; calmwalk queue shows the jobs, and a backup has them whole";
+    "the label queue was changed by hand; calmwalk queue shows the jobs; a backup has the original ones";
 
 /// Violations that make structures or labels missing in an export without being noticed there.
 const LOSSES: [Rule; 7] = [
@@ -44,7 +44,7 @@ const LOSSES: [Rule; 7] = [
     Rule {
         finds: "SELECT count(*), min(candidate) FROM decision WHERE candidate IS NOT NULL
                 AND NOT EXISTS (SELECT 1 FROM candidate WHERE candidate.decision = decision.sequence)",
-        what: "decisions about candidates that are not there",
+        what: "decisions on missing candidates",
         then: LOST,
     },
     Rule {
@@ -56,7 +56,7 @@ const LOSSES: [Rule; 7] = [
     Rule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM label WHERE file IS NOT NULL
                 AND NOT EXISTS (SELECT 1 FROM import WHERE import.structure = label.structure)",
-        what: "labels that came with structures which are not there",
+        what: "labels imported with structures that are missing",
         then: LOST,
     },
     Rule {
@@ -71,7 +71,7 @@ const LOSSES: [Rule; 7] = [
     Rule {
         finds: "SELECT count(*), CAST(min(structure) AS TEXT) FROM label WHERE standing = 'superseded' AND NOT EXISTS (
                 SELECT 1 FROM label AS other WHERE other.structure = label.structure AND other.standing IN ('label', 'excluded'))",
-        what: "labels that were superseded by none, of the structure",
+        what: "superseded labels of structures without another label, of the structure",
         then: LOST,
     },
 ];
@@ -82,7 +82,7 @@ const RULES: [Rule; 10] = [
         finds: "SELECT count(*), min(id) FROM candidate JOIN decision ON sequence = decision
                 WHERE candidate.id IS DISTINCT FROM decision.candidate OR kind <>
                 CASE origin WHEN 'control' THEN 'control' ELSE fate END",
-        what: "candidates whose decision says something else",
+        what: "candidates that contradict their decision",
         then: LOST,
     },
     Rule {
@@ -100,7 +100,7 @@ const RULES: [Rule; 10] = [
     Rule {
         finds: "SELECT count(*), min(id) FROM candidate JOIN structure ON structure.number = candidate.structure
                 WHERE content <> hash",
-        what: "candidates that lead to another structure than their own",
+        what: "candidates that refer to another structure than their own",
         then: LOST,
     },
     Rule {
@@ -113,32 +113,32 @@ const RULES: [Rule; 10] = [
     Rule {
         finds: "SELECT count(*), CAST(min(walk.walk) AS TEXT) FROM walk WHERE accepted <>
                 (SELECT count(*) FROM candidate WHERE candidate.walk = walk.walk AND fate = 'accepted')",
-        what: "walks that count other accepted structures than there are",
+        what: "walks with a wrong count of accepted structures",
         then: LOST,
     },
     Rule {
         finds: "SELECT count(*), min(id) FROM candidate
                 WHERE NOT EXISTS (SELECT 1 FROM walk WHERE walk.walk = candidate.walk)",
-        what: "candidates of walks that are not there",
+        what: "candidates of missing walks",
         then: LOST,
     },
     Rule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job WHERE state = 'superseded' AND NOT EXISTS (
                 SELECT 1 FROM job AS other WHERE other.structure = job.structure AND other.state <> 'superseded')",
-        what: "jobs that were superseded by none",
+        what: "superseded jobs of structures without another job",
         then: QUEUE,
     },
     Rule {
         finds: "SELECT count(*), CAST(min(number) AS TEXT) FROM job
                 WHERE attempts <> (SELECT coalesce(max(attempt), 0) FROM attempt WHERE attempt.job = job.number)
                 OR attempts <> (SELECT count(*) FROM attempt WHERE attempt.job = job.number)",
-        what: "jobs that count other attempts than there are",
+        what: "jobs with a wrong count of attempts",
         then: QUEUE,
     },
     Rule {
         finds: "SELECT count(*), CAST(min(attempt.job) AS TEXT) FROM attempt JOIN job ON job.number = attempt.job
                 WHERE outcome IS NULL AND NOT (state = 'leased' AND attempt = attempts)",
-        what: "attempts that seem to be under way although nobody has the job",
+        what: "running attempts at jobs that are not leased",
         then: QUEUE,
     },
 ];
@@ -180,7 +180,7 @@ pub(super) async fn labelled_jobs(transaction: &mut Transaction) -> Result<Vec<F
     let (count, example): (u64, Option<String>) = query(sql).fetch_one(&mut *transaction).await?;
     let what = || {
         let example = example.unwrap_or_default();
-        format!("{count} jobs that are labelled without a label, or have one and are not (such as {example})")
+        format!("{count} jobs labelled without a label, or not labelled despite one (such as {example})")
     };
     Ok((count > 0).then(|| Finding { what: what(), then: QUEUE }).into_iter().collect())
 }

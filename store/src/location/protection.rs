@@ -9,7 +9,7 @@ use sqlx::postgres::{PgConnectOptions, PgSslMode};
 /// The URL parameter and the environment variable that select the protection.
 const MODE: &str = "sslmode";
 const ROOT: (&str, &str) = ("sslrootcert", "PGSSLROOTCERT");
-const MODES: &str = "disable, require and verify-full";
+const MODES: &str = "disable, require or verify-full";
 
 /// Refuses parameters that have another meaning here than in libpq, and unreadable files: later, these would look
 /// like an unreachable server.
@@ -25,7 +25,7 @@ pub fn check_parameters(url: &str) -> Result<(), String> {
             }
             "ssl-mode" | "ssl-root-cert" | "ssl-ca" | "ssl-cert" | "ssl-key" => {
                 return Err(format!(
-                    "'{key}' is written as libpq does: {MODE}, sslrootcert, sslcert, sslkey"
+                    "unknown parameter '{key}': use the names of libpq, {MODE}, sslrootcert, sslcert and sslkey"
                 ));
             }
             _ => {}
@@ -33,14 +33,14 @@ pub fn check_parameters(url: &str) -> Result<(), String> {
     }
     match mode.as_deref() {
         Some("require") if has_root => Err(format!(
-            "{MODE}=require does not look at the server's certificate, so sslrootcert would be without use: say \
+            "{MODE}=require does not verify the server's certificate, so sslrootcert would have no effect: use \
              {MODE}=verify-full"
         )),
         Some("verify-ca") => Err(format!(
-            "{MODE}=verify-ca would believe any server with a certificate of a public authority: say {MODE}=verify-full"
+            "{MODE}=verify-ca would trust any server with a certificate of a public authority: use {MODE}=verify-full"
         )),
         None | Some("disable" | "allow" | "prefer" | "require" | "verify-full") => Ok(()),
-        Some(mode) => Err(format!("{MODE}={mode} is not known: there are {MODES}")),
+        Some(mode) => Err(format!("unknown {MODE}={mode}, expected {MODES}")),
     }
 }
 
@@ -57,9 +57,9 @@ pub fn resolve(options: PgConnectOptions) -> Result<(PgConnectOptions, bool), St
             Ok((options, unprotected))
         }
         (false, true) => Err(format!(
-            "the server '{}' is another host, and what goes there must be protected: add {MODE}=verify-full, and \
+            "the server '{}' is another host, so the connection must be protected: add {MODE}=verify-full, and \
              sslrootcert=FILE with the authority that signed the server's certificate unless that is a public one \
-             ({MODE}=require encrypts without knowing to whom; {MODE}=disable is for a network that nobody else is on)",
+             ({MODE}=require encrypts without verifying the server; {MODE}=disable is for a private network)",
             options.get_host()
         )),
     }

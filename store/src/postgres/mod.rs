@@ -150,7 +150,7 @@ impl Server {
         let connect = async { self.pool.connect_options().connect().await?.close().await };
         Err(match timeout(PROBE_TIMEOUT, connect).await {
             Ok(Ok(())) => StoreError::Unreachable(timed_out(
-                "it takes new connections, but all of this process waited for it: for its disk, or for what somebody has locked",
+                "it accepts connections, but all connections of this process are waiting, for its disk or for locks",
             )),
             Ok(Err(error)) => error.into(),
             Err(_) => StoreError::Unreachable(timed_out("no answer")),

@@ -44,6 +44,6 @@ mod tests {
             matches!(error, StoreError::InsufficientSpace { needed, .. } if needed >= 1 << 60),
             "{error}"
         );
-        assert!(error.to_string().contains(" MB free, and writing the database anew takes "), "{error}");
+        assert!(error.to_string().contains(" MB free, and rewriting the database needs "), "{error}");
     }
 }

@@ -107,7 +107,7 @@ fn candidate(row: &Row, protocol_name: &str, protocol: ContentHash) -> Result<Ex
     ORIGINAL_GRADES.verify(row)?;
     let id: String = row.get("candidate__id")?;
     if row.get::<Vec<u8>>("candidate__content")? != row.get::<Vec<u8>>("structure__hash")? {
-        return Err(StoreError::damaged(format!("candidate {id}"), "its structure is another one"));
+        return Err(StoreError::damaged(format!("candidate {id}"), "its structure is a different one"));
     }
     let seed_structure_name = match row.get::<Option<i64>>("seed")? {
         None => String::new(),

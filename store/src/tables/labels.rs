@@ -208,7 +208,7 @@ impl LabelRow {
     }
 
     pub(super) fn into_record(self) -> Result<LabelRecord> {
-        let unknown = || StoreError::damaged("a label", "unknown standing or source");
+        let unknown = || StoreError::damaged("a label", "unknown status or source");
         let status = LabelStatus::named(&self.standing).ok_or_else(unknown)?;
         let source = match (self.job, self.attempt, self.file, self.frame) {
             (Some(job), Some(attempt), None, None) => LabelSource::Attempt { job, attempt },

@@ -383,7 +383,8 @@ pub(crate) async fn end_without_label(
             end_attempt(transaction, job, outcome, now).await?;
             let losses: u32 = query(LOSSES).bind(job).fetch_one(&mut *transaction).await?;
             if losses >= LOSS_LIMIT {
-                let log = format!("{losses} attempts in a row ended without a word from their labellers");
+                let log =
+                    format!("{losses} attempts in a row were lost without a message from their labellers");
                 explain(transaction, job, attempts, LOST_TOO_OFTEN, &log).await?;
             }
             losses >= LOSS_LIMIT

@@ -1,4 +1,4 @@
-//! What an agent has done and how its line is, for those who watch it. Decides nothing.
+//! Counters and connection state of an agent, for monitoring only.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -9,61 +9,62 @@ use wire::net::Told;
 
 use super::UNRESPONSIVE_AFTER;
 
-/// Counts since the agent began, and how things stand.
+/// Counts since the agent started, and current values.
 #[derive(Clone, Debug, Default)]
 pub struct AgentMetrics {
-    /// Turns that the orchestrator gave.
+    /// Assignments received from the orchestrator.
     pub assignments_received: u64,
-    /// What came of turns, as far as the orchestrator has taken it.
+    /// Outcomes of assignments that the orchestrator has accepted.
     pub assignments: AssignmentCounts,
-    /// Steps of walkers, also those that were made twice. Of a walk that was elsewhere before they are counted from the first
-    /// that is heard of.
+    /// Steps made by walkers, including repeated ones. For a walk that ran elsewhere before, counting starts at its
+    /// first progress report.
     pub steps: u64,
-    /// Places that the orchestrator gave: more than one after a break of the line, or when it was started again.
+    /// Registrations with the orchestrator: more than one after a broken connection or a restart of the
+    /// orchestrator.
     pub joins: u64,
-    /// Reports that the orchestrator has not taken yet.
+    /// Reports that the orchestrator has not accepted yet.
     pub unsent: usize,
-    /// Walkers that wait for a turn.
+    /// Walkers without an assignment.
     pub idle: usize,
-    /// The newest version of the mixture that came with a turn, or with the place.
+    /// The newest mixture version received with an assignment or at registration.
     pub mixture_version: Option<u64>,
-    /// The time that the last question took to be answered.
+    /// Round-trip time of the last query.
     pub round_trip: Option<Duration>,
-    /// When the orchestrator was last heard.
+    /// When the orchestrator last replied.
     pub heard: Option<Instant>,
-    /// Where walks stood last.
+    /// Last known position of each walk.
     walks: BTreeMap<WalkId, WalkPosition>,
 }
 
-/// Turns by what came of them.
+/// Number of assignments by outcome.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct AssignmentCounts {
-    /// They ended with a candidate, or with a frame of a control walk.
+    /// Ended with a candidate, or with a frame of a control walk.
     pub candidate: u64,
-    /// They were made to their last step.
+    /// Ran to their last step.
     pub steps_done: u64,
-    /// The walker was asked to stop.
+    /// Stopped because the walker was asked to stop.
     pub paused: u64,
-    /// The walk is over.
+    /// Ended with the walk.
     pub ended: u64,
-    /// The walker was lost.
+    /// Lost with their walker.
     pub lost: u64,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct WalkPosition {
     turn: u64,
-    /// Segment and step; none before it is known where the turn began.
+    /// Segment and step; `None` until the start of the assignment is known.
     at: Option<(u32, u64)>,
 }
 
 impl AgentMetrics {
-    /// Whether the orchestrator answers.
+    /// Whether the orchestrator responds.
     pub fn is_linked(&self) -> bool {
         self.heard.is_some_and(|heard| heard.elapsed() <= UNRESPONSIVE_AFTER)
     }
 
-    /// A turn has come, under this version of the mixture.
+    /// Counts a received assignment with its mixture version.
     pub(super) fn received(&mut self, assignment: &Assignment, mixture_version: u64) {
         self.assignments_received += 1;
         self.mixture_version = self.mixture_version.max(Some(mixture_version));
@@ -75,18 +76,18 @@ impl AgentMetrics {
         self.walks.insert(assignment.walk, WalkPosition { turn: assignment.turn, at });
     }
 
-    /// A walk stands there.
+    /// Records the progress of a walk.
     pub(super) fn record_progress(&mut self, walk: WalkId, progress: &Progress) {
         let Some(position) = self.walks.get_mut(&walk) else { return };
         let now = (progress.segment, progress.step);
-        // A return to a checkpoint is no step.
+        // A roll back to a checkpoint is no step.
         if let Some((_, step)) = position.at.filter(|(segment, _)| *segment == now.0) {
             self.steps += now.1.saturating_sub(step);
         }
         position.at = Some(now);
     }
 
-    /// The orchestrator has taken this.
+    /// Counts what the orchestrator has accepted.
     pub(super) fn delivered(&mut self, told: &Told) {
         let counts = &mut self.assignments;
         let count = match told {
@@ -142,15 +143,15 @@ mod tests {
         metrics.received(&turn(0, None), 7);
         metrics.record_progress(WALK, &at(0, 10));
         metrics.record_progress(WALK, &at(0, 40));
-        // Goes on where it stood.
+        // It continues where it was.
         metrics.received(&turn(1, Some(Vec::new())), 7);
         metrics.record_progress(WALK, &at(0, 45));
         assert_eq!(metrics.steps, 45);
-        // It goes back to step 20, and on from there.
+        // It rolls back to step 20 and continues.
         metrics.record_progress(WALK, &at(1, 20));
         metrics.record_progress(WALK, &at(1, 25));
         assert_eq!(metrics.steps, 50);
-        // It was elsewhere for some turns.
+        // It ran elsewhere for some assignments.
         metrics.received(&turn(9, Some(Vec::new())), 7);
         metrics.record_progress(WALK, &at(1, 900));
         metrics.record_progress(WALK, &at(1, 901));

@@ -1,4 +1,4 @@
-//! Who has which turn in hand. No line, no clock.
+//! Which walker works on which assignment. No network, no clock.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -8,18 +8,18 @@ use wire::messages::Report;
 use wire::net::{Slot, Told};
 use wire::transport::Work;
 
-/// The turns and walkers of a host. `S` is a slot: the place of a turn at the orchestrator.
+/// The assignments and walkers of a host. `S` is a slot: the orchestrator's entry for one assignment.
 #[derive(Debug)]
 pub(super) struct AssignmentPool<S = Slot> {
-    /// Turns that no walker has begun.
+    /// Assignments that no walker has started.
     ready: VecDeque<(S, Work)>,
-    /// Walkers that wait for one, in the order in which they came.
+    /// Walkers that wait for an assignment, in order of arrival.
     waiting: VecDeque<(u32, oneshot::Sender<Option<Work>>)>,
-    /// What each of the others works on.
+    /// The assignment of each busy walker.
     assigned: BTreeMap<u32, (Option<S>, WalkId)>,
-    /// Reports whose slots are gone.
+    /// Reports whose slots are lost.
     unsent: VecDeque<Report>,
-    /// Slots for which there may be work.
+    /// Slots that may still get work.
     open_slots: usize,
 }
 
@@ -31,8 +31,8 @@ impl<S> Default for AssignmentPool<S> {
 }
 
 impl<S> AssignmentPool<S> {
-    /// Begins with these slots, or goes on with them in place of others: what is to be told first. Turns that a walker has
-    /// in hand keep a slot; those that nobody has begun are given up.
+    /// Starts with these slots, or replaces lost ones by them. Assignments in progress keep a slot; assignments not
+    /// started are dropped. Returns the first message for each free slot.
     pub(super) fn start(&mut self, slots: Vec<S>) -> Vec<(S, Told)> {
         self.open_slots = slots.len();
         self.ready.clear();
@@ -43,7 +43,7 @@ impl<S> AssignmentPool<S> {
         slots.map(|slot| (slot, self.unsent.pop_front().map_or(Told::Nothing, Told::Report))).collect()
     }
 
-    /// A walker is free: what came of its turn is to be told, and it waits for another.
+    /// Handles an idle walker: returns the report of its assignment, and queues it for another one.
     pub(super) fn walker_idle(
         &mut self,
         walker: u32,
@@ -63,64 +63,64 @@ impl<S> AssignmentPool<S> {
         }
     }
 
-    /// A walker is no more: if it had a turn in hand, that is to be told.
+    /// Handles a lost walker: returns the message about its assignment, if it had one.
     pub(super) fn walker_lost(&mut self, walker: u32, fault: bool) -> Option<(S, Told)> {
         let (slot, _) = self.assigned.remove(&walker)?;
         Some((slot?, Told::Lost { fault }))
     }
 
-    /// A turn has come.
+    /// Adds an assignment.
     pub(super) fn assign(&mut self, slot: S, work: Work) {
         self.ready.push_back((slot, work));
         self.dispatch();
     }
 
-    /// There is no more work for a slot.
+    /// Handles a slot that gets no more work.
     pub(super) fn slot_closed(&mut self) {
         self.open_slots = self.open_slots.saturating_sub(1);
     }
 
-    /// Keeps what could not be told.
+    /// Keeps a report that could not be delivered.
     pub(super) fn keep_unsent(&mut self, told: Told) {
         if let Told::Report(report) = told {
             self.unsent.push_back(report);
         }
     }
 
-    /// The slot of the walk's turn that a walker has in hand.
+    /// The slot of a walk that is in progress here.
     pub(super) fn slot_of(&self, walk: WalkId) -> Option<&S> {
         self.assigned.values().find(|(_, of)| *of == walk).and_then(|(slot, _)| slot.as_ref())
     }
 
-    /// Sends those home who wait.
+    /// Dismisses the waiting walkers.
     pub(super) fn dismiss_idle(&mut self) {
         for (_, reply) in self.waiting.drain(..) {
-            // A walker that is gone already needs no answer.
+            // A walker that has ended needs no reply.
             let _ = reply.send(None);
         }
     }
 
-    /// Reports that nobody takes for the time being.
+    /// Reports that wait for a slot.
     pub(super) fn unsent(&self) -> usize {
         self.unsent.len()
     }
 
-    /// Walkers that wait for a turn.
+    /// Walkers without an assignment.
     pub(super) fn idle(&self) -> usize {
         self.waiting.len()
     }
 
-    /// Whether no walker has a turn in hand.
+    /// Whether no walker has an assignment.
     pub(super) fn is_idle(&self) -> bool {
         self.assigned.is_empty()
     }
 
-    /// Whether nothing is left to be done.
+    /// Whether no work is left.
     pub(super) fn is_over(&self) -> bool {
         self.open_slots == 0 && self.assigned.is_empty()
     }
 
-    /// Gives turns to walkers as far as there are both.
+    /// Gives assignments to waiting walkers.
     fn dispatch(&mut self) {
         while let Some((slot, work)) = self.ready.pop_front() {
             let Some((walker, reply)) = self.waiting.pop_front() else {
@@ -130,7 +130,7 @@ impl<S> AssignmentPool<S> {
             let walk = work.assignment.walk;
             match reply.send(Some(work)) {
                 Ok(()) => drop(self.assigned.insert(walker, (Some(slot), walk))),
-                // This walker is gone; the next one gets it.
+                // This walker has ended; the next one gets the assignment.
                 Err(Some(work)) => self.ready.push_front((slot, work)),
                 Err(None) => {}
             }

@@ -1,4 +1,4 @@
-//! A calculation that was begun, wherever it runs.
+//! Handles of calculations, wherever they run.
 
 use std::path::Path;
 
@@ -10,37 +10,37 @@ use super::code::{blocking, file};
 use super::local::{self, LocalCalculation};
 use super::slurm::{Job, Slurm};
 
-/// What finds a calculation again.
+/// Identifies a calculation.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub(super) enum CalculationHandle {
-    /// A process of a host.
+    /// A process on a host.
     Local(LocalCalculation),
-    /// A job of a cluster.
+    /// A batch job on a cluster.
     Slurm(Job),
 }
 
-/// What is found of one.
+/// The state of a calculation.
 #[derive(Debug, PartialEq)]
 pub(super) enum CalculationState {
-    /// It has ended, and waits to be read.
+    /// It has ended, and its results can be read.
     Ended(CalculationEnd),
     Running,
-    /// Everything is there for it to begin.
+    /// It is prepared and can be started.
     Ready,
-    /// It was broken off, or is cleared away.
+    /// It was interrupted, or its directory was removed.
     Gone,
-    /// Nobody can know from here.
+    /// It cannot be observed from this host.
     Elsewhere,
 }
 
 impl CalculationHandle {
-    /// From what the store has; none for what nobody understands.
+    /// Parses the form in the store; `None` for unknown forms.
     pub fn parse(text: &str) -> Option<Self> {
         serde_json::from_str(text).ok()
     }
 
-    /// As the store keeps it.
+    /// The form in the store.
     pub fn identity(&self) -> String {
         serde_json::to_string(self).expect("plain data becomes JSON")
     }
@@ -59,7 +59,7 @@ impl CalculationHandle {
         }
     }
 
-    /// Waits for the end; `None` if it was broken off.
+    /// Waits for its end; `None` if it was interrupted.
     pub async fn wait(&self, slurm: &Slurm) -> Result<Option<CalculationEnd>, StoreError> {
         match self {
             Self::Local(calculation) => Ok(calculation.wait().await),
@@ -67,7 +67,7 @@ impl CalculationHandle {
         }
     }
 
-    /// Ends whatever is left of it, and removes its directory.
+    /// Ends what is left of it and removes its directory.
     pub async fn clear(&self, slurm: &Slurm) -> Result<(), StoreError> {
         if let Self::Slurm(job) = self {
             slurm.cancel(job).await?;
@@ -75,12 +75,12 @@ impl CalculationHandle {
         self.clone().remove().await
     }
 
-    /// Removes the directory of one that has ended.
+    /// Removes the directory of a calculation that has ended.
     pub async fn remove(self) -> Result<(), StoreError> {
         let directory = self.directory().to_owned();
         let removed = blocking(move || match self {
             Self::Local(calculation) => calculation.clear(),
-            // What a node has not let go of yet is cleared away later.
+            // What a node still uses is removed later.
             Self::Slurm(job) => {
                 local::remove(&job.directory);
                 Ok(())

@@ -1,9 +1,9 @@
-//! The process that keeps a calculation: it starts the program, sees to its limits, and leaves behind how it ended. It
-//! outlives the labeller that started it, so what a killed labeller had begun is finished all the same.
+//! The runner of a calculation: a process that starts the program, enforces its limits and records how it ended. It
+//! outlives the labeller that started it, so a calculation of a killed labeller is finished all the same.
 //!
-//! It is this program again, with an [`RunnerRequest`] on its standard input. Until that has come nothing is started: whoever starts
-//! a keeper writes down which process it is before. The program itself is started by a second process of the same kind,
-//! which ties itself to the keeper and then becomes the program.
+//! The runner is this program again, with a [`RunnerRequest`] on its standard input. It starts nothing before the
+//! request arrives, so that the labeller can first record which process it is. A second process of the same kind
+//! starts the program: it ties itself to the runner and then executes the program.
 
 use std::fs::{self, File};
 use std::io::{self, BufRead, ErrorKind, Write};
@@ -25,28 +25,28 @@ use super::private_directory;
 use super::process_tree::{self, Children};
 use super::remove_tree::remove_tree;
 
-/// Where the program works, in the directory of a calculation.
+/// Working directory of the program, in the directory of the calculation.
 pub(super) const WORK: &str = "work";
-/// What the keeper leaves there when the calculation has ended.
+/// Written there by the runner when the calculation has ended.
 const END: &str = "end.json";
-/// Between two looks at the memory in use, and for processes that have ended.
+/// Time between two checks of memory use and of ended processes.
 const POLL_INTERVAL: Duration = Duration::from_millis(500);
-/// The variable by which everything that a calculation starts can be known: its directory.
+/// Environment variable that marks all processes of a calculation; it holds its directory.
 pub(super) const MARK: &str = "CALMWALK_CALCULATION";
-/// In this variable Slurm says on which node a job runs.
+/// Environment variable in which Slurm gives the node of a job.
 const NODE_VARIABLE: &str = "SLURMD_NODENAME";
-/// Slurm ends all processes of a job, one after the other: the keeper may outlive its program for so long.
+/// Slurm kills the processes of a job one after the other: the runner may outlive its program for this time.
 const SLURM_KILL_TIME: Duration = Duration::from_secs(5);
-/// What the second process leaves there if it could not become the program.
+/// Written there by the second process if it could not execute the program.
 const NOT_STARTED: &str = "not-started";
 
-/// What this program is to be, one line of JSON.
+/// The task of this process, one line of JSON.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) enum RunnerRequest {
-    /// The keeper of a calculation.
+    /// Run a calculation.
     #[serde(rename = "Keep")]
     Run(Calculation),
-    /// Its program.
+    /// Execute its program.
     #[serde(rename = "Become")]
     Exec {
         #[serde(rename = "keeper")]
@@ -56,35 +56,35 @@ pub(super) enum RunnerRequest {
     },
 }
 
-/// What is to be calculated, and within which limits.
+/// A calculation and its limits.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct Calculation {
     pub directory: PathBuf,
     pub command: Vec<String>,
     pub environment: Vec<(String, String)>,
-    /// What the program gets besides of the environment in which the keeper is started.
+    /// Variables that the program gets from the environment of the runner.
     #[serde(default)]
     pub pass_environment: PassedEnvironment,
     /// Seconds.
     pub time_limit: f64,
-    /// Bytes that all its processes together may have in memory.
+    /// Maximum memory of all its processes together, bytes.
     pub memory_limit: Option<u64>,
-    /// How a keeper is started.
+    /// How to start a runner.
     #[serde(rename = "keeper")]
     pub runner: RunnerCommand,
 }
 
-/// The program, with its arguments, that calls [`keep`].
+/// The program, with its arguments, that calls [`run_calculation`].
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunnerCommand {
-    /// A path.
+    /// Path of the program.
     pub program: PathBuf,
-    /// What it is started with.
+    /// Its arguments.
     pub arguments: Vec<String>,
 }
 
 impl Default for RunnerCommand {
-    /// `calmwalk keep`, of this very program, also when its file was replaced meanwhile.
+    /// `calmwalk keep`, run by this very program, even if its file was replaced meanwhile.
     fn default() -> Self {
         Self { program: "/proc/self/exe".into(), arguments: vec!["keep".to_owned()] }
     }
@@ -93,7 +93,7 @@ impl Default for RunnerCommand {
 impl RunnerCommand {
     pub(super) fn command(&self) -> Command {
         let mut command = Command::new(&self.program);
-        // People look for that name in lists of processes.
+        // The name that users see in process lists.
         command.arg0(std::env::args_os().next().unwrap_or_else(|| "calmwalk".into())).args(&self.arguments);
         command
     }
@@ -103,16 +103,16 @@ impl RunnerCommand {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct CalculationEnd {
     pub how: EndReason,
-    /// The program, as the command calls it.
+    /// The program, as the command names it.
     pub program: PathBuf,
     /// From the program's start to its end, s.
     pub seconds: f64,
-    /// Most bytes that its processes were seen to have in memory together; 0 where nobody looked.
+    /// Largest observed memory of all its processes together, bytes; 0 if it was not observed.
     pub memory: u64,
     /// Node of the batch system on which it ran.
     #[serde(default)]
     pub node: Option<String>,
-    /// What is known of it if no keeper left this, but another found it out.
+    /// Further information if another process determined the end, because the runner left none.
     #[serde(default)]
     pub remark: Option<String>,
 }
@@ -122,11 +122,11 @@ pub(super) struct CalculationEnd {
 pub(super) enum EndReason {
     /// By itself, or at a limit.
     Ended(#[serde(with = "ExitOnFile")] Exit),
-    /// There is no such program, or it cannot be executed: the system's number of the error.
+    /// The program does not exist or cannot be executed: the error number of the system.
     NotStarted(i32),
 }
 
-/// [`Exit`] as it is written down.
+/// [`Exit`] in its stored form.
 #[derive(Serialize, Deserialize)]
 #[serde(remote = "Exit")]
 enum ExitOnFile {
@@ -138,12 +138,12 @@ enum ExitOnFile {
 }
 
 impl CalculationEnd {
-    /// What a keeper left in the directory, if the calculation has ended.
+    /// Reads the end that a runner left in the directory, if the calculation has ended.
     pub fn read(directory: &Path) -> Option<Self> {
         serde_json::from_slice(&result_file::read(&directory.join(END)).ok()?).ok()
     }
 
-    /// It appears as a whole, and only when everything else is over.
+    /// The file appears as a whole, and only when everything else is done.
     pub fn write(&self, directory: &Path) -> io::Result<()> {
         let (unfinished, finished) = (directory.join(format!("{END}.new")), directory.join(END));
         // The program may have left anything under these names.
@@ -155,7 +155,7 @@ impl CalculationEnd {
     }
 }
 
-/// Removes what has that name, whatever it is.
+/// Removes whatever has that name.
 fn remove_existing(path: &Path) -> io::Result<()> {
     match fs::symlink_metadata(path) {
         Ok(found) if found.is_dir() => remove_tree(path),
@@ -165,14 +165,15 @@ fn remove_existing(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Does what standard input says: keeps a calculation, or becomes its program. To be called on the main thread of a
-/// process that does nothing else.
+/// Reads a request from standard input: runs a calculation, or executes its program. Call it on the main thread of
+/// a process that does nothing else.
 ///
 /// # Errors
-/// What the system refused. Without an order, since whoever started this process is gone, nothing is done.
+/// Errors of the operating system. Without a request, because the process that started this one has ended, it does
+/// nothing.
 pub fn run_calculation() -> io::Result<()> {
     let stdin = io::stdin();
-    // A batch job reads its order from a file, in whose place another user might have put one.
+    // A batch job reads its request from a file, which another user might have replaced.
     let request = rustix::fs::fstat(&stdin)?;
     if rustix::fs::FileType::from_raw_mode(request.st_mode).is_file() && request.st_uid != geteuid().as_raw()
     {
@@ -183,7 +184,7 @@ pub fn run_calculation() -> io::Result<()> {
     }
     let mut line = String::new();
     stdin.lock().read_line(&mut line)?;
-    // An order that was cut off was not given.
+    // A truncated request counts as none.
     match line.ends_with('\n').then(|| serde_json::from_str(&line)) {
         None => Ok(()),
         Some(Err(error)) => Err(error.into()),
@@ -194,13 +195,13 @@ pub fn run_calculation() -> io::Result<()> {
     }
 }
 
-/// Returns only if that fails.
+/// Returns only on failure.
 fn exec_program(runner: u32, directory: &Path, command: &[String]) -> io::Error {
-    // A request: what starts others on other nodes has to end them.
+    // SIGTERM, not SIGKILL: a program that starts processes on other nodes has to end them.
     if let Err(error) = set_parent_process_death_signal(Some(Signal::TERM)) {
         return error.into();
     }
-    // It may have died before.
+    // It may have ended before.
     if getppid().map(|pid| pid.as_raw_nonzero().get().unsigned_abs()) != Some(runner) {
         return io::Error::other("the runner of this calculation is gone");
     }
@@ -220,9 +221,9 @@ impl Calculation {
             let message = format!("{} is no directory of this user", self.directory.display());
             return Err(io::Error::other(message));
         }
-        // Neither Ctrl-C nor the end of the labeller's group reaches this process or its program.
+        // Neither Ctrl-C nor the end of the labeller's process group reaches this process or its program.
         setsid()?;
-        // Whatever the program starts stays below this process, also when those that started it are gone.
+        // All descendants of the program stay below this process, even if their parents end.
         set_child_subreaper(Some(getpid()))?;
         let kills = out_of_memory_kills();
         let begun = Instant::now();
@@ -235,7 +236,7 @@ impl Calculation {
         let seconds = begun.elapsed().as_secs_f64();
         let node = std::env::var(NODE_VARIABLE).ok();
         if node.is_some() && limit.is_none() && !status.success() {
-            // If it was not the program's fault, this process ends here as well, and Slurm tells why.
+            // If Slurm is killing the job, this process is killed here as well, and Slurm reports the reason.
             std::thread::sleep(SLURM_KILL_TIME);
         }
         let how = match (self.not_started(), limit) {
@@ -273,7 +274,8 @@ impl Calculation {
         }
     }
 
-    /// Waits until the program has ended, or must end: then the limit. The second is how much memory was seen in use.
+    /// Waits until the program has ended or reaches a limit. Returns the limit, if any, and the largest observed
+    /// memory.
     fn wait(&self, program: Pid, children: &mut Children, begun: Instant) -> io::Result<(Option<Exit>, u64)> {
         let end = pidfd_open(program, PidfdFlags::empty())?;
         let limit = Duration::try_from_secs_f64(self.time_limit).unwrap_or(Duration::MAX);
@@ -302,16 +304,16 @@ impl Calculation {
     }
 }
 
-/// Gives an order to a process that waits for one.
+/// Sends a request to a process that waits for one.
 pub(super) fn send_request(mut stdin: impl Write, request: &RunnerRequest) -> io::Result<()> {
     let mut line = serde_json::to_vec(request)?;
     line.push(b'\n');
     stdin.write_all(&line)
 }
 
-/// Waits for the end of a process, for so long.
+/// Waits for the end of a process, up to the timeout.
 fn has_ended(process: &impl AsFd, timeout: Duration) -> io::Result<bool> {
-    // A day more or less: who waits looks at the clock again.
+    // At most a day: the caller checks the time again.
     let timeout = timeout.min(Duration::from_secs(86_400));
     let timeout = Timespec::try_from(timeout).map_err(io::Error::other)?;
     match poll(&mut [PollFd::new(process, PollFlags::IN)], Some(&timeout)) {
@@ -328,7 +330,8 @@ fn exit(status: ExitStatus) -> Exit {
     }
 }
 
-/// How many processes the system has killed in this control group because it had no memory left; 0 where it does not tell.
+/// Number of processes in this control group that the system has killed because memory ran out; 0 if it does not
+/// tell.
 fn out_of_memory_kills() -> u64 {
     let count = || {
         let groups = fs::read_to_string("/proc/self/cgroup").ok()?;

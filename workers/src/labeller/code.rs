@@ -1,4 +1,4 @@
-//! Labels by another program: calculations that outlive the labeller that began them.
+//! Labels made by another program: calculations that outlive the labeller that started them.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -26,17 +26,17 @@ use super::{
     retry_until_written,
 };
 
-/// How long results may be read at least, also where the calculation has taken all of its time.
+/// Minimum time allowed for reading results, even if the calculation used up its time limit.
 const MIN_READ_TIME: Duration = Duration::from_secs(60);
-/// And how long they are read when somebody asks to stop.
+/// Time allowed for reading results after a shutdown request.
 const READ_GRACE: Duration = Duration::from_secs(5);
 
-/// Another program, and how it is run.
+/// Labels by another program, and how to run it.
 pub struct CodeMethod {
     code: Arc<dyn Code>,
     execution: ExecutionSettings,
     runner: RunnerCommand,
-    /// Where the calculations of this campaign are.
+    /// The directory of this campaign's calculations.
     root: OnceCell<ScratchRoot>,
     in_hand: Mutex<Option<InHand>>,
     slurm: Slurm,
@@ -45,21 +45,21 @@ pub struct CodeMethod {
 /// A calculation that this labeller waits for.
 struct InHand {
     handle: CalculationHandle,
-    /// Its keeper, if this process started it, and so has to take note of its end.
+    /// Its runner, if this process started it and must reap it.
     runner: Option<Child>,
 }
 
 /// A calculation that has ended.
 pub(super) struct EndedCalculation {
     pub core_seconds: f64,
-    /// The end of what the program said.
+    /// The end of the program's output.
     pub log: String,
-    /// Where it ran, if a batch system had it run.
+    /// The node where it ran, for a batch job.
     node: Option<String>,
     handle: CalculationHandle,
 }
 
-/// A calculation that only waits for a word.
+/// A calculation that is ready to start.
 enum PreparedCalculation {
     Local(local::PreparedRunner),
     Slurm(slurm::Job),
@@ -76,11 +76,11 @@ impl CodeMethod {
         self.code.size(structure)
     }
 
-    /// Finds the calculation that an earlier attempt began here, or starts one, and waits for its end. None if its results could
-    /// not be read within seconds after `closing` asked to stop.
+    /// Finds the calculation that an earlier attempt started here, or starts one, and waits for its end. `None` if
+    /// its results could not be read within seconds after a shutdown request.
     ///
     /// # Errors
-    /// Of the database; and where no calculation can be started here, whatever the structure.
+    /// Errors of the database, and if no calculation can be started on this host, whatever the structure.
     pub(super) async fn make(
         &self,
         store: &Store,
@@ -120,7 +120,7 @@ impl CodeMethod {
         Ok(Some(made))
     }
 
-    /// A calculation that no campaign knows of.
+    /// A calculation outside a campaign.
     pub(super) async fn single_label(&self, structure: &Structure) -> Result<SingleLabel, StoreError> {
         let none = |result| SingleLabel { result, log: String::new(), core_seconds: 0.0 };
         let prepared = match self.prepare(structure.clone(), Vec::new()).await {
@@ -152,7 +152,7 @@ impl CodeMethod {
         Ok(made.expect("nobody asks to stop"))
     }
 
-    /// Everything that is known before anything is started.
+    /// Prepares everything that is needed before the start.
     async fn prepare(&self, structure: Structure, failures: Vec<FailureClass>) -> Result<Prepared, Failure> {
         let Some(remedies) = dft::remedies(&failures) else {
             let class = failures.last().copied().unwrap_or(FailureClass::Crashed);
@@ -162,7 +162,7 @@ impl CodeMethod {
         blocking(move || prepare(&*code, &execution, &structure, &remedies)).await
     }
 
-    /// Where calculations of this campaign are; what killed ones have left there is tidied up first.
+    /// The directory of this campaign's calculations, after removing what killed labellers left there.
     pub(super) async fn scratch_root(
         &self,
         store: &Store,
@@ -178,19 +178,20 @@ impl CodeMethod {
         self.root.get_or_try_init(make).await
     }
 
-    /// Leaves no empty directory behind.
+    /// Removes empty directories.
     pub(super) fn end(&self) {
         if let Some(root) = self.root.get() {
             root.remove_empty();
         }
     }
 
-    /// The newest of these calculations that goes on, or has ended and can be read. What is left of the others is removed.
+    /// The newest of these calculations that is running, or has ended and can be read. Removes what is left of the
+    /// others.
     async fn find(
         &self,
         earlier: &[String],
     ) -> Result<Option<(CalculationHandle, CalculationState)>, StoreError> {
-        // One that was taken over is named by each attempt that waited for it.
+        // A calculation that was taken over is recorded by each attempt that waited for it.
         let mut named = BTreeSet::new();
         let known = earlier.iter().filter_map(|text| CalculationHandle::parse(text));
         let once: Vec<_> = known.filter(|handle| named.insert(handle.directory().to_owned())).collect();
@@ -209,7 +210,7 @@ impl CodeMethod {
         Ok(found)
     }
 
-    /// A directory with the input in it, and who waits for a word to begin.
+    /// Writes the input into a directory and prepares the runner or job.
     async fn prepare_directory(
         &self,
         directory: &Path,
@@ -246,7 +247,7 @@ impl CodeMethod {
         ready.map_err(|error| unused(file(directory, error)))
     }
 
-    /// Has the calculation begin.
+    /// Starts the calculation.
     async fn start(&self, ready: PreparedCalculation) -> Result<CalculationHandle, StoreError> {
         let handle = ready.handle();
         match ready {
@@ -262,8 +263,8 @@ impl CodeMethod {
         Ok(handle)
     }
 
-    /// Waits for the end of a calculation of at most `time_limit` s, and reads its numbers; none if that takes too long for
-    /// somebody who wants to stop.
+    /// Waits for the end of a calculation of at most `time_limit` s and reads its results; `None` if that takes too
+    /// long after a shutdown request.
     async fn outcome(
         &self,
         structure: Structure,
@@ -284,7 +285,7 @@ impl CodeMethod {
         }
     }
 
-    /// Judges a calculation that has ended, and reads its numbers, for so long.
+    /// Reads and validates the results of a calculation that has ended, within a time limit.
     async fn read(
         &self,
         structure: Structure,
@@ -307,7 +308,7 @@ impl CodeMethod {
             (Err(FailureClass::TimeLimit.because(message)), String::new())
         });
         if let Err(Failure { class: FailureClass::OtherProgram, message }) = &result {
-            // Whatever the structure: no calculation here would be one of the protocol.
+            // Whatever the structure: calculations on this host would not follow the protocol.
             let error = file(&end.program, io::Error::other(message.clone()));
             handle.remove().await?;
             self.reap();
@@ -323,7 +324,7 @@ impl CodeMethod {
         })
     }
 
-    /// Somebody killed the keeper, which says nothing about the job.
+    /// The runner was killed, which says nothing about the job.
     async fn lost_calculation(&self, handle: CalculationHandle) -> Result<LabelAttempt, StoreError> {
         handle.clear(&self.slurm).await?;
         self.reap();
@@ -335,17 +336,17 @@ impl CodeMethod {
         *self.in_hand() = Some(InHand { handle, runner });
     }
 
-    /// What is said of the calculation in hand in the store.
+    /// The handle of the current calculation, in the form of the store.
     pub(super) fn calculation(&self) -> Option<String> {
         self.in_hand().as_ref().map(|in_hand| in_hand.handle.identity())
     }
 
-    /// It goes on without this labeller.
+    /// Leaves the current calculation running without this labeller.
     pub(super) fn detach(&self) {
         self.in_hand().take();
     }
 
-    /// Ends it, and removes what is left of it.
+    /// Ends the current calculation and removes what is left of it.
     pub(super) async fn cancel(&self) -> Result<(), StoreError> {
         let handle = self.in_hand().as_ref().map(|in_hand| in_hand.handle.clone());
         if let Some(handle) = handle {
@@ -358,7 +359,7 @@ impl CodeMethod {
         Ok(())
     }
 
-    /// Takes note of the end of a keeper, so that nothing is left of it.
+    /// Reaps the runner of the current calculation.
     fn reap(&self) {
         let in_hand = self.in_hand().take();
         if let Some(mut runner) = in_hand.and_then(|in_hand| in_hand.runner) {
@@ -367,7 +368,7 @@ impl CodeMethod {
         }
     }
 
-    /// The result is where it belongs: the directory is packed into the store, or only removed.
+    /// After the result is stored: packs the directory into the store if it is to be kept, and removes it.
     pub(super) async fn archive(
         &self,
         store: &Store,
@@ -389,12 +390,12 @@ impl CodeMethod {
     }
 }
 
-/// The classes of the failures of a job so far.
+/// Classes of the job's failures so far.
 pub(super) fn failure_classes(lease: &Lease) -> Vec<FailureClass> {
     lease.failures.iter().filter_map(|name| FailureClass::named(name)).collect()
 }
 
-/// Nodes on which a job failed, where another may help.
+/// Nodes where the job failed and another node may help.
 fn failed_nodes(lease: &Lease) -> Vec<String> {
     let failed = lease.failed_calculations.iter().filter_map(|text| CalculationHandle::parse(text));
     let nodes = failed.filter_map(|handle| match handle {
@@ -404,7 +405,7 @@ fn failed_nodes(lease: &Lease) -> Vec<String> {
     nodes.collect::<BTreeSet<_>>().into_iter().collect()
 }
 
-/// A calculation that failed and may do better on another node, with the node that it had.
+/// The handle of a calculation that failed and may succeed on another node, with its node.
 fn failed_on_node(made: &LabelAttempt) -> Option<CalculationHandle> {
     use FailureClass::{Crashed, LostNode, OutOfMemory};
     let LabelAttempt {
@@ -427,12 +428,12 @@ impl PreparedCalculation {
     }
 }
 
-/// What takes time, in a thread of its own. If it panics, so does who waits for it.
+/// Runs slow work on a thread of its own. A panic in it propagates to the caller.
 pub(super) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
     spawn_blocking(work).await.unwrap_or_else(|crash| std::panic::resume_unwind(crash.into_panic()))
 }
 
-/// What cannot be done here fails the labeller, and not the job: another host may have room for it.
+/// An error that fails the labeller and not the job: another host may be able to run it.
 pub(super) fn file(path: &Path, source: io::Error) -> StoreError {
     StoreError::File { path: path.to_owned(), source }
 }

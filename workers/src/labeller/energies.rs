@@ -1,4 +1,4 @@
-//! What energies of labels are compared with: the potential's, and the offsets of elements that labels show.
+//! Reference for the energies of labels: the potential's energies plus offsets of the elements, fitted to labels.
 
 use std::collections::BTreeMap;
 
@@ -12,15 +12,15 @@ use wire::ContentHash;
 use super::validate::EnergyReference;
 use super::{Shutdown, retry_until_written};
 
-/// Labels that offsets are fitted to: the newest.
+/// Number of labels in the fit: the newest ones.
 const LABELS: u32 = 2_000;
-/// They are fitted again when this labeller has brought so many labels more, by those that the fit used.
+/// The fit is repeated when this labeller has made 1/8 as many new labels as the last fit used.
 const REFIT: usize = 8;
 
-/// Fits the energy offsets of elements to the newest labels of a protocol, without those that are excluded.
+/// Fits the energy offsets of elements to the newest labels of a protocol, without excluded ones.
 ///
 /// # Errors
-/// Of the database; inside, [`TooFewLabels`] for a fit.
+/// Errors of the database; in the inner result, [`TooFewLabels`] for a fit.
 pub async fn energy_offsets(
     store: &Store,
     protocol: ContentHash,
@@ -34,7 +34,7 @@ pub async fn energy_offsets(
     Ok(EnergyOffsets::fit(&labels.collect::<Vec<_>>()))
 }
 
-/// A structure with its energies by the potential and of its label, eV, as the fit takes it.
+/// A structure's energies by the potential and by its label, eV, for the fit.
 pub fn labelled_energy(structure: &Structure, model: f64, label: f64) -> LabelledEnergy {
     let mut counts = BTreeMap::new();
     for species in &structure.species {
@@ -43,7 +43,7 @@ pub fn labelled_energy(structure: &Structure, model: f64, label: f64) -> Labelle
     LabelledEnergy { composition: counts.into_iter().collect(), model, label }
 }
 
-/// The offsets as a labeller knows them.
+/// A labeller's current offsets.
 #[derive(Debug, Default)]
 pub(super) struct Offsets {
     fitted: Option<EnergyOffsets>,
@@ -52,7 +52,7 @@ pub(super) struct Offsets {
 }
 
 impl Offsets {
-    /// What the energy of a result is compared with; `None` if nothing is known.
+    /// The reference for the energy of a result; `None` if there is none yet.
     pub async fn expected(
         &mut self,
         store: &Store,

@@ -5,34 +5,33 @@ use std::path::PathBuf;
 use dft::PassedEnvironment;
 use serde::{Deserialize, Serialize};
 
-/// How the calculations of another program run. Nothing of it changes what comes out.
+/// How to run the calculations of another program. None of these settings changes the results.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExecutionSettings {
-    /// Cores that a calculation has: it finds their number in its environment, as `CALMWALK_CORES`. Core-hours are counted
-    /// by it.
+    /// Cores per calculation, given to the program as `CALMWALK_CORES`. Core-hours are counted with it.
     pub cores: u32,
-    /// Longest time of a calculation, s.
+    /// Maximum time of a calculation, s.
     pub time_limit: f64,
-    /// Most memory of all processes of a calculation together, GB (10⁹ bytes); none for no limit.
+    /// Maximum memory of all processes of a calculation together, GB (10⁹ bytes); `None` for no limit.
     pub memory: Option<f64>,
-    /// Where directories of calculations are made, on a disk of this host; none for the one for temporary files. With a batch
-    /// system every node has to see it.
+    /// Directory for calculations, on a disk of this host; `None` for the system's temporary directory. With a
+    /// batch system every node must see it.
     pub scratch: Option<PathBuf>,
-    /// What becomes of the directory when a calculation has ended.
+    /// What to do with the directory after a calculation.
     pub keep: KeepDirectories,
-    /// Variables of the labeller's environment that the program gets beside those that every program gets.
+    /// Variables of the labeller's environment that the program gets in addition to the default ones.
     #[serde(skip_serializing_if = "PassedEnvironment::is_empty")]
     pub pass_environment: PassedEnvironment,
-    /// The batch system that each calculation is a job of; none for processes beside the labeller.
+    /// The batch system that runs each calculation as a job; `None` for processes on this host.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub batch_system: Option<BatchSystem>,
-    /// Further options of its jobs, as the batch system's own command takes them.
+    /// Further options of its jobs, in the syntax of the batch system's command.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub batch_options: Vec<String>,
 }
 
-/// What runs calculations as jobs of their own.
+/// A batch system that runs calculations as jobs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum BatchSystem {
@@ -40,13 +39,13 @@ pub enum BatchSystem {
     Slurm,
 }
 
-/// Which directories of calculations are packed into the store; all others are removed.
+/// Which directories of calculations to pack into the store; all others are removed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum KeepDirectories {
     /// None.
     Nothing,
-    /// Those of calculations that failed.
+    /// Directories of failed calculations.
     #[default]
     Failed,
     /// All.
@@ -54,7 +53,7 @@ pub enum KeepDirectories {
 }
 
 impl KeepDirectories {
-    /// Whether the directory of a calculation is kept that has `failed`, or has not.
+    /// Whether to keep the directory of a calculation.
     pub(super) fn keeps(self, failed: bool) -> bool {
         match self {
             Self::Nothing => false,
@@ -80,7 +79,7 @@ impl Default for ExecutionSettings {
 }
 
 impl ExecutionSettings {
-    /// Where directories of calculations are made.
+    /// The directory for calculations.
     pub fn scratch(&self) -> PathBuf {
         self.scratch.clone().unwrap_or_else(std::env::temp_dir)
     }

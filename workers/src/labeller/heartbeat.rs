@@ -1,4 +1,4 @@
-//! A labeller as a process of its own: it says that it lives, and sees whether it is still needed.
+//! A labeller as a process of its own: sends heartbeats and checks whether it is still needed.
 
 use std::time::Duration;
 
@@ -6,24 +6,24 @@ use store::{ProcessRecord, Store, StoreError};
 
 use super::{LabellerSettings, Method, Shutdown, retry_until_written, run};
 
-/// For how long a labeller is of use when nobody leads the campaign.
+/// When a labeller exits while nothing runs the campaign.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExitPolicy {
-    /// Until the queue is empty.
+    /// When the queue is empty.
     UntilEmpty,
-    /// Until every walk is over as well: somebody may lead it again.
+    /// When the queue is empty and every walk is over: the campaign may be run again before.
     UntilFinished,
 }
 
-/// Labels as the process `process`, whose record it keeps; `settings.holder` is its name.
+/// Runs a labeller as the process `process` and maintains its record; `settings.holder` is its id.
 ///
-/// It does not need an orchestrator: while none lives, it goes on for as long as `settings.stay` says; one that starts meanwhile
-/// adopts those that an earlier one started. It also goes home, after the label in hand, when another labeller of its
-/// number has taken its place. `tell` gets a line for each job.
+/// It needs no orchestrator: while none is alive, it continues as `settings.exit_policy` says. An orchestrator that
+/// starts later adopts labellers of earlier runs. The labeller also exits after the current label if another
+/// labeller with the same number has replaced it. `tell` receives a line for each job.
 ///
 /// # Errors
-/// Whatever the database says, also that it was deleted or replaced. Leases are given back and the record says why,
-/// where that is still possible.
+/// Errors of the database, also if it was deleted or replaced. Releases leases and records the error if that is
+/// still possible.
 pub async fn serve(
     store: Store,
     method: Method,
@@ -34,7 +34,7 @@ pub async fn serve(
     tell: impl Fn(&str),
 ) -> Result<(), StoreError> {
     let (interval, exit_policy) = (settings.timing.heartbeat_interval, settings.exit_policy);
-    // A lease without a record of its holder would be taken back.
+    // A lease whose holder has no record would be released.
     retry_until_written(shutdown, || store.upsert_process(&process)).await?;
     let holder = settings.holder.clone();
     let ended = tokio::select! {
@@ -43,19 +43,19 @@ pub async fn serve(
     };
     match ended {
         Ok(()) => {
-            // A lease of nobody would only come back when somebody looks for those.
+            // A lease without a holder would stay until another process looks for such leases.
             retry_until_written(shutdown, || store.state_leases(&holder, &[], now())).await?;
             retry_until_written(shutdown, || store.remove_process(&process.id)).await
         }
         Err(error) => match record_failure(&store, process, &error, now()).await {
-            // Why everything else fails.
+            // This explains why everything else fails.
             Err(removed @ StoreError::Removed { .. }) => Err(removed),
             _ => Err(error),
         },
     }
 }
 
-/// Gives signs of life until that is impossible.
+/// Sends heartbeats until that fails for good.
 async fn run_heartbeat(
     store: &Store,
     mut process: ProcessRecord,
@@ -67,7 +67,7 @@ async fn run_heartbeat(
     loop {
         match send_heartbeat(store, &mut process, exit_policy, shutdown, now()).await {
             Err(error) if !error.is_transient() => return error,
-            // A full disk or a busy database: the next one may come through.
+            // The disk is full or the database busy: the next heartbeat may succeed.
             _ => tokio::time::sleep(interval).await,
         }
     }
@@ -92,7 +92,7 @@ async fn send_heartbeat(
     };
     shutdown.set_no_more_jobs(is_over);
     if !led {
-        // Nobody else does.
+        // No other process does so.
         store.release_leases_of_dead_processes(now).await?;
     }
     process.last_seen = now;

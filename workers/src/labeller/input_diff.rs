@@ -1,16 +1,16 @@
-//! What remedies change in the input of a calculation.
+//! Differences that remedies make in the input of a calculation.
 
 use std::collections::BTreeSet;
 use std::fmt::Write;
 
 use dft::Input;
 
-/// Lines that are told, at most.
+/// Maximum number of lines.
 const MAX_LINES: usize = 40;
-/// Characters of a line that are told, at most.
+/// Maximum number of characters per line.
 const MAX_CHARACTERS: usize = 200;
 
-/// The lines that only `plain` has, with `-`, and those that only `changed` has, with `+`, file by file.
+/// Lines only in `plain`, with `-`, and lines only in `changed`, with `+`, file by file.
 pub(super) fn input_diff(plain: &Input, changed: &Input) -> String {
     let mut lines = Vec::new();
     let [before, after] = [plain, changed].map(|input| input.command.join(" "));

@@ -15,15 +15,15 @@ use super::calculation_runner::{self, Calculation, CalculationEnd, RunnerRequest
 use super::remove_tree::remove_tree;
 use super::{private_directory, process_tree};
 
-/// Between two looks at a calculation that has just begun …
+/// Initial time between two checks of a calculation.
 const MIN_POLL_INTERVAL: Duration = Duration::from_millis(5);
-/// … and at one that has lasted for a while.
+/// Longest time between two checks of a calculation.
 const MAX_POLL_INTERVAL: Duration = Duration::from_millis(500);
 
-/// What finds a calculation again: its keeper, and where it works.
+/// Identifies a calculation by its runner and directory.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct LocalCalculation {
-    /// For people.
+    /// For display only.
     pub host: String,
     pub directory: PathBuf,
     pub pid: u32,
@@ -31,7 +31,7 @@ pub(super) struct LocalCalculation {
     pub start_time: String,
 }
 
-/// A keeper that waits for its order.
+/// A runner that waits for its request.
 pub(super) struct PreparedRunner {
     pub handle: LocalCalculation,
     child: Child,
@@ -40,10 +40,10 @@ pub(super) struct PreparedRunner {
 }
 
 impl PreparedRunner {
-    /// Starts the keeper; the calculation itself only begins with [`Self::start`]. Dropped before that, it never does.
+    /// Starts the runner. The calculation starts only with [`Self::start`], and never if this is dropped before.
     pub fn spawn(calculation: Calculation) -> io::Result<Self> {
         let mut runner = calculation.runner.command();
-        // It outlives this process, speaks to no database, and gives its environment to the program.
+        // It outlives this process, does not access the database and passes its environment to the program.
         runner.env_clear().envs(calculation.pass_environment.of_this_process());
         runner.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null());
         let mut child = runner.spawn()?;
@@ -67,14 +67,14 @@ impl LocalCalculation {
             return CalculationState::Elsewhere;
         }
         if !private_directory::is_own(&self.directory) {
-            // Another user may have made one of that name after it was gone.
+            // Another user may have created a directory of that name after it was removed.
             return if is_running(self.pid, &self.start_time) {
                 CalculationState::Running
             } else {
                 CalculationState::Gone
             };
         }
-        // In this order: the last that a keeper does is to write how the calculation ended.
+        // This order matters: a runner writes the end last.
         let runs = is_running(self.pid, &self.start_time);
         match (CalculationEnd::read(&self.directory), runs) {
             (Some(end), _) => CalculationState::Ended(end),
@@ -83,7 +83,7 @@ impl LocalCalculation {
         }
     }
 
-    /// Waits for the end; `None` if it was broken off.
+    /// Waits for the end; `None` if it was interrupted.
     pub async fn wait(&self) -> Option<CalculationEnd> {
         let mut pause = MIN_POLL_INTERVAL;
         loop {
@@ -98,22 +98,22 @@ impl LocalCalculation {
         }
     }
 
-    /// Ends whatever is left of it, and removes its directory.
+    /// Ends what is left of it and removes its directory.
     pub fn clear(&self) -> io::Result<()> {
         process_tree::terminate_process(self.pid, &self.start_time)?;
         clear(&self.directory)
     }
 }
 
-/// The same for the directory of a calculation whose keeper is gone.
+/// The same for a directory whose runner has ended.
 pub(super) fn clear(directory: &Path) -> io::Result<()> {
     process_tree::terminate_marked(directory)?;
     remove(directory);
     Ok(())
 }
 
-/// A directory that is gone already is no error. What cannot be removed, or is not this user's, stays: that is no reason for
-/// a labeller to end.
+/// A missing directory is no error. A directory that cannot be removed, or is not this user's, stays: this does not
+/// end the labeller.
 pub(super) fn remove(directory: &Path) {
     if fs::symlink_metadata(directory).is_ok() && !private_directory::is_own(directory) {
         warn!("{} is not removed: it is no directory of this user", directory.display());

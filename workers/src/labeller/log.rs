@@ -1,10 +1,10 @@
-//! The end of what a program said.
+//! The end of a program's output.
 
 use std::path::Path;
 
 use dft::result_file;
 
-/// Bytes of each stream that are kept.
+/// Bytes kept of each stream.
 const TAIL: u64 = 3000;
 
 /// The last lines of its standard output and standard error.
@@ -14,7 +14,7 @@ pub(super) fn tail(work: &Path) -> String {
     said.map(|(name, text)| format!("{name}:\n{text}\n")).collect()
 }
 
-/// As many whole lines as fit, or the end of the only one; nothing of a file that cannot be read.
+/// As many whole lines as fit, or the end of a single line; empty if the file cannot be read.
 pub(super) fn last_lines(path: &Path) -> String {
     let Ok(tail) = result_file::tail(path, TAIL) else { return String::new() };
     let text = String::from_utf8_lossy(&tail.bytes);

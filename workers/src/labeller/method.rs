@@ -1,4 +1,4 @@
-//! What makes labels.
+//! Methods that make labels.
 
 use std::panic;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -15,21 +15,21 @@ use super::{ExecutionSettings, ReferenceMethod, RunnerCommand, Shutdown};
 
 /// A way to make labels.
 pub enum Method {
-    /// A potential, in this process.
+    /// A potential, evaluated in this process.
     Reference(Arc<Mutex<ReferenceMethod>>),
-    /// Another program, in processes of its own that outlive this one.
+    /// Another program, run in processes that outlive this one.
     Code(Box<CodeMethod>),
 }
 
-/// A result.
+/// The result of an attempt.
 pub(super) struct LabelAttempt {
     pub result: Result<Calculated, Failure>,
-    /// The calculation behind it, if it was a process of its own.
+    /// Its calculation, if another program made it.
     pub ended: Option<EndedCalculation>,
 }
 
 impl LabelAttempt {
-    /// The same, if it can be believed; otherwise why not.
+    /// The same, with an invalid result replaced by a failure.
     pub fn validated(
         self,
         lease: &Lease,
@@ -47,25 +47,25 @@ impl Method {
         Self::Reference(Arc::new(Mutex::new(ReferenceMethod::new(potential))))
     }
 
-    /// Labels by another program.
+    /// Labels by another program, run by `calmwalk keep` of this program.
     pub fn code(code: Box<dyn Code>, execution: ExecutionSettings) -> Self {
         Self::with_runner(RunnerCommand::default(), code, execution)
     }
 
-    /// The same with keepers ([`super::run_calculation`]) that are started so.
+    /// The same, with another command that starts runners (see [`super::run_calculation`]).
     pub fn with_runner(runner: RunnerCommand, code: Box<dyn Code>, execution: ExecutionSettings) -> Self {
         Self::Code(Box::new(CodeMethod::new(runner, code, execution)))
     }
 
-    /// Whether a calculation goes on without this labeller, and another finds it.
+    /// Whether a calculation continues without this labeller, and another labeller can find it.
     pub(super) fn outlives_labeller(&self) -> bool {
         matches!(self, Self::Code(_))
     }
 
-    /// Ends the calculation in hand, if there is one, and removes its directory.
+    /// Ends the current calculation, if there is one, and removes its directory.
     ///
     /// # Errors
-    /// [`StoreError::File`] if that is impossible.
+    /// [`StoreError::File`] if that fails.
     pub async fn stop(&self) -> Result<(), StoreError> {
         match self {
             Self::Reference(_) => Ok(()),
@@ -73,7 +73,7 @@ impl Method {
         }
     }
 
-    /// Makes room for calculations, and clears away what killed labellers have left.
+    /// Prepares the scratch directory, and removes what killed labellers left.
     pub(super) async fn start(&self, store: &Store, shutdown: &Shutdown) -> Result<(), StoreError> {
         match self {
             Self::Reference(_) => Ok(()),
@@ -81,21 +81,21 @@ impl Method {
         }
     }
 
-    /// Nothing more is to be done.
+    /// Cleans up at the end.
     pub(super) fn end(&self) {
         if let Self::Code(method) = self {
             method.end();
         }
     }
 
-    /// Leaves the calculation in hand to whoever waits for it as well.
+    /// Leaves the current calculation to the other labeller that waits for it.
     pub(super) fn detach(&self) {
         if let Self::Code(method) = self {
             method.detach();
         }
     }
 
-    /// The result of a job is where it belongs, and what was needed for it is put away.
+    /// After the result is stored: archives or removes the calculation.
     pub(super) async fn archive(
         &self,
         store: &Store,
@@ -110,8 +110,8 @@ impl Method {
         }
     }
 
-    /// Makes the result for a job. A potential takes a thread of its own. None if somebody asked to stop and it would take longer
-    /// to read it.
+    /// Makes the result of a job. A potential runs on a thread of its own. `None` if a shutdown was requested and
+    /// reading the result would take longer.
     pub(super) async fn make(
         &self,
         store: &Store,
@@ -127,7 +127,7 @@ impl Method {
         }
     }
 
-    /// What the cost of a label depends on.
+    /// The properties that determine the cost of a label.
     pub(super) fn size(&self, structure: &Structure) -> Size {
         match self {
             Self::Reference(_) => Size { atoms: structure.len(), electrons: 0.0, k_points: 1 },
@@ -135,7 +135,7 @@ impl Method {
         }
     }
 
-    /// What is said of the calculation in hand in the store, if there is one.
+    /// The handle of the current calculation in the form of the store, if there is one.
     pub(super) fn calculation(&self) -> Option<String> {
         match self {
             Self::Reference(_) => None,
@@ -143,10 +143,10 @@ impl Method {
         }
     }
 
-    /// Classes of failures after which nothing is left to try.
+    /// Whether no remedy is left after this failure.
     pub(super) fn has_no_remedy(&self, lease: &Lease, failure: &Failure) -> bool {
         match self {
-            // Every attempt would be like the one before.
+            // Every attempt would give the same result.
             Self::Reference(_) => false,
             Self::Code(_) => {
                 let failures = failure_classes(lease).into_iter().chain([failure.class]);
@@ -156,12 +156,12 @@ impl Method {
     }
 }
 
-/// A method that panics takes its labeller with it.
+/// A panic of the method ends its labeller.
 pub(super) async fn evaluate(
     method: Arc<Mutex<ReferenceMethod>>,
     structure: Structure,
 ) -> Result<Calculated, Failure> {
-    // One that panicked has taken everybody with it who could see it.
+    // A panic has ended every task that could see the poisoned state.
     let label = move || method.lock().unwrap_or_else(PoisonError::into_inner).label(&structure);
     spawn_blocking(label).await.unwrap_or_else(|crash| panic::resume_unwind(crash.into_panic()))
 }

@@ -1,6 +1,7 @@
-//! A labeller leases a job, has its method work on it, judges what comes of it and delivers.
+//! Labellers: lease a job, let a method compute it, validate the result and deliver it to the store.
 //!
-//! [`run`] is one of the tasks of a process, [`serve`] a process of its own, which outlives its orchestrator.
+//! [`run`] is a task within a process. [`serve`] runs a labeller as a process of its own, which outlives its
+//! orchestrator.
 
 mod calculation_handle;
 mod calculation_runner;
@@ -54,47 +55,47 @@ pub use shutdown::Shutdown;
 pub use single_label::{SingleLabel, label_structure};
 pub use validate::LabelBounds;
 
-/// Between two signs of life in the store, of every process that gives them there.
+/// Time between two heartbeats in the store, for every process that sends them.
 pub const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(5);
-/// The longest time between two looks at the queue …
+/// Longest time between two polls of the queue.
 const MAX_POLL_INTERVAL: Duration = Duration::from_secs(1);
-/// … and where the database tells of new jobs: only leases that ran out are not told of.
+/// The same if the database sends notifications of new jobs: only expired leases need polling.
 const NOTIFIED_POLL_INTERVAL: Duration = Duration::from_secs(5);
-/// Which part of the time without work passes until the next look, and so how late work may be found.
+/// The poll interval is the idle time divided by this, which bounds the delay until new work is found.
 const IDLE_DIVISOR: u32 = 8;
 
-/// What a labeller needs to know.
+/// Settings of a labeller.
 #[derive(Clone, Debug)]
 pub struct LabellerSettings {
-    /// Whose leases these are: the name of a process that has its record in the store, or `process/part`.
+    /// Holder of its leases: the id of a registered process, or `process/part`.
     pub holder: String,
-    /// Under which settings labels are made.
+    /// The protocol of its labels.
     pub protocol: Protocol,
     /// Attempts before a label counts as failed.
     pub attempts: u32,
-    /// What is believed of a label.
+    /// Bounds that a valid label must satisfy.
     pub bounds: LabelBounds,
-    /// For how long it is of use, if it is a process of its own, while nobody leads the campaign.
+    /// When a labeller process exits while nothing runs the campaign.
     pub exit_policy: ExitPolicy,
-    /// How often it does what has to be done again and again.
+    /// Intervals and timeouts.
     pub timing: Timing,
 }
 
-/// How often a labeller does what has to be done again and again.
+/// Intervals and timeouts of a labeller.
 #[derive(Clone, Copy, Debug)]
 pub struct Timing {
-    /// How long a job is leased, in whole seconds. The lease is renewed at a third of it while the label is made,
-    /// however long that takes, and so also for a method that never comes to an end. It is for processes that nobody
-    /// can see to be gone, see [`Store::lease`].
+    /// Lease duration, in whole seconds. While a label is computed, the lease is renewed every third of it, without
+    /// limit, even for a method that never ends. An expired lease frees jobs of processes that no other process can
+    /// observe, see [`Store::lease`].
     pub lease: Duration,
-    /// How long a labeller that has just run out of work waits before it looks again. The longer it has had none, the
-    /// longer it waits, up to a second: each look costs some tenths of a millisecond.
+    /// Poll interval right after the queue became empty. It grows with the idle time, up to a second: each poll
+    /// costs some tenths of a millisecond.
     pub idle: Duration,
-    /// Between two signs of life of a labeller that is a process.
+    /// Time between two heartbeats of a labeller process.
     pub heartbeat_interval: Duration,
-    /// How long the label in hand may go on when the labeller is asked to stop, before it is given back and its calculation
-    /// ended. With none the label is finished, but a calculation that outlives the labeller is left to the next one after some
-    /// seconds.
+    /// How long the current label may continue after the labeller is asked to stop, before its job is released and
+    /// its calculation ended. If `None`, the label is finished, but a calculation that outlives the labeller is
+    /// left to the next one after some seconds.
     pub grace: Option<Duration>,
 }
 
@@ -115,24 +116,24 @@ impl Timing {
     }
 }
 
-/// What a look at the queue finds.
+/// The result of polling the queue.
 enum QueuePoll {
     Job(Box<Lease>),
     Nothing,
-    /// Nothing, and nothing will come.
+    /// No job, and none will come.
     Finished,
 }
 
-/// After it was asked to stop, a labeller waits so long for a calculation that goes on without it.
+/// How long a labeller that is asked to stop waits for a calculation that can continue without it.
 const DETACH_DELAY: Duration = Duration::from_secs(5);
 
-/// Labels until there is nothing more to do. `now` is asked for ms since 1970; `tell` gets a line for each job.
+/// Labels until there is no more work. `now` returns ms since 1970; `tell` receives a line for each job.
 ///
-/// A database that is busy or full is no reason to end: the queue is polled at again later, and a label that was made is
-/// brought again and again, after `closing` asks to stop for a minute more.
+/// A busy database or a full disk does not end the labeller: it polls the queue again later, and retries the
+/// delivery of a label, for up to a minute after `shutdown` was requested.
 ///
 /// # Errors
-/// Whatever else the database says; the label in hand is lost then, and its job comes back.
+/// Any other error of the database. The current label is lost then, and its job returns to the queue.
 pub async fn run(
     store: Store,
     method: Method,
@@ -179,7 +180,7 @@ async fn label_jobs(
         let begun = Instant::now();
         let size = method.size(&lease.structure);
         if let Some(reason) = retry_until_written(shutdown, || guard::refusal(store, &lease, size)).await? {
-            // Whatever was tried before, another attempt would be refused as well.
+            // Another attempt would be refused as well, whatever was tried before.
             retry_until_written(shutdown, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
             say(&format!("{} is refused: {reason}", lease.candidate));
             continue;
@@ -232,14 +233,14 @@ async fn label_jobs(
     }
 }
 
-/// A result that the store has.
+/// A result that has been stored.
 struct Delivered {
     validated: Result<Calculated, Failure>,
     became: DeliveryOutcome,
     ended: Option<EndedCalculation>,
 }
 
-/// Brings what was made for a job and judged to the store, with what it has cost.
+/// Stores the validated result of a job and its cost.
 async fn deliver_attempt(
     store: &Store,
     method: &Method,
@@ -254,7 +255,7 @@ async fn deliver_attempt(
     if let Some(ended) = &ended {
         retry_until_written(shutdown, || store.record_cost(lease, ended.core_seconds, log)).await?;
     }
-    // What no remedy helps against is not tried again.
+    // A failure without a remedy is not tried again.
     let no_remedy = validated.as_ref().is_err_and(|failure| method.has_no_remedy(lease, failure));
     let attempts = if no_remedy { 1 } else { settings.attempts };
     let became =
@@ -268,7 +269,7 @@ async fn poll_queue(
     no_more_jobs: bool,
     now: i64,
 ) -> Result<QueuePoll, StoreError> {
-    // Its loop holds none now: leasing a job, working on it and the next look follow each other.
+    // The loop holds no lease at this point: leasing, labelling and polling follow each other.
     give_back_unknown(store, &settings.holder, &[], now).await?;
     if !store.awaits_labels(now).await? {
         return Ok(if no_more_jobs { QueuePoll::Finished } else { QueuePoll::Nothing });
@@ -276,13 +277,14 @@ async fn poll_queue(
     let (protocol, seconds) = (settings.protocol.hash, settings.timing.lease_seconds());
     match store.lease(protocol, &settings.holder, now, seconds).await? {
         Some(lease) => Ok(QueuePoll::Job(Box::new(lease))),
-        // What there is to do is for others.
+        // The remaining work is for others.
         None if !store.is_in_force(protocol).await? => Ok(QueuePoll::Finished),
         None => Ok(QueuePoll::Nothing),
     }
 }
 
-/// Gives back leases that the store has in the name of this labeller, and it does not know: the answer to a commit was lost.
+/// Releases leases that the store has under this labeller's name but that it does not know: the reply to a commit
+/// was lost.
 async fn give_back_unknown(store: &Store, holder: &str, held: &[&Lease], now: i64) -> Result<(), StoreError> {
     let leases = store.state_leases(holder, held, now).await?;
     if leases > 0 {
@@ -291,7 +293,8 @@ async fn give_back_unknown(store: &Store, holder: &str, held: &[&Lease], now: i6
     Ok(())
 }
 
-/// Waits until there may be work after `idle` without any, or until something else is `wanted`. Returns how long, at most.
+/// Waits until there may be work, or until the shutdown state differs from `requested`. `idle` is the time without
+/// work so far. Returns the longest time that it may have waited.
 async fn wait(
     store: &Store,
     idle: Duration,
@@ -311,21 +314,22 @@ async fn wait(
     wait
 }
 
-/// What came of a lease.
+/// The outcome of a lease.
 enum LeaseOutcome {
     Done(Box<LabelAttempt>),
-    /// Nobody waits for the result any more.
+    /// The result is no longer needed.
     NotWanted,
-    /// Somebody else waits for this very calculation.
+    /// Another labeller waits for the same calculation.
     Detached,
-    /// Somebody asked to stop, and it goes on without this labeller, or waits to be read.
+    /// The labeller was asked to stop; the calculation continues without it, or waits to be read.
     LeftRunning,
-    /// There was no time to end it.
+    /// The grace period ended first.
     GraceExpired,
 }
 
-/// Works on a job, and renews the lease meanwhile. A label whose lease was lost is made to its end: if another is first, it
-/// becomes a check. But a calculation of its own is ended when nobody waits for it, and left alone when somebody else does.
+/// Works on a job and renews its lease meanwhile. If the lease is lost, the label is still finished: if another
+/// result comes first, it becomes a check. But its calculation is ended when the result is no longer needed, and
+/// left alone when another labeller waits for it.
 async fn make(
     store: &Store,
     method: &Method,
@@ -336,7 +340,7 @@ async fn make(
 ) -> Result<LeaseOutcome, StoreError> {
     let mut making = pin!(method.make(store, lease, shutdown));
     let mut too_late = pin!(end_of_grace(timing.grace, shutdown));
-    // Who has no time of grace is followed by others, who find the calculation.
+    // Labellers without a grace period are followed by others, which find the calculation.
     let leaves = timing.grace.is_none() && method.outlives_labeller();
     let mut leave = pin!(async {
         end_of_grace(leaves.then_some(DETACH_DELAY), shutdown).await;
@@ -362,7 +366,7 @@ async fn make(
                 renewed => renewed?,
             };
         }
-        // A commit that the server was still at when its connection broke may have come after the look at the queue.
+        // The server may have completed a commit after its connection broke and the queue was polled.
         match give_back_unknown(store, &lease.holder, &[lease], now()).await {
             Err(error) if !error.is_transient() => return Err(error),
             _ => {}
@@ -405,14 +409,14 @@ async fn deliver(
     let (class, text) = (failure.class.name(), format!("{failure}\n{log}"));
     let text = text.trim_end();
     let failed = match failure.class {
-        // That was no fault of the job.
+        // This was no fault of the job.
         FailureClass::LostNode => store.release_lost(lease, class, text, now).await,
         _ => store.fail(lease, class, text, attempts, now).await,
     };
     failed.map(DeliveryOutcome::Failed)
 }
 
-/// A result as the store keeps it.
+/// Converts a result for the store.
 fn label(made: &Calculated) -> Label {
     Label {
         energy: made.energy,

@@ -1,4 +1,4 @@
-//! A directory as one row of the store.
+//! Packs a directory into one row of the store.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -9,30 +9,31 @@ use dft::result_file;
 
 use super::prepare::DATA;
 
-/// What VASP's licence lets nobody pass on.
+/// Files that VASP's licence forbids to redistribute.
 const LICENSED: &str = "POTCAR";
-/// Larger files stay out: charge densities and wave functions are of no use without the program, and are made again.
+/// Larger files are left out: charge densities and wave functions are useless without the program and can be
+/// recomputed.
 const MAX_FILE_SIZE: u64 = 16 << 20;
-/// Bytes of all files together, before they are compressed, each with its header.
+/// Maximum size of all files before compression, with headers.
 const MAX_TOTAL_SIZE: u64 = 64 << 20;
-/// What a file takes beside its content.
+/// Size of a file's header.
 const HEADER: u64 = 1024;
-/// Directories within each other that are looked into. Paths of some thousand levels cannot be named any more.
+/// Maximum directory depth. Paths thousands of levels deep exceed the system's limit.
 const MAX_DEPTH: usize = 64;
-/// Lines about what is left out.
+/// Maximum number of lines about files left out.
 const MAX_LINES: usize = 1000;
-/// More would cost time and win little.
+/// Higher levels take longer and gain little.
 const COMPRESSION_LEVEL: i32 = 3;
 
-/// A tar file, compressed.
+/// A compressed tar file.
 pub(super) struct Packed {
     pub bytes: Vec<u8>,
-    /// What is not in it, with its bytes or why, a line each.
+    /// Files left out, with their size or the reason, one per line.
     pub left_out: String,
 }
 
-/// Packs the files below a directory, in order of their names, each as long as it is not too large and there is room.
-/// Pseudopotentials stay out ([`DATA`], [`LICENSED`]): all calculations have the same. So does what cannot be read.
+/// Packs the files below a directory, ordered by name, unless a file or the sum becomes too large. Leaves out
+/// pseudopotentials ([`DATA`], [`LICENSED`]), which all calculations share, and unreadable files.
 pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
     let mut encoder = zstd::Encoder::new(Vec::new(), COMPRESSION_LEVEL)?;
     encoder.include_checksum(true)?;
@@ -58,20 +59,20 @@ pub(super) fn pack(directory: &Path) -> io::Result<Packed> {
 
 /// Why a file is not packed.
 enum Unpacked {
-    /// It stays out.
+    /// It is left out.
     Unreadable(String),
-    /// Nothing can be packed any more.
+    /// The archive is unusable.
     Archive(io::Error),
 }
 
-/// Appends a file or a link, with what it has in common with others of its kind.
+/// Appends a file or a link with its usual metadata.
 fn append<W: io::Write>(archive: &mut tar::Builder<W>, path: &Path, name: &Path) -> Result<(), Unpacked> {
     let unreadable = |error: io::Error| Unpacked::Unreadable(error.to_string());
     let metadata = fs::symlink_metadata(path).map_err(unreadable)?;
     let mut header = tar::Header::new_gnu();
     header.set_metadata(&metadata);
     if metadata.is_symlink() {
-        // It may lead anywhere, and is not followed.
+        // A link may point anywhere and is not followed.
         let target = fs::read_link(path).map_err(unreadable)?;
         header.set_size(0);
         return archive.append_link(&mut header, name, target).map_err(unreadable);
@@ -109,7 +110,7 @@ fn files(directory: &Path, left_out: &mut LeftOut) -> Vec<PathBuf> {
     files
 }
 
-/// What is not packed.
+/// Files left out.
 #[derive(Default)]
 struct LeftOut {
     lines: Vec<String>,
@@ -122,7 +123,7 @@ impl LeftOut {
             self.more += 1;
             return;
         }
-        // A name may have line breaks in it.
+        // A name may contain line breaks.
         let name: String =
             name.to_string_lossy().chars().map(|c| if c.is_control() { '?' } else { c }).collect();
         self.lines.push(format!("{name} ({why})"));

@@ -1,4 +1,4 @@
-//! Before a calculation, and after it: files and numbers, nothing runs here.
+//! Preparing a calculation and reading its results. Runs nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -14,13 +14,13 @@ use super::calculation_runner::WORK;
 use super::code::file;
 use super::input_diff::input_diff;
 
-/// Beside [`WORK`], what the program reads and all calculations have alike.
+/// Beside [`WORK`]: input files that all calculations share.
 pub(super) const DATA: &str = "data";
 
 /// Bytes of a GB.
 const GIGABYTE: f64 = 1e9;
 
-/// What a calculation starts from, and what is said of it in the store.
+/// The input of a calculation and its record in the store.
 pub(super) struct Prepared {
     pub input: Input,
     pub record: CalculationRecord,
@@ -28,11 +28,11 @@ pub(super) struct Prepared {
     pub time_limit: f64,
     /// Bytes.
     pub memory_limit: Option<u64>,
-    /// Whether it is not to run where it failed.
+    /// Whether to avoid nodes where it failed.
     pub avoids_nodes: bool,
 }
 
-/// Everything that is known before anything is started.
+/// Prepares everything that is needed before the start.
 pub(super) fn prepare(
     code: &dyn Code,
     execution: &ExecutionSettings,
@@ -62,10 +62,10 @@ pub(super) fn prepare(
     })
 }
 
-/// Writes its input into the directory of a calculation.
+/// Writes the input into the directory of a calculation.
 ///
 /// # Errors
-/// It cannot be written, or a file of which it gets a copy is not the one of the protocol any more.
+/// The input cannot be written, or a file to be copied no longer has the hash in the protocol.
 pub(super) fn write(directory: &Path, input: &Input) -> Result<(), StoreError> {
     let copy = |(name, original): (&String, &Original)| match original.content() {
         Ok(content) => Ok((name.clone(), content)),
@@ -76,7 +76,7 @@ pub(super) fn write(directory: &Path, input: &Input) -> Result<(), StoreError> {
     written.map_err(|error| file(directory, error))
 }
 
-/// Makes a folder with these files in it.
+/// Creates a folder with these files.
 fn fill(folder: &Path, files: &BTreeMap<String, Vec<u8>>) -> io::Result<()> {
     fs::create_dir_all(folder)?;
     for (name, bytes) in files {
@@ -87,8 +87,8 @@ fn fill(folder: &Path, files: &BTreeMap<String, Vec<u8>>) -> io::Result<()> {
     Ok(())
 }
 
-/// Judges a calculation that ended so, and reads its numbers. Where a limit has ended it, that is why it failed, whatever
-/// its files look like.
+/// Checks and reads the results of a calculation. If it reached a limit, that is the failure, whatever its files
+/// contain.
 pub(super) fn read(
     code: &dyn Code,
     structure: &Structure,

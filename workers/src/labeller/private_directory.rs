@@ -1,7 +1,7 @@
-//! Directories for calculations, which nobody but this user can change.
+//! Directories for calculations that no other user can change.
 //!
-//! What stands in the directory of a calculation is run as this user, and a directory for temporary files is open to
-//! everybody: what has an expected name there may be somebody else's.
+//! Files in the directory of a calculation are executed as this user, and anybody may write to a directory for
+//! temporary files, so an expected name there may belong to another user.
 
 use std::fs::{self, DirBuilder, File};
 use std::io::{self, Read};
@@ -16,39 +16,39 @@ use store::StoreError;
 
 use super::code::file;
 
-/// Random bytes of a name.
+/// Random bytes in a name.
 const RANDOM: usize = 8;
-/// Who has the mode bits that let others change something.
+/// Mode bits that permit others to write.
 const OTHERS_WRITE: u32 = 0o022;
-/// And those that let them do anything at all.
+/// Mode bits that permit others anything.
 const OTHERS: u32 = 0o077;
 const STICKY: u32 = 0o1000;
 
-/// Why a directory is not used.
+/// Why a directory cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum NotPrivate {
-    /// Somebody else can put another directory in the place of one that is made in it.
+    /// Another user could replace a directory created in it.
     #[error(
         "user {owner} owns it and could replace what is made in it; expected a directory of user {uid} or of root: name another \
          one as label.scratch"
     )]
     OtherOwner { owner: u32, uid: u32 },
-    /// The same.
+    /// Any user could replace a directory created in it.
     #[error(
         "others may write to it (mode {mode:04o}, no sticky bit) and could replace what is made in it: make a directory of your \
          own in it with mode 0700, and name that as label.scratch"
     )]
     OpenToOthers { mode: u32 },
-    /// The same, of a directory above it.
+    /// Any user could replace a directory above it.
     #[error("others may write to {} (mode {mode:04o}, no sticky bit) and could replace it: name another one as label.scratch", path.display())]
     OpenAbove { path: PathBuf, mode: u32 },
-    /// The one that was just made is not as it should be: a file system without owners or modes.
+    /// A directory created in it has another owner or mode: the file system does not support them.
     #[error(
         "a directory made in it with mode 0700 belongs to user {owner} and has mode {mode:04o}, expected user {uid}: name one on \
          another file system as label.scratch"
     )]
     NotKept { owner: u32, uid: u32, mode: u32 },
-    /// The system refuses.
+    /// Error of the operating system.
     #[error("{0}")]
     Io(#[from] io::Error),
 }
@@ -59,11 +59,11 @@ impl From<Errno> for NotPrivate {
     }
 }
 
-/// A directory of this user alone with a name that nobody can know before: `prefix` and random digits, in `parent`, which is
-/// made if there is none.
+/// Creates a directory for this user alone in `parent`, with an unpredictable name: `prefix` and random digits.
+/// Creates `parent` if it does not exist.
 ///
 /// # Errors
-/// [`NotPrivate`], if somebody else could change it.
+/// [`NotPrivate`] if another user could change it.
 pub(super) fn make(parent: &Path, prefix: &str) -> Result<PathBuf, StoreError> {
     let made = || {
         let above = open_parent(parent)?;
@@ -82,40 +82,40 @@ pub(super) fn make(parent: &Path, prefix: &str) -> Result<PathBuf, StoreError> {
     made().map_err(|error: NotPrivate| file(parent, io::Error::other(error)))
 }
 
-/// Looks at a directory in which [`make`] is to make others; it is made if there is none.
+/// Checks a directory in which [`make`] is to create others. Creates it if it does not exist.
 ///
 /// # Errors
-/// [`NotPrivate`], if somebody else could change them.
+/// [`NotPrivate`] if another user could change directories in it.
 pub(super) fn check(parent: &Path) -> Result<(), StoreError> {
     open_parent(parent).map(drop).map_err(|error| file(parent, io::Error::other(error)))
 }
 
-/// A directory of this user alone with this name, in one that [`make`] has made. `NotFound` if that one is gone.
+/// Creates a directory for this user alone inside one that [`make`] created. `NotFound` if that one was removed.
 pub(super) fn make_inside(parent: &Path, name: &str) -> io::Result<PathBuf> {
     let above = open_private(parent)?;
     mkdirat(&above, name, Mode::RWXU)?;
     Ok(parent.join(name))
 }
 
-/// Whether this is a directory, and not a link to one, that this user has made and that others cannot write to.
+/// Whether this is a directory, not a link, that this user owns and others cannot write to.
 pub(super) fn is_ours(path: &Path) -> bool {
     let found = open(CWD, path).and_then(|directory| fstat(&directory));
     found.is_ok_and(|found| found.st_uid == geteuid().as_raw() && found.st_mode & OTHERS_WRITE == 0)
 }
 
-/// Whether it is one that others cannot look into either.
+/// Whether others cannot read it either.
 pub(super) fn is_closed(path: &Path) -> bool {
     open_private(path).is_ok()
 }
 
-/// Whether this is a directory, and not a link to one, that this user has made. In one that [`make`] has made nobody else can
-/// change it, whatever its mode.
+/// Whether this is a directory, not a link, that this user owns. Inside a directory created by [`make`] no other
+/// user can change it, whatever its mode.
 pub(super) fn is_own(path: &Path) -> bool {
     let found = open(CWD, path).and_then(|directory| fstat(&directory));
     found.is_ok_and(|found| found.st_uid == geteuid().as_raw())
 }
 
-/// Directories in `parent` whose names begin with `prefix`, in order, that are this user's alone.
+/// Directories in `parent` whose names begin with `prefix`, ordered by name, that only this user can write to.
 pub(super) fn ours_in(parent: &Path, prefix: &str) -> io::Result<Vec<PathBuf>> {
     let begins = |path: &PathBuf| {
         path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(prefix.as_bytes()))
@@ -130,7 +130,7 @@ pub(super) fn ours_in(parent: &Path, prefix: &str) -> io::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// Opens one that [`make`] has made.
+/// Opens a directory created by [`make`].
 fn open_private(path: &Path) -> io::Result<OwnedFd> {
     let directory = open(CWD, path)?;
     match check_made(&fstat(&directory)?) {
@@ -151,10 +151,10 @@ fn check_made(found: &Stat) -> Result<(), NotPrivate> {
     }
 }
 
-/// The handle of a directory in which what this user makes stays as it is.
+/// Opens a directory in which directories of this user are safe from other users.
 fn open_parent(path: &Path) -> Result<OwnedFd, NotPrivate> {
     DirBuilder::new().recursive(true).mode(0o700).create(path)?;
-    // Users may have links to their directories.
+    // Users may use links to their directories.
     let path = path.canonicalize()?;
     let directory = open(CWD, &path)?;
     let found = fstat(&directory)?;
@@ -162,7 +162,7 @@ fn open_parent(path: &Path) -> Result<OwnedFd, NotPrivate> {
     if owner != uid && owner != 0 && !is_unmapped(owner) {
         return Err(NotPrivate::OtherOwner { owner, uid });
     }
-    // Where each user has a group of its own, directories are often open to it.
+    // If each user has a group of its own, directories are often writable for the group.
     let own_group = owner == uid && found.st_gid == getegid().as_raw();
     let open_to = if own_group { 0o002 } else { OTHERS_WRITE };
     if mode & open_to != 0 && mode & STICKY == 0 {
@@ -177,14 +177,14 @@ fn open_parent(path: &Path) -> Result<OwnedFd, NotPrivate> {
     Ok(directory)
 }
 
-/// Whether this is how a container without rights of its own shows the host's root and everybody else whom it does not know.
+/// Whether this is the owner that an unprivileged container shows for the host's root and for all unknown users.
 fn is_unmapped(owner: u32) -> bool {
     let number = |path: &str| fs::read_to_string(path).unwrap_or_default();
     let maps_all = number("/proc/self/uid_map").split_whitespace().eq(["0", "0", "4294967295"]);
     !maps_all && number("/proc/sys/kernel/overflowuid").trim().parse() == Ok(owner)
 }
 
-/// From the system's source of randomness, in hexadecimal digits.
+/// Hexadecimal digits from the system's random source.
 fn random() -> io::Result<String> {
     let mut bytes = [0; RANDOM];
     File::open("/dev/urandom")?.read_exact(&mut bytes)?;

@@ -1,10 +1,10 @@
-//! The processes of a calculation, as the system shows them.
+//! The processes of a calculation.
 //!
-//! While the keeper lives they are its descendants: it is the subreaper of all that its program starts, so what loses its parent
-//! becomes a child of the keeper, also a daemon with a session of its own and an empty environment. When the keeper is gone
-//! they are known by their mark alone, which each inherits in its environment: a daemon that has cleared it is not found then.
-//! Neither are processes that another service has started for the program (`systemd-run`, `at`, a container engine, `ssh`),
-//! nor can those be ended that have taken the rights of another user.
+//! While the runner is alive they are its descendants: it is the subreaper of its program, so orphans become its
+//! children, even a daemon with its own session and an empty environment. After the runner has ended they are
+//! recognized only by the mark that each inherits in its environment; a daemon that has cleared it is not found.
+//! Neither are processes that another service started for the program (`systemd-run`, `at`, a container engine,
+//! `ssh`). Processes that have taken the rights of another user cannot be ended.
 
 use std::collections::{HashMap, HashSet};
 use std::fs;
@@ -22,36 +22,36 @@ use store::is_running;
 
 use super::calculation_runner::MARK;
 
-/// Between two looks at whether all are gone.
+/// Time between two checks whether all have ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(2);
-/// How long a program may take to end what it has started, when it is asked to. Whoever has started it on other nodes of an
-/// allocation (`srun`, `mpirun`) has to end it there, and cannot if it is killed.
+/// How long a program may take to end the processes that it started. A program that started processes on other
+/// nodes of an allocation (`srun`, `mpirun`) has to end them there, and cannot if it is killed.
 const TERMINATION_GRACE: Duration = Duration::from_secs(5);
-/// A process that the system does not let go within this time will not go.
+/// A process that has not ended after this time counts as unkillable.
 const KILL_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// A living process, as `/proc/PID/stat` shows it.
+/// A running process, from `/proc/PID/stat`.
 struct Process {
     pid: Pid,
     parent: Option<Pid>,
     session: Option<Pid>,
-    /// Pages in memory.
+    /// Resident memory, pages.
     pages: u64,
 }
 
-/// The children of this process: the program that it has started, and what was left to it.
+/// The children of this process: the program, and orphans of its descendants.
 pub(super) struct Children {
     program: Pid,
     ended: Option<ExitStatus>,
 }
 
 impl Children {
-    /// With that program, of which nobody else takes note. There is only one of these in a process.
+    /// For this program, which nothing else may reap. Only one of these may exist in a process.
     pub fn new(program: Pid) -> Self {
         Self { program, ended: None }
     }
 
-    /// Takes note of those that have ended. Whether any is left.
+    /// Reaps children that have ended. Returns whether any is left.
     pub fn reap(&mut self) -> io::Result<bool> {
         loop {
             match wait(WaitOptions::NOHANG) {
@@ -66,21 +66,21 @@ impl Children {
         }
     }
 
-    /// Ends every process that descends from this one, and takes note of their ends. How the program ended.
+    /// Ends and reaps all descendants of this process. Returns how the program ended.
     ///
     /// # Errors
-    /// One that cannot be ended.
+    /// A process cannot be ended.
     pub fn terminate(mut self) -> io::Result<ExitStatus> {
         let mut ending = Termination::start();
         loop {
-            // A process that is born while others are listed may be missed, but that no child is left is certain.
+            // The list may miss a process that is just being created, but the absence of children is certain.
             let is_left = self.reap()?;
             if let Some(status) = self.ended.filter(|_| !is_left) {
                 return Ok(status);
             }
             let found = descendants().into_iter().map(|process| process.pid);
             let goes_on = ending.advance(found, is_descendant)?;
-            // What other users run here cannot be ended.
+            // Processes of other users cannot be ended.
             if let Some(status) = self.ended.filter(|_| !goes_on && ending.has_refused) {
                 return Ok(status);
             }
@@ -89,25 +89,25 @@ impl Children {
     }
 }
 
-/// Bytes that the descendants of this process have in memory together, and itself. What several share counts for each.
+/// Resident memory of this process and its descendants, bytes. Shared memory counts for each.
 pub(super) fn memory() -> u64 {
     let own = process(getpid()).map_or(0, |own| own.pages);
     let others: u64 = descendants().iter().map(|process| process.pages).sum();
     (own + others) * rustix::param::page_size() as u64
 }
 
-/// Ends every process that bears the mark of the calculation in this directory.
+/// Ends every process with the mark of the calculation in this directory.
 pub(super) fn terminate_marked(directory: &Path) -> io::Result<()> {
     let mark = [MARK.as_bytes(), b"=", directory.as_os_str().as_bytes()].concat();
     terminate(|pid| is_marked(pid, &mark))
 }
 
-/// Ends the process with this number that was born then, if it still runs.
+/// Ends the process with this id and start time, if it is running.
 pub(super) fn terminate_process(pid: u32, start_time: &str) -> io::Result<()> {
     terminate(|found| number(found) == pid && is_running(pid, start_time))
 }
 
-/// Asks what is ours to end, and kills it if it does not, until nothing of it is left.
+/// Asks our processes to end, and kills those that do not, until none is left.
 fn terminate(is_ours: impl Fn(Pid) -> bool) -> io::Result<()> {
     let mut ending = Termination::start();
     while ending.advance(pids().filter(|pid| is_ours(*pid)), &is_ours)? {
@@ -120,7 +120,7 @@ fn terminate(is_ours: impl Fn(Pid) -> bool) -> io::Result<()> {
 struct Termination {
     begun: Instant,
     asked: HashSet<Pid>,
-    /// Whether there were some that this user may not end.
+    /// Whether this user may not signal some of them.
     has_refused: bool,
 }
 
@@ -129,8 +129,8 @@ impl Termination {
         Self { begun: Instant::now(), asked: HashSet::new(), has_refused: false }
     }
 
-    /// Asks those among `found` that were not asked yet, and kills all when they have had their time. Whether any is left that
-    /// may be ended.
+    /// Sends SIGTERM to new processes among `found`, and SIGKILL to all after the grace period. Returns whether any
+    /// is left that can be ended.
     fn advance(
         &mut self,
         found: impl Iterator<Item = Pid>,
@@ -140,7 +140,7 @@ impl Termination {
         for pid in found {
             let signal = match self.begun.elapsed() >= TERMINATION_GRACE {
                 true => Signal::KILL,
-                // Once: to be told again means haste to some.
+                // Only once: some programs take a second signal as a request to hurry.
                 false if self.asked.insert(pid) => Signal::TERM,
                 false => {
                     left = Some(pid);
@@ -162,7 +162,7 @@ impl Termination {
     }
 }
 
-/// Numbers are given out again: what is looked at and what gets the signal has to be the same process. False for one of
+/// Process ids are reused: checks and signals the same process through a pidfd. Returns false for a process of
 /// another user.
 fn send(signal: Signal, pid: Pid, is_ours: impl Fn(Pid) -> bool) -> io::Result<bool> {
     let sent = pidfd_open(pid, PidfdFlags::empty()).and_then(|process| match is_ours(pid) {
@@ -171,21 +171,21 @@ fn send(signal: Signal, pid: Pid, is_ours: impl Fn(Pid) -> bool) -> io::Result<b
     });
     match sent {
         Ok(()) | Err(Errno::SRCH) => Ok(true),
-        // What the system says where the process has just gone depends on its version.
+        // The error for a process that has just ended depends on the kernel version.
         Err(Errno::NOENT | Errno::INVAL) => Ok(true),
         Err(Errno::PERM) => Ok(false),
         Err(error) => Err(error.into()),
     }
 }
 
-/// Living processes that descend from this one, or are in its session.
+/// Running descendants of this process, and processes in its session.
 fn descendants() -> Vec<Process> {
     let own = getpid();
     let found: Vec<_> = pids().filter_map(process).collect();
     let parents: HashMap<_, _> = found.iter().map(|process| (process.pid, process.parent)).collect();
     let descends = |process: &Process| {
         let mut above = process.parent;
-        // A number may be given out again while others are read, and make a circle.
+        // A process id may be reused while others are read, which can form a cycle.
         for _ in 0..parents.len() {
             match above {
                 Some(pid) if pid == own => return true,
@@ -207,21 +207,22 @@ fn number(pid: Pid) -> u32 {
     pid.as_raw_nonzero().get().unsigned_abs()
 }
 
-/// Every process that this one can see.
+/// Every visible process.
 fn pids() -> impl Iterator<Item = Pid> {
     let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
     entries.filter_map(|entry| Pid::from_raw(entry.file_name().to_str()?.parse().ok()?))
 }
 
-/// None for one that has ended.
+/// `None` for a process that has ended.
 fn process(pid: Pid) -> Option<Process> {
     let stat = fs::read(format!("/proc/{}/stat", pid.as_raw_nonzero())).ok()?;
     let stat = String::from_utf8_lossy(&stat);
-    // The name, field 2, may hold blanks and parentheses; the state is field 3, the parent 4, the session 6, pages in memory 24.
+    // Field 2, the name, may contain blanks and parentheses; field 3 is the state, 4 the parent, 6 the session, 24
+    // the resident pages.
     let (_, fields) = stat.rsplit_once(')')?;
     let fields: Vec<_> = fields.split_whitespace().collect();
     let is_over = matches!(*fields.first()?, "Z" | "X" | "x");
-    // Of a process that is about to end they are 0 or -1, and a number below 0 is a panic in `Pid`.
+    // For a process that is about to end these are 0 or -1, and `Pid` panics on negative numbers.
     let pid_in = |field: usize| {
         let number: i32 = fields.get(field)?.parse().ok()?;
         Some(if number > 0 { Pid::from_raw(number) } else { None })
@@ -230,7 +231,7 @@ fn process(pid: Pid) -> Option<Process> {
     (!is_over).then_some(Process { pid, parent, session, pages })
 }
 
-/// One that has ended has no environment any more.
+/// A process that has ended has no environment.
 fn is_marked(pid: Pid, mark: &[u8]) -> bool {
     let environment = fs::read(format!("/proc/{}/environ", pid.as_raw_nonzero()));
     environment.is_ok_and(|environment| environment.split(|byte| *byte == 0).any(|variable| variable == mark))

@@ -1,4 +1,4 @@
-//! Removing what a program has left: directories as deep as it likes, without permissions, and with anything in them.
+//! Removes whatever a program left: directories of any depth, without permissions, with any content.
 
 use std::ffi::{CStr, CString};
 use std::io;
@@ -8,13 +8,13 @@ use std::path::Path;
 use rustix::fs::{AtFlags, CWD, Dir, Mode, OFlags, chmodat, openat, renameat, unlinkat};
 use rustix::io::Errno;
 
-/// Names of directories that are moved up begin with this.
+/// Prefix of the names of moved directories.
 const MOVED: &str = "calmwalk-moved-";
 
-/// Removes a directory with everything in it. Links are removed and not followed. One that is gone already is no error.
+/// Removes a directory with its content. Links are removed, not followed. A missing directory is no error.
 ///
 /// # Errors
-/// The first that cannot be removed; everything else is gone.
+/// The first entry that cannot be removed; everything else is removed.
 pub(super) fn remove_tree(path: &Path) -> io::Result<()> {
     let root = match open(CWD, path) {
         Err(Errno::NOENT) => return Ok(()),
@@ -37,17 +37,17 @@ pub(super) fn remove_tree(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Directories within directories are moved to the root before they are looked into, so two descriptors are enough and no path
-/// gets long.
+/// Moves nested directories to the root before it reads them, so that two descriptors suffice and no path gets
+/// long.
 struct Removal {
     root: OwnedFd,
-    /// So many were moved.
+    /// Number of moved directories.
     moved: u64,
     first_error: Option<Errno>,
 }
 
 impl Removal {
-    /// Removes an entry of the root, but for what it moves up.
+    /// Removes an entry of the root, after moving its directories up.
     fn remove(&mut self, name: &CStr) -> Result<(), Errno> {
         if remove_simple(&self.root, name)? {
             return Ok(());
@@ -64,13 +64,13 @@ impl Removal {
     }
 
     fn move_up(&mut self, from: &OwnedFd, name: &CStr) -> Result<(), Errno> {
-        // Its entry `..` changes, which counts as writing to it.
+        // Moving a directory changes its entry `..`, which counts as writing to it.
         chmodat(from, name, Mode::RWXU, AtFlags::empty())?;
         loop {
             self.moved += 1;
             let free = CString::new(format!("{MOVED}{}", self.moved)).map_err(|_| Errno::INVAL)?;
             match renameat(from, name, &self.root, &free) {
-                // The program has made one of that name.
+                // The program created a directory of that name.
                 Err(Errno::NOTEMPTY | Errno::EXIST | Errno::NOTDIR) => {}
                 moved => return missing_is_fine(moved),
             }
@@ -84,7 +84,7 @@ impl Removal {
     }
 }
 
-/// Removes what is no directory, or an empty one. Returns whether it is gone.
+/// Removes a file, a link or an empty directory. Returns whether it is gone.
 fn remove_simple(directory: &OwnedFd, name: &CStr) -> Result<bool, Errno> {
     match unlinkat(directory, name, AtFlags::empty()) {
         Ok(()) | Err(Errno::NOENT) => return Ok(true),
@@ -98,10 +98,10 @@ fn remove_simple(directory: &OwnedFd, name: &CStr) -> Result<bool, Errno> {
     }
 }
 
-/// Opens a directory, which its owner may have closed to itself.
+/// Opens a directory, even if its owner has no permission to.
 fn open(parent: impl AsFd, path: impl rustix::path::Arg + Copy) -> Result<OwnedFd, Errno> {
     let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
-    // Without the right to write nothing can be removed from it.
+    // Removing entries requires write permission.
     let by_path = OFlags::PATH | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
     let found = openat(&parent, path, by_path, Mode::empty())?;
     let mode = rustix::fs::fstat(&found)?.st_mode;
@@ -111,7 +111,7 @@ fn open(parent: impl AsFd, path: impl rustix::path::Arg + Copy) -> Result<OwnedF
     openat(&parent, path, flags, Mode::empty())
 }
 
-/// What is in a directory.
+/// Names of the entries of a directory.
 fn names(directory: &OwnedFd) -> Result<Vec<CString>, Errno> {
     let mut names = Vec::new();
     for entry in Dir::read_from(directory)? {
@@ -136,7 +136,7 @@ mod tests {
 
     use super::*;
 
-    /// Directories within each other, whose path is longer than any path may be.
+    /// Creates nested directories whose path exceeds the system's limit.
     fn dig(home: &Path, levels: usize) {
         let mut here = open(CWD, home).unwrap();
         for _ in 0..levels {

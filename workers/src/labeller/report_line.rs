@@ -1,16 +1,16 @@
-//! What came of a leased job, as a line for people.
+//! One line for the user about each job.
 
 use dft::{Calculated, Failure};
 use store::records::Lease;
 use store::{CompleteOutcome, FailOutcome};
 
-/// What became of the job when the result was brought.
+/// The outcome of delivering a result.
 pub(super) enum DeliveryOutcome {
     Completed(CompleteOutcome),
     Failed(FailOutcome),
 }
 
-/// The line. One for a label begins with `labelled`.
+/// Formats the line. For a label it begins with `labelled`.
 pub(super) fn format_report(
     lease: &Lease,
     validated: &Result<Calculated, Failure>,

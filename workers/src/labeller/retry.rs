@@ -1,4 +1,4 @@
-//! What has to be written, however busy or full the database is.
+//! Retries writes while the database is busy or the disk full.
 
 use std::time::{Duration, Instant};
 
@@ -6,15 +6,15 @@ use store::StoreError;
 
 use super::Shutdown;
 
-/// Between two tries.
+/// Time between two tries.
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);
-/// How long it is tried after the labeller was asked to stop: whoever asked will not wait for ever.
+/// How long to retry after a shutdown request.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Calls `write` until it succeeds, fails for good, or has been of no use for a minute after `closing` asked to stop.
+/// Calls `write` until it succeeds, fails permanently, or a minute has passed since `shutdown` was requested.
 ///
 /// # Errors
-/// The last one of `write`.
+/// The last error of `write`.
 pub async fn retry_until_written<T, F: Future<Output = Result<T, StoreError>>>(
     shutdown: &Shutdown,
     write: impl FnMut() -> F,

@@ -1,9 +1,9 @@
-//! Where calculations have their directories, and what becomes of those.
+//! Directories of calculations: creating, archiving and removing them.
 //!
 //! | | |
 //! | --- | --- |
-//! | `<scratch>/calmwalk-<campaign>-<random>/` | a campaign's, of this user alone: see [`private_directory`]; whoever comes later finds it by its name and owner |
-//! | `<scratch>/calmwalk-<campaign>-<random>/<job>-<attempt>-<time>/` | a calculation's, with the folders `work` and `data` |
+//! | `<scratch>/calmwalk-<campaign>-<random>/` | directory of a campaign, for this user alone (see [`private_directory`]); later labellers find it by name and owner |
+//! | `<scratch>/calmwalk-<campaign>-<random>/<job>-<attempt>-<time>/` | directory of a calculation, with the folders `work` and `data` |
 
 use std::fs;
 use std::io;
@@ -19,29 +19,29 @@ use super::execution::KeepDirectories;
 use super::slurm::{self, Slurm};
 use super::{Shutdown, local, pack, private_directory, retry_until_written};
 
-/// What was left behind is only cleared away when nobody can still be at it.
+/// Directories younger than this may still be in use and are not removed.
 const MIN_AGE: Duration = Duration::from_secs(60);
-/// How often it is tried to make a directory where somebody else clears away empty ones.
+/// Tries to create a directory while another process removes empty ones.
 const MAX_ATTEMPTS: u32 = 100;
 
-/// Where all calculations of a campaign that this user makes with this scratch directory are.
+/// The directory for all calculations of a campaign by this user, below the scratch directory.
 #[derive(Debug)]
 pub(super) struct ScratchRoot {
     scratch: PathBuf,
-    /// What the names of its directories begin with. Several labellers that begin at once may make one each.
+    /// Prefix of its name. Several labellers that start at the same time may create one each.
     prefix: String,
 }
 
 impl ScratchRoot {
-    /// That of a campaign.
+    /// The scratch root of a campaign.
     pub fn for_campaign(scratch: &Path, campaign: CampaignId) -> Self {
         Self { scratch: scratch.to_owned(), prefix: format!("calmwalk-{campaign}") }
     }
 
-    /// Makes a directory for calculations, if there is none.
+    /// Creates a directory for calculations if there is none.
     ///
     /// # Errors
-    /// None can be made in which nobody else could change anything.
+    /// No directory can be created that is safe from other users.
     pub fn prepare(&self) -> Result<PathBuf, StoreError> {
         private_directory::check(&self.scratch)?;
         let prefix = format!("{}-", self.prefix);
@@ -53,7 +53,7 @@ impl ScratchRoot {
         }
     }
 
-    /// Makes the directory of a calculation.
+    /// Creates the directory of a calculation.
     ///
     /// # Errors
     /// The same.
@@ -63,15 +63,15 @@ impl ScratchRoot {
             let root = self.prepare()?;
             tries += 1;
             match private_directory::make_inside(&root, &name(job, attempt)) {
-                // Whoever ended last has cleared it away.
+                // The process that ended last has removed it.
                 Err(error) if error.kind() == io::ErrorKind::NotFound && tries < MAX_ATTEMPTS => {}
                 made => return made.map_err(|error| file(&root, error)),
             }
         }
     }
 
-    /// Clears away the directories that killed labellers have left, as far as nobody needs them: those of calculations whose
-    /// keeper is gone and whose job waits for nothing.
+    /// Removes directories that killed labellers left and nobody needs: those of calculations whose runner has
+    /// ended and whose result is not wanted.
     pub async fn cleanup(
         &self,
         store: &Store,
@@ -88,31 +88,31 @@ impl ScratchRoot {
         Ok(())
     }
 
-    /// Removes directories in which no calculation is.
+    /// Removes directories without calculations.
     pub fn remove_empty(&self) {
         for root in self.all().unwrap_or_default() {
             remove_empty(&root);
         }
     }
 
-    /// All directories of this campaign, also those that an earlier version of this program has made.
+    /// All directories of this campaign, including those of earlier versions of this program.
     fn all(&self) -> Result<Vec<PathBuf>, StoreError> {
         private_directory::ours_in(&self.scratch, &self.prefix).map_err(|error| file(&self.scratch, error))
     }
 }
 
-/// Removes the directory that holds those of calculations if there are none.
+/// Removes the directory of a campaign if it holds no calculations.
 pub(super) fn remove_empty(root: &Path) {
     let is_calculation = |path: &Path| job_and_attempt(path).is_some();
     let entries = fs::read_dir(root).into_iter().flatten().flatten();
     if !entries.map(|entry| entry.path()).any(|path| is_calculation(&path)) {
         slurm::remove_cache(root);
-        // Another labeller may be making one there.
+        // Another labeller may be creating one there.
         let _ = fs::remove_dir(root);
     }
 }
 
-/// Name of the directory of a calculation. No two are alike, also if the campaign has copies.
+/// Directory name of a calculation. It is unique even if the campaign was copied.
 pub(super) fn name(job: i64, attempt: u32) -> String {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     format!("{job}-{attempt}-{:x}", now.as_nanos())
@@ -140,12 +140,12 @@ async fn cleanup_one(
 ) -> Result<(), StoreError> {
     let Some((job, attempt)) = job_and_attempt(directory) else { return Ok(()) };
     let past = retry_until_written(shutdown, || store.past_calculation(job, attempt)).await?;
-    // Of a copy of this campaign.
+    // It belongs to a copy of this campaign.
     let Some(past) = past.filter(|past| !past.wanted) else { return Ok(()) };
     let handle = past.calculation.as_deref().and_then(CalculationHandle::parse);
     let is_over = match handle.filter(|handle| handle.directory() == directory) {
         Some(handle) => !matches!(handle.inspect(slurm).await?, CalculationState::Running),
-        // Whoever made it was killed before anything began.
+        // Its creator was killed before anything started.
         None => true,
     };
     if is_over && keep.keeps(past.failed) {
@@ -158,7 +158,7 @@ async fn cleanup_one(
     Ok(())
 }
 
-/// Job and attempt of the directory of that name.
+/// Job and attempt in the name of a directory.
 fn job_and_attempt(directory: &Path) -> Option<(i64, u32)> {
     let mut parts = directory.file_name()?.to_str()?.splitn(3, '-');
     Some((parts.next()?.parse().ok()?, parts.next()?.parse().ok()?))

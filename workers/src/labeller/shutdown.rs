@@ -1,32 +1,33 @@
-//! When a labeller may go home.
+//! Shutdown requests to labellers.
 
 use tokio::sync::watch;
 
-/// What is state of a labeller. Whoever waits for it is woken by every change.
+/// The requests to a labeller. Every change wakes all waiters.
 #[derive(Debug, Default)]
 pub struct Shutdown(watch::Sender<ShutdownState>);
 
-/// What is state at one moment.
+/// The requests at one moment.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct ShutdownState {
-    /// No more jobs will be queued: go home once there are none.
+    /// No more jobs will be queued: exit when there are none.
     pub no_more_jobs: bool,
-    /// Go home after the label in hand.
+    /// Exit after the current label.
     pub stop: bool,
 }
 
 impl Shutdown {
-    /// Go home after the label in hand.
+    /// Requests to exit after the current label.
     pub fn stop(&self) {
         self.change(|state| state.stop = true);
     }
 
-    /// Whether somebody asked to stop.
+    /// Whether a stop was requested.
     pub fn is_stopping(&self) -> bool {
         self.state().stop
     }
 
-    /// Whether jobs may still be queued, as far as is known now: if not, go home once there are none.
+    /// Sets whether no more jobs will be queued, as far as is known now. If so, the labeller exits when there are
+    /// none.
     pub fn set_no_more_jobs(&self, no_more_jobs: bool) {
         self.change(|state| state.no_more_jobs = no_more_jobs);
     }
@@ -35,14 +36,14 @@ impl Shutdown {
         *self.0.borrow()
     }
 
-    /// Waits until something else is state than `before`.
+    /// Waits until the state differs from `before`.
     pub(super) async fn changed_from(&self, before: ShutdownState) {
         let mut changes = self.0.subscribe();
-        // The sender lives as long as this borrows it.
+        // The sender lives as long as this borrow.
         let _ = changes.wait_for(|state| *state != before).await;
     }
 
-    /// Waits until somebody asks to stop.
+    /// Waits for a stop request.
     pub(super) async fn stop_requested(&self) {
         let mut changes = self.0.subscribe();
         let _ = changes.wait_for(|state| state.stop).await;

@@ -10,24 +10,24 @@ use store::StoreError;
 use super::method::{Method, evaluate};
 use super::validate::{LabelBounds, validate};
 
-/// What came of a single calculation.
+/// The result of a single calculation.
 #[derive(Clone, Debug)]
 pub struct SingleLabel {
-    /// Its numbers, judged as those of a campaign are.
+    /// Its numbers, validated like those of a campaign.
     pub result: Result<Calculated, Failure>,
-    /// The end of what the program said; empty for a potential.
+    /// The end of the program's output; empty for a potential.
     pub log: String,
-    /// Cores times the time that it took, s.
+    /// Cores times duration, s.
     pub core_seconds: f64,
 }
 
-/// Labels one structure in a directory below `Running::scratch`, which is removed afterwards.
+/// Labels one structure in a directory below [`super::ExecutionSettings::scratch`], which is removed afterwards.
 ///
-/// Dropped before it is ready, the calculation goes on until it ends by itself or by its time limit: who stops waiting has
-/// to call [`Method::stop`].
+/// If this is dropped early, the calculation continues until its own end or its time limit; call [`Method::stop`]
+/// to end it.
 ///
 /// # Errors
-/// Where no calculation can be started here at all.
+/// No calculation can be started on this host.
 pub async fn label_structure(
     method: &Method,
     structure: &Structure,

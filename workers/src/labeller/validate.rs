@@ -1,4 +1,4 @@
-//! Which results are believed.
+//! Validation of results.
 
 use analysis::EnergyOffsets;
 use atoms::cell::norm;
@@ -8,22 +8,22 @@ use serde::{Deserialize, Serialize};
 
 use super::energies::labelled_energy;
 
-/// So many labelled structures have to speak for a composition before an energy is held against them.
+/// Minimum number of labelled structures that must support a composition before energies are compared for it.
 const LEAST_SUPPORT: f64 = 5.0;
 /// eV/Å³ in GPa.
 const GPA: f64 = 160.217_663_4;
 
-/// `[label]`: the largest values that are believed of a label.
+/// `[label]`: upper bounds for the values of a valid label.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct LabelBounds {
     /// Force, eV/Å.
     pub largest_force: f64,
-    /// Component of the stress, eV/Å³.
+    /// Stress component, eV/Å³.
     pub largest_stress: f64,
-    /// Energy, whatever its sign, eV an atom.
+    /// Absolute energy per atom, eV.
     pub largest_energy: f64,
-    /// Difference from the potential's energy without the elements' offsets, eV an atom.
+    /// Difference per atom from the potential's energy after removing the elements' offsets, eV.
     pub largest_energy_difference: f64,
 }
 
@@ -32,7 +32,7 @@ impl Default for LabelBounds {
         Self {
             largest_force: 1000.0,
             largest_stress: 10.0,
-            // No element's all-electron energy is larger.
+            // No element has a larger all-electron energy.
             largest_energy: 2e6,
             largest_energy_difference: 100.0,
         }
@@ -40,7 +40,7 @@ impl Default for LabelBounds {
 }
 
 impl LabelBounds {
-    /// Which bound finite numbers of a label are beyond, in words: energy, eV; forces, [n], eV/Å; stress, eV/Å³.
+    /// The bound that finite values of a label exceed, as text. Takes energy, eV; forces, [n], eV/Å; stress, eV/Å³.
     pub fn refuses(&self, energy: f64, forces: &[Vec3], stress: Option<&Matrix3>) -> Option<String> {
         let larger = |largest: f64, x: f64| if x.abs() > largest.abs() { x } else { largest };
         let stress = stress.into_iter().flatten().flatten().copied().fold(0.0, larger);
@@ -72,20 +72,20 @@ impl LabelBounds {
     }
 }
 
-/// What the energy of a label is compared with.
+/// The reference for the energy of a label.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct EnergyReference<'a> {
     /// Energy by the potential, eV.
     pub model: f64,
-    /// Offsets of the elements, from the labels that there are.
+    /// Offsets of the elements, fitted to the labels so far.
     pub offsets: &'a EnergyOffsets,
 }
 
-/// A result is believed only if its numbers are finite, belong to the atoms asked for and are within bounds. Where too few labels
-/// speak for its composition, its energy is compared with none.
+/// Validates a result: its numbers must be finite, match the number of atoms and be within bounds. The energy is
+/// compared with the reference only if enough labels support its composition.
 ///
 /// # Errors
-/// [`FailureClass::Implausible`], with what is wrong.
+/// [`FailureClass::Implausible`], with the reason.
 pub(super) fn validate(
     made: Calculated,
     structure: &Structure,
@@ -144,7 +144,7 @@ fn too_far(
     })
 }
 
-/// A number in a few digits, however large it is.
+/// Formats a number of any size with few digits.
 fn number(x: f64) -> String {
     match x.abs() {
         0.0 | 1e-2..1e7 => format!("{x:.2}").trim_end_matches('0').trim_end_matches('.').to_owned(),

@@ -1,4 +1,4 @@
-//! A campaign whose labels a script makes.
+//! A campaign whose labels are made by a script.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -22,18 +22,18 @@ use workers::labeller::{
 use crate::common::*;
 
 pub fn keeper_command() -> RunnerCommand {
-    // With one thread the name of the test would stand before what the code says.
+    // With one thread, the name of the test would precede the output of the code.
     let arguments = ["calculations::keeper", "--exact", "--ignored", "--nocapture", "--test-threads=2"];
     let arguments = arguments.map(str::to_owned).to_vec();
     RunnerCommand { program: std::env::current_exe().unwrap(), arguments }
 }
 
-/// A shell script: exit code 0 is a label whose energy stands in `energy`, 3 says not converged.
+/// A shell script: exit code 0 means a label with the energy in the file `energy`, 3 means not converged.
 pub struct Script {
     text: String,
-    /// A file of which it gets a copy.
+    /// An input file that is copied.
     setup: Option<Original>,
-    /// As long as there is a file of this name, reading results takes.
+    /// While this file exists, reading results blocks.
     slow: PathBuf,
 }
 
@@ -70,7 +70,7 @@ impl Code for Script {
             }
             exit => return Err(exit.failure()),
         }
-        // As from a file system that does not answer.
+        // Like a file system that does not respond.
         while self.slow.exists() {
             std::thread::sleep(Duration::from_millis(5));
         }
@@ -93,7 +93,7 @@ impl Code for Script {
     }
 }
 
-/// A campaign with structures to label, and a place for calculations.
+/// A campaign with structures to label, and a directory for calculations.
 pub struct Fixture {
     pub home: TempDir,
     pub store: Store,
@@ -111,17 +111,17 @@ impl Fixture {
         let scratch = home.path().join("scratch");
         fs::create_dir(&scratch).unwrap();
         let running = ExecutionSettings { scratch: Some(scratch), cores: 3, ..ExecutionSettings::default() };
-        // `begun` gets a line each time that the script is run, `go` lets it end.
+        // `begun` gets a line for each run of the script; `go` lets it end.
         let here = home.path().display();
         let script = format!("echo $$ >> {here}/begun\n{script}").replace("$HERE", &here.to_string());
         Self { home, store, candidates, running, script, setup: None }
     }
 
-    /// The same with a file of which calculations get copies, as `../data/setup`.
+    /// The same with a file that calculations copy as `../data/setup`.
     pub async fn with_setup(structures: u64, script: &str, content: &str) -> Self {
-        let place = Self::new(structures, script).await;
-        fs::write(place.setup_path(), content).unwrap();
-        let (original, _) = Original::hashed(place.setup_path()).unwrap();
+        let fixture = Self::new(structures, script).await;
+        fs::write(fixture.setup_path(), content).unwrap();
+        let (original, _) = Original::hashed(fixture.setup_path()).unwrap();
         Self { setup: Some(original), ..place }
     }
 
@@ -145,7 +145,7 @@ impl Fixture {
     pub async fn labeller_with(&self, change: impl FnOnce(&mut LabellerSettings)) -> Labeller {
         let process =
             ProcessRecord::new(ProcessRecord::LABELLER, Some(0), std::process::id(), unix_milliseconds());
-        // Each is taken for another process.
+        // Each counts as a different process.
         let process =
             ProcessRecord { id: format!("l{:?}", Instant::now()).replace(['/', ' '], ""), ..process };
         let mut settings = LabellerSettings {
@@ -175,7 +175,7 @@ impl Fixture {
         self.labeller().await.ended().await.unwrap();
     }
 
-    /// How often the script was begun.
+    /// Number of runs of the script.
     pub fn begun(&self) -> usize {
         let begun = fs::read_to_string(self.home.path().join("begun")).unwrap_or_default();
         begun.lines().count()
@@ -185,7 +185,7 @@ impl Fixture {
         until("no calculation begins", async || self.begun() >= times).await;
     }
 
-    pub fn go(&self) {
+    pub fn release(&self) {
         fs::write(self.home.path().join("go"), "").unwrap();
     }
 
@@ -202,7 +202,7 @@ impl Fixture {
         self.store.label_history(structure, protocol("dft").hash).await.unwrap()
     }
 
-    /// Process numbers of everything that calculations of this place have started and that still runs.
+    /// Ids of running processes started by calculations of this fixture.
     pub fn processes(&self) -> Vec<u32> {
         let mark = format!("CALMWALK_CALCULATION={}", self.home.path().display());
         let numbers = fs::read_dir("/proc").unwrap().flatten();
@@ -227,13 +227,13 @@ impl Fixture {
         assert_eq!((self.processes(), self.directories()), (vec![], vec![]));
     }
 
-    /// Whatever a check finds in it has to do with candidates, whose walks these tests do without.
+    /// Ignores findings about candidates, whose walks these tests lack.
     pub async fn is_consistent(&self) {
         let found = self.store.check(|_, _| ()).await.unwrap();
         assert!(found.len() == 1 && found[0].what.contains("candidates of walks"), "{found:?}");
     }
 
-    /// Kills what keeps the only calculation that is under way.
+    /// Kills the runner of the only running calculation.
     pub async fn kill_keeper(&self) {
         let attempts = self.attempts().await;
         let calculation = attempts.iter().rev().find_map(|attempt| attempt.calculation.clone()).unwrap();
@@ -254,12 +254,12 @@ impl Labeller {
         ended.expect("the labeller does not go home").unwrap()
     }
 
-    /// As kill -9 does: it does nothing any more, and its record goes with the next look at the processes.
-    pub async fn kill(self, place: &Fixture) {
+    /// Like kill -9: it stops, and its record is removed with the next check of processes.
+    pub async fn kill(self, fixture: &Fixture) {
         self.task.abort();
         assert!(self.task.await.unwrap_err().is_cancelled());
-        place.store.remove_process(&self.id).await.unwrap();
-        assert_eq!(place.store.release_leases_of_dead_processes(unix_milliseconds()).await.unwrap(), 1);
+        fixture.store.remove_process(&self.id).await.unwrap();
+        assert_eq!(fixture.store.release_leases_of_dead_processes(unix_milliseconds()).await.unwrap(), 1);
     }
 }
 
@@ -280,13 +280,13 @@ pub fn outcomes(attempts: &[Attempt]) -> Vec<(&str, Option<&str>)> {
     attempts.iter().map(|a| (a.outcome.as_deref().unwrap(), a.class.as_deref())).collect()
 }
 
-/// Without what the keepers of these tests say before they become the program.
+/// Without the output of this test's runners before they execute the program.
 pub fn said(log: Option<&str>) -> String {
     log.unwrap().replace("running 1 test\n", "")
 }
 
-/// Ends when it may.
+/// Ends when `go` exists.
 pub const WAITS: &str = "while [ ! -e $HERE/go ]; do sleep 0.01; done; echo -7.5 > energy";
-/// The same, and what it starts in the background never ends by itself, also in a session of its own.
+/// The same, with background processes that never end, one in its own session.
 pub const WITH_CHILDREN: &str =
     "sleep 1000 & setsid sleep 1000 & while [ ! -e $HERE/go ]; do sleep 0.01; done; echo -7.5 > energy";

@@ -1,4 +1,4 @@
-//! Each guard by itself, on both sides of its limit.
+//! Each guard on both sides of its limit.
 
 use atoms::Cell;
 use atoms::cell::Matrix3;
@@ -41,7 +41,7 @@ fn bonds_are_those_of_their_pair_and_through_the_boundary() {
     assert!(refused(r#"{ "shortest_bond": { "O-Si": 2.01 } }"#, &apart));
     assert!(refused(r#"{ "shortest_bond": { "Si-O": 2.01 } }"#, &apart));
     assert!(!refused(r#"{ "shortest_bond": { "Si-O": 1.99, "Si-Si": 8.0, "O-O": 8.9 } }"#, &apart));
-    // 1.5 Å through the boundary, and an atom from its own image.
+    // 1.5 Å through the boundary, and an atom to its own image.
     assert!(refused(r#"{ "shortest_bond": { "Si-O": 1.6 } }"#, &box_of(3.5, 9.0, 9.0)));
     assert!(refused(r#"{ "shortest_bond": { "O-O": 3.6 } }"#, &box_of(3.5, 9.0, 9.0)));
     let reason = guard(r#"{ "shortest_bond": { "Si-O": 2.5 } }"#).refuses(&apart).unwrap();
@@ -55,14 +55,14 @@ fn cells_have_a_shape() {
     assert!(refused(r#"{ "least_height": 4.1 }"#, &long) && !refused(r#"{ "least_height": 3.9 }"#, &long));
     assert!(refused(r#"{ "largest_edge_ratio": 2.9 }"#, &long));
     assert!(!refused(r#"{ "largest_edge_ratio": 3.1 }"#, &long));
-    // 45°, and 135° are the same.
+    // 45° and 135° are equivalent.
     for x in [5.0, -5.0] {
         let sheared = structure([[6.0, 0.0, 0.0], [x, 5.0, 0.0], [0.0, 0.0, 6.0]]);
         assert!(refused(r#"{ "least_angle": 46 }"#, &sheared), "{x}");
         assert!(!refused(r#"{ "least_angle": 44 }"#, &sheared), "{x}");
         assert!(refused(r#"{ "least_height": 4.3 }"#, &sheared), "6 sin 45° = 4.24 Å");
     }
-    // What is not periodic has no shape.
+    // Non-periodic directions have no shape.
     let slab = Structure { periodic: [true, true, false], ..long };
     assert!(!refused(r#"{ "largest_edge_ratio": 2.9, "least_volume": 1e6 }"#, &slab));
 }

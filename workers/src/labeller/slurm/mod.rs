@@ -1,12 +1,14 @@
-//! A calculation as a job of its own in the batch system Slurm.
+//! A calculation as a Slurm job.
 //!
-//! Its directory, which every node sees, has all that it needs: whoever finds it there, and that Slurm does not know its
-//! name, submits it (again). Of two jobs of one name the second waits for the end of the first (`singleton`), and only
-//! the one that makes the directory [`BEGUN`] calculates, so what was submitted twice, because an answer was lost, is calculated once.
+//! Its directory, which every node sees, contains everything it needs: a labeller that finds the directory, and
+//! that Slurm does not know the job's name, submits it (again). Of two jobs with the same name the second waits for
+//! the end of the first (`singleton`), and only the one that creates the directory [`BEGUN`] calculates. A job
+//! submitted twice because a reply was lost is therefore calculated once.
 //!
-//! The end is what the keeper leaves, as everywhere. Slurm is asked seldom, only to find jobs that cannot leave one any more;
-//! as long as it does not answer nothing is concluded. It knows every job that lives, and forgets others after a while
-//! (`MinJobAge`): one that it does not know is over, and what Slurm wrote into the job's log before tells why.
+//! The runner records the end, as for local calculations. Slurm is queried rarely, only to find jobs that can no
+//! longer record their end; while it does not respond, nothing is concluded. It knows every unfinished job and
+//! forgets finished ones after a while (`MinJobAge`): a job that it does not know is finished, and the job's log
+//! gives the reason if Slurm ended it.
 
 mod script;
 mod squeue;
@@ -34,56 +36,56 @@ use squeue::{SqueueJob, Traces};
 pub(super) use script::{JobRequirements, write};
 pub(super) use squeue_cache::remove_cache;
 
-/// Made in the directory by the job that calculates.
+/// Created in the directory by the job that calculates.
 const BEGUN: &str = "begun";
-/// What the job is told to do.
+/// The batch script.
 const SCRIPT: &str = "job.sh";
-/// What its keeper reads.
+/// The request to its runner.
 const REQUEST: &str = "order.json";
-/// What Slurm and the script say.
+/// Output of Slurm and of the script.
 const LOG: &str = "slurm.log";
 
-/// No answer is waited for for longer.
+/// Timeout of Slurm's commands.
 const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
-/// Between two looks at the directory of a calculation that has just begun …
+/// Initial time between two checks of a calculation's directory.
 const MIN_POLL_INTERVAL: Duration = Duration::from_millis(50);
-/// … and of one that has lasted for a while.
+/// Longest time between two checks of a calculation's directory.
 const MAX_POLL_INTERVAL: Duration = Duration::from_secs(2);
-/// Between two questions to Slurm.
+/// Time between two queries to Slurm.
 const SQUEUE_INTERVAL: Duration = Duration::from_secs(20);
-/// What a node has written may be seen here so much later.
+/// Delay after which files written by a node are visible here.
 const SETTLE_TIME: Duration = Duration::from_secs(2);
-/// Between two tries to submit …
+/// Time between two tries to submit.
 const RETRY_INTERVAL: Duration = Duration::from_secs(3);
-/// … of which so many may be refused, though Slurm answers.
+/// Maximum number of refusals by a Slurm that responds.
 const MAX_REFUSALS: u32 = 3;
-/// How long a cancelled job may take to end, before its directory is left for later.
+/// How long a cancelled job may take to end before its directory is left for later.
 const CANCEL_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// What finds a job again.
+/// Identifies a job.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Job {
-    /// Elsewhere the name says nothing.
+    /// The cluster: elsewhere the name has no meaning.
     pub cluster: String,
     pub directory: PathBuf,
-    /// That of no other calculation.
+    /// The name, unique to the calculation.
     pub name: String,
-    /// Who has submitted it: others may not see it.
+    /// The user who submitted it: others may not see it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub user: Option<u32>,
-    /// Where it failed, if it may go better on another node.
+    /// The node where it failed, if another node may help.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub node: Option<String>,
 }
 
-/// Slurm, as jobs of calculations need it.
+/// Access to Slurm for calculations.
 pub(super) struct Slurm {
     commands: Commands,
     cluster: OnceCell<String>,
 }
 
 impl Slurm {
-    /// Slurm's commands, with the variables of this environment that programs get: `sbatch` gives its own to its job.
+    /// Slurm's commands, with the variables that programs get: `sbatch` passes its environment to the job.
     pub fn new(passed: &PassedEnvironment) -> Self {
         let is_slurm_variable = |name: &OsStr| {
             let name = name.to_string_lossy();
@@ -95,7 +97,7 @@ impl Slurm {
         Self { commands, cluster: OnceCell::new() }
     }
 
-    /// The job of the calculation in this directory, below that of its campaign.
+    /// The job of the calculation in this directory, which is below its campaign's.
     pub async fn job(&self, directory: &Path) -> Result<Job, StoreError> {
         let last = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let campaign = directory.parent().map(last).filter(|name| name.starts_with("calmwalk-"));
@@ -104,8 +106,8 @@ impl Slurm {
         Ok(Job { cluster, directory: directory.to_owned(), name, user: Some(own_user()), node: None })
     }
 
-    /// Submits a job that Slurm does not know. An answer that was lost is looked for; where Slurm answers, and will not have
-    /// the job, that fails the labeller and not the calculation.
+    /// Submits a job that Slurm does not know. If the reply is lost, looks for the job. If Slurm responds but
+    /// refuses the job, the labeller fails, not the calculation.
     pub async fn submit(&self, job: &Job) -> Result<(), StoreError> {
         let mut refused = 0;
         loop {
@@ -117,7 +119,7 @@ impl Slurm {
                 return Ok(());
             }
             refused += 1;
-            // There may be no node beside those that are avoided.
+            // All allowed nodes may be excluded.
             let again =
                 script::clear_excluded_nodes(&job.directory).map_err(|error| file(&job.directory, error))?;
             if refused >= MAX_REFUSALS && !again {
@@ -129,7 +131,7 @@ impl Slurm {
 
     pub async fn inspect(&self, job: &Job) -> Result<CalculationState, StoreError> {
         if job.directory.symlink_metadata().is_ok() && !private_directory::is_own(&job.directory) {
-            // Another user has made one of that name after it was gone, or has submitted the job.
+            // Another user has created a directory of that name after it was removed, or has submitted the job.
             return Ok(CalculationState::Elsewhere);
         }
         if let Some(end) = CalculationEnd::read(&job.directory) {
@@ -155,7 +157,7 @@ impl Slurm {
         }
     }
 
-    /// What is left of a job that is over, or that Slurm does not know.
+    /// The state of a job that is finished or unknown to Slurm.
     async fn finished_job(&self, job: &Job, jobs: &[SqueueJob]) -> Result<CalculationState, StoreError> {
         settle(&job.directory).await;
         if let Some(end) = CalculationEnd::read(&job.directory) {
@@ -171,13 +173,13 @@ impl Slurm {
             }
             _ => {}
         }
-        // Slurm forgets it before long.
+        // Slurm forgets it after a while.
         let end = squeue::infer_end(reported, &Traces::read(&job.directory));
         end.write(&job.directory).map_err(|error| file(&job.directory, error))?;
         Ok(CalculationState::Ended(end))
     }
 
-    /// Waits for the end, and submits the job should Slurm not know it; `None` if it was cleared away.
+    /// Waits for the end, and submits the job if Slurm does not know it; `None` if its directory was removed.
     pub async fn wait(&self, job: &Job) -> Result<Option<CalculationEnd>, StoreError> {
         let (mut pause, mut asked) = (MIN_POLL_INTERVAL, Instant::now());
         loop {
@@ -200,14 +202,14 @@ impl Slurm {
         }
     }
 
-    /// Ends a job, and waits a little for that. Where Slurm does not answer that is an error: the job goes on then, and whoever
-    /// looks for it finds it.
+    /// Cancels a job and waits briefly for its end. If Slurm does not respond, this fails: the job continues, and
+    /// whoever looks for it later finds it.
     pub async fn cancel(&self, job: &Job) -> Result<(), StoreError> {
         let begun = Instant::now();
         loop {
             let jobs = self.ask(job).await.map_err(|error| cannot(job, error))?;
             let living = jobs.iter().filter(|reported| reported.phase() != Phase::Over);
-            // What ends was told so before.
+            // Jobs that are completing were cancelled before.
             let ids: Vec<_> = living
                 .filter(|reported| reported.phase() != Phase::Completing)
                 .map(|reported| reported.id)
@@ -221,7 +223,7 @@ impl Slurm {
         }
     }
 
-    /// What Slurm says of the job, however long it takes to say something.
+    /// Queries the job, and retries until Slurm responds.
     async fn jobs(&self, job: &Job) -> Result<Vec<SqueueJob>, StoreError> {
         loop {
             match self.ask(job).await {
@@ -264,11 +266,11 @@ fn cannot(job: &Job, why: impl ToString) -> StoreError {
     file(&job.directory, io::Error::other(why.to_string()))
 }
 
-/// Lets what other hosts have written into a directory be seen: a network file system looks again where something was made.
+/// Makes files from other hosts visible: a network file system refreshes a directory when a file is created in it.
 async fn settle(directory: &Path) {
     sleep(SETTLE_TIME).await;
     let new = directory.join("look");
-    // A program may have left something of that name, and a pipe would hold this up.
+    // A program may have left a file of that name, and opening a pipe would block.
     let _ = fs::File::create_new(&new).and_then(|_| fs::remove_file(&new));
 }
 

@@ -1,4 +1,4 @@
-//! What a job is submitted with. All of it stands in its script, so that submitting it again needs nothing else.
+//! The batch script of a job. It contains everything needed to submit the job again.
 
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -12,22 +12,22 @@ use super::super::RunnerCommand;
 use super::super::calculation_runner::{self, Calculation, RunnerRequest};
 use super::{BEGUN, Job, LOG, REQUEST, SCRIPT};
 
-/// Slurm's limit comes so much after that of the keeper, which ends the calculation in order, s.
+/// Slurm's time limit exceeds that of the runner, which ends the calculation in order, by this, s.
 const MARGIN: f64 = 60.0;
-/// Bytes of the M of `--mem`.
+/// Bytes per unit M of `--mem`.
 const MEBIBYTE: u64 = 1 << 20;
 const EXCLUDE: &str = "#SBATCH --exclude=";
 
-/// What a job needs.
+/// Resources of a job.
 pub(in super::super) struct JobRequirements<'a> {
     pub cores: u32,
-    /// Options of the user.
+    /// Options set by the user.
     pub options: &'a [String],
     /// Nodes on which it failed.
     pub avoid: &'a [String],
 }
 
-/// Writes all that the job of a calculation needs into its directory.
+/// Writes everything that the job of a calculation needs into its directory.
 pub(in super::super) fn write(
     calculation: Calculation,
     requirements: &JobRequirements<'_>,
@@ -65,7 +65,7 @@ fn script(calculation: &Calculation, requirements: &JobRequirements<'_>) -> io::
     Ok(script)
 }
 
-/// The keeper's command as a node can call it.
+/// The runner's command as a node can execute it.
 fn runner(command: &RunnerCommand) -> io::Result<String> {
     let program = match command.program.starts_with("/proc/self") {
         true => fs::read_link(&command.program)?,
@@ -75,12 +75,12 @@ fn runner(command: &RunnerCommand) -> io::Result<String> {
     Ok(words.collect::<Vec<_>>().join(" "))
 }
 
-/// A word for the shell.
+/// Quotes a word for the shell.
 fn shell_quoted(word: impl AsRef<Path>) -> String {
     format!("'{}'", word.as_ref().display().to_string().replace('\'', r"'\''"))
 }
 
-/// Lets the job run anywhere. Returns whether there was a node that it avoided.
+/// Permits the job to run on any node. Returns whether it excluded any before.
 pub(super) fn clear_excluded_nodes(directory: &Path) -> io::Result<bool> {
     let path = directory.join(SCRIPT);
     let script = result_file::read(&path).map_err(io::Error::other)?;
@@ -93,20 +93,20 @@ pub(super) fn clear_excluded_nodes(directory: &Path) -> io::Result<bool> {
     Ok(!avoiding.is_empty())
 }
 
-/// What `sbatch` is called with: what makes this job the one that is looked for, whatever the user's options are.
+/// Arguments of `sbatch`. They identify the job, whatever options the user sets.
 pub(super) fn arguments(job: &Job) -> Vec<OsString> {
     let option = |name: &str, value: &Path| {
         let mut option = OsString::from(name);
         option.push(value);
         option
     };
-    // sbatch puts numbers of the job in the place of letters after '%'.
+    // sbatch replaces letters after '%' by numbers of the job.
     let log = job.directory.join(LOG).display().to_string().replace('%', "%%");
     vec![
         format!("--job-name={}", job.name).into(),
         "--dependency=singleton".into(),
         "--no-requeue".into(),
-        // One that comes late and does nothing must not wipe out what was said of the first.
+        // A late job that does nothing must not overwrite the log of the first.
         "--open-mode=append".into(),
         option("--chdir=", &job.directory),
         option("--output=", log.as_ref()),

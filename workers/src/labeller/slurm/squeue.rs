@@ -1,4 +1,4 @@
-//! What Slurm says of a job.
+//! The output of squeue about a job.
 
 use std::fmt;
 use std::fs;
@@ -15,18 +15,18 @@ use super::{BEGUN, LOG};
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct SqueueJob {
     pub id: u64,
-    /// In Slurm's words, as `RUNNING`.
+    /// State in Slurm's terms, such as `RUNNING`.
     state: String,
-    /// Where it runs or ran.
+    /// Nodes on which it runs or ran.
     nodes: String,
-    /// For how long it has run.
+    /// Run time, s.
     seconds: f64,
     /// Why it waits or how it ended.
     reason: String,
 }
 
 impl SqueueJob {
-    /// What `squeue` is to write about a job.
+    /// The format for `squeue`.
     pub const FORMAT: &str = "%i|%T|%N|%M|%r";
 
     pub fn parse(line: &str) -> Result<Self, SlurmError> {
@@ -50,17 +50,18 @@ impl SqueueJob {
         Phase::of(&self.state)
     }
 
-    /// Whether its script has ended, and was not ended.
+    /// Whether its script ended by itself.
     pub fn ran_to_its_end(&self) -> bool {
         matches!(self.state.as_str(), "COMPLETED" | "FAILED")
     }
 
-    /// Whether this is only the trace of a call of `sbatch` that failed: such a job never was.
+    /// Whether this is only the record of a rejected `sbatch` call: such a job never existed.
     pub fn was_refused(&self) -> bool {
         self.state == "FAILED" && self.nodes.is_empty()
     }
 
-    /// What the state alone tells. Where memory is measured and not confined, Slurm calls what it kills for that `FAILED`.
+    /// The exit that the state implies. If memory is measured but not confined, a job killed for its memory has the
+    /// state `FAILED`.
     fn exit(&self) -> Option<Exit> {
         match self.state.as_str() {
             "TIMEOUT" | "DEADLINE" => Some(Exit::TimeLimit),
@@ -70,7 +71,7 @@ impl SqueueJob {
         }
     }
 
-    /// The node that may be to blame; those of jobs that somebody has ended are not.
+    /// The node that may be at fault. Nodes of cancelled jobs are not.
     fn node(&self) -> Option<String> {
         let blamed = ["NODE_FAIL", "BOOT_FAIL", "LAUNCH_FAILED", "OUT_OF_MEMORY", "FAILED", "COMPLETED"];
         let node = blamed.contains(&self.state.as_str()).then(|| self.nodes.clone());
@@ -91,18 +92,18 @@ impl fmt::Display for SqueueJob {
     }
 }
 
-/// The one that says most of several of one name: of those that were submitted twice one did nothing.
+/// The most informative of several jobs with the same name: of jobs submitted twice, one did nothing.
 pub(super) fn most_informative(jobs: &[SqueueJob]) -> Option<&SqueueJob> {
     let said_more = jobs.iter().find(|reported| reported.state != "COMPLETED");
     said_more.or_else(|| jobs.first())
 }
 
-/// What is left of a job in its directory.
+/// What a job left in its directory.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Traces {
-    /// The end of what Slurm wrote into its log: why it has ended a job stands there.
+    /// The end of Slurm's log, which gives the reason if Slurm ended the job.
     log: String,
-    /// From its begin to the last words of the log.
+    /// Time from its start to the last entry of the log, s.
     seconds: f64,
 }
 
@@ -124,7 +125,7 @@ impl Traces {
     }
 }
 
-/// How the calculation of a job ended that is over, or that Slurm has forgotten, and whose keeper has left no end.
+/// Infers how a calculation ended whose job is over or unknown to Slurm and whose runner recorded no end.
 pub(super) fn infer_end(reported: Option<&SqueueJob>, traces: &Traces) -> CalculationEnd {
     let mut remark = match reported {
         Some(reported) => format!("Slurm says: {reported}; its keeper has left no end"),
@@ -144,7 +145,7 @@ pub(super) fn infer_end(reported: Option<&SqueueJob>, traces: &Traces) -> Calcul
     }
 }
 
-/// `1-02:03:04`, `2:03:04` or `3:04`; 0 for what is none of these.
+/// Parses `1-02:03:04`, `2:03:04` or `3:04`; 0 for anything else.
 fn seconds(time: &str) -> f64 {
     let (days, time) = time.split_once('-').unwrap_or(("0", time));
     let parts = time.split(':').map(|part| part.parse::<f64>().ok());
@@ -196,7 +197,7 @@ mod tests {
         }
     }
 
-    /// Lines of Slurm 22.05.
+    /// Log lines of Slurm 22.05.
     #[test]
     fn the_log_tells_what_slurm_has_forgotten() {
         use Exit::{LostNode, OutOfMemory, TimeLimit};
@@ -219,7 +220,7 @@ mod tests {
                 (EndReason::Ended(exit), 7.0, None)
             );
             assert!(forgotten.remark.unwrap().ends_with(log.lines().last().unwrap_or("no end")));
-            // What Slurm itself has no word for.
+            // Cases without a state of their own in Slurm.
             assert_eq!(infer_end(Some(&reported("FAILED")), &traces).how, EndReason::Ended(exit), "{log}");
             assert_eq!(
                 infer_end(Some(&reported("TIMEOUT")), &traces).how,

@@ -1,6 +1,7 @@
-//! What Slurm last said of the jobs that live: one labeller asks, and all of the campaign read the answer.
+//! A shared cache of the running jobs: one labeller queries Slurm, and all labellers of the campaign read the
+//! answer.
 //!
-//! It is only believed about jobs that are in it. Of one that is not, whoever waits for it asks for itself.
+//! It counts only for jobs that it contains. A labeller whose job is missing queries Slurm itself.
 
 use std::fs;
 use std::path::Path;
@@ -10,10 +11,10 @@ use dft::result_file;
 
 use super::{Job, SQUEUE_INTERVAL};
 
-/// Beside the directories of calculations.
+/// File beside the directories of calculations.
 const CACHE_FILE: &str = "calmwalk-squeue";
 
-/// Whether the job was said to live lately, or nobody answers.
+/// Whether the job was recently reported as running, or Slurm does not respond.
 pub(super) async fn is_alive(commands: &Commands, job: &Job) -> bool {
     let path = job.directory.with_file_name(CACHE_FILE);
     let names = match read_recent(&path) {
@@ -29,12 +30,12 @@ pub(super) async fn is_alive(commands: &Commands, job: &Job) -> bool {
     names.lines().any(|name| name == job.name)
 }
 
-/// Removes it from the directory that held those of calculations.
+/// Removes the cache from the directory of a campaign's calculations.
 pub(in super::super) fn remove_cache(root: &Path) {
     let _ = fs::remove_file(root.join(CACHE_FILE));
 }
 
-/// The answer, if it is not old. Clocks that do not agree make it look older, or ask for it again.
+/// The cached answer, if it is recent. Clock differences only make it look older, or cause another query.
 fn read_recent(path: &Path) -> Option<String> {
     let age = fs::metadata(path).and_then(|file| file.modified()).ok()?.elapsed().ok()?;
     if age >= SQUEUE_INTERVAL {
@@ -43,7 +44,7 @@ fn read_recent(path: &Path) -> Option<String> {
     String::from_utf8(result_file::read(path).ok()?).ok()
 }
 
-/// What cannot be written is asked again by all.
+/// If it cannot be written, every labeller queries Slurm itself.
 fn write_cache(path: &Path, names: &str) {
     let unfinished = path.with_extension(std::process::id().to_string());
     let _ = fs::write(&unfinished, names).and_then(|()| fs::rename(&unfinished, path));

@@ -22,14 +22,14 @@ fn good() -> Calculated {
     }
 }
 
-/// Offsets from so many good labels of Si₂, whose energies are 103 eV an atom below the potential's, and some that are not.
+/// Offsets fitted to `good` labels of Si₂, whose energies are 103 eV/atom below the potential's, and to bad ones.
 fn offsets(good: usize, bad: &[f64]) -> EnergyOffsets {
     let energies = (0..good).map(|k| -206.0 + 0.01 * k as f64).chain(bad.iter().copied());
     let label = |label| LabelledEnergy { composition: vec![(14, 2)], model: -9.0, label: label - 9.0 };
     EnergyOffsets::fit(&energies.map(label).collect::<Vec<_>>()).unwrap()
 }
 
-/// What is said of a result with this change; nothing of one that is believed.
+/// The message for a result with this change; empty if it is valid.
 fn said(change: impl FnOnce(&mut Calculated), offsets: Option<&EnergyOffsets>) -> String {
     let mut made = good();
     change(&mut made);
@@ -97,7 +97,7 @@ fn an_energy_is_held_against_the_potential_once_labels_speak_for_it() {
     );
     let end = "from 5 labels, taken out), beyond label.largest_energy_difference = 100 eV/atom";
     assert!(message.ends_with(end), "{message}");
-    // Labels that were believed and should not have been do not move the offsets.
+    // Bad labels that were accepted do not move the offsets.
     let spoilt = offsets(5, &[1e5, -1e300]);
     assert_eq!(said(|_| (), Some(&spoilt)), "");
     assert!(said(far, Some(&spoilt)).contains("from 5 labels"));
