@@ -122,7 +122,7 @@ fn a_stop_finishes_the_label_in_hand_or_gives_it_back() {
     assert_eq!(ended(&mut label), Some(130), "{}", place.said());
     assert_eq!(place.job(&name).job.state, JobState::Queued);
     assert_eq!(place.job(&name).attempts_made[0].outcome.as_deref(), Some("released"));
-    assert!(place.said().contains("is given back"), "{}", place.said());
+    assert!(place.said().contains("there is no time to finish it"), "{}", place.said());
     let mut label = place.label(&["--grace", "100"]);
     place.wait_for_lease();
     signal(label.0.id(), "INT");
@@ -226,7 +226,7 @@ fn a_label_that_comes_too_late_is_a_check_and_changes_nothing() {
     let exported = place.export();
     signal(slot, "CONT");
     assert_eq!(ended(&mut late), Some(0), "{}", place.said());
-    assert!(place.said().contains("had its label already; this one is kept as a check"), "{}", place.said());
+    assert!(place.said().contains("has a label already; this result is kept as a check"), "{}", place.said());
     let job = place.job(&name);
     let outcomes: Vec<_> = job.attempts_made.iter().map(|attempt| attempt.outcome.as_deref()).collect();
     assert_eq!(outcomes, [Some("check"), Some("labelled")]);

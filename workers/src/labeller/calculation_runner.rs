@@ -178,7 +178,7 @@ pub fn run_calculation() -> io::Result<()> {
     if rustix::fs::FileType::from_raw_mode(request.st_mode).is_file() && request.st_uid != geteuid().as_raw()
     {
         return Err(io::Error::other(format!(
-            "the request is a file of user {}, expected one's own",
+            "the request is a file of user {}, expected a file of this user",
             request.st_uid
         )));
     }
@@ -203,7 +203,7 @@ fn exec_program(runner: u32, directory: &Path, command: &[String]) -> io::Error 
     }
     // It may have ended before.
     if getppid().map(|pid| pid.as_raw_nonzero().get().unsigned_abs()) != Some(runner) {
-        return io::Error::other("the runner of this calculation is gone");
+        return io::Error::other("the runner of this calculation has ended");
     }
     let [program, arguments @ ..] = command else { return ErrorKind::InvalidInput.into() };
     let error = Command::new(program).args(arguments).stdin(Stdio::null()).exec();
@@ -218,7 +218,7 @@ impl Calculation {
     /// Starts the program, waits for it, and ends it at a limit.
     fn run(self) -> io::Result<()> {
         if !private_directory::is_own(&self.directory) {
-            let message = format!("{} is no directory of this user", self.directory.display());
+            let message = format!("{} is not a directory of this user", self.directory.display());
             return Err(io::Error::other(message));
         }
         // Neither Ctrl-C nor the end of the labeller's process group reaches this process or its program.

@@ -156,7 +156,7 @@ impl CodeMethod {
     async fn prepare(&self, structure: Structure, failures: Vec<FailureClass>) -> Result<Prepared, Failure> {
         let Some(remedies) = dft::remedies(&failures) else {
             let class = failures.last().copied().unwrap_or(FailureClass::Crashed);
-            return Err(class.because("there is nothing left to try"));
+            return Err(class.because("no remedy is left"));
         };
         let (code, execution) = (Arc::clone(&self.code), self.execution.clone());
         blocking(move || prepare(&*code, &execution, &structure, &remedies)).await
@@ -328,7 +328,7 @@ impl CodeMethod {
     async fn lost_calculation(&self, handle: CalculationHandle) -> Result<LabelAttempt, StoreError> {
         handle.clear(&self.slurm).await?;
         self.reap();
-        let result = Err(FailureClass::LostNode.because("the process that kept the calculation was killed"));
+        let result = Err(FailureClass::LostNode.because("the runner of the calculation was killed"));
         Ok(LabelAttempt { result, ended: None })
     }
 

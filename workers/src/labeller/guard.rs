@@ -105,7 +105,7 @@ impl LabelGuard {
         let ratio = edges().reduce(f64::max)? / edges().reduce(f64::min)?;
         if let Some(largest) = self.largest_edge_ratio.filter(|largest| ratio > *largest) {
             return Some(format!(
-                "its cell is {ratio:.2} times as long as wide, where label.guard.largest_edge_ratio is {largest}"
+                "the longest edge of its cell is {ratio:.2} times the shortest, where label.guard.largest_edge_ratio is {largest}"
             ));
         }
         let least = self.least_angle?;
@@ -126,7 +126,7 @@ impl LabelGuard {
         }
         let volume = structure.cell.volume() / structure.len() as f64;
         let too =
-            |key: &str, limit: f64| format!("{volume:.3} Å³ an atom, where label.guard.{key} is {limit}");
+            |key: &str, limit: f64| format!("{volume:.3} Å³ per atom, where label.guard.{key} is {limit}");
         let small = self.least_volume.filter(|least| volume < *least);
         let large = self.largest_volume.filter(|largest| volume > *largest);
         small.map(|limit| too("least_volume", limit)).or(large.map(|limit| too("largest_volume", limit)))
@@ -156,7 +156,7 @@ pub(super) async fn refusal(
     let like = others.iter().find(|other| is_near(&own, &other.features, lease.structure.len(), bound));
     Ok(like.map(|other| {
         format!(
-            "its features differ by less than {bound} of their norm from those of {}, which has its label \
+            "its features differ by less than {bound} of their norm from those of {}, which has a label \
              (label.guard.near_duplicate)",
             other.candidate
         )
@@ -193,7 +193,7 @@ async fn too_costly(
     let too_much = expected.map(|expected| expected.core_seconds).filter(|seconds| *seconds > largest);
     Ok(too_much.map(|seconds| {
         format!(
-            "a label of it is expected to take {seconds:.0} core-seconds, as {} others did, where label.guard.largest_cost \
+            "its label is expected to take {seconds:.0} core-seconds, judging by {} labels, where label.guard.largest_cost \
              is {largest}",
             measured.len()
         )

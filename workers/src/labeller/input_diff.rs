@@ -34,7 +34,7 @@ pub(super) fn input_diff(plain: &Input, changed: &Input) -> String {
     lines.truncate(MAX_LINES);
     let mut text = lines.join("\n");
     if left_out > 0 {
-        let _ = write!(text, "\n… and {left_out} lines more");
+        let _ = write!(text, "\n… and {left_out} more lines");
     }
     text
 }

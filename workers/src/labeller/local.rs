@@ -116,8 +116,8 @@ pub(super) fn clear(directory: &Path) -> io::Result<()> {
 /// end the labeller.
 pub(super) fn remove(directory: &Path) {
     if fs::symlink_metadata(directory).is_ok() && !private_directory::is_own(directory) {
-        warn!("{} is not removed: it is no directory of this user", directory.display());
+        warn!("not removing {}: it is not a directory of this user", directory.display());
     } else if let Err(error) = remove_tree(directory) {
-        warn!("{} cannot be removed: {error}", directory.display());
+        warn!("cannot remove {}: {error}", directory.display());
     }
 }

@@ -182,34 +182,31 @@ async fn label_jobs(
         if let Some(reason) = retry_until_written(shutdown, || guard::refusal(store, &lease, size)).await? {
             // Another attempt would be refused as well, whatever was tried before.
             retry_until_written(shutdown, || store.fail(&lease, guard::REFUSED, &reason, 1, now())).await?;
-            say(&format!("{} is refused: {reason}", lease.candidate));
+            say(&format!("refused {}: {reason}", lease.candidate));
             continue;
         }
         let made = match make(store, method, &lease, &settings.timing, shutdown, &now).await? {
             LeaseOutcome::Done(made) => *made,
             LeaseOutcome::NotWanted => {
                 method.stop().await?;
-                say(&format!(
-                    "{} is given up here: it has its label, or is requested no more",
-                    lease.candidate
-                ));
+                say(&format!("stopped labelling {}: its result is no longer needed", lease.candidate));
                 continue;
             }
             LeaseOutcome::Detached => {
                 method.detach();
-                say(&format!("{} is finished by somebody else here", lease.candidate));
+                say(&format!("{} is finished by another labeller on this host", lease.candidate));
                 continue;
             }
             LeaseOutcome::LeftRunning => {
                 method.detach();
-                say(&format!("{} goes on and is left to the next labeller here", lease.candidate));
+                say(&format!("{} continues and is left to the next labeller on this host", lease.candidate));
                 return retry_until_written(shutdown, || store.release_all(&settings.holder, now()))
                     .await
                     .map(drop);
             }
             LeaseOutcome::GraceExpired => {
                 method.stop().await?;
-                say(&format!("{} is given back: there is no time to finish it", lease.candidate));
+                say(&format!("released {}: there is no time to finish it", lease.candidate));
                 return retry_until_written(shutdown, || store.release_all(&settings.holder, now()))
                     .await
                     .map(drop);
@@ -288,7 +285,7 @@ async fn poll_queue(
 async fn give_back_unknown(store: &Store, holder: &str, held: &[&Lease], now: i64) -> Result<(), StoreError> {
     let leases = store.state_leases(holder, held, now).await?;
     if leases > 0 {
-        warn!(leases, "given back: the answer of the database to a commit was lost");
+        warn!(leases, "released leases: the database's reply to a commit was lost");
     }
     Ok(())
 }

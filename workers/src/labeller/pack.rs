@@ -102,7 +102,7 @@ fn files(directory: &Path, left_out: &mut LeftOut) -> Vec<PathBuf> {
             match entry.file_type() {
                 Ok(kind) if kind.is_dir() => open.push((entry.path(), depth + 1)),
                 Ok(kind) if kind.is_file() || kind.is_symlink() => files.push(entry.path()),
-                _ => left_out.add(&name.join(entry.file_name()), "no regular file"),
+                _ => left_out.add(&name.join(entry.file_name()), "not a regular file"),
             }
         }
     }

@@ -29,23 +29,23 @@ const STICKY: u32 = 0o1000;
 pub(super) enum NotPrivate {
     /// Another user could replace a directory created in it.
     #[error(
-        "user {owner} owns it and could replace what is made in it; expected a directory of user {uid} or of root: name another \
-         one as label.scratch"
+        "user {owner} owns it and could replace directories in it; expected a directory of user {uid} or of root: choose another \
+         label.scratch"
     )]
     OtherOwner { owner: u32, uid: u32 },
     /// Any user could replace a directory created in it.
     #[error(
-        "others may write to it (mode {mode:04o}, no sticky bit) and could replace what is made in it: make a directory of your \
-         own in it with mode 0700, and name that as label.scratch"
+        "others may write to it (mode {mode:04o}, no sticky bit) and could replace directories in it: make a directory of your \
+         own in it with mode 0700, and set label.scratch to it"
     )]
     OpenToOthers { mode: u32 },
     /// Any user could replace a directory above it.
-    #[error("others may write to {} (mode {mode:04o}, no sticky bit) and could replace it: name another one as label.scratch", path.display())]
+    #[error("others may write to {} (mode {mode:04o}, no sticky bit) and could replace it: choose another label.scratch", path.display())]
     OpenAbove { path: PathBuf, mode: u32 },
     /// A directory created in it has another owner or mode: the file system does not support them.
     #[error(
-        "a directory made in it with mode 0700 belongs to user {owner} and has mode {mode:04o}, expected user {uid}: name one on \
-         another file system as label.scratch"
+        "a directory made in it with mode 0700 belongs to user {owner} and has mode {mode:04o}, expected user {uid}: choose a \
+         label.scratch on another file system"
     )]
     NotKept { owner: u32, uid: u32, mode: u32 },
     /// Error of the operating system.
@@ -227,7 +227,7 @@ mod tests {
         let refused = || make(&parent, "calmwalk-x-").unwrap_err().to_string();
         mode(&parent, 0o777);
         assert!(
-            refused().contains("(mode 0777, no sticky bit) and could replace what is made in it"),
+            refused().contains("(mode 0777, no sticky bit) and could replace directories in it"),
             "{}",
             refused()
         );

@@ -154,7 +154,7 @@ impl Termination {
         }
         match left {
             Some(pid) if self.begun.elapsed() > KILL_TIMEOUT => {
-                let message = format!("process {} cannot be ended", pid.as_raw_nonzero());
+                let message = format!("cannot end process {}", pid.as_raw_nonzero());
                 Err(io::Error::new(io::ErrorKind::TimedOut, message))
             }
             left => Ok(left.is_some()),

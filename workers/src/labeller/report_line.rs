@@ -22,13 +22,13 @@ pub(super) fn format_report(
         (Ok(label), DeliveryOutcome::Completed(CompleteOutcome::Label)) => {
             format!("labelled {candidate}: {:.4} eV, {seconds:.1} s", label.energy)
         }
-        (Ok(_), _) => format!("{candidate} had its label already; this one is kept as a check"),
+        (Ok(_), _) => format!("{candidate} has a label already; this result is kept as a check"),
         (Err(failure), DeliveryOutcome::Failed(FailOutcome::Requeued)) => {
             format!("{candidate} failed and waits for another attempt: {failure}")
         }
         (Err(failure), DeliveryOutcome::Failed(FailOutcome::GivenUp)) => {
-            format!("{candidate} is given up: {failure}")
+            format!("{candidate} has no attempts left: {failure}")
         }
-        (Err(failure), _) => format!("{candidate} failed, and somebody else has it by now: {failure}"),
+        (Err(failure), _) => format!("{candidate} failed, and another labeller has it now: {failure}"),
     }
 }

@@ -21,9 +21,9 @@ use workers::labeller::{
 
 use crate::common::*;
 
-pub fn keeper_command() -> RunnerCommand {
+pub fn runner_command() -> RunnerCommand {
     // With one thread, the name of the test would precede the output of the code.
-    let arguments = ["calculations::keeper", "--exact", "--ignored", "--nocapture", "--test-threads=2"];
+    let arguments = ["calculations::runner", "--exact", "--ignored", "--nocapture", "--test-threads=2"];
     let arguments = arguments.map(str::to_owned).to_vec();
     RunnerCommand { program: std::env::current_exe().unwrap(), arguments }
 }
@@ -122,7 +122,7 @@ impl Fixture {
         let fixture = Self::new(structures, script).await;
         fs::write(fixture.setup_path(), content).unwrap();
         let (original, _) = Original::hashed(fixture.setup_path()).unwrap();
-        Self { setup: Some(original), ..place }
+        Self { setup: Some(original), ..fixture }
     }
 
     pub fn setup_path(&self) -> PathBuf {
@@ -135,7 +135,7 @@ impl Fixture {
             setup: self.setup.clone(),
             slow: self.home.path().join("slow"),
         };
-        Method::with_runner(keeper_command(), Box::new(script), self.running.clone())
+        Method::with_runner(runner_command(), Box::new(script), self.running.clone())
     }
 
     pub async fn labeller(&self) -> Labeller {
@@ -234,7 +234,7 @@ impl Fixture {
     }
 
     /// Kills the runner of the only running calculation.
-    pub async fn kill_keeper(&self) {
+    pub async fn kill_runner(&self) {
         let attempts = self.attempts().await;
         let calculation = attempts.iter().rev().find_map(|attempt| attempt.calculation.clone()).unwrap();
         let calculation: serde_json::Value = serde_json::from_str(&calculation).unwrap();

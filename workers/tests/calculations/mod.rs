@@ -16,8 +16,8 @@ use crate::common::{ATOMS, structure};
 
 /// Not a test: the runner that the tests start for their calculations.
 #[test]
-#[ignore = "keeps the calculations of the other tests"]
-fn keeper() {
+#[ignore = "runs the calculations of the other tests"]
+fn runner() {
     run_calculation().unwrap();
 }
 
@@ -69,7 +69,7 @@ async fn one_structure_is_labelled_without_a_campaign() {
         (once.result.unwrap_err().class, said(Some(&once.log)).as_str()),
         (FailureClass::NotConverged, "stdout:\nsaid\n")
     );
-    for place in [fixture, failing] {
+    for fixture in [fixture, failing] {
         assert_eq!(fixture.processes(), [0_u32; 0]);
         assert_eq!(fs::read_dir(fixture.running.scratch()).unwrap().count(), 0);
     }

@@ -56,10 +56,10 @@ async fn what_is_left_of_a_calculation_without_a_keeper_is_ended_and_it_begins_a
         fixture.wait_until_begun(1).await;
         until("its children do not start", async || fixture.processes().len() >= 3).await;
         if labeller_lives {
-            fixture.kill_keeper().await;
+            fixture.kill_runner().await;
         } else {
             labeller.kill(&fixture).await;
-            fixture.kill_keeper().await;
+            fixture.kill_runner().await;
             labeller = fixture.labeller().await;
         }
         fixture.wait_until_begun(2).await;

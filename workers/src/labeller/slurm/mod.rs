@@ -123,7 +123,7 @@ impl Slurm {
             let again =
                 script::clear_excluded_nodes(&job.directory).map_err(|error| file(&job.directory, error))?;
             if refused >= MAX_REFUSALS && !again {
-                return Err(cannot(job, format_args!("its job cannot be submitted: {error}")));
+                return Err(cannot(job, format_args!("cannot submit its job: {error}")));
             }
             sleep(RETRY_INTERVAL).await;
         }
@@ -148,7 +148,7 @@ impl Slurm {
             (true, false) => Err(cannot(
                 job,
                 format_args!(
-                    "job '{}' is at work there, and it cannot be seen from here: {SCRATCH_NOT_SHARED}",
+                    "job '{}' is running there, but its directory is not visible here: {SCRATCH_NOT_SHARED}",
                     job.name
                 ),
             )),
@@ -168,7 +168,7 @@ impl Slurm {
         match reported {
             None if !begun => return Ok(CalculationState::Ready),
             Some(reported) if !begun && reported.ran_to_its_end() => {
-                let message = format!("{reported}, where that is not seen: {SCRATCH_NOT_SHARED}");
+                let message = format!("{reported}, but its files are not visible here: {SCRATCH_NOT_SHARED}");
                 return Err(cannot(job, message));
             }
             _ => {}
@@ -256,7 +256,7 @@ impl Slurm {
 }
 
 const SCRATCH_NOT_SHARED: &str =
-    "label.scratch has to be a directory that this host and every node see by the same name";
+    "label.scratch must be a directory that this host and every node see under the same name";
 
 fn own_user() -> u32 {
     rustix::process::getuid().as_raw()

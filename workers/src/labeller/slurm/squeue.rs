@@ -128,8 +128,8 @@ impl Traces {
 /// Infers how a calculation ended whose job is over or unknown to Slurm and whose runner recorded no end.
 pub(super) fn infer_end(reported: Option<&SqueueJob>, traces: &Traces) -> CalculationEnd {
     let mut remark = match reported {
-        Some(reported) => format!("Slurm says: {reported}; its keeper has left no end"),
-        None => "Slurm does not know its job any more, and its keeper has left no end".to_owned(),
+        Some(reported) => format!("Slurm reports: {reported}; its runner did not record an end"),
+        None => "Slurm no longer knows its job, and its runner did not record an end".to_owned(),
     };
     if let Some(last) = traces.log.lines().next_back() {
         remark += &format!("; the job's log ends with: {last}");
@@ -219,7 +219,7 @@ mod tests {
                 (forgotten.how, forgotten.seconds, forgotten.node),
                 (EndReason::Ended(exit), 7.0, None)
             );
-            assert!(forgotten.remark.unwrap().ends_with(log.lines().last().unwrap_or("no end")));
+            assert!(forgotten.remark.unwrap().ends_with(log.lines().last().unwrap_or("an end")));
             // Cases without a state of their own in Slurm.
             assert_eq!(infer_end(Some(&reported("FAILED")), &traces).how, EndReason::Ended(exit), "{log}");
             assert_eq!(
