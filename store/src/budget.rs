@@ -2,11 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Limits; none where there is none.
+/// Limits of a campaign; `None` for no limit.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Budget {
-    /// Labels that are made.
+    /// Number of labels.
     pub labels: Option<u64>,
     /// Core-hours of label attempts.
     pub core_hours: Option<f64>,
@@ -29,12 +29,12 @@ pub struct BudgetUse {
     pub wall_hours: f64,
 }
 
-/// Both, for those who watch.
+/// Limits and use, for display.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct BudgetStatus {
     /// The limits.
     pub limits: Budget,
-    /// What was used of them.
+    /// Use of the limits.
     pub used: BudgetUse,
     /// The configuration key of the limit that ended the campaign.
     pub used_up: Option<String>,

@@ -16,12 +16,12 @@ pub struct CandidateRef {
     pub candidate: String,
 }
 
-/// A structure that came with its label.
+/// A structure imported with its label.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportedStructure {
     /// Its import number, from 1.
     pub number: i64,
-    /// The file it came from.
+    /// Its source file.
     pub file: String,
     /// The frame in it, from 0.
     pub frame: u64,

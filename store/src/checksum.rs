@@ -37,7 +37,7 @@ struct Column {
 /// The naming of the columns of a row.
 #[derive(Clone, Copy)]
 pub enum Names {
-    /// Those of the table.
+    /// The table's own names.
     Plain,
     /// `table__column`.
     Joined,
@@ -127,7 +127,7 @@ pub struct CheckedColumn {
     name: &'static str,
     /// The column with the number of its row.
     key: &'static str,
-    /// The column of its checksum.
+    /// The column with its checksum.
     checksum: &'static str,
     what: &'static str,
 }

@@ -21,9 +21,9 @@ pub struct ExportFilter {
 /// Position of a row in an export: candidates in decision order, then imports in import order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum ExportCursor {
-    /// Number of the decision.
+    /// Sequence number of the decision.
     Candidate(i64),
-    /// Number of the import.
+    /// Import number.
     Import(i64),
 }
 
@@ -32,7 +32,7 @@ pub enum ExportCursor {
 pub struct ExportRow {
     /// Its position; the next page starts after it.
     pub cursor: ExportCursor,
-    /// Where it came from.
+    /// Its origin.
     pub source: ExportSource,
     /// The structure.
     pub structure: Structure,

@@ -22,10 +22,10 @@ pub struct ListCursor {
     pub decision: i64,
 }
 
-/// A line of the table.
+/// A row of the table.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ListedCandidate {
-    /// Number of the decision about it.
+    /// Sequence number of the decision on it.
     pub decision: i64,
     /// Its name.
     pub id: String,

@@ -50,7 +50,7 @@ pub struct NewProtocol<'a> {
     pub notes: &'a [(&'a str, String)],
 }
 
-/// What came of it.
+/// The effect of a request.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RelabelCounts {
     /// Structures to be labelled again.

@@ -40,7 +40,7 @@ pub struct Status {
     pub finished: bool,
 }
 
-/// Numbers of candidates.
+/// Candidate counts.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Candidates {
     /// Candidates of biased walks that reached the selector.
@@ -70,7 +70,7 @@ pub struct Declined {
     pub backlog: u64,
 }
 
-/// Numbers of label jobs by state.
+/// Number of label jobs, by state.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Labels {
     /// Waiting.
@@ -81,7 +81,7 @@ pub struct Labels {
     pub labelled: u64,
     /// Given up.
     pub failed: u64,
-    /// Taken out by hand.
+    /// Removed by hand.
     pub dropped: u64,
     /// Of an earlier protocol: a job of a later protocol replaces them.
     pub superseded: u64,
@@ -106,7 +106,7 @@ pub struct WalkStatus {
     pub origin: String,
     /// `waiting`, `running`, or the reason why it ended.
     pub state: String,
-    /// Why it ended, in words.
+    /// Why it ended, as text.
     pub reason: String,
     /// Paused by hand: it gets no assignments until it is resumed.
     pub paused: bool,

@@ -1,4 +1,4 @@
-//! Budgets: what was used, and that no attempt begins where nothing is left.
+//! Budgets: their use, and that no attempt starts once a limit is reached.
 
 use store::{Budget, Store};
 
@@ -27,7 +27,7 @@ async fn no_more_labels_are_begun_than_there_may_be() {
     assert!(store.awaits_labels(0).await.unwrap());
     store.complete(&first, &label(-1.0), 10).await.unwrap();
     store.fail(&second, "unconverged", "", 9, 20).await.unwrap();
-    // One that failed is none.
+    // A failed attempt makes no label.
     let third = lease().await.unwrap();
     store.complete(&third, &label(-2.0), 30).await.unwrap();
     assert!(lease().await.is_none());

@@ -1,4 +1,4 @@
-//! Beginning and opening campaigns; what is committed is what comes back.
+//! Creating and opening campaigns; what is committed is read back.
 
 use store::{
     CandidateRecord, Commit, ComponentRecord, Decision, Fate, ProcessRecord, Store, StoreError, WalkRecord,
@@ -130,7 +130,7 @@ async fn a_contradictory_commit_leaves_nothing() {
     assert_eq!(store.commit(&commit_of(vec![fresh()])).await.unwrap(), 5..6);
 }
 
-/// A walk that is interrupted in its turn is committed without any decision.
+/// A walk interrupted during an assignment is committed without a decision.
 #[tokio::test]
 async fn a_checkpoint_is_kept_between_decisions() {
     let home = Home::new();
@@ -192,7 +192,7 @@ async fn status_counts_everything_once() {
     assert_eq!(status["finished"], false);
     assert!(matches!(reader.commit(&Commit::default()).await, Err(StoreError::ReadOnly)));
 
-    // A new process of its kind takes the place of a dead one; the end of everything is seen.
+    // A new process of a kind replaces a dead one, and the record is removed at the end.
     let next = ProcessRecord { id: "c".into(), ..process("b", std::process::id()) };
     store.upsert_process(&next).await.unwrap();
     store.remove_process("a").await.unwrap();
@@ -224,7 +224,7 @@ async fn what_is_not_known_of_a_walk_is_no_zero() {
     store.commit(&Commit { walks: walks.collect(), ..Commit::default() }).await.unwrap();
     let known = |walk: store::WalkStatus| (walk.tau, walk.temperature, walk.relative_volume, walk.gamma_max);
     let walks = store.status().await.unwrap().walks.into_iter().map(known).collect::<Vec<_>>();
-    // One with a bias, one without, one that has not begun.
+    // One with a bias, one without, one that has not started.
     let begun = (Some(0.5), Some(300.0), Some(1.1), Some(1.2));
     let unbiased = (Some(0.0), Some(300.0), Some(1.1), None);
     assert_eq!(walks, [begun, unbiased, (None, None, None, None)]);
@@ -246,7 +246,7 @@ async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
     assert_eq!(pause(&[1, 0, 1], true).await.unwrap(), [1, 0]);
     assert_eq!(pause(&[1], true).await.unwrap(), [0_u32; 0], "it is paused already");
     assert_eq!(pause(&[0, 2], false).await.unwrap(), [0]);
-    // Nothing is changed where one of them cannot be.
+    // Nothing changes if one of them cannot be paused.
     let error = pause(&[0, 2], true).await.unwrap_err().to_string();
     assert_eq!(error, "walk 2 has ended (blew up): only running walks can be paused");
     let error = pause(&[0, 3], true).await.unwrap_err().to_string();
@@ -261,7 +261,7 @@ async fn walks_are_paused_and_resumed_by_anybody_at_any_time() {
     let log = reader.operations(0, 100).await.unwrap();
     let log = log.iter().filter(|line| line.time == 5).map(|line| format!("{} {}", line.kind, line.detail));
     assert_eq!(log.collect::<Vec<_>>(), ["pause {\"walk\":1}", "pause {\"walk\":0}", "resume {\"walk\":0}"]);
-    // Its end is the end of its pause.
+    // The end of a walk ends its pause.
     store
         .commit(&Commit {
             walks: vec![WalkRecord { state: "steps".into(), ..walk(1, 2) }],
@@ -306,7 +306,7 @@ async fn the_newest_decisions_come_in_short() {
         |decisions: Vec<store::RecentDecision>| decisions.iter().map(|d| d.sequence).collect::<Vec<_>>();
     assert_eq!(numbers(store.newest_decisions(1, 10).await.unwrap()), [3, 2]);
     assert_eq!(numbers(store.newest_decisions(0, 1).await.unwrap()), [3]);
-    // Jobs say as much of what they are for.
+    // Jobs describe their candidates.
     let job = store.queue_list(None, 10, 0).await.unwrap().remove(0);
     assert_eq!(
         (job.walk, job.step, job.seed_structure.as_str(), job.origin.as_str()),

@@ -1,4 +1,4 @@
-//! What is told of one candidate: found by number, name or the beginning of it, with what stands around it.
+//! The history of a candidate, found by number, name or prefix.
 
 use store::{CandidateRef, Commit, CoveredCandidate, Fate, JobState, LabelStatus, StoreError};
 use wire::messages::Decline;
@@ -10,7 +10,7 @@ use crate::common::*;
 async fn a_candidate_is_found_with_what_stands_around_it() {
     let home = Home::new();
     let store = home.create().await.with_caller_clock();
-    // Their walkers saw version 3; after the decisions there are as many versions as steps.
+    // Their walkers saw version 3; each decision adds a version.
     let covered = Fate::Declined(Decline::Covered);
     let records = [
         candidate(0, 4, Origin::Biased, Fate::Accepted),

@@ -1,4 +1,4 @@
-//! What `Store::check` finds, each in a campaign that is damaged in one way.
+//! Findings of `Store::check`, each in a campaign with one kind of damage.
 
 use store::{Commit, Decision, Fate, Finding, Store};
 use wire::Origin;
@@ -6,7 +6,7 @@ use wire::messages::Decline;
 
 use crate::common::*;
 
-/// Two walks with a structure each, one of them labelled, a declined candidate and a decision about none.
+/// Two walks with a structure each, one of them labelled, a declined candidate, and a decision without a candidate.
 pub async fn whole(home: &Home) -> Store {
     let store = home.create().await;
     let records = vec![
@@ -20,7 +20,7 @@ pub async fn whole(home: &Home) -> Store {
     store.commit(&commit).await.unwrap();
     let lease = store.lease(protocol("dft").hash, "l", 0, 600).await.unwrap().unwrap();
     store.complete(&lease, &label(-1.0), 1).await.unwrap();
-    // An empty tar file, compressed.
+    // An empty compressed tar file.
     let packed = zstd::encode_all(&[0; 1024][..], 3).unwrap();
     store.keep_archive(lease.job, lease.attempt, &packed, "").await.unwrap();
     store

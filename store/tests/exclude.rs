@@ -1,4 +1,4 @@
-//! Labels that are taken out of the data set by hand, and in again.
+//! Excluding labels by hand and including them again.
 
 use serde_json::json;
 use store::{
@@ -14,7 +14,7 @@ async fn lease(store: &Store, now: i64) -> Lease {
     store.lease(protocol("dft").hash, "host/a", now, 10).await.unwrap().unwrap()
 }
 
-/// Candidates that all have their labels, with energies −1, −2, … Their names.
+/// Labelled candidates with energies −1, −2, … Returns their names.
 async fn labelled(home: &Home, number: u64) -> (Store, Vec<String>) {
     let store = home.create().await.with_caller_clock();
     let names = accept(&store, number).await;
@@ -42,7 +42,7 @@ async fn exported(store: &Store, protocol: &Protocol) -> Vec<f64> {
     rows.iter().map(|row| row.label.energy).collect()
 }
 
-/// Standing, energy, and why it is excluded of every label of a structure.
+/// Status, energy and reason of exclusion of every label of a structure.
 async fn history(store: &Store, structure: ContentHash) -> Vec<(LabelStatus, f64, Option<String>)> {
     let labels = store.labels_of(structure).await.unwrap().into_iter().map(|label| label.record);
     labels.map(|record| (record.status, record.label.energy, record.excluded.map(|e| e.reason))).collect()
@@ -67,7 +67,7 @@ async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
     let ids = names(&["0.0.2"]);
     let expected = [change(second, true, Some("it has a hole"))];
     assert_eq!(store.exclude(&ids, "it has a hole", 100).await.unwrap(), expected);
-    // Whoever asks twice changes nothing, and the first reason stays.
+    // Repeating it changes nothing; the first reason stays.
     let expected = [change(second, false, Some("it has a hole"))];
     assert_eq!(store.exclude(&ids, "another", 200).await.unwrap(), expected);
 
@@ -94,7 +94,7 @@ async fn an_excluded_label_counts_nowhere_until_it_is_taken_in_again() {
     let all = store.excluded().await.unwrap();
     assert_eq!((all.len(), all[0].id.as_str(), all[0].exclusion.time), (1, second, 100));
     whole(&store).await;
-    // Its job is done: nobody labels it again by himself.
+    // Its job is done: it is not labelled again automatically.
     assert!(store.lease(dft.hash, "host/a", 300, 10).await.unwrap().is_none());
 
     assert_eq!(store.include(&ids, 400).await.unwrap(), [change(second, true, None)]);
@@ -132,7 +132,7 @@ async fn all_that_are_named_are_excluded_or_none() {
         );
     }
     assert_eq!(store.status().await.unwrap().labels.excluded, 0);
-    // One that is named twice is one.
+    // Naming it twice counts once.
     let ids = [candidates[0].clone(), "0.0.1".to_owned(), "0.0.2".to_owned()];
     let changes = store.exclude(&ids, "bad", 1).await.unwrap();
     assert_eq!(
@@ -162,7 +162,7 @@ async fn only_a_label_that_was_asked_for_comes_in_its_place() {
     let order = RelabelRequest { structures: &[content(1)], again: true, reason: "better", protocol: None };
     assert_eq!(store.relabel(&order, 20_005).await.unwrap().again, 1);
     whole(&store).await;
-    // Until it comes, the other stays excluded; in vain, it stays so as well.
+    // Until the new label arrives, the other one stays excluded, also if it never arrives.
     let failing = lease(&store, 20_006).await;
     store.fail(&failing, "crashed", "", 1, 20_007).await.unwrap();
     assert_eq!(store.queue_show(&names[0]).await.unwrap().job.state, JobState::Labelled);
@@ -176,7 +176,7 @@ async fn only_a_label_that_was_asked_for_comes_in_its_place() {
         ((LabelStatus::Superseded, -1.0, bad), |energy| (LabelStatus::Check, energy, None));
     let expected = [superseded, check(-9.0), check(-8.0), (LabelStatus::Label, -1.5, None)];
     assert_eq!(history(&store, content(1)).await, expected);
-    // There is nothing to take in again.
+    // There is nothing to include.
     assert_eq!(store.include(&names, 20_011).await.unwrap(), [change(&names[0], false, None)]);
     assert_eq!(exported(&store, &dft).await, [-1.5]);
     whole(&store).await;
@@ -193,7 +193,7 @@ async fn imported_structures_have_labels_to_exclude() {
     assert_eq!(store.exclude(&ids, "bad", 20).await.unwrap(), [change("import-2", true, Some("bad"))]);
     assert_eq!(exported(&store, &dft).await, [-1.0, -5.0]);
     assert_eq!(store.excluded().await.unwrap()[0].id, "import-2");
-    // The same numbers once more change nothing.
+    // Identical results change nothing.
     assert_eq!(store.import(dft.hash, "known.extxyz", &frames, 30).await.unwrap().known, 2);
     assert_eq!(exported(&store, &dft).await, [-1.0, -5.0]);
     store.include(&ids, 40).await.unwrap();

@@ -1,4 +1,4 @@
-//! What is peculiar to a database that is a file.
+//! Properties of a database that is a file.
 
 use std::fs;
 
@@ -9,7 +9,7 @@ use crate::common::*;
 #[tokio::test]
 async fn a_database_is_there_as_a_whole_or_not_at_all() {
     let directory = tempfile::tempdir().unwrap();
-    // What a creation that was killed may leave behind does not matter.
+    // Leftovers of a killed creation are ignored.
     fs::write(directory.path().join("campaign.sqlite.new"), b"half a file").unwrap();
     create(directory.path()).await.close().await;
     let files = fs::read_dir(directory.path()).unwrap().count();
@@ -48,7 +48,7 @@ async fn other_files_and_versions_are_refused_with_what_was_found() {
     fs::write(&path, &foreign).unwrap();
     assert!(matches!(Store::open(directory.path()).await, Err(StoreError::Foreign { found: 9, .. })));
     assert_eq!(fs::read(&path).unwrap(), foreign, "a foreign database is left as it is");
-    // Bytes of a page in disorder.
+    // Scrambles the bytes of a page.
     let mut damaged = whole;
     damaged[4096..].fill(0x55);
     fs::write(&path, &damaged).unwrap();
@@ -84,7 +84,7 @@ async fn a_campaign_can_be_looked_at_where_nothing_may_be_written() {
     let seen = Store::open_read_only(directory.path()).await.unwrap().status().await.unwrap();
     permit(0o755);
     assert_eq!(seen.labels.queued, 2);
-    // Nothing is forbidden to the superuser.
+    // The superuser may do anything.
     if !rustix::process::geteuid().is_root() {
         assert!(matches!(lock, Err(StoreError::Directory { .. })), "{lock:?}");
         let error = refused.unwrap_err();
@@ -106,7 +106,7 @@ async fn nothing_is_written_into_a_file_that_is_not_there_any_more() {
         assert!(matches!(&error, StoreError::Removed { path: found } if *found == path), "{error}");
         let refused = store.lease(protocol("dft").hash, "l", 0, 9).await;
         assert!(matches!(refused, Err(StoreError::Removed { .. })));
-        // Another file in its place is not the same.
+        // Another file in its place is detected.
         fs::copy(&moved, &path).unwrap();
     }
     fs::rename(&moved, &path).unwrap();

@@ -1,4 +1,4 @@
-//! What became of label jobs, as the cost model, `status` and the table of force errors read it.
+//! Results of label jobs, as the cost model, `status` and the table of force errors read them.
 
 use store::{
     FailureCount, Fate, FateCount, JobState, LabelUsage, Lease, PendingJobs, Store, Unlabelled, ValueRange,
@@ -11,7 +11,7 @@ async fn lease(store: &Store, now: i64) -> Lease {
     store.lease(protocol("dft").hash, "a", now, 1000).await.unwrap().unwrap()
 }
 
-/// Accepts a structure with this largest γ under the original mixture, and V/V₀.
+/// Accepts a structure with this largest γ under the original mixture and this V/V₀.
 async fn accept_with(store: &Store, step: u64, gamma: f64, relative_volume: f64) -> String {
     let mut record = candidate(0, step, Origin::Biased, Fate::Accepted);
     let candidate = Candidate { relative_volume, ..record.block.view().to_candidate() };
@@ -21,7 +21,7 @@ async fn accept_with(store: &Store, step: u64, gamma: f64, relative_volume: f64)
     name_of(&record)
 }
 
-/// Three labels, of which the second takes two attempts; two that fail for good, and one that waits.
+/// Three labels, the second of which takes two attempts; two failed jobs, and one that waits.
 async fn filled(home: &Home) -> (Store, Vec<String>) {
     let store = home.create().await.with_caller_clock();
     let mut names = Vec::new();
@@ -56,10 +56,10 @@ async fn costs_are_those_of_the_attempts_that_brought_labels() {
     assert_eq!(store.label_costs(protocol("dft").hash, 1).await.unwrap(), costs[..1]);
     let waiting = store.waiting_jobs(protocol("dft").hash).await.unwrap();
     assert_eq!(waiting, [PendingJobs { seed_structure: 0, formula: "Si2".into(), atoms: 2, jobs: 1 }]);
-    // Three attempts in vain: 5 s, and twice 1 s.
+    // Three failed attempts: 5 s, and twice 1 s.
     let expected = LabelUsage { core_seconds: Some(21.0), label_core_seconds: Some(14.0), cores: 0 };
     assert_eq!(store.label_usage().await.unwrap(), expected);
-    // There are no walks here; but the sums are those of the attempts.
+    // There are no walks here, but the totals are those of the attempts.
     let findings = store.check(|_, _| ()).await.unwrap();
     assert!(
         findings.iter().all(|finding| finding.what.contains("candidates of missing walks")),
@@ -105,7 +105,7 @@ async fn what_failed_is_a_part_of_the_collected_space() {
     assert_eq!((only.gamma, only.gamma_labelled), (range(3.0, 4.0), range(1.5, 1.7)));
     assert_eq!((only.relative_volume, only.relative_volume_labelled), (range(1.35, 1.4), range(1.0, 1.2)));
 
-    // Page by page, whatever its length.
+    // In pages of any length.
     let (mut after, mut jobs) = (0, Vec::new());
     loop {
         let page = store.finished(protocol("dft").hash, after, 2).await.unwrap();
@@ -122,7 +122,7 @@ async fn what_failed_is_a_part_of_the_collected_space() {
     assert_eq!((jobs[0].class.as_deref(), jobs[3].class.as_deref()), (None, Some("crashed")));
     assert!(jobs[1].unlabelled.is_none());
     assert_eq!(jobs[3].unlabelled.as_ref().unwrap().gamma, [4.0, 0.8]);
-    // Of a protocol without jobs nothing is told.
+    // A protocol without jobs has no results.
     store.add_protocol(&protocol("other"), 0).await.unwrap();
     assert!(store.finished(protocol("other").hash, 0, 9).await.unwrap().is_empty());
     assert!(store.unlabelled(protocol("other").hash, true).await.unwrap().is_empty());

@@ -1,4 +1,4 @@
-//! Who works for a campaign, and what comes back of those who are gone.
+//! Processes of a campaign, and the leases of dead ones.
 
 use store::{JobState, Lease, ProcessRecord, Store, process_start_time};
 
@@ -9,7 +9,7 @@ fn living(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
     ProcessRecord { id: id.into(), ..ProcessRecord::new(kind, number, std::process::id(), 1) }
 }
 
-/// Its number belongs to another process by now.
+/// Its process id belongs to another process now.
 fn gone(id: &str, kind: &str, number: Option<u32>) -> ProcessRecord {
     let living = living(id, kind, number);
     ProcessRecord { start_time: format!("{}0", living.start_time), ..living }
@@ -61,7 +61,7 @@ async fn a_replacement_takes_the_place_of_its_predecessor() {
     let mut found = names(&store).await;
     found.sort();
     assert_eq!(found, ["o", "w0", "w1 again"]);
-    // One that lives on keeps its record.
+    // A predecessor that is alive keeps its record.
     store.upsert_process(&living("w1 again again", "walker", Some(1))).await.unwrap();
     assert_eq!(names(&store).await.len(), 4);
     store.upsert_process(&living("l", "labeller", Some(1))).await.unwrap();
@@ -118,7 +118,7 @@ async fn a_lease_that_ran_out_is_kept_by_a_process_that_may_be_at_work() {
         lease(&store, holder, 0).await;
     }
     let asleep = lease(&store, "asleep", 0).await;
-    // The computer slept for eight hours.
+    // The computer was suspended for eight hours.
     lease(&store, "first awake", 8 * HOUR).await;
     assert_eq!(holders(&store).await, ["asleep", "asleep/3", "first awake", "heard elsewhere"]);
     assert!(store.renew(&asleep, 8 * HOUR, 600).await.unwrap());
@@ -134,7 +134,7 @@ async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
     let processes = [
         living("living", "labeller", Some(0)),
         gone("gone", "labeller", Some(1)),
-        // Whoever holds the lock knows better than the table.
+        // The holder of the lock knows better than the table.
         living("earlier", "orchestrator", None),
         living("w", "walker", Some(0)),
     ];
@@ -149,7 +149,7 @@ async fn a_starting_run_adopts_living_labellers_and_takes_back_the_rest() {
     let logged = store.operations(0, 100).await.unwrap().pop().unwrap();
     assert_eq!((logged.time, logged.kind.as_str()), (1, "lost"));
     assert_eq!(logged.detail, serde_json::json!({ "processes": ["earlier", "gone"], "leases": 4 }));
-    // Nothing more to take over, and nothing to tell.
+    // Nothing more to reclaim or to report.
     assert_eq!(store.reclaim_leases(2).await.unwrap(), 0);
     assert_eq!(store.operations(logged.number, 100).await.unwrap(), []);
 }
@@ -173,7 +173,7 @@ async fn status_says_who_is_gone_and_who_was_given_up() {
         store.status().await.unwrap().processes.into_iter().map(|process| process.state).collect()
     };
     assert_eq!(states().await, ["running", "gone", "given up", "pausing"]);
-    // Without its orchestrator nobody starts the third again.
+    // Without its orchestrator the third is not restarted.
     store.upsert_process(&gone("o", "orchestrator", None)).await.unwrap();
     assert_eq!(states().await, ["gone", "gone", "given up", "gone"]);
 }

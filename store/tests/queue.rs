@@ -37,7 +37,7 @@ async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
     assert!(store.renew(&first, 5_000, 60).await.unwrap());
     assert_eq!(store.unfinished_jobs().await.unwrap(), 3);
 
-    // The two others ran out of time; the renewed one did not.
+    // The two others expired; the renewed one did not.
     assert_eq!(lease(&store, "c", 10_000).await.unwrap().candidate, names[0]);
     assert_eq!(state(&store, &names[1]).await, JobState::Queued);
     assert_eq!(state(&store, &names[2]).await, JobState::Leased);
@@ -45,7 +45,7 @@ async fn jobs_go_by_priority_then_age_and_come_back_when_their_time_is_over() {
     assert_eq!((again.candidate.as_str(), again.attempt), (names[2].as_str(), 2));
     assert_eq!(again.earlier_calculations, ["slurm 17"]);
     assert!(!store.renew(&first, 65_000, 60).await.unwrap());
-    // That time ran out says nothing about the job.
+    // Expiry says nothing about the job.
     let details = store.queue_show(&names[0]).await.unwrap();
     assert_eq!((details.job.state, details.job.failures), (JobState::Queued, 0));
     let outcomes: Vec<_> = details.attempts_made.iter().map(|a| a.outcome.as_deref()).collect();
@@ -150,7 +150,7 @@ async fn a_job_that_is_lost_again_and_again_is_given_up() {
             let released = match loss % 3 {
                 0 => store.release_all("h", now).await.unwrap(),
                 1 => store.release_leases_of_dead_processes(now).await.unwrap(),
-                // It runs out.
+                // It expires.
                 _ => continue,
             };
             assert_eq!(released, 1);
@@ -159,7 +159,7 @@ async fn a_job_that_is_lost_again_and_again_is_given_up() {
     lose(24).await;
     let failing = lease(&store, "h", 240_000).await.unwrap();
     assert_eq!(store.fail(&failing, "not converged", "SCF", LIMIT, 0).await.unwrap(), FailOutcome::Requeued);
-    // Each time with as many attempts as at first: after a failure, and when it is queued by hand.
+    // Each time with as many attempts as at first: after a failure, and when it is requeued by hand.
     for attempts in [50, 75] {
         lose(25).await;
         let details = store.queue_show(&names[0]).await.unwrap();
@@ -261,7 +261,7 @@ async fn candidates_found_before_there_is_a_protocol_get_their_jobs_later() {
     let mut other = protocol("other");
     other.name = "dft".into();
     assert!(matches!(store.add_protocol(&other, 3).await, Err(StoreError::ProtocolName(_))));
-    // A new protocol holds for new candidates only.
+    // A new protocol applies to new candidates only.
     store.add_protocol(&protocol("finer"), 4).await.unwrap();
     assert!(store.lease(protocol("finer").hash, "a", 5, 10).await.unwrap().is_none());
 }
@@ -293,7 +293,7 @@ async fn imports_label_what_waits_and_can_be_repeated() {
     assert_eq!(store.status().await.unwrap().imported, 2);
 }
 
-/// A campaign whose labels come in the order `order`; the text of its export, read in pages of `page`.
+/// A campaign whose labels arrive in the order `order`. Returns the text of its export, read in pages of `page`.
 async fn export_text(order: &[usize], page: u32, filter: &ExportFilter) -> Vec<String> {
     let home = Home::new();
     let store = home.create().await;
@@ -386,7 +386,7 @@ async fn two_connections_never_lease_the_same_job() {
     assert_eq!(store.status().await.unwrap().labels.labelled, 60);
 }
 
-/// A calculation that was taken over counts once, with the attempt that brought its result.
+/// A calculation that was taken over counts once, with the attempt that delivered its result.
 #[tokio::test]
 async fn what_calculations_take_is_kept_and_counted_once() {
     let home = Home::new();
@@ -427,7 +427,7 @@ async fn what_calculations_take_is_kept_and_counted_once() {
     let hash = ContentHash::of(&second.structure);
     assert_eq!(store.label_history(hash, protocol("dft").hash).await.unwrap()[0].label, label);
 
-    // Another time of a calculation that has ended changes the sum by the difference.
+    // A corrected time of a finished calculation changes the total by the difference.
     store.record_cost(&second, 18.0, "the end").await.unwrap();
     let third = lease(&store, "c", 6000).await.unwrap();
     store.record_calculation(&third, "there", &made).await.unwrap();
@@ -461,7 +461,7 @@ async fn directories_of_calculations_are_kept_with_their_attempts() {
         Archive { attempt: 1, bytes: b"second".to_vec(), left_out: "work/large (5 bytes)\n".into() };
     assert_eq!(store.archives(lease.job).await.unwrap(), std::slice::from_ref(&archive));
     assert_eq!(store.past_calculation(lease.job, 2).await.unwrap(), None);
-    // It goes with a copy, and so does what was used up.
+    // A copy keeps the limits and their use.
     let elsewhere = tempfile::tempdir().unwrap();
     let target = elsewhere.path().join("copy");
     store.backup(&target, 7, |_, _| ()).await.unwrap();
@@ -470,7 +470,7 @@ async fn directories_of_calculations_are_kept_with_their_attempts() {
     assert_eq!(copy.budget(9).await.unwrap(), store.budget(9).await.unwrap());
 }
 
-/// The answer to the commit of a lease was lost: its holder lives, and knows nothing of it.
+/// The reply to the commit of a lease was lost: its holder is alive and does not know of it.
 #[tokio::test]
 async fn what_a_holder_does_not_state_comes_back() {
     let home = Home::new();
@@ -487,12 +487,12 @@ async fn what_a_holder_does_not_state_comes_back() {
         assert!(store.renew(held, 2, 600).await.unwrap(), "{}", held.holder);
     }
     assert!(!store.renew(&unknown, 2, 600).await.unwrap());
-    // It waits again, and nobody has failed.
+    // It waits again, and no attempt has failed.
     let again = lease("a").await;
     assert_eq!((again.job, again.attempt, again.failures.len()), (unknown.job, 2, 0));
     let details = store.queue_show(&again.candidate).await.unwrap();
     assert_eq!(details.attempts_made[0].outcome.as_deref(), Some("lost"));
-    // One of an earlier attempt is another lease.
+    // The lease of an earlier attempt is a different one.
     assert_eq!(store.state_leases("a", &[&known, &unknown], 3).await.unwrap(), 1);
     assert_eq!(store.state_leases("a", &[], 3).await.unwrap(), 1);
     assert_eq!((store.state_leases("a/0", &[&part], 3).await.unwrap(), details.job.failures), (0, 0));

@@ -1,4 +1,4 @@
-//! The queue against a model of a few lines, under random operations and a clock of its own.
+//! Compares the queue with a small model, under random operations and a simulated clock.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -49,7 +49,7 @@ struct ModelJob {
     expires: Option<i64>,
     attempts: u32,
     failures: u32,
-    /// Attempts that brought a result; the first one's is the label.
+    /// Attempts that delivered a result; the first one's is the label.
     results: Vec<u32>,
 }
 
@@ -58,7 +58,7 @@ impl ModelJob {
         (self.state, self.holder, self.expires) = (state, None, None);
     }
 
-    /// In so few steps no job is lost so often that it is given up.
+    /// There are too few steps for a job to reach the limit of losses.
     fn lose(&mut self) {
         self.change_to(JobState::Queued);
     }
@@ -69,7 +69,7 @@ impl ModelJob {
     }
 }
 
-/// Jobs by their place in decision order.
+/// Jobs by index in decision order.
 struct Model(BTreeMap<usize, ModelJob>);
 
 impl Model {

@@ -1,4 +1,4 @@
-//! Labels that are made anew, by the same protocol and by another.
+//! Making labels again, under the same protocol and under another.
 
 use serde_json::json;
 use store::{
@@ -15,13 +15,13 @@ async fn lease(store: &Store, protocol: &Protocol, now: i64) -> Option<Lease> {
     store.lease(protocol.hash, "host/a", now, 10).await.unwrap()
 }
 
-/// Leases what is next by a protocol, and labels it.
+/// Leases and labels the next job of a protocol.
 async fn label_next(store: &Store, protocol: &Protocol, energy: f64, now: i64) -> CompleteOutcome {
     let lease = lease(store, protocol, now).await.unwrap();
     store.complete(&lease, &label(energy), now + 1).await.unwrap()
 }
 
-/// Candidates of which the first `labelled` have their labels by "dft", with energies −1, −2, …
+/// Candidates of which the first `labelled` have labels under "dft", with energies −1, −2, …
 async fn campaign_with(home: &Home, candidates: u64, labelled: u64) -> (Store, Vec<ContentHash>) {
     let store = home.create().await;
     accept(&store, candidates).await;
@@ -46,7 +46,7 @@ async fn change_to(store: &Store, to: &Protocol, structures: &[ContentHash]) -> 
     store.relabel(&order, 200).await.unwrap()
 }
 
-/// Standing, energy and protocol of every label of a structure.
+/// Status, energy and protocol of every label of a structure.
 async fn history(store: &Store, structure: ContentHash) -> Vec<(LabelStatus, f64, String)> {
     let labels = store.labels_of(structure).await.unwrap().into_iter();
     labels.map(|label| (label.record.status, label.record.label.energy, label.protocol.name)).collect()
@@ -124,7 +124,7 @@ async fn a_label_that_cannot_be_made_again_stays_as_it_was() {
     let labels = store.status().await.unwrap().labels;
     assert_eq!((labels.labelled, labels.failed, labels.again, labels.again_in_vain), (1, 0, 0, 1));
     whole(&store).await;
-    // It may be asked for once more, and a result that comes late is the one that was asked for.
+    // It may be requested again, and a late result satisfies the request.
     assert_eq!(again(&store, &structures, true).await, AGAIN);
     let third = lease(&store, &dft, 400).await.unwrap();
     assert!(third.failures.is_empty());
@@ -158,7 +158,7 @@ async fn another_protocol_takes_over_label_by_label() {
     let home = Home::new();
     let (store, structures) = campaign_with(&home, 5, 2).await;
     let (dft, fine) = (protocol("dft"), protocol("fine"));
-    // One is under way, one failed, one waits.
+    // One is running, one failed, one waits.
     let under_way = lease(&store, &dft, 10).await.unwrap();
     let failing = lease(&store, &dft, 10).await.unwrap();
     store.fail(&failing, "crashed", "", 1, 11).await.unwrap();
@@ -177,7 +177,7 @@ async fn another_protocol_takes_over_label_by_label() {
     assert_eq!(store.campaign().await.unwrap().configuration_in_force, "{\"new\":1}");
     assert_eq!(store.metadata("label_method").await.unwrap().unwrap(), "how fine is made");
     assert!(store.is_in_force(fine.hash).await.unwrap() && !store.is_in_force(dft.hash).await.unwrap());
-    // Nobody waits for what was under way, and nothing is begun by the old protocol.
+    // The running one is no longer needed, and nothing starts under the old protocol.
     assert!(!store.renew(&under_way, 210, 10).await.unwrap());
     assert_eq!(store.lease_status(&under_way).await.unwrap(), LeaseStatus::Over);
     assert_eq!(store.complete(&under_way, &label(-7.0), 211).await.unwrap(), CompleteOutcome::KeptAsCheck);
@@ -188,7 +188,7 @@ async fn another_protocol_takes_over_label_by_label() {
     assert_eq!((labels.queued, labels.labelled, labels.failed, labels.again), (5, 2, 0, 2));
     assert_eq!(exported(&store, &dft).await, [-1.0, -2.0]);
 
-    // The first gets its label by the new protocol, the second finally fails.
+    // The first is labelled under the new protocol, the second fails.
     assert_eq!(label_next(&store, &fine, -1.5, 300).await, CompleteOutcome::Label);
     let in_vain = lease(&store, &fine, 310).await.unwrap();
     assert_eq!(store.fail(&in_vain, "crashed", "", 1, 311).await.unwrap(), FailOutcome::GivenUp);
@@ -202,7 +202,7 @@ async fn another_protocol_takes_over_label_by_label() {
     assert_eq!((labels.labelled, labels.failed, labels.again, labels.again_in_vain), (2, 1, 0, 1));
     whole(&store).await;
 
-    // Those without a label get their first by the new protocol; the one that failed is asked for once more.
+    // Those without a label get their first under the new protocol; the failed one is requested again.
     for energy in [-3.0, -4.0, -5.0] {
         assert_eq!(label_next(&store, &fine, energy, 400).await, CompleteOutcome::Label);
     }
@@ -255,7 +255,7 @@ async fn what_was_dropped_is_left_alone() {
     assert_eq!(store.complete(&lease, &label(-1.5), 302).await.unwrap(), CompleteOutcome::KeptAsCheck);
     assert_eq!(again(&store, &structures, true).await, RelabelCounts::default());
     whole(&store).await;
-    // Wanted again, it waits for the label that was asked for.
+    // Requested again, it waits for the new label.
     store.retry_job(&name, 303).await.unwrap();
     assert_eq!(label_next(&store, &fine, -1.6, 304).await, CompleteOutcome::Label);
     let expected = [

@@ -203,7 +203,7 @@ pub(super) async fn counts(transaction: &mut Transaction) -> Result<Vec<Finding>
     Ok((count > 0).then(|| Finding { what: what(), then: LOST }).into_iter().collect())
 }
 
-/// The same of label jobs.
+/// The same for label jobs.
 pub(super) async fn job_counts(transaction: &mut Transaction) -> Result<Vec<Finding>> {
     if !job_counts::have_counts(transaction).await? {
         return Ok(Vec::new());

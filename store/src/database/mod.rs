@@ -128,7 +128,7 @@ impl Transaction {
         Ok(found > 0)
     }
 
-    /// The same of a column.
+    /// The same for a column.
     pub async fn has_column(&mut self, table: &str, name: &str) -> Result<bool> {
         let sql = match self {
             Self::Sqlite(_) => "SELECT count(*) FROM pragma_table_info($1) WHERE name = $2",

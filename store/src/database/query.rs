@@ -11,7 +11,7 @@ use super::{Database, Target, Transaction, missing_row};
 use crate::error::{Result, StoreError};
 use crate::postgres::{RETRY_INTERVAL, Server};
 
-/// SQL with its values.
+/// SQL with its bound values.
 #[derive(Clone)]
 pub struct Query {
     sql: &'static str,

@@ -51,7 +51,7 @@ pub(crate) async fn have_counts(transaction: &mut Transaction) -> Result<bool> {
     transaction.has_table("job_count").await
 }
 
-/// Numbers of jobs by state.
+/// Number of jobs by state.
 pub(super) async fn states(transaction: &mut Transaction) -> Result<Vec<(String, u64)>> {
     let sql = if have_counts(transaction).await? { STATES } else { COUNTED_STATES };
     query(sql).fetch_all(transaction).await

@@ -1,4 +1,4 @@
-//! What is said when there is no connection to be had.
+//! Error messages for missing connections.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use store::{Commit, Location, Store};
 use super::common::*;
 use super::leading::connect;
 
-/// A server that refuses new connections, though it is there.
+/// A server that refuses new connections.
 #[tokio::test]
 async fn a_server_without_a_connection_left_is_waited_for_and_says_so() {
     let home = Home::new();
@@ -34,7 +34,7 @@ async fn a_server_without_a_connection_left_is_waited_for_and_says_so() {
     connection.execute(AssertSqlSafe(leave)).await.unwrap();
 }
 
-/// Somebody holds what all connections of a process wait for.
+/// All connections of a process wait for a lock.
 #[tokio::test]
 async fn who_waits_for_a_lock_is_not_told_that_the_server_is_away() {
     let home = Home::new();

@@ -1,4 +1,4 @@
-//! One process leads a campaign, and one schema holds one.
+//! Only one process leads a campaign, and a schema holds only one campaign.
 
 use std::time::Duration;
 
@@ -9,13 +9,13 @@ use wire::{CampaignId, Origin};
 
 use super::common::*;
 
-/// A connection to see and do what a store does not.
+/// A connection for what a store does not do.
 pub async fn connect(home: &Home) -> PgConnection {
     let options: PgConnectOptions = server().parse().unwrap();
     options.options([("search_path", home.schema())]).connect().await.unwrap()
 }
 
-/// Ends the connection that holds the lock, as a break of the network would.
+/// Ends the connection that holds the lock, like a network failure.
 async fn break_the_lock(home: &Home) {
     let sql = "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity
                WHERE application_name = $1 AND pid IN (SELECT pid FROM pg_locks WHERE locktype = 'advisory')";
@@ -63,13 +63,13 @@ async fn who_lost_the_lock_learns_it_and_writes_nothing_more() {
         break_the_lock(&home).await;
         match CampaignLock::acquire_at(home.location(), "second").await {
             Ok(lock) => break lock,
-            // The first was faster to take it again.
+            // The first took it again before.
             Err(error) => assert!(matches!(error, StoreError::Locked { .. }), "{error}"),
         }
     };
     let new = home.open().await.fenced_by(&second);
     let fresh = |step| commit_of(vec![candidate(0, step, Origin::Biased, Fate::Accepted)]);
-    // Before it learns it, too.
+    // Also before it notices.
     for error in [
         old.commit(&fresh(7)).await.unwrap_err(),
         old.add_protocol(&protocol("other"), 0).await.unwrap_err(),
@@ -124,7 +124,7 @@ async fn foreign_tables_and_newer_versions_are_left_alone() {
     }
 }
 
-/// Several at once, so that none finds what another is still making.
+/// Several at once: none finds tables that another is still creating.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn several_processes_may_make_the_tables() {
     let home = Home::new();

@@ -1,4 +1,4 @@
-//! Leases among hosts: nobody gets a job twice, and nobody's clock counts but the server's.
+//! Leases across hosts: no job is leased twice, and only the server's clock counts.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -16,7 +16,7 @@ async fn lease(store: &Store, holder: &str, now: i64, seconds: u32) -> Option<Le
     store.lease(protocol("dft").hash, holder, now, seconds).await.unwrap()
 }
 
-/// A campaign with so many jobs, by the server's clock.
+/// A campaign with this many jobs that uses the server's clock.
 async fn with_jobs(home: &Home, jobs: u64) -> Store {
     let store = home.create().await;
     let records = (1..=jobs).map(|step| candidate(0, step, Origin::Biased, Fate::Accepted)).collect();
@@ -58,7 +58,7 @@ async fn eight_labellers_at_once_never_get_the_same_job() {
     assert_eq!((labels.queued, labels.leased + labels.labelled), (0, 200));
 }
 
-/// A job that is being leased does not keep others from the next.
+/// A job that is being leased does not block the next one.
 #[tokio::test]
 async fn a_job_in_other_hands_is_passed_over() {
     let home = Home::new();
@@ -87,7 +87,7 @@ async fn labellers_whose_clocks_are_an_hour_apart_respect_each_other() {
     }
     assert_eq!(store.complete(&fast, &label(-1.0), now + HOUR).await.unwrap(), CompleteOutcome::Label);
 
-    // Who is silent loses its lease whatever its clock shows: its record was written by the server's.
+    // A silent process loses its lease whatever its clock shows: the server wrote the time of its record.
     let elsewhere = |id: &str, last_seen| {
         let here = ProcessRecord { id: id.into(), ..ProcessRecord::new("labeller", Some(7), 1, last_seen) };
         let start_time = store::process_start_time(std::process::id()).unwrap();
@@ -138,7 +138,7 @@ async fn whoever_waits_is_told_of_new_jobs() {
     store.commit(&commit_of(vec![candidate(1, 1, Origin::Biased, Fate::Accepted)])).await.unwrap();
     wait.await.unwrap();
     assert!(begun.elapsed() < long / 2);
-    // Told of it once; a job that comes back is told of as well.
+    // Notified once; a job that returns to the queue causes a notification as well.
     tokio::time::timeout(Duration::from_millis(300), store.wait_for_jobs(long)).await.unwrap_err();
     let leased = lease(&store, "a", 0, 600).await.unwrap();
     store.release_all("a", 0).await.unwrap();
@@ -147,7 +147,7 @@ async fn whoever_waits_is_told_of_new_jobs() {
     assert_eq!(lease(&store, "b", 0, 600).await.unwrap().job, leased.job);
 }
 
-/// The last words of a process may hold anything.
+/// The output of a process may contain anything.
 #[tokio::test]
 async fn zero_bytes_in_a_log_are_no_obstacle() {
     let home = Home::new();

@@ -5,7 +5,7 @@ use wire::Origin;
 
 use super::common::*;
 
-/// Makes them tables of version 8: what later versions add goes.
+/// Turns them into tables of version 8 by removing what later versions add.
 const WITHOUT_CHECKSUMS: &str = "
     ALTER TABLE campaign DROP COLUMN checksum; ALTER TABLE value DROP COLUMN checksum;
     ALTER TABLE structure DROP COLUMN checksum; ALTER TABLE seed_structure DROP COLUMN checksum;

@@ -1,4 +1,5 @@
-//! TLS to the server that `.ci/postgres` makes, whose certificate, and that of a user who needs one, are of its own authority.
+//! TLS to the server of `.ci/postgres`. Its certificate, and that of a user who needs one, are signed by its own
+//! authority.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -16,7 +17,7 @@ async fn certificates(home: &Home) -> PathBuf {
     Path::new(&file).parent().unwrap().to_owned()
 }
 
-/// The location as `user` by an encrypted connection, to the host by that name.
+/// The location for `user` over an encrypted connection to this host name.
 fn at(home: &Home, user: &str, host: &str, parameters: &str) -> Location {
     let address = server().split_once('@').unwrap().1.replace("127.0.0.1", host);
     let schema = home.schema();
@@ -24,7 +25,7 @@ fn at(home: &Home, user: &str, host: &str, parameters: &str) -> Location {
     url.parse().unwrap()
 }
 
-/// Number of the connections of a test by which its store and its lock are used, and of those that are encrypted.
+/// Number of connections of a test's store and lock, and of the encrypted ones among them.
 async fn connections(home: &Home) -> (i64, i64) {
     let sql = "SELECT count(*), count(*) FILTER (WHERE ssl) FROM pg_stat_activity NATURAL JOIN pg_stat_ssl
                WHERE application_name = $1";
@@ -57,9 +58,9 @@ async fn a_server_that_is_not_known_is_not_spoken_to() {
     let right = format!("sslmode=verify-full&sslrootcert={}/authority.pem", own.display());
     for (host, parameters, expected) in [
         ("localhost", wrong.as_str(), "BadSignature"),
-        // Public authorities alone.
+        // Public authorities only.
         ("localhost", "sslmode=verify-full", "UnknownIssuer"),
-        // Another name than that of its certificate.
+        // Another name than in its certificate.
         ("127.0.0.1", right.as_str(), "not valid for name"),
     ] {
         let error = Store::open(at(&home, "calmwalk", host, parameters)).await.unwrap_err();

@@ -1,5 +1,5 @@
-//! The server is restarted, as after a crash, while work goes on: nothing is lost, and nothing is there twice. By itself, since no
-//! other test can go on meanwhile: `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres restart::`.
+//! Restarts the server during work, as after a crash: nothing is lost or duplicated. Run separately, since no other
+//! test can run meanwhile: `CALMWALK_POSTGRES=$(.ci/postgres start) cargo test -p store --test postgres restart::`.
 
 use std::process::Command;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ fn restart() {
     assert!(Command::new("sh").args(["-c", &command]).status().unwrap().success(), "{command}");
 }
 
-/// The commit with number `k`, from 1, which all its parts tell.
+/// Commit `k`, from 1; all its parts contain `k`.
 fn numbered(k: u64) -> Commit {
     let records = vec![
         candidate(0, 2 * k, Origin::Biased, Fate::Accepted),
@@ -35,7 +35,7 @@ fn numbered(k: u64) -> Commit {
     }
 }
 
-/// Does it until the server is there.
+/// Retries until the server responds.
 async fn insist<T, F: Future<Output = Result<T, StoreError>>>(mut call: impl FnMut() -> F) -> T {
     loop {
         match call().await {
@@ -45,14 +45,14 @@ async fn insist<T, F: Future<Output = Result<T, StoreError>>>(mut call: impl FnM
     }
 }
 
-/// Labels what there is until nothing will come; returns how many labels were accepted.
+/// Labels until no more jobs will come. Returns the number of accepted labels.
 async fn label_all(store: Store, number: usize, no_more_jobs: Arc<AtomicBool>) -> u64 {
     let (holder, mut labelled) = (format!("l{number}"), 0);
     loop {
         let last_look = no_more_jobs.load(Ordering::Relaxed);
         let found = insist(|| store.lease(protocol("dft").hash, &holder, 0, 1)).await;
         let Some(lease) = found else {
-            // A lease whose answer was lost comes back when its time is over.
+            // A lease whose reply was lost is released when it expires.
             if last_look && insist(|| store.unfinished_jobs()).await == 0 {
                 return labelled;
             }
@@ -81,7 +81,7 @@ async fn nothing_is_lost_or_doubled_when_the_server_is_restarted() {
         let (store, done, committed) = (store.clone(), Arc::clone(&done), Arc::clone(&committed));
         async move {
             for k in 1.. {
-                // Each is given once: to wait for the server is up to the store.
+                // Each call is made once: the store waits for the server.
                 let numbers = store.commit(&numbered(k)).await.unwrap();
                 assert_eq!(numbers, 2 * k as i64 - 1..2 * k as i64 + 1);
                 committed.store(k, Ordering::Relaxed);

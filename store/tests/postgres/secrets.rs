@@ -1,4 +1,4 @@
-//! A password is nowhere to be read.
+//! The password is shown nowhere.
 
 use sqlx::Executor;
 use store::{CampaignLock, Location, Store};
@@ -8,7 +8,7 @@ use super::leading::connect;
 
 const PASSWORD: &str = "tr0ub4dor";
 
-/// The location with a user of its own, in the URL with its password.
+/// The location for a user of its own, with the password in the URL.
 async fn with_password(home: &Home) -> Location {
     let user = home.schema();
     let create = format!("CREATE ROLE {user} LOGIN SUPERUSER PASSWORD '{PASSWORD}'");
